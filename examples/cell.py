@@ -31,17 +31,24 @@ class Stage:
         self._at: tuple[float, ...] = (0.0, 0.0, 0.0)
         rows = range(-(marks // 2), marks - marks // 2)
         middle = 0.5 * (marks % 2 == 0)  # of an even number the centre is between the rows
-        self._marks = {(m, n): ((m + middle) * pitch + self._random.gauss(0, 3e-7),
-                                (n + middle) * pitch + self._random.gauss(0, 3e-7))
-                       for m in rows for n in rows}
+        self._marks = {
+            (m, n): (
+                (m + middle) * pitch + self._random.gauss(0, 3e-7),
+                (n + middle) * pitch + self._random.gauss(0, 3e-7),
+            )
+            for m in rows
+            for n in rows
+        }
         self._lines = [math.tau * k / lines + self._random.gauss(0, 2e-5) for k in range(lines)]
         self.place(Placing("", 0.0, 0.0, 0.0))
 
     def place(self, placing: Placing) -> None:
         """Lay the plate half a millirad and 20 um beside where it should be."""
         self._turn = placing.rotation + self._random.gauss(0, 5e-4)
-        self._centre = (placing.x + self._random.gauss(0, 2e-5),
-                        placing.y + self._random.gauss(0, 2e-5))
+        self._centre = (
+            placing.x + self._random.gauss(0, 2e-5),
+            placing.y + self._random.gauss(0, 2e-5),
+        )
 
     def error(self, x: float, y: float) -> Pair:
         """Return what the encoders say too much at (x, y), m: what the calibration shall find."""
@@ -61,22 +68,27 @@ class Stage:
 
     def offsets(self) -> list[Offset]:
         """Return the mark and the line nearest to the optical axis."""
-        (m, n), (x, y) = min(((mark, self.seen(place)) for mark, place in self._marks.items()),
-                             key=lambda item: math.hypot(*item[1]))
+        (m, n), (x, y) = min(
+            ((mark, self.seen(place)) for mark, place in self._marks.items()),
+            key=lambda item: math.hypot(*item[1]),
+        )
         theta = self._at[2] - 2e-5 * math.sin(self._at[2])  # its encoder is eccentric
         turns = [math.remainder(line + self._turn - theta, math.tau) for line in self._lines]
         k = min(range(len(turns)), key=lambda line: abs(turns[line]))
-        return [Offset(x + self._random.gauss(0, 5e-9), y + self._random.gauss(0, 5e-9),
-                       mark=(m, n)),
-                Offset(theta=turns[k] + self._random.gauss(0, 1e-7), line=k)]
+        return [
+            Offset(x + self._random.gauss(0, 5e-9), y + self._random.gauss(0, 5e-9), mark=(m, n)),
+            Offset(theta=turns[k] + self._random.gauss(0, 1e-7), line=k),
+        ]
 
     def seen(self, place: Pair) -> Pair:
         """Return mark centre less optical axis of a place on the plate, stage axes, m."""
         x, y = place
         cosine, sine = math.cos(self._turn), math.sin(self._turn)
         gx, gy = self.error(*self._at[:2])
-        return (self._centre[0] + cosine * x - sine * y - (self._at[0] - gx),
-                self._centre[1] + sine * x + cosine * y - (self._at[1] - gy))
+        return (
+            self._centre[0] + cosine * x - sine * y - (self._at[0] - gx),
+            self._centre[1] + sine * x + cosine * y - (self._at[1] - gy),
+        )
 
     def stop(self) -> None:
         """Stop at once."""

@@ -28,8 +28,10 @@ def main(path: str) -> None:
 
     error, u = stage.length_error((x[0], y[0]), (x[2], y[2]))  # the first point to the last
     k = stage.result.noise.k_xy
-    print(f"distance {np.hypot(x[2] - x[0], y[2] - y[0]):.6f} m is indicated {error[0]:+.1e} m "
-          f"too long, U {k * u[0]:.1e} m (k = {k:.2f}, 95.45 %)")
+    print(
+        f"distance {np.hypot(x[2] - x[0], y[2] - y[0]):.6f} m is indicated {error[0]:+.1e} m "
+        f"too long, U {k * u[0]:.1e} m (k = {k:.2f}, 95.45 %)"
+    )
 
     gradient = np.array([1 / 3, 1 / 3, 1 / 3, 0, 0, 0])  # the mean of Gx at the three points
     u_mean = np.sqrt(gradient @ stage.covariance(x, y) @ gradient)

@@ -56,8 +56,10 @@ x, y = np.array([-0.012, 0.0, 0.007]), np.array([0.003, 0.0, -0.018])
 x_command, y_command = stage.command(x, y)
 u_x, u_y = stage.uncertainty(x, y)
 for i in range(len(x)):
-    print(f"at {x[i]:+.3f} {y[i]:+.3f} m: add {1e6 * (x_command[i] - x[i]):+.3f} "
-          f"{1e6 * (y_command[i] - y[i]):+.3f} µm, u {1e9 * u_x[i]:.0f} {1e9 * u_y[i]:.0f} nm")
+    print(
+        f"at {x[i]:+.3f} {y[i]:+.3f} m: add {1e6 * (x_command[i] - x[i]):+.3f} "
+        f"{1e6 * (y_command[i] - y[i]):+.3f} µm, u {1e9 * u_x[i]:.0f} {1e9 * u_y[i]:.0f} nm"
+    )
 
 # %% [markdown]
 # ## Compare two
@@ -65,8 +67,10 @@ for i in range(len(x)):
 
 # %%
 difference = stage.difference(load("day_2.json"))
-print(f"rms {1e9 * difference.rms_m:.0f} nm, largest {1e9 * difference.max_m:.0f} nm, "
-      f"significant: {difference.significant}")
+print(
+    f"rms {1e9 * difference.rms_m:.0f} nm, largest {1e9 * difference.max_m:.0f} nm, "
+    f"significant: {difference.significant}"
+)
 
 # %% [markdown]
 # ## As a table

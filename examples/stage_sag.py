@@ -28,11 +28,21 @@ def patterns(inputs, term) -> Iterator[Pattern]:
 
 def sentence(cause) -> str:
     """Return what the readings show."""
-    return (f"a stage that sags under a plate off its centre, by {abs(cause.size) * 1e6:.2f} ± "
-            f"{cause.u * 1e6:.2f} µm a metre")
+    return (
+        f"a stage that sags under a plate off its centre, by {abs(cause.size) * 1e6:.2f} ± "
+        f"{cause.u * 1e6:.2f} µm a metre"
+    )
 
 
 BLOCK = Block(
-    "stage_sag", "m/m", patterns, undetected=1e-9, nominal=1e-6, of_map=True, shared=True,
-    cure="add views shifted both ways along both axes", sentence=sentence,
-    action="stiffen the guides, or keep the plate at the centre")
+    "stage_sag",
+    "m/m",
+    patterns,
+    undetected=1e-9,
+    nominal=1e-6,
+    of_map=True,
+    shared=True,
+    cure="add views shifted both ways along both axes",
+    sentence=sentence,
+    action="stiffen the guides, or keep the plate at the centre",
+)

@@ -14,16 +14,28 @@ from selfcal_ros.nodes.launching import SHARED, arguments, node, share, text
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription([
-        *arguments("cell.yaml"),
-        DeclareLaunchArgument("bag", description="MCAP file or rosbag2 folder"),
-        DeclareLaunchArgument("rate", default_value="1.0",
-                              description="speed; 0 = as fast as the nodes can follow"),
-        IncludeLaunchDescription(
-            PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
-            launch_arguments={**{name: LaunchConfiguration(name) for name in SHARED},
-                              "journal": "none"}.items()),  # there is a bag already
-        node("bag_player", {"bag": text("bag"),
-                            "rate": ParameterValue(LaunchConfiguration("rate"),
-                                                   value_type=float)}),
-    ])
+    return LaunchDescription(
+        [
+            *arguments("cell.yaml"),
+            DeclareLaunchArgument("bag", description="MCAP file or rosbag2 folder"),
+            DeclareLaunchArgument(
+                "rate",
+                default_value="1.0",
+                description="speed; 0 = as fast as the nodes can follow",
+            ),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
+                launch_arguments={
+                    **{name: LaunchConfiguration(name) for name in SHARED},
+                    "journal": "none",
+                }.items(),
+            ),  # there is a bag already
+            node(
+                "bag_player",
+                {
+                    "bag": text("bag"),
+                    "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float),
+                },
+            ),
+        ]
+    )

@@ -14,22 +14,33 @@ from selfcal_ros.nodes.launching import SHARED, arguments, journal_argument, nod
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription([
-        *arguments("simulated_cell.yaml"),
-        # separate from real runs: a simulated run must never continue with real readings
-        journal_argument("selfcal_journals_simulated"),
-        DeclareLaunchArgument("bag", default_value="", description="folder to record to; "
-                              "empty = do not record"),
-        node("bag_recorder", {"bag": text("bag")},
-             condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("bag"), ""))),
-        DeclareLaunchArgument("camera", default_value="", description="SIM.yaml with a camera: "
-                              "the cell publishes images, mark_detector finds the marks in them; "
-                              "empty = detections"),
-        node("stage_simulator", {"camera": text("camera")}),
-        IncludeLaunchDescription(
-            PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
-            launch_arguments={**{name: LaunchConfiguration(name)
-                                 for name in (*SHARED, "journal")},
-                              "detect": NotEqualsSubstitution(
-                                  LaunchConfiguration("camera"), "")}.items()),
-    ])
+    return LaunchDescription(
+        [
+            *arguments("simulated_cell.yaml"),
+            # separate from real runs: a simulated run must never continue with real readings
+            journal_argument("selfcal_journals_simulated"),
+            DeclareLaunchArgument(
+                "bag", default_value="", description="folder to record to; empty = do not record"
+            ),
+            node(
+                "bag_recorder",
+                {"bag": text("bag")},
+                condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("bag"), "")),
+            ),
+            DeclareLaunchArgument(
+                "camera",
+                default_value="",
+                description="SIM.yaml with a camera: "
+                "the cell publishes images, mark_detector finds the marks in them; "
+                "empty = detections",
+            ),
+            node("stage_simulator", {"camera": text("camera")}),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
+                launch_arguments={
+                    **{name: LaunchConfiguration(name) for name in (*SHARED, "journal")},
+                    "detect": NotEqualsSubstitution(LaunchConfiguration("camera"), ""),
+                }.items(),
+            ),
+        ]
+    )

@@ -47,11 +47,18 @@ class StageMap(Compensator):
         As `Compensator`.
     """
 
-    def __init__(self, result: CalibrationResult, *, method: Interpolation | None = None,
-                 outside: Outside = "clamp") -> None:
+    def __init__(
+        self,
+        result: CalibrationResult,
+        *,
+        method: Interpolation | None = None,
+        outside: Outside = "clamp",
+    ) -> None:
         if not result.observability.identifiable:
-            raise NotIdentifiableError("the measured plan does not identify the stage; measure "
-                                       "the missing views", result.observability)
+            raise NotIdentifiableError(
+                "the measured plan does not identify the stage; measure the missing views",
+                result.observability,
+            )
         grid = result.plate.map_grid
         whole = grid is not None and bool(result.error_map.valid.all())
         fitted: Interpolation | None = grid.interpolation.value if grid else None
@@ -97,10 +104,17 @@ class StageMap(Compensator):
             If pandas is not installed.
         """
         plate, emap = self.error_map.artifact, self.error_map
-        columns = {"x": plate.x_m, "y": plate.y_m, "gx": emap.gx, "gy": emap.gy,
-                   "u_gx": emap.u_gx, "u_gy": emap.u_gy}
-        return _library("pandas").DataFrame({name: values.ravel()
-                                             for name, values in columns.items()})
+        columns = {
+            "x": plate.x_m,
+            "y": plate.y_m,
+            "gx": emap.gx,
+            "gy": emap.gy,
+            "u_gx": emap.u_gx,
+            "u_gy": emap.u_gy,
+        }
+        return _library("pandas").DataFrame(
+            {name: values.ravel() for name, values in columns.items()}
+        )
 
     def to_xarray(self) -> Any:
         """Return the maps as a data set of xarray, m and rad.
@@ -115,15 +129,25 @@ class StageMap(Compensator):
         """
         emap, plate = self.error_map, self.error_map.artifact
         coordinates = {"x": plate.x_m[:, 0], "y": plate.y_m[0]}
-        maps: dict[str, tuple] = {name: (("x", "y"), getattr(emap, name), {"units": "m"})
-                                  for name in ("gx", "gy", "u_gx", "u_gy")}
+        maps: dict[str, tuple] = {
+            name: (("x", "y"), getattr(emap, name), {"units": "m"})
+            for name in ("gx", "gy", "u_gx", "u_gy")
+        }
         if self.has_theta:
             coordinates["theta"] = 2 * np.pi * np.arange(len(emap.g_theta)) / len(emap.g_theta)
-            maps |= {name: (("theta",), getattr(emap, name), {"units": "rad"})
-                     for name in ("g_theta", "u_g_theta")}
-        return _library("xarray").Dataset(maps, coordinates, {
-            "plan_id": self.result.plan_id, "grade": self.result.verdict.grade.value,
-            "k": self.result.noise.k_xy})
+            maps |= {
+                name: (("theta",), getattr(emap, name), {"units": "rad"})
+                for name in ("g_theta", "u_g_theta")
+            }
+        return _library("xarray").Dataset(
+            maps,
+            coordinates,
+            {
+                "plan_id": self.result.plan_id,
+                "grade": self.result.verdict.grade.value,
+                "k": self.result.noise.k_xy,
+            },
+        )
 
     def covariance(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return the covariance of Gx at all points, then Gy at all points, (2P, 2P), m^2.
@@ -140,25 +164,35 @@ class StageMap(Compensator):
             For more than `MAX_POINTS` points, a point outside the field or one that needs an
             unknown site, or a result that does not contain the correlations of its sites.
         """
-        x, y = (np.ravel(p) for p in np.broadcast_arrays(np.asarray(x_m, dtype=float),
-                                                         np.asarray(y_m, dtype=float)))
+        x, y = (
+            np.ravel(p)
+            for p in np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
+        )
         if len(x) > MAX_POINTS:
             raise InputError("covariance", f"{len(x)} points", f"give at most {MAX_POINTS}")
         if np.isnan(x + y).any():
             raise InputError("covariance", "a position is not a number", "give numbers")
         if not self.inside(x, y).all():
-            raise InputError("covariance", "a point lies outside the calibrated field",
-                             "leave it out: its uncertainty is not known")
+            raise InputError(
+                "covariance",
+                "a point lies outside the calibrated field",
+                "leave it out: its uncertainty is not known",
+            )
         weights = self._weights(x, y)
         used = weights.any(axis=0)
         if not self.error_map.valid.ravel()[used].all():
-            raise InputError("covariance", "a point lies next to an unknown site",
-                             "leave the point out, or measure the site")
+            raise InputError(
+                "covariance",
+                "a point lies next to an unknown site",
+                "leave the point out, or measure the site",
+            )
         sites = covariance_of(self.result, "xy", used.reshape(self.error_map.artifact.shape))
         if sites.ndim == 1:
-            raise InputError("covariance", "the result does not contain the correlations of its "
-                             "sites", "solve again with uncertainties; fields beyond 31 x 31 "
-                             "marks have none")
+            raise InputError(
+                "covariance",
+                "the result does not contain the correlations of its sites",
+                "solve again with uncertainties; fields beyond 31 x 31 marks have none",
+            )
         both = np.kron(np.eye(2), weights[:, used])
         cells = np.stack([self._cell(x, 0), self._cell(y, 1)])
         alike = (cells[:, :, None] == cells[:, None, :]).all(axis=0)
@@ -173,8 +207,9 @@ class StageMap(Compensator):
         half = self.error_map.artifact.half[axis]
         return np.clip(np.floor(p_m / self._pitch + half), 0, 2 * half - 1)
 
-    def length_error(self, first: tuple[ArrayLike, ArrayLike],
-                     second: tuple[ArrayLike, ArrayLike]) -> tuple[np.ndarray, np.ndarray]:
+    def length_error(
+        self, first: tuple[ArrayLike, ArrayLike], second: tuple[ArrayLike, ArrayLike]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the error indicated - true of distances, and its standard uncertainty, (P,) m.
 
         The uncertainty is NaN where an end lies outside the field.
@@ -199,7 +234,7 @@ class StageMap(Compensator):
         u = np.full(len(length), np.nan)
         known = np.flatnonzero(self.inside(x1, y1) & self.inside(x2, y2))
         for start in range(0, len(known), MAX_POINTS // 2):
-            part = known[start:start + MAX_POINTS // 2]
+            part = known[start : start + MAX_POINTS // 2]
             cover = self.covariance(np.append(x1[part], x2[part]), np.append(y1[part], y2[part]))
             u[part] = _along(cover, dx[part] / length[part], dy[part] / length[part])
         return np.hypot(dx + bx - ax, dy + by - ay) - length, u
@@ -231,17 +266,23 @@ class StageMap(Compensator):
         cover, dx, dy = self.covariance(x, y), x[j] - x[i], y[j] - y[i]
         length, n = np.hypot(dx, dy), len(x)
         ex, ey = dx / length, dy / length
-        square = sum(weight * _of_difference(cover, at, to) for weight, at, to in (
-            (ex**2, i, j), (ey**2, i + n, j + n)))
-        square += 2 * ex * ey * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n]
-                                 - cover[j, i + n])
+        square = sum(
+            weight * _of_difference(cover, at, to)
+            for weight, at, to in ((ex**2, i, j), (ey**2, i + n, j + n))
+        )
+        square += (
+            2 * ex * ey * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n] - cover[j, i + n])
+        )
         if anywhere:
             worst = (self.halfway**2).sum(axis=1)
             square += 2 * (ex**2 * worst[0] + ey**2 * worst[1])
         U = self.result.noise.k_xy * np.sqrt(np.maximum(square, 0.0))
         size = U.max() or 1.0  # both unknowns near one
-        found = linprog([1.0, (length / length.max()).mean()], b_ub=-U / size, A_ub=-np.stack(
-            [np.ones(len(U)), length / length.max()], axis=1))
+        found = linprog(
+            [1.0, (length / length.max()).mean()],
+            b_ub=-U / size,
+            A_ub=-np.stack([np.ones(len(U)), length / length.max()], axis=1),
+        )
         return float(found.x[0] * size), float(found.x[1] * size / length.max())
 
     def _places(self, *, between: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -267,8 +308,10 @@ class StageMap(Compensator):
 
     def _weights(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the weights of the sites in the interpolated error at points, (P, sites)."""
-        of_x, of_y = (self._weights_along(p, count) for p, count in zip(
-            (x, y), self.error_map.artifact.shape, strict=True))
+        of_x, of_y = (
+            self._weights_along(p, count)
+            for p, count in zip((x, y), self.error_map.artifact.shape, strict=True)
+        )
         return (of_x[:, :, None] * of_y[:, None, :]).reshape(len(x), -1)
 
     def _weights_along(self, p_m: np.ndarray, count: int) -> np.ndarray:
@@ -304,8 +347,9 @@ def _of_difference(cover: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarra
     return cover[i, i] + cover[j, j] - 2 * cover[i, j]
 
 
-def load(path: str | os.PathLike, *, method: Interpolation | None = None,
-         outside: Outside = "clamp") -> StageMap:
+def load(
+    path: str | os.PathLike, *, method: Interpolation | None = None, outside: Outside = "clamp"
+) -> StageMap:
     """Return the calibrated stage of a RESULT.json.
 
     Raises

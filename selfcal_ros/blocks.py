@@ -18,8 +18,18 @@ from selfcal_ros.errors import InputError, known_are
 
 ENTRY_POINTS = "selfcal.blocks"
 
-BUILT_IN = ("microscope", "drift", "plate_scale", "plate_shape", "approach", "plate_strain",
-            "line_eccentricity", "line_scale", "rotation", "yaw")
+BUILT_IN = (
+    "microscope",
+    "drift",
+    "plate_scale",
+    "plate_shape",
+    "approach",
+    "plate_strain",
+    "line_eccentricity",
+    "line_scale",
+    "rotation",
+    "yaw",
+)
 """Modules of `selfcal_ros.estimation.terms`, in the order in which terms are listed."""
 
 SHARED = -1
@@ -72,8 +82,13 @@ def by_coefficient(found: Any, names: tuple[str, ...]) -> Located:
         Names of the views that the columns count.
     """
     for column, weights in zip(found.columns, np.eye(len(found.columns)), strict=True):
-        yield {"view": names[column.view] if column.view != SHARED else "",
-               "details": {"part": column.component}}, weights
+        yield (
+            {
+                "view": names[column.view] if column.view != SHARED else "",
+                "details": {"part": column.component},
+            },
+            weights,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,18 +205,23 @@ def blocks() -> dict[str, Block]:
     """
     from importlib.metadata import entry_points  # slow, and only this needs it
 
-    found = {name: import_module(f"selfcal_ros.estimation.terms.{name}").BLOCK
-             for name in BUILT_IN}
+    found = {name: import_module(f"selfcal_ros.estimation.terms.{name}").BLOCK for name in BUILT_IN}
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
         where = f"block '{point.name}' ({point.value})"
         try:
             block = point.load()
         except Exception as error:
-            raise InputError(where, f"it cannot be loaded: {error}",
-                             "repair or remove the package that registers it") from error
+            raise InputError(
+                where,
+                f"it cannot be loaded: {error}",
+                "repair or remove the package that registers it",
+            ) from error
         if not isinstance(block, Block) or block.name != point.name or block.name in found:
-            raise InputError(where, "it is not a selfcal_ros.blocks.Block of this name, or another "
-                             "block has the name", "correct the package that registers it")
+            raise InputError(
+                where,
+                "it is not a selfcal_ros.blocks.Block of this name, or another block has the name",
+                "correct the package that registers it",
+            )
         found[block.name] = block
     return found
 

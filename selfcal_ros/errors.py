@@ -88,7 +88,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     names = {str(name).lower(): str(name) for name in known}
     words = sorted(re.split("[-_/]+", word.lower()))
     found = [name for name in names if sorted(re.split("[-_/]+", name)) == words][:2] or (
-        get_close_matches(word.lower(), names, n=2, cutoff=0.7))
+        get_close_matches(word.lower(), names, n=2, cutoff=0.7)
+    )
     return f"did you mean {' or '.join(repr(names[name]) for name in found)}?" if found else ""
 
 
@@ -126,7 +127,7 @@ def printable(text: object) -> str:
     """Return `text` as `visible`; one that is too long as its beginning, length and end."""
     text = str(text)
     if len(text) > sum(SHOWN):
-        text = f"{text[:SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1]:]}"
+        text = f"{text[: SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1] :]}"
     return visible(text)
 
 
@@ -138,12 +139,16 @@ def visible(text: str) -> str:
     """
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
-                   for c in text)
+    return "".join(
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+    )
 
 
 def check_celsius(value: float, where: str, of: str = "") -> None:
     """Raise InputError for a temperature that no machine has in degC, as one given in kelvin."""
     if not -50.0 <= value <= 100.0:
-        raise InputError(where, f"{value:g}{of} is not a temperature from -50 to 100 degC: is it "
-                         "in K?", "give degC")
+        raise InputError(
+            where,
+            f"{value:g}{of} is not a temperature from -50 to 100 degC: is it in K?",
+            "give degC",
+        )

@@ -54,16 +54,21 @@ class _Strict(Composer, SafeConstructor, Resolver):
         """Compose a node and those below it, up to the limit of their number."""
         self._n_nodes += 1
         if self._n_nodes > MAX_YAML_NODES:
-            raise yaml.composer.ComposerError(None, None, f"more than {MAX_YAML_NODES} values",
-                                              self.peek_event().start_mark)
+            raise yaml.composer.ComposerError(
+                None, None, f"more than {MAX_YAML_NODES} values", self.peek_event().start_mark
+            )
         return super().compose_node(parent, index)
 
     def get_single_node(self) -> yaml.Node | None:
         """Compose the document, and check its size with aliases expanded."""
         node = super().get_single_node()
         if node is not None and _yaml_size(node, {}) > MAX_YAML_NODES:
-            raise yaml.composer.ComposerError(None, None, "its aliases expand to more than "
-                                              f"{MAX_YAML_NODES} values", node.start_mark)
+            raise yaml.composer.ComposerError(
+                None,
+                None,
+                f"its aliases expand to more than {MAX_YAML_NODES} values",
+                node.start_mark,
+            )
         return node
 
     def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
@@ -72,8 +77,11 @@ class _Strict(Composer, SafeConstructor, Resolver):
             return super().construct_object(node, deep)
         except (LookupError, AttributeError) as error:
             raise yaml.constructor.ConstructorError(
-                None, None, f"not a value of the type {node.tag.rpartition(':')[2]}",
-                node.start_mark) from error
+                None,
+                None,
+                f"not a value of the type {node.tag.rpartition(':')[2]}",
+                node.start_mark,
+            ) from error
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         """Return the mapping of a node; refuse duplicate keys."""
@@ -82,7 +90,8 @@ class _Strict(Composer, SafeConstructor, Resolver):
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
                 if (key.tag, key.value) in seen:
                     raise yaml.constructor.ConstructorError(
-                        None, None, f"the key '{key.value}' is given twice", key.start_mark)
+                        None, None, f"the key '{key.value}' is given twice", key.start_mark
+                    )
                 seen.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
@@ -91,7 +100,8 @@ class _Strict(Composer, SafeConstructor, Resolver):
         return _whole(self.construct_yaml_int(node) if len(node.value) < 70 else node.value)
 
     yaml_constructors: ClassVar = SafeConstructor.yaml_constructors | {
-        "tag:yaml.org,2002:int": whole_number}
+        "tag:yaml.org,2002:int": whole_number
+    }
 
 
 class YamlLoader(_Strict, yaml.SafeLoader):
@@ -102,6 +112,7 @@ LOADERS: list[type[yaml.SafeLoader] | type[yaml.CSafeLoader]] = [YamlLoader]
 """Loaders: the first is the fastest, the last has the best messages."""
 
 if yaml.__with_libyaml__:
+
     class FastYamlLoader(_Strict, yaml.CSafeLoader):
         """Loader with libyaml's events; values are constructed in Python.
 
@@ -122,8 +133,13 @@ def _yaml_size(node: yaml.Node, known: dict[int, int]) -> int:
     """Return the number of values below a node; infinite for a node that contains itself."""
     if id(node) not in known:
         known[id(node)] = MAX_YAML_NODES + 1  # until known
-        children = [item for pair in node.value for item in pair] if isinstance(
-            node, yaml.MappingNode) else node.value if isinstance(node, yaml.SequenceNode) else ()
+        children = (
+            [item for pair in node.value for item in pair]
+            if isinstance(node, yaml.MappingNode)
+            else node.value
+            if isinstance(node, yaml.SequenceNode)
+            else ()
+        )
         known[id(node)] = 1 + sum(_yaml_size(child, known) for child in children)
     return known[id(node)]
 
@@ -153,9 +169,13 @@ class AsWritten(YamlLoader):
 
 
 AsWritten.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in found
-            if tag.rpartition(":")[2] not in ("bool", "int", "float", "timestamp")]
-    for first, found in YamlLoader.yaml_implicit_resolvers.items()}
+    first: [
+        (tag, pattern)
+        for tag, pattern in found
+        if tag.rpartition(":")[2] not in ("bool", "int", "float", "timestamp")
+    ]
+    for first, found in YamlLoader.yaml_implicit_resolvers.items()
+}
 
 
 def _reason(error: Exception) -> str:
@@ -181,8 +201,9 @@ def read_bytes(path: str | os.PathLike, limit: int | None = None) -> bytes:
     except FileNotFoundError as error:
         raise InputError(str(path), "no such file", "check the path") from error
     except (OSError, ValueError) as error:
-        raise InputError(str(path), f"cannot be read ({_reason(error)})",
-                         "name a readable file") from error
+        raise InputError(
+            str(path), f"cannot be read ({_reason(error)})", "name a readable file"
+        ) from error
 
 
 def _regular(path: str | os.PathLike, limit: int) -> bytes:
@@ -190,14 +211,16 @@ def _regular(path: str | os.PathLike, limit: int) -> bytes:
     if stat.S_ISDIR(os.stat(path).st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if stat.S_ISREG(os.stat(path).st_mode):  # opening a device may have side effects
-        with open(path, "rb", opener=lambda name, flags: os.open(
-                name, flags | AT_ONCE)) as file:
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | AT_ONCE)) as file:
             found = os.fstat(file.fileno())
             if stat.S_ISREG(found.st_mode) and found.st_size <= limit:
                 return file.read(found.st_size)
             if stat.S_ISREG(found.st_mode):
-                raise InputError(str(path), f"has {found.st_size} bytes, more than {limit}",
-                                 "name a smaller file")
+                raise InputError(
+                    str(path),
+                    f"has {found.st_size} bytes, more than {limit}",
+                    "name a smaller file",
+                )
     raise InputError(str(path), "is not a regular file", "name a file on a disk")
 
 
@@ -213,8 +236,9 @@ def _decoded(raw: bytes, path: str | os.PathLike) -> str:
     try:
         return raw.decode().removeprefix("\ufeff")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start}", "not UTF-8 text",
-                         "save the file as UTF-8") from error
+        raise InputError(
+            f"{path}: byte {error.start}", "not UTF-8 text", "save the file as UTF-8"
+        ) from error
 
 
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
@@ -236,8 +260,11 @@ def csv_cells(line: str, where: str) -> list[str]:
     remedy = "save the table with commas between columns and points in numbers"
     for sign, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(cells) == 1 and sign in cells[0]:
-            raise InputError(where, f"columns are separated by {name} (and the numbers "
-                             "have decimal commas?)", remedy)
+            raise InputError(
+                where,
+                f"columns are separated by {name} (and the numbers have decimal commas?)",
+                remedy,
+            )
     for cell in cells:
         if DECIMAL_COMMA.fullmatch(cell):
             raise InputError(where, f"'{cell}' has a decimal comma", remedy)
@@ -260,11 +287,15 @@ def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) ->
     try:
         return json.loads(text, parse_int=_whole)
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}:{error.lineno}:{error.colno}", f"not JSON ({error.msg})",
-                         "give a file that `selfcal` wrote") from error
+        raise InputError(
+            f"{path}:{error.lineno}:{error.colno}",
+            f"not JSON ({error.msg})",
+            "give a file that `selfcal` wrote",
+        ) from error
     except (ValueError, RecursionError) as error:  # a number too long, brackets too deep
-        raise InputError(str(path), f"not usable JSON ({first_line(error)})",
-                         "give a file that `selfcal` wrote") from error
+        raise InputError(
+            str(path), f"not usable JSON ({first_line(error)})", "give a file that `selfcal` wrote"
+        ) from error
 
 
 def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
@@ -274,8 +305,7 @@ def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
     scalars but null as their text. The file is a regular one of at most `MAX_YAML_BYTES`.
     """
     text = read_text(path, MAX_YAML_BYTES)
-    loaders = [AsWritten] if as_written else (
-        LOADERS if len(text) < EXPLAINED else LOADERS[:1])
+    loaders = [AsWritten] if as_written else (LOADERS if len(text) < EXPLAINED else LOADERS[:1])
     try:
         for loader in loaders[:-1]:  # several times as fast
             with contextlib.suppress(yaml.YAMLError):
@@ -288,8 +318,9 @@ def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
     except yaml.YAMLError as error:
         raise InputError(str(path), "not YAML", "give a YAML text file") from error
     except (ValueError, RecursionError) as error:  # an invalid date, brackets too deep
-        raise InputError(str(path), f"not usable YAML ({first_line(error)})",
-                         "correct the value") from error
+        raise InputError(
+            str(path), f"not usable YAML ({first_line(error)})", "correct the value"
+        ) from error
 
 
 def sha256_of(path: str | os.PathLike) -> str:
@@ -315,12 +346,12 @@ def add_file(digest: Any, path: Path) -> None:
             while block := stream.read(1 << 20):
                 digest.update(block)
     except OSError as error:
-        raise InputError(str(path), f"cannot be read ({_reason(error)})",
-                         "name a readable file") from error
+        raise InputError(
+            str(path), f"cannot be read ({_reason(error)})", "name a readable file"
+        ) from error
 
 
-def checked_fields(data: object, where: str, required: dict,
-                   optional: dict | None = None) -> dict:
+def checked_fields(data: object, where: str, required: dict, optional: dict | None = None) -> dict:
     """Return the fields of a mapping with their types checked and defaults filled in.
 
     Parameters
@@ -342,8 +373,9 @@ def checked_fields(data: object, where: str, required: dict,
     optional = optional or {}
     for key in data:
         if key not in required and key not in optional:
-            raise InputError(f"{where}: {key}", "unknown key",
-                             known_are(str(key), [*required, *optional]))
+            raise InputError(
+                f"{where}: {key}", "unknown key", known_are(str(key), [*required, *optional])
+            )
     out = {key: default for key, (_, default) in optional.items()}
     for key in required:
         if key not in data:
@@ -353,8 +385,9 @@ def checked_fields(data: object, where: str, required: dict,
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-            raise InputError(f"{where}: {key}", f"{value!r} is not of type {kind.__name__}",
-                             mend_of(value, kind))
+            raise InputError(
+                f"{where}: {key}", f"{value!r} is not of type {kind.__name__}", mend_of(value, kind)
+            )
         out[key] = value
     return out
 
@@ -375,8 +408,11 @@ def read(kind: Any, value: Any) -> Any:
     inner = get_args(kind)
     if is_dataclass(kind):
         data, make = read(dict, value), cast(Any, kind)
-        needed = [item.name for item in fields(kind) if item.name in data or (
-            item.default is MISSING and item.default_factory is MISSING)]
+        needed = [
+            item.name
+            for item in fields(kind)
+            if item.name in data or (item.default is MISSING and item.default_factory is MISSING)
+        ]
         return make(**{name: read(_hints(make)[name], data[name]) for name in needed})
     if get_origin(kind) is tuple:
         return tuple(read(inner[0], item) for item in read(list, value))

@@ -23,8 +23,19 @@ from selfcal_ros.errors import InputError, first_line
 
 TEMPORARY = re.compile(r"\.selfcal\.[0-9a-f]{16}")
 """Names of unfinished files and folders, locked by their writer."""
-_ASCII = {"µ": "u", "θ": "theta", "φ": "phi", "°": " deg", "±": "+/-", "–": "-", "×": "x",
-          "σ": "sigma", "²": "^2", "−": "-", "∞": "inf"}
+_ASCII = {
+    "µ": "u",
+    "θ": "theta",
+    "φ": "phi",
+    "°": " deg",
+    "±": "+/-",
+    "–": "-",
+    "×": "x",
+    "σ": "sigma",
+    "²": "^2",
+    "−": "-",
+    "∞": "inf",
+}
 
 
 @contextlib.contextmanager
@@ -48,8 +59,11 @@ def atomic_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
             with _replacement(Path(os.path.realpath(target))) as file:
                 yield file
     except OSError as error:
-        raise InputError(str(target), f"cannot be written ({error.strerror or first_line(error)})",
-                         "name an existing, writable folder") from error
+        raise InputError(
+            str(target),
+            f"cannot be written ({error.strerror or first_line(error)})",
+            "name an existing, writable folder",
+        ) from error
 
 
 @contextlib.contextmanager
@@ -145,8 +159,9 @@ def sync_folder(folder: Path) -> None:
         os.close(fd)
 
 
-def check_outputs(inputs: Iterable[str | os.PathLike | None],
-                  outputs: Iterable[str | os.PathLike | None]) -> None:
+def check_outputs(
+    inputs: Iterable[str | os.PathLike | None], outputs: Iterable[str | os.PathLike | None]
+) -> None:
     """Refuse outputs that cannot all be written, before writing the first.
 
     Raises
@@ -156,8 +171,12 @@ def check_outputs(inputs: Iterable[str | os.PathLike | None],
         the same file, or an output is a folder or has no folder.
     """
     taken = {os.path.realpath(name) for name in inputs if name}
-    taken |= {os.path.realpath(file) for folder in map(Path, list(taken)) if folder.is_dir()
-              for file in folder.iterdir()}
+    taken |= {
+        os.path.realpath(file)
+        for folder in map(Path, list(taken))
+        if folder.is_dir()
+        for file in folder.iterdir()
+    }
     for name in outputs:
         if not name:
             continue
@@ -169,8 +188,11 @@ def check_outputs(inputs: Iterable[str | os.PathLike | None],
         if str(target) in taken:
             raise InputError(str(name), "would be overwritten", "name another output file")
         if not target.parent.is_dir():
-            raise InputError(str(name), "cannot be written (No such file or directory)",
-                             "name an existing, writable folder")
+            raise InputError(
+                str(name),
+                "cannot be written (No such file or directory)",
+                "name an existing, writable folder",
+            )
         taken.add(str(target))
 
 
@@ -194,10 +216,16 @@ def json_text(value: Any, depth: int = 0) -> str:
     """Return strict JSON (no NaN), a key or row on a line: lists of numbers are not broken."""
     inner, ends = [], "[]"
     if isinstance(value, dict):
-        ends, inner = "{}", [f"{json.dumps(str(key))}: {json_text(item, depth + 1)}"
-                             for key, item in value.items()]
+        ends, inner = (
+            "{}",
+            [
+                f"{json.dumps(str(key))}: {json_text(item, depth + 1)}"
+                for key, item in value.items()
+            ],
+        )
     elif isinstance(value, list | tuple) and any(
-            isinstance(item, dict | list | tuple) for item in value):
+        isinstance(item, dict | list | tuple) for item in value
+    ):
         inner = [json_text(item, depth + 1) for item in value]
     if not inner:
         return json.dumps(value, allow_nan=False)

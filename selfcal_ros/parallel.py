@@ -54,8 +54,9 @@ class WorkerDied(Exception):
 
 def cores() -> int:
     """Return the number of cores available to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (
-        os.cpu_count() or 1)
+    return (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    )
 
 
 def check_workers(number: int | None, option: str = "--workers") -> int:
@@ -103,8 +104,9 @@ def _start_server(module: str) -> None:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
-             dask: str = "") -> Iterator[Outcome]:
+def outcomes(
+    function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1, dask: str = ""
+) -> Iterator[Outcome]:
     """Yield the outcome of `function` for each item, as it becomes ready.
 
     Parameters
@@ -131,8 +133,13 @@ def outcomes(function: Callable[[Any], Any], items: Sequence[Any], *, workers: i
         yield from _with_processes(function, items, min(workers, len(items)))
 
 
-def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1,
-           progress: Progress = silent) -> list[Any]:
+def mapped(
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    *,
+    workers: int = 1,
+    progress: Progress = silent,
+) -> list[Any]:
     """Return `function` of each item, in their order; the first error is raised.
 
     `progress` is called with the number of items done, and the total.
@@ -146,16 +153,25 @@ def mapped(function: Callable[[Any], Any], items: Sequence[Any], *, workers: int
     return found
 
 
-def mapped_in_parts(function: Callable[[list[Any]], list[Any]], items: Sequence[Any], *,
-                    workers: int = 1, size: int = 20,
-                    progress: Progress = silent) -> list[Any]:
+def mapped_in_parts(
+    function: Callable[[list[Any]], list[Any]],
+    items: Sequence[Any],
+    *,
+    workers: int = 1,
+    size: int = 20,
+    progress: Progress = silent,
+) -> list[Any]:
     """Return the results of `function` for lists of items, joined in their order.
 
     For items too small to be sent to a worker individually.
     """
-    parts = [list(items[start:start + size]) for start in range(0, len(items), size)]
-    found = mapped(function, parts, workers=workers,
-                   progress=lambda done, _: progress(min(done * size, len(items)), len(items)))
+    parts = [list(items[start : start + size]) for start in range(0, len(items), size)]
+    found = mapped(
+        function,
+        parts,
+        workers=workers,
+        progress=lambda done, _: progress(min(done * size, len(items)), len(items)),
+    )
     return [value for part in found for value in part]
 
 
@@ -166,8 +182,9 @@ def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> 
         return Outcome(index, error=error)
 
 
-def _with_processes(function: Callable[[Any], Any], items: Sequence[Any],
-                    workers: int) -> Iterator[Outcome]:
+def _with_processes(
+    function: Callable[[Any], Any], items: Sequence[Any], workers: int
+) -> Iterator[Outcome]:
     """Yield outcomes of a pool; if it breaks, each of its items is retried separately."""
     waiting = list(reversed(range(len(items))))
     while waiting:
@@ -200,8 +217,9 @@ def _alone(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> 
         future = pool.submit(function, items[index])
         wait([future])
         if isinstance(future.exception(), BrokenProcessPool):
-            return Outcome(index, error=WorkerDied(
-                "the process that worked on it was killed (out of memory?)"))
+            return Outcome(
+                index, error=WorkerDied("the process that worked on it was killed (out of memory?)")
+            )
         return _outcome(index, future)
 
 
@@ -222,8 +240,9 @@ def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolE
     """
     context = multiprocessing.get_context(_method())
     if _method() == "forkserver":
-        _start_server(getattr(getattr(function, "func", function), "__module__", None)
-                      or "builtins")
+        _start_server(
+            getattr(getattr(function, "func", function), "__module__", None) or "builtins"
+        )
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker)
     try:
@@ -267,26 +286,40 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _with_dask(function: Callable[[Any], Any], items: Sequence[Any], workers: int,
-               address: str) -> Iterator[Outcome]:
+def _with_dask(
+    function: Callable[[Any], Any], items: Sequence[Any], workers: int, address: str
+) -> Iterator[Outcome]:
     """Yield outcomes of a dask cluster."""
     try:
         from distributed import Client, LocalCluster, as_completed  # an extra, large
     except ImportError as error:
-        raise InputError("--dask", "there is no dask.distributed in this environment",
-                         "install it: pip install 'selfcal_ros[dask]'") from error
+        raise InputError(
+            "--dask",
+            "there is no dask.distributed in this environment",
+            "install it: pip install 'selfcal_ros[dask]'",
+        ) from error
     with contextlib.ExitStack() as stack:
         try:
             if address == LOCAL:
-                address = stack.enter_context(LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address=None,
-                    silence_logs=logging.CRITICAL))
+                address = stack.enter_context(
+                    LocalCluster(
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        dashboard_address=None,
+                        silence_logs=logging.CRITICAL,
+                    )
+                )
             client = stack.enter_context(Client(address, set_as_default=False))
         except (OSError, ValueError, TimeoutError) as error:
-            raise InputError("--dask", f"no scheduler answers at {address} ({error})",
-                             f"start one, or write --dask {LOCAL}") from error
-        futures = {client.submit(_in_dask, function, item, pure=False):
-                   index for index, item in enumerate(items)}
+            raise InputError(
+                "--dask",
+                f"no scheduler answers at {address} ({error})",
+                f"start one, or write --dask {LOCAL}",
+            ) from error
+        futures = {
+            client.submit(_in_dask, function, item, pure=False): index
+            for index, item in enumerate(items)
+        }
         for future in as_completed(futures, loop=client.loop):
             yield _outcome(futures[future], future)
 

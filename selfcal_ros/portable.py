@@ -53,11 +53,16 @@ def ended_by_signals() -> Iterator[None]:
 
     One that is ignored stays so: `nohup` lets a command outlive its terminal.
     """
+
     def end(number: int, _: object) -> None:
         raise Ended(128 + number)
+
     ends = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {number: signal.signal(number, end) for number in ends
-              if signal.getsignal(number) is not signal.SIG_IGN}
+    before = {
+        number: signal.signal(number, end)
+        for number in ends
+        if signal.getsignal(number) is not signal.SIG_IGN
+    }
     try:
         yield
     finally:
@@ -81,11 +86,16 @@ def interrupted_after(seconds: float) -> Iterator[None]:
     Overdue
         After so many seconds.
     """
+
     def ring(*_: object) -> None:
         raise Overdue("no answer")
+
     is_main = threading.current_thread() is threading.main_thread()
-    if not (is_main and hasattr(signal, "setitimer") and signal.getsignal(signal.SIGALRM)
-            is signal.SIG_DFL):
+    if not (
+        is_main
+        and hasattr(signal, "setitimer")
+        and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+    ):
         yield
         return
     signal.signal(signal.SIGALRM, ring)

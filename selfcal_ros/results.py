@@ -28,13 +28,19 @@ def active_map(folder: str | os.PathLike) -> tuple[Path, str]:
     """
     path = Path(folder, ACTIVE)
     if not path.is_file():
-        raise InputError(str(folder), "is a folder, and no map in it is active",
-                         f"name a RESULT.json, or: selfcal history {folder} --activate RESULT.json")
+        raise InputError(
+            str(folder),
+            "is a folder, and no map in it is active",
+            f"name a RESULT.json, or: selfcal history {folder} --activate RESULT.json",
+        )
     name, _, since = read_text(path).strip().partition("\n")
     found = Path(folder, name)
     if not found.is_file():
-        raise InputError(str(path), f"names '{name}', which is not there",
-                         f"selfcal history {folder} --activate RESULT.json")
+        raise InputError(
+            str(path),
+            f"names '{name}', which is not there",
+            f"selfcal history {folder} --activate RESULT.json",
+        )
     return found, since.strip()
 
 
@@ -61,7 +67,13 @@ def read_result(path: str | os.PathLike, limit: int | None = None) -> Calibratio
     data = parse_json(raw, path, limit)
     result = result_from_dict(data, where)
     if not require_unchanged(data, where):
-        result = replace(result, verdict=replace(
-            result.verdict, grade=Grade.NOT_QUALIFIED, sentence=f"Not qualified: {UNCHECKED}",
-            reasons=(UNCHECKED, *result.verdict.reasons)))
+        result = replace(
+            result,
+            verdict=replace(
+                result.verdict,
+                grade=Grade.NOT_QUALIFIED,
+                sentence=f"Not qualified: {UNCHECKED}",
+                reasons=(UNCHECKED, *result.verdict.reasons),
+            ),
+        )
     return replace(result, read_from=(where, hashlib.sha256(raw).hexdigest()))

@@ -20,8 +20,9 @@ BUILD = "colcon build --base-paths src/selfcal_ros src/selfcal_ros/msg_defs"
 NEEDED = {
     "rclpy": "source a ROS 2 installation, or use the environment of `make setup`",
     "selfcal_msgs": f"run `make setup`, or in the workspace `{BUILD}` and "
-                    "source install/setup.bash",
-    "threadpoolctl": "`sudo apt install python3-threadpoolctl`, or with pip"}
+    "source install/setup.bash",
+    "threadpoolctl": "`sudo apt install python3-threadpoolctl`, or with pip",
+}
 """Modules of a node that neither pip nor rosdep installs by default, and how to install them."""
 
 
@@ -39,8 +40,10 @@ def missing_ros() -> str:
         known = kind.get_fields_and_field_types() if kind else {}
         for field in fields_of(text):
             if field not in known:
-                return (f"the selfcal_msgs in this environment is of another version: its {name} "
-                        f"has no {field}; build it again: {NEEDED['selfcal_msgs']}")
+                return (
+                    f"the selfcal_msgs in this environment is of another version: its {name} "
+                    f"has no {field}; build it again: {NEEDED['selfcal_msgs']}"
+                )
     return ""
 
 
@@ -84,7 +87,27 @@ def _run(node: str) -> int | None:
     return importlib.import_module(f"selfcal_ros.nodes.{node}").main()
 
 
-measurement_collector, pose_sequencer, solver, compensator, mark_detector, bag_player, \
-    bag_recorder, cell_driver, stage_simulator = (partial(_run, node) for node in (
-        "measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
-        "bag_player", "bag_recorder", "cell_driver", "stage_simulator"))
+(
+    measurement_collector,
+    pose_sequencer,
+    solver,
+    compensator,
+    mark_detector,
+    bag_player,
+    bag_recorder,
+    cell_driver,
+    stage_simulator,
+) = (
+    partial(_run, node)
+    for node in (
+        "measurement_collector",
+        "pose_sequencer",
+        "solver",
+        "compensator",
+        "mark_detector",
+        "bag_player",
+        "bag_recorder",
+        "cell_driver",
+        "stage_simulator",
+    )
+)

@@ -33,11 +33,17 @@ INFINITE = {"sec": 9223372036, "nsec": 854775807}
 
 def qos_profile(*, reliable: bool, transient_local: bool, depth: int) -> dict:
     """Return an offered QoS profile in the format of rosbag2 (Jazzy)."""
-    return {"history": "keep_last", "depth": depth,
-            "reliability": "reliable" if reliable else "best_effort",
-            "durability": "transient_local" if transient_local else "volatile",
-            "deadline": INFINITE, "lifespan": INFINITE, "liveliness": "automatic",
-            "liveliness_lease_duration": INFINITE, "avoid_ros_namespace_conventions": False}
+    return {
+        "history": "keep_last",
+        "depth": depth,
+        "reliability": "reliable" if reliable else "best_effort",
+        "durability": "transient_local" if transient_local else "volatile",
+        "deadline": INFINITE,
+        "lifespan": INFINITE,
+        "liveliness": "automatic",
+        "liveliness_lease_duration": INFINITE,
+        "avoid_ros_namespace_conventions": False,
+    }
 
 
 def message_texts() -> dict[str, str]:

@@ -20,8 +20,13 @@ NS_PER_S = 1_000_000_000
 S_PER_NS, MS_PER_S, S_PER_H = 1e-9, 1e3, 3600.0
 BYTES_PER_MB = 1e6
 
-RAD_PER = {"rad": 1.0, "mrad": RAD_PER_MRAD, "urad": RAD_PER_URAD, "deg": math.radians(1),
-           "arcsec": RAD_PER_ARCSEC}
+RAD_PER = {
+    "rad": 1.0,
+    "mrad": RAD_PER_MRAD,
+    "urad": RAD_PER_URAD,
+    "deg": math.radians(1),
+    "arcsec": RAD_PER_ARCSEC,
+}
 """Angle of each unit by its name in options and files."""
 
 M_PER = {"m": 1.0, "mm": M_PER_MM, "um": M_PER_UM, "nm": M_PER_NM}

@@ -84,4 +84,5 @@ def jumping_clocks(monkeypatch):
     now_ns = Clock.now_ns
     monkeypatch.setattr(Clock, "now_ns", lambda self: now_ns(self) + sum(jumps_ns))
     monkeypatch.setattr(
-        Clock, "sleep", lambda self, seconds: jumps_ns.append(round(seconds * NS_PER_S)))
+        Clock, "sleep", lambda self, seconds: jumps_ns.append(round(seconds * NS_PER_S))
+    )

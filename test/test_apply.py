@@ -50,10 +50,12 @@ def test_the_command_is_plus_the_error_and_correct_is_its_inverse(file, result):
 def test_at_the_nodes_the_covariance_has_the_variances_of_the_map(file, result):
     emap, plate = result.error_map, result.artifact
     found = load(file).covariance(plate.x_m, plate.y_m)
-    np.testing.assert_allclose(np.sqrt(np.diag(found)),
-                               [*emap.u_gx.ravel(), *emap.u_gy.ravel()], rtol=1e-9)
-    np.testing.assert_allclose(found, covariance_of(result, "xy", emap.valid), rtol=0,
-                               atol=1e-9 * found.max())
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found)), [*emap.u_gx.ravel(), *emap.u_gy.ravel()], rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        found, covariance_of(result, "xy", emap.valid), rtol=0, atol=1e-9 * found.max()
+    )
 
 
 def test_between_the_nodes_it_is_that_of_the_interpolated_error(file, result):
@@ -67,32 +69,40 @@ def test_between_the_nodes_it_is_that_of_the_interpolated_error(file, result):
     basis = []
     for unit in np.eye(len(full)):  # the compensator is linear in the sites
         gx, gy = unit.reshape(2, *plate.shape) * 1e-9
-        basis.append(np.concatenate(
-            StageMap(result_of(replace(emap, gx=gx, gy=gy))).error(x, y)) / 1e-9)
+        basis.append(
+            np.concatenate(StageMap(result_of(replace(emap, gx=gx, gy=gy))).error(x, y)) / 1e-9
+        )
     wanted = np.cov((draws @ np.array(basis)).T)
     stage = load(file)
     stage.halfway = np.zeros((2, 2))  # a stage that is bilinear between its nodes
     found = stage.covariance(x, y)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=0.05 * found.max())
-    assert (np.sqrt(np.diag(found)) <= (1 + 1e-9) * np.concatenate(
-        stage.uncertainty(x, y))).all()  # the bound of `uncertainty` holds
+    assert (
+        np.sqrt(np.diag(found)) <= (1 + 1e-9) * np.concatenate(stage.uncertainty(x, y))
+    ).all()  # the bound of `uncertainty` holds
 
 
 def test_interpolation_adds_its_error_between_the_nodes(file, result):
     """Nothing at a node, on an edge that along it, in the middle of a cell both."""
     stage, pitch = load(file), result.artifact.grid_pitch_m
     stage.halfway = np.zeros((2, 2))
-    x, y = np.array([0.0, 0.5, 0.5, 0.75, 0.5, 2.0]) * pitch, np.array(
-        [1.0, 1.0, 0.5, 1.5, -0.5, 0.5]) * pitch
+    x, y = (
+        np.array([0.0, 0.5, 0.5, 0.75, 0.5, 2.0]) * pitch,
+        np.array([1.0, 1.0, 0.5, 1.5, -0.5, 0.5]) * pitch,
+    )
     plain, before = stage.covariance(x, y), stage.uncertainty(x, y)
     stage.halfway = np.array([[3e-8, 3e-8], [0.0, 5e-8]])
     both = np.sqrt(2)
-    added = np.array([[0, 3, 3 * both, 3 * np.hypot(0.75, 1), 3 * both, 3],
-                      [0, 0, 5, 5, 5, 5]]) * 1e-8
+    added = (
+        np.array([[0, 3, 3 * both, 3 * np.hypot(0.75, 1), 3 * both, 3], [0, 0, 5, 5, 5, 5]]) * 1e-8
+    )
     np.testing.assert_allclose(stage.uncertainty(x, y), np.hypot(before, added))
     cells = [[a == b for a in "ABCBDE"] for b in "ABCBDE"]  # (0.5, 1) is in the cell of y = 1..2
-    wanted = plain + np.kron([[1, 0], [0, 0]], np.outer(added[0], added[0]) * cells) + np.kron(
-        [[0, 0], [0, 1]], np.outer(added[1], added[1]) * cells)
+    wanted = (
+        plain
+        + np.kron([[1, 0], [0, 0]], np.outer(added[0], added[0]) * cells)
+        + np.kron([[0, 0], [0, 1]], np.outer(added[1], added[1]) * cells)
+    )
     np.testing.assert_allclose(stage.covariance(x, y), wanted, atol=1e-22)
 
 
@@ -132,16 +142,22 @@ def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result)
 
 def test_the_line_is_that_of_the_diagonals_if_x_and_y_err_alike(file, result, monkeypatch):
     """Of sites with one error of sigma along both axes, diagonal distances have u = 2 sigma."""
-    monkeypatch.setattr(StageMap, "covariance", lambda self, x, y: 1e-16 * np.kron(
-        np.ones((2, 2)), np.eye(len(x))))
+    monkeypatch.setattr(
+        StageMap, "covariance", lambda self, x, y: 1e-16 * np.kron(np.ones((2, 2)), np.eye(len(x)))
+    )
     a, b = load(file).length_uncertainty(anywhere=False)
     assert a == pytest.approx(2e-8 * result.noise.k_xy, rel=1e-6) and abs(b) < 1e-12
 
 
 def test_no_other_line_over_all_distances_is_lower_on_average(file, result, monkeypatch):
     """With an error of the scale, U grows with the distance."""
-    monkeypatch.setattr(StageMap, "covariance", lambda self, x, y: 1e-16 * np.eye(
-        2 * len(x)) + 1e-12 * np.outer(np.append(x, y), np.append(x, y)))
+    monkeypatch.setattr(
+        StageMap,
+        "covariance",
+        lambda self, x, y: (
+            1e-16 * np.eye(2 * len(x)) + 1e-12 * np.outer(np.append(x, y), np.append(x, y))
+        ),
+    )
     stage, plate = load(file), result.artifact
     i, j = np.triu_indices(25, 1)
     x, y = plate.x_m.ravel(), plate.y_m.ravel()
@@ -203,8 +219,9 @@ def test_the_example_runs(file, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), file])
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 6 and lines[3] in [f"and back: off by at most {e} m" for e in (
-        "0e+00", "2e-18", "3e-18", "4e-18", "5e-18")]
+    assert len(lines) == 6 and lines[3] in [
+        f"and back: off by at most {e} m" for e in ("0e+00", "2e-18", "3e-18", "4e-18", "5e-18")
+    ]
     assert lines[4].startswith("distance 0.025000 m is indicated ")
     assert lines[5].startswith("mean error in x ")
 
@@ -227,8 +244,10 @@ def test_a_map_with_nodes_of_its_own_is_applied_by_its_interpolation(nodes, meth
 
 def stage_of(plate, covariance, monkeypatch, halfway=((0, 0), (0, 0))):
     """Return a stage whose sites have this covariance of Gx, then Gy."""
-    monkeypatch.setattr("selfcal_ros.apply.covariance_of", lambda _, kind, used:
-                        covariance[np.ix_(*[np.tile(used.ravel(), 2)] * 2)])
+    monkeypatch.setattr(
+        "selfcal_ros.apply.covariance_of",
+        lambda _, kind, used: covariance[np.ix_(*[np.tile(used.ravel(), 2)] * 2)],
+    )
     stage = StageMap(result_of(random_map(plate, 1)))
     stage.halfway = np.array(halfway, dtype=float)
     return stage
@@ -272,8 +291,9 @@ def test_cells_of_an_oblong_field_share_no_error_of_interpolation(monkeypatch):
 def test_inside_an_oblong_field(plate):
     stage = StageMap(result_of(random_map(plate, 1)))
     hx, hy = (half * 0.01 for half in plate.half)
-    np.testing.assert_array_equal(stage.inside([hx, 0, hx + 1e-4, 0], [0, hy, 0, hy + 1e-4]),
-                                  [True, True, False, False])
+    np.testing.assert_array_equal(
+        stage.inside([hx, 0, hx + 1e-4, 0], [0, hy, 0, hy + 1e-4]), [True, True, False, False]
+    )
 
 
 def test_u_of_distances_is_their_error_on_a_map_with_nodes_of_its_own():
@@ -286,8 +306,10 @@ def test_u_of_distances_is_their_error_on_a_map_with_nodes_of_its_own():
         first, second = rng.uniform(-0.05, 0.05, (2, 2, 100))
         error, u = stage.length_error(first, second)
         nodes = truth.field.ravel()
-        moved = [place + rows(artifact, place) @ nodes for place in (
-            end[0] + 1j * end[1] for end in (first, second))]
+        moved = [
+            place + rows(artifact, place) @ nodes
+            for place in (end[0] + 1j * end[1] for end in (first, second))
+        ]
         true_error = abs(moved[1] - moved[0]) - np.hypot(*(second - first))
         ratios.append((error - true_error) / u)
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(0.98, abs=0.07)

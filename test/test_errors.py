@@ -6,10 +6,16 @@ import pytest
 from selfcal_ros.errors import InputError, printable
 
 
-@pytest.mark.parametrize("text, shown", [
-    ("a b", "a b"), ("a\n\x1b[2J\u202e", r"a\n\x1b[2J\u202e"), ("\ud800", r"\ud800"),
-    ("x" * 4000, "x" * 4000),
-    ("a" * 3000 + "b" + "c" * 1000, f"{'a' * 3000} ... (4001 characters) ... {'c' * 1000}")])
+@pytest.mark.parametrize(
+    "text, shown",
+    [
+        ("a b", "a b"),
+        ("a\n\x1b[2J\u202e", r"a\n\x1b[2J\u202e"),
+        ("\ud800", r"\ud800"),
+        ("x" * 4000, "x" * 4000),
+        ("a" * 3000 + "b" + "c" * 1000, f"{'a' * 3000} ... (4001 characters) ... {'c' * 1000}"),
+    ],
+)
 def test_a_text_is_one_line_of_bearable_length(text, shown):
     assert printable(text) == shown
 

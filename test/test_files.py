@@ -191,24 +191,35 @@ def test_what_is_no_file_is_written_into_and_not_replaced(tmp_path):
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-@pytest.mark.parametrize(("target", "reason"), [
-    ("none/a", "No such file or directory"), ("file/a", "Not a directory"),
-    ("folder", "Is a directory"), ("n" * 300, "File name too long")])
+@pytest.mark.parametrize(
+    ("target", "reason"),
+    [
+        ("none/a", "No such file or directory"),
+        ("file/a", "Not a directory"),
+        ("folder", "Is a directory"),
+        ("n" * 300, "File name too long"),
+    ],
+)
 def test_where_nothing_can_be_written(tmp_path, target, reason):
     (tmp_path / "file").touch()
     (tmp_path / "folder").mkdir()
     with pytest.raises(InputError) as caught:
         write_bytes(tmp_path / target, b"x")
-    assert str(caught.value) == (f"{tmp_path / target}: cannot be written ({reason}); name an "
-                                 "existing, writable folder")
+    assert str(caught.value) == (
+        f"{tmp_path / target}: cannot be written ({reason}); name an existing, writable folder"
+    )
     assert names(tmp_path) == ["file", "folder"]
 
 
-@pytest.mark.parametrize(("source", "message"), [
-    ("none", "no such file; check the path"),
-    ("", "cannot be read (Is a directory); name a readable file"),
-    ("a\0b", "cannot be read (embedded null byte); name a readable file"),
-    ("n" * 300, "cannot be read (File name too long); name a readable file")])
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("none", "no such file; check the path"),
+        ("", "cannot be read (Is a directory); name a readable file"),
+        ("a\0b", "cannot be read (embedded null byte); name a readable file"),
+        ("n" * 300, "cannot be read (File name too long); name a readable file"),
+    ],
+)
 def test_what_cannot_be_read(tmp_path, source, message):
     for read in (read_bytes, read_text, read_json, read_yaml):
         with pytest.raises(InputError) as caught:
@@ -241,8 +252,7 @@ def test_with_a_limit_a_file_has_that_many_bytes_or_is_refused(tmp_path):
     assert read_bytes(tmp_path / "a", 5) == b"12345"
     with pytest.raises(InputError) as caught:
         read_bytes(tmp_path / "a", 4)
-    assert str(caught.value) == (
-        f"{tmp_path / 'a'}: has 5 bytes, more than 4; name a smaller file")
+    assert str(caught.value) == (f"{tmp_path / 'a'}: has 5 bytes, more than 4; name a smaller file")
     assert read_bytes("/proc/self/pagemap", 5) == b"", "the kernel makes it up, without end"
 
 
@@ -263,10 +273,15 @@ def test_text_that_is_not_utf8(tmp_path):
             read(tmp_path / "a")
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ('{"a": 1,\n "b": }', ":2:7: not JSON (Expecting value)"),
-    ("", ":1:1: not JSON (Expecting value)"),
-    ("[" * 100_000, ": not usable JSON ("), ("9" * 5000, ": not usable JSON (a whole number")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": 1,\n "b": }', ":2:7: not JSON (Expecting value)"),
+        ("", ":1:1: not JSON (Expecting value)"),
+        ("[" * 100_000, ": not usable JSON ("),
+        ("9" * 5000, ": not usable JSON (a whole number"),
+    ],
+)
 def test_faults_in_json(tmp_path, text, message):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError) as caught:
@@ -275,17 +290,23 @@ def test_faults_in_json(tmp_path, text, message):
     assert str(caught.value).endswith("; give a file that `selfcal` wrote")
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("a: 1\nb: [", ":2:5: not YAML (expected the node content, but found '<stream end>')"),
-    ("a: &x 1\nb: *y", ":2:4: not YAML (found undefined alias 'y')"),
-    ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
-    ("a: \x01", ": not YAML; give a YAML text file"),
-    ("a: {b: 1,\n    c: !!int ''}",
-     ":2:8: not YAML (not a value of the type int); correct the line"),
-    ("!!bool perhaps", ":1:1: not YAML (not a value of the type bool)"),
-    ("- !!timestamp x", ":1:3: not YAML (not a value of the type timestamp)"),
-    ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); correct the value"),
-    ("[" * 2_000, ": not usable YAML (maximum recursion depth")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\nb: [", ":2:5: not YAML (expected the node content, but found '<stream end>')"),
+        ("a: &x 1\nb: *y", ":2:4: not YAML (found undefined alias 'y')"),
+        ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
+        ("a: \x01", ": not YAML; give a YAML text file"),
+        (
+            "a: {b: 1,\n    c: !!int ''}",
+            ":2:8: not YAML (not a value of the type int); correct the line",
+        ),
+        ("!!bool perhaps", ":1:1: not YAML (not a value of the type bool)"),
+        ("- !!timestamp x", ":1:3: not YAML (not a value of the type timestamp)"),
+        ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); correct the value"),
+        ("[" * 2_000, ": not usable YAML (maximum recursion depth"),
+    ],
+)
 @pytest.mark.usefixtures("loaders")
 def test_faults_in_yaml(tmp_path, text, message):
     with pytest.raises(InputError) as caught:
@@ -304,10 +325,25 @@ def test_json_is_strict_and_comes_back(tmp_path):
     assert read_json(path) == value
 
 
-@pytest.mark.parametrize(("text", "value"), [
-    ("5e-4", 5e-4), ("1e3", 1e3), ("1E+3", 1e3), ("-2e-6", -2e-6), ("+3e2", 3e2), ("1.e3", 1e3),
-    ("1.0e3", 1e3), ("1.7e9", 1.7e9), (".5e1", 5.0), ("-.5e-1", -0.05), ("-.5", -0.5),
-    ("00e0", 0.0), ("2.0e-7", 2e-7), ("-.inf", -math.inf)])
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("5e-4", 5e-4),
+        ("1e3", 1e3),
+        ("1E+3", 1e3),
+        ("-2e-6", -2e-6),
+        ("+3e2", 3e2),
+        ("1.e3", 1e3),
+        ("1.0e3", 1e3),
+        ("1.7e9", 1.7e9),
+        (".5e1", 5.0),
+        ("-.5e-1", -0.05),
+        ("-.5", -0.5),
+        ("00e0", 0.0),
+        ("2.0e-7", 2e-7),
+        ("-.inf", -math.inf),
+    ],
+)
 def test_floats_as_ros_reads_them(tmp_path, text, value):
     found = yaml_of(tmp_path, f"a: {text}\nb: [{text}, {{c: {text}}}]")
     assert found == {"a": value, "b": [value, {"c": value}]}
@@ -315,10 +351,45 @@ def test_floats_as_ros_reads_them(tmp_path, text, value):
     assert float(text.replace(".inf", "inf")) == value
 
 
-@pytest.mark.parametrize("text", [
-    "1e3abc", "'5e-4'", '"5e-4"', "!!str 5e-4", "e3", "1e", "1e+", "1e3.5", "1 e3", ".e3", "1_0e3",
-    "--1e3", "0x1e3", "1e3e4", "x1e3", "+", ".", "...x", "1.2.3", "1-2e3", "true", "off", "~", "7",
-    "0x1f", "017", "1:30", "2.5", ".nan", "2001-01-02", "1e3:4", "1e3 # x", "|\n 5e-4", "5e-4 m"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1e3abc",
+        "'5e-4'",
+        '"5e-4"',
+        "!!str 5e-4",
+        "e3",
+        "1e",
+        "1e+",
+        "1e3.5",
+        "1 e3",
+        ".e3",
+        "1_0e3",
+        "--1e3",
+        "0x1e3",
+        "1e3e4",
+        "x1e3",
+        "+",
+        ".",
+        "...x",
+        "1.2.3",
+        "1-2e3",
+        "true",
+        "off",
+        "~",
+        "7",
+        "0x1f",
+        "017",
+        "1:30",
+        "2.5",
+        ".nan",
+        "2001-01-02",
+        "1e3:4",
+        "1e3 # x",
+        "|\n 5e-4",
+        "5e-4 m",
+    ],
+)
 def test_everything_else_stays_what_it_was(tmp_path, text):
     found = yaml_of(tmp_path, f"a: {text}\n")["a"]
     expected = yaml.safe_load(f"a: {text}\n")["a"]
@@ -332,20 +403,36 @@ def test_the_loader_of_others_is_left_alone():
     assert yaml.safe_load("5e-4") == "5e-4"
 
 
-WHOLE = st.integers(-2**63, 2**63 - 1)
+WHOLE = st.integers(-(2**63), 2**63 - 1)
 ANY = st.characters(exclude_categories=["Cs"])
 """Said by a codec instead, as by default, Hypothesis first tries all characters for 2 s."""
-PLAIN = st.one_of(st.none(), st.booleans(), WHOLE, st.floats(allow_nan=False), st.text(ANY),
-                  st.from_regex(r"\A[-+]?[0-9]*\.?[0-9]*[eE]?[-+]?[0-9]*\Z", alphabet=ANY))
+PLAIN = st.one_of(
+    st.none(),
+    st.booleans(),
+    WHOLE,
+    st.floats(allow_nan=False),
+    st.text(ANY),
+    st.from_regex(r"\A[-+]?[0-9]*\.?[0-9]*[eE]?[-+]?[0-9]*\Z", alphabet=ANY),
+)
 
 
-@given(value=st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(
-    st.text(ANY, max_size=5), inner, max_size=3), max_leaves=8))
+@given(
+    value=st.recursive(
+        PLAIN,
+        lambda inner: (
+            st.lists(inner, max_size=3)
+            | st.dictionaries(st.text(ANY, max_size=5), inner, max_size=3)
+        ),
+        max_leaves=8,
+    )
+)
 def test_yaml_that_is_written_comes_back(tmp_path_factory, value):
     path = tmp_path_factory.mktemp("yaml") / "x.yaml"
     write_yaml(path, value)
-    for found in (read_yaml(path), *(yaml.load(path.read_text(), loader)
-                                     for loader in files.LOADERS)):
+    for found in (
+        read_yaml(path),
+        *(yaml.load(path.read_text(), loader) for loader in files.LOADERS),
+    ):
         assert found == value
         assert repr(found) == repr(value)
 
@@ -372,11 +459,13 @@ def test_outputs_are_refused_that_cannot_all_be_written(tmp_path, monkeypatch):
     (tmp_path / "in.csv").write_text("")
     (tmp_path / "link.json").symlink_to("in.csv")
     for outputs, message in (
-            (["in.csv"], "in.csv: would be overwritten"),
-            (["link.json"], "link.json: would be overwritten"),
-            (["bag/metadata.yaml"], "bag/metadata.yaml: would be overwritten"),
-            (["a", "./a"], "./a: would be overwritten"), (["bag"], "bag: it is a folder"),
-            (["a", "no/a"], r"no/a: cannot be written \(No such file")):
+        (["in.csv"], "in.csv: would be overwritten"),
+        (["link.json"], "link.json: would be overwritten"),
+        (["bag/metadata.yaml"], "bag/metadata.yaml: would be overwritten"),
+        (["a", "./a"], "./a: would be overwritten"),
+        (["bag"], "bag: it is a folder"),
+        (["a", "no/a"], r"no/a: cannot be written \(No such file"),
+    ):
         with pytest.raises(InputError, match="^" + message):
             check_outputs(["in.csv", "bag", None], outputs)
     check_outputs(["in.csv", None], ["a", "b", None, os.devnull, os.devnull])
@@ -387,17 +476,27 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
     assert json.loads((tmp_path / "a").read_text()) == [0.1, 1e-300, -0.0]
 
 
-@pytest.mark.parametrize("text, problem", [
-    ("a: 1\nb: 2\na: 3\n",
-     r"f\.yaml:3:1: not YAML \(the key 'a' is given twice\); correct the line"),
-    ("a: {b: 1, b: 1}\n", r"f\.yaml:1:11: not YAML \(the key 'b' is given twice\)"),
-    ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct"),
-    ("a: 9223372036854775808", "a whole number beyond 64 bits"),
-    ("a: -9223372036854775809", "a whole number beyond 64 bits"),
-    ("a: &a [*a]", "its aliases expand to more than 50000 values"),
-    ("\n".join(["a0: &a0 [0, 0]"] + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]"
-                                     for i in range(1, 12)]),
-     r"f\.yaml:1:1: not YAML \(its aliases expand to more than 50000 values\)")])
+@pytest.mark.parametrize(
+    "text, problem",
+    [
+        (
+            "a: 1\nb: 2\na: 3\n",
+            r"f\.yaml:3:1: not YAML \(the key 'a' is given twice\); correct the line",
+        ),
+        ("a: {b: 1, b: 1}\n", r"f\.yaml:1:11: not YAML \(the key 'b' is given twice\)"),
+        ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct"),
+        ("a: 9223372036854775808", "a whole number beyond 64 bits"),
+        ("a: -9223372036854775809", "a whole number beyond 64 bits"),
+        ("a: &a [*a]", "its aliases expand to more than 50000 values"),
+        (
+            "\n".join(
+                ["a0: &a0 [0, 0]"]
+                + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
+            ),
+            r"f\.yaml:1:1: not YAML \(its aliases expand to more than 50000 values\)",
+        ),
+    ],
+)
 @pytest.mark.usefixtures("loaders")
 def test_yaml_that_means_harm_or_is_ambiguous_is_refused(tmp_path, text, problem):
     path = tmp_path / "f.yaml"
@@ -435,11 +534,17 @@ def test_a_number_without_end_takes_no_time(tmp_path):
     assert yaml_of(tmp_path, f"a: {'9' * 500_000}.x")["a"].endswith("9.x")
 
 
-@pytest.mark.parametrize("text, value", [
-    ("a: &a [1, 2]\nb: *a\n", {"a": [1, 2], "b": [1, 2]}),
-    ("a: &a {x: 1}\nb:\n  <<: *a\n  x: 2\n", {"a": {"x": 1}, "b": {"x": 2}}),
-    ("a: 9223372036854775807", {"a": 2**63 - 1}), ("a: -9223372036854775808", {"a": -2**63}),
-    ("a: 0x1F", {"a": 31}), ("1: a\n'1': b\n", {1: "a", "1": "b"})])
+@pytest.mark.parametrize(
+    "text, value",
+    [
+        ("a: &a [1, 2]\nb: *a\n", {"a": [1, 2], "b": [1, 2]}),
+        ("a: &a {x: 1}\nb:\n  <<: *a\n  x: 2\n", {"a": {"x": 1}, "b": {"x": 2}}),
+        ("a: 9223372036854775807", {"a": 2**63 - 1}),
+        ("a: -9223372036854775808", {"a": -(2**63)}),
+        ("a: 0x1F", {"a": 31}),
+        ("1: a\n'1': b\n", {1: "a", "1": "b"}),
+    ],
+)
 def test_honest_yaml_is_read(tmp_path, text, value):
     assert yaml_of(tmp_path, text) == value
 
@@ -450,20 +555,30 @@ def test_json_with_a_whole_number_beyond_64_bits_is_refused_without_its_digits(t
     path.write_text('{"a": ' + "9" * digits + "}")
     with pytest.raises(InputError) as caught:
         files.read_json(path)
-    assert str(caught.value) == (f"{path}: not usable JSON (a whole number beyond 64 bits); give a "
-                                 "file that `selfcal` wrote")
+    assert str(caught.value) == (
+        f"{path}: not usable JSON (a whole number beyond 64 bits); give a file that `selfcal` wrote"
+    )
 
 
 @settings(max_examples=50)
-@given(st.recursive(st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False,
-       allow_infinity=False) | st.text(ANY), lambda inner: st.lists(inner) | st.dictionaries(
-           st.text(ANY), inner), max_leaves=20))
+@given(
+    st.recursive(
+        st.none()
+        | st.booleans()
+        | st.integers()
+        | st.floats(allow_nan=False, allow_infinity=False)
+        | st.text(ANY),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(ANY), inner),
+        max_leaves=20,
+    )
+)
 def test_json_is_read_back_whatever_its_lines(value):
     assert json.loads(json_text(value)) == value
 
 
 def test_a_row_of_numbers_is_a_line():
     assert json_text({"a": [[1.5, None], []], "b": {}, "c": [{"d": 1}]}) == (
-        '{\n "a": [\n  [1.5, null],\n  []\n ],\n "b": {},\n "c": [\n  {\n   "d": 1\n  }\n ]\n}')
+        '{\n "a": [\n  [1.5, null],\n  []\n ],\n "b": {},\n "c": [\n  {\n   "d": 1\n  }\n ]\n}'
+    )
     with pytest.raises(ValueError, match="not JSON compliant"):
         json_text({"a": [float("nan")]})

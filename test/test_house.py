@@ -9,17 +9,30 @@ import pytest
 
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-BASE = {"blocks": {"errors"}, "errors": set(), "topics": set(), "units": set(),
-        "plain_numbers": set(), "portable": set(), "start": {"portable", "topics"},
-        "outputs": {"errors", "portable"},
-        "files": {"errors", "outputs", "portable"},
-        "results": {"errors", "files", "model"}}
+BASE = {
+    "blocks": {"errors"},
+    "errors": set(),
+    "topics": set(),
+    "units": set(),
+    "plain_numbers": set(),
+    "portable": set(),
+    "start": {"portable", "topics"},
+    "outputs": {"errors", "portable"},
+    "files": {"errors", "outputs", "portable"},
+    "results": {"errors", "files", "model"},
+}
 """Modules that any package may import (`start`: the edges), and what they import."""
 ROW = re.compile(r"\| `(\w+)` \|[^|]*\|([^|]*)\|")
 ONLY_IN = {
-    "rclpy": "nodes", "mcap": "bagio", "rosbags": "bagio", "matplotlib": "reporting",
-    "selfcal_msgs": "nodes", "sensor_msgs": "nodes", "diagnostic_msgs": "nodes",
-    "std_srvs": "nodes", "std_msgs": "nodes",
+    "rclpy": "nodes",
+    "mcap": "bagio",
+    "rosbags": "bagio",
+    "matplotlib": "reporting",
+    "selfcal_msgs": "nodes",
+    "sensor_msgs": "nodes",
+    "diagnostic_msgs": "nodes",
+    "std_srvs": "nodes",
+    "std_msgs": "nodes",
 }
 
 
@@ -52,14 +65,20 @@ def test_the_table_names_every_package():
     layers = {layer_of(path) for path in SOURCES} - alone
     assert layers == {*documented(), *BASE}, (
         "in the table of docs/theory/architecture.md, or in BASE above, add or remove "
-        f"{sorted(layers ^ {*documented(), *BASE})}")
+        f"{sorted(layers ^ {*documented(), *BASE})}"
+    )
 
 
 @pytest.mark.parametrize("layer", [*documented(), *BASE])
 def test_packages_import_what_the_table_states(layer):
     table = documented()
-    found = {name.split(".")[1] for path in SOURCES if layer_of(path) == layer
-             for name in imports(path) if name.startswith("selfcal_ros.")} & {*table, *BASE}
+    found = {
+        name.split(".")[1]
+        for path in SOURCES
+        if layer_of(path) == layer
+        for name in imports(path)
+        if name.startswith("selfcal_ros.")
+    } & {*table, *BASE}
     if layer in BASE:
         assert found - {layer} == BASE[layer], f"correct BASE['{layer}'] above, or the import"
     else:
@@ -67,7 +86,8 @@ def test_packages_import_what_the_table_states(layer):
         others = found - {layer, "model", *BASE}
         assert others == table[layer], (
             f"the row `{layer}` of docs/theory/architecture.md and its imports differ in "
-            f"{sorted(others ^ table[layer])}: correct the row, or move what is imported")
+            f"{sorted(others ^ table[layer])}: correct the row, or move what is imported"
+        )
         above = [other for other in table[layer] if places.index(other) <= places.index(layer)]
         assert not above, f"`{layer}` imports what is above it: move it out of {above}"
         assert "start" not in found or layer in ("cli", "nodes")

@@ -10,9 +10,22 @@ import pytest
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-ESTIMATION = ("options", "checks", "lattice", "multifrontal", "normal",
-              "datum", "terms", "observability", "joint", "verdict", "comparison",
-              "recheck", "quality", "api")
+ESTIMATION = (
+    "options",
+    "checks",
+    "lattice",
+    "multifrontal",
+    "normal",
+    "datum",
+    "terms",
+    "observability",
+    "joint",
+    "verdict",
+    "comparison",
+    "recheck",
+    "quality",
+    "api",
+)
 """The parts of estimation/: each imports only those before it."""
 
 
@@ -51,7 +64,7 @@ def circle_in(graph: dict[str, set[str]]) -> list[str]:
 
     def visit(module: str, way: list[str]) -> list[str]:
         if module in way:
-            return [*way[way.index(module):], module]
+            return [*way[way.index(module) :], module]
         if module in done:
             return []
         for other in sorted(graph.get(module, ())):
@@ -85,7 +98,8 @@ def test_the_parts_of_estimation_import_only_those_before_them():
         place = ESTIMATION.index(part_of(module))
         for other in graph()[module].intersection(parts):
             assert ESTIMATION.index(part_of(other)) <= place, (
-                f"{module} imports the later {other}: move what they share to an earlier part")
+                f"{module} imports the later {other}: move what they share to an earlier part"
+            )
 
 
 def test_imports_in_functions_state_their_reason():
@@ -111,12 +125,16 @@ def loaded(path: Path) -> set[Path]:
 
 
 def names_scipy(path: Path) -> bool:
-    return any((node.module if isinstance(node, ast.ImportFrom) else node.names[0].name)
-               .partition(".")[0] == "scipy" for node in source(path).imports)
+    return any(
+        (node.module if isinstance(node, ast.ImportFrom) else node.names[0].name).partition(".")[0]
+        == "scipy"
+        for node in source(path).imports
+    )
 
 
 @pytest.mark.parametrize("node", NODE_PARAMETERS)
 def test_only_nodes_that_compute_with_scipy_load_it(node):
-    with_scipy = [dotted(path) for path in loaded(PACKAGE / "nodes" / f"{node}.py")
-                  if names_scipy(path)]
+    with_scipy = [
+        dotted(path) for path in loaded(PACKAGE / "nodes" / f"{node}.py") if names_scipy(path)
+    ]
     assert bool(with_scipy) == (node in WITH_SCIPY), with_scipy

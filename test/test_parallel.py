@@ -24,16 +24,18 @@ ROOT = Path(__file__).parents[1]
 @pytest.mark.parametrize("workers", [1, 2])
 def test_values_come_back_in_their_places(workers):
     numbers, seen = list(range(20)), []
-    assert mapped(math.factorial, numbers, workers=workers,
-                  progress=lambda *at: seen.append(at)) == [math.factorial(n) for n in numbers]
+    assert mapped(
+        math.factorial, numbers, workers=workers, progress=lambda *at: seen.append(at)
+    ) == [math.factorial(n) for n in numbers]
     assert seen == [(n, 20) for n in range(1, 21)]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_parts_are_joined_in_their_order(workers):
     seen = []
-    assert mapped_in_parts(sorted, [3, 1, 5, 4, 2], workers=workers, size=2,
-                           progress=lambda *at: seen.append(at)) == [1, 3, 4, 5, 2]
+    assert mapped_in_parts(
+        sorted, [3, 1, 5, 4, 2], workers=workers, size=2, progress=lambda *at: seen.append(at)
+    ) == [1, 3, 4, 5, 2]
     assert seen == [(2, 5), (4, 5), (5, 5)]
 
 
@@ -110,11 +112,14 @@ def is_alive(stat: Path) -> bool:
 
 
 def test_workers_end_with_a_process_that_is_killed():
-    code = ("import operator, os, sys\nfrom selfcal_ros.parallel import outcomes\n"
-            "found = outcomes(operator.call, [os.getpid] * 9, workers=2)\n"
-            "print(next(found).value, flush=True)\nsys.stdin.read()")
-    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE,
-                          stdout=subprocess.PIPE, text=True) as running:
+    code = (
+        "import operator, os, sys\nfrom selfcal_ros.parallel import outcomes\n"
+        "found = outcomes(operator.call, [os.getpid] * 9, workers=2)\n"
+        "print(next(found).value, flush=True)\nsys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as running:
         worker = Path("/proc", running.stdout.readline().strip(), "stat")
         assert is_alive(worker)
         running.kill()
@@ -123,9 +128,11 @@ def test_workers_end_with_a_process_that_is_killed():
 
 @pytest.mark.parametrize(("workers", "known"), [(1, False), (2, True)])
 def test_what_is_begun_is_imported_where_workers_are_forked(workers, known):
-    code = ("from selfcal_ros.parallel import begin, mapped\n"
-            f"begin('colorsys', {workers})\n"
-            "print(mapped(eval, [\"'colorsys' in __import__('sys').modules\"] * 4, workers=2))")
+    code = (
+        "from selfcal_ros.parallel import begin, mapped\n"
+        f"begin('colorsys', {workers})\n"
+        "print(mapped(eval, [\"'colorsys' in __import__('sys').modules\"] * 4, workers=2))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n")[0] == str([known] * 4)
 
@@ -149,8 +156,12 @@ print(min(frozen) > 10_000 > gc.get_freeze_count())
 @pytest.mark.parametrize("others", ["", "2"])
 def test_workers_start_without_threads_of_blas_and_leave_what_is_loaded_out_of_garbage(others):
     """One thread works, one waits for the end of the parent; the parent itself is as it was."""
-    done = subprocess.run([sys.executable, "-c", f"OTHERS = {others!r}" + LOADED],
-                          capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", f"OTHERS = {others!r}" + LOADED],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.stderr, done.stdout.splitlines()) == ("", ["{2}", "{'1'}", "True"])
 
 
@@ -161,15 +172,18 @@ def test_numbers_of_workers():
         with pytest.raises(InputError) as caught:
             check_workers(number)
         assert str(caught.value) == (
-            f"--workers: {number} is not a number of workers; give 1 to 1024")
+            f"--workers: {number} is not a number of workers; give 1 to 1024"
+        )
 
 
 def test_without_dask_it_is_said_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError) as caught:
         list(outcomes(math.sqrt, [1.0], dask="local"))
-    assert str(caught.value) == ("--dask: there is no dask.distributed in this environment; "
-                                 "install it: pip install 'selfcal_ros[dask]'")
+    assert str(caught.value) == (
+        "--dask: there is no dask.distributed in this environment; "
+        "install it: pip install 'selfcal_ros[dask]'"
+    )
 
 
 def test_dask_gives_the_same(monkeypatch):
@@ -198,8 +212,13 @@ print(parallel.mapped(interrupted.is_blocked, [1, 2], workers=2))
 
 def test_an_interrupt_while_workers_import_is_left_to_their_parent(tmp_path):
     (tmp_path / "interrupted.py").write_text(INTERRUPTED)
-    done = subprocess.run([sys.executable, "-c", WITH_WORKERS], capture_output=True, text=True,
-                          check=False, env=os.environ | {"PYTHONPATH": str(tmp_path)})
+    done = subprocess.run(
+        [sys.executable, "-c", WITH_WORKERS],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "[True, True]\n", "")
 
 
@@ -249,6 +268,10 @@ def test_workers_that_are_not_there_yet_do_not_come_after_an_interrupt(tmp_path)
     """They would find their queues gone, and say so in a traceback behind the prompt."""
     (tmp_path / "slow.py").write_text(SLOW)
     done = subprocess.run(
-        [sys.executable, "-c", STOPPED], capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])})
+        [sys.executable, "-c", STOPPED],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])},
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "stopped\n", "")

@@ -29,8 +29,14 @@ for line in sys.stdin.read().splitlines():
 
 
 def run(folder, *lines):
-    done = subprocess.run([sys.executable, "-c", WITHOUT], input="\n".join(lines), cwd=folder,
-                          capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT],
+        input="\n".join(lines),
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     return [line for line in done.stderr.splitlines() if line.startswith("code ")], done.stderr
 
@@ -38,11 +44,19 @@ def run(folder, *lines):
 def test_from_bag_to_map_report_and_tables(tmp_path):
     bag = ROOT / "bags/demo"
     (tmp_path / "points.csv").write_text("x,y\n0,0\n")
-    lines = (f"solve {bag} -o r.json --quiet", "report r.json", "plot r.json -o m.svg",
-             "table r.json -o t.csv", "apply r.json points.csv -o c.csv", "diff r.json r.json",
-             "export siemens r.json -o t.ini --unit mm", "cal export r.json -o s.cal",
-             f"batch {bag} -o batch --workers 1", f"plan check {ROOT}/config/plans/hu.yaml",
-             f"simulate {ROOT}/config/simulations/recheck.yaml -o simulated")
+    lines = (
+        f"solve {bag} -o r.json --quiet",
+        "report r.json",
+        "plot r.json -o m.svg",
+        "table r.json -o t.csv",
+        "apply r.json points.csv -o c.csv",
+        "diff r.json r.json",
+        "export siemens r.json -o t.ini --unit mm",
+        "cal export r.json -o s.cal",
+        f"batch {bag} -o batch --workers 1",
+        f"plan check {ROOT}/config/plans/hu.yaml",
+        f"simulate {ROOT}/config/simulations/recheck.yaml -o simulated",
+    )
     codes, error = run(tmp_path, *lines)
     assert codes == [f"code 0 {line}" for line in lines], error
     assert json.loads((tmp_path / "r.json").read_text())["verdict"]["qualified"]

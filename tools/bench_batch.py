@@ -46,8 +46,9 @@ def simulate(folder: Path, plan: Path, seed: int) -> None:
     if bag.exists():
         return
     sim = folder / f".{seed:03}.yaml"
-    write_yaml(sim, {"plan": str(plan), "seed": seed,
-                     "noise": {"sigma_xy": 2e-8, "sigma_theta": 1.7e-5}})
+    write_yaml(
+        sim, {"plan": str(plan), "seed": seed, "noise": {"sigma_xy": 2e-8, "sigma_theta": 1.7e-5}}
+    )
     write_simulation(read_simulation(sim), bag)
 
 
@@ -56,8 +57,21 @@ def timed(bags: Path, out: Path, workers: int) -> tuple[float, float]:
     shutil.rmtree(out, ignore_errors=True)
     known = children()
     before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    done = subprocess.run([sys.executable, "-m", "selfcal_ros", "batch", str(bags), "-o", str(out),
-                           "--workers", str(workers)], stdout=subprocess.DEVNULL, check=False)
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "selfcal_ros",
+            "batch",
+            str(bags),
+            "-o",
+            str(out),
+            "--workers",
+            str(workers),
+        ],
+        stdout=subprocess.DEVNULL,
+        check=False,
+    )
     wall = time.perf_counter() - began
     for child in children() - known:  # what started the workers: its parent has ended
         with contextlib.suppress(ChildProcessError):
@@ -88,9 +102,15 @@ print(number, flush=True)
 
 def solved_in(bag: Path, processes: int, seconds: float = 4.0) -> float:
     """Return how often each of some processes at once solves a bag in `seconds`, on average."""
-    running = [subprocess.Popen([sys.executable, "-c", SOLVER, str(bag), str(seconds)], text=True,
-                                stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-               for _ in range(processes)]
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", SOLVER, str(bag), str(seconds)],
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        for _ in range(processes)
+    ]
     for process in running:
         process.stdout.readline()  # it has loaded all
     for process in running:
@@ -112,8 +132,10 @@ def children() -> set[int]:
 
 def maps_of(out: Path) -> dict[str, np.ndarray]:
     """Return the maps of a batch by the file name of their results."""
-    return {path.name: np.array(json.loads(path.read_text())["error_map"]["gx"])
-            for path in sorted((out / "results").iterdir())}
+    return {
+        path.name: np.array(json.loads(path.read_text())["error_map"]["gx"])
+        for path in sorted((out / "results").iterdir())
+    }
 
 
 def main() -> int:
@@ -132,22 +154,37 @@ def main() -> int:
     mapped(partial(simulate, bags, args.plan.resolve()), list(range(args.bags)), workers=workers)
     own = [own_ratio(bags / "000", workers)]
     compileall.compile_dir(ROOT / "selfcal_ros", quiet=1)  # not all programs may write bytecode
-    times = [(*timed(bags, folder / "alone", 1), *timed(bags, folder / "together", workers))
-             for _ in range(max(args.rounds, 1))]
+    times = [
+        (*timed(bags, folder / "alone", 1), *timed(bags, folder / "together", workers))
+        for _ in range(max(args.rounds, 1))
+    ]
     alone, alone_cpu, together, together_cpu = np.mean(times, axis=0).tolist()
     own.append(own_ratio(bags / "000", workers))
     one, other = maps_of(folder / "alone"), maps_of(folder / "together")
     same = one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
-    figures = {"bags": args.bags, "plan": args.plan.stem, "workers": workers, "rounds": times,
-               "seconds_alone": alone, "seconds_together": together, "ratio": together / alone,
-               "cpu_s_alone": alone_cpu, "cpu_s_together": together_cpu, "own_ratio": own,
-               "same_maps": same}
+    figures = {
+        "bags": args.bags,
+        "plan": args.plan.stem,
+        "workers": workers,
+        "rounds": times,
+        "seconds_alone": alone,
+        "seconds_together": together,
+        "ratio": together / alone,
+        "cpu_s_alone": alone_cpu,
+        "cpu_s_together": together_cpu,
+        "own_ratio": own,
+        "same_maps": same,
+    }
     print(f"{args.bags} bags, one after the other: {alone:.1f} s ({alone_cpu:.1f} s of CPU)")
     print(f"{args.bags} bags, {workers} workers: {together:.1f} s ({together_cpu:.1f} s of CPU)")
-    print(f"ratio {together / alone:.2f}; CPU shared by {workers}: "
-          f"{together_cpu / workers / alone_cpu:.2f}; maps equal: {same}")
-    print(f"the cores by themselves, without starts and imports: {own[0]:.2f} before, "
-          f"{own[1]:.2f} after")
+    print(
+        f"ratio {together / alone:.2f}; CPU shared by {workers}: "
+        f"{together_cpu / workers / alone_cpu:.2f}; maps equal: {same}"
+    )
+    print(
+        f"the cores by themselves, without starts and imports: {own[0]:.2f} before, "
+        f"{own[1]:.2f} after"
+    )
     if args.output:
         write_json(args.output, figures)
     return 0

@@ -39,8 +39,13 @@ def main() -> int:
                 lines.append(f"{other.__name__}: {line}")
                 wrong += [f"{other.__name__}: {fault}" for fault in faults]
             bad += bool(wrong)
-            print(f"round {seed}: " + ("WRONG" if wrong else "right"), *lines, *wrong,
-                  sep="\n  ", flush=True)
+            print(
+                f"round {seed}: " + ("WRONG" if wrong else "right"),
+                *lines,
+                *wrong,
+                sep="\n  ",
+                flush=True,
+            )
             shutil.rmtree(place)
     print(f"{args.rounds - bad} of {args.rounds} rounds right")
     return 1 if bad else 0

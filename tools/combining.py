@@ -35,12 +35,21 @@ class Case:
     def __str__(self) -> str:
         """Return a name for the table."""
         return f"{self.runs} runs, {self.kind}" + (
-            f" {self.size_m * 1e9:.0f} nm" if self.size_m else "")
+            f" {self.size_m * 1e9:.0f} nm" if self.size_m else ""
+        )
 
 
-CASES = [Case(runs, kind, size) for kind, size in (
-    ("none", 0.0), ("white", 20e-9), ("smooth", 20e-9), ("smooth", 100e-9), ("square", 100e-9))
-    for runs in (2, 3, 6)]
+CASES = [
+    Case(runs, kind, size)
+    for kind, size in (
+        ("none", 0.0),
+        ("white", 20e-9),
+        ("smooth", 20e-9),
+        ("smooth", 100e-9),
+        ("square", 100e-9),
+    )
+    for runs in (2, 3, 6)
+]
 
 
 @dataclass(frozen=True)
@@ -61,8 +70,14 @@ def part_between(case: Case, rng: np.random.Generator) -> np.ndarray:
     if case.kind == "white":
         field = rng.normal(0, case.size_m, (2, *ARTIFACT.shape))
     elif case.kind == "smooth":
-        field = sum((rng.normal(0, case.size_m / 2, 2)[:, None, None] * x**(d - p) * y**p
-                     for d in (1, 2, 3) for p in range(d + 1)), np.zeros((2, *ARTIFACT.shape)))
+        field = sum(
+            (
+                rng.normal(0, case.size_m / 2, 2)[:, None, None] * x ** (d - p) * y**p
+                for d in (1, 2, 3)
+                for p in range(d + 1)
+            ),
+            np.zeros((2, *ARTIFACT.shape)),
+        )
     else:
         field = rng.normal(0, case.size_m) * np.stack([y, x]) * float(case.kind == "square")
     return remove_modes(field, datum_modes(ARTIFACT, scale=True))
@@ -75,8 +90,12 @@ def combined(case: Case, seed: int) -> tuple[Combination, np.ndarray, np.ndarray
     parts = []
     for run in range(case.runs):
         moved = replace(truth, g=truth.g + part_between(case, rng))
-        result = calibrate(simulate_measurements(moved, hu_plan(ARTIFACT, 2), rng, sigma_m=SIGMA_M,
-                                                 sigma_theta_rad=SIGMA_RAD), OPTIONS)
+        result = calibrate(
+            simulate_measurements(
+                moved, hu_plan(ARTIFACT, 2), rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD
+            ),
+            OPTIONS,
+        )
         parts.append(Part(f"{run}.json", result.error_map, result))
     found = combine(parts)
     emap = found.result.error_map
@@ -96,7 +115,9 @@ def judged(item: tuple[Case, int]) -> Found:
         float((abs(theta) <= noise.k_theta * emap.u_g_theta).mean()),
         float(np.mean([abs(run.e_n) > 1 for run in runs])),
         float(np.mean([run.test is not None and run.test.significant for run in runs])),
-        any(run.p_scatter < 0.05 / case.runs for run in runs), found.xy.p_between < 0.05)
+        any(run.p_scatter < 0.05 / case.runs for run in runs),
+        found.xy.p_between < 0.05,
+    )
 
 
 def main() -> int:
@@ -105,18 +126,30 @@ def main() -> int:
     parser.add_argument("--sets", type=int, default=300, help="sets of each case (default: 300)")
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     args = parser.parse_args()
-    print("| runs, part between them | in U: XY | θ | nodes with \\|E_n\\| > 1 | runs that "
-          "disagree | sets with a run that stands out | sets with a part between runs |")
+    print(
+        "| runs, part between them | in U: XY | θ | nodes with \\|E_n\\| > 1 | runs that "
+        "disagree | sets with a run that stands out | sets with a part between runs |"
+    )
     print("|---|---|---|---|---|---|---|")
     for case in CASES:
         sets = []
-        for outcome in outcomes(judged, [(case, seed) for seed in range(args.sets)],
-                                workers=check_workers(args.workers)):
+        for outcome in outcomes(
+            judged, [(case, seed) for seed in range(args.sets)], workers=check_workers(args.workers)
+        ):
             if outcome.error is not None:
                 raise outcome.error
             sets.append(outcome.value)
-        shares = [100 * float(np.mean([getattr(one, name) for one in sets])) for name in (
-            "covered_xy", "covered_theta", "beyond", "disagree", "stands_out", "between")]
+        shares = [
+            100 * float(np.mean([getattr(one, name) for one in sets]))
+            for name in (
+                "covered_xy",
+                "covered_theta",
+                "beyond",
+                "disagree",
+                "stands_out",
+                "between",
+            )
+        ]
         print(f"| {case} | " + " | ".join(f"{share:.1f} %" for share in shares) + " |", flush=True)
     return 0
 

@@ -20,11 +20,12 @@ URL = "https://ptb.de/dcc/v3.3.0/dcc.xsd"
 XS = "{http://www.w3.org/2001/XMLSchema}"
 IMPORT = re.compile(r'(schemaLocation\s*=\s*)"([^"]+)"')
 SIGNATURES = "http://www.w3.org/2000/09/xmldsig#"
-PINNED = {"https://ptb.de/dcc": "ffadd8bac25f239090afb616f249fe22eb3ca1914ecbb54d3000cd6e74770890",
-          "https://ptb.de/si": "e531807d94168477d8c199e9df266fa902decf73bd0b02729d26ff6be80c795c",
-          "http://qudt.org/vocab/":
-          "9c28b26f96fe9309677474ac08bafd236cbb0d5ff53535164389c9e7c528d501",
-          SIGNATURES: "5e550a6a56bd3ce84c6631f8f5d9703ba056f6e06fcc178a9eddb8817b69da0a"}
+PINNED = {
+    "https://ptb.de/dcc": "ffadd8bac25f239090afb616f249fe22eb3ca1914ecbb54d3000cd6e74770890",
+    "https://ptb.de/si": "e531807d94168477d8c199e9df266fa902decf73bd0b02729d26ff6be80c795c",
+    "http://qudt.org/vocab/": "9c28b26f96fe9309677474ac08bafd236cbb0d5ff53535164389c9e7c528d501",
+    SIGNATURES: "5e550a6a56bd3ce84c6631f8f5d9703ba056f6e06fcc178a9eddb8817b69da0a",
+}
 """Digest of each namespace: DCC 3.3.0, D-SI 2.2.1 with its units, XML signatures."""
 
 
@@ -64,6 +65,7 @@ def fetch(url: str, folder: Path) -> None:
         def local(match: re.Match[str], base: str = waiting[0]) -> str:
             place = urljoin(base, match[2])
             return f'{match[1]}"{names.setdefault(place, f"{len(names)}.xsd")}"'
+
         texts[waiting[0]] = IMPORT.sub(local, text.decode())
     folder.mkdir(parents=True, exist_ok=True)
     for place in reversed(names):  # dcc.xsd last: where it is, all are

@@ -39,21 +39,36 @@ def demo() -> int:
 
     FOLDER.mkdir(parents=True, exist_ok=True)
     output = (FOLDER / "result.json").relative_to(Path.cwd(), walk_up=True)
-    print(f"Replaying {BAG.relative_to(ROOT)} over DDS through measurement_collector, "
-          "pose_sequencer and solver ...", flush=True)
+    print(
+        f"Replaying {BAG.relative_to(ROOT)} over DDS through measurement_collector, "
+        "pose_sequencer and solver ...",
+        flush=True,
+    )
     code = selfcal(["replay", str(BAG), "--fast", "--force", "-o", str(output)])
     if code:
         return code
     result = result_from_dict(read_json(output), str(output))
     save_picture(map_picture(result, read_truth(BAG)), FOLDER / "map.png")
-    code = selfcal(["report", str(output), "--force", "-o", str(FOLDER / "report.html"),
-                    "--truth", str(BAG / "truth.json")])
+    code = selfcal(
+        [
+            "report",
+            str(output),
+            "--force",
+            "-o",
+            str(FOLDER / "report.html"),
+            "--truth",
+            str(BAG / "truth.json"),
+        ]
+    )
     if code:
         return code
     if sys.stdout.isatty():
         tell("\n".join(["", *shades(result.error_map), *known_to(result), ""]))
-    for name, what in (("result.json", "the result"), ("map.png", "picture of the map"),
-                       ("report.html", "report: open it")):
+    for name, what in (
+        ("result.json", "the result"),
+        ("map.png", "picture of the map"),
+        ("report.html", "report: open it"),
+    ):
         print(f"{what:18} {(FOLDER / name).relative_to(ROOT)}")
     return 0
 
@@ -73,11 +88,14 @@ def shades(emap: "ErrorMap") -> list[str]:
     most = float(length[known].max()) if known.any() else 0.0
     part = np.where(known, length, 0.0) / (most or 1.0)
     level = np.minimum((part * len(SHADES)).astype(int), len(SHADES) - 1)
-    rows = [" ".join(SHADES[k] if good else "?" for k, good in zip(levels, goods, strict=True))
-            for levels, goods in zip(level.T[::-1].tolist(), known.T[::-1].tolist(), strict=True)]
+    rows = [
+        " ".join(SHADES[k] if good else "?" for k, good in zip(levels, goods, strict=True))
+        for levels, goods in zip(level.T[::-1].tolist(), known.T[::-1].tolist(), strict=True)
+    ]
     return [f"  {row}" for row in rows] + [
         f"  length of the error: from ' ' = 0 to '{SHADES[-1]}' = {most:.3g} µm; x to the right, "
-        "y upwards"]
+        "y upwards"
+    ]
 
 
 def known_to(result: "CalibrationResult") -> list[str]:
@@ -86,8 +104,10 @@ def known_to(result: "CalibrationResult") -> list[str]:
     from selfcal_ros.reporting.summary.numbers import um
 
     nodes, anywhere = (budget for budget in budgets(result) if budget.quantity == "xy")
-    return [f"  known to ±{um(nodes.U_max)} at the nodes, ±{um(anywhere.U_max)} anywhere "
-            f"(k={nodes.k:.3g})"]
+    return [
+        f"  known to ±{um(nodes.U_max)} at the nodes, ±{um(anywhere.U_max)} anywhere "
+        f"(k={nodes.k:.3g})"
+    ]
 
 
 if __name__ == "__main__":

@@ -76,19 +76,24 @@ def walk(call: Callable[[], object], root: Path) -> Walk:
 
 def table(found: Walk) -> str:
     """Return functions, files entered, loaded and there, a line for each package, and returns."""
+
     def by_package(paths: Iterable[Path]) -> Counter:
-        return Counter(path.relative_to(found.root).parts[0].removesuffix(".py")
-                       for path in paths)
+        return Counter(path.relative_to(found.root).parts[0].removesuffix(".py") for path in paths)
 
     there = [path for path in found.root.rglob("*.py") if path.name != "__init__.py"]
-    columns = [by_package(path for path, *_ in found.functions), by_package(found.files),
-               by_package(path for path in found.loaded if path.name != "__init__.py"),
-               by_package(there)]
+    columns = [
+        by_package(path for path, *_ in found.functions),
+        by_package(found.files),
+        by_package(path for path in found.loaded if path.name != "__init__.py"),
+        by_package(there),
+    ]
     rows = [(name, *(column[name] for column in columns)) for name in sorted(columns[3])]
     rows.append(("all", *(column.total() for column in columns)))
     lines = ["package       functions  files  loaded  there"]
-    lines += [f"{name:14}{functions:9d}{files:7d}{loaded:8d}{all_:7d}"
-              for name, functions, files, loaded, all_ in rows]
+    lines += [
+        f"{name:14}{functions:9d}{files:7d}{loaded:8d}{all_:7d}"
+        for name, functions, files, loaded, all_ in rows
+    ]
     return "\n".join([*lines, f"returns to a file left before: {found.returns}"])
 
 
@@ -98,6 +103,7 @@ def main() -> int:
     parser.add_argument("--files", action="store_true", help="list the files and their functions")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
+
         def solve() -> None:
             from selfcal_ros.cli.main import main as selfcal
 

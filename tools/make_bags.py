@@ -31,8 +31,13 @@ from selfcal_ros.vision.exposures import ImageDetector
 
 ROOT = Path(__file__).parents[1]
 BAGS = ROOT / "bags"
-WRITTEN = {"hu_exact": "hu_exact.yaml", "fig10_faults": "fig10_faults.yaml",
-           "deficient": "deficient.yaml", "camera": "camera.yaml", "demo": "demo.yaml"}
+WRITTEN = {
+    "hu_exact": "hu_exact.yaml",
+    "fig10_faults": "fig10_faults.yaml",
+    "deficient": "deficient.yaml",
+    "camera": "camera.yaml",
+    "demo": "demo.yaml",
+}
 DETECT = {"camera": {"pixel_size": 6.0e-6, "mark_size": 72.0e-6, "turn": 1.5}}
 """Parameters of mark_detector for bags of images."""
 RECORDED = "hu_noise"
@@ -49,14 +54,22 @@ def record(bag: Path) -> None:
         environment = stack.enter_context(domain())
 
         def start(node: str, *more: str, **kwargs):
-            return stack.enter_context(process(f"selfcal_ros.nodes.{node}", [*params, *more],
-                                               environment, **kwargs))
+            return stack.enter_context(
+                process(f"selfcal_ros.nodes.{node}", [*params, *more], environment, **kwargs)
+            )
 
         start("bag_recorder", "-p", f"bag:={bag}", "-p", "all_topics:=false")
         start("stage_simulator", "-p", f"truth_path:={truth}")
         start("measurement_collector")
-        sequencer = start("pose_sequencer", "-p", f"plan:={PLAN}", "-p", "settle_time:=3.0",
-                          stderr=subprocess.PIPE, text=True)
+        sequencer = start(
+            "pose_sequencer",
+            "-p",
+            f"plan:={PLAN}",
+            "-p",
+            "settle_time:=3.0",
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         for line in sequencer.stderr:
             print(line, end="", flush=True)
             if "DONE" in line:
@@ -69,7 +82,8 @@ def of_images(name: str) -> dict:
     detector = ImageDetector(DetectorSettings.checked(DETECT[name], name))
     with TemporaryDirectory() as folder:
         ImageBag(BAGS / name).write_detected(
-            Path(folder, name), detector.take, check=lambda: None, frame_id="stage")
+            Path(folder, name), detector.take, check=lambda: None, frame_id="stage"
+        )
         return {**detector.counts.values(), **of_detections(Path(folder, name))}
 
 
@@ -84,16 +98,21 @@ def of_detections(bag: Path) -> dict:
         return expected | {"identifiable": False, "deficiency": error.observability.deficiency}
     numbers, emap = summary_numbers(result), result.error_map
     return expected | {
-        "identifiable": True, "grade": str(result.verdict.grade),
+        "identifiable": True,
+        "grade": str(result.verdict.grade),
         "max_error_um": round(numbers["max_error_um"], 4),
         "nonorthogonality_urad": round(emap.nonorthogonality * URAD_PER_RAD, 4),
-        "scale_difference_ppm": round(emap.scale_difference * PPM_PER_ONE, 4)}
+        "scale_difference_ppm": round(emap.scale_difference * PPM_PER_ONE, 4),
+    }
 
 
 def entry(name: str, made: str) -> dict:
     """Return the manifest entry of a bag: digest, how it was made, what it must give."""
-    about = {"sha256": bag_input(BAGS / name)["sha256"], "made": made,
-             "truth": f"{name}/truth.json"}
+    about = {
+        "sha256": bag_input(BAGS / name)["sha256"],
+        "made": made,
+        "truth": f"{name}/truth.json",
+    }
     if name in DETECT:
         return about | {"detect": DETECT[name], "expected": of_images(name)}
     return about | {"expected": of_detections(BAGS / name)}
@@ -107,15 +126,24 @@ def main() -> None:
         if name == RECORDED:
             record(BAGS / name)
         else:
-            write_simulation(read_simulation(ROOT / "config" / "simulations" / WRITTEN[name]),
-                             BAGS / name)
-    manifest = {RECORDED: entry(RECORDED, "recorded live by bag_recorder from stage_simulator, "
-                                "config/params/simulated_cell.yaml (seed 2020) and "
-                                "config/plans/hu_repeated.yaml; tools/make_bags.py")}
+            write_simulation(
+                read_simulation(ROOT / "config" / "simulations" / WRITTEN[name]), BAGS / name
+            )
+    manifest = {
+        RECORDED: entry(
+            RECORDED,
+            "recorded live by bag_recorder from stage_simulator, "
+            "config/params/simulated_cell.yaml (seed 2020) and "
+            "config/plans/hu_repeated.yaml; tools/make_bags.py",
+        )
+    }
     for name, file in WRITTEN.items():
         manifest[name] = entry(name, f"selfcal simulate config/simulations/{file}")
-    write_text(BAGS / "manifest.yaml", "# Recorded bags: digest of the MCAP files, origin, and "
-               "what they must give.\n" + yaml.safe_dump(manifest, sort_keys=False))
+    write_text(
+        BAGS / "manifest.yaml",
+        "# Recorded bags: digest of the MCAP files, origin, and "
+        "what they must give.\n" + yaml.safe_dump(manifest, sort_keys=False),
+    )
 
 
 if __name__ == "__main__":

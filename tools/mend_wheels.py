@@ -9,8 +9,10 @@ import sys
 import sysconfig
 from pathlib import Path
 
-BUILD_MACHINE = re.compile(r"/opt/python/cp3\d+-cp3\d+/(include/python3\.\d+|lib/python3\.\d+/"
-                           r"site-packages)")
+BUILD_MACHINE = re.compile(
+    r"/opt/python/cp3\d+-cp3\d+/(include/python3\.\d+|lib/python3\.\d+/"
+    r"site-packages)"
+)
 
 
 def main() -> None:

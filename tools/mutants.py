@@ -53,11 +53,27 @@ TEST_CPU_S = 120
 TIMEOUT_S = 3600
 """Time of a group of tests beyond which it waits for what does not come."""
 
-COMPARE = {ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),
-           ast.Eq: ("==", "!="), ast.NotEq: ("!=", "==")}
+COMPARE = {
+    ast.Lt: ("<", "<="),
+    ast.LtE: ("<=", "<"),
+    ast.Gt: (">", ">="),
+    ast.GtE: (">=", ">"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+}
 ARITHMETIC = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
-NAMES = {"sin": "cos", "cos": "sin", "min": "max", "max": "min", "any": "all", "all": "any",
-         "minimum": "maximum", "maximum": "minimum", "argmax": "argmin", "argmin": "argmax"}
+NAMES = {
+    "sin": "cos",
+    "cos": "sin",
+    "min": "max",
+    "max": "min",
+    "any": "all",
+    "all": "any",
+    "minimum": "maximum",
+    "maximum": "minimum",
+    "argmax": "argmin",
+    "argmin": "argmax",
+}
 
 
 @dataclass(frozen=True)
@@ -73,7 +89,7 @@ class Mutant:
     def applied(self, text: str) -> str:
         """Return the text of the file with the change."""
         data = text.encode()
-        return (data[:self.start] + self.new.encode() + data[self.stop:]).decode()
+        return (data[: self.start] + self.new.encode() + data[self.stop :]).decode()
 
 
 class Source:
@@ -87,8 +103,10 @@ class Source:
 
     def place(self, node: ast.AST) -> tuple[int, int]:
         """Return where a node begins and ends."""
-        return (self.offsets[node.lineno - 1] + node.col_offset,
-                self.offsets[node.end_lineno - 1] + node.end_col_offset)
+        return (
+            self.offsets[node.lineno - 1] + node.col_offset,
+            self.offsets[node.end_lineno - 1] + node.end_col_offset,
+        )
 
     def sign(self, left: ast.AST, right: ast.AST, old: str, new: str) -> tuple | None:
         """Return the change of the operator that stands between two nodes."""
@@ -128,15 +146,20 @@ def _name_or_number(node: ast.AST, source: Source) -> tuple | None:
 def mutants_of(path: str, text: str) -> list[Mutant]:
     """Return all changes of one file."""
     source = Source(text)
-    found = ((node, _operator(node, source) or _name_or_number(node, source))
-             for node in _code(ast.parse(text)))
+    found = (
+        (node, _operator(node, source) or _name_or_number(node, source))
+        for node in _code(ast.parse(text))
+    )
     return [Mutant(path, *change, node.lineno) for node, change in found if change]
 
 
 def _is_text(node: ast.BinOp) -> bool:
     sides = (node.left, node.right)
-    return any(isinstance(side, ast.JoinedStr) or (
-        isinstance(side, ast.Constant) and isinstance(side.value, str)) for side in sides)
+    return any(
+        isinstance(side, ast.JoinedStr)
+        or (isinstance(side, ast.Constant) and isinstance(side.value, str))
+        for side in sides
+    )
 
 
 def _code(tree: ast.AST) -> Iterator[ast.AST]:
@@ -161,8 +184,11 @@ def sample(number: int, seed: int, only: list[str], *, root: Path = ROOT) -> lis
     for path in sorted(package.rglob("*.py")):
         name = str(path.relative_to(root))
         inner = path.relative_to(package).parts[0]
-        if (any(name.startswith(part.rstrip("/")) for part in only) if only
-                else inner not in LEFT_OUT):
+        if (
+            any(name.startswith(part.rstrip("/")) for part in only)
+            if only
+            else inner not in LEFT_OUT
+        ):
             found += _in_lot(seed, name, path.read_text())
     return [mutant for _, mutant in sorted(found, key=itemgetter(0))[:number]]
 
@@ -253,8 +279,9 @@ class Tree:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.sound: dict[str, bool] = {}  # test: whether it passes without any change
-        names = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True,
-                               check=True).stdout.split("\n")
+        names = subprocess.run(
+            ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout.split("\n")
         for name in filter(None, names):
             if (ROOT / name).is_file():
                 (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -269,7 +296,8 @@ class Tree:
         first.unlink(missing_ok=True)
         status = _in_a_fork(
             lambda: pytest.main([*options, *files], plugins=[FirstFailed(tests, first)]),
-            self.folder)
+            self.folder,
+        )
         if status in (None, -signal.SIGXCPU):
             return "time"
         if status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
@@ -307,30 +335,58 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--number", type=int, default=40, help="changes to try (default: 40)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", action="append", default=[], metavar="PATH",
-                        help="file or folder, e.g. selfcal_ros/estimation; may be repeated")
+    parser.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        metavar="PATH",
+        help="file or folder, e.g. selfcal_ros/estimation; may be repeated",
+    )
     parser.add_argument("--skip", type=int, default=0, help="leave out the first of the sample")
-    parser.add_argument("--seconds", type=float, default=600,
-                        help="time of the tests of one change, as in the suite (default: 600)")
-    parser.add_argument("--watch", action="store_true",
-                        help="note anew which functions each test enters")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=600,
+        help="time of the tests of one change, as in the suite (default: 600)",
+    )
+    parser.add_argument(
+        "--watch", action="store_true", help="note anew which functions each test enters"
+    )
     args = parser.parse_args()
     if args.watch or not list(KEPT.glob("*.json")):
         shutil.rmtree(KEPT, ignore_errors=True)
         print("noting which functions each test enters: in the time of the whole suite", flush=True)
-        subprocess.run([sys.executable, "-m", "pytest", "-p", "tools.watched", "-q", "-n", "2",
-                        "--dist", "loadfile"], cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
+        subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "pytest",
+                "-p",
+                "tools.watched",
+                "-q",
+                "-n",
+                "2",
+                "--dist",
+                "loadfile",
+            ],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            check=False,
+        )
     survivors = 0
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         tree = Tree(Path(folder) / "tree")
         watched = Watched(KEPT, tree.folder)
-        chosen = sample(args.number, args.seed, args.only, root=tree.folder)[args.skip:]
+        chosen = sample(args.number, args.seed, args.only, root=tree.folder)[args.skip :]
         for number, mutant in enumerate(chosen, args.skip + 1):
             line = (tree.folder / mutant.path).read_text().splitlines()[mutant.line - 1].strip()
             alive = tree.survives(mutant, watched.groups(mutant.path, mutant.line, args.seconds))
             survivors += alive
-            print(f"{number}/{args.number} {'SURVIVED' if alive else 'seen'}: {mutant.path}:"
-                  f"{mutant.line}: {line}  -> {mutant.new}", flush=True)
+            print(
+                f"{number}/{args.number} {'SURVIVED' if alive else 'seen'}: {mutant.path}:"
+                f"{mutant.line}: {line}  -> {mutant.new}",
+                flush=True,
+            )
         for test in sorted(test for test, sound in tree.sound.items() if not sound):
             print(f"not counted, fails without any change: {test}")
     print(f"{survivors} of {len(chosen)} changes survived (seed {args.seed})")

@@ -39,8 +39,7 @@ FIGURES = ("error-map", "residual-maps")
 
 def calibrated() -> tuple[CalibrationResult, Measurements]:
     """Return the calibration of the demo's bag, and the readings in it."""
-    measurements, _, lost, _ = collect_bag(
-        BAG, CollectorSettings.checked({}, "pictures"))
+    measurements, _, lost, _ = collect_bag(BAG, CollectorSettings.checked({}, "pictures"))
     options = solver_options(SolverSettings.checked({}, "pictures"), measurements)
     result = with_input(worded(calibrate(measurements, options)), bag_input(BAG), lost)
     return result, measurements
@@ -53,33 +52,42 @@ def camera_image() -> str:
     exposed = [event for _, event in arrivals if isinstance(event, Exposure)]
     camera = simulation.camera or Camera()
     values = camera.image(exposed[SHOWN].offsets, np.random.default_rng(1))
-    detector = MarkDetector(DetectorSettings(
-        pixel_size=camera.pixel_size_m, mark_size=camera.mark_size_m))
+    detector = MarkDetector(
+        DetectorSettings(pixel_size=camera.pixel_size_m, mark_size=camera.mark_size_m)
+    )
     marks, _ = detector.marks(Picture(values, camera.full_scale))
     file = io.BytesIO()
     Image.fromarray(values).save(file, "PNG")
     data = base64.b64encode(file.getvalue()).decode()
-    rings = "".join(f'<circle cx="{mark.u + 0.5:.1f}" cy="{mark.v + 0.5:.1f}" r="8"/>'
-                    for mark in marks)
-    return (f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {camera.width} {camera.height}" '
-            f'width="{5 * camera.width}" height="{5 * camera.height}">\n'
-            f'<image width="{camera.width}" height="{camera.height}" '
-            f'style="image-rendering:pixelated" href="data:image/png;base64,{data}"/>\n'
-            f'<g fill="none" stroke="#d62728" stroke-width="0.5">{rings}</g>\n'
-            f'<text x="2" y="{camera.height - 2}" font-size="5" font-family="sans-serif" '
-            f'fill="#d62728">{len(marks)} marks</text>\n</svg>\n')
+    rings = "".join(
+        f'<circle cx="{mark.u + 0.5:.1f}" cy="{mark.v + 0.5:.1f}" r="8"/>' for mark in marks
+    )
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {camera.width} {camera.height}" '
+        f'width="{5 * camera.width}" height="{5 * camera.height}">\n'
+        f'<image width="{camera.width}" height="{camera.height}" '
+        f'style="image-rendering:pixelated" href="data:image/png;base64,{data}"/>\n'
+        f'<g fill="none" stroke="#d62728" stroke-width="0.5">{rings}</g>\n'
+        f'<text x="2" y="{camera.height - 2}" font-size="5" font-family="sans-serif" '
+        f'fill="#d62728">{len(marks)} marks</text>\n</svg>\n'
+    )
 
 
 def pictures() -> dict[str, str]:
     """Return name -> content of every picture."""
     result, measurements = calibrated()
-    found = {figure.drawing.name: figure.drawing for chapter in
-             chapters(result, truth_arrays(result.error_map, read_truth(BAG)))
-             for figure in chapter.figures}
-    drawings: list[Drawing] = [*(found[name] for name in FIGURES), plan_figure(
-        measurements.artifact, [view.view for view in measurements.views])]
+    found = {
+        figure.drawing.name: figure.drawing
+        for chapter in chapters(result, truth_arrays(result.error_map, read_truth(BAG)))
+        for figure in chapter.figures
+    }
+    drawings: list[Drawing] = [
+        *(found[name] for name in FIGURES),
+        plan_figure(measurements.artifact, [view.view for view in measurements.views]),
+    ]
     return {f"{drawing.name}.svg": svg_file(drawing) for drawing in drawings} | {
-        "camera-image.svg": camera_image()}
+        "camera-image.svg": camera_image()
+    }
 
 
 def main() -> int:

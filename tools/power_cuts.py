@@ -36,8 +36,10 @@ def main() -> int:
         undisturbed = measured(whole)
         if undisturbed.returncode:
             sys.exit(undisturbed.stderr)
-        print(f"{'killed':32} {'at':>5} {'kept':>5} {'lost':>5} {'twice':>5} {'away nm':>8} "
-              f"{'/ u':>5}")
+        print(
+            f"{'killed':32} {'at':>5} {'kept':>5} {'lost':>5} {'twice':>5} {'away nm':>8} "
+            f"{'/ u':>5}"
+        )
         wrong = 0
         for number, cut in enumerate(cuts(args.cuts, args.seed, passages(whole))):
             place = Path(folder, str(number))
@@ -48,15 +50,22 @@ def main() -> int:
             head = f"{cut.point:32} {cut.number:5} {len(kept):5}"
             if killed.returncode != -signal.SIGKILL or resumed.returncode:
                 wrong += 1
-                print(f"{head} WRONG: {killed.returncode}, {resumed.returncode}: "
-                      f"{resumed.stderr.strip().splitlines()[-1:]}", flush=True)
+                print(
+                    f"{head} WRONG: {killed.returncode}, {resumed.returncode}: "
+                    f"{resumed.stderr.strip().splitlines()[-1:]}",
+                    flush=True,
+                )
                 continue
             found = outcome(place, whole, kept)
-            is_right = not found.lost and not found.doubled and found.qualified and (
-                found.away <= SIGMAS)
+            is_right = (
+                not found.lost and not found.doubled and found.qualified and (found.away <= SIGMAS)
+            )
             wrong += not is_right
-            print(f"{head} {found.lost:5} {found.doubled:5} {found.away_m * NM_PER_M:8.3f} "
-                  f"{found.away:5.2f}{'' if is_right else '  WRONG'}", flush=True)
+            print(
+                f"{head} {found.lost:5} {found.doubled:5} {found.away_m * NM_PER_M:8.3f} "
+                f"{found.away:5.2f}{'' if is_right else '  WRONG'}",
+                flush=True,
+            )
     print(f"{args.cuts - wrong} of {args.cuts} resumed to the map of the undisturbed run")
     return 1 if wrong else 0
 

@@ -29,14 +29,30 @@ BEND_M = 5e-9
 LENGTH = 0.3
 """Correlation length of a smooth change, as a part of the width of the field."""
 
-MAPS = {"lattice": Artifact(11, PITCH_M, 12), "lattice six": Artifact(11, PITCH_M, 12),
-        "general six": Artifact(11, PITCH_M, 0, map_grid=MapGrid(7, PITCH_M * 10 / 6))}
+MAPS = {
+    "lattice": Artifact(11, PITCH_M, 12),
+    "lattice six": Artifact(11, PITCH_M, 12),
+    "general six": Artifact(11, PITCH_M, 0, map_grid=MapGrid(7, PITCH_M * 10 / 6)),
+}
 PLANS = {
     "lattice": ((0, (0, 0)), (90, (0, 0)), (0, (1, 0))),
-    "lattice six": ((0, (0, 0)), (90, (0, 0)), (180, (0, 0)), (270, (0, 0)), (0, (1, 0)),
-                    (0, (0, 1))),
-    "general six": ((0, (0, 0)), (90, (0, 0)), (37, (0.6, -0.7)), (211, (-1.2, 0.6)), (0, (1, 0)),
-                    (135, (0.4, 1.1)))}
+    "lattice six": (
+        (0, (0, 0)),
+        (90, (0, 0)),
+        (180, (0, 0)),
+        (270, (0, 0)),
+        (0, (1, 0)),
+        (0, (0, 1)),
+    ),
+    "general six": (
+        (0, (0, 0)),
+        (90, (0, 0)),
+        (37, (0.6, -0.7)),
+        (211, (-1.2, 0.6)),
+        (0, (1, 0)),
+        (135, (0.4, 1.1)),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -79,23 +95,25 @@ class Machine:
         inside = view.pose.in_field(artifact)
         m, n = artifact.m[inside], artifact.n[inside]
         mark, phase = (m + 1j * n) * PITCH_M, view.pose.phase
-        spline = MapSpline.of(artifact.field, Interpolation.BICUBIC if artifact.map_grid
-                              else Interpolation.BILINEAR)
+        spline = MapSpline.of(
+            artifact.field, Interpolation.BICUBIC if artifact.map_grid else Interpolation.BILINEAR
+        )
         z = mark / np.abs(mark.real).max()
         bent = np.stack([z**2, abs(z) ** 2, z.conj() ** 2], axis=-1) @ complex_normal(
-            rng, (3,), BEND_M)
+            rng, (3,), BEND_M
+        )
         seen = phase * np.exp(1j * phi) * (mark + self.plate[inside] + bent) - phase * mark
-        seen += spline.rows(view.pose.places(artifact, m, n)) @ spline.coefficients(
-            self.field).ravel()
+        seen += (
+            spline.rows(view.pose.places(artifact, m, n)) @ spline.coefficients(self.field).ravel()
+        )
         seen += complex_normal(rng, (), 3e-6) + complex_normal(rng, m.shape, SIGMA_M)
-        return replace(out, m=m, n=n, dx=seen.real, dy=seen.imag,
-                       count=np.ones(len(m), dtype=int))
+        return replace(out, m=m, n=n, dx=seen.real, dy=seen.imag, count=np.ones(len(m), dtype=int))
 
 
 def smooth(field: Artifact, rng: np.random.Generator) -> np.ndarray:
     """Return a smooth random map without motion and scale, rms 1 of each coordinate."""
     z = (field.x_m + 1j * field.y_m).ravel()
-    near = np.exp(-np.abs(z[:, None] - z) ** 2 / (2 * (LENGTH * np.ptp(field.x_m)) ** 2))
+    near = np.exp(-(np.abs(z[:, None] - z) ** 2) / (2 * (LENGTH * np.ptp(field.x_m)) ** 2))
     values, vectors = np.linalg.eigh(near)
     drawn = (vectors * np.sqrt(np.maximum(values, 0))) @ complex_normal(rng, z.shape, 1.0)
     xy = np.stack([drawn.real, drawn.imag]).reshape(2, *field.shape)
@@ -108,18 +126,24 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
 
     And of the new map the part in U, and error / u, rms.
     """
-    artifact, rng = MAPS[case.plan], np.random.default_rng(
-        [case.seed, int(case.size > 0)])
+    artifact, rng = MAPS[case.plan], np.random.default_rng([case.seed, int(case.size > 0)])
     lines = artifact.angular_count > 0
-    machine = Machine(artifact, complex_normal(rng, artifact.field.shape, SIZE_M),
-                      complex_normal(rng, artifact.shape, SIZE_M),
-                      rng.normal(0, 1e-5, (2, artifact.angular_count)))
-    views = tuple(View(f"{i}", np.radians(turn), (a * PITCH_M, b * PITCH_M), True, lines)
-                  for i, (turn, (a, b)) in enumerate(PLANS[case.plan]))
+    machine = Machine(
+        artifact,
+        complex_normal(rng, artifact.field.shape, SIZE_M),
+        complex_normal(rng, artifact.shape, SIZE_M),
+        rng.normal(0, 1e-5, (2, artifact.angular_count)),
+    )
+    views = tuple(
+        View(f"{i}", np.radians(turn), (a * PITCH_M, b * PITCH_M), True, lines)
+        for i, (turn, (a, b)) in enumerate(PLANS[case.plan])
+    )
     if lines:
         views = (*views, View("line", 2 * np.pi / artifact.angular_count, (0.0, 0.0), False, True))
-    before = calibrate(Measurements(case.plan, artifact, tuple(
-        machine.read(view, rng) for view in views)), Options())
+    before = calibrate(
+        Measurements(case.plan, artifact, tuple(machine.read(view, rng) for view in views)),
+        Options(),
+    )
     field = machine.field.copy()
     known = np.flatnonzero(before.error_map.valid)
     if case.size and not case.nodes:
@@ -128,8 +152,10 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
         u = float(before.error_map.u_gx.flat[node])
         field.flat[node] += case.size * u * np.exp(2j * np.pi * rng.random())
     today = replace(machine, field=field)
-    result = calibrate(Measurements("today", artifact, (today.read(views[0], rng),)),
-                       Options(plate=before, plate_from="before"))
+    result = calibrate(
+        Measurements("today", artifact, (today.read(views[0], rng),)),
+        Options(plate=before, plate_from="before"),
+    )
     emap = result.error_map
     error = np.stack([emap.gx - field.real, emap.gy - field.imag])
     error = remove_modes(error, datum_modes(artifact.field, scale=True))
@@ -137,9 +163,12 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
     good = np.isfinite(u)
     inside = float(np.mean(np.abs(error[good]) < result.noise.k_xy * u[good]))
     failed = {found.name for found in result.verdict.failed}
-    return (before.verdict.qualified and failed <= {"changed_or_drifted"},  # read in one pass
-            bool(result.recheck.changed), inside,
-            float(np.sqrt(np.mean((error[good] / u[good]) ** 2))))
+    return (
+        before.verdict.qualified and failed <= {"changed_or_drifted"},  # read in one pass
+        bool(result.recheck.changed),
+        inside,
+        float(np.sqrt(np.mean((error[good] / u[good]) ** 2))),
+    )
 
 
 def main() -> int:
@@ -150,22 +179,31 @@ def main() -> int:
     parser.add_argument("--nodes", type=int, default=3, help="changed; 0 = all (default: 3)")
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     args = parser.parse_args()
-    print("| calibration | machines | qualified | said to have changed: not changed, changed | "
-          "new map in U | error / u |\n|---|---|---|---|---|---|")
+    print(
+        "| calibration | machines | qualified | said to have changed: not changed, changed | "
+        "new map in U | error / u |\n|---|---|---|---|---|---|"
+    )
     for plan in PLANS:
-        cases = [Case(plan, args.first + i // 2, args.size * (i % 2), args.nodes)
-                 for i in range(args.machines)]
+        cases = [
+            Case(plan, args.first + i // 2, args.size * (i % 2), args.nodes)
+            for i in range(args.machines)
+        ]
         found: list = [None] * len(cases)
         for outcome in outcomes(run, cases, workers=check_workers(args.workers)):
             if outcome.error is not None:
                 raise outcome.error
             found[outcome.index] = outcome.value
-        same, other = ([one[1] for one, case in zip(found, cases, strict=True)
-                        if bool(case.size) is changes] for changes in (False, True))
-        print(f"| {plan} | {len(found)} | {sum(one[0] for one in found)} | "
-              f"{sum(same)} of {len(same)}, {sum(other)} of {len(other)} | "
-              f"{100 * np.mean([one[2] for one in found]):.1f} % | "
-              f"{np.sqrt(np.mean([one[3] ** 2 for one in found])):.3f} |", flush=True)
+        same, other = (
+            [one[1] for one, case in zip(found, cases, strict=True) if bool(case.size) is changes]
+            for changes in (False, True)
+        )
+        print(
+            f"| {plan} | {len(found)} | {sum(one[0] for one in found)} | "
+            f"{sum(same)} of {len(same)}, {sum(other)} of {len(other)} | "
+            f"{100 * np.mean([one[2] for one in found]):.1f} % | "
+            f"{np.sqrt(np.mean([one[3] ** 2 for one in found])):.3f} |",
+            flush=True,
+        )
     return 0
 
 

@@ -30,37 +30,38 @@ of SIM.yaml: [simulate.md](../guides/simulate.md). SI units. `make reference` wr
 """
 PLAN = {
     "plan_id": "name of the plan; a plan has one plate",
-    "artifact": "the plate", "views": "list of views, in their order",
+    "artifact": "the plate",
+    "views": "list of views, in their order",
     "visit_order": "order of the marks in views without their own "
-                   "(docs/guides/identifiability.md); default: chosen by the cell",
+    "(docs/guides/identifiability.md); default: chosen by the cell",
     "model_terms": "list of TERM or TERM:SIZE to be estimated with the map; default: none",
     "verify": "RESULT.json whose correction is on while the plan is measured, relative to the plan "
-              "(docs/guides/verify.md); `artifact` and `map` are then those of the result unless "
-              "given; default: no correction is verified",
+    "(docs/guides/verify.md); `artifact` and `map` are then those of the result unless "
+    "given; default: no correction is verified",
     "artifact_from": "RESULT.json of the calibration that made the plate known, relative to the "
-                     "plan (docs/guides/recheck.md); `artifact` and `map` are then those of the "
-                     "result unless given; default: the plate is not known",
+    "plan (docs/guides/recheck.md); `artifact` and `map` are then those of the "
+    "result unless given; default: the plate is not known",
     "microscope": "standard uncertainties of the microscope; default: the solver's "
-                  "parameters of these names",
+    "parameters of these names",
     "microscope.scale_u": "of its scale, m/m; default 0.01",
     "microscope.rotation_u": "of its rotation relative to the axes, rad; default 0.01",
     "microscope.shear_u": "of half the difference of its scales, and of half its error of "
-                          "squareness, m/m; default 0.002",
+    "squareness, m/m; default 0.002",
     "check_stops": "marks of each grid view that are measured four more times, the stage "
-                   "deliberately off them (docs/start/cell.md); default: none",
+    "deliberately off them (docs/start/cell.md); default: none",
     "check_stops.marks": "how many marks",
     "check_stops.offset": "distance of the stage from the mark, m; at most a quarter of the pitch",
     "map": "nodes of the error map where they are not the sites of the plate's lattice "
-           "(docs/guides/identifiability.md); default: those sites, or for views off the lattice "
-           "three quarters as many nodes as marks over the same field",
+    "(docs/guides/identifiability.md); default: those sites, or for views off the lattice "
+    "three quarters as many nodes as marks over the same field",
     "map.grid_size": "nodes along x, from 3",
     "map.grid_pitch": "distance between neighbouring nodes, m; default: the nodes span the plate",
     "map.interpolation": "between the nodes: bilinear or bicubic; default bicubic",
     "map.harmonics": "harmonics of the angular map, fewer than half the lines: a Fourier series, "
-                     "for lines at any turn; default: a value for each line",
+    "for lines at any turn; default: a value for each line",
     "map.grid_size_y": "nodes along y if the map is not square; default: as along x",
     "image": "marks that an image shows: detections of one stamp are one image "
-             "(docs/reference/bags.md); default: one mark",
+    "(docs/reference/bags.md); default: one mark",
     "image.nx": "marks along stage x, odd; the middle one is on the optical axis",
     "image.ny": "marks along stage y, odd",
     "image.pitch_m": "distance between them, m, a whole number of pitches; default: the pitch",
@@ -71,84 +72,94 @@ PLAN = {
     "views[].name": "name, unique",
     "views[].rotation_deg": "nominal turn, counter-clockwise, degrees; default 0",
     "views[].translation_pitch": "[a, b], nominal shift along stage x and y in pitches; "
-                                 "default [0, 0]",
+    "default [0, 0]",
     "views[].translation_mm": "the same in mm",
     "views[].grid": "whether grid marks are measured; default true",
     "views[].angular": "whether angular lines are measured; needs a turn by whole lines; default: "
-                       "true if the plate has some and the turn is such a turn",
+    "true if the plate has some and the turn is such a turn",
     "views[].repeats": "number of times that every mark is measured; default 1",
-    "views[].visit_order": "order of the grid marks in this view"}
+    "views[].visit_order": "order of the grid marks in this view",
+}
 RESULT = {
-    "schema": "`selfcal.result/1`", "plan_id": "plan that was measured",
-    "method": "`joint` or `law`", "measurement_sense": "`microscope_moves` or `plate_moves`",
-    "artifact": "the plate, as in PLAN.yaml", "run_id": "stamp of the run's first command, ns",
+    "schema": "`selfcal.result/1`",
+    "plan_id": "plan that was measured",
+    "method": "`joint` or `law`",
+    "measurement_sense": "`microscope_moves` or `plate_moves`",
+    "artifact": "the plate, as in PLAN.yaml",
+    "run_id": "stamp of the run's first command, ns",
     "verdict": "`grade` (good, enlarged, not_qualified), `qualified` (false for not_qualified), "
-               "`sentence`, `reasons`, `failed` (the tests that failed, as `findings`), "
-               "`enlarged_by` (each name, u_rms, u_max, unit), and `causes`, most likely first: as "
-               "`findings`, and effect_rms, effect_max, told (whether the readings determine it "
-               "all), remedies (a list of {model}, {map}, {view} to measure again, {action})",
+    "`sentence`, `reasons`, `failed` (the tests that failed, as `findings`), "
+    "`enlarged_by` (each name, u_rms, u_max, unit), and `causes`, most likely first: as "
+    "`findings`, and effect_rms, effect_max, told (whether the readings determine it "
+    "all), remedies (a list of {model}, {map}, {view} to measure again, {action})",
     "model": "`misalignment` (rigid, linear) and `terms`: name, size (null = free), estimates "
-             "(view, component, value, u, unit), "
-             "size_used (if the readings contradict the size), source (declared, default, "
-             "readings)",
+    "(view, component, value, u, unit), "
+    "size_used (if the readings contradict the size), source (declared, default, "
+    "readings)",
     "reference": "kind, relative_error, u_relative, certificate of a known length; null without; "
-                 "with `reference_at` `certified`: its numbers and temperatures; "
-                 "of the kind marks `marks`: their (m, n)",
+    "with `reference_at` `certified`: its numbers and temperatures; "
+    "of the kind marks `marks`: their (m, n)",
     "provenance": "created (ISO 8601, UTC), duration_s, version, first_exposure, last_exposure, "
-                  "visit_order of each view",
+    "visit_order of each view",
     "dof": "degrees of freedom of the map's uncertainty at its nodes, Welch-Satterthwaite: xy, "
-           "theta",
+    "theta",
     "coverage_factor": "k for 95.45 % at those degrees of freedom: xy, theta",
     "views": "a list: name, rotation (rad), translation_x, translation_y (m), misalignment {phi "
-             "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of the readings)",
+    "(rad), tx, ty (m)}, used, rejected, read {grid, angular} (weights of the readings)",
     "error_map": "gx, gy, u_gx, u_gy: N×N lists in m, [i][j] at x = (i − (N−1)/2) pitches and y "
-                 "likewise, null where unknown; g_theta, u_g_theta: K numbers in rad; "
-                 "nonorthogonality, scale_difference, datum_theta",
+    "likewise, null where unknown; g_theta, u_g_theta: K numbers in rad; "
+    "nonorthogonality, scale_difference, datum_theta",
     "artifact_map": "ax, ay, u_ax, u_ay (m), a_theta, u_a_theta (rad) of the plate, as error_map; "
-                    "u_a_theta with the θ datum zero_mean, no u of the plate by Hu's law",
+    "u_a_theta with the θ datum zero_mean, no u of the plate by Hu's law",
     "observability": "rank, unknowns, deficiency, identifiable, modes, advice; unchecked_sites, "
-                     "unchecked_lines: number that depend on single readings, null if not counted",
+    "unchecked_lines: number that depend on single readings, null if not counted",
     "noise": "sigma_* of one reading (m, rad): used, from repeats, from residuals, declared; "
-             "dof_*; k_*; p_* of the F-test",
-    "rejected": "reason -> number of detections", "warnings": "a list of sentences",
+    "dof_*; k_*; p_* of the F-test",
+    "rejected": "reason -> number of detections",
+    "warnings": "a list of sentences",
     "findings": "the data behind `warnings`: a list of name, text, view, axis, mark (m, n) or (k), "
-                "size, u, unit, p, details (by name, SI units)",
+    "size, u, unit, p, details (by name, SI units)",
     "digest": "key -> the first 64 bits of the SHA-256 of its value, without the time of creation: "
-              "a key that was edited is refused by name, a file without `digest` too; one of a "
-              "version before 0.4.0, which wrote none, is not qualified",
+    "a key that was edited is refused by name, a file without `digest` too; one of a "
+    "version before 0.4.0, which wrote none, is not qualified",
     "budget": "a line for each component of the uncertainty: quantity (xy in m, theta in rad), "
-              "component, type (A, B), value, u, unit (of the input quantity), effect_rms, "
-              "effect_max (on the map, k = 1), dof (null = many), source (readings, declared, "
-              "default), details, text",
+    "component, type (A, B), value, u, unit (of the input quantity), effect_rms, "
+    "effect_max (on the map, k = 1), dof (null = many), source (readings, declared, "
+    "default), details, text",
     "input": "file and sha256 of the bag",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
-                        "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
-                        "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
-                        "microscope, (r, 4), the last two times the plate's longer half width; "
-                        "with_map: how many of them belong to the factors; effects_on_plate: what "
-                        "effects outside the model add to the variance of the plate's map, "
-                        "(2, nx, ny), over σ²",
+    "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
+    "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
+    "microscope, (r, 4), the last two times the plate's longer half width; "
+    "with_map: how many of them belong to the factors; effects_on_plate: what "
+    "effects outside the model add to the variance of the plate's map, "
+    "(2, nx, ny), over σ²",
     "angular_terms": "contribution of each term or cause to the uncertainty of the angular map, "
-                     "rad",
+    "rad",
     "residuals": "views: view, dx, dy (m, [i][j] by mark, stage axes), dtheta (rad), course "
-                 "{time_s, dx, dy, count} over the view's time"}
+    "{time_s, dx, dy, count} over the view's time",
+}
 SOMETIMES = {
     "combined": "`selfcal combine`: u_between_m, p_between (_rad, _theta) and `runs`: file, "
-                "weight, e_n_rms, e_n_largest, beyond (share of |E_n| > 1), p, agrees, stands_out "
-                "(_theta)",
+    "weight, e_n_rms, e_n_largest, beyond (share of |E_n| > 1), p, agrees, stands_out "
+    "(_theta)",
     "map_covariance": "covariance of a mean map or a recheck up to 21 × 21 sites, lower "
-                      "triangles over Gx, then Gy, of the known sites (`xy`) and over the known "
-                      "lines (`theta`), in units of scale_xy (m²), scale_theta (rad²)",
+    "triangles over Gx, then Gy, of the known sites (`xy`) and over the known "
+    "lines (`theta`), in units of scale_xy (m²), scale_theta (rad²)",
     "rejected_at": "positions of rejected grid detections: view, reason, x, y (m)",
     "outliers": "`--robust`: rule, and the readings removed",
     "slips": "`--robust`: slips of the plate",
     "noisy_views": "`--robust`: views noisier than the others",
-    "validation": "`--validate`: readings held out, and prediction errors"}
+    "validation": "`--validate`: readings held out, and prediction errors",
+}
 
 
 def table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]] | list) -> list[str]:
-    return ["| " + " | ".join(head) + " |", "|" + "---|" * len(head),
-            *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)]
+    return [
+        "| " + " | ".join(head) + " |",
+        "|" + "---|" * len(head),
+        *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows),
+    ]
 
 
 def known_keys(data: dict, where: str = "p") -> list[str]:
@@ -161,15 +172,25 @@ def known_keys(data: dict, where: str = "p") -> list[str]:
 
 
 def plan_keys() -> list[str]:
-    whole: dict[str, Any] = {"plan_id": "p", "artifact": {
-        "grid_size": 3, "grid_pitch": 0.01, "angular_count": 0}, "views": [{"name": "a"}]}
+    whole: dict[str, Any] = {
+        "plan_id": "p",
+        "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 0},
+        "views": [{"name": "a"}],
+    }
     strange = {"?": 1}
-    return [*known_keys(whole | strange),
-            *(f"{part}.{key}" for part in ("map", "image", "microscope", "check_stops")
-              for key in known_keys(whole | {part: strange})),
-            *(f"artifact.{key}" for key in known_keys(whole | {
-                "artifact": whole["artifact"] | strange})),
-            *(f"views[].{key}" for key in known_keys(whole | {"views": [{"name": "a"} | strange]}))]
+    return [
+        *known_keys(whole | strange),
+        *(
+            f"{part}.{key}"
+            for part in ("map", "image", "microscope", "check_stops")
+            for key in known_keys(whole | {part: strange})
+        ),
+        *(
+            f"artifact.{key}"
+            for key in known_keys(whole | {"artifact": whole["artifact"] | strange})
+        ),
+        *(f"views[].{key}" for key in known_keys(whole | {"views": [{"name": "a"} | strange]})),
+    ]
 
 
 def described(keys: list[str], words: dict[str, str], what: str) -> list[tuple[str, str]]:
@@ -216,21 +237,36 @@ def text(result: dict[str, Any]) -> str:
     unknown = set(result) - set(RESULT)
     if unknown or set(RESULT) - set(result):
         raise SystemExit(f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}")
-    lines = [HEAD, "## PLAN.yaml", "",
-             *table(("key", "meaning"), described(plan_keys(), PLAN, "PLAN.yaml")), "",
-             "## RESULT.json", "", *table(("key", "meaning"), described(
-                 list(result), RESULT, "RESULT.json")), "",
-             "Present only if requested, or if there is something to report:", "",
-             *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]), "",
-             "## Parameters of the nodes", "",
-             "[config/params/all.yaml](../../config/params/all.yaml) has all of them: meaning, "
-             "unit, bounds, default. Copy what differs for your cell into a file of your own, "
-             "which the nodes and `--params NODES.yaml` read; `ros2 param describe` prints the "
-             "same.", ""]
-    lines += ["## Messages, services, action", "",
-              "Each field has its unit and frame in the definition; `ros2 interface show "
-              "selfcal_msgs/msg/ErrorMap` prints it.", "",
-              *table(("definition", "what"), message_rows())]
+    lines = [
+        HEAD,
+        "## PLAN.yaml",
+        "",
+        *table(("key", "meaning"), described(plan_keys(), PLAN, "PLAN.yaml")),
+        "",
+        "## RESULT.json",
+        "",
+        *table(("key", "meaning"), described(list(result), RESULT, "RESULT.json")),
+        "",
+        "Present only if requested, or if there is something to report:",
+        "",
+        *table(("key", "meaning"), [(f"`{k}`", v) for k, v in SOMETIMES.items()]),
+        "",
+        "## Parameters of the nodes",
+        "",
+        "[config/params/all.yaml](../../config/params/all.yaml) has all of them: meaning, "
+        "unit, bounds, default. Copy what differs for your cell into a file of your own, "
+        "which the nodes and `--params NODES.yaml` read; `ros2 param describe` prints the "
+        "same.",
+        "",
+    ]
+    lines += [
+        "## Messages, services, action",
+        "",
+        "Each field has its unit and frame in the definition; `ros2 interface show "
+        "selfcal_msgs/msg/ErrorMap` prints it.",
+        "",
+        *table(("definition", "what"), message_rows()),
+    ]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -34,34 +34,81 @@ for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 import numpy as np  # noqa: E402  # once the number of threads is set
 
 ROOT = Path(__file__).resolve().parents[1]
-SENTENCES = {"sentence", "text", "reasons", "warnings", "advice", "created", "file", "version",
-             "message", "rejected_text", "sha256", "action", "digest"}
+SENTENCES = {
+    "sentence",
+    "text",
+    "reasons",
+    "warnings",
+    "advice",
+    "created",
+    "file",
+    "version",
+    "message",
+    "rejected_text",
+    "sha256",
+    "action",
+    "digest",
+}
 """Keys whose values are words for a reader, or differ from run to run or with the last bit."""
 
 FACTORS = "/covariance_terms/"
 """Where the factors of a result are."""
 
-OPTIONS = ([], ["--model", "none"], ["--robust"], ["--validate"], ["--misalignment", "linear"],
-           ["--theta-datum", "xy_axes"], ["--model", "drift"], ["--model", "plate_scale"],
-           ["--microscope", "0:0:0"], ["--uncertainty", "never"], ["--budget"])
+OPTIONS = (
+    [],
+    ["--model", "none"],
+    ["--robust"],
+    ["--validate"],
+    ["--misalignment", "linear"],
+    ["--theta-datum", "xy_axes"],
+    ["--model", "drift"],
+    ["--model", "plate_scale"],
+    ["--microscope", "0:0:0"],
+    ["--uncertainty", "never"],
+    ["--budget"],
+)
 BAG_OPTIONS = (*OPTIONS, ["--method", "law"], ["--model", "microscope,drift"])
 PLANS = ("hu", "hu_two_shifts", "resistant", "six_views", "qiao", "hu_repeated")
-EFFECTS = {"microscope_scale": 1e-2, "microscope_rotation": 1e-2, "microscope_shear": 2e-3,
-           "backlash_x": 5e-8, "backlash_y": 5e-8, "plate_scale": 2e-6, "plate_shape": 5e-8,
-           "plate_strain": 1e-7, "plate_tilt": 1e-4, "line_eccentricity": 5e-6,
-           "drift_linear": 1e-7, "drift_walk": 1e-7, "optical_tilt_x": 1e-3, "settling": 5e-8,
-           "stage_bend": 3e-8, "pitch_error": 1e-5}
-FAULTS = {"lost": 0.05, "duplicated": 0.02, "outliers": 0.02, "low_score": 0.02,
-          "not_finite": 0.01, "unknown_mark": 0.01, "delay": 0.2}
+EFFECTS = {
+    "microscope_scale": 1e-2,
+    "microscope_rotation": 1e-2,
+    "microscope_shear": 2e-3,
+    "backlash_x": 5e-8,
+    "backlash_y": 5e-8,
+    "plate_scale": 2e-6,
+    "plate_shape": 5e-8,
+    "plate_strain": 1e-7,
+    "plate_tilt": 1e-4,
+    "line_eccentricity": 5e-6,
+    "drift_linear": 1e-7,
+    "drift_walk": 1e-7,
+    "optical_tilt_x": 1e-3,
+    "settling": 5e-8,
+    "stage_bend": 3e-8,
+    "pitch_error": 1e-5,
+}
+FAULTS = {
+    "lost": 0.05,
+    "duplicated": 0.02,
+    "outliers": 0.02,
+    "low_score": 0.02,
+    "not_finite": 0.01,
+    "unknown_mark": 0.01,
+    "delay": 0.2,
+}
 ORDERS = ("serpentine", "raster", "there_and_back", "x_back_y_back", "random")
 
 
 def session(number: int) -> tuple[dict[str, object], list[str]]:
     """Return the SIM.yaml of a random session, and the options of its solution."""
     draw = random.Random(number)
-    physics = {name: draw.choice((-1, 1)) * size * draw.random() if "microscope" in name
-               else size * draw.random()
-               for name, size in EFFECTS.items() if draw.random() < 0.15}
+    physics = {
+        name: draw.choice((-1, 1)) * size * draw.random()
+        if "microscope" in name
+        else size * draw.random()
+        for name, size in EFFECTS.items()
+        if draw.random() < 0.15
+    }
     noise = {"sigma_xy": 2e-8 * 10 ** draw.uniform(-1, 1), "sigma_theta": 1.7e-5 * draw.random()}
     if draw.random() < 0.2:
         noise["noise_ratio"] = 10 ** draw.uniform(-0.5, 0.5)
@@ -75,8 +122,14 @@ def session(number: int) -> tuple[dict[str, object], list[str]]:
     if draw.random() < 0.2:
         cell["sense"] = "plate_moves"
     faults = {name: part * draw.random() for name, part in FAULTS.items() if draw.random() < 0.1}
-    simulation = {"plan": str(ROOT / f"config/plans/{draw.choice(PLANS)}.yaml"), "seed": number,
-                  "physics": physics, "noise": noise, "cell": cell, "faults": faults}
+    simulation = {
+        "plan": str(ROOT / f"config/plans/{draw.choice(PLANS)}.yaml"),
+        "seed": number,
+        "physics": physics,
+        "noise": noise,
+        "cell": cell,
+        "faults": faults,
+    }
     return simulation, draw.choice(OPTIONS) if draw.random() < 0.5 else []
 
 
@@ -149,7 +202,8 @@ def differ(old: object, new: object, allowed: float, part: float) -> bool:
     """Return whether two values differ: numbers by more than `allowed` and a part of themselves."""
     if isinstance(old, list) and isinstance(new, list):
         return len(old) != len(new) or any(
-            differ(one, other, allowed, part) for one, other in zip(old, new, strict=True))
+            differ(one, other, allowed, part) for one, other in zip(old, new, strict=True)
+        )
     if allowed and isinstance(old, int | float) and isinstance(new, int | float):
         return not abs(old - new) <= allowed + part * max(abs(old), abs(new))
     return old != new
@@ -158,13 +212,18 @@ def differ(old: object, new: object, allowed: float, part: float) -> bool:
 def allowed_in(case: dict[str, object], part: float) -> float:
     """Return a part of the standard uncertainty of a case's map, m."""
     rows = case.get("/error_map/u_gx", [])
-    u = [value for row in (rows if part and isinstance(rows, list) else []) for value in row
-         if isinstance(value, float)]
+    u = [
+        value
+        for row in (rows if part and isinstance(rows, list) else [])
+        for value in row
+        if isinstance(value, float)
+    ]
     return part * (sum(value**2 for value in u) / len(u)) ** 0.5 if u else 0.0
 
 
 def factors_of(case: dict[str, object]) -> list[np.ndarray]:
     """Return the factors of a case as columns: over the map, and over each thing beside it."""
+
     def rows(name: str) -> np.ndarray:
         found = np.array(case.get(f"{FACTORS}{name}", []), dtype=float)
         return found.reshape(len(found), found[:1].size)
@@ -185,22 +244,31 @@ def same_covariance(old: dict[str, object], new: dict[str, object], part: float)
     before, after = factors_of(old), factors_of(new)
     if [columns.shape[1] for columns in before] != [columns.shape[1] for columns in after]:
         return False
-    size = np.concatenate([np.full(columns.shape[1], np.sqrt((columns**2).sum(axis=0)).max(
-        initial=0.0)) for columns in before])
+    size = np.concatenate(
+        [
+            np.full(columns.shape[1], np.sqrt((columns**2).sum(axis=0)).max(initial=0.0))
+            for columns in before
+        ]
+    )
     one, other = (np.hstack(columns) for columns in (before, after))
     return bool((abs(one.T @ one - other.T @ other) <= part * np.outer(size, size)).all())
 
 
-def compare(before: dict[str, dict[str, object]], after: dict[str, dict[str, object]],
-            part: float = 0.0) -> int:
+def compare(
+    before: dict[str, dict[str, object]], after: dict[str, dict[str, object]], part: float = 0.0
+) -> int:
     """Print which values differ, and return how many cases have any."""
     different = 0
     alone: Counter[str] = Counter()
     for name in before.keys() & after.keys():
         old, new = before[name], after[name]
         allowed = allowed_in(old, part)
-        wrong = [path for path in old.keys() & new.keys() if not path.startswith(FACTORS)
-                 and differ(old[path], new[path], allowed, 0.0 if "_map/" in path else part)]
+        wrong = [
+            path
+            for path in old.keys() & new.keys()
+            if not path.startswith(FACTORS)
+            and differ(old[path], new[path], allowed, 0.0 if "_map/" in path else part)
+        ]
         if not same_covariance(old, new, part):
             wrong.append(FACTORS)
         for path in old.keys() ^ new.keys():
@@ -208,8 +276,10 @@ def compare(before: dict[str, dict[str, object]], after: dict[str, dict[str, obj
         if wrong:
             different += 1
             first = sorted(wrong)[0]
-            print(f"{name}: {len(wrong)} values differ, first {first}: "
-                  f"{str(old.get(first))[:80]} -> {str(new.get(first))[:80]}")
+            print(
+                f"{name}: {len(wrong)} values differ, first {first}: "
+                f"{str(old.get(first))[:80]} -> {str(new.get(first))[:80]}"
+            )
     for path, count in sorted(alone.items()):
         print(f"in one tree alone: {path} ({count} times)")
     print(f"{len(before.keys() & after.keys())} cases, {different} differ")
@@ -223,8 +293,13 @@ def main() -> int:
     parser.add_argument("--against", action="store_true", help="compare with RECORD.json.gz")
     parser.add_argument("--sessions", type=int, default=200, metavar="N")
     parser.add_argument("--only", default="", metavar="TEXT", help="cases with TEXT in their name")
-    parser.add_argument("--within", type=float, default=0.0, metavar="PART",
-                        help="numbers may differ by this part of u; default: by no bit")
+    parser.add_argument(
+        "--within",
+        type=float,
+        default=0.0,
+        metavar="PART",
+        help="numbers may differ by this part of u; default: by no bit",
+    )
     args = parser.parse_args()
     if args.against:
         before = json.loads(gzip.decompress(args.record.read_bytes()))

@@ -19,15 +19,26 @@ from selfcal_ros import __version__
 from selfcal_ros.outputs import write_json
 
 ROOT = Path(__file__).parents[1]
-STATED = {"apsw": "Zlib", "empy": "LGPL-2.1-or-later",
-          "docutils": "LicenseRef-Public-Domain AND BSD-2-Clause AND GPL-3.0-or-later",
-          "ros-fastcdr": "Apache-2.0", "ros-fastrtps": "Apache-2.0",
-          "setuptools": "MIT"}
+STATED = {
+    "apsw": "Zlib",
+    "empy": "LGPL-2.1-or-later",
+    "docutils": "LicenseRef-Public-Domain AND BSD-2-Clause AND GPL-3.0-or-later",
+    "ros-fastcdr": "Apache-2.0",
+    "ros-fastrtps": "Apache-2.0",
+    "setuptools": "MIT",
+}
 """Licences that neither the metadata of a wheel nor its package.xml name; from their sources."""
-SPDX = {"Apache Software License": "Apache-2.0", "Apache License 2.0": "Apache-2.0",
-        "Apache 2.0": "Apache-2.0", "BSD License": "BSD-3-Clause", "BSD": "BSD-3-Clause",
-        "MIT License": "MIT", "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
-        "Python Software Foundation License": "PSF-2.0", "zlib License": "Zlib"}
+SPDX = {
+    "Apache Software License": "Apache-2.0",
+    "Apache License 2.0": "Apache-2.0",
+    "Apache 2.0": "Apache-2.0",
+    "BSD License": "BSD-3-Clause",
+    "BSD": "BSD-3-Clause",
+    "MIT License": "MIT",
+    "Mozilla Public License 2.0 (MPL 2.0)": "MPL-2.0",
+    "Python Software Foundation License": "PSF-2.0",
+    "zlib License": "Zlib",
+}
 """Names of licences in wheels and manifests -> their identifiers, https://spdx.org/licenses."""
 
 
@@ -63,8 +74,11 @@ def licence(name: str) -> str:
     stated = STATED.get(name) or about.get("License-Expression")
     if stated:
         return stated
-    classifiers = [line.split(" :: ")[-1] for line in about.get_all("Classifier") or ()
-                   if line.startswith("License ::")]
+    classifiers = [
+        line.split(" :: ")[-1]
+        for line in about.get_all("Classifier") or ()
+        if line.startswith("License ::")
+    ]
     if classifiers:
         return " OR ".join(SPDX.get(name, name) for name in classifiers)
     package = re.sub("^ros-(jazzy-)?", "", name).replace("-", "_")
@@ -81,20 +95,46 @@ def bill() -> dict:
     own = required()
     components = []
     for name, (version, hashes) in sorted(pins().items()):
-        scope = "required" if canonicalize_name(name) in own else (
-            "optional" if name.startswith("ros-") else "excluded")
-        components.append({
-            "type": "library", "name": name, "version": version, "scope": scope,
-            "purl": f"pkg:pypi/{canonicalize_name(name)}@{version}",
-            "hashes": [{"alg": "SHA-256", "content": digest} for digest in hashes],
-            "licenses": [{"expression": licence(name)}]})
-    about = {"type": "application", "name": "selfcal_ros", "version": __version__,
-             "licenses": [{"license": {"id": "Apache-2.0"}}]}
-    return {"bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1,
-            "metadata": {"component": about}, "components": components}
+        scope = (
+            "required"
+            if canonicalize_name(name) in own
+            else ("optional" if name.startswith("ros-") else "excluded")
+        )
+        components.append(
+            {
+                "type": "library",
+                "name": name,
+                "version": version,
+                "scope": scope,
+                "purl": f"pkg:pypi/{canonicalize_name(name)}@{version}",
+                "hashes": [{"alg": "SHA-256", "content": digest} for digest in hashes],
+                "licenses": [{"expression": licence(name)}],
+            }
+        )
+    about = {
+        "type": "application",
+        "name": "selfcal_ros",
+        "version": __version__,
+        "licenses": [{"license": {"id": "Apache-2.0"}}],
+    }
+    return {
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "version": 1,
+        "metadata": {"component": about},
+        "components": components,
+    }
 
 
 if __name__ == "__main__":
     write_json(ROOT / "sbom.json", bill())
-    print(json.dumps({part["name"]: part["licenses"][0]["expression"]
-                      for part in bill()["components"] if part["scope"] == "required"}, indent=1))
+    print(
+        json.dumps(
+            {
+                part["name"]: part["licenses"][0]["expression"]
+                for part in bill()["components"]
+                if part["scope"] == "required"
+            },
+            indent=1,
+        )
+    )

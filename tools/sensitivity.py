@@ -89,12 +89,15 @@ def _setup_fault(name: str, make: Callable[[float], tuple[measure.SetUp, measure
 
 def _yaw(axis: int, *, wavy: bool = False, abbe_m: float = 0.0, stacked: bool = False) -> Callable:
     """Return a fault of an axis that turns by `size` in every block, or back and forth."""
+
     def apply(machine: measure.StepMachine, size: float) -> Broken:
         turns = np.zeros((machine.dim, machine.n_blocks, 3))
         turns[axis, :, 2] = size * ((-1.0) ** np.arange(machine.n_blocks) if wavy else 1.0)
         spot = measure.SetUp(abbe_m=(-abbe_m / np.sqrt(2), abbe_m / np.sqrt(2), 0.0))
-        return (replace(machine, turns_rad=turns, stacked=stacked),
-                measure.Measurement({PP: spot, NP: spot}))
+        return (
+            replace(machine, turns_rad=turns, stacked=stacked),
+            measure.Measurement({PP: spot, NP: spot}),
+        )
 
     return apply
 
@@ -104,29 +107,58 @@ def _noise(make: Callable[[float], measure.LaserNoise]) -> Callable:
 
 
 FAULTS = (
-    Fault("none: laser along the machine's own diagonal", 0.0, "",
-          lambda machine, _: (machine, measure.Measurement())),
-    Fault("none: laser along the nominal diagonal", 0.0, "", lambda machine, _: (
-        machine, measure.Measurement(dict.fromkeys((PP, NP), measure.SetUp(to_machine=False))))),
+    Fault(
+        "none: laser along the machine's own diagonal",
+        0.0,
+        "",
+        lambda machine, _: (machine, measure.Measurement()),
+    ),
+    Fault(
+        "none: laser along the nominal diagonal",
+        0.0,
+        "",
+        lambda machine, _: (
+            machine,
+            measure.Measurement(dict.fromkeys((PP, NP), measure.SetUp(to_machine=False))),
+        ),
+    ),
     _setup_fault("mirror off, pp", lambda s: (measure.SetUp(mirror_rad=(s,)), measure.SetUp())),
     _setup_fault("mirror off, pp and np equally", lambda s: (measure.SetUp(mirror_rad=(s,)),) * 2),
     _setup_fault("laser off, pp", lambda s: (measure.SetUp(laser_rad=(s,)), measure.SetUp())),
     _setup_fault("laser off, pp and np equally", lambda s: (measure.SetUp(laser_rad=(s,)),) * 2),
-    _setup_fault("laser and mirror off, pp",
-                 lambda s: (measure.SetUp(laser_rad=(s,), mirror_rad=(s,)), measure.SetUp())),
-    _setup_fault("laser and mirror off, pp and np equally",
-                 lambda s: (measure.SetUp(laser_rad=(s,), mirror_rad=(s,)),) * 2),
+    _setup_fault(
+        "laser and mirror off, pp",
+        lambda s: (measure.SetUp(laser_rad=(s,), mirror_rad=(s,)), measure.SetUp()),
+    ),
+    _setup_fault(
+        "laser and mirror off, pp and np equally",
+        lambda s: (measure.SetUp(laser_rad=(s,), mirror_rad=(s,)),) * 2,
+    ),
     Fault("X turns steadily, per block", 1e-6, "rad", _yaw(0)),
     Fault("X turns back and forth, per block", 1e-6, "rad", _yaw(0, wavy=True)),
     Fault("Y turns steadily, per block", 1e-6, "rad", _yaw(1)),
     Fault("X turns and carries Y, per block", 1e-6, "rad", _yaw(0, stacked=True)),
     Fault("X turns steadily, beam 10 mm off the point", 1e-6, "rad", _yaw(0, abbe_m=0.01)),
-    Fault("unit of length of the laser, pp", 1e-7, "relative", lambda machine, size: (
-        machine, measure.Measurement({PP: measure.SetUp(scale=size)}))),
-    Fault("noise of a laser distance, 3 repeats", 10e-9, "m",
-          _noise(lambda size: measure.LaserNoise(distance_m=size, repeats=3)), random=True),
-    Fault("noise of the linear measurement, 3 repeats", 10e-9, "m",
-          _noise(lambda size: measure.LaserNoise(linear_m=size, repeats=3)), random=True),
+    Fault(
+        "unit of length of the laser, pp",
+        1e-7,
+        "relative",
+        lambda machine, size: (machine, measure.Measurement({PP: measure.SetUp(scale=size)})),
+    ),
+    Fault(
+        "noise of a laser distance, 3 repeats",
+        10e-9,
+        "m",
+        _noise(lambda size: measure.LaserNoise(distance_m=size, repeats=3)),
+        random=True,
+    ),
+    Fault(
+        "noise of the linear measurement, 3 repeats",
+        10e-9,
+        "m",
+        _noise(lambda size: measure.LaserNoise(linear_m=size, repeats=3)),
+        random=True,
+    ),
 )
 
 
@@ -135,44 +167,76 @@ def effect(machine: measure.StepMachine, data: StepDiagonal, method: Method) -> 
     found = identify(data, Choice(method, allow_equal=True))
     truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
     wrong = np.abs(found.errors_m - truth.errors_m)
-    straight = [abs(straightness(found, axis, 1 - axis).value
-                    - straightness(truth, axis, 1 - axis).value) for axis in (0, 1)]
-    return Effect(float(max(wrong[0, :, 0].max(), wrong[1, :, 1].max())),
-                  float(max(wrong[0, :, 1].max(), wrong[1, :, 0].max())),
-                  abs(squareness(found).value - squareness(truth).value), max(straight))
+    straight = [
+        abs(straightness(found, axis, 1 - axis).value - straightness(truth, axis, 1 - axis).value)
+        for axis in (0, 1)
+    ]
+    return Effect(
+        float(max(wrong[0, :, 0].max(), wrong[1, :, 1].max())),
+        float(max(wrong[0, :, 1].max(), wrong[1, :, 0].max())),
+        abs(squareness(found).value - squareness(truth).value),
+        max(straight),
+    )
 
 
-def effect_of(fault: Fault, size: float, machine: measure.StepMachine, *, method: Method,
-              rng: np.random.Generator) -> Effect:
+def effect_of(
+    fault: Fault,
+    size: float,
+    machine: measure.StepMachine,
+    *,
+    method: Method,
+    rng: np.random.Generator,
+) -> Effect:
     """Return the effect of a fault of a given size; for a random one the rms over draws."""
     broken, measurement = fault.apply(machine, size)
-    draws = [effect(broken, measure.simulate_step_diagonal(broken, measurement, rng), method)
-             for _ in range(NOISE_DRAWS if fault.random else 1)]
-    table = np.array([[d.linear_m, d.transverse_m, d.squareness_m, d.straightness_m]
-                      for d in draws])
+    draws = [
+        effect(broken, measure.simulate_step_diagonal(broken, measurement, rng), method)
+        for _ in range(NOISE_DRAWS if fault.random else 1)
+    ]
+    table = np.array(
+        [[d.linear_m, d.transverse_m, d.squareness_m, d.straightness_m] for d in draws]
+    )
     return Effect(*np.sqrt(np.mean(table**2, axis=0)).tolist())
 
 
 def sensitivity(machine: measure.StepMachine, rng: np.random.Generator) -> list[dict]:
     """Return one row per fault: its size and the effects on both formulations, m."""
-    return [{"fault": fault.name, "size": fault.size, "unit": fault.unit,
-             **{method: vars(found) for method, found in
-                _both(fault, fault.size, machine, rng).items()}} for fault in FAULTS]
+    return [
+        {
+            "fault": fault.name,
+            "size": fault.size,
+            "unit": fault.unit,
+            **{
+                method: vars(found)
+                for method, found in _both(fault, fault.size, machine, rng).items()
+            },
+        }
+        for fault in FAULTS
+    ]
 
 
 def sweep(machine: measure.StepMachine, rng: np.random.Generator) -> list[dict]:
     """Return the effects of the faults of laser and mirror over angles, for a plot."""
     chosen = [fault for fault in FAULTS if fault.unit == "rad" and fault.size == 1e-3]
-    return [{"fault": fault.name, "size": list(SWEEP), **_columns(
-        [_both(fault, size, machine, rng) for size in SWEEP])} for fault in chosen]
+    return [
+        {
+            "fault": fault.name,
+            "size": list(SWEEP),
+            **_columns([_both(fault, size, machine, rng) for size in SWEEP]),
+        }
+        for fault in chosen
+    ]
 
 
-def _both(fault: Fault, size: float, machine: measure.StepMachine,
-          rng: np.random.Generator) -> dict[str, Effect]:
+def _both(
+    fault: Fault, size: float, machine: measure.StepMachine, rng: np.random.Generator
+) -> dict[str, Effect]:
     """Return the effect on each formulation, from the same draws."""
     seed = int(rng.integers(2**63))
-    return {str(method): effect_of(fault, size, machine, method=method,
-                                   rng=np.random.default_rng(seed)) for method in Method}
+    return {
+        str(method): effect_of(fault, size, machine, method=method, rng=np.random.default_rng(seed))
+        for method in Method
+    }
 
 
 def _columns(effects: list[dict[str, Effect]]) -> dict[str, list[dict]]:
@@ -185,13 +249,16 @@ def sensitivity_text(rows: list[dict]) -> str:
     head = f"{'fault':{width}s} {'size':>14s}"
     columns = ("linear_m", "transverse_m", "squareness_m", "straightness_m")
     names = ("linear", "transverse", "squareness", "straightness")
-    lines = [f"{'':{width + 15}s} {'conventional, um':>51s} {'new, um':>51s}",
-             head + " ".join(["", *(f"{name:>12s}" for name in names * 2)])]
+    lines = [
+        f"{'':{width + 15}s} {'conventional, um':>51s} {'new, um':>51s}",
+        head + " ".join(["", *(f"{name:>12s}" for name in names * 2)]),
+    ]
     for row in rows:
         size = f"{row['size']:g} {row['unit']}" if row["unit"] else "-"
         values = [row[str(method)][column] * UM_PER_M for method in Method for column in columns]
-        lines.append(f"{row['fault']:{width}s} {size:>14s} "
-                     + " ".join(f"{value:12.4f}" for value in values))
+        lines.append(
+            f"{row['fault']:{width}s} {size:>14s} " + " ".join(f"{value:12.4f}" for value in values)
+        )
     return "\n".join(lines)
 
 
@@ -202,22 +269,46 @@ def sensitivity_figure(curves: list[dict]) -> Drawing:
     """
     drawing = titled("sensitivity", "Errors in µm over the angle by which laser or mirror are off")
     drawing.width = 900.0
-    panels = (("linear_m", "linear error of a block"),
-              ("transverse_m", "transverse error of a block"),
-              ("squareness_m", "squareness over the range"))
+    panels = (
+        ("linear_m", "linear error of a block"),
+        ("transverse_m", "transverse error of a block"),
+        ("squareness_m", "squareness over the range"),
+    )
     for number, (column, title) in enumerate(panels):
-        chart(drawing, (50 + 295 * number, 56, 235, 240), [
-            Curve(np.array(curve["size"]), np.maximum(np.array(
-                [effect[column] for effect in curve[method]]) * UM_PER_M, NOTHING_UM),
-                f"c{place % SERIES}", dash=dash, dots=1.5)
-            for place, curve in enumerate(curves) for method, dash in DASHES.items()],
-            title=title, labels=("angle in rad", ""), log=True)
+        chart(
+            drawing,
+            (50 + 295 * number, 56, 235, 240),
+            [
+                Curve(
+                    np.array(curve["size"]),
+                    np.maximum(
+                        np.array([effect[column] for effect in curve[method]]) * UM_PER_M,
+                        NOTHING_UM,
+                    ),
+                    f"c{place % SERIES}",
+                    dash=dash,
+                    dots=1.5,
+                )
+                for place, curve in enumerate(curves)
+                for method, dash in DASHES.items()
+            ],
+            title=title,
+            labels=("angle in rad", ""),
+            log=True,
+        )
     for place, curve in enumerate(curves):
-        legend(drawing, [(f"c{place % SERIES}", curve["fault"])],
-               (50 + 295 * (place % 3), 356 + 18 * (place // 3)))
+        legend(
+            drawing,
+            [(f"c{place % SERIES}", curve["fault"])],
+            (50 + 295 * (place % 3), 356 + 18 * (place // 3)),
+        )
     bottom = 356.0 + 18 * -(-len(curves) // 3)
-    drawing.label(50, bottom, "dashed: conventional formulation, solid: new; the lowest value "
-                  "stands for all below 1 pm", colour="soft")
+    drawing.label(
+        50,
+        bottom,
+        "dashed: conventional formulation, solid: new; the lowest value stands for all below 1 pm",
+        colour="soft",
+    )
     drawing.height = bottom + 14
     return drawing
 

@@ -62,9 +62,14 @@ def five_views(size: int) -> Plan:
     """Return Hu's grid views and two more: from the third on, each gives a map."""
     plan = hu_plan(Artifact(size, PITCH_M))
     first = plan.views[0]
-    return replace(plan, views=(*plan.views,
-                                replace(first, name="rot180", rotation_rad=np.pi),
-                                replace(first, name="shift_y", translation_m=(0.0, PITCH_M))))
+    return replace(
+        plan,
+        views=(
+            *plan.views,
+            replace(first, name="rot180", rotation_rad=np.pi),
+            replace(first, name="shift_y", translation_m=(0.0, PITCH_M)),
+        ),
+    )
 
 
 def shift(hours: float, size: int) -> Recording:
@@ -75,8 +80,13 @@ def shift(hours: float, size: int) -> Recording:
     marks = sum(len(view.m) for view in measurements.views)
     repeats = max(1, round(3600 * hours / marks))
     plan = replace(plan, views=tuple(replace(view, repeats=repeats) for view in plan.views))
-    part = recording(plan, measurements, repeats=repeats, encoder_ns=ENCODER_NS,
-                     visit_ns=max(round(3600e9 * hours / marks), 50_000_000))
+    part = recording(
+        plan,
+        measurements,
+        repeats=repeats,
+        encoder_ns=ENCODER_NS,
+        visit_ns=max(round(3600e9 * hours / marks), 50_000_000),
+    )
     rng = np.random.default_rng(1)
     for axis in ("x", "y"):
         part.detections[axis] += rng.normal(0, SIGMA_M, len(part.detections[axis]))
@@ -86,7 +96,7 @@ def shift(hours: float, size: int) -> Recording:
 
 def payloads(rows: np.ndarray) -> list[bytes]:
     """Return the CDR bytes in message records."""
-    return [row.tobytes()[FRONT.itemsize:] for row in rows]
+    return [row.tobytes()[FRONT.itemsize :] for row in rows]
 
 
 def batches(part: Recording) -> Iterator[tuple[object, list[tuple[str, bytes]]]]:
@@ -97,18 +107,32 @@ def batches(part: Recording) -> Iterator[tuple[object, list[tuple[str, bytes]]]]
     marks = part.detections["stamp"]
     edges = [command.stamp_ns for command in part.commands] + [np.iinfo(np.int64).max]
     for command, end in zip(part.commands, edges[1:], strict=True):
-        message = build(typestore(), "selfcal_msgs/msg/ViewCommand",
-                        from_model.command(command, "stage"))
-        yield command, [("command", bytes(typestore().serialize_cdr(
-            message, "selfcal_msgs/msg/ViewCommand")))]
+        message = build(
+            typestore(), "selfcal_msgs/msg/ViewCommand", from_model.command(command, "stage")
+        )
+        yield (
+            command,
+            [
+                (
+                    "command",
+                    bytes(typestore().serialize_cdr(message, "selfcal_msgs/msg/ViewCommand")),
+                )
+            ],
+        )
         first, last = np.searchsorted(part.stamps_ns, (command.stamp_ns, end))
         for start in range(int(first), int(last), BATCH):
-            stamps = part.stamps_ns[start:min(start + BATCH, last)]
+            stamps = part.stamps_ns[start : min(start + BATCH, last)]
             chosen = slice(*np.searchsorted(marks, (stamps[0], stamps[-1] + ENCODER_NS)).tolist())
-            found = [(int(t), "encoder", data) for t, data in zip(
-                stamps, payloads(encoder_rows(part, stamps, 1)), strict=True)]
-            found += [(int(t), "detection", data) for t, data in zip(
-                marks[chosen], payloads(detection_rows(part, chosen, 2)), strict=True)]
+            found = [
+                (int(t), "encoder", data)
+                for t, data in zip(stamps, payloads(encoder_rows(part, stamps, 1)), strict=True)
+            ]
+            found += [
+                (int(t), "detection", data)
+                for t, data in zip(
+                    marks[chosen], payloads(detection_rows(part, chosen, 2)), strict=True
+                )
+            ]
             yield None, [item[1:] for item in sorted(found, key=lambda item: item[0])]
 
 
@@ -119,9 +143,14 @@ class Cell:
         rclpy.init()
         self.node, self.executor = Node("soak"), EventsExecutor()
         self.executor.add_node(self.node)
-        self.publishers = {kind: self.node.create_publisher(topic.type, topic.name, topic.qos)
-                           for kind, topic in (("encoder", names.ENCODER), ("command",
-                                               names.COMMAND), ("detection", names.DETECTIONS))}
+        self.publishers = {
+            kind: self.node.create_publisher(topic.type, topic.name, topic.qos)
+            for kind, topic in (
+                ("encoder", names.ENCODER),
+                ("command", names.COMMAND),
+                ("detection", names.DETECTIONS),
+            )
+        }
         self.sent = dict.fromkeys(("encoder", "detection", "command"), 0)
         self.heard = (0, 0, 0)
         self.health: dict[str, str] = {}
@@ -129,9 +158,12 @@ class Cell:
         self.worst_ms, self.worst_cpu_ms, self.warned = 0.0, 0.0, set()
         self.views_solved, self.has_map = 0, False
         self.heard_s = self.map_s = 0.0  # of the newest summary and map
-        for topic, take in ((names.of_node(NODES[0], names.RECEIVED), self._on_received),
-                            (names.of_node(NODES[0], names.HEALTH), self._on_health),
-                            (names.SUMMARY, self._on_summary), (names.ERROR_MAP, self._on_map)):
+        for topic, take in (
+            (names.of_node(NODES[0], names.RECEIVED), self._on_received),
+            (names.of_node(NODES[0], names.HEALTH), self._on_health),
+            (names.SUMMARY, self._on_summary),
+            (names.ERROR_MAP, self._on_map),
+        ):
             self.node.create_subscription(topic.type, topic.name, take, topic.qos)
 
     def _on_received(self, message: object) -> None:
@@ -191,8 +223,11 @@ def cpu_s(pid: int) -> float:
 
 def peak_mb(pid: int) -> float:
     """Return the largest resident memory of a process."""
-    [line] = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines()
-              if line.startswith("VmHWM"))
+    [line] = (
+        line
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("VmHWM")
+    )
     return int(line.split()[1]) / 1024
 
 
@@ -218,16 +253,20 @@ def paced(cell: Cell, batch: list[tuple[str, bytes]]) -> Iterator[str]:
 
 def run_shift(cell: Cell, part: Recording, pid: int, realtime_s: float) -> dict[str, object]:
     """Feed the shift; return what was measured on the way."""
-    stream, last = batches(part), [int(part.detections["stamp"].searchsorted(c.stamp_ns))
-                                   for c in part.commands[2:]]
+    stream, last = (
+        batches(part),
+        [int(part.detections["stamp"].searchsorted(c.stamp_ns)) for c in part.commands[2:]],
+    )
     ends = set(last)
     shares, latencies = [], []
     end_ns = part.detections["stamp"][max(last) - 1]
     late = int(part.stamps_ns.searchsorted(end_ns - round((realtime_s + MARGIN_S) * 1e9)))
     in_time_s, began = 0.0, time.monotonic()
     for command, batch in stream:
-        closing = any(cell.sent["detection"] + number + 1 in ends for number in range(
-            sum(kind == "detection" for kind, _ in batch)))
+        closing = any(
+            cell.sent["detection"] + number + 1 in ends
+            for number in range(sum(kind == "detection" for kind, _ in batch))
+        )
         if closing:
             latencies.append(closing_view(cell, batch, stream, ends))
         else:
@@ -239,12 +278,16 @@ def run_shift(cell: Cell, part: Recording, pid: int, realtime_s: float) -> dict[
             shares.append(in_time(cell, stream, realtime_s, pid))
             in_time_s += realtime_s
     cell.until(lambda: cell.under_way <= 0, "the last messages")
-    return {"shares": shares, "latencies": latencies,
-            "seconds": time.monotonic() - began - in_time_s}
+    return {
+        "shares": shares,
+        "latencies": latencies,
+        "seconds": time.monotonic() - began - in_time_s,
+    }
 
 
-def closing_view(cell: Cell, batch: list[tuple[str, bytes]], stream: Iterator,
-                 ends: set[int]) -> tuple[bool, float]:
+def closing_view(
+    cell: Cell, batch: list[tuple[str, bytes]], stream: Iterator, ends: set[int]
+) -> tuple[bool, float]:
     """Publish the batch with the last reading of a view in real time, and what follows it.
 
     Return whether it gave a map, and the time from that reading to the map, or to the summary that
@@ -255,6 +298,7 @@ def closing_view(cell: Cell, batch: list[tuple[str, bytes]], stream: Iterator,
 
     def solved() -> bool:
         return cell.views_solved > views and (not cell.has_map or cell.map_s > began)
+
     end = time.monotonic() + PATIENCE_S
     while batch:
         if time.monotonic() > end:
@@ -274,8 +318,22 @@ def same_maps(live: Path, journal: Path) -> bool:
     """
     out, params = FOLDER / "offline.json", FOLDER / "params.yaml"
     params.write_text("measurement_collector: {ros__parameters: {clock_limit: 3600.0}}\n")
-    done = subprocess.run([sys.executable, "-m", "selfcal_ros", "solve", str(journal), "--quiet",
-                           "--params", str(params), "--force", "-o", str(out)], check=False)
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "selfcal_ros",
+            "solve",
+            str(journal),
+            "--quiet",
+            "--params",
+            str(params),
+            "--force",
+            "-o",
+            str(out),
+        ],
+        check=False,
+    )
     if done.returncode not in (0, 5):
         raise SystemExit(f"soak: selfcal solve {journal} ends with code {done.returncode}")
     return read_json(live)["error_map"] == read_json(out)["error_map"]
@@ -286,19 +344,32 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
     part = shift(args.hours, args.size)
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir(parents=True)
-    more = {"measurement_collector": [f"journal:={FOLDER}"],
-            "solver": [f"result_folder:={FOLDER}"]}
+    more = {"measurement_collector": [f"journal:={FOLDER}"], "solver": [f"result_folder:={FOLDER}"]}
     with contextlib.ExitStack() as stack:
-        running = {node: stack.enter_context(process(
-            f"selfcal_ros.nodes.{node}",
-            ["--ros-args", "--log-level", "error",
-             *(word for p in more.get(node, []) for word in ("-p", p))],
-            environment)) for node in NODES}
+        running = {
+            node: stack.enter_context(
+                process(
+                    f"selfcal_ros.nodes.{node}",
+                    [
+                        "--ros-args",
+                        "--log-level",
+                        "error",
+                        *(word for p in more.get(node, []) for word in ("-p", p)),
+                    ],
+                    environment,
+                )
+            )
+            for node in NODES
+        }
         os.nice(STAND_BACK)  # the nodes have been started: they are before the cell
         cell, pid = Cell(), running["measurement_collector"].pid
         for kind, readers in (("encoder", 1), ("detection", 1), ("command", 3)):
-            cell.until(lambda kind=kind, readers=readers: cell.publishers[
-                kind].get_subscription_count() >= readers, f"subscribers of {kind}")
+            cell.until(
+                lambda kind=kind, readers=readers: (
+                    cell.publishers[kind].get_subscription_count() >= readers
+                ),
+                f"subscribers of {kind}",
+            )
         used = cpu_s(pid)
         found = run_shift(cell, part, pid, args.realtime)
         used = cpu_s(pid) - used
@@ -312,21 +383,34 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
     equal = same_maps(FOLDER / "live.json", journal)
     total = sum(cell.sent.values())
     size = sum(file.stat().st_size for file in journal.iterdir()) / 1e9
-    print(f"hours {args.hours:g}  plate {args.size} x {args.size}  encoder {cell.sent['encoder']}  "
-          f"detections {cell.sent['detection']}")
+    print(
+        f"hours {args.hours:g}  plate {args.size} x {args.size}  encoder {cell.sent['encoder']}  "
+        f"detections {cell.sent['detection']}"
+    )
     print(f"speed           {total / found['seconds'] / 1e3:.1f} k messages/s, lost {lost}")
     print("memory          " + ", ".join(f"{node} {mb:.0f} MB" for node, mb in memory.items()))
-    print(f"status          median {statistics.median(cell.status_ms):.1f} ms, "
-          f"max {cell.worst_ms:.1f} ms, {cell.worst_cpu_ms:.1f} ms of CPU")
-    print("collector's CPU " + ", ".join(f"{100 * share:.1f} %" for share in found["shares"])
-          + f" of a core in real time at 1 kHz (first view, last view; {args.realtime:g} s each), "
-          f"{1e6 * used / total:.1f} us a message on average")
+    print(
+        f"status          median {statistics.median(cell.status_ms):.1f} ms, "
+        f"max {cell.worst_ms:.1f} ms, {cell.worst_cpu_ms:.1f} ms of CPU"
+    )
+    print(
+        "collector's CPU "
+        + ", ".join(f"{100 * share:.1f} %" for share in found["shares"])
+        + f" of a core in real time at 1 kHz (first view, last view; {args.realtime:g} s each), "
+        f"{1e6 * used / total:.1f} us a message on average"
+    )
     for has_map, what in ((True, "map"), (False, "summary of views that give none")):
-        print(f"latency         last reading to published {what}, ms: " + ", ".join(
-            f"{1e3 * latency:.0f}" for told, latency in found["latencies"] if told is has_map))
-    print(f"journal         {size:.2f} GB, lag {cell.health.get('journal_lag_s')} s, lost "
-          f"{cell.health.get('journal_lost')}; its map is "
-          + ("the live one, bit for bit" if equal else "ANOTHER than the live one"))
+        print(
+            f"latency         last reading to published {what}, ms: "
+            + ", ".join(
+                f"{1e3 * latency:.0f}" for told, latency in found["latencies"] if told is has_map
+            )
+        )
+    print(
+        f"journal         {size:.2f} GB, lag {cell.health.get('journal_lag_s')} s, lost "
+        f"{cell.health.get('journal_lost')}; its map is "
+        + ("the live one, bit for bit" if equal else "ANOTHER than the live one")
+    )
     for line in sorted(cell.warned):
         print(f"warned          {line}")
     return 0 if equal and not lost else 1

@@ -23,12 +23,16 @@ from selfcal_ros.portable import ended_by_signals
 ROOT = Path(__file__).parents[1]
 NODES = ("measurement_collector", "solver", "pose_sequencer", "stage_simulator")
 PATIENCE_S = 180.0
-PLAN = {"plan_id": "starts",
-        "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8},
-        "views": [{"name": "identity", "repeats": 2},
-                  {"name": "turned", "rotation_deg": 90, "repeats": 2},
-                  {"name": "line", "rotation_deg": 45, "grid": False, "repeats": 2},
-                  {"name": "shifted", "translation_pitch": [1, 0], "repeats": 2}]}
+PLAN = {
+    "plan_id": "starts",
+    "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8},
+    "views": [
+        {"name": "identity", "repeats": 2},
+        {"name": "turned", "rotation_deg": 90, "repeats": 2},
+        {"name": "line", "rotation_deg": 45, "grid": False, "repeats": 2},
+        {"name": "shifted", "translation_pitch": [1, 0], "repeats": 2},
+    ],
+}
 BUSY = "while True: sum(range(10000))"
 
 
@@ -41,12 +45,22 @@ def one_start(folder: Path) -> str:
     with domain() as environment, contextlib.ExitStack() as stack:
         nodes = []
         for name in NODES:
-            words = {"pose_sequencer": ["-p", f"plan:={plan}"],
-                     "solver": ["-p", f"save_path:={result}"]}.get(name, [])
+            words = {
+                "pose_sequencer": ["-p", f"plan:={plan}"],
+                "solver": ["-p", f"save_path:={result}"],
+            }.get(name, [])
             log = stack.enter_context((folder / f"{name}.log").open("w"))
-            nodes.append(stack.enter_context(process(
-                f"selfcal_ros.nodes.{name}", ["--ros-args", "--params-file", str(params), *words],
-                environment, stdout=log, stderr=log)))
+            nodes.append(
+                stack.enter_context(
+                    process(
+                        f"selfcal_ros.nodes.{name}",
+                        ["--ros-args", "--params-file", str(params), *words],
+                        environment,
+                        stdout=log,
+                        stderr=log,
+                    )
+                )
+            )
         done = _ends(folder / "pose_sequencer.log", result)
         for node in nodes:
             node.terminate()
@@ -82,8 +96,11 @@ def main() -> int:
             with tempfile.TemporaryDirectory() as folder:
                 problem = one_start(Path(folder))
             failed += bool(problem)
-            print(f"start {number}: {'failed' if problem else 'done'} in "
-                  f"{time.monotonic() - began:.0f} s; load {os.getloadavg()[0]:.1f}", flush=True)
+            print(
+                f"start {number}: {'failed' if problem else 'done'} in "
+                f"{time.monotonic() - began:.0f} s; load {os.getloadavg()[0]:.1f}",
+                flush=True,
+            )
             if problem:
                 print(problem, flush=True)
     print(f"{args.starts - failed} of {args.starts} starts came through")

@@ -65,17 +65,22 @@ def functions_at(name: str, line: int, root: Path) -> set[str]:
     if around:
         return {f"{name}:{around[-1]}"}
     text = (root / name).read_text()
-    names = {target.id for node in ast.walk(ast.parse(text))
-             if isinstance(node, ast.Assign | ast.AnnAssign)
-             and node.lineno <= line <= node.end_lineno
-             for target in getattr(node, "targets", [getattr(node, "target", None)])
-             if isinstance(target, ast.Name)}
+    names = {
+        target.id
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.lineno <= line <= node.end_lineno
+        for target in getattr(node, "targets", [getattr(node, "target", None)])
+        if isinstance(target, ast.Name)
+    }
     found = set()
     for path in sorted((root / "selfcal_ros").rglob("*.py")) if names else []:
         lines = path.read_text().splitlines()
         word = re.compile(rf"\b({'|'.join(sorted(names))})\b")
-        found |= {f"{path.relative_to(root)}:{function}" for function, first, last in _spans(path)
-                  if any(word.search(line) for line in lines[first - 1:last])}
+        found |= {
+            f"{path.relative_to(root)}:{function}"
+            for function, first, last in _spans(path)
+            if any(word.search(line) for line in lines[first - 1 : last])
+        }
     return found or {f"{name}:{function}" for function, *_ in spans}
 
 
@@ -151,8 +156,9 @@ class Watch:
 
     def _note(self, code: CodeType, _: int) -> object:
         if code.co_filename.startswith(PACKAGE):
-            self.current.add(f"{code.co_filename.removeprefix(f'{ROOT}/')}:"
-                             f"{function_name(code.co_qualname)}")
+            self.current.add(
+                f"{code.co_filename.removeprefix(f'{ROOT}/')}:{function_name(code.co_qualname)}"
+            )
         return sys.monitoring.DISABLE
 
     def _under(self, name: str) -> None:
@@ -187,9 +193,14 @@ class Watch:
             return
         KEPT.mkdir(parents=True, exist_ok=True)
         name = os.environ.get("PYTEST_XDIST_WORKER", "main")
-        (KEPT / f"{name}.json").write_text(json.dumps({
-            "seconds": self.seconds,
-            "entered": {name: sorted(names) for name, names in self.entered.items()}}))
+        (KEPT / f"{name}.json").write_text(
+            json.dumps(
+                {
+                    "seconds": self.seconds,
+                    "entered": {name: sorted(names) for name, names in self.entered.items()},
+                }
+            )
+        )
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -55,8 +55,11 @@ class MachineSetup:
         """Return primary units per count of an axis; InputError if unknown."""
         counts = self.of(axis).counts_per_unit
         if counts is None:
-            raise InputError(f"axis {axis}", f"{where} is in counts, whose size is not known",
-                             f"give the counts per primary unit (--counts-per-unit {axis}=...)")
+            raise InputError(
+                f"axis {axis}",
+                f"{where} is in counts, whose size is not known",
+                f"give the counts per primary unit (--counts-per-unit {axis}=...)",
+            )
         return 1.0 / counts
 
     def unit(self, axis: int, unit: Unit, where: str) -> float:
@@ -68,9 +71,11 @@ class MachineSetup:
             return per_count / unit.divisor
         secondary = self.of(axis).counts_per_secondary
         if secondary is None:
-            raise InputError(f"axis {axis}", f"{where} is in secondary units, whose size is not "
-                             "known", "give the counts per secondary unit "
-                             f"(--counts-per-secondary {axis}=...)")
+            raise InputError(
+                f"axis {axis}",
+                f"{where} is in secondary units, whose size is not known",
+                f"give the counts per secondary unit (--counts-per-secondary {axis}=...)",
+            )
         return secondary * per_count / unit.divisor
 
     def of(self, axis: int) -> AxisSetup:
@@ -117,8 +122,13 @@ class AxisSamples:
         return self.first - edge <= zero <= self.first + (self.count - 1) * self.step + edge
 
 
-def _track(axis: int, start: float, distance: float, count: int, rollover: float | None,
-           ) -> tuple[AxisSamples, bool]:
+def _track(
+    axis: int,
+    start: float,
+    distance: float,
+    count: int,
+    rollover: float | None,
+) -> tuple[AxisSamples, bool]:
     """Return the track and whether the entries have to be reversed."""
     if distance < 0:
         return AxisSamples(axis, start + (count - 1) * distance, -distance, count, rollover), True
@@ -162,8 +172,9 @@ class BoundTable2D:
         i1 = np.minimum(i + 1, self.rows.count - 1)
         j1 = np.minimum(j + 1, self.columns.count - 1)
         c = self.values
-        return ((1 - u) * ((1 - v) * c[:, i, j] + v * c[:, i, j1])
-                + u * ((1 - v) * c[:, i1, j] + v * c[:, i1, j1]))
+        return (1 - u) * ((1 - v) * c[:, i, j] + v * c[:, i, j1]) + u * (
+            (1 - v) * c[:, i1, j] + v * c[:, i1, j1]
+        )
 
     def add_to(self, out: dict[int, np.ndarray], positions: Mapping[int, np.ndarray]) -> None:
         """Add this table's corrections at `positions` to `out`."""
@@ -180,10 +191,14 @@ def bound_1d(table: Table1D, setup: MachineSetup) -> BoundTable1D:
     sign = -1.0 if table.negpos else 1.0
     start = -(table.offset or 0.0) * unit * sign + _home_shift(table, setup)
     start += _feedback_shift((reference, table.absolute_feedback_offset), setup, place)
-    rollover = (None if table.rollover is None
-                else table.rollover * setup.per_count(reference, f"ROLLOVER of {place}"))
-    track, reverse = _track(reference, start, table.sample_dist * unit * sign,
-                            len(table.values), rollover)
+    rollover = (
+        None
+        if table.rollover is None
+        else table.rollover * setup.per_count(reference, f"ROLLOVER of {place}")
+    )
+    track, reverse = _track(
+        reference, start, table.sample_dist * unit * sign, len(table.values), rollover
+    )
     scale = setup.unit(table.axis, table.correction_unit, f"CORUNIT of {place}")
     values = table.values * (-scale if table.negcor else scale)
     values = values[::-1] if reverse else values
@@ -214,8 +229,7 @@ def _feedback_shift(axis_then: tuple[int, float | None], setup: MachineSetup, pl
 
 def _expansion(table: Table1D, setup: MachineSetup) -> float:
     """Return alpha * (T - MATERIALTEMP), by which the expanded scale indicates too little."""
-    if (table.expand_coeff is None or table.material_temp is None
-            or setup.temperature_c is None):
+    if table.expand_coeff is None or table.material_temp is None or setup.temperature_c is None:
         return 0.0
     return table.expand_coeff * (setup.temperature_c - table.material_temp)
 
@@ -232,16 +246,18 @@ def bound_2d(table: Table2D, setup: MachineSetup) -> BoundTable2D:
             start, rollover = -(count - 1) / 2 * distance, None
         else:
             then = getattr(table, f"absolute_feedback_offset_{end}")
-            start = (-(getattr(table, f"offset_{end}") or 0.0) * unit
-                     + _feedback_shift((axis, then), setup, place))
+            start = -(getattr(table, f"offset_{end}") or 0.0) * unit + _feedback_shift(
+                (axis, then), setup, place
+            )
             rollover = getattr(table, f"rollover_{end}")
             if rollover is not None:
                 rollover *= setup.per_count(axis, f"ROLLOVER{end.upper()} of {place}")
         track, reverse = _track(axis, start, distance, count, rollover)
         tracks.append(track)
         values = np.flip(values, 1 + dim) if reverse else values
-    scale = [setup.unit(axis, table.correction_unit, f"CORUNIT of {place}")
-             for axis in table.outputs]
+    scale = [
+        setup.unit(axis, table.correction_unit, f"CORUNIT of {place}") for axis in table.outputs
+    ]
     sign = -1.0 if table.negcor else 1.0
     values = values * (sign * np.array(scale))[:, None, None]
     ready = BoundTable2D(table.outputs, tracks[0], tracks[1], values)
@@ -269,8 +285,9 @@ class CalEvaluator:
 
     def __init__(self, tables: Sequence[Table], setup: MachineSetup | None = None) -> None:
         setup = setup or MachineSetup()
-        self._bound = [bound_1d(t, setup) if isinstance(t, Table1D) else bound_2d(t, setup)
-                       for t in tables]
+        self._bound = [
+            bound_1d(t, setup) if isinstance(t, Table1D) else bound_2d(t, setup) for t in tables
+        ]
         self.inputs = sorted({axis for t in tables for axis in t.inputs})
         self.outputs = sorted({axis for t in tables for axis in t.outputs})
 
@@ -284,10 +301,14 @@ class CalEvaluator:
         """
         for axis in self.inputs:
             if axis not in positions:
-                raise InputError(f"axis {axis}", "its position is needed by a table",
-                                 f"give it (--position {axis}=...)")
-        arrays = np.broadcast_arrays(*(np.asarray(positions[axis], dtype=float)
-                                       for axis in self.inputs))
+                raise InputError(
+                    f"axis {axis}",
+                    "its position is needed by a table",
+                    f"give it (--position {axis}=...)",
+                )
+        arrays = np.broadcast_arrays(
+            *(np.asarray(positions[axis], dtype=float) for axis in self.inputs)
+        )
         shape = arrays[0].shape
         flat = [array.ravel() for array in arrays]
         total = {axis: np.zeros(flat[0].size) for axis in self.outputs}

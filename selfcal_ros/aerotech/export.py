@@ -55,14 +55,17 @@ def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:
     pitch = artifact.grid_pitch_m / unit_m
     corrections = np.stack([frame.sign_x * error_map.gx.T, frame.sign_y * error_map.gy.T], axis=-1)
     return Table2D(
-        frame.y_axis, frame.x_axis, (frame.x_axis, frame.y_axis),
+        frame.y_axis,
+        frame.x_axis,
+        (frame.x_axis, frame.y_axis),
         sample_row=tidy(frame.sign_y * pitch),
         sample_col=tidy(frame.sign_x * pitch),
         values=np.round(corrections / M_PER_UM, DECIMALS),
         pos_unit=PRIMARY,
         cor_unit=micrometres(unit_m),
         offset_row=tidy(frame.sign_y * (hy + frame.home_y_m) / unit_m),
-        offset_col=tidy(frame.sign_x * (hx + frame.home_x_m) / unit_m))
+        offset_col=tidy(frame.sign_x * (hx + frame.home_x_m) / unit_m),
+    )
 
 
 def theta_decimals(error_map: ErrorMap) -> int:
@@ -90,23 +93,28 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
     if not count:
         raise InputError("error map", "it has no angular lines", "leave out --theta-axis")
     if not np.isfinite(g).all():
-        raise InputError("error map", f"{int(np.isnan(g).sum())} angular lines are unknown, and a "
-                         "table has no holes", "measure them or leave out --theta-axis")
+        raise InputError(
+            "error map",
+            f"{int(np.isnan(g).sum())} angular lines are unknown, and a table has no holes",
+            "measure them or leave out --theta-axis",
+        )
     counts = frame.theta_counts_per_unit
     lines = np.arange(0 if counts else -count, count + 1)
     sign, first = frame.sign_theta, float(lines[0]) * 360 / count
     return Table1D(
-        frame.theta_axis, tidy(sign * 360 / count),
+        frame.theta_axis,
+        tidy(sign * 360 / count),
         np.round(sign * np.rad2deg(g[lines % count]) * ARCSEC_PER_DEG, theta_decimals(error_map)),
-        pos_unit=PRIMARY, cor_unit=Unit(UnitWord.PRIMARY, ARCSEC_PER_DEG),
+        pos_unit=PRIMARY,
+        cor_unit=Unit(UnitWord.PRIMARY, ARCSEC_PER_DEG),
         offset=tidy(sign * (np.rad2deg(frame.home_theta_rad) - first)),
-        rollover=tidy(360 * counts) if counts else None)
+        rollover=tidy(360 * counts) if counts else None,
+    )
 
 
 UNIFORM = 1e-6
 """Largest deviation of measured positions from equal distances, in distances."""
-_LENGTH = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)",
-                     re.ASCII)
+_LENGTH = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)", re.ASCII)
 _LENGTH_UNITS_M = {**UNITS_M, "µm": M_PER_UM, "μm": M_PER_UM, "nm": M_PER_NM}
 
 Home = Literal["end", "middle", "middle-balanced"]
@@ -128,8 +136,9 @@ def length_m(text: str, what: str) -> float:
     return float(match[1]) * _LENGTH_UNITS_M[match[2]]
 
 
-def orthogonality(measured_m: float, over_m: float, travel_m: float,
-                  home: Home = "end") -> AxisCorrection:
+def orthogonality(
+    measured_m: float, over_m: float, travel_m: float, home: Home = "end"
+) -> AxisCorrection:
     """Return the two-point correction for axes that are not perpendicular.
 
     Parameters
@@ -176,18 +185,23 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
         For another header, a value that is not a number, or positions that are not equidistant.
     """
     lines = enumerate(text.splitlines(), 1)
-    rows = [(number, csv_cells(line, f"{where}:{number}")) for number, line in lines
-            if line.strip(", ")]
+    rows = [
+        (number, csv_cells(line, f"{where}:{number}")) for number, line in lines if line.strip(", ")
+    ]
     if not rows or [cell.lower() for cell in rows[0][1]] != ["position", "error"]:
-        raise InputError(f"{where}:1", "the header is not position,error",
-                         "name the columns: position in primary units, error in um")
+        raise InputError(
+            f"{where}:1",
+            "the header is not position,error",
+            "name the columns: position in primary units, error in um",
+        )
     values = []
     for number, row in rows[1:]:
         try:
             position, error = (plain_number(cell) for cell in row)
         except (ArgumentFault, ValueError):
-            raise InputError(f"{where}:{number}", "not two numbers",
-                             "give position,error") from None
+            raise InputError(
+                f"{where}:{number}", "not two numbers", "give position,error"
+            ) from None
         values.append((position * unit_m, -error * M_PER_UM))
     if len(values) < 2:
         raise InputError(where, f"{len(values)} measured positions", "give at least two")
@@ -196,14 +210,18 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
     steps = np.diff(positions)
     if np.any(np.abs(steps - steps.mean()) > UNIFORM * steps.mean()) or steps.mean() <= 0:
         worst = int(np.argmax(np.abs(steps - steps.mean())))
-        raise InputError(where, "the positions are not equidistant between "
-                         f"{positions[worst] / unit_m:.9g} and {positions[worst + 1] / unit_m:.9g}",
-                         "a table has one sample distance: measure at equal distances")
+        raise InputError(
+            where,
+            "the positions are not equidistant between "
+            f"{positions[worst] / unit_m:.9g} and {positions[worst + 1] / unit_m:.9g}",
+            "a table has one sample distance: measure at equal distances",
+        )
     return AxisCorrection(positions, corrections)
 
 
-def map_line(error_map: ErrorMap, along: Literal["x", "y"],
-             corrected: Literal["x", "y"]) -> AxisCorrection:
+def map_line(
+    error_map: ErrorMap, along: Literal["x", "y"], corrected: Literal["x", "y"]
+) -> AxisCorrection:
     """Return the correction +G of `corrected` along the middle line of an error map.
 
     Between an even number of lines that is the mean of the two in the middle.
@@ -219,8 +237,11 @@ def map_line(error_map: ErrorMap, along: Literal["x", "y"],
     field, size = error_map.gx if corrected == "x" else error_map.gy, artifact.shape[across]
     values = (field.take((size - 1) // 2, across) + field.take(size // 2, across)) / 2
     if not np.isfinite(values).all():
-        raise InputError("error map", f"{int(np.isnan(values).sum())} sites on its {along} axis "
-                         "are unknown", "measure them")
+        raise InputError(
+            "error map",
+            f"{int(np.isnan(values).sum())} sites on its {along} axis are unknown",
+            "measure them",
+        )
     return AxisCorrection(positions, values)
 
 
@@ -235,8 +256,11 @@ def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> AxisCorr
         If O is unknown.
     """
     if not np.isfinite(error_map.nonorthogonality):
-        raise InputError("error map", "its non-orthogonality is not known",
-                         "measure views that identify the stage, see selfcal plan check")
+        raise InputError(
+            "error map",
+            "its non-orthogonality is not known",
+            "measure views that identify the stage, see selfcal plan check",
+        )
     artifact = error_map.artifact
     half = artifact.half[0 if along == "x" else 1] * artifact.grid_pitch_m
     ends = np.array([-half, half])
@@ -249,8 +273,13 @@ def without_slope(line: AxisCorrection) -> AxisCorrection:
     return AxisCorrection(line.positions_m, c - c.mean() - x * (x @ c) / (x @ x))
 
 
-def line_table(line: AxisCorrection, frame: MachineFrame, *, along: Literal["x", "y"],
-               corrected: Literal["x", "y"]) -> Table1D:
+def line_table(
+    line: AxisCorrection,
+    frame: MachineFrame,
+    *,
+    along: Literal["x", "y"],
+    corrected: Literal["x", "y"],
+) -> Table1D:
     """Return the 1D table of a line, in the controller's coordinates.
 
     Parameters
@@ -269,7 +298,11 @@ def line_table(line: AxisCorrection, frame: MachineFrame, *, along: Literal["x",
     first = line.positions_m[0] - homes[along]
     sign, unit_m = signs[along], frame.unit_m
     return Table1D(
-        axes[corrected], tidy(sign * step / unit_m),
+        axes[corrected],
+        tidy(sign * step / unit_m),
         np.round(signs[corrected] * line.corrections_m / M_PER_UM, DECIMALS) + 0.0,
-        reference_axis=None if along == corrected else axes[along], pos_unit=PRIMARY,
-        cor_unit=micrometres(unit_m), offset=tidy(-sign * first / unit_m))
+        reference_axis=None if along == corrected else axes[along],
+        pos_unit=PRIMARY,
+        cor_unit=micrometres(unit_m),
+        offset=tidy(-sign * first / unit_m),
+    )

@@ -55,8 +55,9 @@ def number(text: str) -> float:
 def integer(text: str) -> int:
     """Return the whole number in `text`; ArgumentFault if invalid or too large."""
     if not _INTEGER.fullmatch(text):
-        raise ArgumentFault(f"{short(text)} is not a whole number",
-                            "write it with at most 9 digits")
+        raise ArgumentFault(
+            f"{short(text)} is not a whole number", "write it with at most 9 digits"
+        )
     return int(text)
 
 
@@ -66,17 +67,21 @@ def unit(text: str) -> Unit:
     try:
         name = UnitWord(OLD_UNITS.get(word.upper(), word.upper()))
     except ValueError:
-        raise ArgumentFault(f"{short(word)} is not a unit",
-                            "take PRIMARY, SECONDARY or COUNTS, with /divisor") from None
+        raise ArgumentFault(
+            f"{short(word)} is not a unit", "take PRIMARY, SECONDARY or COUNTS, with /divisor"
+        ) from None
     if not slash:
         return Unit(name)
     if not divisor:
-        raise ArgumentFault("the / of a unit has no divisor after it",
-                            "write it without white space, such as PRIMARY/1000")
+        raise ArgumentFault(
+            "the / of a unit has no divisor after it",
+            "write it without white space, such as PRIMARY/1000",
+        )
     value = number(divisor)
     if value < SMALLEST:
-        raise ArgumentFault(f"the divisor {short(divisor)} is not positive",
-                            "write it as in PRIMARY/1000")
+        raise ArgumentFault(
+            f"the divisor {short(divisor)} is not positive", "write it as in PRIMARY/1000"
+        )
     return Unit(name, value)
 
 
@@ -135,21 +140,33 @@ KEYWORDS: dict[TableKind, dict[str, Keyword]] = {
     },
     TableKind.GALVO: _GALVO,
 }
-ALIASES = {f"PRIMARYABSOLUTEFEEDBACKOFFSET{end}": f"ABSOLUTEFEEDBACKOFFSET{end}"
-           for end in ("", "ROW", "COL")}
+ALIASES = {
+    f"PRIMARYABSOLUTEFEEDBACKOFFSET{end}": f"ABSOLUTEFEEDBACKOFFSET{end}"
+    for end in ("", "ROW", "COL")
+}
 """Other names, from the manufacturer's parameter pages."""
 ALL_KEYWORDS = set().union(*KEYWORDS.values())
 POSITIONAL: dict[TableKind, tuple[str, ...]] = {
     TableKind.ONE_D: ("axis_index",),
-    TableKind.TWO_D: ("RowAxis", "ColumnAxis", "OutputAxis1", "OutputAxis2", "SampDistRow",
-                      "SampDistCol", "NumCols"),
+    TableKind.TWO_D: (
+        "RowAxis",
+        "ColumnAxis",
+        "OutputAxis1",
+        "OutputAxis2",
+        "SampDistRow",
+        "SampDistCol",
+        "NumCols",
+    ),
 }
 POSITIONAL[TableKind.GALVO] = POSITIONAL[TableKind.TWO_D]
 
 
-_WORD = re.compile(r"""[ \t]*(?:
+_WORD = re.compile(
+    r"""[ \t]*(?:
     (?P<key>[A-Za-z_]\w*) (?P<blank>[ \t]*) = (?P<blank2>[ \t]*) (?P<value>"[^"]*"|[^ \t]*)
-    | (?P<word>[^ \t]+))""", re.VERBOSE)
+    | (?P<word>[^ \t]+))""",
+    re.VERBOSE,
+)
 _POSITION = re.compile(r"[+\-.\d]")
 
 
@@ -188,8 +205,11 @@ def read_header(kind: TableKind, heads: list[tuple[int, str]], findings: CalFind
             else:
                 _flag(header, line, match["word"], findings)
         if late and index == 0:
-            findings.tolerated(line, f"an argument of {kind.start} after a keyword",
-                               f"write {', '.join(POSITIONAL[kind])} before the keywords")
+            findings.tolerated(
+                line,
+                f"an argument of {kind.start} after a keyword",
+                f"write {', '.join(POSITIONAL[kind])} before the keywords",
+            )
         _positional(header, (index, line), words, findings)
     return header
 
@@ -208,8 +228,11 @@ def _keyword(header: Header, line: int, name: str, findings: CalFindings) -> str
     if strict in ALL_KEYWORDS:
         findings.error(line, f"a {header.kind} table must not have {strict}", "remove the keyword")
     else:
-        findings.error(line, f"unknown keyword {short(name)}",
-                       "known are " + ", ".join(sorted(KEYWORDS[header.kind])))
+        findings.error(
+            line,
+            f"unknown keyword {short(name)}",
+            "known are " + ", ".join(sorted(KEYWORDS[header.kind])),
+        )
     return None
 
 
@@ -227,8 +250,11 @@ def _argument(header: Header, place: tuple[int, str], text: str, findings: CalFi
         value = keyword.read(text)
     except ArgumentFault as fault:
         header.broken = True
-        findings.error(line, f"{strict}: {fault.what}" if strict not in fault.what else fault.what,
-                       fault.remedy)
+        findings.error(
+            line,
+            f"{strict}: {fault.what}" if strict not in fault.what else fault.what,
+            fault.remedy,
+        )
         return
     _tolerances(line, strict, (text, value), findings)
     _set(header, (line, strict), (keyword.field, value), findings)
@@ -239,8 +265,11 @@ def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: Cal
     if isinstance(value, Unit):
         word = text.partition("/")[0]
         if word.upper() in OLD_UNITS:
-            findings.tolerated(line, f"the unit {word.upper()} of older controllers, read as "
-                               f"{value.word}", f"write {value.word}")
+            findings.tolerated(
+                line,
+                f"the unit {word.upper()} of older controllers, read as {value.word}",
+                f"write {value.word}",
+            )
         if word != word.upper():
             findings.tolerated(line, "a unit in lower case", "write units in upper case")
     elif strict == "HOMEDIRECTION" and text != value:
@@ -252,8 +281,9 @@ def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: Cal
 def _flag(header: Header, line: int, word: str, findings: CalFindings) -> None:
     if word.startswith("/"):
         header.broken = True
-        findings.error(line, "white space before the / of a unit",
-                       "write it without, such as PRIMARY/1000")
+        findings.error(
+            line, "white space before the / of a unit", "write it without, such as PRIMARY/1000"
+        )
         return
     strict = _keyword(header, line, word, findings)
     if strict is None:
@@ -266,34 +296,45 @@ def _flag(header: Header, line: int, word: str, findings: CalFindings) -> None:
     _set(header, (line, strict), (keyword.field, True), findings)
 
 
-def _set(header: Header, place: tuple[int, str], item: tuple[str, Any],
-         findings: CalFindings) -> None:
+def _set(
+    header: Header, place: tuple[int, str], item: tuple[str, Any], findings: CalFindings
+) -> None:
     (line, strict), (name, value) = place, item
     if name in header.values and header.values[name] != value:
         header.broken = True
-        findings.error(line, f"{strict} is given twice, here and in line {header.lines[name]}, "
-                       "and differs", "keep one of them")
+        findings.error(
+            line,
+            f"{strict} is given twice, here and in line {header.lines[name]}, and differs",
+            "keep one of them",
+        )
     elif name in header.values:
         findings.warning(line, f"{strict} is given twice", "keep one of them")
     header.values[name] = value
     header.lines.setdefault(name, line)
 
 
-def _positional(header: Header, place: tuple[int, int], words: list[str],
-                findings: CalFindings) -> None:
+def _positional(
+    header: Header, place: tuple[int, int], words: list[str], findings: CalFindings
+) -> None:
     index, line = place
     names = POSITIONAL[header.kind]
     if index > 0:
         if words:
             header.broken = True
-            findings.error(line, f"{short(words[0])} on a later {header.kind.start} line",
-                           f"only the first {header.kind.start} line of a table carries "
-                           f"{', '.join(names)}; a new table needs {':END'} before it")
+            findings.error(
+                line,
+                f"{short(words[0])} on a later {header.kind.start} line",
+                f"only the first {header.kind.start} line of a table carries "
+                f"{', '.join(names)}; a new table needs {':END'} before it",
+            )
         return
     if len(words) != len(names):
         header.broken = True
-        findings.error(line, f"{header.kind.start} has {len(words)} arguments, not {len(names)}",
-                       f"write {', '.join(names)} after it")
+        findings.error(
+            line,
+            f"{header.kind.start} has {len(words)} arguments, not {len(names)}",
+            f"write {', '.join(names)} after it",
+        )
         return
     for name, word in zip(names, words, strict=True):
         try:

@@ -19,8 +19,11 @@ class TableKind(StrEnum):
     @property
     def start(self) -> str:
         """The token that opens a table of this kind."""
-        return {TableKind.ONE_D: ":START", TableKind.TWO_D: ":START2D",
-                TableKind.GALVO: ":GALVO2D"}[self]
+        return {
+            TableKind.ONE_D: ":START",
+            TableKind.TWO_D: ":START2D",
+            TableKind.GALVO: ":GALVO2D",
+        }[self]
 
 
 class Severity(StrEnum):
@@ -265,8 +268,9 @@ def same_table(a: Table, b: Table) -> bool:
     if type(a) is not type(b) or a.values.shape != b.values.shape:
         return False
     names = [f.name for f in fields(a) if f.name not in ("values", "line", "lines")]
-    return (all(getattr(a, name) == getattr(b, name) for name in names)
-            and bool(np.array_equal(a.values, b.values)))
+    return all(getattr(a, name) == getattr(b, name) for name in names) and bool(
+        np.array_equal(a.values, b.values)
+    )
 
 
 MAX_FINDINGS = 100
@@ -312,8 +316,11 @@ class CalFindings:
     def _add(self, finding: CalFinding) -> None:
         self._listed.append(finding)
         if len(self._listed) >= MAX_FINDINGS:
-            self.stop(finding.line, f"reading stopped after {MAX_FINDINGS} findings",
-                      "correct the first ones")
+            self.stop(
+                finding.line,
+                f"reading stopped after {MAX_FINDINGS} findings",
+                "correct the first ones",
+            )
 
 
 def decode(data: bytes, findings: CalFindings) -> tuple[list[str], set[int]]:
@@ -327,7 +334,7 @@ def decode(data: bytes, findings: CalFindings) -> tuple[list[str], set[int]]:
         return _split(data.decode("utf-16", errors="replace"), findings), set()
     if data.startswith(codecs.BOM_UTF8):
         findings.tolerated(1, "a byte order mark before the first line", "save as plain UTF-8")
-        data = data[len(codecs.BOM_UTF8):]
+        data = data[len(codecs.BOM_UTF8) :]
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
         findings.stop(line, "a zero byte: this is not a text file", "give a text file in UTF-8")
@@ -373,5 +380,5 @@ def strip_comment(line: str) -> tuple[str, str, str]:
             # An unclosed quote does not hide the rest of the line.
             quoted = not quoted and line.find('"', at + 1) >= 0
         elif not quoted:
-            return line[:at], line[at], line[at + 1:]
+            return line[:at], line[at], line[at + 1 :]
     return line, "", ""

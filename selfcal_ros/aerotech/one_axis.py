@@ -37,8 +37,9 @@ Pair = tuple[Axis, Axis]
 """Axis whose position selects an entry, and axis that is corrected."""
 
 
-def leaves_too_much(left: tuple[float, float], before: tuple[float, float], u: float, *,
-                    rounding: float = 0.0) -> bool:
+def leaves_too_much(
+    left: tuple[float, float], before: tuple[float, float], u: float, *, rounding: float = 0.0
+) -> bool:
     """Tell whether more is left of an error than U, or 5 % of it.
 
     Parameters
@@ -50,8 +51,10 @@ def leaves_too_much(left: tuple[float, float], before: tuple[float, float], u: f
     rounding : float
         What the digits of a table leave.
     """
-    return any(rest > max(LEFT_OF_A_MAP * size, limit * u, rounding)
-               for rest, size, limit in zip(left, before, (2, 4), strict=True))
+    return any(
+        rest > max(LEFT_OF_A_MAP * size, limit * u, rounding)
+        for rest, size, limit in zip(left, before, (2, 4), strict=True)
+    )
 
 
 def known_rms(*u: np.ndarray) -> float:
@@ -87,8 +90,9 @@ class OneAxisPart:
     @property
     def unfit(self) -> bool:
         """Whether more is left than U (k = 2, rms; twice U at one node) and 5 % of the part."""
-        return leaves_too_much((self.rms_left, self.largest_left), (self.rms, self.largest),
-                               self.u, rounding=ROUNDED_M)
+        return leaves_too_much(
+            (self.rms_left, self.largest_left), (self.rms, self.largest), self.u, rounding=ROUNDED_M
+        )
 
 
 @dataclass(frozen=True)
@@ -110,8 +114,9 @@ class OneAxisFit:
     squareness_left: float = 0.0
 
 
-def one_axis_fit(error_map: ErrorMap, tables: Sequence[Table1D], frame: MachineFrame,
-                 setup: MachineSetup) -> OneAxisFit:
+def one_axis_fit(
+    error_map: ErrorMap, tables: Sequence[Table1D], frame: MachineFrame, setup: MachineSetup
+) -> OneAxisFit:
     """Return what 1D tables of x and y leave of a map.
 
     Parameters
@@ -163,8 +168,15 @@ class _PairOfAxes:
         The controller.
     """
 
-    def __init__(self, whole: ErrorMap, tables: list[Table1D], pair: Pair, *,
-                 frame: MachineFrame, setup: MachineSetup) -> None:
+    def __init__(
+        self,
+        whole: ErrorMap,
+        tables: list[Table1D],
+        pair: Pair,
+        *,
+        frame: MachineFrame,
+        setup: MachineSetup,
+    ) -> None:
         self.pair = pair
         self.u = known_rms(whole.u_gx if pair[1] == "x" else whole.u_gy)
         bound = [bound_1d(table, setup) for table in tables]
@@ -199,8 +211,9 @@ class _PairOfAxes:
         """Return the least-squares slope of values at the nodes."""
         return _slope(self.nodes, values)
 
-    def judged(self, targets: list[np.ndarray], correction: np.ndarray,
-               without: str = "") -> OneAxisPart:
+    def judged(
+        self, targets: list[np.ndarray], correction: np.ndarray, without: str = ""
+    ) -> OneAxisPart:
         """Return what a correction (places,) leaves of that target (nodes,) which it suits best.
 
         Between the nodes the error of the stage is known to the difference of the straight line
@@ -216,8 +229,14 @@ class _PairOfAxes:
         rms_left, largest_left = min(found)
         part = targets[0] - targets[0].mean()
         along, corrected = self.pair
-        return OneAxisPart(f"{corrected} from the position of {along}{without}", rms(part),
-                           float(np.abs(part).max()), rms_left, largest_left, self.u)
+        return OneAxisPart(
+            f"{corrected} from the position of {along}{without}",
+            rms(part),
+            float(np.abs(part).max()),
+            rms_left,
+            largest_left,
+            self.u,
+        )
 
     def _spline(self, target: np.ndarray) -> np.ndarray:
         if len(self.nodes) < SPLINE_NODES:
@@ -241,8 +260,9 @@ def _stage_positions(table: BoundTable1D, axis: Axis, frame: MachineFrame) -> np
     return frame.from_machine(positions, positions)["xy".index(axis)]
 
 
-def _squareness(whole: ErrorMap, turning: list[_PairOfAxes],
-                across: list[_PairOfAxes]) -> OneAxisPart:
+def _squareness(
+    whole: ErrorMap, turning: list[_PairOfAxes], across: list[_PairOfAxes]
+) -> OneAxisPart:
     """Return what tables with slopes leave of the squareness of a map.
 
     A turn of both axes alike is the choice of the frame: only the sum of the slopes counts. In the
@@ -250,15 +270,25 @@ def _squareness(whole: ErrorMap, turning: list[_PairOfAxes],
     """
     added = [part.slope(part.correction[part.at_nodes]) for part in across]
     whole_slope = _squareness_of(whole)
-    own = [max(abs(slope - part.slope(target))
-               for slope, part, target in zip(added, across, targets, strict=True)
-               if part.has_slope)
-           for targets in product(*(part.targets for part in across))]
+    own = [
+        max(
+            abs(slope - part.slope(target))
+            for slope, part, target in zip(added, across, targets, strict=True)
+            if part.has_slope
+        )
+        for targets in product(*(part.targets for part in across))
+    ]
     left = min(abs(sum(added) - whole_slope), *own)
     nodes, u = turning[0].nodes, turning[0].u
     far = float(np.abs(nodes).max())
-    return OneAxisPart("squareness", abs(whole_slope) * rms(nodes), abs(whole_slope) * far,
-                       left * rms(nodes), left * far, u)
+    return OneAxisPart(
+        "squareness",
+        abs(whole_slope) * rms(nodes),
+        abs(whole_slope) * far,
+        left * rms(nodes),
+        left * far,
+        u,
+    )
 
 
 def _beyond(whole: ErrorMap, pairs: Sequence[Pair]) -> float:
@@ -269,8 +299,9 @@ def _beyond(whole: ErrorMap, pairs: Sequence[Pair]) -> float:
         left["xy".index(corrected)] -= line[:, None] if along == "x" else line[None, :]
     if any(along != corrected for along, corrected in pairs):  # square, and in any turn
         x, y = whole.artifact.x_m, whole.artifact.y_m
-        left -= np.stack([y * _slope(y.ravel(), left[0].ravel()),
-                          x * _slope(x.ravel(), left[1].ravel())])
+        left -= np.stack(
+            [y * _slope(y.ravel(), left[0].ravel()), x * _slope(x.ravel(), left[1].ravel())]
+        )
     left -= left.mean(axis=(1, 2), keepdims=True)
     return float(np.sqrt((left**2).sum(axis=0).mean()))
 
@@ -284,8 +315,9 @@ def _mean_line(whole: ErrorMap, pair: Pair) -> np.ndarray:
 def _squareness_of(whole: ErrorMap) -> float:
     """Return the sum of the slopes of y along x and of x along y, rad; a turn cancels in it."""
     artifact = whole.artifact
-    return (_slope(artifact.x_m[:, 0], _mean_line(whole, ("x", "y")))
-            + _slope(artifact.y_m[0], _mean_line(whole, ("y", "x"))))
+    return _slope(artifact.x_m[:, 0], _mean_line(whole, ("x", "y"))) + _slope(
+        artifact.y_m[0], _mean_line(whole, ("y", "x"))
+    )
 
 
 def _slope(position: np.ndarray, values: np.ndarray) -> float:

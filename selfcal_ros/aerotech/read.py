@@ -80,8 +80,11 @@ class _Reader:
         if mark and not self.first_start:
             self.comments.append(comment.strip())
         if mark == "'":
-            self.findings.tolerated(number_, "a comment that starts with an apostrophe",
-                                    "start comments with a semicolon")
+            self.findings.tolerated(
+                number_,
+                "a comment that starts with an apostrophe",
+                "start comments with a semicolon",
+            )
         if odd:
             self._odd(number_, text)
         if text.startswith(":"):
@@ -91,11 +94,15 @@ class _Reader:
                 self._not_numeric(number_, text)
             self._numbers([text], number_)
         elif text and _NUMBER_FIRST.match(text):
-            self.findings.error(number_, "values outside of a table",
-                                "put them between a start token and :END, or make them a comment")
+            self.findings.error(
+                number_,
+                "values outside of a table",
+                "put them between a start token and :END, or make them a comment",
+            )
         elif text:
-            self.findings.tolerated(number_, "text outside of a table is ignored",
-                                    "start it with a semicolon")
+            self.findings.tolerated(
+                number_, "text outside of a table is ignored", "start it with a semicolon"
+            )
 
     def _odd(self, line: int, text: str) -> None:
         if text.isascii() or not (text.startswith(":") or self.open is not None):
@@ -106,50 +113,67 @@ class _Reader:
     def _finish(self, last: int) -> None:
         if self.open is not None:
             start = self.open.heads[0][0]
-            self.findings.error(last, f"the table of line {start} has no :END",
-                                "end it with :END; the file may be truncated")
+            self.findings.error(
+                last,
+                f"the table of line {start} has no :END",
+                "end it with :END; the file may be truncated",
+            )
             self.open.broken = True
             self._close()
         elif not self.first_start:
-            self.findings.error(0, "no table in the file",
-                                "a table starts with :START, :START2D or :GALVO2D")
+            self.findings.error(
+                0, "no table in the file", "a table starts with :START, :START2D or :GALVO2D"
+            )
 
     def _directive(self, line: int, text: str) -> None:
         match = _TOKEN.match(text)
         assert match is not None, "the pattern takes any text"
-        word, rest = match[1], text[match.end():]
+        word, rest = match[1], text[match.end() :]
         if word.upper() == "END":
             self._end(line, word, rest)
         elif word.upper() in _STARTS:
             if word != word.upper():
-                self.findings.tolerated(line, "a token in mixed case",
-                                        "write :START, :START2D, :GALVO2D, :END")
+                self.findings.tolerated(
+                    line, "a token in mixed case", "write :START, :START2D, :GALVO2D, :END"
+                )
             self._start(line, _STARTS[word.upper()], rest)
         else:
-            self.findings.error(line, f"unknown token {short(text.split()[0])}",
-                                "known are :START, :START2D, :GALVO2D and :END")
+            self.findings.error(
+                line,
+                f"unknown token {short(text.split()[0])}",
+                "known are :START, :START2D, :GALVO2D and :END",
+            )
 
     def _start(self, line: int, kind: model.TableKind, rest: str) -> None:
         if rest and rest[0] not in " \t":
             self.findings.error(line, f"no blank after {kind.start}", "put one")
         if self.open is not None and not self.open.counts:
             if kind is not self.open.kind:
-                self.findings.error(line, f"a {kind.start} line in the {self.open.kind} table of "
-                                    f"line {self.open.heads[0][0]}",
-                                    f"start every line of its head with {self.open.kind.start}")
+                self.findings.error(
+                    line,
+                    f"a {kind.start} line in the {self.open.kind} table of "
+                    f"line {self.open.heads[0][0]}",
+                    f"start every line of its head with {self.open.kind.start}",
+                )
                 self.open.broken = self.open.broken_head = True
                 return
             self.open.heads.append((line, rest))
             return
         if self.open is not None:
-            self.findings.error(line, f"{kind.start} before the :END of the table of line "
-                                f"{self.open.heads[0][0]}", "end that table with :END")
+            self.findings.error(
+                line,
+                f"{kind.start} before the :END of the table of line {self.open.heads[0][0]}",
+                "end that table with :END",
+            )
             self.open.broken = True
             self._close()
         self.n_tables += 1
         if self.n_tables > MAX_TABLES:
-            self.findings.stop(line, f"more than {MAX_TABLES} tables in the file",
-                               f"it may have {rules.MAX_1D_TABLES}")
+            self.findings.stop(
+                line,
+                f"more than {MAX_TABLES} tables in the file",
+                f"it may have {rules.MAX_1D_TABLES}",
+            )
         self.first_start = self.first_start or line
         self.first_kind = self.first_kind or kind
         if kind is not self.first_kind:
@@ -158,8 +182,9 @@ class _Reader:
 
     def _end(self, line: int, word: str, rest: str) -> None:
         if word != "END":
-            self.findings.tolerated(line, "a token in mixed case",
-                                    "write :START, :START2D, :GALVO2D, :END")
+            self.findings.tolerated(
+                line, "a token in mixed case", "write :START, :START2D, :GALVO2D, :END"
+            )
         if rest.strip():
             self.findings.tolerated(line, "text after :END is ignored", "start it with a semicolon")
         if self.open is None:
@@ -175,8 +200,9 @@ class _Reader:
                 self.findings.error(line, fault.what, fault.remedy)
                 break
         else:
-            self.findings.error(line, "odd characters between the numbers",
-                                "separate numbers by blanks or tabs")
+            self.findings.error(
+                line, "odd characters between the numbers", "separate numbers by blanks or tabs"
+            )
         if self.open is not None:
             self.open.broken = True
 
@@ -195,8 +221,11 @@ class _Reader:
 def _numbers(table: _Open, findings: model.CalFindings) -> np.ndarray | None:
     """Return the values of a table, or None with a finding."""
     if not table.words:
-        findings.error(table.heads[-1][0], "the table has no correction values",
-                       "give them between the start lines and :END")
+        findings.error(
+            table.heads[-1][0],
+            "the table has no correction values",
+            "give them between the start lines and :END",
+        )
         return None
     try:
         values = np.fromiter(map(float, table.words), float, len(table.words))
@@ -206,7 +235,7 @@ def _numbers(table: _Open, findings: model.CalFindings) -> np.ndarray | None:
         return values
     index = 0
     for line, count in zip(table.lines, table.counts, strict=True):
-        for word in table.words[index:index + count]:
+        for word in table.words[index : index + count]:
             try:
                 number(word)
             except ArgumentFault as fault:
@@ -216,24 +245,42 @@ def _numbers(table: _Open, findings: model.CalFindings) -> np.ndarray | None:
     return values
 
 
-def _table_1d(header: Header, values: np.ndarray | None, layout: tuple[list[int], list[int]],
-              findings: model.CalFindings) -> model.Table1D | None:
+def _table_1d(
+    header: Header,
+    values: np.ndarray | None,
+    layout: tuple[list[int], list[int]],
+    findings: model.CalFindings,
+) -> model.Table1D | None:
     if "sample_dist" not in header.values and not header.broken:
-        findings.error(header.line, "SAMPLEDIST is missing",
-                       "give the distance between entries: SAMPLEDIST=...")
+        findings.error(
+            header.line,
+            "SAMPLEDIST is missing",
+            "give the distance between entries: SAMPLEDIST=...",
+        )
         return None
     if header.broken or values is None:
         return None
     several = next((line for line, count in zip(*layout, strict=True) if count > 1), 0)
     if several:
-        findings.tolerated(several, "several values on a line of a 1D table",
-                           "write one value a line")
-    return model.Table1D(int(header.positional[0]), header.values.pop("sample_dist"), values,
-                         **header.values, line=header.line, lines=header.lines)
+        findings.tolerated(
+            several, "several values on a line of a 1D table", "write one value a line"
+        )
+    return model.Table1D(
+        int(header.positional[0]),
+        header.values.pop("sample_dist"),
+        values,
+        **header.values,
+        line=header.line,
+        lines=header.lines,
+    )
 
 
-def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int], list[int]],
-              findings: model.CalFindings) -> model.Table2D | None:
+def _table_2d(
+    header: Header,
+    values: np.ndarray | None,
+    layout: tuple[list[int], list[int]],
+    findings: model.CalFindings,
+) -> model.Table2D | None:
     if header.broken:
         return None
     *axes, sample_row, sample_col, n_columns = header.positional
@@ -246,14 +293,23 @@ def _table_2d(header: Header, values: np.ndarray | None, layout: tuple[list[int]
         return None
     if values is None or not _rows_are_whole(columns, len(outputs), layout, findings):
         return None
-    return model.Table2D(row, column, outputs, sample_row, sample_col,
-                         values.reshape(-1, columns, len(outputs)), **header.values,
-                         galvo=header.kind is model.TableKind.GALVO, line=header.line,
-                         lines=header.lines)
+    return model.Table2D(
+        row,
+        column,
+        outputs,
+        sample_row,
+        sample_col,
+        values.reshape(-1, columns, len(outputs)),
+        **header.values,
+        galvo=header.kind is model.TableKind.GALVO,
+        line=header.line,
+        lines=header.lines,
+    )
 
 
-def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[int]],
-                    findings: model.CalFindings) -> bool:
+def _rows_are_whole(
+    columns: int, outputs: int, layout: tuple[list[int], list[int]], findings: model.CalFindings
+) -> bool:
     """Return whether the lines form whole rows; a finding names a line that does not."""
     width = columns * outputs
     want = f"a row has {columns} columns of {outputs} values = {width}"
@@ -263,19 +319,26 @@ def _rows_are_whole(columns: int, outputs: int, layout: tuple[list[int], list[in
         return True
     # Rows may be wrapped, or share a line; but a line may not straddle two rows.
     begins = ends - on_lines
-    straddles = (begins // width != (ends - 1) // width) & ((begins % width != 0)
-                                                            | (ends % width != 0))
+    straddles = (begins // width != (ends - 1) // width) & (
+        (begins % width != 0) | (ends % width != 0)
+    )
     if not straddles.any() and ends[-1] % width == 0:
         findings.tolerated(lines[0], "lines are not rows", "write one row a line")
         return True
     mostly_rows = 2 * np.count_nonzero(on_lines == width) >= len(on_lines)
     if mostly_rows or straddles.any():
         wrong = int(np.argmax(on_lines != width if mostly_rows else straddles))
-        findings.error(lines[wrong], f"{on_lines[wrong]} values on the line; {want}",
-                       "correct the line or NumCols")
+        findings.error(
+            lines[wrong],
+            f"{on_lines[wrong]} values on the line; {want}",
+            "correct the line or NumCols",
+        )
     else:
-        findings.error(lines[-1], f"the last row has {ends[-1] % width} values; {want}",
-                       "complete the row or correct NumCols")
+        findings.error(
+            lines[-1],
+            f"the last row has {ends[-1] % width} values; {want}",
+            "complete the row or correct NumCols",
+        )
     return False
 
 
@@ -297,8 +360,9 @@ def parse_cal(data: bytes, where: str, *, gi4: rules.Gi4 | None = None) -> model
         for table in reader.tables:
             rules.check_table(table, reader.findings, gi4=gi4)
         rules.check_counts(reader.tables, reader.findings)
-    return model.CalFile(where, tuple(reader.tables), reader.findings.sorted(),
-                         tuple(reader.comments))
+    return model.CalFile(
+        where, tuple(reader.tables), reader.findings.sorted(), tuple(reader.comments)
+    )
 
 
 def read_cal(path: str | os.PathLike, *, gi4: rules.Gi4 | None = None) -> model.CalFile:
@@ -339,9 +403,15 @@ def load_cals(paths: Sequence[str]) -> model.CalFile:
     files = [load_cal(path) for path in paths]
     for (first, cal), (again, other) in combinations(zip(paths, files, strict=True), 2):
         if len(cal.tables) == len(other.tables) and all(
-                map(model.same_table, cal.tables, other.tables)):
-            raise InputError(again, f"is the same as {first}, and would be added twice",
-                             "name it once")
-    return model.CalFile(", ".join(paths), *(
-        tuple(item for cal in files for item in getattr(cal, name))
-        for name in ("tables", "findings", "comments")))
+            map(model.same_table, cal.tables, other.tables)
+        ):
+            raise InputError(
+                again, f"is the same as {first}, and would be added twice", "name it once"
+            )
+    return model.CalFile(
+        ", ".join(paths),
+        *(
+            tuple(item for cal in files for item in getattr(cal, name))
+            for name in ("tables", "findings", "comments")
+        ),
+    )

@@ -41,15 +41,21 @@ def setup_of(frame: MachineFrame) -> MachineSetup:
 
 def plane_correction(tables: CalEvaluator, frame: MachineFrame) -> Correction:
     """Return what loaded tables add to x and y."""
+
     def correct(px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         add = tables.corrections({frame.x_axis: px, frame.y_axis: py})
         none = np.zeros(np.shape(px))
         return add.get(frame.x_axis, none), add.get(frame.y_axis, none)
+
     return correct
 
 
-def turned(stage: Compensator, frame: MachineFrame, theta_rad: ArrayLike,
-           tables: CalEvaluator | None = None) -> np.ndarray:
+def turned(
+    stage: Compensator,
+    frame: MachineFrame,
+    theta_rad: ArrayLike,
+    tables: CalEvaluator | None = None,
+) -> np.ndarray:
     """Return the true angle, rad, after a command to `theta_rad`, as `reached` for theta."""
     position = frame.theta_to_machine(theta_rad)
     if tables is not None:
@@ -88,10 +94,16 @@ class TableVerification:
         """
         sites = self.sites
         if sites is not None and self.one_axis is not None:
-            sites = replace(sites, before=_without_turn(sites.position, sites.before),
-                            after=_without_turn(sites.position, sites.after))
-        return any(r.rms("after") > (1 + 1e-6) * r.rms("before")
-                   for r in (sites, self.lines) if r is not None)
+            sites = replace(
+                sites,
+                before=_without_turn(sites.position, sites.before),
+                after=_without_turn(sites.position, sites.after),
+            )
+        return any(
+            r.rms("after") > (1 + 1e-6) * r.rms("before")
+            for r in (sites, self.lines)
+            if r is not None
+        )
 
     def unfit(self, error_map: ErrorMap) -> list[Residual]:
         """Return the residuals of tables that are not those of a map, though no worse than none.
@@ -101,14 +113,26 @@ class TableVerification:
         judged by `one_axis`.
         """
         in_two_axes = self.sites if self.one_axis is None else None
-        pairs = ((in_two_axes, (error_map.u_gx, error_map.u_gy)),
-                 (self.entries, (error_map.u_gx, error_map.u_gy)),
-                 (self.lines, (error_map.u_g_theta,)))
-        found = [residual for residual, u in pairs if residual is not None and leaves_too_much(
-            (residual.rms("after"), residual.largest("after")),
-            (residual.rms("before"), residual.largest("before")), known_rms(*u))]
-        return [residual for residual in found
-                if residual is not self.entries or self.sites not in found]
+        pairs = (
+            (in_two_axes, (error_map.u_gx, error_map.u_gy)),
+            (self.entries, (error_map.u_gx, error_map.u_gy)),
+            (self.lines, (error_map.u_g_theta,)),
+        )
+        found = [
+            residual
+            for residual, u in pairs
+            if residual is not None
+            and leaves_too_much(
+                (residual.rms("after"), residual.largest("after")),
+                (residual.rms("before"), residual.largest("before")),
+                known_rms(*u),
+            )
+        ]
+        return [
+            residual
+            for residual in found
+            if residual is not self.entries or self.sites not in found
+        ]
 
 
 def _without_turn(position: np.ndarray, residual: np.ndarray) -> np.ndarray:
@@ -119,8 +143,12 @@ def _without_turn(position: np.ndarray, residual: np.ndarray) -> np.ndarray:
     return residual - turn * ((turn * residual).sum() / square if square else 0.0)
 
 
-def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame,
-                  active: Correction | None = None) -> TableVerification:
+def verify_tables(
+    error_map: ErrorMap,
+    tables: Sequence[Table],
+    frame: MachineFrame,
+    active: Correction | None = None,
+) -> TableVerification:
     """Return the residuals of a stage with this error map and `tables`.
 
     `active` is the table that was loaded during the calibration, if any; see `plane_residuals`.
@@ -135,10 +163,12 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFr
     theta = [table for table in tables if frame.theta_axis in table.outputs]
     for table in tables:
         if not set(table.inputs) <= (stage if table in xy else {frame.theta_axis}):
-            raise InputError(f"the table of line {table.line}", f"it corrects {list(table.outputs)}"
-                             f" from the positions of {list(table.inputs)}",
-                             f"name the axes of the stage (now x={frame.x_axis}, "
-                             f"y={frame.y_axis}, theta={frame.theta_axis or 'none'})")
+            raise InputError(
+                f"the table of line {table.line}",
+                f"it corrects {list(table.outputs)} from the positions of {list(table.inputs)}",
+                f"name the axes of the stage (now x={frame.x_axis}, "
+                f"y={frame.y_axis}, theta={frame.theta_axis or 'none'})",
+            )
     sites = between = lines = one_axis = entries = None
     in_one_axis = [table for table in xy if isinstance(table, Table1D)]
     if xy:
@@ -155,8 +185,9 @@ def verify_tables(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFr
     return TableVerification(frame, sites, between, lines, one_axis, entries)
 
 
-def _at_entries(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame,
-                evaluator: CalEvaluator) -> Residual | None:
+def _at_entries(
+    error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame, evaluator: CalEvaluator
+) -> Residual | None:
     """Return what tables leave at the entries of 2D ones between the sites; None if none are there.
 
     Between the sites the error of the stage is known to the difference of the bilinear map and the
@@ -164,18 +195,25 @@ def _at_entries(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFram
     """
     whole, _ = fill_unknown(error_map)
     plate = whole.artifact
-    plane = replace(whole, artifact=replace(plate, angular_count=0, harmonics=0),
-                    g_theta=np.zeros(0), u_g_theta=np.zeros(0))
+    plane = replace(
+        whole,
+        artifact=replace(plate, angular_count=0, harmonics=0),
+        g_theta=np.zeros(0),
+        u_g_theta=np.zeros(0),
+    )
     nodes = plate.x_m[:, 0], plate.y_m[0]
     places = [np.stack([plate.x_m.ravel(), plate.y_m.ravel()])]
     for table in tables:
         if isinstance(table, Table2D):
             bound = bound_2d(table, setup_of(frame))
-            along = {track.axis: track.first + track.step * np.arange(track.count)
-                     for track in (bound.rows, bound.columns)}
+            along = {
+                track.axis: track.first + track.step * np.arange(track.count)
+                for track in (bound.rows, bound.columns)
+            }
             entries = frame.from_machine(along[frame.x_axis], along[frame.y_axis])
-            inside = [p[(p > side[0]) & (p < side[-1])]
-                      for p, side in zip(entries, nodes, strict=True)]
+            inside = [
+                p[(p > side[0]) & (p < side[-1])] for p, side in zip(entries, nodes, strict=True)
+            ]
             places.append(np.stack(np.meshgrid(*inside)).reshape(2, -1))
     sites, position = plate.x_m.size, np.concatenate(places, axis=1)
     pitches = (position[:, sites:] - position[:, :1]) / plate.grid_pitch_m
@@ -192,8 +230,14 @@ def _at_entries(error_map: ErrorMap, tables: Sequence[Table], frame: MachineFram
     left = left - left[:, :sites].mean(axis=1, keepdims=True)
     left = np.sign(left) * np.maximum(np.abs(left) - doubt, 0.0)
     mean = error[:, :sites].mean(axis=1)
-    return Residual("entries", position[:, sites:], (error - mean[:, None])[:, sites:],
-                    left[:, sites:], mean, np.zeros(2))
+    return Residual(
+        "entries",
+        position[:, sites:],
+        (error - mean[:, None])[:, sites:],
+        left[:, sites:],
+        mean,
+        np.zeros(2),
+    )
 
 
 def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
@@ -201,8 +245,11 @@ def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator)
     if not len(angles):
         raise InputError("error map", "it knows no angular line", "leave out the theta axis")
     stage = Compensator(error_map)
-    return residual_of("lines", angles[None], [turned(stage, frame, angles, tables)[None]
-                                               for tables in (None, evaluator)])
+    return residual_of(
+        "lines",
+        angles[None],
+        [turned(stage, frame, angles, tables)[None] for tables in (None, evaluator)],
+    )
 
 
 TITLE = "Exported table: before and after"
@@ -236,39 +283,66 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
     rows = []
     for residual in found.residuals:
         unit, scale = ("arcsec", ARCSEC_PER_RAD) if residual.place == "lines" else ("µm", UM_PER_M)
-        sizes = [size(which) * scale for size in (residual.rms, residual.largest)
-                 for which in BEFORE_AND_AFTER]
+        sizes = [
+            size(which) * scale
+            for size in (residual.rms, residual.largest)
+            for which in BEFORE_AND_AFTER
+        ]
         rows.append((PLACES[residual.place], *fixed_column(sizes, 4), unit))
     header = ("error", "rms before", "after", "largest before", "after", "unit")
-    figure = CaptionedFigure(controller_figure(found),
-                             "A simulated controller moves to the nodes and to the middle of every "
-                             "cell, without and with the exported table. What remains between the "
-                             "nodes is the controller's linear interpolation.")
-    leaves = Section("What the table leaves", table=(header, *rows), notes=(
-        "The map is taken as the truth here: its own U adds to what remains.",))
+    figure = CaptionedFigure(
+        controller_figure(found),
+        "A simulated controller moves to the nodes and to the middle of every "
+        "cell, without and with the exported table. What remains between the "
+        "nodes is the controller's linear interpolation.",
+    )
+    leaves = Section(
+        "What the table leaves",
+        table=(header, *rows),
+        notes=("The map is taken as the truth here: its own U adds to what remains.",),
+    )
     return Chapter(TITLE, (figure,), (leaves,))
 
 
 def controller_figure(found: TableVerification) -> Drawing:
     """Return the error of the controller, true − commanded, before and after at one scale."""
-    drawing = parts.titled("before-after",
-                           "Controller: true − commanded, without its constant shift")
+    drawing = parts.titled(
+        "before-after", "Controller: true − commanded, without its constant shift"
+    )
     fields = [residual for residual in found.residuals if residual.place != "lines"]
     shown = [_shown(residual) for residual in fields]
     if fields:
         reach = (np.abs(fields[0].position).max(axis=1) * 1.2 * MM_PER_M).tolist()
         lengths = np.concatenate([np.hypot(*residual.before) for residual in fields])
         factor = parts.enlargement(lengths, min(spacing for _, spacing in shown))
-        frames = parts.panels(drawing, [f"{which}, {PLACES[residual.place]}" for residual in fields
-                                        for which in BEFORE_AND_AFTER], reach, 68.0)
+        frames = parts.panels(
+            drawing,
+            [
+                f"{which}, {PLACES[residual.place]}"
+                for residual in fields
+                for which in BEFORE_AND_AFTER
+            ],
+            reach,
+            68.0,
+        )
         for number, frame in enumerate(frames):
             (residual, which), (take, _) = _pair(fields, number), shown[number // 2]
-            parts.arrows(frame, residual.position[:, take] * MM_PER_M,
-                         getattr(residual, which)[:, take], factor, width=0.9)
+            parts.arrows(
+                frame,
+                residual.position[:, take] * MM_PER_M,
+                getattr(residual, which)[:, take],
+                factor,
+                width=0.9,
+            )
             frame.axes(ticks=(4, 4))
             left, top, _, height = frame.box
-            drawing.label(left, top + height + 32, _sizes(residual, which, "µm", UM_PER_M),
-                          size=11, colour="soft")
+            drawing.label(
+                left,
+                top + height + 32,
+                _sizes(residual, which, "µm", UM_PER_M),
+                size=11,
+                colour="soft",
+            )
         parts.arrow_key(frames[0], factor, (46, drawing.height + 26))
         drawing.label(150, drawing.height + 30, "one scale for all; axes in mm")
         drawing.height += 40
@@ -301,10 +375,16 @@ def _draw_lines(drawing: Drawing, residual: Residual) -> None:
     """Draw the angular residuals before and after over the angle, below what there is."""
     top = max(drawing.height, 16.0) + 44
     angle = np.rad2deg(residual.position[0])
-    parts.chart(drawing, (62, top, 410, 150), [
-        parts.Curve(angle, getattr(residual, which)[0] * ARCSEC_PER_RAD, colour, dots=2.0)
-        for which, colour in zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)],
-        title=PLACES["lines"], labels=("θ in °", "arcsec"))
+    parts.chart(
+        drawing,
+        (62, top, 410, 150),
+        [
+            parts.Curve(angle, getattr(residual, which)[0] * ARCSEC_PER_RAD, colour, dots=2.0)
+            for which, colour in zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)
+        ],
+        title=PLACES["lines"],
+        labels=("θ in °", "arcsec"),
+    )
     for number, (which, colour) in enumerate(zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)):
         sizes = _sizes(residual, which, "arcsec", ARCSEC_PER_RAD)
         parts.legend(drawing, [(colour, f"{which}: {sizes}")], (62, top + 206 + 18 * number))

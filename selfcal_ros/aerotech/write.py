@@ -24,8 +24,9 @@ def decimal(value: float) -> str:
     return np.format_float_positional(value, trim="-") if "e" in text else text.removesuffix(".0")
 
 
-def cal_text(tables: Sequence[Table], *, comments: Sequence[str] = (),
-             decimals: int | None = None) -> str:
+def cal_text(
+    tables: Sequence[Table], *, comments: Sequence[str] = (), decimals: int | None = None
+) -> str:
     """Return a calibration file in the strict form.
 
     Parameters
@@ -73,8 +74,11 @@ def _refuse_what_reads_differently(text: str, tables: Sequence[Table], *, exact:
     for number, (table, read) in enumerate(zip(tables, back, strict=True), 1):
         rounded = table.values.shape == read.values.shape and not exact
         if not same_table(read, replace(table, values=read.values) if rounded else table):
-            raise InputError("calibration file", f"table {number} holds what the format cannot say",
-                             "keep to plain numbers, CW or CCW, and a serial number without quotes")
+            raise InputError(
+                "calibration file",
+                f"table {number} holds what the format cannot say",
+                "keep to plain numbers, CW or CCW, and a serial number without quotes",
+            )
 
 
 def _printable(text: str) -> str:
@@ -82,7 +86,7 @@ def _printable(text: str) -> str:
 
 
 def _no_minus_zero(values: np.ndarray, decimals: int) -> np.ndarray:
-    return np.where(np.abs(values) < 0.5 * 10.0 ** -decimals, 0.0, values)
+    return np.where(np.abs(values) < 0.5 * 10.0**-decimals, 0.0, values)
 
 
 def _head(table: Table) -> list[str]:
@@ -90,9 +94,14 @@ def _head(table: Table) -> list[str]:
     if isinstance(table, Table1D):
         arguments = [str(table.axis)]
     else:
-        arguments = [str(table.row_axis), str(table.column_axis), *map(str, table.outputs[:2]),
-                     decimal(table.sample_row), decimal(table.sample_col),
-                     str(table.values.shape[1])]
+        arguments = [
+            str(table.row_axis),
+            str(table.column_axis),
+            *map(str, table.outputs[:2]),
+            decimal(table.sample_row),
+            decimal(table.sample_col),
+            str(table.values.shape[1]),
+        ]
     lines = [f"{start} {' '.join(arguments)}"]
     for word, keyword in KEYWORDS[table.kind].items():
         if keyword.field == "outaxis3":
@@ -119,12 +128,16 @@ def refuse_existing(paths: Sequence[str | os.PathLike], *, force: bool) -> None:
         if Path(path).is_dir():
             raise InputError(str(path), "it is a folder", "name a file")
         if Path(path).exists() and not force:
-            raise InputError(str(path), "the file exists",
-                             "name another file, or replace it with --force (the old one is kept)")
+            raise InputError(
+                str(path),
+                "the file exists",
+                "name another file, or replace it with --force (the old one is kept)",
+            )
 
 
-def write_cal(path: str | os.PathLike, text: str, *, force: bool = False,
-              now: datetime | None = None) -> Path | None:
+def write_cal(
+    path: str | os.PathLike, text: str, *, force: bool = False, now: datetime | None = None
+) -> Path | None:
     """Write a calibration file atomically and return the backup of the file it replaces.
 
     Parameters

@@ -78,15 +78,19 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
         If there are no rows.
     """
     text = read_text(path)
-    lines = [(f"{path}:{number}", line) for number, line in enumerate(
-        text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = [
+        (f"{path}:{number}", line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.startswith("#")
+    ]
     heading = csv_cells(lines[0][1], lines[0][0]) if lines else []
     columns = [column for column in COLUMNS if plan or column != "view"]
     columns += [TIME] if TIME in heading else []
     for column in columns:
         if column not in heading:
-            raise InputError(str(path), f"no column '{column}'",
-                             f"begin with the line {','.join(columns)}")
+            raise InputError(
+                str(path), f"no column '{column}'", f"begin with the line {','.join(columns)}"
+            )
     if len(lines) == 1:
         raise NoDataError(str(path), "no row below the heading", "give one for each image")
     names = [view.name for view in plan.views] if plan else [""]
@@ -100,20 +104,32 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
         if view not in names:
             raise InputError(where, f"the plan has no view '{view}'", known_are(view, names))
         if first.setdefault(cells["file"], where) != where:
-            raise InputError(where, f"{cells['file']} is in line "
-                             f"{first[cells['file']].rpartition(':')[2]} as well",
-                             "give each image once; a repeated mark is another image")
-        rows.append(Position(where, cells["file"], names.index(view),
-                             _metres(cells["x"], where), _metres(cells["y"], where),
-                             _stamp_ns(cells[TIME], where) if TIME in heading else None))
+            raise InputError(
+                where,
+                f"{cells['file']} is in line {first[cells['file']].rpartition(':')[2]} as well",
+                "give each image once; a repeated mark is another image",
+            )
+        rows.append(
+            Position(
+                where,
+                cells["file"],
+                names.index(view),
+                _metres(cells["x"], where),
+                _metres(cells["y"], where),
+                _stamp_ns(cells[TIME], where) if TIME in heading else None,
+            )
+        )
     if plan:
         _check_unit(str(path), rows, plan)
     rows.sort(key=lambda row: row.view)
     for before, row in pairwise(rows):
         if row.stamp_ns is not None and row.stamp_ns - (before.stamp_ns or 0) < STEP_NS / 10:
-            raise InputError(row.where, f"not exposed 0.1 s or more after {before.file}",
-                             "give the times in the order of the exposures, and the views of the "
-                             "plan in the order in which they were measured; or omit the column")
+            raise InputError(
+                row.where,
+                f"not exposed 0.1 s or more after {before.file}",
+                "give the times in the order of the exposures, and the views of the "
+                "plan in the order in which they were measured; or omit the column",
+            )
     return rows
 
 
@@ -122,18 +138,24 @@ def _stamp_ns(text: str, where: str) -> int:
     with suppress(ValueError):
         if (date := datetime.fromisoformat(text)).tzinfo is not None:
             return (date - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
-    raise InputError(where, f"'{text}' is not a time with its zone",
-                     "write it as 2026-11-21T09:30:00.25+01:00")
+    raise InputError(
+        where, f"'{text}' is not a time with its zone", "write it as 2026-11-21T09:30:00.25+01:00"
+    )
 
 
 def _check_unit(path: str, rows: list[Position], plan: Plan) -> None:
     """Refuse positions in another unit: most of them far from the plate in any of its views."""
     edge_m = plan.artifact.grid_pitch_m * math.hypot(*plan.artifact.reach) + max(
-        math.hypot(*view.translation_m) for view in plan.views)
+        math.hypot(*view.translation_m) for view in plan.views
+    )
     typical_m = float(np.median([math.hypot(row.x_m, row.y_m) for row in rows]))
     if typical_m > FAR * edge_m:
-        raise InputError(path, f"half of the positions are over {typical_m:.3g} m from the origin, "
-                         f"the marks of the plan within {edge_m:.3g} m", "give x and y in m")
+        raise InputError(
+            path,
+            f"half of the positions are over {typical_m:.3g} m from the origin, "
+            f"the marks of the plan within {edge_m:.3g} m",
+            "give x and y in m",
+        )
 
 
 def _metres(text: str, where: str) -> float:
@@ -146,9 +168,16 @@ def _metres(text: str, where: str) -> float:
     return value
 
 
-def write_pictures(folder: Path, rows: Sequence[Position], plan: Plan, output: str | Path, *,
-                   detect: Callable[[bytes, str, int], Iterable[Detection]],
-                   check: Callable[[], None], frame_id: str) -> Counter[str]:
+def write_pictures(
+    folder: Path,
+    rows: Sequence[Position],
+    plan: Plan,
+    output: str | Path,
+    *,
+    detect: Callable[[bytes, str, int], Iterable[Detection]],
+    check: Callable[[], None],
+    frame_id: str,
+) -> Counter[str]:
     """Write a bag of the commands of a plan, the positions and the detections in the images.
 
     Parameters
@@ -181,8 +210,11 @@ def write_pictures(folder: Path, rows: Sequence[Position], plan: Plan, output: s
     missing = [row for row in rows if not (folder / row.file).is_file()]
     if missing:
         number = f" ({len(missing)} of {len(rows)} files are not)" if len(missing) > 1 else ""
-        raise NoDataError(missing[0].where, f"{missing[0].file} is not in {folder}{number}",
-                          "correct the table, or name the folder of its images")
+        raise NoDataError(
+            missing[0].where,
+            f"{missing[0].file} is not in {folder}{number}",
+            "correct the table, or name the folder of its images",
+        )
     problems: Counter[str] = Counter()
     latched = qos_profile(reliable=True, transient_local=True, depth=64)
     volatile = qos_profile(reliable=True, transient_local=False, depth=5000)
@@ -192,14 +224,30 @@ def write_pictures(folder: Path, rows: Sequence[Position], plan: Plan, output: s
 
     def command(phase: Phase, index: int) -> None:
         known = plan.views[index] if index < len(plan.views) else None
-        writer.write(f"/{COMMAND_TOPIC}", from_model.command(Command(
-            now, phase, plan.plan_id, index, known, plan.artifact if known else None,
-            len(plan.views), run_id=run_id, model_terms=plan.model_terms), frame_id), now)
+        writer.write(
+            f"/{COMMAND_TOPIC}",
+            from_model.command(
+                Command(
+                    now,
+                    phase,
+                    plan.plan_id,
+                    index,
+                    known,
+                    plan.artifact if known else None,
+                    len(plan.views),
+                    run_id=run_id,
+                    model_terms=plan.model_terms,
+                ),
+                frame_id,
+            ),
+            now,
+        )
 
     with new_bag(output) as unfinished, BagWriter(unfinished) as writer:
         for topic, typename in INPUT_TOPICS.items():
-            writer.add_topic(f"/{topic}", typename, [
-                latched if topic == COMMAND_TOPIC else volatile])
+            writer.add_topic(
+                f"/{topic}", typename, [latched if topic == COMMAND_TOPIC else volatile]
+            )
         for row in rows:
             if row.view != view:
                 view = row.view
@@ -209,8 +257,9 @@ def write_pictures(folder: Path, rows: Sequence[Position], plan: Plan, output: s
             now = now + STEP_NS if row.stamp_ns is None else row.stamp_ns
             for step in BESIDE_NS:
                 sample = EncoderSample(now + step, ("x", "y", "theta"), (row.x_m, row.y_m, 0.0))
-                writer.write(f"/{ENCODER_TOPIC}", from_model.joint_state(sample, frame_id),
-                             now + step)
+                writer.write(
+                    f"/{ENCODER_TOPIC}", from_model.joint_state(sample, frame_id), now + step
+                )
             try:
                 found = detect(read_bytes(folder / row.file), row.file, now)
             except InputError as error:
@@ -278,16 +327,25 @@ class ImageBag:
         for stream in streams(self._files, [], lambda topic: False):
             for _ in stream.blocks():
                 pass  # blocks of a file without an index
-            found |= {channel.topic: transport for channel in stream.channels.values()
-                      if (transport := self._transport(channel.topic))}
+            found |= {
+                channel.topic: transport
+                for channel in stream.channels.values()
+                if (transport := self._transport(channel.topic))
+            }
         raw = [topic for topic, transport in found.items() if transport == "raw"]
         names = raw or list(found)
         if not names:
-            raise NoDataError(str(self.path), f"no topic {' or '.join(IMAGE_TOPICS.values())}",
-                              "record it, or remap the topic of your camera")
+            raise NoDataError(
+                str(self.path),
+                f"no topic {' or '.join(IMAGE_TOPICS.values())}",
+                "record it, or remap the topic of your camera",
+            )
         if len(names) > 1:
-            raise InputError(str(self.path), f"images of several cells: {', '.join(names)}",
-                             "choose one with --namespace")
+            raise InputError(
+                str(self.path),
+                f"images of several cells: {', '.join(names)}",
+                "choose one with --namespace",
+            )
         self.topic, self._kind = names[0], IMAGE_TYPES[found[names[0]]]
 
     def _transport(self, topic: str) -> str:
@@ -324,8 +382,11 @@ class ImageBag:
                 if channel.topic == self.topic:
                     by_ns = before_ns - message.log_time
                     if by_ns > CLOCK_LIMIT_S * NS_PER_S:
-                        raise InputError(str(self.path), overlap(stream, by_ns), "give each "
-                                         "recording once, in the order in which they were made")
+                        raise InputError(
+                            str(self.path),
+                            overlap(stream, by_ns),
+                            "give each recording once, in the order in which they were made",
+                        )
                     latest_ns = max(latest_ns, message.log_time)
                     item.image = self._decoded(channel, schema, message)
                 yield item
@@ -344,16 +405,25 @@ class ImageBag:
     def _decoded(self, channel: Channel, schema: Schema | None, message: Message) -> Any:
         name = schema.name if schema else self._kind
         if name != self._kind:
-            raise InputError(f"{self.path}: topic {channel.topic}", f"type {name} instead of "
-                             f"{self._kind}", "remap the topic or record the right one")
+            raise InputError(
+                f"{self.path}: topic {channel.topic}",
+                f"type {name} instead of {self._kind}",
+                "remap the topic or record the right one",
+            )
         try:
             return store_with(name).deserialize_cdr(message.data, name)
         except Exception:  # a damaged payload may fail anywhere in the decoder
             self.lost[f"messages on {channel.topic} could not be decoded"] += 1
             return None
 
-    def write_detected(self, output: str | Path, detect: Callable[[Any], Iterable[Detection]], *,
-                       check: Callable[[], None], frame_id: str) -> Counter[str]:
+    def write_detected(
+        self,
+        output: str | Path,
+        detect: Callable[[Any], Iterable[Detection]],
+        *,
+        check: Callable[[], None],
+        frame_id: str,
+    ) -> Counter[str]:
         """Write a bag of all messages other than images, and the detections in the images.
 
         Parameters
@@ -381,8 +451,11 @@ class ImageBag:
         numbers: dict[tuple, int] = {}
         topic = f"{self.space}{DETECTION_TOPIC}"
         with new_bag(output) as unfinished, BagWriter(unfinished) as writer:
-            writer.add_topic(topic, INPUT_TOPICS[DETECTION_TOPIC], [
-                qos_profile(reliable=True, transient_local=False, depth=5000)])
+            writer.add_topic(
+                topic,
+                INPUT_TOPICS[DETECTION_TOPIC],
+                [qos_profile(reliable=True, transient_local=False, depth=5000)],
+            )
             for item in self.items():
                 if not item.is_image:
                     writer.copy(_number(writer, item, numbers), item.channel.topic, item.message)
@@ -393,8 +466,9 @@ class ImageBag:
                     problems[str(error)] += 1
                     continue
                 for detection in found:
-                    writer.write(topic, from_model.detection(detection, frame_id),
-                                 item.message.log_time)
+                    writer.write(
+                        topic, from_model.detection(detection, frame_id), item.message.log_time
+                    )
             check()
         return problems + self.lost
 

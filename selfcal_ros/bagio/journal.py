@@ -123,11 +123,17 @@ def unfinished(folder: str | os.PathLike, journal: Path | None = None) -> list[P
         if found is None:
             return []
         bag, files = found, _files(found)
-        commands = [command for file in files
-                    for command in _commands(scan_file(file, COMMAND_TOPIC), str(file))]
+        commands = [
+            command
+            for file in files
+            for command in _commands(scan_file(file, COMMAND_TOPIC), str(file))
+        ]
     except OSError as error:
-        raise InputError(str(bag), f"the journal cannot be read ({error.strerror})",
-                         "correct that, then restart the collector") from error
+        raise InputError(
+            str(bag),
+            f"the journal cannot be read ({error.strerror})",
+            "correct that, then restart the collector",
+        ) from error
     return [] if _is_over(sorted(commands)) else files
 
 
@@ -174,8 +180,9 @@ def create(bag: Path) -> "Journal":
     except FileExistsError:
         raise
     except OSError as error:
-        raise InputError(str(bag), f"cannot be created ({error.strerror})",
-                         "name a writable folder") from error
+        raise InputError(
+            str(bag), f"cannot be created ({error.strerror})", "name a writable folder"
+        ) from error
     with _as_input_error(bag):
         lock = _locked(bag)
         try:
@@ -245,8 +252,9 @@ class Journal(Closing):
         self._syncer = threading.Thread(target=self._sync_on, name="journal", daemon=True)
         self._syncer.start()
 
-    def add_topic(self, topic: str, typename: str, qos: Sequence[dict] = (),
-                  heard_on: str = "") -> None:
+    def add_topic(
+        self, topic: str, typename: str, qos: Sequence[dict] = (), heard_on: str = ""
+    ) -> None:
         """Declare a topic, with its namespace, before its first message; repeated calls do nothing.
 
         A topic of the contract is identified by its name: a remapped one is declared with its
@@ -261,15 +269,20 @@ class Journal(Closing):
             return
         definition_of(topic, typename)  # refuses an unknown type
         known = self._metadata.topics.setdefault(
-            topic, BagTopic(typename, list(qos), heard_on=heard_on))
+            topic, BagTopic(typename, list(qos), heard_on=heard_on)
+        )
         self._declare(topic, known)
 
     def _declare(self, topic: str, known: BagTopic) -> None:
         number, definition = len(self._channels) + 1, definition_of(topic, known.type)
         schema = Schema(id=number, name=known.type, encoding="ros2msg", data=definition.encode())
         channel = Channel(
-            id=number, topic=topic, message_encoding="cdr", schema_id=number,
-            metadata=known.channel_metadata())
+            id=number,
+            topic=topic,
+            message_encoding="cdr",
+            schema_id=number,
+            metadata=known.channel_metadata(),
+        )
         self.flush()
         with _as_input_error(self.path):
             self._file.append(records(schema, channel))
@@ -306,8 +319,9 @@ class Journal(Closing):
         records: list[bytes] = []
         times: dict[str, list[int]] = {topic: [] for topic in {item[0] for item in waiting}}
         for topic, data, log_time_ns in waiting:
-            records.append(message_record(
-                self._channels[topic], self._sequence[topic], log_time_ns, data))
+            records.append(
+                message_record(self._channels[topic], self._sequence[topic], log_time_ns, data)
+            )
             self._sequence[topic] += 1
             times[topic].append(log_time_ns)
         try:
@@ -377,8 +391,10 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
             schema = content.schemas.get(channel.schema_id)
             if schema is not None:
                 qos = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
-                topic = metadata.topics.setdefault(channel.topic, BagTopic(
-                    schema.name, qos, heard_on=channel.metadata.get("heard_on", "")))
+                topic = metadata.topics.setdefault(
+                    channel.topic,
+                    BagTopic(schema.name, qos, heard_on=channel.metadata.get("heard_on", "")),
+                )
                 topic.count += content.counts.get(channel.id, 0)
         commands += _commands(content, str(file))
     return metadata, sorted(commands)
@@ -397,8 +413,9 @@ def _locked(path: Path) -> int:
         portable.lock(lock)
     except BlockingIOError as error:
         os.close(lock)
-        raise InputError(str(path), "another process writes this journal",
-                         "end it or name another folder") from error
+        raise InputError(
+            str(path), "another process writes this journal", "end it or name another folder"
+        ) from error
     return lock
 
 

@@ -72,8 +72,17 @@ class Content:
 
 def message_record(channel: int, sequence: int, log_time_ns: int, data: bytes) -> bytes:
     """Return the record of one message."""
-    return MESSAGE.pack(Opcode.MESSAGE, MESSAGE_FRONT + len(data), channel,
-                        sequence & 0xFFFFFFFF, log_time_ns, log_time_ns) + data
+    return (
+        MESSAGE.pack(
+            Opcode.MESSAGE,
+            MESSAGE_FRONT + len(data),
+            channel,
+            sequence & 0xFFFFFFFF,
+            log_time_ns,
+            log_time_ns,
+        )
+        + data
+    )
 
 
 def records(*items: McapRecord) -> bytes:
@@ -92,15 +101,26 @@ def front() -> bytes:
 def ending(content: Content) -> bytes:
     """Return the end of a file: repeated declarations, statistics, and checksums."""
     entry = content.entry
-    summary = records(*content.schemas.values(), *content.channels.values(), Statistics(
-        attachment_count=0, channel_count=len(content.channels),
-        channel_message_counts=content.counts, chunk_count=0, message_count=entry.count,
-        message_end_time=entry.last_ns, message_start_time=entry.first_ns or 0, metadata_count=0,
-        schema_count=len(content.schemas)))
+    summary = records(
+        *content.schemas.values(),
+        *content.channels.values(),
+        Statistics(
+            attachment_count=0,
+            channel_count=len(content.channels),
+            channel_message_counts=content.counts,
+            chunk_count=0,
+            message_count=entry.count,
+            message_end_time=entry.last_ns,
+            message_start_time=entry.first_ns or 0,
+            metadata_count=0,
+            schema_count=len(content.schemas),
+        ),
+    )
     data_end = struct.pack("<BQI", Opcode.DATA_END, 4, 0)
     start = content.end + len(data_end)
-    crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, FOOTER_SIZE, start, 0),
-                     zlib.crc32(summary))
+    crc = zlib.crc32(
+        struct.pack("<BQQQ", Opcode.FOOTER, FOOTER_SIZE, start, 0), zlib.crc32(summary)
+    )
     footer = records(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc))
     return data_end + summary + footer + MAGIC
 
@@ -116,8 +136,9 @@ class JournalFile:
         self.content = Content(FileEntry(path.name), end=0)
         self._torn = False  # whether there is data after the last complete record
         part = path.with_suffix(UNFINISHED)  # so that a file of a journal is never empty
-        self._fd = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-                           | os.O_CLOEXEC, 0o666)
+        self._fd = os.open(
+            part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o666
+        )
         try:
             self.append(front())
             os.fsync(self._fd)
@@ -137,7 +158,7 @@ class JournalFile:
         rest = memoryview(data)
         try:
             while rest:
-                rest = rest[os.write(self._fd, rest):]
+                rest = rest[os.write(self._fd, rest) :]
         except OSError:
             self._torn = True
             with suppress(OSError):

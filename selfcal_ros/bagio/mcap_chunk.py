@@ -27,12 +27,22 @@ from selfcal_ros.messages.cdr import Payloads
 
 FRONT = mcap_salvage.HEAD.size + mcap_salvage.MESSAGE_FRONT
 """Bytes of a message record before its payload."""
-FRONT_TYPE = np.dtype({
-    "names": ["length", "channel", "sequence", "log_time", "publish_time"],
-    "formats": ["<u8", "<u2", "<u4", "<u8", "<u8"], "offsets": [1, 9, 11, 15, 23],
-    "itemsize": FRONT})
-HEAD_TYPE = np.dtype({"names": ["opcode", "length"], "formats": ["u1", "<u8"],
-                      "offsets": [0, 1], "itemsize": mcap_salvage.HEAD.size})
+FRONT_TYPE = np.dtype(
+    {
+        "names": ["length", "channel", "sequence", "log_time", "publish_time"],
+        "formats": ["<u8", "<u2", "<u4", "<u8", "<u8"],
+        "offsets": [1, 9, 11, 15, 23],
+        "itemsize": FRONT,
+    }
+)
+HEAD_TYPE = np.dtype(
+    {
+        "names": ["opcode", "length"],
+        "formats": ["u1", "<u8"],
+        "offsets": [0, 1],
+        "itemsize": mcap_salvage.HEAD.size,
+    }
+)
 PATIENCE, MAX_PATIENCE = 3, 1024
 """Messages after which repeating lengths are searched for; grows if there are none."""
 MAX_PERIOD = 64
@@ -86,25 +96,38 @@ class MessageBlock:
         long = np.flatnonzero(payloads.length >= len(mcap_salvage.ZSTD))
         if not len(long):
             return long
-        first = np.ndarray((len(payloads.data) - len(mcap_salvage.ZSTD) + 1,), "V4", payloads.data,
-                           strides=(1,))[payloads.start[long]].view("<u4")
+        first = np.ndarray(
+            (len(payloads.data) - len(mcap_salvage.ZSTD) + 1,), "V4", payloads.data, strides=(1,)
+        )[payloads.start[long]].view("<u4")
         return long[first == int.from_bytes(mcap_salvage.ZSTD, "little")]
 
     def messages(self) -> Iterator[Message]:
         """Yield each message separately."""
-        columns = (self.fronts[name].tolist() for name in ("channel", "sequence", "log_time",
-                                                           "publish_time"))
-        for channel, sequence, log_time, publish_time, data in zip(*columns, self.payloads,
-                                                                   strict=True):
-            yield Message(channel_id=channel, sequence=sequence, log_time=log_time,
-                          publish_time=publish_time, data=data)
+        columns = (
+            self.fronts[name].tolist()
+            for name in ("channel", "sequence", "log_time", "publish_time")
+        )
+        for channel, sequence, log_time, publish_time, data in zip(
+            *columns, self.payloads, strict=True
+        ):
+            yield Message(
+                channel_id=channel,
+                sequence=sequence,
+                log_time=log_time,
+                publish_time=publish_time,
+                data=data,
+            )
 
 
 def block_of(messages: list[Message]) -> MessageBlock:
     """Return single messages as one block."""
     fronts = np.zeros(len(messages), dtype=FRONT_TYPE)
-    for name, attribute in (("channel", "channel_id"), ("sequence", "sequence"),
-                            ("log_time", "log_time"), ("publish_time", "publish_time")):
+    for name, attribute in (
+        ("channel", "channel_id"),
+        ("sequence", "sequence"),
+        ("log_time", "log_time"),
+        ("publish_time", "publish_time"),
+    ):
         fronts[name] = [getattr(message, attribute) for message in messages]
     return MessageBlock(fronts, Payloads.joined([message.data for message in messages]))
 
@@ -117,7 +140,8 @@ def message_block(data: bytes, at: int) -> tuple[MessageBlock, int]:
     if not len(start):
         return MessageBlock(np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)), end
     fronts = np.ndarray((len(data) - FRONT + 1,), f"V{FRONT}", data, strides=(1,))[start].view(
-        FRONT_TYPE)
+        FRONT_TYPE
+    )
     length = fronts["length"].astype(np.int64) - mcap_salvage.MESSAGE_FRONT
     return MessageBlock(fronts, Payloads(data, start + FRONT, length)), end
 
@@ -173,10 +197,12 @@ class _Places:
             count = min(look, possible - found)
             good = np.ones(count, dtype=bool)
             for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
-                heads = np.ndarray((count,), HEAD_TYPE, self.data, at + found * stride + offset,
-                                   (stride,))
-                good &= (heads["opcode"] == Opcode.MESSAGE) & (heads["length"]
-                                                               == size - mcap_salvage.HEAD.size)
+                heads = np.ndarray(
+                    (count,), HEAD_TYPE, self.data, at + found * stride + offset, (stride,)
+                )
+                good &= (heads["opcode"] == Opcode.MESSAGE) & (
+                    heads["length"] == size - mcap_salvage.HEAD.size
+                )
             step = count if good.all() else int(good.argmin())
             found += step
             if step < count:
@@ -219,8 +245,11 @@ def chunk_items(chunk: Chunk) -> list[MessageBlock | Schema | Channel]:
         return _items(data)
     except Exception:  # left to the library's reader
         chunk.data, chunk.compression = data, ""
-        return [item for item in gathered(breakup_chunk(chunk))
-                if isinstance(item, MessageBlock | Schema | Channel)]
+        return [
+            item
+            for item in gathered(breakup_chunk(chunk))
+            if isinstance(item, MessageBlock | Schema | Channel)
+        ]
 
 
 def _items(data: bytes) -> list[MessageBlock | Schema | Channel]:
@@ -274,14 +303,19 @@ class Summary:
         used = {number for chunk in self.chunks for number in chunk.message_index_offsets}
         declared = {0, *self.schemas}
         return used <= self.channels.keys() and all(
-            channel.schema_id in declared for channel in self.channels.values())
+            channel.schema_id in declared for channel in self.channels.values()
+        )
 
     def needless(self, wanted: Callable[[str], bool]) -> dict[int, int]:
         """Return start -> end of the chunks with messages, but of no required topic."""
-        return {chunk.chunk_start_offset: chunk.chunk_start_offset + chunk.chunk_length
-                for chunk in self.chunks if chunk.message_index_offsets
-                and not any(wanted(self.channels[number].topic)
-                            for number in chunk.message_index_offsets)}
+        return {
+            chunk.chunk_start_offset: chunk.chunk_start_offset + chunk.chunk_length
+            for chunk in self.chunks
+            if chunk.message_index_offsets
+            and not any(
+                wanted(self.channels[number].topic) for number in chunk.message_index_offsets
+            )
+        }
 
 
 def read_summary(file: BinaryIO) -> Summary:
@@ -311,7 +345,7 @@ def _content(file: BinaryIO) -> bytes:
         raise ValueError("no summary of a sensible size")
     file.seek(start)
     summary = file.read(size - END.size - start)
-    if zlib.crc32(tail[:END.size - len(MAGIC) - 4], zlib.crc32(summary)) != crc:
+    if zlib.crc32(tail[: END.size - len(MAGIC) - 4], zlib.crc32(summary)) != crc:
         raise ValueError("the summary is damaged")
     return summary
 
@@ -321,7 +355,7 @@ def _parsed(content: bytes) -> Summary:
     while at < len(content):
         opcode, length = mcap_salvage.HEAD.unpack_from(content, at)
         at += mcap_salvage.HEAD.size
-        body = ReadDataStream(io.BytesIO(content[at:at + length]))
+        body = ReadDataStream(io.BytesIO(content[at : at + length]))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(body)
             summary.schemas[schema.id] = schema

@@ -43,16 +43,22 @@ ZSTD_HEAD = 18
 MEMORY = Path("/proc/meminfo")
 HEAD = struct.Struct("<BQ")
 """Opcode and length of a record."""
-PARSERS = {Opcode.SCHEMA: Schema.read, Opcode.CHANNEL: Channel.read, Opcode.CHUNK: Chunk.read,
-           Opcode.STATISTICS: Statistics.read}
+PARSERS = {
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.STATISTICS: Statistics.read,
+}
 CHUNK_FRONT = 49
 """Bytes of a chunk record before its records, without the name of the compression."""
 FOOTER_CONTENT = 28
 """Bytes from the footer's offset of the summary to the end of a file."""
 MESSAGE_FRONT = 22
 """Bytes of a message before its payload."""
-CHUNK_LOOKS = (rb"\x06(?s:.{36})(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
-               rb"|\x0f\x04\0\0\0\0\0\0\0(?s:.{4})[\x01-\x0e]")
+CHUNK_LOOKS = (
+    rb"\x06(?s:.{36})(?:\x04\0\0\0zstd|\x03\0\0\0lz4|\0\0\0\0)"
+    rb"|\x0f\x04\0\0\0\0\0\0\0(?s:.{4})[\x01-\x0e]"
+)
 """The start of a chunk, or the end of the data section followed by another record."""
 SLICE = 4096
 """Bytes decompressed at once if the end is missing."""
@@ -93,9 +99,11 @@ def check_size(size: int, compressed: int, declared: int | None = None) -> None:
 def refuse_beyond(limit: int, size: int) -> None:
     """Raise TooLargeError if `size` bytes are more than `limit`."""
     if size > limit:
-        raise TooLargeError(f"it would decompress to {size / BYTES_PER_MB:,.0f} MB, more than "
-                            f"the {limit / BYTES_PER_MB:,.0f} MB that its size, the file and the "
-                            "memory allow")
+        raise TooLargeError(
+            f"it would decompress to {size / BYTES_PER_MB:,.0f} MB, more than "
+            f"the {limit / BYTES_PER_MB:,.0f} MB that its size, the file and the "
+            "memory allow"
+        )
 
 
 def zstd_chunk(data: bytes, declared: int) -> bytes:
@@ -129,7 +137,7 @@ def lz4_chunk(data: bytes, declared: int) -> bytes:
     check_size(lz4.frame.get_frame_info(data)["content_size"], len(data), declared)
     decoder, out, size = lz4.frame.LZ4FrameDecompressor(), [], 0
     for start in range(0, len(data), BLOCK):  # a block expands by at most 255
-        out.append(decoder.decompress(data[start:start + BLOCK]))
+        out.append(decoder.decompress(data[start : start + BLOCK]))
         size += len(out[-1])
         check_size(size, len(data), declared)
         if decoder.eof:
@@ -169,14 +177,18 @@ def plain_file(path: Path, lost: list[str]) -> Iterator[BinaryIO]:
             try:
                 _copy(file, plain)
             except TooLargeError as error:
-                raise InputError(str(path), str(error),
-                                 "if it is a bag, decompress it with zstd -d") from error
+                raise InputError(
+                    str(path), str(error), "if it is a bag, decompress it with zstd -d"
+                ) from error
             except zstandard.ZstdError as error:
-                lost.append(f"the compression of the file is damaged "
-                            f"({first_line(error)}): what follows is lost")
+                lost.append(
+                    f"the compression of the file is damaged "
+                    f"({first_line(error)}): what follows is lost"
+                )
             if not plain.tell():
-                raise InputError(str(path), "no part of the compressed file can be read",
-                                 "record the bag again")
+                raise InputError(
+                    str(path), "no part of the compressed file can be read", "record the bag again"
+                )
             plain.seek(0)
             yield plain
 
@@ -218,21 +230,24 @@ def chunk_length(data: bytes | mmap, at: int) -> int:
 
     More than available if `data` ends before them.
     """
-    name_length = int.from_bytes(data[at + 28:at + 32], "little")
-    inside = int.from_bytes(data[at + 32 + name_length:at + 40 + name_length], "little")
+    name_length = int.from_bytes(data[at + 28 : at + 32], "little")
+    inside = int.from_bytes(data[at + 32 + name_length : at + 40 + name_length], "little")
     return CHUNK_FRONT - HEAD.size + name_length + inside
 
 
 def declarations(data: mmap) -> Iterator[Schema | Channel]:
     """Yield the schemas and channels repeated in the summary; nothing without a summary."""
-    at = struct.unpack_from("<Q", data, len(data) - FOOTER_CONTENT)[0] if len(
-        data) >= FOOTER_CONTENT else 0
+    at = (
+        struct.unpack_from("<Q", data, len(data) - FOOTER_CONTENT)[0]
+        if len(data) >= FOOTER_CONTENT
+        else 0
+    )
     while 0 < at <= len(data) - HEAD.size:
         opcode, length = HEAD.unpack_from(data, at)
         at += HEAD.size
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             try:
-                record, _ = parsed(opcode, data[at:at + length])
+                record, _ = parsed(opcode, data[at : at + length])
             except Exception:  # no summary, or a damaged one
                 return
             if isinstance(record, Schema | Channel):
@@ -264,8 +279,9 @@ def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int
         if opcode == Opcode.CHUNK:
             fits = length == chunk_length(data, at + HEAD.size)
         else:
-            fits = (struct.unpack_from("<H", data, at + HEAD.size)[0] in (channels or ())
-                    and (end == len(data) or data[end] in (Opcode.MESSAGE, Opcode.DATA_END)))
+            fits = struct.unpack_from("<H", data, at + HEAD.size)[0] in (channels or ()) and (
+                end == len(data) or data[end] in (Opcode.MESSAGE, Opcode.DATA_END)
+            )
         if fits:
             return at
     return len(data)
@@ -280,9 +296,9 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
         return
     size, crc, name_length = struct.unpack_from("<QII", data, 25)
     begin = CHUNK_FRONT + name_length
-    inside = int.from_bytes(data[begin - 8:begin], "little")
-    name = data[41:41 + name_length].decode(errors="replace")
-    body = _decompressed_front(name, data[begin:begin + inside], size)
+    inside = int.from_bytes(data[begin - 8 : begin], "little")
+    name = data[41 : 41 + name_length].decode(errors="replace")
+    body = _decompressed_front(name, data[begin : begin + inside], size)
     if crc and len(body) >= size and zlib.crc32(body[:size]) != crc:
         return
     at = 0
@@ -292,7 +308,7 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
         if at + length > len(body):
             return
         try:
-            record, _ = parsed(opcode, body[at:at + length])
+            record, _ = parsed(opcode, body[at : at + length])
         except Exception:  # a damaged chunk, not only truncated: the rest cannot be trusted
             return
         if record is not None:
@@ -317,7 +333,7 @@ def _decompressed_front(compression: str, data: bytes, declared: int) -> bytes:
         else:
             return data
         for at in range(0, len(data), SLICE):
-            out += decoder.decompress(data[at:at + SLICE])
+            out += decoder.decompress(data[at : at + SLICE])
             if len(out) > limit:
                 return b""
     except (zstandard.ZstdError, RuntimeError, EOFError):

@@ -24,15 +24,23 @@ from selfcal_ros.bagio import mcap_chunk, mcap_salvage
 from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.messages.cdr import Payloads
 
-CHECKED = (Opcode.HEADER, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.MESSAGE, Opcode.SCHEMA,
-           Opcode.CHANNEL)
+CHECKED = (
+    Opcode.HEADER,
+    Opcode.CHUNK,
+    Opcode.MESSAGE_INDEX,
+    Opcode.MESSAGE,
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+)
 """Records whose declared length is validated before skipping, as it may be too large."""
 INDEX = struct.Struct("<HI")
 """Channel and bytes of the entries of a message index."""
 INDEX_ENTRY = 16
 SQLITE = b"SQLite format 3"
-CONVERT = ("convert it with `ros2 bag convert -i BAG -o OPTIONS.yaml`, where OPTIONS.yaml says "
-           "output_bags: [{uri: NEW, storage_id: mcap, all_topics: true}]")
+CONVERT = (
+    "convert it with `ros2 bag convert -i BAG -o OPTIONS.yaml`, where OPTIONS.yaml says "
+    "output_bags: [{uri: NEW, storage_id: mcap, all_topics: true}]"
+)
 """Remedy for a bag with another storage."""
 
 
@@ -40,8 +48,9 @@ class _Cut(Exception):
     """The file ends within a record."""
 
 
-def streams(files: Iterable[Path], lost: list[str],
-            wanted: Callable[[str], bool] | None = None) -> Iterator["McapStream"]:
+def streams(
+    files: Iterable[Path], lost: list[str], wanted: Callable[[str], bool] | None = None
+) -> Iterator["McapStream"]:
     """Yield a stream for each file, and for each file joined to it (`cat A B`), to be read in turn.
 
     Numbers of schemas and channels are those of one stream.
@@ -119,15 +128,22 @@ class McapStream:
                 else:
                     self._pass_strange(file)
         except OSError as error:
-            raise InputError(str(self.path), f"cannot be read ({error.strerror})",
-                             "name a readable file") from error
-        self.lost += [f"{count} messages of the undeclared channel {number} cannot be read"
-                      for number, count in self._undeclared.items()]
-        self.lost += [f"{count} messages on {topic} were not decompressed: they would become too "
-                      "large" for topic, count in self._too_large.items()]
+            raise InputError(
+                str(self.path), f"cannot be read ({error.strerror})", "name a readable file"
+            ) from error
+        self.lost += [
+            f"{count} messages of the undeclared channel {number} cannot be read"
+            for number, count in self._undeclared.items()
+        ]
+        self.lost += [
+            f"{count} messages on {topic} were not decompressed: they would become too large"
+            for topic, count in self._too_large.items()
+        ]
         if self._n_read < self._n_written:
-            self.lost.append(f"{self._n_written - self._n_read} of {self._n_written} messages of "
-                             "the file are lost")
+            self.lost.append(
+                f"{self._n_written - self._n_read} of {self._n_written} messages of "
+                "the file are lost"
+            )
 
     def _pass_strange(self, file: BinaryIO) -> None:
         """Say what follows a recording and is not MCAP, up to the next one."""
@@ -136,8 +152,10 @@ class McapStream:
         end = self._size
         if joint >= 0:
             end = self.rest = joint
-        self.lost.append(f"{end - self.begin} bytes after the end of the recording are not MCAP "
-                         "and were not used")
+        self.lost.append(
+            f"{end - self.begin} bytes after the end of the recording are not MCAP "
+            "and were not used"
+        )
 
     def _refusal(self, head: bytes) -> InputError:
         """Return the problem of a file that is not MCAP, by its first bytes."""
@@ -145,8 +163,9 @@ class McapStream:
             return InputError(str(self.path), "the file is empty", "record the bag again")
         if head.startswith(SQLITE):
             return InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
-        return InputError(str(self.path), "not an MCAP file",
-                          "give an .mcap file or a rosbag2 folder")
+        return InputError(
+            str(self.path), "not an MCAP file", "give an .mcap file or a rosbag2 folder"
+        )
 
     def _look_ahead(self, file: BinaryIO) -> None:
         """Determine the chunks that can be skipped; their declarations are also in the summary."""
@@ -221,8 +240,12 @@ class McapStream:
             self._size = self.rest = joint
         return self._size
 
-    def _chunk(self, file: BinaryIO, chunk: Chunk, place: tuple[int, int],
-               ) -> Iterator[mcap_chunk.MessageBlock]:
+    def _chunk(
+        self,
+        file: BinaryIO,
+        chunk: Chunk,
+        place: tuple[int, int],
+    ) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield the messages of a chunk between two bytes of the file."""
         start, position = place
         try:
@@ -236,15 +259,18 @@ class McapStream:
             if self.rest is not None:
                 yield from self._salvage(file, start, _Cut())
                 return
-            self.lost.append(f"the chunk that ends at byte {position} is damaged "
-                             f"({first_line(error)[:80]}): its messages are lost")
+            self.lost.append(
+                f"the chunk that ends at byte {position} is damaged "
+                f"({first_line(error)[:80]}): its messages are lost"
+            )
             self._declare(file)
             return
         for item in items:
             yield from self._take(item)
 
-    def _take(self, item: McapRecord | mcap_chunk.MessageBlock
-              ) -> Iterator[mcap_chunk.MessageBlock]:
+    def _take(
+        self, item: McapRecord | mcap_chunk.MessageBlock
+    ) -> Iterator[mcap_chunk.MessageBlock]:
         if isinstance(item, Schema):
             self.schemas[item.id] = item
         elif isinstance(item, Channel):
@@ -273,8 +299,11 @@ class McapStream:
 
         A payload that cannot be decompressed is unchanged: decoding it will fail, too.
         """
-        packed = [number for number in block.compressed().tolist()
-                  if self.channels[int(block.fronts["channel"][number])].message_encoding == "cdr"]
+        packed = [
+            number
+            for number in block.compressed().tolist()
+            if self.channels[int(block.fronts["channel"][number])].message_encoding == "cdr"
+        ]
         if not packed:
             return block
         keep = np.ones(len(block), dtype=bool)
@@ -292,17 +321,23 @@ class McapStream:
 
     def _say_end(self, file: BinaryIO, data_ended: bool) -> None:
         self.lost.append(
-            self._grown(file) or (
+            self._grown(file)
+            or (
                 "the end of the file is damaged, after the last message: no message is lost"
-                if data_ended else "the file ends without its footer, as when a recorder is "
-                "killed: every message that was written is read"))
+                if data_ended
+                else "the file ends without its footer, as when a recorder is "
+                "killed: every message that was written is read"
+            )
+        )
 
     def _grown(self, file: BinaryIO) -> str:
         """Return a note if a file has grown since it was opened, else ""."""
         if file.seek(0, 2) == self._size or self.rest is not None:
             return ""
-        return (f"the file is still being written: the messages in its first {self._size} bytes "
-                "are read")
+        return (
+            f"the file is still being written: the messages in its first {self._size} bytes "
+            "are read"
+        )
 
     def _found(self, file: BinaryIO, start: int) -> int:
         """Return where reading can continue after `start`."""
@@ -318,8 +353,9 @@ class McapStream:
                 else:
                     self.channels.setdefault(record.id, record)
 
-    def _salvage(self, file: BinaryIO, start: int,
-                 error: Exception) -> Iterator[mcap_chunk.MessageBlock]:
+    def _salvage(
+        self, file: BinaryIO, start: int, error: Exception
+    ) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield the readable part of the record at `start`, and report the rest."""
         stop, size = self._found(file, start), self._size
         file.seek(start)
@@ -331,16 +367,20 @@ class McapStream:
                 yield block
         self._declare(file)
         if stop < size:
-            self.lost.append(f"the file is damaged from byte {start} to {stop}: {count} messages "
-                             "there were recovered, the rest there is lost")
+            self.lost.append(
+                f"the file is damaged from byte {start} to {stop}: {count} messages "
+                "there were recovered, the rest there is lost"
+            )
             return
         grown = self._grown(file) if isinstance(error, _Cut) else ""
         if grown:
             self.lost.append(grown)
             return
         reason = "truncated" if isinstance(error, _Cut) else f"damaged ({first_line(error)})"
-        self.lost.append(f"the file is {reason} after byte {start} of {size}: {count} messages "
-                         "of the last chunk were recovered, the rest is lost")
+        self.lost.append(
+            f"the file is {reason} after byte {start} of {size}: {count} messages "
+            "of the last chunk were recovered, the rest is lost"
+        )
 
 
 def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:

@@ -31,9 +31,11 @@ from selfcal_ros.topics import (
     INPUT_TOPICS,
 )
 
-FROM_THE_FUTURE = {ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
-                   DETECTION_TOPIC: ("detection", Reason.FUTURE),
-                   COMMAND_TOPIC: ("command", Reason.COMMAND_FUTURE)}
+FROM_THE_FUTURE = {
+    ENCODER_TOPIC: ("encoder", Reason.ENCODER_FUTURE),
+    DETECTION_TOPIC: ("detection", Reason.FUTURE),
+    COMMAND_TOPIC: ("command", Reason.COMMAND_FUTURE),
+}
 """Reasons of messages stamped ahead of their reception."""
 MAX_SAID = 3
 """Number of lines on losses repeated in an error."""
@@ -63,8 +65,13 @@ class BagSession(NamedTuple):
     findings: list[str]
 
 
-def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str | None = None,
-                progress: Callable[[int], None] = lambda count: None) -> BagSession:
+def collect_bag(
+    path: str | Path,
+    settings: CollectorSettings,
+    *,
+    namespace: str | None = None,
+    progress: Callable[[int], None] = lambda count: None,
+) -> BagSession:
     """Return the readings in a bag, the progress of each view, and its problems.
 
     Parameters
@@ -91,39 +98,63 @@ def collect_bag(path: str | Path, settings: CollectorSettings, *, namespace: str
     received = collector.received
     cell = None if namespace is None else namespace.strip("/")
     if cell is not None and reader.cells and cell not in reader.cells:
-        raise NoDataError(str(path), f"no topics of the cell '/{cell}'", "choose one of "
-                          + ", ".join(f"/{name}" for name in sorted(reader.cells)))
+        raise NoDataError(
+            str(path),
+            f"no topics of the cell '/{cell}'",
+            "choose one of " + ", ".join(f"/{name}" for name in sorted(reader.cells)),
+        )
     tail = f" ({'; '.join(dict.fromkeys(reader.lost[-MAX_SAID:]))})" if reader.lost else ""
-    for kind, topic in (("command", COMMAND_TOPIC), ("detection", DETECTION_TOPIC),
-                        ("encoder", ENCODER_TOPIC)):
+    for kind, topic in (
+        ("command", COMMAND_TOPIC),
+        ("detection", DETECTION_TOPIC),
+        ("encoder", ENCODER_TOPIC),
+    ):
         if not received[kind]:
             remedy = f"{topics_like(topic, reader.topics)}record this topic too, see the README"
             if kind == "detection" and any(
-                    name.endswith(("/Image", "/CompressedImage"))
-                    for name in reader.topics.values()):
-                remedy = (f"it has images: find the marks in them with `selfcal detect {path} -o "
-                          "MARKS`, then solve MARKS")
+                name.endswith(("/Image", "/CompressedImage")) for name in reader.topics.values()
+            ):
+                remedy = (
+                    f"it has images: find the marks in them with `selfcal detect {path} -o "
+                    "MARKS`, then solve MARKS"
+                )
             raise NoDataError(str(path), f"no message on {topic}{tail}", remedy)
     if collector.timeline.artifact is None:
-        raise NoDataError(str(path), "no MEASURE command" + (
-            f" that can be used{tail}" if collector.unusable.get(Reason.COMMAND_BAD) else ""),
-                          "readings cannot be assigned to views without one")
+        raise NoDataError(
+            str(path),
+            "no MEASURE command"
+            + (f" that can be used{tail}" if collector.unusable.get(Reason.COMMAND_BAD) else ""),
+            "readings cannot be assigned to views without one",
+        )
     measurements, views = collector.collect()
     clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
-    findings = [(f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
-                for index, finding in collector.findings(measurements, views).items()]
+    findings = [
+        (f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
+        for index, finding in collector.findings(measurements, views).items()
+    ]
     findings = [*collector.missing_commands(), *findings]
     if not any(view.used for view in measurements.views):
-        reasons = ", ".join(f"{reason} {count}" for reason, count in
-                            sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[:4])
-        raise NoDataError(str(path), f"none of {received['detection']} detections became a "
-                          f"reading (rejected: {reasons}){tail}",
-                          [*clock, *findings, "correct the first cause named"][0])
+        reasons = ", ".join(
+            f"{reason} {count}"
+            for reason, count in sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[
+                :4
+            ]
+        )
+        raise NoDataError(
+            str(path),
+            f"none of {received['detection']} detections became a "
+            f"reading (rejected: {reasons}){tail}",
+            [*clock, *findings, "correct the first cause named"][0],
+        )
     return BagSession(measurements, views, [*reader.lost, *clock], [*clock, *findings])
 
 
-def _fed(reader: BagReader, settings: CollectorSettings, roles: Collection[str],
-         progress: Callable[[int], None] = lambda count: None) -> tuple[BagReader, Collector]:
+def _fed(
+    reader: BagReader,
+    settings: CollectorSettings,
+    roles: Collection[str],
+    progress: Callable[[int], None] = lambda count: None,
+) -> tuple[BagReader, Collector]:
     """Return the reader of a bag, and a collector that has taken these topics from it."""
     collector = Collector(settings)
     take = block_handlers(collector, reader.lost)
@@ -165,8 +196,9 @@ class BagLines(NamedTuple):
         return [*self.lost, *self.clock, *self.missing]
 
 
-def bag_lines(path: str | Path, settings: CollectorSettings,
-              namespace: str | None = None) -> BagLines:
+def bag_lines(
+    path: str | Path, settings: CollectorSettings, namespace: str | None = None
+) -> BagLines:
     """Return the problems of a bag, like `collect_bag`."""
     reader = BagReader(Path(path), namespace, settings.clock_limit)
     reader, collector = _fed(reader, settings, [COMMAND_TOPIC, DETECTION_TOPIC])
@@ -179,8 +211,11 @@ def topics_like(topic: str, topics: dict[str, str]) -> str:
 
     The text can be followed by another remedy; it is empty if there is no such topic.
     """
-    others = {name: kind for name, kind in topics.items()
-              if not any(f"/{name}".endswith(f"/{role}") for role in INPUT_TOPICS)}
+    others = {
+        name: kind
+        for name, kind in topics.items()
+        if not any(f"/{name}".endswith(f"/{role}") for role in INPUT_TOPICS)
+    }
     same = sorted(name for name, kind in others.items() if kind == INPUT_TOPICS[topic])
     if same:
         return f"is it {' or '.join(same[:MAX_SAID])}? then remap it to {topic}, or "
@@ -188,12 +223,12 @@ def topics_like(topic: str, topics: dict[str, str]) -> str:
     return f"{hint} then remap it, or " if hint else ""
 
 
-def block_handlers(collector: Collector,
-                   complaints: list[str]) -> dict[str, Callable[[Any], None]]:
+def block_handlers(collector: Collector, complaints: list[str]) -> dict[str, Callable[[Any], None]]:
     """Return topic -> handler that passes the output of `BagReader.columns` to the collector.
 
     An unusable command is not fatal: it is counted, and reported in `complaints`.
     """
+
     def take_command(message: Any) -> None:
         try:
             collector.add_command(to_model.command(message))
@@ -202,11 +237,13 @@ def block_handlers(collector: Collector,
             complaints.append(f"a view command was not used: {error}")
 
     def take_encoder(block: EncoderBlock) -> None:
-        collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
-                                    block.velocities)
+        collector.add_encoder_block(block.stamps_ns, block.names, block.positions, block.velocities)
 
-    return {ENCODER_TOPIC: take_encoder, DETECTION_TOPIC: collector.add_detection_block,
-            COMMAND_TOPIC: take_command}
+    return {
+        ENCODER_TOPIC: take_encoder,
+        DETECTION_TOPIC: collector.add_detection_block,
+        COMMAND_TOPIC: take_command,
+    }
 
 
 def bag_input(path: str | Path) -> dict[str, str]:
@@ -255,17 +292,20 @@ class Playlist:
             reader = self._reader()
             times, topics = _times_and_topics(reader.cdr_messages())
         self.lost = [*reader.lost, *reader.future_lines()]
-        self._has_images = self._shows_images(reader, DETECTION_TOPIC in {
-            TOPICS[number] for number in set(topics)})
+        self._has_images = self._shows_images(
+            reader, DETECTION_TOPIC in {TOPICS[number] for number in set(topics)}
+        )
         if self._has_images:
             images = ImageBag(bag, namespace)
             times, topics = _times_and_topics(self._messages(images))
-            self.lost += [f"{count} {line}" for line, count in images.lost.items()
-                          if line not in reader.lost]
+            self.lost += [
+                f"{count} {line}" for line, count in images.lost.items() if line not in reader.lost
+            ]
         self._times = np.array(times, dtype=np.uint64)
         numbers, counts = np.unique(np.array(topics, dtype=np.uint8), return_counts=True)
-        self.counts = {TOPICS[number]: int(count)
-                       for number, count in zip(numbers, counts, strict=True)}
+        self.counts = {
+            TOPICS[number]: int(count) for number, count in zip(numbers, counts, strict=True)
+        }
         sorted_already = bool((self._times[1:] >= self._times[:-1]).all())
         order = None if sorted_already else np.argsort(self._times, kind="stable")
         self._times = self._times if order is None else self._times[order]
@@ -277,17 +317,23 @@ class Playlist:
     @property
     def transport(self) -> str:
         """The transport of the images that take the place of detections, "" without."""
-        return next((transport for transport, topic in IMAGE_TOPICS.items()
-                     if topic in self.counts), "")
+        return next(
+            (transport for transport, topic in IMAGE_TOPICS.items() if topic in self.counts), ""
+        )
 
     def _shows_images(self, reader: BagReader, has_detections: bool) -> bool:
         """Return whether images are played; say of others that they are not."""
-        images = [topic for topic in reader.topics
-                  if f"/{topic}".endswith(tuple(f"/{role}" for role in IMAGE_TOPICS.values()))]
+        images = [
+            topic
+            for topic in reader.topics
+            if f"/{topic}".endswith(tuple(f"/{role}" for role in IMAGE_TOPICS.values()))
+        ]
         if not images or not has_detections:
             return bool(images)
-        self.lost.append(f"images on {', '.join(images)} are not played: "
-                         f"selfcal detect {self._bag} -o FOUND_BAG makes detections of them")
+        self.lost.append(
+            f"images on {', '.join(images)} are not played: "
+            f"selfcal detect {self._bag} -o FOUND_BAG makes detections of them"
+        )
         return False
 
     def _messages(self, images: ImageBag | None = None) -> Iterable[tuple[str, int, bytes]]:

@@ -88,38 +88,51 @@ class BagReader:
         except (FileNotFoundError, NotADirectoryError) as error:
             raise InputError(str(self.path), "no such file or folder", "check the path") from error
         except OSError as error:
-            raise InputError(str(self.path), f"cannot be read ({error.strerror})",
-                             "name a readable file or folder") from error
+            raise InputError(
+                str(self.path),
+                f"cannot be read ({error.strerror})",
+                "name a readable file or folder",
+            ) from error
 
     def _files(self) -> list[Path]:
         if self.path.is_file():
             return [self.path]
         if not self.path.is_dir():
-            raise InputError(str(self.path), "neither a file nor a folder",
-                             "give an MCAP file or a rosbag2 folder")
+            raise InputError(
+                str(self.path),
+                "neither a file nor a folder",
+                "give an MCAP file or a rosbag2 folder",
+            )
         there = {p.name for p in self.path.iterdir() if p.name.endswith(SUFFIXES) and p.is_file()}
-        found = sorted((name for name in there
-                        if name.removesuffix(".zstd") not in there - {name}), key=_natural)
+        found = sorted(
+            (name for name in there if name.removesuffix(".zstd") not in there - {name}),
+            key=_natural,
+        )
         listed = self._listed()
         names = listed if there.intersection(listed) else found  # the files may have been renamed
         instead = ", ".join(name for name in names if name not in listed)
         for name in listed:
             if name not in there:
-                self.lost.append(f"the file {name}, which metadata.yaml lists, is missing"
-                                 + (f"; {instead} was read" if instead else ""))
+                self.lost.append(
+                    f"the file {name}, which metadata.yaml lists, is missing"
+                    + (f"; {instead} was read" if instead else "")
+                )
         plain = {name.removesuffix(".zstd") for name in names}
         for name in found:
             if name.removesuffix(".zstd") not in plain:
-                self.lost.append(f"the file {name}, which metadata.yaml does not list, was not "
-                                 "used")
+                self.lost.append(
+                    f"the file {name}, which metadata.yaml does not list, was not used"
+                )
         files = [self.path / name for name in names if name in there]
         if not files and any(p.suffix == ".db3" for p in self.path.iterdir()):
             raise InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
         if not files:
             missing = f"; {', '.join(listed)}, which metadata.yaml lists, is missing"
-            raise InputError(str(self.path), "no .mcap file in this folder"
-                             + missing * bool(listed),
-                             "give an MCAP file or a rosbag2 folder with MCAP storage")
+            raise InputError(
+                str(self.path),
+                "no .mcap file in this folder" + missing * bool(listed),
+                "give an MCAP file or a rosbag2 folder with MCAP storage",
+            )
         return files
 
     def _listed(self) -> list[str]:
@@ -147,9 +160,11 @@ class BagReader:
         """Return a line, after reading, if messages were stamped ahead of their log time."""
         if self.leave_ahead or not self.ahead:
             return future_lines(self.ahead)
-        return [f"{COMMAND_TOPIC}: stamped more than {MAX_AHEAD_NS // NS_PER_S} s ahead of its "
-                "log time: a live collector refuses it; set the clock that stamps, or the "
-                "recorder's"]
+        return [
+            f"{COMMAND_TOPIC}: stamped more than {MAX_AHEAD_NS // NS_PER_S} s ahead of its "
+            "log time: a live collector refuses it; set the clock that stamps, or the "
+            "recorder's"
+        ]
 
     def cdr_messages(self) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, log time in ns, CDR bytes) of the three input topics.
@@ -165,8 +180,11 @@ class BagReader:
         """
         bad: Counter = Counter()
         for block, parts in self._blocks(bad):
-            found = [(number, decoder.role, data) for decoder, index in parts
-                     for number, data in decoder.own_bytes(block.payloads[index], index)]
+            found = [
+                (number, decoder.role, data)
+                for decoder, index in parts
+                for number, data in decoder.own_bytes(block.payloads[index], index)
+            ]
             stamps = block.fronts["log_time"].tolist()
             for number, role, data in sorted(found, key=lambda item: item[0]):
                 yield role, stamps[number], data
@@ -209,8 +227,10 @@ class BagReader:
         if len(refused) == len(self.files):
             raise refused[0]
 
-    def _blocks(self, bad: Counter,
-                ) -> Iterator[tuple[MessageBlock, list[tuple[ChannelDecoder, np.ndarray]]]]:
+    def _blocks(
+        self,
+        bad: Counter,
+    ) -> Iterator[tuple[MessageBlock, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
         watches = self._watches()
         decoders: dict[tuple[Path, int, int], ChannelDecoder | None] = {}
@@ -223,8 +243,16 @@ class BagReader:
                     decoders[key] = self._decoder(stream, stream.channels[number], bad)
                 decoder = decoders[key]
                 if decoder is not None:
-                    parts.append((decoder, self._in_time(decoder.role, block, np.flatnonzero(
-                        block.fronts["channel"] == number))))
+                    parts.append(
+                        (
+                            decoder,
+                            self._in_time(
+                                decoder.role,
+                                block,
+                                np.flatnonzero(block.fronts["channel"] == number),
+                            ),
+                        )
+                    )
             used = [index for _, index in parts if len(index)]
             if used:
                 logged_ns = block.fronts["log_time"][np.concatenate(used)]
@@ -236,8 +264,9 @@ class BagReader:
                 latest_ns = max(latest_ns, int(logged_ns.max()))
             for decoder, index in parts:
                 if decoder.role in watches:
-                    self._note_steps(watches[decoder.role], decoder.role, block[
-                        index[::_stride(index)]])
+                    self._note_steps(
+                        watches[decoder.role], decoder.role, block[index[:: _stride(index)]]
+                    )
             yield block, parts
 
     def _watches(self) -> dict[str, StepWatch]:
@@ -246,7 +275,7 @@ class BagReader:
     def _in_time(self, role: str, block: MessageBlock, index: np.ndarray) -> np.ndarray:
         """Count messages stamped ahead of their log time; return the indices to be read."""
         self._n_commands += len(index) * (role == COMMAND_TOPIC)
-        if role == ENCODER_TOPIC and not _ahead(block, index[::_stride(index)]).any():
+        if role == ENCODER_TOPIC and not _ahead(block, index[:: _stride(index)]).any():
             return index
         ahead = _ahead(block, index)
         if not ahead.any():
@@ -260,11 +289,12 @@ class BagReader:
         self.steps.setdefault(role, []).extend(found)
 
     def _say(self, bad: Counter) -> None:
-        self.lost += [f"{count} messages on {role} could not be decoded{why}"
-                      for (role, why), count in bad.items()]
+        self.lost += [
+            f"{count} messages on {role} could not be decoded{why}"
+            for (role, why), count in bad.items()
+        ]
 
-    def _decoder(self, stream: McapStream, channel: Channel,
-                 bad: Counter) -> ChannelDecoder | None:
+    def _decoder(self, stream: McapStream, channel: Channel, bad: Counter) -> ChannelDecoder | None:
         """Return the decoder of a channel, None for another topic."""
         role = self._role(channel.topic)
         if role is None:
@@ -273,20 +303,30 @@ class BagReader:
         schema = stream.schemas.get(channel.schema_id)
         name = schema.name if schema else INPUT_TOPICS[role]
         if channel.message_encoding != "cdr":
-            raise InputError(where, f"message encoding '{channel.message_encoding}' instead of "
-                             "cdr", "convert the bag to ROS 2, e.g. with rosbags-convert")
+            raise InputError(
+                where,
+                f"message encoding '{channel.message_encoding}' instead of cdr",
+                "convert the bag to ROS 2, e.g. with rosbags-convert",
+            )
         if name != INPUT_TOPICS[role]:
-            raise InputError(where, f"type {name} instead of {INPUT_TOPICS[role]}",
-                             "remap the topic or record the right one")
+            raise InputError(
+                where,
+                f"type {name} instead of {INPUT_TOPICS[role]}",
+                "remap the topic or record the right one",
+            )
         text = schema.data.decode(errors="replace") if schema else ""
         store = store_of_schema(name, schema.encoding if schema else "ros2msg", text, where)
         if not text.strip():
-            return ChannelDecoder(role, name, (store, *shorter_stores(name, LAST_FIELDS[role])),
-                                  bad, told=False)
+            return ChannelDecoder(
+                role, name, (store, *shorter_stores(name, LAST_FIELDS[role])), bad, told=False
+            )
         other = other_field(store, name, LAST_FIELDS[role])
         if other:
-            raise InputError(where, f"another version of {name}: {other}",
-                             "record the bag with the messages of this version")
+            raise InputError(
+                where,
+                f"another version of {name}: {other}",
+                "record the bag with the messages of this version",
+            )
         return ChannelDecoder(role, name, (store,), bad, told=True)
 
     def _role(self, topic: str) -> str | None:
@@ -296,9 +336,12 @@ class BagReader:
             if self.namespace is not None:
                 return role if space == self.namespace.strip("/") else None
             if len(self.cells) > 1:
-                raise InputError(str(self.path), "topics of two cells, "
-                                 + " and ".join(f"'/{name}'" for name in sorted(self.cells)),
-                                 "choose one with --namespace")
+                raise InputError(
+                    str(self.path),
+                    "topics of two cells, "
+                    + " and ".join(f"'/{name}'" for name in sorted(self.cells)),
+                    "choose one with --namespace",
+                )
             return role
         return None
 
@@ -306,9 +349,11 @@ class BagReader:
 def overlap(stream: McapStream, by_ns: int) -> str:
     """Say that a recording begins before the end of those that were read before it."""
     where = f" from byte {stream.begin} on" if stream.begin else ""
-    return (f"{stream.path.name}{where} begins {by_ns / NS_PER_S:.3g} s before the end of what was "
-            "read before it: a copy, files in another order than they were recorded in, or a clock "
-            "that stepped back")
+    return (
+        f"{stream.path.name}{where} begins {by_ns / NS_PER_S:.3g} s before the end of what was "
+        "read before it: a copy, files in another order than they were recorded in, or a clock "
+        "that stepped back"
+    )
 
 
 def _stride(index: np.ndarray) -> int:

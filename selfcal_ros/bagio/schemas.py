@@ -38,16 +38,28 @@ COMMON = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
     "std_msgs/msg/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
     "sensor_msgs/msg/JointState": "std_msgs/Header header\nstring[] name\nfloat64[] position\n"
-                                  "float64[] velocity\nfloat64[] effort\n",
+    "float64[] velocity\nfloat64[] effort\n",
 }
 """The common types required by the contract, as in ROS 2 Jazzy. Loading all 180 of rosbags
 would take 0.1 s of CPU in every command and node that reads or writes a bag."""
 
 KEPT = 64
 """Number of schemas with cached typestores; a folder of foreign bags has a handful."""
-NUMBERS = {"bool": "u1", "byte": "u1", "char": "u1", "uint8": "u1", "int8": "i1", "int16": "i2",
-           "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8",
-           "float32": "f4", "float64": "f8"}
+NUMBERS = {
+    "bool": "u1",
+    "byte": "u1",
+    "char": "u1",
+    "uint8": "u1",
+    "int8": "i1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float32": "f4",
+    "float64": "f8",
+}
 """Numpy codes of the basic types."""
 
 
@@ -93,8 +105,9 @@ def definition_of(topic: str, typename: str) -> str:
     """
     store = store_with(typename)
     if typename not in store.fielddefs:
-        raise InputError(f"topic {topic}", f"no definition of {typename}",
-                         "record only topics of known types")
+        raise InputError(
+            f"topic {topic}", f"no definition of {typename}", "record only topics of known types"
+        )
     return store.generate_msgdef(typename, ros_version=2)[0]
 
 
@@ -120,14 +133,18 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
     if not text.strip():
         store = store_with(name)
         if name not in store.fielddefs:
-            raise InputError(where, f"the bag has no definition of {name}",
-                             "record it with message definitions")
+            raise InputError(
+                where, f"the bag has no definition of {name}", "record it with message definitions"
+            )
         return store
     try:
         return _store_of_text(name, encoding, text)
     except Exception as error:
-        raise InputError(where, f"the definition of {name} cannot be read ({first_line(error)})",
-                         "record the bag again") from error
+        raise InputError(
+            where,
+            f"the definition of {name} cannot be read ({first_line(error)})",
+            "record the bag again",
+        ) from error
 
 
 @lru_cache(maxsize=KEPT)
@@ -152,8 +169,10 @@ def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
     constants, fields = typestore().fielddefs[name]
     names = [field for field, _ in fields]
     common = {known: typestore().fielddefs[known] for known in COMMON}
-    return tuple(_store({**common, name: (constants, fields[:count])})
-                 for count in range(len(names) - 1, names.index(last), -1))
+    return tuple(
+        _store({**common, name: (constants, fields[:count])})
+        for count in range(len(names) - 1, names.index(last), -1)
+    )
 
 
 def fields_of(store: Typestore, name: str) -> tuple[Field, ...] | None:
@@ -182,7 +201,8 @@ def same_layout(store: Typestore, name: str) -> bool:
     """Return whether a type has exactly the fields of the known one, in their order."""
     wanted = typestore().fielddefs[name][1]
     return store.fielddefs[name][1] == wanted and all(
-        same_layout(store, inner) for _, (_, inner) in wanted if isinstance(inner, str))
+        same_layout(store, inner) for _, (_, inner) in wanted if isinstance(inner, str)
+    )
 
 
 def own_message(message: Any, name: str) -> object:
@@ -233,8 +253,10 @@ def _free_of_bounds(kind: Any) -> Any:
 
 Input = to_model.EncoderBlock | np.ndarray | object
 """Encoder samples, a table of detections, or a command as rosbags has it."""
-BLOCKS: dict[str, Callable[[Columns], Input]] = {ENCODER_TOPIC: to_model.encoder_block,
-                                                 DETECTION_TOPIC: to_model.detection_table}
+BLOCKS: dict[str, Callable[[Columns], Input]] = {
+    ENCODER_TOPIC: to_model.encoder_block,
+    DETECTION_TOPIC: to_model.detection_table,
+}
 """What many messages of a topic become at once."""
 PADDING = 3
 """Bytes after the last field that belong to it where lengths identify the definition."""
@@ -273,11 +295,19 @@ class ChannelDecoder:
         # without a definition the length identifies it, if a type has grown
         self._any_tail = self.told or not self.name.startswith(OWN)
         self._own = same_layout(self.stores[0], self.name) if self.told else False
-        self._why = "" if self.told else (
-            f": the bag has no definition of {self.name}, and they do not "
-            "fit the one known here")
-        self._columns = ColumnDecoder(self._fields, None if self._any_tail else PADDING) if (
-            self._fields is not None and self.role in BLOCKS) else None
+        self._why = (
+            ""
+            if self.told
+            else (
+                f": the bag has no definition of {self.name}, and they do not "
+                "fit the one known here"
+            )
+        )
+        self._columns = (
+            ColumnDecoder(self._fields, None if self._any_tail else PADDING)
+            if (self._fields is not None and self.role in BLOCKS)
+            else None
+        )
 
     def one(self, data: bytes) -> Any:
         """Return a message decoded by rosbags; None if it cannot be decoded, which is counted.
@@ -308,7 +338,7 @@ class ChannelDecoder:
         if self._fields is None or not self._any_tail:
             return None
         layout = layout_of(self._fields, data)
-        return None if layout is None or layout.end == len(data) else data[:layout.end]
+        return None if layout is None or layout.end == len(data) else data[: layout.end]
 
     def many(self, messages: Payloads) -> Iterator[Input]:
         """Yield the decoded messages; failures are counted."""
@@ -331,15 +361,19 @@ class ChannelDecoder:
             rest[:] = False
             rest[self._columns.decode(messages)[1]] = True
         for number, data, doubtful in zip(index.tolist(), messages, rest.tolist(), strict=True):
-            little = data[:len(LITTLE)] == LITTLE
+            little = data[: len(LITTLE)] == LITTLE
             if little and not doubtful:
                 yield number, data
                 continue
             message = self.one(data)
             if message is not None:
                 name = INPUT_TOPICS[self.role]
-                yield number, data if self._own and little else bytes(
-                    typestore().serialize_cdr(own_message(message, name), name))
+                yield (
+                    number,
+                    data
+                    if self._own and little
+                    else bytes(typestore().serialize_cdr(own_message(message, name), name)),
+                )
 
 
 @dataclass
@@ -371,8 +405,12 @@ def _block(role: str, message: Any) -> Input:
     if role == ENCODER_TOPIC:
         sample = to_model.encoder_sample(message)
         velocities = np.array([sample.velocities], dtype=float) if sample.velocities else None
-        return to_model.EncoderBlock(np.array([sample.stamp_ns]), sample.names,
-                                     np.array([sample.positions], dtype=float), velocities)
+        return to_model.EncoderBlock(
+            np.array([sample.stamp_ns]),
+            sample.names,
+            np.array([sample.positions], dtype=float),
+            velocities,
+        )
     if role == DETECTION_TOPIC:
         return to_model.detection(message).as_table()
     return message

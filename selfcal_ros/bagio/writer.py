@@ -48,8 +48,9 @@ def new_bag(path: str | Path) -> Iterator[Path]:
             yield Path(unfinished, target.name)
             Path(unfinished, target.name).rename(target)
     except OSError as error:
-        raise InputError(str(target), f"cannot be created ({error.strerror})",
-                         "name a writable folder") from error
+        raise InputError(
+            str(target), f"cannot be created ({error.strerror})", "name a writable folder"
+        ) from error
 
 
 def _profiles(metadata: dict[str, str]) -> list[dict]:
@@ -67,8 +68,9 @@ def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(str(path), f"{what} ({error.strerror})",
-                         "free some space or name another folder") from error
+        raise InputError(
+            str(path), f"{what} ({error.strerror})", "free some space or name another folder"
+        ) from error
 
 
 class Closing(ABC):
@@ -82,8 +84,12 @@ class Closing(ABC):
         """Return the writer."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         """Close it."""
         self.close()
 
@@ -108,8 +114,10 @@ class BagTopic:
 
     def channel_metadata(self) -> dict[str, str]:
         """Return the metadata of its channel in rosbag2's format, with `heard_on`."""
-        about = {"offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False)
-                 if self.qos else "", "topic_type_hash": self.hash}
+        about = {
+            "offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False) if self.qos else "",
+            "topic_type_hash": self.hash,
+        }
         return about | ({"heard_on": self.heard_on} if self.heard_on else {})
 
 
@@ -131,9 +139,11 @@ class FileEntry:
     def about(self) -> dict[str, Any]:
         """Return start, duration and count in the format of metadata.yaml."""
         start = self.first_ns or 0
-        return {"duration": {"nanoseconds": max(self.last_ns - start, 0)},
-                "starting_time": {"nanoseconds_since_epoch": start},
-                "message_count": self.count}
+        return {
+            "duration": {"nanoseconds": max(self.last_ns - start, 0)},
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "message_count": self.count,
+        }
 
 
 @dataclass
@@ -145,28 +155,55 @@ class Metadata:
 
     def write(self, folder: Path) -> None:
         """Write metadata.yaml into the bag's folder, atomically."""
-        write_text(folder / "metadata.yaml", yaml.safe_dump(
-            {"rosbag2_bagfile_information": self._information()}, sort_keys=False))
+        write_text(
+            folder / "metadata.yaml",
+            yaml.safe_dump({"rosbag2_bagfile_information": self._information()}, sort_keys=False),
+        )
 
     def _information(self) -> dict[str, Any]:
         firsts = [file.first_ns for file in self.files if file.first_ns is not None]
-        whole = FileEntry("", sum(file.count for file in self.files), min(firsts, default=None),
-                          max((file.last_ns for file in self.files), default=0))
+        whole = FileEntry(
+            "",
+            sum(file.count for file in self.files),
+            min(firsts, default=None),
+            max((file.last_ns for file in self.files), default=0),
+        )
         about = whole.about()
-        topics = [{"topic_metadata": {
-            "name": name, "type": topic.type, "serialization_format": "cdr",
-            "offered_qos_profiles": topic.qos,
-            "type_description_hash": topic.hash},
-            "message_count": topic.count} for name, topic in self.topics.items()]
+        topics = [
+            {
+                "topic_metadata": {
+                    "name": name,
+                    "type": topic.type,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": topic.qos,
+                    "type_description_hash": topic.hash,
+                },
+                "message_count": topic.count,
+            }
+            for name, topic in self.topics.items()
+        ]
         return {
-            "version": 9, "storage_identifier": "mcap", "duration": about["duration"],
-            "starting_time": about["starting_time"], "message_count": about["message_count"],
-            "topics_with_message_count": topics, "compression_format": "", "compression_mode": "",
+            "version": 9,
+            "storage_identifier": "mcap",
+            "duration": about["duration"],
+            "starting_time": about["starting_time"],
+            "message_count": about["message_count"],
+            "topics_with_message_count": topics,
+            "compression_format": "",
+            "compression_mode": "",
             "relative_file_paths": [file.name for file in self.files],
-            "files": [{"path": file.name, "starting_time": file.about()["starting_time"],
-                       "duration": file.about()["duration"], "message_count": file.count}
-                      for file in self.files],
-            "custom_data": None, "ros_distro": "jazzy"}
+            "files": [
+                {
+                    "path": file.name,
+                    "starting_time": file.about()["starting_time"],
+                    "duration": file.about()["duration"],
+                    "message_count": file.count,
+                }
+                for file in self.files
+            ],
+            "custom_data": None,
+            "ros_distro": "jazzy",
+        }
 
 
 @dataclass
@@ -197,17 +234,22 @@ class BagWriter(Closing):
         try:
             self.path.mkdir(parents=True)
         except FileExistsError as error:
-            raise InputError(str(self.path), "exists already",
-                             "remove it or name another folder") from error
+            raise InputError(
+                str(self.path), "exists already", "remove it or name another folder"
+            ) from error
         except OSError as error:
-            raise InputError(str(self.path), f"cannot be created ({error.strerror})",
-                             "name a writable folder") from error
+            raise InputError(
+                str(self.path), f"cannot be created ({error.strerror})", "name a writable folder"
+            ) from error
         self._entry = FileEntry(f"{self.path.name}_0.mcap")
         self._metadata = Metadata(files=[self._entry])
         with writing(self.path):
             self._file = (self.path / self._entry.name).open("wb")
-            self._mcap = Writer(self._file, chunk_size=CHUNK_SIZE,
-                                compression=CompressionType[self.compression.upper()])
+            self._mcap = Writer(
+                self._file,
+                chunk_size=CHUNK_SIZE,
+                compression=CompressionType[self.compression.upper()],
+            )
             self._mcap.start(profile="ros2", library="selfcal_ros")
 
     def add_topic(self, topic: str, typename: str, qos: list[dict], heard_on: str = "") -> None:
@@ -229,19 +271,23 @@ class BagWriter(Closing):
         """
         definition = definition_of(topic, typename)
         if typename not in self._schemas:
-            self._schemas[typename] = self._mcap.register_schema(typename, "ros2msg",
-                                                                 definition.encode())
+            self._schemas[typename] = self._mcap.register_schema(
+                typename, "ros2msg", definition.encode()
+            )
         self._metadata.topics[topic] = declared = BagTopic(typename, qos, heard_on=heard_on)
         self._channels[topic] = self._mcap.register_channel(
-            topic, "cdr", self._schemas[typename], declared.channel_metadata())
+            topic, "cdr", self._schemas[typename], declared.channel_metadata()
+        )
 
     def add_copy(self, channel: Channel, schema: Schema | None) -> int:
         """Declare a channel of another bag, of any type, as it is; return its number here."""
         name = schema.name if schema else ""
         number = self._mcap.register_schema(name, schema.encoding, schema.data) if schema else 0
         about = dict(channel.metadata)
-        self._metadata.topics.setdefault(channel.topic, BagTopic(
-            name, _profiles(about), hash=about.get("topic_type_hash", UNKNOWN_HASH)))
+        self._metadata.topics.setdefault(
+            channel.topic,
+            BagTopic(name, _profiles(about), hash=about.get("topic_type_hash", UNKNOWN_HASH)),
+        )
         return self._mcap.register_channel(channel.topic, channel.message_encoding, number, about)
 
     def copy(self, number: int, topic: str, message: Message) -> None:
@@ -249,8 +295,9 @@ class BagWriter(Closing):
         self._metadata.topics[topic].count += 1
         self._entry.add(message.log_time)
         with writing(self.path):
-            self._mcap.add_message(number, message.log_time, message.data, message.publish_time,
-                                   message.sequence)
+            self._mcap.add_message(
+                number, message.log_time, message.data, message.publish_time, message.sequence
+            )
 
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
         """Write one message given by its fields."""

@@ -75,27 +75,32 @@ class Course:
     last_before: int = 0
 
 
-def course_of(days: np.ndarray, values: np.ndarray, rng: np.random.Generator, *,
-              orders: int = ORDERS) -> Course:
+def course_of(
+    days: np.ndarray, values: np.ndarray, rng: np.random.Generator, *, orders: int = ORDERS
+) -> Course:
     """Return the course of `values` (n,) at the times `days` (n,), which rise.
 
     Without a decision, which `courses` makes for all quantities together.
     """
-    nothing = Course(len(values), (0.0, 0.0, 0.0), 1.0, 1.0, 0, float(values[0]),
-                     float(values[0]))
+    nothing = Course(len(values), (0.0, 0.0, 0.0), 1.0, 1.0, 0, float(values[0]), float(values[0]))
     if len(values) < FEWEST or np.ptp(values) == 0 or np.ptp(days) == 0:
         return nothing
     from scipy import stats  # a second, for a series alone
 
     slope, _, low, high = stats.theilslopes(values, days, 0.95)
     change, p_change = step_of(values), pettitt(values, rng, orders=orders)
-    return Course(len(values), (float(slope), float(low), float(high)),
-                  float(stats.kendalltau(days, values).pvalue), p_change, change,
-                  float(np.median(values[:change])), float(np.median(values[change:])))
+    return Course(
+        len(values),
+        (float(slope), float(low), float(high)),
+        float(stats.kendalltau(days, values).pvalue),
+        p_change,
+        change,
+        float(np.median(values[:change])),
+        float(np.median(values[change:])),
+    )
 
 
-def pettitt(values: np.ndarray, rng: np.random.Generator, *,
-            orders: int = ORDERS) -> float:
+def pettitt(values: np.ndarray, rng: np.random.Generator, *, orders: int = ORDERS) -> float:
     """Return the probability of as large a change in a random order of `values` (n,).
 
     Pettitt's statistic is the largest |2 sum of the first t ranks - t (n + 1)| over t.
@@ -114,8 +119,11 @@ def step_of(values: np.ndarray) -> int:
 
     The maximum of Pettitt's statistic is biased towards the middle.
     """
-    moduli = [np.abs(values[:t] - np.median(values[:t])).sum()
-              + np.abs(values[t:] - np.median(values[t:])).sum() for t in range(1, len(values))]
+    moduli = [
+        np.abs(values[:t] - np.median(values[:t])).sum()
+        + np.abs(values[t:] - np.median(values[t:])).sum()
+        for t in range(1, len(values))
+    ]
     return int(np.argmin(moduli)) + 1
 
 
@@ -125,8 +133,9 @@ def _imbalance(ranks: np.ndarray) -> np.ndarray:
     return np.abs(2 * np.cumsum(ranks, axis=1)[:, :-1] - np.arange(1, n) * (n + 1))
 
 
-def courses(days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SEED,
-            orders: int = ORDERS) -> dict[str, Course]:
+def courses(
+    days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SEED, orders: int = ORDERS
+) -> dict[str, Course]:
     """Return the course of every quantity, with a common decision.
 
     Parameters
@@ -144,13 +153,16 @@ def courses(days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SE
         if known.sum() >= FEWEST:
             course = course_of(days[known], values[known], rng, orders=orders)
             if course.change:
-                last, first = np.flatnonzero(known)[course.change - 1:course.change + 1]
+                last, first = np.flatnonzero(known)[course.change - 1 : course.change + 1]
                 course = replace(course, last_before=int(last), change=int(first))
             found[name] = course
-    adjusted = _adjusted([p for course in found.values()
-                          for p in (course.p_trend, course.p_change)]).reshape(-1, 2)
-    return {name: _judged(course, pair, days, table[name]) for (name, course), pair in
-            zip(found.items(), adjusted, strict=True)}
+    adjusted = _adjusted(
+        [p for course in found.values() for p in (course.p_trend, course.p_change)]
+    ).reshape(-1, 2)
+    return {
+        name: _judged(course, pair, days, table[name])
+        for (name, course), pair in zip(found.items(), adjusted, strict=True)
+    }
 
 
 def _adjusted(p: Sequence[float]) -> np.ndarray:
@@ -162,15 +174,16 @@ def _adjusted(p: Sequence[float]) -> np.ndarray:
     return false_discovery_control(p)
 
 
-def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray,
-            values: np.ndarray) -> Course:
+def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray, values: np.ndarray) -> Course:
     finding = CourseKind.NONE
     if adjusted.min() <= COURSE_LEVEL:
-        finding = _of_both(course, days, values) if adjusted.max() <= COURSE_LEVEL else (
-            CourseKind.TREND if adjusted[0] <= COURSE_LEVEL else CourseKind.CHANGE)
+        finding = (
+            _of_both(course, days, values)
+            if adjusted.max() <= COURSE_LEVEL
+            else (CourseKind.TREND if adjusted[0] <= COURSE_LEVEL else CourseKind.CHANGE)
+        )
     counted = {CourseKind.TREND: adjusted[0], CourseKind.CHANGE: adjusted[1]}
-    return replace(course, adjusted_p=float(counted.get(finding, adjusted.min())),
-                   finding=finding)
+    return replace(course, adjusted_p=float(counted.get(finding, adjusted.min())), finding=finding)
 
 
 def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> CourseKind:
@@ -182,8 +195,10 @@ def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> CourseKind
     step = x - np.where(after, course.after, course.before)
     sizes = [np.abs(line - np.median(line)).sum(), np.abs(step).sum()]
     tiny = np.finfo(float).tiny
-    line_bic, step_bic = (n * np.log(max(size, tiny)) + k * np.log(n) / 2
-                          for size, k in zip(sizes, (2, 3), strict=True))
+    line_bic, step_bic = (
+        n * np.log(max(size, tiny)) + k * np.log(n) / 2
+        for size, k in zip(sizes, (2, 3), strict=True)
+    )
     return CourseKind.TREND if line_bic <= step_bic else CourseKind.CHANGE
 
 
@@ -191,8 +206,9 @@ LEVEL = 0.05
 """Part of the named maps that may be named by chance."""
 
 
-def compared(records: Sequence[Record], folder: Path, baseline: CalibrationResult,
-             where: str) -> list[Record]:
+def compared(
+    records: Sequence[Record], folder: Path, baseline: CalibrationResult, where: str
+) -> list[Record]:
     """Return the records with `baseline` and further quantities, where their map can be compared.
 
     `baseline`: {p, adjusted_p, changed}. The quantities are largest and rms difference, datum
@@ -209,23 +225,42 @@ def compared(records: Sequence[Record], folder: Path, baseline: CalibrationResul
     where : str
         Its file, for the reasons.
     """
-    tried = {number: _difference(record, folder, baseline, where)
-             for number, record in enumerate(records)
-             if record.get("quantities") and "result" in record}
-    found = {number: difference for number, difference in tried.items()
-             if isinstance(difference, MapDifference)}
-    records = [record | {"not_compared": tried[number]}
-               if isinstance(tried.get(number), str) else record
-               for number, record in enumerate(records)]
-    p = {number: value for number, difference in found.items()
-         if np.isfinite(value := probability(difference))}
+    tried = {
+        number: _difference(record, folder, baseline, where)
+        for number, record in enumerate(records)
+        if record.get("quantities") and "result" in record
+    }
+    found = {
+        number: difference
+        for number, difference in tried.items()
+        if isinstance(difference, MapDifference)
+    }
+    records = [
+        record | {"not_compared": tried[number]} if isinstance(tried.get(number), str) else record
+        for number, record in enumerate(records)
+    ]
+    p = {
+        number: value
+        for number, difference in found.items()
+        if np.isfinite(value := probability(difference))
+    }
     adjusted = dict(zip(p, _adjusted(list(p.values())), strict=True))
-    return [record if number not in found else record | {
-        "quantities": record["quantities"] | _quantities(found[number]),
-        "baseline": None if number not in p else {
-            "p": p[number], "adjusted_p": float(adjusted[number]),
-            "changed": bool(adjusted[number] <= LEVEL)}}
-        for number, record in enumerate(records)]
+    return [
+        record
+        if number not in found
+        else record
+        | {
+            "quantities": record["quantities"] | _quantities(found[number]),
+            "baseline": None
+            if number not in p
+            else {
+                "p": p[number],
+                "adjusted_p": float(adjusted[number]),
+                "changed": bool(adjusted[number] <= LEVEL),
+            },
+        }
+        for number, record in enumerate(records)
+    ]
 
 
 def probability(difference: MapDifference) -> float:
@@ -238,8 +273,9 @@ def probability(difference: MapDifference) -> float:
     return min(min(values) * len(values), 1.0) if values else float("nan")
 
 
-def _difference(record: Record, folder: Path, baseline: CalibrationResult,
-                where: str) -> MapDifference | str:
+def _difference(
+    record: Record, folder: Path, baseline: CalibrationResult, where: str
+) -> MapDifference | str:
     file = folder / record["result"]
     try:
         return compare(baseline, read_result(file), names=(where, str(file)))
@@ -248,10 +284,11 @@ def _difference(record: Record, folder: Path, baseline: CalibrationResult,
 
 
 def _quantities(difference: MapDifference) -> dict[str, float | None]:
-    found = {"difference_from_baseline_rms_um": difference.rms_m * UM_PER_M,
-             "difference_from_baseline_largest_um": difference.max_m * UM_PER_M,
-             "theta_difference_from_baseline_rms_arcsec":
-                 difference.rms_theta_rad * ARCSEC_PER_RAD}
+    found = {
+        "difference_from_baseline_rms_um": difference.rms_m * UM_PER_M,
+        "difference_from_baseline_largest_um": difference.max_m * UM_PER_M,
+        "theta_difference_from_baseline_rms_arcsec": difference.rms_theta_rad * ARCSEC_PER_RAD,
+    }
     return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
@@ -259,9 +296,12 @@ def sentence(records: Sequence[Record], where: str) -> str:
     """Return which maps differ from the baseline, in one sentence."""
     tested = [record for record in records if record.get("baseline")]
     changed = [record for record in tested if record["baseline"]["changed"]]
-    named = ", ".join(f"{record['bag']} (p = {record['baseline']['adjusted_p']:.2g})"
-                      for record in changed)
+    named = ", ".join(
+        f"{record['bag']} (p = {record['baseline']['adjusted_p']:.2g})" for record in changed
+    )
     others = Counter(record["not_compared"] for record in records if "not_compared" in record)
-    return (f"{len(changed)} of {len(tested)} maps differ from {where}"
-            + (f": {named}" if changed else "")
-            + "".join(f"; not compared: {count} ({reason})" for reason, count in others.items()))
+    return (
+        f"{len(changed)} of {len(tested)} maps differ from {where}"
+        + (f": {named}" if changed else "")
+        + "".join(f"; not compared: {count} ({reason})" for reason, count in others.items())
+    )

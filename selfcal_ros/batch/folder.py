@@ -53,8 +53,11 @@ def find_bags(paths: Iterable[str]) -> list[Path]:
         for bag in sorted(_below(path)) if path.is_dir() else [path]:
             found.setdefault(os.path.realpath(bag), bag)
     if not found:
-        raise NoDataError(", ".join(paths), "no bag in it", "give MCAP files, rosbag2 folders or "
-                          "folders that contain them")
+        raise NoDataError(
+            ", ".join(paths),
+            "no bag in it",
+            "give MCAP files, rosbag2 folders or folders that contain them",
+        )
     return list(found.values())
 
 
@@ -66,14 +69,18 @@ def _below(top: Path) -> list[Path]:
             folders.clear()
         else:
             folders[:] = [name for name in folders if not name.startswith(".")]
-            bags += [folder / name for name in files
-                     if not name.startswith(".") and Path(name).suffix == STORAGE]
+            bags += [
+                folder / name
+                for name in files
+                if not name.startswith(".") and Path(name).suffix == STORAGE
+            ]
     return bags
 
 
 def _refuse(error: OSError) -> NoReturn:
-    raise InputError(str(error.filename), f"cannot be read ({error.strerror})",
-                     "name a readable folder") from error
+    raise InputError(
+        str(error.filename), f"cannot be read ({error.strerror})", "name a readable folder"
+    ) from error
 
 
 def stat_of(bag: Path) -> list[list]:
@@ -135,10 +142,20 @@ def read_record(path: Path) -> Record | None:
         record = read_json(path)
     except InputError:
         return None
-    good = isinstance(record, dict) and record.get("schema") == SCHEMA and all(
-        isinstance(record.get(name), kind) for name, kind in (
-            ("bag", str), ("settings", str), ("files", list), ("exit_code", int),
-            ("message", str)))
+    good = (
+        isinstance(record, dict)
+        and record.get("schema") == SCHEMA
+        and all(
+            isinstance(record.get(name), kind)
+            for name, kind in (
+                ("bag", str),
+                ("settings", str),
+                ("files", list),
+                ("exit_code", int),
+                ("message", str),
+            )
+        )
+    )
     return record if good else None
 
 
@@ -161,14 +178,18 @@ def opened(folder: Path) -> Iterator[None]:
             part.mkdir(parents=True, exist_ok=True)
         lock = (folder / LOCK).open("w")
     except OSError as error:
-        raise InputError(str(folder), f"cannot be created ({error.strerror})",
-                         "name a writable folder") from error
+        raise InputError(
+            str(folder), f"cannot be created ({error.strerror})", "name a writable folder"
+        ) from error
     with lock:
         try:
             portable.lock(lock.fileno())
         except OSError as error:
-            raise InputError(str(folder), "another batch works in this folder",
-                             "wait for it to end or name another folder") from error
+            raise InputError(
+                str(folder),
+                "another batch works in this folder",
+                "wait for it to end or name another folder",
+            ) from error
         for part in (folder / RECORDS, folder / RESULTS):
             sweep(part)
         yield
@@ -178,12 +199,17 @@ def kept_records(folder: Path, settings: BatchSettings) -> list[Record]:
     """Return the records of these settings in the folder."""
     digest = settings.digest()
     found = (read_record(path) for path in sorted((folder / RECORDS).glob("*.json")))
-    return [record for record in found if record is not None and record["settings"] == digest
-            and is_whole(folder, record)]
+    return [
+        record
+        for record in found
+        if record is not None and record["settings"] == digest and is_whole(folder, record)
+    ]
 
 
-def done_and_to_do(kept: Sequence[Record], bags: Sequence[Path],
-                   ) -> tuple[dict[int, Record], list[int]]:
+def done_and_to_do(
+    kept: Sequence[Record],
+    bags: Sequence[Path],
+) -> tuple[dict[int, Record], list[int]]:
     """Return the records of finished bags, by their index in `bags`, and the other indices.
 
     A bag is finished if it has a record and its files are unchanged. The largest of the others come

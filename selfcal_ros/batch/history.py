@@ -107,11 +107,16 @@ def history(folder: Path) -> list[Entry]:
             if result.observability.identifiable and VERIFICATION not in result.extra:
                 found.append(Entry(path, result, _measured(result, str(path))))
     if not found:
-        raise NoDataError(str(folder), "no RESULT.json with a map is in it",
-                          "write the results of `selfcal solve` there")
+        raise NoDataError(
+            str(folder),
+            "no RESULT.json with a map is in it",
+            "write the results of `selfcal solve` there",
+        )
     found.sort(key=lambda entry: (entry.measured, entry.result.provenance.created))
-    return [Entry(entry.path, entry.result, entry.measured, _change(found[max(at - 1, 0)], entry))
-            for at, entry in enumerate(found)]
+    return [
+        Entry(entry.path, entry.result, entry.measured, _change(found[max(at - 1, 0)], entry))
+        for at, entry in enumerate(found)
+    ]
 
 
 def _is_result(path: Path) -> bool:
@@ -128,8 +133,11 @@ def _measured(result: CalibrationResult, where: str) -> datetime:
     try:
         when = datetime.fromisoformat(str(text))
     except ValueError:
-        raise InputError(where, "it does not tell when it was measured",
-                         "solve its bag again, or take it out of the folder") from None
+        raise InputError(
+            where,
+            "it does not tell when it was measured",
+            "solve its bag again, or take it out of the folder",
+        ) from None
     return when if when.tzinfo else when.replace(tzinfo=UTC)
 
 

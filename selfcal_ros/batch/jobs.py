@@ -37,8 +37,11 @@ def run_job(job: folder.BatchJob) -> folder.Record:
     InputError
         If the folder of the batch cannot be written.
     """
-    record: folder.Record = {"schema": folder.SCHEMA, "bag": os.path.realpath(job.bag),
-                             "settings": job.settings.digest()}
+    record: folder.Record = {
+        "schema": folder.SCHEMA,
+        "bag": os.path.realpath(job.bag),
+        "settings": job.settings.digest(),
+    }
     try:
         source = bag_input(job.bag)
         record["files"] = folder.stat_of(job.bag)
@@ -66,8 +69,10 @@ def run_job(job: folder.BatchJob) -> folder.Record:
     return record
 
 
-def solved(job: folder.BatchJob, source: dict[str, str],
-           ) -> tuple[results.CalibrationResult, NotIdentifiableError | None]:
+def solved(
+    job: folder.BatchJob,
+    source: dict[str, str],
+) -> tuple[results.CalibrationResult, NotIdentifiableError | None]:
     """Return the result of a bag, as from `selfcal solve`, and the reason if it has no map."""
     settings = job.settings
     session = collect_bag(job.bag, settings.collector, namespace=settings.namespace)
@@ -91,13 +96,17 @@ def _without_result(error: SelfcalError) -> folder.Record:
 def _with_result(result: results.CalibrationResult) -> folder.Record:
     good, artifact = result.verdict.qualified, result.artifact
     return {
-        "exit_code": int(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED), "qualified": good,
+        "exit_code": int(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED),
+        "qualified": good,
         "grade": str(result.verdict.grade),
         "causes": plain([finding_to_dict(cause) for cause in result.verdict.causes]),
-        "message": result.verdict.sentence, "plan_id": result.plan_id, "run_id": result.run_id,
+        "message": result.verdict.sentence,
+        "plan_id": result.plan_id,
+        "run_id": result.run_id,
         "plate": [*artifact.shape, artifact.grid_pitch_m, artifact.angular_count],
         "first_exposure": result.provenance.extra.get("first_exposure"),
-        "quantities": quantities(result)}
+        "quantities": quantities(result),
+    }
 
 
 def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
@@ -117,7 +126,8 @@ def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
         **summary_numbers(result),
         "sigma_xy_um": noise.sigma_xy * UM_PER_M,
         "sigma_theta_arcsec": noise.sigma_theta * ARCSEC_PER_RAD,
-        "rejected_percent": 100 * rejected / (used + rejected) if used + rejected else math.nan}
+        "rejected_percent": 100 * rejected / (used + rejected) if used + rejected else math.nan,
+    }
     for term in result.model.terms:
         for estimate in term.estimates:
             if not estimate.view:

@@ -20,13 +20,20 @@ STYLE = """td.text { text-align: left; min-width: 14rem; } td.bad { color: var(-
 details { margin: 1rem 0; } summary { cursor: pointer; color: var(--c0); margin-bottom: .6rem; }
 """
 
-FIRST = ("max_error_um", "nonorthogonality_arcsec", "scale_difference_ppm",
-         "max_theta_error_arcsec", "difference_from_baseline_largest_um")
+FIRST = (
+    "max_error_um",
+    "nonorthogonality_arcsec",
+    "scale_difference_ppm",
+    "max_theta_error_arcsec",
+    "difference_from_baseline_largest_um",
+)
 """Quantities that everybody looks at: plotted first, and the columns of the table."""
 
-U_OF_ONE_PLACE = {"max_error_um": "rms_uncertainty_um",
-                  "difference_from_baseline_largest_um": "rms_uncertainty_um",
-                  "max_theta_error_arcsec": "rms_theta_uncertainty_arcsec"}
+U_OF_ONE_PLACE = {
+    "max_error_um": "rms_uncertainty_um",
+    "difference_from_baseline_largest_um": "rms_uncertainty_um",
+    "max_theta_error_arcsec": "rms_theta_uncertainty_arcsec",
+}
 """Quantities that are the error of one place -> the standard uncertainty of a place, rms."""
 
 ALIKE = ("uncertainty", "sigma", "difference_from_baseline", "error")
@@ -41,17 +48,20 @@ LIMIT = 3.0
 Span = tuple[float, float]
 
 
-def page_html(records: Sequence[Record], found: Sequence[PlanHistory],
-              lines: Sequence[str]) -> str:
+def page_html(records: Sequence[Record], found: Sequence[PlanHistory], lines: Sequence[str]) -> str:
     """Return the page; `lines` are those of `summary_lines`; all text is escaped."""
     head, *findings = lines
     codes = {record["exit_code"] for record in records}
     grade = "good" if codes == {0} else "not_qualified"
-    parts = [f'<p class="verdict {grade}">{_text(head)}</p>',
-             f"<p>{'<br>'.join(map(_text, findings))}</p>" if findings else ""]
+    parts = [
+        f'<p class="verdict {grade}">{_text(head)}</p>',
+        f"<p>{'<br>'.join(map(_text, findings))}</p>" if findings else "",
+    ]
     parts += [_history(series) for series in found if series.courses]
-    parts.append(f"<section><h2>Bags</h2>{_table(records)}"
-                 "<p>table.csv has all quantities of each bag.</p></section>")
+    parts.append(
+        f"<section><h2>Bags</h2>{_table(records)}"
+        "<p>table.csv has all quantities of each bag.</p></section>"
+    )
     return page(f"Calibrations from {len(records)} bags", "\n".join(parts), style=STYLE)
 
 
@@ -62,8 +72,11 @@ def _text(value: object) -> str:
 def _history(series: PlanHistory) -> str:
     """Return the plots of a series: those that are looked at or have a finding come first."""
     first = [name for name in FIRST if name in series.courses]
-    first += [name for name, course in series.courses.items()
-              if course.finding is not CourseKind.NONE and name not in first]
+    first += [
+        name
+        for name, course in series.courses.items()
+        if course.finding is not CourseKind.NONE and name not in first
+    ]
     others = [name for name in series.courses if name not in first]
     spans = _common_spans(series)
 
@@ -71,16 +84,22 @@ def _history(series: PlanHistory) -> str:
         pictures = "\n".join(_figure(series, name, spans[name]) for name in names)
         return f'<div class="figures">{pictures}</div>'
 
-    more = (f"<details><summary>{len(others)} further quantities</summary>{plots(others)}</details>"
-            if others else "")
-    return (f"<section><h2>{_text('Plan ' + series.plan_id)}: over time</h2>"
-            "<p>Dots are bags, red ones not qualified; bars are ± 2 u. The band is the median "
-            f"± {LIMIT:.0f} standard deviations of the bags themselves: a stable stage stays in "
-            f"it.</p>{plots(first)}{more}</section>")
+    more = (
+        f"<details><summary>{len(others)} further quantities</summary>{plots(others)}</details>"
+        if others
+        else ""
+    )
+    return (
+        f"<section><h2>{_text('Plan ' + series.plan_id)}: over time</h2>"
+        "<p>Dots are bags, red ones not qualified; bars are ± 2 u. The band is the median "
+        f"± {LIMIT:.0f} standard deviations of the bags themselves: a stable stage stays in "
+        f"it.</p>{plots(first)}{more}</section>"
+    )
 
 
 def _values(series: PlanHistory, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a quantity of each bag, NaN if unknown, and its standard uncertainty, 0 if unknown."""
+
     def column(key: str) -> np.ndarray:
         return np.array([record["quantities"].get(key) for record in series.records], dtype=float)
 
@@ -125,16 +144,23 @@ def _figure(series: PlanHistory, name: str, span: Span) -> str:
     drawing.shapes([[frame.at(*corner) for corner in corners]], fill="band", opacity=0.25)
     frame.border()
     for value in round_ticks(*span, 4):
-        drawing.label(58, frame.at(0.0, value)[1] + 4, tick_text(value), size=TICK, anchor="end",
-                      colour="soft")
+        drawing.label(
+            58,
+            frame.at(0.0, value)[1] + 4,
+            tick_text(value),
+            size=TICK,
+            anchor="end",
+            colour="soft",
+        )
     for number, (x, anchor) in enumerate(((64.0, "start"), (546.0, "end"))):
         drawing.label(x, 160, series.date(-number)[:10], size=TICK, anchor=anchor, colour="soft")
     for day, value, spread, record in zip(series.days, values, u, series.records, strict=True):
         if not np.isfinite(value):
             continue
         if spread > 0:
-            drawing.line([frame.at(day, value + end) for end in (-2 * spread, 2 * spread)],
-                         stroke="soft")
+            drawing.line(
+                [frame.at(day, value + end) for end in (-2 * spread, 2 * spread)], stroke="soft"
+            )
         drawing.discs([frame.at(day, value)], 3.0, fill="bad" if record["exit_code"] else "good")
         said = f"{record['bag']}: {value:.6g} {unit}" + f" ± {2 * spread:.2g}" * bool(spread > 0)
         drawing.spot(*frame.at(day, value), 6, said)
@@ -149,8 +175,9 @@ def _finding(frame: Frame, series: PlanHistory, values: np.ndarray, course: Cour
     if course.finding is CourseKind.TREND:
         slope = course.slope_per_day[0]
         offset = float(np.nanmedian(values - slope * days))
-        frame.drawing.line([frame.at(day, offset + slope * day) for day in (days[0], days[-1])],
-                           width=1.5)
+        frame.drawing.line(
+            [frame.at(day, offset + slope * day) for day in (days[0], days[-1])], width=1.5
+        )
     elif course.finding is CourseKind.CHANGE:
         middle = (days[course.last_before] + days[course.change]) / 2
         frame.drawing.line([frame.at(middle, end) for end in frame.y], stroke="bad", dash=(4, 3))
@@ -162,23 +189,37 @@ def _table(records: Sequence[Record]) -> str:
     ordered = in_time(records)
     measured = {name for record in ordered for name in record.get("quantities", {})}
     names = [name for name in FIRST if name in measured]
-    heads = ["bag", "first exposure", "verdict",
-             *(f"{text}{', ' * bool(unit)}{unit}" for text, unit in map(described, names))]
+    heads = [
+        "bag",
+        "first exposure",
+        "verdict",
+        *(f"{text}{', ' * bool(unit)}{unit}" for text, unit in map(described, names)),
+    ]
     rows = []
     for record in ordered:
         kind = "text bad" if record["exit_code"] else "text"
         exposed = str(record.get("first_exposure") or "")[:16].replace("T", " ")
         bag = _text(record["bag"])
-        cells = [f'<td title="{bag}" data-name="bag">{_text(os.path.basename(record["bag"]))}</td>',
-                 f'<td data-name="first exposure">{_text(exposed)}</td>',
-                 f'<td class="{kind}" data-name="verdict">{_text(record["message"])}</td>',
-                 *(f'<td data-name="{_text(head)}">{_quantity(record, name)}</td>'
-                   for head, name in zip(heads[3:], names, strict=True))]
+        cells = [
+            f'<td title="{bag}" data-name="bag">{_text(os.path.basename(record["bag"]))}</td>',
+            f'<td data-name="first exposure">{_text(exposed)}</td>',
+            f'<td class="{kind}" data-name="verdict">{_text(record["message"])}</td>',
+            *(
+                f'<td data-name="{_text(head)}">{_quantity(record, name)}</td>'
+                for head, name in zip(heads[3:], names, strict=True)
+            ),
+        ]
         rows.append(f"<tr>{''.join(cells)}</tr>")
-    head = "".join(f'<th class="{"t" if cell == "verdict" else "n"}">{_text(cell)}</th>'
-                   for cell in heads)
-    return ('<div class="scroll"><table class="list"><thead><tr>' + head + "</tr></thead><tbody>"
-            + "\n".join(rows) + "</tbody></table></div>")
+    head = "".join(
+        f'<th class="{"t" if cell == "verdict" else "n"}">{_text(cell)}</th>' for cell in heads
+    )
+    return (
+        '<div class="scroll"><table class="list"><thead><tr>'
+        + head
+        + "</tr></thead><tbody>"
+        + "\n".join(rows)
+        + "</tbody></table></div>"
+    )
 
 
 def _quantity(record: Record, name: str) -> str:

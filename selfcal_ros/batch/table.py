@@ -14,8 +14,18 @@ from selfcal_ros.batch.course import FEWEST, Course, CourseKind, courses
 from selfcal_ros.batch.folder import PER, SCHEMA, Record
 
 S_PER_DAY = 86400.0
-BASE = ("bag", "first_exposure", "exit_code", "qualified", "message", "plan_id", "run_id",
-        "sha256", "result", "grade")
+BASE = (
+    "bag",
+    "first_exposure",
+    "exit_code",
+    "qualified",
+    "message",
+    "plan_id",
+    "run_id",
+    "sha256",
+    "result",
+    "grade",
+)
 
 
 @dataclass(frozen=True)
@@ -45,25 +55,34 @@ class PlanHistory:
 
     def sentences(self) -> list[str]:
         """Return the findings, one line each."""
-        return [self._sentence(name, course) for name, course in self.courses.items()
-                if course.finding is not CourseKind.NONE]
+        return [
+            self._sentence(name, course)
+            for name, course in self.courses.items()
+            if course.finding is not CourseKind.NONE
+        ]
 
     def _sentence(self, name: str, course: Course) -> str:
         text, unit = described(name)
         p = f"p = {course.adjusted_p:.2g}"
         if course.finding is CourseKind.TREND:
             slope, low, high = course.slope_per_day
-            return (f"{text}: trend of {slope:+.3g} {unit} per day (95 %: {low:+.3g} to "
-                    f"{high:+.3g}), {p}")
-        return (f"{text}: changed between {self.date(course.last_before)} and "
-                f"{self.date(course.change)} by {course.after - course.before:+.3g} {unit} "
-                f"(from {course.before:.4g} to {course.after:.4g}), {p}")
+            return (
+                f"{text}: trend of {slope:+.3g} {unit} per day (95 %: {low:+.3g} to "
+                f"{high:+.3g}), {p}"
+            )
+        return (
+            f"{text}: changed between {self.date(course.last_before)} and "
+            f"{self.date(course.change)} by {course.after - course.before:+.3g} {unit} "
+            f"(from {course.before:.4g} to {course.after:.4g}), {p}"
+        )
 
 
 def in_time(records: Sequence[Record]) -> list[Record]:
     """Return the records in the order of their first exposure; those without one last."""
-    return sorted(records, key=lambda r: (r.get("first_exposure") is None,
-                                          str(r.get("first_exposure")), r["bag"]))
+    return sorted(
+        records,
+        key=lambda r: (r.get("first_exposure") is None, str(r.get("first_exposure")), r["bag"]),
+    )
 
 
 def series_of(records: Sequence[Record]) -> list[PlanHistory]:
@@ -80,8 +99,11 @@ def _series(plan_id: str, records: list[Record]) -> PlanHistory:
     times = np.array([_time_s(record) for record in records])
     days = (times - times[0]) / S_PER_DAY
     names = dict.fromkeys(name for record in records for name in record["quantities"])
-    table = {name: np.array([record["quantities"].get(name) for record in records], dtype=float)
-             for name in names if not _is_u(name, names)}
+    table = {
+        name: np.array([record["quantities"].get(name) for record in records], dtype=float)
+        for name in names
+        if not _is_u(name, names)
+    }
     return PlanHistory(plan_id, tuple(records), days, courses(days, table))
 
 
@@ -104,16 +126,22 @@ def csv_text(records: Sequence[Record]) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     compared = ["baseline_p", "changed", "not_compared"] * any(
-        {"baseline", "not_compared"} & set(record) for record in ordered)
+        {"baseline", "not_compared"} & set(record) for record in ordered
+    )
     writer.writerow([*BASE, "cause", "cause_view", *compared, *names])
     for record in ordered:
         found, causes = record.get("quantities", {}), record.get("causes", [])
         likeliest = causes[0] if causes else {"name": "", "view": ""}
-        writer.writerow([_field(record.get(name)) for name in BASE]
-                        + [likeliest["name"], likeliest["view"]]
-                        + [_field(((record.get("baseline") or {}) | record).get(name))
-                           for name in ("adjusted_p", "changed", "not_compared") if compared]
-                        + [_field(found.get(name)) for name in names])
+        writer.writerow(
+            [_field(record.get(name)) for name in BASE]
+            + [likeliest["name"], likeliest["view"]]
+            + [
+                _field(((record.get("baseline") or {}) | record).get(name))
+                for name in ("adjusted_p", "changed", "not_compared")
+                if compared
+            ]
+            + [_field(found.get(name)) for name in names]
+        )
     return out.getvalue()
 
 
@@ -123,39 +151,69 @@ def _field(value: Any) -> Any:
 
 def batch_json(records: Sequence[Record], found: Sequence[PlanHistory], done_before: int) -> dict:
     """Return the whole batch as one JSON object, docs/guides/batch.md."""
-    counts = {name: sum(code == r["exit_code"] for r in records) for name, code in (
-        ("qualified", 0), ("not_qualified", 5))}
-    return {"schema": SCHEMA, "bags": len(records), **counts,
-            "without_result": len(records) - sum(counts.values()), "done_before": done_before,
-            "records": [{k: v for k, v in record.items() if k not in ("files", "schema")}
-                        for record in in_time(records)],
-            "series": [{
-                "plan_id": series.plan_id, "bags": [r["bag"] for r in series.records],
+    counts = {
+        name: sum(code == r["exit_code"] for r in records)
+        for name, code in (("qualified", 0), ("not_qualified", 5))
+    }
+    return {
+        "schema": SCHEMA,
+        "bags": len(records),
+        **counts,
+        "without_result": len(records) - sum(counts.values()),
+        "done_before": done_before,
+        "records": [
+            {k: v for k, v in record.items() if k not in ("files", "schema")}
+            for record in in_time(records)
+        ],
+        "series": [
+            {
+                "plan_id": series.plan_id,
+                "bags": [r["bag"] for r in series.records],
                 "findings": series.sentences(),
-                "courses": {name: _course_json(series, course)
-                            for name, course in series.courses.items()}} for series in found]}
+                "courses": {
+                    name: _course_json(series, course) for name, course in series.courses.items()
+                },
+            }
+            for series in found
+        ],
+    }
 
 
 def _course_json(series: PlanHistory, course: Course) -> dict:
-    changed = [series.records[i]["first_exposure"] for i in
-               (course.last_before, course.change)] if course.change else None
-    return {"n": course.n, "finding": str(course.finding), "adjusted_p": course.adjusted_p,
-            "p_trend": course.p_trend, "slope_per_day": list(course.slope_per_day),
-            "p_change": course.p_change, "change_between": changed,
-            "before": course.before, "after": course.after}
+    changed = (
+        [series.records[i]["first_exposure"] for i in (course.last_before, course.change)]
+        if course.change
+        else None
+    )
+    return {
+        "n": course.n,
+        "finding": str(course.finding),
+        "adjusted_p": course.adjusted_p,
+        "p_trend": course.p_trend,
+        "slope_per_day": list(course.slope_per_day),
+        "p_change": course.p_change,
+        "change_between": changed,
+        "before": course.before,
+        "after": course.after,
+    }
 
 
-def summary_lines(records: Sequence[Record], found: Sequence[PlanHistory],
-                  done_before: int) -> list[str]:
+def summary_lines(
+    records: Sequence[Record], found: Sequence[PlanHistory], done_before: int
+) -> list[str]:
     """Return a summary of a batch, in lines."""
     good = sum(record["exit_code"] == 0 for record in records)
     maps = good + sum(record["exit_code"] == 5 for record in records)
-    lines = [f"{len(records)} bags: {maps} calibrated, {good} of them qualified, "
-             f"{len(records) - maps} without a result; {done_before} were done before"]
+    lines = [
+        f"{len(records)} bags: {maps} calibrated, {good} of them qualified, "
+        f"{len(records) - maps} without a result; {done_before} were done before"
+    ]
     for series in found:
         sentences = series.sentences()
-        lines.append(f"plan {series.plan_id}, {len(series.records)} bags from {series.date(0)} to "
-                     f"{series.date(-1)}:")
+        lines.append(
+            f"plan {series.plan_id}, {len(series.records)} bags from {series.date(0)} to "
+            f"{series.date(-1)}:"
+        )
         few = f"too few bags for a trend (fewer than {FEWEST})"
         nothing = few if len(series.records) < FEWEST else "no quantity has a trend or a change"
         lines += [f"  {line}" for line in sentences or [nothing]]

@@ -26,21 +26,39 @@ ENDS = ("x1", "y1", "x2", "y2")
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
-    parser.add_argument("points", metavar="POINTS.csv",
-                        help="columns x,y or x,y,theta in m and rad, stage frame; x1,y1,x2,y2: "
-                             "the error of the distance between two points")
-    parser.add_argument("-o", "--output", metavar="OUT.csv", required=True,
-                        help="table to write: the points, the corrected ones, and their standard "
-                             "uncertainties (empty = unknown); - = stdout")
-    parser.add_argument("--inverse", action="store_true",
-                        help="the points are indicated positions: give the true ones")
-    parser.add_argument("--method", choices=("bilinear", "bicubic"),
-                        help="interpolation between the nodes (default: that of the map; "
-                             "bilinear on the plate's lattice, or if nodes are unknown)")
-    parser.add_argument("--outside", choices=("empty", "edge", "refuse"), default="empty",
-                        help="points outside the field, where u is not known: leave them empty "
-                             "and end with code 5 (default), use the error at the edge of the "
-                             "field, or refuse")
+    parser.add_argument(
+        "points",
+        metavar="POINTS.csv",
+        help="columns x,y or x,y,theta in m and rad, stage frame; x1,y1,x2,y2: "
+        "the error of the distance between two points",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.csv",
+        required=True,
+        help="table to write: the points, the corrected ones, and their standard "
+        "uncertainties (empty = unknown); - = stdout",
+    )
+    parser.add_argument(
+        "--inverse",
+        action="store_true",
+        help="the points are indicated positions: give the true ones",
+    )
+    parser.add_argument(
+        "--method",
+        choices=("bilinear", "bicubic"),
+        help="interpolation between the nodes (default: that of the map; "
+        "bilinear on the plate's lattice, or if nodes are unknown)",
+    )
+    parser.add_argument(
+        "--outside",
+        choices=("empty", "edge", "refuse"),
+        default="empty",
+        help="points outside the field, where u is not known: leave them empty "
+        "and end with code 5 (default), use the error at the edge of the "
+        "field, or refuse",
+    )
     add_json(parser)
 
 
@@ -51,22 +69,36 @@ def run(args: argparse.Namespace) -> int:
     do points outside the field that are left empty.
     """
     check_outputs([args.result, args.points], [file_of(args)])
-    stage = load(args.result, method=args.method,
-                 outside="refuse" if args.outside == "refuse" else "clamp")
+    stage = load(
+        args.result, method=args.method, outside="refuse" if args.outside == "refuse" else "clamp"
+    )
     points = read_points(read_text(args.points), args.points)
     edge = args.outside == "edge"
     refuse_other_unit(stage, points, args.points)
     table = distances if points.shape[1] == len(ENDS) else corrected
     text, unknown, outside = table(stage, points, inverse=args.inverse, edge=edge)
     _say_better(stage, points)
-    left = ("corrected as the nearest point of its edge, where u is not known" if edge else
-            "left empty (--outside edge corrects them as the nearest point of its edge)")
-    for count, what in ((outside, f"outside the field, {left}"),
-                        (unknown, "next to unknown sites or lines, left empty")):
+    left = (
+        "corrected as the nearest point of its edge, where u is not known"
+        if edge
+        else "left empty (--outside edge corrects them as the nearest point of its edge)"
+    )
+    for count, what in (
+        (outside, f"outside the field, {left}"),
+        (unknown, "next to unknown sites or lines, left empty"),
+    ):
         if count:
             print(f"selfcal apply: points {what}: {count}", file=sys.stderr)
-    code = deliver(args, stage.result, text, "csv", note=f", {len(points)} points",
-                   points=len(points), unknown=unknown, outside=outside)
+    code = deliver(
+        args,
+        stage.result,
+        text,
+        "csv",
+        note=f", {len(points)} points",
+        points=len(points),
+        unknown=unknown,
+        outside=outside,
+    )
     return int(ExitCode.NOT_QUALIFIED) if outside and not edge else code
 
 
@@ -89,9 +121,13 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
         return
     x, y = half * MM_PER_M
     farthest = places[beyond.argmax()]
-    raise InputError(where, f"all points lie outside the field (x from {-x:g} to {x:g} mm, y from "
-                     f"{-y:g} to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in "
-                     "mm?", "give positions in m, in the stage frame")
+    raise InputError(
+        where,
+        f"all points lie outside the field (x from {-x:g} to {x:g} mm, y from "
+        f"{-y:g} to {y:g} mm), up to ({farthest[0]:g}, {farthest[1]:g}) m: is it in "
+        "mm?",
+        "give positions in m, in the stage frame",
+    )
 
 
 def _say_better(stage: StageMap, points: np.ndarray) -> None:
@@ -99,14 +135,15 @@ def _say_better(stage: StageMap, points: np.ndarray) -> None:
     emap, used = stage.error_map, rms(stage.halfway)
     x, y = points[:, :2].T
     plain = np.array(stage.uncertainty(x, y)) if used else np.zeros(1)
-    if stage.method == "bicubic" or not emap.valid.all() \
-            or not rms(plain) > 2 * rms(emap.u_xy):
+    if stage.method == "bicubic" or not emap.valid.all() or not rms(plain) > 2 * rms(emap.u_xy):
         return
     cubic = rms(Compensator(emap, method="bicubic").halfway)
     if cubic < used / 2:
-        print("selfcal apply: between the nodes u is mostly that of bilinear interpolation, "
-              f"{used * UM_PER_M:.2g} um halfway; with --method bicubic {cubic * UM_PER_M:.2g} um",
-              file=sys.stderr)
+        print(
+            "selfcal apply: between the nodes u is mostly that of bilinear interpolation, "
+            f"{used * UM_PER_M:.2g} um halfway; with --method bicubic {cubic * UM_PER_M:.2g} um",
+            file=sys.stderr,
+        )
 
 
 def read_points(text: str, where: str) -> np.ndarray:
@@ -117,12 +154,18 @@ def read_points(text: str, where: str) -> np.ndarray:
     InputError
         For another header, or a line that is not as many finite numbers.
     """
-    rows = [(number, csv_cells(line, f"{where}:{number}"))
-            for number, line in enumerate(text.splitlines(), 1) if line.strip(", ")]
+    rows = [
+        (number, csv_cells(line, f"{where}:{number}"))
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip(", ")
+    ]
     head = [cell.lower() for cell in rows[0][1]] if rows else []
     if tuple(head) not in (AXES, AXES[:2], ENDS):
-        raise InputError(f"{where}:1", "the header is not x,y or x,y,theta or x1,y1,x2,y2",
-                         "name the columns; positions in m and rad")
+        raise InputError(
+            f"{where}:1",
+            "the header is not x,y or x,y,theta or x1,y1,x2,y2",
+            "name the columns; positions in m and rad",
+        )
     points = np.empty((len(rows) - 1, len(head)))
     for index, (number, cells) in enumerate(rows[1:]):
         try:
@@ -130,23 +173,30 @@ def read_points(text: str, where: str) -> np.ndarray:
         except ValueError:
             points[index] = np.nan
         if not np.abs(points[index]).max() < 1e12:
-            raise InputError(f"{where}:{number}", f"not {len(head)} positions",
-                             f"give {','.join(head)} in m and rad")
+            raise InputError(
+                f"{where}:{number}",
+                f"not {len(head)} positions",
+                f"give {','.join(head)} in m and rad",
+            )
     if not len(points):
         raise InputError(where, "it has no points", "give at least one")
     if "theta" in head and (largest := np.abs(points[:, 2]).max()) > 2 * np.pi:
-        raise InputError(where, f"theta up to {largest:g} rad, more than a turn: is it in degrees?",
-                         "give theta in rad, within a turn")
+        raise InputError(
+            where,
+            f"theta up to {largest:g} rad, more than a turn: is it in degrees?",
+            "give theta in rad, within a turn",
+        )
     return points
 
 
-def corrected(stage: StageMap, points: np.ndarray, *, inverse: bool,
-              edge: bool) -> tuple[str, int, int]:
+def corrected(
+    stage: StageMap, points: np.ndarray, *, inverse: bool, edge: bool
+) -> tuple[str, int, int]:
     """Return the table of corrected points, and how many are unknown and outside the field.
 
     Those outside are left empty, or with `edge` corrected as the nearest point of the field.
     """
-    names, what = AXES[:points.shape[1]], "true" if inverse else "command"
+    names, what = AXES[: points.shape[1]], "true" if inverse else "command"
     x, y, *theta = points.T
     found = list(stage.correct(x, y) if inverse else stage.command(x, y))
     u = list((stage.uncertainty_indicated if inverse else stage.uncertainty)(x, y))
@@ -163,8 +213,9 @@ def corrected(stage: StageMap, points: np.ndarray, *, inverse: bool,
     return _csv(head, np.column_stack([points, *found, *u])), unknown, int(outside.sum())
 
 
-def distances(stage: StageMap, points: np.ndarray, *, inverse: bool,
-              edge: bool) -> tuple[str, int, int]:
+def distances(
+    stage: StageMap, points: np.ndarray, *, inverse: bool, edge: bool
+) -> tuple[str, int, int]:
     """Return the table of distances with their errors, as `corrected`; and a line over length."""
     if inverse:
         raise InputError("--inverse", "the ends of distances are true positions", "leave it out")
@@ -175,9 +226,11 @@ def distances(stage: StageMap, points: np.ndarray, *, inverse: bool,
         error = np.where(outside, np.nan, error)
     for where, anywhere in (("anywhere in the field", True), ("of two nodes", False)):
         a, b = stage.length_uncertainty(anywhere=anywhere)
-        print(f"selfcal apply: U of a distance L {where} is at most {a * UM_PER_M:.3g} um + "
-              f"{b * UM_PER_M:.3g} um/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
-              file=sys.stderr)
+        print(
+            f"selfcal apply: U of a distance L {where} is at most {a * UM_PER_M:.3g} um + "
+            f"{b * UM_PER_M:.3g} um/m L (k = {stage.result.noise.k_xy:.3g}, 95.45 %)",
+            file=sys.stderr,
+        )
     rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u])
     return _csv([*ENDS, "length", "error", "u"], rows), 0, int(outside.sum())
 

@@ -25,23 +25,41 @@ SEEN = 1 << 14
 """Bytes at the beginning of a file by which its kind is recognised."""
 
 BAG, RESULT, PLAN, SIMULATION = "a bag", "a result", "a plan", "a simulation"
-PARAMETERS, CAL, TABLE, PROGRAM = ("a parameter file of nodes", "a calibration file",
-                                   "a table of numbers", "a G-code program")
+PARAMETERS, CAL, TABLE, PROGRAM = (
+    "a parameter file of nodes",
+    "a calibration file",
+    "a table of numbers",
+    "a G-code program",
+)
 CELL = "a cell"
-WANTED = {"BAG": BAG, "A.json": RESULT, "B.json": RESULT, "RESULT.json": RESULT,
-          "PLAN.yaml": PLAN, "CELL.yaml": CELL, "SIM.yaml": SIMULATION,
-          "NODES.yaml": PARAMETERS, "FILE.cal": CAL, "ACTIVE.cal": CAL, "POINTS.csv": TABLE,
-          "MAP.csv": TABLE, "DATA.csv": TABLE, "IN": PROGRAM}
+WANTED = {
+    "BAG": BAG,
+    "A.json": RESULT,
+    "B.json": RESULT,
+    "RESULT.json": RESULT,
+    "PLAN.yaml": PLAN,
+    "CELL.yaml": CELL,
+    "SIM.yaml": SIMULATION,
+    "NODES.yaml": PARAMETERS,
+    "FILE.cal": CAL,
+    "ACTIVE.cal": CAL,
+    "POINTS.csv": TABLE,
+    "MAP.csv": TABLE,
+    "DATA.csv": TABLE,
+    "IN": PROGRAM,
+}
 """Name of an argument -> kind of file that it stands for."""
-USES = {BAG: "a map is computed from it with `selfcal solve {} -o RESULT.json`",
-        RESULT: "`selfcal report {}` shows it",
-        PLAN: "`selfcal plan check {}` says what it determines",
-        SIMULATION: "`selfcal simulate {} -o BAG` writes its bag",
-        CELL: "`selfcal cell try {}` shows what its machine sees",
-        PARAMETERS: "give it with --params",
-        CAL: "`selfcal cal check {}` reads it",
-        TABLE: "`selfcal apply RESULT.json {} -o OUT.csv` corrects points",
-        PROGRAM: "`selfcal gcode {} RESULT.json -o OUT` corrects it"}
+USES = {
+    BAG: "a map is computed from it with `selfcal solve {} -o RESULT.json`",
+    RESULT: "`selfcal report {}` shows it",
+    PLAN: "`selfcal plan check {}` says what it determines",
+    SIMULATION: "`selfcal simulate {} -o BAG` writes its bag",
+    CELL: "`selfcal cell try {}` shows what its machine sees",
+    PARAMETERS: "give it with --params",
+    CAL: "`selfcal cal check {}` reads it",
+    TABLE: "`selfcal apply RESULT.json {} -o OUT.csv` corrects points",
+    PROGRAM: "`selfcal gcode {} RESULT.json -o OUT` corrects it",
+}
 """Kind of file -> what it is good for, with its name."""
 BEGINNINGS = (
     (BAG, re.compile(rb"\x89MCAP0\r\n")),
@@ -50,7 +68,8 @@ BEGINNINGS = (
     (PARAMETERS, re.compile(rb"(?:.*\n)*?\s+ros__parameters\s*:")),
     (PLAN, re.compile(rb"(?:.*\n)*?plan_id\s*:")),
     (CELL, re.compile(rb"(?:.*\n)*?limits[ \t]*:")),
-    (SIMULATION, re.compile(rb"(?:.*\n)*?(?:plan|truth|noise)\s*:")))
+    (SIMULATION, re.compile(rb"(?:.*\n)*?(?:plan|truth|noise)\s*:")),
+)
 ENDINGS = {".csv": TABLE, ".nc": PROGRAM, ".ngc": PROGRAM, ".gcode": PROGRAM}
 
 
@@ -104,15 +123,17 @@ def _refuse_ending(path: str, metavar: str) -> None:
     """Raise InputError if the name of an output ends as that of a file of another kind."""
     wanted, ending = (os.path.splitext(name)[1].lower() for name in (metavar, path))
     if wanted in FORMATS and ending in OTHERS and ending not in (wanted, *FORMATS[wanted]):
-        raise InputError(path, f"{metavar} is written here, which is not {ending}",
-                         f"end the name in {wanted}")
+        raise InputError(
+            path, f"{metavar} is written here, which is not {ending}", f"end the name in {wanted}"
+        )
 
 
 def refuse_existing(path: str | os.PathLike, *, force: bool) -> None:
     """Raise InputError if `path` is a file with content, and ``--force`` is not given."""
     if not force and os.path.isfile(path) and os.path.getsize(path):
-        raise InputError(str(path), "the file exists",
-                         "name another file, or replace it with --force")
+        raise InputError(
+            str(path), "the file exists", "name another file, or replace it with --force"
+        )
 
 
 def misplaced(args: argparse.Namespace) -> InputError | None:
@@ -122,13 +143,21 @@ def misplaced(args: argparse.Namespace) -> InputError | None:
     for first in wrong:
         for other in wrong:
             if first.kind in other.wanted and other.kind in first.wanted:
-                words = [{first.path: other.path, other.path: first.path}.get(word, word)
-                         for word in args.words]
-                return InputError(first.path, f"is {first.kind}, and {other.path} is {other.kind}: "
-                                  "they are swapped", f"write `selfcal {shlex.join(words)}`")
+                words = [
+                    {first.path: other.path, other.path: first.path}.get(word, word)
+                    for word in args.words
+                ]
+                return InputError(
+                    first.path,
+                    f"is {first.kind}, and {other.path} is {other.kind}: they are swapped",
+                    f"write `selfcal {shlex.join(words)}`",
+                )
     for item in wrong:
-        return InputError(item.path, f"is {item.kind}, and {' or '.join(item.wanted)} is needed "
-                          "here", USES[item.kind].format(shlex.quote(item.path)))
+        return InputError(
+            item.path,
+            f"is {item.kind}, and {' or '.join(item.wanted)} is needed here",
+            USES[item.kind].format(shlex.quote(item.path)),
+        )
     return None
 
 
@@ -138,8 +167,11 @@ def _files(args: argparse.Namespace) -> Iterator[File]:
         wanted = tuple(WANTED[name] for name in str(action.metavar).split("|") if name in WANTED)
         values = getattr(args, action.dest, None)
         for value in values if isinstance(values, list) else [values]:
-            if wanted and isinstance(value, str) and not OUTPUTS.intersection(
-                    action.option_strings):
+            if (
+                wanted
+                and isinstance(value, str)
+                and not OUTPUTS.intersection(action.option_strings)
+            ):
                 yield File(value, wanted, kind_of(value))
 
 
@@ -148,8 +180,11 @@ def kind_of(path: str) -> str:
     try:
         if os.path.isdir(path):
             names = os.listdir(path)
-            return BAG if any(name == "metadata.yaml" or name.endswith(".mcap")
-                              for name in names) else ""
+            return (
+                BAG
+                if any(name == "metadata.yaml" or name.endswith(".mcap") for name in names)
+                else ""
+            )
         if not os.path.isfile(path):
             return ""
         with open(path, "rb") as file:

@@ -38,20 +38,36 @@ LOCAL = "local"
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("bags", metavar="DIR|BAG", nargs="+", help="MCAP files, rosbag2 folders, "
-                        "or folders that contain them at any depth")
-    parser.add_argument("-o", "--output", metavar="FOLDER", required=True,
-                        help="folder for results, table.csv, index.html and batch.json; results "
-                        "already there are kept")
+    parser.add_argument(
+        "bags",
+        metavar="DIR|BAG",
+        nargs="+",
+        help="MCAP files, rosbag2 folders, or folders that contain them at any depth",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FOLDER",
+        required=True,
+        help="folder for results, table.csv, index.html and batch.json; results "
+        "already there are kept",
+    )
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--workers", type=int, metavar="N",
-                     help="processes (default: one per core)")
-    how.add_argument("--dask", metavar="ADDRESS", nargs="?", const=LOCAL,
-                     help="use a dask.distributed cluster: address of its scheduler, with access "
-                     "to the same files, or 'local' (default) for one started for this run")
+    how.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    how.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        nargs="?",
+        const=LOCAL,
+        help="use a dask.distributed cluster: address of its scheduler, with access "
+        "to the same files, or 'local' (default) for one started for this run",
+    )
     parser.add_argument("--redo", action="store_true", help="solve all bags again")
-    parser.add_argument("--baseline", metavar="RESULT.json",
-                        help="test every map against this one, and name those that differ")
+    parser.add_argument(
+        "--baseline",
+        metavar="RESULT.json",
+        help="test every map against this one, and name those that differ",
+    )
     add_json(parser, "the contents of batch.json instead of a summary")
     add_options(parser, ROBUST)
 
@@ -62,8 +78,11 @@ def run(args: argparse.Namespace) -> int:
         begin("selfcal_ros.batch.jobs", check_workers(args.workers))
 
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
-        raise InputError("--dask", f"'{args.dask}' is not the address of a scheduler",
-                         f"write HOST:PORT, or --dask {LOCAL} in front of a bag")
+        raise InputError(
+            "--dask",
+            f"'{args.dask}' is not the address of a scheduler",
+            f"write HOST:PORT, or --dask {LOCAL} in front of a bag",
+        )
     baseline = read_result(args.baseline) if args.baseline else None
     settings = BatchSettings(*parameters(args), args.namespace)
     bags, folder = find_bags(args.bags), Path(args.output)
@@ -90,13 +109,19 @@ def run(args: argparse.Namespace) -> int:
         write_text(folder / "table.csv", csv_text(records))
         write_text(folder / "index.html", page_html(records, found, lines))
         write_json(folder / "batch.json", content)
-    say(args, "\n".join([*map(printable, lines), f"written: {folder / 'table.csv'}, index.html, "
-                         "batch.json"]), content)
+    say(
+        args,
+        "\n".join(
+            [*map(printable, lines), f"written: {folder / 'table.csv'}, index.html, batch.json"]
+        ),
+        content,
+    )
     return exit_code(records)
 
 
-def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "BatchSettings",
-            places: Sequence[int]) -> dict[int, "Record"]:
+def _worked(
+    args: argparse.Namespace, bags: Sequence[Path], settings: "BatchSettings", places: Sequence[int]
+) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
     found: dict[int, Record] = {}
     workers = check_workers(args.workers)
@@ -116,8 +141,12 @@ def _worked(args: argparse.Namespace, bags: Sequence[Path], settings: "BatchSett
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:
     """Return the record of a bag that failed with an internal error; it is not kept."""
     reason = first_line(error) if error is not None else "no outcome"
-    return {"bag": os.path.realpath(bag), "exit_code": int(ExitCode.INTERNAL), "qualified": None,
-            "message": f"{type(error).__name__}: {reason}"}
+    return {
+        "bag": os.path.realpath(bag),
+        "exit_code": int(ExitCode.INTERNAL),
+        "qualified": None,
+        "message": f"{type(error).__name__}: {reason}",
+    }
 
 
 def _say(record: "Record") -> None:
@@ -133,5 +162,7 @@ def exit_code(records: Sequence["Record"]) -> int:
     From bad to worse: not qualified (5), no usable data (4), not identified (3), bad input (2),
     internal error (1).
     """
-    return min((record["exit_code"] for record in records if record["exit_code"]),
-               default=int(ExitCode.DONE))
+    return min(
+        (record["exit_code"] for record in records if record["exit_code"]),
+        default=int(ExitCode.DONE),
+    )

@@ -44,7 +44,8 @@ STEPS = (
     "Studio, workspace Configure, Controller, Calibration: name the file; or load it without a "
     "reset by CalibrationLoad()",
     "home the axes: they are corrected only once they are homed",
-    "see it act: the data signal Position Calibration All of each axis shows its correction")
+    "see it act: the data signal Position Calibration All of each axis shows its correction",
+)
 """How a file is put into use (Automation1, Axis Calibration)."""
 
 
@@ -64,34 +65,75 @@ def add_files(group: argparse._SubParsersAction) -> None:
     """Add the sub-verbs."""
     check = group.add_parser("check", help="check a file against every rule of the format")
     check.add_argument("file", metavar="FILE.cal")
-    check.add_argument("--gi4", action="store_true",
-                       help="check galvo tables against the restrictions of the GI4 too")
-    check.add_argument("--scanner-bits", type=int, metavar="N",
-                       help=f"bits of the scanner protocol behind --gi4 (default {SCANNER_BITS})")
-    check.add_argument("--strict", action="store_true",
-                       help="also refuse tolerated and doubtful content")
+    check.add_argument(
+        "--gi4",
+        action="store_true",
+        help="check galvo tables against the restrictions of the GI4 too",
+    )
+    check.add_argument(
+        "--scanner-bits",
+        type=int,
+        metavar="N",
+        help=f"bits of the scanner protocol behind --gi4 (default {SCANNER_BITS})",
+    )
+    check.add_argument(
+        "--strict", action="store_true", help="also refuse tolerated and doubtful content"
+    )
     check.add_argument("--json", action="store_true", help="print the findings as JSON")
     check.set_defaults(run_sub_verb=_check)
-    evaluate = group.add_parser("eval", help="print the corrections at a position as JSON, "
-                                             "in primary units by axis")
-    evaluate.add_argument("files", metavar="FILE.cal", nargs="+", help="file, or several that are "
-                          "loaded together: their corrections are added")
+    evaluate = group.add_parser(
+        "eval", help="print the corrections at a position as JSON, in primary units by axis"
+    )
+    evaluate.add_argument(
+        "files",
+        metavar="FILE.cal",
+        nargs="+",
+        help="file, or several that are loaded together: their corrections are added",
+    )
     add = evaluate.add_argument
-    add("--position", action="append", metavar="AXIS=P", help="position: primary units, or a "
-        "length as in 1=10.5mm")
-    add("--unit", choices=("m", "mm", "um"), help="primary unit of the linear axes, for positions "
-        "with a unit (default: from the comments of FILE.cal, else mm)")
-    add("--counts-per-unit", action="append", metavar="AXIS=C",
-        help="encoder counts per primary unit")
-    add("--counts-per-secondary", action="append", metavar="AXIS=C",
-        help="encoder counts per secondary unit")
+    add(
+        "--position",
+        action="append",
+        metavar="AXIS=P",
+        help="position: primary units, or a length as in 1=10.5mm",
+    )
+    add(
+        "--unit",
+        choices=("m", "mm", "um"),
+        help="primary unit of the linear axes, for positions "
+        "with a unit (default: from the comments of FILE.cal, else mm)",
+    )
+    add(
+        "--counts-per-unit",
+        action="append",
+        metavar="AXIS=C",
+        help="encoder counts per primary unit",
+    )
+    add(
+        "--counts-per-secondary",
+        action="append",
+        metavar="AXIS=C",
+        help="encoder counts per secondary unit",
+    )
     add("--temperature", type=float, metavar="T", help="temperature of the scales, degC")
-    add("--home-direction", action="append", metavar="AXIS=CW|CCW",
-        help="home direction now, if it has changed since the table was made")
-    add("--home-offset", action="append", metavar="AXIS=P",
-        help="home offset now, primary units, if it has changed")
-    add("--absolute-feedback-offset", action="append", metavar="AXIS=C",
-        help="absolute feedback offset now, counts, if it has changed")
+    add(
+        "--home-direction",
+        action="append",
+        metavar="AXIS=CW|CCW",
+        help="home direction now, if it has changed since the table was made",
+    )
+    add(
+        "--home-offset",
+        action="append",
+        metavar="AXIS=P",
+        help="home offset now, primary units, if it has changed",
+    )
+    add(
+        "--absolute-feedback-offset",
+        action="append",
+        metavar="AXIS=C",
+        help="absolute feedback offset now, counts, if it has changed",
+    )
     add("--json", action="store_true", help="print JSON (the default)")
     evaluate.set_defaults(run_sub_verb=_evaluate)
 
@@ -105,19 +147,34 @@ def _check(args: argparse.Namespace) -> int:
     cal = read_cal(args.file, gi4=Gi4(bits) if args.gi4 else None)
     counts = {severity: len(cal.of(severity)) for severity in Severity}
     if args.json:
-        print(json.dumps({
-            "file": args.file, "tables": [_described(table) for table in cal.tables],
-            **{f"{severity}s" if severity is not Severity.TOLERATED else "tolerated": number
-               for severity, number in counts.items()},
-            "findings": [{"line": f.line, "severity": f.severity, "what": f.what, "mend": f.remedy}
-                         for f in cal.findings]}, indent=1))
+        print(
+            json.dumps(
+                {
+                    "file": args.file,
+                    "tables": [_described(table) for table in cal.tables],
+                    **{
+                        f"{severity}s"
+                        if severity is not Severity.TOLERATED
+                        else "tolerated": number
+                        for severity, number in counts.items()
+                    },
+                    "findings": [
+                        {"line": f.line, "severity": f.severity, "what": f.what, "mend": f.remedy}
+                        for f in cal.findings
+                    ],
+                },
+                indent=1,
+            )
+        )
     else:
         for finding in cal.findings:
             print(finding.text(args.file))
         for table in cal.tables:
             print(f"{args.file}:{table.line}: {_described(table)['text']}")
-        print(f"{args.file}: {len(cal.tables)} tables, {counts[Severity.ERROR]} errors, "
-              f"{counts[Severity.WARNING]} warnings, {counts[Severity.TOLERATED]} tolerated")
+        print(
+            f"{args.file}: {len(cal.tables)} tables, {counts[Severity.ERROR]} errors, "
+            f"{counts[Severity.WARNING]} warnings, {counts[Severity.TOLERATED]} tolerated"
+        )
     refuse_errors(cal)
     if args.strict and cal.findings:
         first = cal.findings[0]
@@ -129,18 +186,24 @@ def _described(table: "Table1D | Table2D") -> dict:
     shape = " x ".join(map(str, table.values.shape[:2]))
     outputs = ", ".join(map(str, table.outputs))
     inputs = " and ".join(map(str, table.inputs))
-    return {"line": table.line, "kind": table.kind, "inputs": list(table.inputs),
-            "outputs": list(table.outputs), "shape": list(table.values.shape),
-            "text": f"{table.kind} table, {shape} entries, corrects axis {outputs} from the "
-                    f"position of axis {inputs}"}
+    return {
+        "line": table.line,
+        "kind": table.kind,
+        "inputs": list(table.inputs),
+        "outputs": list(table.outputs),
+        "shape": list(table.values.shape),
+        "text": f"{table.kind} table, {shape} entries, corrects axis {outputs} from the "
+        f"position of axis {inputs}",
+    }
 
 
 def _evaluate(args: argparse.Namespace) -> int:
     cal = load_cals(args.files)
     frame = frame_from_comments(cal.comments)
     unit = args.unit or (frame.unit if frame else "mm")
-    rotary = {axis for table in cal.tables if getattr(table, "rollover", None)
-              for axis in table.inputs}
+    rotary = {
+        axis for table in cal.tables if getattr(table, "rollover", None) for axis in table.inputs
+    }
     if frame is not None and frame.theta_axis is not None:
         rotary.add(frame.theta_axis)
     given = cal_lines.in_unit(args.position, unit, rotary=rotary)
@@ -158,44 +221,73 @@ def _setup(args: argparse.Namespace) -> "MachineSetup":
     directions = cal_lines.pairs(args.home_direction, "--home-direction")
     for axis, word in directions.items():
         if word not in ("CW", "CCW"):
-            raise InputError("--home-direction", f"'{word}' is not a home direction",
-                             f"write {axis}=CW or {axis}=CCW")
-    found: dict[str, dict[int, Any]] = {name: cal_lines.numbers(
-        getattr(args, name), f"--{name.replace('_', '-')}", positive=name.startswith("counts"))
-        for name in ("counts_per_unit", "counts_per_secondary", "home_offset",
-                     "absolute_feedback_offset")}
+            raise InputError(
+                "--home-direction",
+                f"'{word}' is not a home direction",
+                f"write {axis}=CW or {axis}=CCW",
+            )
+    found: dict[str, dict[int, Any]] = {
+        name: cal_lines.numbers(
+            getattr(args, name), f"--{name.replace('_', '-')}", positive=name.startswith("counts")
+        )
+        for name in (
+            "counts_per_unit",
+            "counts_per_secondary",
+            "home_offset",
+            "absolute_feedback_offset",
+        )
+    }
     found["home_direction"] = directions
     axes: set[int] = set().union(*found.values())
-    return MachineSetup({axis: AxisSetup(**{name: values.get(axis)
-                                            for name, values in found.items()})
-                         for axis in axes}, args.temperature)
+    return MachineSetup(
+        {
+            axis: AxisSetup(**{name: values.get(axis) for name, values in found.items()})
+            for axis in axes
+        },
+        args.temperature,
+    )
 
 
 def add_maps(group: argparse._SubParsersAction) -> None:
     """Add the sub-verbs."""
     export = group.add_parser("export", help="write the tables of an error map")
     export.add_argument("result", metavar="RESULT.json")
-    export.add_argument("-o", "--output", metavar="FILE.cal", required=True,
-                        help="2D table for x and y")
-    export.add_argument("--theta-output", metavar="FILE.cal",
-                        help="1D table for theta, which cannot share a file with a 2D table "
-                             "(default: FILE_theta.cal)")
-    export.add_argument("--fill", action="store_true",
-                        help="set unknown sites to the mean of their neighbours")
-    export.add_argument("--onto", metavar="ACTIVE.cal", help="table of x and y that was loaded "
-                        "during the calibration: the new one replaces it")
-    export.add_argument("--force", action="store_true",
-                        help="replace existing files; the old ones are kept with their date")
+    export.add_argument(
+        "-o", "--output", metavar="FILE.cal", required=True, help="2D table for x and y"
+    )
+    export.add_argument(
+        "--theta-output",
+        metavar="FILE.cal",
+        help="1D table for theta, which cannot share a file with a 2D table "
+        "(default: FILE_theta.cal)",
+    )
+    export.add_argument(
+        "--fill", action="store_true", help="set unknown sites to the mean of their neighbours"
+    )
+    export.add_argument(
+        "--onto",
+        metavar="ACTIVE.cal",
+        help="table of x and y that was loaded during the calibration: the new one replaces it",
+    )
+    export.add_argument(
+        "--force",
+        action="store_true",
+        help="replace existing files; the old ones are kept with their date",
+    )
     add_json(export)
     cal_lines.add_frame(export, theta=True)
     export.set_defaults(run_sub_verb=_export)
-    verify = group.add_parser("verify", help="print the residual of a simulated controller before "
-                                             "and after a file is loaded, um")
+    verify = group.add_parser(
+        "verify",
+        help="print the residual of a simulated controller before and after a file is loaded, um",
+    )
     verify.add_argument("result", metavar="RESULT.json")
-    verify.add_argument("files", metavar="FILE.cal", nargs="+", help="file, or several that are "
-                        "loaded together")
-    verify.add_argument("--onto", metavar="ACTIVE.cal",
-                        help="table that was loaded during the calibration")
+    verify.add_argument(
+        "files", metavar="FILE.cal", nargs="+", help="file, or several that are loaded together"
+    )
+    verify.add_argument(
+        "--onto", metavar="ACTIVE.cal", help="table that was loaded during the calibration"
+    )
     verify.add_argument("--plot", metavar="F.png", help="draw it (png, svg or pdf)")
     verify.add_argument("--json", action="store_true", help="print as JSON, m and rad")
     cal_lines.add_frame(verify, theta=True, default=False)
@@ -207,23 +299,29 @@ def _export(args: argparse.Namespace) -> int:
     if args.theta_output and frame.theta_axis is None:
         raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
     result, filled = ready(args)
-    comments = [*provenance(result, frame, filled=filled, command=command(args)),
-                "zero at home by the controller"]
+    comments = [
+        *provenance(result, frame, filled=filled, command=command(args)),
+        "zero at home by the controller",
+    ]
     error_map, active = result.error_map, _active(args, frame)
     if active is not None:
         error_map = combined(error_map, frame, active)
         say_bent(args, bends_between(error_map, frame, active))
         comments.append("replaces the table that was loaded during the calibration")
-    texts = {args.output: cal_text([export.table_xy(error_map, frame)],
-                                   comments=comments, decimals=export.DECIMALS)}
+    texts = {
+        args.output: cal_text(
+            [export.table_xy(error_map, frame)], comments=comments, decimals=export.DECIMALS
+        )
+    }
     if frame.theta_axis is not None:
         target = Path(args.output)
         beside = args.theta_output or str(target.with_name(f"{target.stem}_theta{target.suffix}"))
         if os.path.realpath(beside) == os.path.realpath(target):
             raise InputError(beside, "a 1D and a 2D table cannot share a file", "name another file")
         table = export.table_theta(result.error_map, frame)
-        texts[beside] = cal_text([table], comments=comments,
-                                 decimals=export.theta_decimals(result.error_map))
+        texts[beside] = cal_text(
+            [table], comments=comments, decimals=export.theta_decimals(result.error_map)
+        )
     lines, files = [], []
     tables = parse_cal(texts[args.output].encode(), args.output).tables
     loaded = plane_correction(CalEvaluator(tables, setup_of(frame)), frame)
@@ -232,11 +330,17 @@ def _export(args: argparse.Namespace) -> int:
         kind = "1D table for theta" if path != args.output else "2D table for x and y"
         lines.append(f"{path}: {kind}{replaced(backup)}")
         files.append({"file": path, "kind": kind, "old_file": backup})
-    say(args, "\n".join([*lines, *numbered(steps)]),
-        {"files": files, "filled": filled, "checklist": list(steps)})
+    say(
+        args,
+        "\n".join([*lines, *numbered(steps)]),
+        {"files": files, "filled": filled, "checklist": list(steps)},
+    )
     if frame.theta_axis is not None and frame.theta_counts_per_unit is None:
-        print("selfcal cal: the theta table covers one turn either way and does not roll over;"
-              f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over", file=sys.stderr)
+        print(
+            "selfcal cal: the theta table covers one turn either way and does not roll over;"
+            f" --counts-per-unit {frame.theta_axis}=COUNTS makes it roll over",
+            file=sys.stderr,
+        )
     return exit_code(result)
 
 
@@ -257,26 +361,33 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
     """
     result, filled = read_result(args.result), 0
     if not result.observability.identifiable:
-        raise NotIdentifiableError(f"{args.result}: the measured plan does not identify the stage; "
-                                   "measure the missing views",
-                                   result.observability)
+        raise NotIdentifiableError(
+            f"{args.result}: the measured plan does not identify the stage; "
+            "measure the missing views",
+            result.observability,
+        )
     if not args.steep:
         require_plausible(result.error_map, args.result)
     if args.fill:
         error_map, filled = fill_unknown(result.error_map)
         result = replace(result, error_map=error_map)
         if filled:
-            print(f"{args.leaf.prog}: {filled} unknown sites filled from their neighbours",
-                  file=sys.stderr)
+            print(
+                f"{args.leaf.prog}: {filled} unknown sites filled from their neighbours",
+                file=sys.stderr,
+            )
     return result, filled
 
 
 def say_bent(args: argparse.Namespace, bent_m: float) -> None:
     """Say on stderr how far an active table bends between the nodes of the map, from 1 nm on."""
     if bent_m >= LEAST_BEND_M:
-        print(f"{args.leaf.prog}: --onto: the active table is curved between the nodes of the "
-              f"map by up to {bent_m / M_PER_UM:.3g} um, which the new table does not reproduce; "
-              "calibrate with the nodes of that table, or without it", file=sys.stderr)
+        print(
+            f"{args.leaf.prog}: --onto: the active table is curved between the nodes of the "
+            f"map by up to {bent_m / M_PER_UM:.3g} um, which the new table does not reproduce; "
+            "calibrate with the nodes of that table, or without it",
+            file=sys.stderr,
+        )
 
 
 def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | None":
@@ -285,8 +396,11 @@ def _active(args: argparse.Namespace, frame: "MachineFrame") -> "Correction | No
         return None
     tables = CalEvaluator(load_cal(args.onto).tables, setup_of(frame))
     if not {*tables.inputs, *tables.outputs} <= {frame.x_axis, frame.y_axis}:
-        raise InputError(args.onto, f"it is for axes {[*tables.inputs, *tables.outputs]}",
-                         "name its axes with --x-axis and --y-axis; theta is not combined")
+        raise InputError(
+            args.onto,
+            f"it is for axes {[*tables.inputs, *tables.outputs]}",
+            "name its axes with --x-axis and --y-axis; theta is not combined",
+        )
     return plane_correction(tables, frame)
 
 
@@ -303,29 +417,40 @@ def _verify(args: argparse.Namespace) -> int:
     say(args, text, figures)
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
+
         save_picture(controller_figure(found), args.plot)
     unfit_parts = [part for part in one_axis.parts if part.unfit] if one_axis is not None else []
     if found.worse and one_axis is not None and not unfit_parts:
-        raise InputError(cal.where, "the tables make the middle line better and the field worse: "
-                         "most of the error depends on both positions",
-                         "write a 2D table (selfcal cal export)")
+        raise InputError(
+            cal.where,
+            "the tables make the middle line better and the field worse: "
+            "most of the error depends on both positions",
+            "write a 2D table (selfcal cal export)",
+        )
     if found.worse:
-        raise InputError(cal.where, "the tables make the machine worse",
-                         "check signs, axes, unit, home position and encoder directions")
+        raise InputError(
+            cal.where,
+            "the tables make the machine worse",
+            "check signs, axes, unit, home position and encoder directions",
+        )
     for part in unfit_parts:
-        print(f"{args.leaf.prog}: {cal.where}: of {part.name}, which 1D tables can correct, the "
-              f"tables leave {part.rms_left / M_PER_UM:.4g} of {part.rms / M_PER_UM:.4g} µm rms, "
-              f"{part.largest_left / M_PER_UM:.4g} of {part.largest / M_PER_UM:.4g} µm at most, "
-              "more than the U of the map: they are not those of this map; check sign, offset, "
-              "unit and number of entries, or write them again", file=sys.stderr)
+        print(
+            f"{args.leaf.prog}: {cal.where}: of {part.name}, which 1D tables can correct, the "
+            f"tables leave {part.rms_left / M_PER_UM:.4g} of {part.rms / M_PER_UM:.4g} µm rms, "
+            f"{part.largest_left / M_PER_UM:.4g} of {part.largest / M_PER_UM:.4g} µm at most, "
+            "more than the U of the map: they are not those of this map; check sign, offset, "
+            "unit and number of entries, or write them again",
+            file=sys.stderr,
+        )
     unfit = found.unfit(result.error_map)
     for residual in unfit:
-        left, most = (size("after") / size("before")
-                      for size in (residual.rms, residual.largest))
-        print(f"{args.leaf.prog}: {cal.where}: the tables leave {left:.0%} of the error at the "
-              f"{residual.place}, {most:.0%} of the largest, more than the U of the map: they are "
-              "not those of this map; check offset, unit and number of rows, or export them again",
-              file=sys.stderr)
+        left, most = (size("after") / size("before") for size in (residual.rms, residual.largest))
+        print(
+            f"{args.leaf.prog}: {cal.where}: the tables leave {left:.0%} of the error at the "
+            f"{residual.place}, {most:.0%} of the largest, more than the U of the map: they are "
+            "not those of this map; check offset, unit and number of rows, or export them again",
+            file=sys.stderr,
+        )
     return int(ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE)
 
 
@@ -333,21 +458,32 @@ def one_axis_text(fit: OneAxisFit) -> str:
     """Return what 1D tables leave of the parts that they can correct, and what none can correct."""
     title = "what 1D tables can correct of it, rms, µm"
     lines = [f"{title:<48}{'part':>16}{'left':>15}"]
-    lines += [f"{part.name:<48}{part.rms / M_PER_UM:>16.6f}{part.rms_left / M_PER_UM:>15.6f}"
-              for part in fit.parts]
+    lines += [
+        f"{part.name:<48}{part.rms / M_PER_UM:>16.6f}{part.rms_left / M_PER_UM:>15.6f}"
+        for part in fit.parts
+    ]
     lines.append(f"{'no 1D table of these axes corrects':<64}{fit.beyond / M_PER_UM:>15.6f}")
     if fit.squareness_left:
-        lines.append("  straightness leaves the squareness, "
-                     f"{fit.squareness_left * URAD_PER_RAD:.4g} µrad: selfcal cal orthogonality")
+        lines.append(
+            "  straightness leaves the squareness, "
+            f"{fit.squareness_left * URAD_PER_RAD:.4g} µrad: selfcal cal orthogonality"
+        )
     return "\n".join(lines)
 
 
 def figures_of(residuals: "list[Residual]") -> dict:
     """Return the residuals as data, m and rad."""
-    return plain({r.place: {"points": r.position.shape[1],
-                            "before": {"rms": r.rms("before"), "max": r.largest("before")},
-                            "after": {"rms": r.rms("after"), "max": r.largest("after")},
-                            "shift_after": r.shift_after} for r in residuals})
+    return plain(
+        {
+            r.place: {
+                "points": r.position.shape[1],
+                "before": {"rms": r.rms("before"), "max": r.largest("before")},
+                "after": {"rms": r.rms("after"), "max": r.largest("after")},
+                "shift_after": r.shift_after,
+            }
+            for r in residuals
+        }
+    )
 
 
 def residual_text(residuals: "list[Residual]") -> str:
@@ -358,8 +494,9 @@ def residual_text(residuals: "list[Residual]") -> str:
         unit, scale = ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("µm", M_PER_UM)
         for what, value in (("rms", r.rms), ("max", r.largest)):
             name = f"{r.position.shape[1]} {names[r.place]}, {what}, {unit}"
-            lines.append(f"{name:<48}{value('before') / scale:>16.6f}"
-                         f"{value('after') / scale:>15.6f}")
+            lines.append(
+                f"{name:<48}{value('before') / scale:>16.6f}{value('after') / scale:>15.6f}"
+            )
         shift = ", ".join(f"{s / scale:.6f}" for s in r.shift_after)
         lines.append(f"  constant shift after: {shift} {unit} (the controller is zero at home)")
     return "\n".join(lines)

@@ -33,8 +33,10 @@ from selfcal_ros.units import M_PER, M_PER_UM, UM_PER_M
 
 Axis = Literal["x", "y"]
 _HOMES: dict[Literal["end", "middle", "middle-balanced"], str] = {
-    "end": "home at one end of travel", "middle": "home in the middle of travel",
-    "middle-balanced": "home in the middle of travel, balanced"}
+    "end": "home at one end of travel",
+    "middle": "home in the middle of travel",
+    "middle-balanced": "home in the middle of travel, balanced",
+}
 
 
 def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
@@ -43,8 +45,11 @@ def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
     for text in texts or []:
         axis, equals, value = text.partition("=")
         if not (equals and axis.isascii() and axis.isdigit() and 1 <= int(axis[:9]) <= 32):
-            raise InputError(option, f"'{text}' is not AXIS=VALUE with an axis from 1 to 32",
-                             f"write {option} 1=10.5")
+            raise InputError(
+                option,
+                f"'{text}' is not AXIS=VALUE with an axis from 1 to 32",
+                f"write {option} 1=10.5",
+            )
         if int(axis) in found:
             raise InputError(option, f"axis {int(axis)} is given twice", "keep one of them")
         found[int(axis)] = value
@@ -60,8 +65,11 @@ def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> 
         except ArgumentFault:
             value = math.nan
         if not value >= (SMALLEST if positive else -math.inf):
-            raise InputError(option, f"'{text}' is not a {'positive ' * positive}number",
-                             f"write {option} {axis}={1000 if positive else 10.5}")
+            raise InputError(
+                option,
+                f"'{text}' is not a {'positive ' * positive}number",
+                f"write {option} {axis}={1000 if positive else 10.5}",
+            )
         found[axis] = value
     return found
 
@@ -81,8 +89,11 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
             found.append(text)
             continue
         if int(match[1]) in rotary:
-            raise InputError("--position", f"'{text}' is a length, and axis {match[1]} is rotary",
-                             f"write {match[1]}=10.5, in its primary unit (deg)")
+            raise InputError(
+                "--position",
+                f"'{text}' is a length, and axis {match[1]} is rotary",
+                f"write {match[1]}=10.5, in its primary unit (deg)",
+            )
         factor = Fraction(str(M_PER[match[3].replace("µ", "u")])) / Fraction(str(M_PER[unit]))
         try:
             found.append(f"{match[1]}={float(Fraction(match[2]) * factor)!r}")
@@ -91,42 +102,82 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
     return found
 
 
-def add_frame(parser: argparse.ArgumentParser, *, theta: bool, default: bool = True,
-              units: tuple[str, ...] = ("m", "mm", "um")) -> None:
+def add_frame(
+    parser: argparse.ArgumentParser,
+    *,
+    theta: bool,
+    default: bool = True,
+    units: tuple[str, ...] = ("m", "mm", "um"),
+) -> None:
     """Add the options that relate the controller's axes to the stage frame."""
     group = parser.add_argument_group(
-        "machine", "" if default else "default: from the comments of FILE.cal, else columns "
-        "are x and rows are y")
-    group.add_argument("--x-axis", type=int, metavar="N", default=1 if default else None,
-                       help="index of the x axis, from 1")
-    group.add_argument("--y-axis", type=int, metavar="N", default=2 if default else None,
-                       help="index of the y axis")
-    group.add_argument("--unit", choices=units, default="mm" if default and "in" not in units else
-                       None, help="unit of the linear axes (default mm"
-                       + (", kmotion in)" if {"m", "in"} <= set(units) else ")"))
+        "machine",
+        ""
+        if default
+        else "default: from the comments of FILE.cal, else columns are x and rows are y",
+    )
+    group.add_argument(
+        "--x-axis",
+        type=int,
+        metavar="N",
+        default=1 if default else None,
+        help="index of the x axis, from 1",
+    )
+    group.add_argument(
+        "--y-axis",
+        type=int,
+        metavar="N",
+        default=2 if default else None,
+        help="index of the y axis",
+    )
+    group.add_argument(
+        "--unit",
+        choices=units,
+        default="mm" if default and "in" not in units else None,
+        help="unit of the linear axes (default mm"
+        + (", kmotion in)" if {"m", "in"} <= set(units) else ")"),
+    )
     if default:
-        group.add_argument("--steep", action="store_true", help="accept a map that changes by more "
-                           "than 1 %% of the distance between neighbouring nodes")
+        group.add_argument(
+            "--steep",
+            action="store_true",
+            help="accept a map that changes by more "
+            "than 1 %% of the distance between neighbouring nodes",
+        )
     for axis, unit in (("x", "primary unit"), ("y", "primary unit"), ("theta", "deg")):
         if axis == "theta" and not theta:
             continue
-        group.add_argument(f"--home-{axis}", type=float, metavar="P", default=None,
-                           help=f"position of the controller's zero in the stage frame, {unit} "
-                                "(default 0, the centre of the field)")
-        group.add_argument(f"--reverse-{axis}", action="store_true",
-                           help=f"the encoder counts opposite to the stage frame's {axis}")
+        group.add_argument(
+            f"--home-{axis}",
+            type=float,
+            metavar="P",
+            default=None,
+            help=f"position of the controller's zero in the stage frame, {unit} "
+            "(default 0, the centre of the field)",
+        )
+        group.add_argument(
+            f"--reverse-{axis}",
+            action="store_true",
+            help=f"the encoder counts opposite to the stage frame's {axis}",
+        )
     if theta:
         group.add_argument("--theta-axis", type=int, metavar="N", help="index of the theta axis")
-        group.add_argument("--counts-per-unit", action="append", metavar="AXIS=COUNTS",
-                           help="encoder counts per degree of the theta axis")
+        group.add_argument(
+            "--counts-per-unit",
+            action="append",
+            metavar="AXIS=COUNTS",
+            help="encoder counts per degree of the theta axis",
+        )
 
 
 def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "MachineFrame":
     """Return the frame described by the options, with `base` as default."""
     base = base or MachineFrame()
     changes: dict[str, Any] = {
-        name: getattr(args, name) for name in ("x_axis", "y_axis", "theta_axis", "unit")
-        if getattr(args, name, None) is not None}
+        name: getattr(args, name)
+        for name in ("x_axis", "y_axis", "theta_axis", "unit")
+        if getattr(args, name, None) is not None
+    }
     unit_m = LENGTHS_M[changes.get("unit", base.unit)]
     for name in ("x", "y", "theta"):
         home = getattr(args, f"home_{name}", None)
@@ -140,18 +191,27 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
             changes[f"reverse_{name}"] = True
     for name in ("x_axis", "y_axis", "theta_axis"):
         if not 1 <= changes.get(name, 1) <= 32:
-            raise InputError(f"--{name.replace('_', '-')}", f"{changes[name]} is not in 1..32",
-                             "indices in calibration files count from 1")
+            raise InputError(
+                f"--{name.replace('_', '-')}",
+                f"{changes[name]} is not in 1..32",
+                "indices in calibration files count from 1",
+            )
     counts = numbers(getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True)
     theta_axis = changes.get("theta_axis", base.theta_axis)
     for name in ("home_theta_rad", "reverse_theta"):
         if name in changes and theta_axis is None:
-            raise InputError(f"--{name.removesuffix('_rad').replace('_', '-')}",
-                             "there is no theta axis", "name --theta-axis")
+            raise InputError(
+                f"--{name.removesuffix('_rad').replace('_', '-')}",
+                "there is no theta axis",
+                "name --theta-axis",
+            )
     for axis, count in counts.items():
         if axis != theta_axis:
-            raise InputError("--counts-per-unit", f"axis {axis} is not the theta axis",
-                             f"write {theta_axis}={count:g}" if theta_axis else "name --theta-axis")
+            raise InputError(
+                "--counts-per-unit",
+                f"axis {axis} is not the theta axis",
+                f"write {theta_axis}={count:g}" if theta_axis else "name --theta-axis",
+            )
         changes["theta_counts_per_unit"] = count
     return replace(base, **changes)
 
@@ -159,36 +219,48 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
 def add_line_tables(group: argparse._SubParsersAction) -> None:
     """Add the sub-verbs."""
     square = group.add_parser(
-        "orthogonality", help="the two-point table for axes that are not perpendicular",
+        "orthogonality",
+        help="the two-point table for axes that are not perpendicular",
         description="From a precision square: --measured, --over, --travel (lengths such as 5um; "
-                    "write a negative one as --measured=-5um). Or from a calibration: RESULT.json. "
-                    "The y axis is corrected from the position of the x axis; --along y exchanges "
-                    "them.")
+        "write a negative one as --measured=-5um). Or from a calibration: RESULT.json. "
+        "The y axis is corrected from the position of the x axis; --along y exchanges "
+        "them.",
+    )
     square.add_argument("source", nargs="?", metavar="RESULT.json")
     square.add_argument("--measured", metavar="LENGTH", help="error shown by the indicator")
     square.add_argument("--over", metavar="LENGTH", help="length of the square")
     square.add_argument("--travel", metavar="LENGTH", help="full travel of the reference axis")
-    square.add_argument("--home", choices=tuple(_HOMES),
-                        help="home position of the reference axis (default: show all; "
-                             "required with -o)")
+    square.add_argument(
+        "--home",
+        choices=tuple(_HOMES),
+        help="home position of the reference axis (default: show all; required with -o)",
+    )
     _common(square, _orthogonality)
-    for name, what in (("accuracy", "an axis from its own position"),
-                       ("straightness", "the other axis from the position of an axis")):
+    for name, what in (
+        ("accuracy", "an axis from its own position"),
+        ("straightness", "the other axis from the position of an axis"),
+    ):
         sub = group.add_parser(
-            name, help=f"the table that corrects {what}",
+            name,
+            help=f"the table that corrects {what}",
             description=f"Write the 1D table that corrects {what}, from a calibration or from "
-                        "measured errors: a CSV with the header position,error (primary units; "
-                        "um, actual - commanded).")
+            "measured errors: a CSV with the header position,error (primary units; "
+            "um, actual - commanded).",
+        )
         sub.add_argument("source", metavar="RESULT.json|DATA.csv")
         _common(sub, _line)
 
 
 def _common(parser: argparse.ArgumentParser, run: object) -> None:
-    parser.add_argument("--along", choices=("x", "y"), default="x",
-                        help="reference axis (default x)")
+    parser.add_argument(
+        "--along", choices=("x", "y"), default="x", help="reference axis (default x)"
+    )
     parser.add_argument("-o", "--output", metavar="FILE.cal", help="write a calibration file")
-    parser.add_argument("--force", action="store_true",
-                        help="replace an existing file; the old one is kept with its date")
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="replace an existing file; the old one is kept with its date",
+    )
     add_json(parser)
     add_frame(parser, theta=False)
     parser.set_defaults(run_sub_verb=run)
@@ -197,8 +269,9 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
 def _frame(args: argparse.Namespace) -> "MachineFrame":
     """Return the frame of the machine; refuse options without effect."""
     if args.force and not args.output:
-        raise InputError("--force", "it replaces a file, and none is named",
-                         "name one with -o, or omit it")
+        raise InputError(
+            "--force", "it replaces a file, and none is named", "name one with -o, or omit it"
+        )
     return frame_of(args)
 
 
@@ -208,37 +281,51 @@ def _orthogonality(args: argparse.Namespace) -> int:
     measured = (args.measured, args.over, args.travel)
     if args.source is not None:
         if any(measured) or args.home:
-            raise InputError("arguments", "RESULT.json and a measured square exclude each other",
-                             "give one of them; --home-x and --home-y place the home position")
+            raise InputError(
+                "arguments",
+                "RESULT.json and a measured square exclude each other",
+                "give one of them; --home-x and --home-y place the home position",
+            )
         result = read_result(args.source)
         if not args.steep:
             require_plausible(result.error_map, args.source)
         line = cal_lines.map_orthogonality(result.error_map, args.along)
         return _deliver(args, line, frame, (args.along, other), result)
     if None in measured:
-        raise InputError("arguments", "the measurement is not complete",
-                         "give --measured, --over and --travel, or a RESULT.json")
+        raise InputError(
+            "arguments",
+            "the measurement is not complete",
+            "give --measured, --over and --travel, or a RESULT.json",
+        )
     _refuse_frame(args, "a measured square", "use --home")
     measured_m, over_m, travel_m = (
-        cal_lines.length_m(text, name) for text, name in
-        zip(measured, ("--measured", "--over", "--travel"), strict=True))
+        cal_lines.length_m(text, name)
+        for text, name in zip(measured, ("--measured", "--over", "--travel"), strict=True)
+    )
     if args.output:
         if args.home is None:
-            raise InputError("--home", "the home position is missing",
-                             "give end, middle or middle-balanced")
+            raise InputError(
+                "--home", "the home position is missing", "give end, middle or middle-balanced"
+            )
         line = cal_lines.orthogonality(measured_m, over_m, travel_m, args.home)
         return _deliver(args, line, frame, (args.along, other))
     homes = [args.home] if args.home else list(_HOMES)
     found = {home: cal_lines.orthogonality(measured_m, over_m, travel_m, home) for home in homes}
     unit_m = UNITS_M[args.unit]
-    tables = {home: [[round(p / unit_m, 9), round(c / M_PER_UM, 9)] for p, c in
-                     zip(line.positions_m, line.corrections_m, strict=True)]
-              for home, line in found.items()}
+    tables = {
+        home: [
+            [round(p / unit_m, 9), round(c / M_PER_UM, 9)]
+            for p, c in zip(line.positions_m, line.corrections_m, strict=True)
+        ]
+        for home, line in found.items()
+    }
     if args.json:
         print(json.dumps({"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1))
         return int(ExitCode.DONE)
-    tell(f"correction of {other} over the full travel of {args.along}: "
-         f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} µm")
+    tell(
+        f"correction of {other} over the full travel of {args.along}: "
+        f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} µm"
+    )
     for home, rows in tables.items():
         tell(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction µm")
         print("\n".join(f"  {position:<14.9g} {correction:.9g}" for position, correction in rows))
@@ -251,8 +338,7 @@ def _line(args: argparse.Namespace) -> int:
     if args.sub_verb == "straightness":
         corrected = "y" if args.along == "x" else "x"
     if Path(args.source).suffix.lower() == ".csv":
-        _refuse_frame(args, "measured errors, whose positions are the controller's own",
-                      "omit it")
+        _refuse_frame(args, "measured errors, whose positions are the controller's own", "omit it")
         line = cal_lines.measured_line(read_text(args.source), args.source, frame.unit_m)
     else:
         result = read_result(args.source)
@@ -270,25 +356,38 @@ def _refuse_frame(args: argparse.Namespace, what: str, remedy: str) -> None:
         if getattr(args, f"home_{axis}") is not None:
             raise InputError(f"--home-{axis}", f"it has no meaning for {what}", remedy)
         if getattr(args, f"reverse_{axis}"):
-            raise InputError(f"--reverse-{axis}", f"it has no meaning for {what}",
-                             "give positions and errors in the sense of the encoders")
+            raise InputError(
+                f"--reverse-{axis}",
+                f"it has no meaning for {what}",
+                "give positions and errors in the sense of the encoders",
+            )
 
 
-def _deliver(args: argparse.Namespace, line: "AxisCorrection", frame: "MachineFrame",
-             axes: tuple[Axis, Axis], result: "CalibrationResult | None" = None) -> int:
+def _deliver(
+    args: argparse.Namespace,
+    line: "AxisCorrection",
+    frame: "MachineFrame",
+    axes: tuple[Axis, Axis],
+    result: "CalibrationResult | None" = None,
+) -> int:
     """Write the table of a line to a file, or print it; `result` is that of its map."""
     source = args.source or f"{args.measured} over {args.over}, travel {args.travel}"
-    comments = [f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
-                f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",
-                *([] if result is None else [*origin_lines(result, command(args)),
-                                             *verdict_lines(result)]), frame.comment()]
+    comments = [
+        f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
+        f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",
+        *([] if result is None else [*origin_lines(result, command(args)), *verdict_lines(result)]),
+        frame.comment(),
+    ]
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)
     found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if args.output:
         backup = replace_files(args, {args.output: text}, [args.source])[args.output]
-        say(args, f"{args.output}: {args.sub_verb} table for {axes[1]}{replaced(backup)}",
-            found | {"file": args.output, "old_file": backup})
+        say(
+            args,
+            f"{args.output}: {args.sub_verb} table for {axes[1]}{replaced(backup)}",
+            found | {"file": args.output, "old_file": backup},
+        )
     else:
         say(args, text.removesuffix("\n"), found)
     return int(ExitCode.DONE) if result is None else exit_code(result)

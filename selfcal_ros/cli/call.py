@@ -14,9 +14,13 @@ REQUESTS = ("start", "confirm", "redo", "skip", "abort")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("request", choices=REQUESTS, help="start: begin the plan; confirm: the "
-                        "plate is in place; redo: measure the view again; skip: continue "
-                        "without it; abort: end the plan")
+    parser.add_argument(
+        "request",
+        choices=REQUESTS,
+        help="start: begin the plan; confirm: the "
+        "plate is in place; redo: measure the view again; skip: continue "
+        "without it; abort: end the plan",
+    )
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
     add_json(parser)
 
@@ -28,7 +32,14 @@ def run(args: argparse.Namespace) -> int:
         monitor.ask(args.request)
         for message in monitor.messages():
             if "answer" in message:
-                say(args, message["answer"], {"request": args.request, "answer": message["answer"],
-                                              "success": bool(message["success"])})
+                say(
+                    args,
+                    message["answer"],
+                    {
+                        "request": args.request,
+                        "answer": message["answer"],
+                        "success": bool(message["success"]),
+                    },
+                )
                 return int(ExitCode.DONE if message["success"] else ExitCode.BAD_INPUT)
     return int(ExitCode.INTERNAL)

@@ -22,64 +22,129 @@ from selfcal_ros.vision.exposures import ImageDetector
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     init = parser.add_subparsers(dest="camera_verb", metavar="init", required=True).add_parser(
-        "init", help="from a few moves of the stage", description="Follows marks in images taken "
+        "init",
+        help="from a few moves of the stage",
+        description="Follows marks in images taken "
         "while the stage stands at a few positions in x and y, less than half the distance between "
-        "two marks apart, and writes the parameters of mark_detector.")
-    init.add_argument("bag", metavar="BAG", help="bag with images and joint states; with "
-                      "--positions the folder of image files")
-    init.add_argument("--positions", metavar="FILE.csv",
-                      help="table of the image files and indicated positions: file, x, y (m)")
-    init.add_argument("-o", "--output", metavar="NODES.yaml", required=True,
-                      help="ROS parameter file to write")
-    init.add_argument("--mark", choices=("disc", "ring", "cross", "corner"), default="disc",
-                      help="kind of mark (default: disc)")
-    init.add_argument("--mark-size", type=float, metavar="M", required=True,
-                      help="size of the marks on the plate, m (as in selfcal detect)")
-    init.add_argument("--mark-pixels", type=float, metavar="PX", required=True,
-                      help="size of a mark in the image, pixels, to a tenth")
-    init.add_argument("--polarity", choices=("dark", "bright"), default="dark",
-                      help="marks against the background (default: dark)")
-    init.add_argument("--sense", choices=("microscope_moves", "plate_moves"),
-                      default="microscope_moves", help="what moves (default: microscope_moves)")
+        "two marks apart, and writes the parameters of mark_detector.",
+    )
+    init.add_argument(
+        "bag",
+        metavar="BAG",
+        help="bag with images and joint states; with --positions the folder of image files",
+    )
+    init.add_argument(
+        "--positions",
+        metavar="FILE.csv",
+        help="table of the image files and indicated positions: file, x, y (m)",
+    )
+    init.add_argument(
+        "-o", "--output", metavar="NODES.yaml", required=True, help="ROS parameter file to write"
+    )
+    init.add_argument(
+        "--mark",
+        choices=("disc", "ring", "cross", "corner"),
+        default="disc",
+        help="kind of mark (default: disc)",
+    )
+    init.add_argument(
+        "--mark-size",
+        type=float,
+        metavar="M",
+        required=True,
+        help="size of the marks on the plate, m (as in selfcal detect)",
+    )
+    init.add_argument(
+        "--mark-pixels",
+        type=float,
+        metavar="PX",
+        required=True,
+        help="size of a mark in the image, pixels, to a tenth",
+    )
+    init.add_argument(
+        "--polarity",
+        choices=("dark", "bright"),
+        default="dark",
+        help="marks against the background (default: dark)",
+    )
+    init.add_argument(
+        "--sense",
+        choices=("microscope_moves", "plate_moves"),
+        default="microscope_moves",
+        help="what moves (default: microscope_moves)",
+    )
     add_json(init)
 
 
 def run(args: argparse.Namespace) -> int:
     """Follow the marks, print the camera, write the parameters."""
-    settings = DetectorSettings.checked({  # offsets in pixels
-        "pixel_size": 1.0, "mark_size": float(args.mark_pixels), "mark": args.mark,
-        "polarity": args.polarity, "max_marks": ANY_NUMBER}, "--mark-pixels")
+    settings = DetectorSettings.checked(
+        {  # offsets in pixels
+            "pixel_size": 1.0,
+            "mark_size": float(args.mark_pixels),
+            "mark": args.mark,
+            "polarity": args.polarity,
+            "max_marks": ANY_NUMBER,
+        },
+        "--mark-pixels",
+    )
     detector = ImageDetector(settings, "--mark-pixels")
     positions, images = (_of_files if args.positions else _of_bag)(args, detector)
     counts = detector.counts
     if counts.empty:
-        print(f"selfcal camera: {args.bag}: {counts.empty} of {counts.images} images show no mark "
-              "and are left out", file=sys.stderr)
+        print(
+            f"selfcal camera: {args.bag}: {counts.empty} of {counts.images} images show no mark "
+            "and are left out",
+            file=sys.stderr,
+        )
     found = camera_pose(positions, images, Sense(args.sense))
-    require_size(found, mark_size_m=args.mark_size, mark_pixels=args.mark_pixels,
-                 where=args.positions or args.bag)
-    values = {"pixel_size": found.pixel_size_m, "turn": math.degrees(found.turn_rad),
-              "mirror": found.mirror, "mark": args.mark, "mark_size": args.mark_size,
-              "polarity": args.polarity}
+    require_size(
+        found,
+        mark_size_m=args.mark_size,
+        mark_pixels=args.mark_pixels,
+        where=args.positions or args.bag,
+    )
+    values = {
+        "pixel_size": found.pixel_size_m,
+        "turn": math.degrees(found.turn_rad),
+        "mirror": found.mirror,
+        "mark": args.mark,
+        "mark_size": args.mark_size,
+        "polarity": args.polarity,
+    }
     write_yaml(args.output, {"mark_detector": {"ros__parameters": values}})
-    say(args, pose_text(found, args.output), {"file": args.output, **values, "u_pixel_size":
-        found.u_pixel_size_m, "u_turn": math.degrees(found.u_turn_rad), "sheared": found.sheared,
-        "u_sheared": found.u_sheared, "noise_px": found.noise_px})
+    say(
+        args,
+        pose_text(found, args.output),
+        {
+            "file": args.output,
+            **values,
+            "u_pixel_size": found.u_pixel_size_m,
+            "u_turn": math.degrees(found.u_turn_rad),
+            "sheared": found.sheared,
+            "u_sheared": found.u_sheared,
+            "noise_px": found.noise_px,
+        },
+    )
     return 0
 
 
 def pose_text(found: "CameraPose", output: str) -> str:
     """Return a camera in one line."""
-    return (f"{output}: pixel size {found.pixel_size_m / M_PER_UM:.6g} µm (u "
-            f"{found.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(found.turn_rad):.5g}° "
-            f"(u {math.degrees(found.u_turn_rad):.1g}°), "
-            f"{'mirrored' if found.mirror else 'not mirrored'}; axes unequal or sheared by "
-            f"{found.sheared:.1g} (u {found.u_sheared:.1g}); noise of a mark "
-            f"{found.noise_px:.2g} pixels")
+    return (
+        f"{output}: pixel size {found.pixel_size_m / M_PER_UM:.6g} µm (u "
+        f"{found.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(found.turn_rad):.5g}° "
+        f"(u {math.degrees(found.u_turn_rad):.1g}°), "
+        f"{'mirrored' if found.mirror else 'not mirrored'}; axes unequal or sheared by "
+        f"{found.sheared:.1g} (u {found.u_sheared:.1g}); noise of a mark "
+        f"{found.noise_px:.2g} pixels"
+    )
 
 
-def _of_bag(args: argparse.Namespace, detector: "ImageDetector",
-            ) -> "tuple[np.ndarray, list[np.ndarray]]":
+def _of_bag(
+    args: argparse.Namespace,
+    detector: "ImageDetector",
+) -> "tuple[np.ndarray, list[np.ndarray]]":
     """Return stage positions and marks of each image of a bag."""
     stamps, track = encoder_track(args.bag)
     exposed, images = [], []
@@ -93,16 +158,24 @@ def _of_bag(args: argparse.Namespace, detector: "ImageDetector",
     for line, count in bag.lost.items():
         print(f"selfcal camera: {args.bag}: {count} x {line}", file=sys.stderr)
     if not exposed or not len(stamps):
-        raise NoDataError(args.bag, "no image with a mark, or no stage/joint_states",
-                          "check mark, polarity and --mark-pixels")
+        raise NoDataError(
+            args.bag,
+            "no image with a mark, or no stage/joint_states",
+            "check mark, polarity and --mark-pixels",
+        )
     if min(exposed) < stamps[0] or max(exposed) > stamps[-1]:
-        raise InputError(args.bag, "an image was taken before the first or after the last sample "
-                         "of the encoders", "record the joint states around all images")
+        raise InputError(
+            args.bag,
+            "an image was taken before the first or after the last sample of the encoders",
+            "record the joint states around all images",
+        )
     return np.stack([np.interp(exposed, stamps, axis) for axis in track.T], axis=1), images
 
 
-def _of_files(args: argparse.Namespace, detector: "ImageDetector",
-              ) -> "tuple[np.ndarray, list[np.ndarray]]":
+def _of_files(
+    args: argparse.Namespace,
+    detector: "ImageDetector",
+) -> "tuple[np.ndarray, list[np.ndarray]]":
     """Return stage positions and marks of each image of a folder."""
     positions, images = [], []
     for number, row in enumerate(read_positions(args.positions, None)):

@@ -26,31 +26,60 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     verbs = parser.add_subparsers(dest="cell_verb", metavar="try|check", required=True)
     attempt = verbs.add_parser(
-        "try", help="connect a machine, look, make small moves, complete its CELL.yaml",
+        "try",
+        help="connect a machine, look, make small moves, complete its CELL.yaml",
         description="Connects, writes a picture of what it sees, and after a yes moves by the size "
         "of a mark around the present position: pixel size, turn, mirror, backlash and settling "
-        "time, written into CELL.yaml with their standard uncertainties. Needs no ROS.")
-    attempt.add_argument("cell", metavar="CELL.yaml", help="machine, limits, detector with mark "
-                         "and mark_size (docs/start/machines.md)")
-    attempt.add_argument("--mark-pixels", metavar="PX", type=float, default=0.0,
-                         help="size of a mark in the image, pixels; default: it is searched for")
+        "time, written into CELL.yaml with their standard uncertainties. Needs no ROS.",
+    )
+    attempt.add_argument(
+        "cell",
+        metavar="CELL.yaml",
+        help="machine, limits, detector with mark and mark_size (docs/start/machines.md)",
+    )
+    attempt.add_argument(
+        "--mark-pixels",
+        metavar="PX",
+        type=float,
+        default=0.0,
+        help="size of a mark in the image, pixels; default: it is searched for",
+    )
     attempt.add_argument("--yes", action="store_true", help="move without asking")
-    attempt.add_argument("-o", "--output", metavar="SEEN.png", help="picture of what is seen, "
-                         "with circles around the marks (default: beside CELL.yaml)")
+    attempt.add_argument(
+        "-o",
+        "--output",
+        metavar="SEEN.png",
+        help="picture of what is seen, with circles around the marks (default: beside CELL.yaml)",
+    )
     add_json(attempt)
     check = verbs.add_parser(
-        "check", help="drive the cell through a short run and check its messages",
+        "check",
+        help="drive the cell through a short run and check its messages",
         description="Measures the 3 x 3 marks (4 along even sides) in the middle of the plate, "
         "turned by some 1 mrad, and reports joints, rates, clocks, commands, rest, ids, loss, "
-        "check stops, signs. Exit code 0 if all checks pass, else 5.")
+        "check stops, signs. Exit code 0 if all checks pass, else 5.",
+    )
     check.add_argument("--plan", metavar="PLAN.yaml", required=True, help="plan with the plate")
-    check.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
-                       "of measurement_collector is used")
+    check.add_argument(
+        "--params",
+        metavar="NODES.yaml",
+        help="ROS parameter file; the section of measurement_collector is used",
+    )
     check.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
-    check.add_argument("--settle", metavar="S", type=float, default=1.0,
-                       help="time to place the plate, from PLACE to MEASURE, s (default 1)")
-    check.add_argument("--patience", metavar="S", type=float, default=30.0,
-                       help="longest wait for the first message, s (default 30)")
+    check.add_argument(
+        "--settle",
+        metavar="S",
+        type=float,
+        default=1.0,
+        help="time to place the plate, from PLACE to MEASURE, s (default 1)",
+    )
+    check.add_argument(
+        "--patience",
+        metavar="S",
+        type=float,
+        default=30.0,
+        help="longest wait for the first message, s (default 30)",
+    )
     add_json(check)
 
 
@@ -63,16 +92,24 @@ def _try(args: argparse.Namespace) -> int:
     """Look, move after a yes, write what was found into CELL.yaml."""
     cell = read_cell(args.cell)
     output = args.output or f"{Path(args.cell).with_suffix('')}.seen.png"
-    with (ended_by_signals(),
-          connected(cell, lambda line: print(line, file=aside(args))) as machine):
+    with ended_by_signals(), connected(cell, lambda line: print(line, file=aside(args))) as machine:
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
         pixels, marks = trial.look()
-        print("position: " + ", ".join(f"{axis} {value + 0.0:.6g}" for axis, value in zip(
-            trial.position.names, trial.position.positions, strict=True)), file=aside(args))
+        print(
+            "position: "
+            + ", ".join(
+                f"{axis} {value + 0.0:.6g}"
+                for axis, value in zip(trial.position.names, trial.position.positions, strict=True)
+            ),
+            file=aside(args),
+        )
         if pixels is not None:
             write_bytes(output, circled(pixels, marks, trial.mark_pixels))
-            print(f"{output}: {len(marks)} marks of {trial.mark_pixels:.3g} pixels in an image of "
-                  f"{pixels.shape[1]} x {pixels.shape[0]}", file=aside(args))
+            print(
+                f"{output}: {len(marks)} marks of {trial.mark_pixels:.3g} pixels in an image of "
+                f"{pixels.shape[1]} x {pixels.shape[0]}",
+                file=aside(args),
+            )
         if not args.yes and not _agrees(args, trial.step_m):
             say(args, "nothing was moved or written", {"marks": len(marks)})
             return int(ExitCode.DONE)
@@ -82,19 +119,37 @@ def _try(args: argparse.Namespace) -> int:
         with_values(cell.path, "detector", values, notes)
     if found.settling_s > cell.settle.time:
         with_values(cell.path, "settle", {"time": float(f"{found.settling_s:.2g}")}, {})
-    with_values(cell.path, "found", {
-        f"backlash_{axis}": asdict(each) for axis, each in found.reversal.items()} | {
-        "settling_time": found.settling_s, "noise": found.noise_m}, {})
+    with_values(
+        cell.path,
+        "found",
+        {f"backlash_{axis}": asdict(each) for axis, each in found.reversal.items()}
+        | {"settling_time": found.settling_s, "noise": found.noise_m},
+        {},
+    )
     lines = [] if found.camera is None else [pose_text(found.camera, args.cell)]
-    lines += [f"backlash of {axis}: {each.value / M_PER_UM:.3g} µm (u {each.u / M_PER_UM:.1g} µm)"
-              for axis, each in found.reversal.items()]
-    lines.append(f"at rest {found.settling_s:.2g} s after a move; noise of a mark "
-                 f"{found.noise_m / M_PER_UM:.2g} µm")
+    lines += [
+        f"backlash of {axis}: {each.value / M_PER_UM:.3g} µm (u {each.u / M_PER_UM:.1g} µm)"
+        for axis, each in found.reversal.items()
+    ]
+    lines.append(
+        f"at rest {found.settling_s:.2g} s after a move; noise of a mark "
+        f"{found.noise_m / M_PER_UM:.2g} µm"
+    )
     lines += [f"note: {note}" for note in found.notes]
-    say(args, "\n".join(lines), {
-        "file": args.cell, "seen": output if pixels is not None else "", "marks": len(marks),
-        **values, "backlash": {axis: asdict(each) for axis, each in found.reversal.items()},
-        "settling_time": found.settling_s, "noise": found.noise_m, "notes": list(found.notes)})
+    say(
+        args,
+        "\n".join(lines),
+        {
+            "file": args.cell,
+            "seen": output if pixels is not None else "",
+            "marks": len(marks),
+            **values,
+            "backlash": {axis: asdict(each) for axis, each in found.reversal.items()},
+            "settling_time": found.settling_s,
+            "noise": found.noise_m,
+            "notes": list(found.notes),
+        },
+    )
     return int(ExitCode.DONE)
 
 
@@ -102,8 +157,12 @@ def _agrees(args: argparse.Namespace, step_m: float) -> bool:
     """Ask whether the stage may move."""
     if not sys.stdin.isatty():
         raise InputError("stdin", "there is nobody to ask: it is not a terminal", "give --yes")
-    print(f"the stage moves by up to {step_m / M_PER_UM:.4g} um in x and y: may it? [y/N] ", end="",
-          file=aside(args), flush=True)
+    print(
+        f"the stage moves by up to {step_m / M_PER_UM:.4g} um in x and y: may it? [y/N] ",
+        end="",
+        file=aside(args),
+        flush=True,
+    )
     return input().strip().lower() in ("y", "yes")
 
 
@@ -113,14 +172,23 @@ def _check(args: argparse.Namespace) -> int:
     read_plan(args.plan)
     for option in ("settle", "patience"):
         if not 0 <= getattr(args, option) < 1e6:
-            raise InputError(f"--{option}", f"{getattr(args, option):g} s is not a waiting time",
-                             "give 0 or more")
+            raise InputError(
+                f"--{option}",
+                f"{getattr(args, option):g} s is not a waiting time",
+                "give 0 or more",
+            )
     words = [*ros_arguments(args), "--log-level", "warn"]
     items = []
-    with ended_by_signals(), process(
+    with (
+        ended_by_signals(),
+        process(
             "selfcal_ros.nodes.cell_checker",
-            [args.plan, str(args.settle), str(args.patience), *words], dict(os.environ),
-            stdout=subprocess.PIPE, text=True) as child:
+            [args.plan, str(args.settle), str(args.patience), *words],
+            dict(os.environ),
+            stdout=subprocess.PIPE,
+            text=True,
+        ) as child,
+    ):
         for line in child.stdout or ():
             items.append(json.loads(line))
             if not args.json:
@@ -131,9 +199,12 @@ def _check(args: argparse.Namespace) -> int:
     elif code in (ExitCode.DONE, ExitCode.NOT_QUALIFIED):
         wrong = sum(not item["passed"] for item in items)
         following = sum(bool(item["follows"]) for item in items)
-        tell(f"{wrong} of {len(items)} checks failed" + (
-                 f", {following} of them because of others" if following else "") if wrong else
-             f"all {len(items)} checks passed: the cell is ready for a calibration")
+        tell(
+            f"{wrong} of {len(items)} checks failed"
+            + (f", {following} of them because of others" if following else "")
+            if wrong
+            else f"all {len(items)} checks passed: the cell is ready for a calibration"
+        )
     return code
 
 

@@ -23,14 +23,25 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("maps", metavar="RESULT.json|MAP.csv", nargs="+",
-                        help="results of `selfcal solve`, and maps from other sources as CSV (x, "
-                        "y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes)")
-    parser.add_argument("-o", "--output", metavar="MEAN.json", required=True,
-                        help="mean map to write, read by the other verbs as a RESULT.json; "
-                        "- = stdout")
-    parser.add_argument("--keep-scale", action="store_true",
-                        help="keep the magnification: every calibration has a reference length")
+    parser.add_argument(
+        "maps",
+        metavar="RESULT.json|MAP.csv",
+        nargs="+",
+        help="results of `selfcal solve`, and maps from other sources as CSV (x, "
+        "y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes)",
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="MEAN.json",
+        required=True,
+        help="mean map to write, read by the other verbs as a RESULT.json; - = stdout",
+    )
+    parser.add_argument(
+        "--keep-scale",
+        action="store_true",
+        help="keep the magnification: every calibration has a reference length",
+    )
     add_json(parser)
 
 
@@ -55,34 +66,45 @@ def run(args: argparse.Namespace) -> int:
 def read_parts(names: Sequence[str]) -> list[Part]:
     """Return the maps of files; those of CSV files on the lattice of the first result."""
     tables = [name for name in names if name.lower().endswith(".csv")]
-    results = {name: read_result(name)
-               for name in names if name not in tables}
+    results = {name: read_result(name) for name in names if name not in tables}
     if not results:
-        raise InputError(names[0], "no RESULT.json is named", "name at least one: it defines "
-                         "the sites of the mean")
+        raise InputError(
+            names[0],
+            "no RESULT.json is named",
+            "name at least one: it defines the sites of the mean",
+        )
     artifact = next(iter(results.values())).artifact
-    return [Part(name, results[name].error_map, results[name]) if name in results else
-            Part(name, map_from_table(read_text(name), name, artifact))
-            for name in names]
+    return [
+        Part(name, results[name].error_map, results[name])
+        if name in results
+        else Part(name, map_from_table(read_text(name), name, artifact))
+        for name in names
+    ]
 
 
 def _text(result: CalibrationResult, found: dict[str, Any]) -> str:
     emap, noise = result.error_map, result.noise
     u = [rms(emap.u_gx), rms(emap.u_gy)]
-    lines = [f"mean of {len(found['runs'])} maps: {result.verdict.sentence}",
-             f"XY     U {noise.k_xy * math.hypot(*u) / math.sqrt(2) * UM_PER_M:.4g} µm rms "
-             f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {found['u_between_m'] * UM_PER_M:.3g} "
-             f"µm rms, p = {found['p_between']:.2g}"]
+    lines = [
+        f"mean of {len(found['runs'])} maps: {result.verdict.sentence}",
+        f"XY     U {noise.k_xy * math.hypot(*u) / math.sqrt(2) * UM_PER_M:.4g} µm rms "
+        f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {found['u_between_m'] * UM_PER_M:.3g} "
+        f"µm rms, p = {found['p_between']:.2g}",
+    ]
     if "u_between_rad" in found:
-        lines.append(f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} arcsec "
-                     f"rms (k = {noise.k_theta:.3g}), between runs "
-                     f"{found['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, "
-                     f"p = {found['p_between_theta']:.2g}")
+        lines.append(
+            f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} arcsec "
+            f"rms (k = {noise.k_theta:.3g}), between runs "
+            f"{found['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, "
+            f"p = {found['p_between_theta']:.2g}"
+        )
     lines.append("each map against the mean of the others:")
     for run in found["runs"]:
-        lines.append(f"  {run['file']}: weight {run['weight']:.3f}, |E_n| rms "
-                     f"{run['e_n_rms']:.2f}, largest {run['e_n_largest']:.2f}, beyond 1 at "
-                     f"{100 * run['beyond']:.1f} %{_p(run['p'])}{_run_text(run)}")
+        lines.append(
+            f"  {run['file']}: weight {run['weight']:.3f}, |E_n| rms "
+            f"{run['e_n_rms']:.2f}, largest {run['e_n_largest']:.2f}, beyond 1 at "
+            f"{100 * run['beyond']:.1f} %{_p(run['p'])}{_run_text(run)}"
+        )
     return "\n".join([*lines, *(f"warning: {line}" for line in result.warnings)])
 
 
@@ -94,7 +116,10 @@ def _run_text(run: dict[str, Any]) -> str:
     parts = [("disagrees in", "agrees"), ("stands out in", "stands_out")]
     words = []
     for text, key in parts:
-        kinds = [kind for kind, name in (("XY", key), ("theta", f"{key}_theta"))
-                 if run.get(name) is (key != "agrees")]
+        kinds = [
+            kind
+            for kind, name in (("XY", key), ("theta", f"{key}_theta"))
+            if run.get(name) is (key != "agrees")
+        ]
         words += [f"{text} {' and '.join(kinds)}"] if kinds else []
     return f": {', '.join(words)}" if words else ""

@@ -12,8 +12,15 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, write_bytes
 
 
-def deliver(args: argparse.Namespace, result: CalibrationResult, content: str | bytes, key: str, *,
-            note: str = "", **data: Any) -> int:
+def deliver(
+    args: argparse.Namespace,
+    result: CalibrationResult,
+    content: str | bytes,
+    key: str,
+    *,
+    note: str = "",
+    **data: Any,
+) -> int:
     """Write an export of a result to its file or to stdout; return the exit code.
 
     Parameters
@@ -41,8 +48,9 @@ def deliver(args: argparse.Namespace, result: CalibrationResult, content: str | 
     return exit_code(result)
 
 
-def replace_files(args: argparse.Namespace, texts: Mapping[str, str],
-                  sources: Iterable[str | None]) -> dict[str, str | None]:
+def replace_files(
+    args: argparse.Namespace, texts: Mapping[str, str], sources: Iterable[str | None]
+) -> dict[str, str | None]:
     """Write files, keep those that they replace; return path -> the old one.
 
     Raises

@@ -29,45 +29,77 @@ WITH_IDS = OPTIONS | {"aruco": "aruco"}
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("bag", metavar="BAG", help="bag with stage/image or "
-                        "stage/image/compressed; with --positions the folder of image files")
-    parser.add_argument("--positions", metavar="FILE.csv", help="table of the image files and "
-                        "indicated positions: file, view, x, y (m)")
-    parser.add_argument("--plan", metavar="PLAN.yaml", help="plan with plate and views, needed "
-                        "with --positions")
-    parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
-                        "create: the detections and all other topics, without the images")
+    parser.add_argument(
+        "bag",
+        metavar="BAG",
+        help="bag with stage/image or "
+        "stage/image/compressed; with --positions the folder of image files",
+    )
+    parser.add_argument(
+        "--positions",
+        metavar="FILE.csv",
+        help="table of the image files and indicated positions: file, view, x, y (m)",
+    )
+    parser.add_argument(
+        "--plan", metavar="PLAN.yaml", help="plan with plate and views, needed with --positions"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="BAG",
+        required=True,
+        help="bag folder to create: the detections and all other topics, without the images",
+    )
     add_parameters(parser, DetectorSettings, WITH_IDS)
-    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file; the section "
-                        "of mark_detector is used")
-    parser.add_argument("--namespace", metavar="NAME", help="namespace of the camera, for bags "
-                        "with several cells; / is the root")
-    parser.add_argument("--draw", metavar="FOLDER", help="write each image there as PNG, with "
-                        "circles around what was found, squares and reasons around the rejected")
+    parser.add_argument(
+        "--params",
+        metavar="NODES.yaml",
+        help="ROS parameter file; the section of mark_detector is used",
+    )
+    parser.add_argument(
+        "--namespace",
+        metavar="NAME",
+        help="namespace of the camera, for bags with several cells; / is the root",
+    )
+    parser.add_argument(
+        "--draw",
+        metavar="FOLDER",
+        help="write each image there as PNG, with "
+        "circles around what was found, squares and reasons around the rejected",
+    )
     add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
-    settings = replace(node_settings(args.params, DetectorSettings, **given(args, WITH_IDS)),
-                       max_marks=ANY_NUMBER)
+    settings = replace(
+        node_settings(args.params, DetectorSettings, **given(args, WITH_IDS)), max_marks=ANY_NUMBER
+    )
     draw = partial(_drawn, Path(args.draw), settings) if args.draw else None
     detector = ImageDetector(settings, args.params or "options", draw)
     if args.positions:
         problems = _from_files(args, detector, settings.frame_id)
     else:
         problems = ImageBag(Path(args.bag), args.namespace).write_detected(
-            args.output, detector.take, check=partial(detector.refuse_nothing, args.bag),
-            frame_id=settings.frame_id)
+            args.output,
+            detector.take,
+            check=partial(detector.refuse_nothing, args.bag),
+            frame_id=settings.frame_id,
+        )
     truth = Path(args.bag, TRUTH_FILE)
     if truth.is_file():
         write_bytes(Path(args.output, TRUTH_FILE), read_bytes(truth))
     for line, count in problems.most_common(SHOWN):
-        print(f"selfcal detect: {args.bag}: {f'{count} x ' if count > 1 else ''}{line}",
-              file=sys.stderr)
+        print(
+            f"selfcal detect: {args.bag}: {f'{count} x ' if count > 1 else ''}{line}",
+            file=sys.stderr,
+        )
     found = detector.counts.values()
-    say(args, text_of(args.output, found),
-        {"bag": args.output, "counts": found, "problems": dict(problems)})
+    say(
+        args,
+        text_of(args.output, found),
+        {"bag": args.output, "counts": found, "problems": dict(problems)},
+    )
     return 0
 
 
@@ -76,30 +108,50 @@ def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str)
     if not args.plan:
         raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
     plan = read_plan(args.plan)
-    return write_pictures(Path(args.bag), read_positions(args.positions, plan), plan, args.output,
-                          detect=detector.take_file,
-                          check=partial(detector.refuse_nothing, args.bag), frame_id=frame)
+    return write_pictures(
+        Path(args.bag),
+        read_positions(args.positions, plan),
+        plan,
+        args.output,
+        detect=detector.take_file,
+        check=partial(detector.refuse_nothing, args.bag),
+        frame_id=frame,
+    )
 
 
-def _drawn(folder: Path, settings: DetectorSettings, name: str, picture: Picture,
-           judged: Sequence[Judged]) -> None:
+def _drawn(
+    folder: Path, settings: DetectorSettings, name: str, picture: Picture, judged: Sequence[Judged]
+) -> None:
     """Write an image with what was found and what was rejected in it."""
     marks = [(each.u, each.v) for each in judged if isinstance(each.found, Mark)]
-    rejected = [(each.u, each.v, str(each.found)) for each in judged
-                if not isinstance(each.found, Mark)]
+    rejected = [
+        (each.u, each.v, str(each.found)) for each in judged if not isinstance(each.found, Mark)
+    ]
     size = settings.mark_size / settings.pixel_size
     folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(folder / f"{Path(name).stem}.png",
-                circled(picture.values, marks, size, rejected))
+    write_bytes(folder / f"{Path(name).stem}.png", circled(picture.values, marks, size, rejected))
 
 
 def text_of(output: str, found: dict[str, int]) -> str:
     """Return the numbers of images and marks as a line."""
-    rejected = ", ".join(f"{count} {name.removeprefix('rejected_')}"
-                         for name, count in found.items() if name.startswith("rejected_"))
-    more = [f"{found[name]} {text}" for name, text in (
-        ("images_without_marks", "images without marks"), ("images_refused", "images refused"),
-        ("images_with_more_pages", "images with further pages, which were not used"))
-        if found.get(name)]
-    return "; ".join([f"{output}: {found['marks']} marks in {found['images']} images",
-                      *([f"rejected: {rejected}"] if rejected else []), *more])
+    rejected = ", ".join(
+        f"{count} {name.removeprefix('rejected_')}"
+        for name, count in found.items()
+        if name.startswith("rejected_")
+    )
+    more = [
+        f"{found[name]} {text}"
+        for name, text in (
+            ("images_without_marks", "images without marks"),
+            ("images_refused", "images refused"),
+            ("images_with_more_pages", "images with further pages, which were not used"),
+        )
+        if found.get(name)
+    ]
+    return "; ".join(
+        [
+            f"{output}: {found['marks']} marks in {found['images']} images",
+            *([f"rejected: {rejected}"] if rejected else []),
+            *more,
+        ]
+    )

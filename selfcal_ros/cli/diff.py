@@ -31,14 +31,27 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M, URAD_PER_RAD
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("a", metavar="A.json", help="RESULT.json of `selfcal solve`")
-    parser.add_argument("b", metavar="B.json", help="another RESULT.json, or the OUT.json of "
-                        "`selfcal step-diagonal`: then squareness and scale are compared")
-    parser.add_argument("--keep-scale", action="store_true",
-                        help="keep the magnification: both maps have a reference length")
-    parser.add_argument("--artifact", action="store_true",
-                        help="compare the maps of the plates rather than those of the stages")
-    parser.add_argument("--plot", metavar="FILE.png|.svg|.pdf",
-                        help="draw both maps and their difference side by side")
+    parser.add_argument(
+        "b",
+        metavar="B.json",
+        help="another RESULT.json, or the OUT.json of "
+        "`selfcal step-diagonal`: then squareness and scale are compared",
+    )
+    parser.add_argument(
+        "--keep-scale",
+        action="store_true",
+        help="keep the magnification: both maps have a reference length",
+    )
+    parser.add_argument(
+        "--artifact",
+        action="store_true",
+        help="compare the maps of the plates rather than those of the stages",
+    )
+    parser.add_argument(
+        "--plot",
+        metavar="FILE.png|.svg|.pdf",
+        help="draw both maps and their difference side by side",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -48,39 +61,57 @@ def run(args: argparse.Namespace) -> int:
     a, second = read_result(args.a), read_json(args.b)
     if isinstance(second, dict) and "ex_x" in second:
         if args.keep_scale:
-            raise InputError("--keep-scale", f"for {args.b} squareness and scale difference are "
-                             "compared, not the magnification", "omit it")
+            raise InputError(
+                "--keep-scale",
+                f"for {args.b} squareness and scale difference are compared, not the magnification",
+                "omit it",
+            )
         for option in ("plot", "artifact"):
             if getattr(args, option):
                 raise InputError(f"--{option}", f"{args.b} has no map", "name two RESULT.json")
         rows = compare_with_laser(a, second, args.b)
-        say(args, "\n".join([_laser_text(rows), *_grades_text([a])]),
-            {**_laser_json(rows), **_grades([a])})
+        say(
+            args,
+            "\n".join([_laser_text(rows), *_grades_text([a])]),
+            {**_laser_json(rows), **_grades([a])},
+        )
         say_unless_qualified(a, f"selfcal diff: {args.a}")
         return int(ExitCode.DONE)
     b = read_result(args.b)
     if args.keep_scale:
         for name, result in ((args.a, a), (args.b, b)):
             if result.reference is None:
-                raise InputError("--keep-scale", f"{name} has no reference length, so its "
-                                 "magnification is unknown",
-                                 "omit it, or solve with --reference")
+                raise InputError(
+                    "--keep-scale",
+                    f"{name} has no reference length, so its magnification is unknown",
+                    "omit it, or solve with --reference",
+                )
     with busy("comparing"):
-        found = compare(a, b, keep_scale=args.keep_scale, plates=args.artifact,
-                        names=(args.a, args.b))
+        found = compare(
+            a, b, keep_scale=args.keep_scale, plates=args.artifact, names=(args.a, args.b)
+        )
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
-        one, other = ((plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b))
-        save_picture(difference_picture(one, other, {
-            "gx": found.dx, "gy": found.dy, "g_theta": found.d_theta}, _verdict_text(found)),
-            args.plot)
-    say(args, _text(found, _grades_text([a, b]), args.artifact),
-        {**_json(found), **_grades([a, b])})
+        one, other = (plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b)
+        save_picture(
+            difference_picture(
+                one,
+                other,
+                {"gx": found.dx, "gy": found.dy, "g_theta": found.d_theta},
+                _verdict_text(found),
+            ),
+            args.plot,
+        )
+    say(
+        args, _text(found, _grades_text([a, b]), args.artifact), {**_json(found), **_grades([a, b])}
+    )
     datums = [result.error_map.datum_theta for result in (a, b)]
     if datums[0] != datums[1] and not (args.json or args.artifact) and found.theta is not None:
-        print(f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
-              "lines to the XY axes")
+        print(
+            f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
+            "lines to the XY axes"
+        )
     for name, result in ((args.a, a), (args.b, b)):
         say_unless_qualified(result, f"selfcal diff: {name}")
     return int(ExitCode.DONE)
@@ -89,50 +120,77 @@ def run(args: argparse.Namespace) -> int:
 def _grades(results: Sequence[CalibrationResult]) -> dict[str, Any]:
     """Return grade and enlargements of the results A and B."""
     named = dict(zip("ab", (result.verdict for result in results), strict=False))
-    return plain({"grade": {name: str(verdict.grade) for name, verdict in named.items()},
-                  "enlarged_by": {name: [vars(item) for item in verdict.enlarged_by]
-                                  for name, verdict in named.items()}})
+    return plain(
+        {
+            "grade": {name: str(verdict.grade) for name, verdict in named.items()},
+            "enlarged_by": {
+                name: [vars(item) for item in verdict.enlarged_by]
+                for name, verdict in named.items()
+            },
+        }
+    )
 
 
 def _grades_text(results: Sequence[CalibrationResult]) -> list[str]:
-    return [f"{name}      grade: " + "; ".join([
-        str(result.verdict.grade).replace("_", " "), *enlargement_texts(result.verdict)])
-            for name, result in zip("AB", results, strict=False)]
+    return [
+        f"{name}      grade: "
+        + "; ".join(
+            [str(result.verdict.grade).replace("_", " "), *enlargement_texts(result.verdict)]
+        )
+        for name, result in zip("AB", results, strict=False)
+    ]
 
 
 def _json(found: MapDifference) -> dict[str, Any]:
-    return plain({
-        "significant": found.significant,
-        "rms_um": found.rms_m * UM_PER_M, "max_um": found.max_m * UM_PER_M,
-        "rms_theta_arcsec": found.rms_theta_rad * ARCSEC_PER_RAD,
-        "max_theta_arcsec": found.max_theta_rad * ARCSEC_PER_RAD,
-        "datum_difference": {"translation_x": found.translation_m[0],
-                             "translation_y": found.translation_m[1],
-                             "rotation": found.rotation_rad, "scale": found.scale,
-                             "theta": found.theta_rad},
-        "nonorthogonality": found.nonorthogonality, "scale_difference": found.scale_difference,
-        "significance_xy": None if found.xy is None else asdict(found.xy),
-        "significance_theta": None if found.theta is None else asdict(found.theta),
-        "dx": found.dx, "dy": found.dy, "d_theta": found.d_theta})
+    return plain(
+        {
+            "significant": found.significant,
+            "rms_um": found.rms_m * UM_PER_M,
+            "max_um": found.max_m * UM_PER_M,
+            "rms_theta_arcsec": found.rms_theta_rad * ARCSEC_PER_RAD,
+            "max_theta_arcsec": found.max_theta_rad * ARCSEC_PER_RAD,
+            "datum_difference": {
+                "translation_x": found.translation_m[0],
+                "translation_y": found.translation_m[1],
+                "rotation": found.rotation_rad,
+                "scale": found.scale,
+                "theta": found.theta_rad,
+            },
+            "nonorthogonality": found.nonorthogonality,
+            "scale_difference": found.scale_difference,
+            "significance_xy": None if found.xy is None else asdict(found.xy),
+            "significance_theta": None if found.theta is None else asdict(found.theta),
+            "dx": found.dx,
+            "dy": found.dy,
+            "d_theta": found.d_theta,
+        }
+    )
 
 
 def _text(found: MapDifference, grades: Sequence[str], plates: bool) -> str:
     tx, ty = found.translation_m
-    lines = [f"B minus A{', plates' if plates else ''}, datum difference removed: translation "
-             f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
-             f"rotation {_signed(found.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
-             f"scale {_signed(found.scale * UM_PER_M)} µm/m"
-             + ("" if math.isnan(found.theta_rad)
-                else f", theta {_signed(found.theta_rad * ARCSEC_PER_RAD)} arcsec"),
-             f"XY     rms {found.rms_m * UM_PER_M:.5f} µm per axis   "
-             f"largest {found.max_m * UM_PER_M:.5f} µm on an axis",
-             *_test_text(found.xy),
-             f"       non-orthogonality {_signed(found.nonorthogonality * URAD_PER_RAD)} µrad, "
-             f"scale difference {_signed(found.scale_difference * UM_PER_M)} µm/m"]
+    lines = [
+        f"B minus A{', plates' if plates else ''}, datum difference removed: translation "
+        f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
+        f"rotation {_signed(found.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
+        f"scale {_signed(found.scale * UM_PER_M)} µm/m"
+        + (
+            ""
+            if math.isnan(found.theta_rad)
+            else f", theta {_signed(found.theta_rad * ARCSEC_PER_RAD)} arcsec"
+        ),
+        f"XY     rms {found.rms_m * UM_PER_M:.5f} µm per axis   "
+        f"largest {found.max_m * UM_PER_M:.5f} µm on an axis",
+        *_test_text(found.xy),
+        f"       non-orthogonality {_signed(found.nonorthogonality * URAD_PER_RAD)} µrad, "
+        f"scale difference {_signed(found.scale_difference * UM_PER_M)} µm/m",
+    ]
     if not math.isnan(found.rms_theta_rad):
-        lines += [f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
-                  f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",
-                  *_test_text(found.theta)]
+        lines += [
+            f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
+            f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",
+            *_test_text(found.theta),
+        ]
     return "\n".join([*lines, *grades, _verdict_text(found)])
 
 
@@ -146,10 +204,11 @@ def _test_text(test: Significance | None) -> list[str]:
     if test is None:
         return ["       no uncertainties to test against"]
     doubt = "" if test.correlated else "; correlations between nodes unknown"
-    return [f"       Mahalanobis distance^2/dof {test.chi2_ratio:.3f}, {test.dof:.0f} dof, "
-            f"p = {test.p:.2g}{doubt}",
-            f"       largest |z| {test.largest_z:.2f}, limit {test.z_limit:.2f}, "
-            f"p = {test.p_z:.2g}"]
+    return [
+        f"       Mahalanobis distance^2/dof {test.chi2_ratio:.3f}, {test.dof:.0f} dof, "
+        f"p = {test.p:.2g}{doubt}",
+        f"       largest |z| {test.largest_z:.2f}, limit {test.z_limit:.2f}, p = {test.p_z:.2g}",
+    ]
 
 
 def _verdict_text(found: MapDifference) -> str:
@@ -163,9 +222,18 @@ def _verdict_text(found: MapDifference) -> str:
 
 
 def _laser_json(rows: Sequence[LaserDifference]) -> dict[str, Any]:
-    return plain({row.name: {"map": row.of_map, "laser": row.of_laser,
-                             "difference": row.difference, "u": row.u, "p": row.p}
-                  for row in rows})
+    return plain(
+        {
+            row.name: {
+                "map": row.of_map,
+                "laser": row.of_laser,
+                "difference": row.difference,
+                "u": row.u,
+                "p": row.p,
+            }
+            for row in rows
+        }
+    )
 
 
 def _laser_text(rows: Sequence[LaserDifference]) -> str:
@@ -173,7 +241,9 @@ def _laser_text(rows: Sequence[LaserDifference]) -> str:
     for row in rows:
         unit = "µrad" if row.name == "nonorthogonality" else "µm/m"
         test = "" if math.isnan(row.u) else f"  u {row.u * UM_PER_M:.4g}, p = {row.p:.2g}"
-        lines.append(f"  {row.name.replace('_', ' ')}: {row.of_map * UM_PER_M:+.4g} and "
-                     f"{row.of_laser * UM_PER_M:+.4g} {unit}, difference "
-                     f"{row.difference * UM_PER_M:+.4g}{test}")
+        lines.append(
+            f"  {row.name.replace('_', ' ')}: {row.of_map * UM_PER_M:+.4g} and "
+            f"{row.of_laser * UM_PER_M:+.4g} {unit}, difference "
+            f"{row.difference * UM_PER_M:+.4g}{test}"
+        )
     return "\n".join(lines)

@@ -19,23 +19,46 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("format", choices=FORMATS, metavar="|".join(FORMATS), help="the controller")
     add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
-    add("-o", "--output", metavar="FILE", required=True,
-        help="table to write; beckhoff and linuxcnc: FILE_x and FILE_y, same suffix")
-    add("--verify", action="store_true",
-        help="print the residual of a simulated controller before and after")
-    add("--onto", metavar="ACTIVE", nargs="+", action="extend",
+    add(
+        "-o",
+        "--output",
+        metavar="FILE",
+        required=True,
+        help="table to write; beckhoff and linuxcnc: FILE_x and FILE_y, same suffix",
+    )
+    add(
+        "--verify",
+        action="store_true",
+        help="print the residual of a simulated controller before and after",
+    )
+    add(
+        "--onto",
+        metavar="ACTIVE",
+        nargs="+",
+        action="extend",
         help="table that was loaded during the calibration (of x and y where there are two): "
-             "the new one replaces it")
-    add("--negate", action="store_true",
-        help="the controller subtracts the table (beckhoff, siemens: not documented)")
+        "the new one replaces it",
+    )
+    add(
+        "--negate",
+        action="store_true",
+        help="the controller subtracts the table (beckhoff, siemens: not documented)",
+    )
     add("--integers", action="store_true", help="beckhoff before V3.1.3132 / V4.29")
     add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
-    add("--force", action="store_true",
-        help="replace existing files; the old ones are kept with their date")
+    add(
+        "--force",
+        action="store_true",
+        help="replace existing files; the old ones are kept with their date",
+    )
     add_json(parser)
     add_frame(parser, theta=False, units=("m", "mm", "um", "in"))
-    add("--counts-per-unit", action="append", metavar="AXIS=COUNTS",
-        help="pmac: encoder counts per unit, for both motors")
+    add(
+        "--counts-per-unit",
+        action="append",
+        metavar="AXIS=COUNTS",
+        help="pmac: encoder counts per unit, for both motors",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,21 +68,36 @@ def run(args: argparse.Namespace) -> int:
     active = None
     if args.onto:
         active = loaded(args.format, [Source(read_text(path), path) for path in args.onto], wiring)
-    exported = export(args.format, result, wiring, args.output, active=active, filled=filled,
-                  command=command(args))
+    exported = export(
+        args.format,
+        result,
+        wiring,
+        args.output,
+        active=active,
+        filled=filled,
+        command=command(args),
+    )
     say_bent(args, exported.bent_m)
     if exported.remains:
-        print(f"selfcal export: {args.format} cannot hold the whole map: {exported.remains}",
-              file=sys.stderr)
+        print(
+            f"selfcal export: {args.format} cannot hold the whole map: {exported.remains}",
+            file=sys.stderr,
+        )
     backups = replace_files(args, exported.files, [args.result, *(args.onto or ())])
     lines = [path + replaced(backup) for path, backup in backups.items()]
     if args.verify:
         lines.append(residual_text(exported.residuals))
     lines += numbered(exported.checklist)
-    say(args, "\n".join(lines), {
-        "files": [{"file": path, "old_file": backup} for path, backup in backups.items()],
-        "filled": filled, "residuals": figures_of(exported.residuals),
-        "checklist": list(exported.checklist)})
+    say(
+        args,
+        "\n".join(lines),
+        {
+            "files": [{"file": path, "old_file": backup} for path, backup in backups.items()],
+            "filled": filled,
+            "residuals": figures_of(exported.residuals),
+            "checklist": list(exported.checklist),
+        },
+    )
     return exit_code(result)
 
 
@@ -70,7 +108,11 @@ def _wiring(args: argparse.Namespace) -> "Wiring":
     counts = numbers(given, "--counts-per-unit", positive=True)
     axes = (frame.x_axis, frame.y_axis)
     if counts and set(counts) != set(axes):
-        raise InputError("--counts-per-unit", f"it is given for {sorted(counts)}",
-                         f"give it for {axes[0]} and {axes[1]}")
-    return Wiring(frame, (counts[axes[0]], counts[axes[1]]) if counts else None, args.negate,
-                  args.integers)
+        raise InputError(
+            "--counts-per-unit",
+            f"it is given for {sorted(counts)}",
+            f"give it for {axes[0]} and {axes[1]}",
+        )
+    return Wiring(
+        frame, (counts[axes[0]], counts[axes[1]]) if counts else None, args.negate, args.integers
+    )

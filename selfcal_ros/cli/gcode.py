@@ -30,10 +30,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
     add("-o", "--output", metavar="OUT", required=True, help="program to write; - = stdout")
     add("--dialect", required=True, choices=DIALECTS, help="whose list of codes the program keeps")
-    add("--tolerance", type=float, default=1.0, metavar="UM",
-        help="largest distance of the corrected path from the programmed one, um (default 1)")
-    add("--decimals", type=int, default=5, metavar="N",
-        help="decimals of coordinates in mm, one more in inches (default 5)")
+    add(
+        "--tolerance",
+        type=float,
+        default=1.0,
+        metavar="UM",
+        help="largest distance of the corrected path from the programmed one, um (default 1)",
+    )
+    add(
+        "--decimals",
+        type=int,
+        default=5,
+        metavar="N",
+        help="decimals of coordinates in mm, one more in inches (default 5)",
+    )
     add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
     add_json(parser)
     add_frame(parser, theta=False, units=("mm", "in"))
@@ -46,8 +56,11 @@ def step_of(error_map: ErrorMap, tolerance_m: float) -> float:
     pitch. A line between points h apart is off that bend by at most a quarter of the change times
     h, for two components and two bends together.
     """
-    bend_m = max(float(np.nanmax(np.abs(np.diff(part, 2, axis)), initial=0.0))
-                 for part in (error_map.gx, error_map.gy) for axis in (0, 1))
+    bend_m = max(
+        float(np.nanmax(np.abs(np.diff(part, 2, axis)), initial=0.0))
+        for part in (error_map.gx, error_map.gy)
+        for axis in (0, 1)
+    )
     pitch_m = error_map.artifact.grid_pitch_m
     share = OF_SAMPLES * tolerance_m * 4 / (2 * math.sqrt(2) * max(bend_m, 1e-12))
     return pitch_m * min(1 / 32, share)
@@ -56,19 +69,28 @@ def step_of(error_map: ErrorMap, tolerance_m: float) -> float:
 def run(args: argparse.Namespace) -> int:
     """Read program and result, write the program; code 5 and the reason if not qualified."""
     if not 0.001 <= args.tolerance <= 1e4 or not 1 <= args.decimals <= 9:
-        raise InputError("--tolerance, --decimals", f"{args.tolerance} um, {args.decimals}",
-                         "give 0.001 to 10000 um and 1 to 9 decimals")
+        raise InputError(
+            "--tolerance, --decimals",
+            f"{args.tolerance} um, {args.decimals}",
+            "give 0.001 to 10000 um and 1 to 9 decimals",
+        )
     if 10.0**-args.decimals * 1e3 > 2 * args.tolerance:
-        raise InputError("--decimals", f"{args.decimals} round by more than {args.tolerance:g} um",
-                         "give more, or a larger --tolerance")
+        raise InputError(
+            "--decimals",
+            f"{args.decimals} round by more than {args.tolerance:g} um",
+            "give more, or a larger --tolerance",
+        )
     args.unit = args.unit or "mm"
     frame = replace(frame_of(args), unit="m")
     check_outputs([args.program, args.result], [file_of(args)])
     result, filled = ready(args)
     rewriter = Rewriter(
-        wanted(result.error_map, Wiring(frame)), dialect=args.dialect,
+        wanted(result.error_map, Wiring(frame)),
+        dialect=args.dialect,
         tolerance_m=args.tolerance * M_PER_UM,
-        step_m=step_of(result.error_map, args.tolerance * M_PER_UM), decimals=args.decimals)
+        step_m=step_of(result.error_map, args.tolerance * M_PER_UM),
+        decimals=args.decimals,
+    )
     text = read_text(args.program)
     if not text.strip():
         raise InputError(args.program, "the file is empty", "name a G-code program")
@@ -77,11 +99,19 @@ def run(args: argparse.Namespace) -> int:
     lowest, highest = rewriter.reach_m
     said = ["moves leave the field, beyond which the correction at its edge is used, without U"]
     if np.all(lowest >= (x0 - ROUNDING_M, y0 - ROUNDING_M)) and np.all(
-            highest <= (x1 + ROUNDING_M, y1 + ROUNDING_M)):
+        highest <= (x1 + ROUNDING_M, y1 + ROUNDING_M)
+    ):
         said = []
     for line in said:
         print(f"selfcal gcode: {args.program}: {line}", file=sys.stderr)
     comments = [*origin_lines(result, command(args)), *said]
-    return deliver(args, result, commented(program, comments), "program", filled=filled,
-                   moves=rewriter.moves, pieces=rewriter.pieces,
-                   note=f", {rewriter.moves} moves as {rewriter.pieces}")
+    return deliver(
+        args,
+        result,
+        commented(program, comments),
+        "program",
+        filled=filled,
+        moves=rewriter.moves,
+        pieces=rewriter.pieces,
+        note=f", {rewriter.moves} moves as {rewriter.pieces}",
+    )

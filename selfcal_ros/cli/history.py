@@ -23,10 +23,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Lists the RESULT.json files in a folder, whatever verb wrote them, with the change of "
         "each from the one before. Wherever a RESULT.json is read, by the compensator too, the "
-        "folder itself stands for its active map.")
+        "folder itself stands for its active map."
+    )
     parser.add_argument("folder", metavar="FOLDER", help="calibrations of one stage")
-    parser.add_argument("--activate", metavar="RESULT.json",
-                        help="make this result of the folder the active map")
+    parser.add_argument(
+        "--activate", metavar="RESULT.json", help="make this result of the folder the active map"
+    )
     add_json(parser)
 
 
@@ -40,13 +42,26 @@ def run(args: argparse.Namespace) -> int:
         active, since = active_map(folder) if (folder / ACTIVE).exists() else (None, "")
         used = next((entry for entry in entries if active and entry.path.samefile(active)), None)
         drift = drift_from(used, entries) if used else None
-    say(args, "\n".join(_text(folder, entries, (used, since), drift)), plain({
-        "folder": str(folder), "active": used and str(used.path), "since": since or None,
-        "entries": [_entry_json(entry) for entry in entries],
-        "drift": drift and {
-            "per_day_m": drift.per_day_m, "u_per_day_m": drift.u_per_day_m,
-            "clear": drift.is_clear, "limit_m": drift.limit_m,
-            "due": drift.due and drift.due.isoformat(timespec="seconds")}}))
+    say(
+        args,
+        "\n".join(_text(folder, entries, (used, since), drift)),
+        plain(
+            {
+                "folder": str(folder),
+                "active": used and str(used.path),
+                "since": since or None,
+                "entries": [_entry_json(entry) for entry in entries],
+                "drift": drift
+                and {
+                    "per_day_m": drift.per_day_m,
+                    "u_per_day_m": drift.u_per_day_m,
+                    "clear": drift.is_clear,
+                    "limit_m": drift.limit_m,
+                    "due": drift.due and drift.due.isoformat(timespec="seconds"),
+                },
+            }
+        ),
+    )
     return int(ExitCode.DONE)
 
 
@@ -55,23 +70,29 @@ def _activate(folder: Path, path: Path) -> None:
     if folder.resolve() not in path.resolve().parents:
         raise InputError(str(path), f"is not in {folder}", "copy it there first")
     if not read_result(path).verdict.qualified:
-        raise InputError(str(path), "is not qualified, so it is not a map to correct with",
-                         "calibrate again")
+        raise InputError(
+            str(path), "is not qualified, so it is not a map to correct with", "calibrate again"
+        )
     now = datetime.now(UTC).isoformat(timespec="seconds")
     write_text(folder / ACTIVE, f"{path.resolve().relative_to(folder.resolve())}\n{now}\n")
 
 
-def _text(folder: Path, entries: list[Entry], active: tuple[Entry | None, str],
-          drift: Drift | None) -> Iterator[str]:
+def _text(
+    folder: Path, entries: list[Entry], active: tuple[Entry | None, str], drift: Drift | None
+) -> Iterator[str]:
     used, since = active
-    yield (f"  {'measured':<18}{'what':<13}{'largest error':>15}{'U rms':>12}  change from the one "
-           "before: largest, rms")
+    yield (
+        f"  {'measured':<18}{'what':<13}{'largest error':>15}{'U rms':>12}  change from the one "
+        "before: largest, rms"
+    )
     for entry in entries:
         mark = "*" if entry is used else " "
         grade = "" if entry.result.verdict.qualified else ", not qualified"
-        yield (f"{mark} {entry.measured:%Y-%m-%d %H:%M}  {entry.kind:<13}"
-               f"{_largest_m(entry) * UM_PER_M:>12.4g} µm{entry.expanded_m * NM_PER_M:>9.3g} nm  "
-               f"{_change_text(entry.change)}  {entry.path.relative_to(folder)}{grade}")
+        yield (
+            f"{mark} {entry.measured:%Y-%m-%d %H:%M}  {entry.kind:<13}"
+            f"{_largest_m(entry) * UM_PER_M:>12.4g} µm{entry.expanded_m * NM_PER_M:>9.3g} nm  "
+            f"{_change_text(entry.change)}  {entry.path.relative_to(folder)}{grade}"
+        )
     if used is None:
         yield f"no map is active: selfcal history {folder} --activate RESULT.json"
         return
@@ -82,24 +103,33 @@ def _text(folder: Path, entries: list[Entry], active: tuple[Entry | None, str],
 def _change_text(change: MapDifference | str) -> str:
     if isinstance(change, str):
         return f"not compared: {change}" if change else "-"
-    u = ("", "") if change.xy is None else (
-        f" ± {change.xy.u_largest * NM_PER_M:.2g}", f" ± {change.xy.u_rms * NM_PER_M:.2g}")
+    u = (
+        ("", "")
+        if change.xy is None
+        else (f" ± {change.xy.u_largest * NM_PER_M:.2g}", f" ± {change.xy.u_rms * NM_PER_M:.2g}")
+    )
     clear = {True: "changed", False: "within u", None: "u unknown"}[change.significant]
-    return (f"{change.max_m * NM_PER_M:.3g}{u[0]} nm, {change.rms_m * NM_PER_M:.3g}{u[1]} nm "
-            f"(k=1), {clear}")
+    return (
+        f"{change.max_m * NM_PER_M:.3g}{u[0]} nm, {change.rms_m * NM_PER_M:.3g}{u[1]} nm "
+        f"(k=1), {clear}"
+    )
 
 
 def _drift_text(drift: Drift | None) -> str:
     if drift is None:
         return "drift: nothing to compare with the active map; recheck the stage to learn it"
-    day = (f"{drift.per_day_m * NM_PER_M:.3g} ± {drift.u_per_day_m * NM_PER_M:.2g} nm a day (k=1)"
-           if drift.is_clear else "none beyond its uncertainty, so below "
-           f"{drift.most_per_day_m * NM_PER_M:.2g} nm a day")
+    day = (
+        f"{drift.per_day_m * NM_PER_M:.3g} ± {drift.u_per_day_m * NM_PER_M:.2g} nm a day (k=1)"
+        if drift.is_clear
+        else f"none beyond its uncertainty, so below {drift.most_per_day_m * NM_PER_M:.2g} nm a day"
+    )
     if drift.due is None:
         return f"drift from the active map: {day}; it will not reach U"
-    return (f"drift from the active map: {day}; it reaches U, {drift.limit_m * NM_PER_M:.3g} nm, "
-            f"{'on' if drift.is_clear else 'not before'} {drift.due:%Y-%m-%d %H:%M}: the next "
-            "calibration is due then")
+    return (
+        f"drift from the active map: {day}; it reaches U, {drift.limit_m * NM_PER_M:.3g} nm, "
+        f"{'on' if drift.is_clear else 'not before'} {drift.due:%Y-%m-%d %H:%M}: the next "
+        "calibration is due then"
+    )
 
 
 def _largest_m(entry: Entry) -> float:
@@ -109,11 +139,23 @@ def _largest_m(entry: Entry) -> float:
 
 def _entry_json(entry: Entry) -> dict[str, Any]:
     change = entry.change
-    found: dict[str, Any] = {"not_compared": change or None} if isinstance(change, str) else {
-        "changed": change.significant, "change_rms_m": change.rms_m, "change_max_m": change.max_m,
-        "u_change_rms_m": change.xy and change.xy.u_rms,
-        "u_change_max_m": change.xy and change.xy.u_largest}
-    return {"file": str(entry.path), "kind": entry.kind,
-            "measured": entry.measured.isoformat(timespec="seconds"),
-            "grade": str(entry.result.verdict.grade), "largest_m": _largest_m(entry),
-            "U_rms_m": entry.expanded_m, **found}
+    found: dict[str, Any] = (
+        {"not_compared": change or None}
+        if isinstance(change, str)
+        else {
+            "changed": change.significant,
+            "change_rms_m": change.rms_m,
+            "change_max_m": change.max_m,
+            "u_change_rms_m": change.xy and change.xy.u_rms,
+            "u_change_max_m": change.xy and change.xy.u_largest,
+        }
+    )
+    return {
+        "file": str(entry.path),
+        "kind": entry.kind,
+        "measured": entry.measured.isoformat(timespec="seconds"),
+        "grade": str(entry.result.verdict.grade),
+        "largest_m": _largest_m(entry),
+        "U_rms_m": entry.expanded_m,
+        **found,
+    }

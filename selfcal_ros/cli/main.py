@@ -41,8 +41,10 @@ from selfcal_ros.plain_numbers import number_of, whole_number_of
 from selfcal_ros.portable import hold_interrupts, say_no_more
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
-NUMBERS = {"float": "a number; give it without a unit, with a decimal point",
-           "int": "a whole number"}
+NUMBERS = {
+    "float": "a number; give it without a unit, with a decimal point",
+    "int": "a whole number",
+}
 COMPLETE = "_ARGCOMPLETE"
 """Set in the environment by a shell that asks for completions."""
 
@@ -52,11 +54,14 @@ def build_parser(only: str | None = None) -> "Parser":
 
     If it is not one, no verb is imported: their names and help are known without.
     """
-    parser = AllVerbs(prog="selfcal", description="Calibrates XY-theta stages from readings of a "
-                      "plate in several views, and states the uncertainty of every number.",
-                      epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does "
-                      "not identify the stage, 4 no usable data, 5 written but not qualified, 1 "
-                      "internal error")
+    parser = AllVerbs(
+        prog="selfcal",
+        description="Calibrates XY-theta stages from readings of a "
+        "plate in several views, and states the uncertainty of every number.",
+        epilog="exit codes: 0 done, 2 bad usage or input, 3 the measured plan does "
+        "not identify the stage, 4 no usable data, 5 written but not qualified, 1 "
+        "internal error",
+    )
     parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
     group = parser.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=Parser)
     for name in [only] if only in VERBS else VERBS:
@@ -82,8 +87,9 @@ def _configure(parser: argparse.ArgumentParser, module: Any) -> None:
 
 def _leaves(parser: "Parser", words: str) -> Iterator[tuple[str, "Parser"]]:
     """Yield the words and the parser of a verb, or of each of its second words."""
-    groups = [action for action in parser._actions
-              if isinstance(action, argparse._SubParsersAction)]
+    groups = [
+        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+    ]
     if not groups:
         yield words, parser
     for group in groups:
@@ -137,20 +143,24 @@ def _run(words: list[str]) -> int:
         fault = (misplaced(args) if args is not None else None) or error
         if isinstance(fault, NotIdentifiableError):
             from selfcal_ros.reporting.words.observability import told  # numpy: half a second
+
             fault = told(fault)
         return _refused(f"{prefix}: {fault}", fault.exit_code)
     except KeyboardInterrupt:
         return _refused(f"{prefix}: interrupted", 128 + signal.SIGINT)
     except ModuleNotFoundError as error:
-        return _refused(f"{prefix}: there is no module {error.name} in this environment; "
-                        f"{_remedy(error.name)}", ExitCode.BAD_INPUT)
+        return _refused(
+            f"{prefix}: there is no module {error.name} in this environment; {_remedy(error.name)}",
+            ExitCode.BAD_INPUT,
+        )
     except BrokenPipeError:
         raise
     except OSError as error:  # a name too long, a disk that fails
         if error.errno is None:
             raise
-        fault = InputError(str(error.filename or "system"), str(error.strerror),
-                           "check path, disk and permissions")
+        fault = InputError(
+            str(error.filename or "system"), str(error.strerror), "check path, disk and permissions"
+        )
         return _refused(f"{prefix}: {fault}", fault.exit_code)
 
 
@@ -192,8 +202,8 @@ class Parser(argparse.ArgumentParser):
         return f"{text}\nexample:\n  {self.example}\n" if self.example else text
 
     def parse_args(  # type: ignore[override]
-            self, args: Sequence[str] | None = None,
-            namespace: argparse.Namespace | None = None) -> argparse.Namespace:
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
         """Return the arguments; an unknown option ends with a line that names it."""
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
@@ -217,21 +227,29 @@ class Parser(argparse.ArgumentParser):
         required = "the following arguments are required: "
         if message.startswith(required):
             names = message.removeprefix(required).replace("/--", " or --")
-            verbs = [verb for action in self._actions if str(action.metavar) == names
-                     and isinstance(action.choices, dict) for verb in action.choices
-                     if verb not in names]
+            verbs = [
+                verb
+                for action in self._actions
+                if str(action.metavar) == names and isinstance(action.choices, dict)
+                for verb in action.choices
+                if verb not in names
+            ]
             message = f"{names} {'are' if ', ' in names else 'is'} missing" + (
-                f": one of {', '.join(verbs)}" if verbs else "")
-        self.exit(int(ExitCode.BAD_INPUT),
-                  printable(f"{self.prog}: {message}; see {self.prog} --help") + "\n")
+                f": one of {', '.join(verbs)}" if verbs else ""
+            )
+        self.exit(
+            int(ExitCode.BAD_INPUT),
+            printable(f"{self.prog}: {message}; see {self.prog} --help") + "\n",
+        )
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse a value that is not among the choices, with similar ones."""
         if action.choices is None or value in action.choices:
             return
         if not action.option_strings and os.path.exists(str(value)):
-            raise argparse.ArgumentError(None, f"'{value}' is a file, and {_name_of(action)} comes "
-                                         "first")
+            raise argparse.ArgumentError(
+                None, f"'{value}' is a file, and {_name_of(action)} comes first"
+            )
         choices: Iterable[str] = map(str, action.choices)
         known = list(choices)
         hint = did_you_mean(str(value), known) or f"known are {', '.join(known)}"
@@ -244,23 +262,37 @@ class AllVerbs(Parser):
     def format_help(self) -> str:
         """Return the help: where to start, then the verbs in groups."""
         width = shutil.get_terminal_size().columns - 2
-        lines = ["usage: selfcal VERB ...", "", *textwrap.wrap(str(self.description), width),
-                 "", "start here", *_columns({f"selfcal {command}": what for command, what
-                                              in START_HERE.items()}, width)]
+        lines = [
+            "usage: selfcal VERB ...",
+            "",
+            *textwrap.wrap(str(self.description), width),
+            "",
+            "start here",
+            *_columns({f"selfcal {command}": what for command, what in START_HERE.items()}, width),
+        ]
         offered = {action.dest: str(action.help) for action in self._verbs()}
         longest = max(map(len, offered))
         for group in GROUPS:
-            rows = {name.ljust(longest): text for name, text in offered.items()
-                    if (VERBS[name].group if name in VERBS else MORE) == group}
+            rows = {
+                name.ljust(longest): text
+                for name, text in offered.items()
+                if (VERBS[name].group if name in VERBS else MORE) == group
+            }
             lines += ["", group, *_columns(rows, width)]
-        lines += ["", *textwrap.wrap(str(self.epilog), width),
-                  "selfcal --version shows the version"]
+        lines += [
+            "",
+            *textwrap.wrap(str(self.epilog), width),
+            "selfcal --version shows the version",
+        ]
         return "\n".join(lines) + "\n"
 
     def _verbs(self) -> list[argparse.Action]:
-        return [action for group in self._actions
-                if isinstance(group, argparse._SubParsersAction)
-                for action in group._choices_actions]
+        return [
+            action
+            for group in self._actions
+            if isinstance(group, argparse._SubParsersAction)
+            for action in group._choices_actions
+        ]
 
 
 def _columns(rows: dict[str, str], width: int) -> list[str]:

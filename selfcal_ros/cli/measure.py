@@ -27,16 +27,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Leads through the views of a plan: says how the plate is to be placed, moves the stage "
         "after a yes, shows coverage, noise and rejections, saves every exposure at once, and "
-        "solves at the end. Ctrl-C stops the stage; --resume continues.")
+        "solves at the end. Ctrl-C stops the stage; --resume continues."
+    )
     parser.add_argument("plan", metavar="PLAN.yaml", help="plan with plate and views")
-    parser.add_argument("cell", metavar="CELL.yaml", help="machine, limits, detector "
-                        "(docs/start/machines.md)")
-    parser.add_argument("-o", "--output", metavar="BAG", required=True, help="bag folder to "
-                        "create; the result is written beside it, BAG.json and BAG.html")
-    parser.add_argument("--yes", action="store_true", help="ask nothing: the plate is placed by a "
-                        "robot or a simulation, and the stage may move")
-    parser.add_argument("--resume", action="store_true", help="continue the bag of a run that was "
-                        "interrupted")
+    parser.add_argument(
+        "cell", metavar="CELL.yaml", help="machine, limits, detector (docs/start/machines.md)"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="BAG",
+        required=True,
+        help="bag folder to create; the result is written beside it, BAG.json and BAG.html",
+    )
+    parser.add_argument(
+        "--yes",
+        action="store_true",
+        help="ask nothing: the plate is placed by a robot or a simulation, and the stage may move",
+    )
+    parser.add_argument(
+        "--resume", action="store_true", help="continue the bag of a run that was interrupted"
+    )
     add_json(parser, "RESULT.json, and all else on stderr")
 
 
@@ -47,11 +58,17 @@ def run(args: argparse.Namespace) -> int:
     kept = f"{bag} is kept, --resume continues"
     desk = Terminal(args.yes, bag, aside(args))
     if not args.yes and not sys.stdin.isatty():
-        raise InputError("stdin", "there is nobody to ask: it is not a terminal",
-                         "give --yes where a robot or a simulation places the plate")
+        raise InputError(
+            "stdin",
+            "there is nobody to ask: it is not a terminal",
+            "give --yes where a robot or a simulation places the plate",
+        )
     if args.yes and cell.placing == "person":
-        raise InputError(f"{cell.path}: placing", "--yes, but a person places the plate",
-                         "write placing: robot, or leave out --yes")
+        raise InputError(
+            f"{cell.path}: placing",
+            "--yes, but a person places the plate",
+            "write placing: robot, or leave out --yes",
+        )
     try:
         with ended_by_signals(), connected(cell, desk.say) as machine:
             work = Run(plan, cell, machine, bag, desk)
@@ -77,8 +94,9 @@ def run(args: argparse.Namespace) -> int:
         return verify.run(verifying)
     parser = argparse.ArgumentParser()
     solve.configure(parser)
-    solving = parser.parse_args([str(bag), "-o", f"{bag}.json", "--sense", str(cell.sense),
-                                 "--report", f"{bag}.html"])
+    solving = parser.parse_args(
+        [str(bag), "-o", f"{bag}.json", "--sense", str(cell.sense), "--report", f"{bag}.html"]
+    )
     solving.verb = "measure"
     solving.json = args.json
     return solve.run(solving)
@@ -111,8 +129,10 @@ class Terminal:
         picture = f"{self._bag}.placing.png"
         save_picture(plan_figure(command.plate(), [view]), picture)
         turn = math.degrees(view.rotation_rad)
-        self.say(f"place the plate: turned by {turn:g}° counter-clockwise, its centre at "
-                 f"({x:g}, {y:g}) mm from the centre of the field ({picture})")
+        self.say(
+            f"place the plate: turned by {turn:g}° counter-clockwise, its centre at "
+            f"({x:g}, {y:g}) mm from the centre of the field ({picture})"
+        )
         self._ask("Enter when it lies there: ")
 
     def may_move(self, text: str) -> bool:
@@ -123,8 +143,9 @@ class Terminal:
         """Ask."""
         if self._is_silent:
             return True
-        return self._ask(f"view '{view}' was interrupted: does the plate lie as it did? [y/N] "
-                         ).lower() in ("y", "yes")
+        return self._ask(
+            f"view '{view}' was interrupted: does the plate lie as it did? [y/N] "
+        ).lower() in ("y", "yes")
 
     def _ask(self, text: str) -> str:
         self.end()
@@ -159,8 +180,12 @@ class Terminal:
     def _print(self, text: str, end: str = "\n") -> None:
         """Print; where nobody reads it any longer, the measurement goes on."""
         try:
-            print(text if can_print_symbols(self._stream) else to_ascii(text), end=end,
-                  file=self._stream, flush=True)
+            print(
+                text if can_print_symbols(self._stream) else to_ascii(text),
+                end=end,
+                file=self._stream,
+                flush=True,
+            )
         except OSError:
             say_no_more(self._stream)
 

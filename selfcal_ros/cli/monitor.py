@@ -34,8 +34,9 @@ def run(args: argparse.Namespace) -> int:
         return watch(monitor, [], lambda: None, as_json=args.json)
 
 
-def watch(monitor: "Eyes", log: list[str], step: Callable[[], None], *,
-          as_json: bool = False) -> int:
+def watch(
+    monitor: "Eyes", log: list[str], step: Callable[[], None], *, as_json: bool = False
+) -> int:
     """Draw the monitor's pictures and forward keys; call `step` several times a second.
 
     Without a terminal every change of state is a line on stdout instead, and requests are read
@@ -51,8 +52,13 @@ def watch(monitor: "Eyes", log: list[str], step: Callable[[], None], *,
         raise
 
 
-def _watched(monitor: "Eyes", log: list[str], step: Callable[[], None],
-             pressed: Callable[[], list[str]], draw: Callable[[Any], None]) -> int:
+def _watched(
+    monitor: "Eyes",
+    log: list[str],
+    step: Callable[[], None],
+    pressed: Callable[[], list[str]],
+    draw: Callable[[Any], None],
+) -> int:
     while True:
         step()
         message = monitor.next(0.1)
@@ -77,8 +83,10 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
     newest: dict[str, Any] = {}
     console = Console()
     drawn: list[Any] = []  # size and log shown on the screen
-    with Live(Text("Looking for the nodes ..."), console=console, screen=True,
-              auto_refresh=False) as live:
+    with Live(
+        Text("Looking for the nodes ..."), console=console, screen=True, auto_refresh=False
+    ) as live:
+
         def draw(picture: Any) -> None:
             now = [console.size, list(log)]
             newest.update(picture or {})
@@ -86,6 +94,7 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
                 drawn[:] = now
                 size = (console.width, console.height)
                 live.update(screen(newest, log, size), refresh=True)
+
         yield draw
 
 
@@ -104,6 +113,7 @@ def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
             if said.get(key) != line:
                 said[key] = line
                 print(printable(f"{key}: {line}"), flush=True)
+
     yield draw
 
 
@@ -136,6 +146,7 @@ def _json_lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
         if picture is not None and picture != newest[0]:
             newest[0] = picture
             print(json.dumps({"picture": picture}), flush=True)
+
     yield draw
 
 
@@ -158,6 +169,7 @@ def _keys() -> Iterator[Callable[[], list[str]]]:
                 if not keys:  # the terminal is gone
                     return [*found, "quit"]
             return found
+
         yield pressed
     finally:
         with contextlib.suppress(termios.error):  # gone
@@ -179,6 +191,7 @@ def _words() -> Callable[[], list[str]]:
     def read() -> None:
         for line in sys.stdin:
             lines.put(line.strip())
+
     threading.Thread(target=read, name="stdin", daemon=True).start()
 
     def taken() -> list[str]:
@@ -186,4 +199,5 @@ def _words() -> Callable[[], list[str]]:
         while not lines.empty():
             found.append(lines.get())
         return [word for word in found if word]
+
     return taken

@@ -48,41 +48,69 @@ from selfcal_ros.units import MM_PER_M, UM_PER_M
 SHOWN = 8
 """Default number of suggestions."""
 
-NODES_ONLY = ("every reading lies at a node of the map: to test the error between nodes, give the "
-              "map its own nodes (map:) and add a view shifted by half a pitch")
+NODES_ONLY = (
+    "every reading lies at a node of the map: to test the error between nodes, give the "
+    "map its own nodes (map:) and add a view shifted by half a pitch"
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs ``new``, ``check`` and ``suggest``."""
     verbs = parser.add_subparsers(dest="plan_verb", metavar="new|check|suggest", required=True)
-    plan_new.configure(verbs.add_parser(
-        "new", help="write a plan and a CELL.yaml from what you know of stage, plate and time"))
+    plan_new.configure(
+        verbs.add_parser(
+            "new", help="write a plan and a CELL.yaml from what you know of stage, plate and time"
+        )
+    )
     check = verbs.add_parser(
-        "check", help="rank, undetermined modes, predicted uncertainty; exit 3 if deficient")
+        "check", help="rank, undetermined modes, predicted uncertainty; exit 3 if deficient"
+    )
     suggest = verbs.add_parser(
-        "suggest", help="rank the next views, or find the best plan for a number of views")
+        "suggest", help="rank the next views, or find the best plan for a number of views"
+    )
     for sub in (check, suggest):
         sub.add_argument("plan", metavar="PLAN.yaml")
-        sub.add_argument("--theta-datum", choices=("xy_axes", "zero_mean"), default="zero_mean",
-                         help="convention of the angular map (default zero_mean)")
+        sub.add_argument(
+            "--theta-datum",
+            choices=("xy_axes", "zero_mean"),
+            default="zero_mean",
+            help="convention of the angular map (default zero_mean)",
+        )
         sub.add_argument("--json", action="store_true", help="print JSON")
         plan_terms.add_term_options(sub)
-    check.add_argument("--map", action="store_true",
-                       help="also print the predicted uncertainty at every site")
-    check.add_argument("--model", metavar="TERM[:SIZE][,...]", action="append", default=[],
-                       help="terms to be estimated with the map, in addition to the plan's "
-                       "model_terms; without a size they are free, and exit code 3 means that "
-                       "the plan cannot separate them from the stage")
-    check.add_argument("--repeats", type=int, metavar="N",
-                       help="judge the plan as if every mark were measured N times per view")
-    suggest.add_argument("--views", type=int, metavar="N",
-                         help="find the best plan of N views for the plan's plate")
-    suggest.add_argument("--criterion", choices=("rms", "max"), default="rms",
-                         help="which XY uncertainty to minimise (default rms)")
-    suggest.add_argument("--top", type=int, metavar="N",
-                         help=f"number of suggestions to show (default {SHOWN})")
-    suggest.add_argument("-o", "--output", metavar="PLAN.yaml",
-                         help="write the plan with the best suggestion")
+    check.add_argument(
+        "--map", action="store_true", help="also print the predicted uncertainty at every site"
+    )
+    check.add_argument(
+        "--model",
+        metavar="TERM[:SIZE][,...]",
+        action="append",
+        default=[],
+        help="terms to be estimated with the map, in addition to the plan's "
+        "model_terms; without a size they are free, and exit code 3 means that "
+        "the plan cannot separate them from the stage",
+    )
+    check.add_argument(
+        "--repeats",
+        type=int,
+        metavar="N",
+        help="judge the plan as if every mark were measured N times per view",
+    )
+    suggest.add_argument(
+        "--views", type=int, metavar="N", help="find the best plan of N views for the plan's plate"
+    )
+    suggest.add_argument(
+        "--criterion",
+        choices=("rms", "max"),
+        default="rms",
+        help="which XY uncertainty to minimise (default rms)",
+    )
+    suggest.add_argument(
+        "--top", type=int, metavar="N", help=f"number of suggestions to show (default {SHOWN})"
+    )
+    suggest.add_argument(
+        "-o", "--output", metavar="PLAN.yaml", help="write the plan with the best suggestion"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,22 +142,28 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
         if alone is not None and seen.identifiable:
             terms = (*model, *plan_terms.assumed_terms(args.model, declared, plan))
-            budget = plan_budget(plan, terms, assumed, alone,
-                                 asked=[term.name for term in declared])
+            budget = plan_budget(
+                plan, terms, assumed, alone, asked=[term.name for term in declared]
+            )
     seen = worded_observability(seen)
     if args.json:
         found = _check_json(plan, (seen, checked.unknown_sites), alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M
         if alone is not None and args.sigma is not None:
-            found["predicted"] |= {"rms_u_xy_um": alone.rms_xy * unit,
-                                   "max_u_xy_um": alone.max_xy * unit}
+            found["predicted"] |= {
+                "rms_u_xy_um": alone.rms_xy * unit,
+                "max_u_xy_um": alone.max_xy * unit,
+            }
         if alone is not None:
             found["predicted"] |= {
                 "rms_gain_xy_with_terms": joint and joint.rms_xy,
-                "max_gain_xy_with_terms": joint and joint.max_xy}
+                "max_gain_xy_with_terms": joint and joint.max_xy,
+            }
             if args.sigma is not None and joint is not None:
-                found["predicted"] |= {"rms_u_xy_um_with_terms": joint.rms_xy * unit,
-                                       "max_u_xy_um_with_terms": joint.max_xy * unit}
+                found["predicted"] |= {
+                    "rms_u_xy_um_with_terms": joint.rms_xy * unit,
+                    "max_u_xy_um_with_terms": joint.max_xy * unit,
+                }
         found["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
         print(json.dumps(found | {"terms": plan_terms.terms_json(checks)}, indent=1))
     else:
@@ -156,9 +190,13 @@ def _repeated(plan: Plan, repeats: int | None) -> Plan:
     return replace(plan, views=tuple(replace(view, repeats=repeats) for view in plan.views))
 
 
-def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
-           sizes: dict[str, float], without: tuple[Observability, Prediction],
-           ) -> tuple[Observability, Prediction | None, Sequence[TermCheck]]:
+def _judge(
+    plan: Plan,
+    model: tuple[ModelTerm, ...],
+    assumed: Assumed,
+    sizes: dict[str, float],
+    without: tuple[Observability, Prediction],
+) -> tuple[Observability, Prediction | None, Sequence[TermCheck]]:
     """Return observability and prediction with terms, and the checks of the terms.
 
     `without`: observability and prediction without terms.
@@ -169,56 +207,91 @@ def _judge(plan: Plan, model: tuple[ModelTerm, ...], assumed: Assumed,
     return seen, joint, check_terms(terms, sizes, CAUSE_LEVEL)
 
 
-def _check_json(plan: Plan, found: tuple[Observability, int], predicted: Prediction | None, *,
-                maps: bool) -> dict[str, Any]:
+def _check_json(
+    plan: Plan, found: tuple[Observability, int], predicted: Prediction | None, *, maps: bool
+) -> dict[str, Any]:
     seen, unknown = found
-    out = {"plan_id": plan.plan_id, "rank": seen.rank, "unknowns": seen.unknowns,
-           "deficiency": seen.deficiency, "identifiable": seen.identifiable,
-           "modes": [mode.text for mode in seen.modes],
-           "advice": [advice.text for advice in seen.advice], "predicted": None,
-           "unknown_sites": unknown if seen.identifiable else None,
-           "unchecked_sites": seen.unchecked_sites, "unchecked_lines": seen.unchecked_lines}
+    out = {
+        "plan_id": plan.plan_id,
+        "rank": seen.rank,
+        "unknowns": seen.unknowns,
+        "deficiency": seen.deficiency,
+        "identifiable": seen.identifiable,
+        "modes": [mode.text for mode in seen.modes],
+        "advice": [advice.text for advice in seen.advice],
+        "predicted": None,
+        "unknown_sites": unknown if seen.identifiable else None,
+        "unchecked_sites": seen.unchecked_sites,
+        "unchecked_lines": seen.unchecked_lines,
+    }
     if predicted is not None:
-        out["predicted"] = plain({
-            "rms_gain_xy": predicted.rms_xy, "max_gain_xy": predicted.max_xy,
-            "rms_gain_theta": predicted.rms_theta, "note": field_note(predicted, plan)})
+        out["predicted"] = plain(
+            {
+                "rms_gain_xy": predicted.rms_xy,
+                "max_gain_xy": predicted.max_xy,
+                "rms_gain_theta": predicted.rms_theta,
+                "note": field_note(predicted, plan),
+            }
+        )
         if maps:
-            out["predicted"] |= plain({"u_gx": predicted.ux, "u_gy": predicted.uy,
-                                       "u_g_theta": predicted.u_theta})
+            out["predicted"] |= plain(
+                {"u_gx": predicted.ux, "u_gy": predicted.uy, "u_g_theta": predicted.u_theta}
+            )
     return out
 
 
-def _check_text(plan: Plan, found: tuple[Observability, int],
-                predicted: Prediction | None) -> list[str]:
+def _check_text(
+    plan: Plan, found: tuple[Observability, int], predicted: Prediction | None
+) -> list[str]:
     artifact, (seen, unknown) = plan.artifact, found
-    marks = (f"{artifact.shape[0]} x {artifact.shape[1]}" if artifact.marks is None else
-             f"a list of {artifact.shape[0]}")
-    lines = [f"plan {plan.plan_id}: {len(plan.views)} views of {marks} marks, "
-             f"{artifact.angular_count or 'no'} angular lines",
-             *_nodes_text(plan), *_image_text(plan),
-             _rank_text(seen)]
+    marks = (
+        f"{artifact.shape[0]} x {artifact.shape[1]}"
+        if artifact.marks is None
+        else f"a list of {artifact.shape[0]}"
+    )
+    lines = [
+        f"plan {plan.plan_id}: {len(plan.views)} views of {marks} marks, "
+        f"{artifact.angular_count or 'no'} angular lines",
+        *_nodes_text(plan),
+        *_image_text(plan),
+        _rank_text(seen),
+    ]
     if predicted is None or not seen.identifiable:
         lines += ["the plan does not identify the stage: it cannot determine"]
         lines += [f"  - {mode.text}" for mode in seen.modes]
-        return [*lines, "to determine all of it,",
-                *(f"  - {advice.text}" for advice in seen.advice)]
-    lines += [_known_text(plan, unknown), *_unchecked_text(seen),
-              "predicted standard uncertainty, in units of the noise of one averaged reading:",
-              f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}"]
+        return [
+            *lines,
+            "to determine all of it,",
+            *(f"  - {advice.text}" for advice in seen.advice),
+        ]
+    lines += [
+        _known_text(plan, unknown),
+        *_unchecked_text(seen),
+        "predicted standard uncertainty, in units of the noise of one averaged reading:",
+        f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}",
+    ]
     if len(predicted.u_theta):
         lines.append(f"  theta  rms {predicted.rms_theta:.4f}")
     note = field_note(predicted, plan)
-    return [*lines, *([f"  ({note})"] if note else []), _check_stops_text(plan),
-            *([] if artifact.map_grid else [NODES_ONLY])]
+    return [
+        *lines,
+        *([f"  ({note})"] if note else []),
+        _check_stops_text(plan),
+        *([] if artifact.map_grid else [NODES_ONLY]),
+    ]
 
 
 def _rank_text(seen: Observability) -> str:
     """Return rank and unseen modes; the rank is that of the marks, without the lines."""
     lines = seen.deficiency - (seen.unknowns - seen.rank)
-    modes = (counted(seen.deficiency, "undetermined mode") if seen.deficiency else
-             "no undetermined modes")
-    return (f"rank {seen.rank} of {seen.unknowns} unknowns, {modes}"
-            + (f", {lines} of them in the angular map" if lines else ""))
+    modes = (
+        counted(seen.deficiency, "undetermined mode")
+        if seen.deficiency
+        else "no undetermined modes"
+    )
+    return f"rank {seen.rank} of {seen.unknowns} unknowns, {modes}" + (
+        f", {lines} of them in the angular map" if lines else ""
+    )
 
 
 def _known_text(plan: Plan, unknown: int) -> str:
@@ -226,16 +299,28 @@ def _known_text(plan: Plan, unknown: int) -> str:
     return "the plan identifies the stage" + (
         f" at {nodes - unknown} of {nodes} nodes of the map: the other {unknown} remain unknown "
         f"(standard uncertainty above {KNOWN:g} times the noise of a reading); add a view, or give "
-        "the map fewer nodes" if unknown else "")
+        "the map fewer nodes"
+        if unknown
+        else ""
+    )
 
 
 def _nodes_text(plan: Plan) -> list[str]:
     """Return the nodes of a map that is not on the plate's lattice, in a line."""
     grid, (nx, ny) = plan.artifact.map_grid, plan.artifact.field.shape
-    nodes = [] if grid is None else [f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm "
-                                     f"apart, {grid.interpolation} between them"]
-    return nodes + ([f"angular map: Fourier series of {plan.artifact.harmonics} harmonics"]
-                    if plan.artifact.harmonics else [])
+    nodes = (
+        []
+        if grid is None
+        else [
+            f"map of {nx} x {ny} nodes, {grid.pitch_m * MM_PER_M:.6g} mm "
+            f"apart, {grid.interpolation} between them"
+        ]
+    )
+    return nodes + (
+        [f"angular map: Fourier series of {plan.artifact.harmonics} harmonics"]
+        if plan.artifact.harmonics
+        else []
+    )
 
 
 def _image_text(plan: Plan) -> list[str]:
@@ -248,26 +333,41 @@ def _check_stops_text(plan: Plan) -> str:
     if not marks and plan_terms.tells_camera(plan):
         return "no check stops: images show scale, turn, distortion and sign of the camera"
     if not marks:
-        return ("no check stops: scale, turn and sign of the microscope show only if the stage "
-                "happens to stop off its marks; add check_stops: {marks: 5, offset: 20e-6}")
-    return (f"check stops: {marks} marks of each grid view, {offset_m * UM_PER_M:g} µm off in x "
-            f"and y: {4 * marks} more exposures")
+        return (
+            "no check stops: scale, turn and sign of the microscope show only if the stage "
+            "happens to stop off its marks; add check_stops: {marks: 5, offset: 20e-6}"
+        )
+    return (
+        f"check stops: {marks} marks of each grid view, {offset_m * UM_PER_M:g} µm off in x "
+        f"and y: {4 * marks} more exposures"
+    )
 
 
 def _unchecked_text(seen: Observability) -> list[str]:
     counts = ((seen.unchecked_sites, "sites"), (seen.unchecked_lines, "lines"))
     found = " and ".join(f"{count} {what}" for count, what in counts if count)
-    return [f"{found} depend on single readings that no other reading checks: another view would "
-            "check them"] if found else []
+    return (
+        [
+            f"{found} depend on single readings that no other reading checks: another view would "
+            "check them"
+        ]
+        if found
+        else []
+    )
 
 
 def field_note(predicted: Prediction, plan: Plan) -> str:
     """Return a note if a prediction is not for the plan's own field, else an empty string."""
     nx, ny = predicted.ux.shape
-    return "" if (nx, ny) == plan.artifact.field.shape else (
-        f"predicted for a field of {nx} x {ny} sites; XY is about 5 % "
-        "larger for each doubling of "
-        "the field")
+    return (
+        ""
+        if (nx, ny) == plan.artifact.field.shape
+        else (
+            f"predicted for a field of {nx} x {ny} sites; XY is about 5 % "
+            "larger for each doubling of "
+            "the field"
+        )
+    )
 
 
 def _averaged_m(plan: Plan, assumed: Assumed) -> float:
@@ -277,15 +377,19 @@ def _averaged_m(plan: Plan, assumed: Assumed) -> float:
 
 def _in_um(what: str, predicted: Prediction, plan: Plan, assumed: Assumed) -> str:
     unit = _averaged_m(plan, assumed) * UM_PER_M
-    return (f"  {what} rms {predicted.rms_xy * unit:.4f} µm   largest "
-            f"{predicted.max_xy * unit:.4f} µm (k=1) for {assumed.sigma_m * UM_PER_M:.4g} µm "
-            "noise of one reading")
+    return (
+        f"  {what} rms {predicted.rms_xy * unit:.4f} µm   largest "
+        f"{predicted.max_xy * unit:.4f} µm (k=1) for {assumed.sigma_m * UM_PER_M:.4g} µm "
+        "noise of one reading"
+    )
 
 
 def _map_text(predicted: Prediction) -> list[str]:
     both = (predicted.ux**2 + predicted.uy**2) ** 0.5
-    return ["sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:",
-            *(" ".join(f"{value:5.2f}" for value in row) for row in both.T[::-1])]
+    return [
+        "sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:",
+        *(" ".join(f"{value:5.2f}" for value in row) for row in both.T[::-1]),
+    ]
 
 
 def _suggest(args: argparse.Namespace, plan: Plan) -> int:
@@ -304,19 +408,27 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
             angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
             like = [view for view in plan.views if view.grid] or list(plan.views)
             best, score, search = best_plan(
-                plan.artifact, args.views, angular=angular, criterion=args.criterion,
-                like=replace(like[0], repeats=min(view.repeats for view in like)), datum=datum,
-                against=against, progress=progress)
+                plan.artifact,
+                args.views,
+                angular=angular,
+                criterion=args.criterion,
+                like=replace(like[0], repeats=min(view.repeats for view in like)),
+                datum=datum,
+                against=against,
+                progress=progress,
+            )
         else:
-            now, ranked = rank_next(plan, criterion=args.criterion, datum=datum, against=against,
-                                    progress=progress)
+            now, ranked = rank_next(
+                plan, criterion=args.criterion, datum=datum, against=against, progress=progress
+            )
     # without terms (--against none) and --sigma the figures are gains
     in_um = against is not None or args.sigma is not None
     judged = plan if args.views is None else best
     unit = _averaged_m(judged, plan_terms.assumed_of(args)) if in_um else None
     if args.views is not None:
-        best = replace(best, plan_id=f"{plan.plan_id}_best{args.views}",
-                       model_terms=plan.model_terms)
+        best = replace(
+            best, plan_id=f"{plan.plan_id}_best{args.views}", model_terms=plan.model_terms
+        )
         _show_best(args, best, (score, unit), search_text(search))
     else:
         best = replace(plan, views=ranked[0].views)
@@ -331,8 +443,10 @@ def _in_order(plan: Plan, order: str) -> Plan:
     if not order:
         return plan
     order = str(parse_order(order, "--order"))
-    return replace(plan, views=tuple(replace(view, visit_order=order) if view.grid else view
-                                     for view in plan.views))
+    return replace(
+        plan,
+        views=tuple(replace(view, visit_order=order) if view.grid else view for view in plan.views),
+    )
 
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
@@ -344,30 +458,67 @@ def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     return Against(named, plan_terms.assumed_of(args), by_default) if named or by_default else None
 
 
-def _show_ranked(args: argparse.Namespace, plan: Plan, now: tuple[PlanScore, float | None],
-                 ranked: Sequence[Suggestion]) -> None:
+def _show_ranked(
+    args: argparse.Namespace,
+    plan: Plan,
+    now: tuple[PlanScore, float | None],
+    ranked: Sequence[Suggestion],
+) -> None:
     """Print the next steps; `now`: score of the plan and the noise of an averaged reading, m."""
     unit = now[1]
     if args.json:
-        print(json.dumps({
-            "plan_id": plan.plan_id, "criterion": args.criterion, "now": _score_json(*now),
-            "suggestions": [{"text": step_text(item, plan),
-                             "view": item.view and view_to_dict(item.view, plan.artifact),
-                             "repeat_of": item.repeat_of, "visit_order": item.order or None,
-                             **_score_json(item.score, unit)} for item in ranked]}, indent=1))
+        print(
+            json.dumps(
+                {
+                    "plan_id": plan.plan_id,
+                    "criterion": args.criterion,
+                    "now": _score_json(*now),
+                    "suggestions": [
+                        {
+                            "text": step_text(item, plan),
+                            "view": item.view and view_to_dict(item.view, plan.artifact),
+                            "repeat_of": item.repeat_of,
+                            "visit_order": item.order or None,
+                            **_score_json(item.score, unit),
+                        }
+                        for item in ranked
+                    ],
+                },
+                indent=1,
+            )
+        )
         return
-    tell("\n".join([
-        f"plan {plan.plan_id}: {_score_text(*now)}",
-        f"next steps, best first ({args.criterion} uncertainty of XY):",
-        *(f"  {_score_text(item.score, unit)}   {step_text(item, plan)}" for item in ranked)]))
+    tell(
+        "\n".join(
+            [
+                f"plan {plan.plan_id}: {_score_text(*now)}",
+                f"next steps, best first ({args.criterion} uncertainty of XY):",
+                *(
+                    f"  {_score_text(item.score, unit)}   {step_text(item, plan)}"
+                    for item in ranked
+                ),
+            ]
+        )
+    )
 
 
-def _show_best(args: argparse.Namespace, best: Plan, score: tuple[PlanScore, float | None],
-               how: str) -> None:
+def _show_best(
+    args: argparse.Namespace, best: Plan, score: tuple[PlanScore, float | None], how: str
+) -> None:
     views = [view_to_dict(view, best.artifact) for view in best.views]
     if args.json:
-        print(json.dumps({"plan_id": best.plan_id, "criterion": args.criterion, "views": views,
-                          "how": how, **_score_json(*score)}, indent=1))
+        print(
+            json.dumps(
+                {
+                    "plan_id": best.plan_id,
+                    "criterion": args.criterion,
+                    "views": views,
+                    "how": how,
+                    **_score_json(*score),
+                },
+                indent=1,
+            )
+        )
         return
     tell(f"best plan of {len(views)} views ({args.criterion} uncertainty of XY; {how}):")
     for view in views:
@@ -381,11 +532,17 @@ def _score_json(score: PlanScore, noise_m: float | None) -> dict[str, Any]:
     def number(value: float) -> float | None:
         return value if math.isfinite(value) else None
 
-    out = {"deficiency": score.deficiency, "rms_gain_xy": number(score.rms_xy),
-           "max_gain_xy": number(score.max_xy), "rms_gain_theta": number(score.rms_theta)}
+    out = {
+        "deficiency": score.deficiency,
+        "rms_gain_xy": number(score.rms_xy),
+        "max_gain_xy": number(score.max_xy),
+        "rms_gain_theta": number(score.rms_theta),
+    }
     if noise_m is not None:
-        out |= {"u_rms_m": number(score.rms_xy * noise_m),
-                "u_max_m": number(score.max_xy * noise_m)}
+        out |= {
+            "u_rms_m": number(score.rms_xy * noise_m),
+            "u_max_m": number(score.max_xy * noise_m),
+        }
     return out
 
 

@@ -59,7 +59,8 @@ OWN_KEYS = {
     "joint_trajectory": "{joints: [x, y], image: camera/image_raw}",
     "micromanager": "{config: microscope.cfg}",
     "ophyd": "{x: 'beamline:stage.x', y: 'beamline:stage.y', unit: mm, "
-             "detector: 'beamline:camera', image: image1.image}"}
+    "detector: 'beamline:camera', image: image1.image}",
+}
 """Machine -> its own keys in CELL.yaml, to be edited."""
 
 
@@ -144,14 +145,17 @@ QUESTIONS = (
     Question("travel", "travel of the stage, as in 120mm or 120x100mm", _lengths),
     Question("marks", "marks along a side of the plate, as in 11 or 11x9", _counts),
     Question("pitch", "distance between neighbouring marks, as in 10mm", _length),
-    Question("lines", "angular lines of the plate; 0 = none, or the stage does not turn", _count,
-             "0"),
-    Question("field", "what the camera sees at once, as in 25x20mm; none = one mark", _field,
-             "none"),
+    Question(
+        "lines", "angular lines of the plate; 0 = none, or the stage does not turn", _count, "0"
+    ),
+    Question(
+        "field", "what the camera sees at once, as in 25x20mm; none = one mark", _field, "none"
+    ),
     Question("placing", "who places the plate: person or robot", _one_of(*PLACERS), "person"),
     Question("minutes", "minutes that the measurement may take", _positive, "60"),
     Question("seconds", "seconds for a mark: move, come to rest, expose", _positive, "2"),
-    Question("machine", f"what is driven: {', '.join(SHIPPED)}", _one_of(*SHIPPED), "simulated"))
+    Question("machine", f"what is driven: {', '.join(SHIPPED)}", _one_of(*SHIPPED), "simulated"),
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -159,15 +163,23 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Writes a plan and a CELL.yaml to be completed, and says what the plan will determine and "
         "how long it takes. In a terminal it asks; a script gives --travel, --marks and --pitch, "
-        "and what differs from the defaults.")
+        "and what differs from the defaults."
+    )
     for question in QUESTIONS:
         default = f" (default: {question.default})" if question.default else ""
-        parser.add_argument(f"--{question.name}", metavar=question.name.upper(),
-                            help=question.text + default)
-    parser.add_argument("-o", "--output", metavar="PLAN.yaml", required=True,
-                        help="plan to write; its name is that of the plan")
-    parser.add_argument("--cell", metavar="CELL.yaml",
-                        help="cell to write (default: cell.yaml beside the plan)")
+        parser.add_argument(
+            f"--{question.name}", metavar=question.name.upper(), help=question.text + default
+        )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="PLAN.yaml",
+        required=True,
+        help="plan to write; its name is that of the plan",
+    )
+    parser.add_argument(
+        "--cell", metavar="CELL.yaml", help="cell to write (default: cell.yaml beside the plan)"
+    )
     add_json(parser)
 
 
@@ -202,8 +214,9 @@ def _require_new(paths: list[Path], *, force: bool) -> None:
     check_outputs([], paths)
     for path in paths:
         if path.exists() and not force:
-            raise InputError(str(path), "exists already",
-                             "name another file, or replace it with --force")
+            raise InputError(
+                str(path), "exists already", "name another file, or replace it with --force"
+            )
 
 
 def _answers(args: argparse.Namespace) -> Known:
@@ -211,8 +224,11 @@ def _answers(args: argparse.Namespace) -> Known:
     missing = [item for item in QUESTIONS if not item.default and getattr(args, item.name) is None]
     asks = bool(missing) and sys.stdin.isatty()
     if missing and not asks:
-        raise InputError(f"--{missing[0].name}", "is missing, and there is nobody to ask: stdin is "
-                         "not a terminal", f"give the {missing[0].text}")
+        raise InputError(
+            f"--{missing[0].name}",
+            "is missing, and there is nobody to ask: stdin is not a terminal",
+            f"give the {missing[0].text}",
+        )
     values: dict[str, Any] = {}
     for item in QUESTIONS:
         given = getattr(args, item.name)
@@ -242,8 +258,11 @@ def _asked(item: Question) -> Any:
 def _artifact(known: Known) -> Artifact:
     nx, ny = known.marks
     if known.lines and any(known.field):
-        raise InputError("--lines", "lines are not found in images, and a camera is given",
-                         "plan the lines apart, with --field none")
+        raise InputError(
+            "--lines",
+            "lines are not found in images, and a camera is given",
+            "plan the lines apart, with --field none",
+        )
     return Artifact(nx, known.pitch, known.lines, 0 if nx == ny else ny)
 
 
@@ -254,10 +273,17 @@ def _require_travel(known: Known, artifact: Artifact) -> None:
         span = (count - 1) * known.pitch + 2 * aside
         if span > travel:
             fits = int((travel - 2 * aside) / known.pitch) + 1
-            mend = f"take {fits} marks, or marks that are closer" if fits >= 3 else (
-                "take a plate whose marks are closer")
-            raise InputError("--travel", f"{travel * MM_PER_M:g} mm along {axis}, and {count} "
-                             f"marks with their check stops need {span * MM_PER_M:g} mm", mend)
+            mend = (
+                f"take {fits} marks, or marks that are closer"
+                if fits >= 3
+                else ("take a plate whose marks are closer")
+            )
+            raise InputError(
+                "--travel",
+                f"{travel * MM_PER_M:g} mm along {axis}, and {count} "
+                f"marks with their check stops need {span * MM_PER_M:g} mm",
+                mend,
+            )
 
 
 def _check_offset_m(artifact: Artifact) -> float:
@@ -276,40 +302,55 @@ def _image(known: Known) -> ImageCells | None:
 
 def _best(known: Known, artifact: Artifact, name: str, tick: Callable[[], None]) -> Plan:
     """Return the plan of the smallest uncertainty that the time allows."""
-    like = View("", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact),
-                image=_image(known))
+    like = View(
+        "", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact), image=_image(known)
+    )
     fewest = _fewest_exposures(artifact, like)
     plans: list[Plan] = []
     for n_views in range(3, MOST_VIEWS + 1):
         if plans and _minutes(known, n_views, n_views * fewest) > known.minutes:
             break  # without the search that takes longest
-        views = best_plan(artifact, n_views + bool(known.lines), angular=bool(known.lines),
-                          like=like, against=_against())[0].views
+        views = best_plan(
+            artifact,
+            n_views + bool(known.lines),
+            angular=bool(known.lines),
+            like=like,
+            against=_against(),
+        )[0].views
         plans += list(_repeated(Plan(name, artifact, views)))
         tick()
         if minutes_of(known, plans[-len(REPEATS)]) > known.minutes:
             break
     fitting = [plan for plan in plans if minutes_of(known, plan) <= known.minutes]
     if not fitting:
-        raise InputError("--minutes", f"{known.minutes:g}, and the shortest plan takes "
-                         f"{math.ceil(minutes_of(known, plans[0]))}: "
-                         f"{_counted_visits(plans[0], known)}",
-                         "give more minutes, fewer marks, or fewer seconds for a mark")
+        raise InputError(
+            "--minutes",
+            f"{known.minutes:g}, and the shortest plan takes "
+            f"{math.ceil(minutes_of(known, plans[0]))}: "
+            f"{_counted_visits(plans[0], known)}",
+            "give more minutes, fewer marks, or fewer seconds for a mark",
+        )
     return min(fitting, key=_u_of_reading)
 
 
 def _fewest_exposures(artifact: Artifact, like: View) -> int:
     """Return the exposures of the shortest view that can be chosen, measured once."""
-    return min(_exposures(Plan("", artifact, (measured_like(view, like),)))
-               for view in candidate_views(artifact, angular=False))
+    return min(
+        _exposures(Plan("", artifact, (measured_like(view, like),)))
+        for view in candidate_views(artifact, angular=False)
+    )
 
 
 def _repeated(plan: Plan) -> Iterator[Plan]:
     """Yield the plan with every number of repeats."""
     for repeats, order in REPEATS.items():
-        yield replace(plan, views=tuple(
-            replace(view, repeats=repeats, visit_order=order if view.grid else "")
-            for view in plan.views))
+        yield replace(
+            plan,
+            views=tuple(
+                replace(view, repeats=repeats, visit_order=order if view.grid else "")
+                for view in plan.views
+            ),
+        )
 
 
 def _u_of_reading(plan: Plan) -> float:
@@ -322,8 +363,11 @@ def _against() -> Against:
 
 
 def _exposures(plan: Plan) -> int:
-    return sum(stop.exposures for view in plan.views
-               for stop in stops(plan.artifact, view, Sense.MICROSCOPE_MOVES))
+    return sum(
+        stop.exposures
+        for view in plan.views
+        for stop in stops(plan.artifact, view, Sense.MICROSCOPE_MOVES)
+    )
 
 
 def minutes_of(known: Known, plan: Plan) -> float:
@@ -336,16 +380,21 @@ def _minutes(known: Known, placings: int, exposures: int) -> float:
 
 
 def _counted_visits(plan: Plan, known: Known) -> str:
-    return (f"{len(plan.views)} placings of {PLACING_MIN[known.placing]:g} minutes, "
-            f"{_exposures(plan)} exposures of {known.seconds:g} s")
+    return (
+        f"{len(plan.views)} placings of {PLACING_MIN[known.placing]:g} minutes, "
+        f"{_exposures(plan)} exposures of {known.seconds:g} s"
+    )
 
 
 def _budget(plan: Plan) -> PlanBudget:
     """Return the predicted budget, as of `selfcal plan check`."""
     seen = check_plan(plan).observability
     if not seen.identifiable:  # only a search that misses its aim
-        raise InputError("--marks", "no plan of these marks identifies the stage",
-                         "; ".join(each.text for each in worded_observability(seen).advice))
+        raise InputError(
+            "--marks",
+            "no plan of these marks identifies the stage",
+            "; ".join(each.text for each in worded_observability(seen).advice),
+        )
     return plan_budget(plan, default_terms(), Assumed(), predict_plan(plan, ThetaDatum.ZERO_MEAN))
 
 
@@ -358,20 +407,28 @@ def _next(plan: Plan) -> tuple[View, float]:
 
 def _cell_text(known: Known, simulation: str) -> str:
     """Return CELL.yaml, the places to be edited named in comments."""
-    own = (f"{{simulation: {simulation}}}" if known.machine == "simulated" else
-           f"{OWN_KEYS[known.machine]}  # edit these")
+    own = (
+        f"{{simulation: {simulation}}}"
+        if known.machine == "simulated"
+        else f"{OWN_KEYS[known.machine]}  # edit these"
+    )
     x, y = (f"[{-travel / 2:.6g}, {travel / 2:.6g}]" for travel in known.travel)
     theta = ", theta: [-7.0, 7.0]" if known.lines else ""
-    lines = ["# From `selfcal plan new`.", f"machine: {known.machine}", f"{known.machine}: {own}",
-             f"limits: {{x: {x}, y: {y}{theta}}}  # m, as the stage indicates; never left",
-             "origin: {x: 0.0, y: 0.0}  # what it indicates at the centre of the field, m",
-             "sense: microscope_moves  # plate_moves where the stage carries the plate"]
+    lines = [
+        "# From `selfcal plan new`.",
+        f"machine: {known.machine}",
+        f"{known.machine}: {own}",
+        f"limits: {{x: {x}, y: {y}{theta}}}  # m, as the stage indicates; never left",
+        "origin: {x: 0.0, y: 0.0}  # what it indicates at the centre of the field, m",
+        "sense: microscope_moves  # plate_moves where the stage carries the plate",
+    ]
     if any(known.field) or known.machine != "simulated":
         size = _mark_size_m(known)
-        pixel = (f", pixel_size: {size / PIXELS_A_MARK:.6g}"
-                 if known.machine == "simulated" else "")
-        lines.append(f"detector: {{mark: disc, mark_size: {size:.6g}{pixel}}}  # as the artwork; "
-                     "`selfcal cell try` finds pixel size, turn and mirror")
+        pixel = f", pixel_size: {size / PIXELS_A_MARK:.6g}" if known.machine == "simulated" else ""
+        lines.append(
+            f"detector: {{mark: disc, mark_size: {size:.6g}{pixel}}}  # as the artwork; "
+            "`selfcal cell try` finds pixel size, turn and mirror"
+        )
     placing = "robot  # the simulation" if known.machine == "simulated" else known.placing
     return "\n".join([*lines, "settle: {time: 0.0}  # s", f"placing: {placing}", ""])
 
@@ -382,50 +439,74 @@ def _mark_size_m(known: Known) -> float:
 
 def _simulation(known: Known, plan: str) -> dict[str, Any]:
     """Return SIM.yaml of the simulated machine."""
-    out: dict[str, Any] = {"plan": plan, "seed": 1,
-                           "truth": {"t": min(3e-5, known.pitch / 20),  # error of the placing
-                                     "correlation": 4},  # pitches: a smooth stage, as stages are
-                           "noise": {"sigma_xy": 2e-8, "sigma_theta": 1e-6}}
+    out: dict[str, Any] = {
+        "plan": plan,
+        "seed": 1,
+        "truth": {
+            "t": min(3e-5, known.pitch / 20),  # error of the placing
+            "correlation": 4,
+        },  # pitches: a smooth stage, as stages are
+        "noise": {"sigma_xy": 2e-8, "sigma_theta": 1e-6},
+    }
     if any(known.field):
         pixel_m = _mark_size_m(known) / PIXELS_A_MARK
         width, height = (round(side / pixel_m) for side in known.field)
-        out["camera"] = {"width": width, "height": height, "pixel_size": pixel_m,
-                         "mark_size": _mark_size_m(known)}
+        out["camera"] = {
+            "width": width,
+            "height": height,
+            "pixel_size": pixel_m,
+            "mark_size": _mark_size_m(known),
+        }
     return out
 
 
-def _text(known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]],
-          outputs: list[Path]) -> Iterator[str]:
+def _text(
+    known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]], outputs: list[Path]
+) -> Iterator[str]:
     (budget, (further, factor)), artifact = found, plan.artifact
     nx, ny = artifact.shape
     span = " x ".join(f"{(count - 1) * known.pitch * MM_PER_M:g}" for count in artifact.shape)
     travel = " x ".join(f"{side * MM_PER_M:g}" for side in known.travel)
-    yield (f"plan {plan.plan_id}: {nx} x {ny} marks, {known.lines or 'no'} angular lines; the map "
-           f"covers {span} of {travel} mm of travel")
+    yield (
+        f"plan {plan.plan_id}: {nx} x {ny} marks, {known.lines or 'no'} angular lines; the map "
+        f"covers {span} of {travel} mm of travel"
+    )
     for view in plan.views:
         kind = "" if view.grid else ", lines only"
         yield f"  {view.name}: {describe_view(view, artifact)}, {view.repeats} times{kind}"
     noise = Assumed()
-    yield (f"it identifies the stage: U of XY {2 * budget.u_rms('xy') * UM_PER_M:.3g} µm (k = 2, "
-           f"rms) for {noise.sigma_m * UM_PER_M:g} µm noise of one reading; `selfcal plan check` "
-           "shows where U comes from")
+    yield (
+        f"it identifies the stage: U of XY {2 * budget.u_rms('xy') * UM_PER_M:.3g} µm (k = 2, "
+        f"rms) for {noise.sigma_m * UM_PER_M:g} µm noise of one reading; `selfcal plan check` "
+        "shows where U comes from"
+    )
     yield (f"it takes about {minutes_of(known, plan):.0f} minutes: {_counted_visits(plan, known)}")
     longer = minutes_of(known, replace(plan, views=(further,)))
-    yield (f"the further view that helps most: {describe_view(further, artifact)}; it makes U "
-           f"{1 - factor:.0%} smaller and takes {longer:.0f} minutes more")
+    yield (
+        f"the further view that helps most: {describe_view(further, artifact)}; it makes U "
+        f"{1 - factor:.0%} smaller and takes {longer:.0f} minutes more"
+    )
     yield f"written: {', '.join(map(str, outputs))}"
     tried = "" if known.machine == "simulated" else f"selfcal cell try {outputs[1]}; "
     yes = " --yes" if known.machine == "simulated" else ""
-    yield (f"next: selfcal plate {outputs[0]} -o plate.svg; {tried}"
-           f"selfcal measure {outputs[0]} {outputs[1]} -o BAG{yes}")
+    yield (
+        f"next: selfcal plate {outputs[0]} -o plate.svg; {tried}"
+        f"selfcal measure {outputs[0]} {outputs[1]} -o BAG{yes}"
+    )
 
 
-def _json(known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]],
-          outputs: list[Path]) -> dict[str, Any]:
+def _json(
+    known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]], outputs: list[Path]
+) -> dict[str, Any]:
     budget, (further, _) = found
     theta = budget.u_rms("theta")
-    return {"plan_id": plan.plan_id, "written": list(map(str, outputs)),
-            "views": [view_to_dict(view, plan.artifact) for view in plan.views],
-            "minutes": minutes_of(known, plan), "exposures": _exposures(plan),
-            "U_xy": 2 * budget.u_rms("xy"), "U_theta": 2 * theta if known.lines else None,
-            "next_view": view_to_dict(further, plan.artifact)}
+    return {
+        "plan_id": plan.plan_id,
+        "written": list(map(str, outputs)),
+        "views": [view_to_dict(view, plan.artifact) for view in plan.views],
+        "minutes": minutes_of(known, plan),
+        "exposures": _exposures(plan),
+        "U_xy": 2 * budget.u_rms("xy"),
+        "U_theta": 2 * theta if known.lines else None,
+        "next_view": view_to_dict(further, plan.artifact),
+    }

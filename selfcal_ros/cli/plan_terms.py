@@ -37,30 +37,61 @@ NO_TERMS = "none"
 
 def add_term_options(parser: argparse.ArgumentParser) -> None:
     """Add the options for the terms against which a plan is judged."""
-    parser.add_argument("--against", metavar="TERM:SIZE[,...]", action="append", default=[],
-                        help="size of a term against which the plan is judged, a standard "
-                        "deviation in SI units; TERM is microscope, drift, plate_scale, "
-                        "plate_shape or approach; none: not even the terms assumed by default")
-    parser.add_argument("--drift-degree", type=int, metavar="D",
-                        help="degree of the polynomial of the drift of a view (default 3)")
-    parser.add_argument("--order", metavar="ORDER", default="",
-                        help="visiting order of all views, replaces the plan's")
-    parser.add_argument("--sigma", metavar="LENGTH",
-                        help="noise of one reading, m or with a unit as in 20nm (default 20 nm); "
-                        "if given, uncertainties are printed in um")
-    parser.add_argument("--stop-error", metavar="LENGTH", default=STOP_ERROR,
-                        help="stop error of the stage relative to a mark, standard deviation per "
-                        f"axis, m or with a unit (default {STOP_ERROR})")
-    parser.add_argument("--stage-error", metavar="LENGTH", default=STAGE_ERROR,
-                        help="errors of stage and plate, standard deviation per axis, m or with a "
-                        f"unit (default {STAGE_ERROR}): the scale error of the microscope "
-                        "multiplies them")
-    parser.add_argument("--placing", metavar="ANGLE", default=PLACING,
-                        help="rotation by which plates are placed, standard deviation, rad or "
-                        f"with a unit (default {PLACING})")
-    parser.add_argument("--sigma-theta", metavar="ANGLE", default=SIGMA_THETA,
-                        help="noise of one reading of a line, rad or with a unit "
-                        f"(default {SIGMA_THETA})")
+    parser.add_argument(
+        "--against",
+        metavar="TERM:SIZE[,...]",
+        action="append",
+        default=[],
+        help="size of a term against which the plan is judged, a standard "
+        "deviation in SI units; TERM is microscope, drift, plate_scale, "
+        "plate_shape or approach; none: not even the terms assumed by default",
+    )
+    parser.add_argument(
+        "--drift-degree",
+        type=int,
+        metavar="D",
+        help="degree of the polynomial of the drift of a view (default 3)",
+    )
+    parser.add_argument(
+        "--order",
+        metavar="ORDER",
+        default="",
+        help="visiting order of all views, replaces the plan's",
+    )
+    parser.add_argument(
+        "--sigma",
+        metavar="LENGTH",
+        help="noise of one reading, m or with a unit as in 20nm (default 20 nm); "
+        "if given, uncertainties are printed in um",
+    )
+    parser.add_argument(
+        "--stop-error",
+        metavar="LENGTH",
+        default=STOP_ERROR,
+        help="stop error of the stage relative to a mark, standard deviation per "
+        f"axis, m or with a unit (default {STOP_ERROR})",
+    )
+    parser.add_argument(
+        "--stage-error",
+        metavar="LENGTH",
+        default=STAGE_ERROR,
+        help="errors of stage and plate, standard deviation per axis, m or with a "
+        f"unit (default {STAGE_ERROR}): the scale error of the microscope "
+        "multiplies them",
+    )
+    parser.add_argument(
+        "--placing",
+        metavar="ANGLE",
+        default=PLACING,
+        help="rotation by which plates are placed, standard deviation, rad or "
+        f"with a unit (default {PLACING})",
+    )
+    parser.add_argument(
+        "--sigma-theta",
+        metavar="ANGLE",
+        default=SIGMA_THETA,
+        help=f"noise of one reading of a line, rad or with a unit (default {SIGMA_THETA})",
+    )
 
 
 def length_m(text: str, option: str, most: float = math.inf) -> float:
@@ -74,8 +105,7 @@ def length_m(text: str, option: str, most: float = math.inf) -> float:
     return _quantity(text, option, M_PER, "length", most)
 
 
-def _quantity(text: str, option: str, units: Mapping[str, float], what: str,
-              most: float) -> float:
+def _quantity(text: str, option: str, units: Mapping[str, float], what: str, most: float) -> float:
     """Return a positive number with one of the units, the first if none is given."""
     found = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
     plain = next(iter(units))
@@ -85,11 +115,17 @@ def _quantity(text: str, option: str, units: Mapping[str, float], what: str,
     except (ValueError, KeyError):
         value = math.nan
     if not 0 < value < math.inf:
-        raise InputError(option, f"'{text}' is not a positive {what}",
-                         f"give {plain}, or a number and one of " + ", ".join(units))
+        raise InputError(
+            option,
+            f"'{text}' is not a positive {what}",
+            f"give {plain}, or a number and one of " + ", ".join(units),
+        )
     if value > most:
-        raise InputError(option, f"'{text}' is {value:g} {plain}, and at most {most:g} {plain} is "
-                         "possible here", "give a number and one of " + ", ".join(units))
+        raise InputError(
+            option,
+            f"'{text}' is {value:g} {plain}, and at most {most:g} {plain} is possible here",
+            "give a number and one of " + ", ".join(units),
+        )
     return value
 
 
@@ -103,8 +139,11 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
     """
     degree = DRIFT_DEGREE if args.drift_degree is None else args.drift_degree
     if not 1 <= degree <= MAX_DRIFT_DEGREE:
-        raise InputError("--drift-degree", f"{degree} is not a degree of a drift",
-                         f"give 1 to {MAX_DRIFT_DEGREE}")
+        raise InputError(
+            "--drift-degree",
+            f"{degree} is not a degree of a drift",
+            f"give 1 to {MAX_DRIFT_DEGREE}",
+        )
     order = str(parse_order(args.order, "--order")) if args.order else ""
     return Assumed(
         sigma_m=length_m(args.sigma or SIGMA, "--sigma", MOST_M),
@@ -113,7 +152,8 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
         order=order,
         sigma_rad=_quantity(args.sigma_theta, "--sigma-theta", RAD_PER, "angle", MOST_RAD),
         turn_rad=_quantity(args.placing, "--placing", RAD_PER, "angle", MOST_RAD),
-        error_m=length_m(args.stage_error, "--stage-error", MOST_M))
+        error_m=length_m(args.stage_error, "--stage-error", MOST_M),
+    )
 
 
 def sizes_of(args: argparse.Namespace) -> dict[str, float]:
@@ -127,8 +167,11 @@ def sizes_of(args: argparse.Namespace) -> dict[str, float]:
     terms = parse_terms(_named(args.against), "--against")
     for term in terms:
         if term.free:
-            raise InputError(f"--against: {term.name}", "a size is missing",
-                             f"write {term.name}:SIZE, a standard deviation in SI units")
+            raise InputError(
+                f"--against: {term.name}",
+                "a size is missing",
+                f"write {term.name}:SIZE, a standard deviation in SI units",
+            )
     return {term.name: term.size for term in terms}
 
 
@@ -136,8 +179,14 @@ def declared_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
     """Return the terms of the plan, replaced by those of ``--model``; those of size 0 as well."""
     if _is_none(args.model):
         return ()
-    found = {term.name: term for terms in (parse_terms(plan.model_terms, "model_terms"),
-                                           parse_terms(args.model, "--model")) for term in terms}
+    found = {
+        term.name: term
+        for terms in (
+            parse_terms(plan.model_terms, "model_terms"),
+            parse_terms(args.model, "--model"),
+        )
+        for term in terms
+    }
     return in_order(found.values())
 
 
@@ -150,8 +199,9 @@ def _named(given: list[str]) -> list[str]:
     return [text for text in given if text != NO_TERMS]
 
 
-def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
-                  plan: Plan) -> tuple[ModelTerm, ...]:
+def assumed_terms(
+    given: list[str], named: tuple[ModelTerm, ...], plan: Plan
+) -> tuple[ModelTerm, ...]:
     """Return the terms that are assumed by default beside the named ones.
 
     Parameters
@@ -163,10 +213,12 @@ def assumed_terms(given: list[str], named: tuple[ModelTerm, ...],
     plan : Plan
         The plan: its images may tell the microscope better than it is known.
     """
-    names = {term.name for term in named} | ({
-        block.name for block in blocks().values() if block.of_microscope and tells_camera(plan)})
-    return () if _is_none(given) else tuple(
-        term for term in default_terms() if term.name not in names)
+    names = {term.name for term in named} | (
+        {block.name for block in blocks().values() if block.of_microscope and tells_camera(plan)}
+    )
+    return (
+        () if _is_none(given) else tuple(term for term in default_terms() if term.name not in names)
+    )
 
 
 def tells_camera(plan: Plan) -> bool:
@@ -180,38 +232,77 @@ def budget_json(budget: PlanBudget, plan: Plan, assumed: Assumed) -> dict[str, A
     lines = []
     for line in budget.lines:
         removed = budget.removals.get((line.quantity, line.component))
-        lines.append({name: getattr(line, name) for name in (
-            "quantity", "component", "kind", "u", "unit", "effect_rms", "effect_max", "source")}
-            | {"share": budget.share(line), "removal": removed and {
-                "kind": removed.kind, "effect_rms": removed.effect_rms,
-                "text": removal_text(removed, line, plan)}})
-    out: dict[str, Any] = {"sigma_m": assumed.sigma_m, "sigma_rad": assumed.sigma_rad,
-                           "lines": lines}
+        lines.append(
+            {
+                name: getattr(line, name)
+                for name in (
+                    "quantity",
+                    "component",
+                    "kind",
+                    "u",
+                    "unit",
+                    "effect_rms",
+                    "effect_max",
+                    "source",
+                )
+            }
+            | {
+                "share": budget.share(line),
+                "removal": removed
+                and {
+                    "kind": removed.kind,
+                    "effect_rms": removed.effect_rms,
+                    "text": removal_text(removed, line, plan),
+                },
+            }
+        )
+    out: dict[str, Any] = {
+        "sigma_m": assumed.sigma_m,
+        "sigma_rad": assumed.sigma_rad,
+        "lines": lines,
+    }
     for quantity in dict.fromkeys(line.quantity for line in budget.lines):
-        out |= {f"U_{quantity}": 2 * budget.u_rms(quantity),
-                f"U_{quantity}_noise": 2 * budget.u_rms(quantity, noise_only=True),
-                f"U_{quantity}_if_larger": 2 * budget.u_rms(quantity, if_larger=True)}
+        out |= {
+            f"U_{quantity}": 2 * budget.u_rms(quantity),
+            f"U_{quantity}_noise": 2 * budget.u_rms(quantity, noise_only=True),
+            f"U_{quantity}_if_larger": 2 * budget.u_rms(quantity, if_larger=True),
+        }
     return out
 
 
 def terms_json(checks: Iterable[TermCheck]) -> list[dict[str, Any]]:
     """Return the checks of terms as JSON."""
-    return [{"name": str(c.name), "told": c.told, "unseen_modes": c.unseen_modes,
-             "model": c.model, "size": c.size, "unit": c.unit, "effect_rms_m": c.effect_rms_m,
-             "effect_max_m": c.effect_max_m, "power": c.power} for c in checks]
+    return [
+        {
+            "name": str(c.name),
+            "told": c.told,
+            "unseen_modes": c.unseen_modes,
+            "model": c.model,
+            "size": c.size,
+            "unit": c.unit,
+            "effect_rms_m": c.effect_rms_m,
+            "effect_max_m": c.effect_max_m,
+            "power": c.power,
+        }
+        for c in checks
+    ]
 
 
 def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> list[str]:
     """Return the checks of terms as a table, with the assumptions."""
-    lines = ["terms: whether the readings separate them from the stage, what a term of this size",
-             "does to the map if it is left out of the model, and how likely it is to be detected",
-             f"  {'term':<13}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
-             f"{'largest':>10} {'detected':>9}"]
+    lines = [
+        "terms: whether the readings separate them from the stage, what a term of this size",
+        "does to the map if it is left out of the model, and how likely it is to be detected",
+        f"  {'term':<13}{'model':<7}{'separable':<17}{'size':>12}  {'map rms':>10} "
+        f"{'largest':>10} {'detected':>9}",
+    ]
     for c in checks:
         separable = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
-        lines.append(f"  {c.name:<13}{c.model or '-':<7}{separable:<17}{size_text(c):>12}"
-                     f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
-                     f" {100 * c.power:7.1f} %")
+        lines.append(
+            f"  {c.name:<13}{c.model or '-':<7}{separable:<17}{size_text(c):>12}"
+            f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"
+            f" {100 * c.power:7.1f} %"
+        )
     return [*lines, *_assumptions(plan, assumed)]
 
 
@@ -230,18 +321,23 @@ def size_text(check: TermCheck) -> str:
 
 def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
     views = [view for view in plan.views if view.grid]
-    orders = {view.name: parse_order(assumed.order or view.visit_order or DEFAULT_ORDER)
-              for view in views}
+    orders = {
+        view.name: parse_order(assumed.order or view.visit_order or DEFAULT_ORDER) for view in views
+    }
     cut = [view for view in views if view.repeats < orders[view.name].passes]
-    lines = [f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
-             f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
-             "one reading;",
-             f"  plates placed within {math.degrees(assumed.turn_rad):g} deg and "
-             f"{assumed.away_m * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
-             "off the marks, drawn with a fixed seed"]
+    lines = [
+        f"  assumed: order {', '.join(sorted({str(o) for o in orders.values()}))}; drifts of "
+        f"degree {assumed.drift_degree}; {assumed.sigma_m * UM_PER_M:.6g} µm noise of "
+        "one reading;",
+        f"  plates placed within {math.degrees(assumed.turn_rad):g} deg and "
+        f"{assumed.away_m * UM_PER_M:g} µm, stops {assumed.stop_error_m * UM_PER_M:.6g} µm "
+        "off the marks, drawn with a fixed seed",
+    ]
     if cut:
         names = ", ".join(f"'{view.name}'" for view in cut)
         first = orders[cut[0].name]
-        lines.append(f"  the order {first} needs {first.passes} repeats: it is truncated "
-                     f"in the views {names}")
+        lines.append(
+            f"  the order {first} needs {first.passes} repeats: it is truncated "
+            f"in the views {names}"
+        )
     return lines

@@ -16,10 +16,18 @@ from selfcal_ros.results import read_result
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
-    parser.add_argument("-o", "--output", metavar="FILE.png|.svg|.pdf", required=True,
-                        help="picture to write; its suffix sets the format")
-    parser.add_argument("--truth", metavar="TRUTH.json",
-                        help="known truth to compare with: gx, gy in m, g_theta in rad")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE.png|.svg|.pdf",
+        required=True,
+        help="picture to write; its suffix sets the format",
+    )
+    parser.add_argument(
+        "--truth",
+        metavar="TRUTH.json",
+        help="known truth to compare with: gx, gy in m, g_theta in rad",
+    )
     add_json(parser)
 
 
@@ -30,6 +38,9 @@ def run(args: argparse.Namespace) -> int:
     truth = read_truth(args.truth) if args.truth else None
     with busy("drawing"):
         save_picture(map_picture(result, truth), args.output)
-    say(args, f"written: {args.output}",
-        {"written": args.output, "kind": Path(args.output).suffix.lower().lstrip(".")})
+    say(
+        args,
+        f"written: {args.output}",
+        {"written": args.output, "kind": Path(args.output).suffix.lower().lstrip(".")},
+    )
     return int(ExitCode.DONE)

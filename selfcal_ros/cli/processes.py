@@ -65,8 +65,12 @@ def ros_arguments(args: argparse.Namespace) -> list[str]:
 
 
 @contextlib.contextmanager
-def process(module: str, arguments: list[str], environment: dict, **kwargs: Any,
-            ) -> Iterator[subprocess.Popen]:
+def process(
+    module: str,
+    arguments: list[str],
+    environment: dict,
+    **kwargs: Any,
+) -> Iterator[subprocess.Popen]:
     """Run a module as a process that is stopped, at worst killed, at the end of the block.
 
     Ctrl-C reaches the process from the terminal, too. It is blocked from the start, and unblocked
@@ -74,8 +78,12 @@ def process(module: str, arguments: list[str], environment: dict, **kwargs: Any,
     """
     child, before = None, signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        child = subprocess.Popen([sys.executable, "-m", module, *arguments], env=environment,
-                                 preexec_fn=_die_with_parent(os.getpid()), **kwargs)
+        child = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            env=environment,
+            preexec_fn=_die_with_parent(os.getpid()),
+            **kwargs,
+        )
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         yield child
     finally:
@@ -95,6 +103,7 @@ def _die_with_parent(parent: int) -> Callable[[], None] | None:
         prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
         if os.getppid() != parent:  # it died in between
             os._exit(128 + signal.SIGTERM)
+
     return ask
 
 
@@ -111,8 +120,13 @@ def stop(child: subprocess.Popen) -> None:
                 stream.close()
 
 
-REACHES_OTHERS = ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER", "FASTRTPS_DEFAULT_PROFILES_FILE",
-                  "FASTDDS_DEFAULT_PROFILES_FILE", "CYCLONEDDS_URI")
+REACHES_OTHERS = (
+    "ROS_STATIC_PEERS",
+    "ROS_DISCOVERY_SERVER",
+    "FASTRTPS_DEFAULT_PROFILES_FILE",
+    "FASTDDS_DEFAULT_PROFILES_FILE",
+    "CYCLONEDDS_URI",
+)
 """Variables of the environment that can lead nodes beyond this machine."""
 
 
@@ -137,8 +151,11 @@ def domain(chosen: int | None = None) -> Iterator[dict]:
                 continue
             yield environment | {"ROS_DOMAIN_ID": str(number)}
             return
-    raise InputError("ROS domains 50 to 99", "all are in use on this machine",
-                     "end other replays, or choose one with --domain")
+    raise InputError(
+        "ROS domains 50 to 99",
+        "all are in use on this machine",
+        "end other replays, or choose one with --domain",
+    )
 
 
 def _is_used(number: int) -> bool:
@@ -164,8 +181,12 @@ class Supervisor:
         Monotonic seconds.
     """
 
-    def __init__(self, commands: dict[str, list[str]], environment: dict,
-                 now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        commands: dict[str, list[str]],
+        environment: dict,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._commands, self._environment, self._now_s = commands, environment, now_s
         self._stack = contextlib.ExitStack()
         self._running: dict[str, subprocess.Popen] = {}
@@ -201,18 +222,28 @@ class Supervisor:
             if code in NEVER_AGAIN or node in ONCE:
                 self._say(f"{node} ended with {how} and is not restarted")
             elif len(recent) >= MOST_RESTARTS:
-                self._say(f"{node} ended with {how}, {len(recent) + 1} times within {WINDOW_S:.0f} "
-                          "s: not restarted")
+                self._say(
+                    f"{node} ended with {how}, {len(recent) + 1} times within {WINDOW_S:.0f} "
+                    "s: not restarted"
+                )
             else:
                 self._restarts[node] = [*recent, self._now_s()]
                 self._say(f"{node} ended with {how}: restarted")
                 self._start(node)
 
     def _start(self, node: str) -> None:
-        child = self._stack.enter_context(process(
-            f"selfcal_ros.nodes.{node}", self._commands[node], self._environment,
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
-            text=True, errors="replace"))
+        child = self._stack.enter_context(
+            process(
+                f"selfcal_ros.nodes.{node}",
+                self._commands[node],
+                self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                errors="replace",
+            )
+        )
         self._running[node] = child
         threading.Thread(target=self._read, args=(child,), name=node, daemon=True).start()
 
@@ -271,8 +302,17 @@ class Eyes:
 def eyes(namespace: str, environment: dict | None = None) -> Iterator[Eyes]:
     """Yield a monitor process of the cell in `namespace`."""
     need_ros("")
-    with process("selfcal_ros.nodes.monitor_session",
-                 [f"/{namespace.strip('/')}" if namespace.strip("/") else "", "--ros-args",
-                  "--log-level", "error"], environment or dict(os.environ),
-                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as child:
+    with process(
+        "selfcal_ros.nodes.monitor_session",
+        [
+            f"/{namespace.strip('/')}" if namespace.strip("/") else "",
+            "--ros-args",
+            "--log-level",
+            "error",
+        ],
+        environment or dict(os.environ),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as child:
         yield Eyes(child)

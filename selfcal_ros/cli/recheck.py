@@ -19,8 +19,7 @@ from selfcal_ros.results import read_result
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("plate_from", metavar="RESULT.json",
-                        help="calibration of the plate")
+    parser.add_argument("plate_from", metavar="RESULT.json", help="calibration of the plate")
     solve.add_arguments(parser, {"theta_datum": "theta_datum", "reference_at": "reference_at"})
 
 
@@ -32,43 +31,80 @@ def run(args: argparse.Namespace) -> int:
 def _awaited(args: argparse.Namespace, plan: "Plan") -> int:
     """Print what can be said before the plate is calibrated."""
     if args.json:
-        print(json.dumps({"plan_id": plan.plan_id, "identifiable": None,
-                          "artifact_from": plan.artifact_from, "predicted": None}, indent=1))
+        print(
+            json.dumps(
+                {
+                    "plan_id": plan.plan_id,
+                    "identifiable": None,
+                    "artifact_from": plan.artifact_from,
+                    "predicted": None,
+                },
+                indent=1,
+            )
+        )
         return int(ExitCode.DONE)
-    tell(f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of a plate that a calibration "
-         f"makes known\n{plan.artifact_from} is not there yet: `selfcal solve BAG -o FILE` writes "
-         "it;\nwhat the view will show is predicted from it")
+    tell(
+        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of a plate that a calibration "
+        f"makes known\n{plan.artifact_from} is not there yet: `selfcal solve BAG -o FILE` writes "
+        "it;\nwhat the view will show is predicted from it"
+    )
     return int(ExitCode.DONE)
 
 
 def planned(args: argparse.Namespace, plan: "Plan") -> int:
     """Print what views of a known plate will show; for `selfcal plan check`."""
     if args.plan_verb == "suggest":
-        raise InputError(args.plan, "its plate is already calibrated: any view that reads all "
-                         "marks will do", "use selfcal plan check")
+        raise InputError(
+            args.plan,
+            "its plate is already calibrated: any view that reads all marks will do",
+            "use selfcal plan check",
+        )
     if not Path(plan.artifact_from).exists():
         return _awaited(args, plan)
     plate = known_plate(read_result(plan.artifact_from), plan.artifact_from)
     with busy("judging the plan"):
         found = predict_recheck(plan, plate)
     if args.json:
-        print(json.dumps(plain({
-            "plan_id": plan.plan_id, "identifiable": True, "artifact_from": plan.artifact_from,
-            "unknown_sites": found.map.n_unknown,
-            "predicted": {"rms_gain_xy": found.map.rms_xy, "max_gain_xy": found.map.max_xy,
-                          "rms_gain_theta": found.map.rms_theta,
-                          "rms_gain_change": found.change}}), indent=1))
+        print(
+            json.dumps(
+                plain(
+                    {
+                        "plan_id": plan.plan_id,
+                        "identifiable": True,
+                        "artifact_from": plan.artifact_from,
+                        "unknown_sites": found.map.n_unknown,
+                        "predicted": {
+                            "rms_gain_xy": found.map.rms_xy,
+                            "max_gain_xy": found.map.max_xy,
+                            "rms_gain_theta": found.map.rms_theta,
+                            "rms_gain_change": found.change,
+                        },
+                    }
+                ),
+                indent=1,
+            )
+        )
         return int(ExitCode.DONE)
-    tell("\n".join([
-        f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of "
-        "the plate calibrated in "
-        f"{plan.artifact_from}",
-        *([f"{found.map.n_unknown} of {found.map.ux.size} nodes of the "
-           "map remain unknown"]
-          if found.map.n_unknown else []),
-        "predicted standard uncertainty, in units of the noise of one averaged reading:",
-        f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",
-        *([f"  theta  rms {found.map.rms_theta:.4f}"] if len(found.map.u_theta) else []),
-        f"  change of XY since the calibration: rms {found.change:.4f}",
-        *([ONE_PASS] if min(view.repeats for view in plan.views) == 1 else [])]))
+    tell(
+        "\n".join(
+            [
+                f"plan {plan.plan_id}: {counted(len(plan.views), 'view')} of "
+                "the plate calibrated in "
+                f"{plan.artifact_from}",
+                *(
+                    [
+                        f"{found.map.n_unknown} of {found.map.ux.size} nodes of the "
+                        "map remain unknown"
+                    ]
+                    if found.map.n_unknown
+                    else []
+                ),
+                "predicted standard uncertainty, in units of the noise of one averaged reading:",
+                f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",
+                *([f"  theta  rms {found.map.rms_theta:.4f}"] if len(found.map.u_theta) else []),
+                f"  change of XY since the calibration: rms {found.change:.4f}",
+                *([ONE_PASS] if min(view.repeats for view in plan.views) == 1 else []),
+            ]
+        )
+    )
     return int(ExitCode.DONE)

@@ -53,25 +53,44 @@ NODES = ("measurement_collector", "pose_sequencer", "solver")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder; of one with "
-                        "images and no detections mark_detector finds the marks")
+    parser.add_argument(
+        "bag",
+        metavar="BAG",
+        help="MCAP file or rosbag2 folder; of one with "
+        "images and no detections mark_detector finds the marks",
+    )
     speed = parser.add_mutually_exclusive_group()
     speed.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed (default: 1)")
     speed.add_argument("--fast", action="store_true", help="as fast as the nodes can follow")
-    parser.add_argument("--shuffle", type=int, metavar="SEED",
-                        help="deliver the messages in shuffled order")
-    parser.add_argument("-o", "--output", metavar="RESULT.json", help="file for the result; "
-                        "- is stdout, and other output goes to stderr")
+    parser.add_argument(
+        "--shuffle", type=int, metavar="SEED", help="deliver the messages in shuffled order"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="RESULT.json",
+        help="file for the result; - is stdout, and other output goes to stderr",
+    )
     add_json(parser, "RESULT.json, and the summary on stderr")
     parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
-    parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
-                        "for bags with several cells; / is the root")
-    parser.add_argument("--domain", type=int, metavar="ID", help="ROS domain to play in, to watch "
-                        "with ros2 topic echo; refused if somebody publishes in it (default: one "
-                        "that nobody uses)")
+    parser.add_argument(
+        "--namespace",
+        metavar="NAME",
+        help="namespace of the cell's topics, for bags with several cells; / is the root",
+    )
+    parser.add_argument(
+        "--domain",
+        type=int,
+        metavar="ID",
+        help="ROS domain to play in, to watch "
+        "with ros2 topic echo; refused if somebody publishes in it (default: one "
+        "that nobody uses)",
+    )
     parser.add_argument("--quiet", action="store_true", help="print no summary")
-    images = parser.add_argument_group("for a bag with images and no detections", "options of "
-                                       "mark_detector, as in selfcal detect, or in NODES.yaml")
+    images = parser.add_argument_group(
+        "for a bag with images and no detections",
+        "options of mark_detector, as in selfcal detect, or in NODES.yaml",
+    )
     add_parameters(images, DetectorSettings, OPTIONS)
 
 
@@ -81,19 +100,26 @@ def run(args: argparse.Namespace) -> int:
     if not args.fast and not args.rate > 0:
         raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
     if args.shuffle is not None and not 0 <= args.shuffle <= LARGEST_SEED:
-        raise InputError("--shuffle", f"{args.shuffle} is not a seed",
-                         f"give a number from 0 to {LARGEST_SEED}")
+        raise InputError(
+            "--shuffle", f"{args.shuffle} is not a seed", f"give a number from 0 to {LARGEST_SEED}"
+        )
     if args.domain is not None and not 0 <= args.domain <= MOST_DOMAIN:
-        raise InputError("--domain", f"{args.domain} is not a ROS domain",
-                         f"give a number from 0 to {MOST_DOMAIN}")
+        raise InputError(
+            "--domain",
+            f"{args.domain} is not a ROS domain",
+            f"give a number from 0 to {MOST_DOMAIN}",
+        )
     check_outputs([args.bag, args.params], [file_of(args)])
     source, detector = bag_input(args.bag), detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
     bag = bag_lines(args.bag, settings, args.namespace)
     for line in bag.faults:  # first: what the nodes say of the readings follows from them
         print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
-    with (ended_by_signals(), temporary_folder(Path(tempfile.gettempdir())) as folder,
-          domain(args.domain) as environment):
+    with (
+        ended_by_signals(),
+        temporary_folder(Path(tempfile.gettempdir())) as folder,
+        domain(args.domain) as environment,
+    ):
         saved = folder / "result.json"
         code, unplayed = _play(args, saved, environment, detector, said=bag.faults)
         if saved.exists():
@@ -117,12 +143,17 @@ def run(args: argparse.Namespace) -> int:
 
 def offline(args: argparse.Namespace, bag: str | Path) -> BagSession:
     """Return what `selfcal solve` collects from a bag."""
-    return collect_bag(bag, node_settings(args.params, CollectorSettings),
-                       namespace=args.namespace)
+    return collect_bag(bag, node_settings(args.params, CollectorSettings), namespace=args.namespace)
 
 
-def _refuse_fault(args: argparse.Namespace, code: int, detector: DetectorSettings | None,
-                  folder: Path, *, said: Sequence[str]) -> None:
+def _refuse_fault(
+    args: argparse.Namespace,
+    code: int,
+    detector: DetectorSettings | None,
+    folder: Path,
+    *,
+    said: Sequence[str],
+) -> None:
     """Refuse a plan that is not identified because of a fault of the cell, as `solve` does.
 
     A fault that is `said` is not repeated.
@@ -141,8 +172,11 @@ def _refuse_fault(args: argparse.Namespace, code: int, detector: DetectorSetting
         session = offline(args, bag)
         for fault in session.findings:
             if fault not in session.lost:
-                raise InputError(args.bag, "not identified, for the reason said first"
-                                 if fault in said else fault, "correct this first")
+                raise InputError(
+                    args.bag,
+                    "not identified, for the reason said first" if fault in said else fault,
+                    "correct this first",
+                )
 
 
 def _detected(args: argparse.Namespace, settings: DetectorSettings, folder: Path) -> Path:
@@ -151,8 +185,11 @@ def _detected(args: argparse.Namespace, settings: DetectorSettings, folder: Path
 
     detector, found = ImageDetector(settings, args.bag), folder / "detected"
     ImageBag(Path(args.bag), args.namespace).write_detected(
-        found, detector.take, check=lambda: detector.refuse_nothing(args.bag),
-        frame_id=settings.frame_id)
+        found,
+        detector.take,
+        check=lambda: detector.refuse_nothing(args.bag),
+        frame_id=settings.frame_id,
+    )
     return found
 
 
@@ -173,20 +210,29 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
         if not playlist.counts.keys() >= INPUT_TOPICS.keys():
             offline(args, args.bag)  # raises what is missing
         for name in (name for name, value in options.items() if value is not None):
-            raise InputError(f"--{name.replace('_', '-')}", f"no images of {args.bag} are played",
-                             "leave it out; it is for bags with images and no detections")
+            raise InputError(
+                f"--{name.replace('_', '-')}",
+                f"no images of {args.bag} are played",
+                "leave it out; it is for bags with images and no detections",
+            )
         return None
     from selfcal_ros.vision.detector import MarkDetector  # with scipy, for images only
 
     settings = node_settings(args.params, DetectorSettings, **options)
     MarkDetector(settings, f"{args.bag} has images and no detections: {args.params or 'options'}")
     way = DetectorSettings(transport=transport)  # how images reach it is not the user's here
-    return replace(settings, transport=transport, max_waiting=way.max_waiting,
-                   max_marks=ANY_NUMBER, autostart=way.autostart)
+    return replace(
+        settings,
+        transport=transport,
+        max_waiting=way.max_waiting,
+        max_marks=ANY_NUMBER,
+        autostart=way.autostart,
+    )
 
 
-def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str],
-             source: dict[str, str]) -> dict[str, Any]:
+def with_bag(
+    data: dict[str, Any], bag: BagLines, unplayed: list[str], source: dict[str, str]
+) -> dict[str, Any]:
     """Return the JSON form of a result with what the nodes could not see of the bag.
 
     No node can detect clock steps during fast replay, and messages stamped in the future were not
@@ -207,12 +253,19 @@ def with_bag(data: dict[str, Any], bag: BagLines, unplayed: list[str],
     known = [*bag.lost, *beside, *bag.clock]
     of_nodes = [line for line in data["warnings"] if line not in known]
     refused = dict(sorted((data["rejected"] | bag.refused).items()))
-    return with_digests(data | {"warnings": [*of_nodes, *known], "rejected": refused,
-                                "input": source})
+    return with_digests(
+        data | {"warnings": [*of_nodes, *known], "rejected": refused, "input": source}
+    )
 
 
-def _play(args: argparse.Namespace, saved: Path, environment: dict,
-          detector: DetectorSettings | None, *, said: Sequence[str]) -> tuple[int, list[str]]:
+def _play(
+    args: argparse.Namespace,
+    saved: Path,
+    environment: dict,
+    detector: DetectorSettings | None,
+    *,
+    said: Sequence[str],
+) -> tuple[int, list[str]]:
     """Return the exit code of the session, and what it could not play, a line each.
 
     Lines that are `said` are not printed again.
@@ -226,16 +279,35 @@ def _play(args: argparse.Namespace, saved: Path, environment: dict,
         if detector is not None:
             file = saved.with_name("mark_detector.yaml")
             write_yaml(file, {detector.NODE: {"ros__parameters": asdict(detector)}})
-            stack.enter_context(process(f"selfcal_ros.nodes.{detector.NODE}", [
-                "--ros-args", "--params-file", str(file), *quiet], environment))
+            stack.enter_context(
+                process(
+                    f"selfcal_ros.nodes.{detector.NODE}",
+                    ["--ros-args", "--params-file", str(file), *quiet],
+                    environment,
+                )
+            )
         for node in NODES:
-            stack.enter_context(process(f"selfcal_ros.nodes.{node}",
-                                        [*rest, *own.get(node, []), *quiet], environment))
-        session = stack.enter_context(process(
-            "selfcal_ros.nodes.replay_session",
-            [args.bag, str(rate), str(AS_RECORDED if args.shuffle is None else args.shuffle),
-             str(saved), cell, *quiet], environment,
-            stdout=subprocess.PIPE, text=True))
+            stack.enter_context(
+                process(
+                    f"selfcal_ros.nodes.{node}", [*rest, *own.get(node, []), *quiet], environment
+                )
+            )
+        session = stack.enter_context(
+            process(
+                "selfcal_ros.nodes.replay_session",
+                [
+                    args.bag,
+                    str(rate),
+                    str(AS_RECORDED if args.shuffle is None else args.shuffle),
+                    str(saved),
+                    cell,
+                    *quiet,
+                ],
+                environment,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+        )
         bar = stack.enter_context(progress_bar("replaying"))
         lost = []
         for line in session.stdout or ():

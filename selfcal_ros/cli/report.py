@@ -25,20 +25,39 @@ from selfcal_ros.standards.details import read_details
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
-    parser.add_argument("-o", "--output", metavar="REPORT.html|.pdf",
-                        help="file to write (default: next to the result, ending in .html)")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="REPORT.html|.pdf",
+        help="file to write (default: next to the result, ending in .html)",
+    )
     parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
-    parser.add_argument("--truth", metavar="TRUTH.json",
-                        help="known truth to compare with: gx, gy in m, g_theta in rad")
-    parser.add_argument("--table", metavar="FILE.cal", help="the table that `selfcal cal export` "
-                        "wrote: add the error of a simulated controller before and after it")
-    parser.add_argument("--details", metavar="DETAILS.yaml", help="add the contents of a "
-                        "certificate: laboratory, customer, item, conditions "
-                        "(docs/guides/certificate.md), traceability, U of distances")
-    for name, what in (("stage", "name of the stage"), ("serial-number", "its serial number"),
-                       ("operator", "who calibrated it")):
-        parser.add_argument(f"--{name}", metavar="TEXT", default="",
-                            help=f"{what}, for the heading of the report")
+    parser.add_argument(
+        "--truth",
+        metavar="TRUTH.json",
+        help="known truth to compare with: gx, gy in m, g_theta in rad",
+    )
+    parser.add_argument(
+        "--table",
+        metavar="FILE.cal",
+        help="the table that `selfcal cal export` "
+        "wrote: add the error of a simulated controller before and after it",
+    )
+    parser.add_argument(
+        "--details",
+        metavar="DETAILS.yaml",
+        help="add the contents of a "
+        "certificate: laboratory, customer, item, conditions "
+        "(docs/guides/certificate.md), traceability, U of distances",
+    )
+    for name, what in (
+        ("stage", "name of the stage"),
+        ("serial-number", "its serial number"),
+        ("operator", "who calibrated it"),
+    ):
+        parser.add_argument(
+            f"--{name}", metavar="TEXT", default="", help=f"{what}, for the heading of the report"
+        )
     add_json(parser)
     parser.add_argument("--text", action="store_true", help="also print the summary")
 
@@ -58,21 +77,31 @@ def run(args: argparse.Namespace) -> int:
     with busy("drawing"):
         if args.plot:
             from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
+
             save_picture(map_picture(result, truth), args.plot)
         write_report(result, output, truth=truth, more=more, about=_about(args, details))
     written = [str(name) for name in (output, args.plot) if name]
-    text = [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))
-            ] if args.text else []
-    say(args, "\n".join([*text, *(f"written: {name}" for name in written)]),
-        {"written": written, "summary": text[0] if text else None})
+    text = (
+        [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))]
+        if args.text
+        else []
+    )
+    say(
+        args,
+        "\n".join([*text, *(f"written: {name}" for name in written)]),
+        {"written": written, "summary": text[0] if text else None},
+    )
     return 0
 
 
 def _about(args: argparse.Namespace, details: dict | None) -> dict[str, str]:
     """Return what the head of the report states: of a certificate, or the options."""
     named = {name: getattr(args, name) for name in ABOUT}
-    return {**certified(details), **{name: text for name, text in named.items() if text}} \
-        if details else named
+    return (
+        {**certified(details), **{name: text for name, text in named.items() if text}}
+        if details
+        else named
+    )
 
 
 def read_truth(path: str) -> dict:

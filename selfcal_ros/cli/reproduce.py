@@ -22,13 +22,19 @@ MANY = 1000
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("paper", choices=tuple(PAPERS))
-    parser.add_argument("--draws", type=int, default=200, metavar="N",
-                        help="draws of noise (default 200)")
-    parser.add_argument("--seed", type=int, default=1, metavar="S",
-                        help="seed of all random numbers (default 1)")
-    parser.add_argument("--workers", type=int, metavar="N",
-                        help="processes; the numbers do not depend on it (default: 1, from "
-                        f"{MANY} draws on one per core)")
+    parser.add_argument(
+        "--draws", type=int, default=200, metavar="N", help="draws of noise (default 200)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=1, metavar="S", help="seed of all random numbers (default 1)"
+    )
+    parser.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="processes; the numbers do not depend on it (default: 1, from "
+        f"{MANY} draws on one per core)",
+    )
     add_json(parser, "the numbers")
     parser.add_argument("--out", metavar="DIR", help="folder for the plots and the text")
 
@@ -61,8 +67,9 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(str(folder), f"cannot be created ({error.strerror})",
-                         "name a writable folder") from error
+        raise InputError(
+            str(folder), f"cannot be created ({error.strerror})", "name a writable folder"
+        ) from error
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
@@ -71,12 +78,28 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
     def figures() -> list[Drawing]:
         return hu_figures(found)
 
-    tables = [{"name": run.published.name, "sigma_um": run.published.sigma_um,
-               "sigma_deg": run.published.sigma_deg, "published": run.published.table,
-               "law_first": run.law.first.tolist(), "law_std": run.law.std.tolist(),
-               "joint_std": run.joint.std.tolist(), "bound": run.bound} for run in found.runs]
-    return hu_text(found), figures, {"noise_free_um": found.noise_free_um,
-                                  "noise_free_deg": found.noise_free_deg, "tables": tables}
+    tables = [
+        {
+            "name": run.published.name,
+            "sigma_um": run.published.sigma_um,
+            "sigma_deg": run.published.sigma_deg,
+            "published": run.published.table,
+            "law_first": run.law.first.tolist(),
+            "law_std": run.law.std.tolist(),
+            "joint_std": run.joint.std.tolist(),
+            "bound": run.bound,
+        }
+        for run in found.runs
+    ]
+    return (
+        hu_text(found),
+        figures,
+        {
+            "noise_free_um": found.noise_free_um,
+            "noise_free_deg": found.noise_free_deg,
+            "tables": tables,
+        },
+    )
 
 
 def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
@@ -85,12 +108,23 @@ def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple
     def figures() -> list[Drawing]:
         return qiao_figures(found)
 
-    programs = [{"views": program.views, "rms_um": program.rms_um,
-                 "deficiency": program.deficiency} for program in found.programs]
-    return qiao_text(found), figures, {
-        "sizes": SIZES, "ranks": found.ranks.tolist(), "unknowns": found.unknowns.tolist(),
-        "programs": programs, "rms_um": found.rms_um.tolist(),
-        "rms_uniform_um": found.rms_uniform_um.tolist(), "bound_um": found.bound_um}
+    programs = [
+        {"views": program.views, "rms_um": program.rms_um, "deficiency": program.deficiency}
+        for program in found.programs
+    ]
+    return (
+        qiao_text(found),
+        figures,
+        {
+            "sizes": SIZES,
+            "ranks": found.ranks.tolist(),
+            "unknowns": found.unknowns.tolist(),
+            "programs": programs,
+            "rms_um": found.rms_um.tolist(),
+            "rms_uniform_um": found.rms_uniform_um.tolist(),
+            "bound_um": found.bound_um,
+        },
+    )
 
 
 def _ibaraki(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
@@ -99,10 +133,16 @@ def _ibaraki(args: argparse.Namespace, workers: int, progress: "Progress") -> tu
     def figures() -> list[Drawing]:
         return []
 
-    return ibaraki_text(found), figures, {
-        "table_1_mm": {case: values.tolist() for case, values in found.table_1_mm.items()},
-        "published_um": CASE_STUDY_UM, "new_um": found.new_um.tolist(),
-        "conventional_um": found.conventional_um.tolist()}
+    return (
+        ibaraki_text(found),
+        figures,
+        {
+            "table_1_mm": {case: values.tolist() for case, values in found.table_1_mm.items()},
+            "published_um": CASE_STUDY_UM,
+            "new_um": found.new_um.tolist(),
+            "conventional_um": found.conventional_um.tolist(),
+        },
+    )
 
 
 PAPERS = {"hu": _hu, "qiao": _qiao, "ibaraki": _ibaraki}

@@ -40,7 +40,7 @@ def fitted(rows: list[Text], most: int) -> list[Text]:
         return rows
     left = len(rows) - max(most - 1, 0)
     more = Text(f"... {left} more row{'s' * (left > 1)}", style="dim")
-    return [*rows[:max(most - 1, 0)], more][:most]
+    return [*rows[: max(most - 1, 0)], more][:most]
 
 
 def last_fitted(texts: Sequence[Text], width: int, most: int) -> list[Text]:
@@ -62,8 +62,9 @@ def headed(title: str, rows: list[Text], width: int) -> list[Text]:
     return [head, *rows]
 
 
-def coarser[T](cells: Sequence[Sequence[T]], width: int, height: int,
-               worst: Callable[[list[T]], T]) -> tuple[list[list[T]], int]:
+def coarser[T](
+    cells: Sequence[Sequence[T]], width: int, height: int, worst: Callable[[list[T]], T]
+) -> tuple[list[list[T]], int]:
     """Return cells coarsened to fit, blank-separated, and the factor per side.
 
     Parameters
@@ -77,28 +78,41 @@ def coarser[T](cells: Sequence[Sequence[T]], width: int, height: int,
     """
     across = max(map(len, cells), default=0)
     step = max(1, ceil(len(cells) / height), ceil(across / ((width + 1) // 2)))
-    return [[worst([cell for row in cells[top:top + step] for cell in row[left:left + step]])
-             for left in range(0, across, step)] for top in range(0, len(cells), step)], step
+    return [
+        [
+            worst([cell for row in cells[top : top + step] for cell in row[left : left + step]])
+            for left in range(0, across, step)
+        ]
+        for top in range(0, len(cells), step)
+    ], step
 
 
-def screen(picture: dict[str, Any], log: list[str],
-           size: tuple[int, int] = (80, 24)) -> RenderableType:
+def screen(
+    picture: dict[str, Any], log: list[str], size: tuple[int, int] = (80, 24)
+) -> RenderableType:
     """Return the screen of a picture and the last lines of the log, for (columns, rows)."""
     width, height = size
-    keys = Text("  ".join(f"[{key}] {word}" for key, word in KEYS.items()) + "  [q] quit",
-                style="reverse", no_wrap=True, overflow="ellipsis")
+    keys = Text(
+        "  ".join(f"[{key}] {word}" for key, word in KEYS.items()) + "  [q] quit",
+        style="reverse",
+        no_wrap=True,
+        overflow="ellipsis",
+    )
     if width < LEAST[0] or height < LEAST[1]:
         small = Text(f"Make this terminal larger: {LEAST[0]} x {LEAST[1]}.", style="yellow")
         return Group(*fitted(wrapped([*_task(picture), small], width), max(height - 1, 0)), keys)
     now = headed("now", fitted(wrapped(_task(picture), width), height // 4), width)
     nodes = headed("nodes", fitted(wrapped(_health(picture), width), height // 8), width)
-    said = headed("log", last_fitted([_said(line) for line in log] or [Text("-")], width,
-                                     height // 8), width)
+    said = headed(
+        "log", last_fitted([_said(line) for line in log] or [Text("-")], width, height // 8), width
+    )
     rows = height - len(now) - len(nodes) - len(said) - 1
     left = (width - BETWEEN) // 2
     halves = (_measured(picture, left, rows), _found(picture, width - BETWEEN - left, rows))
-    beside = [_beside(width, *(half[row] if row < len(half) else Text() for half in halves))
-              for row in range(rows)]
+    beside = [
+        _beside(width, *(half[row] if row < len(half) else Text() for half in halves))
+        for row in range(rows)
+    ]
     return Group(*now, *beside, *nodes, *said, keys)
 
 
@@ -124,16 +138,21 @@ def what_now(picture: dict[str, Any]) -> str:
     if state == "PLACING":
         x, y = command.get("translation_mm") or (None, None)
         turn = command.get("rotation_deg")
-        pose = "" if None in (x, y, turn) else (
-            f" turned by {turn:g} deg{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm")
+        pose = (
+            ""
+            if None in (x, y, turn)
+            else (f" turned by {turn:g} deg{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm")
+        )
         name = command.get("view_name") or told["values"].get("view_name", "")
         return f"Place the plate for view '{printable(name)}'{pose}; then press c. {look}".rstrip()
     if state == "MEASURING":
         return look or "Nothing: the view is being measured."
-    return {"IDLE": "Press s to start the plan.", "DONE": "Done. s starts another run.",
-            "ABORTED": "Aborted. s starts a new run.",
-            "FOLLOWING": "Nothing: another sequencer is in command; a ends that.",
-            }.get(state, printable(told["message"]))
+    return {
+        "IDLE": "Press s to start the plan.",
+        "DONE": "Done. s starts another run.",
+        "ABORTED": "Aborted. s starts a new run.",
+        "FOLLOWING": "Nothing: another sequencer is in command; a ends that.",
+    }.get(state, printable(told["message"]))
 
 
 def _sense_of(turn_deg: Any) -> str:
@@ -157,8 +176,9 @@ def _state(values: dict[str, str], command: dict[str, Any]) -> str:
     state = values.get("state", "")
     if state not in ("PLACING", "MEASURING") or command.get("plan_id") != values.get("plan_id"):
         return state
-    return {"PLACE": "PLACING", "MEASURE": "MEASURING", "DONE": "DONE",
-            "ABORT": "ABORTED"}.get(command.get("phase", ""), state)
+    return {"PLACE": "PLACING", "MEASURE": "MEASURING", "DONE": "DONE", "ABORT": "ABORTED"}.get(
+        command.get("phase", ""), state
+    )
 
 
 def _task(picture: dict[str, Any]) -> list[Text]:
@@ -169,15 +189,22 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     name, index = (command or {}).get("view_name", ""), (command or {}).get("view_index", 0)
     of = "no view yet"
     if command and views:
-        of = (f"view {index + 1} of {views}: {printable(name)}"
-              if command["phase"] in ("PLACE", "MEASURE")
-              else f"{min(index, views)} of {views} views done")
+        of = (
+            f"view {index + 1} of {views}: {printable(name)}"
+            if command["phase"] in ("PLACE", "MEASURE")
+            else f"{min(index, views)} of {views} views done"
+        )
     run = printable(values.get("run_id") or (command or {}).get("run_id") or "-")
     plan = printable(values.get("plan_id") or (command or {}).get("plan_id") or "-")
-    return [Text.assemble((of, "bold"), (f"   plan {plan}, run {run}", "dim")),
-            Text(what_now(picture), style="bold cyan"),
-            *([Text(f"The map is saved as {printable(saved_as(picture))}")]
-              if saved_as(picture) else [])]
+    return [
+        Text.assemble((of, "bold"), (f"   plan {plan}, run {run}", "dim")),
+        Text(what_now(picture), style="bold cyan"),
+        *(
+            [Text(f"The map is saved as {printable(saved_as(picture))}")]
+            if saved_as(picture)
+            else []
+        ),
+    ]
 
 
 def _whole(text: Any) -> int:
@@ -191,28 +218,44 @@ def _measured(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
     view = picture["view"]
     if view is None:
         return headed("coverage", [Text("nothing measured yet")], width)
-    reasons = [Text(f"{count:6d}  {printable(reason)}") for reason, count in sorted(
-        view["rejected"].items(), key=lambda item: -item[1])] or [Text("none")]
-    rejected = headed(f"rejected by reason; {view['used']} used",
-                      fitted(wrapped(reasons, width), max(2, rows // 5)), width)
+    reasons = [
+        Text(f"{count:6d}  {printable(reason)}")
+        for reason, count in sorted(view["rejected"].items(), key=lambda item: -item[1])
+    ] or [Text("none")]
+    rejected = headed(
+        f"rejected by reason; {view['used']} used",
+        fitted(wrapped(reasons, width), max(2, rows // 5)),
+        width,
+    )
     text = wrapped(_coverage(view, width), width)
     room = rows - 1 - len(text) - len(rejected)
     plate = _plate(view, width, room) if view["plate"] else []
-    return fitted([*headed(f"coverage of {printable(view['view_name'])}", [*text, *plate], width),
-                   *rejected], rows)
+    return fitted(
+        [*headed(f"coverage of {printable(view['view_name'])}", [*text, *plate], width), *rejected],
+        rows,
+    )
 
 
 def _coverage(view: dict[str, Any], width: int) -> list[Text]:
     """Return the numbers of a view."""
-    counted = [("marks", *view["grid"]), ("lines", *view["angular"]),
-               ("check stops of marks", *view["checks"])]
-    share = min(1.0, sum(done for _, done, _ in counted)
-                / max(1, sum(wanted for *_, wanted in counted)))
+    counted = [
+        ("marks", *view["grid"]),
+        ("lines", *view["angular"]),
+        ("check stops of marks", *view["checks"]),
+    ]
+    share = min(
+        1.0, sum(done for _, done, _ in counted) / max(1, sum(wanted for *_, wanted in counted))
+    )
     wide = width - 6
     counts = [f"{what} {done} of {wanted}" for what, done, wanted in counted if wanted]
-    texts = [Text.assemble(("█" * int(share * wide), "green"), "░" * (wide - int(share * wide)),
-                           f" {int(100 * share):3d} %"),
-             Text(", ".join([*counts, *["complete"] * view["complete"]]))]
+    texts = [
+        Text.assemble(
+            ("█" * int(share * wide), "green"),
+            "░" * (wide - int(share * wide)),
+            f" {int(100 * share):3d} %",
+        ),
+        Text(", ".join([*counts, *["complete"] * view["complete"]])),
+    ]
     noise = [_with_unit(view[f"repeatability_{unit}"], unit) for unit in ("um", "arcsec")]
     if noise != ["-", "-"]:
         texts.append(Text(f"repeatability {', '.join(noise)}"))
@@ -229,8 +272,10 @@ def _plate(view: dict[str, Any], width: int, room: int) -> list[Text]:
     step *= view.get("plate_step", 1)
     what = "a mark" if step == 1 else f"{step} x {step} marks"
     unknown = ", ? unknown" if any("?" in row for row in cells) else ""
-    return [Text(f"each cell: {what}; . missing{unknown}", style="dim"),
-            *(Text(" ".join(row), style="green") for row in cells)]
+    return [
+        Text(f"each cell: {what}; . missing{unknown}", style="dim"),
+        *(Text(" ".join(row), style="green") for row in cells),
+    ]
 
 
 def _worst_mark(cells: list[str]) -> str:
@@ -242,10 +287,13 @@ def _found(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
     told = picture["map"]
     um = told["um"] if told else []
     room = min(len(um), max(4, rows // 2 - 1))
-    verdict = headed("map and verdict", fitted(wrapped(_verdict(picture), width),
-                                               rows - 2 - room), width)
-    return [*verdict, *(_map(um, width, rows - len(verdict), told) if um else [
-        Text("no map yet", style="dim")])]
+    verdict = headed(
+        "map and verdict", fitted(wrapped(_verdict(picture), width), rows - 2 - room), width
+    )
+    return [
+        *verdict,
+        *(_map(um, width, rows - len(verdict), told) if um else [Text("no map yet", style="dim")]),
+    ]
 
 
 def _verdict(picture: dict[str, Any]) -> list[Text]:
@@ -253,22 +301,36 @@ def _verdict(picture: dict[str, Any]) -> list[Text]:
     summary = picture["summary"]
     if summary is None:
         return [Text("no view has been solved yet")]
-    word, colour = ("not qualified" if summary["identifiable"] else "not identified yet",
-                    "bold yellow")
+    word, colour = (
+        "not qualified" if summary["identifiable"] else "not identified yet",
+        "bold yellow",
+    )
     if summary["qualified"]:
-        word, colour = ("good within an enlarged U", "bold yellow") if summary["enlarged"] else (
-            "good", "bold green")
+        word, colour = (
+            ("good within an enlarged U", "bold yellow")
+            if summary["enlarged"]
+            else ("good", "bold green")
+        )
     done, planned = summary["views"]
     run, now = summary["run_id"], (picture["command"] or {}).get("run_id", "")
     earlier = "; an earlier run" if run and now and run != now else ""
-    texts = [Text.assemble((word, colour), f"; views {done} of {planned}{earlier}"),
-             Text(printable(summary["state"]))]
-    texts += [Text(f"- {printable(line)}", style="yellow")
-              for line in (*summary["causes"], *summary["advice"])]
+    texts = [
+        Text.assemble((word, colour), f"; views {done} of {planned}{earlier}"),
+        Text(printable(summary["state"])),
+    ]
+    texts += [
+        Text(f"- {printable(line)}", style="yellow")
+        for line in (*summary["causes"], *summary["advice"])
+    ]
     if summary["max_error_um"] is None:
         return texts
-    return [*texts, Text(f"largest error {_with_unit(summary['max_error_um'], 'um')}, rms u "
-                         f"{_with_unit(summary['rms_uncertainty_um'], 'um')}")]
+    return [
+        *texts,
+        Text(
+            f"largest error {_with_unit(summary['max_error_um'], 'um')}, rms u "
+            f"{_with_unit(summary['rms_uncertainty_um'], 'um')}"
+        ),
+    ]
 
 
 def _map(um: list[list[float | None]], width: int, rows: int, told: dict[str, Any]) -> list[Text]:
@@ -276,8 +338,10 @@ def _map(um: list[list[float | None]], width: int, rows: int, told: dict[str, An
     cells, step = coarser(um, width, max(rows - 1, 1), _worst_error)
     step *= told.get("step", 1)
     most = max((value for row in cells for value in row if value is not None), default=0.0)
-    signs = [["?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))]
-              for value in row] for row in cells]
+    signs = [
+        ["?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))] for value in row]
+        for row in cells
+    ]
     title = f"error, '@' = {most:.3g} µm" + (f", cell {step} x {step}" if step > 1 else "")
     return headed(title, [Text(" ".join(row), style="magenta") for row in signs], width)
 
@@ -294,8 +358,9 @@ def _health(picture: dict[str, Any]) -> list[Text]:
         if told is not None and not told["level"]:
             well.append(node)
             continue
-        word, colour = ("no sign of life", "red") if told is None else LEVELS.get(
-            told["level"], LEVELS[2])
+        word, colour = (
+            ("no sign of life", "red") if told is None else LEVELS.get(told["level"], LEVELS[2])
+        )
         message = "" if told is None else f" {printable(told['message'])}"
         texts.append(Text.assemble((f"{node}: ", "bold"), (word, colour), message))
     return [*texts, *([Text.assemble(("ok: ", "green"), ", ".join(well))] if well else [])]
@@ -307,8 +372,10 @@ def _said(line: str) -> Text:
     if told is None:
         return Text(printable(line))
     level = "" if told[1] == "INFO" else f"{told[1]} "
-    return Text(printable(f"{level}{told[2]}: {line[told.end():]}"),
-                style={"WARN": "yellow", "ERROR": "red", "FATAL": "red"}.get(told[1], ""))
+    return Text(
+        printable(f"{level}{told[2]}: {line[told.end() :]}"),
+        style={"WARN": "yellow", "ERROR": "red", "FATAL": "red"}.get(told[1], ""),
+    )
 
 
 def _with_unit(value: float | None, unit: str) -> str:

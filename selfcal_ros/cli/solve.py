@@ -56,35 +56,58 @@ from selfcal_ros.reporting.words.tables import budget_text, validation_json, val
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     add_arguments(parser, SOLVER)
-    parser.add_argument("--validate", action="store_true",
-                        help="hold out tenths of the readings and whole views, and predict them")
+    parser.add_argument(
+        "--validate",
+        action="store_true",
+        help="hold out tenths of the readings and whole views, and predict them",
+    )
 
 
 def add_arguments(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> None:
     """Add what `selfcal solve` and `selfcal recheck` have in common, and options as `names`."""
     parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder")
-    parser.add_argument("-o", "--output", metavar="RESULT.json", help="file for the result; "
-                        "- is stdout, and other output goes to stderr")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="RESULT.json",
+        help="file for the result; - is stdout, and other output goes to stderr",
+    )
     add_json(parser, "RESULT.json, and the summary on stderr")
     add_options(parser, names)
-    parser.add_argument("--reference", metavar="KIND:ERROR:U", help="known length that sets the "
-                        "scale: artifact, stage_x or stage_y, its relative error and the standard "
-                        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
-                        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of "
-                        "marks marks:ID:ID:LENGTH:U")
+    parser.add_argument(
+        "--reference",
+        metavar="KIND:ERROR:U",
+        help="known length that sets the "
+        "scale: artifact, stage_x or stage_y, its relative error and the standard "
+        "uncertainty of this error, e.g. artifact:1.2e-6:3e-7; or the distance "
+        "of two marks and its u in m: marks:M,N:M,N:LENGTH:U, of a list of "
+        "marks marks:ID:ID:LENGTH:U",
+    )
     parser.set_defaults(validate=False)
-    parser.add_argument("--budget", action="store_true",
-                        help="print the uncertainty budget of the map (GUM)")
-    parser.add_argument("--report", metavar="REPORT.html|.pdf", help="also write the report, "
-                        "compared with the truth if the bag has one")
-    parser.add_argument("--map", metavar="NODES[:INTERPOLATION]", help="nodes per side of the "
-                        "map over the field of the plan, bicubic (default) or bilinear, instead "
-                        "of those of the plan, e.g. 9:bicubic")
+    parser.add_argument(
+        "--budget", action="store_true", help="print the uncertainty budget of the map (GUM)"
+    )
+    parser.add_argument(
+        "--report",
+        metavar="REPORT.html|.pdf",
+        help="also write the report, compared with the truth if the bag has one",
+    )
+    parser.add_argument(
+        "--map",
+        metavar="NODES[:INTERPOLATION]",
+        help="nodes per side of the "
+        "map over the field of the plan, bicubic (default) or bilinear, instead "
+        "of those of the plan, e.g. 9:bicubic",
+    )
     parser.add_argument("--quiet", action="store_true", help="print no summary")
 
 
-METHOD = {"method": "method", "theta_datum": "theta_datum", "misalignment": "misalignment_model",
-          "uncertainty": "uncertainty"}
+METHOD = {
+    "method": "method",
+    "theta_datum": "theta_datum",
+    "misalignment": "misalignment_model",
+    "uncertainty": "uncertainty",
+}
 REFERENCE = {"certificate": "reference_certificate", "reference_at": "reference_at"}
 ROBUST = {"robust": "robust"}
 SOLVER = METHOD | REFERENCE | ROBUST
@@ -105,34 +128,53 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
     add_parameters(parser, SolverSettings, names)
     parser.set_defaults(reference=None, **dict.fromkeys(SOLVER.keys() - names))
     add_parameters(parser, CollectorSettings, SENSE)
-    parser.add_argument("--params", metavar="NODES.yaml",
-                        help="ROS parameter file, the same as for the nodes")
-    parser.add_argument("--model", metavar="TERM[:SIZE],...", action="append",
-                        help=f"terms estimated with the map: {', '.join(BUILT_IN)}; "
-                        "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
-                        "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
-                        "terms, not even those assumed by default (docs/theory/estimation.md)")
-    parser.add_argument("--microscope", metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
-                        help="standard uncertainties of the microscope's scale, rotation (rad) "
-                        "and shear (default: 0.01:0.01:0.002)")
-    parser.add_argument("--namespace", metavar="NAME", help="namespace of the cell's topics, "
-                        "for bags with several cells; / is the root")
+    parser.add_argument(
+        "--params", metavar="NODES.yaml", help="ROS parameter file, the same as for the nodes"
+    )
+    parser.add_argument(
+        "--model",
+        metavar="TERM[:SIZE],...",
+        action="append",
+        help=f"terms estimated with the map: {', '.join(BUILT_IN)}; "
+        "SIZE is a standard deviation known from elsewhere (SI; 0: exactly zero), "
+        "e.g. drift,plate_shape:30e-9; default: those of the plan; none: no "
+        "terms, not even those assumed by default (docs/theory/estimation.md)",
+    )
+    parser.add_argument(
+        "--microscope",
+        metavar="SCALE_U[:ROTATION_U[:SHEAR_U]]",
+        help="standard uncertainties of the microscope's scale, rotation (rad) "
+        "and shear (default: 0.01:0.01:0.002)",
+    )
+    parser.add_argument(
+        "--namespace",
+        metavar="NAME",
+        help="namespace of the cell's topics, for bags with several cells; / is the root",
+    )
 
 
 def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSettings]":
     """Return the settings of collector and solver; options take precedence over the file."""
     collector = node_settings(args.params, CollectorSettings, **given(args, SENSE))
-    solver = node_settings(args.params, SolverSettings, model_terms=_model(args),
-                           **given(args, SOLVER), **_reference(args.reference))
+    solver = node_settings(
+        args.params,
+        SolverSettings,
+        model_terms=_model(args),
+        **given(args, SOLVER),
+        **_reference(args.reference),
+    )
     of_plate = {"reference_at"} if getattr(args, "plate_from", "") else set()
     for option in {"certificate", "reference_at"} - of_plate:
         if getattr(args, option) is not None and solver.reference_kind == "none":
-            raise InputError(f"--{option.replace('_', '-')}",
-                             "it belongs to a reference length, and none is given",
-                             "name the length with --reference KIND:ERROR:U")
+            raise InputError(
+                f"--{option.replace('_', '-')}",
+                "it belongs to a reference length, and none is given",
+                "name the length with --reference KIND:ERROR:U",
+            )
     if args.misalignment == "rigid" and solver.method == "law":
-        raise InputError("--misalignment", "Hu's law is linear, not rigid",
-                         "omit it, or use --method joint")
+        raise InputError(
+            "--misalignment", "Hu's law is linear, not rigid", "omit it, or use --method joint"
+        )
     return collector, solver
 
 
@@ -142,11 +184,15 @@ def _model(args: argparse.Namespace) -> list[str] | None:
         return args.model
     sizes = args.microscope.split(":")
     usual = microscope_term()
-    missing = [f"{size:g}" for size in usual.parts[len(sizes):]]
+    missing = [f"{size:g}" for size in usual.parts[len(sizes) :]]
     if len(sizes) > len(usual.parts) or any(
-            usual.name in text or text == "none" for text in args.model or ()):
-        raise InputError("--microscope", f"'{args.microscope}' does not fit",
-                         "give up to three sizes, and no microscope or none in --model")
+        usual.name in text or text == "none" for text in args.model or ()
+    ):
+        raise InputError(
+            "--microscope",
+            f"'{args.microscope}' does not fit",
+            "give up to three sizes, and no microscope or none in --model",
+        )
     return [*(args.model or ()), ":".join([usual.name, *sizes, *missing])]
 
 
@@ -159,12 +205,17 @@ def _reference(text: str | None) -> dict[str, Any]:
         return {"reference_kind": kind, "reference_marks": rest}
     try:
         error, u = rest.split(":")
-        return {"reference_kind": kind, "reference_error": number_of(error),
-                "reference_u": number_of(u)}
+        return {
+            "reference_kind": kind,
+            "reference_error": number_of(error),
+            "reference_u": number_of(u),
+        }
     except ValueError as error:
-        raise InputError("--reference", f"{text!r} is not KIND:ERROR:U",
-                         "write e.g. artifact:1.2e-6:3e-7, or marks:-5,0:5,0:0.1000002:5e-9"
-                         ) from error
+        raise InputError(
+            "--reference",
+            f"{text!r} is not KIND:ERROR:U",
+            "write e.g. artifact:1.2e-6:3e-7, or marks:-5,0:5,0:0.1000002:5e-9",
+        ) from error
 
 
 def run(args: argparse.Namespace) -> int:
@@ -172,25 +223,32 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.bag, args.params], [file_of(args), args.report])
     if args.report:
         from selfcal_ros.reporting.report import check_name  # loads every figure
+
         check_name(args.report)
     collector, solver = parameters(args)
     if args.validate and solver.method == "law":  # the joint solution is validated
-        raise InputError("--validate", "Hu's law needs every reading and cannot hold any out",
-                         "solve with --method joint")
+        raise InputError(
+            "--validate",
+            "Hu's law needs every reading and cannot hold any out",
+            "solve with --method joint",
+        )
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
-            args.bag, collector, namespace=args.namespace,
-            progress=lambda count: bar(count, None))
+            args.bag, collector, namespace=args.namespace, progress=lambda count: bar(count, None)
+        )
     used = sum(view.used for view in measurements.views)
-    said = [*findings, *lost, *(
-        () if findings else rejections(measurements.all_rejected(), used))]
+    said = [*findings, *lost, *(() if findings else rejections(measurements.all_rejected(), used))]
     for line in dict.fromkeys(said):  # a clock step is a finding, and noted in the result
         print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
     measurements = _with_map(args, measurements)
     options = solver_options(solver, measurements, plate_from=getattr(args, "plate_from", ""))
     if options.plate is not None and args.validate:
-        raise InputError("--validate", f"the plate is known from {options.plate_from}, and one "
-                         "view has nothing to check its readings against", "omit it")
+        raise InputError(
+            "--validate",
+            f"the plate is known from {options.plate_from}, and one "
+            "view has nothing to check its readings against",
+            "omit it",
+        )
     try:
         with busy("solving"):
             result = _calibrated(args, measurements, options, method=solver.method)
@@ -199,24 +257,31 @@ def run(args: argparse.Namespace) -> int:
         if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
             result = worded(with_places(result, measurements.views))
-            _write(args, result_to_dict(created_now(
-                with_input(result, bag_input(args.bag), lost))))
+            _write(args, result_to_dict(created_now(with_input(result, bag_input(args.bag), lost))))
         if set(findings) - set(lost):  # a fault of the cell: a plate placed otherwise, a wrong sign
             raise InputError(args.bag, "correct this first", f"as it is, {error}") from refused
         if findings:  # missing readings look like a deficient plan
-            raise NotIdentifiableError(f"{args.bag}: correct this first; as it is, {error}",
-                                       error.observability) from refused
+            raise NotIdentifiableError(
+                f"{args.bag}: correct this first; as it is, {error}", error.observability
+            ) from refused
         raise
-    if options.plate is not None and options.plate.input.get("sha256") == bag_input(
-            args.bag)["sha256"]:
-        raise InputError(args.bag, f"the recording that {options.plate_from} was computed "
-                         "from: it would be compared with itself", "record a new view of the plate")
+    if (
+        options.plate is not None
+        and options.plate.input.get("sha256") == bag_input(args.bag)["sha256"]
+    ):
+        raise InputError(
+            args.bag,
+            f"the recording that {options.plate_from} was computed "
+            "from: it would be compared with itself",
+            "record a new view of the plate",
+        )
     with busy("validating"):
         result, lines = _validated(args, measurements, options, result)
     result = created_now(with_input(worded(result), bag_input(args.bag), lost))
     _write(args, result_to_dict(result))
     if args.report:
         from selfcal_ros.reporting.report import write_report  # loads every figure
+
         write_report(result, args.report, truth=read_truth(args.bag))
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
@@ -233,8 +298,7 @@ def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
     return replace(measurements, artifact=with_nodes(measurements.artifact, args.map, "--map"))
 
 
-def _calibrated(args: argparse.Namespace, measurements: Any, options: Any, *,
-                method: str) -> Any:
+def _calibrated(args: argparse.Namespace, measurements: Any, options: Any, *, method: str) -> Any:
     """Return the result without sentences; errors of offsets or plate name the bag."""
     try:
         return calibrate_by(method, measurements, options)
@@ -250,8 +314,9 @@ def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
         put(data)
 
 
-def _validated(args: argparse.Namespace, measurements: Any, options: Any,
-               result: Any) -> tuple[Any, list[str]]:
+def _validated(
+    args: argparse.Namespace, measurements: Any, options: Any, result: Any
+) -> tuple[Any, list[str]]:
     """Return the result with places, validated if requested, and the text to print."""
     lines: list[str] = []
     result = with_places(result, measurements.views)
@@ -259,18 +324,25 @@ def _validated(args: argparse.Namespace, measurements: Any, options: Any,
         used = clean(measurements, options).measurements if options.robust else measurements
         found = validate(used, options)
         result = judged_by(result, found)
-        result = replace(result, extra={
-            **result.extra, "validation": validation_json(found, result.plate)})
-        lines += ["", "held-out readings:", *(f"  {line}" for line in validation_text(
-            found, result.plate))]
+        result = replace(
+            result, extra={**result.extra, "validation": validation_json(found, result.plate)}
+        )
+        lines += [
+            "",
+            "held-out readings:",
+            *(f"  {line}" for line in validation_text(found, result.plate)),
+        ]
     return result, lines
 
 
 def _since(result: Any) -> list[str]:
     """Return the text of the change since the calibration of a known plate."""
     found = result.recheck
-    return [] if found is None else ["", f"change since {found.of}:", *(
-        f"  {line}" for line in recheck_lines(found))]
+    return (
+        []
+        if found is None
+        else ["", f"change since {found.of}:", *(f"  {line}" for line in recheck_lines(found))]
+    )
 
 
 def _budget(result: Any) -> list[str]:

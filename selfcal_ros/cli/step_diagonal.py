@@ -40,41 +40,78 @@ SHORTEST_MM = 1e-6
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("data", metavar="DATA.csv|BAG", nargs="?",
-                        help="columns block, rx_pp, ry_pp, rx_np, ry_np [, ex_x, ey_y], mm; "
-                             "several rows of a block are repeats; 3D: rx_ppp, ry_ppp, rz_ppp, "
-                             "rx_npp, ... [, ez_z]")
-    parser.add_argument("--method", choices=("conventional", "new"),
-                        help="conventional: nominal laser directions (Wang); new: measured linear "
-                             "errors, unknown set-up (Ibaraki)")
-    parser.add_argument("--form", default="exact", choices=("exact", "stepwise", "printed"),
-                        help="new formulation: exact geometry by least squares (default), the "
-                             "paper's equations with the exact form of eq. 5, or as printed")
+    parser.add_argument(
+        "data",
+        metavar="DATA.csv|BAG",
+        nargs="?",
+        help="columns block, rx_pp, ry_pp, rx_np, ry_np [, ex_x, ey_y], mm; "
+        "several rows of a block are repeats; 3D: rx_ppp, ry_ppp, rz_ppp, "
+        "rx_npp, ... [, ez_z]",
+    )
+    parser.add_argument(
+        "--method",
+        choices=("conventional", "new"),
+        help="conventional: nominal laser directions (Wang); new: measured linear "
+        "errors, unknown set-up (Ibaraki)",
+    )
+    parser.add_argument(
+        "--form",
+        default="exact",
+        choices=("exact", "stepwise", "printed"),
+        help="new formulation: exact geometry by least squares (default), the "
+        "paper's equations with the exact form of eq. 5, or as printed",
+    )
     for axis in "xyz":
-        parser.add_argument(f"--step-{axis}", type=float, default=STEP_MM, metavar="MM",
-                            help=f"nominal step of {axis.upper()} in a block, mm (default "
-                                 f"{STEP_MM:g})")
-    parser.add_argument("--line", default="lsq", choices=("lsq", "end"),
-                        help="reference line: least squares (default) or through the end points")
-    parser.add_argument("--diagonals", metavar="LIST",
-                        help="diagonals to use, separated by commas (default: all)")
-    parser.add_argument("--allow-equal", action="store_true",
-                        help="accept X and Y readings that are equal in every block")
+        parser.add_argument(
+            f"--step-{axis}",
+            type=float,
+            default=STEP_MM,
+            metavar="MM",
+            help=f"nominal step of {axis.upper()} in a block, mm (default {STEP_MM:g})",
+        )
+    parser.add_argument(
+        "--line",
+        default="lsq",
+        choices=("lsq", "end"),
+        help="reference line: least squares (default) or through the end points",
+    )
+    parser.add_argument(
+        "--diagonals", metavar="LIST", help="diagonals to use, separated by commas (default: all)"
+    )
+    parser.add_argument(
+        "--allow-equal",
+        action="store_true",
+        help="accept X and Y readings that are equal in every block",
+    )
     parser.add_argument("--plot", metavar="FILE", help="draw the profiles (png, svg or pdf)")
-    parser.add_argument("--simulate", metavar="SIM.yaml",
-                        help="without DATA.csv: write the readings of a simulated measurement to "
-                             "-o (or print them); see config/step_diagonal/case_study.yaml")
-    parser.add_argument("--truth", metavar="TRUTH.json",
-                        help="with --simulate: write the errors of the machine")
-    parser.add_argument("--cal", metavar="FILE.cal",
-                        help="write straightness, squareness and measured linear errors as 1D "
-                             "tables; positions count from the start of the first block")
-    parser.add_argument("--force", action="store_true",
-                        help="replace an existing FILE.cal; the old one is kept with its date")
+    parser.add_argument(
+        "--simulate",
+        metavar="SIM.yaml",
+        help="without DATA.csv: write the readings of a simulated measurement to "
+        "-o (or print them); see config/step_diagonal/case_study.yaml",
+    )
+    parser.add_argument(
+        "--truth", metavar="TRUTH.json", help="with --simulate: write the errors of the machine"
+    )
+    parser.add_argument(
+        "--cal",
+        metavar="FILE.cal",
+        help="write straightness, squareness and measured linear errors as 1D "
+        "tables; positions count from the start of the first block",
+    )
+    parser.add_argument(
+        "--force",
+        action="store_true",
+        help="replace an existing FILE.cal; the old one is kept with its date",
+    )
     add_frame(parser, theta=False)
     add_bag_options(parser)
-    parser.add_argument("-o", "--output", metavar="OUT.json|.csv",
-                        help="file for the result, or the readings; default: print it")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT.json|.csv",
+        help="file for the result, or the readings; default: print it",
+    )
     add_json(parser, "the result, even if it is written to a file")
 
 
@@ -84,8 +121,9 @@ def run(args: argparse.Namespace) -> int:
     if args.simulate:
         return _simulate(args)
     if args.data is None or args.method is None:
-        raise InputError("arguments", "DATA.csv and --method are required",
-                         "give both, or --simulate alone")
+        raise InputError(
+            "arguments", "DATA.csv and --method are required", "give both, or --simulate alone"
+        )
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
     with busy("identifying"):
@@ -98,6 +136,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
+
         save_picture(profiles_figure(found, data), args.plot)
     if args.cal:
         _write_cal(args, found)
@@ -114,15 +153,21 @@ def _check_outputs(args: argparse.Namespace) -> None:
     """Refuse outputs that would not be written."""
     measured = not args.simulate
     for option, path, there, remedy in (
-            ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
-            ("--plot", args.plot, measured, "omit it with --simulate"),
-            ("--cal", args.cal, measured, "it belongs to a measurement"),
-            ("--save-csv", args.save_csv, measured and args.data and is_bag(args.data),
-             "it belongs to a bag")):
+        ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
+        ("--plot", args.plot, measured, "omit it with --simulate"),
+        ("--cal", args.cal, measured, "it belongs to a measurement"),
+        (
+            "--save-csv",
+            args.save_csv,
+            measured and args.data and is_bag(args.data),
+            "it belongs to a bag",
+        ),
+    ):
         if path and not there:
             raise InputError(option, "nothing would be written", remedy)
-    check_outputs([args.data, args.simulate],
-                  [args.output, args.plot, args.cal, args.truth, args.save_csv])
+    check_outputs(
+        [args.data, args.simulate], [args.output, args.plot, args.cal, args.truth, args.save_csv]
+    )
     if args.cal:
         refuse_existing([args.cal], force=args.force)
     else:
@@ -131,18 +176,23 @@ def _check_outputs(args: argparse.Namespace) -> None:
 
 def _refuse_machine(args: argparse.Namespace) -> None:
     """Refuse options of a calibration file if none is written."""
-    refuse_given(args, ("x_axis", "y_axis", "unit", "home_x", "home_y", "reverse_x", "reverse_y",
-                        "force"), "it belongs to a calibration file",
-                 "name one with --cal, or omit it")
+    refuse_given(
+        args,
+        ("x_axis", "y_axis", "unit", "home_x", "home_y", "reverse_x", "reverse_y", "force"),
+        "it belongs to a calibration file",
+        "name one with --cal, or omit it",
+    )
 
 
 def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
     """Write the corrections as 1D tables."""
     frame = frame_of(args)
-    comments = [f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
-                f"{found.method} formulation; correction = -(actual - commanded)",
-                "positions count from the start of the first block; the x axis is the reference",
-                frame.comment()]
+    comments = [
+        f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
+        f"{found.method} formulation; correction = -(actual - commanded)",
+        "positions count from the start of the first block; the x axis is the reference",
+        frame.comment(),
+    ]
     text = cal_text(correction_tables(found, frame), comments=comments, decimals=DECIMALS)
     backup = write_cal(args.cal, text, force=args.force)
     if backup:
@@ -155,23 +205,28 @@ def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> lis
     The machine's home is counted from the start of the first block.
     """
     lines = axis_corrections(found)
-    return [line_table(AxisCorrection(*lines[pair]), frame, along=pair[0], corrected=pair[1])
-            for pair in sorted(lines)]
+    return [
+        line_table(AxisCorrection(*lines[pair]), frame, along=pair[0], corrected=pair[1])
+        for pair in sorted(lines)
+    ]
 
 
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
     if args.data is not None:
-        raise InputError("arguments", "--simulate writes data and reads none",
-                         "omit DATA.csv")
+        raise InputError("arguments", "--simulate writes data and reads none", "omit DATA.csv")
     simulation = simulation_from_dict(read_yaml(args.simulate), args.simulate)
     data = simulate_step_diagonal(simulation.machine, simulation.measurement, simulation.rng)
-    text = table_text(data, [
-        f"simulated from {args.simulate}; mm; several rows of a block are repeats",
-        "readings are positive on every diagonal (np: rx = -l.dx); a "
-        "block is a position on the "
-        "axis",
-        "ex_x, ey_y: directly measured linear errors, actual - nominal of each step"])
+    text = table_text(
+        data,
+        [
+            f"simulated from {args.simulate}; mm; several rows of a block are repeats",
+            "readings are positive on every diagonal (np: rx = -l.dx); a "
+            "block is a position on the "
+            "axis",
+            "ex_x, ey_y: directly measured linear errors, actual - nominal of each step",
+        ],
+    )
     if args.truth:
         write_json(args.truth, truth_of(simulation.machine))
     if args.output:
@@ -188,9 +243,22 @@ def _measurement(args: argparse.Namespace) -> tuple:
         if args.diagonals is not None:
             data = data.pick(_diagonals(args, data.dim))
     else:
-        refuse_given(args, ("laser_topic", "laser_field", "laser_unit", "laser_sign",
-                            "position_topic", "joints", "rest_tolerance", "min_rest", "settle"),
-                     f"it is for bags, and {args.data} is a table", "omit it")
+        refuse_given(
+            args,
+            (
+                "laser_topic",
+                "laser_field",
+                "laser_unit",
+                "laser_sign",
+                "position_topic",
+                "joints",
+                "rest_tolerance",
+                "min_rest",
+                "settle",
+            ),
+            f"it is for bags, and {args.data} is a table",
+            "omit it",
+        )
         dim = dimension_of(args.data)
         columns = RequiredColumns(_steps(args, dim), _diagonals(args, dim), args.method == "new")
         data, warnings = read_table(args.data, columns)
@@ -203,8 +271,11 @@ def _steps(args: argparse.Namespace, dim: int) -> tuple[float, ...]:
     for axis in "xyz"[:dim]:
         step = getattr(args, f"step_{axis}")
         if not SHORTEST_MM <= step < math.inf:
-            raise InputError(f"--step-{axis}", f"{step:g} mm is not a length",
-                             "give the nominal step in mm, greater than 0")
+            raise InputError(
+                f"--step-{axis}",
+                f"{step:g} mm is not a length",
+                "give the nominal step in mm, greater than 0",
+            )
     return tuple(getattr(args, f"step_{axis}") * M_PER_MM for axis in "xyz"[:dim])
 
 
@@ -214,35 +285,70 @@ def _diagonals(args: argparse.Namespace, dim: int) -> tuple[str, ...]:
     names = tuple(name.strip() for name in args.diagonals.split(","))
     for name in names:
         if name not in DIAGONALS[dim] or names.count(name) > 1:
-            raise InputError("--diagonals", f"'{name}' is unknown or named twice",
-                             "choose from " + ", ".join(DIAGONALS[dim]))
+            raise InputError(
+                "--diagonals",
+                f"'{name}' is unknown or named twice",
+                "choose from " + ", ".join(DIAGONALS[dim]),
+            )
     return names
 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of a bag."""
     group = parser.add_argument_group(
-        "bag", "with an MCAP file or a rosbag2 folder in place of DATA.csv; the zig-zag is cut "
-        "into blocks at the rests of the axes")
-    group.add_argument("--laser-topic", metavar="TOPIC",
-                       help="laser distance: Float64, Float32, Range, or any type with "
-                            "--laser-field")
-    group.add_argument("--laser-field", metavar="FIELD", default="",
-                       help="field of the distance, or its joint in a JointState")
-    group.add_argument("--laser-unit", choices=tuple(M_PER), default="m",
-                       help="unit of the distance (default m)")
-    group.add_argument("--laser-sign", type=int, choices=(1, -1), default=1,
-                       help="-1 if the distance decreases along the diagonals (default 1)")
-    group.add_argument("--position-topic", metavar="TOPIC",
-                       help="axis positions: JointState, PointStamped or PoseStamped, m")
-    group.add_argument("--joints", metavar="LIST", default="x,y",
-                       help="joints of X, Y[, Z] (default x,y; three names mean 3D)")
-    group.add_argument("--rest-tolerance", type=float, default=2.0, metavar="UM",
-                       help="largest motion of an axis at rest, um (default 2)")
-    group.add_argument("--min-rest", type=float, default=0.5, metavar="S",
-                       help="shortest rest, s (default 0.5)")
-    group.add_argument("--settle", type=float, default=0.1, metavar="S",
-                       help="time ignored at both ends of a rest, s (default 0.1)")
+        "bag",
+        "with an MCAP file or a rosbag2 folder in place of DATA.csv; the zig-zag is cut "
+        "into blocks at the rests of the axes",
+    )
+    group.add_argument(
+        "--laser-topic",
+        metavar="TOPIC",
+        help="laser distance: Float64, Float32, Range, or any type with --laser-field",
+    )
+    group.add_argument(
+        "--laser-field",
+        metavar="FIELD",
+        default="",
+        help="field of the distance, or its joint in a JointState",
+    )
+    group.add_argument(
+        "--laser-unit", choices=tuple(M_PER), default="m", help="unit of the distance (default m)"
+    )
+    group.add_argument(
+        "--laser-sign",
+        type=int,
+        choices=(1, -1),
+        default=1,
+        help="-1 if the distance decreases along the diagonals (default 1)",
+    )
+    group.add_argument(
+        "--position-topic",
+        metavar="TOPIC",
+        help="axis positions: JointState, PointStamped or PoseStamped, m",
+    )
+    group.add_argument(
+        "--joints",
+        metavar="LIST",
+        default="x,y",
+        help="joints of X, Y[, Z] (default x,y; three names mean 3D)",
+    )
+    group.add_argument(
+        "--rest-tolerance",
+        type=float,
+        default=2.0,
+        metavar="UM",
+        help="largest motion of an axis at rest, um (default 2)",
+    )
+    group.add_argument(
+        "--min-rest", type=float, default=0.5, metavar="S", help="shortest rest, s (default 0.5)"
+    )
+    group.add_argument(
+        "--settle",
+        type=float,
+        default=0.1,
+        metavar="S",
+        help="time ignored at both ends of a rest, s (default 0.1)",
+    )
     group.add_argument("--save-csv", metavar="FILE", help="write the blocks as a CSV table")
 
 
@@ -262,13 +368,15 @@ def joints_of(args: argparse.Namespace) -> tuple[str, ...]:
     """Return the joints named; two for face, three for body diagonals."""
     joints = tuple(name.strip() for name in args.joints.split(","))
     if len(joints) not in (2, 3) or len(set(joints)) < len(joints) or "" in joints:
-        raise InputError("--joints", f"'{args.joints}' is not two or three names",
-                         "write --joints x,y")
+        raise InputError(
+            "--joints", f"'{args.joints}' is not two or three names", "write --joints x,y"
+        )
     return joints
 
 
-def measurement_from_bag(args: argparse.Namespace,
-                         steps_m: tuple[float, ...]) -> tuple["StepDiagonal", list[str]]:
+def measurement_from_bag(
+    args: argparse.Namespace, steps_m: tuple[float, ...]
+) -> tuple["StepDiagonal", list[str]]:
     """Return the measurement in a bag, and warnings.
 
     Raises
@@ -276,22 +384,40 @@ def measurement_from_bag(args: argparse.Namespace,
     InputError
         If a topic is missing, an option is not a valid number, or the bag cannot be used.
     """
-    for option, value in (("--laser-topic", args.laser_topic),
-                          ("--position-topic", args.position_topic)):
+    for option, value in (
+        ("--laser-topic", args.laser_topic),
+        ("--position-topic", args.position_topic),
+    ):
         if not value:
             raise InputError(option, "a bag needs it", "name the topic")
-    for option, value in (("--rest-tolerance", args.rest_tolerance), ("--min-rest", args.min_rest),
-                          ("--settle", args.settle)):
+    for option, value in (
+        ("--rest-tolerance", args.rest_tolerance),
+        ("--min-rest", args.min_rest),
+        ("--settle", args.settle),
+    ):
         if not (math.isfinite(value) and value >= 0):
             raise InputError(option, f"{value:g} is not a positive number", "give one")
-    topics = SeriesTopics(args.laser_topic, args.position_topic, joints_of(args),
-                          args.laser_field, M_PER[args.laser_unit])
+    topics = SeriesTopics(
+        args.laser_topic,
+        args.position_topic,
+        joints_of(args),
+        args.laser_field,
+        M_PER[args.laser_unit],
+    )
     series, notes = read_series(Path(args.data), topics)
-    rule = CutRule(steps_m, args.rest_tolerance * M_PER_UM, args.min_rest, args.settle,
-                   laser_sign=args.laser_sign)
+    rule = CutRule(
+        steps_m,
+        args.rest_tolerance * M_PER_UM,
+        args.min_rest,
+        args.settle,
+        laser_sign=args.laser_sign,
+    )
     cut = cut_zigzag(series, rule)
     if args.save_csv:
         write_table(args.save_csv, cut.data, [f"blocks of {args.data}"])
     runs = ", ".join(f"{name} {count}" for name, count in cut.runs.items())
-    return cut.data, [*notes, f"{args.data}: complete runs: {runs}",
-                      *(f"{args.data}: {note}" for note in cut.notes)]
+    return cut.data, [
+        *notes,
+        f"{args.data}: complete runs: {runs}",
+        *(f"{args.data}: {note}" for note in cut.notes),
+    ]

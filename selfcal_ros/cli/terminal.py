@@ -23,12 +23,14 @@ STDOUT = "-"
 
 def add_json(parser: argparse.ArgumentParser, what: str = "one JSON object") -> None:
     """Add the option ``--json``."""
-    parser.add_argument("--json", action="store_true",
-                        help=f"print {what} (docs/reference/json.md)")
+    parser.add_argument(
+        "--json", action="store_true", help=f"print {what} (docs/reference/json.md)"
+    )
 
 
-def add_parameters(parser: argparse._ActionsContainer, kind: type[Settings],
-                   options: Mapping[str, str]) -> None:
+def add_parameters(
+    parser: argparse._ActionsContainer, kind: type[Settings], options: Mapping[str, str]
+) -> None:
     """Add options for parameters of a node, None if not given.
 
     Parameters
@@ -45,11 +47,20 @@ def add_parameters(parser: argparse._ActionsContainer, kind: type[Settings],
         parameter = known[name]
         default = parameter.default
         suffix = f" (default: {default})" if default else ""
-        how: dict[str, Any] = {"action": "store_true", "default": None} if default is False else {
-            "type": type(default), "choices": parameter.choices or None,
-            "metavar": None if parameter.choices else (parameter.unit or "value").upper()}
-        parser.add_argument(f"--{option.replace('_', '-')}", **how,
-                            help=f"{parameter.description}{suffix}".replace("%", "%%"))
+        how: dict[str, Any] = (
+            {"action": "store_true", "default": None}
+            if default is False
+            else {
+                "type": type(default),
+                "choices": parameter.choices or None,
+                "metavar": None if parameter.choices else (parameter.unit or "value").upper(),
+            }
+        )
+        parser.add_argument(
+            f"--{option.replace('_', '-')}",
+            **how,
+            help=f"{parameter.description}{suffix}".replace("%", "%%"),
+        )
 
 
 def node_settings[S: Settings](params: str | None, kind: type[S], **given: Any) -> S:
@@ -103,8 +114,10 @@ def show(result: CalibrationResult, bag: str, output: str | None, stream: TextIO
     from selfcal_ros.bagio.offline import read_truth  # with mcap, which not every verb needs
     from selfcal_ros.reporting.summary.sections import summary_text  # with scipy, likewise
 
-    print(summary_text(result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)),
-          file=stream)
+    print(
+        summary_text(result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)),
+        file=stream,
+    )
     if output:
         print(f"result: {output}", file=stream)
     elif stream is sys.stdout:
@@ -157,6 +170,7 @@ def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, i
     began = time.monotonic()
     draw: Callable[[int, int | None], None] | None = None
     with contextlib.ExitStack() as stack:
+
         def advance(done: int, total: int | None = None) -> None:
             nonlocal draw
             if draw is None and time.monotonic() - began >= after_s:
@@ -199,7 +213,12 @@ def _watch(label: str, after_s: float, ended: threading.Event) -> None:
         TimeElapsedColumn,
     )
 
-    with Progress(SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(),
-                  console=Console(stderr=True), transient=True) as bar:
+    with Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        transient=True,
+    ) as bar:
         bar.add_task(label, total=None)
         ended.wait()

@@ -25,21 +25,37 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
     parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
     parser.add_argument("--bag", metavar="FOLDER", help="record the session to this new folder")
-    parser.add_argument("--results", metavar="FOLDER", default=".",
-                        help="folder for the map of each run, PLAN_RUN.json, and for those of "
-                        "save_map (default: the working directory)")
+    parser.add_argument(
+        "--results",
+        metavar="FOLDER",
+        default=".",
+        help="folder for the map of each run, PLAN_RUN.json, and for those of "
+        "save_map (default: the working directory)",
+    )
     add_json(parser, "one JSON object per line: pictures as they change, answers to requests")
-    parser.add_argument("--journal", metavar="FOLDER", help="folder for journals, from which a "
-                        "restarted collector continues (default: one for each folder of results, "
-                        "in selfcal of the user's folder for states, ~/.local/state)")
-    parser.add_argument("--compensate", action="store_true",
-                        help="publish corrected joint states as well")
-    parser.add_argument("--detect", action="store_true",
-                        help="find marks in stage/image as well (mark_detector in NODES.yaml)")
-    parser.add_argument("--cell", metavar="CELL.yaml", help="machine to be driven by cell_driver "
-                        "(docs/start/machines.md)")
-    parser.add_argument("--simulate", action="store_true",
-                        help="also run a simulated cell, to try it out")
+    parser.add_argument(
+        "--journal",
+        metavar="FOLDER",
+        help="folder for journals, from which a "
+        "restarted collector continues (default: one for each folder of results, "
+        "in selfcal of the user's folder for states, ~/.local/state)",
+    )
+    parser.add_argument(
+        "--compensate", action="store_true", help="publish corrected joint states as well"
+    )
+    parser.add_argument(
+        "--detect",
+        action="store_true",
+        help="find marks in stage/image as well (mark_detector in NODES.yaml)",
+    )
+    parser.add_argument(
+        "--cell",
+        metavar="CELL.yaml",
+        help="machine to be driven by cell_driver (docs/start/machines.md)",
+    )
+    parser.add_argument(
+        "--simulate", action="store_true", help="also run a simulated cell, to try it out"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -67,8 +83,9 @@ def state_folder(results: str) -> Path:
     """
     state, home = os.environ.get("XDG_STATE_HOME"), os.environ.get("HOME")
     if not state and not home:
-        raise InputError("HOME", "is not set, and journals are kept there",
-                         "set it, or give --journal FOLDER")
+        raise InputError(
+            "HOME", "is not set, and journals are kept there", "set it, or give --journal FOLDER"
+        )
     name = re.sub(r"[^\w.-]", "_", str(Path(results).absolute()).strip("/")) or "root"
     return Path(state or Path(home or "", ".local/state"), "selfcal", name[-MOST_OF_A_NAME:])
 
@@ -78,18 +95,28 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     common = ros_arguments(args)
 
     def with_parameters(**values: str) -> list[str]:
-        return common + [word for name, value in values.items()
-                         for word in ("-p", f"{name}:={value}")]
+        return common + [
+            word for name, value in values.items() for word in ("-p", f"{name}:={value}")
+        ]
+
     # separate: an interrupted simulated run must never continue with real readings
     folder = "journals_simulated" if args.simulate else "journals"
     journal = args.journal or str(state_folder(args.results) / folder)
     of = "_simulated" if args.simulate else ""
     # first, so that a parameter file can override it
     saved = Path(args.results, f"{Path(args.plan).stem}{of}_{{run_id}}.json")
-    nodes = {"measurement_collector": with_parameters(journal=str(Path(journal).absolute())),
-             "solver": ["--ros-args", "-p", f"save_path:={saved.absolute()}", *common[1:], "-p",
-                        f"result_folder:={Path(args.results).absolute()}"],
-             "pose_sequencer": with_parameters(plan=str(Path(args.plan).absolute()))}
+    nodes = {
+        "measurement_collector": with_parameters(journal=str(Path(journal).absolute())),
+        "solver": [
+            "--ros-args",
+            "-p",
+            f"save_path:={saved.absolute()}",
+            *common[1:],
+            "-p",
+            f"result_folder:={Path(args.results).absolute()}",
+        ],
+        "pose_sequencer": with_parameters(plan=str(Path(args.plan).absolute())),
+    }
     if args.compensate:
         nodes["compensator"] = with_parameters()
     if args.detect:

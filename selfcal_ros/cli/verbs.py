@@ -16,14 +16,21 @@ ENTRY_POINTS = "selfcal.verbs"
 """Group of entry points; each names a module with ``configure(parser)`` and ``run(args)``."""
 
 MEASURE, LOOK, USE, CERTIFY, CHECK, MORE = GROUPS = (
-    "measure", "look", "use", "certify", "check plans", "more")
+    "measure",
+    "look",
+    "use",
+    "certify",
+    "check plans",
+    "more",
+)
 
 START_HERE = {
     "plan check PLAN.yaml": "do these views determine the stage?",
     "up --plan PLAN.yaml --simulate": "measure, here on a simulated machine",
     "solve BAG -o RESULT.json": "from a bag: the map and its U",
     "report RESULT.json": "all of it on one page",
-    "help VERB": "options of a verb, and an example"}
+    "help VERB": "options of a verb, and an example",
+}
 """Commands of the first ten minutes -> what they are for."""
 
 
@@ -63,7 +70,8 @@ VERBS = {
     "plate": Verb(CHECK, "draw the plate of a plan, true to size: svg, pdf, dxf or gds"),
     "simulate": Verb(CHECK, "write a bag of a simulated cell, with its known truth"),
     "step-diagonal": Verb(MORE, "axis errors from a laser step-diagonal measurement"),
-    "reproduce": Verb(MORE, "repeat the published simulations of Hu, Qiao or Ibaraki")}
+    "reproduce": Verb(MORE, "repeat the published simulations of Hu, Qiao or Ibaraki"),
+}
 """Verbs; `step-diagonal` is the module ``step_diagonal.py`` of this package."""
 
 EXAMPLES = {
@@ -73,11 +81,10 @@ EXAMPLES = {
     "cell try": "selfcal cell try CELL.yaml",
     "cell check": "selfcal cell check --plan config/plans/hu.yaml",
     "measure": "selfcal measure config/plans/small.yaml config/cells/simulated.yaml "
-               "-o measured --yes",
-    "camera init": "selfcal camera init BAG -o nodes.yaml --mark-size 72e-6 "
-                   "--mark-pixels 12",
+    "-o measured --yes",
+    "camera init": "selfcal camera init BAG -o nodes.yaml --mark-size 72e-6 --mark-pixels 12",
     "detect": "selfcal detect bags/camera -o marks --pixel-size 6e-6 --mark disc "
-              "--mark-size 72e-6 --turn 1.5",
+    "--mark-size 72e-6 --turn 1.5",
     "solve": "selfcal solve bags/hu_noise -o RESULT.json",
     "replay": "selfcal replay bags/hu_noise --fast -o RESULT.json",
     "batch": "selfcal batch bags/hu_noise bags/hu_exact -o batch",
@@ -98,7 +105,7 @@ EXAMPLES = {
     "cal accuracy": "selfcal cal accuracy RESULT.json -o accuracy.cal",
     "cal straightness": "selfcal cal straightness RESULT.json -o straightness.cal",
     "cal orthogonality": "selfcal cal orthogonality --measured 5um --over 200mm --travel 300mm "
-                         "--home middle -o square.cal",
+    "--home middle -o square.cal",
     "gcode": "selfcal gcode part.nc RESULT.json -o corrected.nc --dialect linuxcnc",
     "certificate": "selfcal certificate RESULT.json config/certificates/details.yaml -o dcc.xml",
     "iso230": "selfcal iso230 RESULT.json",
@@ -108,7 +115,8 @@ EXAMPLES = {
     "plate": "selfcal plate config/plans/hu.yaml -o plate.svg",
     "simulate": "selfcal simulate config/simulations/general.yaml -o simulated",
     "step-diagonal": "selfcal step-diagonal config/step_diagonal/case_study.csv --method new",
-    "reproduce": "selfcal reproduce hu --draws 20"}
+    "reproduce": "selfcal reproduce hu --draws 20",
+}
 """Verb, with its second word if it has one -> a command for its help."""
 
 
@@ -121,8 +129,11 @@ def verbs_of_others() -> dict[str, "EntryPoint"]:
     """Return the verbs that other installed packages register, by name."""
     from importlib.metadata import entry_points  # slow, and seldom needed
 
-    return {point.name: point for point in entry_points(group=ENTRY_POINTS)
-            if point.name not in VERBS and not point.value.startswith("selfcal_ros.")}
+    return {
+        point.name: point
+        for point in entry_points(group=ENTRY_POINTS)
+        if point.name not in VERBS and not point.value.startswith("selfcal_ros.")
+    }
 
 
 def summary_of(point: "EntryPoint") -> str:

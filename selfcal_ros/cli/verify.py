@@ -25,11 +25,18 @@ from selfcal_ros.results import read_result
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("map", metavar="MAP.json", help="RESULT.json whose map is corrected")
-    parser.add_argument("bag", metavar="BAG", help="MCAP file or rosbag2 folder, measured with the "
-                        "correction on: a plan that identifies the stage, with any plate, or one "
-                        "view of the plate of MAP.json")
-    parser.add_argument("--plot", metavar="FILE.png|.svg|.pdf",
-                        help="draw the error without and with the correction side by side")
+    parser.add_argument(
+        "bag",
+        metavar="BAG",
+        help="MCAP file or rosbag2 folder, measured with the "
+        "correction on: a plan that identifies the stage, with any plate, or one "
+        "view of the plate of MAP.json",
+    )
+    parser.add_argument(
+        "--plot",
+        metavar="FILE.png|.svg|.pdf",
+        help="draw the error without and with the correction side by side",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON (docs/guides/verify.md)")
     solve.add_options(parser, {})
 
@@ -47,10 +54,12 @@ def run(args: argparse.Namespace) -> int:
         from selfcal_ros.reporting.figures.maps import verification_picture  # loads matplotlib
         from selfcal_ros.reporting.figures.paper import save_picture  # likewise
 
-        save_picture(verification_picture(before, after, found, told["sentence"]),
-                     args.plot)
-    say(args, verification_text(found), told | plain(
-        {"gx": found.gx, "gy": found.gy, "g_theta": found.g_theta}))
+        save_picture(verification_picture(before, after, found, told["sentence"]), args.plot)
+    say(
+        args,
+        verification_text(found),
+        told | plain({"gx": found.gx, "gy": found.gy, "g_theta": found.g_theta}),
+    )
     if not is_believed(after, found):
         say_unless_qualified(after, f"selfcal verify: {args.bag}")
     return int(ExitCode.DONE if told["passed"] else ExitCode.NOT_QUALIFIED)
@@ -61,20 +70,24 @@ def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationRe
     collector, solver = solve.parameters(args)
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
-            args.bag, collector, namespace=args.namespace,
-            progress=lambda count: bar(count, None))
+            args.bag, collector, namespace=args.namespace, progress=lambda count: bar(count, None)
+        )
     for line in dict.fromkeys([*findings, *lost]):
         print(f"selfcal verify: {args.bag}: {line}", file=sys.stderr)
     source = bag_input(args.bag)
     if before.input.get("sha256") == source["sha256"]:
-        raise InputError(args.bag, f"the recording that {args.map} was computed from, without the "
-                         "correction", "measure again with the correction on")
+        raise InputError(
+            args.bag,
+            f"the recording that {args.map} was computed from, without the correction",
+            "measure again with the correction on",
+        )
     with busy("solving"):
         return worded(with_input(_solved(args, measurements, solver), source, lost))
 
 
-def _solved(args: argparse.Namespace, measurements: Measurements,
-            solver: SolverSettings) -> CalibrationResult:
+def _solved(
+    args: argparse.Namespace, measurements: Measurements, solver: SolverSettings
+) -> CalibrationResult:
     """Return the map with the correction on."""
     options = solver_options(solver, measurements, plate_from=args.map)
     try:

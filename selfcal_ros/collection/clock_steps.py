@@ -18,8 +18,9 @@ GROUP, BESIDE = 5, 3
 """Messages per group, and groups compared on either side of a step."""
 SLEW = 2000
 """Largest drift of a disciplined clock: one part in this many."""
-REMEDY = ("let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after the "
-          "start)")
+REMEDY = (
+    "let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after the start)"
+)
 Span = tuple[np.ndarray, np.ndarray]
 """Lowest and highest of offset, stamp and reception, each (3, n)."""
 
@@ -77,11 +78,21 @@ class StepWatch:
             return []
         stamps, received = both[:, :whole].reshape(2, -1, GROUP)
         offset = stamps - received
-        self._groups = np.concatenate([self._groups, np.stack([
-            column for values in (offset, stamps, received)
-            for column in (values.min(axis=1), values.max(axis=1))])], axis=1)
+        self._groups = np.concatenate(
+            [
+                self._groups,
+                np.stack(
+                    [
+                        column
+                        for values in (offset, stamps, received)
+                        for column in (values.min(axis=1), values.max(axis=1))
+                    ]
+                ),
+            ],
+            axis=1,
+        )
         found = self._look()
-        self._groups = self._groups[:, -2 * BESIDE:]
+        self._groups = self._groups[:, -2 * BESIDE :]
         return found
 
     def _look(self) -> list[ClockStep]:
@@ -89,11 +100,14 @@ class StepWatch:
         count = self._groups.shape[1] - 2 * BESIDE
         if count <= 0:
             return []
-        low = np.stack([self._groups[0::2, k:k + count + BESIDE + 1] for k in range(BESIDE)]).min(0)
-        high = np.stack([self._groups[1::2, k:k + count + BESIDE + 1]
-                         for k in range(BESIDE)]).max(0)
+        low = np.stack([self._groups[0::2, k : k + count + BESIDE + 1] for k in range(BESIDE)]).min(
+            0
+        )
+        high = np.stack(
+            [self._groups[1::2, k : k + count + BESIDE + 1] for k in range(BESIDE)]
+        ).max(0)
         before = (low[:, :count], high[:, :count])
-        after = (low[:, BESIDE + 1:][:, :count], high[:, BESIDE + 1:][:, :count])
+        after = (low[:, BESIDE + 1 :][:, :count], high[:, BESIDE + 1 :][:, :count])
         size = _parted(before, after, self._limit_ns)
         offset = (after[0][0] + after[1][0]) // 2
         out = []
@@ -144,8 +158,12 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
     back = clear & (by < 0) & (next_low[1] < high[1] - limit_ns // 2)
     # both clocks went back, with the messages otherwise in order
     length = np.maximum(high[2] - low[2], next_high[2] - next_low[2])
-    together = (~clear) & (stamps < -limit_ns) & (received < -limit_ns) & (
-        np.minimum(-stamps, -received) > 2 * length)
+    together = (
+        (~clear)
+        & (stamps < -limit_ns)
+        & (received < -limit_ns)
+        & (np.minimum(-stamps, -received) > 2 * length)
+    )
     return np.where(ahead | back, by, np.where(together, stamps, 0))
 
 
@@ -159,8 +177,10 @@ def step_lines(steps: Mapping[str, Iterable[ClockStep]], timeline: Timeline) -> 
     timeline : Timeline
         Commands of the session.
     """
-    found = sorted(((step, topic) for topic, mine in steps.items() for step in mine),
-                   key=lambda item: (item[0].before_ns, item[1]))
+    found = sorted(
+        ((step, topic) for topic, mine in steps.items() for step in mine),
+        key=lambda item: (item[0].before_ns, item[1]),
+    )
     lines = []
     while found:
         step, _ = found[0]
@@ -173,13 +193,21 @@ def step_lines(steps: Mapping[str, Iterable[ClockStep]], timeline: Timeline) -> 
 
 def future_lines(topics: Collection[str]) -> list[str]:
     """Return a line for topics with messages refused as stamped in the future, if any."""
-    return [f"{', '.join(sorted(topics))}: what was stamped more than {MAX_AHEAD_NS // NS_PER_S} s "
-            "ahead of its reception was not used; set the clock that stamps it"] if topics else []
+    return (
+        [
+            f"{', '.join(sorted(topics))}: what was stamped more than {MAX_AHEAD_NS // NS_PER_S} s "
+            "ahead of its reception was not used; set the clock that stamps it"
+        ]
+        if topics
+        else []
+    )
 
 
 def _alike(one: ClockStep, other: ClockStep) -> bool:
-    return (abs(one.by_ns - other.by_ns) < 0.1 * abs(other.by_ns)
-            and abs(one.before_ns - other.before_ns) < abs(other.by_ns) + 10_000_000_000)
+    return (
+        abs(one.by_ns - other.by_ns) < 0.1 * abs(other.by_ns)
+        and abs(one.before_ns - other.before_ns) < abs(other.by_ns) + 10_000_000_000
+    )
 
 
 def _line(topics: str, step: ClockStep, timeline: Timeline) -> str:
@@ -187,6 +215,8 @@ def _line(topics: str, step: ClockStep, timeline: Timeline) -> str:
     view = timeline.intervals[index].view_index if index >= 0 else None
     where = "between views" if view is None else f"in view '{timeline.views[view].name}'"
     way, wrong = ("back", "an earlier") if step.by_ns < 0 else ("ahead", "a later")
-    return (f"the clock that stamps {topics} stepped {way} by {abs(step.by_ns) * S_PER_NS:.3g} s "
-            f"{where}, at {step.before_ns * S_PER_NS:.3f} s: what was stamped since may be missing "
-            f"or counted in {wrong} view; {REMEDY}, and measure again from that view on")
+    return (
+        f"the clock that stamps {topics} stepped {way} by {abs(step.by_ns) * S_PER_NS:.3g} s "
+        f"{where}, at {step.before_ns * S_PER_NS:.3f} s: what was stamped since may be missing "
+        f"or counted in {wrong} view; {REMEDY}, and measure again from that view on"
+    )

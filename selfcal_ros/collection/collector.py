@@ -59,20 +59,29 @@ class Collector:
         linear = TrackLimits(gap_ns, settings.max_speed, settings.encoder_agreement)
         turn = TrackLimits(gap_ns, settings.max_angular_speed, settings.encoder_agreement, True)
         self.sense = Sense(settings.measurement_sense)
-        self._joints = {settings.joint_x: "x", settings.joint_y: "y",
-                        settings.joint_theta: "theta"}
+        self._joints = {settings.joint_x: "x", settings.joint_y: "y", settings.joint_theta: "theta"}
         if len(self._joints) < 3:
-            raise InputError("measurement_collector: joint_x, joint_y, joint_theta",
-                             "two of them are the same joint", "give each its own name")
-        self.tracks = Tracks(JointTrack(linear, store), JointTrack(linear, store),
-                             JointTrack(turn, store))
+            raise InputError(
+                "measurement_collector: joint_x, joint_y, joint_theta",
+                "two of them are the same joint",
+                "give each its own name",
+            )
+        self.tracks = Tracks(
+            JointTrack(linear, store), JointTrack(linear, store), JointTrack(turn, store)
+        )
         self._rules = Rules(
-            self.sense, IdentityRules(settings.max_deviation, settings.ambiguity_ratio,
-                                      settings.max_rotation, settings.max_stage_distance),
-            settings.min_score, settings.outlier_limit)
+            self.sense,
+            IdentityRules(
+                settings.max_deviation,
+                settings.ambiguity_ratio,
+                settings.max_rotation,
+                settings.max_stage_distance,
+            ),
+            settings.min_score,
+            settings.outlier_limit,
+        )
         self._min_repeats = settings.min_repeats
-        self._exposures = Exposures(self.tracks,
-                                    approach_threshold_m=settings.approach_threshold)
+        self._exposures = Exposures(self.tracks, approach_threshold_m=settings.approach_threshold)
         self._views = ViewCache(self._rules)
         self._unsettled = 0
         self._commands: dict[inputs.Command, None] = {}
@@ -85,12 +94,20 @@ class Collector:
 
     def add_encoder(self, sample: inputs.EncoderSample) -> None:
         """Take one encoder message; an unusable one is counted under its reason."""
-        self.add_encoder_block(np.array([sample.stamp_ns]), sample.names,
-                               np.array([sample.positions], dtype=float),
-                               np.array([sample.velocities], dtype=float))
+        self.add_encoder_block(
+            np.array([sample.stamp_ns]),
+            sample.names,
+            np.array([sample.positions], dtype=float),
+            np.array([sample.velocities], dtype=float),
+        )
 
-    def add_encoder_block(self, stamps_ns: np.ndarray, names: Sequence[str], positions: np.ndarray,
-                          velocities: np.ndarray | None = None) -> None:
+    def add_encoder_block(
+        self,
+        stamps_ns: np.ndarray,
+        names: Sequence[str],
+        positions: np.ndarray,
+        velocities: np.ndarray | None = None,
+    ) -> None:
         """Take encoder messages of the same joints; unusable ones are counted under their reason.
 
         Parameters
@@ -108,7 +125,8 @@ class Collector:
         self.received["encoder"] += count
         speeds = None if velocities is None or not velocities.shape[1] else velocities
         if positions.shape[1] != len(names) or (
-                speeds is not None and speeds.shape[1] != len(names)):
+            speeds is not None and speeds.shape[1] != len(names)
+        ):
             self._rejected_input[inputs.Reason.ENCODER_MALFORMED] += count
             return
         finite, known = np.ones(count, dtype=bool), False
@@ -119,8 +137,11 @@ class Collector:
             known = True
             good = np.isfinite(positions[:, column])
             finite &= good
-            joint.store.add_block(stamps_ns[good], positions[good, column],
-                                  None if speeds is None else speeds[good, column])
+            joint.store.add_block(
+                stamps_ns[good],
+                positions[good, column],
+                None if speeds is None else speeds[good, column],
+            )
         if not finite.all():
             self._rejected_input[inputs.Reason.ENCODER_NOT_FINITE] += int((~finite).sum())
         if not known and count:
@@ -177,8 +198,9 @@ class Collector:
         """The command with the latest stamp, the last received of equal ones; no stray."""
         if self._newest is None and self._commands:
             kept = set(without_strays(self._commands))
-            self._newest = max((c for c in reversed(self._commands) if c in kept),
-                               key=lambda c: c.stamp_ns)
+            self._newest = max(
+                (c for c in reversed(self._commands) if c in kept), key=lambda c: c.stamp_ns
+            )
         return self._newest
 
     @property
@@ -213,58 +235,76 @@ class Collector:
         """
         timeline = self.timeline
         if timeline.artifact is None:
-            raise NoDataError(COMMAND_TOPIC, "no MEASURE command",
-                              "readings cannot be assigned to views without one")
+            raise NoDataError(
+                COMMAND_TOPIC,
+                "no MEASURE command",
+                "readings cannot be assigned to views without one",
+            )
         self._settle()
         readings, loose = self._views.readings(timeline, self._exposures)
         loose.update({str(reason): count for reason, count in self._rejected_input.items()})
         stamps = [command.stamp_ns for command in self._commands]
         self._seen = DetectionsSeen(
-            self._views.table, self._views.view_of, self._exposures,
+            self._views.table,
+            self._views.view_of,
+            self._exposures,
             encoder=self._facts,
             commands_ns=(min(stamps), max(stamps)),
             artifact=timeline.artifact,
             rules=self._rules.identity,
-            sense=self.sense)
-        progress = {index: view_progress(timeline, index, found, self._min_repeats)
-                    for index, found in readings.items()}
+            sense=self.sense,
+        )
+        progress = {
+            index: view_progress(timeline, index, found, self._min_repeats)
+            for index, found in readings.items()
+        }
         parts = tuple(part for view in readings.values() for part in view.parts)
         return Measurements(
-            timeline.plan_id, timeline.artifact, parts,
+            timeline.plan_id,
+            timeline.artifact,
+            parts,
             sense=self.sense,
             rejected=dict(sorted(loose.items())),
             run_id=timeline.run_id,
             model_terms=timeline.model_terms,
             artifact_from=timeline.artifact_from,
-            **plan_keys(timeline)), progress
+            **plan_keys(timeline),
+        ), progress
 
-    def findings(self, measurements: Measurements,
-                 progress: dict[int, ViewProgress]) -> dict[int | None, RejectionFinding]:
+    def findings(
+        self, measurements: Measurements, progress: dict[int, ViewProgress]
+    ) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.
 
         `measurements` and `progress` are the last result of `collect`.
         """
         if self._seen is None:
             return {}
-        return self._seen.findings({index: view.readings for index, view in progress.items()},
-                                   measurements.rejected)
+        return self._seen.findings(
+            {index: view.readings for index, view in progress.items()}, measurements.rejected
+        )
 
     def missing_commands(self) -> list[str]:
         """Return which commands of the run were lost, as far as that is seen, one line each."""
         timeline, stamps = self.timeline, self._views.table["stamp"]
-        lines = [f"no command of view {index} of the plan (from 0) is there: what was measured in "
-                 f"it counts in no view, or in another; receive and record {COMMAND_TOPIC} whole"
-                 for index in timeline.absent]
+        lines = [
+            f"no command of view {index} of the plan (from 0) is there: what was measured in "
+            f"it counts in no view, or in another; receive and record {COMMAND_TOPIC} whole"
+            for index in timeline.absent
+        ]
         for name, after in timeline.unmeasured.values():
             count = int(((stamps >= after.start_ns) & (stamps < after.end_ns)).sum())
             if count:
-                lines.append(f"view '{name}' was placed, and {count} detections followed, but its "
-                             "MEASURE command is missing: they count in no view; measure the view "
-                             f"again, and receive and record {COMMAND_TOPIC} whole")
+                lines.append(
+                    f"view '{name}' was placed, and {count} detections followed, but its "
+                    "MEASURE command is missing: they count in no view; measure the view "
+                    f"again, and receive and record {COMMAND_TOPIC} whole"
+                )
         return lines
 
-    def finding_of_last(self, progress: Mapping[int, ViewProgress], index: int,
-                        rejected: Mapping[str, int]) -> RejectionFinding | None:
+    def finding_of_last(
+        self, progress: Mapping[int, ViewProgress], index: int, rejected: Mapping[str, int]
+    ) -> RejectionFinding | None:
         """Return why the last detections of a view were rejected, none of which was used."""
         if self._seen is None:
             return None
@@ -276,20 +316,26 @@ class Collector:
         spans = [span for span in (track.store.span() for track in self.tracks) if span]
         return EncoderFacts(
             {axis: name for name, axis in self._joints.items()},
-            {axis: len(track) > 0 for axis, track in tracks.items()}, tuple(self._foreign),
+            {axis: len(track) > 0 for axis, track in tracks.items()},
+            tuple(self._foreign),
             (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else None,
-            self.tracks.x.usual_step_s(), self.tracks.x.limits.max_gap_ns / NS_PER_S)
+            self.tracks.x.usual_step_s(),
+            self.tracks.x.limits.max_gap_ns / NS_PER_S,
+        )
 
 
-def view_progress(timeline: Timeline, index: int, readings: ViewReadings,
-                  min_repeats: int = 0) -> ViewProgress:
+def view_progress(
+    timeline: Timeline, index: int, readings: ViewReadings, min_repeats: int = 0
+) -> ViewProgress:
     """Return the progress of a view."""
     artifact, view = timeline.planned_view(index)
     grid, angular = expected_marks(artifact, view)
     done, done_theta = n_read_enough(artifact, view, readings, min_repeats)
     checked = min(max(count_stops(view, part)[1] for part in readings.parts), view.check_marks)
     return ViewProgress(
-        index, view, grid,
+        index,
+        view,
+        grid,
         grid_done=done,
         angular_expected=angular,
         angular_done=done_theta,
@@ -297,7 +343,8 @@ def view_progress(timeline: Timeline, index: int, readings: ViewReadings,
         end_ns=max(i.end_ns for i in timeline.of_view(index)),
         artifact=artifact,
         check_done=checked,
-        min_repeats=min_repeats)
+        min_repeats=min_repeats,
+    )
 
 
 LARGEST_KEPT = 31 * 2**20

@@ -22,15 +22,28 @@ MOST = 0.5
 """Fraction of the detections above which one reason of rejection is diagnosed."""
 AT_LEAST = 5
 """Smallest number of detections for a diagnosis."""
-SCALES = {1.0: "", 1e3: "1000 times those of the marks: they are in mm",
-          1e-3: "a thousandth of those of the marks: they are in km, or their unit is unknown",
-          1e6: "a million times those of the marks: they are in µm"}
+SCALES = {
+    1.0: "",
+    1e3: "1000 times those of the marks: they are in mm",
+    1e-3: "a thousandth of those of the marks: they are in km, or their unit is unknown",
+    1e6: "a million times those of the marks: they are in µm",
+}
 """Indicated position over true position -> meaning."""
-UNUSABLE = {Reason.ENCODER_MALFORMED: "give each name of a joint state its position",
-            Reason.ENCODER_NOT_FINITE: "publish positions that are finite"}
+UNUSABLE = {
+    Reason.ENCODER_MALFORMED: "give each name of a joint state its position",
+    Reason.ENCODER_NOT_FINITE: "publish positions that are finite",
+}
 """Encoder samples that cannot be used -> remedy."""
-PLACED = (Reason.NOT_AT_MARK, Reason.TOO_FAR, Reason.MOVING, Reason.CONTRADICTION,
-          Reason.NOT_IN_VIEW, Reason.AMBIGUOUS, Reason.OUTLIER, Reason.ROTATION)
+PLACED = (
+    Reason.NOT_AT_MARK,
+    Reason.TOO_FAR,
+    Reason.MOVING,
+    Reason.CONTRADICTION,
+    Reason.NOT_IN_VIEW,
+    Reason.AMBIGUOUS,
+    Reason.OUTLIER,
+    Reason.ROTATION,
+)
 """Reasons possibly caused by a stage away from all marks."""
 
 Span = tuple[int, int] | None
@@ -101,12 +114,14 @@ class RejectionFinding:
         """Return it as one line."""
         if not self.count:
             return self.text
-        return (f"{self.count} of {self.total} detections were rejected as {self.reason}: "
-                f"{self.text}")
+        return (
+            f"{self.count} of {self.total} detections were rejected as {self.reason}: {self.text}"
+        )
 
 
-def main_reason(rejected: Mapping[str, int], used: int, *,
-                placed: bool = False) -> tuple[str, int, int] | None:
+def main_reason(
+    rejected: Mapping[str, int], used: int, *, placed: bool = False
+) -> tuple[str, int, int] | None:
     """Return the reason of most rejections, its count, and the total considered; or None.
 
     Detections of other runs and plans, redone views, and duplicates are not faults. `placed`:
@@ -142,12 +157,16 @@ def _joints(e: Evidence) -> str | None:
         return None
     for reason, remedy in UNUSABLE.items():
         if e.rejected.get(reason) and not e.seen_joints:
-            return (f"no encoder sample came that can be used, {e.rejected[reason]} were rejected "
-                    f"as {reason}; {remedy}")
+            return (
+                f"no encoder sample came that can be used, {e.rejected[reason]} were rejected "
+                f"as {reason}; {remedy}"
+            )
     seen = ", ".join(repr(name) for name in e.seen_joints) or "none"
     missing = ", ".join(repr(name) for name in e.missing_joints)
-    return (f"no encoder sample of the joint {missing} arrived; joints received: {seen}; set "
-            "joint_x, joint_y, joint_theta")
+    return (
+        f"no encoder sample of the joint {missing} arrived; joints received: {seen}; set "
+        "joint_x, joint_y, joint_theta"
+    )
 
 
 def _clock(e: Evidence) -> str | None:
@@ -157,16 +176,20 @@ def _clock(e: Evidence) -> str | None:
     if first <= end and last >= begin:
         return None
     offset = (last - end) / NS_PER_S
-    return (f"the detections are stamped about {_seconds(offset)} "
-            f"{'after' if offset > 0 else 'before'} the encoder samples; stamp both by one "
-            "clock")
+    return (
+        f"the detections are stamped about {_seconds(offset)} "
+        f"{'after' if offset > 0 else 'before'} the encoder samples; stamp both by one "
+        "clock"
+    )
 
 
 def _rate(e: Evidence) -> str | None:
     if not e.encoder_step_s > e.max_gap_s:
         return None
-    return (f"the encoder sends a sample every {e.encoder_step_s:.3g} s, and max_encoder_gap is "
-            f"{e.max_gap_s:g} s; send them more often, or raise max_encoder_gap")
+    return (
+        f"the encoder sends a sample every {e.encoder_step_s:.3g} s, and max_encoder_gap is "
+        f"{e.max_gap_s:g} s; send them more often, or raise max_encoder_gap"
+    )
 
 
 def _command_clock(e: Evidence) -> str | None:
@@ -176,9 +199,11 @@ def _command_clock(e: Evidence) -> str | None:
     if first <= end and last >= begin:
         return None
     offset = (first - begin if last < begin else last - end) / NS_PER_S
-    return (f"all detections are stamped {'before the first' if offset < 0 else 'after the last'} "
-            f"view command, about {_seconds(offset)} off; synchronise the clocks of the cell and "
-            "the sequencer")
+    return (
+        f"all detections are stamped {'before the first' if offset < 0 else 'after the last'} "
+        f"view command, about {_seconds(offset)} off; synchronise the clocks of the cell and "
+        "the sequencer"
+    )
 
 
 def _seconds(offset_s: float) -> str:
@@ -201,11 +226,15 @@ def _stage(e: Evidence) -> str | None:
     where = np.concatenate([view.stage for view in e.marks]) * e.pitch_m
     middle = complex(np.median(where.real), np.median(where.imag))
     if np.quantile(np.abs(where - middle), 0.9) < e.pitch_m / 4:
-        return (f"the stage did not move: it is indicated at {_place(e, middle)} at all of them; "
-                "name the joints that move, in joint_x and joint_y")
+        return (
+            f"the stage did not move: it is indicated at {_place(e, middle)} at all of them; "
+            "name the joints that move, in joint_x and joint_y"
+        )
     check = "joint_x and joint_y, " if e.joints else ""
-    return (f"the stage stands {away:.3g} m from the sites of the detected marks (median); "
-            f"check {check}the ids of the marks and how the plate lies")
+    return (
+        f"the stage stands {away:.3g} m from the sites of the detected marks (median); "
+        f"check {check}the ids of the marks and how the plate lies"
+    )
 
 
 def _at_another_time(e: Evidence) -> str | None:
@@ -215,15 +244,17 @@ def _at_another_time(e: Evidence) -> str | None:
     placed = [(view.stage, view.sites - view.cells) for view in e.marks]
     half = sum(len(stage) for stage, _ in placed) / 2
     for steps, late in product(range(1, LATE + 1), (True, False)):
-        at, of = (slice(None, -steps), slice(steps, None))[::1 if late else -1]
+        at, of = (slice(None, -steps), slice(steps, None))[:: 1 if late else -1]
         apart = np.concatenate([np.abs(stage[at] - axis[of]) for stage, axis in placed])
         if len(apart) < half:
             break
         if np.quantile(apart, NEARLY_ALL) * e.pitch_m <= e.limit_m:
             detections = "1 detection" if steps == 1 else f"{steps} detections"
-            return (f"at the stamp of a mark the stage stands where the mark {detections} "
-                    f"{'later' if late else 'earlier'} is seen; stamp detections and encoder "
-                    "samples with the time of the exposure, by one clock")
+            return (
+                f"at the stamp of a mark the stage stands where the mark {detections} "
+                f"{'later' if late else 'earlier'} is seen; stamp detections and encoder "
+                "samples with the time of the exposure, by one clock"
+            )
     return None
 
 
@@ -234,9 +265,11 @@ def _stopped(e: Evidence) -> str | None:
         still = len(stage) == STOPPED and np.abs(stage - stage[-1]).max() < 1 / 4
         moved = np.abs(view.stage - stage[-1]).max() > 1 / 2
         if still and moved and np.abs(sites - sites[-1]).max() > 1:
-            return (f"the stage has stopped: it is indicated at {_place(e, stage[-1] * e.pitch_m)} "
-                    f"at each of the last {STOPPED} marks; check the encoder and what publishes "
-                    "its joints")
+            return (
+                f"the stage has stopped: it is indicated at {_place(e, stage[-1] * e.pitch_m)} "
+                f"at each of the last {STOPPED} marks; check the encoder and what publishes "
+                "its joints"
+            )
     return None
 
 
@@ -250,10 +283,16 @@ def wrong_joints(e: Evidence) -> str | None:
     """Return the fault of the joints without which the stage is at the marks of all views."""
     if not _away(e, lambda stage: stage) > e.limit_m:
         return None
-    for scale, swapped, signs in product(SCALES, (False, True), ((1, 1), (-1, -1), (-1, 1),
-                                                                 (1, -1))):
-        def tried(stage: np.ndarray, scale: float = scale, swapped: bool = swapped,
-                  signs: tuple[int, int] = signs) -> np.ndarray:
+    for scale, swapped, signs in product(
+        SCALES, (False, True), ((1, 1), (-1, -1), (-1, 1), (1, -1))
+    ):
+
+        def tried(
+            stage: np.ndarray,
+            scale: float = scale,
+            swapped: bool = swapped,
+            signs: tuple[int, int] = signs,
+        ) -> np.ndarray:
             x, y = (stage.imag, stage.real) if swapped else (stage.real, stage.imag)
             return (signs[0] * x + 1j * signs[1] * y) / scale
 

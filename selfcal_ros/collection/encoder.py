@@ -60,9 +60,14 @@ class JointTrack:
     def between(self, start_ns: int, end_ns: int) -> "JointSamples":
         """Return the samples relevant to exposures from `start_ns` to `end_ns`."""
         half_gap = self.limits.max_gap_ns // 2
-        return JointSamples(self.limits, self.store.near(
-            max(start_ns, NEVER + half_gap) - half_gap, min(end_ns, EVER - half_gap) + half_gap,
-            DEPTH + 2))
+        return JointSamples(
+            self.limits,
+            self.store.near(
+                max(start_ns, NEVER + half_gap) - half_gap,
+                min(end_ns, EVER - half_gap) + half_gap,
+                DEPTH + 2,
+            ),
+        )
 
     def usual_step_s(self) -> float:
         """Return the median time between the last samples, NaN with fewer than two."""
@@ -105,8 +110,11 @@ class JointSamples:
         """Return the number of stamps."""
         return len(self.t)
 
-    def decided_by(self, stamps_ns: np.ndarray, since_ns: np.ndarray | None = None,
-                   ) -> tuple[np.ndarray, np.ndarray]:
+    def decided_by(
+        self,
+        stamps_ns: np.ndarray,
+        since_ns: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the first and last stamps on which the result for each exposure depends.
 
         Parameters
@@ -175,19 +183,27 @@ class JointSamples:
             # at a sample: the larger distance to one of its neighbours
             left = np.where(exact, np.maximum(before - 1, 0), before)
             right = np.where(exact, np.minimum(after + 1, len(t) - 1), after)
-            way = np.fmax(np.abs(self._difference(p[right] - p[after])),
-                          np.abs(self._difference(p[after] - p[left])))
+            way = np.fmax(
+                np.abs(self._difference(p[right] - p[after])),
+                np.abs(self._difference(p[after] - p[left])),
+            )
             noise = self._noise_near(stamps_ns)
             speed_noise = self._speed_noise_near(stamps_ns)
-            excess = np.where(np.isfinite(v[before]) & np.isfinite(v[after]),
-                            np.fmax(v[before], v[after]), 0.0)
+            excess = np.where(
+                np.isfinite(v[before]) & np.isfinite(v[after]), np.fmax(v[before], v[after]), 0.0
+            )
             excess = np.where(excess > BEYOND_NOISE * speed_noise, excess, 0.0)
             excess *= (t[right] - t[left]) / NS_PER_S
             fast &= np.fmax(way, excess) > BEYOND_NOISE * np.sqrt(2) * noise
         return fast
 
-    def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float,
-                 ) -> np.ndarray:
+    def approach(
+        self,
+        stamps_ns: np.ndarray,
+        positions: np.ndarray,
+        *,
+        threshold: float,
+    ) -> np.ndarray:
         """Return the sign of the last motion before each exposure, int8 array (Q,).
 
         A motion is a displacement beyond `threshold`, m, and beyond the noise at rest. It is
@@ -215,8 +231,9 @@ class JointSamples:
         moved = (away > threshold) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
         limit = np.full(len(stamps_ns), threshold)
         doubtful = np.unique(owner[moved])  # the noise is computed only where it matters
-        limit[doubtful] = np.fmax(threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(
-            stamps_ns[doubtful]))
+        limit[doubtful] = np.fmax(
+            threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(stamps_ns[doubtful])
+        )
         moved &= away > limit[owner]
         last = np.full(len(stamps_ns), -1)
         last[owner[moved]] = sample[moved]  # the last sample of each owner
@@ -238,10 +255,13 @@ class JointSamples:
         From each sample's distance to the line through its neighbours, whose variance is 1.5 times
         as large: motion at a steady speed adds nothing to it.
         """
+
         def off(t: np.ndarray, p: np.ndarray) -> np.ndarray:
             step, dt = self._difference(np.diff(p)), np.diff(t)
             return np.abs(step[..., :-1] * dt[..., 1:] - step[..., 1:] * dt[..., :-1]) / (
-                dt[..., :-1] + dt[..., 1:])
+                dt[..., :-1] + dt[..., 1:]
+            )
+
         return self._median_near(off, (self.t, self.p), stamps_ns) / np.sqrt(1.5)
 
     def _speed_noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
@@ -249,12 +269,15 @@ class JointSamples:
 
         From the second differences: a steady speed and a steady acceleration add nothing to it.
         """
+
         def off(v: np.ndarray) -> np.ndarray:
             return np.abs(np.diff(np.where(np.isfinite(v), v, 0.0), 2))
+
         return self._median_near(off, (self.speed,), stamps_ns) / np.sqrt(6)
 
-    def _median_near(self, off: Callable[..., np.ndarray], columns: tuple[np.ndarray, ...],
-                     stamps_ns: np.ndarray) -> np.ndarray:
+    def _median_near(
+        self, off: Callable[..., np.ndarray], columns: tuple[np.ndarray, ...], stamps_ns: np.ndarray
+    ) -> np.ndarray:
         """Return the robust standard deviation about 0 of values near each exposure.
 
         `off` converts columns (..., n) of samples to non-negative values (..., n - 2),
@@ -263,8 +286,9 @@ class JointSamples:
         if len(self) < 3:
             return np.zeros(len(stamps_ns))
         width = min(2 * NEAR, len(self) - 2)
-        start = np.clip(np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR, 0,
-                        len(self) - 2 - width)
+        start = np.clip(
+            np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR, 0, len(self) - 2 - width
+        )
         windows = np.lib.stride_tricks.sliding_window_view
         if len(start) * width < len(self):  # usual case: few exposures, far apart
             near = off(*(windows(column, width + 2)[start] for column in columns))
@@ -288,8 +312,12 @@ class JointSamples:
         outside |= t[after] - t[before] > self.limits.max_gap_ns
         return before, after, exact, outside
 
-    def _motion(self, before: np.ndarray, after: np.ndarray, exact: np.ndarray,
-                ) -> tuple[np.ndarray, np.ndarray]:
+    def _motion(
+        self,
+        before: np.ndarray,
+        after: np.ndarray,
+        exact: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return for which exposures the stage moves, and for which it jumps back and forth."""
         v = self.v
         move_left, fast_left, near_left = self._step_to(before)
@@ -303,8 +331,11 @@ class JointSamples:
         rate = np.fmax(v[before], v[after])
         moving = np.where(reported & exact, rate > self.limits.max_speed, moving)
         moving |= reported & (rate > self.limits.max_speed)
-        reversing = fast & ~exact & (
-            (fast_left & (move_left * middle < 0)) | (fast_right & (move_right * middle < 0)))
+        reversing = (
+            fast
+            & ~exact
+            & ((fast_left & (move_left * middle < 0)) | (fast_right & (move_right * middle < 0)))
+        )
         reversing |= exact & fast_left & fast_right & (move_left * move_right < 0) & ~reported
         return moving, reversing
 
@@ -319,11 +350,15 @@ class JointSamples:
         dt = self.t[to] - self.t[since]
         step = np.where(inside, self._difference(self.p[to] - self.p[since]), 0.0)
         speed = np.abs(step) / np.where(dt > 0, dt, 1) * NS_PER_S
-        return step, inside & (speed > self.limits.max_speed), (
-            inside & (dt <= self.limits.max_gap_ns))
+        return (
+            step,
+            inside & (speed > self.limits.max_speed),
+            (inside & (dt <= self.limits.max_gap_ns)),
+        )
 
-    def _contradicted(self, stamps_ns: np.ndarray, before: np.ndarray,
-                      after: np.ndarray) -> np.ndarray:
+    def _contradicted(
+        self, stamps_ns: np.ndarray, before: np.ndarray, after: np.ndarray
+    ) -> np.ndarray:
         """Return the exposures next to, or within half a gap of, a contradictory stamp."""
         t, bad = self.t, self.bad
         if not bad.any():

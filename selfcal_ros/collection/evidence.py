@@ -99,14 +99,18 @@ class DetectionsSeen:
     rules: IdentityRules
     sense: Sense
 
-    def of_last(self, index: int, readings: ViewReadings,
-                rejected: Mapping[str, int]) -> RejectionFinding | None:
+    def of_last(
+        self, index: int, readings: ViewReadings, rejected: Mapping[str, int]
+    ) -> RejectionFinding | None:
         """Return why the last detections of a view were rejected, none of which was used."""
         marks = self._named({index: readings}) if rejected.keys() & set(PLACED) else {}
         return diagnose(self._evidence(rejected, 0, marks, joints=False, lies="", view=index))
 
-    def findings(self, views: Mapping[int, ViewReadings], loose: Mapping[str, int],
-                 ) -> dict[int | None, RejectionFinding]:
+    def findings(
+        self,
+        views: Mapping[int, ViewReadings],
+        loose: Mapping[str, int],
+    ) -> dict[int | None, RejectionFinding]:
         """Return why most detections of the session (key None), or of single views, were rejected.
 
         Ids of a plate of another size are named for the session if they are most of those rejected.
@@ -130,64 +134,102 @@ class DetectionsSeen:
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
         seen = seen_poses(marks, limit, self.rules.max_rotation_rad)
         joints, told = not any(one.planned for one in seen.values()), texts(seen)
-        alike = (told.get(next(iter(views)), "") if len(views) == 1
-                 else mirrored_alike(seen.values()))
+        alike = (
+            told.get(next(iter(views)), "") if len(views) == 1 else mirrored_alike(seen.values())
+        )
         whole = self._evidence(rejected, used, marks, joints=joints, lies=alike)
         finding = diagnose(whole)
-        found: dict[int | None, RejectionFinding | None] = {index: diagnose(self._evidence(
-            readings.rejected, readings.used, {i: marks[i] for i in marks if i == index},
-            joints=joints and not told, lies=told.get(index, ""), view=index))
-            for index, readings in views.items()}
+        found: dict[int | None, RejectionFinding | None] = {
+            index: diagnose(
+                self._evidence(
+                    readings.rejected,
+                    readings.used,
+                    {i: marks[i] for i in marks if i == index},
+                    joints=joints and not told,
+                    lies=told.get(index, ""),
+                    view=index,
+                )
+            )
+            for index, readings in views.items()
+        }
         named = {index: one for index, one in found.items() if one is not None}
-        if finding is None or (not alike and told.keys() & named.keys() and not (
-                finding.reason in PLACED and joints and wrong_joints(whole))):
+        if finding is None or (
+            not alike
+            and told.keys() & named.keys()
+            and not (finding.reason in PLACED and joints and wrong_joints(whole))
+        ):
             return named
         return {None: finding}
 
-    def _other_size(self, views: Mapping[int, ViewReadings], rejected: Mapping[str, int],
-                    used: int) -> RejectionFinding | None:
+    def _other_size(
+        self, views: Mapping[int, ViewReadings], rejected: Mapping[str, int], used: int
+    ) -> RejectionFinding | None:
         """Return that the ids are those of a plate with more or fewer rows; None if not."""
         unknown = rejected.get(Reason.UNKNOWN_MARK, 0)
         bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
         plate, outside = self.artifact, unknown >= AT_LEAST and unknown > MOST * bad
         asked = _asked(plate, [view.view for view in views.values() if view.view.grid])
         parts = [part for view in views.values() for part in view.parts]
-        unread = [whole.difference(*(np.unique(getattr(part, axis)).tolist() for part in parts))
-                  for axis, whole in zip("mn", asked, strict=True)]
+        unread = [
+            whole.difference(*(np.unique(getattr(part, axis)).tolist() for part in parts))
+            for axis, whole in zip("mn", asked, strict=True)
+        ]
         if plate.marks is not None or not (outside or any(unread)):
             return None
         here = (self.table["kind"] == Kind.GRID) & self.table["has_id"] & (self.view_of >= 0)
         view_of = self.view_of[here]
-        found = [_rows(self.table[axis][here], view_of, limits)
-                 for axis, limits in zip("mn", plate.limits, strict=True)]
+        found = [
+            _rows(self.table[axis][here], view_of, limits)
+            for axis, limits in zip("mn", plate.limits, strict=True)
+        ]
         if len(np.unique(view_of)) < 2:  # rows that are missing may follow
             found = [rows | whole for rows, whole in zip(found, asked, strict=True)]
         if not all(found) or any(max(rows) - min(rows) + 1 != len(rows) for rows in found):
             return None
         sides, planned = (tuple(map(len, rows)) for rows in (found, asked))
-        on_plate = all(low <= min(rows) and max(rows) <= high
-                       for rows, (low, high) in zip(found, plate.limits, strict=True))
+        on_plate = all(
+            low <= min(rows) and max(rows) <= high
+            for rows, (low, high) in zip(found, plate.limits, strict=True)
+        )
         if sides == planned or outside is on_plate:
             return None
         (m, n), (nx, ny) = ((f"{min(rows)} to {max(rows)}" for rows in found), plate.shape)
         exchanged = " (the sides are exchanged)" if sides == (ny, nx) else ""
         return RejectionFinding(
-            Reason.UNKNOWN_MARK, unknown, used + bad,
+            Reason.UNKNOWN_MARK,
+            unknown,
+            used + bad,
             f"the ids are those of {sides[0]} x {sides[1]} marks (m {m}, n {n}), not of "
-            f"{nx} x {ny}{exchanged}; correct grid_size in the plan, or the ids")
+            f"{nx} x {ny}{exchanged}; correct grid_size in the plan, or the ids",
+        )
 
-    def _evidence(self, rejected: Mapping[str, int], used: int, marks: Mapping[int, NamedMarks], *,
-                  joints: bool, lies: str, view: int | None = None) -> Evidence:
+    def _evidence(
+        self,
+        rejected: Mapping[str, int],
+        used: int,
+        marks: Mapping[int, NamedMarks],
+        *,
+        joints: bool,
+        lies: str,
+        view: int | None = None,
+    ) -> Evidence:
         """Return the facts on a view, or on all."""
         here = np.ones(len(self.table), dtype=bool) if view is None else self.view_of == view
         table, encoder = self.table[here], self.encoder()
         kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
-        missing = tuple(encoder.names[axis] for axis, kind in kinds.items()
-                        if not encoder.sampled[axis] and (table["kind"] == kind).any())
-        came = (*(name for axis, name in encoder.names.items() if encoder.sampled[axis]),
-                *encoder.foreign)
+        missing = tuple(
+            encoder.names[axis]
+            for axis, kind in kinds.items()
+            if not encoder.sampled[axis] and (table["kind"] == kind).any()
+        )
+        came = (
+            *(name for axis, name in encoder.names.items() if encoder.sampled[axis]),
+            *encoder.foreign,
+        )
         return Evidence(
-            rejected, used, missing,
+            rejected,
+            used,
+            missing,
             seen_joints=came,
             detections_ns=_span(table["stamp"]),
             encoder_ns=encoder.span_ns,
@@ -199,7 +241,8 @@ class DetectionsSeen:
             limit_m=self.rules.stage_limit_m(self.artifact),
             sense=self.sense,
             lies=lies,
-            joints=joints)
+            joints=joints,
+        )
 
     def _named(self, views: Mapping[int, ViewReadings]) -> dict[int, NamedMarks]:
         """Return view_index -> the last of its marks with ids, as `sense` has them."""
@@ -217,9 +260,14 @@ class DetectionsSeen:
             offset = np.stack([table["ox"][good], table["oy"][good]])
             cells = places_of_cells(readings.view, offset)
             found[index] = NamedMarks(
-                readings.view.name, readings.view.on_stage(self.artifact), x + 1j * y,
-                self.sense.sign * where[good] / pitch, _complex(cells) / pitch,
-                _complex(offset - cells) / pitch, listed=self.artifact.marks is not None)
+                readings.view.name,
+                readings.view.on_stage(self.artifact),
+                x + 1j * y,
+                self.sense.sign * where[good] / pitch,
+                _complex(cells) / pitch,
+                _complex(offset - cells) / pitch,
+                listed=self.artifact.marks is not None,
+            )
         return found
 
 
@@ -233,8 +281,11 @@ def _rows(ids: np.ndarray, view_of: np.ndarray, limits: tuple[int, int]) -> set[
     for view in numbers:
         values, counts = np.unique(ids[view_of == view], return_counts=True)
         views.update(values[counts > A_ROW * counts.max()].tolist())
-    return {row for row, count in views.items()
-            if limits[0] <= row <= limits[1] or count > len(numbers) / 2}
+    return {
+        row
+        for row, count in views.items()
+        if limits[0] <= row <= limits[1] or count > len(numbers) / 2
+    }
 
 
 def _asked(artifact: Artifact, views: Iterable[View]) -> tuple[set[int], set[int]]:

@@ -45,16 +45,21 @@ def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
     return int(mark_rows(artifact, view)[1].sum()), lines
 
 
-def n_read_enough(artifact: Artifact, view: View, readings: ViewReadings,
-                  min_repeats: int = 0) -> tuple[int, int]:
+def n_read_enough(
+    artifact: Artifact, view: View, readings: ViewReadings, min_repeats: int = 0
+) -> tuple[int, int]:
     """Return the numbers of grid marks and lines read often enough, see `read_enough`."""
     if not readings.cells:
         done, done_theta = read_enough(view, readings, min_repeats)
         return int(done.sum()), int(done_theta.sum())
     shown = marks_shown(artifact, view)
-    return (sum(int((marks & _read(artifact, part, min_repeats)).sum())
-                for marks, part in zip(shown, readings.cells, strict=True)),
-            int(read_enough(view, readings, min_repeats)[1].sum()))
+    return (
+        sum(
+            int((marks & _read(artifact, part, min_repeats)).sum())
+            for marks, part in zip(shown, readings.cells, strict=True)
+        ),
+        int(read_enough(view, readings, min_repeats)[1].sum()),
+    )
 
 
 def _read(artifact: Artifact, part: ViewReadings, min_repeats: int) -> np.ndarray:
@@ -65,8 +70,9 @@ def _read(artifact: Artifact, part: ViewReadings, min_repeats: int) -> np.ndarra
     return out
 
 
-def _missing_stops(artifact: Artifact, view: View, readings: ViewReadings,
-                   min_repeats: int) -> tuple[np.ndarray, np.ndarray]:
+def _missing_stops(
+    artifact: Artifact, view: View, readings: ViewReadings, min_repeats: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the marks (m, n) at which an image has to be taken again: not all of it was read."""
     stops = np.zeros(artifact.shape, dtype=bool)
     for marks, part in zip(marks_shown(artifact, view), readings.cells, strict=True):
@@ -75,8 +81,9 @@ def _missing_stops(artifact: Artifact, view: View, readings: ViewReadings,
     return artifact.marks_at(i[:NAMED_AT_MOST], j[:NAMED_AT_MOST])
 
 
-def read_enough(view: View, readings: ViewReadings,
-                min_repeats: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def read_enough(
+    view: View, readings: ViewReadings, min_repeats: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return which marks, and which lines, of the readings were read often enough, bool arrays.
 
     As often as the plan asks; with `min_repeats`, this many good readings suffice once the mark was
@@ -93,13 +100,18 @@ def read_enough(view: View, readings: ViewReadings,
 
 def _tried(view: View, readings: ViewReadings) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return readings and repeats, outliers included, of marks (without check stops) and lines."""
-    return [(count, count + outliers if len(outliers) else count) for count, outliers in (
-        (count_stops(view, readings)[0], readings.outliers),
-        (readings.count_theta, readings.outliers_theta))]
+    return [
+        (count, count + outliers if len(outliers) else count)
+        for count, outliers in (
+            (count_stops(view, readings)[0], readings.outliers),
+            (readings.count_theta, readings.outliers_theta),
+        )
+    ]
 
 
-def missing_marks(artifact: Artifact, view: View, readings: ViewReadings,
-                  min_repeats: int = 0) -> Missing:
+def missing_marks(
+    artifact: Artifact, view: View, readings: ViewReadings, min_repeats: int = 0
+) -> Missing:
     """Return the first marks, in the order of (m, n) and of k, not read often enough.
 
     Where images show several marks: those at which an image has to be taken again.
@@ -116,8 +128,11 @@ def missing_marks(artifact: Artifact, view: View, readings: ViewReadings,
     row = artifact.index(readings.m[done], readings.n[done])[0]
     number = first_missing(np.sort(of_zero[row] + readings.n[done]), grid)
     row = np.searchsorted(end, number, "right")
-    return Missing(tuple(artifact.marks_at(row, row)[0].tolist()),
-                   tuple((number - of_zero[row]).tolist()), tuple(lines.tolist()))
+    return Missing(
+        tuple(artifact.marks_at(row, row)[0].tolist()),
+        tuple((number - of_zero[row]).tolist()),
+        tuple(lines.tolist()),
+    )
 
 
 def first_missing(done: np.ndarray, total: int) -> np.ndarray:
@@ -164,15 +179,21 @@ class ViewProgress:
             if self.min_repeats:
                 more = np.minimum(more, np.maximum(repeats - tries, self.min_repeats - count))
             have += int((repeats - np.maximum(more, 0)).sum())
-        return (repeats * (self.grid_expected + self.angular_expected) - have
-                + self.check_expected - self.check_done)
+        return (
+            repeats * (self.grid_expected + self.angular_expected)
+            - have
+            + self.check_expected
+            - self.check_done
+        )
 
     @property
     def complete(self) -> bool:
         """Whether every expected mark has been read often enough, and checked."""
-        return (self.grid_done >= self.grid_expected
-                and self.angular_done >= self.angular_expected
-                and self.check_done >= self.check_expected)
+        return (
+            self.grid_done >= self.grid_expected
+            and self.angular_done >= self.angular_expected
+            and self.check_done >= self.check_expected
+        )
 
     @property
     def coverage(self) -> float:
@@ -180,6 +201,7 @@ class ViewProgress:
 
         Marks that are complete would be none until the last pass over the plate.
         """
-        wanted = (self.view.repeats * (self.grid_expected + self.angular_expected)
-                  + self.check_expected)
+        wanted = (
+            self.view.repeats * (self.grid_expected + self.angular_expected) + self.check_expected
+        )
         return 1 - self.needed / wanted if wanted else 1.0

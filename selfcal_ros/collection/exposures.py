@@ -81,8 +81,9 @@ class Exposures:
     def __init__(self, tracks: Tracks, *, approach_threshold_m: float) -> None:
         self._tracks, self._threshold_m = tracks, approach_threshold_m
         self._stamps = GrowingTable(np.dtype(np.int64))
-        self._joints = [GrowingColumns(COLUMNS | (APPROACH if linear else {}))
-                        for linear in (True, True, False)]
+        self._joints = [
+            GrowingColumns(COLUMNS | (APPROACH if linear else {})) for linear in (True, True, False)
+        ]
 
     def __len__(self) -> int:
         """Return the number of instants."""
@@ -91,10 +92,13 @@ class Exposures:
     def at(self, stamps_ns: np.ndarray) -> StageAt:
         """Return the stage at some of the instants, in the given order."""
         index = self._index(stamps_ns)
-        x, y, theta = (JointAt(joint["position"][index], joint["reason"][index],
-                               joint["moving"][index]) for joint in self._joints)
-        return StageAt(x, y, theta, np.stack([joint["approach"][index]
-                                              for joint in self._joints[:2]]))
+        x, y, theta = (
+            JointAt(joint["position"][index], joint["reason"][index], joint["moving"][index])
+            for joint in self._joints
+        )
+        return StageAt(
+            x, y, theta, np.stack([joint["approach"][index] for joint in self._joints[:2]])
+        )
 
     def _index(self, stamps_ns: np.ndarray) -> np.ndarray | slice:
         """Return the indices of some instants; consecutive ones as a slice, to avoid copies."""
@@ -139,8 +143,9 @@ class Exposures:
             first, last = joint["first"], joint["last"]
             if len(new) and len(due):
                 near = np.flatnonzero((last >= new[0]) & (first <= new[-1]))
-                due[near] |= (np.searchsorted(new, first[near], "left")
-                              < np.searchsorted(new, last[near], "right"))
+                due[near] |= np.searchsorted(new, first[near], "left") < np.searchsorted(
+                    new, last[near], "right"
+                )
         return due
 
     def _insert(self, stamps_ns: np.ndarray, due: np.ndarray) -> np.ndarray:
@@ -162,8 +167,11 @@ class Exposures:
 
     def _at_instants(self, index: np.ndarray) -> list[np.ndarray]:
         """Return positions, reasons and motions of all joints at some of the instants."""
-        return [joint[name][index] for joint in self._joints
-                for name in ("position", "reason", "moving")]
+        return [
+            joint[name][index]
+            for joint in self._joints
+            for name in ("position", "reason", "moving")
+        ]
 
     def _groups(self, due: np.ndarray) -> list[np.ndarray]:
         """Return the due instants in groups with a limited number of samples, (n,) each.
@@ -209,17 +217,20 @@ class Exposures:
             if linear:
                 joint["motion"][here] = self._motions(series, index, position)
             joint["first"][here], joint["last"][here] = series.decided_by(
-                stamps, since if linear else None)
+                stamps, since if linear else None
+            )
 
-    def _motions(self, series: encoder.JointSamples, index: np.ndarray,
-                 position: np.ndarray) -> np.ndarray:
+    def _motions(
+        self, series: encoder.JointSamples, index: np.ndarray, position: np.ndarray
+    ) -> np.ndarray:
         stamps, first = self._stamps.rows, index[0]
         if first == 0:
             return series.approach(stamps[index], position, threshold=self._threshold_m)
         # after the previous exposure, whose own samples may be incomplete here
-        both = np.concatenate([stamps[first - 1:first], stamps[index]])
-        return series.approach(both, np.concatenate([[np.nan], position]),
-                               threshold=self._threshold_m)[1:]
+        both = np.concatenate([stamps[first - 1 : first], stamps[index]])
+        return series.approach(
+            both, np.concatenate([[np.nan], position]), threshold=self._threshold_m
+        )[1:]
 
     def _fill(self, due: np.ndarray, changed: np.ndarray) -> np.ndarray:
         """Compute the directions of approach; return the stamps of changes."""
@@ -229,7 +240,7 @@ class Exposures:
         changed, known = changed[start:], np.zeros(0, dtype=bool)
         for joint in self._joints[:N_LINEAR]:
             old = joint["approach"][start:]
-            before = joint["approach"][start - 1:start] if start else np.zeros(1, dtype=np.int8)
+            before = joint["approach"][start - 1 : start] if start else np.zeros(1, dtype=np.int8)
             found = encoder.filled(np.concatenate([before, joint["motion"][start:]]))[1:]
             known = old != NEW
             changed |= found != old
@@ -239,5 +250,6 @@ class Exposures:
 
 def _differ(before: list[np.ndarray], after: list[np.ndarray]) -> np.ndarray:
     """Return the instants with a changed result; NaN equals NaN."""
-    return np.array([(a != b) & ((a == a) | (b == b))
-                     for a, b in zip(before, after, strict=True)]).any(axis=0)
+    return np.array(
+        [(a != b) & ((a == a) | (b == b)) for a, b in zip(before, after, strict=True)]
+    ).any(axis=0)

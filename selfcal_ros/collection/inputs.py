@@ -41,9 +41,21 @@ MAX_TEXT = 8192
 """Largest length of the texts that name a plan and a run: nodes keep them."""
 MAX_EXPOSURES = 5_000_000
 """Largest number of exposures of a view in the simulated cell: 240 MB."""
-DETECTION = np.dtype([
-    ("stamp", "i8"), ("kind", "u1"), ("has_id", "?"), ("m", "i8"), ("n", "i8"), ("k", "i8"),
-    ("ox", "f8"), ("oy", "f8"), ("ot", "f8"), ("sigma", "f8"), ("score", "f8")])
+DETECTION = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("kind", "u1"),
+        ("has_id", "?"),
+        ("m", "i8"),
+        ("n", "i8"),
+        ("k", "i8"),
+        ("ox", "f8"),
+        ("oy", "f8"),
+        ("ot", "f8"),
+        ("sigma", "f8"),
+        ("score", "f8"),
+    ]
+)
 """Many detections as a table: fields as in `Detection`, offsets as ox, oy, ot."""
 
 
@@ -153,12 +165,18 @@ def check_command(command: Command) -> None:
     if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
         raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
     if len(command.plan_id) + len(command.run_id) > MAX_TEXT:
-        raise InputError(where, f"plan_id and run_id are longer than {MAX_TEXT} characters",
-                         "shorten plan_id; let run_id be a stamp")
+        raise InputError(
+            where,
+            f"plan_id and run_id are longer than {MAX_TEXT} characters",
+            "shorten plan_id; let run_id be a stamp",
+        )
     begun = begun_ns(command.run_id)
     if begun is not None and begun > command.stamp_ns:
-        raise InputError(where, f"its run {command.run_id} begins after its own stamp",
-                         "let run_id be the stamp of the run's first command, ns")
+        raise InputError(
+            where,
+            f"its run {command.run_id} begins after its own stamp",
+            "let run_id be the stamp of the run's first command, ns",
+        )
     if command.view is None or command.artifact is None:
         if command.phase in (Phase.PLACE, Phase.MEASURE):
             raise InputError(where, "it describes no view", "fill in its pose and its plate")
@@ -179,21 +197,31 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
     readings.view.on_stage(artifact)
     limits = [("k", readings.k, 0, artifact.angular_count - 1)]
     if artifact.marks is None:
-        limits[:0] = [(name, index, *ends) for name, index, ends in zip(
-            "mn", (readings.m, readings.n), artifact.limits, strict=True)]
+        limits[:0] = [
+            (name, index, *ends)
+            for name, index, ends in zip(
+                "mn", (readings.m, readings.n), artifact.limits, strict=True
+            )
+        ]
     elif not artifact.has(readings.m, readings.n).all():
         raise InputError(where, "an id that is not in the list of marks", "correct the publisher")
     for name, index, least, most in limits:
         if len(index) and not least <= np.min(index) <= np.max(index) <= most:
-            raise InputError(where, f"{name} goes beyond {least} to {most}",
-                             "correct the publisher")
-    _check_values(where, readings, ("dx", "dy", "dtheta"), ("u", "u_theta", "sigma_xy",
-                                                            "sigma_theta"))
+            raise InputError(
+                where, f"{name} goes beyond {least} to {most}", "correct the publisher"
+            )
+    _check_values(
+        where, readings, ("dx", "dy", "dtheta"), ("u", "u_theta", "sigma_xy", "sigma_theta")
+    )
     if not abs(readings.axis_theta) <= np.pi:
         raise InputError(where, "axis_theta is not an angle", "give rad")
     if readings.visits is not None:
-        _check_values(f"{where}, visits", readings.visits, ("dx", "dy", "offset_x", "offset_y"),
-                      ("u", "sigma_m"))
+        _check_values(
+            f"{where}, visits",
+            readings.visits,
+            ("dx", "dy", "offset_x", "offset_y"),
+            ("u", "sigma_m"),
+        )
         if np.min(readings.visits.count) < 1:
             raise InputError(f"{where}, visits", "a count below 1", "correct the publisher")
 
@@ -208,8 +236,9 @@ def good_sigmas(sigma: np.ndarray) -> np.ndarray:
     return (sigma == 0) | (known & (sigma >= least))
 
 
-def _check_values(where: str, table: ViewReadings | GridVisits, told: Iterable[str],
-                  perhaps: Iterable[str]) -> None:
+def _check_values(
+    where: str, table: ViewReadings | GridVisits, told: Iterable[str], perhaps: Iterable[str]
+) -> None:
     """Raise InputError for values that are too large, or NaN where required."""
     for name in (*told, *perhaps):
         size = np.abs(getattr(table, name))
@@ -223,8 +252,11 @@ def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:
     """Raise InputError for a plate that is too large for the marks read."""
     marks, sites = sum(len(view.m) for view in views), math.prod(artifact.shape)
     if sites > SITES_A_MARK * (1 + marks):
-        raise InputError(MEASUREMENT_TOPIC, f"{marks} readings of a plate with {sites} marks",
-                         "correct grid_size, or measure more of it")
+        raise InputError(
+            MEASUREMENT_TOPIC,
+            f"{marks} readings of a plate with {sites} marks",
+            "correct grid_size, or measure more of it",
+        )
 
 
 def check_simulated(command: Command) -> None:
@@ -235,8 +267,11 @@ def check_simulated(command: Command) -> None:
         return  # DONE or ABORT: nothing to simulate
     exposures = max(math.prod(artifact.shape), artifact.angular_count) * view.repeats
     if exposures > MAX_EXPOSURES:
-        raise InputError(f"view command {command.view_index}", f"{exposures} exposures exceed "
-                         f"the {MAX_EXPOSURES} of a simulated cell", "ask for fewer marks, repeats")
+        raise InputError(
+            f"view command {command.view_index}",
+            f"{exposures} exposures exceed the {MAX_EXPOSURES} of a simulated cell",
+            "ask for fewer marks, repeats",
+        )
 
 
 class Reason(StrEnum):
@@ -274,51 +309,51 @@ class Reason(StrEnum):
 
 ADVICE = {
     Reason.ROTATION: "the view's rotation is not known well enough to tell these marks or lines "
-                     "from their neighbours; give the detections ids, or measure grid marks "
-                     "in the same view, or state a max_rotation of less than half a line",
+    "from their neighbours; give the detections ids, or measure grid marks "
+    "in the same view, or state a max_rotation of less than half a line",
     Reason.BAD_SIGMA: "their sigma is not a standard uncertainty in m or rad (1e-12 to 1000, 0 = "
-                      "not known), or 10,000 times smaller than that of the others; correct the "
-                      "publisher of the detections",
+    "not known), or 10,000 times smaller than that of the others; correct the "
+    "publisher of the detections",
     Reason.FUTURE: "they were stamped more than a minute ahead of the collector's clock; set the "
-                   "clock that stamps them",
+    "clock that stamps them",
 }
 """Remedies for reasons reported even for a single detection."""
 
 REMEDY = {
     Reason.NO_ENCODER: "the encoder has a gap around the exposures; make it publish without gaps, "
-                       "or raise max_encoder_gap",
+    "or raise max_encoder_gap",
     Reason.MOVING: "the stage moved at the exposure; expose at rest, stamp the exposure itself, or "
-                   "raise max_speed and max_angular_speed",
+    "raise max_speed and max_angular_speed",
     Reason.OUTSIDE_VIEWS: "they were exposed when no view was being measured; expose between "
-                          "MEASURE and the next command, stamped by one clock",
+    "MEASURE and the next command, stamped by one clock",
     Reason.CONTRADICTION: "encoder samples contradict each other; publish the joints from one "
-                          "source, with a clock that does not step",
+    "source, with a clock that does not step",
     Reason.NOT_FINITE: "NaN, infinite or negative where a length or an angle is expected; correct "
-                       "the publisher of the detections",
+    "the publisher of the detections",
     Reason.BAD_SIGMA: ADVICE[Reason.BAD_SIGMA],
     Reason.FUTURE: ADVICE[Reason.FUTURE],
     Reason.UNKNOWN_KIND: "kind is neither GRID nor ANGULAR; correct the publisher of the "
-                         "detections",
+    "detections",
     Reason.UNKNOWN_MARK: "their ids are not on the plate; check grid_size, angular_count and the "
-                         "numbering of the marks (m, n from -h to h, k from 0)",
+    "numbering of the marks (m, n from -h to h, k from 0)",
     Reason.NOT_IN_VIEW: "the view does not ask for these marks; check its pose and its kinds of "
-                        "marks in the plan",
+    "marks in the plan",
     Reason.AMBIGUOUS: "two marks are about equally near; give the detections ids",
     Reason.ROTATION: ADVICE[Reason.ROTATION],
     Reason.TOO_FAR: "the marks are not where the view places them; check how the plate lies, the "
-                    "unit of the offsets (m, stage axes) and the ids, or raise max_deviation",
+    "unit of the offsets (m, stage axes) and the ids, or raise max_deviation",
     Reason.NOT_AT_MARK: "the stage does not stand at the detected marks; check joint_x, "
-                        "joint_y and measurement_sense, or set max_stage_distance",
+    "joint_y and measurement_sense, or set max_stage_distance",
     Reason.OUTSIDE_IMAGE: "they lie beyond the marks that an image shows; raise nx and ny under "
-                          "image in the plan, or if the plate lies half a pitch or more off its "
-                          "place: state that in the plan (translation_mm of the views), or give "
-                          "the detections ids",
+    "image in the plan, or if the plate lies half a pitch or more off its "
+    "place: state that in the plan (translation_mm of the views), or give "
+    "the detections ids",
     Reason.SEVERAL: "an exposure shows several marks, but the plan expects one; state in the plan "
-                    "how many an image shows (image: {nx: 3, ny: 3}), or publish only the mark "
-                    "nearest to the optical axis",
+    "how many an image shows (image: {nx: 3, ny: 3}), or publish only the mark "
+    "nearest to the optical axis",
     Reason.LOW_SCORE: "their score is below min_score; correct the detection, or lower min_score",
     Reason.OUTLIER: "repeats of a mark contradict each other; check the stage for backlash, that "
-                    "each id belongs to one mark, or raise outlier_limit",
+    "each id belongs to one mark, or raise outlier_limit",
 }
 """Remedies if most detections are rejected for a reason; reasons not listed are not faults."""
 
@@ -331,17 +366,26 @@ HARMLESS = (Reason.OUTSIDE_VIEWS, Reason.MOVING, Reason.NOT_IN_VIEW)
 
 def rejections(rejected: Mapping[str, int], used: int) -> list[str]:
     """Return what to say of the rejections of a session whose cause is not known."""
-    bad = {reason: count for reason, count in rejected.items()
-           if reason in REMEDY and reason not in HARMLESS}
+    bad = {
+        reason: count
+        for reason, count in rejected.items()
+        if reason in REMEDY and reason not in HARMLESS
+    }
     total = used + sum(bad.values())
     reason = max(bad, key=lambda name: bad[name], default="")
     if reason in ADVICE or sum(bad.values()) <= MANY * total:
         return advice(rejected)
-    return [f"{sum(bad.values())} of {total} detections were rejected, {bad[reason]} of them as "
-            f"{reason}: {REMEDY[Reason(reason)]}", *advice(rejected)]
+    return [
+        f"{sum(bad.values())} of {total} detections were rejected, {bad[reason]} of them as "
+        f"{reason}: {REMEDY[Reason(reason)]}",
+        *advice(rejected),
+    ]
 
 
 def advice(rejected: Mapping[str, int]) -> list[str]:
     """Return one line for each reason in `rejected` with advice, with its count."""
-    return [f"{count} detection{'s' * (count != 1)} rejected as {reason}: {text}"
-            for reason, text in ADVICE.items() if (count := rejected.get(reason))]
+    return [
+        f"{count} detection{'s' * (count != 1)} rejected as {reason}: {text}"
+        for reason, text in ADVICE.items()
+        if (count := rejected.get(reason))
+    ]

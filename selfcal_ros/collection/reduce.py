@@ -72,8 +72,12 @@ def canonical(detections: np.ndarray) -> np.ndarray:
     return d
 
 
-def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
-          ) -> tuple[np.ndarray, np.ndarray, Counter]:
+def clean(
+    detections: np.ndarray,
+    rules: Rules,
+    *,
+    scored: bool,
+) -> tuple[np.ndarray, np.ndarray, Counter]:
     """Return usable detections, those of a low score, and how many were rejected for what reason.
 
     Both in canonical order, each once.
@@ -115,15 +119,16 @@ def clean(detections: np.ndarray, rules: Rules, *, scored: bool,
     return unique, low, +rejected
 
 
-def with_low_scores(readings: ViewReadings, low: np.ndarray,
-                    exposures: Exposures) -> ViewReadings:
+def with_low_scores(readings: ViewReadings, low: np.ndarray, exposures: Exposures) -> ViewReadings:
     """Return `readings` with the positions of grid detections rejected for a low score."""
     low = low[low["kind"] == Kind.GRID]
     if not len(low):
         return readings
     stage, places = exposures.at(low["stamp"]), PlaceList(readings.places)
-    places.add(np.full(len(low), Reason.LOW_SCORE, dtype=object),
-               np.stack([stage.x.position, stage.y.position]))
+    places.add(
+        np.full(len(low), Reason.LOW_SCORE, dtype=object),
+        np.stack([stage.x.position, stage.y.position]),
+    )
     return replace(readings, places=places.places())
 
 
@@ -141,8 +146,9 @@ def _canonical(d: np.ndarray) -> np.ndarray:
     return d[np.argsort(d["stamp"], kind="stable")]
 
 
-def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
-                exposures: Exposures, rules: Rules) -> ViewReadings:
+def reduce_view(
+    artifact: Artifact, view: View, detections: np.ndarray, *, exposures: Exposures, rules: Rules
+) -> ViewReadings:
     """Return the readings of one view from its cleaned detections (see `clean`).
 
     `exposures` contain the stage at the instants of at least these detections.
@@ -151,33 +157,51 @@ def reduce_view(artifact: Artifact, view: View, detections: np.ndarray, *,
     places = PlaceList()
     grid = _where(detections["kind"] == Kind.GRID, detections)
     angular = _where(detections["kind"] == Kind.ANGULAR, detections)
-    marks = _grid_marks(artifact, view, grid, exposures=exposures, rules=rules, rejected=rejected,
-                        places=places)
+    marks = _grid_marks(
+        artifact, view, grid, exposures=exposures, rules=rules, rejected=rejected, places=places
+    )
     lines = _reduce_angular(artifact, view, angular, exposures, rules, rejected, marks.phi_rad)
     parts = []
     for number, sub in enumerate(view.sub_views):
         here = _reduce_grid(artifact, sub, marks.of_cell(number), rules, rejected, places)
         with_lines = lines if sub.cell in (None, (0, 0)) else {}
-        parts.append(replace(ViewReadings(sub), **here, **with_lines, used=int(
-            here["count"].sum() + (lines["count_theta"].sum() if with_lines else 0))))
+        parts.append(
+            replace(
+                ViewReadings(sub),
+                **here,
+                **with_lines,
+                used=int(here["count"].sum() + (lines["count_theta"].sum() if with_lines else 0)),
+            )
+        )
     whole = parts[0] if parts[0].view is view else _of_image(view, parts, lines)
-    return replace(with_rejections(whole, dict(sorted((str(r), c) for r, c in rejected.items()))),
-                   places=places.places())
+    return replace(
+        with_rejections(whole, dict(sorted((str(r), c) for r, c in rejected.items()))),
+        places=places.places(),
+    )
 
 
 def _of_image(view: View, parts: Sequence[ViewReadings], lines: dict) -> ViewReadings:
     """Return the readings of a view with images from those of its cells, and of its lines."""
     dof = sum(part.dof_xy for part in parts)
     squares = sum(part.dof_xy * part.sigma_xy**2 for part in parts if part.dof_xy)
-    return replace(ViewReadings(view), **lines, cells=tuple(parts), dof_xy=dof,
-                   sigma_xy=float(np.sqrt(squares / dof)) if dof else float("nan"),
-                   used=sum(part.used for part in parts))
+    return replace(
+        ViewReadings(view),
+        **lines,
+        cells=tuple(parts),
+        dof_xy=dof,
+        sigma_xy=float(np.sqrt(squares / dof)) if dof else float("nan"),
+        used=sum(part.used for part in parts),
+    )
 
 
 def with_rejections(readings: ViewReadings, rejected: dict[str, int]) -> ViewReadings:
     """Return the readings of a view with its rejections; of an image, in the cell of the axis."""
-    cells = tuple(replace(part, rejected=rejected, places=readings.places)
-                  if part.view.cell == (0, 0) else part for part in readings.cells)
+    cells = tuple(
+        replace(part, rejected=rejected, places=readings.places)
+        if part.view.cell == (0, 0)
+        else part
+        for part in readings.cells
+    )
     return replace(readings, rejected=rejected, cells=cells)
 
 
@@ -204,14 +228,31 @@ class _GridMarks:
         if here.all():
             return self
         index, deviation, residual, position, approach = (
-            np.compress(here, values, axis=-1) for values in (
-                self.index, self.deviation, self.residual, self.position, self.approach))
-        return _GridMarks(self.detections[here], index, deviation, residual, position, approach,
-                          self.phi_rad, self.cell[here])
+            np.compress(here, values, axis=-1)
+            for values in (self.index, self.deviation, self.residual, self.position, self.approach)
+        )
+        return _GridMarks(
+            self.detections[here],
+            index,
+            deviation,
+            residual,
+            position,
+            approach,
+            self.phi_rad,
+            self.cell[here],
+        )
 
 
-def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exposures,
-                rules: Rules, rejected: Counter, places: PlaceList) -> _GridMarks:
+def _grid_marks(
+    artifact: Artifact,
+    view: View,
+    d: np.ndarray,
+    *,
+    exposures: Exposures,
+    rules: Rules,
+    rejected: Counter,
+    places: PlaceList,
+) -> _GridMarks:
     """Identify the marks of grid detections; count the others, with the stage positions."""
     stage = exposures.at(d["stamp"])
     position = np.stack([stage.x.position, stage.y.position])
@@ -219,15 +260,33 @@ def _grid_marks(artifact: Artifact, view: View, d: np.ndarray, *, exposures: Exp
     d, (position, approach) = _keep(d, why, rejected, position, stage.approach, places=places)
     found, number = _identified(artifact, view, d, position, rules)
     d, (position, index, deviation, residual, approach, number) = _keep(
-        d, found.reasons, rejected, position, found.index, found.deviation, found.residual,
-        approach, number, places=places)
+        d,
+        found.reasons,
+        rejected,
+        position,
+        found.index,
+        found.deviation,
+        found.residual,
+        approach,
+        number,
+        places=places,
+    )
     told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
-    return _GridMarks(d, index, deviation, residual, position, approach,
-                      found.rigid.phi_rad if told else None, number)
+    return _GridMarks(
+        d,
+        index,
+        deviation,
+        residual,
+        position,
+        approach,
+        found.rigid.phi_rad if told else None,
+        number,
+    )
 
 
-def _identified(artifact: Artifact, view: View, d: np.ndarray, position: np.ndarray,
-                rules: Rules) -> tuple[identify.MarkAssignment, np.ndarray]:
+def _identified(
+    artifact: Artifact, view: View, d: np.ndarray, position: np.ndarray, rules: Rules
+) -> tuple[identify.MarkAssignment, np.ndarray]:
     """Return the marks of detections with the stage at `position` (2, n), and their cells (n,).
 
     Marks of a displaced plate are displaced in the image, and lie beside it without ids.
@@ -240,16 +299,25 @@ def _identified(artifact: Artifact, view: View, d: np.ndarray, position: np.ndar
     marks = artifact.places(d["m"][named], d["n"][named])
     away = offset[:, named] + _reading(rules.sense, position[:, named], 0.0)
     away -= np.stack(view.on_stage(artifact).site_of(*marks)) * artifact.grid_pitch_m
-    plate = 0j if named.any() else displacement(
-        artifact, view, found.rigid, _reading(rules.sense, position, offset))
-    tried = _identified_at(artifact, view, d, position, rules, plate=plate,
-                           shift=stops.shift_of(view, offset, away))
+    plate = (
+        0j
+        if named.any()
+        else displacement(artifact, view, found.rigid, _reading(rules.sense, position, offset))
+    )
+    tried = _identified_at(
+        artifact, view, d, position, rules, plate=plate, shift=stops.shift_of(view, offset, away)
+    )
     scaled = _identified_at(artifact, view, d, position, rules, of_cell=True)
     return tried if plate else max((found, number), scaled, tried, key=lambda one: _found(one[0]))
 
 
-DISPLACED = (Reason.OUTSIDE_IMAGE, Reason.NOT_AT_MARK, Reason.SEVERAL, Reason.TOO_FAR,
-             Reason.NOT_IN_VIEW)
+DISPLACED = (
+    Reason.OUTSIDE_IMAGE,
+    Reason.NOT_AT_MARK,
+    Reason.SEVERAL,
+    Reason.TOO_FAR,
+    Reason.NOT_IN_VIEW,
+)
 """Reasons of rejection of marks in images of a displaced plate."""
 
 
@@ -262,25 +330,41 @@ def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.nda
     pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
     centred = reading_m - np.array(pose.shift)[:, None] * pitch
     on_plate = artifact.nearest(*pose.turned_back(*(rigid.undo(centred) / pitch)))
-    beside = (stops.middle_of(row, side) for row, side in zip(
-        on_plate, artifact.shape, strict=True))
+    beside = (
+        stops.middle_of(row, side) for row, side in zip(on_plate, artifact.shape, strict=True)
+    )
     x, y = pose.turned(*(np.array([float(number)]) for number in beside))
     return complex(x[0], y[0])
 
 
-def _identified_at(artifact: Artifact, view: View, d: np.ndarray, position: np.ndarray,
-                   rules: Rules, *, shift: complex = 0j, plate: complex = 0j, of_cell: bool = False,
-                   ) -> tuple[identify.MarkAssignment, np.ndarray]:
+def _identified_at(
+    artifact: Artifact,
+    view: View,
+    d: np.ndarray,
+    position: np.ndarray,
+    rules: Rules,
+    *,
+    shift: complex = 0j,
+    plate: complex = 0j,
+    of_cell: bool = False,
+) -> tuple[identify.MarkAssignment, np.ndarray]:
     """Return marks and cells with a displacement of the image, cells, and of the plate, pitches."""
     offset = np.stack([d["ox"], d["oy"]])
     number = stops.numbers_of(view, stops.cells_of(view, offset, shift))
     beside = stops.places_of_cells(view, offset, shift)
     away = np.array([[plate.real], [plate.imag]]) * artifact.grid_pitch_m + (
-        stops.middles(view, number, offset - beside) if of_cell else 0.0)
+        stops.middles(view, number, offset - beside) if of_cell else 0.0
+    )
     found = identify.identify_grid(
-        artifact, view, _reading(rules.sense, position, offset) - away,
-        ids=np.stack([d["m"], d["n"]]), has_id=d["has_id"], rules=rules.identity,
-        stage_m=_reading(rules.sense, position, beside), beside_m=beside if view.image else None)
+        artifact,
+        view,
+        _reading(rules.sense, position, offset) - away,
+        ids=np.stack([d["m"], d["n"]]),
+        has_id=d["has_id"],
+        rules=rules.identity,
+        stage_m=_reading(rules.sense, position, beside),
+        beside_m=beside if view.image else None,
+    )
     found = replace(found, deviation=found.deviation + away)
     found.reasons[number < 0] = Reason.OUTSIDE_IMAGE
     astray = found.reasons == Reason.NOT_AT_MARK
@@ -290,52 +374,106 @@ def _identified_at(artifact: Artifact, view: View, d: np.ndarray, position: np.n
     return found, number
 
 
-def _reduce_grid(artifact: Artifact, view: View, marks: _GridMarks, rules: Rules,
-                 rejected: Counter, places: PlaceList) -> dict:
+def _reduce_grid(
+    artifact: Artifact,
+    view: View,
+    marks: _GridMarks,
+    rules: Rules,
+    rejected: Counter,
+    places: PlaceList,
+) -> dict:
     """Return the grid readings of a view, or of a sub-view: offsets from the place of its cell."""
     d, key = marks.detections, artifact.flat(*marks.index)
     offset = np.stack([d["ox"] - view.cell_m.real, d["oy"] - view.cell_m.imag])
     means = reduce_repeats(
-        key, marks.deviation, d["sigma"], limit=rules.outlier_limit,
-        extent=2 * max(artifact.reach) * artifact.grid_pitch_m, residual=marks.residual,
-        steady=without_aside(key, marks.deviation, offset, view.check_offset_m))
+        key,
+        marks.deviation,
+        d["sigma"],
+        limit=rules.outlier_limit,
+        extent=2 * max(artifact.reach) * artifact.grid_pitch_m,
+        residual=marks.residual,
+        steady=without_aside(key, marks.deviation, offset, view.check_offset_m),
+    )
     _count(rejected, Reason.OUTLIER, means.outlier)
     out = np.flatnonzero(means.outlier)
     places.add(np.full(len(out), Reason.OUTLIER, dtype=object), marks.position[:, out])
-    visits = grid_visits(means, key, d["sigma"], stamps_ns=d["stamp"], deviation=marks.deviation,
-                         offset=offset, approach=marks.approach,
-                         step_m=view.check_offset_m / 2 or np.inf)
-    motion = None if view.cell not in (None, (0, 0)) else repeat_motion(  # the same in every cell
-        key, _reading(rules.sense, marks.position, 0.0), offset, means.outlier)
+    visits = grid_visits(
+        means,
+        key,
+        d["sigma"],
+        stamps_ns=d["stamp"],
+        deviation=marks.deviation,
+        offset=offset,
+        approach=marks.approach,
+        step_m=view.check_offset_m / 2 or np.inf,
+    )
+    motion = (
+        None
+        if view.cell not in (None, (0, 0))
+        else repeat_motion(  # the same in every cell
+            key, _reading(rules.sense, marks.position, 0.0), offset, means.outlier
+        )
+    )
     m, n = artifact.marks_at(*np.divmod(means.key.astype(np.int64), artifact.shape[1]))
-    return {"m": m, "n": n, "dx": means.mean[0],
-            "dy": means.mean[1], "count": means.count, "u": means.u, "sigma_xy": means.sigma,
-            "dof_xy": means.dof, "visits": visits, "motion": motion,
-            "outliers": _outliers_of(means, key)}
+    return {
+        "m": m,
+        "n": n,
+        "dx": means.mean[0],
+        "dy": means.mean[1],
+        "count": means.count,
+        "u": means.u,
+        "sigma_xy": means.sigma,
+        "dof_xy": means.dof,
+        "visits": visits,
+        "motion": motion,
+        "outliers": _outliers_of(means, key),
+    }
 
 
-def _reduce_angular(artifact: Artifact, view: View, d: np.ndarray, exposures: Exposures,
-                    rules: Rules, rejected: Counter, phi: float | None) -> dict:
+def _reduce_angular(
+    artifact: Artifact,
+    view: View,
+    d: np.ndarray,
+    exposures: Exposures,
+    rules: Rules,
+    rejected: Counter,
+    phi: float | None,
+) -> dict:
     stage = exposures.at(d["stamp"])
     why = _reasons((stage.theta,), (stage.x, stage.y))
     # an offset beyond half a turn is invalid, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, stage.theta.position)
     found = identify.identify_angular(
-        artifact, view, _reading(rules.sense, theta, d["ot"]), ids=d["k"], has_id=d["has_id"],
-        rules=rules.identity, phi_rad=phi)
-    d, (k, v, rest) = _keep(d, found.reasons, rejected, found.index, found.deviation,
-                            found.residual)
-    means = reduce_repeats(k, v[None], d["sigma"], limit=rules.outlier_limit,
-                           extent=4 * np.pi, residual=rest[None])
+        artifact,
+        view,
+        _reading(rules.sense, theta, d["ot"]),
+        ids=d["k"],
+        has_id=d["has_id"],
+        rules=rules.identity,
+        phi_rad=phi,
+    )
+    d, (k, v, rest) = _keep(
+        d, found.reasons, rejected, found.index, found.deviation, found.residual
+    )
+    means = reduce_repeats(
+        k, v[None], d["sigma"], limit=rules.outlier_limit, extent=4 * np.pi, residual=rest[None]
+    )
     _count(rejected, Reason.OUTLIER, means.outlier)
     place = identify.wrap(v - d["ot"])  # of the axis relative to the line, without full turns
     motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
     about = place[~means.outlier].mean() if len(means.key) else 0.0
-    return {"k": means.key.astype(np.int64), "dtheta": means.mean[0], "count_theta": means.count,
-            "u_theta": means.u, "sigma_theta": means.sigma, "dof_theta": means.dof,
-            "motion_theta": motion, "outliers_theta": _outliers_of(means, k),
-            "axis_theta": float(about)}
+    return {
+        "k": means.key.astype(np.int64),
+        "dtheta": means.mean[0],
+        "count_theta": means.count,
+        "u_theta": means.u,
+        "sigma_theta": means.sigma,
+        "dof_theta": means.dof,
+        "motion_theta": motion,
+        "outliers_theta": _outliers_of(means, k),
+        "axis_theta": float(about),
+    }
 
 
 def _outliers_of(means: Means, key: np.ndarray) -> np.ndarray:
@@ -346,8 +484,7 @@ def _outliers_of(means: Means, key: np.ndarray) -> np.ndarray:
     return np.bincount(place, minlength=len(means.key))
 
 
-def _reading(sense: Sense, position: np.ndarray,
-             offset: np.ndarray | float) -> np.ndarray:
+def _reading(sense: Sense, position: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
     """Return the position of the mark, for a moving microscope or a moving plate (method 1)."""
     return offset - position if sense is Sense.PLATE_MOVES else position + offset
 
@@ -370,8 +507,13 @@ def _where(good: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return rows if good.all() else rows[good]
 
 
-def _keep(d: np.ndarray, reasons: np.ndarray, rejected: Counter, *values: np.ndarray,
-          places: PlaceList | None = None) -> tuple[np.ndarray, list[np.ndarray]]:
+def _keep(
+    d: np.ndarray,
+    reasons: np.ndarray,
+    rejected: Counter,
+    *values: np.ndarray,
+    places: PlaceList | None = None,
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return detections and values (n,) or (k, n) without the rejected ones, which are counted.
 
     Their stage positions, the first of the values, go to `places`.
@@ -398,6 +540,13 @@ def with_places(result: CalibrationResult, views: Iterable[ViewReadings]) -> Cal
 
 def places_json(views: Iterable[ViewReadings]) -> list[dict[str, Any]]:
     """Return the positions for ``extra["rejected_at"]`` of a result: one row per view, m."""
-    return [{"view": view.view.name, "reason": list(view.places.reason),
-             "x": view.places.x.round(6), "y": view.places.y.round(6)}
-            for view in views if view.places.reason]
+    return [
+        {
+            "view": view.view.name,
+            "reason": list(view.places.reason),
+            "x": view.places.x.round(6),
+            "y": view.places.y.round(6),
+        }
+        for view in views
+        if view.places.reason
+    ]

@@ -40,14 +40,14 @@ class GrowingTable:
         total = len(self)
         if total > len(self._room):
             room = np.empty(max(total, 2 * len(self._room)), dtype=self._room.dtype)
-            room[:self._count] = self._room[:self._count]
+            room[: self._count] = self._room[: self._count]
             self._room = room
         self._waiting.reverse()
         while self._waiting:
             rows = self._waiting.pop()  # and its memory is freed
-            self._room[self._count:self._count + len(rows)] = rows
+            self._room[self._count : self._count + len(rows)] = rows
             self._count += len(rows)
-        return self._room[:self._count]
+        return self._room[: self._count]
 
     def append(self, rows: np.ndarray) -> None:
         """Append rows; they are owned by the table afterwards and must not be written to."""
@@ -136,8 +136,9 @@ class SampleStore:
         size = self._limits.block
         return np.empty(size, dtype=np.int64), np.empty(size), np.empty(size)
 
-    def add_block(self, stamps: np.ndarray, positions: np.ndarray,
-                  speeds: np.ndarray | None = None) -> None:
+    def add_block(
+        self, stamps: np.ndarray, positions: np.ndarray, speeds: np.ndarray | None = None
+    ) -> None:
         """Add samples in any order; `speeds` None or NaN if unknown."""
         start = 0
         while start < len(stamps):
@@ -159,14 +160,14 @@ class SampleStore:
 
     def _open(self) -> Samples:
         """Return the samples of the block that is being filled, in the order of their stamps."""
-        filled = tuple(column[:self._filled] for column in self._filling)
+        filled = tuple(column[: self._filled] for column in self._filling)
         if not self._rising:
             order = np.argsort(filled[0], kind="stable")
             self._filling = self._empty()  # arrays returned before are unchanged
             for column, old in zip(self._filling, filled, strict=True):
-                column[:self._filled] = old[order]
+                column[: self._filled] = old[order]
             self._rising, self._last_ns = True, int(self._filling[0][self._filled - 1])
-            filled = tuple(column[:self._filled] for column in self._filling)
+            filled = tuple(column[: self._filled] for column in self._filling)
         stamps, positions, speeds = filled
         return stamps, positions, speeds
 
@@ -175,8 +176,14 @@ class SampleStore:
         told = bool(np.isfinite(speeds).any() or np.isinf(speeds).any())
         columns = (stamps, positions, speeds) if told else (stamps, positions)
         self._blocks.append(_Block(int(stamps[0]), int(stamps[-1]), len(stamps), told, columns))
-        self._firsts, self._lasts, self._counts = (np.append(known, new) for known, new in (
-            (self._firsts, stamps[0]), (self._lasts, stamps[-1]), (self._counts, len(stamps))))
+        self._firsts, self._lasts, self._counts = (
+            np.append(known, new)
+            for known, new in (
+                (self._firsts, stamps[0]),
+                (self._lasts, stamps[-1]),
+                (self._counts, len(stamps)),
+            )
+        )
         self._filling, self._filled, self._rising = self._empty(), 0, True
         self._last_ns = np.iinfo(np.int64).min
         held = [number for number, block in enumerate(self._blocks) if block.columns]
@@ -195,13 +202,16 @@ class SampleStore:
             for column in block.columns:
                 data = memoryview(column).cast("B")
                 while len(data):
-                    data = data[self._file.write(data):]
+                    data = data[self._file.write(data) :]
         except OSError as error:
-            self.problem = (f"encoder samples stay in memory: no temporary file can be written "
-                            f"({error.strerror})")
+            self.problem = (
+                f"encoder samples stay in memory: no temporary file can be written "
+                f"({error.strerror})"
+            )
             return
-        self._blocks[number] = _Block(block.first_ns, block.last_ns, block.count, block.has_speeds,
-                                      place=self._end)
+        self._blocks[number] = _Block(
+            block.first_ns, block.last_ns, block.count, block.has_speeds, place=self._end
+        )
         self._end += sum(column.nbytes for column in block.columns)
 
     def _columns(self, block: _Block) -> tuple[np.ndarray, ...]:
@@ -216,14 +226,16 @@ class SampleStore:
         """Return the columns of a block from the file."""
         if self._file is None:
             raise ValueError("a block that is not in memory has been stored")
-        kinds = (np.int64, np.float64, np.float64)[:3 if block.has_speeds else 2]
+        kinds = (np.int64, np.float64, np.float64)[: 3 if block.has_speeds else 2]
         data = bytearray(8 * block.count * len(kinds))
         self._file.seek(block.place)
         view = memoryview(data)
         while len(view):
-            view = view[self._file.readinto(view):]
-        return tuple(np.frombuffer(data, kind, block.count, 8 * block.count * at)
-                     for at, kind in enumerate(kinds))
+            view = view[self._file.readinto(view) :]
+        return tuple(
+            np.frombuffer(data, kind, block.count, 8 * block.count * at)
+            for at, kind in enumerate(kinds)
+        )
 
     def new_stamps(self) -> np.ndarray:
         """Return the stamps added since the last call, rising."""
@@ -257,12 +269,16 @@ class SampleStore:
         """
         open_samples = self._open()
         parts = [_cut(open_samples, start_ns, end_ns, beside)] if len(open_samples[0]) else []
-        parts += [_cut(self._columns(self._blocks[number]), start_ns, end_ns, beside)
-                  for number in np.flatnonzero(self._touched(start_ns, end_ns))]
+        parts += [
+            _cut(self._columns(self._blocks[number]), start_ns, end_ns, beside)
+            for number in np.flatnonzero(self._touched(start_ns, end_ns))
+        ]
         before = np.flatnonzero(self._lasts < start_ns)
         after = np.flatnonzero(self._firsts > end_ns)
-        for side, sign, edge, known in ((before, -1, start_ns, -self._lasts[before]),
-                                        (after, 1, end_ns, self._firsts[after])):
+        for side, sign, edge, known in (
+            (before, -1, start_ns, -self._lasts[before]),
+            (after, 1, end_ns, self._firsts[after]),
+        ):
             for at in np.argsort(known, kind="stable"):
                 if known[at] > _nth(parts, edge, sign, beside):
                     break
@@ -286,8 +302,10 @@ def _with_speeds(columns: tuple[np.ndarray, ...]) -> Samples:
 
 def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
     """Return sign times the n-th stamp before or after an edge, infinity if there are fewer."""
-    beyond = [t[:np.searchsorted(t, edge)] if sign < 0 else t[np.searchsorted(t, edge, "right"):]
-              for t, _, _ in parts]
+    beyond = [
+        t[: np.searchsorted(t, edge)] if sign < 0 else t[np.searchsorted(t, edge, "right") :]
+        for t, _, _ in parts
+    ]
     stamps = np.unique(sign * np.concatenate([NO_STAMPS, *beyond]))
     return float("inf") if len(stamps) < n else int(stamps[n - 1])
 
@@ -295,8 +313,8 @@ def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
 def _cut(columns: tuple[np.ndarray, ...], start_ns: int, end_ns: int, beside: int) -> Samples:
     """Return the samples between two stamps and of at least `beside` stamps on either side."""
     t = columns[0]
-    low = _reach(t[:np.searchsorted(t, start_ns)][::-1], beside)
-    high = _reach(t[np.searchsorted(t, end_ns, "right"):], beside)
+    low = _reach(t[: np.searchsorted(t, start_ns)][::-1], beside)
+    high = _reach(t[np.searchsorted(t, end_ns, "right") :], beside)
     first = int(np.searchsorted(t, start_ns)) - low
     last = int(np.searchsorted(t, end_ns, "right")) + high
     return _with_speeds(tuple(column[first:last] for column in columns))
@@ -306,7 +324,7 @@ def _reach(stamps: np.ndarray, n: int) -> int:
     """Return the number of samples from the front that contain n complete stamps."""
     take = 2 * n
     while take < len(stamps):
-        change = np.flatnonzero(stamps[1:take] != stamps[:take - 1])
+        change = np.flatnonzero(stamps[1:take] != stamps[: take - 1])
         if len(change) >= n:
             return int(change[n - 1]) + 1
         take *= 2

@@ -53,8 +53,9 @@ class Sequencer:
     def start(self) -> list[Command]:
         """Begin the plan with its first view."""
         if self.state not in ENDED:
-            raise InputError("pose_sequencer", f"cannot start while {self.state}",
-                             "abort the plan first")
+            raise InputError(
+                "pose_sequencer", f"cannot start while {self.state}", "abort the plan first"
+            )
         self.need_plan()
         self.skipped, self.index = [], 0
         return self._place()
@@ -62,8 +63,9 @@ class Sequencer:
     def resume(self, index: int, phase: Phase) -> Command:
         """Resume a run at the view and the command (PLACE or MEASURE) that it had reached."""
         if self.state not in ENDED:
-            raise InputError("pose_sequencer", f"cannot resume while {self.state}",
-                             "abort the plan first")
+            raise InputError(
+                "pose_sequencer", f"cannot resume while {self.state}", "abort the plan first"
+            )
         self.need_plan()
         self.skipped, self.index = [], index
         self.state = State.PLACING if phase == Phase.PLACE else State.MEASURING
@@ -78,30 +80,40 @@ class Sequencer:
     def confirm(self) -> list[Command]:
         """Measure: the plate is placed."""
         if self.state is not State.PLACING:
-            raise InputError("pose_sequencer", f"confirm_view does not fit while {self.state}",
-                             "redo_view has the plate placed again"
-                             if self.state is State.MEASURING else "start a plan first")
+            raise InputError(
+                "pose_sequencer",
+                f"confirm_view does not fit while {self.state}",
+                "redo_view has the plate placed again"
+                if self.state is State.MEASURING
+                else "start a plan first",
+            )
         self.state = State.MEASURING
         return [self._command(Phase.MEASURE)]
 
     def status(self, plan_id: str, view_index: int, complete: bool) -> list[Command]:
         """Continue when the current view is complete; other statuses are ignored."""
-        current = (self.state is State.MEASURING and self.plan is not None
-                   and plan_id == self.plan.plan_id and view_index == self.index)
+        current = (
+            self.state is State.MEASURING
+            and self.plan is not None
+            and plan_id == self.plan.plan_id
+            and view_index == self.index
+        )
         return self._advance() if current and complete else []
 
     def redo(self) -> list[Command]:
         """Place the current view again, superseding its readings."""
         if self.state not in (State.PLACING, State.MEASURING):
-            raise InputError("pose_sequencer", f"nothing to redo while {self.state}",
-                             "start a plan first")
+            raise InputError(
+                "pose_sequencer", f"nothing to redo while {self.state}", "start a plan first"
+            )
         return self._place()
 
     def skip(self) -> list[Command]:
         """Keep the current view as it is and continue with the next."""
         if self.state not in (State.PLACING, State.MEASURING):
-            raise InputError("pose_sequencer", f"nothing to skip while {self.state}",
-                             "start a plan first")
+            raise InputError(
+                "pose_sequencer", f"nothing to skip while {self.state}", "start a plan first"
+            )
         self.skipped.append(self.need_plan().views[self.index].name)
         return self._advance()
 
@@ -115,8 +127,9 @@ class Sequencer:
             self.state = State.IDLE
             return []
         if self.state not in (State.PLACING, State.MEASURING):
-            raise InputError("pose_sequencer", f"nothing to abort while {self.state}",
-                             "start a plan first")
+            raise InputError(
+                "pose_sequencer", f"nothing to abort while {self.state}", "start a plan first"
+            )
         self.state = State.ABORTED
         return [self._command(Phase.ABORT)]
 
@@ -140,6 +153,15 @@ class Sequencer:
         number = len(plan.views)
         if phase in (Phase.DONE, Phase.ABORT):
             return Command(0, phase, plan.plan_id, self.index, views_planned=number)
-        return Command(0, phase, plan.plan_id, self.index, plan.views[self.index], plan.artifact,
-                       number, model_terms=plan.model_terms, artifact_from=plan.artifact_from,
-                       **plan_keys(plan))
+        return Command(
+            0,
+            phase,
+            plan.plan_id,
+            self.index,
+            plan.views[self.index],
+            plan.artifact,
+            number,
+            model_terms=plan.model_terms,
+            artifact_from=plan.artifact_from,
+            **plan_keys(plan),
+        )

@@ -98,8 +98,11 @@ class Timeline:
     @property
     def absent(self) -> list[int]:
         """Views before the last measured one of which there is no command."""
-        return [index for index in range(max(self.views, default=0))
-                if index not in self.views and index not in self.unmeasured]
+        return [
+            index
+            for index in range(max(self.views, default=0))
+            if index not in self.views and index not in self.unmeasured
+        ]
 
     def assign(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
@@ -126,8 +129,7 @@ class Timeline:
 
 def begins_run(command: Command) -> bool:
     """Return whether a command is the first of a run that names itself."""
-    return (command.phase in (Phase.PLACE, Phase.MEASURE)
-            and command.run_id == str(command.stamp_ns))
+    return command.phase in (Phase.PLACE, Phase.MEASURE) and command.run_id == str(command.stamp_ns)
 
 
 def without_strays(commands: Iterable[Command]) -> list[Command]:
@@ -170,8 +172,9 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     measures = [number for number, c in enumerate(ordered) if c.phase == Phase.MEASURE]
     if not measures:
         last = ordered[-1].stamp_ns if ordered else 0
-        return Timeline(intervals=tuple(_unused(ordered)), views={}, last_stamp_ns=last,
-                        strays=strays)
+        return Timeline(
+            intervals=tuple(_unused(ordered)), views={}, last_stamp_ns=last, strays=strays
+        )
     newest = ordered[measures[-1]]
     plan_id, artifact = newest.plan_id, newest.artifact
     runs = _runs(ordered, plan_id)
@@ -183,16 +186,23 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
             continue
         view = command.placed()
         if command.artifact != artifact:
-            raise InputError(f"view command of '{view.name}'", "describes a different plate from "
-                             f"the rest of plan '{plan_id}'", "use one plate in one plan")
+            raise InputError(
+                f"view command of '{view.name}'",
+                f"describes a different plate from the rest of plan '{plan_id}'",
+                "use one plate in one plan",
+            )
         views[command.view_index] = view
     planned = max([c.views_planned for c in mine] + [max(views) + 1])
     intervals = tuple(_intervals(ordered, runs, run_id))
-    unmeasured = {c.view_index: (c.placed().name, interval)
-                  for c, run, interval in zip(ordered, runs, intervals, strict=True)
-                  if run == run_id and c.phase == Phase.PLACE and c.view_index not in views}
+    unmeasured = {
+        c.view_index: (c.placed().name, interval)
+        for c, run, interval in zip(ordered, runs, intervals, strict=True)
+        if run == run_id and c.phase == Phase.PLACE and c.view_index not in views
+    }
     return Timeline(
-        plan_id, artifact, dict(sorted(views.items())),
+        plan_id,
+        artifact,
+        dict(sorted(views.items())),
         intervals=intervals,
         views_planned=planned,
         finished=ordered[-1].phase in (Phase.DONE, Phase.ABORT),
@@ -202,7 +212,8 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
         strays=strays,
         artifact_from=newest.artifact_from,
         unmeasured=unmeasured,
-        **plan_keys(newest))
+        **plan_keys(newest),
+    )
 
 
 def _begin_is_known(first: Command, runs: list[str | None]) -> bool:
@@ -210,8 +221,11 @@ def _begin_is_known(first: Command, runs: list[str | None]) -> bool:
 
     Commands that do not name their run may arrive in any order: an earlier one may follow.
     """
-    return bool(first.run_id or (first.phase == Phase.PLACE and first.view_index == 0)
-                or len(set(runs) - {None}) > 1)
+    return bool(
+        first.run_id
+        or (first.phase == Phase.PLACE and first.view_index == 0)
+        or len(set(runs) - {None}) > 1
+    )
 
 
 def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
@@ -225,8 +239,9 @@ def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
             out.append(None)
             continue
         over = command.phase in (Phase.DONE, Phase.ABORT)
-        anew = not over and command.view_index == 0 and (
-            ended or (later and command.phase == first))
+        anew = (
+            not over and command.view_index == 0 and (ended or (later and command.phase == first))
+        )
         fresh = command.run_id or (str(command.stamp_ns) if anew or not run else run)
         if fresh != run:
             run, ended, later = fresh, False, False
@@ -237,15 +252,27 @@ def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
 
 
 def _sort_key(command: Command) -> tuple:
-    return (command.stamp_ns, int(command.phase), command.plan_id, command.view_index,
-            repr(command.view), repr(command.artifact), command.views_planned, command.run_id,
-            command.model_terms, command.artifact_from, *plan_keys(command).values())
+    return (
+        command.stamp_ns,
+        int(command.phase),
+        command.plan_id,
+        command.view_index,
+        repr(command.view),
+        repr(command.artifact),
+        command.views_planned,
+        command.run_id,
+        command.model_terms,
+        command.artifact_from,
+        *plan_keys(command).values(),
+    )
 
 
 def _unused(ordered: list[Command]) -> list[Interval]:
-    ends = [*(command.stamp_ns for command in ordered[1:]), NO_END][:len(ordered)]
-    return [Interval(c.stamp_ns, end, None, Reason.OUTSIDE_VIEWS)
-            for c, end in zip(ordered, ends, strict=True)]
+    ends = [*(command.stamp_ns for command in ordered[1:]), NO_END][: len(ordered)]
+    return [
+        Interval(c.stamp_ns, end, None, Reason.OUTSIDE_VIEWS)
+        for c, end in zip(ordered, ends, strict=True)
+    ]
 
 
 def _intervals(ordered: list[Command], runs: list[str | None], run_id: str) -> list[Interval]:
@@ -314,7 +341,7 @@ class ViewCache:
 
     def new_stamps(self) -> np.ndarray:
         """Return the stamps of the detections since the last call."""
-        new = self.table["stamp"][self._looked_up:]
+        new = self.table["stamp"][self._looked_up :]
         self._looked_up = len(self._table)
         return new
 
@@ -323,8 +350,11 @@ class ViewCache:
         if len(stamps_ns):
             self._changed.append(stamps_ns)
 
-    def readings(self, timeline: Timeline, exposures: Exposures,
-                 ) -> tuple[dict[int, ViewReadings], Counter]:
+    def readings(
+        self,
+        timeline: Timeline,
+        exposures: Exposures,
+    ) -> tuple[dict[int, ViewReadings], Counter]:
         """Return the readings of every view, and reason -> detections that belong to no view."""
         for index in self._assign(timeline):
             self._readings.pop(index, None)
@@ -342,8 +372,13 @@ class ViewCache:
             self._readings = {}
         start = 0 if old is not None else known
         self._place.insert(np.full(len(self._table) - known, known), {})
-        view_of = np.array([-1 if interval.view_index is None else interval.view_index
-                            for interval in timeline.intervals] + [-1])
+        view_of = np.array(
+            [
+                -1 if interval.view_index is None else interval.view_index
+                for interval in timeline.intervals
+            ]
+            + [-1]
+        )
         for begin in range(start, len(self._table), TOGETHER):
             here = slice(begin, begin + TOGETHER)
             interval = timeline.assign(self.table["stamp"][here])
@@ -358,8 +393,9 @@ class ViewCache:
 
     def _loose(self, timeline: Timeline) -> Counter:
         """Return reason -> number of detections that belong to no view."""
-        counts = np.bincount(self._place["interval"] + 1,
-                             minlength=len(timeline.intervals) + 1).tolist()
+        counts = np.bincount(
+            self._place["interval"] + 1, minlength=len(timeline.intervals) + 1
+        ).tolist()
         loose = Counter({str(Reason.OUTSIDE_VIEWS): counts[0]})
         for interval, count in zip(timeline.intervals, counts[1:], strict=True):
             if interval.view_index is None:
@@ -370,8 +406,9 @@ class ViewCache:
         rows = np.flatnonzero(self.view_of == index)
         detections = self.table[_as_slice(rows)]
         good, low, reasons = clean(detections, self._rules, scored=self._scored)
-        readings = reduce_view(*timeline.planned_view(index), good,
-                               exposures=exposures, rules=self._rules)
+        readings = reduce_view(
+            *timeline.planned_view(index), good, exposures=exposures, rules=self._rules
+        )
         readings = with_low_scores(readings, low, exposures)
         total = Counter(readings.rejected)
         total.update({str(reason): count for reason, count in reasons.items()})

@@ -26,8 +26,7 @@ SNAP = 1e-9
 """Distance to a node, in pitches, below which a position is taken to be on it."""
 
 
-def cubic_pieces(values: np.ndarray, *, periodic: bool = False,
-                 local: bool = False) -> np.ndarray:
+def cubic_pieces(values: np.ndarray, *, periodic: bool = False, local: bool = False) -> np.ndarray:
     """Return the cubic spline through `values` (n, ...) one apart, (4, intervals, ...).
 
     Coefficients of 1, u, u^2, u^3 with u from 0 to 1 in each interval. Not-a-knot ends; a parabola
@@ -114,12 +113,13 @@ class Cells:
         """
         powers = np.arange(self.degree + 1)
         places = np.linspace(0, 1, 5)[:, None]
-        value = places ** powers
+        value = places**powers
         slope = powers * places ** np.maximum(powers - 1, 0)
         largest = 0.0
         for along, along_slope in zip(value, slope, strict=True):
-            size = (np.abs((along_slope @ self.coefficients) @ value.T)
-                    + np.abs((along @ self.coefficients) @ slope.T))
+            size = np.abs((along_slope @ self.coefficients) @ value.T) + np.abs(
+                (along @ self.coefficients) @ slope.T
+            )
             largest = max(largest, np.nan_to_num(size).max(initial=0.0))
         return float(largest)
 
@@ -133,8 +133,9 @@ class Cells:
         unknown = np.isnan(first) | np.isnan(second)
         if unknown.any():
             for out, field in zip((first, second), self.nodes, strict=True):
-                out[unknown] = _known_corners(field, (i[unknown], j[unknown]),
-                                              (u[unknown], v[unknown]))
+                out[unknown] = _known_corners(
+                    field, (i[unknown], j[unknown]), (u[unknown], v[unknown])
+                )
         return first, second
 
     def beyond(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -145,13 +146,19 @@ class Cells:
         out = np.empty((2, len(s)))
         for start in range(0, len(s), self.block):
             part = slice(start, start + self.block)
-            i, j = (np.clip(np.floor(w[part]), 0, size - 2).astype(np.int64)
-                    for w, size in zip((s, t), self.shape, strict=True))
+            i, j = (
+                np.clip(np.floor(w[part]), 0, size - 2).astype(np.int64)
+                for w, size in zip((s, t), self.shape, strict=True)
+            )
             out[:, part] = self._polynomials(self._rows(i, j), s[part] - i, t[part] - j)
         return out
 
-    def solve_in_cell(self, s: np.ndarray, t: np.ndarray, scale: float,
-                      ) -> tuple[np.ndarray, np.ndarray]:
+    def solve_in_cell(
+        self,
+        s: np.ndarray,
+        t: np.ndarray,
+        scale: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the (a, b) with (a, b) + scale * fields(a, b) = (s, t), by fixed point.
 
         The solution is nearly always in the cell of (s, t) itself, so each cell's polynomial
@@ -193,8 +200,12 @@ class Cells:
             return i + u, j + v
         return math.nan, math.nan
 
-    def solve(self, s: np.ndarray, t: np.ndarray, scale: float,
-              ) -> tuple[np.ndarray, np.ndarray]:
+    def solve(
+        self,
+        s: np.ndarray,
+        t: np.ndarray,
+        scale: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the same as `solve_in_cell`, with the solution in any cell."""
         a, b = s, t
         for _ in range(MAX_ITERATIONS):
@@ -243,10 +254,14 @@ class Cells:
         rows = self.coefficients.reshape(len(self.coefficients), -1).take(cell, axis=0).T
         return np.ascontiguousarray(rows) if often else rows
 
-    def _polynomials(self, rows: np.ndarray, u: np.ndarray, v: np.ndarray,
-                     ) -> tuple[np.ndarray, np.ndarray]:
+    def _polynomials(
+        self,
+        rows: np.ndarray,
+        u: np.ndarray,
+        v: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
         side = self.degree + 1
-        return (_horner(rows[:side * side], u, v, side), _horner(rows[side * side:], u, v, side))
+        return (_horner(rows[: side * side], u, v, side), _horner(rows[side * side :], u, v, side))
 
 
 def _largest(step: np.ndarray) -> float:
@@ -285,8 +300,9 @@ def _horner_point(rows: list[list[float]], u: float, v: float, side: int) -> flo
     return out
 
 
-def _known_corners(field: np.ndarray, cell: tuple[np.ndarray, np.ndarray],
-                   inside: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def _known_corners(
+    field: np.ndarray, cell: tuple[np.ndarray, np.ndarray], inside: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
     """Return bilinear values that ignore corners of zero weight, (P,)."""
     (i, j), (u, v) = cell, inside
     u, v = (np.where(abs(w - np.round(w)) < SNAP, np.round(w), w) for w in (u, v))

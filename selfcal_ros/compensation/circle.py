@@ -58,8 +58,11 @@ class Circle:
         self._closed = np.append(values, values[:1])
         self._points: list[float] = self._closed.tolist()
         if cubic and not np.isfinite(values).all():
-            raise InputError("error map", f"{int((~np.isfinite(values)).sum())} angular lines are "
-                             "unknown", "bicubic needs all of them: use bilinear")
+            raise InputError(
+                "error map",
+                f"{int((~np.isfinite(values)).sum())} angular lines are unknown",
+                "bicubic needs all of them: use bilinear",
+            )
         steps = np.abs(np.diff(self._closed))
         if np.any(steps > MAX_SLOPE * 2 * np.pi / max(self._count, 1)):
             raise steep("angular lines")
@@ -111,6 +114,8 @@ class Circle:
 
 def steep(what: str) -> InputError:
     """Return the refusal of a map that cannot be inverted."""
-    return InputError("error map", f"the error changes between neighbouring {what} by more than "
-                      "a quarter of their distance", "such a map cannot be inverted: check its "
-                      "units (m, rad)")
+    return InputError(
+        "error map",
+        f"the error changes between neighbouring {what} by more than a quarter of their distance",
+        "such a map cannot be inverted: check its units (m, rad)",
+    )

@@ -70,32 +70,46 @@ class Compensator:
     All methods take scalars or arrays that broadcast and return float arrays of that shape.
     """
 
-    def __init__(self, error_map: ErrorMap, *,
-                 method: Interpolation = "bilinear",
-                 outside: Outside = "clamp", fitted: Interpolation | None = None) -> None:
+    def __init__(
+        self,
+        error_map: ErrorMap,
+        *,
+        method: Interpolation = "bilinear",
+        outside: Outside = "clamp",
+        fitted: Interpolation | None = None,
+    ) -> None:
         if method not in get_args(Interpolation):
-            raise InputError("compensator method", f"'{method}' is unknown",
-                             "use bilinear or bicubic")
+            raise InputError(
+                "compensator method", f"'{method}' is unknown", "use bilinear or bicubic"
+            )
         if outside not in get_args(Outside):
-            raise InputError("compensator outside", f"'{outside}' is unknown",
-                             "use clamp or refuse")
+            raise InputError(
+                "compensator outside", f"'{outside}' is unknown", "use clamp or refuse"
+            )
         self.error_map, self.method, self.outside = error_map, method, outside
         self._is_fitted = fitted == method
         self._pitch = error_map.artifact.grid_pitch_m
         fields = np.stack([error_map.gx, error_map.gy])
         if method == "bicubic" and not np.isfinite(fields).all():
             missing = int((~error_map.valid).sum())
-            raise InputError("error map", f"{missing} sites are unknown",
-                             "bicubic needs all of them: use bilinear or measure them")
+            raise InputError(
+                "error map",
+                f"{missing} sites are unknown",
+                "bicubic needs all of them: use bilinear or measure them",
+            )
         self._cells = bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
         if self._cells.largest_step > MAX_SLOPE * self._pitch:
             raise steep("sites")
-        if method == "bicubic" and self._cells.largest_step > GENTLE * self._pitch \
-                and self._cells.steepest() > 2 * MAX_SLOPE * self._pitch:
+        if (
+            method == "bicubic"
+            and self._cells.largest_step > GENTLE * self._pitch
+            and self._cells.steepest() > 2 * MAX_SLOPE * self._pitch
+        ):
             raise _steep_spline()
         self._u_cells = bilinear_cells(error_map.u_xy)
-        self._theta = Circle(error_map.g_theta, cubic=method == "bicubic",
-                             harmonics=error_map.artifact.harmonics)
+        self._theta = Circle(
+            error_map.g_theta, cubic=method == "bicubic", harmonics=error_map.artifact.harmonics
+        )
         self._u_theta = Circle(error_map.u_g_theta, cubic=False, harmonics=0)
 
     @property
@@ -111,8 +125,9 @@ class Compensator:
     def is_inside(self, x_m: float, y_m: float) -> bool:
         """Return `inside` of one position, fifty times as fast."""
         half_x, half_y = self.error_map.artifact.half
-        return bool(abs(x_m) <= (half_x + SNAP) * self._pitch
-                    and abs(y_m) <= (half_y + SNAP) * self._pitch)
+        return bool(
+            abs(x_m) <= (half_x + SNAP) * self._pitch and abs(y_m) <= (half_y + SNAP) * self._pitch
+        )
 
     def error(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return G = indicated - true, m, at true positions `x_m`, `y_m`.
@@ -123,8 +138,7 @@ class Compensator:
             With ``outside="refuse"``, if a position is outside the field.
         """
         self._refuse_outside(x_m, y_m)
-        return self._blocks(lambda x, y: self._at(self._cells, x, y), (x_m, y_m),
-                            self._cells.block)
+        return self._blocks(lambda x, y: self._at(self._cells, x, y), (x_m, y_m), self._cells.block)
 
     def command(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the indicated position to command so that the true one is `x_m`, `y_m`.
@@ -149,8 +163,9 @@ class Compensator:
         out = self._blocks(self._invert(self._cells.solve_in_cell), (x, y), self._cells.block)
         left = np.isnan(out[0])
         if left.any():
-            found = self._blocks(self._invert(self._cells.solve), (x[left], y[left]),
-                                 self._cells.block)
+            found = self._blocks(
+                self._invert(self._cells.solve), (x[left], y[left]), self._cells.block
+            )
             for axis, part in zip(out, found, strict=True):
                 axis[left] = part
         self._refuse_outside(*out)
@@ -192,15 +207,21 @@ class Compensator:
             With ``outside="refuse"``, if a position is outside the field.
         """
         self._refuse_outside(x_m, y_m)
-        ux, uy = self._blocks(lambda x, y: self._at(self._u_cells, x, y), (x_m, y_m),
-                              self._u_cells.block)
+        ux, uy = self._blocks(
+            lambda x, y: self._at(self._u_cells, x, y), (x_m, y_m), self._u_cells.block
+        )
         more_x, more_y = self._between(x_m, y_m)
         inside = self.inside(x_m, y_m)
-        return (np.where(inside, np.hypot(ux, more_x), np.nan),
-                np.where(inside, np.hypot(uy, more_y), np.nan))
+        return (
+            np.where(inside, np.hypot(ux, more_x), np.nan),
+            np.where(inside, np.hypot(uy, more_y), np.nan),
+        )
 
-    def uncertainty_indicated(self, x_m: ArrayLike, y_m: ArrayLike,
-                              ) -> tuple[np.ndarray, np.ndarray]:
+    def uncertainty_indicated(
+        self,
+        x_m: ArrayLike,
+        y_m: ArrayLike,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return `uncertainty` at the true positions of indicated ones `x_m`, `y_m`.
 
         What is indicated in the field belongs to it, also where its error places it just beyond
@@ -223,18 +244,25 @@ class Compensator:
         emap, cubic = self.error_map, self.method == "bicubic"
         if self._is_fitted:
             return np.zeros((2, 2))
-        return np.array([[error_halfway(np.moveaxis(g, axis, 0), np.moveaxis(u, axis, 0),
-                                        cubic=cubic)[0] for axis in (0, 1)]
-                         for g, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))])
+        return np.array(
+            [
+                [
+                    error_halfway(np.moveaxis(g, axis, 0), np.moveaxis(u, axis, 0), cubic=cubic)[0]
+                    for axis in (0, 1)
+                ]
+                for g, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))
+            ]
+        )
 
     def _between(self, x_m: ArrayLike, y_m: ArrayLike) -> np.ndarray:
         """Return the standard uncertainty of the interpolation of Gx and Gy, (2, ...), m."""
         shares = []
-        for p, half in zip(np.broadcast_arrays(x_m, y_m), self.error_map.artifact.half,
-                           strict=True):
+        for p, half in zip(
+            np.broadcast_arrays(x_m, y_m), self.error_map.artifact.half, strict=True
+        ):
             at = np.clip(np.asarray(p, dtype=float) / self._pitch + half, 0, 2 * half)
             shares.append(share_between(np.where(abs(at - np.round(at)) < SNAP, np.round(at), at)))
-        return np.sqrt(np.tensordot(self.halfway**2, np.stack(shares)**2, axes=1))
+        return np.sqrt(np.tensordot(self.halfway**2, np.stack(shares) ** 2, axes=1))
 
     def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
         """Return Gtheta = indicated - true, rad, at true angles; any number of turns.
@@ -302,8 +330,10 @@ class Compensator:
         """
         self._refuse_no_theta()
         angle, count = np.asarray(theta_rad, dtype=float), self.error_map.artifact.angular_count
-        return np.hypot(self._u_theta.at(angle), self._halfway_theta * share_between(
-            angle * (count / (2 * np.pi))))
+        return np.hypot(
+            self._u_theta.at(angle),
+            self._halfway_theta * share_between(angle * (count / (2 * np.pi))),
+        )
 
     @cached_property
     def _halfway_theta(self) -> float:
@@ -318,10 +348,15 @@ class Compensator:
         Splines pass beyond the values of their nodes; bilinear ones do not.
         """
         artifact, count = self.error_map.artifact, PER_STEP * self.error_map.artifact.angular_count
-        places = [np.linspace(-half, half, round(2 * half * PER_STEP) + 1) * self._pitch
-                  for half in artifact.half]
-        grids = ([self.error_map.gx, self.error_map.gy] if self.method == "bilinear" else
-                 [*self.error(places[0][:, None], places[1])])
+        places = [
+            np.linspace(-half, half, round(2 * half * PER_STEP) + 1) * self._pitch
+            for half in artifact.half
+        ]
+        grids = (
+            [self.error_map.gx, self.error_map.gy]
+            if self.method == "bilinear"
+            else [*self.error(places[0][:, None], places[1])]
+        )
         return grids, self._theta.at(np.arange(count) * (2 * np.pi / max(count, 1)))
 
     def _at(self, cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -338,8 +373,12 @@ class Compensator:
 
         return field
 
-    def _blocks(self, field: _Field, position: tuple[ArrayLike, ArrayLike], block: int,
-                ) -> tuple[np.ndarray, np.ndarray]:
+    def _blocks(
+        self,
+        field: _Field,
+        position: tuple[ArrayLike, ArrayLike],
+        block: int,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Apply `field` block by block to broadcast positions."""
         x, y = np.broadcast_arrays(*(np.asarray(p, dtype=float) for p in position))
         shape, x, y = x.shape, x.ravel(), y.ravel()
@@ -357,15 +396,22 @@ class Compensator:
         if np.any(off):
             x, y = np.broadcast_arrays(x_m, y_m)
             first = np.flatnonzero(off)[0]
-            raise InputError("position", f"({x.flat[first]:.9g}, {y.flat[first]:.9g}) m lies "
-                             "outside the calibrated field", "stay inside or use clamp")
+            raise InputError(
+                "position",
+                f"({x.flat[first]:.9g}, {y.flat[first]:.9g}) m lies outside the calibrated field",
+                "stay inside or use clamp",
+            )
 
     def _refuse_no_theta(self) -> None:
         if not self.has_theta:
-            raise InputError("error map", "it has no angular lines",
-                             "calibrate with a plate that has them")
+            raise InputError(
+                "error map", "it has no angular lines", "calibrate with a plate that has them"
+            )
 
 
 def _steep_spline() -> InputError:
-    return InputError("error map", "the cubic spline between the sites is steeper than one half",
-                      "such a map cannot be inverted: use bilinear, or check its units (m, rad)")
+    return InputError(
+        "error map",
+        "the cubic spline between the sites is steeper than one half",
+        "such a map cannot be inverted: use bilinear, or check its units (m, rad)",
+    )

@@ -63,8 +63,14 @@ def _neighbours(shift: tuple[int, int], shape: tuple[int, int]) -> tuple[tuple, 
     return tuple(here), tuple(there)
 
 
-def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 0,
-               command: str = "", now: datetime | None = None) -> list[str]:
+def provenance(
+    result: CalibrationResult,
+    frame: MachineFrame,
+    *,
+    filled: int = 0,
+    command: str = "",
+    now: datetime | None = None,
+) -> list[str]:
     """Return comments with the origin and conventions of a table.
 
     Parameters
@@ -88,9 +94,11 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
         f"bag: {source.get('file', 'unknown')}; sha256: {source.get('sha256', 'unknown')}",
         *verdict_lines(result),
         _uncertainty_line(result),
-        f"model: {result.model.misalignment} misalignments" + "".join(
+        f"model: {result.model.misalignment} misalignments"
+        + "".join(
             f", {term.name}" + ("" if term.size is None else f":{term.size:g}")
-            for term in result.model.terms),
+            for term in result.model.terms
+        ),
         *_reference_lines(result),
         f"datum: no translation, rotation, magnification; theta: {emap.datum_theta}",
         "correction = + (indicated - true), added to the command",
@@ -103,17 +111,24 @@ def provenance(result: CalibrationResult, frame: MachineFrame, *, filled: int = 
 
 def origin_lines(result: CalibrationResult, command: str = "") -> list[str]:
     """Return the command of an export, and file and digest of its result."""
-    return [*([f"command: {command}"] if command else []),
-            *([f"result: {result.read_from[0]}", f"sha256 of the result: {result.read_from[1]}"]
-              if result.read_from else [])]
+    return [
+        *([f"command: {command}"] if command else []),
+        *(
+            [f"result: {result.read_from[0]}", f"sha256 of the result: {result.read_from[1]}"]
+            if result.read_from
+            else []
+        ),
+    ]
 
 
 def _uncertainty_line(result: CalibrationResult) -> str:
     if not result.has_uncertainty:
         return "uncertainty: not computed"
     u = result.error_map.u_xy
-    return (f"standard uncertainty of the corrections (k=1): {rms(u) * UM_PER_M:.3g} um rms; U: "
-            f"k = {result.noise.k_xy:.3g} for 95.45 %")
+    return (
+        f"standard uncertainty of the corrections (k=1): {rms(u) * UM_PER_M:.3g} um rms; U: "
+        f"k = {result.noise.k_xy:.3g} for 95.45 %"
+    )
 
 
 def verdict_lines(result: CalibrationResult) -> list[str]:
@@ -121,8 +136,10 @@ def verdict_lines(result: CalibrationResult) -> list[str]:
     verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
     measured = [f"measured until {when}"] if when else []
     said = verdict.sentence or verdict.grade.replace("_", " ")
-    lines = [f"verdict: {said if verdict.qualified else 'NOT QUALIFIED'}",
-             *(f"because: {reason}" for reason in verdict.reasons)]
+    lines = [
+        f"verdict: {said if verdict.qualified else 'NOT QUALIFIED'}",
+        *(f"because: {reason}" for reason in verdict.reasons),
+    ]
     return [*measured, *map(to_ascii, lines)]
 
 
@@ -131,5 +148,7 @@ def _reference_lines(result: CalibrationResult) -> list[str]:
     if length is None:
         return ["reference length: none, the scale is a convention"]
     certificate = length.certificate or "no certificate named"
-    return [f"reference length: {length.name}, relative error "
-            f"{length.relative_error:g}, u {length.u_relative:g} ({certificate})"]
+    return [
+        f"reference length: {length.name}, relative error "
+        f"{length.relative_error:g}, u {length.u_relative:g} ({certificate})"
+    ]

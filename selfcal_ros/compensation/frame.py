@@ -55,14 +55,18 @@ class MachineFrame:
             raise InputError("unit", f"'{self.unit}' is not a primary unit", "use m, mm, um or in")
         axes = [a for a in (self.x_axis, self.y_axis, self.theta_axis) if a is not None]
         if len(set(axes)) < len(axes):
-            raise InputError("axes", f"the indices {axes} are not distinct",
-                             "give each axis its own index")
+            raise InputError(
+                "axes", f"the indices {axes} are not distinct", "give each axis its own index"
+            )
         for value in (self.home_x_m, self.home_y_m, self.home_theta_rad):
             if not math.isfinite(value):
                 raise InputError("home position", f"{value} is not a position", "give a number")
         if self.theta_counts_per_unit is not None and not 0 < self.theta_counts_per_unit < math.inf:
-            raise InputError("counts per degree", f"{self.theta_counts_per_unit} is not a positive "
-                             "number", "give the encoder counts in a degree of theta")
+            raise InputError(
+                "counts per degree",
+                f"{self.theta_counts_per_unit} is not a positive number",
+                "give the encoder counts in a degree of theta",
+            )
 
     @property
     def unit_m(self) -> float:
@@ -86,13 +90,17 @@ class MachineFrame:
 
     def to_machine(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return controller positions, primary units, of stage positions in m."""
-        return (self.sign_x * (np.asarray(x_m) - self.home_x_m) / self.unit_m,
-                self.sign_y * (np.asarray(y_m) - self.home_y_m) / self.unit_m)
+        return (
+            self.sign_x * (np.asarray(x_m) - self.home_x_m) / self.unit_m,
+            self.sign_y * (np.asarray(y_m) - self.home_y_m) / self.unit_m,
+        )
 
     def from_machine(self, px: ArrayLike, py: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return stage positions in m of controller positions in primary units."""
-        return (self.sign_x * np.asarray(px) * self.unit_m + self.home_x_m,
-                self.sign_y * np.asarray(py) * self.unit_m + self.home_y_m)
+        return (
+            self.sign_x * np.asarray(px) * self.unit_m + self.home_x_m,
+            self.sign_y * np.asarray(py) * self.unit_m + self.home_y_m,
+        )
 
     def theta_to_machine(self, theta_rad: ArrayLike) -> np.ndarray:
         """Return controller positions, deg, of stage angles in rad."""
@@ -104,14 +112,21 @@ class MachineFrame:
 
     def comment(self) -> str:
         """Return the frame as a comment of a calibration file."""
-        words = [f"x-axis={self.x_axis}", f"y-axis={self.y_axis}", f"unit={self.unit}",
-                 f"home-x={self.home_x_m / self.unit_m:.15g}",
-                 f"home-y={self.home_y_m / self.unit_m:.15g}"]
-        words += [f"reverse-{name}" for name in ("x", "y", "theta")
-                  if getattr(self, f"reverse_{name}")]
+        words = [
+            f"x-axis={self.x_axis}",
+            f"y-axis={self.y_axis}",
+            f"unit={self.unit}",
+            f"home-x={self.home_x_m / self.unit_m:.15g}",
+            f"home-y={self.home_y_m / self.unit_m:.15g}",
+        ]
+        words += [
+            f"reverse-{name}" for name in ("x", "y", "theta") if getattr(self, f"reverse_{name}")
+        ]
         if self.theta_axis is not None:
-            words += [f"theta-axis={self.theta_axis}",
-                      f"home-theta={math.degrees(self.home_theta_rad):.15g}"]
+            words += [
+                f"theta-axis={self.theta_axis}",
+                f"home-theta={math.degrees(self.home_theta_rad):.15g}",
+            ]
         if self.theta_counts_per_unit is not None:
             words.append(f"theta-counts-per-unit={self.theta_counts_per_unit:.17g}")
         return _MARK + " ".join(words)
@@ -129,25 +144,31 @@ def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
     whole = max(stated, key=lambda frame: frame.theta_axis is not None, default=None)
     for frame in stated:
         if whole is not None and frame not in (whole, _plane(whole)):
-            raise InputError("comments", f"the tables are for different axes, '{frame.comment()}' "
-                             f"and '{whole.comment()}'", "write them with the same options")
+            raise InputError(
+                "comments",
+                f"the tables are for different axes, '{frame.comment()}' and '{whole.comment()}'",
+                "write them with the same options",
+            )
     return whole
 
 
 def _plane(frame: MachineFrame) -> MachineFrame:
     """Return a frame without its theta axis."""
-    return replace(frame, theta_axis=None, home_theta_rad=0.0, reverse_theta=False,
-                   theta_counts_per_unit=None)
+    return replace(
+        frame, theta_axis=None, home_theta_rad=0.0, reverse_theta=False, theta_counts_per_unit=None
+    )
 
 
 def _stated(line: str) -> MachineFrame | None:
-    words = dict(re.findall(r"([a-z-]+)(?:=(\S+))?", line[len(_MARK):]))
+    words = dict(re.findall(r"([a-z-]+)(?:=(\S+))?", line[len(_MARK) :]))
     try:
         unit_m = LENGTHS_M[words.get("unit", "mm")]
         theta = words.get("theta-axis")
         counts = words.get("theta-counts-per-unit")
         return MachineFrame(
-            int(words["x-axis"]), int(words["y-axis"]), int(theta) if theta else None,
+            int(words["x-axis"]),
+            int(words["y-axis"]),
+            int(theta) if theta else None,
             unit=words.get("unit", "mm"),
             home_x_m=float(words.get("home-x", 0)) * unit_m,
             home_y_m=float(words.get("home-y", 0)) * unit_m,
@@ -155,6 +176,7 @@ def _stated(line: str) -> MachineFrame | None:
             reverse_x="reverse-x" in words,
             reverse_y="reverse-y" in words,
             reverse_theta="reverse-theta" in words,
-            theta_counts_per_unit=float(counts) if counts else None)
+            theta_counts_per_unit=float(counts) if counts else None,
+        )
     except (KeyError, ValueError):
         return None

@@ -47,8 +47,11 @@ def require_known(error_map: ErrorMap) -> None:
     """Raise InputError if a site is unknown: a table has no holes."""
     missing = int((~error_map.valid).sum())
     if missing:
-        raise InputError("error map", f"{missing} sites are unknown, and a table has no holes",
-                         "measure them, or fill them from their neighbours (--fill)")
+        raise InputError(
+            "error map",
+            f"{missing} sites are unknown, and a table has no holes",
+            "measure them, or fill them from their neighbours (--fill)",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,9 +102,14 @@ def residual_of(place: str, position: np.ndarray, reached: list[np.ndarray]) -> 
     return Residual(place, position[:, known], before, after, *shifts)
 
 
-def reached(stage: Compensator, frame: MachineFrame, command: tuple[ArrayLike, ArrayLike], *,
-            correct: Correction | None = None, active: Correction | None = None,
-            ) -> tuple[np.ndarray, np.ndarray]:
+def reached(
+    stage: Compensator,
+    frame: MachineFrame,
+    command: tuple[ArrayLike, ArrayLike],
+    *,
+    correct: Correction | None = None,
+    active: Correction | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the true positions, m, after commands in the stage frame.
 
     Parameters
@@ -129,8 +137,9 @@ def reached(stage: Compensator, frame: MachineFrame, command: tuple[ArrayLike, A
     return stage.correct(*frame.from_machine(px, py))
 
 
-def plane_residuals(error_map: ErrorMap, frame: MachineFrame, correct: Correction,
-                    active: Correction | None = None) -> list[Residual]:
+def plane_residuals(
+    error_map: ErrorMap, frame: MachineFrame, correct: Correction, active: Correction | None = None
+) -> list[Residual]:
     """Return the residuals at the sites and, if all are known, between them.
 
     At the sites the map is the truth. Between them the truth is unknown: it is substituted by the
@@ -138,16 +147,31 @@ def plane_residuals(error_map: ErrorMap, frame: MachineFrame, correct: Correctio
     the error of the controller's interpolation.
     """
     plate, known = error_map.artifact, error_map.valid
-    plane = replace(error_map, artifact=replace(plate, angular_count=0, harmonics=0),
-                    g_theta=np.zeros(0), u_g_theta=np.zeros(0))
+    plane = replace(
+        error_map,
+        artifact=replace(plate, angular_count=0, harmonics=0),
+        g_theta=np.zeros(0),
+        u_g_theta=np.zeros(0),
+    )
     places = [("sites", np.stack([plate.x_m[known], plate.y_m[known]]), Compensator(plane))]
     if known.all():
-        centres = np.stack([along[:-1, :-1].ravel() + plate.grid_pitch_m / 2
-                            for along in (plate.x_m, plate.y_m)])
+        centres = np.stack(
+            [along[:-1, :-1].ravel() + plate.grid_pitch_m / 2 for along in (plate.x_m, plate.y_m)]
+        )
         places.append(("between", centres, Compensator(plane, method="bicubic")))
-    return [residual_of(name, points, [np.stack(reached(
-        stage, frame, (points[0], points[1]), correct=table, active=active))
-        for table in (None, correct)]) for name, points, stage in places]
+    return [
+        residual_of(
+            name,
+            points,
+            [
+                np.stack(
+                    reached(stage, frame, (points[0], points[1]), correct=table, active=active)
+                )
+                for table in (None, correct)
+            ],
+        )
+        for name, points, stage in places
+    ]
 
 
 def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> ErrorMap:
@@ -169,8 +193,13 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
     limit_m = plate.grid_pitch_m / 4
     step_m = _steepest(added)
     if step_m > limit_m or _steepest(own + added) > limit_m >= _steepest(own):
-        raise _misfit(active, (px, py), f"changes by up to {step_m / M_PER_MM:.3g} mm between "
-                      f"neighbouring sites {plate.grid_pitch_m / M_PER_MM:g} mm apart", frame.unit)
+        raise _misfit(
+            active,
+            (px, py),
+            f"changes by up to {step_m / M_PER_MM:.3g} mm between "
+            f"neighbouring sites {plate.grid_pitch_m / M_PER_MM:g} mm apart",
+            frame.unit,
+        )
     gx, gy = own + added
     return replace(error_map, gx=gx, gy=gy)
 
@@ -180,20 +209,28 @@ def _steepest(fields: np.ndarray) -> float:
     return max(float(np.nanmax(np.abs(np.diff(fields, axis=axis)))) for axis in (1, 2))
 
 
-def _misfit(active: Correction, at: tuple[np.ndarray, np.ndarray], what: str,
-            unit: str) -> InputError:
+def _misfit(
+    active: Correction, at: tuple[np.ndarray, np.ndarray], what: str, unit: str
+) -> InputError:
     """Return the refusal of an active table that is too steep at positions of the controller."""
     spans = [(float(np.nanmin(p)), float(np.nanmax(p))) for p in at]
     if isinstance(active, Covering) and any(
-            max(low - first, last - high) > (last - first) / 4
-            for (low, high), (first, last) in zip(active.field, spans, strict=True)):
-        table, stage = ("x from {:.4g} to {:.4g}, y from {:.4g} to {:.4g}".format(*x, *y)
-                        for x, y in (active.field, spans))
-        return InputError("--onto", f"the active table covers only part of the field: {table} "
-                          f"{unit}, the map {stage}; beyond it the table {what}",
-                          "name the table of this stage, in this unit (--unit)")
-    return InputError("--onto", f"the active table {what}",
-                      "is it that of this stage, in this unit?")
+        max(low - first, last - high) > (last - first) / 4
+        for (low, high), (first, last) in zip(active.field, spans, strict=True)
+    ):
+        table, stage = (
+            "x from {:.4g} to {:.4g}, y from {:.4g} to {:.4g}".format(*x, *y)
+            for x, y in (active.field, spans)
+        )
+        return InputError(
+            "--onto",
+            f"the active table covers only part of the field: {table} "
+            f"{unit}, the map {stage}; beyond it the table {what}",
+            "name the table of this stage, in this unit (--unit)",
+        )
+    return InputError(
+        "--onto", f"the active table {what}", "is it that of this stage, in this unit?"
+    )
 
 
 def bends_between(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> float:
@@ -203,10 +240,13 @@ def bends_between(error_map: ErrorMap, frame: MachineFrame, active: Correction) 
     table that replaces it has the nodes of the map and loses this.
     """
     plate = error_map.artifact
-    x, y = (np.interp(np.arange(4 * len(p) - 3) / 4, np.arange(len(p)), p)
-            for p in (plate.x_m[:, 0], plate.y_m[0]))
-    left, right = (np.stack([np.interp(p, p[::4], unit) for unit in np.eye(len(p[::4]))], axis=1)
-                   for p in (x, y))
+    x, y = (
+        np.interp(np.arange(4 * len(p) - 3) / 4, np.arange(len(p)), p)
+        for p in (plate.x_m[:, 0], plate.y_m[0])
+    )
+    left, right = (
+        np.stack([np.interp(p, p[::4], unit) for unit in np.eye(len(p[::4]))], axis=1)
+        for p in (x, y)
+    )
     fields = active(*frame.to_machine(*np.meshgrid(x, y, indexing="ij")))
-    return frame.unit_m * max(
-        float(abs(c - left @ c[::4, ::4] @ right.T).max()) for c in fields)
+    return frame.unit_m * max(float(abs(c - left @ c[::4, ::4] @ right.T).max()) for c in fields)

@@ -31,8 +31,16 @@ from selfcal_ros.model.error_map import ErrorMap
 
 MAX_LINES = 256
 """LinuxCNC: entries of a joint."""
-CEC_KEYS = ("INPUT_AXIS", "OUTPUT_AXIS", "STEP", "MIN", "MAX", "DIRECTION", "MULT_BY_TABLE",
-            "IS_MODULO")
+CEC_KEYS = (
+    "INPUT_AXIS",
+    "OUTPUT_AXIS",
+    "STEP",
+    "MIN",
+    "MAX",
+    "DIRECTION",
+    "MULT_BY_TABLE",
+    "IS_MODULO",
+)
 
 
 def _means(error_map: ErrorMap, wiring: Wiring) -> tuple[tuple, list[tuple]]:
@@ -56,8 +64,10 @@ def write_linuxcnc(error_map: ErrorMap, wiring: Wiring) -> Texts:
         if len(at) > MAX_LINES:
             at = np.linspace(positions[0], positions[-1], MAX_LINES)
         values = values - np.interp(0.0, at, np.interp(at, positions, values))
-        files[name] = [" ".join((fixed(p, unit_m), *[fixed(p - c, unit_m)] * 2))
-                       for p, c in zip(at, np.interp(at, positions, values), strict=True)]
+        files[name] = [
+            " ".join((fixed(p, unit_m), *[fixed(p - c, unit_m)] * 2))
+            for p, c in zip(at, np.interp(at, positions, values), strict=True)
+        ]
     return files
 
 
@@ -72,11 +82,17 @@ def read_linuxcnc(sources: Sequence[Source], wiring: Wiring) -> Correction:
             rows.append(numbers(text.strip(), f"{source.where}:{number}", r"N\s+N\s+N"))
         nominal, forward, reverse = np.array(rows).T if rows else np.zeros((3, 0))
         if not 2 <= len(rows) <= MAX_LINES or not (np.diff(nominal) > 0).all():
-            raise InputError(source.where, f"{len(rows)} lines, or positions that do not increase",
-                             f"2 to {MAX_LINES} lines nominal forward reverse, before any comment")
+            raise InputError(
+                source.where,
+                f"{len(rows)} lines, or positions that do not increase",
+                f"2 to {MAX_LINES} lines nominal forward reverse, before any comment",
+            )
         if (forward != reverse).any():
-            raise InputError(source.where, "forward and reverse differ", "a calibrated map has one "
-                             "correction for both directions")
+            raise InputError(
+                source.where,
+                "forward and reverse differ",
+                "a calibrated map has one correction for both directions",
+            )
         joints.append((nominal, nominal - forward))
     (xs, cx), (ys, cy) = joints
     return lambda px, py: (np.interp(px, xs, cx), np.interp(py, ys, cy))
@@ -89,12 +105,24 @@ def write_siemens(error_map: ErrorMap, wiring: Wiring) -> Texts:
     table = 0
     for output, (of_x, of_y, mean) in zip(axes, means, strict=True):
         for source, positions, values in zip(axes, at, (of_x, of_y - mean), strict=True):
-            lines += [f"$AN_CEC[{table},{n}]={fixed(value, frame.unit_m)}"
-                      for n, value in enumerate(values)]
-            settings = (f"(AX{source})", f"(AX{output})", plain(spacing(positions)),
-                        plain(positions[0]), plain(positions[-1]), "0", "0", "0")
-            lines += [f"$AN_CEC_{key}[{table}]={value}"
-                      for key, value in zip(CEC_KEYS, settings, strict=True)]
+            lines += [
+                f"$AN_CEC[{table},{n}]={fixed(value, frame.unit_m)}"
+                for n, value in enumerate(values)
+            ]
+            settings = (
+                f"(AX{source})",
+                f"(AX{output})",
+                plain(spacing(positions)),
+                plain(positions[0]),
+                plain(positions[-1]),
+                "0",
+                "0",
+                "0",
+            )
+            lines += [
+                f"$AN_CEC_{key}[{table}]={value}"
+                for key, value in zip(CEC_KEYS, settings, strict=True)
+            ]
             table += 1
     return {"": [*lines, "M17"]}
 
@@ -102,19 +130,28 @@ def write_siemens(error_map: ErrorMap, wiring: Wiring) -> Texts:
 def read_siemens(sources: Sequence[Source], wiring: Wiring) -> Correction:
     """Return the sum of CEC tables; the first and last value hold outside."""
     [source] = sources
-    axes = {f"(AX{axis})": place for place, axis in enumerate((
-        wiring.frame.x_axis, wiring.frame.y_axis))}
+    axes = {
+        f"(AX{axis})": place
+        for place, axis in enumerate((wiring.frame.x_axis, wiring.frame.y_axis))
+    }
     entries: dict[int, dict] = {}
     settings: dict[tuple[int, str], Any] = {}
     for line in lines_of(source, ";.*"):
         if re.fullmatch(r"%_N_NC_CEC_INI|CHANDATA\(1\)|M17", line.text):
             continue
-        match = re.fullmatch(r"\$AN_CEC(?:_(\w+))?\[(\d{1,3})(?:,(\d{1,5}))?\]\s*=\s*(\S+)",
-                             line.text, re.ASCII)
-        if match is None or (match[1] is None) != (match[3] is not None) \
-                or match[1] not in (None, *CEC_KEYS):
-            raise InputError(line.where, f"'{line.text[:60]}' is not a value of a CEC table",
-                             "export the tables again")
+        match = re.fullmatch(
+            r"\$AN_CEC(?:_(\w+))?\[(\d{1,3})(?:,(\d{1,5}))?\]\s*=\s*(\S+)", line.text, re.ASCII
+        )
+        if (
+            match is None
+            or (match[1] is None) != (match[3] is not None)
+            or match[1] not in (None, *CEC_KEYS)
+        ):
+            raise InputError(
+                line.where,
+                f"'{line.text[:60]}' is not a value of a CEC table",
+                "export the tables again",
+            )
         table = int(match[2])
         known: dict[Any, Any] = settings if match[1] else entries.setdefault(table, {})
         place = (table, match[1]) if match[1] else (int(match[3]), 0)
@@ -122,8 +159,9 @@ def read_siemens(sources: Sequence[Source], wiring: Wiring) -> Correction:
             raise InputError(line.where, "it is given twice", "keep one of them")
         is_axis = match[1] in CEC_KEYS[:2]
         known[place] = match[4] if is_axis else numbers(match[4], line.where, "N")[0]
-    grids = [_cec_grid(table, values, settings, axes, source.where)
-             for table, values in entries.items()]
+    grids = [
+        _cec_grid(table, values, settings, axes, source.where) for table, values in entries.items()
+    ]
     if not grids:
         raise InputError(source.where, "it has no CEC table", "export it again")
     sense = -1.0 if wiring.negate else 1.0
@@ -133,20 +171,35 @@ def read_siemens(sources: Sequence[Source], wiring: Wiring) -> Correction:
         for source_axis, output, grid in grids:
             out[output] = out[output] + sense * grid.at((px, py)[source_axis], px)
         return out[0], out[1]
+
     return correct
 
 
-def _cec_grid(table: int, values: dict, settings: dict, axes: dict[str, int], where: str,
-              ) -> tuple[int, int, Grid]:
+def _cec_grid(
+    table: int,
+    values: dict,
+    settings: dict,
+    axes: dict[str, int],
+    where: str,
+) -> tuple[int, int, Grid]:
     """Return input axis, output axis and values of a table."""
     found: list[Any] = [settings.get((table, key)) for key in CEC_KEYS]
     place = f"{where}: table {table}"
     if None in found or any(axis not in axes for axis in found[:2]):
-        raise InputError(place, "a setting is missing, or an axis is not one of the stage",
-                         f"the axes are {' and '.join(axes)} (--x-axis, --y-axis)")
+        raise InputError(
+            place,
+            "a setting is missing, or an axis is not one of the stage",
+            f"the axes are {' and '.join(axes)} (--x-axis, --y-axis)",
+        )
     step, first, last, *rest = found[2:]
     if any(rest) or not step > 0 or abs((last - first) / step - (len(values) - 1)) > 1e-6:
-        raise InputError(place, f"{len(values)} values from {first} to {last} in steps of {step}",
-                         "they do not fit, or direction, multiplication or modulo is set")
-    return axes[found[0]], axes[found[1]], Grid(
-        (first, 0.0), (step, 1.0), filled(values, (len(values), 1), place))
+        raise InputError(
+            place,
+            f"{len(values)} values from {first} to {last} in steps of {step}",
+            "they do not fit, or direction, multiplication or modulo is set",
+        )
+    return (
+        axes[found[0]],
+        axes[found[1]],
+        Grid((first, 0.0), (step, 1.0), filled(values, (len(values), 1), place)),
+    )

@@ -97,7 +97,7 @@ def commented(program: str, comments: Sequence[str]) -> str:
     begins = re.match(r"\s*%[^\n]*\n", program)
     head = begins[0] if begins else ""
     lines = ["; " + re.sub("[^ -~]|[!?~]", "_", text[:MAX_COMMENT]) + newline for text in comments]
-    return head + "".join(lines) + program[len(head):]
+    return head + "".join(lines) + program[len(head) :]
 
 
 class Rewriter:
@@ -117,8 +117,15 @@ class Rewriter:
         Of coordinates in mm; one more in inches.
     """
 
-    def __init__(self, correct: Correction, *, dialect: str, tolerance_m: float, step_m: float,
-                 decimals: int = 5) -> None:
+    def __init__(
+        self,
+        correct: Correction,
+        *,
+        dialect: str,
+        tolerance_m: float,
+        step_m: float,
+        decimals: int = 5,
+    ) -> None:
         self._correct = correct
         self._tolerance_m = tolerance_m
         self._step_m = step_m
@@ -174,8 +181,9 @@ class Rewriter:
         pattern = PRINTER_WORD if self._printer else WORD
         left = pattern.sub("", text)
         if left:
-            self._refuse(f"{left[0]!r} does not belong to a word of {self.dialect}",
-                         remedy(left[0].upper()))
+            self._refuse(
+                f"{left[0]!r} does not belong to a word of {self.dialect}", remedy(left[0].upper())
+            )
         line = ProgramLine([], {}, [])
         for letter, value, comment in pattern.findall(text):
             letter = letter.upper()
@@ -200,8 +208,10 @@ class Rewriter:
         """Return a code of the list; printers may know it in one way of writing only."""
         name = f"{letter}{float(value or math.nan):.10g}"
         if name not in self._codes:
-            self._refuse(f"{letter}{value} is not in the list of codes that are known of "
-                         f"{self.dialect}", remedy(name))
+            self._refuse(
+                f"{letter}{value} is not in the list of codes that are known of {self.dialect}",
+                remedy(name),
+            )
         if self._printer and name != letter + value:
             self._refuse(f"{letter}{value} is not understood by all firmware", f"write {name}")
         return self._codes[name]
@@ -239,8 +249,9 @@ class Rewriter:
         distance = line.code("distance")
         mode = distance.name if distance else self._modes.get("distance")
         if mode != "G91" or line.number("X") or line.number("Y"):
-            self._refuse("the way home passes a point that is not corrected",
-                         "write G91 with it, and X0, Y0")
+            self._refuse(
+                "the way home passes a point that is not corrected", "write G91 with it, and X0, Y0"
+            )
 
     def _set_mode(self, code: Code) -> None:
         """Follow a mode."""
@@ -264,8 +275,10 @@ class Rewriter:
         for mode, moves in NEEDED.items():
             names = [code.name for code in self._codes.values() if code.does == mode]
             if names and act.does in moves and mode not in self._modes:
-                self._refuse(f"the program has not said {' or '.join(names)}",
-                             "write it before the first move")
+                self._refuse(
+                    f"the program has not said {' or '.join(names)}",
+                    "write it before the first move",
+                )
         if line.named("E") and not relative and "extruder" not in self._modes:
             self._refuse("the program has not said M82 or M83", "write it after the last G90")
         if relative and act.does in IN_PLANE:
@@ -295,11 +308,15 @@ class Rewriter:
         unit_m = M_PER_INCH if self._modes["unit"] == "G20" else M_PER_MM
         start_m, end_m = (complex(at["X"], at["Y"]) * unit_m for at in (self._at, ends))
         travels = act.does in ("rapid", "hole") or (
-            act.does == "line" and not line.named("E") and (
-                self.prints or (self._printer and act.name == "G0")))
+            act.does == "line"
+            and not line.named("E")
+            and (self.prints or (self._printer and act.name == "G0"))
+        )
         if not cmath.isfinite(end_m if travels else start_m + end_m):
-            self._refuse("the position before this line is not known", "write an absolute move of "
-                         "X and Y before it" + " with G0" * (not self.prints))
+            self._refuse(
+                "the position before this line is not known",
+                "write an absolute move of X and Y before it" + " with G0" * (not self.prints),
+            )
         limit_m = (1 - OF_SAMPLES) * self._tolerance_m
         if act.does == "arc":
             centre_m = start_m + complex(line.number("I"), line.number("J")) * unit_m
@@ -335,12 +352,15 @@ class Rewriter:
         for axis in line.named("ZE"):
             self._sent[axis] = 0.0 if self._relative(axis) else self._at[axis]
             if math.isnan(self._sent[axis]):
-                self._refuse(f"{axis} before this line is not known, and the move is split",
-                             f"command {axis} alone first")
+                self._refuse(
+                    f"{axis} before this line is not known, and the move is split",
+                    f"command {axis} alone first",
+                )
         return {axis: self._sent[axis] for axis in line.named("ZE")}
 
-    def _arc(self, start_m: complex, end_m: complex, centre_m: complex, *,
-             sense: int) -> np.ndarray:
+    def _arc(
+        self, start_m: complex, end_m: complex, centre_m: complex, *, sense: int
+    ) -> np.ndarray:
         """Return points of an arc, m."""
         from_m, to_m = start_m - centre_m, end_m - centre_m
         if not from_m or not to_m:
@@ -350,9 +370,11 @@ class Rewriter:
         if start_m == end_m:
             sweep, unsure = 2 * math.pi, False
         if unsure or abs(abs(to_m) - abs(from_m)) > self._tolerance_m / 2:
-            self._refuse(f"the arc ends at {abs(to_m) / abs(from_m):.6f} times its radius, "
-                         f"after {math.degrees(sweep):.3f} deg", "give more digits or a larger "
-                         "--tolerance; write what is as good as straight as G1")
+            self._refuse(
+                f"the arc ends at {abs(to_m) / abs(from_m):.6f} times its radius, "
+                f"after {math.degrees(sweep):.3f} deg",
+                "give more digits or a larger --tolerance; write what is as good as straight as G1",
+            )
         sagitta = min(1.0, OF_SAMPLES * self._tolerance_m / abs(from_m))
         step = min(2 * math.acos(1 - sagitta), self._step_m / abs(from_m))
         share = np.linspace(0, 1, self._count(sweep, step))
@@ -382,8 +404,11 @@ def _text(act: Code, line: ProgramLine, places: Mapping[str, str]) -> str:
     number = [f"N{line.values[letter]}" for letter in line.named("N")]
     command = "G1" if act.does == "arc" else act.name
     axes = [letter + value for letter, value in places.items()]
-    words = [letter + value for letter, value in line.values.items()
-             if letter not in {"N", "I", "J", *places}]
+    words = [
+        letter + value
+        for letter, value in line.values.items()
+        if letter not in {"N", "I", "J", *places}
+    ]
     codes = [code.name for code in line.codes if code is not act]
     return " ".join([*number, command, *axes, *words, *codes, *line.comments])
 

@@ -23,7 +23,9 @@ other: G40 G91.1 G94 M3 M4 M5 M7 M8 M9
 stop: M0 M1
 end: M2 M30
 """
-LINUXCNC = RS274 + """\
+LINUXCNC = (
+    RS274
+    + """\
 hole: G81 G85 XYZR
 hole: G82 G86 G89 XYZRP
 hole: G73 G83 XYZRQ
@@ -33,9 +35,13 @@ offset: G43 H
 unknown: M6
 other: G97 G98 G99 M48 M49
 """
-GRBL = RS274 + """\
+)
+GRBL = (
+    RS274
+    + """\
 other: G61
 """
+)
 KLIPPER = """
 line: G0 G1 XYZEF
 arc: G2 G3 XYZEFIJ
@@ -49,17 +55,20 @@ extruder: M82 M83
 other: G17 M105 M107 M114 M115 M117 M400
 other: M73 M104 M106 M109 M140 M190 M204 M220 M221 PRST
 """
-MARLIN = KLIPPER + """\
+MARLIN = (
+    KLIPPER
+    + """\
 unknown: G29
 other: M17 M201 M203 M205 M900 XYZEBJKST
 stop: M0 M1 PS
 """
+)
 PRINTERS = ("marlin", "klipper")
 """Dialects in mm, with one command in a line, which is always named, and with the axis E."""
 REMEDIES = {
-    "G10 G52 G54 G55 G56 G57 G58 G59 G92 G92.1 G92.2 G92.3 M206 M428":
-        ("set the frame before the program, "
-         "and give its zero with --home-x and --home-y"),
+    "G10 G52 G54 G55 G56 G57 G58 G59 G92 G92.1 G92.2 G92.3 M206 M428": (
+        "set the frame before the program, and give its zero with --home-x and --home-y"
+    ),
     "G43 G43.1 G49": "write G43 or G49 before the first move in X or Y",
     "G18 G19 R": "have arcs written in the XY plane, with I and J for their centre",
     "G20 G21": "write it once, before the first move",
@@ -69,7 +78,8 @@ REMEDIES = {
     "* N": "leave numbers of lines and checksums to the sender",
     "# [ = < O": "have parameters, expressions and sub-programs replaced by plain moves",
     "K L P": "write each repeat, turn or hole as a line of its own",
-    "T": "write a program for each tool"}
+    "T": "write a program for each tool",
+}
 
 
 class Code(NamedTuple):
@@ -82,8 +92,10 @@ class Code(NamedTuple):
 
 def remedy(name: str) -> str:
     """Return what to do about a code, letter or character that is refused."""
-    return next((text for names, text in REMEDIES.items() if name in names.split()),
-                "write the program without it")
+    return next(
+        (text for names, text in REMEDIES.items() if name in names.split()),
+        "write the program without it",
+    )
 
 
 def _list(text: str) -> dict[str, Code]:
@@ -97,5 +109,9 @@ def _list(text: str) -> dict[str, Code]:
     return codes
 
 
-DIALECTS = {"linuxcnc": _list(LINUXCNC), "grbl": _list(GRBL), "marlin": _list(MARLIN),
-            "klipper": _list(KLIPPER)}
+DIALECTS = {
+    "linuxcnc": _list(LINUXCNC),
+    "grbl": _list(GRBL),
+    "marlin": _list(MARLIN),
+    "klipper": _list(KLIPPER),
+}

@@ -82,8 +82,9 @@ class Grid:
         """Return the values at positions."""
         (i, i1, u), (j, j1, v) = (self._cell(axis, p) for axis, p in enumerate((x, y)))
         c = self.values
-        return ((1 - u) * ((1 - v) * c[i, j] + v * c[i, j1])
-                + u * ((1 - v) * c[i1, j] + v * c[i1, j1]))
+        return (1 - u) * ((1 - v) * c[i, j] + v * c[i, j1]) + u * (
+            (1 - v) * c[i1, j] + v * c[i1, j1]
+        )
 
     def _cell(self, axis: int, position: np.ndarray) -> tuple:
         last = self.values.shape[axis] - 1
@@ -113,6 +114,7 @@ def wanted(error_map: ErrorMap, wiring: Wiring) -> Correction:
     def correct(px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         gx, gy = stage.error(*frame.from_machine(px, py))
         return sense * frame.sign_x * gx, sense * frame.sign_y * gy
+
     return correct
 
 
@@ -143,8 +145,10 @@ def plain(value: float) -> str:
 
 def lines_of(source: Source, comment: str) -> list[Line]:
     """Return the lines with content; `comment` is a pattern of what is removed from each."""
-    found = [Line(re.sub(comment, " ", text).strip(), f"{source.where}:{number}")
-             for number, text in enumerate(source.text.splitlines(), 1)]
+    found = [
+        Line(re.sub(comment, " ", text).strip(), f"{source.where}:{number}")
+        for number, text in enumerate(source.text.splitlines(), 1)
+    ]
     return [line for line in found if line.text]
 
 
@@ -160,8 +164,11 @@ def numbers(text: str, where: str, pattern: str) -> list[float]:
     match = re.fullmatch(form, text, re.ASCII | re.I)
     if match is None:
         shown = re.sub(r"\\(.)", r"\1", pattern.replace(r"\s*", " ").replace(r"\s+", " "))
-        raise InputError(where, f"'{text[:60]}' is not of the form {shown}",
-                         "N is a number, I an integer: export the table again")
+        raise InputError(
+            where,
+            f"'{text[:60]}' is not of the form {shown}",
+            "N is a number, I an integer: export the table again",
+        )
     values = [float(group) for group in match.groups()]
     if not all(abs(value) < 1e15 for value in values):
         raise InputError(where, "a number is too large", "export the table again")
@@ -171,9 +178,13 @@ def numbers(text: str, where: str, pattern: str) -> list[float]:
 def filled(entries: dict[tuple[int, int], float], shape: Sequence[int], where: str) -> np.ndarray:
     """Return entries as an array; InputError if one is missing or outside."""
     if len(entries) != shape[0] * shape[1] or not all(
-            i < shape[0] and j < shape[1] for i, j in entries):
-        raise InputError(where, f"{len(entries)} entries, not those of {shape[0]} x {shape[1]} "
-                         "nodes", "export the table again")
+        i < shape[0] and j < shape[1] for i, j in entries
+    ):
+        raise InputError(
+            where,
+            f"{len(entries)} entries, not those of {shape[0]} x {shape[1]} nodes",
+            "export the table again",
+        )
     out = np.empty(tuple(shape))
     for place, value in entries.items():
         out[place] = value

@@ -47,11 +47,17 @@ def write_kmotion(error_map: ErrorMap, wiring: Wiring) -> Texts:
     unit_m, (x, y) = wiring.frame.unit_m, nodes(error_map, wiring.frame)
     px, py = np.meshgrid(x, y)
     cx, cy = wanted(error_map, wiring)(px, py)
-    lines = [f"{len(y)},{len(x)}", f"{plain(spacing(x))},{plain(spacing(y))}",
-             f"{plain(x[0])},{plain(y[0])}"]
-    lines += [f"{row},{column},{fixed(px[row, column] + cx[row, column], unit_m)},"
-              f"{fixed(py[row, column] + cy[row, column], unit_m)},0"
-              for row in range(len(y)) for column in range(len(x))]
+    lines = [
+        f"{len(y)},{len(x)}",
+        f"{plain(spacing(x))},{plain(spacing(y))}",
+        f"{plain(x[0])},{plain(y[0])}",
+    ]
+    lines += [
+        f"{row},{column},{fixed(px[row, column] + cx[row, column], unit_m)},"
+        f"{fixed(py[row, column] + cy[row, column], unit_m)},0"
+        for row in range(len(y))
+        for column in range(len(x))
+    ]
     return {"": lines}
 
 
@@ -61,30 +67,48 @@ def read_kmotion(sources: Sequence[Source], wiring: Wiring) -> Correction:
     What follows the last entry is not read by the controller: there are the comments.
     """
     [source] = sources
-    lines = [Line(text.strip(), f"{source.where}:{number}")
-             for number, text in enumerate(source.text.splitlines(), 1)]
+    lines = [
+        Line(text.strip(), f"{source.where}:{number}")
+        for number, text in enumerate(source.text.splitlines(), 1)
+    ]
     if len(lines) < 3:
         raise InputError(source.where, "it has no Geo Table", "export it again")
     comma = r"\s*,\s*"
     rows, columns = map(int, numbers(*lines[0], f"I{comma}I"))
     step, first = (numbers(*line, f"N{comma}N") for line in lines[1:3])
     if not (2 <= rows <= 4000 and 2 <= columns <= 4000) or not all(step):
-        raise InputError(source.where, f"{rows} rows and {columns} columns, spacing {step}",
-                         "2 to 4000 of each, with a distance between them")
+        raise InputError(
+            source.where,
+            f"{rows} rows and {columns} columns, spacing {step}",
+            "2 to 4000 of each, with a distance between them",
+        )
     entries: tuple[dict, dict] = {}, {}
-    for line in lines[3:3 + rows * columns]:
+    for line in lines[3 : 3 + rows * columns]:
         row, column, *command = numbers(*line, comma.join("IINNN"))
         if not (0 <= row < rows and 0 <= column < columns):
-            raise InputError(line.where, f"row {row:.0f}, column {column:.0f} is not in the table",
-                             "export it again")
+            raise InputError(
+                line.where,
+                f"row {row:.0f}, column {column:.0f} is not in the table",
+                "export it again",
+            )
         for out, value in zip(entries, command[:2], strict=True):
             out[int(column), int(row)] = value
-    grids = [Grid((first[0], first[1]), (step[0], step[1]),
-                  filled(out, (columns, rows), source.where), "extrapolate") for out in entries]
-    along_x, along_y = ((start, start + by * (count - 1)) for start, by, count in zip(
-        first, step, (columns, rows), strict=True))
-    return Covering(lambda px, py: (grids[0].at(px, py) - px, grids[1].at(px, py) - py),
-                    along_x, along_y)
+    grids = [
+        Grid(
+            (first[0], first[1]),
+            (step[0], step[1]),
+            filled(out, (columns, rows), source.where),
+            "extrapolate",
+        )
+        for out in entries
+    ]
+    along_x, along_y = (
+        (start, start + by * (count - 1))
+        for start, by, count in zip(first, step, (columns, rows), strict=True)
+    )
+    return Covering(
+        lambda px, py: (grids[0].at(px, py) - px, grids[1].at(px, py) - py), along_x, along_y
+    )
 
 
 def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
@@ -108,21 +132,30 @@ def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
     px, py = np.meshgrid(*at, indexing="ij")
     correct = wanted(error_map, wiring)
     tables = {}
-    for motor, values, per in zip((frame.x_axis, frame.y_axis), correct(px, py), counts,
-                                  strict=True):
+    for motor, values, per in zip(
+        (frame.x_axis, frame.y_axis), correct(px, py), counts, strict=True
+    ):
         integers = np.rint(PER_COUNT * per * (values - values[0, 0])).astype(int).T.ravel()[1:]
         tables[motor] = [
-            f"#{motor}", f"DEFINE COMP {shape[1]}.{shape[0]},#{frame.x_axis}D,#{frame.y_axis}D,"
+            f"#{motor}",
+            f"DEFINE COMP {shape[1]}.{shape[0]},#{frame.x_axis}D,#{frame.y_axis}D,"
             f"#{motor},{spans[0]},{spans[1]}",
-            *(" ".join(map(str, integers[k:k + 10].tolist())) for k in range(0, len(integers), 10))]
+            *(
+                " ".join(map(str, integers[k : k + 10].tolist()))
+                for k in range(0, len(integers), 10)
+            ),
+        ]
     high_first = sorted(tables, reverse=True)
     return {"": [line for motor in high_first for line in tables[motor]] + ["I51=1"]}
 
 
 def _counts(wiring: Wiring) -> tuple[float, float]:
     if wiring.counts is None:
-        raise InputError("--counts-per-unit", "PMAC's tables are in counts, whose size is not "
-                         "known", "give the counts per unit of both motors")
+        raise InputError(
+            "--counts-per-unit",
+            "PMAC's tables are in counts, whose size is not known",
+            "give the counts per unit of both motors",
+        )
     return wiring.counts
 
 
@@ -136,18 +169,21 @@ def read_pmac(sources: Sequence[Source], wiring: Wiring) -> Correction:
         if re.match("define", line.text, re.I):
             head = numbers(*line, r"define\s+comp\s+I\.I,\s*#ID?,\s*#ID?,\s*#I,\s*I,\s*I")
             tables.append((line, [int(value) for value in head], []))
-        elif tables and re.fullmatch(r"[-+]?\d{1,9}(\s+[-+]?\d{1,9})*", line.text,
-                                      re.ASCII):
+        elif tables and re.fullmatch(r"[-+]?\d{1,9}(\s+[-+]?\d{1,9})*", line.text, re.ASCII):
             tables[-1][2].extend(map(int, line.text.split()))
         else:
-            raise InputError(line.where, f"'{line.text[:60]}' is not part of a table",
-                             "export the tables again")
+            raise InputError(
+                line.where, f"'{line.text[:60]}' is not part of a table", "export the tables again"
+            )
     grids = [_pmac_grid(*table) for table in tables]
     counts, motors = _counts(wiring), (wiring.frame.x_axis, wiring.frame.y_axis)
     for axes, (line, *_) in zip((axes for axes, _ in grids), tables, strict=True):
         if not set(axes) <= set(motors):
-            raise InputError(line.where, f"motors {axes} are not those of the stage, {motors}",
-                             "name them with --x-axis and --y-axis")
+            raise InputError(
+                line.where,
+                f"motors {axes} are not those of the stage, {motors}",
+                "name them with --x-axis and --y-axis",
+            )
     if not grids:
         raise InputError(source.where, "it has no table", "export it again")
 
@@ -157,6 +193,7 @@ def read_pmac(sources: Sequence[Source], wiring: Wiring) -> Correction:
         for (row, column, target), grid in grids:
             out[target] = out[target] + grid.at(at[row], at[column]) / PER_COUNT
         return out[motors[0]] / counts[0], out[motors[1]] / counts[1]
+
     return correct
 
 
@@ -164,10 +201,19 @@ def _pmac_grid(line: Line, head: list[int], entries: list[int]) -> tuple[tuple, 
     """Return (row motor, column motor, target) and the values over their positions in counts."""
     rows, columns, *axes, row_span, column_span = head
     number = (rows + 1) * (columns + 1) - 1
-    if not (rows > 0 and columns > 0 and number <= MAX_ENTRIES and row_span > 0
-            and column_span > 0 and len(entries) == number):
-        raise InputError(line.where, f"{len(entries)} entries for {rows}.{columns}",
-                         f"{number} belong to it, and positive spans")
+    if not (
+        rows > 0
+        and columns > 0
+        and number <= MAX_ENTRIES
+        and row_span > 0
+        and column_span > 0
+        and len(entries) == number
+    ):
+        raise InputError(
+            line.where,
+            f"{len(entries)} entries for {rows}.{columns}",
+            f"{number} belong to it, and positive spans",
+        )
     values = np.array([0, *entries], dtype=float).reshape(rows + 1, columns + 1).T
     return tuple(axes), Grid((0.0, 0.0), (row_span / columns, column_span / rows), values, "roll")
 
@@ -178,8 +224,10 @@ def write_beckhoff(error_map: ErrorMap, wiring: Wiring) -> Texts:
     x, y = (positions * per for positions in nodes(error_map, frame))
     step = max(1, round(spacing(x)))
     first = [round(positions[0]) for positions in (x, y)]
-    last = [int(np.ceil((positions[-1] - start) / step - 1e-6))
-            for positions, start in zip((x, y), first, strict=True)]
+    last = [
+        int(np.ceil((positions[-1] - start) / step - 1e-6))
+        for positions, start in zip((x, y), first, strict=True)
+    ]
     at = [start + step * np.arange(end + 1) for start, end in zip(first, last, strict=True)]
     values = wanted(error_map, wiring)(*(p / per for p in np.meshgrid(*at, indexing="ij")))
     number = (last[0] + 1) * (last[1] + 1)
@@ -187,15 +235,25 @@ def write_beckhoff(error_map: ErrorMap, wiring: Wiring) -> Texts:
     for name, axis, field in zip("xy", (frame.x_axis, frame.y_axis), values, strict=True):
         lines = [f"kopf.achs_nr {axis}", f"kopf.log_achs_name {name.upper()}"]
         keys = {"max_points": number} if number > MAX_POINTS else {}
-        keys |= {"interval": step, "last_index_master1": last[0], "last_index_master2": last[1],
-                 "start_position_master1": first[0], "start_position_master2": first[1],
-                 "unit": 1, "master1_ax_nr": frame.x_axis, "master2_ax_nr": frame.y_axis,
-                 "n_cycles": 20}
+        keys |= {
+            "interval": step,
+            "last_index_master1": last[0],
+            "last_index_master2": last[1],
+            "start_position_master1": first[0],
+            "start_position_master2": first[1],
+            "unit": 1,
+            "master1_ax_nr": frame.x_axis,
+            "master2_ax_nr": frame.y_axis,
+            "n_cycles": 20,
+        }
         lines += [f"kw.crosscomp2.{key} {value}" for key, value in keys.items()]
         scaled = field * per
-        lines += [f"kw.crosscomp2.table[{j}][{i}].correction "
-                  + (str(round(scaled[i, j])) if wiring.integers else fixed(scaled[i, j], TENTH_UM))
-                  for j in range(last[1] + 1) for i in range(last[0] + 1)]
+        lines += [
+            f"kw.crosscomp2.table[{j}][{i}].correction "
+            + (str(round(scaled[i, j])) if wiring.integers else fixed(scaled[i, j], TENTH_UM))
+            for j in range(last[1] + 1)
+            for i in range(last[0] + 1)
+        ]
         files[name] = lines
     return files
 
@@ -207,15 +265,21 @@ def read_beckhoff(sources: Sequence[Source], wiring: Wiring) -> Correction:
     for source in sources:
         slave, grid = _beckhoff_grid(source, (frame.x_axis, frame.y_axis))
         if slave in grids or slave not in (frame.x_axis, frame.y_axis):
-            raise InputError(source.where, f"axis {slave} is not the other axis of the stage",
-                             "give the list of x and that of y, and --x-axis, --y-axis")
+            raise InputError(
+                source.where,
+                f"axis {slave} is not the other axis of the stage",
+                "give the list of x and that of y, and --x-axis, --y-axis",
+            )
         grids[slave] = grid
     sense = -1.0 if wiring.negate else 1.0
 
     def correct(px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        cx, cy = (sense * grids[axis].at(px * per, py * per) / per
-                  for axis in (frame.x_axis, frame.y_axis))
+        cx, cy = (
+            sense * grids[axis].at(px * per, py * per) / per
+            for axis in (frame.x_axis, frame.y_axis)
+        )
         return cx, cy
+
     return correct
 
 
@@ -225,28 +289,52 @@ def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]
     entries: dict[tuple[int, int], float] = {}
     text = re.sub(r"/\*.*?\*/", lambda match: "\n" * match[0].count("\n"), source.text, flags=re.S)
     for line in lines_of(Source(text, where), "#.*"):
-        match = re.fullmatch(r"([\w.]+)(?:\[\s*(\d{1,4})\]\s*\[\s*(\d{1,4})\]\.correction)?"
-                             rf"\s+({NUMBER}|\w+)", line.text, re.ASCII)
+        match = re.fullmatch(
+            r"([\w.]+)(?:\[\s*(\d{1,4})\]\s*\[\s*(\d{1,4})\]\.correction)?"
+            rf"\s+({NUMBER}|\w+)",
+            line.text,
+            re.ASCII,
+        )
         if match is None or (match[2] is not None) != (match[1] == "kw.crosscomp2.table"):
-            raise InputError(line.where, f"'{line.text[:60]}' is not a key and its value",
-                             "export the list again")
+            raise InputError(
+                line.where,
+                f"'{line.text[:60]}' is not a key and its value",
+                "export the list again",
+            )
         place = (int(match[3]), int(match[2])) if match[2] else match[1]
         known: dict[Any, Any] = entries if match[2] else found
         if place in known:
             raise InputError(line.where, f"{match[1]} is given twice", "keep one of them")
-        known[place] = match[4] if match[1] == "kopf.log_achs_name" else numbers(
-            match[4], line.where, "N")[0]
-    keys = ["interval", "last_index_master1", "last_index_master2", "start_position_master1",
-            "start_position_master2", "unit", "master1_ax_nr", "master2_ax_nr"]
+        known[place] = (
+            match[4] if match[1] == "kopf.log_achs_name" else numbers(match[4], line.where, "N")[0]
+        )
+    keys = [
+        "interval",
+        "last_index_master1",
+        "last_index_master2",
+        "start_position_master1",
+        "start_position_master2",
+        "unit",
+        "master1_ax_nr",
+        "master2_ax_nr",
+    ]
     names = ["kopf.achs_nr", *(f"kw.crosscomp2.{key}" for key in keys)]
     missing = [name for name in names if name not in found]
     if missing:
         raise InputError(where, f"{missing[0]} is missing", "export the list again")
     slave, step, last1, last2, first1, first2, unit, *axes = (int(found[name]) for name in names)
-    if step < 1 or unit != 1 or min(last1, last2) < 0 or not (last1 + 1) * (
-            last2 + 1) <= MAX_ENTRIES or tuple(axes) != masters:
-        raise InputError(where, f"interval {step}, unit {unit}, {last1 + 1} x {last2 + 1} points, "
-                         f"masters {axes}", f"unit 1, masters {list(masters)} and a positive "
-                         "interval are needed")
-    return slave, Grid((first1, first2), (step, step), filled(
-        entries, (last1 + 1, last2 + 1), where))
+    if (
+        step < 1
+        or unit != 1
+        or min(last1, last2) < 0
+        or not (last1 + 1) * (last2 + 1) <= MAX_ENTRIES
+        or tuple(axes) != masters
+    ):
+        raise InputError(
+            where,
+            f"interval {step}, unit {unit}, {last1 + 1} x {last2 + 1} points, masters {axes}",
+            f"unit 1, masters {list(masters)} and a positive interval are needed",
+        )
+    return slave, Grid(
+        (first1, first2), (step, step), filled(entries, (last1 + 1, last2 + 1), where)
+    )

@@ -70,8 +70,11 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     """
     options = options or Options()
     if measurements.verify:
-        raise InputError(f"plan '{measurements.plan_id}'", "was measured with the correction by "
-                         f"{measurements.verify} on", f"selfcal verify {measurements.verify} BAG")
+        raise InputError(
+            f"plan '{measurements.plan_id}'",
+            f"was measured with the correction by {measurements.verify} on",
+            f"selfcal verify {measurements.verify} BAG",
+        )
     if options.robust:
         return robust_calibrate(measurements, options)
     check_wiring(measurements)
@@ -82,8 +85,10 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if camera is not None:  # the microscope that images show, in place of the assumed one
         (scale, turn), other = camera.u_coefficients[1:3]
         known = microscope_term(float(scale), float(turn), float(other.max()))
-        options = replace(options, assumed=tuple(
-            known if term.block.of_microscope else term for term in options.assumed))
+        options = replace(
+            options,
+            assumed=tuple(known if term.block.of_microscope else term for term in options.assumed),
+        )
     solved = solve_joint(measurements, options)
     converged = solved.converged
     if not converged:  # first: with a wrong wiring the search for causes takes seconds
@@ -96,9 +101,11 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     if not measurements.has_images:
         return result
     return replace(
-        result, findings=(*result.findings, *few_read(measurements, camera)),
+        result,
+        findings=(*result.findings, *few_read(measurements, camera)),
         camera=None if camera is None else camera.shown,
-        stage_yaw=yaw_of(solved.joint, measurements.sense))
+        stage_yaw=yaw_of(solved.joint, measurements.sense),
+    )
 
 
 def require_placed(result: CalibrationResult, measurements: Measurements) -> None:
@@ -122,8 +129,11 @@ def calibrate_corrected(measurements: Measurements, options: Options) -> Calibra
     """
     before = options.plate
     if before is None:
-        raise InputError(f"plan '{measurements.plan_id}'", "no map is named whose correction is on",
-                         "write verify: RESULT.json")
+        raise InputError(
+            f"plan '{measurements.plan_id}'",
+            "no map is named whose correction is on",
+            "write verify: RESULT.json",
+        )
     require_correctable(before, options.plate_from)
     readings = replace(measurements, verify="")
     if not measurements.artifact_from:
@@ -156,11 +166,13 @@ def _fits(result: CalibrationResult) -> bool:
     An effect beyond U leaves a result unqualified, and contradicts no wiring; one that is not
     plausible does, such as a microscope whose scale of -1 undoes it.
     """
-    found = [(cause, block_of(cause.name)) for cause in result.verdict.causes
-             if cause.name in blocks()]
+    found = [
+        (cause, block_of(cause.name)) for cause in result.verdict.causes if cause.name in blocks()
+    ]
     failed = {found.name for found in result.verdict.failed}
     return failed <= {BY_LINES} and not any(
-        block.between or abs(cause.size) > block.plausible for cause, block in found)
+        block.between or abs(cause.size) > block.plausible for cause, block in found
+    )
 
 
 def _check_turned(measurements: Measurements, options: Options, *, contradicted: bool) -> None:
@@ -198,8 +210,9 @@ def _check_turned(measurements: Measurements, options: Options, *, contradicted:
         raise turned_error(measurements, found)
 
 
-def robust_calibrate(measurements: Measurements,
-                     options: Options | None = None) -> CalibrationResult:
+def robust_calibrate(
+    measurements: Measurements, options: Options | None = None
+) -> CalibrationResult:
     """Calibrate without the readings that contradict the others.
 
     Parameters
@@ -230,13 +243,18 @@ def robust_calibrate(measurements: Measurements,
     check_wiring(measurements)
     cleaned = clean(measurements, options)
     result = calibrate(cleaned.measurements, replace(options, robust=False))
-    left = tuple(found for found in cleaned.findings if found.name in LEFT
-                 or found.details.get("spoils"))
+    left = tuple(
+        found for found in cleaned.findings if found.name in LEFT or found.details.get("spoils")
+    )
     verdict = result.verdict
     if left:
         verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *left))
-    return replace(result, findings=(*result.findings, *cleaned.findings), verdict=verdict,
-                   extra={**result.extra, **listed(cleaned)})
+    return replace(
+        result,
+        findings=(*result.findings, *cleaned.findings),
+        verdict=verdict,
+        extra={**result.extra, **listed(cleaned)},
+    )
 
 
 def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurements:
@@ -244,21 +262,28 @@ def _as_calibrated(measurements: Measurements, plate: KnownPlate) -> Measurement
     if not measurements.has_images:
         return measurements
     if plate.result.kept.images is None:
-        raise InputError(plate.where, "its noise is not separated into that of images and that of "
-                         "marks, but the readings have images of several marks",
-                         "recheck with one mark an image, or calibrate with such images")
+        raise InputError(
+            plate.where,
+            "its noise is not separated into that of images and that of "
+            "marks, but the readings have images of several marks",
+            "recheck with one mark an image, or calibrate with such images",
+        )
     camera = known_camera(plate.result)
     return measurements if camera is None else straightened(measurements, camera)
 
 
-def _camera(measurements: Measurements,
-            options: Options) -> tuple[FittedCamera | None, Measurements]:
+def _camera(
+    measurements: Measurements, options: Options
+) -> tuple[FittedCamera | None, Measurements]:
     """Return the camera shown by images of several marks, and the readings corrected for it."""
     straight, camera = measurements, None
     if not measurements.has_images:
         return None, measurements
-    plain = replace(options, terms=(), assumed=tuple(
-        term for term in options.model_terms(visits=True) if term.block.of_images))
+    plain = replace(
+        options,
+        terms=(),
+        assumed=tuple(term for term in options.model_terms(visits=True) if term.block.of_images),
+    )
     for _ in range(CAMERA_STEPS):
         camera = camera_of(measurements, fit_joint(straight, plain))
         if camera is None:

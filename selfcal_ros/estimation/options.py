@@ -80,16 +80,26 @@ class Options:
     def __post_init__(self) -> None:
         """Refuse unknown names."""
         if self.misalignment_model not in MISALIGNMENT_MODELS:
-            raise InputError("misalignment_model", f"'{self.misalignment_model}' is unknown",
-                             known_are(self.misalignment_model, MISALIGNMENT_MODELS))
+            raise InputError(
+                "misalignment_model",
+                f"'{self.misalignment_model}' is unknown",
+                known_are(self.misalignment_model, MISALIGNMENT_MODELS),
+            )
         try:
             object.__setattr__(self, "datum_theta", ThetaDatum(self.datum_theta))
         except ValueError as error:
-            raise InputError("datum_theta", f"'{self.datum_theta}' is unknown",
-                             known_are(str(self.datum_theta), ThetaDatum)) from error
+            raise InputError(
+                "datum_theta",
+                f"'{self.datum_theta}' is unknown",
+                known_are(str(self.datum_theta), ThetaDatum),
+            ) from error
         if self.robust and self.plate is not None:
-            raise InputError("robust", f"the plate is known from {self.plate_from}, and one view "
-                             "has nothing to check its readings against", "omit it")
+            raise InputError(
+                "robust",
+                f"the plate is known from {self.plate_from}, and one view "
+                "has nothing to check its readings against",
+                "omit it",
+            )
 
     @property
     def finite_rotations(self) -> bool:
@@ -107,6 +117,9 @@ class Options:
             Whether to include assumed terms.
         """
         named = {term.name for term in self.terms}
-        more = [term for term in self.assumed if assumed and term.name not in named
-                and (visits or not term.block.needs_visits)]
+        more = [
+            term
+            for term in self.assumed
+            if assumed and term.name not in named and (visits or not term.block.needs_visits)
+        ]
         return tuple(term for term in (*self.terms, *more) if term.size > 0)

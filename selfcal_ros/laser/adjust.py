@@ -65,7 +65,7 @@ class Geometry:
         free = np.ones((self.dim, self.n, self.dim), dtype=bool)
         for j in range(self.dim):
             free[j, :, j] = False
-            free[j, 0, j + 1:] = False
+            free[j, 0, j + 1 :] = False
         return free
 
     @cached_property
@@ -87,8 +87,9 @@ class Geometry:
         w, *_ = self._directions(vectors, tilt)
         return self.signs[:, :, None] * np.einsum("kc,jic->kji", w, vectors)
 
-    def _directions(self, vectors: np.ndarray,
-                    tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _directions(
+        self, vectors: np.ndarray, tilt: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return w (K, D), dw/dD (K, D, D) and dw/dtilt (K, D, D-1)."""
         along = np.einsum("kj,jic->kc", self.signs, vectors)
         length = np.linalg.norm(along, axis=1)[:, None]
@@ -98,21 +99,20 @@ class Geometry:
         slip = np.einsum("kc,kc->k", unit, t)[:, None]
         w = unit + t - slip * unit
         # unit changes by P dD / |D|; w = unit + t - (unit . t) unit follows it.
-        chain = ((1.0 - slip)[:, :, None] * np.eye(self.dim)
-                 - unit[:, :, None] * t[:, None, :])
+        chain = (1.0 - slip)[:, :, None] * np.eye(self.dim) - unit[:, :, None] * t[:, None, :]
         by_along = chain @ project / length[:, :, None]
         by_tilt = np.einsum("kce,kme->kcm", project, self.sideways)
         return w, by_along, by_tilt
 
-    def derivatives(self, errors_m: np.ndarray,
-                    tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(self, errors_m: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return dR/dE (K*D*n, D*n*D) and dR/dtilt (K*D*n, K*(D-1))."""
         vectors = step_vectors(self.steps, errors_m)
         w, by_along, by_tilt = self._directions(vectors, tilt)
         n_k, dim, n = self.shape
         sign = self.signs
-        by_errors = np.einsum("kj,kJ,jikc->kjiJc", sign, sign, np.tensordot(
-            vectors, by_along, axes=(2, 1)))[:, :, :, :, None].repeat(n, axis=4)
+        by_errors = np.einsum(
+            "kj,kJ,jikc->kjiJc", sign, sign, np.tensordot(vectors, by_along, axes=(2, 1))
+        )[:, :, :, :, None].repeat(n, axis=4)
         j, i = np.ogrid[:dim, :n]
         by_errors[:, j, i, j, i] += np.moveaxis(sign.T[:, None, :, None] * w, 2, 0)
         by_tilts = np.zeros((n_k, dim, n, n_k, dim - 1))
@@ -148,12 +148,15 @@ def adjust(data: StepDiagonal) -> Adjusted:
         pinv = _solver(np.hstack([by_errors[:, free], by_tilt]) * weights[:, None], data)
         change = pinv @ (weights * misfit.ravel())
         errors[geometry.free] += change[: free.sum()]
-        tilt += change[free.sum():].reshape(tilt.shape)
+        tilt += change[free.sum() :].reshape(tilt.shape)
         if np.abs(change[: free.sum()]).max() <= CONVERGED * max(data.steps_m):
             break
     else:
-        raise InputError("readings", "the least squares does not converge",
-                         "check units, steps and the order of the columns")
+        raise InputError(
+            "readings",
+            "the least squares does not converge",
+            "check units, steps and the order of the columns",
+        )
     return _solution(data, geometry, (errors, tilt, pinv[: free.sum()] * weights))
 
 
@@ -165,12 +168,14 @@ def _solver(matrix: np.ndarray, data: StepDiagonal) -> np.ndarray:
     if matrix.shape[0] < matrix.shape[1] or s[-1] < 1e-9 * s[0]:
         raise NotIdentifiableError(
             f"diagonals {', '.join(data.diagonals)}: they do not determine the errors of "
-            f"{data.dim} axes; measure the missing diagonals")
+            f"{data.dim} axes; measure the missing diagonals"
+        )
     return (vt.T / s) @ u.T / scale[:, None]
 
 
-def _solution(data: StepDiagonal, geometry: Geometry,
-              found: tuple[np.ndarray, np.ndarray, np.ndarray]) -> Adjusted:
+def _solution(
+    data: StepDiagonal, geometry: Geometry, found: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> Adjusted:
     errors, tilt, gain = found
     by_errors, _ = geometry.derivatives(errors, tilt)
     is_linear = np.zeros(geometry.free.shape, dtype=bool)
@@ -183,5 +188,6 @@ def _solution(data: StepDiagonal, geometry: Geometry,
     by_linear = np.zeros((free.size, int(is_linear.sum())))
     by_linear[is_linear] = np.eye(int(is_linear.sum()))
     by_linear[free] = -gain @ by_errors[:, is_linear]
-    return Adjusted(errors, tilt, by_readings, by_linear,
-                    data.readings_m - geometry.readings(errors, tilt))
+    return Adjusted(
+        errors, tilt, by_readings, by_linear, data.readings_m - geometry.readings(errors, tilt)
+    )

@@ -20,11 +20,17 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.laser.zigzag import Recording
 from selfcal_ros.messages.to_model import stamp_ns
 
-FIELDS = {"std_msgs/msg/Float64": "data", "std_msgs/msg/Float32": "data",
-          "sensor_msgs/msg/Range": "range"}
+FIELDS = {
+    "std_msgs/msg/Float64": "data",
+    "std_msgs/msg/Float32": "data",
+    "sensor_msgs/msg/Range": "range",
+}
 """Default field of the distance by type."""
-POINTS = {"geometry_msgs/msg/PointStamped": "point", "geometry_msgs/msg/PoseStamped":
-          "pose.position", "geometry_msgs/msg/Point": ""}
+POINTS = {
+    "geometry_msgs/msg/PointStamped": "point",
+    "geometry_msgs/msg/PoseStamped": "pose.position",
+    "geometry_msgs/msg/Point": "",
+}
 """Fields of x, y, z by type, other than JointState."""
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
@@ -84,17 +90,25 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
                 unstamped.add(topic)
             stamp = stamp_ns(decoded) if hasattr(decoded, "header") else message.log_time
             if stamp > np.iinfo(np.int64).max:
-                raise InputError(f"{path}: topic {topic}", f"{stamp} ns is not a log time",
-                                 "record the bag again")
+                raise InputError(
+                    f"{path}: topic {topic}",
+                    f"{stamp} ns is not a log time",
+                    "record the bag again",
+                )
             found[topic].append((stamp, wanted[topic](name, decoded, f"{path}: topic {topic}")))
     for topic, samples in found.items():
         if not samples:
-            raise NoDataError(f"{path}: topic {topic}", "no message of it in the bag",
-                              "the bag has " + (", ".join(sorted(others)) or "no other topic"))
+            raise NoDataError(
+                f"{path}: topic {topic}",
+                "no message of it in the bag",
+                "the bag has " + (", ".join(sorted(others)) or "no other topic"),
+            )
     notes = [f"{path}: {line}" for line in reader.lost]
     if len(unstamped) == 1:
-        notes.append(f"{path}: {unstamped.pop()} has no stamps and is used at its log time, the "
-                     "other topic at its stamps: both clocks must agree")
+        notes.append(
+            f"{path}: {unstamped.pop()} has no stamps and is used at its log time, the "
+            "other topic at its stamps: both clocks must agree"
+        )
     laser_ns, laser = _sorted(found[topics.laser])
     position_ns, positions = _sorted(found[topics.position])
     return Recording(laser_ns, laser * topics.laser_unit_m, position_ns, positions), notes
@@ -107,17 +121,22 @@ def _match(topic: str, wanted: dict[str, Callable]) -> str | None:
 def _decoder(stream: McapStream, channel: Any, where: str) -> Callable:
     schema = stream.schemas.get(channel.schema_id)
     if channel.message_encoding != "cdr" or schema is None:
-        raise InputError(where, f"message encoding '{channel.message_encoding}' instead of cdr "
-                         "with a definition", "convert the bag to ROS 2, e.g. with rosbags-convert")
-    store = store_of_schema(schema.name, schema.encoding, schema.data.decode(errors="replace"),
-                            where)
+        raise InputError(
+            where,
+            f"message encoding '{channel.message_encoding}' instead of cdr with a definition",
+            "convert the bag to ROS 2, e.g. with rosbags-convert",
+        )
+    store = store_of_schema(
+        schema.name, schema.encoding, schema.data.decode(errors="replace"), where
+    )
 
     def decode(data: bytes) -> tuple[str, Any]:
         try:
             return schema.name, store.deserialize_cdr(data, schema.name)
         except Exception as error:  # a damaged payload may fail anywhere in the decoder
-            raise InputError(where, "a message cannot be decoded",
-                             "record the bag again") from error
+            raise InputError(
+                where, "a message cannot be decoded", "record the bag again"
+            ) from error
 
     return decode
 
@@ -128,8 +147,11 @@ def _laser_value(topics: SeriesTopics) -> Callable:
             return _joints(message, (topics.laser_field or "laser",), where)[0]
         field = topics.laser_field or FIELDS.get(name)
         if field is None:
-            raise InputError(where, f"the type {name} has no known distance field",
-                             "name its field with --laser-field")
+            raise InputError(
+                where,
+                f"the type {name} has no known distance field",
+                "name its field with --laser-field",
+            )
         return _number(message, field, where)
 
     return value
@@ -140,11 +162,16 @@ def _position_value(topics: SeriesTopics) -> Callable:
         if name == JOINT_STATE:
             return _joints(message, topics.joints, where)
         if name not in POINTS:
-            raise InputError(where, f"the type {name} holds no axis positions", "record a "
-                             "JointState, or one of " + ", ".join(sorted(POINTS)))
+            raise InputError(
+                where,
+                f"the type {name} holds no axis positions",
+                "record a JointState, or one of " + ", ".join(sorted(POINTS)),
+            )
         prefix = f"{POINTS[name]}." if POINTS[name] else ""
-        return [_number(message, f"{prefix}{axis}", where)
-                for axis in ("x", "y", "z")[:len(topics.joints)]]
+        return [
+            _number(message, f"{prefix}{axis}", where)
+            for axis in ("x", "y", "z")[: len(topics.joints)]
+        ]
 
     return value
 
@@ -153,22 +180,29 @@ def _joints(message: Any, joints: Sequence[str], where: str) -> list[float]:
     named = dict(zip(message.name, message.position, strict=False))
     missing = [joint for joint in joints if joint not in named]
     if missing:
-        raise InputError(where, f"no joint '{missing[0]}', only {', '.join(named)}",
-                         "name the joints with --joints, the laser's with --laser-field")
+        raise InputError(
+            where,
+            f"no joint '{missing[0]}', only {', '.join(named)}",
+            "name the joints with --joints, the laser's with --laser-field",
+        )
     return [float(named[joint]) for joint in joints]
 
 
 def _number(message: Any, field: str, where: str) -> float:
     for part in field.split("."):
         if not hasattr(message, part):
-            raise InputError(where, f"the message has no field '{field}'",
-                             "name the field with --laser-field, a.b for a nested one")
+            raise InputError(
+                where,
+                f"the message has no field '{field}'",
+                "name the field with --laser-field, a.b for a nested one",
+            )
         message = getattr(message, part)
     try:
         return float(message)
     except (TypeError, ValueError) as error:
-        raise InputError(where, f"the field '{field}' is not a number", "name a numeric field"
-                         ) from error
+        raise InputError(
+            where, f"the field '{field}' is not a number", "name a numeric field"
+        ) from error
 
 
 def _sorted(samples: list[tuple[int, Any]]) -> tuple[np.ndarray, np.ndarray]:

@@ -119,9 +119,11 @@ class StepDiagonal:
             If they were not measured.
         """
         if self.linear_m is None:
-            raise InputError("linear errors", "the new formulation needs them",
-                             "measure them directly along the axes, or use the conventional "
-                             "formulation")
+            raise InputError(
+                "linear errors",
+                "the new formulation needs them",
+                "measure them directly along the axes, or use the conventional formulation",
+            )
         return np.nanmean(self.linear_m, axis=0)
 
     def pick(self, diagonals: Sequence[str]) -> "StepDiagonal":
@@ -134,11 +136,13 @@ class StepDiagonal:
         """
         for name in diagonals:
             if name not in self.diagonals:
-                raise InputError("diagonals", f"{name} was not measured, only "
-                                 + ", ".join(self.diagonals), "choose one of these")
+                raise InputError(
+                    "diagonals",
+                    f"{name} was not measured, only " + ", ".join(self.diagonals),
+                    "choose one of these",
+                )
         index = [self.diagonals.index(name) for name in diagonals]
-        return StepDiagonal(self.steps_m, tuple(diagonals), self.samples_m[:, index],
-                            self.linear_m)
+        return StepDiagonal(self.steps_m, tuple(diagonals), self.samples_m[:, index], self.linear_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +239,7 @@ def turn_to_first_step(vectors_m: np.ndarray) -> np.ndarray:
     q = q * np.sign(np.diag(r))
     turned = vectors_m @ q
     for j in range(dim):
-        turned[j, 0, j + 1:] = 0.0
+        turned[j, 0, j + 1 :] = 0.0
     return turned
 
 
@@ -267,15 +271,19 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
         explains the ratio.
     """
     if not math.isfinite(value_m):
-        raise InputError(where, "not a finite number",
-                         "measure the block again or correct the cell")
+        raise InputError(
+            where, "not a finite number", "measure the block again or correct the cell"
+        )
     ratio = value_m / nominal_m
     shown = f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
     if _is_near(ratio):
         return
     if _is_near(-ratio):
-        raise InputError(where, f"{shown}: the sign is wrong",
-                         "readings are positive on every diagonal (np: R_x = -l . dx)")
+        raise InputError(
+            where,
+            f"{shown}: the sign is wrong",
+            "readings are positive on every diagonal (np: R_x = -l . dx)",
+        )
     for factor, unit in _UNITS.items():
         if _is_near(ratio / factor):
             raise InputError(where, f"{shown}: it looks like {unit}", "give millimetres")
@@ -291,12 +299,16 @@ def check_linear(value_m: float, step_m: float, where: str) -> None:
         If it is not finite or larger than `LINEAR_SHARE` of the step.
     """
     if not math.isfinite(value_m):
-        raise InputError(where, "not a finite number",
-                         "measure the block again or correct the cell")
+        raise InputError(
+            where, "not a finite number", "measure the block again or correct the cell"
+        )
     if abs(value_m) > LINEAR_SHARE * step_m:
         if _is_near((value_m + step_m) / step_m) or not _is_near(value_m / step_m):
             hint = "it looks like micrometres; give millimetres"
         else:
             hint = "it looks like the step itself; give measured step - nominal step"
-        raise InputError(where, f"a linear error of {value_m * MM_PER_M:.6g} mm in a step of "
-                         f"{step_m * MM_PER_M:g} mm", hint)
+        raise InputError(
+            where,
+            f"a linear error of {value_m * MM_PER_M:.6g} mm in a step of {step_m * MM_PER_M:g} mm",
+            hint,
+        )

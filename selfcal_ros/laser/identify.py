@@ -44,8 +44,11 @@ def eq3(r: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return Ex(y) for Ey(x) = 0 from the length of the diagonal, r = R_x + R_y (eq. 3)."""
     if np.any(r <= q):
         block = int(np.argmax(r <= q)) + 1
-        raise InputError(f"block {block}", "the diagonal is shorter than the Y step",
-                         "check the units and the steps")
+        raise InputError(
+            f"block {block}",
+            "the diagonal is shorter than the Y step",
+            "check the units and the steps",
+        )
     return np.sqrt(r**2 - q**2) - u
 
 
@@ -85,8 +88,9 @@ def eq6(p_0: np.ndarray, v: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndar
     return p_0 * np.cos(gamma) - q * np.sin(gamma)
 
 
-def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndarray, *,
-                   form: Form) -> np.ndarray:
+def solve_diagonal(
+    data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndarray, *, form: Form
+) -> np.ndarray:
     """Return the errors (K, D, n, D) from eqs. 3 to 6 for every diagonal separately.
 
     Parameters
@@ -101,8 +105,11 @@ def solve_diagonal(data: StepDiagonal, readings_m: np.ndarray, linear_m: np.ndar
         ``printed`` uses eq. 5 as printed, ``stepwise`` its exact form.
     """
     if data.dim != 2:
-        raise InputError(f"form {form}", "the source gives its equations in 2D only",
-                         "use the exact form for body diagonals")
+        raise InputError(
+            f"form {form}",
+            "the source gives its equations in 2D only",
+            "use the exact form for body diagonals",
+        )
     u, q = linear_m + np.array(data.steps_m)[:, None]
     # The source sets pi/4 "without loss of generality", which is valid for a = b.
     alpha_2 = float(np.arctan2(data.steps_m[1], data.steps_m[0]))
@@ -133,9 +140,11 @@ def laser_directions(data: StepDiagonal) -> np.ndarray:
     return data.signs * steps / np.linalg.norm(steps)
 
 
-EQUAL_READINGS = ("the readings of all axes are equal in every block: either the linear errors of "
-                  "the axes are the same, or the mirror is parallel to the other diagonal and they "
-                  "hold only the length of the diagonal")
+EQUAL_READINGS = (
+    "the readings of all axes are equal in every block: either the linear errors of "
+    "the axes are the same, or the mirror is parallel to the other diagonal and they "
+    "hold only the length of the diagonal"
+)
 
 
 def readings_are_equal(data: StepDiagonal) -> bool:
@@ -189,8 +198,11 @@ def identify_wang(data: StepDiagonal) -> StepDiagonalResult:
         If a diagonal is missing.
     """
     if len(data.diagonals) < 2 ** (data.dim - 1):
-        raise InputError("diagonals", f"only {', '.join(data.diagonals)} measured",
-                         "the conventional formulation needs every diagonal; measure the others")
+        raise InputError(
+            "diagonals",
+            f"only {', '.join(data.diagonals)} measured",
+            "the conventional formulation needs every diagonal; measure the others",
+        )
     readings, gain = data.readings_m, block_gain(data)
     errors = solve_blocks(data, readings, gain)
     covariance = None
@@ -198,21 +210,33 @@ def identify_wang(data: StepDiagonal) -> StepDiagonalResult:
     if noise.dof:
         jac = jacobian(lambda r: solve_blocks(data, r, gain), readings)
         covariance = jac @ reading_covariance(data, noise) @ jac.T
-    return StepDiagonalResult(data.steps_m, errors, covariance, Method.CONVENTIONAL,
-                              Form.PRINTED, {}, Closure(residual_rms_m=_residual(data, readings)))
+    return StepDiagonalResult(
+        data.steps_m,
+        errors,
+        covariance,
+        Method.CONVENTIONAL,
+        Form.PRINTED,
+        {},
+        Closure(residual_rms_m=_residual(data, readings)),
+    )
 
 
 def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
     if data.dim == 2:
         return None
     directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
-    misfit = [readings_m[:, j] - directions[:, j] @ np.linalg.lstsq(
-        directions[:, j], readings_m[:, j], rcond=None)[0] for j in range(data.dim)]
+    misfit = [
+        readings_m[:, j]
+        - directions[:, j] @ np.linalg.lstsq(directions[:, j], readings_m[:, j], rcond=None)[0]
+        for j in range(data.dim)
+    ]
     return rms(np.array(misfit))
 
 
-def jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray,
-             ) -> np.ndarray:
+def jacobian(
+    function: Callable[[np.ndarray], np.ndarray],
+    x: np.ndarray,
+) -> np.ndarray:
     """Return d function / d x by central differences, (outputs, inputs) in C order.
 
     The formulations are linear except for terms of (error / step)^2, so the differences are
@@ -251,8 +275,10 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT) -> StepDiag
     if form is not Form.EXACT:
         return _paper(data, form, lengths)
     found = adjust(data)
-    mirror = {name: np.arctan(tilt).tolist()
-              for name, tilt in zip(data.diagonals, found.tilt, strict=True)}
+    mirror = {
+        name: np.arctan(tilt).tolist()
+        for name, tilt in zip(data.diagonals, found.tilt, strict=True)
+    }
     between, u_between, residual = None, None, None
     if len(data.diagonals) > 1:
         residual = rms(found.residuals_m)
@@ -260,13 +286,21 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT) -> StepDiag
             alone = [adjust(data.pick([name])) for name in data.diagonals]
             between, u_between = between_diagonals(data, alone)
     return StepDiagonalResult(
-        data.steps_m, found.errors_m, propagated(data, found.by_readings, found.by_linear),
-        Method.NEW, form, mirror, Closure(lengths[0], lengths[1], between, u_between, residual))
+        data.steps_m,
+        found.errors_m,
+        propagated(data, found.by_readings, found.by_linear),
+        Method.NEW,
+        form,
+        mirror,
+        Closure(lengths[0], lengths[1], between, u_between, residual),
+    )
 
 
-def _paper(data: StepDiagonal, form: Form,
-           lengths: tuple[float | None, float | None]) -> StepDiagonalResult:
+def _paper(
+    data: StepDiagonal, form: Form, lengths: tuple[float | None, float | None]
+) -> StepDiagonalResult:
     """Return the mean of the diagonals by the paper's own equations."""
+
     def solve(readings: np.ndarray, linear: np.ndarray) -> np.ndarray:
         return solve_diagonal(data, readings, linear, form=form)
 
@@ -276,8 +310,14 @@ def _paper(data: StepDiagonal, form: Form,
     by_linear = jacobian(lambda e: solve(readings, e).mean(axis=0), linear)
     between = alone[0] - alone[1] if len(alone) == 2 else None
     return StepDiagonalResult(
-        data.steps_m, alone.mean(axis=0), propagated(data, by_readings, by_linear), Method.NEW,
-        form, {}, Closure(*lengths, between))
+        data.steps_m,
+        alone.mean(axis=0),
+        propagated(data, by_readings, by_linear),
+        Method.NEW,
+        form,
+        {},
+        Closure(*lengths, between),
+    )
 
 
 @dataclass(frozen=True)
@@ -312,10 +352,17 @@ def identify(data: StepDiagonal, choice: Choice) -> StepDiagonalResult:
     """
     if choice.method is Method.CONVENTIONAL:
         if choice.form is not Form.EXACT:
-            raise InputError("--form", "the conventional formulation has one form only",
-                             "leave it out, or use --method new")
+            raise InputError(
+                "--form",
+                "the conventional formulation has one form only",
+                "leave it out, or use --method new",
+            )
         return identify_wang(data)
     if readings_are_equal(data) and not choice.allow_equal:
-        raise InputError("readings", EQUAL_READINGS, "turn the mirror square to the laser, or "
-                         "allow equal readings if the linear errors truly are the same")
+        raise InputError(
+            "readings",
+            EQUAL_READINGS,
+            "turn the mirror square to the laser, or "
+            "allow equal readings if the linear errors truly are the same",
+        )
     return identify_ibaraki(data, form=choice.form)

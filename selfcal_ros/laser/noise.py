@@ -55,8 +55,10 @@ def reading_noise(data: StepDiagonal) -> ReadingNoise:
     """Return the noise of the laser readings of a measurement, from the scatter of repeats."""
     deviation = data.samples_m - data.readings_m
     order = [time_order(signs, data.n_blocks) for signs in data.signs]
-    runs = np.stack([deviation[:, k].reshape(len(deviation), -1)[:, order[k]]
-                     for k in range(len(order))], axis=1)
+    runs = np.stack(
+        [deviation[:, k].reshape(len(deviation), -1)[:, order[k]] for k in range(len(order))],
+        axis=1,
+    )
     return _pooled(runs.reshape(len(deviation), len(order), -1))
 
 
@@ -135,8 +137,9 @@ LENGTH_TOLERANCE = 1e-3
 or mirror misaligned by about 30 mrad."""
 
 
-def propagated(data: StepDiagonal, by_readings: np.ndarray,
-               by_linear: np.ndarray) -> np.ndarray | None:
+def propagated(
+    data: StepDiagonal, by_readings: np.ndarray, by_linear: np.ndarray
+) -> np.ndarray | None:
     """Return the covariance of values with these derivatives; None if readings have no repeats.
 
     Linear errors without repeats are taken as exact.
@@ -172,8 +175,9 @@ def length_closure(data: StepDiagonal) -> tuple[float, float | None] | None:
     return mean - side, None if variance is None else float(np.sqrt(variance[0, 0]))
 
 
-def between_diagonals(data: StepDiagonal,
-                      alone: list[Adjusted]) -> tuple[np.ndarray, np.ndarray | None]:
+def between_diagonals(
+    data: StepDiagonal, alone: list[Adjusted]
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the errors from pp alone minus those from np alone, and their uncertainties.
 
     Parameters
@@ -212,13 +216,19 @@ def check_lengths(data: StepDiagonal) -> None:
     if abs(excess[worst]) <= LENGTH_TOLERANCE:
         return
     smaller = _excess(square, steps + 1e-3 * linear)[worst]
-    what = (f"diagonals and linear errors disagree by "
-            f"{excess[worst] * np.linalg.norm(steps) * MM_PER_M:.4g} mm")
+    what = (
+        f"diagonals and linear errors disagree by "
+        f"{excess[worst] * np.linalg.norm(steps) * MM_PER_M:.4g} mm"
+    )
     if abs(smaller) < 0.1 * abs(excess[worst]):
-        raise InputError(f"block {worst + 1}", what + "; the linear errors look like micrometres",
-                         "give ex_x, ey_y in mm")
-    raise InputError(f"block {worst + 1}", what,
-                     "check the steps, the units, and that both are of one machine")
+        raise InputError(
+            f"block {worst + 1}",
+            what + "; the linear errors look like micrometres",
+            "give ex_x, ey_y in mm",
+        )
+    raise InputError(
+        f"block {worst + 1}", what, "check the steps, the units, and that both are of one machine"
+    )
 
 
 def _excess(square: np.ndarray, sides: np.ndarray) -> np.ndarray:

@@ -59,15 +59,20 @@ def u_profile_m(found: StepDiagonalResult, axis: int, direction: int) -> np.ndar
     return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, block, rows), 0.0))
 
 
-def straightness(found: StepDiagonalResult, axis: int, direction: int,
-                 line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> Value:
+def straightness(
+    found: StepDiagonalResult,
+    axis: int,
+    direction: int,
+    line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
+) -> Value:
     """Return the straightness of `axis` in `direction`, m.
 
     Its uncertainty is that of the distance between the two extreme points; as a peak-to-valley
     value it is biased upwards unless the noise is much smaller.
     """
-    rows = _accumulate(found.n_blocks) - np.outer(np.arange(found.n_blocks + 1),
-                                                  _slope_row(found.n_blocks, line))
+    rows = _accumulate(found.n_blocks) - np.outer(
+        np.arange(found.n_blocks + 1), _slope_row(found.n_blocks, line)
+    )
     residual = rows @ found.errors_m[axis, :, direction]
     row = rows[np.argmax(residual)] - rows[np.argmin(residual)]
     value = float(np.ptp(residual))
@@ -77,15 +82,23 @@ def straightness(found: StepDiagonalResult, axis: int, direction: int,
     return Value(value, float(np.sqrt(max(row @ block @ row, 0.0))))
 
 
-def slope(found: StepDiagonalResult, axis: int, direction: int,
-          line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float:
+def slope(
+    found: StepDiagonalResult,
+    axis: int,
+    direction: int,
+    line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
+) -> float:
     """Return the slope of a profile: rad for a transverse one, relative for a linear one."""
     row = _slope_row(found.n_blocks, line) / found.steps_m[axis]
     return float(row @ found.errors_m[axis, :, direction])
 
 
-def u_slope(found: StepDiagonalResult, axis: int, direction: int,
-            line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float | None:
+def u_slope(
+    found: StepDiagonalResult,
+    axis: int,
+    direction: int,
+    line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
+) -> float | None:
     """Return the standard uncertainty of `slope`; None if unknown."""
     if found.covariance is None:
         return None
@@ -94,25 +107,36 @@ def u_slope(found: StepDiagonalResult, axis: int, direction: int,
     return float(np.sqrt(max(row @ block @ row, 0.0)))
 
 
-def squareness(found: StepDiagonalResult, first: int = 0, second: int = 1,
-               line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> Value:
+def squareness(
+    found: StepDiagonalResult,
+    first: int = 0,
+    second: int = 1,
+    line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
+) -> Value:
     """Return the squareness of two axes over the range of the second, m (sign: see above)."""
     row = _slope_row(found.n_blocks, line)
     of_first = row * found.steps_m[second] / found.steps_m[first] * found.n_blocks
     of_second = row * found.n_blocks
-    value = float(of_second @ found.errors_m[second, :, first]
-                  + of_first @ found.errors_m[first, :, second])
+    value = float(
+        of_second @ found.errors_m[second, :, first] + of_first @ found.errors_m[first, :, second]
+    )
     if found.covariance is None:
         return Value(value)
     a, b = (second, first), (first, second)
-    variance = (of_second @ _block(found, a, a) @ of_second
-                + of_first @ _block(found, b, b) @ of_first
-                + 2 * of_second @ _block(found, a, b) @ of_first)
+    variance = (
+        of_second @ _block(found, a, a) @ of_second
+        + of_first @ _block(found, b, b) @ of_first
+        + 2 * of_second @ _block(found, a, b) @ of_first
+    )
     return Value(value, float(np.sqrt(max(variance, 0.0))))
 
 
-def squareness_rad(found: StepDiagonalResult, first: int = 0, second: int = 1,
-                   line: ReferenceLine = ReferenceLine.LEAST_SQUARES) -> float:
+def squareness_rad(
+    found: StepDiagonalResult,
+    first: int = 0,
+    second: int = 1,
+    line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
+) -> float:
     """Return the squareness as an angle, rad: 90 deg minus the angle between the axes."""
     return slope(found, second, first, line) + slope(found, first, second, line)
 
@@ -183,8 +207,9 @@ def map_equivalent(found: StepDiagonalResult) -> MapEquivalent:
     return MapEquivalent(o, u_o, (slope(found, 1, 1) - slope(found, 0, 0)) / 2, u_r)
 
 
-def axis_corrections(found: StepDiagonalResult,
-                     ) -> dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]]:
+def axis_corrections(
+    found: StepDiagonalResult,
+) -> dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]]:
     """Return (along, corrected) -> positions and corrections -E, m, of every profile of X and Y.
 
     The datum is rotated from the first X step to the line of the X axis: the correction of Y along
@@ -197,13 +222,17 @@ def axis_corrections(found: StepDiagonalResult,
         For a 3D measurement: the tables of the package have no Z axis.
     """
     if found.dim != 2:
-        raise InputError("calibration table", "body diagonals measure three axes, the tables hold "
-                         "x and y", "export a measurement of face diagonals")
+        raise InputError(
+            "calibration table",
+            "body diagonals measure three axes, the tables hold x and y",
+            "export a measurement of face diagonals",
+        )
     x, y = (positions_m(found, axis) for axis in (0, 1))
     turn = slope(found, 0, 1)
     lines: dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]] = {
         ("x", "y"): (x, turn * x - profile_m(found, 0, 1)),
-        ("y", "x"): (y, -turn * y - profile_m(found, 1, 0))}
+        ("y", "x"): (y, -turn * y - profile_m(found, 1, 0)),
+    }
     if found.method == Method.NEW:
         lines["x", "x"] = x, -profile_m(found, 0, 0)
         lines["y", "y"] = y, -profile_m(found, 1, 1)

@@ -120,8 +120,9 @@ class Measurement:
     noise: LaserNoise = field(default_factory=LaserNoise)
 
 
-def simulate_step_diagonal(machine: StepMachine, measurement: Measurement,
-                           rng: np.random.Generator) -> StepDiagonal:
+def simulate_step_diagonal(
+    machine: StepMachine, measurement: Measurement, rng: np.random.Generator
+) -> StepDiagonal:
     """Return the readings and linear errors of the measurement.
 
     Parameters
@@ -160,8 +161,8 @@ def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np
     """
     signs = signs_of([name])[0]
     vectors = np.zeros((machine.dim, machine.n_blocks, 3))
-    vectors[:, :, :machine.dim] = step_vectors(machine.steps_m, machine.errors_m)
-    turns = (np.zeros(vectors.shape) if machine.turns_rad is None else machine.turns_rad)
+    vectors[:, :, : machine.dim] = step_vectors(machine.steps_m, machine.errors_m)
+    turns = np.zeros(vectors.shape) if machine.turns_rad is None else machine.turns_rad
     order, centres, angles = [], [np.zeros(3)], [np.zeros(3)]
     carried = np.zeros((machine.dim + 1, 3))  # turn of the axes before axis j
     for block in range(machine.n_blocks):
@@ -184,11 +185,12 @@ def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np
     return np.array(order), np.array(distances) * (1.0 + setup.scale)
 
 
-def _directions(machine: StepMachine, signs: np.ndarray, setup: SetUp,
-                end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _directions(
+    machine: StepMachine, signs: np.ndarray, setup: SetUp, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the beam's direction and the mirror's normal, unit vectors (3,)."""
     nominal = np.zeros(3)
-    nominal[:machine.dim] = signs * np.array(machine.steps_m)
+    nominal[: machine.dim] = signs * np.array(machine.steps_m)
     reference = end if setup.to_machine else nominal
     reference = reference / np.linalg.norm(reference)
     level = np.cross(_Z, nominal)
@@ -198,8 +200,9 @@ def _directions(machine: StepMachine, signs: np.ndarray, setup: SetUp,
     return beam, _tilted(beam, (level, upward), setup.mirror_rad)
 
 
-def _tilted(direction: np.ndarray, sideways: tuple[np.ndarray, np.ndarray],
-            angles_rad: tuple[float, ...]) -> np.ndarray:
+def _tilted(
+    direction: np.ndarray, sideways: tuple[np.ndarray, np.ndarray], angles_rad: tuple[float, ...]
+) -> np.ndarray:
     for side, angle in zip(sideways, angles_rad, strict=False):
         direction = rotation(angle * np.cross(direction, side)) @ direction
     return direction
@@ -215,8 +218,9 @@ def rotation(vector_rad: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def random_machine(steps_m: tuple[float, ...], n_blocks: int, rng: np.random.Generator, *,
-                   sigma_m: float = 1e-7) -> StepMachine:
+def random_machine(
+    steps_m: tuple[float, ...], n_blocks: int, rng: np.random.Generator, *, sigma_m: float = 1e-7
+) -> StepMachine:
     """Return a machine with normally distributed step errors, in the datum of the results."""
     machine = StepMachine(steps_m, rng.normal(0, sigma_m, (len(steps_m), n_blocks, len(steps_m))))
     return StepMachine(steps_m, machine.truth_m())
@@ -281,34 +285,65 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
     InputError
         For an unknown or missing key, or a wrong type.
     """
-    top = checked_fields(data, where, {}, {"seed": (int, 0), "machine": (object, "case_study"),
-                                           "setups": (dict, {}), "noise": (dict, {})})
+    top = checked_fields(
+        data,
+        where,
+        {},
+        {
+            "seed": (int, 0),
+            "machine": (object, "case_study"),
+            "setups": (dict, {}),
+            "noise": (dict, {}),
+        },
+    )
     if top["seed"] < 0:
         raise InputError(f"{where}: seed", f"{top['seed']} is negative", "give 0 or more")
     rng = np.random.default_rng(top["seed"])
     machine = _machine(top["machine"], f"{where}: machine", rng)
-    setups = checked_fields(top["setups"], f"{where}: setups", {},
-                            dict.fromkeys(DIAGONALS[machine.dim], (dict, None)))
+    setups = checked_fields(
+        top["setups"], f"{where}: setups", {}, dict.fromkeys(DIAGONALS[machine.dim], (dict, None))
+    )
     lengths = ("distance_nm", "reading_nm", "linear_nm")
-    noise = checked_fields(top["noise"], f"{where}: noise", {},
-                           {"repeats": (int, 1), **dict.fromkeys(lengths, (float, 0.0))})
+    noise = checked_fields(
+        top["noise"],
+        f"{where}: noise",
+        {},
+        {"repeats": (int, 1), **dict.fromkeys(lengths, (float, 0.0))},
+    )
     repeats = _count(noise["repeats"], f"{where}: noise: repeats", MAX_REPEATS)
     distance_m, reading_m, linear_m = (
-        _number(noise[key], f"{where}: noise: {key}", positive=True) * M_PER_NM
-        for key in lengths)
-    return LaserSimulation(machine, Measurement(
-        {name: _setup(raw, f"{where}: setups: {name}", machine.dim)
-         for name, raw in setups.items() if raw is not None},
-        LaserNoise(distance_m, reading_m, linear_m, repeats)), rng)
+        _number(noise[key], f"{where}: noise: {key}", positive=True) * M_PER_NM for key in lengths
+    )
+    return LaserSimulation(
+        machine,
+        Measurement(
+            {
+                name: _setup(raw, f"{where}: setups: {name}", machine.dim)
+                for name, raw in setups.items()
+                if raw is not None
+            },
+            LaserNoise(distance_m, reading_m, linear_m, repeats),
+        ),
+        rng,
+    )
 
 
 def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
     if raw == "case_study":
         return case_study_machine()
     kinds = [name_of(j, c) for j in range(3) for c in range(3)]
-    found = checked_fields(raw, where, {"steps_mm": list}, {
-        "blocks": (int, 6), "sigma_um": (float, 0.1), "stacked": (bool, False),
-        "turns_urad": (dict, {}), **dict.fromkeys(kinds, (list, None))})
+    found = checked_fields(
+        raw,
+        where,
+        {"steps_mm": list},
+        {
+            "blocks": (int, 6),
+            "sigma_um": (float, 0.1),
+            "stacked": (bool, False),
+            "turns_urad": (dict, {}),
+            **dict.fromkeys(kinds, (list, None)),
+        },
+    )
     steps = tuple(np.array(_numbers(found["steps_mm"], f"{where}: steps_mm", (2, 3))) * M_PER_MM)
     if min(steps) <= 0:
         raise InputError(f"{where}: steps_mm", "a step is not positive", "give lengths in mm")
@@ -331,13 +366,17 @@ def _errors(listed: Mapping[str, list], where: str, dim: int) -> np.ndarray:
     lists = {}
     for name, values in listed.items():
         if name not in kinds:
-            raise InputError(f"{where}: {name}", f"the machine has {dim} steps only",
-                             "leave it out")
+            raise InputError(
+                f"{where}: {name}", f"the machine has {dim} steps only", "leave it out"
+            )
         lists[name] = _numbers(values, f"{where}: {name}", range(1, MAX_BLOCKS + 1))
     counts = {len(values) for values in lists.values()}
     if len(counts) > 1:
-        raise InputError(where, f"lists of errors of different lengths {sorted(counts)}",
-                         "give one value per block")
+        raise InputError(
+            where,
+            f"lists of errors of different lengths {sorted(counts)}",
+            "give one value per block",
+        )
     errors = np.zeros((dim, counts.pop(), dim))
     for name, values in lists.items():
         j, c = kinds[name]
@@ -346,7 +385,7 @@ def _errors(listed: Mapping[str, list], where: str, dim: int) -> np.ndarray:
 
 
 def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray | None:
-    axes = "xyz"[:shape[0]]
+    axes = "xyz"[: shape[0]]
     given = checked_fields(raw, where, {}, dict.fromkeys(axes, (list, None)))
     if not raw:
         return None
@@ -355,30 +394,50 @@ def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray |
         if rows is None:
             continue
         if len(rows) != shape[1]:
-            raise InputError(f"{where}: {axis}", f"not {shape[1]} rotation vectors",
-                             "give [rx, ry, rz] for every block")
+            raise InputError(
+                f"{where}: {axis}",
+                f"not {shape[1]} rotation vectors",
+                "give [rx, ry, rz] for every block",
+            )
         turns[axes.index(axis)] = [_numbers(row, f"{where}: {axis}", (3,)) for row in rows]
     return turns * RAD_PER_URAD
 
 
 def _setup(raw: object, where: str, dim: int) -> SetUp:
     straight = (list, [0.0] * (dim - 1))
-    given = checked_fields(raw, where, {}, {
-        "laser_mrad": straight, "mirror_mrad": straight, "to_machine": (bool, True),
-        "abbe_mm": (list, [0, 0, 0]), "scale_ppm": (float, 0.0)})
+    given = checked_fields(
+        raw,
+        where,
+        {},
+        {
+            "laser_mrad": straight,
+            "mirror_mrad": straight,
+            "to_machine": (bool, True),
+            "abbe_mm": (list, [0, 0, 0]),
+            "scale_ppm": (float, 0.0),
+        },
+    )
     laser_rad, mirror_rad = (
         tuple(np.array(_numbers(given[key], f"{where}: {key}", (dim - 1,))) * RAD_PER_MRAD)
-        for key in ("laser_mrad", "mirror_mrad"))
+        for key in ("laser_mrad", "mirror_mrad")
+    )
     x, y, z = np.array(_numbers(given["abbe_mm"], f"{where}: abbe_mm", (3,))) * M_PER_MM
     scale = _number(given["scale_ppm"], f"{where}: scale_ppm") * ONE_PER_PPM
     return SetUp(laser_rad, mirror_rad, given["to_machine"], (x, y, z), scale)
 
 
 def _number(value: object, where: str, *, positive: bool = False) -> float:
-    if (not isinstance(value, int | float) or isinstance(value, bool)
-            or not abs(value) <= LARGEST or (positive and value < 0)):
-        raise InputError(where, f"{value!r} is not a number" + " from 0" * positive,
-                         f"give one within +-{LARGEST:g}")
+    if (
+        not isinstance(value, int | float)
+        or isinstance(value, bool)
+        or not abs(value) <= LARGEST
+        or (positive and value < 0)
+    ):
+        raise InputError(
+            where,
+            f"{value!r} is not a number" + " from 0" * positive,
+            f"give one within +-{LARGEST:g}",
+        )
     return float(value)
 
 

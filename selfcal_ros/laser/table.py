@@ -48,8 +48,11 @@ class RequiredColumns:
     @property
     def readings(self) -> list[str]:
         """Names of the reading columns, diagonal by diagonal."""
-        return [f"r{axis}_{name}" for name in self.diagonals
-                for axis in laser_data.AXES[:len(self.steps_m)]]
+        return [
+            f"r{axis}_{name}"
+            for name in self.diagonals
+            for axis in laser_data.AXES[: len(self.steps_m)]
+        ]
 
     @property
     def errors(self) -> list[str]:
@@ -57,8 +60,9 @@ class RequiredColumns:
         return [name_of(j, j) for j in range(len(self.steps_m))] if self.linear else []
 
 
-def read_table(path: str | os.PathLike,
-               columns: RequiredColumns) -> tuple[laser_data.StepDiagonal, list[str]]:
+def read_table(
+    path: str | os.PathLike, columns: RequiredColumns
+) -> tuple[laser_data.StepDiagonal, list[str]]:
     """Return the measurement in a CSV file, and warnings.
 
     Raises
@@ -72,16 +76,23 @@ def read_table(path: str | os.PathLike,
     header = _header(path, rows, columns)
     known = {BLOCK, *columns.readings, *columns.errors}
     known |= {name_of(j, j) for j in range(3)}
-    known |= {f"r{axis}_{name}" for names in laser_data.DIAGONALS.values() for name in names
-              for axis in laser_data.AXES}
+    known |= {
+        f"r{axis}_{name}"
+        for names in laser_data.DIAGONALS.values()
+        for name in names
+        for axis in laser_data.AXES
+    }
     ignored = [name for name in header if name not in known]
     warnings = [f"{path}: column '{name}' is not used" for name in ignored]
     cells: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     first_line: dict[int, int] = {}
     for line, row in rows[1:]:
         if len(row) != len(header):
-            raise InputError(f"{path}:{line}", f"{len(row)} cells where the header has "
-                             f"{len(header)}", "correct the line")
+            raise InputError(
+                f"{path}:{line}",
+                f"{len(row)} cells where the header has {len(header)}",
+                "correct the line",
+            )
         named = dict(zip(header, row, strict=True))
         block = _block(named[BLOCK], f"{path}:{line}: {BLOCK}")
         cells.setdefault(block, []).append(_values(named, columns, f"{path}:{line}"))
@@ -99,8 +110,11 @@ def dimension_of(path: str | os.PathLike) -> int:
 
 def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
     lines = read_text(path).splitlines()
-    kept = [(number, line) for number, line in enumerate(lines, 1)
-            if line.strip() and not line.lstrip().startswith("#")]
+    kept = [
+        (number, line)
+        for number, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if not kept:
         raise NoDataError(str(path), "the table is empty", "give a header and one row per block")
     rows = [(number, csv_cells(line, f"{path}:{number}")) for number, line in kept]
@@ -116,24 +130,38 @@ def _header(path: str | os.PathLike, rows: list, columns: RequiredColumns) -> li
         if header.count(name) > 1:
             raise InputError(where, f"the column '{name}' appears twice", "keep one")
     if BLOCK not in header:
-        raise InputError(where, f"the column '{BLOCK}' is missing",
-                         f"head the columns {BLOCK}, {', '.join(columns.readings)}")
+        raise InputError(
+            where,
+            f"the column '{BLOCK}' is missing",
+            f"head the columns {BLOCK}, {', '.join(columns.readings)}",
+        )
     missing = [name for name in columns.readings if name not in header]
-    absent = [name for name in columns.diagonals
-              if all(column in missing for column in columns.readings if
-                     column.endswith(f"_{name}"))]
+    absent = [
+        name
+        for name in columns.diagonals
+        if all(column in missing for column in columns.readings if column.endswith(f"_{name}"))
+    ]
     if absent and len(absent) < len(columns.diagonals):
-        raise InputError(where, f"no readings of the diagonal {', '.join(absent)}",
-                         "measure every diagonal, or with the new formulation in 2D name the one "
-                         "measured by --diagonals")
+        raise InputError(
+            where,
+            f"no readings of the diagonal {', '.join(absent)}",
+            "measure every diagonal, or with the new formulation in 2D name the one "
+            "measured by --diagonals",
+        )
     if missing:
-        raise InputError(where, f"the column {_listed(missing)} is missing",
-                         "the table needs " + ", ".join([BLOCK, *columns.readings]))
+        raise InputError(
+            where,
+            f"the column {_listed(missing)} is missing",
+            "the table needs " + ", ".join([BLOCK, *columns.readings]),
+        )
     lacking = [name for name in columns.errors if name not in header]
     if lacking:
-        raise InputError(where, f"the column {_listed(lacking)} is missing",
-                         "the new formulation needs the linear errors, measured directly along "
-                         "the axes; without them use --method conventional")
+        raise InputError(
+            where,
+            f"the column {_listed(lacking)} is missing",
+            "the new formulation needs the linear errors, measured directly along "
+            "the axes; without them use --method conventional",
+        )
     return header
 
 
@@ -152,23 +180,30 @@ def _number(text: str, where: str) -> float:
     try:
         value = number_of(text)
     except ValueError as error:
-        raise InputError(where, f"'{text}' is not a number" if text else "the cell is empty",
-                         "give a number in mm") from error
+        raise InputError(
+            where,
+            f"'{text}' is not a number" if text else "the cell is empty",
+            "give a number in mm",
+        ) from error
     if not math.isfinite(value):
-        raise InputError(where, f"'{text}' is not a finite number",
-                         "measure the block again or leave its row out of the repeats")
+        raise InputError(
+            where,
+            f"'{text}' is not a finite number",
+            "measure the block again or leave its row out of the repeats",
+        )
     return value
 
 
-def _values(named: dict[str, str], columns: RequiredColumns,
-            where: str) -> tuple[np.ndarray, np.ndarray]:
+def _values(
+    named: dict[str, str], columns: RequiredColumns, where: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Return one row's readings (K, D) and linear errors (D,), m."""
     steps = np.array(columns.steps_m)
     nominal = steps**2 / np.linalg.norm(steps)
     readings = np.full((len(columns.diagonals), len(steps)), np.nan)
     for index, name in enumerate(columns.readings):
         k, j = divmod(index, len(steps))
-        of_diagonal = columns.readings[k * len(steps):(k + 1) * len(steps)]
+        of_diagonal = columns.readings[k * len(steps) : (k + 1) * len(steps)]
         if not any(named[other] for other in of_diagonal):
             continue
         place = f"{where}: {name}"
@@ -183,21 +218,28 @@ def _values(named: dict[str, str], columns: RequiredColumns,
     return readings, linear
 
 
-def _refuse_unread(rows: list[tuple[np.ndarray, np.ndarray]], columns: RequiredColumns,
-                   where: str) -> None:
+def _refuse_unread(
+    rows: list[tuple[np.ndarray, np.ndarray]], columns: RequiredColumns, where: str
+) -> None:
     """Refuse a block without readings of a diagonal."""
     read = np.isfinite([readings for readings, _ in rows]).any(axis=0).ravel()
     if not read.all():
-        raise InputError(f"{where}: {columns.readings[int(np.argmin(read))]}", "the cell is empty",
-                         "give a number in mm")
+        raise InputError(
+            f"{where}: {columns.readings[int(np.argmin(read))]}",
+            "the cell is empty",
+            "give a number in mm",
+        )
 
 
 def _in_order(cells: dict[int, list], path: str | os.PathLike) -> list[list]:
     first = min(cells) if min(cells) in (0, 1) else 1
     for block in range(first, max(cells) + 1):
         if block not in cells:
-            raise InputError(str(path), f"block {block} is missing",
-                             f"measure every block from {first} to {max(cells)}")
+            raise InputError(
+                str(path),
+                f"block {block} is missing",
+                f"measure every block from {first} to {max(cells)}",
+            )
     return [cells[block] for block in sorted(cells)]
 
 
@@ -209,8 +251,9 @@ def _assemble(blocks: list[list], columns: RequiredColumns) -> laser_data.StepDi
         for repeat, (readings, errors) in enumerate(rows):
             samples[repeat, :, :, i] = readings
             linear[repeat, :, i] = errors
-    return laser_data.StepDiagonal(columns.steps_m, columns.diagonals, samples,
-                                   linear if columns.linear else None)
+    return laser_data.StepDiagonal(
+        columns.steps_m, columns.diagonals, samples, linear if columns.linear else None
+    )
 
 
 def table_text(data: laser_data.StepDiagonal, comments: Sequence[str] = ()) -> str:
@@ -240,7 +283,8 @@ def _row(of_block: np.ndarray, repeat: int) -> list[float]:
     return [math.nan] * of_block[0].size
 
 
-def write_table(path: str | os.PathLike, data: laser_data.StepDiagonal,
-                comments: Sequence[str] = ()) -> None:
+def write_table(
+    path: str | os.PathLike, data: laser_data.StepDiagonal, comments: Sequence[str] = ()
+) -> None:
     """Write a measurement as a CSV file, with comment lines at the top."""
     write_text(path, table_text(data, comments))

@@ -141,12 +141,17 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
             named.setdefault(name, []).append(chain)
     _same_length(named, dim)
     origin = _origin(named)
-    runs = {name: [_readings(chain, name, origin, rule) for chain in each]
-            for name, each in named.items()}
+    runs = {
+        name: [_readings(chain, name, origin, rule) for chain in each]
+        for name, each in named.items()
+    }
     diagonals = tuple(name for name in DIAGONALS[dim] if name in runs)
     if not diagonals:
-        raise NoDataError("recording", "no run along a diagonal",
-                          "check topics, joints, steps and the tolerances of rest and step")
+        raise NoDataError(
+            "recording",
+            "no run along a diagonal",
+            "check topics, joints, steps and the tolerances of rest and step",
+        )
     samples = _stack([np.array(runs[name]) for name in diagonals])
     axes = [runs.get(AXES[j], []) for j in range(dim)]
     linear = None
@@ -155,8 +160,11 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     if all(axes):
         steps = np.array(rule.steps_m)[:, None]
         linear = _stack([np.array(axis) for axis in axes]) - steps
-    return Cut(StepDiagonal(rule.steps_m, diagonals, samples, linear),
-               {name: len(runs[name]) for name in sorted(runs)}, tuple(notes))
+    return Cut(
+        StepDiagonal(rule.steps_m, diagonals, samples, linear),
+        {name: len(runs[name]) for name in sorted(runs)},
+        tuple(notes),
+    )
 
 
 def _check(series: Recording) -> None:
@@ -165,8 +173,9 @@ def _check(series: Recording) -> None:
             raise NoDataError(name, "no samples", "check the topic")
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
         if bad.any():
-            raise InputError(name, f"sample {int(np.argmax(bad))} is not finite",
-                             "leave lost samples out")
+            raise InputError(
+                name, f"sample {int(np.argmax(bad))} is not finite", "leave lost samples out"
+            )
 
 
 def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
@@ -183,8 +192,9 @@ def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
         if last - first >= rule.min_rest_s * NS_PER_S:
             laser = _mean_laser(series, (first, last), rule)
             if laser is not None:
-                rests.append(Rest(positions[start:end].mean(axis=0), laser[0], int(first),
-                                  laser[1]))
+                rests.append(
+                    Rest(positions[start:end].mean(axis=0), laser[0], int(first), laser[1])
+                )
             start, end = end, end + 1
         elif end == len(stamps):
             break
@@ -208,16 +218,19 @@ def _end_of_rest(positions: np.ndarray, known: tuple[int, int], tolerance_m: flo
     return end
 
 
-def _mean_laser(series: Recording, between_ns: tuple[int, int],
-                rule: CutRule) -> tuple[float, int] | None:
+def _mean_laser(
+    series: Recording, between_ns: tuple[int, int], rule: CutRule
+) -> tuple[float, int] | None:
     """Return the mean distance of a rest without its ends, and the number of ignored samples.
 
     A single outlier (an interrupted beam, a lost digit) would move the
     mean by far more than the noise of the laser. None without samples.
     """
     settle_ns = round(rule.settle_s * NS_PER_S)
-    inside = slice(np.searchsorted(series.laser_ns, between_ns[0] + settle_ns),
-                   np.searchsorted(series.laser_ns, between_ns[1] - settle_ns, side="right"))
+    inside = slice(
+        np.searchsorted(series.laser_ns, between_ns[0] + settle_ns),
+        np.searchsorted(series.laser_ns, between_ns[1] - settle_ns, side="right"),
+    )
     distances = series.laser_m[inside]
     if not len(distances):
         return None
@@ -243,9 +256,16 @@ def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:
             continue
         axis = int(np.argmax(moved))
         fits = abs(abs(change[axis]) - steps[axis]) <= rule.step_tolerance * steps[axis]
-        out.append(Move(axis, int(np.sign(change[axis])),
-                        min(before.position_m[axis], after.position_m[axis]),
-                        after.laser_m - before.laser_m) if moved.sum() == 1 and fits else None)
+        out.append(
+            Move(
+                axis,
+                int(np.sign(change[axis])),
+                min(before.position_m[axis], after.position_m[axis]),
+                after.laser_m - before.laser_m,
+            )
+            if moved.sum() == 1 and fits
+            else None
+        )
     return out
 
 
@@ -270,8 +290,9 @@ def _continues(chain: list[Move], move: Move) -> bool:
     same = [earlier for earlier in chain if earlier.axis == move.axis]
     if same and same[-1].sense != move.sense:
         return False
-    period = next((index for index in range(1, len(chain))
-                   if chain[index].axis == chain[0].axis), None)
+    period = next(
+        (index for index in range(1, len(chain)) if chain[index].axis == chain[0].axis), None
+    )
     if period is None:
         # The first cycle is not closed: X may follow X (a run of one axis) or close the cycle.
         return not same or move.axis == chain[0].axis
@@ -302,8 +323,7 @@ def _origin(named: dict[str, list[list[Move]]]) -> dict[int, float]:
     return origin
 
 
-def _readings(chain: list[Move], name: str, origin: dict[int, float],
-              rule: CutRule) -> np.ndarray:
+def _readings(chain: list[Move], name: str, origin: dict[int, float], rule: CutRule) -> np.ndarray:
     """Return the readings of a run, (D, n), or (n,) for a run of one axis; by position."""
     dim, steps = len(rule.steps_m), np.array(rule.steps_m)
     alone = len(name) == 1
@@ -315,8 +335,11 @@ def _readings(chain: list[Move], name: str, origin: dict[int, float],
         block = round((move.low_m - origin[move.axis]) / steps[move.axis])
         where = f"run {name}, {AXES[move.axis]} move, block {block + 1}"
         if not 0 <= block < n:
-            raise InputError(where, f"the run has {n} blocks only and starts elsewhere on the axis",
-                             "run all diagonals and axes over the same range")
+            raise InputError(
+                where,
+                f"the run has {n} blocks only and starts elsewhere on the axis",
+                "run all diagonals and axes over the same range",
+            )
         nominal = steps[move.axis] if alone else (steps**2 / np.linalg.norm(steps))[move.axis]
         check_reading(move.reading_m, nominal, where)
         out[move.axis, block] = move.reading_m
@@ -324,12 +347,16 @@ def _readings(chain: list[Move], name: str, origin: dict[int, float],
 
 
 def _same_length(named: dict[str, list[list[Move]]], dim: int) -> None:
-    lengths = {name: {_blocks_of(chain, name, dim) for chain in each}
-               for name, each in named.items()}
+    lengths = {
+        name: {_blocks_of(chain, name, dim) for chain in each} for name, each in named.items()
+    }
     if len({length for each in lengths.values() for length in each}) > 1:
         counts = ", ".join(f"{name} {sorted(each)}" for name, each in sorted(lengths.items()))
-        raise InputError("recording", f"runs of different numbers of blocks: {counts}",
-                         "record complete runs over the same range only")
+        raise InputError(
+            "recording",
+            f"runs of different numbers of blocks: {counts}",
+            "record complete runs over the same range only",
+        )
 
 
 def _stack(each: list[np.ndarray]) -> np.ndarray:
@@ -337,5 +364,5 @@ def _stack(each: list[np.ndarray]) -> np.ndarray:
     most = max(map(len, each))
     out = np.full((most, len(each), *each[0].shape[1:]), np.nan)
     for index, array in enumerate(each):
-        out[:len(array), index] = array
+        out[: len(array), index] = array
     return out

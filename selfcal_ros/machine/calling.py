@@ -16,8 +16,13 @@ LIBRARIES = {"site-packages", "dist-packages"}
 """Names of folders of code in which nobody looks for a mistake of their own."""
 
 
-def called(where: str, function: Callable[..., Any], *values: Any,
-           remedy: str = "check cables, power and the driver", **more: Any) -> Any:
+def called(
+    where: str,
+    function: Callable[..., Any],
+    *values: Any,
+    remedy: str = "check cables, power and the driver",
+    **more: Any,
+) -> Any:
     """Return what a function returns.
 
     Parameters
@@ -40,11 +45,21 @@ def called(where: str, function: Callable[..., Any], *values: Any,
     except (SelfcalError, ModuleNotFoundError, Ended):
         raise
     except (Exception, SystemExit) as error:
-        frames = [frame for frame in traceback.extract_tb(error.__traceback__)
-                  if frame.filename != __file__]  # none if a library in C raised it
-        of_user = [frame for frame in frames if not frame.filename.startswith(STDLIB)
-                   and LIBRARIES.isdisjoint(Path(frame.filename).parts)]
-        place = "".join(f" ({Path(frame.filename).name}, line {frame.lineno})"
-                        for frame in (of_user or frames)[-1:])
-        raise MachineError(f"{type(error).__name__}: {first_line(error)}{place}", where,
-                           remedy) from error
+        frames = [
+            frame
+            for frame in traceback.extract_tb(error.__traceback__)
+            if frame.filename != __file__
+        ]  # none if a library in C raised it
+        of_user = [
+            frame
+            for frame in frames
+            if not frame.filename.startswith(STDLIB)
+            and LIBRARIES.isdisjoint(Path(frame.filename).parts)
+        ]
+        place = "".join(
+            f" ({Path(frame.filename).name}, line {frame.lineno})"
+            for frame in (of_user or frames)[-1:]
+        )
+        raise MachineError(
+            f"{type(error).__name__}: {first_line(error)}{place}", where, remedy
+        ) from error

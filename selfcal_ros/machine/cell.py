@@ -128,8 +128,9 @@ class Cell:
         """Return the position in the stage frame of a machine's position."""
         return value - self.origin.get(axis, 0.0)
 
-    def require_limits(self, axis: str, value: float, what: str,
-                       start: float | None = None) -> None:
+    def require_limits(
+        self, axis: str, value: float, what: str, start: float | None = None
+    ) -> None:
         """Raise MachineError for a machine's position that is not a number or leaves the limits.
 
         From a `start` beyond the limits a move back towards them is allowed.
@@ -137,15 +138,20 @@ class Cell:
         if not math.isfinite(value):
             raise MachineError(f"{what}: {axis} = {value} is not a position", str(self.path))
         if axis not in self.limits:
-            raise MachineError(f"{what} moves {axis}, which has no limits", f"{self.path}: limits",
-                               f"give limits: {{{axis}: [low, high]}}")
+            raise MachineError(
+                f"{what} moves {axis}, which has no limits",
+                f"{self.path}: limits",
+                f"give limits: {{{axis}: [low, high]}}",
+            )
         low, high = self.limits[axis]
         if start is not None and (start < value < low or high < value < start):
             return
         if not low <= value <= high:
             raise MachineError(
                 f"{what} is at {axis} = {value:.6g}, beyond the limits {low:g} to {high:g}",
-                f"{self.path}: limits", "correct limits or origin, or take a smaller plan")
+                f"{self.path}: limits",
+                "correct limits or origin, or take a smaller plan",
+            )
 
 
 def read_cell(path: str | Path) -> Cell:
@@ -160,14 +166,19 @@ def read_cell(path: str | Path) -> Cell:
     where = str(path)
     data = _mapping(read_yaml(path), where)
     if not isinstance(data.get("machine"), str):
-        raise InputError(where, "the key 'machine' is missing", "name a machine: "
-                         f"{', '.join(known_machines())}, or package.module:Class")
+        raise InputError(
+            where,
+            "the key 'machine' is missing",
+            f"name a machine: {', '.join(known_machines())}, or package.module:Class",
+        )
     machine = data["machine"]
     own = machine.rpartition(":")[2]
     if ":" not in machine and machine not in SHIPPED and machine not in known_machines():
-        raise InputError(f"{where}: machine", f"there is no machine '{machine}'",
-                         f"{known_are(machine, sorted(known_machines()))}; or "
-                         "package.module:Class")
+        raise InputError(
+            f"{where}: machine",
+            f"there is no machine '{machine}'",
+            f"{known_are(machine, sorted(known_machines()))}; or package.module:Class",
+        )
     known = ("machine", own, "limits", "origin", "sense", "settle", "detector", "placing", "found")
     _only(data, known, where)
     limits = {}
@@ -176,25 +187,45 @@ def read_cell(path: str | Path) -> Cell:
     _only(limits, AXES, f"{where}: limits")
     for axis in AXES[:2]:
         if max(map(abs, limits.get(axis, (0.0,)))) > LONGEST_M:
-            raise InputError(f"{where}: limits: {axis}", f"{limits[axis]} m: is it in mm?",
-                             "give m")
+            raise InputError(
+                f"{where}: limits: {axis}", f"{limits[axis]} m: is it in mm?", "give m"
+            )
     for axis in ("x", "y"):
         if axis not in limits:
-            raise InputError(f"{where}: limits", f"the travel of {axis} is not limited",
-                             f"give {axis}: [low, high] in m, as the machine indicates them")
+            raise InputError(
+                f"{where}: limits",
+                f"the travel of {axis} is not limited",
+                f"give {axis}: [low, high] in m, as the machine indicates them",
+            )
     sense = Parameter("sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense)))
     found = _mapping(data.get("placing") if isinstance(data.get("placing"), dict) else {}, where)
     _only(found, ("command",), f"{where}: placing")
-    placing = "robot" if found else Parameter("placing", "person", "", choices=PLACERS).check(
-        data.get("placing", "person"), where)
+    placing = (
+        "robot"
+        if found
+        else Parameter("placing", "person", "", choices=PLACERS).check(
+            data.get("placing", "person"), where
+        )
+    )
     return Cell(
-        path, machine, _mapping(data.get(own, {}), f"{where}: {own}"), limits,
+        path,
+        machine,
+        _mapping(data.get(own, {}), f"{where}: {own}"),
+        limits,
         origin=_numbers(data.get("origin", {}), f"{where}: origin", dict.fromkeys(AXES, 0.0)),
         sense=Sense(sense.check(data.get("sense", sense.default), where)),
-        settle=Settle(**_numbers(data.get("settle", {}), f"{where}: settle", {
-            item.name: getattr(Settle(), item.name) for item in fields(Settle)}, low=0.0)),
+        settle=Settle(
+            **_numbers(
+                data.get("settle", {}),
+                f"{where}: settle",
+                {item.name: getattr(Settle(), item.name) for item in fields(Settle)},
+                low=0.0,
+            )
+        ),
         detector=_detector(data["detector"], where) if "detector" in data else None,
-        placing=placing, place_command=str(found.get("command", "")))
+        placing=placing,
+        place_command=str(found.get("command", "")),
+    )
 
 
 def _detector(data: Any, where: str) -> DetectorSettings:
@@ -218,17 +249,24 @@ def _only(data: Mapping[str, Any], known: Any, where: str) -> None:
             raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known))
 
 
-def _numbers(data: Any, where: str, defaults: Mapping[str, float], low: float | None = None,
-             ) -> dict[str, float]:
+def _numbers(
+    data: Any,
+    where: str,
+    defaults: Mapping[str, float],
+    low: float | None = None,
+) -> dict[str, float]:
     section = _mapping(data, where)
     _only(section, defaults, where)
-    return {name: Parameter(name, float(defaults[name]), "", low=low).check(value, where)
-            for name, value in section.items()}
+    return {
+        name: Parameter(name, float(defaults[name]), "", low=low).check(value, where)
+        for name, value in section.items()
+    }
 
 
 def _pair(value: Any, where: str) -> tuple[float, float]:
-    numbers = [item for item in value if isinstance(item, int | float)] if isinstance(
-        value, list) else []
+    numbers = (
+        [item for item in value if isinstance(item, int | float)] if isinstance(value, list) else []
+    )
     if len(numbers) != 2 or not numbers[0] < numbers[1]:
         raise InputError(where, f"{value!r} is not [low, high]", "give two rising numbers, SI")
     return float(numbers[0]), float(numbers[1])
@@ -258,12 +296,18 @@ def open_machine(cell: Cell) -> Machine:
     machine = called(f"{cell.path}: {cell.machine}", kind, **keys)
     for name in ("axes", "position", "move_to", "image", "offsets", "stop", "close"):
         if not hasattr(machine, name):
-            raise InputError(f"{cell.path}: machine", f"{cell.machine} has no '{name}'",
-                             "give the class all that selfcal_ros.machine.Machine has")
+            raise InputError(
+                f"{cell.path}: machine",
+                f"{cell.machine} has no '{name}'",
+                "give the class all that selfcal_ros.machine.Machine has",
+            )
     axes = tuple(machine.axes)
     if axes not in (AXES[:2], AXES):
-        raise InputError(f"{cell.path}: machine", f"the axes of {cell.machine} are {axes}",
-                         "let them be ('x', 'y') or ('x', 'y', 'theta')")
+        raise InputError(
+            f"{cell.path}: machine",
+            f"the axes of {cell.machine} are {axes}",
+            "let them be ('x', 'y') or ('x', 'y', 'theta')",
+        )
     return cast(Machine, machine)
 
 
@@ -285,8 +329,11 @@ def connected(cell: Cell, say: Callable[[str], None]) -> Iterator[Machine]:
 
 def class_of(cell: Cell) -> Any:
     """Return the class of a cell's machine; raises InputError like `open_machine`."""
-    target = cell.machine if ":" in cell.machine else (
-        SHIPPED.get(cell.machine) or known_machines()[cell.machine])
+    target = (
+        cell.machine
+        if ":" in cell.machine
+        else (SHIPPED.get(cell.machine) or known_machines()[cell.machine])
+    )
     where = f"{cell.path}: machine"
     module, _, name = target.partition(":")
     folder = str(cell.path.resolve().parent)
@@ -296,39 +343,59 @@ def class_of(cell: Cell) -> Any:
         found = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not module.startswith(error.name):
-            raise InputError(where, f"'{cell.machine}' needs the module {error.name}",
-                             f"pip install 'selfcal_ros[{cell.machine}]'" if ":" not in
-                             cell.machine else f"install {error.name}") from error
-        raise InputError(where, f"there is no module '{module}'",
-                         f"put {module.partition('.')[0]}.py beside {cell.path.name}, or install "
-                         "it") from error
+            raise InputError(
+                where,
+                f"'{cell.machine}' needs the module {error.name}",
+                f"pip install 'selfcal_ros[{cell.machine}]'"
+                if ":" not in cell.machine
+                else f"install {error.name}",
+            ) from error
+        raise InputError(
+            where,
+            f"there is no module '{module}'",
+            f"put {module.partition('.')[0]}.py beside {cell.path.name}, or install it",
+        ) from error
     except Exception as error:
-        raise InputError(where, f"the module '{module}' fails: {type(error).__name__}: "
-                         f"{first_line(error)}", "correct it") from error
+        raise InputError(
+            where,
+            f"the module '{module}' fails: {type(error).__name__}: {first_line(error)}",
+            "correct it",
+        ) from error
     if not hasattr(found, name):
         path = getattr(found, "__file__", None) or "built into Python"
-        raise InputError(where, f"the module '{module}' ({path}) has no '{name}'",
-                         known_are(name, [key for key in vars(found) if not key.startswith("_")]))
+        raise InputError(
+            where,
+            f"the module '{module}' ({path}) has no '{name}'",
+            known_are(name, [key for key in vars(found) if not key.startswith("_")]),
+        )
     return getattr(found, name)
 
 
 def check_keys(kind: Any, cell: Cell) -> None:
     """Refuse keys that the class does not take, and missing ones."""
     where = f"{cell.path}: {cell.name}"
-    parameters = {name: item for name, item in inspect.signature(kind).parameters.items()
-                  if item.kind not in (item.VAR_POSITIONAL, item.VAR_KEYWORD)}
+    parameters = {
+        name: item
+        for name, item in inspect.signature(kind).parameters.items()
+        if item.kind not in (item.VAR_POSITIONAL, item.VAR_KEYWORD)
+    }
     takes_any = len(parameters) < len(inspect.signature(kind).parameters)
     if not takes_any:
         _only(cell.keys, parameters, where)
-    missing = [name for name, item in parameters.items()
-               if item.default is item.empty and name not in {*cell.keys, FOLDER}]
+    missing = [
+        name
+        for name, item in parameters.items()
+        if item.default is item.empty and name not in {*cell.keys, FOLDER}
+    ]
     if missing:
-        raise InputError(where, f"the key '{missing[0]}' is missing",
-                         f"give {cell.name}: {{{missing[0]}: ...}}")
+        raise InputError(
+            where, f"the key '{missing[0]}' is missing", f"give {cell.name}: {{{missing[0]}: ...}}"
+        )
 
 
-def with_values(path: Path, section: str, values: Mapping[str, Any],
-                notes: Mapping[str, str]) -> None:
+def with_values(
+    path: Path, section: str, values: Mapping[str, Any], notes: Mapping[str, str]
+) -> None:
     """Write values into a section of a CELL.yaml, in block style, and keep the rest as it is.
 
     Parameters

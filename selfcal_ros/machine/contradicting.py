@@ -36,8 +36,9 @@ def contradiction(visits: GridVisits) -> Contradiction | None:
         return None
     order = np.argsort(visits.stamp_ns)
     moved = _about_means(np.stack([visits.dx, visits.dy]), mark)
-    found = max(_reversal(visits, moved, mark), _jump(order, moved, mark),
-                _running(visits, moved, mark))
+    found = max(
+        _reversal(visits, moved, mark), _jump(order, moved, mark), _running(visits, moved, mark)
+    )
     return found if found.explained > EXPLAINED else None
 
 
@@ -61,8 +62,11 @@ def _reversal(visits: GridVisits, moved: np.ndarray, mark: np.ndarray) -> Contra
     slope, explained = _fitted(_about_means(signs, mark), moved)
     x, y = np.abs(2 * slope) * UM_PER_M
     return Contradiction(
-        explained, f"marks approached from + and from - lie {x:.3g} um apart in x and {y:.3g} um "
-        "in y: backlash", "take up the play, or have all marks approached from one side")
+        explained,
+        f"marks approached from + and from - lie {x:.3g} um apart in x and {y:.3g} um "
+        "in y: backlash",
+        "take up the play, or have all marks approached from one side",
+    )
 
 
 def _jump(order: np.ndarray, moved: np.ndarray, mark: np.ndarray) -> Contradiction:
@@ -75,9 +79,12 @@ def _jump(order: np.ndarray, moved: np.ndarray, mark: np.ndarray) -> Contradicti
         if explained > best.explained:
             x, y = slope * UM_PER_M
             best = Contradiction(
-                explained, f"from visit {number + 2} on all marks lie {x:+.3g} um in x and "
+                explained,
+                f"from visit {number + 2} on all marks lie {x:+.3g} um in x and "
                 f"{y:+.3g} um in y from where they were: steps were lost, or the plate or the "
-                "camera has slipped", "fasten plate and camera, move more slowly, home the stage")
+                "camera has slipped",
+                "fasten plate and camera, move more slowly, home the stage",
+            )
     return best
 
 
@@ -87,5 +94,7 @@ def _running(visits: GridVisits, moved: np.ndarray, mark: np.ndarray) -> Contrad
     slope, explained = _fitted(np.tile(_about_means(time, mark), (2, 1)), moved)
     x, y = slope * UM_PER_M
     return Contradiction(
-        explained, f"the marks run away by {x:+.3g} um in x and {y:+.3g} um in y over the view",
-        "see whether the stage loses steps, or plate, camera or temperature drift")
+        explained,
+        f"the marks run away by {x:+.3g} um in x and {y:+.3g} um in y over the view",
+        "see whether the stage loses steps, or plate, camera or temperature drift",
+    )

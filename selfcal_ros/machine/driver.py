@@ -41,8 +41,9 @@ class Driver:
         Why the machine stands still; empty if all is well.
     """
 
-    def __init__(self, cell: Cell, machine: Machine, say: Callable[[str], None],
-                 clock: Clock | None = None) -> None:
+    def __init__(
+        self, cell: Cell, machine: Machine, say: Callable[[str], None], clock: Clock | None = None
+    ) -> None:
         self._cell, self._machine, self._say = cell, machine, say
         self._clock = clock or Clock()
         self._visitor = Visitor(machine, cell, self._clock)
@@ -129,8 +130,11 @@ class Driver:
         except Exception as error:
             if self._visitor.stopped:
                 return  # a new command
-            line = str(error) if isinstance(error, SelfcalError) else (
-                f"machine: {type(error).__name__}: {error}")
+            line = (
+                str(error)
+                if isinstance(error, SelfcalError)
+                else (f"machine: {type(error).__name__}: {error}")
+            )
             if line != self.problem:
                 self._say(line)
             self.problem = line
@@ -144,15 +148,19 @@ class Driver:
         view = command.placed()
         x, y = view.translation_m
         self._unplaced = True
-        place_by_robot(self._machine, self._cell, Placing(view.name, x, y, view.rotation_rad,
-                                                          command))
+        place_by_robot(
+            self._machine, self._cell, Placing(view.name, x, y, view.rotation_rad, command)
+        )
         self._unplaced = False
 
     def _measure(self, command: Command, again: Again | None) -> None:
         view, artifact = command.placed(), command.plate()
         if self._unplaced:
-            raise MachineError("the robot has not placed the plate", f"view '{view.name}'",
-                               "redo_view has it placed again")
+            raise MachineError(
+                "the robot has not placed the plate",
+                f"view '{view.name}'",
+                "redo_view has it placed again",
+            )
         with self._visitor.stopping():
             if again is None:
                 self._visitor.approach(artifact, view)

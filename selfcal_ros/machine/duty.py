@@ -52,9 +52,13 @@ class Duty:
             The time, and that of the last exposure.
         """
         command = self.command
-        if (command is None or status.complete or status.view_index != command.view_index
-                or command.run_id not in ("", status.run_id)
-                or now_ns < idle_since_ns + PATIENCE_NS):
+        if (
+            command is None
+            or status.complete
+            or status.view_index != command.view_index
+            or command.run_id not in ("", status.run_id)
+            or now_ns < idle_since_ns + PATIENCE_NS
+        ):
             return Again()
         marks = {*zip(status.missing_m, status.missing_n, strict=False)}
         return Again(marks, {*status.missing_k}, status.check_done < status.check_expected)

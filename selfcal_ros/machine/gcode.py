@@ -67,13 +67,25 @@ class GcodeMachine:
         If the controller does not answer, or is in alarm.
     """
 
-    def __init__(self, port: str, dialect: str, feed: float, baud: int = 115200,
-                 axes: Sequence[str] = ("x", "y"), camera: int | str | None = None,
-                 width: int = 0, height: int = 0, password: str = "EMC",
-                 enable_password: str = "EMCTOO") -> None:
+    def __init__(
+        self,
+        port: str,
+        dialect: str,
+        feed: float,
+        baud: int = 115200,
+        axes: Sequence[str] = ("x", "y"),
+        camera: int | str | None = None,
+        width: int = 0,
+        height: int = 0,
+        password: str = "EMC",
+        enable_password: str = "EMCTOO",
+    ) -> None:
         if dialect not in DIALECTS:
-            raise MachineError(f"the dialect '{dialect}' is unknown", "gcode: dialect",
-                               f"choose one of {', '.join(DIALECTS)}")
+            raise MachineError(
+                f"the dialect '{dialect}' is unknown",
+                "gcode: dialect",
+                f"choose one of {', '.join(DIALECTS)}",
+            )
         if not (math.isfinite(feed) and feed > 0):
             raise MachineError(f"a feed of {feed} mm/min", "gcode: feed", "give mm/min above 0")
         self.axes = tuple(axes)
@@ -84,6 +96,7 @@ class GcodeMachine:
             self._talk = _TALKS[dialect](self._lines, self.axes, (password, enable_password))
             if camera is not None:
                 from selfcal_ros.machine.video import VideoCamera  # extra camera
+
                 self._camera = VideoCamera(camera, width, height)
         except BaseException:
             self._lines.close()
@@ -99,8 +112,9 @@ class GcodeMachine:
         here = self._talk.position()
         native = [_from_si(axis, value) for axis, value in zip(self.axes, position, strict=True)]
         way = math.hypot(*(to - at for to, at in zip(native, here, strict=True)))
-        words = " ".join(f"{LETTERS[axis]}{value:.6f}" for axis, value in zip(
-            self.axes, native, strict=True))
+        words = " ".join(
+            f"{LETTERS[axis]}{value:.6f}" for axis, value in zip(self.axes, native, strict=True)
+        )
         longest_s = ALLOWANCE * way / self._feed * 60 + PATIENCE_S
         try:
             self._talk.move(_Travel(f"{words} F{self._feed:g}", longest_s))
@@ -165,11 +179,15 @@ class _Talk:
         if self._may_greet:
             self._may_greet = not (self.GREETING and answer.startswith(self.GREETING))
         elif self.GREETING and answer.startswith(self.GREETING):
-            raise MachineError(f"the controller was reset: it says '{answer}'", "controller",
-                               "home it: its position may be lost")
+            raise MachineError(
+                f"the controller was reset: it says '{answer}'",
+                "controller",
+                "home it: its position may be lost",
+            )
         elif "\N{REPLACEMENT CHARACTER}" in answer:
-            raise MachineError(f"'{answer:.40}' is not an answer", "controller",
-                               "check baud, cable and its shield")
+            raise MachineError(
+                f"'{answer:.40}' is not an answer", "controller", "check baud, cable and its shield"
+            )
         return answer
 
     def _ok(self, line: str, timeout_s: float = PATIENCE_S) -> list[str]:
@@ -191,8 +209,11 @@ class _Talk:
         """Raise if an answer is an error."""
         low = answer.lower()
         if low.startswith(("error", "alarm", "!!")) or "kill()" in low or "halted" in low:
-            raise MachineError(f"'{line}' was answered by '{answer}'", "controller",
-                               "check limit switches, soft limits and homing; reset it")
+            raise MachineError(
+                f"'{line}' was answered by '{answer}'",
+                "controller",
+                "check limit switches, soft limits and homing; reset it",
+            )
 
 
 class _Grbl(_Talk):
@@ -231,24 +252,31 @@ class _Grbl(_Talk):
         parts = dict(part.partition(":")[::2] for part in fields)
         state = state.partition(":")[0].lower()
         if state in ("alarm", "door", "sleep"):
-            raise MachineError(f"the controller is in state '{state}'", "controller",
-                               "find out why, then home or unlock it ($H, $X)")
+            raise MachineError(
+                f"the controller is in state '{state}'",
+                "controller",
+                "find out why, then home or unlock it ($H, $X)",
+            )
         if "WCO" in parts:
             self._offset = _numbers(parts["WCO"])
         if "MPos" in parts:
             return state, self._chosen(_numbers(parts["MPos"]))
         if "WPos" in parts and hasattr(self, "_offset"):
-            at = [value + off for value, off in zip(
-                _numbers(parts["WPos"]), self._offset, strict=True)]
+            at = [
+                value + off
+                for value, off in zip(_numbers(parts["WPos"]), self._offset, strict=True)
+            ]
             return state, self._chosen(at)
-        raise MachineError(f"its report '{answer}' has no machine position", "controller",
-                           "set $10=1")
+        raise MachineError(
+            f"its report '{answer}' has no machine position", "controller", "set $10=1"
+        )
 
     def _chosen(self, values: list[float]) -> list[float]:
         if len(values) < len(self._axes):
             raise MachineError(f"it reports {len(values)} axes", "controller", "correct axes")
         return [values[index] for index in ([0, 1, 3] if len(values) > 3 else [0, 1, 2])][
-            :len(self._axes)]
+            : len(self._axes)
+        ]
 
     def position(self) -> list[float]:
         return self._status()[1]
@@ -258,8 +286,11 @@ class _Grbl(_Talk):
         deadline = time.monotonic() + travel.longest_s
         while self._status()[0] in MOTION_STATES:
             if time.monotonic() > deadline:
-                raise MachineError(f"the move has not ended in {travel.longest_s:.3g} s",
-                                   "controller", "check feed and drives")
+                raise MachineError(
+                    f"the move has not ended in {travel.longest_s:.3g} s",
+                    "controller",
+                    "check feed and drives",
+                )
             time.sleep(POLL_S)
 
     def stop(self) -> None:
@@ -284,15 +315,20 @@ class _Marlin(_Talk):
         self._ok("G90")
         self._per_mm: dict[str, float] = {}
         for answer in self._ok(self.STEPS) if self.STEPS else ():
-            self._per_mm |= {letter: float(value) for letter, value in re.findall(
-                r"\b([XYZABC])(\d+\.?\d*)", answer)}
+            self._per_mm |= {
+                letter: float(value)
+                for letter, value in re.findall(r"\b([XYZABC])(\d+\.?\d*)", answer)
+            }
 
     def position(self) -> list[float]:
         for answer in self._ok(self.QUERY):
             told, _, counted = answer.partition("Count")
             found = {letter: float(value) for letter, value in NUMBER.findall(told)}
-            found |= {letter: float(value) / self._per_mm[letter]
-                      for letter, value in NUMBER.findall(counted) if self._per_mm.get(letter)}
+            found |= {
+                letter: float(value) / self._per_mm[letter]
+                for letter, value in NUMBER.findall(counted)
+                if self._per_mm.get(letter)
+            }
             if {LETTERS[axis] for axis in self._axes} <= found.keys():
                 return [found[LETTERS[axis]] for axis in self._axes]
         raise MachineError("M114 tells no position of all axes", "controller", "correct axes")
@@ -328,8 +364,7 @@ class _LinuxCnc(_Talk):
         if not answer.upper().startswith("HELLO ACK"):
             raise MachineError(f"linuxcncrsh answered '{answer}'", "controller", "check password")
         self._lines.send("set echo off")
-        for words in ("verbose on", f"enable {enable}", "mode mdi", "set_wait done",
-                      "mdi G21 G90"):
+        for words in ("verbose on", f"enable {enable}", "mode mdi", "set_wait done", "mdi G21 G90"):
             self._set(words)
 
     def _set(self, words: str, timeout_s: float = PATIENCE_S) -> None:
@@ -341,8 +376,11 @@ class _LinuxCnc(_Talk):
             if answer.endswith("ACK"):
                 return
             if answer.endswith("NAK") or answer.startswith("ERROR"):
-                raise MachineError(f"'set {words}' was answered by '{answer}'", "controller",
-                                   "release the emergency stop, switch the machine on, home it")
+                raise MachineError(
+                    f"'set {words}' was answered by '{answer}'",
+                    "controller",
+                    "release the emergency stop, switch the machine on, home it",
+                )
 
     def position(self) -> list[float]:
         self._lines.send("get abs_act_pos")
@@ -369,9 +407,14 @@ def _numbers(text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise MachineError(f"'{text}' is not a position", "controller",
-                           "check baud, cable and its shield") from None
+        raise MachineError(
+            f"'{text}' is not a position", "controller", "check baud, cable and its shield"
+        ) from None
 
 
-_TALKS: dict[str, type] = {"grbl": _Grbl, "marlin": _Marlin, "klipper": _Klipper,
-                           "linuxcnc": _LinuxCnc}
+_TALKS: dict[str, type] = {
+    "grbl": _Grbl,
+    "marlin": _Marlin,
+    "klipper": _Klipper,
+    "linuxcnc": _LinuxCnc,
+}

@@ -36,8 +36,11 @@ class Lines:
         try:
             self._serial: Any = serial.serial_for_url(port, baudrate=baud, timeout=0.1)
         except (serial.SerialException, OSError, ValueError) as error:
-            raise MachineError(f"the port cannot be opened ({error})", port,
-                               "check name, cable and permissions (group dialout)") from error
+            raise MachineError(
+                f"the port cannot be opened ({error})",
+                port,
+                "check name, cable and permissions (group dialout)",
+            ) from error
 
     def send(self, line: str) -> None:
         """Send a line."""
@@ -71,8 +74,9 @@ class Lines:
                 return data.decode("ascii", "replace").strip()
             if not data.strip():
                 data = b""
-        raise MachineError(f"no answer in {wait_s:g} s", self._port,
-                           "check baud, dialect and the emergency stop")
+        raise MachineError(
+            f"no answer in {wait_s:g} s", self._port, "check baud, dialect and the emergency stop"
+        )
 
     def forget(self) -> None:
         """Drop what has been received and not read."""
@@ -86,5 +90,8 @@ class Lines:
         self._serial.close()
 
     def _gone(self, error: Exception) -> MachineError:
-        return MachineError(f"the connection was lost ({error})", self._port,
-                            "check cable and power; then --resume continues")
+        return MachineError(
+            f"the connection was lost ({error})",
+            self._port,
+            "check cable and power; then --resume continues",
+        )

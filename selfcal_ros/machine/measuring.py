@@ -127,18 +127,22 @@ class Run:
             If a stop is beyond the limits, or the machine lacks an axis or cannot place.
         """
         for view in self.plan.views:
-            route = stops(self.plan.artifact, replace(view, repeats=1, visit_order=""),
-                          self.cell.sense)
+            route = stops(
+                self.plan.artifact, replace(view, repeats=1, visit_order=""), self.cell.sense
+            )
             try:
                 self.visitor.require(route)
             except MachineError as error:
-                raise MachineError(error.what, f"view '{view.name}': {error.where}",
-                                   error.remedy) from error
+                raise MachineError(
+                    error.what, f"view '{view.name}': {error.where}", error.remedy
+                ) from error
         places = bool(self.cell.place_command) or hasattr(self.machine, "place")
         if self.cell.placing == "robot" and not places:
-            raise MachineError("the machine has no method 'place'", f"{self.cell.path}: placing",
-                               "write placing: {command: 'PROGRAM {view} {x} {y} {rotation}'}, or "
-                               "placing: person")
+            raise MachineError(
+                "the machine has no method 'place'",
+                f"{self.cell.path}: placing",
+                "write placing: {command: 'PROGRAM {view} {x} {y} {rotation}'}, or placing: person",
+            )
 
     def measure(self, *, resume: bool = False) -> None:
         """Measure all views; return when the last one is complete.
@@ -179,23 +183,30 @@ class Run:
             self._declare()
             return self._sequencer.start()
         if not resume:
-            raise InputError(str(self.bag), "exists already",
-                             "continue it with --resume, remove it, or name another folder")
+            raise InputError(
+                str(self.bag),
+                "exists already",
+                "continue it with --resume, remove it, or name another folder",
+            )
         return self._take_up()
 
     def _declare(self) -> None:
         assert self._journal is not None
         for topic, typename in INPUT_TOPICS.items():
-            profile = qos_profile(reliable=True, transient_local=topic == COMMAND_TOPIC,
-                                  depth=64 if topic == COMMAND_TOPIC else 1000)
+            profile = qos_profile(
+                reliable=True,
+                transient_local=topic == COMMAND_TOPIC,
+                depth=64 if topic == COMMAND_TOPIC else 1000,
+            )
             self._journal.add_topic(f"/{topic}", typename, [profile])
 
     def _take_up(self) -> list[Command]:
         """Continue an interrupted run where it stood; no commands if it is in the middle of one."""
         where = str(self.bag)
         if not any(self.bag.glob("*.mcap")):
-            raise InputError(where, "not a bag of an interrupted run",
-                             "remove it, or name another folder")
+            raise InputError(
+                where, "not a bag of an interrupted run", "remove it, or name another folder"
+            )
         self._journal = Claim(self.bag).resume()
         if self._journal is None:
             self.desk.say(f"{where}: measured already")
@@ -208,16 +219,28 @@ class Run:
         last = self.collector.newest_command
         if last is None:
             return self._sequencer.start()
-        if last.plan_id != self.plan.plan_id or last.view_index >= len(self.plan.views) or (
-                last.view is None or last.artifact is None
-                or placing_digest(last.artifact, last.view) != placing_digest(
-                    self.plan.artifact, self.plan.views[last.view_index])):
-            raise InputError(where, f"the interrupted run is of another plan, '{last.plan_id}'",
-                             "name the same PLAN.yaml, unchanged, or another folder")
+        if (
+            last.plan_id != self.plan.plan_id
+            or last.view_index >= len(self.plan.views)
+            or (
+                last.view is None
+                or last.artifact is None
+                or placing_digest(last.artifact, last.view)
+                != placing_digest(self.plan.artifact, self.plan.views[last.view_index])
+            )
+        ):
+            raise InputError(
+                where,
+                f"the interrupted run is of another plan, '{last.plan_id}'",
+                "name the same PLAN.yaml, unchanged, or another folder",
+            )
         newest_ns = max(last.stamp_ns, self.collector.encoder_until_ns)
         if self.clock.now_ns() <= newest_ns:
-            raise InputError(where, "this computer's clock is behind the last message of the bag",
-                             "set the clock")
+            raise InputError(
+                where,
+                "this computer's clock is behind the last message of the bag",
+                "set the clock",
+            )
         self._run_id, self._stamp_ns = last.run_id, last.stamp_ns
         self._resumed = True
         self._sequencer.resume(last.view_index, last.phase)
@@ -231,17 +254,25 @@ class Run:
         command = self._sequencer_command()
         view = command.placed()
         if self.cell.placing == "robot":
-            placing = Placing(view.name, view.translation_m[0], view.translation_m[1],
-                              view.rotation_rad, command)
+            placing = Placing(
+                view.name, view.translation_m[0], view.translation_m[1], view.rotation_rad, command
+            )
             place_by_robot(self.machine, self.cell, placing)
         else:
             self.desk.place(command)
 
     def _sequencer_command(self) -> Command:
         index = self._sequencer.index
-        return Command(self._stamp_ns, Phase.PLACE, self.plan.plan_id, index,
-                       self.plan.views[index], self.plan.artifact, len(self.plan.views),
-                       run_id=self._run_id)
+        return Command(
+            self._stamp_ns,
+            Phase.PLACE,
+            self.plan.plan_id,
+            index,
+            self.plan.views[index],
+            self.plan.artifact,
+            len(self.plan.views),
+            run_id=self._run_id,
+        )
 
     def _write_all(self, commands: list[Command]) -> None:
         for command in commands:
@@ -266,8 +297,9 @@ class Run:
         finding = findings.get(progress.view_index) or findings.get(None)
         if finding:
             return f": {finding}", ""
-        return _rejected(progress), ("clean the plate there, check light and focus, or leave "
-                                     "these marks out of the plan")
+        return _rejected(progress), (
+            "clean the plate there, check light and focus, or leave these marks out of the plan"
+        )
 
     def _contradiction(self, progress: ViewProgress) -> Contradiction | None:
         """Return why repeats of a view's marks contradict each other, if many do."""
@@ -294,8 +326,9 @@ class Run:
         resumed, self._resumed = self._resumed, False
         self.desk.say(f"view {index + 1} of {number} '{view.name}'")
         if not self.desk.may_move("the stage makes a small move, then goes to its marks"):
-            raise InputError(f"view '{view.name}'", "the stage may not move",
-                             "continue with --resume")
+            raise InputError(
+                f"view '{view.name}'", "the stage may not move", "continue with --resume"
+            )
         self.visitor.approach(self.plan.artifact, view)
         if resumed and self._has_shifted():
             self._write_all(self._sequencer.redo())
@@ -309,11 +342,19 @@ class Run:
             left = progress.needed
             if rounds >= REVISITS:
                 why, remedy = self._why(progress)
-                raise NoDataError(f"view '{view.name}'", f"{_named(progress)} are not read after "
-                                  f"{rounds} more visits{why}", remedy)
+                raise NoDataError(
+                    f"view '{view.name}'",
+                    f"{_named(progress)} are not read after {rounds} more visits{why}",
+                    remedy,
+                )
             missing = progress.missing
-            self._visit(Again({*zip(missing.m, missing.n, strict=True)}, {*missing.k},
-                              progress.check_done < progress.check_expected))
+            self._visit(
+                Again(
+                    {*zip(missing.m, missing.n, strict=True)},
+                    {*missing.k},
+                    progress.check_done < progress.check_expected,
+                )
+            )
             progress = self._progress()
         self.desk.show(progress)
         found = self._contradiction(progress)
@@ -363,8 +404,10 @@ class Run:
             return False
         some = np.linspace(0, len(readings.m) - 1, min(SHIFT_MARKS, len(readings.m))).astype(int)
         marks = [(int(readings.m[row]), int(readings.n[row])) for row in some]
-        before = {mark: (readings.dx[row], readings.dy[row])
-                  for mark, row in zip(marks, some, strict=True)}
+        before = {
+            mark: (readings.dx[row], readings.dy[row])
+            for mark, row in zip(marks, some, strict=True)
+        }
         again = Collector(collector_settings(self.cell))
         command = self.collector.newest_command
         assert command is not None
@@ -372,9 +415,15 @@ class Run:
         for event in self.visitor.view(self.plan.artifact, view, Again(marks)):
             _feed(again, event)
         found = again.collect()[1][progress.view_index].readings
-        shift = np.array([[x - before[m, n][0], y - before[m, n][1]] for m, n, x, y in zip(
-            found.m.tolist(), found.n.tolist(), found.dx, found.dy, strict=True)
-            if (m, n) in before])
+        shift = np.array(
+            [
+                [x - before[m, n][0], y - before[m, n][1]]
+                for m, n, x, y in zip(
+                    found.m.tolist(), found.n.tolist(), found.dx, found.dy, strict=True
+                )
+                if (m, n) in before
+            ]
+        )
         if not len(shift):
             return False
         sigma = readings.sigma_xy if math.isfinite(readings.sigma_xy) else 0.0
@@ -382,9 +431,11 @@ class Run:
         x, y = np.median(shift, axis=0)
         if math.hypot(x, y) <= limit:
             return False
-        self.desk.say(f"view '{view.name}': its marks lie {x * UM_PER_M:+.3g}, "
-                      f"{y * UM_PER_M:+.3g} um from where they were: the plate was moved, or the "
-                      "stage has another zero; the view is measured anew")
+        self.desk.say(
+            f"view '{view.name}': its marks lie {x * UM_PER_M:+.3g}, "
+            f"{y * UM_PER_M:+.3g} um from where they were: the plate was moved, or the "
+            "stage has another zero; the view is measured anew"
+        )
         return True
 
 
@@ -413,23 +464,32 @@ def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:
     if not cell.place_command:
         place: Callable[[Placing], None] | None = getattr(machine, "place", None)
         if place is None:
-            raise MachineError("the machine has no method 'place'", f"{cell.path}: placing",
-                               "name a command")
+            raise MachineError(
+                "the machine has no method 'place'", f"{cell.path}: placing", "name a command"
+            )
         called("machine.place", place, placing)
         return
-    words = [word.format(view=placing.view, x=repr(placing.x), y=repr(placing.y),
-                         rotation=repr(placing.rotation))
-             for word in shlex.split(cell.place_command)]
+    words = [
+        word.format(
+            view=placing.view, x=repr(placing.x), y=repr(placing.y), rotation=repr(placing.rotation)
+        )
+        for word in shlex.split(cell.place_command)
+    ]
     try:
-        done = subprocess.run(words, cwd=cell.path.parent, check=False, capture_output=True,
-                              text=True)
+        done = subprocess.run(
+            words, cwd=cell.path.parent, check=False, capture_output=True, text=True
+        )
     except OSError as error:
-        raise MachineError(f"{words[0]} cannot be run ({error.strerror})",
-                           f"{cell.path}: placing") from error
+        raise MachineError(
+            f"{words[0]} cannot be run ({error.strerror})", f"{cell.path}: placing"
+        ) from error
     if done.returncode:
         last = (done.stderr.strip().splitlines() or [""])[-1]
-        raise MachineError(f"{words[0]} ended with {done.returncode}: {last}",
-                           f"{cell.path}: placing", "the plate is not placed; --resume continues")
+        raise MachineError(
+            f"{words[0]} ended with {done.returncode}: {last}",
+            f"{cell.path}: placing",
+            "the plate is not placed; --resume continues",
+        )
 
 
 def _named(progress: ViewProgress) -> str:

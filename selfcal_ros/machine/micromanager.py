@@ -52,19 +52,31 @@ class MicroManagerMachine:
 
     axes = ("x", "y")
 
-    def __init__(self, config: str, adapters: str = "", speed: float = 1e-3, exposure: float = 0.0,
-                 folder: str = "", core: Any = None) -> None:
+    def __init__(
+        self,
+        config: str,
+        adapters: str = "",
+        speed: float = 1e-3,
+        exposure: float = 0.0,
+        folder: str = "",
+        core: Any = None,
+    ) -> None:
         self._speed = speed
         self._core = core or _new_core()
         self._where = str(config)
         try:
             self._load(adapters or _test_adapters(), config, folder)
             self._stage = self._core.getXYStageDevice()
-            for name, device in (("XY stage", self._stage),
-                                 ("camera", self._core.getCameraDevice())):
+            for name, device in (
+                ("XY stage", self._stage),
+                ("camera", self._core.getCameraDevice()),
+            ):
                 if not device:
-                    raise MachineError(f"it has no {name}", self._where,
-                                       f"name one under Core in the configuration ({name})")
+                    raise MachineError(
+                        f"it has no {name}",
+                        self._where,
+                        f"name one under Core in the configuration ({name})",
+                    )
             if exposure:
                 self._expose_for(exposure)
             self._signs = self._transposed()
@@ -81,26 +93,35 @@ class MicroManagerMachine:
                 self._core.setDeviceAdapterSearchPaths([adapters])
             self._core.loadSystemConfiguration(str(path))
         except Exception as error:
-            raise MachineError(f"cannot be loaded ({first_line(error)})", str(path),
-                               "load it in Micro-Manager first; check adapters and cables"
-                               ) from error
+            raise MachineError(
+                f"cannot be loaded ({first_line(error)})",
+                str(path),
+                "load it in Micro-Manager first; check adapters and cables",
+            ) from error
 
     def _expose_for(self, exposure_s: float) -> None:
         """Set the exposure; a core clips it without a word."""
         self._call("exposure", self._core.setExposure, exposure_s * MS_PER_S)
         told = self._core.getExposure() / MS_PER_S
         if not math.isclose(told, exposure_s, rel_tol=1e-3):
-            raise MachineError(f"the exposure is {told:g} s instead of {exposure_s:g} s",
-                               f"{self._where}: exposure", "give one that the camera has")
+            raise MachineError(
+                f"the exposure is {told:g} s instead of {exposure_s:g} s",
+                f"{self._where}: exposure",
+                "give one that the camera has",
+            )
 
     def _transposed(self) -> tuple[str, ...]:
-        return tuple(self._core.getProperty(self._stage, name) for name in TRANSPOSED
-                     if self._core.hasProperty(self._stage, name))
+        return tuple(
+            self._core.getProperty(self._stage, name)
+            for name in TRANSPOSED
+            if self._core.hasProperty(self._stage, name)
+        )
 
     def _call(self, what: str, function: Any, *values: Any) -> Any:
         """Call the core; its errors become those of a machine."""
-        return called(f"{self._where}: {what}", function, *values,
-                      remedy="check the device and its cables")
+        return called(
+            f"{self._where}: {what}", function, *values, remedy="check the device and its cables"
+        )
 
     def position(self) -> tuple[float, ...]:
         """Return the position read back from the stage, m."""
@@ -110,8 +131,11 @@ class MicroManagerMachine:
     def move_to(self, position: tuple[float, ...]) -> None:
         """Move, and wait for the end; a stage that does not arrive in time is stopped."""
         if self._transposed() != self._signs:
-            raise MachineError(f"{' or '.join(TRANSPOSED)} was changed during the run",
-                               self._stage, "begin anew: the position has another sign")
+            raise MachineError(
+                f"{' or '.join(TRANSPOSED)} was changed during the run",
+                self._stage,
+                "begin anew: the position has another sign",
+            )
         x, y = position
         here = self.position()
         longest_s = ALLOWANCE * math.hypot(x - here[0], y - here[1]) / self._speed + PATIENCE_S

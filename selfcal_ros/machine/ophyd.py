@@ -43,18 +43,32 @@ class OphydMachine:
         If an object cannot be had or is not connected.
     """
 
-    def __init__(self, x: str, y: str, theta: str = "", unit: str = "mm", angle_unit: str = "deg",
-                 detector: str = "", image: str = "image", timeout: float = 60.0) -> None:
+    def __init__(
+        self,
+        x: str,
+        y: str,
+        theta: str = "",
+        unit: str = "mm",
+        angle_unit: str = "deg",
+        detector: str = "",
+        image: str = "image",
+        timeout: float = 60.0,
+    ) -> None:
         if unit not in M_PER:
-            raise MachineError(f"the unit '{unit}' is unknown", "ophyd: unit",
-                               f"use {', '.join(M_PER)}")
+            raise MachineError(
+                f"the unit '{unit}' is unknown", "ophyd: unit", f"use {', '.join(M_PER)}"
+            )
         if angle_unit not in RAD_PER:
-            raise MachineError(f"the unit '{angle_unit}' is unknown", "ophyd: angle_unit",
-                               f"use {', '.join(RAD_PER)}")
+            raise MachineError(
+                f"the unit '{angle_unit}' is unknown",
+                "ophyd: angle_unit",
+                f"use {', '.join(RAD_PER)}",
+            )
         names = {"x": x, "y": y} | ({"theta": theta} if theta else {})
         self.axes = tuple(names)
-        self._per_unit = {axis: RAD_PER[angle_unit] if axis == "theta" else M_PER[unit]
-                          for axis in names}
+        self._per_unit = {
+            axis: RAD_PER[angle_unit] if axis == "theta" else M_PER[unit] for axis in names
+        }
         self._timeout_s, self._image = timeout, image
         self._motors = {axis: _object(name, timeout) for axis, name in names.items()}
         self._detector = _object(detector, timeout) if detector else None
@@ -72,8 +86,10 @@ class OphydMachine:
     def move_to(self, position: tuple[float, ...]) -> None:
         """Start all axes, and wait for all."""
         try:
-            waiting = [(axis, _called(axis, self._motors[axis].set, value / self._per_unit[axis]))
-                       for axis, value in zip(self.axes, position, strict=True)]
+            waiting = [
+                (axis, _called(axis, self._motors[axis].set, value / self._per_unit[axis]))
+                for axis, value in zip(self.axes, position, strict=True)
+            ]
             for axis, status in waiting:
                 _called(axis, status.wait, timeout=self._timeout_s)
         except MachineError:
@@ -110,8 +126,11 @@ def _object(name: str, timeout_s: float) -> Any:
     try:
         found = reduce(getattr, path.split("."), importlib.import_module(module))
     except (ImportError, AttributeError, ValueError) as error:
-        raise MachineError(f"'{name}' cannot be had ({first_line(error)})", "ophyd",
-                           "name module:object; the module may lie beside CELL.yaml") from error
+        raise MachineError(
+            f"'{name}' cannot be had ({first_line(error)})",
+            "ophyd",
+            "name module:object; the module may lie beside CELL.yaml",
+        ) from error
     if hasattr(found, "wait_for_connection"):
         _called(name, found.wait_for_connection, timeout=timeout_s)
     return found

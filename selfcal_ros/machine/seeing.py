@@ -46,11 +46,15 @@ class Eye:
         counts = self._detector.counts if self._detector else None
         if counts is None or not counts.rejected:
             return ""
-        return " (rejected: " + ", ".join(
-            f"{reason} {count}" for reason, count in counts.rejected.most_common(3)) + ")"
+        return (
+            " (rejected: "
+            + ", ".join(f"{reason} {count}" for reason, count in counts.rejected.most_common(3))
+            + ")"
+        )
 
-    def detections(self, shown: Image | list[Offset], stamp_ns: int,
-                   position: tuple[float, ...]) -> list[Detection]:
+    def detections(
+        self, shown: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
+    ) -> list[Detection]:
         """Return the detections in an image or of offsets.
 
         Parameters
@@ -77,9 +81,11 @@ class Eye:
     def _of_images(self) -> "ImageDetector":
         if self._detector is None:
             if self._settings is None:
-                raise InputError(f"{self._where}: detector", "the machine returns images, and how "
-                                 "marks are found in them is not stated",
-                                 "give detector: {mark: disc, mark_size: ...}, in m")
+                raise InputError(
+                    f"{self._where}: detector",
+                    "the machine returns images, and how marks are found in them is not stated",
+                    "give detector: {mark: disc, mark_size: ...}, in m",
+                )
             from selfcal_ros.vision.exposures import ImageDetector  # scipy: for images alone
 
             self._detector = ImageDetector(self._settings, f"{self._where}: detector")
@@ -89,31 +95,47 @@ class Eye:
         """Return the grey values of an image, after checks; raises MachineError."""
         pixels = np.asarray(image.pixels)
         if pixels.ndim != 2 or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
-            raise MachineError(f"an image is {pixels.dtype} {pixels.shape}", "machine.image",
-                               "return grey values (h, w), uint8 or uint16")
+            raise MachineError(
+                f"an image is {pixels.dtype} {pixels.shape}",
+                "machine.image",
+                "return grey values (h, w), uint8 or uint16",
+            )
         kind = (pixels.dtype, *pixels.shape)
         self._kind = self._kind or kind
         if kind != self._kind:
-            raise MachineError(f"an image is {_said(kind)}, those before were {_said(self._kind)}",
-                               "machine.image", "set the camera to one size and type; see whether "
-                               "it was reset")
+            raise MachineError(
+                f"an image is {_said(kind)}, those before were {_said(self._kind)}",
+                "machine.image",
+                "set the camera to one size and type; see whether it was reset",
+            )
         full = (self._settings.full_scale if self._settings else 0) or int(
-            np.iinfo(pixels.dtype).max)
+            np.iinfo(pixels.dtype).max
+        )
         last, self._before = self._before, (pixels.copy(), position)
         self.newest = self._before[0]
-        if last is not None and np.array_equal(last[0], pixels) and np.abs(np.subtract(
-                last[1][:2], position[:2])).max() > MOVED_M:
-            raise MachineError("the camera returns the last image again after a move, or is late "
-                               "by one frame", "machine.image", "let it expose when it is asked "
-                               "(software trigger), or drop a frame")
+        if (
+            last is not None
+            and np.array_equal(last[0], pixels)
+            and np.abs(np.subtract(last[1][:2], position[:2])).max() > MOVED_M
+        ):
+            raise MachineError(
+                "the camera returns the last image again after a move, or is late by one frame",
+                "machine.image",
+                "let it expose when it is asked (software trigger), or drop a frame",
+            )
         if (pixels >= full).mean() > SATURATED:
-            raise MachineError("the image is saturated", "machine.image",
-                               "shorten the exposure, or reduce the light")
+            raise MachineError(
+                "the image is saturated",
+                "machine.image",
+                "shorten the exposure, or reduce the light",
+            )
         if float(pixels.max()) - float(pixels.min()) < LEAST_RANGE * full:
             shade = "black" if pixels.max() < 0.1 * full else "blank"
-            raise MachineError(f"the image is {shade}, grey values up to {pixels.max()} of {full}",
-                               "machine.image", "check light, shutter, lens cap and exposure time, "
-                               "and full_scale of the detector")
+            raise MachineError(
+                f"the image is {shade}, grey values up to {pixels.max()} of {full}",
+                "machine.image",
+                "check light, shutter, lens cap and exposure time, and full_scale of the detector",
+            )
         return Picture(pixels, int(np.iinfo(pixels.dtype).max))
 
 
@@ -124,12 +146,23 @@ def _said(kind: tuple[object, ...]) -> str:
 
 def _detection(offset: Offset, stamp_ns: int) -> Detection:
     if not np.isfinite([offset.x, offset.y, offset.theta or 0.0]).all():
-        raise MachineError(f"an offset is x {offset.x}, y {offset.y}, theta {offset.theta}",
-                           "machine.offsets", "leave out what is not seen")
+        raise MachineError(
+            f"an offset is x {offset.x}, y {offset.y}, theta {offset.theta}",
+            "machine.offsets",
+            "leave out what is not seen",
+        )
     m, n = offset.mark or (0, 0)
     is_line = offset.theta is not None
     return Detection(
-        offset.stamp_ns or stamp_ns, int(Kind.ANGULAR if is_line else Kind.GRID),
-        (offset.line if is_line else offset.mark) is not None, int(m), int(n),
-        int(offset.line or 0), float(offset.x), float(offset.y), float(offset.theta or 0.0),
-        float(offset.sigma), float(offset.score))
+        offset.stamp_ns or stamp_ns,
+        int(Kind.ANGULAR if is_line else Kind.GRID),
+        (offset.line if is_line else offset.mark) is not None,
+        int(m),
+        int(n),
+        int(offset.line or 0),
+        float(offset.x),
+        float(offset.y),
+        float(offset.theta or 0.0),
+        float(offset.sigma),
+        float(offset.score),
+    )

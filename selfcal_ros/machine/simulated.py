@@ -62,16 +62,28 @@ class SimulatedMachine:
         self._position, self._servo, self._encoder = np.zeros((3, 3))
         self._approach, self._sign = np.zeros((2, 2))
         self._rested = self._n_placed = self._free_ns = 0
-        self._lay(Command(0, Phase.PLACE, self._plan.plan_id, 0, self._plan.views[0],
-                          self._plan.artifact, len(self._plan.views)))
+        self._lay(
+            Command(
+                0,
+                Phase.PLACE,
+                self._plan.plan_id,
+                0,
+                self._plan.views[0],
+                self._plan.artifact,
+                len(self._plan.views),
+            )
+        )
 
     def place(self, placing: Placing) -> None:
         """Lay the plate as a view commands, with the errors of a hand."""
         if not isinstance(placing.command, Command):
             raise MachineError("a simulation needs the command of the view", "simulated")
         if placing.command.plate() != self._plan.artifact:
-            raise MachineError("the plan has another plate than the simulation", "simulated",
-                               "name the same plan in SIM.yaml")
+            raise MachineError(
+                "the plan has another plate than the simulation",
+                "simulated",
+                "name the same plan in SIM.yaml",
+            )
         self._lay(placing.command)
 
     def _lay(self, command: Command) -> None:
@@ -91,7 +103,8 @@ class SimulatedMachine:
         self._n_exposed = 0
         self._n_placed += 1
         self._rng = np.random.default_rng(
-            (self._given.seed, self._given.noise_seed or 0, index, self._n_placed))
+            (self._given.seed, self._given.noise_seed or 0, index, self._n_placed)
+        )
         self._flicker = flicker_noise(self._rng, (3, 4 * self._n_expected))
         self._visit_noise = np.zeros(2)
         self._commanded = np.full(3, np.nan)
@@ -119,10 +132,14 @@ class SimulatedMachine:
             self._approach = np.where(self._sign, self._sign, self._approach)
             self._visit_noise = normal(self._rng, given.visit_xy_m, 2)
             self._rested = 0
-        self._servo = np.where(stays, self._servo, self._scattered(
-            given.servo_sigma_m, given.servo_sigma_theta_rad))
-        self._encoder = np.where(stays, self._encoder, self._scattered(
-            given.encoder_sigma_m, given.encoder_sigma_theta_rad))
+        self._servo = np.where(
+            stays, self._servo, self._scattered(given.servo_sigma_m, given.servo_sigma_theta_rad)
+        )
+        self._encoder = np.where(
+            stays,
+            self._encoder,
+            self._scattered(given.encoder_sigma_m, given.encoder_sigma_theta_rad),
+        )
         self._position = stop + self._servo
 
     def _scattered(self, sigma_m: float, sigma_rad: float) -> np.ndarray:
@@ -137,8 +154,9 @@ class SimulatedMachine:
         if self._sites.size:
             away = np.hypot(*(sign * self._sites - target[:2, None]))
             nearest = slice(np.argmin(away), np.argmin(away) + 1)
-            place = sign * (self._places[:, nearest]
-                            + physics.drift(truth, self._index, self._tau()))
+            place = sign * (
+                self._places[:, nearest] + physics.drift(truth, self._index, self._tau())
+            )
             at = place + physics.stage_error(truth, place, self._index)
             goal[:2] += (at - sign * self._sites[:, nearest])[:, 0]
         direction, nominal, _ = self._lines
@@ -170,20 +188,28 @@ class SimulatedMachine:
             x, y = quantised(offsets[:, nearest], given.resolution_xy_m).tolist()
             mark = tuple(self._marks[:, nearest].tolist()) if given.with_ids else None
             if away[nearest] < self.truth.artifact.grid_pitch_m / 2:
-                found.append(Offset(x, y, mark=mark, score=0.95,
-                                    sigma=given.sigma_xy_m if declared else 0.0))
+                found.append(
+                    Offset(x, y, mark=mark, score=0.95, sigma=given.sigma_xy_m if declared else 0.0)
+                )
         direction, _, line = self._lines
         if len(direction):
             away = physics.line_offset(self.truth, given.sense, direction, self._position[2:])
             away = np.remainder(away + np.pi, 2 * np.pi) - np.pi
             nearest = int(np.argmin(np.abs(away)))
-            told = (self.truth.line_factor * away[nearest]
-                    + given.sigma_theta_rad * self._rng.normal()
-                    + given.flicker_theta_rad * self._flicker[2, self._at()])
+            told = (
+                self.truth.line_factor * away[nearest]
+                + given.sigma_theta_rad * self._rng.normal()
+                + given.flicker_theta_rad * self._flicker[2, self._at()]
+            )
             theta = float(quantised(told, given.resolution_theta_rad))
-            found.append(Offset(theta=theta, score=0.95,
-                                line=int(line[nearest]) if given.with_ids else None,
-                                sigma=given.sigma_theta_rad if declared else 0.0))
+            found.append(
+                Offset(
+                    theta=theta,
+                    score=0.95,
+                    line=int(line[nearest]) if given.with_ids else None,
+                    sigma=given.sigma_theta_rad if declared else 0.0,
+                )
+            )
         return found
 
     def _at(self) -> int:
@@ -204,14 +230,28 @@ class SimulatedMachine:
         truth, given, tau = self.truth, self._settings, self._tau()
         position = self._position[:2, None]
         stage = physics.true_position(
-            truth, self._index, position, tau=tau, approach=self._approach[:, None],
-            sign=self._sign[:, None], rested_s=np.array([self._rested * given.exposure_period_s]))
+            truth,
+            self._index,
+            position,
+            tau=tau,
+            approach=self._approach[:, None],
+            sign=self._sign[:, None],
+            rested_s=np.array([self._rested * given.exposure_period_s]),
+        )
         place = self._places + physics.drift(truth, self._index, tau)
         count = place.shape[1]
-        offsets = physics.offset_seen(truth, given.sense, np.repeat(position, count, axis=1),
-                                      np.repeat(stage, count, axis=1), place)
-        shared = (self._visit_noise + given.flicker_xy_m * self._flicker[:2, self._at()]
-                  + normal(self._rng, given.image_xy_m, 2))
+        offsets = physics.offset_seen(
+            truth,
+            given.sense,
+            np.repeat(position, count, axis=1),
+            np.repeat(stage, count, axis=1),
+            place,
+        )
+        shared = (
+            self._visit_noise
+            + given.flicker_xy_m * self._flicker[:2, self._at()]
+            + normal(self._rng, given.image_xy_m, 2)
+        )
         self._n_exposed += 1
         self._rested += 1
         return offsets + white_noise(self._rng, given, count) + shared[:, None]

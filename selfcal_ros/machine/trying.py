@@ -110,30 +110,47 @@ class Trial:
             return None, seen
         given = self.cell.detector
         if given is None or not given.mark_size:
-            raise InputError(f"{self.cell.path}: detector", "the size of the marks is not stated",
-                             "give detector: {mark: disc, mark_size: ...}, in m")
+            raise InputError(
+                f"{self.cell.path}: detector",
+                "the size of the marks is not stated",
+                "give detector: {mark: disc, mark_size: ...}, in m",
+            )
         picture = visitor.eye.trusted(shown, self.position.positions)
         size, marks = self._sized(picture, given)
         if not marks:
-            raise NoDataError("machine.image", "no mark is found in the image",
-                              "move to a mark, focus; check mark, polarity and mark_size in "
-                              "CELL.yaml, or give --mark-pixels")
+            raise NoDataError(
+                "machine.image",
+                "no mark is found in the image",
+                "move to a mark, focus; check mark, polarity and mark_size in "
+                "CELL.yaml, or give --mark-pixels",
+            )
         self.mark_pixels = size
-        in_pixels = replace(given, pixel_size=1.0, mark_size=size, turn=0.0, mirror=False,
-                            mark_width=given.mark_width * size / given.mark_size)
+        in_pixels = replace(
+            given,
+            pixel_size=1.0,
+            mark_size=size,
+            turn=0.0,
+            mirror=False,
+            mark_width=given.mark_width * size / given.mark_size,
+        )
         # offsets are pixels in it: those that matter here are those of the stage
         self._visitor = Visitor(self.machine, replace(self.cell, detector=in_pixels), self.clock)
         return picture.values, marks
 
-    def _sized(self, picture: Picture, given: DetectorSettings,
-               ) -> tuple[float, list[tuple[float, float]]]:
+    def _sized(
+        self,
+        picture: Picture,
+        given: DetectorSettings,
+    ) -> tuple[float, list[tuple[float, float]]]:
         """Return the size of a mark, px, and the places of all, columns and rows."""
         known = self.mark_pixels or (given.mark_size / given.pixel_size if given.pixel_size else 0)
         best: tuple[float, float, list[tuple[float, float]]] = (0.0, known, [])
         for size in [known] if known else _sizes(picture.values.shape):
             width = given.mark_width * size / given.mark_size
-            detector = MarkDetector(replace(given, pixel_size=1.0, mark_size=size,
-                                            mark_width=width), str(self.cell.path))
+            detector = MarkDetector(
+                replace(given, pixel_size=1.0, mark_size=size, mark_width=width),
+                str(self.cell.path),
+            )
             found, _ = detector.marks(picture)
             score = sum(mark.score for mark in found) * size
             if score > best[0]:
@@ -184,8 +201,11 @@ class Trial:
         """Return offsets of the marks seen now, (k, 2): px with a camera, else m."""
         found = self._visitor.marks()
         if not found:
-            raise NoDataError("machine", "no mark is seen after a small move",
-                              "begin with a mark near the middle of the image")
+            raise NoDataError(
+                "machine",
+                "no mark is seen after a small move",
+                "begin with a mark near the middle of the image",
+            )
         return np.array([(item.offset_x, item.offset_y) for item in found])
 
     def _camera(self) -> CameraPose:
@@ -203,13 +223,19 @@ class Trial:
         late = np.hypot(*(_nearest(images[1]) - _nearest(images[0])))
         fresh = np.hypot(*(_nearest(again[1]) - _nearest(images[1])))
         if fresh > 0.5 * self.mark_pixels and late < 0.1 * self.mark_pixels:
-            raise MachineError("the image is late by one frame", "machine.image",
-                               "let the camera expose when it is asked (software trigger), or "
-                               "drop a frame")
+            raise MachineError(
+                "the image is late by one frame",
+                "machine.image",
+                "let the camera expose when it is asked (software trigger), or drop a frame",
+            )
         found = camera_pose(np.array(positions), images, self.cell.sense)
         assert self.cell.detector is not None
-        require_size(found, mark_size_m=self.cell.detector.mark_size,
-                     mark_pixels=self.mark_pixels, where=str(self.cell.path))
+        require_size(
+            found,
+            mark_size_m=self.cell.detector.mark_size,
+            mark_pixels=self.mark_pixels,
+            where=str(self.cell.path),
+        )
         return found
 
     def _true(self, axis: str, at: EncoderSample) -> float:
@@ -245,7 +271,7 @@ class Trial:
             places.append(self._per_pixel(_nearest(self._marks())))
             times.append((self.clock.now_ns() - ended_ns) / NS_PER_S)
         place = np.array(places)
-        last = place[SETTLING // 2:]
+        last = place[SETTLING // 2 :]
         noise = float(np.sqrt(last.var(axis=0, ddof=1).mean()))
         away = np.hypot(*(place - last.mean(axis=0)).T)
         moving = np.flatnonzero(away > max(2 * SIGMAS * noise, 1e-9))
@@ -254,10 +280,15 @@ class Trial:
         return times[min(int(moving[-1]) + 1, SETTLING - 1)] + self.cell.settle.time, noise
 
     def _notes_of_sense(self) -> Iterator[str]:
-        moving = ("the plate under a resting camera" if self.cell.sense is Sense.PLATE_MOVES else
-                  "the camera over a resting plate")
-        yield (f"sense: {self.cell.sense} as stated: the stage moves {moving}; no image shows "
-               "which, and the other sense turns the image by 180 degrees")
+        moving = (
+            "the plate under a resting camera"
+            if self.cell.sense is Sense.PLATE_MOVES
+            else "the camera over a resting plate"
+        )
+        yield (
+            f"sense: {self.cell.sense} as stated: the stage moves {moving}; no image shows "
+            "which, and the other sense turns the image by 180 degrees"
+        )
 
 
 def _sizes(shape: tuple[int, ...]) -> Iterator[float]:
@@ -284,16 +315,22 @@ def _to_metres(camera: CameraPose) -> Callable[[np.ndarray], np.ndarray]:
 def _notes(camera: CameraPose | None, reversal: dict[str, FoundValue]) -> Iterator[str]:
     """Yield what is implausible."""
     if camera is not None and camera.mirror:
-        yield ("the image is mirrored: either the camera mirrors, or an axis counts backwards; if "
-               "it is an axis, correct it first")
+        yield (
+            "the image is mirrored: either the camera mirrors, or an axis counts backwards; if "
+            "it is an axis, correct it first"
+        )
     if camera is not None and camera.sheared > max(SIGMAS * camera.u_sheared, 0.005):
-        yield (f"the axes of the stage are unequal or not square by {camera.sheared:.2g}, or the "
-               "pixels are not square")
+        yield (
+            f"the axes of the stage are unequal or not square by {camera.sheared:.2g}, or the "
+            "pixels are not square"
+        )
     for axis, found in reversal.items():
         if abs(found.value) > max(SIGMAS * found.u, LARGE_REVERSAL_M):
-            yield (f"{axis} has a backlash of {found.value * UM_PER_M:.3g} um (u "
-                   f"{found.u * UM_PER_M:.2g} um): approach marks from one side, or let the model "
-                   "have the term approach; the map holds for one side only")
+            yield (
+                f"{axis} has a backlash of {found.value * UM_PER_M:.3g} um (u "
+                f"{found.u * UM_PER_M:.2g} um): approach marks from one side, or let the model "
+                "have the term approach; the map holds for one side only"
+            )
 
 
 def values_of(findings: Findings) -> tuple[dict[str, object], dict[str, str]]:
@@ -303,5 +340,7 @@ def values_of(findings: Findings) -> tuple[dict[str, object], dict[str, str]]:
         return {}, {}
     turn = math.degrees(camera.turn_rad)
     u_turn = math.degrees(camera.u_turn_rad)
-    return ({"pixel_size": camera.pixel_size_m, "turn": turn, "mirror": camera.mirror},
-            {"pixel_size": f"u {camera.u_pixel_size_m:.2g} m", "turn": f"u {u_turn:.2g} degrees"})
+    return (
+        {"pixel_size": camera.pixel_size_m, "turn": turn, "mirror": camera.mirror},
+        {"pixel_size": f"u {camera.u_pixel_size_m:.2g} m", "turn": f"u {u_turn:.2g} degrees"},
+    )

@@ -47,16 +47,24 @@ class VideoCamera:
         self._where = f"camera {source}"
         self._capture: Any = cv2.VideoCapture(source)
         if not self._capture.isOpened():
-            raise MachineError("it cannot be opened", self._where,
-                               "check number, cable and permissions (group video)")
-        for name, value, given in ((cv2.CAP_PROP_FRAME_WIDTH, width, "width"),
-                                   (cv2.CAP_PROP_FRAME_HEIGHT, height, "height")):
+            raise MachineError(
+                "it cannot be opened",
+                self._where,
+                "check number, cable and permissions (group video)",
+            )
+        for name, value, given in (
+            (cv2.CAP_PROP_FRAME_WIDTH, width, "width"),
+            (cv2.CAP_PROP_FRAME_HEIGHT, height, "height"),
+        ):
             if value:
                 self._capture.set(name, value)
                 told = round(self._capture.get(name))
                 if told != value:
-                    raise MachineError(f"its {given} is {told} instead of {value} pixels",
-                                       self._where, "give a size that it has")
+                    raise MachineError(
+                        f"its {given} is {told} instead of {value} pixels",
+                        self._where,
+                        "give a size that it has",
+                    )
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         self._is_live = self._capture.get(cv2.CAP_PROP_FRAME_COUNT) <= 0
         self._period_s = self._measured_period_s() if self._is_live else 0.0
@@ -65,9 +73,13 @@ class VideoCamera:
         """Take the next frame; return how long it had to be waited for, s."""
         began = time.monotonic()
         if not self._capture.grab():
-            raise MachineError("it returns no image any more", self._where,
-                               "check the cable and whether another program uses it" if
-                               self._is_live else "the file has ended")
+            raise MachineError(
+                "it returns no image any more",
+                self._where,
+                "check the cable and whether another program uses it"
+                if self._is_live
+                else "the file has ended",
+            )
         return time.monotonic() - began
 
     def _measured_period_s(self) -> float:
@@ -93,8 +105,11 @@ class VideoCamera:
         while fresh < (FRESH if self._is_live else 1):
             fresh += self._grab() >= WAITED * self._period_s
             if time.monotonic() - began > PATIENCE_S:
-                raise MachineError(f"no image is exposed after the call in {PATIENCE_S:g} s",
-                                   self._where, "let it send fewer frames a second")
+                raise MachineError(
+                    f"no image is exposed after the call in {PATIENCE_S:g} s",
+                    self._where,
+                    "let it send fewer frames a second",
+                )
         good, frame = self._capture.retrieve()
         if not good:
             raise MachineError("an image cannot be decoded", self._where, "check the cable")

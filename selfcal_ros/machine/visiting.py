@@ -46,11 +46,21 @@ FIRST_TURN_RAD = 0.01
 """First move of a rotary axis."""
 FOLLOWS = 0.25
 """Largest deviation, over the step, of a position or a mark from the step of the stage."""
-UNITS = {1e3: "mm for m", 1e6: "um for m", 1e-3: "m for mm", 1e-6: "m for um",
-         25.4: "inches", 1 / 25.4: "inches", 1 / 0.0254: "inches for m"}
+UNITS = {
+    1e3: "mm for m",
+    1e6: "um for m",
+    1e-3: "m for mm",
+    1e-6: "m for um",
+    25.4: "inches",
+    1 / 25.4: "inches",
+    1 / 0.0254: "inches for m",
+}
 """Factor of a position that is given in another unit -> the units."""
-ANGLE_UNITS = {math.degrees(1.0): "degrees for rad", math.radians(1.0): "rad for degrees",
-               1e3: "mrad for rad"}
+ANGLE_UNITS = {
+    math.degrees(1.0): "degrees for rad",
+    math.radians(1.0): "rad for degrees",
+    1e3: "mrad for rad",
+}
 """The same for theta."""
 
 
@@ -85,8 +95,15 @@ class Stop:
     exposures: int = 1
 
 
-def stops(artifact: Artifact, view: View, sense: Sense, *, again: Again | None = None,
-          consecutive: bool = False, rng: np.random.Generator | None = None) -> list[Stop]:
+def stops(
+    artifact: Artifact,
+    view: View,
+    sense: Sense,
+    *,
+    again: Again | None = None,
+    consecutive: bool = False,
+    rng: np.random.Generator | None = None,
+) -> list[Stop]:
     """Return the stops of a view in their order, marks first.
 
     Parameters
@@ -188,8 +205,11 @@ class Visitor:
         return ANSWER_S + self.cell.settle.patience
 
     def _silent(self, where: str) -> MachineError:
-        return MachineError(f"it has not answered for {self._longest_s:g} s", where, "check "
-                            "cables, power and the driver; for longer moves raise settle: patience")
+        return MachineError(
+            f"it has not answered for {self._longest_s:g} s",
+            where,
+            "check cables, power and the driver; for longer moves raise settle: patience",
+        )
 
     @property
     def silence(self) -> MachineError | None:
@@ -210,9 +230,12 @@ class Visitor:
                 with interrupted_after(ANSWER_S):
                     self.machine.stop()
             except (Exception, Overdue) as failed:
-                raise MachineError(f"{str(error) or 'interrupted'}; and it cannot be stopped "
-                                   f"({first_line(failed)})", "machine.stop",
-                                   "use the emergency stop") from error
+                raise MachineError(
+                    f"{str(error) or 'interrupted'}; and it cannot be stopped "
+                    f"({first_line(failed)})",
+                    "machine.stop",
+                    "use the emergency stop",
+                ) from error
             raise
 
     def show(self, kind: Kind = Kind.GRID) -> Image | list[Offset]:
@@ -227,15 +250,22 @@ class Visitor:
         if isinstance(image, Image):
             return image
         if image is not None:
-            raise MachineError(f"it returns {type(image).__name__}", "machine.image",
-                               "return Image(pixels), or None without a camera")
+            raise MachineError(
+                f"it returns {type(image).__name__}",
+                "machine.image",
+                "return Image(pixels), or None without a camera",
+            )
         if kind == Kind.GRID and self.eye.newest is not None:
-            raise MachineError("it returns no image any more", "machine.image",
-                               "check the camera and its cable")
+            raise MachineError(
+                "it returns no image any more", "machine.image", "check the camera and its cable"
+            )
         offsets = self._ask("offsets")
         if not isinstance(offsets, list) or not all(isinstance(each, Offset) for each in offsets):
-            raise MachineError(f"it returns {offsets!r:.50}", "machine.offsets",
-                               "return a list of Offset, empty if nothing is seen")
+            raise MachineError(
+                f"it returns {offsets!r:.50}",
+                "machine.offsets",
+                "return a list of Offset, empty if nothing is seen",
+            )
         return offsets
 
     def approach(self, artifact: Artifact, view: View) -> None:
@@ -258,8 +288,12 @@ class Visitor:
             self.go(route[0].target)
             self.first_move(marks=True)
 
-    def view(self, artifact: Artifact, view: View, again: Again | None = None,
-             ) -> Iterator[Event]:
+    def view(
+        self,
+        artifact: Artifact,
+        view: View,
+        again: Again | None = None,
+    ) -> Iterator[Event]:
         """Visit a view and yield positions, and detections or images, in the order of their stamps.
 
         Raises
@@ -269,8 +303,14 @@ class Visitor:
         NoDataError
             If nothing is seen at several stops one after another.
         """
-        route = stops(artifact, view, self.cell.sense, again=again, consecutive=self.consecutive,
-                      rng=self._rng)
+        route = stops(
+            artifact,
+            view,
+            self.cell.sense,
+            again=again,
+            consecutive=self.consecutive,
+            rng=self._rng,
+        )
         self.require(route)
         empty = 0
         for number, stop in enumerate(route):
@@ -285,23 +325,32 @@ class Visitor:
 
     def _sees_nothing(self, view: View, empty: int, *, at_first: bool) -> NoDataError:
         which = "first" if at_first else "last"
-        remedy = ("place the plate as the view says, check focus, light, and mark_size and "
-                  "pixel_size in CELL.yaml" if at_first else
-                  "check light, focus, the camera, and whether the plate is dirty there")
+        remedy = (
+            "place the plate as the view says, check focus, light, and mark_size and "
+            "pixel_size in CELL.yaml"
+            if at_first
+            else "check light, focus, the camera, and whether the plate is dirty there"
+        )
         if self.cell.detector and self.eye.newest is None:
-            remedy = "the machine returns no images: check the camera, or take detector out of " \
-                     "CELL.yaml"
-        return NoDataError(f"view '{view.name}'", f"nothing is seen at the {which} {empty} stops"
-                           f"{self.eye.why}", remedy)
+            remedy = (
+                "the machine returns no images: check the camera, or take detector out of CELL.yaml"
+            )
+        return NoDataError(
+            f"view '{view.name}'",
+            f"nothing is seen at the {which} {empty} stops{self.eye.why}",
+            remedy,
+        )
 
     def require(self, route: Iterable[Stop]) -> None:
         """Refuse a route that leaves the limits or needs an axis that the machine lacks."""
         for stop in route:
             for axis, value in stop.target.items():
                 if axis not in self.axes:
-                    raise MachineError(f"the view moves {axis}, the machine has "
-                                       f"{' and '.join(self.axes)}", str(self.cell.path),
-                                       "set angular: false in the plan")
+                    raise MachineError(
+                        f"the view moves {axis}, the machine has {' and '.join(self.axes)}",
+                        str(self.cell.path),
+                        "set angular: false in the plan",
+                    )
                 self.cell.require_limits(axis, self.cell.to_machine(axis, value), "a stop")
 
     def sample(self) -> EncoderSample:
@@ -320,11 +369,20 @@ class Visitor:
         except (TypeError, ValueError):
             values = ()
         if len(values) != len(self.axes) or not all(map(math.isfinite, values)):
-            raise MachineError(f"its position is {told!r:.100}", "machine.position",
-                               f"return {', '.join(self.axes)} in m and rad")
+            raise MachineError(
+                f"its position is {told!r:.100}",
+                "machine.position",
+                f"return {', '.join(self.axes)} in m and rad",
+            )
         self._told_ns = stamp
-        return EncoderSample(stamp, self.axes, tuple(
-            self.cell.to_stage(axis, value) for axis, value in zip(self.axes, values, strict=True)))
+        return EncoderSample(
+            stamp,
+            self.axes,
+            tuple(
+                self.cell.to_stage(axis, value)
+                for axis, value in zip(self.axes, values, strict=True)
+            ),
+        )
 
     def go(self, target: Position) -> EncoderSample:
         """Move to a position in the stage frame, verify arrival and rest; return the position.
@@ -343,12 +401,15 @@ class Visitor:
             target = target | {"theta": self._within_limits(target["theta"] + turns * math.tau)}
         goal = start | target
         for axis in target:
-            self.cell.require_limits(axis, self.cell.to_machine(axis, goal[axis]), "a move",
-                                     start=self.cell.to_machine(axis, start[axis]))
+            self.cell.require_limits(
+                axis,
+                self.cell.to_machine(axis, goal[axis]),
+                "a move",
+                start=self.cell.to_machine(axis, start[axis]),
+            )
         if self.stopped:
             raise MachineError("stopped", "a move")
-        self._ask("move_to", tuple(self.cell.to_machine(axis, goal[axis])
-                                   for axis in self.axes))
+        self._ask("move_to", tuple(self.cell.to_machine(axis, goal[axis]) for axis in self.axes))
         if self.cell.settle.time:
             self.clock.sleep(self.cell.settle.time)
         at = self._rest(start, goal, target)
@@ -368,9 +429,11 @@ class Visitor:
         """Raise if the position at rest has changed by more than the tolerance of arrival."""
         axis = self._farthest(moved)
         if abs(moved[axis]) > self.cell.settle.of(axis, "arrival"):
-            raise MachineError(f"{axis} has changed by {_shown(axis, moved[axis])} at rest, "
-                               "without a command", "machine.position", "see whether it was moved "
-                               "by hand, was reset, or has lost its zero; home it")
+            raise MachineError(
+                f"{axis} has changed by {_shown(axis, moved[axis])} at rest, without a command",
+                "machine.position",
+                "see whether it was moved by hand, was reset, or has lost its zero; home it",
+            )
 
     def _rests(self, moved: Position) -> bool:
         """Return whether two readings agree."""
@@ -378,15 +441,19 @@ class Visitor:
 
     def _farthest(self, away: Position) -> str:
         """Return the axis that is farthest off, in units of its tolerance of arrival."""
-        return max(away, key=lambda axis: abs(away[axis]) / max(
-            self.cell.settle.of(axis, "arrival"), TINY))
+        return max(
+            away, key=lambda axis: abs(away[axis]) / max(self.cell.settle.of(axis, "arrival"), TINY)
+        )
 
     def _within_limits(self, theta: float) -> float:
         """Return an angle or the same some turns off, within the limits if one is."""
         low, high = self.cell.limits.get("theta", (-math.inf, math.inf))
         at = self.cell.to_machine("theta", theta)
-        turns = math.ceil((low - at) / math.tau) if at < low else (
-            math.floor((high - at) / math.tau) if at > high else 0)
+        turns = (
+            math.ceil((low - at) / math.tau)
+            if at < low
+            else (math.floor((high - at) / math.tau) if at > high else 0)
+        )
         return theta + turns * math.tau
 
     def _rest(self, start: Position, goal: Position, commanded: Position) -> EncoderSample:
@@ -398,8 +465,10 @@ class Visitor:
             self.clock.sleep(self.step_ns / 2 / NS_PER_S)
             now = self.sample()
             moved = _difference(before, now)
-            away = {axis: value - goal[axis]
-                    for axis, value in zip(self.axes, now.positions, strict=True)}
+            away = {
+                axis: value - goal[axis]
+                for axis, value in zip(self.axes, now.positions, strict=True)
+            }
             self._check_limits(start, goal, now)
             rests = self._rests(moved)
             arrived = all(abs(away[axis]) <= settle.of(axis, "arrival") for axis in commanded)
@@ -409,17 +478,29 @@ class Visitor:
             if self.stopped:
                 raise MachineError("stopped", "a move")
             if now.stamp_ns > deadline_ns:
-                raise self._not_at_rest(before, now) if not rests else self._astray(
-                    start, goal, {axis: away[axis] for axis in self.axes if axis in commanded
-                                  or axis != "theta"}, f"after {settle.patience:g} s")
+                raise (
+                    self._not_at_rest(before, now)
+                    if not rests
+                    else self._astray(
+                        start,
+                        goal,
+                        {
+                            axis: away[axis]
+                            for axis in self.axes
+                            if axis in commanded or axis != "theta"
+                        },
+                        f"after {settle.patience:g} s",
+                    )
+                )
             before = now
 
     def _check_limits(self, start: Position, goal: Position, now: EncoderSample) -> None:
         """Raise if an axis leaves its limits, beyond where it was and where it is to go."""
         for axis, value in zip(self.axes, now.positions, strict=True):
             low, high = self.cell.limits.get(axis, (-math.inf, math.inf))
-            at, *ends = (self.cell.to_machine(axis, place)
-                         for place in (value, start[axis], goal[axis]))
+            at, *ends = (
+                self.cell.to_machine(axis, place) for place in (value, start[axis], goal[axis])
+            )
             near = self.cell.settle.of(axis, "arrival")
             if not min(low, *ends) - near <= at <= max(high, *ends) + near:
                 raise self._astray(start, goal, {axis: value - goal[axis]}, "beyond its limits")
@@ -427,38 +508,52 @@ class Visitor:
     def _not_at_rest(self, before: EncoderSample, now: EncoderSample) -> MachineError:
         self._check_axes(before, now)
         moved = _difference(before, now)
-        axis = max(self.axes, key=lambda name: abs(moved[name]) / max(
-            self.cell.settle.of(name, "within"), TINY))
+        axis = max(
+            self.axes,
+            key=lambda name: abs(moved[name]) / max(self.cell.settle.of(name, "within"), TINY),
+        )
         return MachineError(
             f"{axis} does not come to rest in {self.cell.settle.patience:g} s: two readings differ "
-            f"by {_shown(axis, moved[axis])}", "machine", "tune the axis, or raise settle: within "
-            "or patience in CELL.yaml")
+            f"by {_shown(axis, moved[axis])}",
+            "machine",
+            "tune the axis, or raise settle: within or patience in CELL.yaml",
+        )
 
     def _check_axes(self, before: EncoderSample, now: EncoderSample) -> None:
         """Raise if two readings at rest differ by an exchange of x and y."""
         exchanged = replace(now, positions=(*now.positions[1::-1], *now.positions[2:]))
         if self._rests(_difference(before, exchanged)):
-            raise MachineError("the readings of x and y change places: it answers for the other "
-                               "axis", "machine.position", "wait for each answer before the next "
-                               "question; drop what is left of old answers")
+            raise MachineError(
+                "the readings of x and y change places: it answers for the other axis",
+                "machine.position",
+                "wait for each answer before the next question; drop what is left of old answers",
+            )
 
-    def _astray(self, start: Position, goal: Position, away: Position,
-                when: str) -> MachineError:
-        moving = {axis: value for axis, value in away.items() if goal[axis] != start[axis] and (
-            abs(value) > self.cell.settle.of(axis, "arrival"))}
+    def _astray(self, start: Position, goal: Position, away: Position, when: str) -> MachineError:
+        moving = {
+            axis: value
+            for axis, value in away.items()
+            if goal[axis] != start[axis] and (abs(value) > self.cell.settle.of(axis, "arrival"))
+        }
         axis = self._farthest(moving or away)
         other = {"x": "y", "y": "x"}.get(axis, "")
         at, step = goal[axis] + away[axis], goal[axis] - start[axis]
-        reason = _reason(axis, step, at - start[axis], away.get(other, 0.0)) if (
-            abs(step) > self.cell.settle.of(axis, "within")) else ""
+        reason = (
+            _reason(axis, step, at - start[axis], away.get(other, 0.0))
+            if (abs(step) > self.cell.settle.of(axis, "within"))
+            else ""
+        )
         return MachineError(
             f"{axis} was sent to {goal[axis]:.6g} and indicates {at:.6g} {when}, "
             f"{_shown(axis, away[axis])} away"
-            f"{reason and ': '}{reason}", "machine", "check drives, limit switches and the unit of "
-            "the positions, or raise settle: arrival")
+            f"{reason and ': '}{reason}",
+            "machine",
+            "check drives, limit switches and the unit of the positions, or raise settle: arrival",
+        )
 
-    def expose(self, kind: Kind = Kind.GRID) -> tuple[EncoderSample, list[Detection | Photo],
-                                                      EncoderSample]:
+    def expose(
+        self, kind: Kind = Kind.GRID
+    ) -> tuple[EncoderSample, list[Detection | Photo], EncoderSample]:
         """Expose at rest: the positions before and after, and what is seen: all, or an image.
 
         Raises
@@ -483,23 +578,31 @@ class Visitor:
             self._check_axes(before, after)
             self._check_left_alone(moved)
         axis = max(self.axes, key=lambda name: abs(moved[name]))
-        raise MachineError(f"{axis} moved by {_shown(axis, moved[axis])} during {TRIES} exposures",
-                           "machine", "wait longer: settle: time in CELL.yaml")
+        raise MachineError(
+            f"{axis} moved by {_shown(axis, moved[axis])} during {TRIES} exposures",
+            "machine",
+            "wait longer: settle: time in CELL.yaml",
+        )
 
-    def _found(self, shown: Image | list[Offset], stamp_ns: int,
-               position: tuple[float, ...]) -> list[Detection | Photo]:
+    def _found(
+        self, shown: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
+    ) -> list[Detection | Photo]:
         if isinstance(shown, Image) and not self.detects:
             return [Photo(shown.stamp_ns or stamp_ns, np.asarray(shown.pixels))]
         return [*self.eye.detections(shown, stamp_ns, position)]
 
-    def _check_stamps(self, found: list[Detection | Photo], before: EncoderSample,
-                      after: EncoderSample) -> None:
+    def _check_stamps(
+        self, found: list[Detection | Photo], before: EncoderSample, after: EncoderSample
+    ) -> None:
         for item in found:
             if not before.stamp_ns <= item.stamp_ns <= after.stamp_ns:
                 late_s = (item.stamp_ns - after.stamp_ns) / NS_PER_S
-                raise MachineError(f"the stamp of an exposure is {late_s:+.3g} s from the reading "
-                                   "of the position after it", "machine",
-                                   "stamp by this computer's clock, or give no stamp")
+                raise MachineError(
+                    f"the stamp of an exposure is {late_s:+.3g} s from the reading "
+                    "of the position after it",
+                    "machine",
+                    "stamp by this computer's clock, or give no stamp",
+                )
 
     def _visit(self, stop: Stop, *, only_nearest: bool) -> Iterator[Event]:
         at = self.go(stop.target)
@@ -523,9 +626,14 @@ class Visitor:
         for number in range(1, count + 1):
             part = number / (count + 1)
             stamp = before.stamp_ns + round(part * (after.stamp_ns - before.stamp_ns))
-            yield EncoderSample(stamp, after.names, tuple(
-                early + part * (late - early) for early, late in zip(
-                    before.positions, after.positions, strict=True)))
+            yield EncoderSample(
+                stamp,
+                after.names,
+                tuple(
+                    early + part * (late - early)
+                    for early, late in zip(before.positions, after.positions, strict=True)
+                ),
+            )
         if before.stamp_ns < after.stamp_ns:
             yield after
 
@@ -568,11 +676,20 @@ class Visitor:
 
     def marks(self) -> list[Detection]:
         """Expose at rest; return the marks that are seen; raises like `expose`."""
-        return [item for item in self.expose()[1]
-                if isinstance(item, Detection) and item.kind == Kind.GRID]
+        return [
+            item
+            for item in self.expose()[1]
+            if isinstance(item, Detection) and item.kind == Kind.GRID
+        ]
 
-    def _check_marks(self, axis: str, step: float, first: list[Detection],
-                     second: list[Detection], third: list[Detection]) -> None:
+    def _check_marks(
+        self,
+        axis: str,
+        step: float,
+        first: list[Detection],
+        second: list[Detection],
+        third: list[Detection],
+    ) -> None:
         """Raise if the marks did not follow a step of the stage along an axis, m."""
         if not (first and second and third):
             return
@@ -584,19 +701,25 @@ class Visitor:
         if follows:
             return
         if abs(along) <= FOLLOWS * abs(step) and abs(again - expected) <= FOLLOWS * abs(step):
-            reason, remedy = "the image is late by one frame", (
-                "let the camera expose when it is asked (software trigger), or drop a frame")
+            reason, remedy = (
+                "the image is late by one frame",
+                ("let the camera expose when it is asked (software trigger), or drop a frame"),
+            )
         elif abs(along) <= FOLLOWS * abs(step) and abs(across) <= FOLLOWS * abs(step):
-            reason, remedy = "the marks stand still", (
-                "check that the camera returns new images, and that the stage really moves")
+            reason, remedy = (
+                "the marks stand still",
+                ("check that the camera returns new images, and that the stage really moves"),
+            )
         else:
             other = "y" if axis == "x" else "x"
             reason = _reason(axis, expected, along, across) or (
                 f"the marks moved by {_shown(axis, along)} along {axis} and "
-                f"{_shown(other, across)} along {other}")
+                f"{_shown(other, across)} along {other}"
+            )
             remedy = "correct pixel_size, turn, mirror and sense in CELL.yaml: `selfcal cell try`"
-        raise MachineError(f"the stage moved by {_shown(axis, step)} along {axis}: {reason}",
-                           "first move", remedy)
+        raise MachineError(
+            f"the stage moved by {_shown(axis, step)} along {axis}: {reason}", "first move", remedy
+        )
 
 
 def _reason(axis: str, step: float, along: float, across: float) -> str:
@@ -605,8 +728,10 @@ def _reason(axis: str, step: float, along: float, across: float) -> str:
     if not step or abs(along - step) <= near:
         return ""
     if abs(along) <= near and abs(across) <= near:
-        return ("nothing moved: its position is frozen, its drive is off, or it stands at a limit "
-                "switch")
+        return (
+            "nothing moved: its position is frozen, its drive is off, or it stands at a limit "
+            "switch"
+        )
     if abs(along + step) <= near and abs(across) <= near:
         return f"the opposite direction: {axis} is reversed"
     if abs(along) <= near and abs(abs(across) - abs(step)) <= near:
@@ -618,8 +743,9 @@ def _reason(axis: str, step: float, along: float, across: float) -> str:
     return f"{ratio:.3g} times as far" if abs(across) <= near else ""
 
 
-def _change(first: list[Detection], later: list[Detection], axis: str,
-            expected: float) -> tuple[float, float]:
+def _change(
+    first: list[Detection], later: list[Detection], axis: str, expected: float
+) -> tuple[float, float]:
     """Return the motion of the mark nearest to the middle along and across an axis, m.
 
     Of several marks in an image, it went to the one nearest to where it is expected, or stayed.
@@ -637,19 +763,21 @@ def _shown(axis: str, value: float) -> str:
 
 
 def _difference(before: EncoderSample, after: EncoderSample) -> Position:
-    return {axis: late - early for axis, early, late in zip(
-        before.names, before.positions, after.positions, strict=True)}
+    return {
+        axis: late - early
+        for axis, early, late in zip(before.names, before.positions, after.positions, strict=True)
+    }
 
 
 def _from_axis(item: Detection | Photo) -> float:
     return 0.0 if isinstance(item, Photo) else math.hypot(item.offset_x, item.offset_y)
 
 
-def message_of(event: Command | Event,
-               frame_id: str = "stage") -> tuple[str, from_model.Fields]:
+def message_of(event: Command | Event, frame_id: str = "stage") -> tuple[str, from_model.Fields]:
     """Return topic and fields of a message of a cell."""
     if isinstance(event, Photo):
         encoding = f"mono{8 * event.pixels.itemsize}"
-        return IMAGE_TOPICS["raw"], from_model.image(event.pixels, encoding, event.stamp_ns,
-                                                     "camera")
+        return IMAGE_TOPICS["raw"], from_model.image(
+            event.pixels, encoding, event.stamp_ns, "camera"
+        )
     return from_model.event_fields(event, frame_id)

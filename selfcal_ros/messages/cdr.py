@@ -88,8 +88,8 @@ class Layout:
         words = []
         for at in range(0, self.length, WORD):
             place = min(at, self.length - WORD)
-            mask = int.from_bytes(self.fixed[place:place + WORD], "little")
-            value = int.from_bytes(self.example[place:place + WORD], "little") & mask
+            mask = int.from_bytes(self.fixed[place : place + WORD], "little")
+            value = int.from_bytes(self.example[place : place + WORD], "little") & mask
             if mask:
                 words.append((f"word {place}", place, np.uint64(mask), np.uint64(value)))
         return words
@@ -97,12 +97,15 @@ class Layout:
     @cached_property
     def dtype(self) -> np.dtype:
         """The messages as a numpy structure: the values, and the determining words."""
-        fields = [(name, code if count is None else (code, (count,)), at)
-                  for name, (code, at, count) in self.values.items()]
+        fields = [
+            (name, code if count is None else (code, (count,)), at)
+            for name, (code, at, count) in self.values.items()
+        ]
         fields += [(name, "<u8", at) for name, at, _, _ in self._words]
         names, formats, offsets = zip(*fields, strict=True)
-        return np.dtype({"names": names, "formats": formats, "offsets": offsets,
-                         "itemsize": self.length})
+        return np.dtype(
+            {"names": names, "formats": formats, "offsets": offsets, "itemsize": self.length}
+        )
 
     def matches(self, rows: np.ndarray) -> np.ndarray:
         """Return which messages have this layout, bool (n,), from a table of `dtype`."""
@@ -189,7 +192,7 @@ class _Walk:
         self._fix(start, self.at)
         if self.at == start or self.data[self.at - 1]:
             raise ValueError("a text without its end")
-        return self.data[start:self.at - 1].decode()
+        return self.data[start : self.at - 1].decode()
 
     def _numbers(self, name: str | None, code: str, count: int | None) -> None:
         size = int(code[1:])
@@ -233,7 +236,7 @@ class Payloads:
     def __iter__(self) -> Iterator[bytes]:
         """Yield the bytes of each message."""
         for start, length in zip(self.start.tolist(), self.length.tolist(), strict=True):
-            yield self.data[start:start + length]
+            yield self.data[start : start + length]
 
 
 @dataclass(frozen=True)
@@ -304,14 +307,16 @@ class ColumnDecoder:
             rest.append(undecoded)
         return groups, np.sort(np.concatenate(rest))
 
-    def _decode_length(self, messages: Payloads, index: np.ndarray, groups: list[Columns],
-                       tries: int) -> tuple[int, np.ndarray]:
+    def _decode_length(
+        self, messages: Payloads, index: np.ndarray, groups: list[Columns], tries: int
+    ) -> tuple[int, np.ndarray]:
         """Decode messages of one length; return the remaining `tries` and messages."""
         length = int(messages.length[index[0]])
         if not HEAD + WORD <= length <= min(len(messages.data), MAX_LENGTH):
             return tries, index
-        bytes_at = np.ndarray((len(messages.data) - length + 1,), f"V{length}", messages.data,
-                              strides=(1,))
+        bytes_at = np.ndarray(
+            (len(messages.data) - length + 1,), f"V{length}", messages.data, strides=(1,)
+        )
         rows = bytes_at[messages.start[index]]
         for known in tuple(self._known.get(length, ())):
             index, rows = _take(known, index, rows, groups)
@@ -319,8 +324,9 @@ class ColumnDecoder:
         while len(index) and tries > 0:
             tries -= 1 + length // TRY_BYTES
             layout = layout_of(self._fields, rows[0].tobytes())
-            if layout is None or (self._tail is not None
-                                  and layout.length - layout.end > self._tail):
+            if layout is None or (
+                self._tail is not None and layout.length - layout.end > self._tail
+            ):
                 failed.append(index[0])
                 index, rows = index[1:], rows[1:]
                 continue
@@ -331,8 +337,10 @@ class ColumnDecoder:
     def _remember(self, layout: Layout) -> None:
         known = [*self._known.pop(layout.length, []), layout]
         self._known[layout.length] = known[-MAX_KNOWN:]
-        while len(self._known) > MAX_LENGTHS or sum(
-                length * len(found) for length, found in self._known.items()) > MAX_KNOWN_BYTES:
+        while (
+            len(self._known) > MAX_LENGTHS
+            or sum(length * len(found) for length, found in self._known.items()) > MAX_KNOWN_BYTES
+        ):
             self._known.pop(next(iter(self._known)))
 
 
@@ -346,8 +354,9 @@ def _by_length(length: np.ndarray) -> list[np.ndarray]:
     return np.split(order, np.flatnonzero(np.diff(length[order])) + 1)
 
 
-def _take(layout: Layout, index: np.ndarray, rows: np.ndarray,
-          groups: list[Columns]) -> tuple[np.ndarray, np.ndarray]:
+def _take(
+    layout: Layout, index: np.ndarray, rows: np.ndarray, groups: list[Columns]
+) -> tuple[np.ndarray, np.ndarray]:
     """Add the messages of a layout to `groups` and return the others."""
     table = rows.view(layout.dtype)
     good = layout.matches(table)

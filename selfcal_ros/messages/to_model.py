@@ -39,8 +39,10 @@ MOST_NOTES = 20
 TIME = (cdr.Field("sec", "i4"), cdr.Field("nanosec", "u4"))
 HEADER = (cdr.Field("stamp", TIME), cdr.Field("frame_id", cdr.TEXT))
 JOINT_STATE = (
-    cdr.Field("header", HEADER), cdr.Field("name", cdr.TEXT, cdr.SEQUENCE),
-    *(cdr.Field(name, "f8", cdr.SEQUENCE) for name in ("position", "velocity", "effort")))
+    cdr.Field("header", HEADER),
+    cdr.Field("name", cdr.TEXT, cdr.SEQUENCE),
+    *(cdr.Field(name, "f8", cdr.SEQUENCE) for name in ("position", "velocity", "effort")),
+)
 """Fields of sensor_msgs/msg/JointState."""
 STAMP_END = 12
 """Bytes of the encapsulation, and of the stamp after it."""
@@ -55,8 +57,12 @@ def stamp_ns(message: Any) -> int:
 
 def encoder_sample(message: Any) -> EncoderSample:
     """Return the sample in a sensor_msgs/JointState."""
-    return EncoderSample(stamp_ns(message), tuple(message.name), tuple(_floats(message.position)),
-                         tuple(_floats(getattr(message, "velocity", ()))))
+    return EncoderSample(
+        stamp_ns(message),
+        tuple(message.name),
+        tuple(_floats(message.position)),
+        tuple(_floats(getattr(message, "velocity", ()))),
+    )
 
 
 def _floats(values: Any) -> list[float]:
@@ -66,9 +72,18 @@ def _floats(values: Any) -> list[float]:
 def detection(message: Any) -> Detection:
     """Return the detection in a selfcal_msgs/MarkDetection."""
     return Detection(
-        stamp_ns(message), int(message.kind), bool(message.has_id), int(message.m),
-        int(message.n), int(message.k), float(message.offset_x), float(message.offset_y),
-        float(message.offset_theta), float(message.sigma), float(message.score))
+        stamp_ns(message),
+        int(message.kind),
+        bool(message.has_id),
+        int(message.m),
+        int(message.n),
+        int(message.k),
+        float(message.offset_x),
+        float(message.offset_y),
+        float(message.offset_theta),
+        float(message.sigma),
+        float(message.score),
+    )
 
 
 def command(message: Any) -> Command:
@@ -85,17 +100,30 @@ def command(message: Any) -> Command:
     try:
         phase = Phase(int(message.phase))
     except ValueError as error:
-        raise InputError(COMMAND_TOPIC, f"unknown phase {message.phase}",
-                         "use PLACE, MEASURE, DONE or ABORT") from error
+        raise InputError(
+            COMMAND_TOPIC, f"unknown phase {message.phase}", "use PLACE, MEASURE, DONE or ABORT"
+        ) from error
     placed = phase in (Phase.PLACE, Phase.MEASURE)
     return Command(
-        stamp_ns(message), phase, str(message.plan_id), int(message.view_index),
-        view_of(message, repeats=max(1, int(message.repeats)), grid=bool(message.grid),
-                angular=bool(message.angular)) if placed else None,
+        stamp_ns(message),
+        phase,
+        str(message.plan_id),
+        int(message.view_index),
+        view_of(
+            message,
+            repeats=max(1, int(message.repeats)),
+            grid=bool(message.grid),
+            angular=bool(message.angular),
+        )
+        if placed
+        else None,
         artifact_of(message) if placed else None,
         views_planned=int(getattr(message, "views_planned", 0)),
-        run_id=str(getattr(message, "run_id", "")), model_terms=terms_of(message),
-        artifact_from=plate_from(message), **plan_keys_of(message))
+        run_id=str(getattr(message, "run_id", "")),
+        model_terms=terms_of(message),
+        artifact_from=plate_from(message),
+        **plan_keys_of(message),
+    )
 
 
 def refuse_unknown_keys(message: Any, topic: str) -> None:
@@ -104,8 +132,11 @@ def refuse_unknown_keys(message: Any, topic: str) -> None:
         key, colon, _ = str(text).partition(": ")
         if colon and key in PLAN_KEYS:
             continue
-        raise InputError(topic, f"the key {printable(str(text).partition(':')[0])!r} of the plan "
-                         "is not known here", "run all nodes in the newer version")
+        raise InputError(
+            topic,
+            f"the key {printable(str(text).partition(':')[0])!r} of the plan is not known here",
+            "run all nodes in the newer version",
+        )
 
 
 def terms_of(message: Any) -> tuple[str, ...]:
@@ -134,9 +165,15 @@ def artifact_of(message: Any) -> Artifact:
     """Return the plate of a ViewCommand, ViewMeasurement or ErrorMap."""
     ids = [int(number) for number in getattr(message, "mark_id", ())]
     marks = marks_of(ids, _floats(message.mark_x), _floats(message.mark_y)) if ids else None
-    return Artifact(int(message.grid_size), float(message.grid_pitch),
-                    int(message.angular_count), int(getattr(message, "grid_size_y", 0)),
-                    _map_grid_of(message), int(getattr(message, "map_harmonics", 0)), marks)
+    return Artifact(
+        int(message.grid_size),
+        float(message.grid_pitch),
+        int(message.angular_count),
+        int(getattr(message, "grid_size_y", 0)),
+        _map_grid_of(message),
+        int(getattr(message, "map_harmonics", 0)),
+        marks,
+    )
 
 
 def _map_grid_of(message: Any) -> MapGrid | None:
@@ -146,10 +183,15 @@ def _map_grid_of(message: Any) -> MapGrid | None:
         return None
     name = str(getattr(message, "map_interpolation", "")) or Interpolation.BICUBIC
     if name not in list(Interpolation):
-        raise InputError("map_interpolation", f"{name!r} is not known",
-                         f"use one of {', '.join(Interpolation)}")
-    return MapGrid(size, float(getattr(message, "map_grid_pitch", 0.0)), Interpolation(name),
-                   int(getattr(message, "map_grid_size_y", 0)))
+        raise InputError(
+            "map_interpolation", f"{name!r} is not known", f"use one of {', '.join(Interpolation)}"
+        )
+    return MapGrid(
+        size,
+        float(getattr(message, "map_grid_pitch", 0.0)),
+        Interpolation(name),
+        int(getattr(message, "map_grid_size_y", 0)),
+    )
 
 
 def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
@@ -165,7 +207,8 @@ def view_of(message: Any, *, repeats: int, grid: bool, angular: bool) -> View:
         check_marks=int(getattr(message, "check_marks", 0)),
         check_offset_m=float(getattr(message, "check_offset", 0.0)),
         image=_image_of(message),
-        cell=cell_of(message))
+        cell=cell_of(message),
+    )
 
 
 def _image_of(message: Any) -> ImageCells | None:
@@ -204,24 +247,40 @@ def view_readings(message: Any) -> ViewReadings:
         plan has an unknown key.
     """
     refuse_unknown_keys(message, f"{MEASUREMENT_TOPIC} of '{message.view_name}'")
-    table: dict[str, Any] = {name: np.array(getattr(message, name), dtype=kind)
-                             for name, kind in COLUMNS}
-    for *names, u in (("m", "n", "dx", "dy", "count", "u"),
-                      ("k", "dtheta", "count_theta", "u_theta")):
+    table: dict[str, Any] = {
+        name: np.array(getattr(message, name), dtype=kind) for name, kind in COLUMNS
+    }
+    for *names, u in (
+        ("m", "n", "dx", "dy", "count", "u"),
+        ("k", "dtheta", "count_theta", "u_theta"),
+    ):
         names += [u] * (len(table[u]) > 0)
         if len({len(table[name]) for name in names}) > 1:
-            raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                             f"{', '.join(names)} differ in length", "correct the publisher")
+            raise InputError(
+                f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+                f"{', '.join(names)} differ in length",
+                "correct the publisher",
+            )
     return ViewReadings(
-        view_of(message, repeats=int(message.repeats), grid=bool(message.grid),
-                angular=bool(message.angular)),
+        view_of(
+            message,
+            repeats=int(message.repeats),
+            grid=bool(message.grid),
+            angular=bool(message.angular),
+        ),
         **table,
-        sigma_xy=float(message.sigma_xy), sigma_theta=float(message.sigma_theta),
-        dof_xy=int(message.dof_xy), dof_theta=int(message.dof_theta),
-        used=int(message.detections_used), rejected=counts(message, "reject"),
-        visits=_visits_of(message), places=_places_of(message),
+        sigma_xy=float(message.sigma_xy),
+        sigma_theta=float(message.sigma_theta),
+        dof_xy=int(message.dof_xy),
+        dof_theta=int(message.dof_theta),
+        used=int(message.detections_used),
+        rejected=counts(message, "reject"),
+        visits=_visits_of(message),
+        places=_places_of(message),
         motion=_motion_of(message, "motion", 4),
-        motion_theta=_motion_of(message, "motion_theta", 2), axis_theta=float(message.axis_theta))
+        motion_theta=_motion_of(message, "motion_theta", 2),
+        axis_theta=float(message.axis_theta),
+    )
 
 
 def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:
@@ -230,9 +289,11 @@ def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:
     if not len(products):
         return None
     if len(products) != size**2:
-        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                         f"{name} has {len(products)} values, not {size**2}",
-                         "correct the publisher")
+        raise InputError(
+            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+            f"{name} has {len(products)} values, not {size**2}",
+            "correct the publisher",
+        )
     return RepeatMotion(products.reshape(size, size), int(getattr(message, f"dof_{name}")))
 
 
@@ -240,25 +301,33 @@ def _visits_of(message: Any) -> GridVisits | None:
     """Return the visits in a ViewMeasurement; None if it has none."""
     if not len(getattr(message, "visit_mark", ())):
         return None
-    table = {name: np.array(getattr(message, f"visit_{name.removesuffix('_ns')}"), dtype=kind)
-             for name, kind in VISIT_COLUMNS}
+    table = {
+        name: np.array(getattr(message, f"visit_{name.removesuffix('_ns')}"), dtype=kind)
+        for name, kind in VISIT_COLUMNS
+    }
     lengths = {len(column) for name, column in table.items() if name != "u" or len(column)}
     if len(lengths) > 1 or table["mark"].min() < 0 or table["mark"].max() >= len(message.m):
-        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                         "the visits differ in length or name marks that were not read",
-                         "correct the publisher")
+        raise InputError(
+            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+            "the visits differ in length or name marks that were not read",
+            "correct the publisher",
+        )
     return GridVisits(**table, sigma_m=float(message.sigma_visit), dof=int(message.dof_visit))
 
 
 def _places_of(message: Any) -> RejectedPlaces:
     """Return the positions of rejected detections in a ViewMeasurement."""
-    number, x, y = (np.array(getattr(message, f"rejected_{name}"), dtype=kind)
-                    for name, kind in (("reason", int), ("x", float), ("y", float)))
+    number, x, y = (
+        np.array(getattr(message, f"rejected_{name}"), dtype=kind)
+        for name, kind in (("reason", int), ("x", float), ("y", float))
+    )
     reasons = list(map(str, message.reject_reasons))
     if not len(number) == len(x) == len(y) or (number >= len(reasons)).any():
-        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                         "the rejected detections differ in length or name no reason",
-                         "correct the publisher")
+        raise InputError(
+            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+            "the rejected detections differ in length or name no reason",
+            "correct the publisher",
+        )
     return RejectedPlaces(tuple(reasons[index] for index in number), x, y)
 
 
@@ -266,9 +335,11 @@ def counts(message: Any, prefix: str) -> dict[str, int]:
     """Return reason -> count from a pair of arrays; InputError if they differ in length."""
     reasons, numbers = (getattr(message, f"{prefix}_{name}") for name in ("reasons", "counts"))
     if len(reasons) != len(numbers):
-        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                         f"{prefix}_reasons and {prefix}_counts differ in length",
-                         "correct the publisher")
+        raise InputError(
+            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+            f"{prefix}_reasons and {prefix}_counts differ in length",
+            "correct the publisher",
+        )
     return {str(reason): int(number) for reason, number in zip(reasons, numbers, strict=True)}
 
 
@@ -277,9 +348,11 @@ def sense_of(message: Any) -> Sense:
     try:
         return Sense(message.measurement_sense or Sense.MICROSCOPE_MOVES)
     except ValueError as error:
-        raise InputError(f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
-                         f"measurement_sense {message.measurement_sense!r} is not known",
-                         f"use one of {', '.join(Sense)}") from error
+        raise InputError(
+            f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
+            f"measurement_sense {message.measurement_sense!r} is not known",
+            f"use one of {', '.join(Sense)}",
+        ) from error
 
 
 def error_map(message: Any) -> ErrorMap:
@@ -293,44 +366,72 @@ def error_map(message: Any) -> ErrorMap:
     """
     artifact = artifact_of(message)
     sites, lines = math.prod(artifact.shape), artifact.angular_count
-    for name, size in (("gx", sites), ("gy", sites), ("u_gx", sites), ("u_gy", sites),
-                       ("valid", sites), ("g_theta", lines), ("u_g_theta", lines)):
+    for name, size in (
+        ("gx", sites),
+        ("gy", sites),
+        ("u_gx", sites),
+        ("u_gy", sites),
+        ("valid", sites),
+        ("g_theta", lines),
+        ("u_g_theta", lines),
+    ):
         if len(getattr(message, name)) != size:
-            raise InputError(ERROR_MAP_TOPIC, f"{name} has {len(getattr(message, name))} "
-                             f"values, the plate {size}", "correct the publisher")
+            raise InputError(
+                ERROR_MAP_TOPIC,
+                f"{name} has {len(getattr(message, name))} values, the plate {size}",
+                "correct the publisher",
+            )
     if message.datum_theta not in list(ThetaDatum):
-        raise InputError(ERROR_MAP_TOPIC, f"datum_theta {message.datum_theta!r} is not known",
-                         f"use one of {', '.join(ThetaDatum)}")
-    grids = {name: np.array(getattr(message, name), dtype=float).reshape(artifact.shape)
-             for name in ("gx", "gy", "u_gx", "u_gy")}
+        raise InputError(
+            ERROR_MAP_TOPIC,
+            f"datum_theta {message.datum_theta!r} is not known",
+            f"use one of {', '.join(ThetaDatum)}",
+        )
+    grids = {
+        name: np.array(getattr(message, name), dtype=float).reshape(artifact.shape)
+        for name in ("gx", "gy", "u_gx", "u_gy")
+    }
     known = np.array(message.valid, dtype=bool).reshape(artifact.shape)
-    g_theta, u_g_theta = (np.array(getattr(message, name), dtype=float)
-                          for name in ("g_theta", "u_g_theta"))
+    g_theta, u_g_theta = (
+        np.array(getattr(message, name), dtype=float) for name in ("g_theta", "u_g_theta")
+    )
     _refuse_not_finite(grids, known, g_theta)
     for values in grids.values():
         values[~known] = np.nan
-    return ErrorMap(artifact, **grids, g_theta=g_theta, u_g_theta=u_g_theta,
-                    nonorthogonality=float(message.nonorthogonality),
-                    scale_difference=float(message.scale_difference),
-                    datum_theta=ThetaDatum(message.datum_theta))
+    return ErrorMap(
+        artifact,
+        **grids,
+        g_theta=g_theta,
+        u_g_theta=u_g_theta,
+        nonorthogonality=float(message.nonorthogonality),
+        scale_difference=float(message.scale_difference),
+        datum_theta=ThetaDatum(message.datum_theta),
+    )
 
 
-def _refuse_not_finite(grids: dict[str, np.ndarray], known: np.ndarray,
-                       g_theta: np.ndarray) -> None:
+def _refuse_not_finite(
+    grids: dict[str, np.ndarray], known: np.ndarray, g_theta: np.ndarray
+) -> None:
     """Refuse a map that is not finite where it is said to be known, or known nowhere."""
     for name in ("gx", "gy"):
         bad = int((~np.isfinite(grids[name][known])).sum())
         if bad:
-            raise InputError(ERROR_MAP_TOPIC, f"{name} is not finite at {bad} of the "
-                             f"{int(known.sum())} valid sites", "correct the publisher")
+            raise InputError(
+                ERROR_MAP_TOPIC,
+                f"{name} is not finite at {bad} of the {int(known.sum())} valid sites",
+                "correct the publisher",
+            )
     for name in ("u_gx", "u_gy"):
         if (grids[name] < 0).any():
             raise InputError(ERROR_MAP_TOPIC, f"{name} is negative", "correct the publisher")
     if np.isinf(g_theta).any():
         raise InputError(ERROR_MAP_TOPIC, "g_theta is infinite", "correct the publisher")
     if not known.any() or (len(g_theta) and np.isnan(g_theta).all()):
-        raise InputError(ERROR_MAP_TOPIC, "the error of no site or of no line is known",
-                         "measure, or correct the publisher")
+        raise InputError(
+            ERROR_MAP_TOPIC,
+            "the error of no site or of no line is known",
+            "measure, or correct the publisher",
+        )
 
 
 @dataclass(frozen=True)
@@ -384,7 +485,7 @@ class PositionEditor:
         """Return the last message read with other positions."""
         found = self._known[0]
         end = found.at + found.form.size
-        return data[:found.at] + found.form.pack(*positions) + data[end:]
+        return data[: found.at] + found.form.pack(*positions) + data[end:]
 
     def _find(self, data: bytes) -> bool:
         """Move the layout of a message to the front; return whether it has one."""
@@ -397,9 +498,17 @@ class PositionEditor:
             return False
         code, at, count = layout.values["position"]
         mask = int.from_bytes(layout.fixed)
-        self._known.appendleft(_Positions(
-            len(data), mask, int.from_bytes(data) & mask, layout.texts["name"],
-            layout.texts["header.frame_id"][0], Struct(f"{code[0]}{count}d"), at))
+        self._known.appendleft(
+            _Positions(
+                len(data),
+                mask,
+                int.from_bytes(data) & mask,
+                layout.texts["name"],
+                layout.texts["header.frame_id"][0],
+                Struct(f"{code[0]}{count}d"),
+                at,
+            )
+        )
         return True
 
 
@@ -433,10 +542,13 @@ def first_stamps_ns(messages: cdr.Payloads) -> tuple[np.ndarray, np.ndarray]:
     """
     there = messages.length >= STAMP_END
     octets = np.frombuffer(messages.data, np.uint8)[
-        messages.start[there][:, None] + np.arange(STAMP_END)]
+        messages.start[there][:, None] + np.arange(STAMP_END)
+    ]
     words = octets[:, 4:].copy()
-    little, big = (words.view(np.dtype([("sec", f"{order}i4"), ("nanosec", f"{order}u4")]))[:, 0]
-                   for order in "<>")
+    little, big = (
+        words.view(np.dtype([("sec", f"{order}i4"), ("nanosec", f"{order}u4")]))[:, 0]
+        for order in "<>"
+    )
     is_little = octets[:, 1] & 1 == 1
     second = np.where(is_little, little["sec"], big["sec"]).astype(np.int64)
     return second * NS_PER_S + np.where(is_little, little["nanosec"], big["nanosec"]), there
@@ -445,8 +557,12 @@ def first_stamps_ns(messages: cdr.Payloads) -> tuple[np.ndarray, np.ndarray]:
 def encoder_block(group: cdr.Columns) -> EncoderBlock:
     """Return the samples in messages of sensor_msgs/JointState."""
     velocities = group["velocity"] if "velocity" in group else np.zeros((len(group), 0))
-    return EncoderBlock(stamps_ns(group), group.layout.texts["name"], group["position"],
-                        velocities if velocities.shape[1] else None)
+    return EncoderBlock(
+        stamps_ns(group),
+        group.layout.texts["name"],
+        group["position"],
+        velocities if velocities.shape[1] else None,
+    )
 
 
 def detection_table(group: cdr.Columns) -> np.ndarray:

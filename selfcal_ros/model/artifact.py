@@ -97,51 +97,81 @@ class Artifact:
     def __post_init__(self) -> None:
         """Refuse impossible sizes, pitches and counts."""
         if self.marks is not None:
-            for name, value in (("grid_size", len(self.marks.ids)), ("grid_size_y", 1),
-                                ("grid_pitch_m", self.marks.spacing_m)):
+            for name, value in (
+                ("grid_size", len(self.marks.ids)),
+                ("grid_size_y", 1),
+                ("grid_pitch_m", self.marks.spacing_m),
+            ):
                 object.__setattr__(self, name, value)
         sides = ("grid_size", self.grid_size), ("grid_size_y", self.shape[1])
         for name, size in () if self.marks else sides:
             if size > MAX_GRID_SIZE:
-                raise InputError(f"artifact {name}", f"{size} rows of marks are more than "
-                                 f"{MAX_GRID_SIZE}", "use every other mark: half the rows, twice "
-                                 "the pitch")
+                raise InputError(
+                    f"artifact {name}",
+                    f"{size} rows of marks are more than {MAX_GRID_SIZE}",
+                    "use every other mark: half the rows, twice the pitch",
+                )
             if size < 3:
-                raise InputError(f"artifact {name}", f"{size} is not a number from 3 to "
-                                 f"{MAX_GRID_SIZE}", "give the number of rows; marks in fewer rows "
-                                 "as a list (artifact: {marks: FILE.csv})")
+                raise InputError(
+                    f"artifact {name}",
+                    f"{size} is not a number from 3 to {MAX_GRID_SIZE}",
+                    "give the number of rows; marks in fewer rows "
+                    "as a list (artifact: {marks: FILE.csv})",
+                )
         if not (np.isfinite(self.grid_pitch_m) and self.grid_pitch_m > 0):
-            raise InputError("artifact grid_pitch", f"{self.grid_pitch_m} m is not a length",
-                             "give the distance between marks in metres")
+            raise InputError(
+                "artifact grid_pitch",
+                f"{self.grid_pitch_m} m is not a length",
+                "give the distance between marks in metres",
+            )
         if not PITCH_RANGE_M[0] <= self.grid_pitch_m <= PITCH_RANGE_M[1]:
-            raise InputError("artifact grid_pitch", f"{self.grid_pitch_m:g} m is not a pitch of a "
-                             f"plate ({PITCH_RANGE_M[0]:g} to {PITCH_RANGE_M[1]:g} m)",
-                             f"is it in {'mm' if self.grid_pitch_m < MM_PER_M else 'um'}? "
-                             "give the distance between marks in metres")
+            raise InputError(
+                "artifact grid_pitch",
+                f"{self.grid_pitch_m:g} m is not a pitch of a "
+                f"plate ({PITCH_RANGE_M[0]:g} to {PITCH_RANGE_M[1]:g} m)",
+                f"is it in {'mm' if self.grid_pitch_m < MM_PER_M else 'um'}? "
+                "give the distance between marks in metres",
+            )
         if self.angular_count and not 3 <= self.angular_count <= MAX_ANGULAR_COUNT:
-            raise InputError("artifact angular_count", f"{self.angular_count} is not a number from "
-                             f"3 to {MAX_ANGULAR_COUNT}", "give 0 for a plate without lines")
+            raise InputError(
+                "artifact angular_count",
+                f"{self.angular_count} is not a number from 3 to {MAX_ANGULAR_COUNT}",
+                "give 0 for a plate without lines",
+            )
         most = min((self.angular_count - 1) // 2, MAX_HARMONICS)
         if self.harmonics and not 0 < self.harmonics <= most:
-            raise InputError("map harmonics", f"{self.harmonics} harmonics cannot be told with "
-                             f"{self.angular_count} lines", f"give 1 to {most}" if most > 0 else
-                             "leave them out for a plate without lines")
+            raise InputError(
+                "map harmonics",
+                f"{self.harmonics} harmonics cannot be told with {self.angular_count} lines",
+                f"give 1 to {most}" if most > 0 else "leave them out for a plate without lines",
+            )
         if self.map_grid is not None:
             try:
                 Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)
             except InputError as error:
-                raise InputError(error.where.replace("artifact", "map"), error.what,
-                                 "give the number of nodes a side, their pitch in m") from error
+                raise InputError(
+                    error.where.replace("artifact", "map"),
+                    error.what,
+                    "give the number of nodes a side, their pitch in m",
+                ) from error
 
     @cached_property
     def field(self) -> "Artifact":
         """Lattice of the error map: that of the plate unless `map_grid` is given."""
         grid = self.map_grid
         if grid is None and self.marks is not None:
-            raise InputError("artifact marks", "a list of marks without nodes of the map",
-                             "give map_grid_size and map_grid_pitch with it")
-        return self if grid is None else Artifact(
-            grid.size, grid.pitch_m, self.angular_count, grid.size_y, harmonics=self.harmonics)
+            raise InputError(
+                "artifact marks",
+                "a list of marks without nodes of the map",
+                "give map_grid_size and map_grid_pitch with it",
+            )
+        return (
+            self
+            if grid is None
+            else Artifact(
+                grid.size, grid.pitch_m, self.angular_count, grid.size_y, harmonics=self.harmonics
+            )
+        )
 
     @property
     def placed(self) -> "Artifact | None":
@@ -157,7 +187,8 @@ class Artifact:
     def field_half_m(self) -> tuple[float, float]:
         """Largest x and y of the stage's field, m."""
         return self.field.half[0] * self.field.grid_pitch_m, (
-            self.field.half[1] * self.field.grid_pitch_m)
+            self.field.half[1] * self.field.grid_pitch_m
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -301,13 +332,16 @@ def default_map_grid(artifact: Artifact) -> MapGrid:
         along = sqrt(len(artifact.marks.ids) * longer / min(artifact.reach))
         cells = int(0.75 * along - 1 + 1e-9) // 2 * 2
         if cells < 2:
-            raise InputError("artifact marks", f"{len(artifact.marks.ids)} marks are too few to "
-                             "choose the nodes of the map", "give them in the plan, e.g. "
-                             "map: {grid_size: 3}, or use a plate with more marks")
+            raise InputError(
+                "artifact marks",
+                f"{len(artifact.marks.ids)} marks are too few to choose the nodes of the map",
+                "give them in the plan, e.g. map: {grid_size: 3}, or use a plate with more marks",
+            )
     else:
         cells = max(int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, int(2 * longer) // 2 * 2))
     cells = min(cells, DEFAULT_NODES - 1)
     pitch_m = 2 * longer * artifact.grid_pitch_m / cells
     sides = [max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3) for half in artifact.reach]
-    return MapGrid(sides[0], pitch_m, Interpolation.BICUBIC,
-                   sides[1] if sides[1] != sides[0] else 0)
+    return MapGrid(
+        sides[0], pitch_m, Interpolation.BICUBIC, sides[1] if sides[1] != sides[0] else 0
+    )

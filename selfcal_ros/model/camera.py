@@ -106,5 +106,7 @@ def shown_by_images(data: Any) -> tuple[CameraErrors | None, StageYawMap | None]
 
 def camera_to_dict(camera: CameraErrors | None, yaw: StageYawMap | None) -> dict[str, Any]:
     """Return ``camera`` of RESULT.json; empty without images."""
-    return {**({} if camera is None else plain(camera)),
-            **({} if yaw is None else {"yaw": plain(yaw)})}
+    return {
+        **({} if camera is None else plain(camera)),
+        **({} if yaw is None else {"yaw": plain(yaw)}),
+    }

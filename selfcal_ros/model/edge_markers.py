@@ -29,9 +29,16 @@ def edge_markers(nx: int, ny: int) -> np.ndarray:
         If there are not as many markers.
     """
     if 2 * (nx + ny) > MOST:
-        raise InputError("aruco", f"{nx} x {ny} marks need {2 * (nx + ny)} markers",
-                         f"there are {MOST}: leave the markers out")
+        raise InputError(
+            "aruco",
+            f"{nx} x {ny} marks need {2 * (nx + ny)} markers",
+            f"there are {MOST}: leave the markers out",
+        )
     x, y = (np.arange(count) - (count - 1) / 2 for count in (nx, ny))
     low, left = y[0] - AWAY, x[0] - AWAY
-    return np.concatenate([np.stack(np.broadcast_arrays(*side), axis=1) for side in (
-        (x, low), (x, -low), (left, y), (-left, y))])
+    return np.concatenate(
+        [
+            np.stack(np.broadcast_arrays(*side), axis=1)
+            for side in ((x, low), (x, -low), (left, y), (-left, y))
+        ]
+    )

@@ -99,8 +99,7 @@ def datum_modes(artifact: Artifact, *, scale: bool) -> np.ndarray:
     return np.array([*modes, (x, y)] if scale else modes)
 
 
-def datum_columns(artifact: Artifact, kind: str, known: np.ndarray, *,
-                  scale: bool) -> np.ndarray:
+def datum_columns(artifact: Artifact, kind: str, known: np.ndarray, *, scale: bool) -> np.ndarray:
     """Return the modes of the datum over known places as columns, (values, modes).
 
     Parameters
@@ -167,7 +166,7 @@ def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
     if not all(size % 2 for size in artifact.shape):
         return np.full((4, *g_m.shape[3:]), np.nan)
     hx, hy = artifact.middle
-    along = (g_m[1, hx + 1:, hy], -g_m[0, hx, hy + 1:], g_m[1, :hx, hy], -g_m[0, hx, :hy])
+    along = (g_m[1, hx + 1 :, hy], -g_m[0, hx, hy + 1 :], g_m[1, :hx, hy], -g_m[0, hx, :hy])
     return np.stack([_slope(line, artifact.grid_pitch_m) for line in along])
 
 
@@ -194,8 +193,12 @@ def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     """
     hx, hy = (size // 2 for size in z_m.shape)
     out = np.zeros((4, *z_m.shape), dtype=complex)
-    halves = ((np.s_[hx + 1:, hy], 1j), (np.s_[hx, hy + 1:], -1), (np.s_[:hx, hy], 1j),
-              (np.s_[hx, :hy], -1))
+    halves = (
+        (np.s_[hx + 1 :, hy], 1j),
+        (np.s_[hx, hy + 1 :], -1),
+        (np.s_[:hx, hy], 1j),
+        (np.s_[hx, :hy], -1),
+    )
     for row, (part, unit) in zip(out, halves, strict=True):
         good = known[part]
         if good.sum() >= 2:
@@ -214,8 +217,9 @@ _SMOOTH = 1 / 4
 """Error of linear interpolation over a pitch, as a share of that over two, of a smooth function."""
 
 
-def error_halfway(values: np.ndarray, u: np.ndarray, *, cubic: bool = False,
-                  ring: bool = False) -> tuple[float, float]:
+def error_halfway(
+    values: np.ndarray, u: np.ndarray, *, cubic: bool = False, ring: bool = False
+) -> tuple[float, float]:
     """Return the rms and the largest error of interpolation halfway between nodes.
 
     A node minus the value interpolated from its neighbours is the error over two pitches. Over one
@@ -245,8 +249,9 @@ def error_halfway(values: np.ndarray, u: np.ndarray, *, cubic: bool = False,
     return float(mean), float(largest)
 
 
-def _squares(values: np.ndarray, u: np.ndarray, weights: dict[int, float],
-             pitches: int, ring: bool) -> np.ndarray:
+def _squares(
+    values: np.ndarray, u: np.ndarray, weights: dict[int, float], pitches: int, ring: bool
+) -> np.ndarray:
     """Return the squared errors of known nodes predicted from neighbours, less noise, (k,)."""
     reach = pitches * max(weights)
     if ring:
@@ -255,8 +260,10 @@ def _squares(values: np.ndarray, u: np.ndarray, weights: dict[int, float],
     middle = slice(reach, max(n - reach, reach))
     error, power = values[middle], u[middle] ** 2
     for distance, weight in weights.items():
-        low, high = (slice(reach + step, max(n - reach, reach) + step)
-                     for step in (-pitches * distance, pitches * distance))
+        low, high = (
+            slice(reach + step, max(n - reach, reach) + step)
+            for step in (-pitches * distance, pitches * distance)
+        )
         error = error - weight * (values[low] + values[high]) / 2
         power = power + weight**2 * (u[low] ** 2 + u[high] ** 2) / 4
     square = error**2 - power

@@ -12,7 +12,12 @@ from selfcal_ros.files import read
 from selfcal_ros.outputs import plain
 
 FACTORS, ANGULAR, ADDED, IMAGES, COVARIANCE = KEYS = (
-    "covariance_terms", "angular_terms", "first_order_added", "images", "map_covariance")
+    "covariance_terms",
+    "angular_terms",
+    "first_order_added",
+    "images",
+    "map_covariance",
+)
 """Keys in RESULT.json."""
 
 DIGITS = 7
@@ -153,15 +158,24 @@ class Kept:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form: the keys of what there is."""
-        parts = {ADDED: self.added, FACTORS: self.factors and self.factors.to_dict(),
-                 ANGULAR: dict(self.angular) or None, IMAGES: self.images, COVARIANCE: {
-                     key: value for kind, kept in self.covariances.items() for key, value in (
-                         (kind, kept.lower), (f"scale_{kind}", kept.scale))} or None}
+        parts = {
+            ADDED: self.added,
+            FACTORS: self.factors and self.factors.to_dict(),
+            ANGULAR: dict(self.angular) or None,
+            IMAGES: self.images,
+            COVARIANCE: {
+                key: value
+                for kind, kept in self.covariances.items()
+                for key, value in ((kind, kept.lower), (f"scale_{kind}", kept.scale))
+            }
+            or None,
+        }
         return {key: plain(part) for key, part in parts.items() if part is not None}
 
 
-def kept_from_dict(data: Mapping[str, Any], of_map: tuple[int, ...],
-                   of_plate: tuple[int, ...], lines: int) -> Kept:
+def kept_from_dict(
+    data: Mapping[str, Any], of_map: tuple[int, ...], of_plate: tuple[int, ...], lines: int
+) -> Kept:
     """Return what a result keeps from its JSON form.
 
     Parameters
@@ -181,42 +195,66 @@ def kept_from_dict(data: Mapping[str, Any], of_map: tuple[int, ...],
     images = read(ImagesKept | None, data.get(IMAGES))
     if images is not None and math.isnan(images.dof_mark):  # JSON has no infinity
         images = replace(images, dof_mark=math.inf)
-    if images is not None and not (0 <= images.share <= 1 and images.dof_mark >= 0 and all(
-            len(step) == 2 for step in images.step)):
+    if images is not None and not (
+        0 <= images.share <= 1
+        and images.dof_mark >= 0
+        and all(len(step) == 2 for step in images.step)
+    ):
         raise ValueError(f"{IMAGES}: no noise of images")
     return Kept(
         _factors(data[FACTORS], of_map, of_plate, lines) if FACTORS in data else None,
-        {name: _numbers(u, (lines,), ANGULAR, "no contributions to these lines", finite=False)
-         for name, u in read(dict, data.get(ANGULAR, {})).items()},
-        _numbers(data[ADDED], (2,), ADDED, "not two variances") if ADDED in data else None, images,
-        {kind: Covariance(_numbers(stored[kind], (-1,), COVARIANCE, "not a triangle of numbers"),
-                          read(float, stored[f"scale_{kind}"]))
-         for stored in (read(dict, data.get(COVARIANCE, {})),) for kind in ("xy", "theta")
-         if kind in stored})
+        {
+            name: _numbers(u, (lines,), ANGULAR, "no contributions to these lines", finite=False)
+            for name, u in read(dict, data.get(ANGULAR, {})).items()
+        },
+        _numbers(data[ADDED], (2,), ADDED, "not two variances") if ADDED in data else None,
+        images,
+        {
+            kind: Covariance(
+                _numbers(stored[kind], (-1,), COVARIANCE, "not a triangle of numbers"),
+                read(float, stored[f"scale_{kind}"]),
+            )
+            for stored in (read(dict, data.get(COVARIANCE, {})),)
+            for kind in ("xy", "theta")
+            if kind in stored
+        },
+    )
 
 
-def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...],
-             lines: int) -> Factors:
+def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...], lines: int) -> Factors:
     kept = read(dict, data)
     terms = read(tuple[str, ...], kept["terms"])
-    factors = _numbers(kept["factors"], (len(terms), 2, *of_map), FACTORS,
-                       "no factors of this lattice")
+    factors = _numbers(
+        kept["factors"], (len(terms), 2, *of_map), FACTORS, "no factors of this lattice"
+    )
     shapes = {"plate": (2, *of_plate), "lines": (2, lines)}
     beside = dict(read(dict, kept.get("beside", {})))
     with_map, known = read(int, beside.pop("with_map", 0)), {}
     for name, values in beside.items():
-        known[name] = _numbers(values, (len(read(list, values)), *shapes.get(name, (4,))), FACTORS,
-                               f"no {name} of this plate")
+        known[name] = _numbers(
+            values,
+            (len(read(list, values)), *shapes.get(name, (4,))),
+            FACTORS,
+            f"no {name} of this plate",
+        )
     numbers = {len(values) for values in known.values()}
     if known and (len(numbers) > 1 or not 0 <= with_map <= min(*numbers, len(terms))):
         raise ValueError(f"{FACTORS}: quantities beside the map of other factors")
     on_plate = kept.get("effects_on_plate")
-    return Factors(terms, factors, known, with_map, None if on_plate is None else _numbers(
-        on_plate, (2, *of_plate), FACTORS, "no effects on the plate"))
+    return Factors(
+        terms,
+        factors,
+        known,
+        with_map,
+        None
+        if on_plate is None
+        else _numbers(on_plate, (2, *of_plate), FACTORS, "no effects on the plate"),
+    )
 
 
-def _numbers(value: Any, shape: tuple[int, ...], where: str, wrong: str, *,
-             finite: bool = True) -> np.ndarray:
+def _numbers(
+    value: Any, shape: tuple[int, ...], where: str, wrong: str, *, finite: bool = True
+) -> np.ndarray:
     """Return numbers of a shape; ValueError says where they are wrong, and what is."""
     try:
         found = read(np.ndarray, value).reshape(shape)

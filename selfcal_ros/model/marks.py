@@ -72,8 +72,11 @@ class MarkList:
     def innermost(self, number: int) -> "MarkList":
         """Return the marks nearest to the plate's centre."""
         near = sorted(np.argsort(np.hypot(*self.places_m), kind="stable")[:number].tolist())
-        return MarkList(tuple(self.ids[i] for i in near), tuple(self.x_m[i] for i in near),
-                        tuple(self.y_m[i] for i in near))
+        return MarkList(
+            tuple(self.ids[i] for i in near),
+            tuple(self.x_m[i] for i in near),
+            tuple(self.y_m[i] for i in near),
+        )
 
     @cached_property
     def tree(self) -> Any:
@@ -83,8 +86,9 @@ class MarkList:
         return cKDTree(self.places_m.T)
 
 
-def marks_of(ids: Sequence[int], x_m: Sequence[float], y_m: Sequence[float],
-             where: Sequence[str] = ()) -> MarkList:
+def marks_of(
+    ids: Sequence[int], x_m: Sequence[float], y_m: Sequence[float], where: Sequence[str] = ()
+) -> MarkList:
     """Return a list of marks, checked.
 
     Parameters
@@ -101,30 +105,48 @@ def marks_of(ids: Sequence[int], x_m: Sequence[float], y_m: Sequence[float],
         in another unit, and ids that are equal or no int32.
     """
     if not len(ids) == len(x_m) == len(y_m):
-        raise InputError("artifact marks", f"{len(ids)} ids, {len(x_m)} x and {len(y_m)} y",
-                         "give each mark an id, x and y")
+        raise InputError(
+            "artifact marks",
+            f"{len(ids)} ids, {len(x_m)} x and {len(y_m)} y",
+            "give each mark an id, x and y",
+        )
     where = where or [f"artifact marks[{i}]" for i in range(len(ids))]
     whole = where[0].rpartition(":")[0] if where and ":" in where[0] else "artifact marks"
     if not MARKS_RANGE[0] <= len(ids) <= MARKS_RANGE[1]:
-        raise InputError(whole, f"{len(ids)} marks, not {MARKS_RANGE[0]} to {MARKS_RANGE[1]}",
-                         "list the marks of the plate, one a line")
+        raise InputError(
+            whole,
+            f"{len(ids)} marks, not {MARKS_RANGE[0]} to {MARKS_RANGE[1]}",
+            "list the marks of the plate, one a line",
+        )
     known: dict[int, str] = {}
     for number, x, y, place in zip(ids, x_m, y_m, where, strict=True):
-        if not -2**31 <= number < 2**31:
+        if not -(2**31) <= number < 2**31:
             raise InputError(place, f"id {number} is no 32 bit integer", "number the marks anew")
         if not (isfinite(x) and isfinite(y)):
-            raise InputError(place, f"mark {number} has no place ({x:g}, {y:g})",
-                             "give x and y in m, or delete the mark")
+            raise InputError(
+                place,
+                f"mark {number} has no place ({x:g}, {y:g})",
+                "give x and y in m, or delete the mark",
+            )
         if max(abs(x), abs(y)) > MOST_M:
-            raise InputError(place, f"({x:g}, {y:g}) m of mark {number} is beyond every plate "
-                             f"({MOST_M:g} m)", "is it in mm? give x and y in m")
+            raise InputError(
+                place,
+                f"({x:g}, {y:g}) m of mark {number} is beyond every plate ({MOST_M:g} m)",
+                "is it in mm? give x and y in m",
+            )
         if number in known:
-            raise InputError(place, f"the id {number} is used already in {known[number]}",
-                             "give every mark its own id")
+            raise InputError(
+                place,
+                f"the id {number} is used already in {known[number]}",
+                "give every mark its own id",
+            )
         known[number] = place
     order = np.argsort(ids)
-    found = MarkList(tuple(int(ids[i]) for i in order), tuple(float(x_m[i]) for i in order),
-                     tuple(float(y_m[i]) for i in order))
+    found = MarkList(
+        tuple(int(ids[i]) for i in order),
+        tuple(float(x_m[i]) for i in order),
+        tuple(float(y_m[i]) for i in order),
+    )
     _check_places(found, whole, known)
     return found
 
@@ -134,15 +156,21 @@ def _check_places(marks: MarkList, whole: str, known: dict[int, str]) -> None:
     nearest = int(marks.neighbours[0].argmin())
     if marks.neighbours[0][nearest] < LEAST_DISTANCE_M:
         first, second = sorted((nearest, int(marks.neighbours[1][nearest])))
-        raise InputError(known[marks.ids[second]], f"marks {marks.ids[first]} and "
-                         f"{marks.ids[second]} lie at one place", "delete one of them")
+        raise InputError(
+            known[marks.ids[second]],
+            f"marks {marks.ids[first]} and {marks.ids[second]} lie at one place",
+            "delete one of them",
+        )
     length, width = np.linalg.svd(marks.places_m - marks.places_m.mean(axis=1)[:, None])[1]
     if width < THINNEST * length:
-        raise InputError(whole, "all marks lie on one line",
-                         "use a plate with marks in two directions")
+        raise InputError(
+            whole, "all marks lie on one line", "use a plate with marks in two directions"
+        )
     low, high = marks.places_m.min(axis=1), marks.places_m.max(axis=1)
     middle = (low + high) / 2
     if (np.abs(middle) > FARTHEST_CENTRE * (high - low) / 2).any():
-        raise InputError(whole, f"the marks lie about ({middle[0]:g}, {middle[1]:g}) m, not about "
-                         "the plate's centre", "count x and y from the centre of the plate: "
-                         "subtract this place from all")
+        raise InputError(
+            whole,
+            f"the marks lie about ({middle[0]:g}, {middle[1]:g}) m, not about the plate's centre",
+            "count x and y from the centre of the plate: subtract this place from all",
+        )

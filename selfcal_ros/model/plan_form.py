@@ -58,40 +58,71 @@ def plan_from_dict(data: object, where: str) -> Plan:
         For a missing or unknown key, a wrong type, an unknown visiting order or term, or an
         impossible pose.
     """
-    fields = checked_fields(data, where, {"plan_id": str, "artifact": dict, "views": list},
-                            {"visit_order": (str, ""), "model_terms": (list, []),
-                             "check_stops": (dict, {}), "microscope": (dict, {}),
-                             "map": (dict, {}), "image": (dict, {}), "artifact_from": (str, ""),
-                             **dict.fromkeys(PLAN_KEYS, (str, ""))})
-    artifact = replace(artifact_of(fields["artifact"], f"{where}: artifact"),
-                       harmonics=harmonics_of(fields["map"], f"{where}: map"))
+    fields = checked_fields(
+        data,
+        where,
+        {"plan_id": str, "artifact": dict, "views": list},
+        {
+            "visit_order": (str, ""),
+            "model_terms": (list, []),
+            "check_stops": (dict, {}),
+            "microscope": (dict, {}),
+            "map": (dict, {}),
+            "image": (dict, {}),
+            "artifact_from": (str, ""),
+            **dict.fromkeys(PLAN_KEYS, (str, "")),
+        },
+    )
+    artifact = replace(
+        artifact_of(fields["artifact"], f"{where}: artifact"),
+        harmonics=harmonics_of(fields["map"], f"{where}: map"),
+    )
     order = _order(fields["visit_order"], where)
     if len(fields["views"]) > MAX_VIEWS:
-        raise InputError(f"{where}: views", f"{len(fields['views'])} views are more than "
-                         f"{MAX_VIEWS}", "measure fewer views")
+        raise InputError(
+            f"{where}: views",
+            f"{len(fields['views'])} views are more than {MAX_VIEWS}",
+            "measure fewer views",
+        )
     checks = _checks(fields["check_stops"], f"{where}: check_stops")
-    views = tuple(_view_from_dict(view, f"{where}: views[{index}]", artifact, order)
-                  for index, view in enumerate(fields["views"]))
+    views = tuple(
+        _view_from_dict(view, f"{where}: views[{index}]", artifact, order)
+        for index, view in enumerate(fields["views"])
+    )
     grid = map_grid_of(fields["map"], artifact, f"{where}: map")
     if grid is None and not all(view.is_on_lattice(artifact) for view in views):
         grid = default_map_grid(artifact)
     artifact = replace(artifact, map_grid=grid)
     image = image_of(fields["image"], artifact, f"{where}: image")
-    views = tuple(replace(_with_checks(view, *checks, artifact, where),
-                          image=image if view.grid else None) for view in views)
+    views = tuple(
+        replace(_with_checks(view, *checks, artifact, where), image=image if view.grid else None)
+        for view in views
+    )
     if len(with_sub_views(views)) > MAX_VIEWS:
-        raise InputError(f"{where}: image", f"{len(with_sub_views(views))} views with the cells of "
-                         f"the image are more than {MAX_VIEWS}", "state fewer marks in an image")
+        raise InputError(
+            f"{where}: image",
+            f"{len(with_sub_views(views))} views with the cells of "
+            f"the image are more than {MAX_VIEWS}",
+            "state fewer marks in an image",
+        )
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
     for index, view in enumerate(views):
         if view.name in [other.name for other in views[:index]]:
-            raise InputError(f"{where}: views[{index}]", f"the name '{view.name}' is used twice",
-                             "give every view its own name")
+            raise InputError(
+                f"{where}: views[{index}]",
+                f"the name '{view.name}' is used twice",
+                "give every view its own name",
+            )
     terms = terms_of(fields["model_terms"], where)
-    return Plan(fields["plan_id"], artifact, views, with_microscope(
-        terms, fields["microscope"], f"{where}: microscope"), fields["artifact_from"],
-        **{key: fields[key] for key in PLAN_KEYS})
+    return Plan(
+        fields["plan_id"],
+        artifact,
+        views,
+        with_microscope(terms, fields["microscope"], f"{where}: microscope"),
+        fields["artifact_from"],
+        **{key: fields[key] for key in PLAN_KEYS},
+    )
 
 
 def _checks(data: dict, where: str) -> tuple[int, float]:
@@ -123,34 +154,57 @@ def _order(text: str, where: str) -> str:
 
 
 def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) -> View:
-    raw = checked_fields(data, where, {"name": str},
-                         {"rotation_deg": (float, 0.0), "translation_pitch": (list, None),
-                          "translation_mm": (list, None), "grid": (bool, True),
-                          "angular": (bool, None), "repeats": (int, 1),
-                          "visit_order": (str, order)})
+    raw = checked_fields(
+        data,
+        where,
+        {"name": str},
+        {
+            "rotation_deg": (float, 0.0),
+            "translation_pitch": (list, None),
+            "translation_mm": (list, None),
+            "grid": (bool, True),
+            "angular": (bool, None),
+            "repeats": (int, 1),
+            "visit_order": (str, order),
+        },
+    )
     a, b = _translation_m(raw, where, artifact)
     if raw["repeats"] < 1:
         raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
     if raw["angular"] and not artifact.angular_count:
-        raise InputError(where, "angular marks are wanted but the plate has none",
-                         "set angular to false, or give the plate its angular_count")
+        raise InputError(
+            where,
+            "angular marks are wanted but the plate has none",
+            "set angular to false, or give the plate its angular_count",
+        )
     _check_degrees(raw["rotation_deg"], where)
     turn = math.radians(raw["rotation_deg"])
     if raw["angular"] is None:  # without harmonics only grid marks can be read between two lines
         raw["angular"] = artifact.angular_count > 0 and (
-            not raw["grid"] or not math.isfinite(turn) or turn_in_lines(turn, artifact) is not None)
+            not raw["grid"] or not math.isfinite(turn) or turn_in_lines(turn, artifact) is not None
+        )
     if not (raw["grid"] or raw["angular"]):
         raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
-    return View(raw["name"], turn, (a, b), raw["grid"], raw["angular"], raw["repeats"],
-                _order(raw["visit_order"], where))
+    return View(
+        raw["name"],
+        turn,
+        (a, b),
+        raw["grid"],
+        raw["angular"],
+        raw["repeats"],
+        _order(raw["visit_order"], where),
+    )
 
 
 def _check_degrees(rotation_deg: float, where: str) -> None:
     """Raise InputError for a rotation that is a whole number of quarter turns in rad."""
     quarters = rotation_deg / (math.pi / 2) if math.isfinite(rotation_deg) else 0.0
     if 1 <= abs(round(quarters)) <= 4 and math.isclose(quarters, round(quarters), rel_tol=ROUNDED):
-        raise InputError(f"{where}: rotation_deg", f"{rotation_deg:g} degrees: is it in rad?",
-                         f"give {90 * round(quarters)} for {round(quarters)} quarter turns")
+        raise InputError(
+            f"{where}: rotation_deg",
+            f"{rotation_deg:g} degrees: is it in rad?",
+            f"give {90 * round(quarters)} for {round(quarters)} quarter turns",
+        )
 
 
 def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, float]:
@@ -159,8 +213,11 @@ def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, fl
     if len(given) > 1:
         raise InputError(where, f"{' and '.join(given)} are given", "leave one of them out")
     if given == ["translation_pitch"] and artifact.marks is not None:
-        raise InputError(f"{where}: translation_pitch", "a list of marks has no pitch",
-                         "give translation_mm: [a, b]")
+        raise InputError(
+            f"{where}: translation_pitch",
+            "a list of marks has no pitch",
+            "give translation_mm: [a, b]",
+        )
     shift = raw[given[0]] if given else [0, 0]
     if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
         raise InputError(f"{where}: {given[0]}", "not two numbers", "give [a, b]")
@@ -172,12 +229,21 @@ def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, fl
 def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
     """Return a view in the format of PLAN.yaml."""
     unit = "pitch" if artifact.marks is None else "mm"
-    shift = view.on_stage(artifact).shift if unit == "pitch" else [
-        value * MM_PER_M for value in view.translation_m]
+    shift = (
+        view.on_stage(artifact).shift
+        if unit == "pitch"
+        else [value * MM_PER_M for value in view.translation_m]
+    )
     order = {"visit_order": view.visit_order} if view.visit_order else {}
-    return {"name": view.name, "rotation_deg": round(math.degrees(view.rotation_rad), 9),
-            f"translation_{unit}": [round(step, 9) for step in shift], "grid": view.grid,
-            "angular": view.angular, "repeats": view.repeats, **order}
+    return {
+        "name": view.name,
+        "rotation_deg": round(math.degrees(view.rotation_rad), 9),
+        f"translation_{unit}": [round(step, 9) for step in shift],
+        "grid": view.grid,
+        "angular": view.angular,
+        "repeats": view.repeats,
+        **order,
+    }
 
 
 def plan_to_dict(plan: Plan) -> dict[str, Any]:
@@ -185,11 +251,14 @@ def plan_to_dict(plan: Plan) -> dict[str, Any]:
     artifact, own = plan.artifact, map_to_dict(plan.artifact)
     marks, offset_m = plan.check_stops
     image = next((view.image for view in plan.views if view.image), None)
-    return {"plan_id": plan.plan_id, "artifact": artifact_to_dict(artifact),
-            **({"map": own} if own else {}),
-            "views": [view_to_dict(view, artifact) for view in plan.views],
-            **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
-            **({"image": dict(vars(image))} if image else {}),
-            **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
-            **({"artifact_from": plan.artifact_from} if plan.artifact_from else {}),
-            **{key: text for key, text in plan_keys(plan).items() if text}}
+    return {
+        "plan_id": plan.plan_id,
+        "artifact": artifact_to_dict(artifact),
+        **({"map": own} if own else {}),
+        "views": [view_to_dict(view, artifact) for view in plan.views],
+        **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
+        **({"image": dict(vars(image))} if image else {}),
+        **({"model_terms": list(plan.model_terms)} if plan.model_terms else {}),
+        **({"artifact_from": plan.artifact_from} if plan.artifact_from else {}),
+        **{key: text for key, text in plan_keys(plan).items() if text},
+    }

@@ -14,9 +14,12 @@ def map_to_dict(artifact: Artifact) -> dict[str, Any]:
     """Return what a map has of its own in the form of ``map`` in PLAN.yaml; empty if nothing."""
     grid, own = artifact.map_grid, {}
     if grid is not None:
-        own = {"grid_size": grid.size, "grid_pitch": grid.pitch_m,
-               "interpolation": str(grid.interpolation),
-               **({"grid_size_y": grid.size_y} if grid.size_y else {})}
+        own = {
+            "grid_size": grid.size,
+            "grid_pitch": grid.pitch_m,
+            "interpolation": str(grid.interpolation),
+            **({"grid_size_y": grid.size_y} if grid.size_y else {}),
+        }
     return own | ({"harmonics": artifact.harmonics} if artifact.harmonics else {})
 
 
@@ -30,8 +33,12 @@ def map_grid_from_dict(data: dict[str, Any]) -> MapGrid | None:
     """
     if not set(data) - {"harmonics"}:
         return None
-    return MapGrid(data["grid_size"], float(data["grid_pitch"]),
-                   Interpolation(data["interpolation"]), data.get("grid_size_y", 0))
+    return MapGrid(
+        data["grid_size"],
+        float(data["grid_pitch"]),
+        Interpolation(data["interpolation"]),
+        data.get("grid_size_y", 0),
+    )
 
 
 def harmonics_of(data: dict, where: str) -> int:
@@ -44,17 +51,33 @@ def map_grid_of(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
     """Return the nodes of the map; None if the plan does not give them."""
     if not set(data) - {"harmonics"}:
         return None
-    raw = checked_fields(data, where, {"grid_size": int}, {
-        "grid_pitch": (float, 0.0), "interpolation": (str, str(Interpolation.BICUBIC)),
-        "grid_size_y": (int, 0), "harmonics": (int, 0)})
+    raw = checked_fields(
+        data,
+        where,
+        {"grid_size": int},
+        {
+            "grid_pitch": (float, 0.0),
+            "interpolation": (str, str(Interpolation.BICUBIC)),
+            "grid_size_y": (int, 0),
+            "harmonics": (int, 0),
+        },
+    )
     if raw["interpolation"] not in list(Interpolation):
-        raise InputError(f"{where}: interpolation", f"'{raw['interpolation']}' is not known",
-                         f"use one of {', '.join(Interpolation)}")
+        raise InputError(
+            f"{where}: interpolation",
+            f"'{raw['interpolation']}' is not known",
+            f"use one of {', '.join(Interpolation)}",
+        )
     sizes = raw["grid_size"], raw["grid_size_y"] or raw["grid_size"]
-    spans = max(2 * half / max(size - 1, 1) for half, size in zip(
-        artifact.reach, sizes, strict=True))
-    return MapGrid(sizes[0], raw["grid_pitch"] or spans * artifact.grid_pitch_m,
-                   Interpolation(raw["interpolation"]), raw["grid_size_y"])
+    spans = max(
+        2 * half / max(size - 1, 1) for half, size in zip(artifact.reach, sizes, strict=True)
+    )
+    return MapGrid(
+        sizes[0],
+        raw["grid_pitch"] or spans * artifact.grid_pitch_m,
+        Interpolation(raw["interpolation"]),
+        raw["grid_size_y"],
+    )
 
 
 def artifact_of(data: dict, where: str) -> Artifact:
@@ -76,18 +99,28 @@ def artifact_of(data: dict, where: str) -> Artifact:
     """
     if "marks" in data:
         raw = checked_fields(data, where, {"marks": dict}, {"angular_count": (int, 0)})
-        lists = checked_fields(raw["marks"], f"{where}: marks", dict.fromkeys("xy", list)
-                               | {"id": list})
+        lists = checked_fields(
+            raw["marks"], f"{where}: marks", dict.fromkeys("xy", list) | {"id": list}
+        )
         if len({len(column) for column in lists.values()}) > 1 or not all(
-                type(value) in ((int,) if key == "id" else (int, float))
-                for key, column in lists.items() for value in column):
-            raise InputError(f"{where}: marks", "id, x and y are not as many numbers each",
-                             "give each mark a whole id, x and y in m")
-        return Artifact(0, 0.0, raw["angular_count"], marks=marks_of(
-            lists["id"], lists["x"], lists["y"]))
-    raw = checked_fields(_with_sides(data, where), where, {
-        "grid_size": int, "grid_pitch": float}, {
-        "angular_count": (int, 0), "grid_size_y": (int, 0)})
+            type(value) in ((int,) if key == "id" else (int, float))
+            for key, column in lists.items()
+            for value in column
+        ):
+            raise InputError(
+                f"{where}: marks",
+                "id, x and y are not as many numbers each",
+                "give each mark a whole id, x and y in m",
+            )
+        return Artifact(
+            0, 0.0, raw["angular_count"], marks=marks_of(lists["id"], lists["x"], lists["y"])
+        )
+    raw = checked_fields(
+        _with_sides(data, where),
+        where,
+        {"grid_size": int, "grid_pitch": float},
+        {"angular_count": (int, 0), "grid_size_y": (int, 0)},
+    )
     return Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"], raw["grid_size_y"])
 
 
@@ -97,8 +130,11 @@ def _with_sides(data: dict, where: str) -> dict:
     if not isinstance(sides, list):
         return data
     if len(sides) != 2 or "grid_size_y" in data or not all(type(size) is int for size in sides):
-        raise InputError(f"{where}: grid_size", f"{sides!r} is not a number of marks along x and y",
-                         "give [8, 6], or grid_size and grid_size_y")
+        raise InputError(
+            f"{where}: grid_size",
+            f"{sides!r} is not a number of marks along x and y",
+            "give [8, 6], or grid_size and grid_size_y",
+        )
     return data | {"grid_size": sides[0], "grid_size_y": sides[1] if sides[1] != sides[0] else 0}
 
 
@@ -107,18 +143,27 @@ def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
     count = {"angular_count": artifact.angular_count}
     if artifact.marks is not None:
         marks = artifact.marks
-        return {"marks": {"id": list(marks.ids), "x": list(marks.x_m), "y": list(marks.y_m)},
-                **count}
-    return {"grid_size": artifact.grid_size, "grid_pitch": artifact.grid_pitch_m, **count,
-            **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {})}
+        return {
+            "marks": {"id": list(marks.ids), "x": list(marks.x_m), "y": list(marks.y_m)},
+            **count,
+        }
+    return {
+        "grid_size": artifact.grid_size,
+        "grid_pitch": artifact.grid_pitch_m,
+        **count,
+        **({"grid_size_y": artifact.grid_size_y} if artifact.grid_size_y else {}),
+    }
 
 
 def with_nodes(artifact: Artifact, text: str, where: str) -> Artifact:
     """Return the plate with a map of NODES[:INTERPOLATION] over the same field."""
     size, _, interpolation = text.partition(":")
     if not (size.isascii() and size.isdecimal() and int(size) >= 3):
-        raise InputError(where, f"'{text}' is not NODES[:INTERPOLATION]",
-                         "give a number of nodes a side from 3 on, e.g. 9:bicubic")
+        raise InputError(
+            where,
+            f"'{text}' is not NODES[:INTERPOLATION]",
+            "give a number of nodes a side from 3 on, e.g. 9:bicubic",
+        )
     given = {"grid_size": int(size), "interpolation": interpolation or str(Interpolation.BICUBIC)}
     field = artifact.field
     if field.half[0] == field.half[1]:

@@ -310,12 +310,17 @@ class ImageCells:
         """Refuse impossible images."""
         for name, size in (("nx", self.nx), ("ny", self.ny)):
             if not 1 <= size <= MOST_CELLS or size % 2 == 0:
-                raise InputError(f"image {name}", f"{size} is not an odd number from 1 to "
-                                 f"{MOST_CELLS}", "count the mark on the optical axis and as many "
-                                 "on either side of it")
+                raise InputError(
+                    f"image {name}",
+                    f"{size} is not an odd number from 1 to {MOST_CELLS}",
+                    "count the mark on the optical axis and as many on either side of it",
+                )
         if not (math.isfinite(self.pitch_m) and self.pitch_m > 0):
-            raise InputError("image pitch_m", f"{self.pitch_m} m is not a length",
-                             "give the distance between marks in metres")
+            raise InputError(
+                "image pitch_m",
+                f"{self.pitch_m} m is not a length",
+                "give the distance between marks in metres",
+            )
 
     @property
     def cells(self) -> list[tuple[int, int]]:
@@ -323,8 +328,9 @@ class ImageCells:
         hx, hy = self.nx // 2, self.ny // 2
         return [(x, y) for x in range(-hx, hx + 1) for y in range(-hy, hy + 1)]
 
-    def step_on_plate(self, cell: tuple[int, int], pose: "Pose",
-                      artifact: Artifact) -> tuple[int, int]:
+    def step_on_plate(
+        self, cell: tuple[int, int], pose: "Pose", artifact: Artifact
+    ) -> tuple[int, int]:
         """Return the steps (m, n) on a plate from the mark on the axis to that of a cell."""
         step = (1, -1j, -1, 1j)[pose.quarters % 4] * complex(*cell) * self.steps(artifact)
         return round(step.real), round(step.imag)
@@ -332,10 +338,17 @@ class ImageCells:
     def steps(self, artifact: Artifact) -> int:
         """Return the distance between cells in pitches of the plate; InputError if not whole."""
         if artifact.marks is not None:
-            raise InputError("image", "images show the cells of a lattice, the plate is a list of "
-                             "marks", "leave image out: one mark in an exposure")
-        return whole_steps(self.pitch_m / artifact.grid_pitch_m, "image pitch_m", "pitch",
-                           "let cells be whole pitches of the plate apart")
+            raise InputError(
+                "image",
+                "images show the cells of a lattice, the plate is a list of marks",
+                "leave image out: one mark in an exposure",
+            )
+        return whole_steps(
+            self.pitch_m / artifact.grid_pitch_m,
+            "image pitch_m",
+            "pitch",
+            "let cells be whole pitches of the plate apart",
+        )
 
 
 def cell_label(cell: tuple[int, int]) -> str:

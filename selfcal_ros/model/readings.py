@@ -19,12 +19,31 @@ AFTER_SLIP = " after slip"
 """End of the name of the part of a view that was read after the plate slipped."""
 Key = tuple[int, str, tuple[int, ...]]
 """A reading: position of its view, ``grid`` or ``angular``, and (m, n) or (k,)."""
-COLUMNS = (("m", "i8"), ("n", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("u", "f8"),
-           ("k", "i8"), ("dtheta", "f8"), ("count_theta", "i8"), ("u_theta", "f8"))
+COLUMNS = (
+    ("m", "i8"),
+    ("n", "i8"),
+    ("dx", "f8"),
+    ("dy", "f8"),
+    ("count", "i8"),
+    ("u", "f8"),
+    ("k", "i8"),
+    ("dtheta", "f8"),
+    ("count_theta", "i8"),
+    ("u_theta", "f8"),
+)
 """Columns of `ViewReadings` with their types, named like their fields in ViewMeasurement."""
-VISIT_COLUMNS = (("mark", "i8"), ("dx", "f8"), ("dy", "f8"), ("count", "i8"), ("stamp_ns", "i8"),
-                 ("offset_x", "f8"), ("offset_y", "f8"), ("approach_x", "i1"),
-                 ("approach_y", "i1"), ("u", "f8"))
+VISIT_COLUMNS = (
+    ("mark", "i8"),
+    ("dx", "f8"),
+    ("dy", "f8"),
+    ("count", "i8"),
+    ("stamp_ns", "i8"),
+    ("offset_x", "f8"),
+    ("offset_y", "f8"),
+    ("approach_x", "i1"),
+    ("approach_y", "i1"),
+    ("u", "f8"),
+)
 """Columns of `GridVisits`; their fields in ViewMeasurement begin with visit_, that of stamp_ns is
 visit_stamp."""
 
@@ -45,8 +64,9 @@ class Sense(StrEnum):
         return -1 if self is Sense.PLATE_MOVES else 1
 
 
-def turned_over(sense: str, field: np.ndarray, *, sign: int = -1,
-                axes: tuple[int, int] = (-2, -1)) -> np.ndarray:
+def turned_over(
+    sense: str, field: np.ndarray, *, sign: int = -1, axes: tuple[int, int] = (-2, -1)
+) -> np.ndarray:
     """Return what the map of the stage is of the solved one, or the solved of that of the stage.
 
     With ``plate_moves`` the equations are solved for H(X) = -G(-X) (method eq. 1.6).
@@ -125,8 +145,9 @@ class GridVisits:
     def of_marks(self, keep: np.ndarray) -> "GridVisits":
         """Return the visits of the marks where `keep` (P,) is true, renumbered."""
         stay = keep[self.mark]
-        columns = {name: column[stay] for name, _ in VISIT_COLUMNS
-                   if len(column := getattr(self, name))}
+        columns = {
+            name: column[stay] for name, _ in VISIT_COLUMNS if len(column := getattr(self, name))
+        }
         return replace(self, **columns | {"mark": (np.cumsum(keep) - 1)[self.mark[stay]]})
 
 
@@ -297,11 +318,13 @@ class Measurements:
 def subset(view: ViewReadings, grid: np.ndarray, lines: np.ndarray) -> ViewReadings:
     """Return the readings of a view where the masks over its marks and lines are true."""
     return replace(
-        view, **{name: getattr(view, name)[grid] for name in ("m", "n", "dx", "dy", "count")},
+        view,
+        **{name: getattr(view, name)[grid] for name in ("m", "n", "dx", "dy", "count")},
         **{name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")},
         u=view.u[grid] if len(view.u) else view.u,
         u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta,
-        visits=None if view.visits is None else view.visits.of_marks(grid))
+        visits=None if view.visits is None else view.visits.of_marks(grid),
+    )
 
 
 def left_out(measurements: Measurements, index: int) -> Measurements:
@@ -309,12 +332,11 @@ def left_out(measurements: Measurements, index: int) -> Measurements:
     view = measurements.views[index]
     lost = int(view.count.sum() + view.count_theta.sum())
     empty = subset(view, np.zeros(len(view.m), dtype=bool), np.zeros(len(view.k), dtype=bool))
-    views = (*measurements.views[:index], _rejecting(empty, lost), *measurements.views[index + 1:])
+    views = (*measurements.views[:index], _rejecting(empty, lost), *measurements.views[index + 1 :])
     return replace(measurements, views=views)
 
 
-def without(measurements: Measurements, gone: Iterable[Key], *,
-            mark: bool = False) -> Measurements:
+def without(measurements: Measurements, gone: Iterable[Key], *, mark: bool = False) -> Measurements:
     """Return the measurement without some readings; `mark` counts them as rejected."""
     views, keys = [], set(gone)
     for index, view in enumerate(measurements.views):
@@ -324,10 +346,12 @@ def without(measurements: Measurements, gone: Iterable[Key], *,
     return replace(measurements, views=tuple(views))
 
 
-def _thinned(view: ViewReadings, marks: set[tuple[int, ...]], lines: set[int], *,
-             mark: bool) -> ViewReadings:
-    keep = np.array([(int(m), int(n)) not in marks for m, n in zip(view.m, view.n, strict=True)],
-                    dtype=bool)
+def _thinned(
+    view: ViewReadings, marks: set[tuple[int, ...]], lines: set[int], *, mark: bool
+) -> ViewReadings:
+    keep = np.array(
+        [(int(m), int(n)) not in marks for m, n in zip(view.m, view.n, strict=True)], dtype=bool
+    )
     stay = np.array([int(k) not in lines for k in view.k], dtype=bool)
     lost = int(view.count[~keep].sum() + view.count_theta[~stay].sum())
     thinned = subset(view, keep, stay)
@@ -372,20 +396,41 @@ def _digest(readings: ViewReadings) -> str:
     digest.update(readings.places.x.tobytes() + readings.places.y.tobytes())
     # the readings, not the settings of the measurement
     view = replace(readings.view, visit_order="", check_marks=0, check_offset_m=0.0)
-    digest.update(repr((view, readings.sigma_xy, readings.sigma_theta, readings.dof_xy,
-                        readings.dof_theta, readings.used, readings.rejected,
-                        *([readings.axis_theta] if readings.axis_theta else []))).encode())
+    digest.update(
+        repr(
+            (
+                view,
+                readings.sigma_xy,
+                readings.sigma_theta,
+                readings.dof_xy,
+                readings.dof_theta,
+                readings.used,
+                readings.rejected,
+                *([readings.axis_theta] if readings.axis_theta else []),
+            )
+        ).encode()
+    )
     return digest.hexdigest()
 
 
 def placing_digest(artifact: Artifact, view: View) -> str:
     """Return a short digest of a plate with its map, and of pose and marks of a view, unnamed."""
-    numbers = (*artifact.shape, artifact.grid_pitch_m, artifact.angular_count, view.rotation_rad,
-               *view.translation_m, view.grid, view.angular, view.repeats,
-               view.check_marks, view.check_offset_m)
+    numbers = (
+        *artifact.shape,
+        artifact.grid_pitch_m,
+        artifact.angular_count,
+        view.rotation_rad,
+        *view.translation_m,
+        view.grid,
+        view.angular,
+        view.repeats,
+        view.check_marks,
+        view.check_offset_m,
+    )
     text = ",".join(float(number).hex() for number in numbers)
-    text += "".join(repr(part) for part in (artifact.map_grid, view.image, artifact.marks)
-                    if part is not None)
+    text += "".join(
+        repr(part) for part in (artifact.map_grid, view.image, artifact.marks) if part is not None
+    )
     text += f",{artifact.harmonics}" if artifact.harmonics else ""
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

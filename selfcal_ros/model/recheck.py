@@ -165,5 +165,8 @@ class Recheck:
 
 def _given(part: Any) -> dict[str, Any]:
     """Return the fields of a dataclass as JSON values, without those that were left out."""
-    return {field.name: plain(value) for field in fields(part)
-            if (value := getattr(part, field.name)) is not None or field.default is MISSING}
+    return {
+        field.name: plain(value)
+        for field in fields(part)
+        if (value := getattr(part, field.name)) is not None or field.default is MISSING
+    }

@@ -136,37 +136,58 @@ class ReferenceLength:
         try:
             first, second, *numbers = text.split(":")
             more = ",0" * (artifact.marks is not None)
-            marks = tuple((whole_number_of(m), whole_number_of(n)) for m, n in (
-                (name + more * ("," not in name)).split(",") for name in (first, second)))
+            marks = tuple(
+                (whole_number_of(m), whole_number_of(n))
+                for m, n in (
+                    (name + more * ("," not in name)).split(",") for name in (first, second)
+                )
+            )
             length, u = map(number_of, numbers)
         except ValueError as error:
             raise InputError(where, f"'{text}' is not {form}:LENGTH:U", example) from error
         for mark in marks:
             if not artifact.has(*map(np.array, mark)):
-                known = "write the ids of marks in its list" if artifact.marks else (
-                    "its marks go from ({}, {}) to ({}, {})".format(
-                        *(end for ends in zip(*artifact.limits, strict=True) for end in ends)))
+                known = (
+                    "write the ids of marks in its list"
+                    if artifact.marks
+                    else (
+                        "its marks go from ({}, {}) to ({}, {})".format(
+                            *(end for ends in zip(*artifact.limits, strict=True) for end in ends)
+                        )
+                    )
+                )
                 raise InputError(where, f"the plate has no mark {mark}", known)
-        nominal = artifact.grid_pitch_m * math.dist(*(
-            tuple(map(float, artifact.places(*map(np.array, mark)))) for mark in marks))
+        nominal = artifact.grid_pitch_m * math.dist(
+            *(tuple(map(float, artifact.places(*map(np.array, mark)))) for mark in marks)
+        )
         if nominal == 0:
             raise InputError(where, f"'{text}' names one mark twice", "name two marks")
-        return cls(ReferenceKind.MARKS, (length - nominal) / nominal, u / nominal, certificate,
-                   marks=marks)
+        return cls(
+            ReferenceKind.MARKS, (length - nominal) / nominal, u / nominal, certificate, marks=marks
+        )
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be relative errors, and marks that are not two."""
         two = len(set(self.marks or ())) == 2 and all(len(mark) == 2 for mark in self.marks or ())
         if (self.kind == ReferenceKind.MARKS) != two:
-            raise InputError("reference length", f"kind '{self.kind}' with the marks {self.marks}",
-                             "the kind 'marks' needs two different marks, other kinds have none")
+            raise InputError(
+                "reference length",
+                f"kind '{self.kind}' with the marks {self.marks}",
+                "the kind 'marks' needs two different marks, other kinds have none",
+            )
         object.__setattr__(self, "kind", ReferenceKind(self.kind))
         if not abs(self.relative_error) < 0.1:
-            raise InputError("reference length", f"{self.relative_error} is not a relative error",
-                             "give (true - nominal) / nominal, below 0.1")
+            raise InputError(
+                "reference length",
+                f"{self.relative_error} is not a relative error",
+                "give (true - nominal) / nominal, below 0.1",
+            )
         if not 0 <= self.u_relative < 0.1:
-            raise InputError("reference length", f"{self.u_relative} is not a standard "
-                             "uncertainty of a relative error", "give a number from 0 to 0.1")
+            raise InputError(
+                "reference length",
+                f"{self.u_relative} is not a standard uncertainty of a relative error",
+                "give a number from 0 to 0.1",
+            )
 
     def at_temperature(self, text: str) -> "ReferenceLength":
         """Return the length at the temperature of the measurement (method eq. 3.10).
@@ -183,38 +204,58 @@ class ReferenceLength:
         InputError
             If the text is something else, or the uncertainties are negative.
         """
-        names = ("temperature_c", "u_temperature_k", "expansion_per_k", "u_expansion_per_k",
-                 "certified_at_c")
+        names = (
+            "temperature_c",
+            "u_temperature_k",
+            "expansion_per_k",
+            "u_expansion_per_k",
+            "certified_at_c",
+        )
         try:
             numbers = [*map(number_of, text.split(":"))]
         except ValueError:
             numbers = []
         known = dict(zip(names, [*numbers, 20.0], strict=False))
-        if len(numbers) not in (4, 5) or not all(map(math.isfinite, numbers)) or min(
-                known["u_temperature_k"], known["u_expansion_per_k"]) < 0 or not (
-                LEAST_EXPANSION_PER_K <= known["expansion_per_k"] <= MAX_EXPANSION_PER_K):
-            raise InputError("reference length", f"'{text}' is not T:U_T:ALPHA:U_ALPHA[:T0]",
-                             "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)")
+        if (
+            len(numbers) not in (4, 5)
+            or not all(map(math.isfinite, numbers))
+            or min(known["u_temperature_k"], known["u_expansion_per_k"]) < 0
+            or not (LEAST_EXPANSION_PER_K <= known["expansion_per_k"] <= MAX_EXPANSION_PER_K)
+        ):
+            raise InputError(
+                "reference length",
+                f"'{text}' is not T:U_T:ALPHA:U_ALPHA[:T0]",
+                "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)",
+            )
         for name in ("temperature_c", "certified_at_c"):
             check_celsius(known[name], "reference length", f" in '{text}'")
         warmer = known["temperature_c"] - known["certified_at_c"]
         sign = 1 if self.kind.of_plate else -1  # a longer scale indicates less
         return replace(
-            self, relative_error=self.relative_error + sign * known["expansion_per_k"] * warmer,
-            u_relative=math.hypot(self.u_relative, known["expansion_per_k"]
-                                  * known["u_temperature_k"], warmer * known["u_expansion_per_k"]),
-            certified=Certified(self.relative_error, self.u_relative, **known))
+            self,
+            relative_error=self.relative_error + sign * known["expansion_per_k"] * warmer,
+            u_relative=math.hypot(
+                self.u_relative,
+                known["expansion_per_k"] * known["u_temperature_k"],
+                warmer * known["u_expansion_per_k"],
+            ),
+            certified=Certified(self.relative_error, self.u_relative, **known),
+        )
 
 
 def reference_to_dict(length: ReferenceLength | None) -> dict[str, Any] | None:
     """Return the JSON form of a reference length; null without one."""
     if length is None:
         return None
-    return {"kind": str(length.kind), "relative_error": length.relative_error,
-            "u_relative": length.u_relative, "certificate": length.certificate,
-            **({"certified": vars(length.certified)} if length.certified else {}),
-            **({"marks": [*map(list, length.marks)]} if length.marks else {}),
-            **({"runs": [*map(reference_to_dict, length.runs)]} if length.runs else {})}
+    return {
+        "kind": str(length.kind),
+        "relative_error": length.relative_error,
+        "u_relative": length.u_relative,
+        "certificate": length.certificate,
+        **({"certified": vars(length.certified)} if length.certified else {}),
+        **({"marks": [*map(list, length.marks)]} if length.marks else {}),
+        **({"runs": [*map(reference_to_dict, length.runs)]} if length.runs else {}),
+    }
 
 
 def reference_from_dict(raw: Any) -> ReferenceLength | None:

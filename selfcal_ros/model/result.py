@@ -241,8 +241,9 @@ class CalibrationResult:
         return bool((np.isfinite(emap.u_gx) & np.isfinite(emap.u_gy)).any())
 
 
-def with_input(result: CalibrationResult, source: dict[str, str],
-               lost: list[str]) -> CalibrationResult:
+def with_input(
+    result: CalibrationResult, source: dict[str, str], lost: list[str]
+) -> CalibrationResult:
     """Return `result` with its input file, and losses in the file as warnings."""
     return replace(with_warnings(result, lost), input=source)
 
@@ -258,23 +259,40 @@ def created_now(result: CalibrationResult) -> CalibrationResult:
     return replace(result, provenance=replace(result.provenance, created=now))
 
 
-def unidentified_result(measurements: Measurements, observability: Observability
-                        ) -> CalibrationResult:
+def unidentified_result(
+    measurements: Measurements, observability: Observability
+) -> CalibrationResult:
     """Return the result of a plan that does not identify the stage, with unknown maps."""
     artifact = measurements.artifact
     grid, circle = np.full(artifact.field.shape, np.nan), np.full(artifact.angular_count, np.nan)
     plate, nan = np.full(artifact.shape, np.nan), math.nan
-    views = tuple(ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m, nan, nan, nan,
-                             v.used, sum(v.rejected.values())) for v in measurements.views)
+    views = tuple(
+        ViewResult(
+            v.view.name,
+            v.view.rotation_rad,
+            *v.view.translation_m,
+            nan,
+            nan,
+            nan,
+            v.used,
+            sum(v.rejected.values()),
+        )
+        for v in measurements.views
+    )
     return CalibrationResult(
         measurements.plan_id,
         ErrorMap(artifact.field, grid, grid, grid, grid, circle, circle, nan, nan),
-        ArtifactMap(plate, plate, circle), views, observability, Noise(nan, nan),
-        measurements.all_rejected(), sense=str(measurements.sense),
+        ArtifactMap(plate, plate, circle),
+        views,
+        observability,
+        Noise(nan, nan),
+        measurements.all_rejected(),
+        sense=str(measurements.sense),
         verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_identified"),)),
         provenance=Provenance(version=__version__),
         run_id=measurements.run_id,
-        placed_plate=artifact.placed)
+        placed_plate=artifact.placed,
+    )
 
 
 def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
@@ -294,29 +312,46 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "plan_id": result.plan_id,
         "method": result.method,
         "measurement_sense": result.sense,
-        "artifact": {**artifact_to_dict(artifact),
-                     **{key: plain(getattr(amap, key))
-                        for key in ("magnification", "u_magnification")}},
+        "artifact": {
+            **artifact_to_dict(artifact),
+            **{key: plain(getattr(amap, key)) for key in ("magnification", "u_magnification")},
+        },
         **({"map": own} if (own := map_to_dict(artifact)) else {}),
         "run_id": result.run_id,
         "verdict": plain(verdict_to_dict(result.verdict)),
         "model": plain(result.model),
         "reference": plain(reference_to_dict(result.reference)),
-        "provenance": plain({"created": provenance.created, "duration_s": provenance.duration_s,
-                             "version": provenance.version, **provenance.extra}),
+        "provenance": plain(
+            {
+                "created": provenance.created,
+                "duration_s": provenance.duration_s,
+                "version": provenance.version,
+                **provenance.extra,
+            }
+        ),
         "dof": plain({kind: result.noise.dof_of(kind) for kind in ("xy", "theta")}),
-        "coverage_factor": plain({kind: getattr(result.noise, f"k_{kind}")
-                                  for kind in ("xy", "theta")}),
-        "views": [{"name": v.name, "rotation": v.rotation, "translation_x": v.translation_x,
-                   "translation_y": v.translation_y,
-                   "misalignment": {key: plain(getattr(v, key)) for key in ("phi", "tx", "ty")},
-                   "used": v.used, "rejected": v.rejected,
-                   "read": {"grid": plain(v.read_grid), "angular": plain(v.read_angular)}}
-                  for v in result.views],
-        "error_map": {**{key: plain(getattr(emap, key)) for key in _MAP_ARRAYS},
-                      "nonorthogonality": plain(emap.nonorthogonality),
-                      "scale_difference": plain(emap.scale_difference),
-                      "datum_theta": str(emap.datum_theta)},
+        "coverage_factor": plain(
+            {kind: getattr(result.noise, f"k_{kind}") for kind in ("xy", "theta")}
+        ),
+        "views": [
+            {
+                "name": v.name,
+                "rotation": v.rotation,
+                "translation_x": v.translation_x,
+                "translation_y": v.translation_y,
+                "misalignment": {key: plain(getattr(v, key)) for key in ("phi", "tx", "ty")},
+                "used": v.used,
+                "rejected": v.rejected,
+                "read": {"grid": plain(v.read_grid), "angular": plain(v.read_angular)},
+            }
+            for v in result.views
+        ],
+        "error_map": {
+            **{key: plain(getattr(emap, key)) for key in _MAP_ARRAYS},
+            "nonorthogonality": plain(emap.nonorthogonality),
+            "scale_difference": plain(emap.scale_difference),
+            "datum_theta": str(emap.datum_theta),
+        },
         "artifact_map": {key: plain(getattr(amap, key)) for key in _PLATE_ARRAYS},
         "observability": _seen_to_dict(result.observability),
         "noise": plain(result.noise),
@@ -382,10 +417,36 @@ def require_unchanged(data: dict[str, Any], where: str) -> bool:
 
 _MAP_ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
 _PLATE_ARRAYS = ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta")
-_KNOWN = {"schema", "run_id", "verdict", "model", "reference", "provenance", "dof",
-          "coverage_factor", "plan_id", "method", "measurement_sense", "artifact", "views",
-          "error_map", "artifact_map", "observability", "noise", "rejected", "warnings", "findings",
-          "budget", "excluded", "input", "map", "recheck", "camera", DIGEST, *KEYS}
+_KNOWN = {
+    "schema",
+    "run_id",
+    "verdict",
+    "model",
+    "reference",
+    "provenance",
+    "dof",
+    "coverage_factor",
+    "plan_id",
+    "method",
+    "measurement_sense",
+    "artifact",
+    "views",
+    "error_map",
+    "artifact_map",
+    "observability",
+    "noise",
+    "rejected",
+    "warnings",
+    "findings",
+    "budget",
+    "excluded",
+    "input",
+    "map",
+    "recheck",
+    "camera",
+    DIGEST,
+    *KEYS,
+}
 
 
 def result_from_dict(data: object, where: str) -> CalibrationResult:
@@ -397,36 +458,50 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
         If the schema differs, or a key is missing or has the wrong shape.
     """
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise InputError(where, f"not a result of schema {SCHEMA}",
-                         "give a RESULT.json that `selfcal solve` wrote")
+        raise InputError(
+            where,
+            f"not a result of schema {SCHEMA}",
+            "give a RESULT.json that `selfcal solve` wrote",
+        )
     try:
         return _parse(data)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         reason = f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
-        raise InputError(where, f"damaged result ({reason})",
-                         "write it again with `selfcal solve`") from error
+        raise InputError(
+            where, f"damaged result ({reason})", "write it again with `selfcal solve`"
+        ) from error
 
 
 def _parse(data: dict) -> CalibrationResult:
     raw = data["artifact"]
     grid, own = data.get("map", {}), read(int, data.get("map", {}).get("harmonics", 0))
-    artifact = Artifact(
-        raw["grid_size"], float(raw["grid_pitch"]), raw["angular_count"],
-        raw.get("grid_size_y", 0)) if "marks" not in raw else artifact_of(
-            {key: raw[key] for key in ("marks", "angular_count")}, "artifact")
+    artifact = (
+        Artifact(
+            raw["grid_size"],
+            float(raw["grid_pitch"]),
+            raw["angular_count"],
+            raw.get("grid_size_y", 0),
+        )
+        if "marks" not in raw
+        else artifact_of({key: raw[key] for key in ("marks", "angular_count")}, "artifact")
+    )
     artifact = replace(artifact, map_grid=map_grid_from_dict(grid), harmonics=own)
     emap, amap = data["error_map"], data["artifact_map"]
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.field.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
     error_map = ErrorMap(
-        artifact.field, **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
+        artifact.field,
+        **{key: _array(emap[key], shape, key) for key, shape in shapes.items()},
         nonorthogonality=read(float, emap["nonorthogonality"]),
         scale_difference=read(float, emap["scale_difference"]),
-        datum_theta=ThetaDatum(emap["datum_theta"]))
+        datum_theta=ThetaDatum(emap["datum_theta"]),
+    )
     seen = _seen_from_dict(read(dict, data["observability"]))
     camera, stage_yaw = shown_by_images(data.get("camera"))
     return CalibrationResult(
-        read(str, data["plan_id"]), error_map, _plate(amap, artifact, raw),
+        read(str, data["plan_id"]),
+        error_map,
+        _plate(amap, artifact, raw),
         views=tuple(map(_view, data["views"])),
         observability=seen,
         noise=read(Noise, data["noise"]),
@@ -447,17 +522,23 @@ def _parse(data: dict) -> CalibrationResult:
         placed_plate=artifact if artifact.map_grid else None,
         recheck=read(Recheck | None, data.get("recheck")),
         camera=camera,
-        stage_yaw=stage_yaw)
+        stage_yaw=stage_yaw,
+    )
 
 
 def _plate(amap: dict, artifact: Artifact, raw: dict) -> ArtifactMap:
     shapes = dict.fromkeys(("ax", "ay", "u_ax", "u_ay"), artifact.shape) | dict.fromkeys(
-        ("a_theta", "u_a_theta"), (artifact.angular_count,))
+        ("a_theta", "u_a_theta"), (artifact.angular_count,)
+    )
     return ArtifactMap(
-        **{key: _array(amap[key], shape, key) for key, shape in shapes.items()
-           if key in ("ax", "ay", "a_theta") or amap.get(key)},
+        **{
+            key: _array(amap[key], shape, key)
+            for key, shape in shapes.items()
+            if key in ("ax", "ay", "a_theta") or amap.get(key)
+        },
         magnification=read(float, raw.get("magnification")),
-        u_magnification=read(float, raw.get("u_magnification")))
+        u_magnification=read(float, raw.get("u_magnification")),
+    )
 
 
 def _view(v: dict) -> ViewResult:
@@ -465,23 +546,37 @@ def _view(v: dict) -> ViewResult:
     if not np.isfinite([turn, x, y]).all():
         raise ValueError(f"the pose of view {v['name']!r} is not finite")
     phi, tx, ty = (read(float, v["misalignment"][key]) for key in ("phi", "tx", "ty"))
-    return ViewResult(read(str, v["name"]), turn, x, y, phi, tx, ty, used=read(int, v["used"]),
-                      rejected=read(int, v["rejected"]),
-                      read_grid=v.get("read", {}).get("grid"),
-                      read_angular=v.get("read", {}).get("angular"))
+    return ViewResult(
+        read(str, v["name"]),
+        turn,
+        x,
+        y,
+        phi,
+        tx,
+        ty,
+        used=read(int, v["used"]),
+        rejected=read(int, v["rejected"]),
+        read_grid=v.get("read", {}).get("grid"),
+        read_angular=v.get("read", {}).get("angular"),
+    )
 
 
 def _seen_to_dict(seen: Observability) -> dict[str, Any]:
     """Return the JSON form of an observability: modes and advice in words."""
-    words = {"modes": [found.text for found in seen.modes],
-             "advice": [found.text for found in seen.advice]}
+    words = {
+        "modes": [found.text for found in seen.modes],
+        "advice": [found.text for found in seen.advice],
+    }
     return plain(replace(seen, modes=(), advice=())) | words
 
 
 def _seen_from_dict(data: dict[str, Any]) -> Observability:
-    words = {name: tuple(Finding("in_words", text=text)
-                         for text in read(tuple[str, ...], data.get(name, [])))
-             for name in ("modes", "advice")}
+    words = {
+        name: tuple(
+            Finding("in_words", text=text) for text in read(tuple[str, ...], data.get(name, []))
+        )
+        for name in ("modes", "advice")
+    }
     return replace(read(Observability, data | {"modes": [], "advice": []}), **words)
 
 

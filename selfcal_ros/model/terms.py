@@ -103,9 +103,13 @@ def nominal_terms(known: Collection[str], *, visits: bool) -> list[ModelTerm]:
 
     `visits`: whether the visits of all views are known, as some terms require.
     """
-    return [ModelTerm(block.name, block.nominal) for block in blocks().values()
-            if block.nominal and not (block.sizes or block.part_of or block.name in known)
-            and (visits or not block.needs_visits)]
+    return [
+        ModelTerm(block.name, block.nominal)
+        for block in blocks().values()
+        if block.nominal
+        and not (block.sizes or block.part_of or block.name in known)
+        and (visits or not block.needs_visits)
+    ]
 
 
 @cache
@@ -129,7 +133,7 @@ def microscope_term(*parts: float) -> ModelTerm:
         half the difference of its scales and half its squareness error; missing ones by default.
     """
     block = block_of_offsets()
-    return ModelTerm(block.name, parts=(*parts, *block.sizes[len(parts):]))
+    return ModelTerm(block.name, parts=(*parts, *block.sizes[len(parts) :]))
 
 
 def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
@@ -175,9 +179,16 @@ def _term(name: str, texts: list[str], where: str) -> ModelTerm:
     if len(sizes) < 2:
         return ModelTerm(name, sizes[0] if sizes else math.inf)
     if len(sizes) != len(parts):
-        raise InputError(where, f"{len(sizes)} sizes are given", "give one" + (
-            f", or those of {':'.join([name, *(part.upper() for part, _ in parts)])}"
-            if parts else ""))
+        raise InputError(
+            where,
+            f"{len(sizes)} sizes are given",
+            "give one"
+            + (
+                f", or those of {':'.join([name, *(part.upper() for part, _ in parts)])}"
+                if parts
+                else ""
+            ),
+        )
     return ModelTerm(name, parts=tuple(sizes))
 
 
@@ -188,12 +199,18 @@ def parse_size(text: str, where: str) -> float:
     except ValueError:
         size = math.nan
     if not 0 <= size < math.inf:
-        raise InputError(where, f"the size '{text}' is not a positive number",
-                         "give a standard deviation in SI units, as in plate_shape:30e-9, or 0 "
-                         "for a term that is known to be zero")
+        raise InputError(
+            where,
+            f"the size '{text}' is not a positive number",
+            "give a standard deviation in SI units, as in plate_shape:30e-9, or 0 "
+            "for a term that is known to be zero",
+        )
     if size and not SMALLEST <= size <= LARGEST:
-        raise InputError(where, f"the size {text} is outside {SMALLEST:g} to {LARGEST:g}",
-                         "give a standard deviation in SI units, as in plate_shape:30e-9")
+        raise InputError(
+            where,
+            f"the size {text} is outside {SMALLEST:g} to {LARGEST:g}",
+            "give a standard deviation in SI units, as in plate_shape:30e-9",
+        )
     return size
 
 
@@ -201,8 +218,12 @@ def with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str,
     """Return the terms, including the microscope's from the plan."""
     if not raw:
         return terms
-    fields = checked_fields(raw, where, {}, {
-        "scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)})
+    fields = checked_fields(
+        raw,
+        where,
+        {},
+        {"scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)},
+    )
     declared = microscope_term(*(parse_size(f"{size:g}", where) for size in fields.values()))
     if any(term.partition(":")[0] == declared.name for term in terms):
         raise InputError(where, "model_terms has a microscope as well", "leave one of them out")

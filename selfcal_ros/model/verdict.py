@@ -258,18 +258,33 @@ def finding_to_dict(found: Finding) -> dict[str, Any]:
 
 def findings_from_list(kind: type, data: Any) -> tuple:
     """Return findings, or causes."""
-    return tuple(read(kind, found | {"remedies": [
-        {"kind": name, "value": value} for remedy in found.get("remedies", [])
-        for name, value in remedy.items()]}) for found in read(list, data))
+    return tuple(
+        read(
+            kind,
+            found
+            | {
+                "remedies": [
+                    {"kind": name, "value": value}
+                    for remedy in found.get("remedies", [])
+                    for name, value in remedy.items()
+                ]
+            },
+        )
+        for found in read(list, data)
+    )
 
 
 def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
     """Return the JSON form of a verdict; ValueError if it has no sentences."""
-    return {"qualified": verdict.qualified, "grade": str(verdict.grade),
-            "sentence": verdict.sentence, "reasons": list(verdict.reasons),
-            "failed": [finding_to_dict(found) for found in verdict.failed],
-            "causes": [finding_to_dict(cause) for cause in verdict.causes],
-            "enlarged_by": [vars(item) for item in verdict.enlarged_by]}
+    return {
+        "qualified": verdict.qualified,
+        "grade": str(verdict.grade),
+        "sentence": verdict.sentence,
+        "reasons": list(verdict.reasons),
+        "failed": [finding_to_dict(found) for found in verdict.failed],
+        "causes": [finding_to_dict(cause) for cause in verdict.causes],
+        "enlarged_by": [vars(item) for item in verdict.enlarged_by],
+    }
 
 
 def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
@@ -282,10 +297,13 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
     if qualified is (grade is Grade.NOT_QUALIFIED):
         raise ValueError(f"the grade '{grade}' contradicts qualified {qualified}")
     return Verdict(
-        grade, findings_from_list(Finding, data.get("failed", [])),
+        grade,
+        findings_from_list(Finding, data.get("failed", [])),
         findings_from_list(Cause, data["causes"]),
         read(tuple[Enlargement, ...], data.get("enlarged_by", [])),
-        read(str, data["sentence"]), read(tuple[str, ...], data["reasons"]))
+        read(str, data["sentence"]),
+        read(tuple[str, ...], data["reasons"]),
+    )
 
 
 def line_to_dict(line: BudgetLine) -> dict[str, Any]:
@@ -296,13 +314,22 @@ def line_to_dict(line: BudgetLine) -> dict[str, Any]:
 def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
     """Return the lines of a budget."""
     return tuple(
-        read(BudgetLine, row | {"dof": math.inf if row["dof"] is None else row["dof"],
-                                  "kind": row["type"]})
-        for row in (read(dict, one) for one in read(list, rows)))
+        read(
+            BudgetLine,
+            row | {"dof": math.inf if row["dof"] is None else row["dof"], "kind": row["type"]},
+        )
+        for row in (read(dict, one) for one in read(list, rows))
+    )
 
 
 def provenance_from_dict(data: dict | None) -> Provenance:
     """Return the provenance of a result, as far as known."""
     known = ("created", "duration_s", "version")
-    return Provenance() if data is None else read(Provenance, data | {
-        "extra": {key: value for key, value in data.items() if key not in known}})
+    return (
+        Provenance()
+        if data is None
+        else read(
+            Provenance,
+            data | {"extra": {key: value for key, value in data.items() if key not in known}},
+        )
+    )

@@ -66,8 +66,11 @@ def parse_order(text: str, where: str = "visit_order") -> VisitOrder:
     """
     name = text.removesuffix(PLATE_SUFFIX)
     if name not in ORDERS:
-        raise InputError(where, f"'{text}' is not a visiting order",
-                         f"use one of {', '.join(ORDERS)}, if need be with {PLATE_SUFFIX}")
+        raise InputError(
+            where,
+            f"'{text}' is not a visiting order",
+            f"use one of {', '.join(ORDERS)}, if need be with {PLATE_SUFFIX}",
+        )
     return VisitOrder(name, name != text)
 
 
@@ -144,8 +147,12 @@ class View:
             return (self,)
         out = []
         for cell in self.image.cells:
-            view = replace(self, name=self.name + cell_label(cell), cell=cell,
-                           angular=self.angular and cell == (0, 0))
+            view = replace(
+                self,
+                name=self.name + cell_label(cell),
+                cell=cell,
+                angular=self.angular and cell == (0, 0),
+            )
             x, y = self.translation_m
             out.append(replace(view, translation_m=(x - view.cell_m.real, y - view.cell_m.imag)))
         return tuple(out)
@@ -160,16 +167,25 @@ class View:
         if not self.check_marks and not self.check_offset_m:
             return
         if self.check_marks < 1 or not self.check_offset_m > 0:
-            raise InputError(where, f"{self.check_marks} marks, {self.check_offset_m:g} m off",
-                             "give both marks and offset, e.g. {marks: 5, offset: 20e-6}")
+            raise InputError(
+                where,
+                f"{self.check_marks} marks, {self.check_offset_m:g} m off",
+                "give both marks and offset, e.g. {marks: 5, offset: 20e-6}",
+            )
         most = MOST_CHECK_OFFSET * artifact.grid_pitch_m
         if self.check_offset_m > most:
-            raise InputError(where, f"{self.check_offset_m:g} m is more than a quarter of the "
-                             "pitch", f"stop at most {most:g} m off the mark; 20e-6 is usual")
+            raise InputError(
+                where,
+                f"{self.check_offset_m:g} m is more than a quarter of the pitch",
+                f"stop at most {most:g} m off the mark; 20e-6 is usual",
+            )
         there = self.on_stage(artifact).n_in_field(artifact) if self.grid else 0
         if self.check_marks > there:
-            raise InputError(where, f"{self.check_marks} marks are requested, {there} lie in the "
-                             "field", "ask for fewer marks")
+            raise InputError(
+                where,
+                f"{self.check_marks} marks are requested, {there} lie in the field",
+                "ask for fewer marks",
+            )
 
     @property
     def pose(self) -> Pose:
@@ -201,20 +217,29 @@ class View:
             not a whole quarter.
         """
         where, beside = f"view '{self.name}'", self._beside(artifact)
-        a, b = (self._half_steps(step, artifact) if beside else whole_steps(
-            step, f"{where} translation", "pitch", f"place the plate on the {OFF}")
-            for step in self._pitches(artifact))
+        a, b = (
+            self._half_steps(step, artifact)
+            if beside
+            else whole_steps(step, f"{where} translation", "pitch", f"place the plate on the {OFF}")
+            for step in self._pitches(artifact)
+        )
         quarter = nearest_step(self.rotation_rad / (math.pi / 2))
         if self.grid and quarter is None:
-            raise InputError(where, f"grid marks cannot be measured at a turn of "
-                             f"{math.degrees(self.rotation_rad):.6g} deg",
-                             f"turn by 90 deg, set grid to false, or place it on the {OFF}")
+            raise InputError(
+                where,
+                f"grid marks cannot be measured at a turn of "
+                f"{math.degrees(self.rotation_rad):.6g} deg",
+                f"turn by 90 deg, set grid to false, or place it on the {OFF}",
+            )
         lines = turn_in_lines(self.rotation_rad, artifact)
         if lines is None and artifact.angular_count and (self.angular or quarter is None):
             lines = self._lines(artifact)
         if lines is None and quarter is None:
-            raise InputError(where, "a turn that is not a quarter needs angular lines",
-                             "turn by a multiple of 90 deg")
+            raise InputError(
+                where,
+                "a turn that is not a quarter needs angular lines",
+                "turn by a multiple of 90 deg",
+            )
         return LatticePose(None if quarter is None else quarter % 4, (a, b), lines)
 
     def is_on_lattice(self, artifact: Artifact) -> bool:
@@ -235,32 +260,49 @@ class View:
         whole = nearest_step(step - 0.5)
         if whole is None:
             nx, ny = artifact.shape
-            raise InputError(f"view '{self.name}' translation", f"after a quarter turn the rows of "
-                             f"{nx} x {ny} marks lie between rows at a shift of {step:.6g} pitch",
-                             f"shift it by [0.5, 0.5] pitch to place it on the {OFF}")
+            raise InputError(
+                f"view '{self.name}' translation",
+                f"after a quarter turn the rows of "
+                f"{nx} x {ny} marks lie between rows at a shift of {step:.6g} pitch",
+                f"shift it by [0.5, 0.5] pitch to place it on the {OFF}",
+            )
         return whole + 0.5
 
     def _pitches(self, artifact: Artifact) -> tuple[float, float]:
         """Return the translation in pitches; InputError unless the pose is finite."""
         where = f"view '{self.name}'"
         if not all(map(math.isfinite, self.translation_m)):
-            raise InputError(f"{where} translation", f"{self.translation_m} are not two lengths",
-                             "give a finite translation")
+            raise InputError(
+                f"{where} translation",
+                f"{self.translation_m} are not two lengths",
+                "give a finite translation",
+            )
         if not math.isfinite(self.rotation_rad):
-            raise InputError(f"{where} rotation", f"{self.rotation_rad} is not an angle",
-                             "give a finite turn")
+            raise InputError(
+                f"{where} rotation", f"{self.rotation_rad} is not an angle", "give a finite turn"
+            )
         a, b = (value / artifact.grid_pitch_m for value in self.translation_m)
         if max(abs(a), abs(b)) > MAX_SHIFT + 0.5:
-            raise InputError(f"{where} translation", f"{max(a, b, key=abs):.6g} pitches are beyond "
-                             "every field", "is it in mm? give the translation in metres")
+            raise InputError(
+                f"{where} translation",
+                f"{max(a, b, key=abs):.6g} pitches are beyond every field",
+                "is it in mm? give the translation in metres",
+            )
         return a, b
 
     def _lines(self, artifact: Artifact) -> float:
         """Return the turn in angular lines, 0 to K; whole unless the map is a Fourier series."""
         lines = turn_in_lines(self.rotation_rad, artifact)
-        return lines if lines is not None else whole_steps(
-            self.rotation_rad * artifact.angular_count / math.tau, f"view '{self.name}' rotation",
-            "angular line", "turn by whole lines, or set angular to false, or give map: harmonics")
+        return (
+            lines
+            if lines is not None
+            else whole_steps(
+                self.rotation_rad * artifact.angular_count / math.tau,
+                f"view '{self.name}' rotation",
+                "angular line",
+                "turn by whole lines, or set angular to false, or give map: harmonics",
+            )
+        )
 
 
 def with_sub_views(views: Iterable[View]) -> tuple[View, ...]:
@@ -271,8 +313,10 @@ def with_sub_views(views: Iterable[View]) -> tuple[View, ...]:
 def placings_of(views: Iterable[View]) -> tuple[int, ...]:
     """Return the first of the views that belong to the same placing of the plate, for each view."""
     first: dict[str, int] = {}
-    return tuple(row if view.cell is None else first.setdefault(view.plan_view, row)
-                 for row, view in enumerate(views))
+    return tuple(
+        row if view.cell is None else first.setdefault(view.plan_view, row)
+        for row, view in enumerate(views)
+    )
 
 
 def rotations_of(views: Sequence[View]) -> tuple[int, ...]:
@@ -280,18 +324,21 @@ def rotations_of(views: Sequence[View]) -> tuple[int, ...]:
     return shared_rotations(placings_of(views), [view.cell or (0, 0) for view in views])
 
 
-def shared_rotations(placings: Sequence[int],
-                     cells: Sequence[tuple[int, int]]) -> tuple[int, ...]:
+def shared_rotations(placings: Sequence[int], cells: Sequence[tuple[int, int]]) -> tuple[int, ...]:
     """Return the same for views with the placings `placings`, and their cells in the image.
 
     A turned plate moves the marks in the image, and the camera's error there differs from that at
     the middle of the cell: where it is known in x and y, readings are freed from it. Cells in one
     line do not tell it: then each has a rotation of its own.
     """
-    seen = {placing: [cell for one, cell in zip(placings, cells, strict=True) if one == placing]
-            for placing in placings}
-    return tuple(placing if all(len(set(along)) > 1 for along in zip(*seen[placing], strict=True))
-                 else row for row, placing in enumerate(placings))
+    seen = {
+        placing: [cell for one, cell in zip(placings, cells, strict=True) if one == placing]
+        for placing in placings
+    }
+    return tuple(
+        placing if all(len(set(along)) > 1 for along in zip(*seen[placing], strict=True)) else row
+        for row, placing in enumerate(placings)
+    )
 
 
 CellsSeen = Sequence[tuple[Any, tuple[int, int]]]

@@ -50,8 +50,14 @@ class VisitSequence:
         return len(self.m)
 
 
-def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecutive: bool = False,
-                   rng: np.random.Generator | None = None) -> VisitSequence:
+def visit_sequence(
+    artifact: Artifact,
+    view: View,
+    *,
+    order: str = "",
+    consecutive: bool = False,
+    rng: np.random.Generator | None = None,
+) -> VisitSequence:
     """Return the order in which the grid marks of a view are visited.
 
     Parameters
@@ -92,8 +98,9 @@ def visit_sequence(artifact: Artifact, view: View, *, order: str = "", consecuti
     return _visits(marks, sites, passes, together=view.repeats if consecutive else 1, view=view)
 
 
-def stage_targets(artifact: Artifact, view: View, visits: VisitSequence,
-                  sense: Sense) -> np.ndarray:
+def stage_targets(
+    artifact: Artifact, view: View, visits: VisitSequence, sense: Sense
+) -> np.ndarray:
     """Return the stage position at which the mark of each visit is on the axis, (2, V), m.
 
     Without `VisitSequence.aside_m`, if plate and stage were perfect.
@@ -105,8 +112,9 @@ def stage_targets(artifact: Artifact, view: View, visits: VisitSequence,
     return sense.sign * site
 
 
-def line_targets(artifact: Artifact, view: View, sense: Sense, *,
-                 consecutive: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def line_targets(
+    artifact: Artifact, view: View, sense: Sense, *, consecutive: bool = False
+) -> tuple[np.ndarray, np.ndarray]:
     """Return line and angle of the stage of each exposure of the angular lines of a view.
 
     Parameters
@@ -134,8 +142,14 @@ def line_targets(artifact: Artifact, view: View, sense: Sense, *,
     return k, centre[k]
 
 
-def _passes(order: VisitOrder, places: np.ndarray, lines: np.ndarray, *, n_passes: int,
-            rng: np.random.Generator | None) -> np.ndarray:
+def _passes(
+    order: VisitOrder,
+    places: np.ndarray,
+    lines: np.ndarray,
+    *,
+    n_passes: int,
+    rng: np.random.Generator | None,
+) -> np.ndarray:
     """Return the indices of `places` (2, n) in the order of their visits, (passes, n).
 
     `lines` (2, n): their row and column.
@@ -147,16 +161,19 @@ def _passes(order: VisitOrder, places: np.ndarray, lines: np.ndarray, *, n_passe
     (x, y), (row, column) = places, lines
     # line by line along x: each line runs along y
     along_x, along_y = np.lexsort((y, row)), np.lexsort((x, column))
-    cycle = {"raster": (along_x,),
-             "serpentine": (np.lexsort((np.where((row - row.min()) % 2, -y, y), row)),),
-             "there_and_back": (along_x, along_x[::-1]),
-             "x_then_y": (along_x, along_y),
-             "x_back_y_back": (along_x, along_x[::-1], along_y, along_y[::-1])}[order.name]
+    cycle = {
+        "raster": (along_x,),
+        "serpentine": (np.lexsort((np.where((row - row.min()) % 2, -y, y), row)),),
+        "there_and_back": (along_x, along_x[::-1]),
+        "x_then_y": (along_x, along_y),
+        "x_back_y_back": (along_x, along_x[::-1], along_y, along_y[::-1]),
+    }[order.name]
     return np.stack([cycle[number % len(cycle)] for number in range(n_passes)])
 
 
-def _visits(marks: np.ndarray, sites: np.ndarray, passes: np.ndarray, *, together: int,
-            view: View) -> VisitSequence:
+def _visits(
+    marks: np.ndarray, sites: np.ndarray, passes: np.ndarray, *, together: int, view: View
+) -> VisitSequence:
     """Return the visits of passes (P, n) in which each mark is exposed `together` times.
 
     Check stops come half way, one exposure each. All marks are measured from +x, then all in the
@@ -189,7 +206,8 @@ def check_marks(sites: np.ndarray, number: int) -> np.ndarray:
     angle = np.pi / 4 + 2 * np.pi * np.arange(number - 1) / max(number - 1, 1)
     out = np.sqrt(0.5) * np.stack([np.cos(angle), np.sin(angle)])  # half way to the corners
     targets = middle[:, None] + np.ptp(sites, axis=1)[:, None] / 2 * np.hstack(
-        [np.zeros((2, 1)), out])
+        [np.zeros((2, 1)), out]
+    )
     chosen: list[int] = []
     for target in targets.T:
         away = np.round(np.hypot(*(sites - target[:, None])), 6)  # the first of equals

@@ -28,9 +28,14 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         self.finished = Future()
         self.exit_code = ExitCode.DONE
         listener, patience_s = self.settings.listener, self.settings.wait_for_subscribers
-        self.player = Player(self, self.settings.bag, rate=self.settings.rate,
-                             seed=self.settings.seed, listener=listener or CollectorSettings.NODE,
-                             beside_others=self.settings.beside_others)
+        self.player = Player(
+            self,
+            self.settings.bag,
+            rate=self.settings.rate,
+            seed=self.settings.seed,
+            listener=listener or CollectorSettings.NODE,
+            beside_others=self.settings.beside_others,
+        )
         self._patience = time.monotonic() + patience_s
         self._waits = bool(listener and patience_s)
         self._started = False
@@ -57,7 +62,8 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             return
         try:
             self._started = self._started or (
-                self.player.is_alone() and (not self._waits or self._is_heard()))
+                self.player.is_alone() and (not self._waits or self._is_heard())
+            )
             if self._started:
                 self.player.step()
         except SelfcalError as error:
@@ -73,14 +79,22 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             self.finished.set_result(None)
 
     def _is_heard(self) -> bool:
-        missing = [f"{node} does not listen to {', '.join(topics)}" for node, topics in (
-            (self.player.listener, self.player.unheard()),
-            (self.player.detector, self.player.unseen())) if topics]
+        missing = [
+            f"{node} does not listen to {', '.join(topics)}"
+            for node, topics in (
+                (self.player.listener, self.player.unheard()),
+                (self.player.detector, self.player.unseen()),
+            )
+            if topics
+        ]
         if missing and time.monotonic() > self._patience:
             raise InputError(
-                "bag_player", f"{' and '.join(missing)} "
-                f"after {self.settings.wait_for_subscribers:g} s, nothing was played", "start it, "
-                "name another node as listener, or set listener to '' to play without waiting")
+                "bag_player",
+                f"{' and '.join(missing)} "
+                f"after {self.settings.wait_for_subscribers:g} s, nothing was played",
+                "start it, "
+                "name another node as listener, or set listener to '' to play without waiting",
+            )
         return not missing
 
 

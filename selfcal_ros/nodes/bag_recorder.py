@@ -31,8 +31,12 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
             self._writer.add_topic(name, typename, [offered(topic)], heard)
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
-        MatchedInput(self, names.ENCODER_EITHER, partial(
-            self._record, kept_names(self, names.ENCODER)[0]), raw=True)
+        MatchedInput(
+            self,
+            names.ENCODER_EITHER,
+            partial(self._record, kept_names(self, names.ENCODER)[0]),
+            raw=True,
+        )
         self._failed, self._unrecorded = "", 0
         self.every(1.0, self._flush)
 
@@ -48,8 +52,11 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
     def _fail(self, error: InputError) -> None:
         """Stop recording: after an incomplete write, later messages could not be read."""
         self._failed, self._unrecorded = str(error), self._unrecorded + 1
-        self.say(Level.ERROR, f"recording has ended: {error}; what was recorded is readable, "
-                 "start again in another folder")
+        self.say(
+            Level.ERROR,
+            f"recording has ended: {error}; what was recorded is readable, "
+            "start again in another folder",
+        )
 
     def _flush(self) -> None:
         if not self._failed:
@@ -61,8 +68,11 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
     def diagnosis(self) -> Diagnosis:
         """Return the number of recorded messages, or why recording has ended."""
         if self._failed:
-            return Diagnosis(Level.ERROR, f"recording has ended: {self._failed}",
-                             self._writer.counts | {"unrecorded": self._unrecorded})
+            return Diagnosis(
+                Level.ERROR,
+                f"recording has ended: {self._failed}",
+                self._writer.counts | {"unrecorded": self._unrecorded},
+            )
         return Diagnosis(Level.OK, "recording", self._writer.counts)
 
     def close(self) -> None:

@@ -50,9 +50,14 @@ class NodeBase[S: Settings](Answering):
         self._heard_on: dict[str, Topic] = {}
         try:
             self._take_parameters(kind)
-            self.set_descriptor("use_sim_time", ParameterDescriptor(
-                type=ParameterType.PARAMETER_BOOL, read_only=True,
-                description="take the time of stamps from /clock"))
+            self.set_descriptor(
+                "use_sim_time",
+                ParameterDescriptor(
+                    type=ParameterType.PARAMETER_BOOL,
+                    read_only=True,
+                    description="take the time of stamps from /clock",
+                ),
+            )
         except InputError:
             self.destroy_node()  # otherwise its name stays in the graph until garbage collection
             raise
@@ -64,16 +69,21 @@ class NodeBase[S: Settings](Answering):
         overrides = {key: value.value for key, value in self._parameter_overrides.items()}
         self.settings = kind.checked(overrides, f"parameters of {kind.NODE}")
         for parameter in kind.parameters():  # the checked value: 2 is accepted as 2.0
-            self.declare_parameter(parameter.name, getattr(self.settings, parameter.name),
-                                   descriptor(parameter), ignore_override=True)
+            self.declare_parameter(
+                parameter.name,
+                getattr(self.settings, parameter.name),
+                descriptor(parameter),
+                ignore_override=True,
+            )
         for key in (key for key, value in overrides.items() if value is True):
             if getattr(self.settings, key, "") == BARE_Y:
                 self.say(Level.OK, f"{key}: true is a bare y as ROS reads it; taken as 'y'")
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return a publisher of `topic`."""
-        return self.own(self.create_publisher(topic.type, topic.name, topic.qos),
-                        self.destroy_publisher)
+        return self.own(
+            self.create_publisher(topic.type, topic.name, topic.qos), self.destroy_publisher
+        )
 
     def output(self, topic: Topic) -> Callable[[dict[str, Any]], None]:
         """Return a function that publishes the fields of a message on `topic`."""
@@ -83,20 +93,26 @@ class NodeBase[S: Settings](Answering):
     def subscribe(self, topic: Topic, callback: Callable[..., None], **kwargs: Any) -> Any:
         """Subscribe `callback` to `topic`; its exceptions are counted and do not end the node."""
         name = self.resolve_topic_name(topic.name)
-        guarded = callback if hasattr(callback, "__signature__") else self.guarded(
-            callback, topic.name)
+        guarded = (
+            callback if hasattr(callback, "__signature__") else self.guarded(callback, topic.name)
+        )
         self._heard_on[name] = topic
 
         def lost(event: Any) -> None:
             if topic.qos.depth > 1:  # otherwise only the newest is used: the others are not lost
                 self.losses.add(topic.name, event.total_count_change)
-        events = SubscriptionEventCallbacks(message_lost=lost)
-        return self.own(self.create_subscription(
-            topic.type, topic.name, guarded, topic.qos, event_callbacks=events, **kwargs),
-            self.destroy_subscription)
 
-    def subscribe_with_age(self, topic: Topic, callback: Callable[[Any, bool], None],
-                           **kwargs: Any) -> Any:
+        events = SubscriptionEventCallbacks(message_lost=lost)
+        return self.own(
+            self.create_subscription(
+                topic.type, topic.name, guarded, topic.qos, event_callbacks=events, **kwargs
+            ),
+            self.destroy_subscription,
+        )
+
+    def subscribe_with_age(
+        self, topic: Topic, callback: Callable[[Any, bool], None], **kwargs: Any
+    ) -> Any:
         """Subscribe `callback`; its second argument is whether the message is older than this call.
 
         Only a latched message, published before the subscription, can be.
@@ -107,6 +123,7 @@ class NodeBase[S: Settings](Answering):
             # the events executor of rclpy 7.1 passes message and info as one pair
             message, info = received[0] if len(received) == 1 else received
             callback(message, info["source_timestamp"] < began_ns)
+
         return self.subscribe(topic, WithInfo(self.guarded(call, topic.name)), **kwargs)
 
     def every(self, seconds: float, callback: Callable[[], None]) -> Timer:
@@ -116,8 +133,9 @@ class NodeBase[S: Settings](Answering):
         every due timer of the same clock, and each call delays the next by a period:
         the health of a node that starts slowly would be published three times, then not for 3 s.
         """
-        timer = self.create_timer(seconds, self.guarded(callback),
-                                  clock=Clock(clock_type=ClockType.STEADY_TIME))
+        timer = self.create_timer(
+            seconds, self.guarded(callback), clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         return self.own(timer, self.destroy_timer)
 
     def own(self, entity: Any, destroy: Callable[[Any], Any]) -> Any:
@@ -126,8 +144,7 @@ class NodeBase[S: Settings](Answering):
 
     def ports(self, publish: Callable[[str, dict[str, Any]], None]) -> Ports:
         """Return the ports of this node for a session; `publish` takes its outputs."""
-        return Ports(publish, self.say, time.monotonic,
-                     lambda: self.get_clock().now().nanoseconds)
+        return Ports(publish, self.say, time.monotonic, lambda: self.get_clock().now().nanoseconds)
 
     def say(self, level: Level, line: str) -> None:
         """Write one line to the log."""
@@ -146,10 +163,16 @@ class NodeBase[S: Settings](Answering):
     def report(self) -> None:
         """Publish the health of this node."""
         graph = [mismatched(self, self._heard_on), others_publishing(self, self.alone_on)]
-        clock = self._ros_time.look(simulated=self.get_parameter("use_sim_time").value,
-                                    now_ns=self.get_clock().now().nanoseconds)
-        self.diagnose(merged(self.diagnosis(), [
-            self.refusals.diagnosis(), self.losses.diagnosis(), clock, *graph]))
+        clock = self._ros_time.look(
+            simulated=self.get_parameter("use_sim_time").value,
+            now_ns=self.get_clock().now().nanoseconds,
+        )
+        self.diagnose(
+            merged(
+                self.diagnosis(),
+                [self.refusals.diagnosis(), self.losses.diagnosis(), clock, *graph],
+            )
+        )
 
     def diagnose(self, diagnosis: Diagnosis) -> None:
         """Publish a diagnostic status of this node, on /diagnostics and on its health topic."""
@@ -187,8 +210,9 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
     if low is None or high is None:
         return described
     if isinstance(parameter.default, float):
-        described.floating_point_range = [FloatingPointRange(
-            from_value=float(low), to_value=float(high))]
+        described.floating_point_range = [
+            FloatingPointRange(from_value=float(low), to_value=float(high))
+        ]
     else:
         described.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     return described

@@ -53,6 +53,7 @@ class Guarded(Node):
         """Return `callback` with exceptions counted and logged instead of raised."""
         place = place or getattr(callback, "__name__", "callback").strip("_")
         if inspect.iscoroutinefunction(callback):
+
             @wraps(callback)
             async def task(*args: Any) -> Any:
                 try:
@@ -60,6 +61,7 @@ class Guarded(Node):
                 except Exception as error:
                     self.refusals.add(place, error)
                     return None
+
             return task
 
         @wraps(callback)
@@ -69,6 +71,7 @@ class Guarded(Node):
             except Exception as error:
                 self.refusals.add(place, error)
                 return None
+
         return call
 
     @property
@@ -107,6 +110,7 @@ class Guarded(Node):
             except Exception as error:
                 self.refusals.add(place, error)
                 return failed(request, response, error)
+
         service.callback = call
         service.send_response = self.guarded(service.send_response, place)
 

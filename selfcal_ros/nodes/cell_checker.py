@@ -36,11 +36,17 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         super().__init__(CollectorSettings, **kwargs)
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._said = 0
-        self._outputs = {"command": self.output(names.NEWEST_COMMAND),
-                         "status": self.output(names.STATUS)}
-        self.session = CellCheck(plan, self.settings, self.ports(
-            lambda output, fields: self._outputs[output](fields)),
-            settle_s=settle_s, patience_s=patience_s)
+        self._outputs = {
+            "command": self.output(names.NEWEST_COMMAND),
+            "status": self.output(names.STATUS),
+        }
+        self.session = CellCheck(
+            plan,
+            self.settings,
+            self.ports(lambda output, fields: self._outputs[output](fields)),
+            settle_s=settle_s,
+            patience_s=patience_s,
+        )
         MatchedInput(self, names.ENCODER_EITHER, self.session.take_encoder)
         self.subscribe(names.DETECTIONS, self.session.take_detection)
         for node in OF_A_CELL:
@@ -66,11 +72,13 @@ class CellChecker(SelfcalNode[CollectorSettings]):
             self._end(ExitCode.BAD_INPUT)
             return
         for topic in (names.ENCODER.name, names.DETECTIONS.name):
-            nodes = [offer.node_name for offer in self.get_publishers_info_by_topic(
-                self.resolve_topic_name(topic))]
+            nodes = [
+                offer.node_name
+                for offer in self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+            ]
             self.session.publishers[topic] = sorted(nodes)
         self.session.tick()
-        for item in self.session.items[self._said:]:
+        for item in self.session.items[self._said :]:
             print(json.dumps(asdict(item)), flush=True)
         self._said = len(self.session.items)
         if self.session.done:

@@ -28,8 +28,9 @@ class CellDriver(CellNode[DriverSettings]):
         cell = read_cell(self.settings.cell)
         self._driver = Driver(cell, open_machine(cell), lambda line: self.say(Level.ERROR, line))
         self.publish(images=False)
-        self.subscribe(names.COMMAND, lambda message: self._driver.take_command(
-            to_model.command(message)))
+        self.subscribe(
+            names.COMMAND, lambda message: self._driver.take_command(to_model.command(message))
+        )
         self.subscribe(names.STATUS_AS_IT_COMES, self._driver.take_status)
         self.every(TICK_S, self._tell)
 

@@ -44,8 +44,9 @@ class MapsOfOneNode:
         The topics, and what takes a message of each.
     """
 
-    def __init__(self, node: "CompensatorNode",
-                 inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]]) -> None:
+    def __init__(
+        self, node: "CompensatorNode", inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]]
+    ) -> None:
         self._node = node
         self._inputs = [(topic, node.guarded(take, topic.name)) for topic, take in inputs]
         self._waiting: deque[tuple[float, str, Callable[[], None]]] = deque()
@@ -77,12 +78,16 @@ class MapsOfOneNode:
         of_topic = [one for one in self._waiting if one[1] == topic]
         if len(of_topic) > MOST_WAITING:
             self._waiting.remove(of_topic[0])
-            raise InputError(topic, f"a message is not used: more than {MOST_WAITING} within "
-                             f"{ALONE_S:g} s", "publish each map once")
+            raise InputError(
+                topic,
+                f"a message is not used: more than {MOST_WAITING} within {ALONE_S:g} s",
+                "publish each map once",
+            )
 
     def _of_several(self, topic: str) -> InputError:
-        return InputError(topic, f"a message is not used: {self._rivals}",
-                          "end all publishers but one")
+        return InputError(
+            topic, f"a message is not used: {self._rivals}", "end all publishers but one"
+        )
 
     def _has_rivals(self) -> bool:
         rivals = names.rivals(self._node, [topic.name for topic, _ in self._inputs])
@@ -130,15 +135,24 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         self.session = CompensatingSession(self.settings, self.ports(lambda *_: None))
         self._corrected = self.publisher(names.CORRECTED)
         self._commands = self.publisher(names.CORRECTED_MOTION)
-        self.alone_on += [names.ERROR_MAP.name, names.SUMMARY.name, names.CORRECTED.name,
-                          names.CORRECTED_MOTION.name]
+        self.alone_on += [
+            names.ERROR_MAP.name,
+            names.SUMMARY.name,
+            names.CORRECTED.name,
+            names.CORRECTED_MOTION.name,
+        ]
 
     def activate(self) -> None:
         """Subscribe to the maps and to the encoder."""
-        self._maps = MapsOfOneNode(self, [(names.SUMMARY, self.session.take_summary),
-                                          (names.ERROR_MAP, self.session.take_map)])
-        self._input = ByTheClock(names.ENCODER.name, self.session.receive,
-                                 self.guarded(self._on_samples, names.ENCODER.name))
+        self._maps = MapsOfOneNode(
+            self,
+            [(names.SUMMARY, self.session.take_summary), (names.ERROR_MAP, self.session.take_map)],
+        )
+        self._input = ByTheClock(
+            names.ENCODER.name,
+            self.session.receive,
+            self.guarded(self._on_samples, names.ENCODER.name),
+        )
         self._encoder = self.subscribe(names.ENCODER_NEWEST, self._input, raw=True)
         self.subscribe(names.MOTION, self._on_command, raw=True)
         self.service(Correct, "~/correct", self._correct)

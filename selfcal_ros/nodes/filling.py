@@ -71,11 +71,14 @@ def map_geometry(error_map: ErrorMap) -> MapGeometry:
     ends = np.stack((sites, sites + factor * errors), axis=1).reshape(-1, 3)
     u = np.hypot(error_map.u_gx[shown], error_map.u_gy[shown])
     largest = float(np.max(u, where=np.isfinite(u), initial=0.0))
-    legend = (f"stage error (indicated - true), enlarged {factor:,.0f} x, longest "
-              f"{longest * UM_PER_M:.3g} um; dark: u = {largest * UM_PER_M:.3g} um (k=1)")
+    legend = (
+        f"stage error (indicated - true), enlarged {factor:,.0f} x, longest "
+        f"{longest * UM_PER_M:.3g} um; dark: u = {largest * UM_PER_M:.3g} um (k=1)"
+    )
     below = -(artifact.half[1] * artifact.grid_pitch_m + 1.5 * spacing)
-    return MapGeometry(factor, ends, sites, _colours(u, largest), spacing, legend,
-                       (0.0, below, 0.0))
+    return MapGeometry(
+        factor, ends, sites, _colours(u, largest), spacing, legend, (0.0, below, 0.0)
+    )
 
 
 def enlargement(spacing_m: float, longest_m: float) -> float:
@@ -112,17 +115,25 @@ def fill(message: Any, fields: dict[str, Any]) -> Any:
 def status_of(diagnosis: Diagnosis, name: str, hardware_id: str) -> DiagnosticStatus:
     """Return the status message of a diagnosis; control characters are made visible."""
     return DiagnosticStatus(
-        level=bytes([diagnosis.level]), name=name, message=printable(diagnosis.message),
+        level=bytes([diagnosis.level]),
+        name=name,
+        message=printable(diagnosis.message),
         hardware_id=printable(hardware_id),
-        values=[KeyValue(key=printable(key), value=printable(str(value)))
-                for key, value in diagnosis.values.items()])
+        values=[
+            KeyValue(key=printable(key), value=printable(str(value)))
+            for key, value in diagnosis.values.items()
+        ],
+    )
 
 
 def diagnosis_of(status: DiagnosticStatus) -> Diagnosis:
     """Return the diagnosis in a status message; an unknown level counts as ERROR."""
     level = status.level[0]
-    return Diagnosis(Level(level) if level in list(Level) else Level.ERROR, status.message,
-                     {item.key: item.value for item in status.values})
+    return Diagnosis(
+        Level(level) if level in list(Level) else Level.ERROR,
+        status.message,
+        {item.key: item.value for item in status.values},
+    )
 
 
 UNKNOWN_PITCH_M = 1e-3
@@ -136,19 +147,46 @@ def map_markers(error_map: ErrorMap, stamp_ns: int, frame_id: str) -> MarkerArra
     wide = shape.spacing_m
 
     def marker(number: int, kind: int, namespace: str, **fields: Any) -> Marker:
-        return fill(Marker(), {
-            "header": header(stamp_ns, frame_id), "id": number, "type": kind, "ns": namespace,
-            "action": Marker.ADD, "color": _colour(INK), "pose": {"orientation": {"w": 1.0}},
-            **fields})
-    return MarkerArray(markers=[
-        marker(0, Marker.LINE_LIST, "error", scale={"x": wide / 20}, points=_points(shape.ends)),
-        marker(1, Marker.CUBE_LIST, "uncertainty",
-               scale={"x": 0.9 * wide, "y": 0.9 * wide, "z": wide / 100},
-               points=_points(shape.sites - (0.0, 0.0, wide / 20)),  # below the vectors
-               colors=[_colour(rgb) for rgb in shape.colours.tolist()]),
-        marker(2, Marker.TEXT_VIEW_FACING, "legend", scale={"z": wide / 3}, text=shape.legend,
-               pose={"position": dict(zip("xyz", shape.legend_at, strict=True)),
-                     "orientation": {"w": 1.0}})])
+        return fill(
+            Marker(),
+            {
+                "header": header(stamp_ns, frame_id),
+                "id": number,
+                "type": kind,
+                "ns": namespace,
+                "action": Marker.ADD,
+                "color": _colour(INK),
+                "pose": {"orientation": {"w": 1.0}},
+                **fields,
+            },
+        )
+
+    return MarkerArray(
+        markers=[
+            marker(
+                0, Marker.LINE_LIST, "error", scale={"x": wide / 20}, points=_points(shape.ends)
+            ),
+            marker(
+                1,
+                Marker.CUBE_LIST,
+                "uncertainty",
+                scale={"x": 0.9 * wide, "y": 0.9 * wide, "z": wide / 100},
+                points=_points(shape.sites - (0.0, 0.0, wide / 20)),  # below the vectors
+                colors=[_colour(rgb) for rgb in shape.colours.tolist()],
+            ),
+            marker(
+                2,
+                Marker.TEXT_VIEW_FACING,
+                "legend",
+                scale={"z": wide / 3},
+                text=shape.legend,
+                pose={
+                    "position": dict(zip("xyz", shape.legend_at, strict=True)),
+                    "orientation": {"w": 1.0},
+                },
+            ),
+        ]
+    )
 
 
 def rejected_marker(measurement: Any, frame_id: str) -> Marker:
@@ -160,13 +198,20 @@ def rejected_marker(measurement: Any, frame_id: str) -> Marker:
     places = np.stack([measurement.rejected_x, measurement.rejected_y], axis=1)
     known = np.isfinite(places).all(axis=1)
     above = np.full((known.sum(), 1), wide / 20)  # the vectors of the map
-    return fill(Marker(), {
-        "header": {"stamp": measurement.header.stamp, "frame_id": frame_id},
-        "ns": "rejected", "id": int(measurement.view_index), "type": Marker.POINTS,
-        "action": Marker.ADD if known.any() else Marker.DELETE,
-        "scale": {"x": wide / 5, "y": wide / 5}, "color": _colour(RED),
-        "pose": {"orientation": {"w": 1.0}},
-        "points": _points(np.hstack([places[known], above]))})
+    return fill(
+        Marker(),
+        {
+            "header": {"stamp": measurement.header.stamp, "frame_id": frame_id},
+            "ns": "rejected",
+            "id": int(measurement.view_index),
+            "type": Marker.POINTS,
+            "action": Marker.ADD if known.any() else Marker.DELETE,
+            "scale": {"x": wide / 5, "y": wide / 5},
+            "color": _colour(RED),
+            "pose": {"orientation": {"w": 1.0}},
+            "points": _points(np.hstack([places[known], above])),
+        },
+    )
 
 
 def _points(places: np.ndarray) -> list[Point]:

@@ -26,8 +26,11 @@ def not_heard(node: Node, publishers: Mapping[str, Publisher], by: str) -> list[
         Name of the listening node with its namespace.
     """
     found = {topic: _reliabilities(node, publisher, by) for topic, publisher in publishers.items()}
-    return [topic + (" reliably (another publisher offers best effort)" if heard else "")
-            for topic, heard in found.items() if ReliabilityPolicy.RELIABLE not in heard]
+    return [
+        topic + (" reliably (another publisher offers best effort)" if heard else "")
+        for topic, heard in found.items()
+        if ReliabilityPolicy.RELIABLE not in heard
+    ]
 
 
 def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
@@ -44,9 +47,11 @@ def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
     matched : int
         Number of subscriptions to which the publisher is connected.
     """
-    readers = [reader for reader in node.get_subscriptions_info_by_topic(
-        node.resolve_topic_name(topic))
-        if reader.qos_profile.durability == DurabilityPolicy.VOLATILE]  # others never match
+    readers = [
+        reader
+        for reader in node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
+        if reader.qos_profile.durability == DurabilityPolicy.VOLATILE
+    ]  # others never match
     return matched >= len(readers) and by in [_name(reader) for reader in readers]
 
 
@@ -79,6 +84,8 @@ def _reliabilities(node: Node, publisher: Publisher, by: str) -> list[Reliabilit
     """Return the reliabilities requested by the subscriptions of a node to a publisher."""
     if not publisher.get_subscription_count():
         return []
-    return [reader.qos_profile.reliability
-            for reader in node.get_subscriptions_info_by_topic(publisher.topic_name)
-            if by == _name(reader)]
+    return [
+        reader.qos_profile.reliability
+        for reader in node.get_subscriptions_info_by_topic(publisher.topic_name)
+        if by == _name(reader)
+    ]

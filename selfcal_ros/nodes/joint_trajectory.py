@@ -51,16 +51,25 @@ class JointTrajectoryMachine:
         If no controller listens, or no positions are published.
     """
 
-    def __init__(self, joints: Sequence[str] = ("x", "y"),
-                 controller: str = "joint_trajectory_controller",
-                 joint_states: str = "joint_states", image: str = "", speed: float = 0.01,
-                 turn_speed: float = 0.1, timeout: float = 5.0) -> None:
+    def __init__(
+        self,
+        joints: Sequence[str] = ("x", "y"),
+        controller: str = "joint_trajectory_controller",
+        joint_states: str = "joint_states",
+        image: str = "",
+        speed: float = 0.01,
+        turn_speed: float = 0.1,
+        timeout: float = 5.0,
+    ) -> None:
         if len(joints) not in (2, 3) or min(speed, turn_speed, timeout) <= 0:
-            raise MachineError(f"{len(joints)} joints, speeds {speed:g} and {turn_speed:g}",
-                               "joint_trajectory", "give two or three joints, positive numbers")
-        self.axes = ("x", "y", "theta")[:len(joints)]
+            raise MachineError(
+                f"{len(joints)} joints, speeds {speed:g} and {turn_speed:g}",
+                "joint_trajectory",
+                "give two or three joints, positive numbers",
+            )
+        self.axes = ("x", "y", "theta")[: len(joints)]
         self._joints, self._timeout_s = list(joints), timeout
-        self._speeds = (speed, speed, turn_speed)[:len(joints)]
+        self._speeds = (speed, speed, turn_speed)[: len(joints)]
         self._news = threading.Condition()  # guards what has been received
         self._states: tuple[int, tuple[float, ...]] = (0, ())
         self._image: ImageMessage | None = None
@@ -94,9 +103,11 @@ class JointTrajectoryMachine:
         deadline = time.monotonic() + self._timeout_s
         while not self._trajectory.get_subscription_count():
             if time.monotonic() > deadline:
-                raise MachineError("no controller listens", self._topic,
-                                   "start and activate it (ros2 control list_controllers), or "
-                                   "correct controller")
+                raise MachineError(
+                    "no controller listens",
+                    self._topic,
+                    "start and activate it (ros2 control list_controllers), or correct controller",
+                )
             time.sleep(0.05)
 
     def _on_states(self, message: JointState) -> None:
@@ -115,8 +126,11 @@ class JointTrajectoryMachine:
     def _wait(self, arrived: Callable[[], bool], topic: str) -> None:
         """Wait for news; `self._news` is held."""
         if not self._news.wait_for(arrived, self._timeout_s):
-            raise MachineError(f"no message in {self._timeout_s:g} s", topic,
-                               "check the driver, the topic and the names of the joints")
+            raise MachineError(
+                f"no message in {self._timeout_s:g} s",
+                topic,
+                "check the driver, the topic and the names of the joints",
+            )
 
     def position(self) -> tuple[float, ...]:
         """Return the next position that is published, m and rad."""
@@ -128,15 +142,19 @@ class JointTrajectoryMachine:
     def move_to(self, position: tuple[float, ...]) -> None:
         """Send a trajectory of one point, and wait for its time."""
         here = self.position()
-        needed_s = max(LEAST_S, *(abs(to - at) / speed for to, at, speed in zip(
-            position, here, self._speeds, strict=True)))
+        needed_s = max(
+            LEAST_S,
+            *(
+                abs(to - at) / speed
+                for to, at, speed in zip(position, here, self._speeds, strict=True)
+            ),
+        )
         self._send(position, needed_s)
         time.sleep(needed_s)
 
     def _send(self, position: Sequence[float], duration_s: float) -> None:
         self._need_controller()
-        point = JointTrajectoryPoint(positions=list(position),
-                                     velocities=[0.0] * len(self._joints))
+        point = JointTrajectoryPoint(positions=list(position), velocities=[0.0] * len(self._joints))
         point.time_from_start = Duration(nanoseconds=math.ceil(duration_s * 1e9)).to_msg()
         self._trajectory.publish(JointTrajectory(joint_names=self._joints, points=[point]))
 
@@ -148,6 +166,7 @@ class JointTrajectoryMachine:
 
         def is_new() -> bool:
             return self._image is not None and stamp_ns(self._image) >= began_ns
+
         with self._news:
             self._wait(is_new, self._image_topic)
             message: Any = self._image

@@ -38,26 +38,47 @@ def arguments(params: str) -> list[Any]:
     argument = DeclareLaunchArgument
     return [
         argument("namespace", default_value="", description="namespace of the cell"),
-        argument("params", default_value=str(share() / "config/params" / params),
-                 description="ROS parameter file for all nodes"),
-        argument("plan", default_value=str(share() / "config/plans/resistant.yaml"),
-                 description="PLAN.yaml with plate and views"),
-        argument("use_sim_time", default_value="false", choices=["true", "false"],
-                 description="take time from /clock, as of a simulator or `ros2 bag play --clock`"),
-        argument("log_level", default_value="info",
-                 choices=["debug", "info", "warn", "error", "fatal"],
-                 description="lowest level that nodes log"),
-        argument("foxglove", default_value="false", choices=["true", "false"],
-                 description="also start foxglove_bridge, port 8765 (package foxglove_bridge)"),
-        OpaqueFunction(function=refuse_wrong)]
+        argument(
+            "params",
+            default_value=str(share() / "config/params" / params),
+            description="ROS parameter file for all nodes",
+        ),
+        argument(
+            "plan",
+            default_value=str(share() / "config/plans/resistant.yaml"),
+            description="PLAN.yaml with plate and views",
+        ),
+        argument(
+            "use_sim_time",
+            default_value="false",
+            choices=["true", "false"],
+            description="take time from /clock, as of a simulator or `ros2 bag play --clock`",
+        ),
+        argument(
+            "log_level",
+            default_value="info",
+            choices=["debug", "info", "warn", "error", "fatal"],
+            description="lowest level that nodes log",
+        ),
+        argument(
+            "foxglove",
+            default_value="false",
+            choices=["true", "false"],
+            description="also start foxglove_bridge, port 8765 (package foxglove_bridge)",
+        ),
+        OpaqueFunction(function=refuse_wrong),
+    ]
 
 
 def journal_argument(folder: str) -> DeclareLaunchArgument:
     """Return the declaration of `journal`, which is `folder` below ROS_HOME by default."""
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     return DeclareLaunchArgument(
-        "journal", default_value=str(home / folder), description="folder for journals, from which "
-        "a restarted collector continues; none = no journal")
+        "journal",
+        default_value=str(home / folder),
+        description="folder for journals, from which "
+        "a restarted collector continues; none = no journal",
+    )
 
 
 def refuse_wrong(context: LaunchContext) -> None:
@@ -70,13 +91,19 @@ def refuse_wrong(context: LaunchContext) -> None:
     try:
         float(given.get("rate", "1"))
     except ValueError:
-        raise InputError(f"rate:={given['rate']}", "not a number",
-                         "give the speed; 0 = as fast as the nodes can follow") from None
+        raise InputError(
+            f"rate:={given['rate']}",
+            "not a number",
+            "give the speed; 0 = as fast as the nodes can follow",
+        ) from None
     if not Path(given["params"]).is_file():
         raise InputError(f"params:={given['params']}", "no such file", "check the path")
     if given["foxglove"] == "true" and "foxglove_bridge" not in get_packages_with_prefixes():
-        raise InputError("foxglove:=true", "there is no package foxglove_bridge",
-                         "sudo apt install ros-jazzy-foxglove-bridge")
+        raise InputError(
+            "foxglove:=true",
+            "there is no package foxglove_bridge",
+            "sudo apt install ros-jazzy-foxglove-bridge",
+        )
 
 
 def text(name: str) -> ParameterValue:
@@ -105,18 +132,27 @@ class OfCell(Substitution):
 def node(name: str, *parameters: Any, **kwargs: Any) -> Node:
     """Return the action that starts a node of this package with the shared arguments."""
     simulated = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
-    return Node(package="selfcal_ros", executable=name, name=name, output="screen",
-                namespace=LaunchConfiguration("namespace"),
-                parameters=[LaunchConfiguration("params"), *parameters,
-                            {"use_sim_time": simulated}],
-                ros_arguments=["--log-level", LaunchConfiguration("log_level")],
-                on_exit=end_if_it_cannot_start, **kwargs)
+    return Node(
+        package="selfcal_ros",
+        executable=name,
+        name=name,
+        output="screen",
+        namespace=LaunchConfiguration("namespace"),
+        parameters=[LaunchConfiguration("params"), *parameters, {"use_sim_time": simulated}],
+        ros_arguments=["--log-level", LaunchConfiguration("log_level")],
+        on_exit=end_if_it_cannot_start,
+        **kwargs,
+    )
 
 
 def foxglove() -> Node:
     """Return the action that starts foxglove_bridge if requested."""
-    return Node(package="foxglove_bridge", executable="foxglove_bridge", output="screen",
-                condition=IfCondition(LaunchConfiguration("foxglove")))
+    return Node(
+        package="foxglove_bridge",
+        executable="foxglove_bridge",
+        output="screen",
+        condition=IfCondition(LaunchConfiguration("foxglove")),
+    )
 
 
 def end_if_it_cannot_start(event: Any, _context: Any) -> None:

@@ -30,8 +30,10 @@ class WhileConfigured[T]:
         try:
             return node.held[self._name]
         except KeyError:
-            raise SelfcalError(f"{node.get_name()}: there is no {self._name.strip('_')} while "
-                               f"{node.state}; configure the node first") from None
+            raise SelfcalError(
+                f"{node.get_name()}: there is no {self._name.strip('_')} while "
+                f"{node.state}; configure the node first"
+            ) from None
 
     def __set__(self, node: "ManagedNode", value: T) -> None:
         """Keep `value` until the node is cleaned up."""
@@ -110,8 +112,10 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         if self.state == "active":
             return self.diagnose_session()
         if self.state == "finalized":
-            return Diagnosis(Level.ERROR, "finalized: shut down on request; end this "
-                             "process and start the node again")
+            return Diagnosis(
+                Level.ERROR,
+                "finalized: shut down on request; end this process and start the node again",
+            )
         if self.problem is not None:
             return Diagnosis(Level.ERROR, f"{self.state}: {first_line(self.problem)}")
         return Diagnosis(Level.WARN, f"{self.state}: a managed node that waits to be activated")

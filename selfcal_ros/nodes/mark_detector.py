@@ -67,8 +67,7 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
 
     def _tell_taken(self) -> None:
         self._matched = self._detections.get_subscription_count()
-        self._received.publish(names.RECEIVED.type(
-            data=[self._taken, self._found, self._matched]))
+        self._received.publish(names.RECEIVED.type(data=[self._taken, self._found, self._matched]))
 
     def _look(self) -> None:
         """Take a few waiting images, and count the lost ones by their numbers."""

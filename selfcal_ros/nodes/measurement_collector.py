@@ -57,21 +57,30 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         keep_freed_memory()
         ports = self.ports(self._publish)
         self.session = CollectingSession(self.settings, ports)
-        journal = JournalKeeper(self._journal_folder(), {
-            topic.name: self._kept(topic) for topic in names.INPUTS}, self.settings, ports)
+        journal = JournalKeeper(
+            self._journal_folder(),
+            {topic.name: self._kept(topic) for topic in names.INPUTS},
+            self.settings,
+            ports,
+        )
         self._reception = self.own(
             Reception(self.session, journal, say=self.say, refuse=self.refusals.add),
-            Reception.close)
+            Reception.close,
+        )
         worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="journal"), stop)
         self._reception.open(worker)
-        self._outputs = {"status": self.output(names.STATUS),
-                         "measurement": self.output(names.MEASUREMENT),
-                         "progress": self.output(names.PROGRESS)}
+        self._outputs = {
+            "status": self.output(names.STATUS),
+            "measurement": self.output(names.MEASUREMENT),
+            "progress": self.output(names.PROGRESS),
+        }
         self._received = self.publisher(names.private(names.RECEIVED))
-        self._inputs = {names.ENCODER.name: ByTheClock(names.ENCODER.name, self._reception.encoder),
-                        names.DETECTIONS.name: ByTheClock(
-                            names.DETECTIONS.name, self._reception.detection,
-                            self.guarded(self._on_detection))}
+        self._inputs = {
+            names.ENCODER.name: ByTheClock(names.ENCODER.name, self._reception.encoder),
+            names.DETECTIONS.name: ByTheClock(
+                names.DETECTIONS.name, self._reception.detection, self.guarded(self._on_detection)
+            ),
+        }
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
     def _kept(self, topic: names.Topic) -> KeptTopic:
@@ -135,8 +144,9 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
     def _tell_received(self) -> None:
         if self._reception.restoring:
             return
-        self._received.publish(names.RECEIVED.type(
-            data=list(self.session.collector.received.values())))
+        self._received.publish(
+            names.RECEIVED.type(data=list(self.session.collector.received.values()))
+        )
 
     def _finish(self) -> str:
         self._drain()
@@ -146,9 +156,10 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
 
     def diagnose_session(self) -> Diagnosis:
         """Return the diagnosis of the session."""
-        return merged(self.session.diagnosis(
-            detections_matched=self._detections.get_publisher_count() > 0),
-            [self._reception.diagnosis()])
+        return merged(
+            self.session.diagnosis(detections_matched=self._detections.get_publisher_count() > 0),
+            [self._reception.diagnosis()],
+        )
 
 
 def main() -> None:

@@ -30,10 +30,24 @@ from selfcal_ros.nodes.running import run
 from selfcal_ros.sessions.health import Level, Ports, Refusals
 from selfcal_ros.sessions.watching import Watch
 
-REQUESTS = {"start": "start", "confirm": "confirm_view", "redo": "redo_view",
-            "skip": "skip_view", "abort": "abort"}
-WATCHED = ("measurement_collector", "pose_sequencer", "solver", "compensator", "mark_detector",
-           "bag_recorder", "cell_driver", "stage_simulator", "bag_player")
+REQUESTS = {
+    "start": "start",
+    "confirm": "confirm_view",
+    "redo": "redo_view",
+    "skip": "skip_view",
+    "abort": "abort",
+}
+WATCHED = (
+    "measurement_collector",
+    "pose_sequencer",
+    "solver",
+    "compensator",
+    "mark_detector",
+    "bag_recorder",
+    "cell_driver",
+    "stage_simulator",
+    "bag_player",
+)
 PERIOD_S = 0.2
 PATIENCE_S = 10.0
 
@@ -46,15 +60,19 @@ class MonitorSession(Guarded):
         self.finished = Future()
         self.refusals = Refusals(self._say, time.monotonic)
         self._watch = Watch(Ports(lambda *_: None, self._say, time.monotonic, time.time_ns))
-        for topic, take in ((names.COMMAND, self._watch.take_command),
-                            (names.STATUS, self._watch.take_status),
-                            (names.SUMMARY, self._watch.take_summary),
-                            (names.ERROR_MAP, self._watch.take_map)):
+        for topic, take in (
+            (names.COMMAND, self._watch.take_command),
+            (names.STATUS, self._watch.take_status),
+            (names.SUMMARY, self._watch.take_summary),
+            (names.ERROR_MAP, self._watch.take_map),
+        ):
             self._hear(topic, take)
         for node in WATCHED:
             self._hear(names.of_node(node, names.HEALTH), partial(self._on_health, node))
-        self._askers = {word: self.create_client(Trigger, f"pose_sequencer/{service}")
-                        for word, service in REQUESTS.items()}
+        self._askers = {
+            word: self.create_client(Trigger, f"pose_sequencer/{service}")
+            for word, service in REQUESTS.items()
+        }
         self._words: list[str] = []
         self._asked: list[tuple[str, float, Any]] = []
         self._shown = ""
@@ -99,11 +117,13 @@ class MonitorSession(Guarded):
             if future is None and client.service_is_ready():
                 future = client.call_async(Trigger.Request())
             if future is not None and future.done():
-                self._answer(f"{word}: {future.result().message}",
-                             success=future.result().success)
+                self._answer(f"{word}: {future.result().message}", success=future.result().success)
             elif time.monotonic() > until:
-                self._answer(f"{word}: pose_sequencer does not answer; is it running in this "
-                             "namespace and ROS_DOMAIN_ID?", success=False)
+                self._answer(
+                    f"{word}: pose_sequencer does not answer; is it running in this "
+                    "namespace and ROS_DOMAIN_ID?",
+                    success=False,
+                )
             else:
                 waiting.append((word, until, future))
         self._asked = waiting

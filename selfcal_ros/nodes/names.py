@@ -41,7 +41,8 @@ def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProf
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
 
 
 PARTICIPANT = 12
@@ -59,8 +60,9 @@ NEWEST_COMMAND = Topic(topics.COMMAND_TOPIC, msg.ViewCommand, _qos(1, latched=Tr
 STATUS = Topic(topics.STATUS_TOPIC, msg.ViewStatus, _qos(64, latched=True))
 STATUS_AS_IT_COMES = Topic(topics.STATUS_TOPIC, msg.ViewStatus, _qos(64))
 # one message a view, or a cell of its image; each is sent again when a view was redone
-MEASUREMENT = Topic(topics.MEASUREMENT_TOPIC, msg.ViewMeasurement, _qos(
-    2 * MAX_VIEWS, latched=True))
+MEASUREMENT = Topic(
+    topics.MEASUREMENT_TOPIC, msg.ViewMeasurement, _qos(2 * MAX_VIEWS, latched=True)
+)
 ERROR_MAP = Topic(topics.ERROR_MAP_TOPIC, msg.ErrorMap, _qos(1, latched=True))
 SUMMARY = Topic(topics.SUMMARY_TOPIC, msg.CalibrationSummary, _qos(1, latched=True))
 PROGRESS = Topic(topics.PROGRESS_TOPIC, String, _qos(1, latched=True))
@@ -116,8 +118,10 @@ def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
             verdict, reason = qos_check_compatible(offer.qos_profile, topic.qos)
             if verdict == QoSCompatibility.ERROR:
                 why = reason.removeprefix("ERROR: ").rstrip(";. ")
-                found.append(f"{topic.name}: no messages are received from {_name(offer)} ({why}); "
-                             "offer the QoS in docs/reference/ros2.md")
+                found.append(
+                    f"{topic.name}: no messages are received from {_name(offer)} ({why}); "
+                    "offer the QoS in docs/reference/ros2.md"
+                )
     return Diagnosis(Level.ERROR if found else Level.OK, "; ".join(found))
 
 
@@ -127,8 +131,10 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
     for topic in topics:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
         if len(offers) > 1:
-            found.append(f"{topic} has {len(offers)} publishers: "
-                         f"{', '.join(sorted(map(_name, offers)))}; only one is allowed")
+            found.append(
+                f"{topic} has {len(offers)} publishers: "
+                f"{', '.join(sorted(map(_name, offers)))}; only one is allowed"
+            )
     return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
 
 
@@ -141,8 +147,9 @@ def rivals(node: Node, topics: Iterable[str]) -> str:
     for topic in topics:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
         if len({(_name(offer), bytes(offer.endpoint_gid[:PARTICIPANT])) for offer in offers}) > 1:
-            found.append(f"{topic} has {len(offers)} publishers: "
-                         f"{', '.join(sorted(map(_name, offers)))}")
+            found.append(
+                f"{topic} has {len(offers)} publishers: {', '.join(sorted(map(_name, offers)))}"
+            )
     return "; ".join(found)
 
 
@@ -151,16 +158,20 @@ def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
 
     Readers of a bag expect the names of the contract, after a namespace.
     """
-    own, heard = f"{node.get_namespace().rstrip('/')}/{topic.name}", node.resolve_topic_name(
-        topic.name)
+    own, heard = (
+        f"{node.get_namespace().rstrip('/')}/{topic.name}",
+        node.resolve_topic_name(topic.name),
+    )
     return own, heard if heard != own else ""
 
 
 def offered(topic: Topic) -> dict:
     """Return the quality of service of a topic in the format of rosbag2."""
-    return qos_profile(reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
-                       transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-                       depth=topic.qos.depth)
+    return qos_profile(
+        reliable=topic.qos.reliability == ReliabilityPolicy.RELIABLE,
+        transient_local=topic.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+        depth=topic.qos.depth,
+    )
 
 
 def _name(offer: Any) -> str:
@@ -184,8 +195,9 @@ class MatchedInput:
         For `NodeBase.subscribe`.
     """
 
-    def __init__(self, node: Any, topics: tuple[Topic, Topic], callback: Any,
-                 **kwargs: Any) -> None:
+    def __init__(
+        self, node: Any, topics: tuple[Topic, Topic], callback: Any, **kwargs: Any
+    ) -> None:
         self._node, self.callback, self._kwargs = node, callback, kwargs
         self._topics = topics
         self._name = node.resolve_topic_name(topics[0].name)

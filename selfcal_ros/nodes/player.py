@@ -54,9 +54,17 @@ class Player:
     of selfcal in its namespace, unless `beside_others`.
     """
 
-    def __init__(self, node: SelfcalNode, bag: str, *, rate: float, seed: int,
-                 namespace: str | None = None, listener: str = CollectorSettings.NODE,
-                 beside_others: bool = False) -> None:
+    def __init__(
+        self,
+        node: SelfcalNode,
+        bag: str,
+        *,
+        rate: float,
+        seed: int,
+        namespace: str | None = None,
+        listener: str = CollectorSettings.NODE,
+        beside_others: bool = False,
+    ) -> None:
         self.node, self.rate, self._bag = node, rate, bag
         own = node.get_namespace().rstrip("/")
         self.listener = listener if listener.startswith("/") else f"{own}/{listener}"
@@ -78,10 +86,16 @@ class Player:
         self._began: float | None = None
         self._published_s = 0.0  # last time that a message was sent, or none was due
         self._before = 0  # messages received by the listener before the first of these
-        self.alone_on = [] if beside_others else [
-            *self._publishers, *([DETECTION_TOPIC] if images else [])]
-        self._own = [node.get_fully_qualified_name(), *(f"{own}/{name}" for name in (
-            SequencerSettings.NODE, CollectorSettings.NODE, SolverSettings.NODE))]
+        self.alone_on = (
+            [] if beside_others else [*self._publishers, *([DETECTION_TOPIC] if images else [])]
+        )
+        self._own = [
+            node.get_fully_qualified_name(),
+            *(
+                f"{own}/{name}"
+                for name in (SequencerSettings.NODE, CollectorSettings.NODE, SolverSettings.NODE)
+            ),
+        ]
         self._own += [self.detector] if images else []
         self._created_s = self._looked_s = time.monotonic()
         received = names.of_node(self.listener, names.RECEIVED)
@@ -120,8 +134,11 @@ class Player:
         """
         played = [topic for topic in self.playlist.counts if topic in KINDS]
         waits = self.heard is None and self._tells()
-        if played and self.taken is not None and not hears(
-                self.node, DETECTION_TOPIC, self.listener, matched=self.matched):
+        if (
+            played
+            and self.taken is not None
+            and not hears(self.node, DETECTION_TOPIC, self.listener, matched=self.matched)
+        ):
             return [DETECTION_TOPIC]  # it would lose those of the first images
         return played if waits else self._not_heard(played, self.listener)
 
@@ -141,7 +158,8 @@ class Player:
             return self.heard == self.sent
         return self.taken == self.sent[IMAGES] and self.heard == {
             KINDS[topic]: self.found if topic == DETECTION_TOPIC else self.sent[KINDS[topic]]
-            for topic in KINDS}
+            for topic in KINDS
+        }
 
     @property
     def overheard(self) -> bool:
@@ -160,13 +178,17 @@ class Player:
         self._looked_s = time.monotonic()
         looked_s = self._looked_s - self._created_s
         others = self._others()
-        named = {other: topics for other, topics in others.items()
-                 if not other.endswith(UNNAMED) or looked_s > NAME_S}
+        named = {
+            other: topics
+            for other, topics in others.items()
+            if not other.endswith(UNNAMED) or looked_s > NAME_S
+        }
         for other, topics in named.items():
             raise InputError(
                 f"ROS domain {self.node.context.get_domain_id()}",
                 f"{other} publishes {', '.join(topics)} as well; {self._at} messages were played",
-                "end it, or play in another ROS domain")
+                "end it, or play in another ROS domain",
+            )
         return not others and (looked_s >= LOOK_S or not self.alone_on)
 
     def _others(self) -> dict[str, list[str]]:
@@ -216,8 +238,11 @@ class Player:
         """Publish up to this many messages logged by then; return whether more may be due."""
         for _ in range(min(count, self.total - self._at)):
             if self._next is None:
-                raise InputError(self._bag, f"{self.total} messages when it was opened, "
-                                 f"{self._at} now", "play a bag that is not being changed")
+                raise InputError(
+                    self._bag,
+                    f"{self.total} messages when it was opened, {self._at} now",
+                    "play a bag that is not being changed",
+                )
             topic, stamp, data = self._next
             if stamp > due_ns:
                 return False
@@ -231,8 +256,15 @@ class Player:
         """Return the number of messages that subscribers can take, `played_s` after the first."""
         images = self.sent.get(IMAGES, 0)
         others = self._at - images
-        room = WINDOW - others + (int(UNHEARD_RATE * played_s / 2) if self.heard is None
-                                  else self._received - self._before)
+        room = (
+            WINDOW
+            - others
+            + (
+                int(UNHEARD_RATE * played_s / 2)
+                if self.heard is None
+                else self._received - self._before
+            )
+        )
         if self.taken is None:
             return room
         return min(room, WAITING_IMAGES - images + self.taken - self._taken_before)

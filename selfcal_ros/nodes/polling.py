@@ -47,8 +47,9 @@ class ByTheClock:
 
     __signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
 
-    def __init__(self, topic: str, take: Callable[[bytes, int], None],
-                 wake: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self, topic: str, take: Callable[[bytes, int], None], wake: Callable[[], None] | None = None
+    ) -> None:
         self.topic, self.take, self.wake = topic, take, wake
         self._numbers: list[int | None] = []  # of messages taken since the last check for gaps
         self._last: int | None = None
@@ -78,8 +79,9 @@ class ByTheClock:
         self._numbers.append(info["publication_sequence_number"])
         self.take(data, info["received_timestamp"] or time.time_ns())
 
-    def _missing(self, numbers: list[int | None], n_publishers: int,
-                 is_empty: bool) -> LostMessages:
+    def _missing(
+        self, numbers: list[int | None], n_publishers: int, is_empty: bool
+    ) -> LostMessages:
         """Return the gaps in the sequence numbers, if they are of one publisher.
 
         This is the case if there was one publisher now and at the previous check: messages of a
@@ -119,8 +121,11 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
     @property
     def subscriptions(self) -> Iterator[Subscription]:
         """The subscriptions handled by an executor."""
-        return (item for item in super().subscriptions
-                if not isinstance(item.callback, ByTheClock) or item.callback.wake)
+        return (
+            item
+            for item in super().subscriptions
+            if not isinstance(item.callback, ByTheClock) or item.callback.wake
+        )
 
     def poll(self) -> None:
         """Take the messages of these subscriptions, and count losses in transport."""
@@ -136,7 +141,8 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
         callback = subscription.callback
         if isinstance(callback, ByTheClock) and subscription in [*super().subscriptions]:
             self.guarded(self._empty, callback.topic)(
-                subscription, callback, subscription.qos_profile.depth)
+                subscription, callback, subscription.qos_profile.depth
+            )
             callback.pause()
         return super().destroy_subscription(subscription)
 

@@ -48,17 +48,23 @@ class CalibrationAction:
         self._saved: Future | None = None
         self._save_until = 0.0
         server = ActionServer(
-            node, RunCalibration, "~/run_calibration", self._execute,
-            goal_callback=self._on_goal, handle_accepted_callback=self._on_accepted,
-            cancel_callback=lambda goal: CancelResponse.ACCEPT)
+            node,
+            RunCalibration,
+            "~/run_calibration",
+            self._execute,
+            goal_callback=self._on_goal,
+            handle_accepted_callback=self._on_accepted,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+        )
         self.destroy = server.destroy
 
     def serve(self, session: SequencingSession) -> None:
         """Execute goals with a session, until the configuration of the node is undone."""
         self._session = session
         session.on_end = lambda: _complete(self._ended)
-        self._saver = self._node.own(self._node.create_client(SaveMap, "solver/save_map"),
-                                     self._node.destroy_client)
+        self._saver = self._node.own(
+            self._node.create_client(SaveMap, "solver/save_map"), self._node.destroy_client
+        )
         self._node.own(None, lambda _: self._leave())
 
     def _leave(self) -> None:
@@ -80,7 +86,8 @@ class CalibrationAction:
         if view is None:
             return
         feedback = RunCalibration.Feedback(
-            view=view.name, view_index=session.machine.index, coverage=session.coverage)
+            view=view.name, view_index=session.machine.index, coverage=session.coverage
+        )
         if feedback != self._feedback:
             self._feedback = feedback
             self._goal.publish_feedback(feedback)
@@ -89,9 +96,13 @@ class CalibrationAction:
         session = self._session if self._node.state == "active" else None
         if session is not None and session.ended and not self._taken:
             return GoalResponse.ACCEPT
-        why = (f"the node is {self._node.state}: activate it first" if session is None else
-               "another one is executed: cancel it, or wait for its end" if self._taken else
-               f"{session.machine.state}: abort the plan first")
+        why = (
+            f"the node is {self._node.state}: activate it first"
+            if session is None
+            else "another one is executed: cancel it, or wait for its end"
+            if self._taken
+            else f"{session.machine.state}: abort the plan first"
+        )
         self._node.say(Level.WARN, f"goal rejected while {why}")
         return GoalResponse.REJECT
 
@@ -127,9 +138,12 @@ class CalibrationAction:
         await future
         if session is not self._session:
             raise NoDataError(
-                "run_calibration", "pose_sequencer was cleaned up before the map was saved",
-                "call solver/save_map" if session.machine.state is State.DONE else
-                "activate it again: its service start resumes the plan")
+                "run_calibration",
+                "pose_sequencer was cleaned up before the map was saved",
+                "call solver/save_map"
+                if session.machine.state is State.DONE
+                else "activate it again: its service start resumes the plan",
+            )
 
     async def _conclude(self, goal: Any, result: Any, session: SequencingSession) -> None:
         machine = session.machine
@@ -138,8 +152,9 @@ class CalibrationAction:
             result.message = f"the plan was not measured to its end: {machine.state}"
             goal.canceled() if goal.is_cancel_requested else goal.abort()
             return
-        answer = await self._save(session, self._node.settings.result_path
-                                  or plan_file_name(machine.need_plan().plan_id))
+        answer = await self._save(
+            session, self._node.settings.result_path or plan_file_name(machine.need_plan().plan_id)
+        )
         result.message, result.map_path = answer.message, answer.path
         if answer.success:
             result.error_code = int(ExitCode.DONE)
@@ -162,8 +177,11 @@ class CalibrationAction:
             self._saved = None
         if not answer.done():
             self._saver.remove_pending_request(answer)
-            raise NoDataError("run_calibration", f"the solver has not saved the map in {patience:g}"
-                              " s", "check the solver, then call save_map")
+            raise NoDataError(
+                "run_calibration",
+                f"the solver has not saved the map in {patience:g} s",
+                "check the solver, then call save_map",
+            )
         return answer.result()
 
 
@@ -189,7 +207,8 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
         """Create the session, with its plan, and the publisher of commands."""
         command = self.output(names.NEWEST_COMMAND)
         self.session = SequencingSession(
-            self.settings, self.ports(lambda _, fields: command(fields)))
+            self.settings, self.ports(lambda _, fields: command(fields))
+        )
         self._action.serve(self.session)
 
     def destroy_node(self) -> None:
@@ -205,14 +224,17 @@ class PoseSequencer(ManagedNode[SequencerSettings]):
         self.subscribe(names.STATUS_AS_IT_COMES, session.take_status)
         self.subscribe(names.MEASUREMENT, session.take_measurement)
         for node in COMPANIONS:
-            self.subscribe_with_age(names.of_node(node, names.HEALTH),
-                                    partial(self._on_health, node))
+            self.subscribe_with_age(
+                names.of_node(node, names.HEALTH), partial(self._on_health, node)
+            )
         machine = session.machine
         for name, act in (
-                ("start", session.begin), ("abort", session.give_up),
-                ("confirm_view", lambda: session.act(machine.confirm)),
-                ("redo_view", lambda: session.act(machine.redo)),
-                ("skip_view", lambda: session.act(machine.skip))):
+            ("start", session.begin),
+            ("abort", session.give_up),
+            ("confirm_view", lambda: session.act(machine.confirm)),
+            ("redo_view", lambda: session.act(machine.redo)),
+            ("skip_view", lambda: session.act(machine.skip)),
+        ):
             self.service(Trigger, f"~/{name}", lambda request, act=act: act())
         self.every(TICK_S, self._on_timer)
 

@@ -31,8 +31,7 @@ PATIENCE_S = 60.0
 class ReplaySession(SelfcalNode[PlayerSettings]):
     """Wait for subscribers, play, check for losses, have the map saved."""
 
-    def __init__(self, player: Callable[[SelfcalNode], Player], output: str,
-                 **kwargs: Any) -> None:
+    def __init__(self, player: Callable[[SelfcalNode], Player], output: str, **kwargs: Any) -> None:
         super().__init__(PlayerSettings, parameter_overrides=[], **kwargs)
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._output = output
@@ -64,15 +63,21 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         return time.monotonic() > self._deadline
 
     def _wait_for_nodes(self) -> None:
-        alone = [f"{node} does not listen to {', '.join(topics)}" for node, topics in (
-            (self.player.listener, self.player.unheard()),
-            (self.player.detector, self.player.unseen())) if topics]
+        alone = [
+            f"{node} does not listen to {', '.join(topics)}"
+            for node, topics in (
+                (self.player.listener, self.player.unheard()),
+                (self.player.detector, self.player.unseen()),
+            )
+            if topics
+        ]
         ready = self._finish.service_is_ready() and self._save.service_is_ready()
         if self.player.is_alone() and not alone and ready:
             self._go(self._play)
         elif self._late():
-            self._end(" and ".join(alone) or "no services of collector and solver",
-                      ExitCode.INTERNAL)
+            self._end(
+                " and ".join(alone) or "no services of collector and solver", ExitCode.INTERNAL
+            )
 
     def _play(self) -> None:
         self.player.step()
@@ -89,15 +94,20 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         if self.player.arrived:
             self._ask(self._finish, Trigger.Request(), self._on_finished)
         elif self.player.overheard:
-            self._end(f"the nodes heard somebody else as well: {self._counts()}; play in a ROS "
-                      "domain of its own", ExitCode.BAD_INPUT)
+            self._end(
+                f"the nodes heard somebody else as well: {self._counts()}; play in a ROS "
+                "domain of its own",
+                ExitCode.BAD_INPUT,
+            )
         elif self._late():
             self._end(f"messages were lost: {self._counts()}", ExitCode.INTERNAL)
 
     def _counts(self) -> str:
         received = (self.player.heard or {}) | {IMAGES: self.player.taken or 0}
-        return ", ".join(f"{received.get(kind, 0)} of {sent} {kind} messages received"
-                         for kind, sent in self.player.sent.items())
+        return ", ".join(
+            f"{received.get(kind, 0)} of {sent} {kind} messages received"
+            for kind, sent in self.player.sent.items()
+        )
 
     def _ask(self, client: Any, request: Any, then: Callable[[Any], None]) -> None:
         answer = client.call_async(request)
@@ -107,6 +117,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
                 then(answer.result())
             elif self._late():
                 self._end(f"{client.srv_name} does not answer", ExitCode.INTERNAL)
+
         self._go(wait)
 
     def _on_finished(self, response: Any) -> None:
@@ -119,8 +130,13 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
     def _wait_until_solved(self) -> None:
         """Wait until the solver has solved exactly the readings that the collector sent last."""
         if self._solved == self._digest:
-            self._ask(self._save, SaveMap.Request(path=self._output), lambda response: self._end(
-                "" if response.success else response.message, ExitCode(response.error_code)))
+            self._ask(
+                self._save,
+                SaveMap.Request(path=self._output),
+                lambda response: self._end(
+                    "" if response.success else response.message, ExitCode(response.error_code)
+                ),
+            )
         elif self._late():
             self._end("the solver did not receive the readings of all views", ExitCode.INTERNAL)
 

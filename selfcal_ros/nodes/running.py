@@ -57,8 +57,9 @@ LOG_FOLDERS = ("HOME", "ROS_HOME", "ROS_LOG_DIR")
 
 def _init(argv: list[str] | None) -> None:
     if not any(map(os.environ.get, LOG_FOLDERS)):
-        raise InputError("HOME", "is not set, and ROS keeps its log there",
-                         "set it, or ROS_LOG_DIR")
+        raise InputError(
+            "HOME", "is not set, and ROS keeps its log there", "set it, or ROS_LOG_DIR"
+        )
     try:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     except (RCLError, UnknownROSArgsError) as error:

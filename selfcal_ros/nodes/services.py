@@ -9,8 +9,9 @@ from selfcal_ros.errors import SelfcalError, as_answer, printable
 from selfcal_ros.nodes.callbacks import Guarded
 
 
-def answered(response: Any, answer: Callable[[], str],
-             refuse: Callable[[str, Exception], None]) -> Any:
+def answered(
+    response: Any, answer: Callable[[], str], refuse: Callable[[str, Exception], None]
+) -> Any:
     """Return `response` with the result of `answer` as its message, or with its error.
 
     A foreign error is passed to `refuse` as well.
@@ -63,6 +64,7 @@ def answering_later(service: Any) -> Any:
             response.ask(lambda known: send(known, header))
         else:
             send(response, header)
+
     service.send_response = send_response
     return service
 
@@ -84,21 +86,37 @@ class Answering(Guarded):
         arguments = sum(parameter.default is parameter.empty for parameter in parameters)
 
         def call(request: Any, response: Any) -> Any:
-            return answered(response, lambda: answer(*(request, response)[:arguments]),
-                            self.refusals.add)
+            return answered(
+                response, lambda: answer(*(request, response)[:arguments]), self.refusals.add
+            )
+
         return self.own(self.create_service(kind, name, call), self.destroy_service)
 
-    def service_later(self, kind: type, name: str, answer: Callable[[Any, Any], str],
-                      when: Callable[[Callable[[], None]], None]) -> Any:
+    def service_later(
+        self,
+        kind: type,
+        name: str,
+        answer: Callable[[Any, Any], str],
+        when: Callable[[Callable[[], None]], None],
+    ) -> Any:
         """Offer a service that answers like `service`, possibly later.
 
         `when` takes the function that gives the answer, and calls it once, at once or later, in the
         thread of the executor.
         """
+
         def call(request: Any, response: Any) -> Later:
             later = Later()
-            when(self.guarded(lambda: later.give(answered(
-                response, lambda: answer(request, response), self.refusals.add)), name))
+            when(
+                self.guarded(
+                    lambda: later.give(
+                        answered(response, lambda: answer(request, response), self.refusals.add)
+                    ),
+                    name,
+                )
+            )
             return later
-        return self.own(answering_later(self.create_service(kind, name, call)),
-                        self.destroy_service)
+
+        return self.own(
+            answering_later(self.create_service(kind, name, call)), self.destroy_service
+        )

@@ -47,8 +47,7 @@ class Solver(ManagedNode[SolverSettings]):
         self._running = None
         warm_up()
         self._worker.submit(warm_up, READY_FOR)
-        self._outputs = {"map": self.output(names.ERROR_MAP),
-                         "summary": self.output(names.SUMMARY)}
+        self._outputs = {"map": self.output(names.ERROR_MAP), "summary": self.output(names.SUMMARY)}
         self._markers = self.publisher(names.MAP_MARKERS)
         self._rejected: dict[int, Marker] = {}  # by view
         self._rejected_in = ("", "")  # plan and run

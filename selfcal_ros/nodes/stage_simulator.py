@@ -73,21 +73,40 @@ class StageSimulator(CellNode[SimulatorSettings]):
     def _prepare(self, plan: Plan) -> None:
         """Draw a machine with the plate of a plan, and a placing for each of its views."""
         given = self.settings
-        self.machine = SimulatedMachine.of(Simulation(
-            plan, given.seed, self._spread, self._settings, camera=self._camera), self._time)
-        cell = Cell(Path("stage_simulator"), "simulated", {}, dict.fromkeys(AXES, ANYWHERE),
-                    sense=self._settings.sense, settle=Settle(arrival=math.inf,
-                                                              arrival_theta=math.inf))
+        self.machine = SimulatedMachine.of(
+            Simulation(plan, given.seed, self._spread, self._settings, camera=self._camera),
+            self._time,
+        )
+        cell = Cell(
+            Path("stage_simulator"),
+            "simulated",
+            {},
+            dict.fromkeys(AXES, ANYWHERE),
+            sense=self._settings.sense,
+            settle=Settle(arrival=math.inf, arrival_theta=math.inf),
+        )
         self._visitor = Visitor(
-            self.machine, cell, self._time, given.seed, consecutive=given.consecutive,
-            step_ns=self._step_ns, detects=self._camera is None)
+            self.machine,
+            cell,
+            self._time,
+            given.seed,
+            consecutive=given.consecutive,
+            step_ns=self._step_ns,
+            detects=self._camera is None,
+        )
         if plan.plan_id == CHECK_ID:
             truth = self.machine.truth
-            self.machine.truth = replace(truth, phi_rad=np.copysign(
-                np.maximum(abs(truth.phi_rad), CHECK_TURN_RAD), truth.phi_rad))
+            self.machine.truth = replace(
+                truth,
+                phi_rad=np.copysign(np.maximum(abs(truth.phi_rad), CHECK_TURN_RAD), truth.phi_rad),
+            )
         if given.truth_path:
-            write_truth(Path(given.truth_path), self.machine.truth, seed=given.seed,
-                        cell=asdict(self._settings))
+            write_truth(
+                Path(given.truth_path),
+                self.machine.truth,
+                seed=given.seed,
+                cell=asdict(self._settings),
+            )
 
     def diagnosis(self) -> Diagnosis:
         """Return its activity and the number of messages sent."""
@@ -114,8 +133,11 @@ class StageSimulator(CellNode[SimulatorSettings]):
         """Visit the commanded view, or what is missing of it."""
         check_simulated(command)
         view, plate, index = command.placed(), command.plate(), command.view_index
-        if self.machine is None or self.machine.truth.artifact != plate or (
-                index >= len(self.machine.truth.phi_rad)):
+        if (
+            self.machine is None
+            or self.machine.truth.artifact != plate
+            or (index >= len(self.machine.truth.phi_rad))
+        ):
             n_views = max(command.views_planned, index + 1)
             self._prepare(Plan(command.plan_id, plate, (view,) * n_views))
         assert self.machine is not None and self._visitor is not None
@@ -135,8 +157,11 @@ class StageSimulator(CellNode[SimulatorSettings]):
             self._next, self._free_ns = next(self._events, None), now_ns
         if self._next is None and now_ns - self._time.ns >= IDLE_STEPS * self._step_ns:
             self._time.ns = now_ns
-            self.tell(self._visitor.sample() if self._visitor else EncoderSample(
-                now_ns, AXES, (0.0, 0.0, 0.0)))
+            self.tell(
+                self._visitor.sample()
+                if self._visitor
+                else EncoderSample(now_ns, AXES, (0.0, 0.0, 0.0))
+            )
 
 
 def main() -> None:

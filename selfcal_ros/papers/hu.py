@@ -53,12 +53,22 @@ class Published:
 
 
 TABLES = (
-    Published("Table 1", ("Figure 6", "Figure 7"), (20, 20), 0.02, 0.001,
-              ((0.0541, -0.0490, 0.0195), (0.0511, -0.0506, 0.0196),
-               (1.5877e-3, -1.2065e-3, 7.1184e-4))),
-    Published("Table 2", ("Figure 8", "Figure 9"), (10, 20), 0.002, 0.0001,
-              ((0.0051, -0.0051, 0.0020), (0.0051, -0.0053, 0.0020),
-               (2.9963e-4, -6.9733e-4, 7.6657e-5))),
+    Published(
+        "Table 1",
+        ("Figure 6", "Figure 7"),
+        (20, 20),
+        0.02,
+        0.001,
+        ((0.0541, -0.0490, 0.0195), (0.0511, -0.0506, 0.0196), (1.5877e-3, -1.2065e-3, 7.1184e-4)),
+    ),
+    Published(
+        "Table 2",
+        ("Figure 8", "Figure 9"),
+        (10, 20),
+        0.002,
+        0.0001,
+        ((0.0051, -0.0051, 0.0020), (0.0051, -0.0053, 0.0020), (2.9963e-4, -6.9733e-4, 7.6657e-5)),
+    ),
 )
 
 
@@ -103,8 +113,9 @@ class HuReproduction:
 
 
 @one_thread()
-def reproduce_hu(n_draws: int, seed: int, *, workers: int = 1,
-                 progress: Progress = silent) -> HuReproduction:
+def reproduce_hu(
+    n_draws: int, seed: int, *, workers: int = 1, progress: Progress = silent
+) -> HuReproduction:
     """Run Hu's simulation: one truth, `n_draws` draws of noise at each of the two levels.
 
     The draws are solved by `workers` processes, with the same results for any number of them.
@@ -114,23 +125,33 @@ def reproduce_hu(n_draws: int, seed: int, *, workers: int = 1,
     exact = _law_errors(truth, [simulate_measurements(truth, hu_plan(ARTIFACT), rng)])
     runs = []
     for number, table in enumerate(TABLES):
-        spread = partial(mapped_in_parts, workers=workers,
-                         progress=partial(_later, progress, number))
+        spread = partial(
+            mapped_in_parts, workers=workers, progress=partial(_later, progress, number)
+        )
         runs.append(_run(truth, table, rng, n_draws, spread))
-    return HuReproduction(truth, float(abs(exact.xy).max()), float(abs(exact.theta).max()),
-                          tuple(runs))
+    return HuReproduction(
+        truth, float(abs(exact.xy).max()), float(abs(exact.theta).max()), tuple(runs)
+    )
 
 
 def _later(progress: Progress, number: int, done: int, total: int) -> None:
     progress(done + number * total, len(TABLES) * total)
 
 
-def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int,
-         spread: Callable) -> HuRun:
+def _run(
+    truth: Truth, table: Published, rng: np.random.Generator, n_draws: int, spread: Callable
+) -> HuRun:
     plan = hu_plan(ARTIFACT)
-    draws = [simulate_measurements(truth, plan, rng, sigma_m=table.sigma_um * M_PER_UM,
-                                          sigma_theta_rad=np.deg2rad(table.sigma_deg))
-             for _ in range(n_draws)]
+    draws = [
+        simulate_measurements(
+            truth,
+            plan,
+            rng,
+            sigma_m=table.sigma_um * M_PER_UM,
+            sigma_theta_rad=np.deg2rad(table.sigma_deg),
+        )
+        for _ in range(n_draws)
+    ]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES)
     bound = gain.rms_xy * table.sigma_um, gain.rms_theta * table.sigma_deg
     return HuRun(table, _law_errors(truth, draws), _joint_errors(truth, draws, spread), bound)
@@ -139,8 +160,14 @@ def _run(truth: Truth, table: Published, rng: np.random.Generator, n_draws: int,
 def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
     law = law_for(ARTIFACT, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)
     each = [hu_readings(ARTIFACT, hu_views(readings)) for readings in draws]
-    found = law.solve(HuReadings(*(np.concatenate([getattr(one, name) for one in each], axis=-1)
-                                   for name in ("v0", "v1", "v3", "vt"))))
+    found = law.solve(
+        HuReadings(
+            *(
+                np.concatenate([getattr(one, name) for one in each], axis=-1)
+                for name in ("v0", "v1", "v3", "vt")
+            )
+        )
+    )
     xy = np.moveaxis(found.g, -1, 0) - truth.g
     return Errors(xy * UM_PER_M, np.rad2deg(found.g_theta.T - truth.g_theta))
 
@@ -153,21 +180,24 @@ def _joint_errors(truth: Truth, draws: list[Measurements], spread: Callable) -> 
 
 
 def _joint_maps(draws: list[Measurements]) -> list[ErrorMap]:
-    options = Options(datum_theta=ThetaDatum.XY_AXES, misalignment_model="linear",
-                      uncertainty=False, causes=False)
+    options = Options(
+        datum_theta=ThetaDatum.XY_AXES, misalignment_model="linear", uncertainty=False, causes=False
+    )
     return [calibrate(readings, options).error_map for readings in draws]
 
 
 def hu_text(found: HuReproduction) -> str:
     """Return Tables 1 and 2 and the series of Figures 6 to 9, next to the paper's."""
     n = len(found.runs[0].law.xy)
-    lines = ["Hu, Zhu, Liu: self-calibration of XY-theta stages, section 4",
-             "N = 11, 10 mm, K = 24; law = the published steps, joint = least squares of all "
-             "readings at once",
-             f"without noise the law errs by {found.noise_free_um:.1e} um, "
-             f"{found.noise_free_deg:.1e} deg",
-             "bound = smallest rms error of any unbiased method; std leaves out the mean of a "
-             "map's error, so that it may lie below"]
+    lines = [
+        "Hu, Zhu, Liu: self-calibration of XY-theta stages, section 4",
+        "N = 11, 10 mm, K = 24; law = the published steps, joint = least squares of all "
+        "readings at once",
+        f"without noise the law errs by {found.noise_free_um:.1e} um, "
+        f"{found.noise_free_deg:.1e} deg",
+        "bound = smallest rms error of any unbiased method; std leaves out the mean of a "
+        "map's error, so that it may lie below",
+    ]
     for run in found.runs:
         lines += ["", *_table_text(run, n), "", *_series_text(run)]
     return "\n".join(lines)
@@ -175,24 +205,32 @@ def hu_text(found: HuReproduction) -> str:
 
 def _table_text(run: HuRun, n_draws: int) -> list[str]:
     table = run.published
-    lines = [f"{table.name}: noise {table.sigma_um:g} um, {table.sigma_deg:g} deg",
-             f"{'':10}{'published':^33} {'law, first draw':^33} "
-             f"{f'std of {n_draws} draws, mean +- spread':^46}",
-             f"{'':10}{'max':>11}{'min':>11}{'std':>11} {'max':>11}{'min':>11}{'std':>11} "
-             f"{'law':>22}{'joint':>22}{'bound':>11}"]
+    lines = [
+        f"{table.name}: noise {table.sigma_um:g} um, {table.sigma_deg:g} deg",
+        f"{'':10}{'published':^33} {'law, first draw':^33} "
+        f"{f'std of {n_draws} draws, mean +- spread':^46}",
+        f"{'':10}{'max':>11}{'min':>11}{'std':>11} {'max':>11}{'min':>11}{'std':>11} "
+        f"{'law':>22}{'joint':>22}{'bound':>11}",
+    ]
     names = ("EGx, um", "EGy, um", "EGth, deg")
     bounds = (run.bound[0], run.bound[0], run.bound[1])
     first = run.law.first
     for row, name in enumerate(names):
         cells = [f"{value:11.4g}" for value in (*table.table[row], *first[row])]
-        spreads = [f"{errors.std[:, row].mean():.4g} +- {_spread(errors.std[:, row]):.2g}"
-                   for errors in (run.law, run.joint)]
-        lines.append(f"{name:10}{''.join(cells[:3])} {''.join(cells[3:])} "
-                     f"{spreads[0]:>22}{spreads[1]:>22}{bounds[row]:11.4g}")
+        spreads = [
+            f"{errors.std[:, row].mean():.4g} +- {_spread(errors.std[:, row]):.2g}"
+            for errors in (run.law, run.joint)
+        ]
+        lines.append(
+            f"{name:10}{''.join(cells[:3])} {''.join(cells[3:])} "
+            f"{spreads[0]:>22}{spreads[1]:>22}{bounds[row]:11.4g}"
+        )
     for row, name in enumerate(names):
         if table.table[row][2] < table.least_std(row):
-            lines.append(f"the published row of {name.split(',')[0]} contradicts itself: with its "
-                         f"max and min, its std is at least {table.least_std(row):.3g}")
+            lines.append(
+                f"the published row of {name.split(',')[0]} contradicts itself: with its "
+                f"max and min, its std is at least {table.least_std(row):.3g}"
+            )
     return lines
 
 
@@ -202,12 +240,15 @@ def _spread(values: np.ndarray) -> float:
 
 def _series_text(run: HuRun) -> list[str]:
     lines = []
-    for figure, n, columns in zip(run.published.figures, run.published.n_draws,
-                                  ((0, 1), (2,)), strict=True):
+    for figure, n, columns in zip(
+        run.published.figures, run.published.n_draws, ((0, 1), (2,)), strict=True
+    ):
         lines.append(f"{figure}: std of the law's error in {min(n, len(run.law.xy))} draws")
         for column in columns:
             name = ("x, um", "y, um", "theta, deg")[column]
-            values = " ".join(f"{value:.2e}" if column == 2 else f"{value:.4f}"
-                              for value in run.law.std[:n, column])
+            values = " ".join(
+                f"{value:.2e}" if column == 2 else f"{value:.4f}"
+                for value in run.law.std[:n, column]
+            )
             lines.append(f"  {name}: {values}")
     return lines

@@ -83,8 +83,9 @@ class HuLaw:
         +1, or -1 for the second sense.
     """
 
-    def __init__(self, artifact: Artifact, datum: ThetaDatum, axis_lines: np.ndarray,
-                 axis_sign: int) -> None:
+    def __init__(
+        self, artifact: Artifact, datum: ThetaDatum, axis_lines: np.ndarray, axis_sign: int
+    ) -> None:
         self.artifact, self.datum, self.axis_sign = artifact, datum, axis_sign
         self.x, self.y = artifact.x_m[..., None], artifact.y_m[..., None]
         self.sum_r2 = float((artifact.x_m**2 + artifact.y_m**2).sum())
@@ -98,38 +99,48 @@ class HuLaw:
         """Return the solution for every column of `readings`."""
         x, y, d = self.x, self.y, self.sum_r2
         v0, v1, v3, vt = readings.v0, readings.v1, readings.v3, readings.vt
-        t0, t1 = v0.mean(axis=(1, 2)), v1.mean(axis=(1, 2))                          # eq. 16
-        phi0 = (v0[1] * x - v0[0] * y).sum(axis=(0, 1)) / d                          # eq. 16
-        phi1 = -(v1[0] * x + v1[1] * y).sum(axis=(0, 1)) / d                         # eq. 16
-        phi2 = vt[2].mean(axis=0) - vt[0].mean(axis=0) + phi0                        # eq. 17
-        phi3 = vt[3].mean(axis=0) - vt[0].mean(axis=0) + phi0                        # eq. 17
-        u0x, u0y = v0[0] - t0[0] + phi0 * y, v0[1] - t0[1] - phi0 * x                # eq. 18
-        u1x, u1y = v1[0] - t1[0] + phi1 * x, v1[1] - t1[1] + phi1 * y                # eq. 19
-        u3x, u3y = v3[0] + phi3 * y[:-1], v3[1] - phi3 * x[:-1]                      # eq. 21
-        o = ((u0x * y + u0y * x) + (u1x * x - u1y * y)).sum(axis=(0, 1)) / (2 * d)   # eq. 22
-        r = ((u0x * x - u0y * y) - (u1x * y + u1y * x)).sum(axis=(0, 1)) / (2 * d)   # eq. 22
+        t0, t1 = v0.mean(axis=(1, 2)), v1.mean(axis=(1, 2))  # eq. 16
+        phi0 = (v0[1] * x - v0[0] * y).sum(axis=(0, 1)) / d  # eq. 16
+        phi1 = -(v1[0] * x + v1[1] * y).sum(axis=(0, 1)) / d  # eq. 16
+        phi2 = vt[2].mean(axis=0) - vt[0].mean(axis=0) + phi0  # eq. 17
+        phi3 = vt[3].mean(axis=0) - vt[0].mean(axis=0) + phi0  # eq. 17
+        u0x, u0y = v0[0] - t0[0] + phi0 * y, v0[1] - t0[1] - phi0 * x  # eq. 18
+        u1x, u1y = v1[0] - t1[0] + phi1 * x, v1[1] - t1[1] + phi1 * y  # eq. 19
+        u3x, u3y = v3[0] + phi3 * y[:-1], v3[1] - phi3 * x[:-1]  # eq. 21
+        o = ((u0x * y + u0y * x) + (u1x * x - u1y * y)).sum(axis=(0, 1)) / (2 * d)  # eq. 22
+        r = ((u0x * x - u0y * y) - (u1x * y + u1y * x)).sum(axis=(0, 1)) / (2 * d)  # eq. 22
         quarter = (u0x - u1y - 2 * o * y - 2 * r * x, u0y + u1x - 2 * o * x + 2 * r * y)  # eq. 23
-        step = (u3x - u0x[:-1], u3y - u0y[:-1])                                      # eq. 24
-        right = np.concatenate([_columns(part) for part in (
-            *quarter, *(np.diff(part, axis=axis) for part in step for axis in (0, 1)))])  # eq. 25
-        f, rest_xy = self.solve_xy(right, np.zeros((6, right.shape[1])))             # eq. 26
+        step = (u3x - u0x[:-1], u3y - u0y[:-1])  # eq. 24
+        right = np.concatenate(
+            [
+                _columns(part)
+                for part in (
+                    *quarter,
+                    *(np.diff(part, axis=axis) for part in step for axis in (0, 1)),
+                )
+            ]
+        )  # eq. 25
+        f, rest_xy = self.solve_xy(right, np.zeros((6, right.shape[1])))  # eq. 26
         rest_xy -= self.phi3_rest[:, None] * (self.phi3_rest @ rest_xy)
         f = f.reshape(v0.shape)
-        g = np.stack([o * y + r * x + f[0], o * x - r * y + f[1]])                   # eq. 6
+        g = np.stack([o * y + r * x + f[0], o * x - r * y + f[1]])  # eq. 6
         phi = np.stack([phi0, phi1, phi2, phi3])
         g_theta, rest_theta = self._theta(vt - phi[:, None], g)
-        a = np.stack([u0x, u0y]) - g                                                 # eq. 18
-        t3 = v3 - g[:, 1:] - a[:, :-1] - phi3 * np.stack([-y, x])[:, :-1]            # eq. 15
+        a = np.stack([u0x, u0y]) - g  # eq. 18
+        t3 = v3 - g[:, 1:] - a[:, :-1] - phi3 * np.stack([-y, x])[:, :-1]  # eq. 15
         t = np.stack([t0, t1, np.full_like(t0, np.nan), t3.mean(axis=(1, 2))])
         return HuSolution(
-            g, a, g_theta,
+            g,
+            a,
+            g_theta,
             a_theta=vt[0] - phi0 - g_theta,
             phi=phi,
             t=t,
             o=o,
             r=r,
             rest_xy=rest_xy,
-            rest_theta=rest_theta)
+            rest_theta=rest_theta,
+        )
 
     def _left_by_phi3(self) -> np.ndarray:
         """Return the residual of eq. 25 caused by an error of phi3, of unit length.
@@ -137,11 +148,16 @@ class HuLaw:
         phi3 comes from the angular lines alone (eq. 17), so its error is angular noise: it is
         removed from the residuals before the noise of the grid readings is estimated from them.
         """
-        step = np.stack([np.broadcast_to(self.y, (*self.artifact.shape, 1)),
-                         np.broadcast_to(-self.x, (*self.artifact.shape, 1))])[:, :-1]
+        step = np.stack(
+            [
+                np.broadcast_to(self.y, (*self.artifact.shape, 1)),
+                np.broadcast_to(-self.x, (*self.artifact.shape, 1)),
+            ]
+        )[:, :-1]
         quarter = np.zeros((2 * self.x.size, 1))
-        right = np.concatenate([quarter, *(_columns(np.diff(part, axis=axis))
-                                           for part in step for axis in (0, 1))])
+        right = np.concatenate(
+            [quarter, *(_columns(np.diff(part, axis=axis)) for part in step for axis in (0, 1))]
+        )
         rest = self.solve_xy(right, np.zeros((6, 1)))[1][:, 0]
         return rest / np.linalg.norm(rest)
 
@@ -160,8 +176,9 @@ def _columns(part: np.ndarray) -> np.ndarray:
 
 def _diagonals(values: tuple[float, ...], shape: tuple[int, int]) -> sparse.csr_array:
     """Return a matrix of constant diagonals, the main one first; SciPy 1.11 lacks diags_array."""
-    return sparse.dia_array((np.outer(values, np.ones(shape[1])), range(len(values))),
-                            shape=shape).tocsr()
+    return sparse.dia_array(
+        (np.outer(values, np.ones(shape[1])), range(len(values))), shape=shape
+    ).tocsr()
 
 
 def _identity(size: int) -> sparse.csr_array:
@@ -173,13 +190,23 @@ def _rows_xy(size: int) -> sparse.csr_array:
     one = _identity(size)
     first = _diagonals((-1.0, 1.0), (size - 1, size))
     second = first[:-1, :-1] @ first
-    curve = sparse.kron(second, one)                       # F(m+2,n) - 2 F(m+1,n) + F(m,n)
-    twist = sparse.kron(first, first)                      # the mixed difference
+    curve = sparse.kron(second, one)  # F(m+2,n) - 2 F(m+1,n) + F(m,n)
+    twist = sparse.kron(first, first)  # the mixed difference
     full = _identity(size * size)
     i, j = (index.ravel() for index in np.indices((size, size)))
-    turned = full[(size - 1 - j) * size + i]               # value at (-n, m)
-    return sparse.csr_array(sparse.bmat([[full, -turned], [turned, full], [curve, None],
-                                         [twist, None], [None, curve], [None, twist]]))
+    turned = full[(size - 1 - j) * size + i]  # value at (-n, m)
+    return sparse.csr_array(
+        sparse.bmat(
+            [
+                [full, -turned],
+                [turned, full],
+                [curve, None],
+                [twist, None],
+                [None, curve],
+                [None, twist],
+            ]
+        )
+    )
 
 
 def _first_order_rows(artifact: Artifact) -> np.ndarray:
@@ -191,36 +218,51 @@ def _first_order_rows(artifact: Artifact) -> np.ndarray:
     return rows.reshape(6, -1)
 
 
-def _rows_theta(count: int, datum: ThetaDatum, axis_lines: np.ndarray,
-                ) -> tuple[sparse.csr_array, np.ndarray]:
+def _rows_theta(
+    count: int,
+    datum: ThetaDatum,
+    axis_lines: np.ndarray,
+) -> tuple[sparse.csr_array, np.ndarray]:
     one = _identity(count)
     k = np.arange(count)
-    rows = sparse.csr_array(sparse.vstack([one[(k + count // 4) % count] - one,
-                                           one[(k + 1) % count] - one]))
+    rows = sparse.csr_array(
+        sparse.vstack([one[(k + count // 4) % count] - one, one[(k + 1) % count] - one])
+    )
     if datum is ThetaDatum.ZERO_MEAN:
         return rows, np.full((1, count), 1 / np.sqrt(count))
     return rows, one[axis_lines].toarray()
 
 
-def _bordered(rows: sparse.csr_array, ties: np.ndarray,
-              ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+def _bordered(
+    rows: sparse.csr_array,
+    ties: np.ndarray,
+) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Return a least-squares solver for `rows` together with the few dense rows `ties`.
 
     The dense rows border the normal matrix, so that it stays sparse. The solver takes the
     right-hand sides of both and returns the solution and the residuals of `rows`.
     """
     unknowns = rows.shape[1]
-    bordered = sparse.csc_array(sparse.bmat(
-        [[rows.T @ rows, sparse.csr_array(ties).T],
-         [sparse.csr_array(ties), -_identity(len(ties))]]))
-    factor = splu(bordered, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01,
-                  options={"SymmetricMode": True})
+    bordered = sparse.csc_array(
+        sparse.bmat(
+            [
+                [rows.T @ rows, sparse.csr_array(ties).T],
+                [sparse.csr_array(ties), -_identity(len(ties))],
+            ]
+        )
+    )
+    factor = splu(
+        bordered,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.01,
+        options={"SymmetricMode": True},
+    )
 
     def solve(right: np.ndarray, tied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = factor.solve(np.concatenate([rows.T @ right, tied]))[:unknowns]
         rest, slack = right - rows @ found, tied - ties @ found
         more = factor.solve(np.concatenate([rows.T @ rest, slack]))[:unknowns]
-        return found + more, rest - rows @ more            # one refinement: to rounding
+        return found + more, rest - rows @ more  # one refinement: to rounding
 
     return solve
 
@@ -235,8 +277,12 @@ JOINTLY = "solve with --method joint"
 """Remedy for what the law cannot use."""
 
 _REMEDY = f"measure Hu's four views in full, or {JOINTLY}"
-_NAMES = ("0 deg with grid and lines", "90 deg with grid and lines", "one line, lines only",
-          "one pitch along +X with grid and lines")
+_NAMES = (
+    "0 deg with grid and lines",
+    "90 deg with grid and lines",
+    "one line, lines only",
+    "one pitch along +X with grid and lines",
+)
 
 
 def solve_law(measurements: Measurements, options: Options) -> Solved:
@@ -277,25 +323,40 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     result = CalibrationResult(
         measurements.plan_id,
         ErrorMap(
-            artifact, gx, gy,
+            artifact,
+            gx,
+            gy,
             u_gx=u_gx,
             u_gy=u_gy,
             g_theta=g_theta,
             u_g_theta=u_theta,
             nonorthogonality=float(found.o[0]),
             scale_difference=float(found.r[0]),
-            datum_theta=law.datum),
+            datum_theta=law.datum,
+        ),
         ArtifactMap(found.a[0, ..., 0], found.a[1, ..., 0], found.a_theta[:, 0]),
-        tuple(ViewResult(
-            view.view.name, view.view.rotation_rad, *view.view.translation_m,
-            phi=float(found.phi[order.index(i), 0]), tx=float(found.t[order.index(i), 0, 0]),
-            ty=float(found.t[order.index(i), 1, 0]), used=view.used,
-            rejected=sum(view.rejected.values())) for i, view in enumerate(measurements.views)),
+        tuple(
+            ViewResult(
+                view.view.name,
+                view.view.rotation_rad,
+                *view.view.translation_m,
+                phi=float(found.phi[order.index(i), 0]),
+                tx=float(found.t[order.index(i), 0, 0]),
+                ty=float(found.t[order.index(i), 1, 0]),
+                used=view.used,
+                rejected=sum(view.rejected.values()),
+            )
+            for i, view in enumerate(measurements.views)
+        ),
         # complete views: each site and each line has two readings or more
         Observability(4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0),
         noise,
-        measurements.all_rejected(), findings=_findings(artifact, options), method="law",
-        sense=str(sense), run_id=measurements.run_id)
+        measurements.all_rejected(),
+        findings=_findings(artifact, options),
+        method="law",
+        sense=str(sense),
+        run_id=measurements.run_id,
+    )
     return Solved(result, xy, theta)
 
 
@@ -312,11 +373,18 @@ def law_for(artifact: Artifact, datum: ThetaDatum, sense: Sense) -> HuLaw:
         If the half axes are too short for the slopes of eq. 27, or have no sites.
     """
     if datum is ThetaDatum.XY_AXES and artifact.grid_size % 2 == 0:
-        raise InputError("method law", f"no marks of {artifact.grid_size} rows lie on the axes, "
-                         "which have no slope (Hu eq. 27)", "use the theta datum zero_mean")
+        raise InputError(
+            "method law",
+            f"no marks of {artifact.grid_size} rows lie on the axes, "
+            "which have no slope (Hu eq. 27)",
+            "use the theta datum zero_mean",
+        )
     if datum is ThetaDatum.XY_AXES and artifact.grid_size < 5:
-        raise InputError("method law", "a half axis of one mark has no slope (Hu eq. 27)",
-                         "use the theta datum zero_mean")
+        raise InputError(
+            "method law",
+            "a half axis of one mark has no slope (Hu eq. 27)",
+            "use the theta datum zero_mean",
+        )
     quarter = artifact.angular_count // 4
     if sense is Sense.PLATE_MOVES:
         return HuLaw(artifact, datum, np.array([2, 1, 0, 3]) * quarter, -1)
@@ -332,13 +400,21 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
         If the plate or the views are not Hu's, or marks are missing.
     """
     artifact = measurements.artifact
-    if artifact.shape[0] != artifact.shape[1] or not artifact.angular_count or (
-            artifact.angular_count % 4 or artifact.harmonics):
-        raise InputError("method law", "Hu's law needs a square plate with 4, 8, 12, ... lines "
-                         "and a value at each line",
-                         JOINTLY)
+    if (
+        artifact.shape[0] != artifact.shape[1]
+        or not artifact.angular_count
+        or (artifact.angular_count % 4 or artifact.harmonics)
+    ):
+        raise InputError(
+            "method law",
+            "Hu's law needs a square plate with 4, 8, 12, ... lines and a value at each line",
+            JOINTLY,
+        )
     wanted: dict[tuple, int] = {
-        (0, (0, 0), 0): 0, (1, (0, 0), artifact.angular_count // 4): 1, (0, (1, 0), 0): 3}
+        (0, (0, 0), 0): 0,
+        (1, (0, 0), artifact.angular_count // 4): 1,
+        (0, (1, 0), 0): 3,
+    }
     found: dict[int, ViewReadings] = {}
     for view in measurements.views:
         pose = view.view.lattice_pose(artifact)
@@ -347,8 +423,11 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
         if not grid and lines and (pose.shift, pose.turn_lines) == ((0, 0), 1):
             index = 2
         if index is None or index in found:
-            raise InputError(f"method law: view '{view.view.name}'", "is not one of Hu's four "
-                             "views, each once", _REMEDY)
+            raise InputError(
+                f"method law: view '{view.view.name}'",
+                "is not one of Hu's four views, each once",
+                _REMEDY,
+            )
         found[index] = view
     for index, name in enumerate(_NAMES):
         if index not in found:
@@ -360,11 +439,16 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
 def _require_complete(view: ViewReadings, index: int, artifact: Artifact) -> None:
     size, lines = artifact.grid_size, artifact.angular_count
     wanted = {2: 0, 3: size * (size - 1)}.get(index, size * size)
-    for what, have, want in (("grid marks", len(view.m), wanted),
-                             ("angular lines", len(view.k), lines)):
+    for what, have, want in (
+        ("grid marks", len(view.m), wanted),
+        ("angular lines", len(view.k), lines),
+    ):
         if have != want:
-            raise InputError(f"method law: view '{view.view.name}'",
-                             f"{have} of {want} {what} were read", _REMEDY)
+            raise InputError(
+                f"method law: view '{view.view.name}'",
+                f"{have} of {want} {what} were read",
+                _REMEDY,
+            )
 
 
 def hu_readings(artifact: Artifact, views: list[ViewReadings]) -> HuReadings:
@@ -400,20 +484,26 @@ class _Spread:
     def uncertainty(self, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
         """Return the standard uncertainties of g (2, N, N) and g_theta (K,)."""
         power = np.array([noise.sigma_xy, noise.sigma_theta]) ** 2
-        return (np.sqrt(np.tensordot(power, self.var_g, axes=1)),
-                np.sqrt(np.tensordot(power, self.var_theta, axes=1)))
+        return (
+            np.sqrt(np.tensordot(power, self.var_g, axes=1)),
+            np.sqrt(np.tensordot(power, self.var_theta, axes=1)),
+        )
 
 
 def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
     """Propagate the noise of each reading: exactly up to EXACT_SIZE, else by draws."""
     exact = law.artifact.grid_size <= EXACT_SIZE
-    grid, lines = (law.solve(_unit_noise(law.artifact, views, kind=kind, exact=exact))
-                   for kind in range(2))
-    rest, dof = np.transpose([_quadratic_form(each, exact=exact)
-                              for each in (grid.rest_xy, lines.rest_theta)])
+    grid, lines = (
+        law.solve(_unit_noise(law.artifact, views, kind=kind, exact=exact)) for kind in range(2)
+    )
+    rest, dof = np.transpose(
+        [_quadratic_form(each, exact=exact) for each in (grid.rest_xy, lines.rest_theta)]
+    )
     columns = 1 if exact else N_DRAWS
-    var_g, var_theta = (np.stack([(values**2).sum(axis=-1) / columns for values in each]) for each
-                        in ((grid.g, lines.g), (grid.g_theta, lines.g_theta)))
+    var_g, var_theta = (
+        np.stack([(values**2).sum(axis=-1) / columns for values in each])
+        for each in ((grid.g, lines.g), (grid.g_theta, lines.g_theta))
+    )
     return _Spread(var_g, var_theta, rest, dof)
 
 
@@ -428,16 +518,20 @@ def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:
     return mean, 2 * mean**2 / twice_squares
 
 
-def _unit_noise(artifact: Artifact, views: list[ViewReadings], *, kind: int,
-                exact: bool) -> HuReadings:
+def _unit_noise(
+    artifact: Artifact, views: list[ViewReadings], *, kind: int, exact: bool
+) -> HuReadings:
     """Return unit noise of all readings of one kind: one column per reading, or random columns."""
     size, lines = artifact.grid_size, artifact.angular_count
     shapes = [(2, size, size), (2, size, size), (2, size - 1, size), (4, lines)]
-    weights = [_per_mean(views[index], artifact, shape)
-               for index, shape in zip((0, 1, 3), shapes, strict=False)]
+    weights = [
+        _per_mean(views[index], artifact, shape)
+        for index, shape in zip((0, 1, 3), shapes, strict=False)
+    ]
     weights.append(np.array([1 / np.sqrt(view.count_theta) for view in views]))
-    slots = np.concatenate([w.ravel() if (i == 3) == bool(kind) else np.zeros(w.size)
-                            for i, w in enumerate(weights)])
+    slots = np.concatenate(
+        [w.ravel() if (i == 3) == bool(kind) else np.zeros(w.size) for i, w in enumerate(weights)]
+    )
     active = np.flatnonzero(slots)
     if exact:
         columns = np.zeros((len(slots), len(active)))
@@ -446,35 +540,52 @@ def _unit_noise(artifact: Artifact, views: list[ViewReadings], *, kind: int,
         rng = np.random.default_rng(kind)
         columns = slots[:, None] * rng.standard_normal((len(slots), N_DRAWS))
     edges = np.cumsum([w.size for w in weights])[:-1]
-    return HuReadings(*(part.reshape(*shape, -1) for part, shape in
-                        zip(np.split(columns, edges), shapes, strict=True)))
+    return HuReadings(
+        *(
+            part.reshape(*shape, -1)
+            for part, shape in zip(np.split(columns, edges), shapes, strict=True)
+        )
+    )
 
 
 def _per_mean(view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]) -> np.ndarray:
     counts = np.full(artifact.shape, np.nan)
     counts[artifact.index(view.m, view.n)] = view.count
-    return np.broadcast_to(1 / np.sqrt(counts[:shape[1]]), shape)
+    return np.broadcast_to(1 / np.sqrt(counts[: shape[1]]), shape)
 
 
-def _noise(found: HuSolution, spread: _Spread,
-           views: tuple[ViewReadings, ...]) -> tuple[NoiseEstimate, NoiseEstimate]:
+def _noise(
+    found: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]
+) -> tuple[NoiseEstimate, NoiseEstimate]:
     """Estimate the noise of one reading from repeats, and from the residuals."""
-    rest = np.sqrt([(found.rest_xy**2).sum() / spread.rest[0],
-                    (found.rest_theta**2).sum() / spread.rest[1]])
+    rest = np.sqrt(
+        [(found.rest_xy**2).sum() / spread.rest[0], (found.rest_theta**2).sum() / spread.rest[1]]
+    )
     dof = np.maximum(np.round(spread.rest_dof), 1).astype(int)
     declared = float("nan")
-    xy = noise_estimate(pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
-               (float(rest[0]), int(dof[0])), declared, floor=FLOOR)
-    theta = noise_estimate(pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
-                  (float(rest[1]), int(dof[1])), declared, floor=FLOOR)
+    xy = noise_estimate(
+        pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
+        (float(rest[0]), int(dof[0])),
+        declared,
+        floor=FLOOR,
+    )
+    theta = noise_estimate(
+        pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
+        (float(rest[1]), int(dof[1])),
+        declared,
+        floor=FLOOR,
+    )
     return xy, theta
 
 
-def _to_stage(sense: Sense, field: np.ndarray, theta: np.ndarray, *,
-              sign: int = -1) -> tuple[np.ndarray, np.ndarray]:
+def _to_stage(
+    sense: Sense, field: np.ndarray, theta: np.ndarray, *, sign: int = -1
+) -> tuple[np.ndarray, np.ndarray]:
     """Return maps (2, N, N, ...) and (K, ...) of the equations as those of the stage."""
-    return (turned_over(sense, field, sign=sign, axes=(1, 2)),
-            lines_turned_over(sense, theta, sign=sign))
+    return (
+        turned_over(sense, field, sign=sign, axes=(1, 2)),
+        lines_turned_over(sense, theta, sign=sign),
+    )
 
 
 def _findings(artifact: Artifact, options: Options) -> tuple[Finding, ...]:

@@ -56,11 +56,15 @@ def calibrate_by_law(measurements: Measurements, options: Options) -> Calibratio
 def require_plain(measurements: Measurements, options: Options) -> None:
     """Raise InputError if readings or options have what the law cannot use."""
     for name, given, why in (
-            ("robust", options.robust, "Hu's law needs every reading and cannot leave any out"),
-            ("method law", options.plate, "Hu's law cannot use a known plate"),
-            ("method law", measurements.has_images,  # their common noise is not in its U
-             "Hu's law cannot use images of several marks"),
-            ("method law", options.reference, "Hu's law has no reference length"),
-            ("method law", options.terms, "Hu's law has no terms besides stage and plate")):
+        ("robust", options.robust, "Hu's law needs every reading and cannot leave any out"),
+        ("method law", options.plate, "Hu's law cannot use a known plate"),
+        (
+            "method law",
+            measurements.has_images,  # their common noise is not in its U
+            "Hu's law cannot use images of several marks",
+        ),
+        ("method law", options.reference, "Hu's law has no reference length"),
+        ("method law", options.terms, "Hu's law has no terms besides stage and plate"),
+    ):
         if given:
             raise InputError(name, why, JOINTLY)

@@ -24,14 +24,26 @@ from selfcal_ros.units import UM_PER_M
 
 SIZES = (3, 5, 7, 9, 11)
 ARTIFACT = Artifact(11, 0.01)
-SPREAD = Spread(g_m=1e-6, a_m=1e-6, phi_rad=np.deg2rad(30 / 3600), t_m=30e-6,
-                encoder="xy_axes", rotation="linear")
+SPREAD = Spread(
+    g_m=1e-6,
+    a_m=1e-6,
+    phi_rad=np.deg2rad(30 / 3600),
+    t_m=30e-6,
+    encoder="xy_axes",
+    rotation="linear",
+)
 SIGMA_M = 0.1e-6
 PUBLISHED_RMS_UM = (0.0563, 0.0572)
 PUBLISHED_MEAN_UM = 0.05
 
-POSES = {"initial": (0, 0, 0), "90 deg": (1, 0, 0), "180 deg": (2, 0, 0), "shift +x": (0, 1, 0),
-         "shift -x": (0, -1, 0), "shift +y": (0, 0, 1)}
+POSES = {
+    "initial": (0, 0, 0),
+    "90 deg": (1, 0, 0),
+    "180 deg": (2, 0, 0),
+    "shift +x": (0, 1, 0),
+    "shift -x": (0, -1, 0),
+    "shift +y": (0, 0, 1),
+}
 
 
 @dataclass(frozen=True)
@@ -117,36 +129,48 @@ class QiaoReproduction:
 def plan_of(views: tuple[str, ...], artifact: Artifact = ARTIFACT) -> Plan:
     """Return the plan of Qiao's positions on a plate."""
     pitch = artifact.grid_pitch_m
-    return Plan(" + ".join(views), artifact, tuple(
-        View(name, q * pi / 2, (a * pitch, b * pitch), True, False)
-        for name, (q, a, b) in ((name, POSES[name]) for name in views)))
+    return Plan(
+        " + ".join(views),
+        artifact,
+        tuple(
+            View(name, q * pi / 2, (a * pitch, b * pitch), True, False)
+            for name, (q, a, b) in ((name, POSES[name]) for name in views)
+        ),
+    )
 
 
 @one_thread()
-def reproduce_qiao(n_draws: int, seed: int, *, workers: int = 1,
-                   progress: Progress = silent) -> QiaoReproduction:
+def reproduce_qiao(
+    n_draws: int, seed: int, *, workers: int = 1, progress: Progress = silent
+) -> QiaoReproduction:
     """Compute all ranks, run both programs without noise and the noise run `n_draws` times.
 
     The noise runs are solved by `workers` processes, with the same results for any number.
     """
-    seen = [[plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES]
-            for row in ROWS]
+    seen = [
+        [plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES] for row in ROWS
+    ]
     rng = np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, 3, rng, SPREAD)
     first, second = (_program(truth, views) for views in PROGRAMS)
     plan = plan_of(PROGRAMS[0])
-    draws = [simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M)
-             for _ in range(n_draws)]
+    draws = [simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M) for _ in range(n_draws)]
     exact = simulate_measurements(truth, plan, rng)
     draws += [_with_uniform_noise(exact, rng) for _ in range(n_draws)]
-    errors = mapped_in_parts(partial(_all_errors_um, truth), draws, workers=workers,
-                             progress=progress)
+    errors = mapped_in_parts(
+        partial(_all_errors_um, truth), draws, workers=workers, progress=progress
+    )
     normal, uniform = errors[:n_draws], errors[n_draws:]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES).rms_xy
     return QiaoReproduction(
         np.array([[s.rank for s in row] for row in seen]),
-        np.array([[s.unknowns for s in row] for row in seen]), (first, second), _rms(normal),
-        _rms(uniform), normal[0], gain * SIGMA_M * UM_PER_M)
+        np.array([[s.unknowns for s in row] for row in seen]),
+        (first, second),
+        _rms(normal),
+        _rms(uniform),
+        normal[0],
+        gain * SIGMA_M * UM_PER_M,
+    )
 
 
 def _rms(errors: list[np.ndarray]) -> np.ndarray:
@@ -165,12 +189,17 @@ def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
 
 def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Measurements:
     """Add uniform noise within +-SIGMA_M."""
+
     def shaken(view: ViewReadings) -> ViewReadings:
         dx, dy = rng.uniform(-SIGMA_M, SIGMA_M, (2, len(view.dx)))
         return ViewReadings(view.view, view.m, view.n, view.dx + dx, view.dy + dy, view.count)
 
-    return Measurements(readings.plan_id, readings.artifact,
-                        tuple(shaken(view) for view in readings.views), readings.sense)
+    return Measurements(
+        readings.plan_id,
+        readings.artifact,
+        tuple(shaken(view) for view in readings.views),
+        readings.sense,
+    )
 
 
 def _program(truth: Truth, views: tuple[str, ...]) -> Program:
@@ -200,21 +229,28 @@ def _minimum_norm(truth: Truth, plan: Plan) -> np.ndarray:
         columns.append(_observe(_truth_of(vector, artifact, n_views), plan))
     stage, plate = datum_modes(artifact, scale=True), datum_modes(artifact, scale=False)
     datum = np.zeros((7, 4 * sites + 3 * n_views))
-    datum[:4, :2 * sites] = stage.reshape(4, -1)
-    datum[4:, 2 * sites:4 * sites] = plate.reshape(3, -1)
+    datum[:4, : 2 * sites] = stage.reshape(4, -1)
+    datum[4:, 2 * sites : 4 * sites] = plate.reshape(3, -1)
     matrix = np.vstack([np.array(columns).T, datum])
     right = np.concatenate([_observe(truth, plan), np.zeros(7)])
     found = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
-    return found[:2 * sites].reshape(2, *artifact.shape)
+    return found[: 2 * sites].reshape(2, *artifact.shape)
 
 
 def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> Truth:
     sites, pitch = artifact.m.size, artifact.grid_pitch_m
     shape = (2, *artifact.shape)
-    tail = vector[4 * sites:].reshape(n_views, 3)
-    return Truth(artifact, vector[:2 * sites].reshape(shape),
-                        vector[2 * sites:4 * sites].reshape(shape), np.zeros(0), np.zeros(0),
-                        tail[:, 0] / pitch, tail[:, 1:], linear=True)
+    tail = vector[4 * sites :].reshape(n_views, 3)
+    return Truth(
+        artifact,
+        vector[: 2 * sites].reshape(shape),
+        vector[2 * sites : 4 * sites].reshape(shape),
+        np.zeros(0),
+        np.zeros(0),
+        tail[:, 0] / pitch,
+        tail[:, 1:],
+        linear=True,
+    )
 
 
 def _observe(truth: Truth, plan: Plan) -> np.ndarray:
@@ -225,36 +261,62 @@ def _observe(truth: Truth, plan: Plan) -> np.ndarray:
 
 def qiao_text(found: QiaoReproduction) -> str:
     """Return the rank tables, both programs and the noise run, next to the paper's."""
-    lines = ["Qiao et al.: position self-calibration by least squares, tables 1-4",
-             f"{'positions':44}{'printed rank':>14}  " + "".join(f"{f'n = {n}':>10}" for n in SIZES)
-             + "   unknowns"]
+    lines = [
+        "Qiao et al.: position self-calibration by least squares, tables 1-4",
+        f"{'positions':44}{'printed rank':>14}  "
+        + "".join(f"{f'n = {n}':>10}" for n in SIZES)
+        + "   unknowns",
+    ]
     for row, ranks in zip(ROWS, found.ranks, strict=True):
-        marks = [f"{rank:>9}" + ("=" if rank == row.rank(n) else "!")
-                 for rank, n in zip(ranks, SIZES, strict=True)]
-        lines.append(f"{' + '.join(row.views):44}{row.formula:>14}  {''.join(marks)}"
-                     f"   4n^2+{row.extra}")
-    equal = sum(int(rank == row.rank(n)) for row, ranks in zip(ROWS, found.ranks, strict=True)
-                for rank, n in zip(ranks, SIZES, strict=True))
-    lines += [f"{equal} of {found.ranks.size} ranks as printed (marked =)", "",
-              "Figure 3: without noise, n = 11, stage and plate errors of 1 um"]
-    for number, (program, published) in enumerate(zip(found.programs, (
-            "the answer covers the truth", "the answer differs from the truth"), strict=True), 1):
-        how = "" if not program.deficiency else \
-            (" by the generalised inverse; `solve` refuses "
-             f"({program.deficiency} modes undetermined)")
-        lines.append(f"  program {number}, {' + '.join(program.views)}: rms error "
-                     f"{program.rms_um:.3g} um{how}; published: {published}")
+        marks = [
+            f"{rank:>9}" + ("=" if rank == row.rank(n) else "!")
+            for rank, n in zip(ranks, SIZES, strict=True)
+        ]
+        lines.append(
+            f"{' + '.join(row.views):44}{row.formula:>14}  {''.join(marks)}   4n^2+{row.extra}"
+        )
+    equal = sum(
+        int(rank == row.rank(n))
+        for row, ranks in zip(ROWS, found.ranks, strict=True)
+        for rank, n in zip(ranks, SIZES, strict=True)
+    )
+    lines += [
+        f"{equal} of {found.ranks.size} ranks as printed (marked =)",
+        "",
+        "Figure 3: without noise, n = 11, stage and plate errors of 1 um",
+    ]
+    for number, (program, published) in enumerate(
+        zip(
+            found.programs,
+            ("the answer covers the truth", "the answer differs from the truth"),
+            strict=True,
+        ),
+        1,
+    ):
+        how = (
+            ""
+            if not program.deficiency
+            else (
+                " by the generalised inverse; `solve` refuses "
+                f"({program.deficiency} modes undetermined)"
+            )
+        )
+        lines.append(
+            f"  program {number}, {' + '.join(program.views)}: rms error "
+            f"{program.rms_um:.3g} um{how}; published: {published}"
+        )
     return "\n".join([*lines, "", *_noise_text(found)])
 
 
 def _noise_text(found: QiaoReproduction) -> list[str]:
     n, (x, y) = len(found.rms_um), found.rms_um[0]
     both, uniform = (rms(r) for r in (found.rms_um, found.rms_uniform_um))
-    return [f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",
-            f"  rms error of one draw: x {x:.4f} um, y {y:.4f} um; published "
-            f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} um",
-            f"  rms over all draws: {both:.4f} um; published {PUBLISHED_MEAN_UM} um",
-            f"  bound of any unbiased estimator: {found.bound_um:.4f} um",
-            "  The published figure lies below that bound, so that it is not reproducible as "
-            "printed.",
-            f"  Noise uniform within +-0.1 um gives {uniform:.4f} um: probably this was used."]
+    return [
+        f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",
+        f"  rms error of one draw: x {x:.4f} um, y {y:.4f} um; published "
+        f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} um",
+        f"  rms over all draws: {both:.4f} um; published {PUBLISHED_MEAN_UM} um",
+        f"  bound of any unbiased estimator: {found.bound_um:.4f} um",
+        "  The published figure lies below that bound, so that it is not reproducible as printed.",
+        f"  Noise uniform within +-0.1 um gives {uniform:.4f} um: probably this was used.",
+    ]

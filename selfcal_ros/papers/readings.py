@@ -15,8 +15,9 @@ from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.machine import Truth
 
 
-def grid_deviation(truth: Truth, index: int, view: View, *,
-                   sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
+def grid_deviation(
+    truth: Truth, index: int, view: View, *, sense: Sense = Sense.MICROSCOPE_MOVES
+) -> np.ndarray:
     """Return the deviation of every mark in a view, (2, nx, ny), m; NaN off the field.
 
     For a stage that stops at the nominal position, at the beginning of the view, without
@@ -37,18 +38,25 @@ def grid_deviation(truth: Truth, index: int, view: View, *,
     return out.reshape(2, *artifact.shape)
 
 
-def angular_deviation(truth: Truth, index: int, view: View, *,
-                      sense: Sense = Sense.MICROSCOPE_MOVES) -> np.ndarray:
+def angular_deviation(
+    truth: Truth, index: int, view: View, *, sense: Sense = Sense.MICROSCOPE_MOVES
+) -> np.ndarray:
     """Return the noise-free deviation of every angular line in a view, (K,), rad."""
     direction, nominal, _ = physics.line_directions(truth, index, view)
     sign = sense.sign
     return direction - nominal + sign * physics.encoder_error(truth, sign * nominal)
 
 
-def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
-                          sigma_m: float = 0.0, sigma_theta_rad: float = 0.0,
-                          sense: Sense = Sense.MICROSCOPE_MOVES,
-                          missing: float = 0.0) -> Measurements:
+def simulate_measurements(
+    truth: Truth,
+    plan: Plan,
+    rng: np.random.Generator,
+    *,
+    sigma_m: float = 0.0,
+    sigma_theta_rad: float = 0.0,
+    sense: Sense = Sense.MICROSCOPE_MOVES,
+    missing: float = 0.0,
+) -> Measurements:
     """Return the readings of all views, with noise and missing marks.
 
     Parameters
@@ -62,32 +70,61 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
     missing : float
         Fraction of marks lost, independently in each view.
     """
-    views = tuple(_simulate_view(truth, (index, view), rng, sigma=(sigma_m, sigma_theta_rad),
-                                 sense=sense, missing=missing)
-                  for index, view in enumerate(plan.views))
+    views = tuple(
+        _simulate_view(
+            truth,
+            (index, view),
+            rng,
+            sigma=(sigma_m, sigma_theta_rad),
+            sense=sense,
+            missing=missing,
+        )
+        for index, view in enumerate(plan.views)
+    )
     return Measurements(plan.plan_id, plan.artifact, views, sense)
 
 
-def _simulate_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator, *,
-                   sigma: tuple[float, float], sense: Sense, missing: float) -> ViewReadings:
+def _simulate_view(
+    truth: Truth,
+    item: tuple[int, View],
+    rng: np.random.Generator,
+    *,
+    sigma: tuple[float, float],
+    sense: Sense,
+    missing: float,
+) -> ViewReadings:
     index, view = item
     artifact, repeats = truth.artifact, view.repeats
-    readings = ViewReadings(view, sigma_xy=_repeatability(sigma[0], repeats),
-                            sigma_theta=_repeatability(sigma[1], repeats))
+    readings = ViewReadings(
+        view,
+        sigma_xy=_repeatability(sigma[0], repeats),
+        sigma_theta=_repeatability(sigma[1], repeats),
+    )
     if view.grid:
         v = grid_deviation(truth, index, view, sense=sense)
         v = v + rng.normal(0, 1, v.shape) * (sigma[0] / np.sqrt(repeats))
         read = np.isfinite(v).all(axis=0) & (rng.random(artifact.shape) >= missing)
-        readings = replace(readings, m=artifact.m[read], n=artifact.n[read], dx=v[0][read],
-                           dy=v[1][read], count=np.full(read.sum(), repeats),
-                           dof_xy=2 * int(read.sum()) * (repeats - 1))
+        readings = replace(
+            readings,
+            m=artifact.m[read],
+            n=artifact.n[read],
+            dx=v[0][read],
+            dy=v[1][read],
+            count=np.full(read.sum(), repeats),
+            dof_xy=2 * int(read.sum()) * (repeats - 1),
+        )
     if view.angular:
         v = angular_deviation(truth, index, view, sense=sense)
         v = v + rng.normal(0, 1, v.shape) * (sigma[1] / np.sqrt(repeats))
         read = rng.random(len(v)) >= missing
         k = np.arange(len(v))[read]
-        readings = replace(readings, k=k, dtheta=v[read], count_theta=np.full(len(k), repeats),
-                           dof_theta=len(k) * (repeats - 1))
+        readings = replace(
+            readings,
+            k=k,
+            dtheta=v[read],
+            count_theta=np.full(len(k), repeats),
+            dof_theta=len(k) * (repeats - 1),
+        )
     used = int(readings.count.sum() + readings.count_theta.sum())
     return replace(readings, used=used)
 
@@ -100,8 +137,10 @@ def hu_plan(artifact: Artifact, repeats: int = 1, plan_id: str = "hu") -> Plan:
     """Return Hu's four views: identity, 90 deg, one line (angular only), one pitch along +X."""
     line = 2 * np.pi / artifact.angular_count if artifact.angular_count else 0.0
     angular = artifact.angular_count > 0
-    views = [View("identity", 0.0, (0.0, 0.0), True, angular, repeats),
-             View("rot90", np.pi / 2, (0.0, 0.0), True, angular, repeats),
-             View("line", line, (0.0, 0.0), False, True, repeats),
-             View("shift_x", 0.0, (artifact.grid_pitch_m, 0.0), True, angular, repeats)]
+    views = [
+        View("identity", 0.0, (0.0, 0.0), True, angular, repeats),
+        View("rot90", np.pi / 2, (0.0, 0.0), True, angular, repeats),
+        View("line", line, (0.0, 0.0), False, True, repeats),
+        View("shift_x", 0.0, (artifact.grid_pitch_m, 0.0), True, angular, repeats),
+    ]
     return Plan(plan_id, artifact, tuple(v for v in views if v.grid or angular))

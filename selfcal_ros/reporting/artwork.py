@@ -53,8 +53,9 @@ class Artwork:
         return float(left), float(lower), float(right), float(upper)
 
 
-def artwork_of(plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0,
-               aruco: bool = False) -> Artwork:
+def artwork_of(
+    plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0, aruco: bool = False
+) -> Artwork:
     """Return the artwork of the plate of a plan.
 
     Parameters
@@ -78,8 +79,11 @@ def artwork_of(plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0,
     nearest = _nearest(places)
     most = nearest / (3 if mark == "corner" else 1.5)  # two squares meet in a corner
     if not 0 < size <= most:
-        raise InputError("--mark-size", f"{size:g} mm, and the marks are {nearest:g} mm apart",
-                         f"give a size above 0 and of {most:.3g} mm at most")
+        raise InputError(
+            "--mark-size",
+            f"{size:g} mm, and the marks are {nearest:g} mm apart",
+            f"give a size above 0 and of {most:.3g} mm at most",
+        )
     shapes = _shapes(mark, size, width_m * MM_PER_M or size / 5)
     outlines = [shape + place for place in places for shape in shapes]
     low, high = places.min(axis=0), places.max(axis=0)
@@ -97,13 +101,19 @@ def artwork_of(plan: Plan, *, mark: str, size_m: float, width_m: float = 0.0,
     left = float(low[0])
     outlines.append(_box(length, step / 10) + np.array([left + length / 2, below]))
     letters = 0.35 * step
-    return Artwork(outlines, [(f"{length:g} mm", left, below + 0.2 * step, letters),
-                              (plan.plan_id, left, below - 0.6 * step, letters),
-                              *_numbers(plate, step, beside)])
+    return Artwork(
+        outlines,
+        [
+            (f"{length:g} mm", left, below + 0.2 * step, letters),
+            (plan.plan_id, left, below - 0.6 * step, letters),
+            *_numbers(plate, step, beside),
+        ],
+    )
 
 
-def _numbers(plate: Artifact, step: float,
-             beside: float) -> Iterator[tuple[str, float, float, float]]:
+def _numbers(
+    plate: Artifact, step: float, beside: float
+) -> Iterator[tuple[str, float, float, float]]:
     """Yield the numbers m below the columns of a lattice, and n to the left of its rows."""
     if plate.marks:
         return
@@ -119,13 +129,19 @@ def _numbers(plate: Artifact, step: float,
 def _markers(plate: Artifact, step: float) -> list[np.ndarray]:
     """Return the black cells of the markers of a lattice, those side by side in one outline."""
     if plate.marks:
-        raise InputError("--aruco", "markers stand around a lattice, the plate is a list of marks",
-                         "leave --aruco out")
+        raise InputError(
+            "--aruco",
+            "markers stand around a lattice, the plate is a list of marks",
+            "leave --aruco out",
+        )
     try:
         import cv2  # extra camera
     except ModuleNotFoundError as error:
-        raise InputError("--aruco", "OpenCV, which has the patterns, is not installed",
-                         "pip install 'selfcal_ros[camera]', or leave --aruco out") from error
+        raise InputError(
+            "--aruco",
+            "OpenCV, which has the patterns, is not installed",
+            "pip install 'selfcal_ros[camera]', or leave --aruco out",
+        ) from error
     patterns = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
     cells = patterns.markerSize + 2  # with its frame
     side = SIDE * step / cells
@@ -162,8 +178,24 @@ def _shapes(mark: str, size: float, width: float) -> list[np.ndarray]:
         return [np.concatenate([outer, outer[:1], inner[:1], inner[:0:-1], inner[:1]])]
     if mark == "cross":
         a, b = size / 2, width / 2
-        return [np.array([(a, b), (b, b), (b, a), (-b, a), (-b, b), (-a, b), (-a, -b), (-b, -b),
-                          (-b, -a), (b, -a), (b, -b), (a, -b)])]
+        return [
+            np.array(
+                [
+                    (a, b),
+                    (b, b),
+                    (b, a),
+                    (-b, a),
+                    (-b, b),
+                    (-a, b),
+                    (-a, -b),
+                    (-b, -b),
+                    (-b, -a),
+                    (b, -a),
+                    (b, -b),
+                    (a, -b),
+                ]
+            )
+        ]
     side = size / 2
     to_square = np.array([side, -side])
     return [_box(size, size) + to_square, _box(size, size) - to_square]
@@ -189,15 +221,21 @@ def save_artwork(art: Artwork, path: str | os.PathLike, paper: str = "") -> None
     """
     kind = Path(path).suffix.lower()
     if kind not in KINDS:
-        raise InputError(str(path), "not a format of artwork by its suffix",
-                         f"name a file that ends in {', '.join(KINDS)}")
+        raise InputError(
+            str(path),
+            "not a format of artwork by its suffix",
+            f"name a file that ends in {', '.join(KINDS)}",
+        )
     left, low, right, high = art.box
     if paper:
         across, along = PAPERS_MM[paper]
         if right - left > across or high - low > along:
-            raise InputError("--paper", f"the plate needs {right - left:.0f} x {high - low:.0f} "
-                             f"mm, and {paper} has {across:g} x {along:g} mm",
-                             "omit --paper, or plan a smaller plate")
+            raise InputError(
+                "--paper",
+                f"the plate needs {right - left:.0f} x {high - low:.0f} "
+                f"mm, and {paper} has {across:g} x {along:g} mm",
+                "omit --paper, or plan a smaller plate",
+            )
         x, y = (right + left) / 2, (high + low) / 2
         left, low, right, high = x - across / 2, y - along / 2, x + across / 2, y + along / 2
     if kind == ".svg":
@@ -211,15 +249,21 @@ def save_artwork(art: Artwork, path: str | os.PathLike, paper: str = "") -> None
 def _svg(art: Artwork, box: tuple[float, float, float, float]) -> str:
     """Return an SVG in mm, y downwards."""
     left, low, right, high = box
-    path = "".join("M" + "L".join(f"{x - left:.6f},{high - y:.6f}" for x, y in outline) + "Z"
-                   for outline in art.outlines)
+    path = "".join(
+        "M" + "L".join(f"{x - left:.6f},{high - y:.6f}" for x, y in outline) + "Z"
+        for outline in art.outlines
+    )
     texts = "".join(
         f'<text x="{x - left:.3f}" y="{high - y:.3f}" font-size="{size:.3f}" '
-        f'font-family="sans-serif">{escape(text)}</text>\n' for text, x, y, size in art.labels)
+        f'font-family="sans-serif">{escape(text)}</text>\n'
+        for text, x, y, size in art.labels
+    )
     width, height = right - left, high - low
-    return (f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.6f}mm" '
-            f'height="{height:.6f}mm" viewBox="0 0 {width:.6f} {height:.6f}">\n'
-            f'<path d="{path}"/>\n{texts}</svg>\n')
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.6f}mm" '
+        f'height="{height:.6f}mm" viewBox="0 0 {width:.6f} {height:.6f}">\n'
+        f'<path d="{path}"/>\n{texts}</svg>\n'
+    )
 
 
 def _pdf(art: Artwork, box: tuple[float, float, float, float]) -> bytes:
@@ -232,8 +276,7 @@ def _pdf(art: Artwork, box: tuple[float, float, float, float]) -> bytes:
     axes = page.add_axes((0, 0, 1, 1))
     axes.set(xlim=(left, right), ylim=(low, high))
     axes.set_axis_off()
-    axes.add_collection(PolyCollection(art.outlines, facecolor="black", linewidth=0),
-                        autolim=False)
+    axes.add_collection(PolyCollection(art.outlines, facecolor="black", linewidth=0), autolim=False)
     for text, x, y, size in art.labels:
         axes.text(x, y, text, fontsize=size / 25.4 * 72, parse_math=False)
     data = io.BytesIO()
@@ -277,5 +320,8 @@ def _gds(art: Artwork) -> bytes:
 
 
 def _missing(what: str, package: str) -> InputError:
-    return InputError(what, f"the package {package} is not installed",
-                      f"pip install {package}, or write .svg or .pdf")
+    return InputError(
+        what,
+        f"the package {package} is not installed",
+        f"pip install {package}, or write .svg or .pdf",
+    )

@@ -21,9 +21,14 @@ from selfcal_ros.reporting.summary.sections import Section, state_sentence
 from selfcal_ros.reporting.turning import script, script_source, turning_map
 
 
-def write_report(result: CalibrationResult, path: str | os.PathLike, *,
-                 truth: Mapping[str, np.ndarray] | None = None,
-                 more: Sequence[Chapter] = (), about: Mapping[str, str] | None = None) -> None:
+def write_report(
+    result: CalibrationResult,
+    path: str | os.PathLike,
+    *,
+    truth: Mapping[str, np.ndarray] | None = None,
+    more: Sequence[Chapter] = (),
+    about: Mapping[str, str] | None = None,
+) -> None:
     """Write the report of a calibration, HTML or PDF, atomically.
 
     Parameters
@@ -91,15 +96,20 @@ def printed_page(html: str, path: str | os.PathLike) -> bytes:
 
 def _no_printer(path: str | os.PathLike, why: str) -> InputError:
     page = Path(path).with_suffix(".html").name
-    return InputError(str(path), f"a PDF is printed by WeasyPrint, which {why}",
-                      f"pip install 'selfcal_ros[pdf]', or write {page} and print it in a browser")
+    return InputError(
+        str(path),
+        f"a PDF is printed by WeasyPrint, which {why}",
+        f"pip install 'selfcal_ros[pdf]', or write {page} and print it in a browser",
+    )
 
 
 def _nothing_from_outside(url: str) -> dict:
     raise ValueError(f"{url}: a report loads nothing")
 
 
-CSS = css() + """
+CSS = (
+    css()
+    + """
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 1rem; max-width: 72rem; background: var(--paper);
   color: var(--ink); font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; }
@@ -148,6 +158,7 @@ figcaption { color: var(--soft); font-size: .9rem; margin-top: .3rem; }
   @page { margin: 15mm; @bottom-right { content: counter(page) " / " counter(pages);
     font-size: 8pt; } } }
 """
+)
 
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'"
@@ -188,8 +199,9 @@ SHORT = 24
 """Length of text up to which a cell does not wrap."""
 
 
-def report_html(result: CalibrationResult, found: Sequence[Chapter], head: Section, *,
-                printed: bool = False) -> str:
+def report_html(
+    result: CalibrationResult, found: Sequence[Chapter], head: Section, *, printed: bool = False
+) -> str:
     """Return the report as one HTML document that needs nothing from outside.
 
     Parameters
@@ -204,13 +216,18 @@ def report_html(result: CalibrationResult, found: Sequence[Chapter], head: Secti
         For paper: light colours, no links, nothing that needs a pointer.
     """
     turning = "" if printed else turning_map(result)
-    parts = [f'<p class="verdict {_grade(result)}">{_text(state_sentence(result))}</p>',
-             _section(head, titled=False),
-             "" if printed else _contents(found),
-             *(_chapter(chapter, printed=printed, more=turning if chapter.title == MAP else "")
-               for chapter in found)]
-    return page(_text(f"Stage calibration: plan {result.plan_id}"), "\n".join(parts),
-                turns=bool(turning))
+    parts = [
+        f'<p class="verdict {_grade(result)}">{_text(state_sentence(result))}</p>',
+        _section(head, titled=False),
+        "" if printed else _contents(found),
+        *(
+            _chapter(chapter, printed=printed, more=turning if chapter.title == MAP else "")
+            for chapter in found
+        ),
+    ]
+    return page(
+        _text(f"Stage calibration: plan {result.plan_id}"), "\n".join(parts), turns=bool(turning)
+    )
 
 
 def _grade(result: CalibrationResult) -> str:
@@ -234,13 +251,21 @@ def _contents(found: Sequence[Chapter]) -> str:
 
 def _chapter(chapter: Chapter, *, printed: bool, more: str) -> str:
     figures = "\n".join(_figure(figure, printed=printed) for figure in chapter.figures)
-    parts = [f"<h2>{_text(chapter.title)}</h2>",
-             f'<div class="figures">\n{figures}\n</div>' if figures else "", more,
-             *(_section(s, titled=len(chapter.sections) > 1 and s.title != chapter.title)
-               for s in chapter.sections)]
+    parts = [
+        f"<h2>{_text(chapter.title)}</h2>",
+        f'<div class="figures">\n{figures}\n</div>' if figures else "",
+        more,
+        *(
+            _section(s, titled=len(chapter.sections) > 1 and s.title != chapter.title)
+            for s in chapter.sections
+        ),
+    ]
     kind = ' class="attention"' if chapter.alert else ""
-    return f'<section id="{_anchor(chapter.title)}"{kind}>' + "\n".join(
-        part for part in parts if part) + "</section>"
+    return (
+        f'<section id="{_anchor(chapter.title)}"{kind}>'
+        + "\n".join(part for part in parts if part)
+        + "</section>"
+    )
 
 
 def _figure(figure: CaptionedFigure, *, printed: bool) -> str:
@@ -253,8 +278,10 @@ def _section(section: Section, *, titled: bool) -> str:
     """Return a section with its facts, its table and its notes."""
     parts = [f"<h3>{_text(section.title)}</h3>"] if titled and section.title else []
     if section.facts:
-        rows = "".join(f"<tr><th>{_text(label)}</th><td>{_text(value)}</td></tr>"
-                       for label, value in section.facts)
+        rows = "".join(
+            f"<tr><th>{_text(label)}</th><td>{_text(value)}</td></tr>"
+            for label, value in section.facts
+        )
         parts.append(f'<table class="facts"><tbody>{rows}</tbody></table>')
     if section.table:
         parts.append(_table(section.table))
@@ -270,14 +297,19 @@ def _table(table: tuple[tuple[str, ...], ...]) -> str:
     for number, column in zip(numeric_columns(table), zip(*table, strict=True), strict=True):
         longest = max(map(len, column))
         kinds.append("n" if number else "w" if longest > WIDE else "s" if longest < SHORT else "t")
-    head = "".join(f'<th class="{kind}">{_text(name)}</th>'
-                   for name, kind in zip(table[0], kinds, strict=True))
+    head = "".join(
+        f'<th class="{kind}">{_text(name)}</th>' for name, kind in zip(table[0], kinds, strict=True)
+    )
     rows = "".join(f"<tr>{_row(row, table[0], kinds)}</tr>" for row in table[1:])
-    return (f'<div class="scroll"><table class="list"><thead><tr>{head}</tr></thead>'
-            f"<tbody>{rows}</tbody></table></div>")
+    return (
+        f'<div class="scroll"><table class="list"><thead><tr>{head}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></div>"
+    )
 
 
 def _row(row: Sequence[str], names: Sequence[str], kinds: Sequence[str]) -> str:
     """Return the cells of a row; on a telephone each stands below the other with its name."""
-    return "".join(f'<td class="{kind}" data-name="{_text(name)}">{_text(value)}</td>'
-                   for value, name, kind in zip(row, names, kinds, strict=True))
+    return "".join(
+        f'<td class="{kind}" data-name="{_text(name)}">{_text(value)}</td>'
+        for value, name, kind in zip(row, names, kinds, strict=True)
+    )

@@ -30,11 +30,13 @@ def turning_map(result: CalibrationResult) -> str:
     if not emap.valid.any() or emap.valid.size > LARGEST or min(emap.valid.shape) < 2:
         return ""
     expanded = np.fmax(emap.u_gx, emap.u_gy) * result.noise.k_xy
-    numbers = {"x": _rounded(artifact.x_m[:, 0], MM_PER_M),
-               "y": _rounded(artifact.y_m[0], MM_PER_M),
-               "gx": _rounded(np.where(emap.valid, emap.gx, np.nan), UM_PER_M),
-               "gy": _rounded(np.where(emap.valid, emap.gy, np.nan), UM_PER_M),
-               "u": _rounded(expanded, UM_PER_M)}
+    numbers = {
+        "x": _rounded(artifact.x_m[:, 0], MM_PER_M),
+        "y": _rounded(artifact.y_m[0], MM_PER_M),
+        "gx": _rounded(np.where(emap.valid, emap.gx, np.nan), UM_PER_M),
+        "gy": _rounded(np.where(emap.valid, emap.gy, np.nan), UM_PER_M),
+        "u": _rounded(expanded, UM_PER_M),
+    }
     text = escape(json.dumps(numbers, separators=(",", ":"), allow_nan=False))
     return f'<div class="map3d" data-map="{text}" hidden></div>'
 
@@ -43,15 +45,20 @@ def _rounded(values: np.ndarray, scale: float) -> list:
     """Return numbers as lists, unknown ones as None."""
     if values.ndim > 1:
         return [_rounded(row, scale) for row in values]
-    return [round(value * scale, DECIMALS) + 0.0 if math.isfinite(value) else None
-            for value in values.tolist()]
+    return [
+        round(value * scale, DECIMALS) + 0.0 if math.isfinite(value) else None
+        for value in values.tolist()
+    ]
 
 
 @cache
 def script() -> str:
     """Return the script: three.js and tools/map3d/map3d.js in one."""
-    return resources.files("selfcal_ros.reporting").joinpath("assets/map3d.min.js").read_text(
-        encoding="ascii")
+    return (
+        resources.files("selfcal_ros.reporting")
+        .joinpath("assets/map3d.min.js")
+        .read_text(encoding="ascii")
+    )
 
 
 @cache

@@ -60,11 +60,19 @@ COVERED = {
     "detection clock": ("rest", "ids", "marks", "check stops", "signs"),
     "rest": ("ids", "marks", "check stops", "signs"),
     "ids": ("rest", "marks", "check stops", "signs"),
-    "marks": ("check stops", "signs"), "check stops": ("signs",),
-    "signs": ("rest", "ids", "marks", "check stops")}
+    "marks": ("check stops", "signs"),
+    "check stops": ("signs",),
+    "signs": ("rest", "ids", "marks", "check stops"),
+}
 """Checks of the readings -> those that fail as well if they fail."""
-MISTAKEN = (Reason.UNKNOWN_MARK, Reason.TOO_FAR, Reason.AMBIGUOUS, Reason.NOT_IN_VIEW,
-            Reason.ROTATION, Reason.NOT_AT_MARK)
+MISTAKEN = (
+    Reason.UNKNOWN_MARK,
+    Reason.TOO_FAR,
+    Reason.AMBIGUOUS,
+    Reason.NOT_IN_VIEW,
+    Reason.ROTATION,
+    Reason.NOT_AT_MARK,
+)
 """Reasons of rejection related to ids."""
 
 type Steps[T] = Generator[None, None, T]
@@ -93,8 +101,9 @@ def grouped(items: list[CheckItem], fault: str) -> list[CheckItem]:
         Name of the one that tells the fault, "" = the first that failed.
     """
     found = [item for item in items if item.passed]
-    failed = sorted((item for item in items if not item.passed),
-                    key=lambda item: item.name != fault)
+    failed = sorted(
+        (item for item in items if not item.passed), key=lambda item: item.name != fault
+    )
     while failed:
         first, *others = failed
         covered = [item for item in others if item.name in COVERED.get(first.name, ())]
@@ -107,13 +116,17 @@ def checked_view(plan: Plan) -> tuple[Artifact, View]:
     """Return the middle of a plan's plate, and its view: straight, with check stops."""
     plate, listed = plan.artifact, plan.artifact.marks
     nx, ny = (MARKS + 1 - size % 2 for size in plate.shape)  # about the same centre
-    plate = (replace(plate, marks=listed.innermost(MARKS**2)) if listed else
-             Artifact(nx, plate.grid_pitch_m, plate.angular_count, 0 if nx == ny else ny))
+    plate = (
+        replace(plate, marks=listed.innermost(MARKS**2))
+        if listed
+        else Artifact(nx, plate.grid_pitch_m, plate.angular_count, 0 if nx == ny else ny)
+    )
     marks = next((view for view in plan.views if view.check_marks), View(""))
     offset = marks.check_offset_m or min(OFFSET_M, plate.grid_pitch_m / 4)
     angular = plate.angular_count > 0 and any(view.angular for view in plan.views)
-    return plate, View("check", grid=True, angular=angular, repeats=REPEATS, check_marks=5,
-                       check_offset_m=offset)
+    return plate, View(
+        "check", grid=True, angular=angular, repeats=REPEATS, check_marks=5, check_offset_m=offset
+    )
 
 
 class CellCheck:
@@ -131,8 +144,15 @@ class CellCheck:
         Time from PLACE to MEASURE, and for the first message.
     """
 
-    def __init__(self, plan: Plan, settings: CollectorSettings, ports: Ports, *,
-                 settle_s: float = 1.0, patience_s: float = 30.0) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        settings: CollectorSettings,
+        ports: Ports,
+        *,
+        settle_s: float = 1.0,
+        patience_s: float = 30.0,
+    ) -> None:
         self.plate, self.view = checked_view(plan)
         self.items: list[CheckItem] = []
         self.done = False
@@ -177,8 +197,9 @@ class CellCheck:
     def take_detection(self, message: Any) -> None:
         """Take a detection."""
         found = to_model.detection(message)
-        self._seen.append((self._ports.now_s(), self._ports.now_ns() - found.stamp_ns,
-                           found.has_id))
+        self._seen.append(
+            (self._ports.now_s(), self._ports.now_ns() - found.stamp_ns, found.has_id)
+        )
         self._collector.add_detection(found)
         self._events.append(found)
 
@@ -207,28 +228,42 @@ class CellCheck:
             self.done = next(self._script, self) is self
         except Exception as error:
             self.done = True
-            self._tell("check", False, f"ended by an error: {printable(str(error))}",
-                       "correct what the error names, and check again")
+            self._tell(
+                "check",
+                False,
+                f"ended by an error: {printable(str(error))}",
+                "correct what the error names, and check again",
+            )
             raise
 
     def _run_and_diagnosed(self) -> Steps[None]:
         """Check the cell, then tell which nodes are in error at the end."""
         yield from self._run()
         if self._foreign or self._has_unread:
-            said = [f"{name}: {line}"
-                    for name, line in islice(sorted(self._foreign.items()), MOST_NAMED)]
+            said = [
+                f"{name}: {line}"
+                for name, line in islice(sorted(self._foreign.items()), MOST_NAMED)
+            ]
             more = len(self._foreign) - len(said)
             if more > 0:
                 said.append(f"and {more} more")
             if self._has_unread:
                 said.append(f"there were more than {MOST_KEPT} names, and others were not read")
-            self._tell("diagnostics", False, "ERROR on /diagnostics: " + "; ".join(said),
-                       "correct what these nodes say, or end them if they are not of this machine")
+            self._tell(
+                "diagnostics",
+                False,
+                "ERROR on /diagnostics: " + "; ".join(said),
+                "correct what these nodes say, or end them if they are not of this machine",
+            )
 
     def _run(self) -> Steps[None]:
         if not (yield from self._until(lambda: self._samples, self._patience_s)):
-            self._tell("encoder", False, f"nothing on stage/joint_states in {self._patience_s:g} s",
-                       "publish sensor_msgs/JointState there all the time, at rest as well")
+            self._tell(
+                "encoder",
+                False,
+                f"nothing on stage/joint_states in {self._patience_s:g} s",
+                "publish sensor_msgs/JointState there all the time, at rest as well",
+            )
             return
         yield from self._wait(LISTEN_S)
         if not self._judge_publishers() or not self._judge_encoder():
@@ -243,10 +278,14 @@ class CellCheck:
         self._send(Phase.DONE)
         yield from self._wait(self._pause_s)
         if revisited is not None:
-            self._tell("revisits", revisited, "a mark named as missing was " + (
-                   "seen again" if revisited else f"not measured again within {REVISIT_S:g} s"),
-                   "read missing_m, missing_n, missing_k of selfcal/view_status and visit these "
-                   "marks until the next command; if it cannot, set min_repeats")
+            self._tell(
+                "revisits",
+                revisited,
+                "a mark named as missing was "
+                + ("seen again" if revisited else f"not measured again within {REVISIT_S:g} s"),
+                "read missing_m, missing_n, missing_k of selfcal/view_status and visit these "
+                "marks until the next command; if it cannot, set min_repeats",
+            )
         yield from self._old(aborted, measured)
 
     def _aborted(self) -> Steps[Command | None]:
@@ -255,8 +294,10 @@ class CellCheck:
         first = len(self._seen)
         if not (yield from self._until(lambda: len(self._seen) >= first + 3, self._patience_s)):
             figure = f"{len(self._seen) - first} detections in {self._patience_s:g} s after MEASURE"
-            remedy = ("subscribe selfcal/view_command reliable and transient local, act on "
-                      "MEASURE, publish stage/mark_detections reliable")
+            remedy = (
+                "subscribe selfcal/view_command reliable and transient local, act on "
+                "MEASURE, publish stage/mark_detections reliable"
+            )
             if self._errors:  # a node of the cell knows better
                 node, error = next(iter(self._errors.items()))
                 what, _, remedy = error.partition("; ")
@@ -270,8 +311,12 @@ class CellCheck:
         before = len(self._events)
         yield from self._wait(self._pause_s)
         late = self._exposed_since(aborted, before)
-        self._tell("abort", not late, f"{late} detections later than {self._pause_s:.3g} s after "
-                   "ABORT", "stop measuring when ABORT arrives")
+        self._tell(
+            "abort",
+            not late,
+            f"{late} detections later than {self._pause_s:.3g} s after ABORT",
+            "stop measuring when ABORT arrives",
+        )
         return command
 
     def _measured(self) -> Steps[Command]:
@@ -283,8 +328,10 @@ class CellCheck:
 
         def over() -> bool:
             last = self._seen[-1][0] if self._seen else begin + self._patience_s
-            return (self._collected()[1].complete or self._ports.now_s() - last
-                    > max(STALL_S, 2 * self._longest_pause_s()))
+            return self._collected()[1].complete or self._ports.now_s() - last > max(
+                STALL_S, 2 * self._longest_pause_s()
+            )
+
         while not over():  # without a status: nothing to revisit yet
             yield from self._wait(STATUS_S)
         self._pause_s = self._longest_pause_s()
@@ -299,9 +346,12 @@ class CellCheck:
         if not len(progress.readings.m):
             return None
         before, end = len(self._seen), self._ports.now_s() + REVISIT_S + self._pause_s
-        mark = {"missing_m": [int(progress.readings.m[0])],
-                "missing_n": [int(progress.readings.n[0])], "complete": False,
-                "grid_done": progress.grid_done - 1}
+        mark = {
+            "missing_m": [int(progress.readings.m[0])],
+            "missing_n": [int(progress.readings.n[0])],
+            "complete": False,
+            "grid_done": progress.grid_done - 1,
+        }
         while len(self._seen) == before and self._ports.now_s() < end:
             self._status(progress, mark)
             yield from self._wait(STATUS_S)
@@ -317,17 +367,22 @@ class CellCheck:
             count += self._exposed_since(ended, before)
             self._send(Phase.ABORT)
             yield from self._wait(self._pause_s)
-        self._tell("old commands", not count, f"{count} detections after a finished MEASURE was "
-                   "sent again", "remember the stamps of executed commands and do not "
-                   "execute them again")
+        self._tell(
+            "old commands",
+            not count,
+            f"{count} detections after a finished MEASURE was sent again",
+            "remember the stamps of executed commands and do not execute them again",
+        )
 
     def _exposed_since(self, command: Command, before: int) -> int:
         """Return the number of detections exposed after a command: others are in transit.
 
         Of those received after the first `before` messages.
         """
-        return sum(isinstance(event, Detection) and event.stamp_ns > command.stamp_ns
-                   for event in self._events[before:])
+        return sum(
+            isinstance(event, Detection) and event.stamp_ns > command.stamp_ns
+            for event in self._events[before:]
+        )
 
     def _place_and_measure(self, view: View) -> Steps[Command]:
         self._send(Phase.PLACE, view)
@@ -339,8 +394,9 @@ class CellCheck:
         stamp = max(self._ports.now_ns(), self._command.stamp_ns + 1)
         begins = phase is Phase.PLACE or not self._command.run_id
         run_id = str(stamp) if begins else self._command.run_id
-        self._command = Command(stamp, phase, PLAN_ID, 0, view,
-                                None if view is None else self.plate, 1, run_id)
+        self._command = Command(
+            stamp, phase, PLAN_ID, 0, view, None if view is None else self.plate, 1, run_id
+        )
         self._publish(self._command)
         return self._command
 
@@ -348,8 +404,13 @@ class CellCheck:
         self._ports.publish("command", from_model.command(command, self._settings.frame_id))
 
     def _status(self, progress: ViewProgress, changes: dict[str, Any]) -> None:
-        fields = from_model.view_status(progress, PLAN_ID, self._ports.now_ns(),
-                                        self._settings.frame_id, run_id=self._command.run_id)
+        fields = from_model.view_status(
+            progress,
+            PLAN_ID,
+            self._ports.now_ns(),
+            self._settings.frame_id,
+            run_id=self._command.run_id,
+        )
         self._ports.publish("status", fields | changes)
 
     def _wait(self, seconds: float) -> Steps[None]:
@@ -379,34 +440,50 @@ class CellCheck:
     def _judge_publishers(self) -> bool:
         """Tell whether one node publishes each of the cell's topics; return whether it is so."""
         several = {topic: nodes for topic, nodes in self.publishers.items() if len(nodes) > 1}
-        self._tell("publishers", not several, "; ".join(
-            f"{len(nodes)} publishers of {topic}: {', '.join(nodes)}"
-            for topic, nodes in several.items()) or "one of each topic",
-            "end all but one: a simulator, a second driver, or a bag being played")
+        self._tell(
+            "publishers",
+            not several,
+            "; ".join(
+                f"{len(nodes)} publishers of {topic}: {', '.join(nodes)}"
+                for topic, nodes in several.items()
+            )
+            or "one of each topic",
+            "end all but one: a simulator, a second driver, or a bag being played",
+        )
         return not several
 
     def _judge_encoder(self) -> bool:
         """Tell joints, rate and clock; return whether the joints are there."""
         settings, (stamps, ages) = self._settings, np.array(self._samples).T
         missing = [joint for joint in self._wanted_joints if joint not in self._joints]
-        self._tell("joints", not missing, f"heard {printable(', '.join(sorted(self._joints)))}",
-                   f"no joint {', '.join(missing)}: set joint_x, joint_y, joint_theta of "
-                   "measurement_collector")
+        self._tell(
+            "joints",
+            not missing,
+            f"heard {printable(', '.join(sorted(self._joints)))}",
+            f"no joint {', '.join(missing)}: set joint_x, joint_y, joint_theta of "
+            "measurement_collector",
+        )
         steps = np.diff(np.sort(stamps)) * S_PER_NS
         gap = float(steps.max()) if len(steps) else float("inf")
         rate = len(steps) / float(steps.sum()) if steps.sum() > 0 else 0.0
         jitter = float(np.ptp(np.quantile(steps, [0.025, 0.975]))) / 2 if len(steps) else 0.0
-        self._tell("encoder rate", gap <= settings.max_encoder_gap
-                   and rate >= settings.encoder_rate_min,
-                   f"{rate:.4g} Hz, intervals ± {jitter * MS_PER_S:.3g} ms, largest "
-                   f"{gap * MS_PER_S:.3g} ms", f"publish with gaps below max_encoder_gap "
-                   f"({settings.max_encoder_gap:g} s) and encoder_rate_min "
-                   f"({settings.encoder_rate_min:g} Hz), or set these")
+        self._tell(
+            "encoder rate",
+            gap <= settings.max_encoder_gap and rate >= settings.encoder_rate_min,
+            f"{rate:.4g} Hz, intervals ± {jitter * MS_PER_S:.3g} ms, largest "
+            f"{gap * MS_PER_S:.3g} ms",
+            f"publish with gaps below max_encoder_gap "
+            f"({settings.max_encoder_gap:g} s) and encoder_rate_min "
+            f"({settings.encoder_rate_min:g} Hz), or set these",
+        )
         age = float(np.median(ages)) * S_PER_NS
-        self._tell("encoder clock", abs(age) <= settings.clock_limit,
-                   f"stamps {age * MS_PER_S:.4g} ms old when they arrive",
-                   "stamp samples when they are taken, by a clock synchronised with this machine's "
-                   "(NTP, PTP)")
+        self._tell(
+            "encoder clock",
+            abs(age) <= settings.clock_limit,
+            f"stamps {age * MS_PER_S:.4g} ms old when they arrive",
+            "stamp samples when they are taken, by a clock synchronised with this machine's "
+            "(NTP, PTP)",
+        )
         return not missing
 
     def _judge_readings(self, measurements: Measurements, progress: ViewProgress) -> None:
@@ -416,16 +493,26 @@ class CellCheck:
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
         # whether the stage stood at the marks at these stamps
         good = progress.readings.used > (total - outside) / 2
-        self._tell("detection clock", not outside and age <= OLDEST_S
-                   and earliest >= -self._settings.clock_limit,
-                   f"stamps {age * MS_PER_S:.4g} ms old when they arrive, {outside} outside the "
-                   "view", "publish each detection as soon as it is found" if good else
-                   "stamp detections at the instant of exposure, by the clock of the joint states")
+        self._tell(
+            "detection clock",
+            not outside and age <= OLDEST_S and earliest >= -self._settings.clock_limit,
+            f"stamps {age * MS_PER_S:.4g} ms old when they arrive, {outside} outside the view",
+            "publish each detection as soon as it is found"
+            if good
+            else "stamp detections at the instant of exposure, by the clock of the joint states",
+        )
         moving = rejected.get(Reason.MOVING, 0) + rejected.get(Reason.NO_ENCODER, 0)
-        self._tell("rest", not moving, f"{moving} of {total} exposures while the stage moved, or "
-                   "without samples around them", REMEDY[Reason.MOVING])
-        bad = sum(count for reason, count in rejected.items() if reason in REMEDY
-                  and reason != Reason.OUTLIER)  # offsets in any unit contradict each other less
+        self._tell(
+            "rest",
+            not moving,
+            f"{moving} of {total} exposures while the stage moved, or without samples around them",
+            REMEDY[Reason.MOVING],
+        )
+        bad = sum(
+            count
+            for reason, count in rejected.items()
+            if reason in REMEDY and reason != Reason.OUTLIER
+        )  # offsets in any unit contradict each other less
         fault = explaining(self._command, self._events, self._settings) if bad else None
         named = sum(has_id for *_, has_id in self._seen)
         mistaken = {reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)}
@@ -445,17 +532,24 @@ class CellCheck:
     def _judge_loss(self, progress: ViewProgress, rejected: Mapping[str, int], total: int) -> None:
         others = {reason: count for reason, count in rejected.items() if reason not in MISTAKEN}
         grid, angular = expected_marks(self.plate, self.view)
-        self._tell("marks", progress.grid_done >= grid and progress.angular_done >= angular,
-                   f"{progress.grid_done} of {grid} marks and {progress.angular_done} of {angular} "
-                   f"lines {REPEATS} times; {progress.readings.used} of {total} detections used"
-                   + "".join(f", {count} {reason}" for reason, count in others.items()),
-                   "; ".join(REMEDY.get(Reason(reason), reason) for reason in others)
-                   or "measure every mark `repeats` times; publish reliable, depth 1000")
-        self._tell("check stops", progress.check_done >= progress.check_expected,
-                   f"{progress.check_done} of {progress.check_expected} marks from all four sides",
-                   REMEDY[Reason.OUTLIER] if rejected.get(Reason.OUTLIER) else
-                   "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
-                   "(docs/start/cell.md)")
+        self._tell(
+            "marks",
+            progress.grid_done >= grid and progress.angular_done >= angular,
+            f"{progress.grid_done} of {grid} marks and {progress.angular_done} of {angular} "
+            f"lines {REPEATS} times; {progress.readings.used} of {total} detections used"
+            + "".join(f", {count} {reason}" for reason, count in others.items()),
+            "; ".join(REMEDY.get(Reason(reason), reason) for reason in others)
+            or "measure every mark `repeats` times; publish reliable, depth 1000",
+        )
+        self._tell(
+            "check stops",
+            progress.check_done >= progress.check_expected,
+            f"{progress.check_done} of {progress.check_expected} marks from all four sides",
+            REMEDY[Reason.OUTLIER]
+            if rejected.get(Reason.OUTLIER)
+            else "measure check_marks marks again at +x, -x, +y and -y, check_offset off each "
+            "(docs/start/cell.md)",
+        )
 
     def _judge_theta(self, measurements: Measurements) -> None:
         """Tell whether the lines show the turn of the plate that the marks show, or its opposite.
@@ -469,12 +563,15 @@ class CellCheck:
         by_marks = float((x * view.dy - y * view.dx).sum() / (x**2 + y**2).sum())
         by_lines = float(view.dtheta.mean()) if len(view.dtheta) else 0.0
         turned = abs(by_marks) > LEAST_TURN_RAD
-        same, reversed_ = (turned and abs(by_lines - sign * by_marks) < CLEARLY * abs(by_marks)
-                           for sign in (1, -1))
+        same, reversed_ = (
+            turned and abs(by_lines - sign * by_marks) < CLEARLY * abs(by_marks) for sign in (1, -1)
+        )
         scatters = view.motion_theta is not None and view.motion_theta.products[1, 1] > 0
         shown = scatters and sign_of_lines_is_shown(measurements)
-        figure = (f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
-                  f"lines {by_lines * MRAD_PER_RAD:+.3f} mrad")
+        figure = (
+            f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
+            f"lines {by_lines * MRAD_PER_RAD:+.3f} mrad"
+        )
         if reversed_:
             figure += ": offset_theta has the other sign"
             remedy = "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise"
@@ -483,8 +580,10 @@ class CellCheck:
             figure += "" if shown else ", too little to tell the sign"
         else:
             enough = (abs(by_marks) + abs(by_lines)) / CLEARLY * MRAD_PER_RAD
-            remedy = ("lay the plate straight, set theta to 0 where line 0 is read, turn the plate "
-                      f"by 1 mrad and check again; or turn it by {enough:.2g} mrad")
+            remedy = (
+                "lay the plate straight, set theta to 0 where line 0 is read, turn the plate "
+                f"by 1 mrad and check again; or turn it by {enough:.2g} mrad"
+            )
             figure += "" if same or shown else ": neither the same nor the opposite turn"
         self._tell("theta", same or (shown and not reversed_), figure, remedy)
 
@@ -498,35 +597,53 @@ class CellCheck:
         """
         [view] = measurements.views
         faults = [worded(fault) for fault in wiring_faults(measurements)]
-        slopes = {"x": _slope(view.motion, 0), "y": _slope(view.motion, 1),
-                "theta": _slope(view.motion_theta, 0)}
-        figure = ", ".join(f"{axis} {slope:+.3f}" for axis, slope in slopes.items()
-                           if slope is not None)
+        slopes = {
+            "x": _slope(view.motion, 0),
+            "y": _slope(view.motion, 1),
+            "theta": _slope(view.motion_theta, 0),
+        }
+        figure = ", ".join(
+            f"{axis} {slope:+.3f}" for axis, slope in slopes.items() if slope is not None
+        )
         shown = slopes["x"] is not None and slopes["y"] is not None
         what = "; ".join(error.what for error in faults)
         remedy = "; ".join(error.remedy for error in faults)
         turned = _turned_deg(view.motion) if stops else None
-        if turned is not None and abs(turned) > TURNED_DEG and not (
-                faults and abs(turned) > 180 - TURNED_DEG):
+        if (
+            turned is not None
+            and abs(turned) > TURNED_DEG
+            and not (faults and abs(turned) > 180 - TURNED_DEG)
+        ):
             shown = False
             what = f"the offsets are turned by {turned:+.1f}° against the stage"
-            remedy = ("publish offsets along the stage's axes: turn the camera back by this angle, "
-                      "or state it (detector: turn)")
+            remedy = (
+                "publish offsets along the stage's axes: turn the camera back by this angle, "
+                "or state it (detector: turn)"
+            )
         factor = max((abs(slopes[axis] or 1.0) for axis in "xy"), key=lambda size: abs(size - 1))
         if shown and stops and not faults and abs(factor - 1) > block_of_offsets().plausible:
             shown = False
             what = f"the offsets are {factor:.3g} times as large as the motion of the stage"
-            remedy = ("divide pixel_size by this factor, or find it with selfcal camera init: no "
-                      "map would be qualified")
+            remedy = (
+                "divide pixel_size by this factor, or find it with selfcal camera init: no "
+                "map would be qualified"
+            )
         if stops and not shown and not what:
             moved_um, seen_um = _spreads_um(view.motion)
-            what = (f"the offsets do not follow the stage: between the stops at a mark it moves by "
-                    f"{moved_um:.3g} um rms, they by {seen_um:.3g} um")
-            remedy = ("measure the offset anew in each image, and publish it in m: check the unit "
-                      "and pixel_size")
-        self._tell("signs", shown and not faults,
-                   what or f"offset against stage {figure or 'not known'} (-1 expected)",
-                   remedy or "let the stage stop off the marks: check stops")
+            what = (
+                f"the offsets do not follow the stage: between the stops at a mark it moves by "
+                f"{moved_um:.3g} um rms, they by {seen_um:.3g} um"
+            )
+            remedy = (
+                "measure the offset anew in each image, and publish it in m: check the unit "
+                "and pixel_size"
+            )
+        self._tell(
+            "signs",
+            shown and not faults,
+            what or f"offset against stage {figure or 'not known'} (-1 expected)",
+            remedy or "let the stage stop off the marks: check stops",
+        )
         return shown and not faults, bool(what)
 
 
@@ -535,8 +652,9 @@ def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
     if motion is None:
         return None
     n = len(motion.products) // 2
-    place, offset, both = (float(motion.products[at]) for at in (
-        (axis, axis), (n + axis, n + axis), (axis, n + axis)))
+    place, offset, both = (
+        float(motion.products[at]) for at in ((axis, axis), (n + axis, n + axis), (axis, n + axis))
+    )
     return both / place if both**2 > FOLLOWS * place * offset else None
 
 
@@ -557,13 +675,16 @@ def _turned_deg(motion: RepeatMotion | None) -> float | None:
     """
     if motion is None or len(motion.products) != 4:
         return None
-    place, both, offset = (motion.products[at] for at in (
-        (slice(2), slice(2)), (slice(2, 4), slice(2)), (slice(2, 4), slice(2, 4))))
+    place, both, offset = (
+        motion.products[at]
+        for at in ((slice(2), slice(2)), (slice(2, 4), slice(2)), (slice(2, 4), slice(2, 4)))
+    )
     if not np.linalg.det(place) > 0:
         return None
     response = -both @ np.linalg.inv(place)  # the offset is minus D times the motion
     explained = np.trace(response @ place @ response.T)
     if np.linalg.det(response) <= 0 or explained < FOLLOWS * np.trace(offset):
         return None
-    return float(np.degrees(np.arctan2(response[1, 0] - response[0, 1],
-                                       response[0, 0] + response[1, 1])))
+    return float(
+        np.degrees(np.arctan2(response[1, 0] - response[0, 1], response[0, 0] + response[1, 1]))
+    )

@@ -36,8 +36,9 @@ class Fault:
     events: tuple[Event, ...] = ()
 
 
-def explaining(command: Command, events: Sequence[Event], settings: CollectorSettings
-               ) -> Fault | None:
+def explaining(
+    command: Command, events: Sequence[Event], settings: CollectorSettings
+) -> Fault | None:
     """Return the fault without which most of the rejected detections would be used, if any.
 
     Of several, one whose offsets then follow the stage; all of them if nothing tells them apart.
@@ -67,8 +68,15 @@ def explaining(command: Command, events: Sequence[Event], settings: CollectorSet
             found, best = [], outcome
         if outcome == best:
             found.append(fault)
-    return replace(found[0], what=", or ".join(fault.what for fault in found),
-                   remedy="; or ".join(fault.remedy for fault in found)) if found else None
+    return (
+        replace(
+            found[0],
+            what=", or ".join(fault.what for fault in found),
+            remedy="; or ".join(fault.remedy for fault in found),
+        )
+        if found
+        else None
+    )
 
 
 def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int]:
@@ -76,42 +84,59 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int]:
     collector = Collector(settings)
     collector.add_command(fault.command)
     samples = [event for event in fault.events if isinstance(event, EncoderSample)]
-    for (names, _, _), alike in groupby(samples, key=lambda sample: (
-            sample.names, len(sample.positions), len(sample.velocities))):
-        stamps, positions, velocities = zip(*(
-            (sample.stamp_ns, sample.positions, sample.velocities) for sample in alike),
-            strict=True)
-        collector.add_encoder_block(np.array(stamps), names, np.array(positions, dtype=float),
-                                    np.array(velocities, dtype=float))
+    for (names, _, _), alike in groupby(
+        samples, key=lambda sample: (sample.names, len(sample.positions), len(sample.velocities))
+    ):
+        stamps, positions, velocities = zip(
+            *((sample.stamp_ns, sample.positions, sample.velocities) for sample in alike),
+            strict=True,
+        )
+        collector.add_encoder_block(
+            np.array(stamps),
+            names,
+            np.array(positions, dtype=float),
+            np.array(velocities, dtype=float),
+        )
     for event in fault.events:
         if isinstance(event, Detection):
             collector.add_detection(event)
     measurements, _ = collector.collect()
     views = measurements.views
-    return (sum(view.used for view in views), -len(wiring_faults(measurements)),
-            sum(len(view.m) + len(view.k) for view in views))
+    return (
+        sum(view.used for view in views),
+        -len(wiring_faults(measurements)),
+        sum(len(view.m) + len(view.k) for view in views),
+    )
 
 
-def _standing(command: Command, events: Sequence[Event], settings: CollectorSettings
-              ) -> Fault | None:
+def _standing(
+    command: Command, events: Sequence[Event], settings: CollectorSettings
+) -> Fault | None:
     """Return the fault of a stage that is indicated at one place, or turn, during the view."""
     plate = command.artifact
     samples = [event for event in events if isinstance(event, EncoderSample)]
-    places = np.array([place for sample in samples
-                       if (place := _place(sample, settings)) is not None])
+    places = np.array(
+        [place for sample in samples if (place := _place(sample, settings)) is not None]
+    )
     if not len(places) or plate is None:
         return None
     if np.ptp(places, axis=0).max() <= STILL * plate.grid_pitch_m:
         x, y = np.median(places, axis=0) * MM_PER_M
-        return Fault(f"the stage does not move: it is indicated at x = {x:.6g} mm, y = {y:.6g} mm "
-                     "during the whole view", "move the stage to each mark, and name the joints "
-                     "that move in joint_x and joint_y", command)
+        return Fault(
+            f"the stage does not move: it is indicated at x = {x:.6g} mm, y = {y:.6g} mm "
+            "during the whole view",
+            "move the stage to each mark, and name the joints that move in joint_x and joint_y",
+            command,
+        )
     lines = {event.k for event in events if isinstance(event, Detection) and _is_line(event)}
     _, turns = _turns(samples, settings)
     if len(lines) > 1 and len(turns) and np.ptp(turns) <= STILL * 2 * pi / plate.angular_count:
-        return Fault(f"theta does not move: it is indicated at {np.median(turns):.6g} rad during "
-                     "the whole view", "turn the stage to each line, and name the joint that turns "
-                     "in joint_theta", command)
+        return Fault(
+            f"theta does not move: it is indicated at {np.median(turns):.6g} rad during "
+            "the whole view",
+            "turn the stage to each line, and name the joint that turns in joint_theta",
+            command,
+        )
     return None
 
 
@@ -123,8 +148,9 @@ def _place(sample: EncoderSample, settings: CollectorSettings) -> tuple[float, f
     return where[settings.joint_x], where[settings.joint_y]
 
 
-def _faults(command: Command, events: Sequence[Event], settings: CollectorSettings
-            ) -> Iterator[Fault]:
+def _faults(
+    command: Command, events: Sequence[Event], settings: CollectorSettings
+) -> Iterator[Fault]:
     """Yield the faults that are tried."""
     seen = [event for event in events if isinstance(event, Detection)]
     samples = [event for event in events if isinstance(event, EncoderSample)]
@@ -133,73 +159,126 @@ def _faults(command: Command, events: Sequence[Event], settings: CollectorSettin
         return Fault(what, remedy, command, (*samples, *detections))
 
     yield from _counts(command, samples, seen, settings, fault)
-    yield fault("m and n are exchanged", "m counts the marks along plate x, n along plate y",
-                [replace(one, m=one.n, n=one.m) for one in seen])
+    yield fault(
+        "m and n are exchanged",
+        "m counts the marks along plate x, n along plate y",
+        [replace(one, m=one.n, n=one.m) for one in seen],
+    )
     for scale, unit in ((1e3, "mm"), (1e6, "µm")):
-        yield fault(f"the offsets are in {unit}", "publish offset_x and offset_y in m",
-                    [replace(one, offset_x=one.offset_x / scale, offset_y=one.offset_y / scale)
-                     for one in seen])
+        yield fault(
+            f"the offsets are in {unit}",
+            "publish offset_x and offset_y in m",
+            [
+                replace(one, offset_x=one.offset_x / scale, offset_y=one.offset_y / scale)
+                for one in seen
+            ],
+        )
     for late in (1, 2):
         exposures = f"{late} exposure{'s' * (late > 1)}"
-        yield fault(f"each detection shows the mark of {exposures} before its stamp",
-                    "stamp detections with the time of the exposure, and read each image once",
-                    [replace(one, stamp_ns=before.stamp_ns)
-                     for one, before in zip(seen[late:], seen, strict=False)])
-        yield fault(f"each detection shows the mark of {exposures} after its stamp",
-                    "stamp detections with the time of the exposure",
-                    [replace(one, stamp_ns=after.stamp_ns)
-                     for one, after in zip(seen, seen[late:], strict=False)])
+        yield fault(
+            f"each detection shows the mark of {exposures} before its stamp",
+            "stamp detections with the time of the exposure, and read each image once",
+            [
+                replace(one, stamp_ns=before.stamp_ns)
+                for one, before in zip(seen[late:], seen, strict=False)
+            ],
+        )
+        yield fault(
+            f"each detection shows the mark of {exposures} after its stamp",
+            "stamp detections with the time of the exposure",
+            [
+                replace(one, stamp_ns=after.stamp_ns)
+                for one, after in zip(seen, seen[late:], strict=False)
+            ],
+        )
     turns = list(product((1.0,), (False, True), ((1, 1), (-1, -1), (-1, 1), (1, -1))))
     for scale, swapped, signs in (*turns[1:], (1e3, False, (1, 1)), (1e6, False, (1, 1))):
-        what, _, remedy = fault_text(scale, swapped=swapped, signs=signs,
-                                     sense=Sense(settings.measurement_sense)).partition("; ")
-        yield Fault(what, remedy, command, (*(
-            _moved(sample, settings, scale=scale, swapped=swapped, signs=signs)
-            for sample in samples), *seen))
+        what, _, remedy = fault_text(
+            scale, swapped=swapped, signs=signs, sense=Sense(settings.measurement_sense)
+        ).partition("; ")
+        yield Fault(
+            what,
+            remedy,
+            command,
+            (
+                *(
+                    _moved(sample, settings, scale=scale, swapped=swapped, signs=signs)
+                    for sample in samples
+                ),
+                *seen,
+            ),
+        )
     for what, remedy, factor in (
-            ("theta is indicated with the wrong sign", "reverse the sign of theta", -1.0),
-            ("theta is indicated in degrees", "publish theta in rad", radians(1.0))):
-        yield Fault(what, remedy, command, (
-            *(_turned(sample, settings, factor=factor) for sample in samples), *seen))
+        ("theta is indicated with the wrong sign", "reverse the sign of theta", -1.0),
+        ("theta is indicated in degrees", "publish theta in rad", radians(1.0)),
+    ):
+        yield Fault(
+            what,
+            remedy,
+            command,
+            (*(_turned(sample, settings, factor=factor) for sample in samples), *seen),
+        )
     yield from _placings(command, events)
 
 
-def _counts(command: Command, samples: Sequence[EncoderSample], seen: Sequence[Detection],
-            settings: CollectorSettings,
-            fault: Callable[[str, str, Sequence[Detection]], Fault]) -> Iterator[Fault]:
+def _counts(
+    command: Command,
+    samples: Sequence[EncoderSample],
+    seen: Sequence[Detection],
+    settings: CollectorSettings,
+    fault: Callable[[str, str, Sequence[Detection]], Fault],
+) -> Iterator[Fault]:
     """Yield that marks or lines are counted otherwise; `fault` makes one of other detections."""
     view, plate = command.view, command.artifact
     if view is None or plate is None:
         return
-    for signs, what in (((-1, 1), "m is counted against plate x"),
-                        ((1, -1), "n is counted against plate y"),
-                        ((-1, -1), "m and n are counted against plate x and y")):
+    for signs, what in (
+        ((-1, 1), "m is counted against plate x"),
+        ((1, -1), "n is counted against plate y"),
+        ((-1, -1), "m and n are counted against plate x and y"),
+    ):
         even = [sign < 0 and size % 2 == 0 for sign, size in zip(signs, plate.shape, strict=True)]
-        yield fault(what, "m counts the marks along plate x, n along plate y", [
-            replace(one, m=signs[0] * one.m - even[0], n=signs[1] * one.n - even[1])
-            for one in seen])
+        yield fault(
+            what,
+            "m counts the marks along plate x, n along plate y",
+            [
+                replace(one, m=signs[0] * one.m - even[0], n=signs[1] * one.n - even[1])
+                for one in seen
+            ],
+        )
     lines = [one for one in seen if _is_line(one)]
     if not lines or not plate.angular_count:
         return
-    yield fault("the lines are counted clockwise", "count k counter-clockwise",
-                [replace(one, k=-one.k % plate.angular_count) for one in seen])
+    yield fault(
+        "the lines are counted clockwise",
+        "count k counter-clockwise",
+        [replace(one, k=-one.k % plate.angular_count) for one in seen],
+    )
     zero = _other_zero(view.rotation_rad, plate.angular_count, samples, lines, settings)
     yield Fault(
-        f"theta is indicated {degrees(zero):+.4g}° from where the lines are", "count k from the "
-        "line along plate x, and set theta to 0 where that line is read", command, (
-            *(_turned(sample, settings, zero_rad=zero) for sample in samples), *seen))
+        f"theta is indicated {degrees(zero):+.4g}° from where the lines are",
+        "count k from the line along plate x, and set theta to 0 where that line is read",
+        command,
+        (*(_turned(sample, settings, zero_rad=zero) for sample in samples), *seen),
+    )
 
 
-def _other_zero(rotation_rad: float, count: int, samples: Sequence[EncoderSample],
-                lines: Sequence[Detection], settings: CollectorSettings) -> float:
+def _other_zero(
+    rotation_rad: float,
+    count: int,
+    samples: Sequence[EncoderSample],
+    lines: Sequence[Detection],
+    settings: CollectorSettings,
+) -> float:
     """Return the mean difference of the indicated theta to that of the lines, rad."""
     stamps, turns = _turns(samples, settings)
     if not turns:
         return 0.0
     at = np.interp([one.stamp_ns for one in lines], stamps, turns)
     sites = rotation_rad + 2 * pi * np.array([one.k for one in lines]) / count
-    return float(np.angle(np.exp(
-        1j * (at - Sense(settings.measurement_sense).sign * sites)).mean()))
+    return float(
+        np.angle(np.exp(1j * (at - Sense(settings.measurement_sense).sign * sites)).mean())
+    )
 
 
 def _is_line(event: Detection) -> bool:
@@ -207,33 +286,61 @@ def _is_line(event: Detection) -> bool:
     return event.kind == Kind.ANGULAR and event.has_id
 
 
-def _turns(samples: Sequence[EncoderSample], settings: CollectorSettings
-           ) -> tuple[list[int], list[float]]:
+def _turns(
+    samples: Sequence[EncoderSample], settings: CollectorSettings
+) -> tuple[list[int], list[float]]:
     """Return stamps, ns, and theta, rad, of the samples that have it."""
-    told = [(sample.stamp_ns, theta) for sample in samples if (theta := dict(zip(
-        sample.names, sample.positions, strict=False)).get(settings.joint_theta)) is not None]
+    told = [
+        (sample.stamp_ns, theta)
+        for sample in samples
+        if (
+            theta := dict(zip(sample.names, sample.positions, strict=False)).get(
+                settings.joint_theta
+            )
+        )
+        is not None
+    ]
     return [stamp for stamp, _ in told], [theta for _, theta in told]
 
 
-def _turned(sample: EncoderSample, settings: CollectorSettings, *, factor: float = 1.0,
-            zero_rad: float = 0.0) -> EncoderSample:
+def _turned(
+    sample: EncoderSample,
+    settings: CollectorSettings,
+    *,
+    factor: float = 1.0,
+    zero_rad: float = 0.0,
+) -> EncoderSample:
     """Return a sample with another theta."""
-    return replace(sample, positions=tuple(
-        factor * position - zero_rad if name == settings.joint_theta else position
-        for name, position in zip(sample.names, sample.positions, strict=False)))
+    return replace(
+        sample,
+        positions=tuple(
+            factor * position - zero_rad if name == settings.joint_theta else position
+            for name, position in zip(sample.names, sample.positions, strict=False)
+        ),
+    )
 
 
-def _moved(sample: EncoderSample, settings: CollectorSettings, *, scale: float, swapped: bool,
-           signs: tuple[int, int]) -> EncoderSample:
+def _moved(
+    sample: EncoderSample,
+    settings: CollectorSettings,
+    *,
+    scale: float,
+    swapped: bool,
+    signs: tuple[int, int],
+) -> EncoderSample:
     """Return a sample with other x and y."""
     place = _place(sample, settings)
     if place is None:
         return sample
     x, y = place[::-1] if swapped else place
     moved = {settings.joint_x: signs[0] * x / scale, settings.joint_y: signs[1] * y / scale}
-    return replace(sample, positions=tuple(
-        moved.get(name, position) for name, position in
-        zip(sample.names, sample.positions, strict=False)))
+    return replace(
+        sample,
+        positions=tuple(
+            moved.get(name, position)
+            for name, position in zip(sample.names, sample.positions, strict=False)
+        ),
+    )
 
 
 def _placings(command: Command, events: Sequence[Event]) -> Iterator[Fault]:
@@ -243,10 +350,20 @@ def _placings(command: Command, events: Sequence[Event]) -> Iterator[Fault]:
         return
     remedy = "place the plate as commanded, and measure the view of the command"
     for deg in (90, 180, 270):
-        yield Fault(f"the marks are those of a plate turned by {deg}°", remedy, replace(
-            command, view=replace(view, rotation_rad=radians(deg))), tuple(events))
+        yield Fault(
+            f"the marks are those of a plate turned by {deg}°",
+            remedy,
+            replace(command, view=replace(view, rotation_rad=radians(deg))),
+            tuple(events),
+        )
     for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        yield Fault(f"the marks are those of a plate shifted by {a or b:+d} pitch along "
-                    f"{'x' if a else 'y'}", remedy, replace(command, view=replace(
-                        view, translation_m=(a * plate.grid_pitch_m, b * plate.grid_pitch_m))),
-                    tuple(events))
+        yield Fault(
+            f"the marks are those of a plate shifted by {a or b:+d} pitch along "
+            f"{'x' if a else 'y'}",
+            remedy,
+            replace(
+                command,
+                view=replace(view, translation_m=(a * plate.grid_pitch_m, b * plate.grid_pitch_m)),
+            ),
+            tuple(events),
+        )

@@ -66,8 +66,9 @@ class ClockWatch:
         self._live_run, self._watches = run_id, {}
         self.steps = {topic: list(mine) for topic, mine in steps.items()}
 
-    def data(self, topic: str, stamps_ns: np.ndarray, now_ns: np.ndarray,
-             steady_ns: np.ndarray) -> None:
+    def data(
+        self, topic: str, stamps_ns: np.ndarray, now_ns: np.ndarray, steady_ns: np.ndarray
+    ) -> None:
         """Take the stamps and the reception, by both clocks, of messages of the cell; n > 0."""
         if self._live:
             watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
@@ -102,9 +103,13 @@ class ClockWatch:
         if abs(offset) <= self._limit_ns:
             return Diagnosis(Level.OK, "", values)
         side = "ahead of" if offset > 0 else "behind"
-        return Diagnosis(Level.WARN, f"the cell's clock is {abs(offset) * S_PER_NS:.3g} s {side} "
-                         "this machine's: detections fall into wrong views; synchronise the clocks "
-                         "(PTP, NTP)", values)
+        return Diagnosis(
+            Level.WARN,
+            f"the cell's clock is {abs(offset) * S_PER_NS:.3g} s {side} "
+            "this machine's: detections fall into wrong views; synchronise the clocks "
+            "(PTP, NTP)",
+            values,
+        )
 
 
 class RosTime:
@@ -116,8 +121,10 @@ class RosTime:
         Writes to the log: one line for each change.
     """
 
-    NOTHING = ("use_sim_time is set but nothing is received on /clock: this node stamps "
-               "everything 0; play the bag with --clock, or start the node without use_sim_time")
+    NOTHING = (
+        "use_sim_time is set but nothing is received on /clock: this node stamps "
+        "everything 0; play the bag with --clock, or start the node without use_sim_time"
+    )
 
     def __init__(self, say: Callable[[Level, str], None]) -> None:
         self._say = say
@@ -132,16 +139,21 @@ class RosTime:
         if state != self._state:
             self._state = state
             self._say(*self._line(state))
-        return Diagnosis(Level.WARN if now_ns == 0 else Level.OK,
-                         self.NOTHING if now_ns == 0 else "", {"/clock": state})
+        return Diagnosis(
+            Level.WARN if now_ns == 0 else Level.OK,
+            self.NOTHING if now_ns == 0 else "",
+            {"/clock": state},
+        )
 
     def _line(self, state: str) -> tuple[Level, str]:
         if state == "not heard":
             return Level.WARN, self.NOTHING
         if state == "moves":
             return Level.OK, "stamps follow /clock (use_sim_time); work and health do not"
-        return Level.OK, (f"/clock has stopped at {self._last_ns * S_PER_NS:.3f} s; work and "
-                          "health continue, stamps do not")
+        return Level.OK, (
+            f"/clock has stopped at {self._last_ns * S_PER_NS:.3f} s; work and "
+            "health continue, stamps do not"
+        )
 
 
 @dataclass(frozen=True)
@@ -187,35 +199,43 @@ class RunWatch:
         """Take a command on reception; an old one, such as a recorded one, hides nothing."""
         if newest is None or _run_of(command) == _run_of(newest):
             self._hidden = None
-        elif begins_run(command) and abs(command.stamp_ns - now_ns) <= MAX_AHEAD_NS and (
-                command.stamp_ns < newest.stamp_ns):
+        elif (
+            begins_run(command)
+            and abs(command.stamp_ns - now_ns) <= MAX_AHEAD_NS
+            and (command.stamp_ns < newest.stamp_ns)
+        ):
             self._hidden = command
 
-    def lines(self, newest: Command | None, strays: tuple[Command, ...],
-              now_ns: int) -> dict[str, str]:
+    def lines(
+        self, newest: Command | None, strays: tuple[Command, ...], now_ns: int
+    ) -> dict[str, str]:
         """Return a line for each problem, with its remedy, by the kind of problem."""
         found = {}
         if newest is not None and is_future(newest.stamp_ns, now_ns):
             found["set back"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.0f} s "
                 "ahead of this machine's clock, which was set back: no later run is shown; restart "
-                "measurement_collector, which ignores such a run, and start the plan again")
+                "measurement_collector, which ignores such a run, and start the plan again"
+            )
         elif newest is not None and 0 < now_ns < newest.stamp_ns - NS_PER_S:
             found["ahead"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.1f} s "
                 "ahead of this machine's clock: detections until then count before it; synchronise "
-                "the clocks")
+                "the clocks"
+            )
         if self._hidden is not None and newest is not None:
             behind = (newest.stamp_ns - self._hidden.stamp_ns) * S_PER_NS
             found[f"hidden {self._hidden.run_id} {newest.run_id}"] = (
                 f"run {self._hidden.run_id} is not shown: it began {behind:.3g} s before the last "
                 f"view command of run {newest.run_id}, by its stamps; abort it, synchronise the "
-                "clocks, and start it again")
+                "clocks, and start it again"
+            )
         if strays:
             found["strays"] = (
                 f"{len(strays)} view command{'s' * (len(strays) > 1)} of plan "
                 f"'{strays[-1].plan_id}' arrived during a run, belonging to no run that has begun, "
-                "and changed nothing: find their publisher")
+                "and changed nothing: find their publisher"
+            )
         return found
 
 

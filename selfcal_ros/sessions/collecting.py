@@ -88,8 +88,9 @@ class CollectingSession:
         if not len(block):
             return
         self._encoder_s = self._ports.now_s() - int(np.atleast_1d(age_ns)[-1]) * S_PER_NS
-        self.collector.add_encoder_block(block.stamps_ns, block.names, block.positions,
-                                         block.velocities)
+        self.collector.add_encoder_block(
+            block.stamps_ns, block.names, block.positions, block.velocities
+        )
         self._encoder_rate.add(block.stamps_ns)
         self._note_clock(ENCODER_TOPIC, block.stamps_ns, age_ns)
         self._dirty = True
@@ -108,11 +109,20 @@ class CollectingSession:
         ages = np.atleast_1d(age_ns)
         if len(ages) != len(stamps_ns):  # for another number of messages: that of the newest
             ages, stamps_ns = ages[-1:], stamps_ns.max(keepdims=True)
-        self._clock.data(topic, stamps_ns, self._ports.now_ns() - ages,
-                         round(self._ports.now_s() * NS_PER_S) - ages)
+        self._clock.data(
+            topic,
+            stamps_ns,
+            self._ports.now_ns() - ages,
+            round(self._ports.now_s() * NS_PER_S) - ages,
+        )
 
-    def adopt(self, collector: Collector, journal: str,
-              steps: Mapping[str, list[ClockStep]] | None = None, away_s: float = 0.0) -> None:
+    def adopt(
+        self,
+        collector: Collector,
+        journal: str,
+        steps: Mapping[str, list[ClockStep]] | None = None,
+        away_s: float = 0.0,
+    ) -> None:
         """Continue with a collector that has taken the run from a journal.
 
         Parameters
@@ -133,10 +143,14 @@ class CollectingSession:
         where = "between views"
         if last is not None and last.phase == Phase.MEASURE:
             self._gap_stamp_ns, view = last.stamp_ns, last.placed().name
-            self._gap = (f"view '{view}': detections of {away_s:.1f} s without a collector are "
-                         "lost, those of complete marks included")
-            where = (f"in view '{view}'; {self._gap}; missing marks have to be measured again, by "
-                     "the cell or with redo_view")
+            self._gap = (
+                f"view '{view}': detections of {away_s:.1f} s without a collector are "
+                "lost, those of complete marks included"
+            )
+            where = (
+                f"in view '{view}'; {self._gap}; missing marks have to be measured again, by "
+                "the cell or with redo_view"
+            )
         messages = sum(collector.received.values())
         self._ports.say(Level.OK, f"resumed {journal} with {messages} messages, {where}")
 
@@ -146,8 +160,9 @@ class CollectingSession:
             command = to_model.command(message)
             known = self.collector.knows(command)
             self.collector.add_command(command)
-            self._clock.command(command.stamp_ns, self._ports.now_ns(), is_older=is_older,
-                                run_id=command.run_id)
+            self._clock.command(
+                command.stamp_ns, self._ports.now_ns(), is_older=is_older, run_id=command.run_id
+            )
             if not known:
                 self._runs.command(command, self.collector.newest_command, self.now_ns)
                 self._note_missed(command, is_older=is_older)
@@ -168,8 +183,10 @@ class CollectingSession:
         elif command.phase == Phase.MEASURE and is_older:
             self.missed[view] = name = command.placed().name
             self._ports.say(
-                Level.WARN, f"view '{name}' began before this node: earlier "
-                "detections are missing here; redo_view measures it again")
+                Level.WARN,
+                f"view '{name}' began before this node: earlier "
+                "detections are missing here; redo_view measures it again",
+            )
 
     def tick(self) -> None:
         """Publish the progress of the views, if there are new messages and it is due."""
@@ -237,7 +254,8 @@ class CollectingSession:
         """
         until_ns = self.collector.encoder_until_ns
         return self.expects_end() and self._needed <= sum(
-            int((stamps < until_ns).sum()) for stamps in self._unseen)
+            int((stamps < until_ns).sum()) for stamps in self._unseen
+        )
 
     def finish(self) -> str:
         """Publish every view as it is and return the digest of all readings."""
@@ -246,8 +264,9 @@ class CollectingSession:
         self._publish(measurements, progress, final=True)
         return session_digest(self._published)
 
-    def _publish(self, measurements: Measurements, progress: dict[int, ViewProgress], *,
-                 final: bool) -> None:
+    def _publish(
+        self, measurements: Measurements, progress: dict[int, ViewProgress], *, final: bool
+    ) -> None:
         timeline, frame_id = self.collector.timeline, self.settings.frame_id
         stuck = self._is_stuck(self._ports.now_s())
         self._named |= stuck
@@ -258,38 +277,66 @@ class CollectingSession:
         self._tell_runs()
         self._tell_steps()
         self._checks.take(measurements)
-        ended = [index for index, view in progress.items()
-                 if final or view.end_ns <= timeline.last_stamp_ns]
-        self._rejections.take(self.collector.findings(measurements, progress), progress, ended,
-                              partial(self.collector.finding_of_last, progress), final=final)
+        ended = [
+            index
+            for index, view in progress.items()
+            if final or view.end_ns <= timeline.last_stamp_ns
+        ]
+        self._rejections.take(
+            self.collector.findings(measurements, progress),
+            progress,
+            ended,
+            partial(self.collector.finding_of_last, progress),
+            final=final,
+        )
         for index, view in progress.items():
             stamp = from_model.session_stamp_ns(timeline, view)
             current = index == timeline.intervals[-1].view_index or not view.complete
             key = view_digest(view.readings.parts, measurements.rejected)
             ready = index in ended or view.complete
             # empty, unless a previous collector may have sent its readings
-            worth = view.readings.used or view.readings.rejected or index in self._published or (
-                index in ended and (timeline.plan_id, index) not in self.missed)
+            worth = (
+                view.readings.used
+                or view.readings.rejected
+                or index in self._published
+                or (index in ended and (timeline.plan_id, index) not in self.missed)
+            )
             is_new = self._published.get(index) != key or self._noted != self._stepped
             if ready and worth and is_new:
                 self._published[index], self._noted = key, self._stepped
                 for part in view.readings.parts:
-                    self._ports.publish("measurement", from_model.view_measurement(
-                        replace(view, readings=part), measurements, stamp, frame_id,
-                        self._stepped))
+                    self._ports.publish(
+                        "measurement",
+                        from_model.view_measurement(
+                            replace(view, readings=part),
+                            measurements,
+                            stamp,
+                            frame_id,
+                            self._stepped,
+                        ),
+                    )
             # after the readings: a complete view can be solved
             if current or index == max(progress) or final:
                 fields = from_model.view_status(
-                    view, timeline.plan_id, stamp, frame_id, run_id=timeline.run_id,
-                    name_all=stuck or index in ended)
+                    view,
+                    timeline.plan_id,
+                    stamp,
+                    frame_id,
+                    run_id=timeline.run_id,
+                    name_all=stuck or index in ended,
+                )
                 fields["complete"] &= not self._clock.ahead  # may be of another view
                 self._ports.publish("status", fields)
 
     def _tell_steps(self) -> None:
         """Log once that a clock has stepped or is ahead; in the health until the run ends."""
         refused = self.collector.unusable
-        lines = [*step_lines(self._clock.steps, self.collector.timeline), *future_lines(
-            [topic for topic, (_, reason) in FROM_THE_FUTURE.items() if refused.get(reason)])]
+        lines = [
+            *step_lines(self._clock.steps, self.collector.timeline),
+            *future_lines(
+                [topic for topic, (_, reason) in FROM_THE_FUTURE.items() if refused.get(reason)]
+            ),
+        ]
         for line in lines:
             if line not in self._stepped:
                 self._ports.say(Level.WARN, line)
@@ -297,8 +344,9 @@ class CollectingSession:
 
     def _tell_runs(self) -> None:
         """Log once why a run is not shown; in the health while it applies."""
-        lines = self._runs.lines(self.collector.newest_command, self.collector.timeline.strays,
-                                 self.now_ns)
+        lines = self._runs.lines(
+            self.collector.newest_command, self.collector.timeline.strays, self.now_ns
+        )
         for fault, line in lines.items():
             if fault not in self._run_lines:  # durations change
                 self._ports.say(Level.WARN, line)
@@ -312,15 +360,24 @@ class CollectingSession:
         index = self.collector.timeline.intervals[-1].view_index
         for number in sorted(progress):  # of the last view with one
             readings = progress[number].readings
-            xy, theta = (new if math.isfinite(new) else old for new, old in zip(
-                (readings.sigma_xy, readings.sigma_theta), self._noise, strict=True))
+            xy, theta = (
+                new if math.isfinite(new) else old
+                for new, old in zip(
+                    (readings.sigma_xy, readings.sigma_theta), self._noise, strict=True
+                )
+            )
             self._noise = xy, theta
         self._needed = progress[index].needed if index is not None else 0
         self._since_ns = self.collector.timeline.intervals[-1].start_ns
-        self._state = "between views" if index is None else (
-            f"view '{progress[index].view.name}': "
-            f"{100 * progress[index].coverage:.0f} % of the "
-            "readings taken")
+        self._state = (
+            "between views"
+            if index is None
+            else (
+                f"view '{progress[index].view.name}': "
+                f"{100 * progress[index].coverage:.0f} % of the "
+                "readings taken"
+            )
+        )
 
     def diagnosis(self, *, detections_matched: bool) -> Diagnosis:
         """Return the diagnosis of the node.
@@ -340,44 +397,71 @@ class CollectingSession:
         gap = self._gap if last is not None and last.stamp_ns == self._gap_stamp_ns else ""
         state += f"; {gap}" if gap else ""
         bad = missed or self._problem or self.collector.unusable or stored or gap
-        main = Diagnosis(Level.WARN if bad else Level.OK, state, {
-            **received, "views": len(self._published), **self._newest(), **self._cost(),
-            "detections_matched": "yes" if detections_matched else "no",
-            **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())}})
+        main = Diagnosis(
+            Level.WARN if bad else Level.OK,
+            state,
+            {
+                **received,
+                "views": len(self._published),
+                **self._newest(),
+                **self._cost(),
+                "detections_matched": "yes" if detections_matched else "no",
+                **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())},
+            },
+        )
         lines = self._rejections.findings or advice(self._rejected)
         found = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
-        runs = Diagnosis(Level.WARN if self._run_lines else Level.OK,
-                         "; ".join(self._run_lines.values()))
+        runs = Diagnosis(
+            Level.WARN if self._run_lines else Level.OK, "; ".join(self._run_lines.values())
+        )
         stepped = Diagnosis(Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped))
-        return merged(main, [
-            runs, self._checks.diagnosis(), found, self._clock.diagnosis(), stepped,
-            self._encoder(), self._repeatability()])
+        return merged(
+            main,
+            [
+                runs,
+                self._checks.diagnosis(),
+                found,
+                self._clock.diagnosis(),
+                stepped,
+                self._encoder(),
+                self._repeatability(),
+            ],
+        )
 
     def _cost(self) -> dict[str, str]:
         """Return the time of the last statuses, with and without waiting for a processor."""
         costs, worked = zip(*(self._costs or [(0.0, 0.0)]), strict=True)
-        return {"status_ms": f"{MS_PER_S * statistics.median(costs):.1f}",
-                "status_ms_max": f"{MS_PER_S * max(costs):.1f}",
-                "status_cpu_ms_max": f"{MS_PER_S * max(worked):.1f}"}
+        return {
+            "status_ms": f"{MS_PER_S * statistics.median(costs):.1f}",
+            "status_ms_max": f"{MS_PER_S * max(costs):.1f}",
+            "status_cpu_ms_max": f"{MS_PER_S * max(worked):.1f}",
+        }
 
     def _newest(self) -> dict[str, Any]:
         """Return the state of the run, from which a restarted sequencer resumes."""
         command = self.collector.newest_command
         if command is None:
             return {}
-        return {"plan_id": command.plan_id, "run_id": command.run_id,
-                "phase": command.phase.name, "view": command.view_index,
-                "view_name": command.view.name if command.view else "",
-                "command_stamp": command.stamp_ns,
-                "placing": placing_digest(command.plate(), command.view) if command.view else ""}
+        return {
+            "plan_id": command.plan_id,
+            "run_id": command.run_id,
+            "phase": command.phase.name,
+            "view": command.view_index,
+            "view_name": command.view.name if command.view else "",
+            "command_stamp": command.stamp_ns,
+            "placing": placing_digest(command.plate(), command.view) if command.view else "",
+        }
 
     def _encoder(self) -> Diagnosis:
         """Return rate, largest gap and jitter of the encoder, WARN beyond the limits."""
         heard = self._ports.now_s() - self._encoder_s <= HEARD_S
         gap = self._encoder_rate.take_gap_ns() * S_PER_NS
         rate, least = self._encoder_rate.per_second, self.settings.encoder_rate_min
-        values = {"encoder_heard": "yes" if heard else "no", "encoder_rate": f"{rate:.0f}",
-                  "encoder_gap_s": f"{gap:.4f}"}
+        values = {
+            "encoder_heard": "yes" if heard else "no",
+            "encoder_rate": f"{rate:.0f}",
+            "encoder_gap_s": f"{gap:.4f}",
+        }
         jitter, limit = self._encoder_rate.take_jitter_s(), self.settings.encoder_jitter_limit
         if math.isfinite(jitter):
             values["encoder_jitter_s"] = f"{jitter:.6f}"
@@ -387,26 +471,42 @@ class CollectingSession:
         if measuring and not heard:
             problems.append("no encoder samples are received")
         elif measuring and gap > self.settings.max_encoder_gap:
-            problems.append(f"a gap of {gap:.3g} s between encoder samples: exposures in it are "
-                            "rejected")
+            problems.append(
+                f"a gap of {gap:.3g} s between encoder samples: exposures in it are rejected"
+            )
         elif measuring and rate < least:
             problems.append(f"{rate:.0f} encoder samples per second, {least:g} are wanted")
         elif measuring and 0 < limit < jitter:
-            problems.append(f"the intervals between encoder samples vary by {jitter:.3g} s, the "
-                            f"limit is {limit:g} s")
+            problems.append(
+                f"the intervals between encoder samples vary by {jitter:.3g} s, the "
+                f"limit is {limit:g} s"
+            )
         return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)
 
     def _repeatability(self) -> Diagnosis:
         """Return the repeatability of the newest view, WARN beyond the limits."""
         values, problems = {}, []
         for value, limit, name, scale, unit in (
-                (self._noise[0], self.settings.repeatability_xy_limit, "repeatability_xy",
-                 UM_PER_M, "um"),
-                (self._noise[1], self.settings.repeatability_theta_limit, "repeatability_theta",
-                 1.0, "rad")):
+            (
+                self._noise[0],
+                self.settings.repeatability_xy_limit,
+                "repeatability_xy",
+                UM_PER_M,
+                "um",
+            ),
+            (
+                self._noise[1],
+                self.settings.repeatability_theta_limit,
+                "repeatability_theta",
+                1.0,
+                "rad",
+            ),
+        ):
             if math.isfinite(value):
                 values[f"{name}_{unit}"] = f"{value * scale:.4g}"
             if 0 < limit < value:
-                problems.append(f"{name.replace('_', ' ')} is {value * scale:.3g} {unit}, the "
-                                f"limit {limit * scale:.3g} {unit}")
+                problems.append(
+                    f"{name.replace('_', ' ')} is {value * scale:.3g} {unit}, the "
+                    f"limit {limit * scale:.3g} {unit}"
+                )
         return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)

@@ -54,8 +54,15 @@ class CompensatingSession:
     def __init__(self, settings: CompensatorSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
         self.compensator: Compensator | None = None
-        self.counts = {"corrected": 0, "without_map": 0, "refused": 0, "skipped": 0,
-                       "commands": 0, "commands_refused": 0, "outside": 0}
+        self.counts = {
+            "corrected": 0,
+            "without_map": 0,
+            "refused": 0,
+            "skipped": 0,
+            "commands": 0,
+            "commands_refused": 0,
+            "outside": 0,
+        }
         self._waiting: list[tuple[bytes, int]] = []
         self._editor = PositionEditor()
         self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
@@ -72,11 +79,15 @@ class CompensatingSession:
     def _load_file(self, path: str) -> None:
         result = results.read_result(path)
         if VERIFICATION in result.extra:
-            raise InputError(path, "was measured with the correction on, so it is not a map to "
-                             "correct with", f"name {result.extra[VERIFICATION]['of']}")
+            raise InputError(
+                path,
+                "was measured with the correction on, so it is not a map to correct with",
+                f"name {result.extra[VERIFICATION]['of']}",
+            )
         if self._settings.require_qualified and not is_qualified(result):
-            raise InputError(path, "the map is not qualified", "measure again, or set "
-                             "require_qualified to false")
+            raise InputError(
+                path, "the map is not qualified", "measure again, or set require_qualified to false"
+            )
         read_from = Path(result.read_from[0] if result.read_from else path).resolve()
         self._use(result.error_map, f"{read_from}, plan {result.plan_id}", 0, result.interpolation)
 
@@ -97,8 +108,9 @@ class CompensatingSession:
         self._contradicted = contradicted = self._contradiction()
         waits = contradicted or doubt
         if waits != self._waits and waits:
-            self._ports.say(Level.WARN if contradicted else Level.OK,
-                            f"the newest map is not used: {waits}")
+            self._ports.say(
+                Level.WARN if contradicted else Level.OK, f"the newest map is not used: {waits}"
+            )
         self._waits = waits
         if not waits:
             message, self._map = self._map, None
@@ -106,10 +118,15 @@ class CompensatingSession:
                 self._refuse_other_frame(message)
                 error_map = to_model.error_map(message)
                 _refuse_other_axes(error_map, _source(message))
-                require_plausible(error_map, f"the map of {_source(message)}",
-                                  "load its file with ~/load_map")
-                self._use(error_map, _source(message), to_model.stamp_ns(message),
-                          str(getattr(message, "interpolation", "")))
+                require_plausible(
+                    error_map, f"the map of {_source(message)}", "load its file with ~/load_map"
+                )
+                self._use(
+                    error_map,
+                    _source(message),
+                    to_model.stamp_ns(message),
+                    str(getattr(message, "interpolation", "")),
+                )
             except InputError as error:
                 self._waits = str(error)
                 raise
@@ -118,10 +135,12 @@ class CompensatingSession:
         """Refuse a map of another frame than the positions'; an empty one is not stated."""
         frame, own = message.header.frame_id, self._settings.frame_id
         if frame not in ("", own):
-            raise InputError(f"the map of {_source(message)}", f"it is in the frame "
-                             f"{printable(frame)!r}, the positions to correct are in {own!r}",
-                             "use a map of this stage, or set frame_id of the compensator and of "
-                             "the solver alike")
+            raise InputError(
+                f"the map of {_source(message)}",
+                f"it is in the frame {printable(frame)!r}, the positions to correct are in {own!r}",
+                "use a map of this stage, or set frame_id of the compensator and of "
+                "the solver alike",
+            )
 
     def _doubt(self) -> str:
         """Return why the newest map must not be used, or ""."""
@@ -135,15 +154,19 @@ class CompensatingSession:
         if not summary.qualified:
             return f"{_source(message)} is not qualified: {summary.state}"
         if summary.views_done < summary.views_planned:
-            return (f"{_source(message)} contains {summary.views_done} of {summary.views_planned} "
-                    "views")
+            return (
+                f"{_source(message)} contains {summary.views_done} of {summary.views_planned} views"
+            )
         return ""
 
     def _is_of_one_result(self) -> bool:
         """Whether newest map and newest summary are of the same run and stamp."""
         message, summary = self._map, self._summary
-        return (summary is not None and summary.run_id == message.run_id
-                and to_model.stamp_ns(summary) == to_model.stamp_ns(message))
+        return (
+            summary is not None
+            and summary.run_id == message.run_id
+            and to_model.stamp_ns(summary) == to_model.stamp_ns(message)
+        )
 
     def _contradiction(self) -> str:
         """Return which figure of its own summary contradicts the newest map, or "".
@@ -158,10 +181,15 @@ class CompensatingSession:
             return ""  # refused with its reason when it is used
         for name, value in figures.items():
             stated = float(getattr(self._summary, name))
-            if stated and math.isfinite(stated) and not math.isclose(stated, value,
-                                                                     rel_tol=SAME_FIGURE):
-                return (f"selfcal/summary states {name} {stated:.6g}, and the map of "
-                        f"{_source(self._map)} has {value:.6g}: it is not the map that was solved")
+            if (
+                stated
+                and math.isfinite(stated)
+                and not math.isclose(stated, value, rel_tol=SAME_FIGURE)
+            ):
+                return (
+                    f"selfcal/summary states {name} {stated:.6g}, and the map of "
+                    f"{_source(self._map)} has {value:.6g}: it is not the map that was solved"
+                )
         return ""
 
     def _use(self, error_map: ErrorMap, source: str, stamp_ns: int, stated: str) -> None:
@@ -172,22 +200,32 @@ class CompensatingSession:
         self._refuse_large(error_map, [error_map.gx, error_map.gy], error_map.g_theta, source)
         method, fitted = self._settings.interpolation, None
         if stated and stated not in get_args(Interpolation):
-            raise InputError(f"the map of {source}", f"its interpolation {stated!r} is not known",
-                             f"known are {' and '.join(get_args(Interpolation))}")
+            raise InputError(
+                f"the map of {source}",
+                f"its interpolation {stated!r} is not known",
+                f"known are {' and '.join(get_args(Interpolation))}",
+            )
         if stated:
             fitted = cast(Interpolation, stated)
             method = fitted if error_map.valid.all() else "bilinear"
         use = Compensator(error_map, method=method, fitted=fitted, outside=self._settings.outside)
         self._refuse_large(error_map, *use.between(), source)
         if stamp_ns < self._map_ns:
-            self._ports.say(Level.WARN, f"the map of {source} is older than the one that it "
-                            f"replaces, of {self._used}")
+            self._ports.say(
+                Level.WARN,
+                f"the map of {source} is older than the one that it replaces, of {self._used}",
+            )
         self.compensator = use
         self._used, self._since_s, self._map_ns = source, self._ports.now_s(), stamp_ns
         self._ports.say(Level.OK, f"correcting by the map of {source} from now on")
 
-    def _refuse_large(self, error_map: ErrorMap, errors: Sequence[np.ndarray],
-                      errors_theta: np.ndarray, source: str) -> None:
+    def _refuse_large(
+        self,
+        error_map: ErrorMap,
+        errors: Sequence[np.ndarray],
+        errors_theta: np.ndarray,
+        source: str,
+    ) -> None:
         """Refuse errors that move a position by more than `max_correction`.
 
         An angular error moves the farthest site, or what is as far as `LEAST_RADIUS_M`, by its
@@ -195,12 +233,16 @@ class CompensatingSession:
         """
         artifact, limit_m = error_map.artifact, self._settings.max_correction
         radius_m = max(math.hypot(*artifact.half) * artifact.grid_pitch_m, LEAST_RADIUS_M)
-        largest_m = max(np.abs(part[~np.isnan(part)]).max(initial=0.0)
-                        for part in (*errors, errors_theta * radius_m))
+        largest_m = max(
+            np.abs(part[~np.isnan(part)]).max(initial=0.0)
+            for part in (*errors, errors_theta * radius_m)
+        )
         if largest_m > limit_m:
-            raise InputError(f"the map of {source}", f"it corrects by up to {largest_m:.3g} m, "
-                             f"max_correction is {limit_m:.3g} m",
-                             "check its units (m, rad), or set max_correction")
+            raise InputError(
+                f"the map of {source}",
+                f"it corrects by up to {largest_m:.3g} m, max_correction is {limit_m:.3g} m",
+                "check its units (m, rad), or set max_correction",
+            )
 
     def receive(self, data: bytes, received_ns: int) -> None:
         """Take a sensor_msgs/JointState as received; it waits for `correct_waiting`."""
@@ -269,9 +311,12 @@ class CompensatingSession:
         self.counts["commands"] += 1
         return self._editor.replaced(data, corrected)
 
-    def _corrected(self, names: Sequence[str], positions: Sequence[float],
-                   by: tuple[Callable[[float, float], tuple], Callable[[float], Any]],
-                   ) -> list[float] | None:
+    def _corrected(
+        self,
+        names: Sequence[str],
+        positions: Sequence[float],
+        by: tuple[Callable[[float, float], tuple], Callable[[float], Any]],
+    ) -> list[float] | None:
         """Return the positions of all joints with the stage's corrected; None if unknown.
 
         That is: outside the field with outside=refuse, next to an unknown site or line, no
@@ -296,7 +341,8 @@ class CompensatingSession:
         if not stage or (x is None) != (y is None):
             return None
         if self.compensator is None or not all(
-                abs(positions[index]) <= FARTHEST for index in stage):  # nor NaN
+            abs(positions[index]) <= FARTHEST for index in stage
+        ):  # nor NaN
             return None
         corrected = list(positions)
         try:
@@ -311,8 +357,9 @@ class CompensatingSession:
             return None
         return corrected if all(math.isfinite(corrected[index]) for index in stage) else None
 
-    def answer(self, x: Sequence[float], y: Sequence[float], theta: Sequence[float], *,
-               inverse: bool) -> dict[str, np.ndarray]:
+    def answer(
+        self, x: Sequence[float], y: Sequence[float], theta: Sequence[float], *, inverse: bool
+    ) -> dict[str, np.ndarray]:
         """Return the fields of the answer to a selfcal_msgs/Correct request.
 
         Raises
@@ -323,12 +370,18 @@ class CompensatingSession:
         """
         use = self.compensator
         if use is None:
-            raise InputError("compensator", f"no error map yet{self._waits and ': '}{self._waits}",
-                             "calibrate, or name one with the parameter map")
+            raise InputError(
+                "compensator",
+                f"no error map yet{self._waits and ': '}{self._waits}",
+                "calibrate, or name one with the parameter map",
+            )
         points = [np.asarray(axis, dtype=float) for axis in (x, y, theta)]
         if len(points[0]) != len(points[1]) or len(points[2]) not in (0, len(points[0])):
-            raise InputError("request", f"{len(x)} x, {len(y)} y and {len(theta)} theta",
-                             "give equally many of each; theta may be empty")
+            raise InputError(
+                "request",
+                f"{len(x)} x, {len(y)} y and {len(theta)} theta",
+                "give equally many of each; theta may be empty",
+            )
         if not all((np.abs(axis) <= FARTHEST).all() for axis in points):
             raise InputError("request", "a position is not a number", "give m and rad")
         found = [*(use.correct if inverse else use.command)(*points[:2]), points[2]]
@@ -337,15 +390,22 @@ class CompensatingSession:
             found[2] = (use.correct_theta if inverse else use.command_theta)(points[2])
             u[2] = use.uncertainty_theta(found[2] if inverse else points[2])
         if not all(np.isfinite(axis).all() for axis in found):
-            raise InputError("request", "a position lies next to an unknown site or line",
-                             "leave it out, or measure the site")
+            raise InputError(
+                "request",
+                "a position lies next to an unknown site or line",
+                "leave it out, or measure the site",
+            )
         return dict(zip(("x", "y", "theta", "u_x", "u_y", "u_theta"), [*found, *u], strict=True))
 
     def remark(self, answer: dict[str, np.ndarray]) -> str:
         """Return the line of an answer: the map that was used, and whether u is missing."""
         unknown = int(np.isnan([answer["u_x"], answer["u_y"]]).any(axis=0).sum())
-        missing = f"; u is not known at {unknown} positions: is one outside the field, or has " \
-            "the map no uncertainties?" if unknown else ""
+        missing = (
+            f"; u is not known at {unknown} positions: is one outside the field, or has "
+            "the map no uncertainties?"
+            if unknown
+            else ""
+        )
         return f"corrected by the map of {self._used}{missing}"
 
     def diagnosis(self) -> Diagnosis:
@@ -358,33 +418,49 @@ class CompensatingSession:
         oldest, limit = max(ages_s, default=0.0), self._settings.max_age
         lines = []
         if skipped:
-            lines.append(f"{skipped} samples skipped since the last status: newer ones arrived "
-                         "before they could be corrected, or they were lost in transport")
+            lines.append(
+                f"{skipped} samples skipped since the last status: newer ones arrived "
+                "before they could be corrected, or they were lost in transport"
+            )
         refused, self._commands_refused = self._commands_refused, 0
         if refused:
-            lines.append(f"{refused} commands refused since the last status and not passed on: no "
-                         "map, no complete position, a joint named twice, or a position where the "
-                         "map is unknown")
+            lines.append(
+                f"{refused} commands refused since the last status and not passed on: no "
+                "map, no complete position, a joint named twice, or a position where the "
+                "map is unknown"
+            )
         strange, self._strange = self._strange, ()
         if strange and (refused or not ages_s):  # beside samples of the stage they may be others
-            own = ", ".join((self._settings.joint_x, self._settings.joint_y,
-                             self._settings.joint_theta))
-            lines.append(f"joints {printable(', '.join(strange))} are not of the stage ({own}): "
-                         "correct joint_x, joint_y and joint_theta, or the publisher")
+            own = ", ".join(
+                (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
+            )
+            lines.append(
+                f"joints {printable(', '.join(strange))} are not of the stage ({own}): "
+                "correct joint_x, joint_y and joint_theta, or the publisher"
+            )
         frame, self._other_frame = self._other_frame, ""
         if frame:
-            lines.append(f"commands name the frame {printable(frame)!r}, but are corrected as "
-                         f"positions in {self._settings.frame_id!r}: transform them first, or set "
-                         "frame_id if it is the stage's")
+            lines.append(
+                f"commands name the frame {printable(frame)!r}, but are corrected as "
+                f"positions in {self._settings.frame_id!r}: transform them first, or set "
+                "frame_id if it is the stage's"
+            )
         outside, self._outside = self._outside, 0
         if outside:
-            lines.append(f"{outside} positions outside the field since the last status, corrected "
-                         "as at its edge: how well is not known")
+            lines.append(
+                f"{outside} positions outside the field since the last status, corrected "
+                "as at its edge: how well is not known"
+            )
         if oldest > limit:
-            lines.append(f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
-                         f"published, max_age is {limit * MS_PER_S:g} ms")
-        values = {"age_ms": f"{median(ages_s) * MS_PER_S:.2f}",
-                  "age_ms_max": f"{oldest * MS_PER_S:.2f}"} if ages_s else {}
+            lines.append(
+                f"a corrected position was {oldest * MS_PER_S:.1f} ms old when it was "
+                f"published, max_age is {limit * MS_PER_S:g} ms"
+            )
+        values = (
+            {"age_ms": f"{median(ages_s) * MS_PER_S:.2f}", "age_ms_max": f"{oldest * MS_PER_S:.2f}"}
+            if ages_s
+            else {}
+        )
         return Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines), values)
 
     def _state(self) -> Diagnosis:
@@ -393,12 +469,17 @@ class CompensatingSession:
             return Diagnosis(Level.WARN, f"no error map yet{waits}", self.counts)
         age = (self._ports.now_ns() - self._map_ns) * S_PER_NS if self._map_ns else math.nan
         values = self.counts | {
-            "map": self._used, "since_s": f"{self._ports.now_s() - self._since_s:.0f}",
-            **({"map_age_s": f"{age:.0f}"} if math.isfinite(age) else {})}
+            "map": self._used,
+            "since_s": f"{self._ports.now_s() - self._since_s:.0f}",
+            **({"map_age_s": f"{age:.0f}"} if math.isfinite(age) else {}),
+        }
         if 0 < self._settings.max_map_age < age:
             return Diagnosis(Level.WARN, f"the map is {age:.0f} s old: calibrate again", values)
-        return Diagnosis(Level.WARN if self._contradicted else Level.OK,
-                         f"correcting by the map of {self._used}{waits}", values)
+        return Diagnosis(
+            Level.WARN if self._contradicted else Level.OK,
+            f"correcting by the map of {self._used}{waits}",
+            values,
+        )
 
 
 def _refuse_other_axes(error_map: ErrorMap, source: str) -> None:
@@ -414,12 +495,15 @@ def _refuse_other_axes(error_map: ErrorMap, source: str) -> None:
     half_m = max(error_map.artifact.half) * error_map.artifact.grid_pitch_m
     largest_m = float(np.nanmax(np.hypot(error_map.gx, error_map.gy)))
     if max(abs(a - b) for a, b in zip(found, stated, strict=True)) * half_m > (
-            SAME_FIGURE * largest_m):
+        SAME_FIGURE * largest_m
+    ):
         raise InputError(
-            f"the map of {source}", "its non-orthogonality and scale difference are "
+            f"the map of {source}",
+            "its non-orthogonality and scale difference are "
             f"{found[0]:.4g} and {found[1]:.4g}, it states {stated[0]:.4g} and {stated[1]:.4g}: "
             "axes were exchanged or reversed, or numbers changed, after it was solved",
-            "publish the map as the solver does")
+            "publish the map as the solver does",
+        )
 
 
 def _source(message: Any) -> str:
@@ -451,8 +535,11 @@ def result_file(path: str, folder: str) -> Path:
     root = Path(os.path.realpath(folder or os.curdir))
     target = Path(os.path.realpath(root / path))
     if not target.is_relative_to(root):
-        raise InputError(path, f"lies outside of {root}", "name a file in it, or set the parameter "
-                         "result_folder of the solver")
+        raise InputError(
+            path,
+            f"lies outside of {root}",
+            "name a file in it, or set the parameter result_folder of the solver",
+        )
     if os.path.exists(target) and not os.path.isfile(target):  # a pipe would block
         raise InputError(path, "is not a regular file", "name another file")
     return target

@@ -42,8 +42,9 @@ class DetectingSession:
         found = self._detector.take(message)
         self._empty = 0 if found else self._empty + 1
         for detection in found:
-            self._ports.publish("detection", from_model.detection(
-                detection, self._settings.frame_id))
+            self._ports.publish(
+                "detection", from_model.detection(detection, self._settings.frame_id)
+            )
         self._busy_s = max(self._busy_s, time.thread_time() - began_s)
 
     def diagnosis(self) -> Diagnosis:
@@ -57,7 +58,10 @@ class DetectingSession:
             return Diagnosis(Level.WARN, "no image yet", values)
         if self._empty >= MANY_EMPTY:
             most = max(counts.rejected, key=lambda name: counts.rejected[name], default="")
-            why = f", most rejected as {most}" if most else ", nothing looks like one: check " \
-                "mark, mark_size, pixel_size and polarity"
+            why = (
+                f", most rejected as {most}"
+                if most
+                else ", nothing looks like one: check mark, mark_size, pixel_size and polarity"
+            )
             return Diagnosis(Level.WARN, f"no mark in the last {self._empty} images{why}", values)
         return Diagnosis(Level.OK, f"{counts.marks} marks in {counts.images} images", values)

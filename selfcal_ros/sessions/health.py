@@ -90,8 +90,11 @@ def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
     values = dict(main.values)
     for item in others:
         values |= item.values
-    return Diagnosis(max([main.level, *(item.level for item in others)]),
-                     "; ".join(dict.fromkeys([*wrong, main.message])), values)
+    return Diagnosis(
+        max([main.level, *(item.level for item in others)]),
+        "; ".join(dict.fromkeys([*wrong, main.message])),
+        values,
+    )
 
 
 class Tally:
@@ -119,8 +122,11 @@ class Tally:
     def diagnosis(self) -> Diagnosis:
         """Return WARN and the newest lines for some time after a fault."""
         recent = [line for place, (_, line) in self._last.items() if self._is_recent(place)]
-        return Diagnosis(Level.WARN if recent else Level.OK, "; ".join(recent),
-                         {f"{self.word} {place}": n for place, n in sorted(self.counts.items())})
+        return Diagnosis(
+            Level.WARN if recent else Level.OK,
+            "; ".join(recent),
+            {f"{self.word} {place}": n for place, n in sorted(self.counts.items())},
+        )
 
 
 class Refusals(Tally):
@@ -130,8 +136,13 @@ class Refusals(Tally):
 
     def add(self, place: str, error: Exception) -> None:
         """Count an error of the callback at `place`; a foreign one shows its type."""
-        line = str(error) if isinstance(error, SelfcalError) else (
-            f"{place}: cannot be used ({type(error).__name__}: {printable(first_line(error))})")
+        line = (
+            str(error)
+            if isinstance(error, SelfcalError)
+            else (
+                f"{place}: cannot be used ({type(error).__name__}: {printable(first_line(error))})"
+            )
+        )
         self.counts[place] += 1
         self._last[place] = (self._now_s(), line)
         count = self.counts[place]
@@ -159,8 +170,13 @@ class Losses(Tally):
         total = max(counts.values())
         new = total - self.counts[topic]
         if new > 0:
-            self._tell(topic, total, f"{topic}: {new} messages were lost in transport; the machine "
-                       "or the network is too slow for them", f"{topic}: {total} messages lost")
+            self._tell(
+                topic,
+                total,
+                f"{topic}: {new} messages were lost in transport; the machine "
+                "or the network is too slow for them",
+                f"{topic}: {total} messages lost",
+            )
 
     def add_unheard(self, topic: str, number: int) -> None:
         """Count messages published while this node had no subscription."""
@@ -247,8 +263,10 @@ class Rate:
     def per_second(self) -> float:
         """Messages a second by reception."""
         now = self._now_s()
-        return sum(count for began, count, _ in self._bins
-                   if now - began <= self.WINDOW_S) / self.WINDOW_S
+        return (
+            sum(count for began, count, _ in self._bins if now - began <= self.WINDOW_S)
+            / self.WINDOW_S
+        )
 
     def take_gap_ns(self) -> int:
         """Return the longest gap between stamps since the last call."""
@@ -285,8 +303,10 @@ class CellChecks:
 
     def take(self, measurements: Measurements) -> None:
         """Check the readings of all views so far."""
-        faults = {f"{fault.view} {fault.kind}": str(worded(fault))
-                  for fault in wiring_faults(measurements)}
+        faults = {
+            f"{fault.view} {fault.kind}": str(worded(fault))
+            for fault in wiring_faults(measurements)
+        }
         for place in faults.keys() - self._miswired.keys():
             self._say(Level.ERROR, faults[place])
         self._miswired = faults
@@ -299,8 +319,9 @@ class CellChecks:
         fault.
         """
         marks = sum(len(view.m) for view in measurements.views)
-        if marks == self._marks or (not self._misplaced
-                                    and self._marks < marks < MORE * self._marks):
+        if marks == self._marks or (
+            not self._misplaced and self._marks < marks < MORE * self._marks
+        ):
             return
         self._marks, found = marks, misplaced(measurements)
         line = str(said(found)) if found else ""
@@ -355,10 +376,16 @@ def missing_marks(status: Any) -> str:
     lines = [str(k) for k in status.missing_k]
     angular = status.angular_expected - status.angular_done
     checks = status.check_expected - status.check_done
-    parts = [_named(words, count, what) for words, count, what in (
-        (marks, grid, "mark"), (lines, angular, "line")) if count > 0]
-    parts += [f"check stops of {checks} mark{'s' * (checks != 1)} (see check_marks of the view "
-              "command)"] if checks > 0 else []
+    parts = [
+        _named(words, count, what)
+        for words, count, what in ((marks, grid, "mark"), (lines, angular, "line"))
+        if count > 0
+    ]
+    parts += (
+        [f"check stops of {checks} mark{'s' * (checks != 1)} (see check_marks of the view command)"]
+        if checks > 0
+        else []
+    )
     return " and ".join(parts)
 
 

@@ -111,8 +111,9 @@ class JournalSearch:
     problem: InputError | None = None
 
 
-def search_journal(found: journals.Claim | None, folder: str,
-                   left: Path | None = None) -> JournalSearch:
+def search_journal(
+    found: journals.Claim | None, folder: str, left: Path | None = None
+) -> JournalSearch:
     """Read the newest journal of `folder`, which may take long.
 
     Parameters
@@ -154,8 +155,9 @@ class JournalKeeper:
         Log and clocks.
     """
 
-    def __init__(self, folder: str, topics: dict[str, KeptTopic],
-                 settings: CollectorSettings, ports: Ports) -> None:
+    def __init__(
+        self, folder: str, topics: dict[str, KeptTopic], settings: CollectorSettings, ports: Ports
+    ) -> None:
         self._folder, self._topics, self._ports = folder, topics, ports
         self._lag_limit_s = settings.journal_lag_limit
         self._max_age_s = settings.journal_max_age
@@ -252,9 +254,12 @@ class JournalKeeper:
         """Report that a run is too old to be resumed; return none of its files."""
         self._tell_problem(looked)
         for file in looked.files[:1]:
-            self._ports.say(Level.WARN, f"{file.parent}: its run was left "
-                            f"{(self._left_ago_s or 0.0) / S_PER_H:.0f} h ago and is not resumed; "
-                            "'selfcal solve' reads it, a larger journal_max_age resumes it")
+            self._ports.say(
+                Level.WARN,
+                f"{file.parent}: its run was left "
+                f"{(self._left_ago_s or 0.0) / S_PER_H:.0f} h ago and is not resumed; "
+                "'selfcal solve' reads it, a larger journal_max_age resumes it",
+            )
         return []
 
     def _tell_problem(self, looked: JournalSearch) -> None:
@@ -297,8 +302,7 @@ class JournalKeeper:
             self._fail(error)
 
     def _try_again(self) -> None:
-        if (self._folder and not self.holds
-                and self._ports.now_s() >= self._tried_s + RETRY_S):
+        if self._folder and not self.holds and self._ports.now_s() >= self._tried_s + RETRY_S:
             self._tried_s = self._ports.now_s()
             # an older journal gets only later messages: the session has its content
             self._open(journals.resume(self._folder) if self._goes_on else None)
@@ -307,8 +311,10 @@ class JournalKeeper:
         """Report that a failure is over, after some time without one."""
         if self._problem and self._ports.now_s() >= self._failed_s + RETRY_S:
             self._problem = ""
-            self._ports.say(Level.WARN, f"{self.path}: the journal is written again; "
-                            f"{self.lost} messages are not in it")
+            self._ports.say(
+                Level.WARN,
+                f"{self.path}: the journal is written again; {self.lost} messages are not in it",
+            )
 
     def _fail(self, error: InputError) -> None:
         self._tried_s = self._failed_s = self._ports.now_s()
@@ -344,9 +350,15 @@ class JournalKeeper:
             wrong.append(f"{self.lost} messages are not in the journal")
         if lag_s > self._lag_limit_s:
             wrong.append(f"the disk is {lag_s:.1f} s behind with the journal")
-        return Diagnosis(Level.WARN if wrong else Level.OK, "; ".join(wrong), {
-            "journal": str(self.path or ""), "journal_lag_s": f"{lag_s:.2f}",
-            "journal_lost": self.lost})
+        return Diagnosis(
+            Level.WARN if wrong else Level.OK,
+            "; ".join(wrong),
+            {
+                "journal": str(self.path or ""),
+                "journal_lag_s": f"{lag_s:.2f}",
+                "journal_lost": self.lost,
+            },
+        )
 
 
 def _given_up(journal: journals.Journal) -> None:

@@ -24,11 +24,15 @@ def progress_line(command: Command, view: ViewProgress | None) -> str:
 
 def _parts(view: ViewProgress) -> list[str]:
     """Return what is done, what was rejected, and the noise of a view."""
-    parts = [f"{done} of {expected} {what}" for done, expected, what in (
-        (view.grid_done, view.grid_expected, "marks"),
-        (view.angular_done, view.angular_expected, "lines"),
-        (min(view.check_done, view.check_expected), view.check_expected, "check stops"))
-        if expected]
+    parts = [
+        f"{done} of {expected} {what}"
+        for done, expected, what in (
+            (view.grid_done, view.grid_expected, "marks"),
+            (view.angular_done, view.angular_expected, "lines"),
+            (min(view.check_done, view.check_expected), view.check_expected, "check stops"),
+        )
+        if expected
+    ]
     if view.view.repeats > 1 and not view.complete:  # no mark is complete until the last pass
         parts.append(f"{math.floor(100 * view.coverage)} % of {view.view.repeats} repeats")
 

@@ -52,9 +52,14 @@ class Reception:
         Counts and reports unusable messages.
     """
 
-    def __init__(self, session: CollectingSession, journal: JournalKeeper, *,
-                 say: Callable[[Level, str], None],
-                 refuse: Callable[[str, Exception], None]) -> None:
+    def __init__(
+        self,
+        session: CollectingSession,
+        journal: JournalKeeper,
+        *,
+        say: Callable[[Level, str], None],
+        refuse: Callable[[str, Exception], None],
+    ) -> None:
         self.session, self.journal, self._say, self._refuse = session, journal, say, refuse
         self._waiting: list[tuple[str, bytes, int, bool]] = []
         self._n_detections = 0  # waiting
@@ -64,8 +69,10 @@ class Reception:
         self._restoring: Future[ResumedRun] | None = None
         self._source = ""  # the journal being resumed
         self._bad: Counter = Counter()
-        self._decoders = {topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
-                          for topic, name in INPUT_TOPICS.items()}
+        self._decoders = {
+            topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
+            for topic, name in INPUT_TOPICS.items()
+        }
 
     def open(self, worker: Executor) -> None:
         """Open the journal; an unfinished run in it is read by `worker`."""
@@ -141,8 +148,10 @@ class Reception:
         self._feed(waiting)
         return adopted or bool(came)
 
-    def _believable(self, waiting: list[tuple[str, bytes, int, bool]],
-                    ) -> list[tuple[str, bytes, int, bool]]:
+    def _believable(
+        self,
+        waiting: list[tuple[str, bytes, int, bool]],
+    ) -> list[tuple[str, bytes, int, bool]]:
         """Return messages not stamped in the future of this node; the rest is counted and reported.
 
         Nor are they in the journal: they would hide later messages stamped by a correct clock,
@@ -162,9 +171,15 @@ class Reception:
             mine = refused & (topics == topic)
             kind, reason = FROM_THE_FUTURE[topic]
             self.session.collector.refuse(kind, reason, int(mine.sum()))
-            self._refuse(topic, InputError(
-                topic, f"stamped {ahead[mine].max() * S_PER_NS:.0f} s ahead of this node's clock: "
-                "not used", "set the clock that stamps it; correctly stamped messages are used"))
+            self._refuse(
+                topic,
+                InputError(
+                    topic,
+                    f"stamped {ahead[mine].max() * S_PER_NS:.0f} s ahead of this node's clock: "
+                    "not used",
+                    "set the clock that stamps it; correctly stamped messages are used",
+                ),
+            )
         return [item for item, left_out in zip(waiting, refused, strict=True) if not left_out]
 
     def _write(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
@@ -201,8 +216,10 @@ class Reception:
             if message is not None:
                 self._guarded(COMMAND_TOPIC, self.session.take_command, message, is_older)
         now_ns = time.time_ns()
-        for topic, take in ((ENCODER_TOPIC, self.session.take_encoder),
-                            (DETECTION_TOPIC, self.session.take_detections)):
+        for topic, take in (
+            (ENCODER_TOPIC, self.session.take_encoder),
+            (DETECTION_TOPIC, self.session.take_detections),
+        ):
             mine = [item for item in waiting if item[0] == topic]
             if mine:
                 ages_ns = now_ns - np.array([item[2] for item in mine])

@@ -42,9 +42,15 @@ class RejectionWatch:
         self._said: set[Key] = set()
         self._progress: dict[int, tuple[int, Counter[str]]] = {}  # used, and rejected until then
 
-    def take(self, findings: Mapping[int | None, RejectionFinding],
-             progress: Mapping[int, ViewProgress], ended: Collection[int], of_last: OfLast, *,
-             final: bool = False) -> None:
+    def take(
+        self,
+        findings: Mapping[int | None, RejectionFinding],
+        progress: Mapping[int, ViewProgress],
+        ended: Collection[int],
+        of_last: OfLast,
+        *,
+        final: bool = False,
+    ) -> None:
         """Take what is found now.
 
         Parameters
@@ -63,7 +69,8 @@ class RejectionWatch:
         where: dict[int | None, str] = {None: ""}
         where.update((index, f"view '{view.view.name}': ") for index, view in progress.items())
         found: dict[Key, str] = {
-            (index, one.reason): f"{where[index]}{one}" for index, one in findings.items()}
+            (index, one.reason): f"{where[index]}{one}" for index, one in findings.items()
+        }
         for index, rejected in self._since_used(progress, ended).items():
             one = of_last(index, rejected)
             if one and not {(index, one.reason), (None, one.reason)} & found.keys():
@@ -71,16 +78,19 @@ class RejectionWatch:
         known = found.keys() | self._said
         advised: dict[Key, str] = {
             (index, reason): where[index] + line
-            for index in ended for reason, count in progress[index].readings.rejected.items()
+            for index in ended
+            for reason, count in progress[index].readings.rejected.items()
             if not {(index, reason), (None, reason)} & known
-            for line in advice({reason: count})}
+            for line in advice({reason: count})
+        }
         now = float("-inf") if final else self._now_s()
         self._found = _since(now, self._found, found)
         self._advised = _since(now, self._advised, advised)
         self.tell()
 
-    def _since_used(self, progress: Mapping[int, ViewProgress],
-                    ended: Collection[int]) -> dict[int, Counter[str]]:
+    def _since_used(
+        self, progress: Mapping[int, ViewProgress], ended: Collection[int]
+    ) -> dict[int, Counter[str]]:
         """Return what was rejected of each open view since one of its detections was used.
 
         Where the marks are read and the lines are not, that need not be most of the view.
@@ -111,7 +121,8 @@ class RejectionWatch:
         return {key: line for key, (since, line) in lines.items() if now - since >= PATIENCE_S}
 
 
-def _since(now: float, before: Mapping[Key, tuple[float, str]],
-           lines: Mapping[Key, str]) -> dict[Key, tuple[float, str]]:
+def _since(
+    now: float, before: Mapping[Key, tuple[float, str]], lines: Mapping[Key, str]
+) -> dict[Key, tuple[float, str]]:
     """Return the lines, each with the time since which there has been one for its key."""
     return {key: (min(now, before.get(key, (now, ""))[0]), line) for key, line in lines.items()}

@@ -97,8 +97,9 @@ class SequencingSession:
     def begin(self) -> str:
         """Start the plan, or resume its run; wait for missing nodes and name them."""
         if self.machine.state not in ENDED:
-            raise InputError("pose_sequencer", f"cannot start while {self.machine.state}",
-                             "abort the plan first")
+            raise InputError(
+                "pose_sequencer", f"cannot start while {self.machine.state}", "abort the plan first"
+            )
         self.machine.need_plan()
         missing = self.missing()
         self.waiting = bool(missing)
@@ -121,10 +122,16 @@ class SequencingSession:
             return ""
         health, phase = collector.values, collector.values.get("phase", "")
         index, stamp_ns = collector.number("view"), collector.number("command_stamp")
-        if (health.get("plan_id") != plan.plan_id or not health.get("run_id")
-                or phase not in ("PLACE", "MEASURE") or index is None or index >= len(plan.views)
-                or health.get("view_name") != plan.views[index].name
-                or stamp_ns is None or is_future(stamp_ns, self._ports.now_ns())):
+        if (
+            health.get("plan_id") != plan.plan_id
+            or not health.get("run_id")
+            or phase not in ("PLACE", "MEASURE")
+            or index is None
+            or index >= len(plan.views)
+            or health.get("view_name") != plan.views[index].name
+            or stamp_ns is None
+            or is_future(stamp_ns, self._ports.now_ns())
+        ):
             return ""
         if health.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
             return ""  # the plan has been edited: the readings are of another one
@@ -133,8 +140,9 @@ class SequencingSession:
         self._send([command], stamp_ns=stamp_ns)  # unchanged: it is latched again
         known = self._measured.get((plan.plan_id, self.run_id), {})
         names = ", ".join(known[number] for number in sorted(known))
-        return (f"resumed run {self.run_id} in view '{plan.views[index].name}', {phase}"
-                + (f"; already measured: {names}" if names else ""))
+        return f"resumed run {self.run_id} in view '{plan.views[index].name}', {phase}" + (
+            f"; already measured: {names}" if names else ""
+        )
 
     def act(self, request: Callable[[], list[Command]]) -> str:
         """Pass a request to the state machine and report the result."""
@@ -152,13 +160,19 @@ class SequencingSession:
     def take_measurement(self, message: Any) -> None:
         """Record a view of this plan that has been completed."""
         plan = self.machine.plan
-        if plan is None or message.plan_id != plan.plan_id or (
-                to_model.artifact_of(message) != plan.artifact):
+        if (
+            plan is None
+            or message.plan_id != plan.plan_id
+            or (to_model.artifact_of(message) != plan.artifact)
+        ):
             return
-        view = to_model.view_of(message, repeats=message.repeats, grid=message.grid,
-                                  angular=message.angular)
-        done = [np.count_nonzero(np.asarray(counts) >= message.repeats)
-                for counts in (message.count, message.count_theta)]
+        view = to_model.view_of(
+            message, repeats=message.repeats, grid=message.grid, angular=message.angular
+        )
+        done = [
+            np.count_nonzero(np.asarray(counts) >= message.repeats)
+            for counts in (message.count, message.count_theta)
+        ]
         views = self._measured.setdefault((message.plan_id, message.run_id), {})
         if all(map(ge, done, expected_marks(plan.artifact, view))):
             views[message.view_index] = message.view_name
@@ -172,13 +186,20 @@ class SequencingSession:
             return
         check_command(command)
         if is_future(command.stamp_ns, self._ports.now_ns()):
-            raise InputError(COMMAND_TOPIC, "stamped in the future of this node's clock: not "
-                             "followed", "set the clock that stamps it")
+            raise InputError(
+                COMMAND_TOPIC,
+                "stamped in the future of this node's clock: not followed",
+                "set the clock that stamps it",
+            )
         if self.current is not None and not (
-                begins_run(command) and command.stamp_ns > self._commanded_ns):
+            begins_run(command) and command.stamp_ns > self._commanded_ns
+        ):
             if not self._strayed:
-                self._ports.say(Level.WARN, "another publisher sends view commands that begin no "
-                                "run later than this one: not followed; find who sends them")
+                self._ports.say(
+                    Level.WARN,
+                    "another publisher sends view commands that begin no "
+                    "run later than this one: not followed; find who sends them",
+                )
             self._strayed = True
             return
         warning = "another publisher sends view commands: following them; abort ends that"
@@ -211,8 +232,11 @@ class SequencingSession:
         now = self._ports.now_s()
         if self.waiting and not self.missing():
             self.begin()
-        if (self.machine.state is State.PLACING and self._settings.auto_confirm
-                and now >= self._confirm_at):
+        if (
+            self.machine.state is State.PLACING
+            and self._settings.auto_confirm
+            and now >= self._confirm_at
+        ):
             self._send(self.machine.confirm())
         self._tell_set_back()
         self._tell_silent()
@@ -227,16 +251,20 @@ class SequencingSession:
         if self.current is None or behind_s <= SET_BACK_S:
             self._set_back = ""
         elif not self._set_back:
-            self._set_back = (f"this machine's clock is {behind_s:.3g} s behind its own last "
-                              "command: it was set back, and what is detected until it has "
-                              "caught up counts in an earlier view; wait, then redo_view")
+            self._set_back = (
+                f"this machine's clock is {behind_s:.3g} s behind its own last "
+                "command: it was set back, and what is detected until it has "
+                "caught up counts in an earlier view; wait, then redo_view"
+            )
             self._ports.say(Level.WARN, self._set_back)
 
     def _tell_silent(self) -> None:
         """Report once that a companion is silent while a plan is running."""
         nodes = " and ".join(self.presence.silent()) if self.current is not None else ""
-        line = nodes and (f"no sign of life from {nodes} for {PATIENCE_S:g} s: it hangs or has "
-                          "ended; wait for it, or start it again: what was measured is kept")
+        line = nodes and (
+            f"no sign of life from {nodes} for {PATIENCE_S:g} s: it hangs or has "
+            "ended; wait for it, or start it again: what was measured is kept"
+        )
         if line and line != self._silent:
             self._ports.say(Level.WARN, line)
         self._silent = line
@@ -258,8 +286,11 @@ class SequencingSession:
         collector = self.presence.of("measurement_collector")
         if collector is None:
             return line + "; measurement_collector gives no sign of life"
-        return line + (f"; measurement_collector: {collector.message}" if collector.level else
-                       "; redo_view measures it again, skip_view continues without it")
+        return line + (
+            f"; measurement_collector: {collector.message}"
+            if collector.level
+            else "; redo_view measures it again, skip_view continues without it"
+        )
 
     def _time_out(self) -> None:
         self._ports.say(Level.WARN, f"view {self._view_name} is not complete in time")
@@ -277,11 +308,19 @@ class SequencingSession:
         for line in filter(None, (self._silent, self._set_back)):
             state, level = f"{line}; {state}", Level.WARN
         plan, view = self.machine.plan, self.current
-        return Diagnosis(level, state, {
-            "state": self.machine.state.name, "plan_id": plan.plan_id if plan else "",
-            "run_id": self.run_id, "view": self.machine.index,
-            "view_name": view.name if view else "", "views": len(plan.views) if plan else 0,
-            "coverage": f"{self.coverage:.3f}"})
+        return Diagnosis(
+            level,
+            state,
+            {
+                "state": self.machine.state.name,
+                "plan_id": plan.plan_id if plan else "",
+                "run_id": self.run_id,
+                "view": self.machine.index,
+                "view_name": view.name if view else "",
+                "views": len(plan.views) if plan else 0,
+                "coverage": f"{self.coverage:.3f}",
+            },
+        )
 
     def _send(self, commands: list[Command], stamp_ns: int = 0) -> None:
         for command in commands:

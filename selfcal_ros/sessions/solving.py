@@ -87,8 +87,11 @@ def _verified(job: Job) -> results.CalibrationResult:
     """Return the map with the correction on, and what that shows, as `selfcal verify` does."""
     before = job.options.plate
     after = _finished(job, calibrate_corrected(job.measurements, job.options))
-    return with_verification(cast(results.CalibrationResult, before), after,
-                             names=(job.options.plate_from, job.measurements.plan_id))[0]
+    return with_verification(
+        cast(results.CalibrationResult, before),
+        after,
+        names=(job.options.plate_from, job.measurements.plan_id),
+    )[0]
 
 
 def _finished(job: Job, result: results.CalibrationResult) -> results.CalibrationResult:
@@ -125,19 +128,36 @@ def pure_noise(marks: int) -> Measurements:
     """
     plate, rng = Artifact(marks, 0.01, 8), np.random.default_rng(1)
     lines, views = np.arange(plate.angular_count), []
-    for number, view in enumerate((
-            View("identity"), View("rot90", np.pi / 2), View("line", np.pi / 4, grid=False),
-            View("shift_x", 0.0, (plate.grid_pitch_m, 0.0)))):
+    for number, view in enumerate(
+        (
+            View("identity"),
+            View("rot90", np.pi / 2),
+            View("line", np.pi / 4, grid=False),
+            View("shift_x", 0.0, (plate.grid_pitch_m, 0.0)),
+        )
+    ):
         on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.limits[0][1])
         m, n = plate.m[on_field], plate.n[on_field]
         dx, dy, offset_x, offset_y = rng.normal(0.0, 2e-8, (4, len(m)))
         once, mark = np.ones(len(m), dtype=int), np.arange(len(m))
-        visits = GridVisits(mark, dx, dy, once, (1000 * number + mark) * NS_PER_S, offset_x,
-                            offset_y, once, once)
-        views.append(ViewReadings(
-            view, m, n, dx, dy, once, k=lines, dtheta=rng.normal(0.0, 1e-6, len(lines)),
-            count_theta=np.ones(len(lines), dtype=int), used=len(m) + len(lines),
-            visits=visits if view.grid else None))
+        visits = GridVisits(
+            mark, dx, dy, once, (1000 * number + mark) * NS_PER_S, offset_x, offset_y, once, once
+        )
+        views.append(
+            ViewReadings(
+                view,
+                m,
+                n,
+                dx,
+                dy,
+                once,
+                k=lines,
+                dtheta=rng.normal(0.0, 1e-6, len(lines)),
+                count_theta=np.ones(len(lines), dtype=int),
+                used=len(m) + len(lines),
+                visits=visits if view.grid else None,
+            )
+        )
     return Measurements("noise", plate, tuple(views))
 
 
@@ -207,9 +227,11 @@ class SolvingSession:
         if ends:
             self._ended.add(run)
         tells = not self._planned_views(run) or isinstance(
-            self.shown.problem, NoDataError | NotIdentifiableError)
+            self.shown.problem, NoDataError | NotIdentifiableError
+        )
         if run in (self._run, PlanRun(self._run.plan_id)) and (
-                command.views_planned > known or (ends and tells)):
+            command.views_planned > known or (ends and tells)
+        ):
             self._stale = True  # the summary shows the number of planned or remaining views
 
     def _planned_views(self, run: PlanRun) -> int:
@@ -224,19 +246,27 @@ class SolvingSession:
         InputError
             If the message is inconsistent or impossible.
         """
-        check_view(to_model.view_readings(message), to_model.artifact_of(message),
-                   int(message.view_index))
+        check_view(
+            to_model.view_readings(message), to_model.artifact_of(message), int(message.view_index)
+        )
         run, now_ns = PlanRun(message.plan_id, message.run_id), self._ports.now_ns()
         if begins_in_future(run, now_ns):
-            raise InputError(MEASUREMENT_TOPIC, f"run {run.run_id} begins in the future of this "
-                             "node's clock", "set the clocks, and start the plan again")
+            raise InputError(
+                MEASUREMENT_TOPIC,
+                f"run {run.run_id} begins in the future of this node's clock",
+                "set the clocks, and start the plan again",
+            )
         if run != self._run:
-            if self._messages and not (supersedes(run, self._run)
-                                       or begins_in_future(self._run, now_ns)):
+            if self._messages and not (
+                supersedes(run, self._run) or begins_in_future(self._run, now_ns)
+            ):
                 if begun_ns(run.run_id) is None:
-                    raise InputError(MEASUREMENT_TOPIC, "readings without a run_id, while "
-                                     f"run {self._run.run_id} is known: not used",
-                                     "set run_id in the commands, or restart the solver")
+                    raise InputError(
+                        MEASUREMENT_TOPIC,
+                        "readings without a run_id, while "
+                        f"run {self._run.run_id} is known: not used",
+                        "set run_id in the commands, or restart the solver",
+                    )
                 self._left_aside += 1
                 return
             self._run, self._messages = run, {}
@@ -249,25 +279,30 @@ class SolvingSession:
     def measurements(self) -> Measurements:
         """Return the readings of all views of the run so far."""
         if not self._messages:
-            raise NoDataError(MEASUREMENT_TOPIC, "no view has been measured",
-                              "start the collector and measure")
+            raise NoDataError(
+                MEASUREMENT_TOPIC, "no view has been measured", "start the collector and measure"
+            )
         ordered = [self._messages[index] for index in sorted(self._messages)]
         newest = max(ordered, key=lambda m: sum(m.session_reject_counts))
         artifacts = {to_model.artifact_of(message) for message in ordered}
         if len(artifacts) > 1:
-            raise InputError(MEASUREMENT_TOPIC, "views of different plates in one plan",
-                             "measure one plate")
+            raise InputError(
+                MEASUREMENT_TOPIC, "views of different plates in one plan", "measure one plate"
+            )
         artifact = artifacts.pop()
         views = tuple(to_model.view_readings(message) for message in ordered)
         check_plate(artifact, views)
         return Measurements(
-            ordered[0].plan_id, artifact, views,
+            ordered[0].plan_id,
+            artifact,
+            views,
             sense=to_model.sense_of(ordered[0]),
             rejected=to_model.counts(newest, "session_reject"),
             run_id=self._run.run_id,
             model_terms=to_model.terms_of(newest),
             artifact_from=to_model.plate_from(newest),
-            **to_model.plan_keys_of(newest))
+            **to_model.plan_keys_of(newest),
+        )
 
     def _by_view(self, readings: Sequence[ViewReadings]) -> dict[int, list[ViewReadings]]:
         """Return the readings, in the order of the messages, by their view in the plan."""
@@ -284,8 +319,10 @@ class SolvingSession:
     def _incomplete(self) -> bool:
         """Whether cells of an image are still to come: they are sent one after the other."""
         cells = Counter(index for index, *_ in self._messages)
-        return any(cells[index] < max(message.image_nx * message.image_ny, 1)
-                   for (index, *_), message in self._messages.items())
+        return any(
+            cells[index] < max(message.image_nx * message.image_ny, 1)
+            for (index, *_), message in self._messages.items()
+        )
 
     def next_job(self) -> Job | None:
         """Return the next job, if readings have arrived since the last one.
@@ -303,26 +340,45 @@ class SolvingSession:
         stamp = max(map(to_model.stamp_ns, self._messages.values()), default=0)
         try:
             measurements = self.measurements()
-            digest = session_digest({
-                index: view_digest(parts, measurements.rejected)
-                for index, parts in self._by_view(measurements.views).items()})
+            digest = session_digest(
+                {
+                    index: view_digest(parts, measurements.rejected)
+                    for index, parts in self._by_view(measurements.views).items()
+                }
+            )
             options = solver_options(self._settings, measurements)
         except SelfcalError as error:
             self.shown = Shown(None, error, self._run, self._views_done, stamp)
             self._publish_summary()
             raise
-        return Job(self._run, measurements, options, self._settings.method, digest,
-                   stamp_ns=stamp, notes=self._notes, views_done=self._views_done)
+        return Job(
+            self._run,
+            measurements,
+            options,
+            self._settings.method,
+            digest,
+            stamp_ns=stamp,
+            notes=self._notes,
+            views_done=self._views_done,
+        )
 
     def _verifies_later(self) -> bool:
         """Return whether views of a verification are to come: one says less than all."""
         newest = next(iter(self._messages.values()), None)
         over = bool(self._ended & {self._run, PlanRun(self._run.plan_id)})
-        if newest is None or not to_model.plan_keys_of(newest)["verify"] or over or (
-                self._views_done >= self._planned_views(self._run)):
+        if (
+            newest is None
+            or not to_model.plan_keys_of(newest)["verify"]
+            or over
+            or (self._views_done >= self._planned_views(self._run))
+        ):
             return False
-        self.shown = Shown(None, NoDataError("the verification", "views are to come",
-                                             "measure them"), self._run, self._views_done)
+        self.shown = Shown(
+            None,
+            NoDataError("the verification", "views are to come", "measure them"),
+            self._run,
+            self._views_done,
+        )
         self._publish_summary()
         return True
 
@@ -334,8 +390,9 @@ class SolvingSession:
         if outcome.result is None:
             self._take_none(outcome)
             return
-        self.shown = Shown(outcome.result, outcome.problem, job.run, job.views_done,
-                           job.stamp_ns, job.digest)
+        self.shown = Shown(
+            outcome.result, outcome.problem, job.run, job.views_done, job.stamp_ns, job.digest
+        )
         self._saved = ""
         self._publish(outcome.result)
         if self._settings.save_path and outcome.problem is None:
@@ -344,8 +401,7 @@ class SolvingSession:
     def _take_none(self, outcome: SolvingOutcome) -> None:
         """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
-        self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns,
-                           job.digest)
+        self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns, job.digest)
         self._publish_summary()
         if not self._unfinished():
             raise outcome.problem or ValueError("neither a result nor a problem")
@@ -368,8 +424,11 @@ class SolvingSession:
 
     def save_again(self) -> None:
         """Write a result that could not be written, some time after the last attempt."""
-        if (self._unsaved and self.shown.result is not None
-                and self._ports.now_s() - self._tried_s >= RETRY_S):
+        if (
+            self._unsaved
+            and self.shown.result is not None
+            and self._ports.now_s() - self._tried_s >= RETRY_S
+        ):
             self._save_by_itself(self.shown.result)
 
     def _publish(self, result: results.CalibrationResult) -> None:
@@ -377,12 +436,16 @@ class SolvingSession:
         of_stage = results.VERIFICATION not in result.extra  # else of what a correction leaves
         is_map = shown.problem is None and of_stage
         if is_map:
-            self._ports.publish("map", from_model.error_map(
-                result, shown.stamp_ns, self._settings.frame_id) | _verdict(shown))
+            self._ports.publish(
+                "map",
+                from_model.error_map(result, shown.stamp_ns, self._settings.frame_id)
+                | _verdict(shown),
+            )
         self._publish_summary()
         if is_map:  # last, as pictures are slow
-            self._ports.publish("markers", {"error_map": result.error_map,
-                                            "stamp_ns": shown.stamp_ns})
+            self._ports.publish(
+                "markers", {"error_map": result.error_map, "stamp_ns": shown.stamp_ns}
+            )
 
     def _publish_summary(self) -> None:
         """Publish what is shown, also that there is no map: an earlier summary says otherwise."""
@@ -390,18 +453,26 @@ class SolvingSession:
         planned = self._planned_views(shown.run)
         advice = [f"{counted(planned - shown.views_done, 'view')} to come"]
         if not self._unfinished():
-            advice = [str(shown.problem)] if result is None else [
-                found.text for found in result.observability.advice]
-        self._ports.publish("summary", {
-            "header": from_model.header(shown.stamp_ns, self._settings.frame_id),
-            "state": self._state(), "views_done": shown.views_done,
-            "views_planned": planned,
-            "identifiable": result is not None and result.observability.identifiable,
-            "rank_deficiency": 0 if result is None else result.observability.deficiency,
-            **summary_numbers(result),
-            "advice": [*advice, *(result.warnings if result else ())],
-            "causes": [cause.text for cause in result.verdict.causes] if result else [],
-            **_verdict(shown)})
+            advice = (
+                [str(shown.problem)]
+                if result is None
+                else [found.text for found in result.observability.advice]
+            )
+        self._ports.publish(
+            "summary",
+            {
+                "header": from_model.header(shown.stamp_ns, self._settings.frame_id),
+                "state": self._state(),
+                "views_done": shown.views_done,
+                "views_planned": planned,
+                "identifiable": result is not None and result.observability.identifiable,
+                "rank_deficiency": 0 if result is None else result.observability.deficiency,
+                **summary_numbers(result),
+                "advice": [*advice, *(result.warnings if result else ())],
+                "causes": [cause.text for cause in result.verdict.causes] if result else [],
+                **_verdict(shown),
+            },
+        )
 
     def _unfinished(self) -> bool:
         """Return whether remaining views may help.
@@ -420,8 +491,11 @@ class SolvingSession:
     def _state(self) -> str:
         if self._unfinished():
             done, planned = self.shown.views_done, self._planned_views(self.shown.run)
-            views = f"{done} of {planned} views measured" if planned \
+            views = (
+                f"{done} of {planned} views measured"
+                if planned
                 else f"{counted(done, 'view')} measured so far"
+            )
             return f"{views}, not yet enough to identify the stage."
         if self.shown.problem is not None or self.shown.result is None:
             return str(self.shown.problem)
@@ -444,8 +518,9 @@ class SolvingSession:
         """
         problem = self.shown.problem
         if self.shown.result is None:
-            raise problem or NoDataError("solver", "there is no map yet",
-                                         "measure the views of the plan")
+            raise problem or NoDataError(
+                "solver", "there is no map yet", "measure the views of the plan"
+            )
         target = result_file(path, self._settings.result_folder)
         if problem is not None and os.path.exists(target):
             raise problem
@@ -462,19 +537,30 @@ class SolvingSession:
     def _newer(self, runs: Iterable[PlanRun]) -> str:
         """Return a note on a run that is newer than the published one; "" if none."""
         now_ns, shown = self._ports.now_ns(), begun_ns(self.shown.run.run_id)
-        later = [(begun, run) for run in runs if (begun := begun_ns(run.run_id))
-                 and shown and begun > shown and not begins_in_future(run, now_ns)]
+        later = [
+            (begun, run)
+            for run in runs
+            if (begun := begun_ns(run.run_id))
+            and shown
+            and begun > shown
+            and not begins_in_future(run, now_ns)
+        ]
         if not later:
             return ""
         run = max(later, key=lambda item: item[0])[1]
-        return (f"the newer run {run.run_id} of plan '{run.plan_id}' is not in this map: none of "
-                "its readings has arrived; the health of measurement_collector says why")
+        return (
+            f"the newer run {run.run_id} of plan '{run.plan_id}' is not in this map: none of "
+            "its readings has arrived; the health of measurement_collector says why"
+        )
 
     def load(self, path: str) -> str:
         """Publish the map of a RESULT.json and log it."""
         result = read_result(path)
-        self.shown = Shown(result, run=PlanRun(result.plan_id, result.run_id),
-                           views_done=len({without_cell(view.name) for view in result.views}))
+        self.shown = Shown(
+            result,
+            run=PlanRun(result.plan_id, result.run_id),
+            views_done=len({without_cell(view.name) for view in result.views}),
+        )
         self._saved = self._unsaved = ""
         self._publish(result)
         return f"loaded {path}: plan {result.plan_id}"
@@ -485,19 +571,29 @@ class SolvingSession:
         known = shown.result is not None or shown.problem is not None
         newer = self._newer(self._ended)  # a running one may still send its readings
         fine = (shown.problem is None or self._unfinished()) and (
-            shown.problem is not None or shown.result is None or is_qualified(shown.result))
+            shown.problem is not None or shown.result is None or is_qualified(shown.result)
+        )
         state = self._state() if known else "waiting for views"
         wrong = [line for line in (self._unsaved, newer) if line]
-        return Diagnosis(Level.OK if fine and not wrong else Level.WARN,
-                         "; ".join([*wrong, state]),
-                         {"views": self._views_done, "readings": self.digest(),
-                          "plan_id": self._run.plan_id, "run_id": self._run.run_id,
-                          "left_aside": self._left_aside, "saved": self._saved})
+        return Diagnosis(
+            Level.OK if fine and not wrong else Level.WARN,
+            "; ".join([*wrong, state]),
+            {
+                "views": self._views_done,
+                "readings": self.digest(),
+                "plan_id": self._run.plan_id,
+                "run_id": self._run.run_id,
+                "left_aside": self._left_aside,
+                "saved": self._saved,
+            },
+        )
 
 
 def _verdict(shown: Shown) -> dict[str, Any]:
     """Return the fields of a verdict that map and summary share; without a map it is not good."""
     result = shown.result
-    return {"qualified": result is not None and is_qualified(result),
-            "run_id": shown.run.run_id,
-            "grade": 0 if result is None else from_model.grade_number(result)}
+    return {
+        "qualified": result is not None and is_qualified(result),
+        "run_id": shown.run.run_id,
+        "grade": 0 if result is None else from_model.grade_number(result),
+    }

@@ -59,7 +59,9 @@ class Watch:
         """Take the progress of a view; that of the commanded view is used."""
         command = self._command
         if command is None or (message.plan_id, message.view_index) == (
-                command.plan_id, command.view_index):
+            command.plan_id,
+            command.view_index,
+        ):
             self._status, self._measured = message, command
 
     def take_summary(self, message: Any) -> None:
@@ -72,46 +74,71 @@ class Watch:
 
     def picture(self) -> dict[str, Any]:
         """Return everything as JSON values."""
-        return {"health": {node: self._health(node) for node in sorted(self._seen)},
-                "command": self._commanded(), "view": self._view(),
-                "summary": self._summed(), "map": self._mapped()}
+        return {
+            "health": {node: self._health(node) for node in sorted(self._seen)},
+            "command": self._commanded(),
+            "view": self._view(),
+            "summary": self._summed(),
+            "map": self._mapped(),
+        }
 
     def _health(self, node: str) -> dict[str, Any] | None:
         health = self._presence.of(node)
-        return None if health is None else {
-            "level": int(health.level), "message": printable(health.message), "values": {
-                printable(key): printable(value) for key, value
-                in islice(health.values.items(), MOST_ENTRIES)}}
+        return (
+            None
+            if health is None
+            else {
+                "level": int(health.level),
+                "message": printable(health.message),
+                "values": {
+                    printable(key): printable(value)
+                    for key, value in islice(health.values.items(), MOST_ENTRIES)
+                },
+            }
+        )
 
     def _commanded(self) -> dict[str, Any] | None:
         command = self._command
         return command and {
             "phase": Phase(command.phase).name if command.phase in list(Phase) else "?",
-            "plan_id": printable(command.plan_id), "run_id": printable(command.run_id),
-            "view_index": command.view_index, "view_name": printable(command.view_name),
+            "plan_id": printable(command.plan_id),
+            "run_id": printable(command.run_id),
+            "view_index": command.view_index,
+            "view_name": printable(command.view_name),
             "views_planned": command.views_planned,
             "rotation_deg": _finite(math.degrees(command.rotation)),
-            "translation_mm": [_finite(command.translation_x * MM_PER_M),
-                               _finite(command.translation_y * MM_PER_M)]}
+            "translation_mm": [
+                _finite(command.translation_x * MM_PER_M),
+                _finite(command.translation_y * MM_PER_M),
+            ],
+        }
 
     def _view(self) -> dict[str, Any] | None:
         status, command = self._status, self._command
-        if status is None or (status.run_id and command is not None and command.run_id
-                              and status.run_id != command.run_id):
+        if status is None or (
+            status.run_id
+            and command is not None
+            and command.run_id
+            and status.run_id != command.run_id
+        ):
             return None  # nothing measured in this run yet
         plate, step = self._plate()
         return {
-            "view_name": printable(status.view_name), "complete": bool(status.complete),
+            "view_name": printable(status.view_name),
+            "complete": bool(status.complete),
             "grid": [status.grid_done, status.grid_expected],
             "angular": [status.angular_done, status.angular_expected],
             "checks": [status.check_done, status.check_expected],
             "used": status.detections_used,
-            "rejected": dict(zip(_lines(status.reject_reasons), map(int, status.reject_counts),
-                                 strict=False)),
+            "rejected": dict(
+                zip(_lines(status.reject_reasons), map(int, status.reject_counts), strict=False)
+            ),
             "repeatability_um": _finite(status.sigma_xy * UM_PER_M),
             "repeatability_arcsec": _finite(status.sigma_theta * ARCSEC_PER_RAD),
             "missing_lines": [int(k) for k in status.missing_k[:MOST_ENTRIES]],
-            "plate": plate, "plate_step": step}
+            "plate": plate,
+            "plate_step": step,
+        }
 
     def _plate(self) -> tuple[list[str], int]:
         """Return the plate as in `plate_picture`; empty if the command has none."""
@@ -119,23 +146,33 @@ class Watch:
         try:
             artifact = to_model.artifact_of(command)
             view = to_model.view_of(command, repeats=1, grid=bool(command.grid), angular=False)
-            missing = list(zip(map(int, status.missing_m[:MOST_ENTRIES]),
-                               map(int, status.missing_n[:MOST_ENTRIES]), strict=False))
-            return plate_picture(artifact, view, missing,
-                                 status.grid_expected - status.grid_done, MOST_SITES)
+            missing = list(
+                zip(
+                    map(int, status.missing_m[:MOST_ENTRIES]),
+                    map(int, status.missing_n[:MOST_ENTRIES]),
+                    strict=False,
+                )
+            )
+            return plate_picture(
+                artifact, view, missing, status.grid_expected - status.grid_done, MOST_SITES
+            )
         except Exception:  # faults of a command are not reported here
             return [], 1
 
     def _summed(self) -> dict[str, Any] | None:
         summary = self._summary
         return summary and {
-            "state": printable(summary.state), "views": [summary.views_done, summary.views_planned],
-            "identifiable": bool(summary.identifiable), "qualified": bool(summary.qualified),
+            "state": printable(summary.state),
+            "views": [summary.views_done, summary.views_planned],
+            "identifiable": bool(summary.identifiable),
+            "qualified": bool(summary.qualified),
             "enlarged": bool(summary.qualified) and int(getattr(summary, "grade", 2)) == 1,
             "max_error_um": _finite(summary.max_error_um),
             "rms_uncertainty_um": _finite(summary.rms_uncertainty_um),
-            "advice": _lines(summary.advice), "causes": _lines(summary.causes),
-            "run_id": printable(summary.run_id)}
+            "advice": _lines(summary.advice),
+            "causes": _lines(summary.causes),
+            "run_id": printable(summary.run_id),
+        }
 
     def _mapped(self) -> dict[str, Any] | None:
         """Return |G| in um by site, rows from the top; None if unknown.
@@ -154,9 +191,12 @@ class Watch:
         step = max(1, math.ceil(max(size.shape) / MOST_SITES))
         for axis in (0, 1):
             size = np.maximum.reduceat(size, np.arange(0, size.shape[axis], step), axis=axis)
-        return {"run_id": printable(message.run_id), "qualified": bool(message.qualified),
-                "step": step, "um": [
-                    [_finite(value) for value in row] for row in size.T[::-1].tolist()]}
+        return {
+            "run_id": printable(message.run_id),
+            "qualified": bool(message.qualified),
+            "step": step,
+            "um": [[_finite(value) for value in row] for row in size.T[::-1].tolist()],
+        }
 
 
 def _lines(texts: Iterable[str]) -> list[str]:
@@ -167,8 +207,9 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def plate_picture(artifact: Artifact, view: View, missing: Iterable[tuple[int, int]],
-                  n_missing: int, most: int) -> tuple[list[str], int]:
+def plate_picture(
+    artifact: Artifact, view: View, missing: Iterable[tuple[int, int]], n_missing: int, most: int
+) -> tuple[list[str], int]:
     """Return the plate in its own frame, top line first, and the number of marks per cell side.
 
     Of a list of marks each cell is a square, at least as wide as marks are apart.

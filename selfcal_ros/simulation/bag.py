@@ -31,9 +31,12 @@ IMAGES = 0x1D
 """Part of the seed of the images."""
 
 
-def write_simulation(simulation: Simulation, path: str | Path, *,
-                     progress: Callable[[int, int], None] = lambda done, total: None,
-                     ) -> dict[str, int]:
+def write_simulation(
+    simulation: Simulation,
+    path: str | Path,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, int]:
     """Simulate, write the bag folder `path` with `truth.json` in it, return messages by topic.
 
     It is written under another name and renamed when complete.
@@ -47,16 +50,18 @@ def write_simulation(simulation: Simulation, path: str | Path, *,
         return _write(simulation, unfinished, progress)
 
 
-def _write(simulation: Simulation, path: Path,
-           progress: Callable[[int, int], None]) -> dict[str, int]:
+def _write(
+    simulation: Simulation, path: Path, progress: Callable[[int, int], None]
+) -> dict[str, int]:
     truth, arrivals, ledger = simulation.run()
     rng = np.random.default_rng((simulation.seed, simulation.noise_seed or 0, IMAGES))
     with BagWriter(path, simulation.compression) as writer:
         for topic, typename in topics.INPUT_TOPICS.items():
             writer.add_topic(f"/{topic}", typename, [QOS[topic]])
         if simulation.camera:
-            writer.add_topic(f"/{IMAGE_TOPIC}", topics.IMAGE_TYPES["raw"],
-                             [QOS[topics.DETECTION_TOPIC]])
+            writer.add_topic(
+                f"/{IMAGE_TOPIC}", topics.IMAGE_TYPES["raw"], [QOS[topics.DETECTION_TOPIC]]
+            )
         for number, (arrival_ns, event) in enumerate(arrivals):
             if isinstance(event, Exposure):
                 topic, fields = image_fields(event, simulation.camera or Camera(), rng)
@@ -65,15 +70,25 @@ def _write(simulation: Simulation, path: Path,
             writer.write(f"/{topic}", fields, arrival_ns)
             if number % 1000 == 0:
                 progress(number, len(arrivals))
-        write_truth(path / TRUTH_FILE, truth, seed=simulation.seed,
-                    noise_seed=simulation.noise_seed, faults=ledger,
-                    cell=asdict(simulation.settings), spread=asdict(simulation.spread),
-                    **({"camera": asdict(simulation.camera)} if simulation.camera else {}))
+        write_truth(
+            path / TRUTH_FILE,
+            truth,
+            seed=simulation.seed,
+            noise_seed=simulation.noise_seed,
+            faults=ledger,
+            cell=asdict(simulation.settings),
+            spread=asdict(simulation.spread),
+            **({"camera": asdict(simulation.camera)} if simulation.camera else {}),
+        )
         return writer.counts
 
 
-def write_files(simulation: Simulation, path: str | Path, *,
-                progress: Callable[[int, int], None] = lambda done, total: None) -> dict[str, int]:
+def write_files(
+    simulation: Simulation,
+    path: str | Path,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, int]:
     """Write the images of a simulated camera as PNG files, with positions.csv and truth.json.
 
     Raises
@@ -97,20 +112,30 @@ def write_files(simulation: Simulation, path: str | Path, *,
                 last = event
             elif isinstance(event, Exposure):
                 name = f"{len(rows):05}.png"
-                Image.fromarray(simulation.camera.image(
-                    event.offsets, rng, angles=event.angle)).save(folder / name)
+                Image.fromarray(
+                    simulation.camera.image(event.offsets, rng, angles=event.angle)
+                ).save(folder / name)
                 rows.append(f"{name},{view},{last.positions[0]!r},{last.positions[1]!r}")
             if number % 1000 == 0:
                 progress(number, len(arrivals))
         write_text(folder / POSITIONS_FILE, "\n".join(rows) + "\n")
-        write_truth(folder / TRUTH_FILE, truth, seed=simulation.seed,
-                    noise_seed=simulation.noise_seed, cell=asdict(simulation.settings),
-                    spread=asdict(simulation.spread), camera=asdict(simulation.camera))
+        write_truth(
+            folder / TRUTH_FILE,
+            truth,
+            seed=simulation.seed,
+            noise_seed=simulation.noise_seed,
+            cell=asdict(simulation.settings),
+            spread=asdict(simulation.spread),
+            camera=asdict(simulation.camera),
+        )
     return {"images": len(rows) - 1}
 
 
-def image_fields(exposure: Exposure, camera: Camera, rng: np.random.Generator,
-                 ) -> tuple[str, from_model.Fields]:
+def image_fields(
+    exposure: Exposure,
+    camera: Camera,
+    rng: np.random.Generator,
+) -> tuple[str, from_model.Fields]:
     """Return topic and fields of a rendered image."""
     values = camera.image(exposure.offsets, rng, angles=exposure.angle)
     return IMAGE_TOPIC, from_model.image(values, camera.encoding, exposure.stamp_ns, "camera")
@@ -129,15 +154,37 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
         nodes, still = truth.artifact.field, replace(truth, stage_bend_m=truth.stage_bend_m[:0])
         places = np.stack([nodes.x_m.ravel(), nodes.y_m.ravel()])
         g = stage_error(still, places).reshape(2, *nodes.shape)
-    write_json(path, plain({
-        "gx": g[0], "gy": g[1], "g_theta": truth.g_theta, "ax": truth.a[0],
-        "ay": truth.a[1], "a_theta": truth.a_theta, "phi": truth.phi_rad, "t": truth.t_m,
-        "rotation": "linear" if truth.linear else "finite", "microscope": truth.microscope,
-        "backlash": truth.backlash_m, "plate_scale": truth.plate_scale,
-        "plate_shape": truth.plate_shape_m, "drift": truth.drift_m, "drift_walk": truth.walk_m,
-        "stage_bend": truth.stage_bend_m, "stage_yaw": truth.yaw,
-        "plate_strain": truth.plate_strain, "plate_tilt": truth.plate_tilt_rad,
-        "line_eccentricity": truth.line_eccentricity_rad,
-        "placed": [None if view is None else {
-            "rotation": view.rotation_rad, "translation": view.translation_m}
-            for view in truth.placed], **more}))
+    write_json(
+        path,
+        plain(
+            {
+                "gx": g[0],
+                "gy": g[1],
+                "g_theta": truth.g_theta,
+                "ax": truth.a[0],
+                "ay": truth.a[1],
+                "a_theta": truth.a_theta,
+                "phi": truth.phi_rad,
+                "t": truth.t_m,
+                "rotation": "linear" if truth.linear else "finite",
+                "microscope": truth.microscope,
+                "backlash": truth.backlash_m,
+                "plate_scale": truth.plate_scale,
+                "plate_shape": truth.plate_shape_m,
+                "drift": truth.drift_m,
+                "drift_walk": truth.walk_m,
+                "stage_bend": truth.stage_bend_m,
+                "stage_yaw": truth.yaw,
+                "plate_strain": truth.plate_strain,
+                "plate_tilt": truth.plate_tilt_rad,
+                "line_eccentricity": truth.line_eccentricity_rad,
+                "placed": [
+                    None
+                    if view is None
+                    else {"rotation": view.rotation_rad, "translation": view.translation_m}
+                    for view in truth.placed
+                ],
+                **more,
+            }
+        ),
+    )

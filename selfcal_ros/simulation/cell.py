@@ -100,10 +100,13 @@ class CellSettings:
     def __post_init__(self) -> None:
         """Refuse impossible settings."""
         if DWELL * self.exposure_period_s * self.encoder_rate_hz < 2.5:
-            raise InputError("simulated cell", f"{self.encoder_rate_hz:g} Hz gives fewer than "
-                             f"2.5 encoder samples in a dwell of "
-                             f"{DWELL * self.exposure_period_s:g} s",
-                             "raise encoder_rate or exposure_period")
+            raise InputError(
+                "simulated cell",
+                f"{self.encoder_rate_hz:g} Hz gives fewer than "
+                f"2.5 encoder samples in a dwell of "
+                f"{DWELL * self.exposure_period_s:g} s",
+                "raise encoder_rate or exposure_period",
+            )
         if self.visit_order:
             parse_order(self.visit_order, "simulated cell: visit_order")
 
@@ -185,15 +188,21 @@ class AngularExposures:
     offset: np.ndarray
 
 
-def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
-                   rng: np.random.Generator) -> GridExposures:
+def grid_exposures(
+    truth: Truth, index: int, view: View, *, settings: CellSettings, rng: np.random.Generator
+) -> GridExposures:
     """Return the exposures of the grid marks of view `index`.
 
     The plate drifts from the first of them to the last. The first one is approached in
     + direction, in x and in y (`lead_in`).
     """
-    visits = visit_sequence(truth.artifact, view, order=view.visit_order or settings.visit_order,
-                            consecutive=settings.consecutive, rng=rng)
+    visits = visit_sequence(
+        truth.artifact,
+        view,
+        order=view.visit_order or settings.visit_order,
+        consecutive=settings.consecutive,
+        rng=rng,
+    )
     visit = np.repeat(np.arange(len(visits)), visits.count)
     size = len(visit)
     m, n, there = physics.marks_below(truth, index, view, (visits.m, visits.n))
@@ -211,14 +220,21 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
     position = stop[:, visit] + normal(rng, settings.servo_sigma_m, (2, size))
     rested = np.arange(size) - np.searchsorted(visit, visit)
     stage = physics.true_position(
-        truth, index, position, tau=tau, approach=approach[:, visit],
+        truth,
+        index,
+        position,
+        tau=tau,
+        approach=approach[:, visit],
         sign=physics.motion_sign(np.diff(came, axis=1))[:, visit],
-        rested_s=rested * settings.exposure_period_s)
+        rested_s=rested * settings.exposure_period_s,
+    )
     at = (truth, settings.sense, position, stage)
     white = white_noise(rng, settings, size)
-    shared = (normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
-              + _flicker(rng, settings.flicker_xy_m, (2, size))
-              + normal(rng, settings.image_xy_m, (2, size)))
+    shared = (
+        normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
+        + _flicker(rng, settings.flicker_xy_m, (2, size))
+        + normal(rng, settings.image_xy_m, (2, size))
+    )
     told = physics.offset_seen(*at, place[:, visit] + moved) + white + shared
     indicated = position + normal(rng, settings.encoder_sigma_m, (2, size))
     others = []
@@ -227,16 +243,26 @@ def grid_exposures(truth: Truth, index: int, view: View, *, settings: CellSettin
             marks = physics.marks_beside(truth, index, view, (m, n), sub)
             away = physics.mark_places(truth, index, truth.placed_as(index, view), marks[:2])[0]
             beside = physics.offset_seen(*at, away[:, visit] + moved)
-            others.append(Seen(sub.cell, quantised(
-                beside + white_noise(rng, settings, size) + shared, settings.resolution_xy_m),
-                np.stack(marks[:2]), there & marks[2]))
+            others.append(
+                Seen(
+                    sub.cell,
+                    quantised(
+                        beside + white_noise(rng, settings, size) + shared, settings.resolution_xy_m
+                    ),
+                    np.stack(marks[:2]),
+                    there & marks[2],
+                )
+            )
     return GridExposures(
-        visits, visit, indicated,
+        visits,
+        visit,
+        indicated,
         offset=quantised(told, settings.resolution_xy_m),
         mark=np.stack([m, n]),
         there=there,
         approach=approach,
-        others=tuple(others))
+        others=tuple(others),
+    )
 
 
 def white_noise(rng: np.random.Generator, settings: CellSettings, size: int) -> np.ndarray:
@@ -251,12 +277,12 @@ def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
     return first - truth.artifact.grid_pitch_m / 2
 
 
-def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSettings,
-                      rng: np.random.Generator) -> AngularExposures:
+def angular_exposures(
+    truth: Truth, index: int, view: View, *, settings: CellSettings, rng: np.random.Generator
+) -> AngularExposures:
     """Return the exposures of the angular lines of view `index`, line by line."""
     direction, _, there = physics.line_directions(truth, index, view)
-    k, target = line_targets(truth.artifact, view, settings.sense,
-                             consecutive=settings.consecutive)
+    k, target = line_targets(truth.artifact, view, settings.sense, consecutive=settings.consecutive)
     n_stops = len(direction) if settings.consecutive else len(k)
     stop = normal(rng, settings.stop_sigma_theta_rad, n_stops)
     stop = np.repeat(stop, view.repeats) if settings.consecutive else stop
@@ -265,8 +291,11 @@ def angular_exposures(truth: Truth, index: int, view: View, *, settings: CellSet
         target = (centre + physics.encoder_error(truth, centre))[k]
     position = target + stop + normal(rng, settings.servo_sigma_theta_rad, len(k))
     offset = physics.line_offset(truth, settings.sense, direction[k], position)
-    told = (truth.line_factor * offset + normal(rng, settings.sigma_theta_rad, len(k))
-            + _flicker(rng, settings.flicker_theta_rad, (len(k),)))
+    told = (
+        truth.line_factor * offset
+        + normal(rng, settings.sigma_theta_rad, len(k))
+        + _flicker(rng, settings.flicker_theta_rad, (len(k),))
+    )
     indicated = position + normal(rng, settings.encoder_sigma_theta_rad, len(k))
     return AngularExposures(k, there[k], indicated, quantised(told, settings.resolution_theta_rad))
 
@@ -284,7 +313,7 @@ def flicker_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarra
     parts = rng.normal(0, 1, (2, *shape[:-1], len(k)))
     spectrum[..., 1:-1] = (parts[0] + 1j * parts[1]) / np.sqrt(k)
     wave = np.fft.irfft(spectrum, length) * (length / (2 * np.sqrt((1 / k).sum())))
-    return wave[..., :shape[-1]]
+    return wave[..., : shape[-1]]
 
 
 def _flicker(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> np.ndarray | float:
@@ -301,8 +330,15 @@ JOINTS = ("x", "y", "theta")
 Event = EncoderSample | Detection | Command
 
 
-def view_events(truth: Truth, plan: Plan, index: int, *, settings: CellSettings,
-                rng: np.random.Generator, start_ns: int) -> Iterator[EncoderSample | Detection]:
+def view_events(
+    truth: Truth,
+    plan: Plan,
+    index: int,
+    *,
+    settings: CellSettings,
+    rng: np.random.Generator,
+    start_ns: int,
+) -> Iterator[EncoderSample | Detection]:
     """Yield encoder samples and detections of view `index` in the order of their stamps.
 
     Every mark is visited `repeats` times, grid first. The first stamp is `start_ns`; the stage
@@ -323,16 +359,26 @@ def view_events(truth: Truth, plan: Plan, index: int, *, settings: CellSettings,
         yield EncoderSample(stamp, JOINTS, _position(stops, stamp - start_ns, settings))
 
 
-def plan_events(truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.random.Generator,
-                start_ns: int) -> Iterator[Event]:
+def plan_events(
+    truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.random.Generator, start_ns: int
+) -> Iterator[Event]:
     """Yield all messages of a plan, commands included, in the order of their stamps."""
     now = start_ns
     pause_ns = 20_000_000
     for index, view in enumerate(plan.views):
         for phase in (Phase.PLACE, Phase.MEASURE):
-            yield Command(now, phase, plan.plan_id, index, view, plan.artifact, len(plan.views),
-                          model_terms=plan.model_terms, artifact_from=plan.artifact_from,
-                          **plan_keys(plan))
+            yield Command(
+                now,
+                phase,
+                plan.plan_id,
+                index,
+                view,
+                plan.artifact,
+                len(plan.views),
+                model_terms=plan.model_terms,
+                artifact_from=plan.artifact_from,
+                **plan_keys(plan),
+            )
             now += pause_ns
         for event in view_events(truth, plan, index, settings=settings, rng=rng, start_ns=now):
             yield event
@@ -341,9 +387,13 @@ def plan_events(truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.ran
     yield Command(now, Phase.DONE, plan.plan_id, len(plan.views), views_planned=len(plan.views))
 
 
-def _exposures(truth: Truth, index: int, view: View, settings: CellSettings,
-               rng: np.random.Generator,
-               ) -> tuple[np.ndarray, list[list[tuple[np.ndarray, tuple]]]]:
+def _exposures(
+    truth: Truth,
+    index: int,
+    view: View,
+    settings: CellSettings,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, list[list[tuple[np.ndarray, tuple]]]]:
     """Return stops (E + 1, 3), the first before any exposure, and what each exposure shows.
 
     Offset (3,) and mark (kind, m, n, k) of each; none if the plate has none there.
@@ -365,8 +415,10 @@ def _exposures(truth: Truth, index: int, view: View, settings: CellSettings,
         zero = np.zeros(len(lines.k))
         stops.append(np.stack([zero, zero, lines.position], axis=1))
         offsets = np.stack([zero, zero, lines.offset], axis=1)
-        shown += [[(offset, (Kind.ANGULAR, 0, 0, k))]
-                  for offset, k in zip(offsets, lines.line.tolist(), strict=True)]
+        shown += [
+            [(offset, (Kind.ANGULAR, 0, 0, k))]
+            for offset, k in zip(offsets, lines.line.tolist(), strict=True)
+        ]
     every = np.concatenate(stops)
     before = every[:1].copy()
     if view.grid:
@@ -389,7 +441,9 @@ def _detection(stamp_ns: int, offset: np.ndarray, mark: tuple, settings: CellSet
     m, n, k = (m, n, k) if settings.with_ids else (0, 0, 0)
     x, y, theta = offset.tolist()
     return Detection(
-        stamp_ns, int(kind), settings.with_ids,
+        stamp_ns,
+        int(kind),
+        settings.with_ids,
         m=m,
         n=n,
         k=k,
@@ -397,4 +451,5 @@ def _detection(stamp_ns: int, offset: np.ndarray, mark: tuple, settings: CellSet
         offset_y=y,
         offset_theta=theta,
         sigma=sigma if settings.declare_sigma else 0.0,
-        score=0.95)
+        score=0.95,
+    )

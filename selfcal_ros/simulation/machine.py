@@ -14,8 +14,16 @@ from selfcal_ros.model.view import View
 
 WALK_STEPS = 256
 """Steps of a random walk from the first grid exposure of a view to the last."""
-AXES = {"xy": (1, 0, 0, 1), "-x-y": (-1, 0, 0, -1), "-xy": (-1, 0, 0, 1), "x-y": (1, 0, 0, -1),
-        "yx": (0, 1, 1, 0), "-y-x": (0, -1, -1, 0), "y-x": (0, 1, -1, 0), "-yx": (0, -1, 1, 0)}
+AXES = {
+    "xy": (1, 0, 0, 1),
+    "-x-y": (-1, 0, 0, -1),
+    "-xy": (-1, 0, 0, 1),
+    "x-y": (1, 0, 0, -1),
+    "yx": (0, 1, 1, 0),
+    "-y-x": (0, -1, -1, 0),
+    "y-x": (0, 1, -1, 0),
+    "-yx": (0, -1, 1, 0),
+}
 """Published x and y of an offset from its true x and y: rows of a matrix, consecutively."""
 DRIFT_POWERS = (1, 2, 3)
 """Powers of time behind the columns of `Truth.drift_m`: linear, quadratic, cubic."""
@@ -158,8 +166,9 @@ class Waves:
     def at(self, place: np.ndarray) -> np.ndarray:
         """Return the sum of the waves at positions (d, E), (components, E)."""
         parts = np.array_split(place, 1 + place.shape[1] // MOST_PLACES, axis=1)
-        return np.concatenate([np.real(self.size.T @ np.exp(1j * (self.number @ part)))
-                               for part in parts], axis=1)
+        return np.concatenate(
+            [np.real(self.size.T @ np.exp(1j * (self.number @ part))) for part in parts], axis=1
+        )
 
 
 NO_WAVES = Waves(np.zeros((0, 2)), np.zeros((0, 2), dtype=complex))
@@ -281,9 +290,14 @@ class Truth:
         return (self.placed[index] if index < len(self.placed) else None) or commanded
 
 
-def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
-                 spread: Spread | None = None, *,
-                 placing: np.random.Generator | None = None) -> Truth:
+def random_truth(
+    artifact: Artifact,
+    n_views: int,
+    rng: np.random.Generator,
+    spread: Spread | None = None,
+    *,
+    placing: np.random.Generator | None = None,
+) -> Truth:
     """Draw a truth that satisfies Hu's datum (eqs. 5, 11) exactly.
 
     Parameters
@@ -303,8 +317,9 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
     spread = spread or Spread()
     drawn_g, waves = _stage(artifact.lattice, spread, rng)
     g = remove_modes(drawn_g, datum_modes(artifact.lattice, scale=True))
-    a = remove_modes(rng.normal(0, spread.a_m, (2, *artifact.shape)),
-                     datum_modes(artifact, scale=False))
+    a = remove_modes(
+        rng.normal(0, spread.a_m, (2, *artifact.shape)), datum_modes(artifact, scale=False)
+    )
     a += spread.pitch_error * np.stack([artifact.x_m, artifact.y_m])
     drawn_theta, waves_theta = _circle(artifact.angular_count, spread, rng)
     g_theta = _encoder(artifact.lattice, g, drawn_theta, spread.encoder)
@@ -320,7 +335,9 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         phi += rng.normal(0, spread.phi_common_rad)
         t += rng.normal(0, spread.t_common_m, 2)
     return Truth(
-        artifact, g, a,
+        artifact,
+        g,
+        a,
         g_theta=g_theta,
         a_theta=a_theta,
         phi_rad=phi,
@@ -339,11 +356,13 @@ def random_truth(artifact: Artifact, n_views: int, rng: np.random.Generator,
         waves=waves,
         waves_theta=waves_theta,
         yaw=yaw,
-        **drawn)
+        **drawn,
+    )
 
 
-def _stage(artifact: Artifact, spread: Spread,
-           rng: np.random.Generator) -> tuple[np.ndarray, Waves]:
+def _stage(
+    artifact: Artifact, spread: Spread, rng: np.random.Generator
+) -> tuple[np.ndarray, Waves]:
     """Return the stage error at the sites, (2, nx, ny), m, and its waves."""
     length = spread.correlation_pitches
     if not length:
@@ -381,8 +400,11 @@ def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str)
     if encoder == "independent":
         return drawn - drawn.mean()
     if artifact.angular_count % 4:
-        raise InputError("encoder xy_axes", f"of {artifact.angular_count} lines, none lies on the "
-                         "y axis", "use independent")
+        raise InputError(
+            "encoder xy_axes",
+            f"of {artifact.angular_count} lines, none lies on the y axis",
+            "use independent",
+        )
     slopes = half_axis_slopes(artifact, g)  # a half axis of one site has no slope
     quarter = drawn[:: artifact.angular_count // 4]
     quarter[:] = np.where(np.isfinite(slopes), slopes, quarter)
@@ -407,8 +429,11 @@ def _of_views(spread: Spread, n_views: int, rng: np.random.Generator) -> dict[st
     if spread.drift_walk_m:
         steps = rng.normal(0, spread.drift_walk_m / np.sqrt(WALK_STEPS), (n_views, 2, WALK_STEPS))
         drawn["walk_m"] = np.insert(steps.cumsum(axis=2), 0, 0.0, axis=2)
-    for name, shape in (("stage_bend_m", (2, 3)), ("plate_tilt_rad", (2,)),
-                        ("line_eccentricity_rad", (2,))):
+    for name, shape in (
+        ("stage_bend_m", (2, 3)),
+        ("plate_tilt_rad", (2,)),
+        ("line_eccentricity_rad", (2,)),
+    ):
         if getattr(spread, name):
             drawn[name] = rng.normal(0, getattr(spread, name), (n_views, *shape))
     return drawn

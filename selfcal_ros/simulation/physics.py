@@ -45,8 +45,12 @@ def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -
     return moved
 
 
-def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray],
-                ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def marks_below(
+    truth: Truth,
+    index: int,
+    view: View,
+    marks: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the marks found where `marks` would be if the plate were placed as commanded.
 
     If it is placed off its lattice, those are the nearest ones.
@@ -64,29 +68,36 @@ def marks_below(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, n
     place = lies.turned_back(x - lies.shift[0], y - lies.shift[1])
     if artifact.marks:
         away, near = artifact.marks.tree.query(np.stack(place, axis=1) * artifact.grid_pitch_m)
-        return (artifact.marks.id_array[near], np.zeros(len(near), dtype=int),
-                away < artifact.grid_pitch_m / 2)
+        return (
+            artifact.marks.id_array[near],
+            np.zeros(len(near), dtype=int),
+            away < artifact.grid_pitch_m / 2,
+        )
     m, n = np.stack(artifact.nearest(*place)).astype(int)
     there = artifact.has(m, n)
     return m * there, n * there, there
 
 
-def marks_beside(truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray],
-                 sub_view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def marks_beside(
+    truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray], sub_view: View
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the marks that a cell of an image shows if `marks` are on the optical axis.
 
     As `marks_below`; the nearest ones.
     """
     lies = truth.placed_as(index, view)
     step = np.conj(lies.pose.phase) * sub_view.cell_m / truth.artifact.grid_pitch_m
-    m, n = (at + np.rint(part).astype(int) for at, part in zip(
-        marks, (step.real, step.imag), strict=True))
+    m, n = (
+        at + np.rint(part).astype(int)
+        for at, part in zip(marks, (step.real, step.imag), strict=True)
+    )
     there = truth.artifact.has(m, n)
     return m * there, n * there, there
 
 
-def mark_places(truth: Truth, index: int, view: View,
-                marks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def mark_places(
+    truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
     """Return true and nominal positions of marks in the stage frame at the beginning of a view.
 
     The plate is rotated about its centre, by the view's turn, by its misalignment and by its tilt,
@@ -108,8 +119,9 @@ def mark_places(truth: Truth, index: int, view: View,
     if truth.linear:
         away = phi * rotate(1, arm) + error
     else:  # R(phi) (arm + error) - arm, without cancellation
-        away = (np.sin(phi) * rotate(1, arm + error) - 2 * np.sin(phi / 2) ** 2 * (arm + error)
-                + error)
+        away = (
+            np.sin(phi) * rotate(1, arm + error) - 2 * np.sin(phi / 2) ** 2 * (arm + error) + error
+        )
     height = _bow(truth, m, n)
     if len(truth.plate_tilt_rad):
         sunk, risen = _tilted(truth.plate_tilt_rad[index], arm + away, height)
@@ -124,8 +136,11 @@ def _bow(truth: Truth, m: np.ndarray, n: np.ndarray) -> np.ndarray:
     return truth.plate_bow_m * (1 - (x / hx) ** 2 - (y / hy) ** 2)
 
 
-def _tilted(tilt: np.ndarray, arm: np.ndarray, height: np.ndarray,
-            ) -> tuple[np.ndarray, np.ndarray]:
+def _tilted(
+    tilt: np.ndarray,
+    arm: np.ndarray,
+    height: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the displacement of points (2, V) at heights (V,) along stage x, y, and upwards.
 
     They rotate about the horizontal axis `tilt` (2,) by its length (Rodrigues).
@@ -156,8 +171,16 @@ def motion_sign(step: np.ndarray) -> np.ndarray:
     return np.where(np.abs(step) > NO_MOTION_M, np.sign(step), 0)
 
 
-def true_position(truth: Truth, index: int, position: np.ndarray, *, tau: np.ndarray,
-                  approach: np.ndarray, sign: np.ndarray, rested_s: np.ndarray) -> np.ndarray:
+def true_position(
+    truth: Truth,
+    index: int,
+    position: np.ndarray,
+    *,
+    tau: np.ndarray,
+    approach: np.ndarray,
+    sign: np.ndarray,
+    rested_s: np.ndarray,
+) -> np.ndarray:
     """Return the true position of the stage at exposures, (2, E), m.
 
     Parameters
@@ -187,8 +210,9 @@ def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarra
     """
     artifact = truth.artifact.lattice
     place = position / artifact.grid_pitch_m
-    error = between_sites(artifact, truth.bilinear, position) + stage_bending(truth, position,
-                                                                             index)
+    error = between_sites(artifact, truth.bilinear, position) + stage_bending(
+        truth, position, index
+    )
     return error + truth.waves.at(place) if len(truth.waves.number) else error
 
 
@@ -198,8 +222,9 @@ def between_sites(artifact: Artifact, values: np.ndarray, position: np.ndarray) 
     u, v = position / artifact.grid_pitch_m + np.array([[hx], [hy]])
     i, j = (np.clip(np.floor(w), 0, size - 2).astype(int) for w, size in ((u, nx), (v, ny)))
     u, v = u - i, v - j
-    return ((1 - u) * ((1 - v) * values[..., i, j] + v * values[..., i, j + 1])
-            + u * ((1 - v) * values[..., i + 1, j] + v * values[..., i + 1, j + 1]))
+    return (1 - u) * ((1 - v) * values[..., i, j] + v * values[..., i, j + 1]) + u * (
+        (1 - v) * values[..., i + 1, j] + v * values[..., i + 1, j + 1]
+    )
 
 
 def stage_bending(truth: Truth, position: np.ndarray, index: int) -> np.ndarray | float:
@@ -242,8 +267,9 @@ def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarra
     return place + stage if sense is Sense.PLATE_MOVES else place - stage
 
 
-def offset_seen(truth: Truth, sense: Sense, position: np.ndarray, stage: np.ndarray,
-                place: np.ndarray) -> np.ndarray:
+def offset_seen(
+    truth: Truth, sense: Sense, position: np.ndarray, stage: np.ndarray, place: np.ndarray
+) -> np.ndarray:
     """Return the published offsets of marks, (2, E), m, without noise.
 
     The stage, whatever it carries, is rotated about the optical axis where it is: its error is that
@@ -261,8 +287,9 @@ def offset_seen(truth: Truth, sense: Sense, position: np.ndarray, stage: np.ndar
     return seen_offset(truth, with_yaw(truth, sense, position, true_offset(sense, place, stage)))
 
 
-def line_offset(truth: Truth, sense: Sense, direction: np.ndarray,
-                position: np.ndarray) -> np.ndarray:
+def line_offset(
+    truth: Truth, sense: Sense, direction: np.ndarray, position: np.ndarray
+) -> np.ndarray:
     """Return the true offsets of lines at `direction` with the stage at indicated angles, rad."""
     return true_offset(sense, direction, position - encoder_error(truth, position))
 
@@ -286,8 +313,11 @@ def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:
     return offset if np.array_equal(truth.wiring, np.eye(2)) else truth.wiring @ offset
 
 
-def line_directions(truth: Truth, index: int, view: View,
-                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def line_directions(
+    truth: Truth,
+    index: int,
+    view: View,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the true and the nominal direction in the stage frame of every line expected, rad.
 
     The nominal direction is within one turn, 0 included. The true one is relative to the rotation

@@ -109,11 +109,17 @@ class Camera:
             right = -right
         centre = np.array([[(self.width - 1) / 2], [(self.height - 1) / 2]])
         out = np.stack([right, -up])
-        return centre + out * (1 + self.distortion * np.square(out).sum(axis=0)
-                               / np.square(centre).sum())
+        return centre + out * (
+            1 + self.distortion * np.square(out).sum(axis=0) / np.square(centre).sum()
+        )
 
-    def image(self, offsets: np.ndarray, rng: np.random.Generator, *,
-              angles: Sequence[float] | float = 0.0) -> np.ndarray:
+    def image(
+        self,
+        offsets: np.ndarray,
+        rng: np.random.Generator,
+        *,
+        angles: Sequence[float] | float = 0.0,
+    ) -> np.ndarray:
         """Return an image (height, width) of marks at `offsets` (2, n), m, with noise and dirt.
 
         Parameters
@@ -128,40 +134,58 @@ class Camera:
         sign = 1 if self.polarity == "bright" else -1
         grey = np.full((self.height, self.width), self.ground)
         size = self.mark_size_m / self.pixel_size_m
-        for (u, v), angle in zip(self.pixels_of(offsets).T, np.broadcast_to(
-                angles, offsets.shape[1]), strict=True):
+        for (u, v), angle in zip(
+            self.pixels_of(offsets).T, np.broadcast_to(angles, offsets.shape[1]), strict=True
+        ):
             self._add(grey, u, v, size, np.deg2rad(self.turn_deg) - angle, sign * self.contrast)
         for _ in range(rng.poisson(self.dirt) if self.dirt else 0):
             u, v = rng.uniform(0, self.width), rng.uniform(0, self.height)
             self._speck(grey, u, v, 2 * size * rng.uniform(*DIRT_RADIUS))
         light = np.clip(grey, 0.0, None) * self._lighting
-        spread = np.sqrt(self.read_noise ** 2 + self.shot_noise ** 2 * light)
+        spread = np.sqrt(self.read_noise**2 + self.shot_noise**2 * light)
         value = (light + spread * rng.normal(size=light.shape)) * self.full_scale
         return np.clip(np.rint(value), 0, self.full_scale).astype(
-            np.uint16 if self.encoding == "mono16" else np.uint8)
+            np.uint16 if self.encoding == "mono16" else np.uint8
+        )
 
     @cached_property
     def _lighting(self) -> np.ndarray:
         """Share of the light that reaches each pixel, (height, width)."""
-        v, u = np.mgrid[0:self.height, 0:self.width]
+        v, u = np.mgrid[0 : self.height, 0 : self.width]
         right, down = u - (self.width - 1) / 2, v - (self.height - 1) / 2
-        return 1 - self.vignetting * (right ** 2 + down ** 2) / (
-            right[0, 0] ** 2 + down[0, 0] ** 2)
+        return 1 - self.vignetting * (right**2 + down**2) / (right[0, 0] ** 2 + down[0, 0] ** 2)
 
-    def _add(self, grey: np.ndarray, u: float, v: float, size: float, angle: float,
-             contrast: float) -> None:
+    def _add(
+        self, grey: np.ndarray, u: float, v: float, size: float, angle: float, contrast: float
+    ) -> None:
         """Add a blurred mark at column `u` and row `v`."""
         half = int(np.ceil((1.5 if self.mark == "corner" else 0.75) * size + 4 * self.blur_px)) + 2
         width = self.mark_width_m / self.pixel_size_m
-        self._stamp(grey, u, v, half, lambda a, b: distance(self.mark, a, b, size, width),
-                    contrast, angle)
+        self._stamp(
+            grey, u, v, half, lambda a, b: distance(self.mark, a, b, size, width), contrast, angle
+        )
 
     def _speck(self, grey: np.ndarray, u: float, v: float, size: float) -> None:
-        self._stamp(grey, u, v, int(np.ceil(size + 4 * self.blur_px)) + 2,
-                    lambda a, b: distance("disc", a, b, size, 0.0), -0.9 * self.ground, 0.0)
+        self._stamp(
+            grey,
+            u,
+            v,
+            int(np.ceil(size + 4 * self.blur_px)) + 2,
+            lambda a, b: distance("disc", a, b, size, 0.0),
+            -0.9 * self.ground,
+            0.0,
+        )
 
-    def _stamp(self, grey: np.ndarray, u: float, v: float, half: int, inside: "Distance",
-               contrast: float, angle: float) -> None:
+    def _stamp(
+        self,
+        grey: np.ndarray,
+        u: float,
+        v: float,
+        half: int,
+        inside: "Distance",
+        contrast: float,
+        angle: float,
+    ) -> None:
         column, row = round(u), round(v)
         top, left = row - half, column - half
         rows = slice(max(top, 0), min(top + 2 * half + 1, self.height))
@@ -178,8 +202,10 @@ class Camera:
         np.clip(cover, 0, 1, out=cover)
         along = blurred_pixels(2 * half + 1, self.blur_px)
         pixels = along @ cover @ along.T
-        grey[rows, columns] += contrast * pixels[
-            rows.start - top:rows.stop - top, columns.start - left:columns.stop - left]
+        grey[rows, columns] += (
+            contrast
+            * pixels[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+        )
 
 
 @cache
@@ -194,10 +220,9 @@ def blurred_pixels(count: int, blur_px: float) -> np.ndarray:
     """
     sigma, n = blur_px * FINE, count * FINE
     away = np.arange(-int(5 * sigma + 0.5), int(5 * sigma + 0.5) + 1)
-    weight = np.exp(-(away / max(sigma, np.finfo(float).tiny)) ** 2 / 2)
+    weight = np.exp(-((away / max(sigma, np.finfo(float).tiny)) ** 2) / 2)
     point, means = np.arange(n)[:, None], np.zeros((count, n))
-    np.add.at(means, (point // FINE, np.clip(point + away, 0, n - 1)),
-              weight / weight.sum() / FINE)
+    np.add.at(means, (point // FINE, np.clip(point + away, 0, n - 1)), weight / weight.sum() / FINE)
     return means
 
 
@@ -220,8 +245,9 @@ def distance(mark: str, a: np.ndarray, b: np.ndarray, size: float, width: float)
         return width / 2 - np.abs(np.sqrt(a * a + b * b) - (size - width) / 2)
     if mark == "cross":
         return np.maximum(_box(a, b, size, width), _box(a, b, width, size))
-    return np.maximum(_box(a - size / 2, b - size / 2, size, size),
-                      _box(a + size / 2, b + size / 2, size, size))
+    return np.maximum(
+        _box(a - size / 2, b - size / 2, size, size), _box(a + size / 2, b + size / 2, size, size)
+    )
 
 
 @dataclass(frozen=True)
@@ -243,16 +269,20 @@ class Exposure:
     angle: float
 
 
-def exposures(truth: Truth, plan: Plan, camera: Camera, events: Iterable[Event], *,
-              sense: Sense) -> Iterator[Event | Exposure]:
+def exposures(
+    truth: Truth, plan: Plan, camera: Camera, events: Iterable[Event], *, sense: Sense
+) -> Iterator[Event | Exposure]:
     """Yield `events` with an exposure for all grid detections of a stamp, which name their marks.
 
     The detected marks are at their offsets; the others lie around the first one as on the plate,
     turned by the yaw of the stage there, seen through the same microscope.
     """
     if truth.artifact.marks:
-        raise InputError("camera", "images are rendered of lattices, the plate is a list of marks",
-                         "simulate detections instead")
+        raise InputError(
+            "camera",
+            "images are rendered of lattices, the plate is a list of marks",
+            "simulate detections instead",
+        )
     artifact, reach = truth.artifact, camera.reach_m
     (m, n), (i, j) = physics.all_marks(artifact), artifact.middle
     place, index, angle = np.zeros((2, 0)), -1, 0.0
@@ -264,8 +294,11 @@ def exposures(truth: Truth, plan: Plan, camera: Camera, events: Iterable[Event],
                 view = truth.placed_as(index, event.view)
                 place, _ = physics.mark_places(truth, index, view, (m, n))
                 angle = float(view.rotation_rad + truth.phi_rad[index])
-        seen = {(event.m + i) * artifact.shape[1] + event.n + j: (event.offset_x, event.offset_y)
-                for event in found if isinstance(event, Detection) and _is_grid(event)}
+        seen = {
+            (event.m + i) * artifact.shape[1] + event.n + j: (event.offset_x, event.offset_y)
+            for event in found
+            if isinstance(event, Detection) and _is_grid(event)
+        }
         if not seen:
             yield from found
             continue

@@ -69,12 +69,18 @@ class Faults:
         """Refuse impossible fractions: a detection has one fault at most."""
         total = sum(getattr(self, name) for name in PARTS)
         if total > 1 + 1e-9:
-            raise InputError("faults", f"the parts of the detections add up to {total:g}",
-                             "keep the sum at 1 or below: a detection has one fault at most")
+            raise InputError(
+                "faults",
+                f"the parts of the detections add up to {total:g}",
+                "keep the sum at 1 or below: a detection has one fault at most",
+            )
 
 
-def apply_faults(events: Sequence[Event | Exposure], faults: Faults, rng: np.random.Generator,
-                 ) -> tuple[list[tuple[int, Event | Exposure]], dict[str, int]]:
+def apply_faults(
+    events: Sequence[Event | Exposure],
+    faults: Faults,
+    rng: np.random.Generator,
+) -> tuple[list[tuple[int, Event | Exposure]], dict[str, int]]:
     """Return (time of arrival in ns, message) in the order of arrival, and the ledger.
 
     Parameters
@@ -97,7 +103,8 @@ def apply_faults(events: Sequence[Event | Exposure], faults: Faults, rng: np.ran
         if faults.delay_s:
             arrival += round(rng.exponential(faults.delay_s / 5) * NS_PER_S)
         if isinstance(event, EncoderSample) and gap <= event.stamp_ns < gap + round(
-                faults.encoder_gap_s * NS_PER_S):
+            faults.encoder_gap_s * NS_PER_S
+        ):
             ledger["encoder_samples_lost"] += 1
             continue
         if step and event.stamp_ns >= step_at:
@@ -109,8 +116,12 @@ def apply_faults(events: Sequence[Event | Exposure], faults: Faults, rng: np.ran
     return out, dict(ledger)
 
 
-def _spoil(event: Event | Exposure, faults: Faults, rng: np.random.Generator, ledger: Counter,
-           ) -> Sequence[Event | Exposure]:
+def _spoil(
+    event: Event | Exposure,
+    faults: Faults,
+    rng: np.random.Generator,
+    ledger: Counter,
+) -> Sequence[Event | Exposure]:
     if not isinstance(event, Detection | Exposure):
         return [event]
     chance = rng.random()
@@ -138,10 +149,19 @@ def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Ev
         return [replace(event, has_id=True, m=9999, n=0, k=2**31)]
     size, angle = rng.uniform(1, 20), rng.uniform(0, 2 * np.pi)
     if event.kind == Kind.ANGULAR:
-        return [replace(event, offset_theta=event.offset_theta
-                        + np.sign(np.cos(angle)) * size * RAD_PER_MRAD)]
-    return [replace(event, offset_x=event.offset_x + size * M_PER_UM * np.cos(angle),
-                    offset_y=event.offset_y + size * M_PER_UM * np.sin(angle))]
+        return [
+            replace(
+                event,
+                offset_theta=event.offset_theta + np.sign(np.cos(angle)) * size * RAD_PER_MRAD,
+            )
+        ]
+    return [
+        replace(
+            event,
+            offset_x=event.offset_x + size * M_PER_UM * np.cos(angle),
+            offset_y=event.offset_y + size * M_PER_UM * np.sin(angle),
+        )
+    ]
 
 
 UNITS = ("", "_m", "_rad", "_s", "_hz", "_pitches", "_px", "_deg")
@@ -163,44 +183,83 @@ def _keys(*names: str, unit: str = "", high: float = 1.0) -> Section:
 def field_of(key: str, kind: type) -> str:
     """Return the field of a dataclass that a key sets: the key with a unit; "" if none."""
     names = {item.name for item in fields(kind)}
-    return next((key.removesuffix("_s") + unit for unit in UNITS
-                 if key.removesuffix("_s") + unit in names), "")
+    return next(
+        (key.removesuffix("_s") + unit for unit in UNITS if key.removesuffix("_s") + unit in names),
+        "",
+    )
 
 
 TRUTH: Section = (
     _keys("g", "a", "t", "t_common", unit="m", high=1e-3)
     | _keys("g_theta", "a_theta", "phi", "phi_common", unit="rad", high=0.1)
     | _keys("correlation", unit="pitches", high=1000.0)
-    | {name: _NODE[name] for name in ("encoder", "rotation")})
-NOISE: Section = {name: _NODE[name] for name in (
-    "sigma_xy", "sigma_theta", "noise_ratio", "visit_xy", "image_xy", "flicker_xy", "flicker_theta",
-    "resolution_xy", "resolution_theta")}
+    | {name: _NODE[name] for name in ("encoder", "rotation")}
+)
+NOISE: Section = {
+    name: _NODE[name]
+    for name in (
+        "sigma_xy",
+        "sigma_theta",
+        "noise_ratio",
+        "visit_xy",
+        "image_xy",
+        "flicker_xy",
+        "flicker_theta",
+        "resolution_xy",
+        "resolution_theta",
+    )
+}
 CELL: Section = {"sense": replace(_NODE["measurement_sense"], name="sense")} | {
-    name: _NODE[name] for name in (
-        "encoder_rate", "exposure_period", "with_ids", "declare_sigma", "servo_sigma",
-        "servo_sigma_theta", "encoder_sigma", "encoder_sigma_theta", "stop_sigma",
-        "stop_sigma_theta", "follow_mark", "visit_order", "consecutive")}
-PHYSICS: Section = {name: parameter for name, parameter in _NODE.items()
-                    if name not in TRUTH and field_of(name, Spread)}
+    name: _NODE[name]
+    for name in (
+        "encoder_rate",
+        "exposure_period",
+        "with_ids",
+        "declare_sigma",
+        "servo_sigma",
+        "servo_sigma_theta",
+        "encoder_sigma",
+        "encoder_sigma_theta",
+        "stop_sigma",
+        "stop_sigma_theta",
+        "follow_mark",
+        "visit_order",
+        "consecutive",
+    )
+}
+PHYSICS: Section = {
+    name: parameter
+    for name, parameter in _NODE.items()
+    if name not in TRUTH and field_of(name, Spread)
+}
 FAULTS: Section = _keys(*PARTS) | {
     f"{name}{unit}": Parameter(f"{name}{unit}", 0.0, "", "s", 0.0, 3600.0)
-    for unit in ("", "_s") for name in ("delay", "clock_step", "encoder_gap")}
+    for unit in ("", "_s")
+    for name in ("delay", "clock_step", "encoder_gap")
+}
 _DETECTOR: Section = {parameter.name: parameter for parameter in DetectorSettings.parameters()}
 CAMERA: Section = (
-    {name: _DETECTOR[name] for name in (
-        "pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")}
+    {
+        name: _DETECTOR[name]
+        for name in ("pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")
+    }
     | {name: Parameter(name, 0, "", "px", 8, 10_000) for name in ("width", "height")}
-    | _keys("blur", unit="px", high=100.0) | _keys("dirt", high=1000.0)
+    | _keys("blur", unit="px", high=100.0)
+    | _keys("dirt", high=1000.0)
     | _keys("ground", "contrast", "read_noise", "shot_noise", "vignetting")
-    | {"distortion": Parameter("distortion", 0.0, "", "", -0.5, 0.5), "encoding": Parameter(
-        "encoding", "mono8", "", choices=("mono8", "mono16"))})
+    | {
+        "distortion": Parameter("distortion", 0.0, "", "", -0.5, 0.5),
+        "encoding": Parameter("encoding", "mono8", "", choices=("mono8", "mono16")),
+    }
+)
 CORRECTION_TIMES = Parameter("times", 1.0, "of the table that act", low=-1000.0, high=1000.0)
 OF_IMAGES = ("lost", "duplicated")
 """Faults that images can have."""
 TOP = (
     Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**61),
-    Parameter("noise_seed", 0, "of all that a new measurement of the machine changes", low=0,
-              high=2**61),
+    Parameter(
+        "noise_seed", 0, "of all that a new measurement of the machine changes", low=0, high=2**61
+    ),
     Parameter("start_time", 1.7e9, "first stamp", "s", 0.0, LAST_START_S),
     Parameter("compression", "zstd", "of the bag", choices=("zstd", "lz4", "none")),
 )
@@ -244,8 +303,11 @@ class Simulation:
         truth, rng = self.draw(len(self.plan.views))
         settings = replace(self.settings, with_ids=True) if self.camera else self.settings
         made = plan_events(truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns)
-        events = list(exposures(truth, self.plan, self.camera, made, sense=settings.sense)
-                      if self.camera else made)
+        events = list(
+            exposures(truth, self.plan, self.camera, made, sense=settings.sense)
+            if self.camera
+            else made
+        )
         arrivals, ledger = apply_faults(events, self.faults, rng)
         return truth, arrivals, ledger
 
@@ -265,18 +327,39 @@ def read_simulation(path: str | Path) -> Simulation:
         all detections together.
     """
     where = str(path)
-    data = _mapping(read_yaml(path), where, (
-        "plan", "truth", "physics", "placed", "noise", "cell", "faults", "camera", "correction",
-        *(parameter.name for parameter in TOP)))
+    data = _mapping(
+        read_yaml(path),
+        where,
+        (
+            "plan",
+            "truth",
+            "physics",
+            "placed",
+            "noise",
+            "cell",
+            "faults",
+            "camera",
+            "correction",
+            *(parameter.name for parameter in TOP),
+        ),
+    )
     if "plan" not in data:
         raise InputError(where, "the key 'plan' is missing", "name a PLAN.yaml")
-    top = {parameter.name: parameter.check(data.get(parameter.name, parameter.default), where)
-           for parameter in TOP}
-    read = {name: _section(data.get(name, {}), f"{where}: {name}", keys, defaults)
-            for name, keys, defaults in (
-                ("truth", TRUTH, Spread()), ("physics", PHYSICS, Spread()),
-                ("noise", NOISE, CellSettings()), ("cell", CELL, CellSettings()),
-                ("faults", FAULTS, Faults()), ("camera", CAMERA, Camera()))}
+    top = {
+        parameter.name: parameter.check(data.get(parameter.name, parameter.default), where)
+        for parameter in TOP
+    }
+    read = {
+        name: _section(data.get(name, {}), f"{where}: {name}", keys, defaults)
+        for name, keys, defaults in (
+            ("truth", TRUTH, Spread()),
+            ("physics", PHYSICS, Spread()),
+            ("noise", NOISE, CellSettings()),
+            ("cell", CELL, CellSettings()),
+            ("faults", FAULTS, Faults()),
+            ("camera", CAMERA, Camera()),
+        )
+    }
     try:
         settings = CellSettings(**read["noise"], **read["cell"])
         faults = Faults(**read["faults"])
@@ -287,13 +370,24 @@ def read_simulation(path: str | Path) -> Simulation:
         _check_of_images(data.get("faults", {}), f"{where}: faults")
     plan = _plan(data["plan"], Path(path))
     if camera is not None and plan.artifact.marks:
-        raise InputError(f"{where}: camera", "images are rendered of lattices, the plate is a list "
-                         "of marks", "leave camera out: simulate detections")
-    return Simulation(plan, top["seed"], Spread(**read["truth"], **read["physics"]), settings,
-                      faults, round(top["start_time"] * NS_PER_S), top["compression"],
-                      top["noise_seed"] if "noise_seed" in data else None,
-                      _placed(data.get("placed", []), plan, f"{where}: placed"), camera,
-                      *_correction(data.get("correction", {}), Path(path)))
+        raise InputError(
+            f"{where}: camera",
+            "images are rendered of lattices, the plate is a list of marks",
+            "leave camera out: simulate detections",
+        )
+    return Simulation(
+        plan,
+        top["seed"],
+        Spread(**read["truth"], **read["physics"]),
+        settings,
+        faults,
+        round(top["start_time"] * NS_PER_S),
+        top["compression"],
+        top["noise_seed"] if "noise_seed" in data else None,
+        _placed(data.get("placed", []), plan, f"{where}: placed"),
+        camera,
+        *_correction(data.get("correction", {}), Path(path)),
+    )
 
 
 def camera_of(path: str | Path) -> tuple[Camera, Spread]:
@@ -314,8 +408,11 @@ def _check_of_images(faults: Mapping[str, Any], where: str) -> None:
     """Refuse faults that images cannot have."""
     for name in PARTS:
         if faults.get(name) and name not in OF_IMAGES:
-            raise InputError(f"{where}: {name}", "a fault of detections, but the cell has a camera",
-                             f"use {' and '.join(OF_IMAGES)}, or dirt of the camera")
+            raise InputError(
+                f"{where}: {name}",
+                "a fault of detections, but the cell has a camera",
+                f"use {' and '.join(OF_IMAGES)}, or dirt of the camera",
+            )
 
 
 def settings_of(values: Mapping[str, Any]) -> CellSettings:
@@ -346,15 +443,24 @@ def _placed(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:
     if not views:
         return ()
     written = plan_to_dict(plan)
-    lies = {view.name: view for view in plan_from_dict(
-        {key: written[key] for key in ("plan_id", "artifact", "map") if key in written}
-        | {"views": views}, where).views}
+    lies = {
+        view.name: view
+        for view in plan_from_dict(
+            {key: written[key] for key in ("plan_id", "artifact", "map") if key in written}
+            | {"views": views},
+            where,
+        ).views
+    }
     names = [view.name for view in plan.views]
     for name in lies:
         if name not in names:
             raise InputError(where, f"the plan has no view '{name}'", known_are(name, names))
-    placed = [replace(lies[view.name], grid=view.grid, angular=view.angular)
-              if view.name in lies else None for view in plan.views]
+    placed = [
+        replace(lies[view.name], grid=view.grid, angular=view.angular)
+        if view.name in lies
+        else None
+        for view in plan.views
+    ]
     for lie in filter(None, placed):
         lie.on_stage(plan.artifact)
     return tuple(placed)
@@ -378,8 +484,9 @@ def corrected(truth: Truth, table: ErrorMap, times: float) -> Truth:
     g = truth.g - times * np.stack(controller.error(plate.x_m, plate.y_m))
     if not controller.has_theta or not plate.angular_count:
         return replace(truth, g=g)
-    return replace(truth, g=g, g_theta=truth.g_theta - times * controller.error_theta(
-        plate.theta_rad))
+    return replace(
+        truth, g=g, g_theta=truth.g_theta - times * controller.error_theta(plate.theta_rad)
+    )
 
 
 def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:

@@ -31,36 +31,55 @@ def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> C
         As `require_certifiable`.
     """
     require_certifiable(result, details)
-    sections = [_facts(title, details[name]) for title, name in (
-        ("Certificate", "certificate"), ("Laboratory", "laboratory"), ("Customer", "customer"),
-        ("Item", "item"))]
-    sections += [_table(title, details[name]) for title, name in (
-        ("Persons", "persons"), ("Conditions, u with k=1", "conditions"),
-        ("Equipment", "equipment"))]
+    sections = [
+        _facts(title, details[name])
+        for title, name in (
+            ("Certificate", "certificate"),
+            ("Laboratory", "laboratory"),
+            ("Customer", "customer"),
+            ("Item", "item"),
+        )
+    ]
+    sections += [
+        _table(title, details[name])
+        for title, name in (
+            ("Persons", "persons"),
+            ("Conditions, u with k=1", "conditions"),
+            ("Equipment", "equipment"),
+        )
+    ]
     try:
         stage = StageMap(result)
         distance = distance_text(stage, *stage.length_uncertainty())
     except InputError as error:
         distance = f"the correlations between nodes are not known ({printable(error.what)})"
     sections += [
-        *(Section(name, notes=tuple(map(visible, texts)))
-          for name, texts in statement_texts(result)),
+        *(
+            Section(name, notes=tuple(map(visible, texts)))
+            for name, texts in statement_texts(result)
+        ),
         Section("Uncertainty of distances", notes=(distance,)),
-        Section("Remarks", notes=tuple(visible(item["text"]) for item in details["remarks"]))]
+        Section("Remarks", notes=tuple(visible(item["text"]) for item in details["remarks"])),
+    ]
     return Chapter("Certificate", sections=tuple(sections))
 
 
 def certified(details: dict[str, Any]) -> dict[str, str]:
     """Return what the head of a certificate states, on its first page."""
     laboratory, customer, item = (details[name] for name in ("laboratory", "customer", "item"))
-    persons = (person["name"] + (f" ({person['role']})" if "role" in person else "")
-               for person in details["persons"])
-    return {"certificate": details["certificate"]["id"],
-            "issued": details["certificate"]["issued"],
-            "laboratory": _addressed(laboratory), "customer": _addressed(customer),
-            "stage": " ".join(item[key] for key in ("manufacturer", "name", "model")
-                              if key in item),
-            "serial_number": item["serial_number"], "operator": ", ".join(persons)}
+    persons = (
+        person["name"] + (f" ({person['role']})" if "role" in person else "")
+        for person in details["persons"]
+    )
+    return {
+        "certificate": details["certificate"]["id"],
+        "issued": details["certificate"]["issued"],
+        "laboratory": _addressed(laboratory),
+        "customer": _addressed(customer),
+        "stage": " ".join(item[key] for key in ("manufacturer", "name", "model") if key in item),
+        "serial_number": item["serial_number"],
+        "operator": ", ".join(persons),
+    }
 
 
 def _addressed(party: dict[str, Any]) -> str:
@@ -68,13 +87,19 @@ def _addressed(party: dict[str, Any]) -> str:
 
 
 def _facts(title: str, found: dict[str, Any]) -> Section:
-    return Section(title, tuple((key.replace("_", " "), printable(str(value)))
-                                for key, value in found.items()))
+    return Section(
+        title, tuple((key.replace("_", " "), printable(str(value))) for key, value in found.items())
+    )
 
 
 def _table(title: str, rows: list[dict[str, Any]]) -> Section:
     keys = tuple(dict.fromkeys(key for row in rows for key in row))
-    return Section(title, table=(
-        tuple(key.replace("_", " ") for key in keys),
-        *(tuple(printable(str(row.get(key, ""))) for key in keys) for row in rows))
-        if rows else ())
+    return Section(
+        title,
+        table=(
+            tuple(key.replace("_", " ") for key in keys),
+            *(tuple(printable(str(row.get(key, ""))) for key in keys) for row in rows),
+        )
+        if rows
+        else (),
+    )

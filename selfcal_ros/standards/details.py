@@ -12,8 +12,14 @@ from selfcal_ros.files import read_yaml
 
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
 """Places of a calibration that the schema knows."""
-UNITS = {"degC": r"\degreecelsius", "%": r"\percent", "hPa": r"\hecto\pascal", "K": r"\kelvin",
-         "K/h": r"\kelvin\hour\tothe{-1}", "m/s": r"\metre\second\tothe{-1}"}
+UNITS = {
+    "degC": r"\degreecelsius",
+    "%": r"\percent",
+    "hPa": r"\hecto\pascal",
+    "K": r"\kelvin",
+    "K/h": r"\kelvin\hour\tothe{-1}",
+    "m/s": r"\metre\second\tothe{-1}",
+}
 """Units of conditions -> D-SI."""
 
 
@@ -54,23 +60,54 @@ COUNTRY: Kind = (_code("[A-Z]{2}"), "a country code of two capitals, e.g. DE")
 LANGUAGE: Kind = (_code("[a-z]{2}"), "a language code of two letters, e.g. en")
 NUMBER: Kind = (_number, "a number")
 _ADDRESS: dict[str, Kind] = {
-    "name": TEXT, "city": TEXT, "country": COUNTRY, "street": TEXT, "number": TEXT,
-    "post_code": TEXT, "email": TEXT, "phone": TEXT}
+    "name": TEXT,
+    "city": TEXT,
+    "country": COUNTRY,
+    "street": TEXT,
+    "number": TEXT,
+    "post_code": TEXT,
+    "email": TEXT,
+    "phone": TEXT,
+}
 _THING: dict[str, Kind] = {
-    "name": TEXT, "manufacturer": TEXT, "model": TEXT, "serial_number": TEXT, "certificate": TEXT}
+    "name": TEXT,
+    "manufacturer": TEXT,
+    "model": TEXT,
+    "serial_number": TEXT,
+    "certificate": TEXT,
+}
 SECTIONS: dict[str, tuple[dict[str, Kind], tuple[str, ...]]] = {
-    "certificate": ({"id": TEXT, "country": COUNTRY, "language": LANGUAGE,
-                     "place": (_choice(*PLACES), "one of " + ", ".join(PLACES)), "begin": DATE,
-                     "end": DATE, "issued": DATE, "order": TEXT, "clock": TEXT},
-                    ("id", "country", "language", "place", "begin", "end")),
+    "certificate": (
+        {
+            "id": TEXT,
+            "country": COUNTRY,
+            "language": LANGUAGE,
+            "place": (_choice(*PLACES), "one of " + ", ".join(PLACES)),
+            "begin": DATE,
+            "end": DATE,
+            "issued": DATE,
+            "order": TEXT,
+            "clock": TEXT,
+        },
+        ("id", "country", "language", "place", "begin", "end"),
+    ),
     "laboratory": ({**_ADDRESS, "code": TEXT}, ("name", "city", "country")),
     "customer": (_ADDRESS, ("name", "city", "country")),
     "item": (_THING, ("name", "serial_number")),
     "persons": ({"name": TEXT, "role": TEXT}, ("name",)),
-    "conditions": ({"name": TEXT, "value": NUMBER, "u": NUMBER, "unit": (_choice(*UNITS), "one of "
-                    + ", ".join(UNITS)), "text": TEXT}, ("name",)),
+    "conditions": (
+        {
+            "name": TEXT,
+            "value": NUMBER,
+            "u": NUMBER,
+            "unit": (_choice(*UNITS), "one of " + ", ".join(UNITS)),
+            "text": TEXT,
+        },
+        ("name",),
+    ),
     "equipment": ({**_THING, "valid_until": DATE}, ("name",)),
-    "remarks": ({"text": TEXT}, ("text",))}
+    "remarks": ({"text": TEXT}, ("text",)),
+}
 """Section -> its keys, and those that must be there."""
 LISTS = ("persons", "conditions", "equipment", "remarks")
 """Sections that are lists of such entries."""
@@ -99,8 +136,9 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
         If a key is missing or unknown, or a value is invalid.
     """
     if not isinstance(data, dict):
-        raise InputError(where, "not the details of a certificate",
-                         f"give the sections {', '.join(NEEDED)}")
+        raise InputError(
+            where, "not the details of a certificate", f"give the sections {', '.join(NEEDED)}"
+        )
     for name in data:
         if name not in SECTIONS:
             raise InputError(f"{where}: {name}", "is unknown", known_are(str(name), SECTIONS))
@@ -108,20 +146,29 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
     for name in SECTIONS:
         if not data.get(name):
             if name in NEEDED:
-                raise InputError(f"{where}: {name}", "is missing", "give "
-                                 + ", ".join(SECTIONS[name][1]))
+                raise InputError(
+                    f"{where}: {name}", "is missing", "give " + ", ".join(SECTIONS[name][1])
+                )
             found[name] = []
         elif name in LISTS:
             items = data[name] if isinstance(data[name], list) else [data[name]]
-            found[name] = [_section(item, name, f"{where}: {name}[{index}]")
-                           for index, item in enumerate(items)]
+            found[name] = [
+                _section(item, name, f"{where}: {name}[{index}]")
+                for index, item in enumerate(items)
+            ]
         else:
             found[name] = _section(data[name], name, f"{where}: {name}")
     for index, item in enumerate(found["conditions"]):
-        if ("value" in item) is not ("unit" in item) or not ("value" in item or "text" in item) or (
-                item.get("u", 1.0) <= 0):
-            raise InputError(f"{where}: conditions[{index}]", "neither a value with its unit nor a "
-                             "text", "give value, u and unit, or text")
+        if (
+            ("value" in item) is not ("unit" in item)
+            or not ("value" in item or "text" in item)
+            or (item.get("u", 1.0) <= 0)
+        ):
+            raise InputError(
+                f"{where}: conditions[{index}]",
+                "neither a value with its unit nor a text",
+                "give value, u and unit, or text",
+            )
         if item.get("unit") == "degC":
             check_celsius(item["value"], f"{where}: conditions[{index}]")
     _check_dates(found, where)
@@ -132,17 +179,25 @@ def _check_dates(found: dict[str, Any], where: str) -> None:
     """Refuse dates that are not in their order; the day of issue is today unless it is given."""
     core = found["certificate"]
     if core["begin"] > core["end"]:
-        raise InputError(f"{where}: certificate.end", f"{core['end']} is before {core['begin']}",
-                         "exchange begin and end")
+        raise InputError(
+            f"{where}: certificate.end",
+            f"{core['end']} is before {core['begin']}",
+            "exchange begin and end",
+        )
     issued = core.setdefault("issued", date.today().isoformat())
     if issued < core["end"]:
-        raise InputError(f"{where}: certificate.issued", f"{issued} is before the end of the "
-                         f"measurement, {core['end']}", "correct the dates")
+        raise InputError(
+            f"{where}: certificate.issued",
+            f"{issued} is before the end of the measurement, {core['end']}",
+            "correct the dates",
+        )
     for index, item in enumerate(found["equipment"]):
         if item.get("valid_until", issued) < core["end"]:
-            raise InputError(f"{where}: equipment[{index}].valid_until", f"{item['valid_until']} "
-                             f"is before the end of the measurement, {core['end']}",
-                             "measure with equipment whose certificate is valid")
+            raise InputError(
+                f"{where}: equipment[{index}].valid_until",
+                f"{item['valid_until']} is before the end of the measurement, {core['end']}",
+                "measure with equipment whose certificate is valid",
+            )
 
 
 def _section(data: Any, name: str, where: str) -> dict[str, Any]:

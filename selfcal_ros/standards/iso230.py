@@ -119,8 +119,11 @@ def scatters(measurements: Measurements, axis: int) -> dict[tuple[int, int], Sca
         If the map has nodes of its own.
     """
     if measurements.artifact.map_grid is not None:
-        raise InputError("iso230", "the map has nodes of its own, off the marks",
-                         "give its RESULT.json: figures without repeats")
+        raise InputError(
+            "iso230",
+            "the map has nodes of its own, off the marks",
+            "give its RESULT.json: figures without repeats",
+        )
     sign = measurements.sense.sign
     groups: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = {}
     for view in measurements.views:
@@ -130,8 +133,9 @@ def scatters(measurements: Measurements, axis: int) -> dict[tuple[int, int], Sca
     return {site: item for site, item in found.items() if item is not None}
 
 
-def _groups(view: ViewReadings, measurements: Measurements, axis: int,
-            sign: int) -> Iterator[tuple[tuple[int, int], tuple[np.ndarray, np.ndarray]]]:
+def _groups(
+    view: ViewReadings, measurements: Measurements, axis: int, sign: int
+) -> Iterator[tuple[tuple[int, int], tuple[np.ndarray, np.ndarray]]]:
     """Yield the site of each mark with stage errors and signs of approach of its visits."""
     visits = view.visits
     if visits is None or not len(visits.mark):
@@ -169,12 +173,20 @@ def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:
     if not weight or not dof.all():
         return None
     s = np.sqrt(square / dof)
-    return Scatter(float(moved / weight), float(1 / np.sqrt(weight)), float(s[0]), float(s[1]),
-                   int(dof[0]), int(dof[1]), float(signs.mean()))
+    return Scatter(
+        float(moved / weight),
+        float(1 / np.sqrt(weight)),
+        float(s[0]),
+        float(s[1]),
+        int(dof[0]),
+        int(dof[1]),
+        float(signs.mean()),
+    )
 
 
-def bidirectional(up: np.ndarray, down: np.ndarray, s_up: np.ndarray,
-                  s_down: np.ndarray) -> dict[str, np.ndarray]:
+def bidirectional(
+    up: np.ndarray, down: np.ndarray, s_up: np.ndarray, s_down: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return the figures of ISO 230-2, clause 3, over the last axis of the arrays.
 
     Parameters
@@ -182,6 +194,7 @@ def bidirectional(up: np.ndarray, down: np.ndarray, s_up: np.ndarray,
     up, down, s_up, s_down : float array (..., n)
         Mean deviation and standard deviation at each position, by direction of approach.
     """
+
     def spread(high: np.ndarray, low: np.ndarray) -> np.ndarray:
         return high.max(axis=-1) - low.min(axis=-1)
 
@@ -190,17 +203,29 @@ def bidirectional(up: np.ndarray, down: np.ndarray, s_up: np.ndarray,
     high = np.maximum(up + 2 * s_up, down + 2 * s_down)
     low = np.minimum(up - 2 * s_up, down - 2 * s_down)
     return {
-        "M": spread((up + down) / 2, (up + down) / 2), "B": np.abs(reversal).max(axis=-1),
-        "mean B": reversal.mean(axis=-1), "E": spread(np.maximum(up, down), np.minimum(up, down)),
-        "E+": spread(up, up), "E-": spread(down, down), "R": both.max(axis=-1),
-        "R+": 4 * s_up.max(axis=-1), "R-": 4 * s_down.max(axis=-1), "A": spread(high, low),
+        "M": spread((up + down) / 2, (up + down) / 2),
+        "B": np.abs(reversal).max(axis=-1),
+        "mean B": reversal.mean(axis=-1),
+        "E": spread(np.maximum(up, down), np.minimum(up, down)),
+        "E+": spread(up, up),
+        "E-": spread(down, down),
+        "R": both.max(axis=-1),
+        "R+": 4 * s_up.max(axis=-1),
+        "R-": 4 * s_down.max(axis=-1),
+        "A": spread(high, low),
         "A+": spread(up + 2 * s_up, up - 2 * s_up),
-        "A-": spread(down + 2 * s_down, down - 2 * s_down)}
+        "A-": spread(down + 2 * s_down, down - 2 * s_down),
+    }
 
 
-def axis_figures(stage: StageMap, axis: int, line: int,
-                 repeats: dict[tuple[int, int], Scatter] | None = None, *,
-                 approach_in_model: bool = False) -> AxisFigures:
+def axis_figures(
+    stage: StageMap,
+    axis: int,
+    line: int,
+    repeats: dict[tuple[int, int], Scatter] | None = None,
+    *,
+    approach_in_model: bool = False,
+) -> AxisFigures:
     """Return the figures of an axis along a line of sites.
 
     Parameters
@@ -233,18 +258,30 @@ def axis_figures(stage: StageMap, axis: int, line: int,
         value = -error
         whole = float(np.ptp(value))
         return AxisFigures(
-            "xy"[axis], line_m, position,
+            "xy"[axis],
+            line_m,
+            position,
             up_m=value,
             down_m=value,
             s_up_m=nothing,
             s_down_m=nothing,
             approaches=(0, 0),
             left_out_m=left_out,
-            figures={"M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))})
+            figures={"M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))},
+        )
     items = [repeats[site] for site in known]
     s_up, s_down, reversal, u_reversal, dof_up, dof_down, sign = (
-        np.array([getattr(item, name) for item in items]) for name in (
-            "s_up_m", "s_down_m", "reversal_m", "u_reversal_m", "dof_up", "dof_down", "mean_sign"))
+        np.array([getattr(item, name) for item in items])
+        for name in (
+            "s_up_m",
+            "s_down_m",
+            "reversal_m",
+            "u_reversal_m",
+            "dof_up",
+            "dof_down",
+            "mean_sign",
+        )
+    )
     shift = np.zeros(len(known)) if approach_in_model else sign * reversal / 2
     up, down = -(error - shift + reversal / 2), -(error - shift - reversal / 2)
     rng = np.random.default_rng(0)
@@ -252,20 +289,27 @@ def axis_figures(stage: StageMap, axis: int, line: int,
     u = u_reversal * np.sqrt(np.mean(s_up**2 + s_down**2) / 2)
     turned = _true_values(reversal, u, rng)
     draws = bidirectional(
-        -(drawn - shift + turned / 2), -(drawn - shift - turned / 2),
+        -(drawn - shift + turned / 2),
+        -(drawn - shift - turned / 2),
         s_up * np.sqrt(rng.chisquare(dof_up, size) / dof_up),
-        s_down * np.sqrt(rng.chisquare(dof_down, size) / dof_down))
+        s_down * np.sqrt(rng.chisquare(dof_down, size) / dof_down),
+    )
     found = bidirectional(up, down, s_up, s_down)
     return AxisFigures(
-        "xy"[axis], line_m, position,
+        "xy"[axis],
+        line_m,
+        position,
         up_m=up,
         down_m=down,
         s_up_m=s_up,
         s_down_m=s_down,
         approaches=(int(dof_up.min()) + 1, int(dof_down.min()) + 1),
         left_out_m=left_out,
-        figures={name: Figure(float(value), _rms_about(draws[name], float(value)))
-                 for name, value in found.items()})
+        figures={
+            name: Figure(float(value), _rms_about(draws[name], float(value)))
+            for name, value in found.items()
+        },
+    )
 
 
 def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -281,14 +325,14 @@ def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) ->
         return np.broadcast_to(values, (DRAWS, n))
     equal = 1 / u**2
     common = equal @ values / equal.sum()
-    if chdtrc(n - 1, equal @ (values - common)**2) > LEVEL:
+    if chdtrc(n - 1, equal @ (values - common) ** 2) > LEVEL:
         drawn = common + rng.standard_normal((DRAWS, 1)) / np.sqrt(equal.sum())
         return np.repeat(drawn, n, axis=1)
     share = (np.arange(SHARES) + 0.5) / SHARES
     variance = np.mean(u**2) * (1 / share - 1)[:, None] + u**2
     weight = 1 / variance
     mean = weight @ values / weight.sum(axis=1)
-    fit = 0.5 * (np.log(weight) - weight * (values - mean[:, None])**2).sum(axis=1)
+    fit = 0.5 * (np.log(weight) - weight * (values - mean[:, None]) ** 2).sum(axis=1)
     fit -= 0.5 * np.log(weight.sum(axis=1))
     chosen = rng.choice(SHARES, DRAWS, p=np.exp(fit - fit.max()) / np.exp(fit - fit.max()).sum())
     about = mean[chosen] + rng.standard_normal(DRAWS) / np.sqrt(weight[chosen].sum(axis=1))
@@ -297,22 +341,34 @@ def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) ->
     return about[:, None] + kept * (values - about[:, None]) + drawn
 
 
-def _positions(stage: StageMap, axis: int, line: int,
-               repeats: dict[tuple[int, int], Scatter] | None) -> list[tuple[int, int]]:
+def _positions(
+    stage: StageMap, axis: int, line: int, repeats: dict[tuple[int, int], Scatter] | None
+) -> list[tuple[int, int]]:
     """Return the known sites along a line, with repeats if there are some."""
     at, valid = stage.error_map.artifact, stage.error_map.valid
     (first, last), (low, high) = at.limits[axis], at.limits[1 - axis]
     sites = [(i, line) if axis == 0 else (line, i) for i in range(first, last + 1)]
-    known = [site for site in sites if low <= line <= high
-             and valid[site[0] + at.middle[0], site[1] + at.middle[1]]
-             and (repeats is None or site in repeats)]
+    known = [
+        site
+        for site in sites
+        if low <= line <= high
+        and valid[site[0] + at.middle[0], site[1] + at.middle[1]]
+        and (repeats is None or site in repeats)
+    ]
     if len(known) < FEWEST:
         raise InputError(
-            f"line {line} along {'xy'[axis]}", f"{len(known)} positions "
-            + ("are known" if repeats is None else "were approached at least twice from each "
-               "side in one view"),
-            "choose another line" if repeats is None else "measure with visit_order "
-            "there_and_back, or x_back_y_back for both axes, and repeats 4 or more")
+            f"line {line} along {'xy'[axis]}",
+            f"{len(known)} positions "
+            + (
+                "are known"
+                if repeats is None
+                else "were approached at least twice from each side in one view"
+            ),
+            "choose another line"
+            if repeats is None
+            else "measure with visit_order "
+            "there_and_back, or x_back_y_back for both axes, and repeats 4 or more",
+        )
     return known
 
 
@@ -352,8 +408,9 @@ class PathFigures:
     figures: dict[str, Figure]
 
 
-def circle_figures(stage: StageMap, radius_m: float,
-                   centre_m: tuple[float, float] = (0.0, 0.0)) -> PathFigures:
+def circle_figures(
+    stage: StageMap, radius_m: float, centre_m: tuple[float, float] = (0.0, 0.0)
+) -> PathFigures:
     """Return circular deviation G and radial deviations F of a circle, ISO 230-4.
 
     G is the range of radii about the least-squares centre of the actual path, Fmax and Fmin the
@@ -368,8 +425,11 @@ def circle_figures(stage: StageMap, radius_m: float,
     at = stage.error_map.artifact
     reach = np.array(at.half) * at.grid_pitch_m - np.abs(centre_m)
     if not 0 < radius_m <= reach.min() * (1 + 1e-9):
-        raise InputError("circle", f"a radius of {radius_m:g} m about {centre_m} m is not in the "
-                         "field", f"give one up to {max(reach.min(), 0.0):g} m")
+        raise InputError(
+            "circle",
+            f"a radius of {radius_m:g} m about {centre_m} m is not in the field",
+            f"give one up to {max(reach.min(), 0.0):g} m",
+        )
     angle = 2 * np.pi * np.arange(CIRCLE_POINTS) / CIRCLE_POINTS
     e = np.stack([np.cos(angle), np.sin(angle)])
     x, y = np.array(centre_m)[:, None] + radius_m * e
@@ -379,12 +439,16 @@ def circle_figures(stage: StageMap, radius_m: float,
         radial = (path * e).sum(axis=-2)
         centre = 2 * np.einsum("...p,cp->...c", radial, e) / CIRCLE_POINTS
         about = radial - np.einsum("...c,cp->...p", centre, e)
-        return {"G": np.ptp(about, axis=-1), "Fmax": radial.max(axis=-1),
-                "Fmin": radial.min(axis=-1)}
+        return {
+            "G": np.ptp(about, axis=-1),
+            "Fmax": radial.max(axis=-1),
+            "Fmin": radial.min(axis=-1),
+        }
 
     name = f"circle of radius {radius_m * 1e3:g} mm"
-    return PathFigures(name, _path(stage, (x, y), figures, (
-        name, "measure them, or choose a smaller --radius")))
+    return PathFigures(
+        name, _path(stage, (x, y), figures, (name, "measure them, or choose a smaller --radius"))
+    )
 
 
 def diagonal_figures(stage: StageMap) -> list[PathFigures]:
@@ -407,21 +471,39 @@ def diagonal_figures(stage: StageMap) -> list[PathFigures]:
         d = (path * e).sum(axis=-2)
         one, two = d[..., :count], d[..., count:]
         lengths = [part[..., -1] - part[..., 0] for part in (one, two)]
-        return {"1 M": np.ptp(one, axis=-1), "1 length": lengths[0], "2 M": np.ptp(two, axis=-1),
-                "2 length": lengths[1], "3 length": lengths[0] - lengths[1]}
+        return {
+            "1 M": np.ptp(one, axis=-1),
+            "1 length": lengths[0],
+            "2 M": np.ptp(two, axis=-1),
+            "2 length": lengths[1],
+            "3 length": lengths[0] - lengths[1],
+        }
 
     both = _path(stage, (x, y), figures, ("diagonals", "measure them"))
-    for key, name in (("1", "diagonal +x +y"), ("2", "diagonal +x -y"),
-                      ("3", "difference of the diagonals")):
-        found.append(PathFigures(name, {
-            symbol.partition(" ")[2]: figure for symbol, figure in both.items()
-            if symbol.startswith(key)}))
+    for key, name in (
+        ("1", "diagonal +x +y"),
+        ("2", "diagonal +x -y"),
+        ("3", "difference of the diagonals"),
+    ):
+        found.append(
+            PathFigures(
+                name,
+                {
+                    symbol.partition(" ")[2]: figure
+                    for symbol, figure in both.items()
+                    if symbol.startswith(key)
+                },
+            )
+        )
     return found
 
 
-def _path(stage: StageMap, at: tuple[np.ndarray, np.ndarray],
-          figures: Callable[[np.ndarray], dict[str, np.ndarray]],
-          said: tuple[str, str]) -> dict[str, Figure]:
+def _path(
+    stage: StageMap,
+    at: tuple[np.ndarray, np.ndarray],
+    figures: Callable[[np.ndarray], dict[str, np.ndarray]],
+    said: tuple[str, str],
+) -> dict[str, Figure]:
     """Return the figures of the deviations, actual minus commanded, at points of a path.
 
     `said` are the name of the path, and what helps if it crosses unknown sites.
@@ -435,5 +517,7 @@ def _path(stage: StageMap, at: tuple[np.ndarray, np.ndarray],
         drawn = figures(deviation - _draws(stage.covariance(*at)).reshape(DRAWS, 2, -1))
     except InputError:  # without the correlations of the sites
         drawn = {name: np.full(1, np.nan) for name in found}
-    return {name: Figure(float(value), _rms_about(drawn[name], float(value)))
-            for name, value in found.items()}
+    return {
+        name: Figure(float(value), _rms_about(drawn[name], float(value)))
+        for name, value in found.items()
+    }

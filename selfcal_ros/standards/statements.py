@@ -12,11 +12,15 @@ from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.units import UM_PER_M
 
 TRACEABILITY, AGREEMENT = "Metrological traceability", "Agreement of readings and model"
-EXPANDED = ("Each U is the expanded measurement uncertainty after JCGM 100:2008 (GUM): the "
-            "standard uncertainty times the coverage factor stated with it, for a coverage "
-            "probability of 95.45 %.")
-SCOPE = ("The results relate only to the item calibrated, as it was and under the conditions "
-         "stated here.")
+EXPANDED = (
+    "Each U is the expanded measurement uncertainty after JCGM 100:2008 (GUM): the "
+    "standard uncertainty times the coverage factor stated with it, for a coverage "
+    "probability of 95.45 %."
+)
+SCOPE = (
+    "The results relate only to the item calibrated, as it was and under the conditions "
+    "stated here."
+)
 INVALID = "No statement of the uncertainty is valid: the result is not qualified."
 
 
@@ -31,8 +35,11 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
         certificate. A day either way is a time zone.
     """
     if not result.has_uncertainty:
-        raise InputError("certificate", "the result has no uncertainties",
-                         "solve again with --uncertainty always")
+        raise InputError(
+            "certificate",
+            "the result has no uncertainties",
+            "solve again with --uncertainty always",
+        )
     _require_temperature(result, details["conditions"])
     core, zone = details["certificate"], timedelta(days=1)
     times = [str(result.provenance.extra.get(f"{end}_exposure", "")) for end in ("first", "last")]
@@ -40,9 +47,11 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
         first, last = (date.fromisoformat(text[:10]) for text in times)
         begin, end = (date.fromisoformat(core[name]) for name in ("begin", "end"))
         if first < begin - zone or last > end + zone:
-            raise InputError("certificate", f"the readings are of {first} to {last}, the dates of "
-                             f"performance {begin} to {end}", "correct begin and end, or explain "
-                             "the clock of the readings in certificate.clock")
+            raise InputError(
+                "certificate",
+                f"the readings are of {first} to {last}, the dates of performance {begin} to {end}",
+                "correct begin and end, or explain the clock of the readings in certificate.clock",
+            )
 
 
 def _require_temperature(result: CalibrationResult, conditions: list[dict[str, Any]]) -> None:
@@ -55,27 +64,40 @@ def _require_temperature(result: CalibrationResult, conditions: list[dict[str, A
         return
     used, u = length.certified.temperature_c, length.certified.u_temperature_k
     for item in conditions:
-        if item.get("unit") == "degC" and "plate" in item["name"] and (
-                abs(item["value"] - used) > 2 * math.hypot(u, item.get("u", 0.0)) + 1e-9):
+        if (
+            item.get("unit") == "degC"
+            and "plate" in item["name"]
+            and (abs(item["value"] - used) > 2 * math.hypot(u, item.get("u", 0.0)) + 1e-9)
+        ):
             raise InputError(
-                "certificate", f"{item['name']} is {item['value']:g} °C, but the reference length "
-                f"was converted to {used:g} °C (u {u:g} K)", "correct the condition, or solve "
-                "again with the temperature of the measurement in --reference-at")
+                "certificate",
+                f"{item['name']} is {item['value']:g} °C, but the reference length "
+                f"was converted to {used:g} °C (u {u:g} K)",
+                "correct the condition, or solve "
+                "again with the temperature of the measurement in --reference-at",
+            )
 
 
 def is_traceable(result: CalibrationResult) -> bool:
     """Return whether certified lengths, at the temperature of the measurement, set the scale."""
     return result.reference is not None and all(
         found.certificate and found.certified and found.u_relative
-        for found in result.reference.each)
+        for found in result.reference.each
+    )
 
 
 def statement_texts(result: CalibrationResult) -> Iterator[tuple[str, list[str]]]:
     """Yield name and texts of what a certificate states of a result, for programs and people."""
     verdict = result.verdict
     yield TRACEABILITY, scale_texts(result)
-    yield AGREEMENT, [verdict.sentence or str(verdict.grade), *verdict.reasons,
-                      *([] if verdict.qualified else [INVALID])]
+    yield (
+        AGREEMENT,
+        [
+            verdict.sentence or str(verdict.grade),
+            *verdict.reasons,
+            *([] if verdict.qualified else [INVALID]),
+        ],
+    )
     if verdict.qualified:
         yield "Uncertainty", [EXPANDED]
     yield "Scope", [SCOPE]
@@ -93,42 +115,64 @@ def known_plate_texts(result: CalibrationResult) -> list[str]:
     if result.recheck is None:
         return []
     known = result.recheck.calibration
-    readings, dates = known.readings, [
-        instant[:10] for instant in (known.first_exposure, known.last_exposure) if instant]
-    facts = [f"plan {known.plan_id}", *([f"run {known.run_id}"] if known.run_id else []),
-             *([f"readings of {' to '.join(dict.fromkeys(dates))}"] if dates else []),
-             *([f"{readings['file']}, sha256 {readings['sha256']}"]
-               if {"file", "sha256"} <= readings.keys() else []),
-             *([f"evaluated {known.created}"] if known.created else [])]
-    return [f"the errors of the marks are those of a self-calibration ({'; '.join(facts)}); their "
-            "uncertainty is the line 'known plate' of the budget"]
+    readings, dates = (
+        known.readings,
+        [instant[:10] for instant in (known.first_exposure, known.last_exposure) if instant],
+    )
+    facts = [
+        f"plan {known.plan_id}",
+        *([f"run {known.run_id}"] if known.run_id else []),
+        *([f"readings of {' to '.join(dict.fromkeys(dates))}"] if dates else []),
+        *(
+            [f"{readings['file']}, sha256 {readings['sha256']}"]
+            if {"file", "sha256"} <= readings.keys()
+            else []
+        ),
+        *([f"evaluated {known.created}"] if known.created else []),
+    ]
+    return [
+        f"the errors of the marks are those of a self-calibration ({'; '.join(facts)}); their "
+        "uncertainty is the line 'known plate' of the budget"
+    ]
 
 
 def scale_texts(result: CalibrationResult) -> list[str]:
     """Return what sets the scale of a map, and whether it is traceable."""
     if result.reference is None:
-        why = ("the temperature of the known plate in this measurement was not stated"
-               if result.recheck is not None else "no reference length was used")
-        return [f"The scale of the map is a convention, relative to the encoders: {why}. Form, "
-                "straightness and squareness do not depend on a reference."]
+        why = (
+            "the temperature of the known plate in this measurement was not stated"
+            if result.recheck is not None
+            else "no reference length was used"
+        )
+        return [
+            f"The scale of the map is a convention, relative to the encoders: {why}. Form, "
+            "straightness and squareness do not depend on a reference."
+        ]
     texts = []
     if result.recheck is not None:
-        texts.append("The scale is that of the known plate, set at its calibration and converted "
-                     "to the temperature of this measurement as follows.")
+        texts.append(
+            "The scale is that of the known plate, set at its calibration and converted "
+            "to the temperature of this measurement as follows."
+        )
     for found in result.reference.each:
-        texts.append(f"The scale is set by a reference length ({found.name}): relative "
-                     f"error {found.relative_error:.4g}, standard uncertainty "
-                     f"{found.u_relative:.3g}; certificate: {found.certificate or 'none'}.")
+        texts.append(
+            f"The scale is set by a reference length ({found.name}): relative "
+            f"error {found.relative_error:.4g}, standard uncertainty "
+            f"{found.u_relative:.3g}; certificate: {found.certificate or 'none'}."
+        )
         if known := found.certified:
             texts.append(
                 f"Certified at {known.certified_at_c:g} °C: {known.relative_error:.4g}, "
                 f"standard uncertainty {known.u_relative:.3g}; used at "
                 f"{known.temperature_c:g} °C (u {known.u_temperature_k:g} K) with the "
                 f"expansion coefficient {known.expansion_per_k:.4g} 1/K "
-                f"(u {known.u_expansion_per_k:.2g} 1/K).")
+                f"(u {known.u_expansion_per_k:.2g} 1/K)."
+            )
     if not is_traceable(result):
-        texts.append("Not traceable: this needs a certificate, its uncertainty, and the "
-                     "temperature of the reference (--certificate, --reference-at).")
+        texts.append(
+            "Not traceable: this needs a certificate, its uncertainty, and the "
+            "temperature of the reference (--certificate, --reference-at)."
+        )
     return texts
 
 
@@ -137,8 +181,12 @@ def distance_text(stage: StageMap, a: float, b: float) -> str:
     nodes = ""
     if stage.halfway.any():
         a_nodes, b_nodes = stage.length_uncertainty(anywhere=False)
-        nodes = (f"; of any two nodes {a_nodes * UM_PER_M:.3g} µm + {b_nodes * UM_PER_M:.3g} µm/m "
-                 f"· L, without the {stage.method} interpolation between nodes")
-    return (f"U of the distance L of any two points of the field is at most {a * UM_PER_M:.3g} µm "
-            f"+ {b * UM_PER_M:.3g} µm/m · L{nodes}; k = {stage.result.noise.k_xy:.3g}, 95.45 %. "
-            "Errors of neighbouring nodes are correlated.")
+        nodes = (
+            f"; of any two nodes {a_nodes * UM_PER_M:.3g} µm + {b_nodes * UM_PER_M:.3g} µm/m "
+            f"· L, without the {stage.method} interpolation between nodes"
+        )
+    return (
+        f"U of the distance L of any two points of the field is at most {a * UM_PER_M:.3g} µm "
+        f"+ {b * UM_PER_M:.3g} µm/m · L{nodes}; k = {stage.result.noise.k_xy:.3g}, 95.45 %. "
+        "Errors of neighbouring nodes are correlated."
+    )

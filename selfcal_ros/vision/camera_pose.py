@@ -58,8 +58,12 @@ def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
     images : sequence of float arrays (k, 2)
         Places of the marks, px.
     """
-    apart = [float(np.hypot(*(found[i] - found[j]))) for found in images
-             for i in range(len(found)) for j in range(i)]
+    apart = [
+        float(np.hypot(*(found[i] - found[j])))
+        for found in images
+        for i in range(len(found))
+        for j in range(i)
+    ]
     limit = min(apart) / 2 if apart else np.inf
     numbers: list[np.ndarray] = []
     count, before, known = 0, np.zeros((0, 2)), np.zeros(0, dtype=int)
@@ -105,26 +109,40 @@ def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sens
     _, number = np.unique(number, return_inverse=True)
     count = number.max(initial=-1) + 1
     if len(number) < count + 3:
-        raise NoDataError("images", f"{len(number)} readings of {count} marks that were followed",
-                          "move the stage in x and y by less than half the distance of two marks, "
-                          "so that marks stay in the image")
-    stage = stage - (np.stack([np.bincount(number, axis) for axis in stage.T])
-                     / np.bincount(number)).T[number]
-    place = place - (np.stack([np.bincount(number, axis) for axis in place.T])
-                     / np.bincount(number)).T[number]
+        raise NoDataError(
+            "images",
+            f"{len(number)} readings of {count} marks that were followed",
+            "move the stage in x and y by less than half the distance of two marks, "
+            "so that marks stay in the image",
+        )
+    stage = (
+        stage
+        - (np.stack([np.bincount(number, axis) for axis in stage.T]) / np.bincount(number)).T[
+            number
+        ]
+    )
+    place = (
+        place
+        - (np.stack([np.bincount(number, axis) for axis in place.T]) / np.bincount(number)).T[
+            number
+        ]
+    )
     span = np.linalg.svd(stage, compute_uv=False)
     if span[1] < LEAST_SPAN * span[0]:
-        raise InputError("images", "the stage moved along one line only",
-                         "move it in x and in y")
+        raise InputError("images", "the stage moved along one line only", "move it in x and in y")
     by_stage = np.linalg.lstsq(stage, place, rcond=None)[0].T  # px per m
     residual = place - stage @ by_stage.T
     noise = float(np.sqrt(np.square(residual).sum() / (2 * (len(number) - count - 2))))
-    covariance = np.kron(np.eye(2), np.linalg.inv(stage.T @ stage)) * noise ** 2
+    covariance = np.kron(np.eye(2), np.linalg.inv(stage.T @ stage)) * noise**2
     return _similar(by_stage, covariance, sense, noise)
 
 
-def _similar(by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: float,
-             ) -> CameraPose:
+def _similar(
+    by_stage: np.ndarray,
+    covariance: np.ndarray,
+    sense: Sense,
+    noise: float,
+) -> CameraPose:
     """Return the similarity in the change of places (px) by the stage (m), with uncertainties."""
     sign = 1 if sense is Sense.PLATE_MOVES else -1
     mirror = bool(np.linalg.det(by_stage) < 0)
@@ -150,31 +168,41 @@ def _similar(by_stage: np.ndarray, covariance: np.ndarray, sense: Sense, noise: 
         jacobian[:, index] = differ / (2 * step)
     u = np.sqrt(np.diagonal(jacobian @ covariance @ jacobian.T))
     if not u[0] <= TOO_UNCERTAIN * found[0]:
-        raise InputError("images", "the marks do not follow the stage: the size of a pixel has a "
-                         f"standard uncertainty of {u[0] / found[0]:.2g} of itself",
-                         "move the stage from image to image by less than half the distance of "
-                         "two marks, and check the positions")
+        raise InputError(
+            "images",
+            "the marks do not follow the stage: the size of a pixel has a "
+            f"standard uncertainty of {u[0] / found[0]:.2g} of itself",
+            "move the stage from image to image by less than half the distance of "
+            "two marks, and check the positions",
+        )
     sheared = float(np.hypot(*found[2:]))
     if sheared > max(NOT_SIMILAR, 5 * float(u[2:].max())):
-        raise InputError("images", f"the image of the motion is sheared by {sheared:.1%}",
-                         "check that the moves are shorter than half the distance of two marks, "
-                         "and that the encoder axes are those of the camera's stage")
+        raise InputError(
+            "images",
+            f"the image of the motion is sheared by {sheared:.1%}",
+            "check that the moves are shorter than half the distance of two marks, "
+            "and that the encoder axes are those of the camera's stage",
+        )
     return CameraPose(
-        float(found[0]), float(u[0]), float(found[1]),
+        float(found[0]),
+        float(u[0]),
+        float(found[1]),
         u_turn_rad=float(u[1]),
         mirror=mirror,
         sheared=sheared,
         u_sheared=float(u[2:].max()),
-        noise_px=noise)
+        noise_px=noise,
+    )
 
 
-def require_size(found: CameraPose, *, mark_size_m: float, mark_pixels: float,
-                 where: str) -> None:
+def require_size(found: CameraPose, *, mark_size_m: float, mark_pixels: float, where: str) -> None:
     """Raise InputError for a camera in which marks would have another size than stated."""
     told = mark_size_m / mark_pixels
     if abs(told / found.pixel_size_m - 1) > DetectorSettings().size_tolerance:
-        raise InputError(where, "by the moves of the stage a pixel has "
-                         f"{found.pixel_size_m / M_PER_UM:.3g} µm, by the size of the marks over "
-                         f"their pixels {told / M_PER_UM:.3g} µm",
-                         "correct the unit of the positions (m), the size of the marks (m) or "
-                         "their pixels")
+        raise InputError(
+            where,
+            "by the moves of the stage a pixel has "
+            f"{found.pixel_size_m / M_PER_UM:.3g} µm, by the size of the marks over "
+            f"their pixels {told / M_PER_UM:.3g} µm",
+            "correct the unit of the positions (m), the size of the marks (m) or their pixels",
+        )

@@ -37,24 +37,32 @@ class CodedPlate:
     def __init__(self, text: str, where: str) -> None:
         found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
         if not found:
-            raise InputError(f"{where}: aruco", f"'{text}' is not the marks along x and y",
-                             "write for example 11x9")
+            raise InputError(
+                f"{where}: aruco",
+                f"'{text}' is not the marks along x and y",
+                "write for example 11x9",
+            )
         try:
             import cv2  # extra camera
         except ModuleNotFoundError as error:
-            raise InputError(f"{where}: aruco", "OpenCV, which reads the markers, is not installed",
-                             "pip install 'selfcal_ros[camera]', or leave aruco out") from error
+            raise InputError(
+                f"{where}: aruco",
+                "OpenCV, which reads the markers, is not installed",
+                "pip install 'selfcal_ros[camera]', or leave aruco out",
+            ) from error
         self._shape = np.array([int(found[1]), int(found[2])])
         self._centres = edge_markers(*self._shape.tolist())
         parameters = cv2.aruco.DetectorParameters()
         parameters.detectInvertedMarker = True
         parameters.minMarkerPerimeterRate = 0.01
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        self._reader: Any = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(
-            getattr(cv2.aruco, DICTIONARY)), parameters)
+        self._reader: Any = cv2.aruco.ArucoDetector(
+            cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY)), parameters
+        )
 
-    def identified(self, marks: Sequence[Mark], picture: Picture, *,
-                   mirror: bool) -> list[tuple[int, int] | MarkFault | None]:
+    def identified(
+        self, marks: Sequence[Mark], picture: Picture, *, mirror: bool
+    ) -> list[tuple[int, int] | MarkFault | None]:
         """Return the id (m, n) of each mark; None if it is not known, a fault if it is none.
 
         Parameters
@@ -104,8 +112,11 @@ class CodedPlate:
             return MarkFault.MARKER
         index = at + (self._shape - 1) / 2
         nearest = np.round(index)
-        if np.abs(index - nearest).max() > NEAR or (nearest < 0).any() or (
-                nearest >= self._shape).any():
+        if (
+            np.abs(index - nearest).max() > NEAR
+            or (nearest < 0).any()
+            or (nearest >= self._shape).any()
+        ):
             return None
         m, n = (nearest - self._shape // 2).astype(int).tolist()
         return m, n

@@ -101,18 +101,25 @@ class MarkDetector:
         unset = [name for name in ("pixel_size", "mark_size") if not getattr(settings, name) > 0]
         if unset:
             verb, them = ("are", "them") if len(unset) > 1 else ("is", "it")
-            raise InputError(f"{where}: {' and '.join(unset)}", f"{verb} not set", f"give {them} "
-                             "in m; `selfcal camera init` finds the size of a pixel")
+            raise InputError(
+                f"{where}: {' and '.join(unset)}",
+                f"{verb} not set",
+                f"give {them} in m; `selfcal camera init` finds the size of a pixel",
+            )
         self.settings, self._model = settings, MODELS[settings.mark]
         self.size = settings.mark_size / settings.pixel_size
         self._width = settings.mark_width / settings.pixel_size or WIDTH * self.size
         if not SMALLEST_SIZE <= self.size <= LARGEST_SIZE:
-            raise InputError(f"{where}: mark_size", f"{self.size:.3g} pixels",
-                             f"a mark has {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} pixels; correct "
-                             "mark_size or pixel_size")
+            raise InputError(
+                f"{where}: mark_size",
+                f"{self.size:.3g} pixels",
+                f"a mark has {SMALLEST_SIZE:g} to {LARGEST_SIZE:g} pixels; correct "
+                "mark_size or pixel_size",
+            )
         if 2 * self._width >= self.size and settings.mark in ("ring", "cross"):
-            raise InputError(f"{where}: mark_width", "at least half of mark_size",
-                             "give the width of one line")
+            raise InputError(
+                f"{where}: mark_width", "at least half of mark_size", "give the width of one line"
+            )
         self._sign = 0 if settings.mark == "corner" else 1 if settings.polarity == "bright" else -1
 
     def judged(self, picture: Picture) -> list[Judged]:
@@ -124,12 +131,21 @@ class MarkDetector:
             If there are more possible marks than `max_marks`.
         """
         image, full = picture.values, self.settings.full_scale or picture.full_scale
-        seen = candidates(image, mark=self.settings.mark, size=self.size, width=self._width,
-                          sign=self._sign, most=self.settings.max_marks)
+        seen = candidates(
+            image,
+            mark=self.settings.mark,
+            size=self.size,
+            width=self._width,
+            sign=self._sign,
+            most=self.settings.max_marks,
+        )
         found = _without_doubles(self._fitted(image, seen, full), SAME * self.size)
-        return [Judged(mark.u, mark.v, mark) if isinstance(mark, Mark)
-                else Judged(candidate.column, candidate.row, mark)
-                for candidate, mark in zip(seen, found, strict=True)]
+        return [
+            Judged(mark.u, mark.v, mark)
+            if isinstance(mark, Mark)
+            else Judged(candidate.column, candidate.row, mark)
+            for candidate, mark in zip(seen, found, strict=True)
+        ]
 
     def marks(self, picture: Picture) -> tuple[list[Mark], Counter[str]]:
         """Return the marks of an image, row by row, and the number of rejected ones by reason.
@@ -141,8 +157,9 @@ class MarkDetector:
         """
         return told_apart(self.judged(picture))
 
-    def _fitted(self, image: np.ndarray, seen: list[Candidate],
-                full: int) -> list[Mark | MarkFault]:
+    def _fitted(
+        self, image: np.ndarray, seen: list[Candidate], full: int
+    ) -> list[Mark | MarkFault]:
         """Return the mark at each candidate, or why there is none.
 
         Each is fitted again in a window centred on a first fit, so that nothing depends on the
@@ -151,11 +168,14 @@ class MarkDetector:
         if not seen:
             return []
         out: list[Mark | MarkFault] = [MarkFault.NO_FIT] * len(seen)
-        columns, rows = (np.array([getattr(candidate, name) for candidate in seen], dtype=int)
-                         for name in ("column", "row"))
+        columns, rows = (
+            np.array([getattr(candidate, name) for candidate in seen], dtype=int)
+            for name in ("column", "row")
+        )
         blur = max(1.0, FIRST_BLUR * self.size)
-        starts = np.array([self._model.start(self.size, self._width, candidate.angle, blur)
-                           for candidate in seen])
+        starts = np.array(
+            [self._model.start(self.size, self._width, candidate.angle, blur) for candidate in seen]
+        )
         waiting, moved = np.arange(len(seen)), False
         while len(waiting):
             again = []
@@ -174,8 +194,14 @@ class MarkDetector:
             waiting, moved = np.array(again, dtype=int), True
         return out
 
-    def _fits(self, image: np.ndarray, at: tuple[np.ndarray, np.ndarray], starts: np.ndarray,
-              which: np.ndarray, full: int) -> Iterator[tuple[int, Fit | MarkFault]]:
+    def _fits(
+        self,
+        image: np.ndarray,
+        at: tuple[np.ndarray, np.ndarray],
+        starts: np.ndarray,
+        which: np.ndarray,
+        full: int,
+    ) -> Iterator[tuple[int, Fit | MarkFault]]:
         """Yield the fit of each candidate in `which`, or why there is none."""
         columns, rows = at[0][which], at[1][which]
         radius = self._model.reach * self.size + 2
@@ -187,8 +213,9 @@ class MarkDetector:
         for index in which[inside][saturated]:
             yield int(index), MarkFault.SATURATED
         left = which[inside][~saturated]
-        fits = fit_marks(self._model, Windows(windows.disc, windows.values[~saturated]),
-                         starts[left])
+        fits = fit_marks(
+            self._model, Windows(windows.disc, windows.values[~saturated]), starts[left]
+        )
         for index, fit in zip(left, fits, strict=True):
             yield int(index), MarkFault.NO_FIT if fit is None else fit
 
@@ -198,8 +225,14 @@ class MarkDetector:
         if fault is not None:
             return fault
         u_u, u_v = fit.sigmas
-        return Mark(column + float(fit.centre[0]), row + float(fit.centre[1]), u_u, u_v,
-                    min(max(fit.explained, 0.0), 1.0), fit)
+        return Mark(
+            column + float(fit.centre[0]),
+            row + float(fit.centre[1]),
+            u_u,
+            u_v,
+            min(max(fit.explained, 0.0), 1.0),
+            fit,
+        )
 
     def _fault(self, fit: Fit) -> MarkFault | None:
         """Return why a fitted mark is rejected, or None."""
@@ -230,8 +263,10 @@ class MarkDetector:
             Reason -> possible marks that were rejected in all of them.
         """
         given = self.settings
-        wanted = f"no {'' if self._sign == 0 else given.polarity + ' '}{given.mark} of " \
-                 f"{self.size:.3g} px was found"
+        wanted = (
+            f"no {'' if self._sign == 0 else given.polarity + ' '}{given.mark} of "
+            f"{self.size:.3g} px was found"
+        )
         reasons = ", ".join(f"{count} {name}" for name, count in rejected.most_common())
         said = wanted + (f"; rejected: {reasons}" if reasons else "")
         spots = None if picture is None else spots_in(picture.values)
@@ -243,28 +278,41 @@ class MarkDetector:
         if self._sign and spots.polarity != given.polarity:
             options.append(f"--polarity {spots.polarity}")
         seen = f"{said}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
-        return seen, (f"try {' '.join(options)}" if options else
-                      "see where they are with --draw FOLDER; another --mark (disc, ring, cross, "
-                      "corner)?")
+        return seen, (
+            f"try {' '.join(options)}"
+            if options
+            else "see where they are with --draw FOLDER; another --mark (disc, ring, cross, "
+            "corner)?"
+        )
 
-    def detections(self, marks: Sequence[Mark], shape: tuple[int, ...], stamp_ns: int,
-                   ids: Sequence[tuple[int, int] | None] = ()) -> list[Detection]:
+    def detections(
+        self,
+        marks: Sequence[Mark],
+        shape: tuple[int, ...],
+        stamp_ns: int,
+        ids: Sequence[tuple[int, int] | None] = (),
+    ) -> list[Detection]:
         """Return the marks of an image of this shape (h, w) as detections, with ids if known."""
         out = []
         for mark, known in zip(marks, ids or [None] * len(marks), strict=True):
             x, y = offset(mark.u, mark.v, shape, self.settings)
-            sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u ** 2 + mark.u_v ** 2) / 2))
+            sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u**2 + mark.u_v**2) / 2))
             m, n = known or (0, 0)
-            out.append(Detection(
-                stamp_ns, int(Kind.GRID), known is not None,
-                m=m,
-                n=n,
-                k=0,
-                offset_x=x,
-                offset_y=y,
-                offset_theta=0.0,
-                sigma=sigma,
-                score=mark.score))
+            out.append(
+                Detection(
+                    stamp_ns,
+                    int(Kind.GRID),
+                    known is not None,
+                    m=m,
+                    n=n,
+                    k=0,
+                    offset_x=x,
+                    offset_y=y,
+                    offset_theta=0.0,
+                    sigma=sigma,
+                    score=mark.score,
+                )
+            )
         return out
 
 
@@ -282,8 +330,9 @@ def told_apart(judged: Iterable[Judged]) -> tuple[list[Mark], Counter[str]]:
 
 def _without_doubles(marks: list[Mark | MarkFault], near: float) -> list[Mark | MarkFault]:
     """Return the marks; one that lies nearer than `near` to an earlier one is a double, px."""
-    places = np.array([(mark.u, mark.v) if isinstance(mark, Mark) else (np.nan, np.nan)
-                       for mark in marks]).reshape(len(marks), 2)
+    places = np.array(
+        [(mark.u, mark.v) if isinstance(mark, Mark) else (np.nan, np.nan) for mark in marks]
+    ).reshape(len(marks), 2)
     known = np.flatnonzero(np.isfinite(places[:, 0]))
     out = list(marks)
     if len(known) < 2:
@@ -295,8 +344,12 @@ def _without_doubles(marks: list[Mark | MarkFault], near: float) -> list[Mark | 
     return out
 
 
-def offset(u: float, v: float, shape: tuple[int, ...], settings: DetectorSettings,
-           ) -> tuple[float, float]:
+def offset(
+    u: float,
+    v: float,
+    shape: tuple[int, ...],
+    settings: DetectorSettings,
+) -> tuple[float, float]:
     """Return the offset of a place in the image from the optical axis, stage axes, m.
 
     The axis is the centre of the image; rows run along -y before the turn.
@@ -306,5 +359,7 @@ def offset(u: float, v: float, shape: tuple[int, ...], settings: DetectorSetting
         right = -right
     turn = np.deg2rad(settings.turn)
     cosine, sine = np.cos(turn), np.sin(turn)
-    return (float(cosine * right - sine * up) * settings.pixel_size,
-            float(sine * right + cosine * up) * settings.pixel_size)
+    return (
+        float(cosine * right - sine * up) * settings.pixel_size,
+        float(sine * right + cosine * up) * settings.pixel_size,
+    )

@@ -12,8 +12,12 @@ RADIUS = 0.75
 COLOUR, AXIS, REJECTED = (0, 190, 90), (0, 160, 255), (255, 60, 0)
 
 
-def circled(pixels: np.ndarray, marks: Sequence[tuple[float, float]], size_px: float,
-            rejected: Sequence[tuple[float, float, str]] = ()) -> bytes:
+def circled(
+    pixels: np.ndarray,
+    marks: Sequence[tuple[float, float]],
+    size_px: float,
+    rejected: Sequence[tuple[float, float, str]] = (),
+) -> bytes:
     """Return an image as PNG, stretched to its range, with a circle around every mark.
 
     A square with a reason stands around what was rejected. A cross shows the optical axis, the
@@ -39,8 +43,9 @@ def circled(pixels: np.ndarray, marks: Sequence[tuple[float, float]], size_px: f
     for u, v in marks:
         draw.ellipse([u - radius, v - radius, u + radius, v + radius], outline=COLOUR, width=line)
     for u, v, reason in rejected:
-        draw.rectangle([u - radius, v - radius, u + radius, v + radius], outline=REJECTED,
-                       width=line)
+        draw.rectangle(
+            [u - radius, v - radius, u + radius, v + radius], outline=REJECTED, width=line
+        )
         draw.text((u - radius, v + radius + line), reason, fill=REJECTED)
     u, v, arm = (pixels.shape[1] - 1) / 2, (pixels.shape[0] - 1) / 2, size_px / 2
     draw.line([u - arm, v, u + arm, v], fill=AXIS, width=line)

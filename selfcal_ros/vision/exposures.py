@@ -53,10 +53,14 @@ class Counts:
 
     def values(self) -> dict[str, int]:
         """Return name -> number, the reasons last."""
-        return {"images": self.images, "images_refused": self.refused,
-                "images_without_marks": self.empty, "marks": self.marks,
-                **({"images_with_more_pages": self.paged} if self.paged else {}),
-                **{f"rejected_{name}": count for name, count in sorted(self.rejected.items())}}
+        return {
+            "images": self.images,
+            "images_refused": self.refused,
+            "images_without_marks": self.empty,
+            "marks": self.marks,
+            **({"images_with_more_pages": self.paged} if self.paged else {}),
+            **{f"rejected_{name}": count for name, count in sorted(self.rejected.items())},
+        }
 
 
 class ImageDetector:
@@ -79,8 +83,9 @@ class ImageDetector:
         Line -> number of images that could not be used.
     """
 
-    def __init__(self, settings: DetectorSettings, where: str = "mark_detector",
-                 draw: Draw | None = None) -> None:
+    def __init__(
+        self, settings: DetectorSettings, where: str = "mark_detector", draw: Draw | None = None
+    ) -> None:
         self._detector = MarkDetector(settings, where)
         self._coded = CodedPlate(settings.aruco, where) if settings.aruco else None
         self.counts = Counts()
@@ -99,8 +104,12 @@ class ImageDetector:
             If the image cannot be used, which is counted: unknown encoding, damaged, of another
             camera or size, the stamp of an earlier image, more possible marks than `max_marks`.
         """
-        return self._detect(partial(picture_of, message), stamp_ns(message), "image",
-                            camera=str(message.header.frame_id))
+        return self._detect(
+            partial(picture_of, message),
+            stamp_ns(message),
+            "image",
+            camera=str(message.header.frame_id),
+        )
 
     def take_file(self, data: bytes, name: str, stamp: int) -> list[Detection]:
         """Return the detections of an image file exposed at `stamp`, ns; raises like `take`."""
@@ -123,17 +132,27 @@ class ImageDetector:
             return
         if not counts.images:
             why = "".join(f": {line}" for line, _ in self.problems.most_common(1))
-            raise NoDataError(where, f"no image could be used{why}", "correct the images" if why
-                              else "record stage/image, or name the folder of the images")
-        raise NoDataError(where, *self._detector.nothing_found(
-            self._empty, rejected=counts.rejected))
+            raise NoDataError(
+                where,
+                f"no image could be used{why}",
+                "correct the images"
+                if why
+                else "record stage/image, or name the folder of the images",
+            )
+        raise NoDataError(
+            where, *self._detector.nothing_found(self._empty, rejected=counts.rejected)
+        )
 
-    def _detect(self, decode: Callable[[Check], Picture], stamp: int, name: str, *,
-                camera: str = "") -> list[Detection]:
+    def _detect(
+        self, decode: Callable[[Check], Picture], stamp: int, name: str, *, camera: str = ""
+    ) -> list[Detection]:
         try:
             if stamp in self._stamps:
-                raise InputError(name, "its stamp is that of an earlier image",
-                                 "stamp each exposure by its own instant")
+                raise InputError(
+                    name,
+                    "its stamp is that of an earlier image",
+                    "stamp each exposure by its own instant",
+                )
             picture = decode(lambda shape: self._refuse_other((camera, *shape), name))
             if not self._source.agrees(seen := (camera, *picture.values.shape)):
                 raise other_source(self._source.image, seen, name)
@@ -158,8 +177,11 @@ class ImageDetector:
         self.counts.rejected.update(rejected)
         return found
 
-    def _identified(self, judged: list[Judged], picture: Picture,
-                    ) -> tuple[list[Judged], list[tuple[int, int] | None]]:
+    def _identified(
+        self,
+        judged: list[Judged],
+        picture: Picture,
+    ) -> tuple[list[Judged], list[tuple[int, int] | None]]:
         """Return the possible marks without parts of markers, and the ids of the marks."""
         if self._coded is None:
             return judged, []
@@ -188,12 +210,18 @@ def other_source(image: tuple, other: tuple, name: str) -> InputError:
     Its centre would not be the optical axis of the others.
     """
     if image[0] != other[0]:
-        return InputError(name, f"of the camera '{printable(other[0])}', earlier ones are of "
-                          f"'{printable(image[0])}' (frame_id)",
-                          "remap one of the two: a mark_detector has one camera")
+        return InputError(
+            name,
+            f"of the camera '{printable(other[0])}', earlier ones are of "
+            f"'{printable(image[0])}' (frame_id)",
+            "remap one of the two: a mark_detector has one camera",
+        )
     old, new = (f"{width} x {height}" for _, height, width in (image, other))
-    return InputError(name, f"{new} pixels, but earlier images have {old}",
-                      "record images of one size; the optical axis is their centre")
+    return InputError(
+        name,
+        f"{new} pixels, but earlier images have {old}",
+        "record images of one size; the optical axis is their centre",
+    )
 
 
 @dataclass

@@ -63,26 +63,35 @@ class _Template:
 
 
 @lru_cache(maxsize=16)
-def _templates(mark: str, size: float, width: float, shape: tuple[int, int], sign: int,
-               ) -> list[_Template]:
+def _templates(
+    mark: str,
+    size: float,
+    width: float,
+    shape: tuple[int, int],
+    sign: int,
+) -> list[_Template]:
     """Return the templates over the turns of a mark.
 
     Those of the second half of the turns of a mark without sign, a corner, are the negatives of
     those of the first half.
     """
     model, half = MODELS[mark], _half(size)
-    v, u = np.mgrid[-half:half + 1, -half:half + 1].astype(float)
+    v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
     found = []
     angles = np.arange(ANGLES if sign else ANGLES // 2) * model.turns / ANGLES
     for angle in angles if model.turns else [0.0]:
-        value = (sign or 1) * model.shape(u.ravel(), v.ravel(), model.start(
-            size, width, float(angle), TEMPLATE_BLUR * size))[0]
+        value = (sign or 1) * model.shape(
+            u.ravel(), v.ravel(), model.start(size, width, float(angle), TEMPLATE_BLUR * size)
+        )[0]
         value = value - value.mean()
         square = (value / np.sqrt(value @ value)).reshape(u.shape).astype(np.float32)
         padded = np.zeros(shape, dtype=np.float32)
-        padded[:2 * half + 1, :2 * half + 1] = square
-        found.append(_Template(float(angle), square, np.conj(
-            fft.rfft2(np.roll(padded, (-half, -half), (0, 1))))))
+        padded[: 2 * half + 1, : 2 * half + 1] = square
+        found.append(
+            _Template(
+                float(angle), square, np.conj(fft.rfft2(np.roll(padded, (-half, -half), (0, 1))))
+            )
+        )
     return found
 
 
@@ -92,13 +101,15 @@ def _half(size: float) -> int:
 
 def _reflected(image: np.ndarray, half: int) -> np.ndarray:
     """Return the image with a reflected border, of a size with a fast transform."""
-    pad = [(half, fft.next_fast_len(side + 2 * half, real=True) - side - half)
-           for side in image.shape]
+    pad = [
+        (half, fft.next_fast_len(side + 2 * half, real=True) - side - half) for side in image.shape
+    ]
     return np.pad(image, pad, mode="symmetric")
 
 
-def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign: int,
-               most: int) -> list[Candidate]:
+def candidates(
+    image: np.ndarray, *, mark: str, size: float, width: float, sign: int, most: int
+) -> list[Candidate]:
     """Return the candidates for marks, row by row.
 
     Parameters
@@ -128,31 +139,41 @@ def candidates(image: np.ndarray, *, mark: str, size: float, width: float, sign:
     padded = _reflected(small, half)
     templates = _templates(mark, size / factor, width / factor, padded.shape, sign)
     best = _correlated(padded, templates, sign)[
-        half:half + small.shape[0], half:half + small.shape[1]]
+        half : half + small.shape[0], half : half + small.shape[1]
+    ]
     amplitude = max(NOISES * max(_noise(small), QUANTUM / factor), FAINT * float(best.max()))
     peaks = (best > amplitude) & (best == _largest(best, round(APART * size / factor)))
     if np.count_nonzero(peaks) > PEAKS * most:
         raise too_many(most)
     rows, columns = np.nonzero(peaks)
     squares = np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1, 2 * half + 1))[
-        rows, columns].reshape(len(rows), (2 * half + 1) ** 2)
+        rows, columns
+    ].reshape(len(rows), (2 * half + 1) ** 2)
     norms = squares.shape[1] ** 0.5 * np.maximum(squares.std(axis=1, dtype=float), 1e-3)
     similar = best[rows, columns] > CORRELATION * norms
     if np.count_nonzero(similar) > most:
         raise too_many(most)
     near = squares[similar] @ np.stack([template.square.ravel() for template in templates]).T
     which = np.argmax(np.abs(near) if sign == 0 else near, axis=1)
-    return [Candidate(round((column + _vertex(best[row, :], column) + 0.5) * factor - 0.5),
-                      round((row + _vertex(best[:, column], row) + 0.5) * factor - 0.5),
-                      templates[nearest].angle)
-            for row, column, nearest in zip(
-                rows[similar].tolist(), columns[similar].tolist(), which.tolist(), strict=True)]
+    return [
+        Candidate(
+            round((column + _vertex(best[row, :], column) + 0.5) * factor - 0.5),
+            round((row + _vertex(best[:, column], row) + 0.5) * factor - 0.5),
+            templates[nearest].angle,
+        )
+        for row, column, nearest in zip(
+            rows[similar].tolist(), columns[similar].tolist(), which.tolist(), strict=True
+        )
+    ]
 
 
 def too_many(most: int) -> InputError:
     """Return the error that an image shows more possible marks than `most`."""
-    return InputError("image", f"more than {most} possible marks",
-                      "check mark_size and pixel_size, or set max_marks")
+    return InputError(
+        "image",
+        f"more than {most} possible marks",
+        "check mark_size and pixel_size, or set max_marks",
+    )
 
 
 def _correlated(padded: np.ndarray, templates: list[_Template], sign: int) -> np.ndarray:
@@ -181,7 +202,7 @@ def _vertex(row: np.ndarray, peak: int) -> float:
     """Return the vertex of the parabola through a peak and its neighbours, relative to it."""
     if not 0 < peak < len(row) - 1:
         return 0.0
-    before, at, after = row[peak - 1:peak + 2].tolist()
+    before, at, after = row[peak - 1 : peak + 2].tolist()
     return (before - after) / (2 * (before - 2 * at + after)) if before + after < 2 * at else 0.0
 
 

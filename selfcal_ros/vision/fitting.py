@@ -118,23 +118,22 @@ class Fit:
 @lru_cache(maxsize=2)
 def _disc(radius: float) -> Disc:
     half = int(np.ceil(radius))
-    v, u = np.mgrid[-half:half + 1, -half:half + 1].astype(PRECISION)
+    v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(PRECISION)
     inside = u * u + v * v <= radius * radius
     near = ndimage.uniform_filter(inside.astype(PRECISION), 3, mode="constant")
     return Disc(u[inside], v[inside], inside, near[inside])
 
 
-def lie_inside(image: np.ndarray, columns: np.ndarray, rows: np.ndarray,
-               radius: float) -> np.ndarray:
+def lie_inside(
+    image: np.ndarray, columns: np.ndarray, rows: np.ndarray, radius: float
+) -> np.ndarray:
     """Return which windows (marks,) around pixels lie inside the image."""
     half = int(np.ceil(radius))
     height, width = image.shape
-    return ((half <= columns) & (columns < width - half)
-            & (half <= rows) & (rows < height - half))
+    return (half <= columns) & (columns < width - half) & (half <= rows) & (rows < height - half)
 
 
-def windows_of(image: np.ndarray, columns: np.ndarray, rows: np.ndarray,
-               radius: float) -> Windows:
+def windows_of(image: np.ndarray, columns: np.ndarray, rows: np.ndarray, radius: float) -> Windows:
     """Return the windows around pixels; each must lie inside the image."""
     disc = _disc(radius)
     across, down = disc.u.astype(int), disc.v.astype(int)
@@ -177,15 +176,19 @@ def _fitted(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit 
     return found
 
 
-def _image(model: MarkModel, u: np.ndarray, v: np.ndarray, p: np.ndarray,
-           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _image(
+    model: MarkModel,
+    u: np.ndarray,
+    v: np.ndarray,
+    p: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return modelled images (marks, n), derivatives (marks, 6 + shape, n), shapes (marks, n).
 
     Parameters `p` (marks, 6 + shape): centre u and v, ground, contrast, slopes of the
     illumination, shape.
     """
     columns = p.T[..., None].astype(PRECISION)
-    shape, by = model.shape(u - columns[0], v - columns[1], columns[2 + LIGHTING:])
+    shape, by = model.shape(u - columns[0], v - columns[1], columns[2 + LIGHTING :])
     light = 1 + columns[4] * u + columns[5] * v
     level, bright = columns[2] + columns[3] * shape, columns[3] * light
     jacobian = np.empty((len(p), p.shape[1], len(u)), dtype=PRECISION)
@@ -234,8 +237,11 @@ def _each(solver: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
     return found
 
 
-def _solved(jacobian: np.ndarray, residual: np.ndarray, damping: np.ndarray,
-            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solved(
+    jacobian: np.ndarray,
+    residual: np.ndarray,
+    damping: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the damped steps (marks, p), the normal matrices and the scales."""
     normal, scale = _normal(jacobian)
     damped = normal + damping[:, None, None] * np.eye(normal.shape[1])
@@ -245,11 +251,15 @@ def _solved(jacobian: np.ndarray, residual: np.ndarray, damping: np.ndarray,
 
 def _diverged(p: np.ndarray, radius: float) -> np.ndarray:
     near = np.hypot(p[:, 0], p[:, 1]) <= radius / 2
-    return ~(near & (np.abs(p[:, 2 + LIGHTING:]).max(axis=1) < 10 * radius))
+    return ~(near & (np.abs(p[:, 2 + LIGHTING :]).max(axis=1) < 10 * radius))
 
 
-def _settled(model: MarkModel, windows: Windows, starts: np.ndarray, step: int,
-             ) -> tuple[np.ndarray, np.ndarray]:
+def _settled(
+    model: MarkModel,
+    windows: Windows,
+    starts: np.ndarray,
+    step: int,
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the parameters of the unweighted fits, and which converged (Marquardt).
 
     They are a start for the weighted ones: every `step`-th pixel of a mark serves.
@@ -281,7 +291,10 @@ def _settled(model: MarkModel, windows: Windows, starts: np.ndarray, step: int,
 
         taken = running[better]
         p[taken], residual[taken], jacobian[taken] = (
-            tried[better], new_residual[better], new_jacobian[better])
+            tried[better],
+            new_residual[better],
+            new_jacobian[better],
+        )
         cost[taken] = new_cost[better]
         damping[running] *= np.where(better, 0.1, 10.0)
         done = small & possible & (~better | (damping[running] < 1e-3))
@@ -290,8 +303,9 @@ def _settled(model: MarkModel, windows: Windows, starts: np.ndarray, step: int,
     return p, settled
 
 
-def _variance(residual: np.ndarray, image: np.ndarray, shape: np.ndarray, used: np.ndarray,
-              free: int) -> np.ndarray:
+def _variance(
+    residual: np.ndarray, image: np.ndarray, shape: np.ndarray, used: np.ndarray, free: int
+) -> np.ndarray:
     """Return the variance of each pixel, linear in its value between those of ground and mark."""
     square = np.square(residual)
     count = used.sum(axis=1)
@@ -308,7 +322,8 @@ def _variance(residual: np.ndarray, image: np.ndarray, shape: np.ndarray, used: 
     low, high = np.where(apart, low, mean), np.where(apart, high, mean)
     slope = (high - low) / np.where(apart, at_high - at_low, 1.0)
     low, high, slope, at_low = (
-        each[:, None].astype(PRECISION) for each in (low, high, slope, at_low))
+        each[:, None].astype(PRECISION) for each in (low, high, slope, at_low)
+    )
     return np.clip(low + slope * (image - at_low), np.minimum(low, high), np.maximum(low, high))
 
 
@@ -332,8 +347,9 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
         enough = used.sum(axis=1) >= 2 * p.shape[1]
         variance = _variance(residual, image, shape, used, p.shape[1])
         root = used / np.sqrt(variance)
-        sigmas, normal, scale = _solved(jacobian * root[:, None, :], residual * root,
-                                        np.full(len(running), WEIGHTED_DAMPING))
+        sigmas, normal, scale = _solved(
+            jacobian * root[:, None, :], residual * root, np.full(len(running), WEIGHTED_DAMPING)
+        )
         after = before + sigmas / scale
         after[:, -1] = np.maximum(after[:, -1], SMALLEST_BLUR)
         whole = enough & ~_diverged(after, disc.inside.shape[0] / 2)
@@ -342,18 +358,26 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
         ready = whole & (last | ((done >= WEIGHTED_ROUNDS[0]) & settled))
         p[running] = after
         if ready.any():
-            fits = _fits(model, Windows(disc, values[ready]), after[ready],
-                         (shape[ready], residual[ready], variance[ready], spread[ready]),
-                         (normal[ready], scale[ready]))
+            fits = _fits(
+                model,
+                Windows(disc, values[ready]),
+                after[ready],
+                (shape[ready], residual[ready], variance[ready], spread[ready]),
+                (normal[ready], scale[ready]),
+            )
             for index, fit in zip(running[ready], fits, strict=True):
                 found[index] = fit
         running = running[whole & ~ready]
     return found
 
 
-def _fits(model: MarkModel, windows: Windows, p: np.ndarray,
-          modelled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-          normal_and_scale: tuple[np.ndarray, np.ndarray]) -> list[Fit | None]:
+def _fits(
+    model: MarkModel,
+    windows: Windows,
+    p: np.ndarray,
+    modelled: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    normal_and_scale: tuple[np.ndarray, np.ndarray],
+) -> list[Fit | None]:
     """Return the fits of marks that have settled; None where the uncertainty is not known."""
     shape, residual, variance, spread = modelled
     normal, scale = normal_and_scale
@@ -364,14 +388,25 @@ def _fits(model: MarkModel, windows: Windows, p: np.ndarray,
     explained = 1 - _dot(residual, residual) / np.maximum(_dot(away, away), TINY)
     noise = np.sqrt(row_medians(variance)[:, 0])
     stains = _stains(windows, (shape, residual, spread), p)
-    return [Fit(p[i, :2], tuple(sigmas[i].tolist()),
-                dict(zip(model.names, p[i, 6:].tolist(), strict=True)), float(p[i, 3]),
-                float(noise[i]), float(explained[i]), *stains[i].tolist())
-            if np.isfinite(sigmas[i]).all() else None for i in range(len(p))]
+    return [
+        Fit(
+            p[i, :2],
+            tuple(sigmas[i].tolist()),
+            dict(zip(model.names, p[i, 6:].tolist(), strict=True)),
+            float(p[i, 3]),
+            float(noise[i]),
+            float(explained[i]),
+            *stains[i].tolist(),
+        )
+        if np.isfinite(sigmas[i]).all()
+        else None
+        for i in range(len(p))
+    ]
 
 
-def _stains(windows: Windows, modelled: tuple[np.ndarray, np.ndarray, np.ndarray],
-            p: np.ndarray) -> np.ndarray:
+def _stains(
+    windows: Windows, modelled: tuple[np.ndarray, np.ndarray, np.ndarray], p: np.ndarray
+) -> np.ndarray:
     """Count stained pixels in the residuals averaged over 3 x 3 pixels, by their kind (marks, 4).
 
     The order is that of `Fit`: bright, dark, inner, outer.
@@ -387,16 +422,22 @@ def _stains(windows: Windows, modelled: tuple[np.ndarray, np.ndarray, np.ndarray
     found = np.zeros((len(p), 4), dtype=int)
     some = stained.any(axis=1)  # the levels of the others are not wanted
     p, values, shape, mean, stained = (
-        each[some] for each in (p, windows.values, shape, mean, stained))
-    levels = np.stack([_median_of_part(values, shape < CLEAR, p[:, 2]),
-                       _median_of_part(values, shape > 1 - CLEAR, p[:, 2] + p[:, 3])])
+        each[some] for each in (p, windows.values, shape, mean, stained)
+    )
+    levels = np.stack(
+        [
+            _median_of_part(values, shape < CLEAR, p[:, 2]),
+            _median_of_part(values, shape > 1 - CLEAR, p[:, 2] + p[:, 3]),
+        ]
+    )
     low, high = levels.min(axis=0)[:, None], levels.max(axis=0)[:, None]
     beyond = 0.25 * (high - low)
     bright = stained & (mean > 0) & (values > high + beyond)
     dark = stained & (mean < 0) & (values < low - beyond)
     other, inner = stained & ~bright & ~dark, shape > 0.5
-    found[some] = np.stack([part.sum(axis=1) for part in (
-        bright, dark, other & inner, other & ~inner)], axis=1)
+    found[some] = np.stack(
+        [part.sum(axis=1) for part in (bright, dark, other & inner, other & ~inner)], axis=1
+    )
     return found
 
 

@@ -15,8 +15,14 @@ from PIL import Image, UnidentifiedImageError
 
 from selfcal_ros.errors import InputError, first_line
 
-ENCODINGS = {"mono8": ("u1", 1), "mono16": ("u2", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3),
-             "8UC1": ("u1", 1), "16UC1": ("u2", 1)}
+ENCODINGS = {
+    "mono8": ("u1", 1),
+    "mono16": ("u2", 1),
+    "rgb8": ("u1", 3),
+    "bgr8": ("u1", 3),
+    "8UC1": ("u1", 1),
+    "16UC1": ("u2", 1),
+}
 """Encoding -> type and number of its values."""
 LARGEST = 1 << 26
 """Largest number of pixels of an image."""
@@ -66,20 +72,31 @@ def picture_of(message: Any, check: Check = any_size) -> Picture:
     if hasattr(message, "format"):
         return decoded(message.data, "image", check)
     if message.encoding not in ENCODINGS:
-        raise InputError("image", f"encoding '{message.encoding[:40]}'",
-                         f"publish one of {', '.join(ENCODINGS)}")
+        raise InputError(
+            "image", f"encoding '{message.encoding[:40]}'", f"publish one of {', '.join(ENCODINGS)}"
+        )
     kind, channels = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     row = width * channels * int(kind[1])
-    if not 0 < width * height <= LARGEST or step < row or len(message.data) < (
-            (height - 1) * step + row):
-        raise InputError("image", f"{len(message.data)} bytes in rows of {step} are not "
-                         f"{width} x {height} pixels of {message.encoding}",
-                         "correct width, height, step and data")
+    if (
+        not 0 < width * height <= LARGEST
+        or step < row
+        or len(message.data) < ((height - 1) * step + row)
+    ):
+        raise InputError(
+            "image",
+            f"{len(message.data)} bytes in rows of {step} are not "
+            f"{width} x {height} pixels of {message.encoding}",
+            "correct width, height, step and data",
+        )
     check((height, width))
     data = np.frombuffer(memoryview(message.data).cast("B"), np.uint8)
-    values = np.ndarray((height, width, channels), (">" if message.is_bigendian else "<") + kind,
-                        data, strides=(step, channels * int(kind[1]), int(kind[1])))
+    values = np.ndarray(
+        (height, width, channels),
+        (">" if message.is_bigendian else "<") + kind,
+        data,
+        strides=(step, channels * int(kind[1]), int(kind[1])),
+    )
     return _grey(values.astype(values.dtype.newbyteorder("=")))
 
 
@@ -97,8 +114,9 @@ def decoded(data: Buffer, where: str, check: Check = any_size) -> Picture:
             warnings.simplefilter("error")  # a bomb of decompression is announced by a warning
             with Image.open(io.BytesIO(octets), formats=FORMATS) as picture:
                 if picture.width * picture.height > min(LARGEST, EXPANSION * len(octets)):
-                    raise ValueError(f"{picture.width} x {picture.height} pixels in "
-                                     f"{len(octets)} bytes")
+                    raise ValueError(
+                        f"{picture.width} x {picture.height} pixels in {len(octets)} bytes"
+                    )
                 check((picture.height, picture.width))
                 return _values(picture)._replace(more_pages=_has_second_page(picture))
     except InputError:
@@ -106,8 +124,9 @@ def decoded(data: Buffer, where: str, check: Check = any_size) -> Picture:
     except UnidentifiedImageError as error:  # its text has the address of an object
         raise InputError(where, "not an image of a known kind, or damaged", SAVE_AS) from error
     except Exception as error:  # the decoders of Pillow raise many kinds
-        raise InputError(where, f"cannot be decoded as an image ({first_line(error)[:80]})",
-                         SAVE_AS) from error
+        raise InputError(
+            where, f"cannot be decoded as an image ({first_line(error)[:80]})", SAVE_AS
+        ) from error
 
 
 def _has_second_page(picture: Image.Image) -> bool:

@@ -82,8 +82,12 @@ def _bars(along: np.ndarray, sides: tuple[Value, Value], blur: Value) -> tuple[n
     """Return blurred bars of two lengths, and their derivatives by position, length and blur."""
     half = np.stack(np.broadcast_arrays(*map(np.atleast_1d, sides)))[:, None] / 2
     ends, slopes, by_blur = _edge(np.stack([along + half, along - half]), blur)
-    return (ends[0] - ends[1], slopes[0] - slopes[1], (slopes[0] + slopes[1]) / 2,
-            by_blur[0] - by_blur[1])
+    return (
+        ends[0] - ends[1],
+        slopes[0] - slopes[1],
+        (slopes[0] + slopes[1]) / 2,
+        by_blur[0] - by_blur[1],
+    )
 
 
 def _disc(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
@@ -96,16 +100,19 @@ def _disc(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
 def _ring(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     """Parameters: outer diameter, width of the line, blur."""
     radius = np.hypot(u, v)
-    inside, slope, by_blur = _edge(
-        np.stack([p[0] / 2 - radius, p[0] / 2 - p[1] - radius]), p[2])
+    inside, slope, by_blur = _edge(np.stack([p[0] / 2 - radius, p[0] / 2 - p[1] - radius]), p[2])
     change = slope[0] - slope[1]
     outward = change / np.maximum(radius, 1e-9)
-    return inside[0] - inside[1], np.stack([
-        outward * u, outward * v, change / 2, slope[1], by_blur[0] - by_blur[1]])
+    return inside[0] - inside[1], np.stack(
+        [outward * u, outward * v, change / 2, slope[1], by_blur[0] - by_blur[1]]
+    )
 
 
-def _turned(u: np.ndarray, v: np.ndarray, angle: Value,
-            ) -> tuple[np.ndarray, np.ndarray, Value, Value]:
+def _turned(
+    u: np.ndarray,
+    v: np.ndarray,
+    angle: Value,
+) -> tuple[np.ndarray, np.ndarray, Value, Value]:
     cosine, sine = np.cos(angle), np.sin(angle)
     return cosine * u + sine * v, cosine * v - sine * u, cosine, sine
 
@@ -114,18 +121,34 @@ def _cross(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     """Parameters: length of the bars, their width, angle of the first one, blur."""
     length, width, angle, blur = p
     a, b, cosine, sine = _turned(u, v, angle)
-    (((long_a, long_b), (wide_a, wide_b)), (to_long, to_wide), (by_long, by_wide),
-     (blur_long, blur_wide)) = _bars(np.stack([a, b]), (length, width), blur)
+    (
+        ((long_a, long_b), (wide_a, wide_b)),
+        (to_long, to_wide),
+        (by_long, by_wide),
+        (blur_long, blur_wide),
+    ) = _bars(np.stack([a, b]), (length, width), blur)
     only_a, only_b = long_a - wide_a, long_b - wide_b
     shape = long_a * wide_b + wide_a * only_b
     by_a = to_long[0] * wide_b + to_wide[0] * only_b
     by_b = to_long[1] * wide_a + to_wide[1] * only_a
     by_length = by_long[0] * wide_b + wide_a * by_long[1]
     by_width = only_a * by_wide[1] + by_wide[0] * only_b
-    by_blur = (blur_long[0] * wide_b + only_a * blur_wide[1] + blur_wide[0] * only_b
-               + wide_a * blur_long[1])
-    return shape, np.stack([sine * by_b - cosine * by_a, -sine * by_a - cosine * by_b, by_length,
-                            by_width, by_a * b - by_b * a, by_blur])
+    by_blur = (
+        blur_long[0] * wide_b
+        + only_a * blur_wide[1]
+        + blur_wide[0] * only_b
+        + wide_a * blur_long[1]
+    )
+    return shape, np.stack(
+        [
+            sine * by_b - cosine * by_a,
+            -sine * by_a - cosine * by_b,
+            by_length,
+            by_width,
+            by_a * b - by_b * a,
+            by_blur,
+        ]
+    )
 
 
 def _corner(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
@@ -134,20 +157,40 @@ def _corner(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     (over_a, over_b), (slope_a, slope_b), (blur_a, blur_b) = _edge(np.stack([a, b]), p[1])
     odd_a, odd_b = 2 * over_a - 1, 2 * over_b - 1
     by_a, by_b = slope_a * odd_b, odd_a * slope_b
-    return (1 + odd_a * odd_b) / 2, np.stack([
-        sine * by_b - cosine * by_a, -sine * by_a - cosine * by_b, by_a * b - by_b * a,
-        blur_a * odd_b + odd_a * blur_b])
+    return (1 + odd_a * odd_b) / 2, np.stack(
+        [
+            sine * by_b - cosine * by_a,
+            -sine * by_a - cosine * by_b,
+            by_a * b - by_b * a,
+            blur_a * odd_b + odd_a * blur_b,
+        ]
+    )
 
 
 MODELS = {
-    "disc": MarkModel(("size", "blur"), _disc,
-                      lambda size, width, angle, blur: np.array([size, blur]), 0.75, 0.0),
-    "ring": MarkModel(("size", "width", "blur"), _ring,
-                      lambda size, width, angle, blur: np.array([size, width, blur]), 0.75, 0.0),
-    "cross": MarkModel(("size", "width", "angle", "blur"), _cross,
-                       lambda size, width, angle, blur: np.array([size, width, angle, blur]),
-                       0.75, np.pi / 2),
-    "corner": MarkModel(("angle", "blur"), _corner,
-                        lambda size, width, angle, blur: np.array([angle, blur]), 0.6, np.pi),
+    "disc": MarkModel(
+        ("size", "blur"), _disc, lambda size, width, angle, blur: np.array([size, blur]), 0.75, 0.0
+    ),
+    "ring": MarkModel(
+        ("size", "width", "blur"),
+        _ring,
+        lambda size, width, angle, blur: np.array([size, width, blur]),
+        0.75,
+        0.0,
+    ),
+    "cross": MarkModel(
+        ("size", "width", "angle", "blur"),
+        _cross,
+        lambda size, width, angle, blur: np.array([size, width, angle, blur]),
+        0.75,
+        np.pi / 2,
+    ),
+    "corner": MarkModel(
+        ("angle", "blur"),
+        _corner,
+        lambda size, width, angle, blur: np.array([angle, blur]),
+        0.6,
+        np.pi,
+    ),
 }
 """Kind of mark -> its model."""

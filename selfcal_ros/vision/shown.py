@@ -32,8 +32,11 @@ def spots_in(image: np.ndarray) -> Spots | None:
     level = _threshold(image)
     if level is None:
         return None
-    kinds = [found for polarity, mask in (("dark", image <= level), ("bright", image > level))
-             if (found := _alike(mask, polarity)) is not None]
+    kinds = [
+        found
+        for polarity, mask in (("dark", image <= level), ("bright", image > level))
+        if (found := _alike(mask, polarity)) is not None
+    ]
     return max(kinds, key=lambda found: found.number, default=None)
 
 
@@ -60,8 +63,12 @@ def _alike(mask: np.ndarray, polarity: str) -> Spots | None:
         return None
     sides = []
     for rows, columns in ndimage.find_objects(labels):
-        inside = (rows.start > 0 and columns.start > 0 and rows.stop < mask.shape[0]
-                  and columns.stop < mask.shape[1])
+        inside = (
+            rows.start > 0
+            and columns.start > 0
+            and rows.stop < mask.shape[0]
+            and columns.stop < mask.shape[1]
+        )
         side = (rows.stop - rows.start + columns.stop - columns.start) / 2
         if inside and SMALLEST <= side <= LARGEST * min(mask.shape):
             sides.append(side)

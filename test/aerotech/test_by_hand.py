@@ -37,8 +37,9 @@ def test_the_middle_line_of_an_oblong_field(shape, along, corrected):
     count = shape[0] if along == "x" else shape[1]
     wanted = [10 * n + middle[1] if along == "x" else 10 * middle[0] + n for n in range(count)]
     np.testing.assert_allclose(line.positions_m, 0.01 * (np.arange(count) - count // 2), atol=1e-15)
-    np.testing.assert_allclose(line.corrections_m, np.array(wanted) * (
-        1e-9 if corrected == "x" else -1e-9), rtol=1e-12)
+    np.testing.assert_allclose(
+        line.corrections_m, np.array(wanted) * (1e-9 if corrected == "x" else -1e-9), rtol=1e-12
+    )
 
 
 @pytest.mark.parametrize("along", ["x", "y"])
@@ -66,6 +67,7 @@ def test_theta_has_the_digits_that_the_corner_of_the_field_needs(side):
 
     def rounding(d):
         return 0.5 * 10.0**-d * ARCSEC * corner
+
     assert rounding(digits) <= 0.1 * MAX_THETA_ROUNDING_M * (1 + 1e-9)
     assert digits == DECIMALS or rounding(digits - 1) > 0.1 * MAX_THETA_ROUNDING_M
 
@@ -77,11 +79,20 @@ def test_zeros_of_a_reversed_axis_have_no_sign():
     assert not np.signbit(table.offset)
 
 
-@pytest.mark.parametrize(("first", "rollover", "covers"), [
-    (100.0, 120.0, True),  # 100 to 140, and 0 is 120
-    (-100.0, 360.0, False), (-100.0, 90.0, True), (100.0, None, False), (-40.0, None, True),
-    (5 * EDGE, None, True), (20 * EDGE, None, False),  # a step of 10: the edge is 10 EDGE wide
-    (-40 - 5 * EDGE, None, True), (-40 - 20 * EDGE, None, False)])
+@pytest.mark.parametrize(
+    ("first", "rollover", "covers"),
+    [
+        (100.0, 120.0, True),  # 100 to 140, and 0 is 120
+        (-100.0, 360.0, False),
+        (-100.0, 90.0, True),
+        (100.0, None, False),
+        (-40.0, None, True),
+        (5 * EDGE, None, True),
+        (20 * EDGE, None, False),  # a step of 10: the edge is 10 EDGE wide
+        (-40 - 5 * EDGE, None, True),
+        (-40 - 20 * EDGE, None, False),
+    ],
+)
 def test_zero_is_covered_also_after_a_turn(first, rollover, covers):
     assert AxisSamples(1, first, 10.0, 5, rollover).covers_zero() == covers
 

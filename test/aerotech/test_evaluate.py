@@ -19,9 +19,15 @@ positions = st.fixed_dictionaries({axis: decimals(-600, 600) for axis in AXES})
 
 
 def machine(axes, temperature=None):
-    return MachineSetup({axis: AxisSetup(s["counts"], s["secondary"], s.get("direction"),
-                                         s.get("offset"), s.get("feedback"))
-                         for axis, s in axes.items()}, temperature)
+    return MachineSetup(
+        {
+            axis: AxisSetup(
+                s["counts"], s["secondary"], s.get("direction"), s.get("offset"), s.get("feedback")
+            )
+            for axis, s in axes.items()
+        },
+        temperature,
+    )
 
 
 def far_from_a_jump(track, at, rollover):
@@ -40,8 +46,12 @@ def check(tables, want, at, setup):
         assert got[axis] == pytest.approx(value, rel=1e-12, abs=1e-12 * scale)
 
 
-@given(tables=st.lists(tables_1d(), min_size=1, max_size=3), axes=setups(), at=positions,
-       temperature=st.none() | decimals(0, 60))
+@given(
+    tables=st.lists(tables_1d(), min_size=1, max_size=3),
+    axes=setups(),
+    at=positions,
+    temperature=st.none() | decimals(0, 60),
+)
 def test_1d_tables_agree_with_the_slow_controller(tables, axes, at, temperature):
     want = {}
     for table in tables:
@@ -103,8 +113,9 @@ def test_a_1d_table_is_biased_by_its_end_point_if_home_lies_outside():
 
 
 def test_rollover_counts_from_the_lowest_entry():
-    table = Table1D(1, 90.0, np.array([0.0, 1, 2, 3, 0]), pos_unit=MM, offset=180.0,
-                    rollover=36000.0)
+    table = Table1D(
+        1, 90.0, np.array([0.0, 1, 2, 3, 0]), pos_unit=MM, offset=180.0, rollover=36000.0
+    )
     setup = MachineSetup({1: AxisSetup(100.0)})
     got = CalEvaluator([table], setup).corrections({1: [0, 90, 180, 270, 360, 450, -360, 45]})[1]
     np.testing.assert_allclose(got, np.array([2, 3, 0, 1, 2, 3, 2, 2.5]) - 2)
@@ -142,10 +153,18 @@ def test_three_outputs_in_their_own_units():
     assert CalEvaluator([table], setup).corrections({1: 10, 2: 0}) == {1: 1.0, 2: 0.2, 3: 0.03}
 
 
-@pytest.mark.parametrize(("pos", "cor", "factor"), [
-    (None, None, 1 / 50), (MM, None, 1.0), (UM, None, 1e-3), (MM, UM, 1e-3),
-    (None, UM, 1e-3), (MM, Unit(UnitWord.COUNTS, 2.0), 1 / 100),
-    (MM, Unit(UnitWord.SECONDARY, 10.0), 25 / 50 / 10)])
+@pytest.mark.parametrize(
+    ("pos", "cor", "factor"),
+    [
+        (None, None, 1 / 50),
+        (MM, None, 1.0),
+        (UM, None, 1e-3),
+        (MM, UM, 1e-3),
+        (None, UM, 1e-3),
+        (MM, Unit(UnitWord.COUNTS, 2.0), 1 / 100),
+        (MM, Unit(UnitWord.SECONDARY, 10.0), 25 / 50 / 10),
+    ],
+)
 def test_default_units(pos, cor, factor):
     table = Table1D(1, 1e6, np.array([0.0, 3.0]), pos_unit=pos, cor_unit=cor)
     setup = MachineSetup({1: AxisSetup(50.0, 25.0)})
@@ -153,25 +172,34 @@ def test_default_units(pos, cor, factor):
 
 
 def test_tables_add_up_and_cross_axis_tables_follow_the_other_axis():
-    tables = [Table1D(1, 10.0, np.array([0.0, 1.0]), pos_unit=MM),
-              Table1D(2, 900.0, np.array([0.0, -22.5]), 1, MM, UM),
-              Table1D(1, 10.0, np.array([0.0, 2.0]), 2, MM)]
+    tables = [
+        Table1D(1, 10.0, np.array([0.0, 1.0]), pos_unit=MM),
+        Table1D(2, 900.0, np.array([0.0, -22.5]), 1, MM, UM),
+        Table1D(1, 10.0, np.array([0.0, 2.0]), 2, MM),
+    ]
     got = CalEvaluator(tables).corrections({1: 10.0, 2: 5.0})
     assert got == {1: 2.0, 2: pytest.approx(-0.25e-3)}
 
 
-@pytest.mark.parametrize(("now", "moved"), [
-    (AxisSetup(), 0.0), (AxisSetup(home_offset=3.0), 0.0 - 2.0),
-    (AxisSetup(home_direction="CCW"), 100.0), (AxisSetup(home_direction="CCW", home_offset=1.5),
-                                                99.5)])
+@pytest.mark.parametrize(
+    ("now", "moved"),
+    [
+        (AxisSetup(), 0.0),
+        (AxisSetup(home_offset=3.0), 0.0 - 2.0),
+        (AxisSetup(home_direction="CCW"), 100.0),
+        (AxisSetup(home_direction="CCW", home_offset=1.5), 99.5),
+    ],
+)
 def test_home_keywords_shift_the_table_with_the_home_position(now, moved):
     # Home CW is the positive end. From there to CCW, home moves by -FULLTRAVEL: every point of
     # the stage then has a coordinate that is FULLTRAVEL larger.
     c = np.array([0.0, 1.0, 5.0, 2.0])
-    table = Table1D(1, -10.0, c, pos_unit=MM, home_direction="CW", home_offset=1.0,
-                    full_travel=100.0)
+    table = Table1D(
+        1, -10.0, c, pos_unit=MM, home_direction="CW", home_offset=1.0, full_travel=100.0
+    )
     got = CalEvaluator([table], MachineSetup({1: now})).corrections(
-        {1: np.array([0, -10, -20, -30]) + moved})[1]
+        {1: np.array([0, -10, -20, -30]) + moved}
+    )[1]
     np.testing.assert_allclose(got - got[0], c - c[0], atol=1e-12)
 
 
@@ -204,13 +232,19 @@ def test_positions_that_are_not_finite():
     np.testing.assert_array_equal(got[1], [np.nan, 1.0])
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    (":START 2 SAMPLEDIST=1 POSUNIT=PRIMARY\n0\n:END\n", "axis 2: its position is needed"),
-    (":START 1 SAMPLEDIST=1\n0\n:END\n", r"POSUNIT of the table of line 1 is in counts, .*"
-                                         r"--counts-per-unit 1="),
-    (":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY ROLLOVER=9\n0\n:END\n", "ROLLOVER of the table"),
-    (":START 1 SAMPLEDIST=1 POSUNIT=SECONDARY\n0\n:END\n", "counts"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (":START 2 SAMPLEDIST=1 POSUNIT=PRIMARY\n0\n:END\n", "axis 2: its position is needed"),
+        (
+            ":START 1 SAMPLEDIST=1\n0\n:END\n",
+            r"POSUNIT of the table of line 1 is in counts, .*"
+            r"--counts-per-unit 1=",
+        ),
+        (":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY ROLLOVER=9\n0\n:END\n", "ROLLOVER of the table"),
+        (":START 1 SAMPLEDIST=1 POSUNIT=SECONDARY\n0\n:END\n", "counts"),
+    ],
+)
 def test_what_is_not_known_is_asked_for(text, message):
     with pytest.raises(InputError, match=message):
         CalEvaluator(parse_cal(text.encode(), "x").tables).corrections({1: 0.0})

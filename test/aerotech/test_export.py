@@ -30,10 +30,28 @@ FRAMES = [
     MachineFrame(1, 2, 3),
     MachineFrame(4, 3, 9, "um", home_x_m=-0.03, home_y_m=-0.03, theta_counts_per_unit=1000.0),
     MachineFrame(1, 2, 3, "m", home_x_m=0.03, home_y_m=-0.03, reverse_x=True, reverse_theta=True),
-    MachineFrame(2, 1, 3, home_x_m=0.013, home_y_m=0.004, reverse_y=True, home_theta_rad=0.7,
-                 theta_counts_per_unit=12345.6),
-    MachineFrame(1, 2, 3, home_x_m=-0.2, reverse_x=True, reverse_y=True, home_theta_rad=-2.0,
-                 reverse_theta=True, theta_counts_per_unit=100.0)]
+    MachineFrame(
+        2,
+        1,
+        3,
+        home_x_m=0.013,
+        home_y_m=0.004,
+        reverse_y=True,
+        home_theta_rad=0.7,
+        theta_counts_per_unit=12345.6,
+    ),
+    MachineFrame(
+        1,
+        2,
+        3,
+        home_x_m=-0.2,
+        reverse_x=True,
+        reverse_y=True,
+        home_theta_rad=-2.0,
+        reverse_theta=True,
+        theta_counts_per_unit=100.0,
+    ),
+]
 
 
 def written(tables, frame, decimals=DECIMALS):
@@ -46,8 +64,11 @@ def written(tables, frame, decimals=DECIMALS):
 
 def shift_error(emap, shift_m):
     """Bound of what a constant shift changes: the error's slope times the shift."""
-    slope = max(np.abs(np.diff(g, axis=axis)).max() / emap.artifact.grid_pitch_m
-                for g in (emap.gx, emap.gy) for axis in (0, 1))
+    slope = max(
+        np.abs(np.diff(g, axis=axis)).max() / emap.artifact.grid_pitch_m
+        for g in (emap.gx, emap.gy)
+        for axis in (0, 1)
+    )
     return 2 * slope * np.abs(shift_m).sum()
 
 
@@ -74,8 +95,10 @@ def test_rounding_alone_is_left_if_the_error_at_home_is_zero(frame):
 @pytest.mark.parametrize("frame", FRAMES)
 def test_a_flipped_sign_doubles_the_error(frame):
     emap = random_map(ARTIFACT, 5)
-    for flipped in (replace(table_xy(emap, frame), negcor=True),
-                    table_xy(replace(emap, gx=-emap.gx, gy=-emap.gy), frame)):
+    for flipped in (
+        replace(table_xy(emap, frame), negcor=True),
+        table_xy(replace(emap, gx=-emap.gx, gy=-emap.gy), frame),
+    ):
         found = verify_tables(emap, [flipped], frame)
         assert found.worse
         assert found.sites.rms("after") == pytest.approx(2 * found.sites.rms("before"), rel=1e-3)
@@ -84,9 +107,16 @@ def test_a_flipped_sign_doubles_the_error(frame):
     assert found.worse and found.lines.rms("after") > 1.9 * found.lines.rms("before")
 
 
-@pytest.mark.parametrize("change", [
-    {"reverse_x": True}, {"reverse_y": True}, {"home_x_m": 0.01}, {"home_y_m": 0.02},
-    {"unit": "um"}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"reverse_x": True},
+        {"reverse_y": True},
+        {"home_x_m": 0.01},
+        {"home_y_m": 0.02},
+        {"unit": "um"},
+    ],
+)
 def test_a_wrong_frame_leaves_an_error(change):
     emap = random_map(ARTIFACT, 5)
     right = MachineFrame(1, 2)
@@ -146,8 +176,9 @@ def test_from_readings_to_a_true_machine_whoever_moves(sense):
 def test_the_theta_table_makes_the_simulated_machine_true_at_its_lines(frame):
     # A smooth error, so that the shift of the zero bias costs little.
     angle = ARTIFACT.theta_rad
-    emap = replace(random_map(ARTIFACT, 5), g_theta=1e-5 * np.sin(angle + 1) + 4e-6 * np.cos(
-        3 * angle))
+    emap = replace(
+        random_map(ARTIFACT, 5), g_theta=1e-5 * np.sin(angle + 1) + 4e-6 * np.cos(3 * angle)
+    )
     cal = written([table_theta(emap, frame)], frame, theta_decimals(emap))
     found = verify_tables(emap, cal.tables, frame_from_comments(cal.comments))
     assert found.sites is None and found.lines.largest("before") > 1e-5
@@ -161,8 +192,10 @@ def test_theta_rolls_over_for_ever_with_counts_and_covers_two_turns_without():
         tables = CalEvaluator([table_theta(emap, frame)], setup_of(frame))
         base = turned(Compensator(emap), frame, ARTIFACT.theta_rad, tables)
         for turn in turns:
-            reached = turned(Compensator(emap), frame, ARTIFACT.theta_rad + 2 * np.pi * turn,
-                             tables) - 2 * np.pi * turn
+            reached = (
+                turned(Compensator(emap), frame, ARTIFACT.theta_rad + 2 * np.pi * turn, tables)
+                - 2 * np.pi * turn
+            )
             np.testing.assert_allclose(reached, base, rtol=0, atol=1e-11)
 
 
@@ -185,8 +218,9 @@ def test_rounding_stays_below_a_hundredth_of_a_nanometre(unit):
     emap = random_map(ARTIFACT, 2, gain=30)
     frame = MachineFrame(1, 2, unit=unit)
     evaluator = CalEvaluator(written([table_xy(emap, frame)], frame).tables)
-    got = evaluator.corrections(dict(zip((1, 2), frame.to_machine(ARTIFACT.x_m, ARTIFACT.y_m),
-                                         strict=True)))
+    got = evaluator.corrections(
+        dict(zip((1, 2), frame.to_machine(ARTIFACT.x_m, ARTIFACT.y_m), strict=True))
+    )
     for axis, g in ((1, emap.gx), (2, emap.gy)):
         bias = round(g[3, 3] * 1e6, 5) * 1e-6
         assert np.abs(got[axis] * frame.unit_m - (g - bias)).max() < 0.51e-11
@@ -234,14 +268,23 @@ def test_theta_needs_an_axis_and_lines():
 def test_frames_survive_their_comment(frame):
     got = frame_from_comments(["x", frame.comment()])
     assert repr(replace(got, home_x_m=0, home_y_m=0, home_theta_rad=0)) == repr(
-        replace(frame, home_x_m=0, home_y_m=0, home_theta_rad=0))
+        replace(frame, home_x_m=0, home_y_m=0, home_theta_rad=0)
+    )
     assert (got.home_x_m, got.home_y_m, got.home_theta_rad) == pytest.approx(
-        (frame.home_x_m, frame.home_y_m, frame.home_theta_rad), rel=1e-12)
+        (frame.home_x_m, frame.home_y_m, frame.home_theta_rad), rel=1e-12
+    )
 
 
-@pytest.mark.parametrize("comments", [[], ["machine"], ["machine: x-axis=1"],
-                                      ["machine: x-axis=1 y-axis=b"],
-                                      ["machine: x-axis=1 y-axis=2 unit=ell"]])
+@pytest.mark.parametrize(
+    "comments",
+    [
+        [],
+        ["machine"],
+        ["machine: x-axis=1"],
+        ["machine: x-axis=1 y-axis=b"],
+        ["machine: x-axis=1 y-axis=2 unit=ell"],
+    ],
+)
 def test_comments_that_tell_no_frame(comments):
     assert frame_from_comments(comments) is None
 
@@ -264,8 +307,17 @@ def test_provenance_says_bag_plan_date_and_uncertainty(datum):
     result = result_of(replace(random_map(ARTIFACT, 1), datum_theta=datum), sense="plate_moves")
     when = datetime(2026, 1, 2, tzinfo=UTC)
     text = "\n".join(provenance(result, MachineFrame(), filled=2, now=when))
-    for part in ("2026-01-02T00:00:00Z", "plan: demo", "plate_moves", "demo.mcap", "ab" * 32,
-                 "um rms", str(datum), "2 sites were not measured", "machine: x-axis=1"):
+    for part in (
+        "2026-01-02T00:00:00Z",
+        "plan: demo",
+        "plate_moves",
+        "demo.mcap",
+        "ab" * 32,
+        "um rms",
+        str(datum),
+        "2 sites were not measured",
+        "machine: x-axis=1",
+    ):
         assert part in text
     u = np.sqrt(np.mean(np.square([result.error_map.u_gx, result.error_map.u_gy]))) * 1e6
     assert f"(k=1): {u:.3g} um rms" in text
@@ -276,8 +328,9 @@ def test_the_residual_is_true_minus_commanded():
     found = verify_tables(emap, [table_xy(emap, MachineFrame())], MachineFrame())
     g = np.stack([emap.gx.ravel(), emap.gy.ravel()])
     np.testing.assert_allclose(found.sites.before, g.mean(axis=1)[:, None] - g, atol=1e-10)
-    np.testing.assert_allclose(found.sites.shift_after, -np.array([emap.gx[3, 2], emap.gy[3, 2]]),
-                               atol=1e-10)
+    np.testing.assert_allclose(
+        found.sites.shift_after, -np.array([emap.gx[3, 2], emap.gy[3, 2]]), atol=1e-10
+    )
     lines = verify_tables(emap, [table_theta(emap, FRAMES[0])], FRAMES[0]).lines
     # Without a table the stage stands at the angle whose error it shows: slope times error off.
     np.testing.assert_allclose(lines.before[0], emap.g_theta.mean() - emap.g_theta, atol=1e-6)

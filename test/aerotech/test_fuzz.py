@@ -20,11 +20,42 @@ SEEDS = [
     b'OFFSETROW=10 SERIALNUMBER="a;b"\n1 2 3 4 5 6 7 8 9\n7 8 9 10 11 12 1 2 3\n:END\nend\n',
     b"' \xb0C\r\n:GALVO2D 2 1 1 2 10 20 3 NEGCOR\r\n" + b"0 1 2 3 4 5\r\n" * 3 + b":END\r\n",
 ]
-PIECES = [b"1e999", b"-1e308", b"1e-400", b"nan", b"inf", b":START 1", b":START2D", b":END\n",
-          b"\0", b"\xff", b"\xc3", b'"', b";", b"'", b"/", b"=", b"\t", b"\r", b"\n\n",
-          b"99999999999", b"POSUNIT=", b"SECONDARY/1e-15", b"ROLLOVER=1e-15", b"\xe2\x80\xa8",
-          b"\x0b\x1f", b"\xd9\xa3", b"1_0", b"0x1", b"-", b"+", b".", b"e", b"9" * 500,
-          b"SAMPLEDIST=1e-15"]
+PIECES = [
+    b"1e999",
+    b"-1e308",
+    b"1e-400",
+    b"nan",
+    b"inf",
+    b":START 1",
+    b":START2D",
+    b":END\n",
+    b"\0",
+    b"\xff",
+    b"\xc3",
+    b'"',
+    b";",
+    b"'",
+    b"/",
+    b"=",
+    b"\t",
+    b"\r",
+    b"\n\n",
+    b"99999999999",
+    b"POSUNIT=",
+    b"SECONDARY/1e-15",
+    b"ROLLOVER=1e-15",
+    b"\xe2\x80\xa8",
+    b"\x0b\x1f",
+    b"\xd9\xa3",
+    b"1_0",
+    b"0x1",
+    b"-",
+    b"+",
+    b".",
+    b"e",
+    b"9" * 500,
+    b"SAMPLEDIST=1e-15",
+]
 SETUP = MachineSetup({a: AxisSetup(1000.0, 10.0, "CW", 1.0, 5.0) for a in range(1, 33)}, 25.0)
 
 
@@ -32,8 +63,10 @@ def survive(data, *, write=True):
     """Read, check, evaluate and write `data`; return whether it was good."""
     cal = parse_cal(data, "f.cal")
     lines = data.count(b"\n") + data.count(b"\r") + 1
-    assert all(0 <= f.line <= lines and f.what and f.remedy and "\n" not in f.text("f.cal")
-               for f in cal.findings)
+    assert all(
+        0 <= f.line <= lines and f.what and f.remedy and "\n" not in f.text("f.cal")
+        for f in cal.findings
+    )
     if cal.of(Severity.ERROR):
         return False
     assert cal.tables
@@ -56,14 +89,14 @@ def mutate(data, rng):
         elif what == 1:
             del data[at:]
         elif what == 2:
-            del data[at:at + rng.randint(1, 12)]
+            del data[at : at + rng.randint(1, 12)]
         elif what == 3:
-            data[at:at + 1] = bytes([rng.randrange(256)])
+            data[at : at + 1] = bytes([rng.randrange(256)])
         elif what == 4:
             start = rng.randrange(len(data) + 1)
-            data[at:at] = data[start:start + rng.randint(1, 60)]
+            data[at:at] = data[start : start + rng.randint(1, 60)]
         else:
-            data[at:at + rng.randint(0, 6)] = rng.choice(PIECES)
+            data[at : at + rng.randint(0, 6)] = rng.choice(PIECES)
         data = data or bytearray(b"\n")
     return bytes(data)
 
@@ -84,30 +117,35 @@ def test_any_bytes(data):
     survive(data)
 
 
-@given(st.lists(st.sampled_from([*PIECES, b":START 1 SAMPLEDIST=1", b"\n", b" ", b"0", b":END"]),
-                max_size=30))
+@given(
+    st.lists(
+        st.sampled_from([*PIECES, b":START 1 SAMPLEDIST=1", b"\n", b" ", b"0", b":END"]),
+        max_size=30,
+    )
+)
 def test_any_pieces(pieces):
     survive(b"".join(pieces))
 
 
 HUGE = {
-    "a million columns on a line": b":START2D 2 1 1 2 1 1 1000000\n" + b"0 1 " * 10 ** 6
-                                   + b"\n:END\n",
+    "a million columns on a line": b":START2D 2 1 1 2 1 1 1000000\n"
+    + b"0 1 " * 10**6
+    + b"\n:END\n",
     "a million columns, few values": b":START2D 2 1 1 2 1 1 1000000\n0 1\n:END\n",
     "300,000 words in a head": b":START 1 SAMPLEDIST=1 " + b"A " * 300_000 + b"\n0\n:END\n",
     "300,000 numbers in a head": b":START 1 SAMPLEDIST=1 " + b"1 " * 300_000 + b"\n0\n:END\n",
-    "one word of a million letters": b":START 1 SAMPLEDIST=1 " + b"A" * 10 ** 6 + b"\n0\n:END\n",
+    "one word of a million letters": b":START 1 SAMPLEDIST=1 " + b"A" * 10**6 + b"\n0\n:END\n",
     "300,000 quotes": b":START 1 SAMPLEDIST=1 SERIALNUMBER=" + b'"' * 300_000 + b"\n0\n:END\n",
-    "a million blanks": b":START 1 SAMPLEDIST" + b" " * 10 ** 6 + b"x\n0\n:END\n",
-    "a number of a million digits": b":START 1 SAMPLEDIST=" + b"1" * 10 ** 6 + b"\n0\n:END\n",
-    "a value of a million digits": b":START 1 SAMPLEDIST=1\n0." + b"1" * 10 ** 6 + b"\n:END\n",
+    "a million blanks": b":START 1 SAMPLEDIST" + b" " * 10**6 + b"x\n0\n:END\n",
+    "a number of a million digits": b":START 1 SAMPLEDIST=" + b"1" * 10**6 + b"\n0\n:END\n",
+    "a value of a million digits": b":START 1 SAMPLEDIST=1\n0." + b"1" * 10**6 + b"\n:END\n",
     "nested starts": b":START 1 SAMPLEDIST=1\n0\n" * 40_000,
     "start lines only": b":START 1 SAMPLEDIST=1\n" * 40_000,
     "repeated keywords": b":START 1 SAMPLEDIST=1\n" + b":START NEGCOR\n" * 40_000 + b"0\n:END\n",
     "40,000 tables": b":START 1 SAMPLEDIST=1\n0\n:END\n" * 40_000,
     "comments only": b"; x\n" * 40_000 + b"' y\n" * 40_000,
     "words outside": b"words outside\n" * 40_000,
-    "carriage returns only": b"\r" * 10 ** 6,
+    "carriage returns only": b"\r" * 10**6,
     "letters in the table": b":START 1 SAMPLEDIST=1\n" + b"x\n" * 40_000 + b":END\n",
 }
 """Large enough that what grows with the square of a count takes minutes, or all memory."""
@@ -116,8 +154,9 @@ HUGE = {
 @pytest.mark.parametrize("data", HUGE.values(), ids=HUGE.keys())
 def test_huge_files_end(data):
     good = survive(data, write=False)
-    assert good == (data in (HUGE["a million columns on a line"],
-                             HUGE["a value of a million digits"]))
+    assert good == (
+        data in (HUGE["a million columns on a line"], HUGE["a value of a million digits"])
+    )
 
 
 def test_refusals_are_one_line():

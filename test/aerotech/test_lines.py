@@ -24,9 +24,11 @@ from selfcal_ros.model.artifact import Artifact
 from test.support.maps import first_order, random_map
 
 ARTIFACT = Artifact(7, 0.01)
-FRAMES = [MachineFrame(1, 2), MachineFrame(2, 1, unit="um", home_x_m=-0.03, home_y_m=0.01,
-                                           reverse_x=True),
-          MachineFrame(1, 2, unit="m", reverse_y=True, home_y_m=-0.03)]
+FRAMES = [
+    MachineFrame(1, 2),
+    MachineFrame(2, 1, unit="um", home_x_m=-0.03, home_y_m=0.01, reverse_x=True),
+    MachineFrame(1, 2, unit="m", reverse_y=True, home_y_m=-0.03),
+]
 
 
 def smooth_map(gx, gy):
@@ -38,10 +40,14 @@ def smooth_map(gx, gy):
 
 
 # Aerotech, Orthogonality Correction: 5 um over 200 mm, 900 mm of travel.
-@pytest.mark.parametrize(("home", "positions_mm", "corrections_um"), [
-    ("end", [0, 900], [0, -22.5]),
-    ("middle", [-450, 450], [0, -22.5]),
-    ("middle-balanced", [-450, 450], [11.25, -11.25])])
+@pytest.mark.parametrize(
+    ("home", "positions_mm", "corrections_um"),
+    [
+        ("end", [0, 900], [0, -22.5]),
+        ("middle", [-450, 450], [0, -22.5]),
+        ("middle-balanced", [-450, 450], [11.25, -11.25]),
+    ],
+)
 def test_the_three_tables_of_the_source(home, positions_mm, corrections_um):
     line = orthogonality(5e-6, 0.2, 0.9, home)
     table = line_table(line, MachineFrame(1, 2), along="x", corrected="y")
@@ -54,31 +60,49 @@ def test_the_three_tables_of_the_source(home, positions_mm, corrections_um):
 
 def test_both_forms_for_a_home_in_the_middle_mean_the_same():
     at = {1: np.linspace(-500, 500, 11)}
-    first, second = (CalEvaluator([line_table(orthogonality(5e-6, 0.2, 0.9, home), MachineFrame(),
-                                              along="x", corrected="y")]).corrections(at)[2]
-                     for home in ("middle", "middle-balanced"))
+    first, second = (
+        CalEvaluator(
+            [
+                line_table(
+                    orthogonality(5e-6, 0.2, 0.9, home), MachineFrame(), along="x", corrected="y"
+                )
+            ]
+        ).corrections(at)[2]
+        for home in ("middle", "middle-balanced")
+    )
     np.testing.assert_allclose(first, second, atol=1e-15)
 
 
 def test_the_orthogonality_correction_cancels_what_the_indicator_showed():
     # The indicator showed +5 um of y over 200 mm of x: true y - commanded y = x / 40000.
-    evaluator = CalEvaluator([line_table(orthogonality(5e-6, 0.2, 0.9, "end"), MachineFrame(),
-                                         along="x", corrected="y")])
+    evaluator = CalEvaluator(
+        [line_table(orthogonality(5e-6, 0.2, 0.9, "end"), MachineFrame(), along="x", corrected="y")]
+    )
     x_mm = np.array([0.0, 200.0, 555.0, 900.0])
     error_mm = x_mm * (5e-3 / 200)
     np.testing.assert_allclose(error_mm + evaluator.corrections({1: x_mm})[2], 0, atol=1e-15)
 
 
-@pytest.mark.parametrize(("over", "travel", "name"), [(0.0, 1.0, "--over"), (1.0, -1.0, "--travel"),
-                                                      (float("nan"), 1.0, "--over")])
+@pytest.mark.parametrize(
+    ("over", "travel", "name"),
+    [(0.0, 1.0, "--over"), (1.0, -1.0, "--travel"), (float("nan"), 1.0, "--over")],
+)
 def test_lengths_must_be_positive(over, travel, name):
     with pytest.raises(InputError, match=f"{name}: .* is not a positive length"):
         orthogonality(1e-6, over, travel)
 
 
-@pytest.mark.parametrize(("text", "value"), [
-    ("5um", 5e-6), ("-5.5 µm", -5.5e-6), ("200mm", 0.2), ("1e3nm", 1e-6), (" 2m ", 2.0),
-    (".5mm", 5e-4)])
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("5um", 5e-6),
+        ("-5.5 µm", -5.5e-6),
+        ("200mm", 0.2),
+        ("1e3nm", 1e-6),
+        (" 2m ", 2.0),
+        (".5mm", 5e-4),
+    ],
+)
 def test_lengths_with_units(text, value):
     assert length_m(text, "--over") == pytest.approx(value, rel=1e-12)
 
@@ -97,10 +121,13 @@ def test_accuracy_and_straightness_tables_make_a_line_true(frame, along):
     def wave(p):
         return 1e-6 * np.sin(200 * p)
 
-    emap = smooth_map(lambda x, y: wave(x if along == "x" else y),
-                      lambda x, y: 2 * wave(x if along == "x" else y))
-    tables = [line_table(map_line(emap, along, corrected), frame, along=along, corrected=corrected)
-              for corrected in (along, other)]
+    emap = smooth_map(
+        lambda x, y: wave(x if along == "x" else y), lambda x, y: 2 * wave(x if along == "x" else y)
+    )
+    tables = [
+        line_table(map_line(emap, along, corrected), frame, along=along, corrected=corrected)
+        for corrected in (along, other)
+    ]
     found = verify_tables(emap, tables, frame)
     assert found.sites.largest("before") > 1e-6 and found.sites.largest("after") < 1e-9
     flipped = [replace(table, negcor=True) for table in tables]
@@ -118,12 +145,14 @@ def test_straightness_has_no_slope():
 def test_a_slope_is_removed_about_the_middle_of_positions_that_start_at_home():
     x = np.arange(5) * 0.1
     flat = without_slope(AxisCorrection(x, np.array([1.0, 0, 0, 0, 1.0]) * 1e-6 + 3e-6 * x))
-    np.testing.assert_allclose(flat.corrections_m, np.array([0.6, -0.4, -0.4, -0.4, 0.6]) * 1e-6,
-                               rtol=0, atol=1e-18)
+    np.testing.assert_allclose(
+        flat.corrections_m, np.array([0.6, -0.4, -0.4, -0.4, 0.6]) * 1e-6, rtol=0, atol=1e-18
+    )
 
 
-@pytest.mark.parametrize(("along", "half_m", "row"), [("x", 0.03, (slice(None), 2)),
-                                                      ("y", 0.02, (3, slice(None)))])
+@pytest.mark.parametrize(
+    ("along", "half_m", "row"), [("x", 0.03, (slice(None), 2)), ("y", 0.02, (3, slice(None)))]
+)
 def test_the_lines_of_an_oblong_field_are_its_middle_ones_from_edge_to_edge(along, half_m, row):
     emap = replace(random_map(Artifact(7, 0.01, 0, 5), 2), nonorthogonality=4e-6)
     for corrected, values in (("x", emap.gx), ("y", emap.gy)):
@@ -165,17 +194,21 @@ def test_measured_errors_are_opposed():
     np.testing.assert_array_equal(table.values, [-2.5, 3, -1])
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("", "d.csv:1: the header is not position,error"),
-    ("x,y\n1,2\n", "d.csv:1: the header is not position,error"),
-    ("position,error\n1,2\n", "d.csv: 1 measured positions; give at least two"),
-    ("position,error\n1,2\n2,x\n", "d.csv:3: not two numbers"),
-    ("position,error\n1,2\n2,1_0\n", "d.csv:3: not two numbers"),
-    ("position,error\n1,2\n2\n", "d.csv:3: not two numbers"),
-    ("position,error\n1,nan\n2,0\n", "d.csv:2: not two numbers"),
-    ("position,error\n1,1\n1,2\n", "not equidistant between 1 and 1"),
-    ("position,error\n1,1\n2,2\n4,0\n", "not equidistant between"),
-    ("position,error\n1,1\n2,2\n4,0\n7,1\n", "not equidistant between 1 and 2")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "d.csv:1: the header is not position,error"),
+        ("x,y\n1,2\n", "d.csv:1: the header is not position,error"),
+        ("position,error\n1,2\n", "d.csv: 1 measured positions; give at least two"),
+        ("position,error\n1,2\n2,x\n", "d.csv:3: not two numbers"),
+        ("position,error\n1,2\n2,1_0\n", "d.csv:3: not two numbers"),
+        ("position,error\n1,2\n2\n", "d.csv:3: not two numbers"),
+        ("position,error\n1,nan\n2,0\n", "d.csv:2: not two numbers"),
+        ("position,error\n1,1\n1,2\n", "not equidistant between 1 and 1"),
+        ("position,error\n1,1\n2,2\n4,0\n", "not equidistant between"),
+        ("position,error\n1,1\n2,2\n4,0\n7,1\n", "not equidistant between 1 and 2"),
+    ],
+)
 def test_measured_errors_without_sense(text, message):
     with pytest.raises(InputError, match=message):
         measured_line(text, "d.csv", 1e-3)

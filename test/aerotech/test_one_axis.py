@@ -24,8 +24,10 @@ from selfcal_ros.outputs import write_json
 from test.support.maps import first_order, random_map, result_of
 
 OTHER = {"x": "y", "y": "x"}
-FRAMES = [MachineFrame(), MachineFrame(2, 1, unit="um", reverse_x=True, home_x_m=0.03,
-                                       home_y_m=-0.05)]
+FRAMES = [
+    MachineFrame(),
+    MachineFrame(2, 1, unit="um", reverse_x=True, home_x_m=0.03, home_y_m=-0.05),
+]
 
 
 def stage(u_m: float = 8e-9) -> ErrorMap:
@@ -39,18 +41,35 @@ def stage(u_m: float = 8e-9) -> ErrorMap:
     turn = (x * gy - y * gx).sum() / (x**2 + y**2).sum()
     gx, gy = gx + turn * y, gy - turn * x
     u = np.full(artifact.shape, u_m)
-    return ErrorMap(artifact, gx, gy, u, u, np.zeros(0), np.zeros(0),
-                    nonorthogonality=first_order(artifact, gx, gy)[0])
+    return ErrorMap(
+        artifact,
+        gx,
+        gy,
+        u,
+        u,
+        np.zeros(0),
+        np.zeros(0),
+        nonorthogonality=first_order(artifact, gx, gy)[0],
+    )
 
 
 def accuracy(error_map, frame):
-    return [line_table(map_line(error_map, axis, axis), frame, along=axis, corrected=axis)
-            for axis in "xy"]
+    return [
+        line_table(map_line(error_map, axis, axis), frame, along=axis, corrected=axis)
+        for axis in "xy"
+    ]
 
 
 def straightness(error_map, frame):
-    return [line_table(without_slope(map_line(error_map, axis, OTHER[axis])), frame, along=axis,
-                       corrected=OTHER[axis]) for axis in "xy"]
+    return [
+        line_table(
+            without_slope(map_line(error_map, axis, OTHER[axis])),
+            frame,
+            along=axis,
+            corrected=OTHER[axis],
+        )
+        for axis in "xy"
+    ]
 
 
 def square(error_map, frame):
@@ -69,8 +88,9 @@ def means(error_map, frame):
 
 
 def everything(error_map, frame):
-    return [table for write in (accuracy, straightness, square)
-            for table in write(error_map, frame)]
+    return [
+        table for write in (accuracy, straightness, square) for table in write(error_map, frame)
+    ]
 
 
 def with_a_wrong_entry(table):
@@ -80,8 +100,9 @@ def with_a_wrong_entry(table):
 
 
 def unfit(error_map, tables, frame):
-    return [part.name for part in verify_tables(error_map, tables, frame).one_axis.parts
-            if part.unfit]
+    return [
+        part.name for part in verify_tables(error_map, tables, frame).one_axis.parts if part.unfit
+    ]
 
 
 WRITERS = [accuracy, straightness, square, means, everything]
@@ -95,19 +116,24 @@ def test_tables_of_a_map_pass(write, frame):
     assert not any(part.unfit for part in found.one_axis.parts) and not found.worse
 
 
-@pytest.mark.parametrize("spoil", [
-    lambda table: replace(table, values=table.values / 1000),
-    lambda table: replace(table, values=table.values * 0),
-    lambda table: replace(table, negcor=True),
-    lambda table: replace(table, offset=table.offset + table.sample_dist / 2),
-    with_a_wrong_entry], ids=["unit", "zero", "sign", "offset", "entry"])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda table: replace(table, values=table.values / 1000),
+        lambda table: replace(table, values=table.values * 0),
+        lambda table: replace(table, negcor=True),
+        lambda table: replace(table, offset=table.offset + table.sample_dist / 2),
+        with_a_wrong_entry,
+    ],
+    ids=["unit", "zero", "sign", "offset", "entry"],
+)
 @pytest.mark.parametrize("frame", FRAMES)
 @pytest.mark.parametrize("write", WRITERS)
 def test_spoilt_tables_do_not_pass(write, frame, spoil):
     error_map = stage()
     tables = write(error_map, frame)
     for number, table in enumerate(tables):
-        spoilt = [*tables[:number], spoil(table), *tables[number + 1:]]
+        spoilt = [*tables[:number], spoil(table), *tables[number + 1 :]]
         assert unfit(error_map, spoilt, frame)
 
 
@@ -152,9 +178,11 @@ def test_a_wrong_entry_of_a_fine_2d_table_does_not_pass(frame, entry):
     for axis in (0, 1):
         fine = np.arange(2 * values.shape[axis] - 1) / 2
         values = np.apply_along_axis(
-            lambda line, fine=fine: np.interp(fine, np.arange(len(line)), line), axis, values)
-    table = replace(table, values=values, sample_row=table.sample_row / 2,
-                    sample_col=table.sample_col / 2)
+            lambda line, fine=fine: np.interp(fine, np.arange(len(line)), line), axis, values
+        )
+    table = replace(
+        table, values=values, sample_row=table.sample_row / 2, sample_col=table.sample_col / 2
+    )
     assert verify_tables(error_map, [table], frame).unfit(error_map) == []
     values = values.copy()
     values[entry] += 1.0
@@ -164,8 +192,14 @@ def test_a_wrong_entry_of_a_fine_2d_table_does_not_pass(frame, entry):
 
 def test_what_is_within_u_of_the_map_is_not_blamed():
     error_map, frame = stage(u_m=2e-6), FRAMES[0]
-    assert unfit(error_map, [replace(table, values=table.values / 1000)
-                             for table in accuracy(error_map, frame)], frame) == []
+    assert (
+        unfit(
+            error_map,
+            [replace(table, values=table.values / 1000) for table in accuracy(error_map, frame)],
+            frame,
+        )
+        == []
+    )
 
 
 def test_gaps_of_a_map_do_not_matter():
@@ -182,8 +216,10 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_json("r.json", result_to_dict(result_of(stage())))
     for axis in "xy":
-        assert main(["cal", "accuracy", "r.json", "--along", axis, "-o", f"{axis}.cal",
-                     "--steep"]) == 0
+        assert (
+            main(["cal", "accuracy", "r.json", "--along", axis, "-o", f"{axis}.cal", "--steep"])
+            == 0
+        )
     return tmp_path
 
 
@@ -197,8 +233,10 @@ def test_the_command_ends_with_5_and_names_the_part(folder, capsys):
     (folder / "bad.cal").write_text(text.replace("PRIMARY/1000", "PRIMARY/1000000"))
     assert main(["cal", "verify", "r.json", "bad.cal", "y.cal"]) == 5
     out, err = capsys.readouterr()
-    assert err.startswith("selfcal cal verify: bad.cal, y.cal: of x from the position of x, which "
-                          "1D tables can correct, the tables leave ")
+    assert err.startswith(
+        "selfcal cal verify: bad.cal, y.cal: of x from the position of x, which "
+        "1D tables can correct, the tables leave "
+    )
     assert "y from the position of y," not in err and err.count("\n") == 1
 
 

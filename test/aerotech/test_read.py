@@ -64,10 +64,12 @@ def test_strict_2d_file():
 
 
 def test_every_1d_keyword():
-    head = (":START 1 REFERENCEAXIS=2 POSUNIT=SECONDARY/10 CORUNIT=COUNTS SAMPLEDIST=-5 "
-            "OFFSET=-1.5 EXPANDCOEFF=1.1e-5 MATERIALTEMP=20.5 NEGPOS NEGCOR ROLLOVER=4000 "
-            'HOMEDIRECTION=CCW HOMEOFFSET=2 ABSOLUTEFEEDBACKOFFSET=77 FULLTRAVEL=300 '
-            'SERIALNUMBER="A 1"')
+    head = (
+        ":START 1 REFERENCEAXIS=2 POSUNIT=SECONDARY/10 CORUNIT=COUNTS SAMPLEDIST=-5 "
+        "OFFSET=-1.5 EXPANDCOEFF=1.1e-5 MATERIALTEMP=20.5 NEGPOS NEGCOR ROLLOVER=4000 "
+        "HOMEDIRECTION=CCW HOMEOFFSET=2 ABSOLUTEFEEDBACKOFFSET=77 FULLTRAVEL=300 "
+        'SERIALNUMBER="A 1"'
+    )
     (table,) = only_tolerated(f"{head}\n1\n2\n:END\n")
     assert table.reference_axis == 2 and table.pos_unit == Unit(UnitWord.SECONDARY, 10.0)
     assert table.cor_unit == Unit(UnitWord.COUNTS) and table.expand_coeff == 1.1e-5
@@ -78,9 +80,11 @@ def test_every_1d_keyword():
 
 
 def test_every_2d_keyword_and_a_galvo_table():
-    head = (":START2D 2 1 1 2 10 10 1 OUTAXIS3=4 POSUNIT=PRIMARY CORUNIT=PRIMARY OFFSETROW=0 "
-            "OFFSETCOL=0 ABSOLUTEFEEDBACKOFFSETROW=1 ABSOLUTEFEEDBACKOFFSETCOL=2 NEGCOR "
-            'ROLLOVERROW=3 ROLLOVERCOL=4 SERIALNUMBER="S"')
+    head = (
+        ":START2D 2 1 1 2 10 10 1 OUTAXIS3=4 POSUNIT=PRIMARY CORUNIT=PRIMARY OFFSETROW=0 "
+        "OFFSETCOL=0 ABSOLUTEFEEDBACKOFFSETROW=1 ABSOLUTEFEEDBACKOFFSETCOL=2 NEGCOR "
+        'ROLLOVERROW=3 ROLLOVERCOL=4 SERIALNUMBER="S"'
+    )
     (table,) = only_tolerated(f"{head}\n1 2 3\n:END\n")
     assert table.outputs == (1, 2, 4) and table.values.shape == (1, 1, 3) and table.negcor
     assert (table.absolute_feedback_offset_row, table.absolute_feedback_offset_col) == (1.0, 2.0)
@@ -95,43 +99,60 @@ def test_several_tables_and_several_start_lines():
 
 
 WILD = [
-    ("' by an older controller\n" + STRICT_1D,
-     (1, "a comment that starts with an apostrophe")),
-    (STRICT_1D.replace("; another", "' another"),
-     (5, "a comment that starts with an apostrophe")),
-    ("*" * 60 + "\n* Factory file *\n" + "*" * 60 + "\n" + STRICT_1D,
-     (1, "text outside of a table is ignored (and in 2 more lines)")),
+    ("' by an older controller\n" + STRICT_1D, (1, "a comment that starts with an apostrophe")),
+    (STRICT_1D.replace("; another", "' another"), (5, "a comment that starts with an apostrophe")),
+    (
+        "*" * 60 + "\n* Factory file *\n" + "*" * 60 + "\n" + STRICT_1D,
+        (1, "text outside of a table is ignored (and in 2 more lines)"),
+    ),
     (STRICT_2D.replace(":START2D 2", ":Start2D 2"), (1, "a token in mixed case")),
     (STRICT_2D.replace("OFFSETROW=", "OFFSETROW = "), (2, "blanks around =")),
     (STRICT_1D.replace("SAMPLEDIST=", "SAMPLEDIST= "), (3, "blanks around =")),
-    (STRICT_1D.replace("POSUNIT=PRIMARY", "POSUNIT=METRIC"),
-     (2, "the unit METRIC of older controllers, read as PRIMARY")),
+    (
+        STRICT_1D.replace("POSUNIT=PRIMARY", "POSUNIT=METRIC"),
+        (2, "the unit METRIC of older controllers, read as PRIMARY"),
+    ),
     (STRICT_1D.replace("CORUNIT=PRIMARY/", "CORUNIT=Primary/"), (2, "a unit in lower case")),
     (STRICT_1D.replace("OFFSET=", "Offset="), (3, "a keyword in lower case")),
     (STRICT_1D.replace("0\n1.5", "0 1.5"), (4, "several values on a line of a 1D table")),
     (STRICT_2D.replace("1 2 3 4 5 6", "1\n2\n3\n4\n5\n6"), (3, "lines are not rows")),
     (STRICT_2D.replace("1 2 3 4 5 6\n", "1 2 3 4 5 6 "), (3, "lines are not rows")),
-    (STRICT_2D.replace("1 2 3 4 5 6\n7 8 9 10 11 12", "1 2 3 4\n5 6\n7 8 9 10\n11 12"),
-     (3, "lines are not rows")),
+    (
+        STRICT_2D.replace("1 2 3 4 5 6\n7 8 9 10 11 12", "1 2 3 4\n5 6\n7 8 9 10\n11 12"),
+        (3, "lines are not rows"),
+    ),
     (STRICT_1D.replace("\n", "\r\n"), (1, "lines end with CR or CRLF")),
     (STRICT_1D.removesuffix("\n"), (7, "the last line has no end")),
     (STRICT_1D.replace(":END", ":END of the table"), (7, "text after :END is ignored")),
     (STRICT_1D + "\nbye\n", (9, "text outside of a table is ignored")),
-    (STRICT_1D.replace("; another", "; 20 °C").encode("cp1252"),
-     (5, "Windows-1252 characters in a comment")),
-    ("**** 20 °C ****\n".encode("cp1252") + STRICT_1D.encode(),
-     (1, "Windows-1252 characters in a comment"), (1, "text outside of a table is ignored")),
+    (
+        STRICT_1D.replace("; another", "; 20 °C").encode("cp1252"),
+        (5, "Windows-1252 characters in a comment"),
+    ),
+    (
+        "**** 20 °C ****\n".encode("cp1252") + STRICT_1D.encode(),
+        (1, "Windows-1252 characters in a comment"),
+        (1, "text outside of a table is ignored"),
+    ),
     (b"\xef\xbb\xbf" + STRICT_1D.encode(), (1, "a byte order mark before the first line")),
     (STRICT_1D.replace('"', "").replace(";3'4", ""), (3, "a serial number without quotes")),
-    (":START 1 SAMPLEDIST=1 PRIMARYABSOLUTEFEEDBACKOFFSET=5\n0\n:END\n",
-     (1, "the keyword 'PRIMARYABSOLUTEFEEDBACKOFFSET'")),
+    (
+        ":START 1 SAMPLEDIST=1 PRIMARYABSOLUTEFEEDBACKOFFSET=5\n0\n:END\n",
+        (1, "the keyword 'PRIMARYABSOLUTEFEEDBACKOFFSET'"),
+    ),
     (":START SAMPLEDIST=1 2\n0\n:END\n", (1, "an argument of :START after a keyword")),
-    (":START NEGPOS 2\n:START SAMPLEDIST=1\n0\n:END\n",
-     (1, "an argument of :START after a keyword")),
-    (STRICT_2D.replace("2 1 1 2 10 20 3", "2 1 1 2 OUTAXIS3=3 10 20 2"),
-     (1, "an argument of :START2D after a keyword")),
-    (":START 1 SAMPLEDIST=1 HOMEOFFSET=0 HOMEDIRECTION=cw\n0\n:END\n",
-     (1, "a home direction in lower case")),
+    (
+        ":START NEGPOS 2\n:START SAMPLEDIST=1\n0\n:END\n",
+        (1, "an argument of :START after a keyword"),
+    ),
+    (
+        STRICT_2D.replace("2 1 1 2 10 20 3", "2 1 1 2 OUTAXIS3=3 10 20 2"),
+        (1, "an argument of :START2D after a keyword"),
+    ),
+    (
+        ":START 1 SAMPLEDIST=1 HOMEOFFSET=0 HOMEDIRECTION=cw\n0\n:END\n",
+        (1, "a home direction in lower case"),
+    ),
 ]
 
 
@@ -191,31 +212,64 @@ BROKEN = [
     (":START 1 SAMPLEDIST=1 NEGCOR=1\n0\n:END\n", 1, "NEGCOR takes no argument"),
     (":START 1 SAMPLEDIST=1 INTABLE\n0\n:END\n", 1, "unknown keyword 'INTABLE'"),
     (":START 1 SAMPLEDIST=1 OFFSETROW=1\n0\n:END\n", 1, "a 1D table must not have OFFSETROW"),
-    (":START 1 SAMPLEDIST=1\n:START SAMPLEDIST=2\n0\n:END\n", 2,
-     "SAMPLEDIST is given twice, here and in line 1, and differs"),
-    (":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY /1000\n0\n:END\n", 1,
-     "white space before the / of a unit"),
-    (":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY/ 1000\n0\n:END\n", 1,
-     "POSUNIT: the / of a unit has no divisor after it"),
-    (":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY/0\n0\n:END\n", 1,
-     "POSUNIT: the divisor '0' is not positive"),
+    (
+        ":START 1 SAMPLEDIST=1\n:START SAMPLEDIST=2\n0\n:END\n",
+        2,
+        "SAMPLEDIST is given twice, here and in line 1, and differs",
+    ),
+    (
+        ":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY /1000\n0\n:END\n",
+        1,
+        "white space before the / of a unit",
+    ),
+    (
+        ":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY/ 1000\n0\n:END\n",
+        1,
+        "POSUNIT: the / of a unit has no divisor after it",
+    ),
+    (
+        ":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY/0\n0\n:END\n",
+        1,
+        "POSUNIT: the divisor '0' is not positive",
+    ),
     (":START 1 SAMPLEDIST=1 POSUNIT=MM\n0\n:END\n", 1, "POSUNIT: 'MM' is not a unit"),
-    (":START 1 SAMPLEDIST=1 HOMEDIRECTION=LEFT\n0\n:END\n", 1,
-     "HOMEDIRECTION: 'LEFT' is not a home direction"),
-    (':START 1 SAMPLEDIST=1 SERIALNUMBER="5\n0\n:END\n', 1,
-     "SERIALNUMBER: a stray quote in the serial number"),
+    (
+        ":START 1 SAMPLEDIST=1 HOMEDIRECTION=LEFT\n0\n:END\n",
+        1,
+        "HOMEDIRECTION: 'LEFT' is not a home direction",
+    ),
+    (
+        ':START 1 SAMPLEDIST=1 SERIALNUMBER="5\n0\n:END\n',
+        1,
+        "SERIALNUMBER: a stray quote in the serial number",
+    ),
     (":START2D 1 2 1 2 10 10\n0 0\n:END\n", 1, ":START2D has 6 arguments, not 7"),
     (":START2D 1 2 1 2 10 10 0\n0 0\n:END\n", 1, "NumCols is 0"),
-    (":START2D 1 2 1 2 10 10 2 SAMPLEDIST=1\n0 0 0 0\n:END\n", 1,
-     "a 2D table must not have SAMPLEDIST"),
-    (STRICT_2D.replace("9 10 ", "9 "), 4,
-     "5 values on the line; a row has 3 columns of 2 values = 6"),
-    (STRICT_2D.replace("5 6", "5 6 6"), 3,
-     "7 values on the line; a row has 3 columns of 2 values = 6"),
-    (STRICT_2D.replace("10 20 3", "10 20 5"), 4,
-     "6 values on the line; a row has 5 columns of 2 values = 10"),
-    (STRICT_2D.replace("10 20 3", "10 20 999999999"), 4, "the last row has 12 values; "
-     "a row has 999999999 columns of 2 values = 1999999998"),
+    (
+        ":START2D 1 2 1 2 10 10 2 SAMPLEDIST=1\n0 0 0 0\n:END\n",
+        1,
+        "a 2D table must not have SAMPLEDIST",
+    ),
+    (
+        STRICT_2D.replace("9 10 ", "9 "),
+        4,
+        "5 values on the line; a row has 3 columns of 2 values = 6",
+    ),
+    (
+        STRICT_2D.replace("5 6", "5 6 6"),
+        3,
+        "7 values on the line; a row has 3 columns of 2 values = 6",
+    ),
+    (
+        STRICT_2D.replace("10 20 3", "10 20 5"),
+        4,
+        "6 values on the line; a row has 5 columns of 2 values = 10",
+    ),
+    (
+        STRICT_2D.replace("10 20 3", "10 20 999999999"),
+        4,
+        "the last row has 12 values; a row has 999999999 columns of 2 values = 1999999998",
+    ),
     (STRICT_1D.replace("1.5", "1.5 °").encode("cp1252"), 5, "the line is not UTF-8"),
     (STRICT_1D.encode("utf-16"), 1, "the file is UTF-16"),
     (b":START 1\n\0\0", 2, "a zero byte: this is not a text file"),
@@ -233,8 +287,10 @@ def test_broken_files_name_line_reason_and_mend(text, line, what):
 
 def test_utf16_is_read_on_for_its_other_errors():
     cal = read(STRICT_1D.replace("OFFSET=10", "OFFSET=x").encode("utf-16"))
-    assert said(cal, Severity.ERROR) == [(1, "the file is UTF-16"),
-                                         (3, "OFFSET: 'x' is not a number")]
+    assert said(cal, Severity.ERROR) == [
+        (1, "the file is UTF-16"),
+        (3, "OFFSET: 'x' is not a number"),
+    ]
 
 
 def test_a_broken_table_does_not_hide_the_next_one():
@@ -261,12 +317,14 @@ def test_files_are_read_from_disk_and_errors_refused(tmp_path):
     path.write_text(STRICT_1D.replace("1.5", "x").replace("OFFSET=10", "OFFSET=y"))
     with pytest.raises(InputError) as caught:
         load_cal(path)
-    assert str(caught.value) == (f"{path}:3: OFFSET: 'y' is not a number; write a plain decimal "
-                                 "number (1 more errors)")
+    assert str(caught.value) == (
+        f"{path}:3: OFFSET: 'y' is not a number; write a plain decimal number (1 more errors)"
+    )
     path.write_text(STRICT_1D.replace("OFFSET=10", "OFFSET=y"))
     with pytest.raises(InputError) as caught:
         load_cal(path)
-    assert str(caught.value) == (f"{path}:3: OFFSET: 'y' is not a number; write a plain decimal "
-                                 "number")
+    assert str(caught.value) == (
+        f"{path}:3: OFFSET: 'y' is not a number; write a plain decimal number"
+    )
     with pytest.raises(InputError, match="no such file"):
         read_cal(tmp_path / "none.cal")

@@ -45,16 +45,24 @@ def test_the_table_leaves_nothing_at_the_nodes_and_the_curvature_between():
 
 def test_before_and_after_are_drawn_at_one_scale():
     chapter = table_chapter(parabola(), exported(parabola()))
-    drawing, = (figure.drawing for figure in chapter.figures)
+    (drawing,) = (figure.drawing for figure in chapter.figures)
     titles = words(drawing)
     assert [t for t in titles if t.startswith(("before", "after"))] == [
-        "before, at the nodes", "after, at the nodes", "before, between the nodes",
-        "after, between the nodes"]
+        "before, at the nodes",
+        "after, at the nodes",
+        "before, between the nodes",
+        "after, between the nodes",
+    ]
     assert [text for text in titles if text.startswith(("rms", "below"))][1] == (
-        "below 0.0001 µm everywhere")
+        "below 0.0001 µm everywhere"
+    )
     assert sum(text.endswith(" µm") and not text.startswith("rms") for text in titles) == 1  # key
-    shafts = [line for item in drawing.items if isinstance(item, Path)
-              and (item.stroke, item.width) == ("ink", 0.9) for line in item.lines]
+    shafts = [
+        line
+        for item in drawing.items
+        if isinstance(item, Path) and (item.stroke, item.width) == ("ink", 0.9)
+        for line in item.lines
+    ]
     lengths = [abs(end[0] - start[0]) for start, end in shafts]
     assert len(lengths) < 40 + 16 + 1  # nothing can be seen of what the table leaves at the nodes
     assert max(lengths) > 10
@@ -64,8 +72,11 @@ def test_the_lines_before_and_after_share_one_chart():
     result, frame = known_result(5, 8)[0], MachineFrame(theta_axis=3)
     found = verify_tables(result.error_map, [table_theta(result.error_map, frame)], frame)
     drawing = controller_figure(found)
-    before, after = (item.centres for item in drawing.items if isinstance(item, Discs)
-                     and item.radii[0][0] == 2.0)
+    before, after = (
+        item.centres
+        for item in drawing.items
+        if isinstance(item, Discs) and item.radii[0][0] == 2.0
+    )
     assert np.ptp([y for _, y in before]) > 100 > 0.1 > np.ptp([y for _, y in after])
     legend = [text for text in words(drawing) if text.endswith("arcsec") and "rms" in text]
     assert legend[0].startswith("before: rms") and legend[1].startswith("after: rms")
@@ -76,7 +87,7 @@ def test_a_table_of_the_other_sign_doubles_the_error_that_the_chapter_states():
     emap = result.error_map
     flipped = exported(replace(result, error_map=replace(emap, gx=-emap.gx, gy=-emap.gy)))
     for cal, factor in ((exported(result), 0.0), (flipped, 2.0)):
-        section, = table_chapter(result, cal).sections
+        (section,) = table_chapter(result, cal).sections
         at_nodes = section.table[1]
         assert at_nodes[0] == "at the nodes"
         assert float(at_nodes[2]) == pytest.approx(factor * float(at_nodes[1]), abs=2e-4)

@@ -40,26 +40,43 @@ def written(tables, decimals=None, comments=()):
 def case(seed):
     """Return a random map, a random wiring, and stage positions: inside, outside, sites, edges."""
     rng = np.random.default_rng(seed)
-    artifact = Artifact(int(rng.choice([3, 5, 11])), float(rng.choice([0.01, 0.0033, 1 / 3e3])),
-                        int(rng.choice([4, 24, 72])), int(rng.choice([3, 7, 11])))
+    artifact = Artifact(
+        int(rng.choice([3, 5, 11])),
+        float(rng.choice([0.01, 0.0033, 1 / 3e3])),
+        int(rng.choice([4, 24, 72])),
+        int(rng.choice([3, 7, 11])),
+    )
     half = np.array(artifact.half) * artifact.grid_pitch_m
-    home = [float(rng.choice([0, -h, h, rng.uniform(-h, h), rng.uniform(-3 * h, 3 * h)]))
-            for h in half]
+    home = [
+        float(rng.choice([0, -h, h, rng.uniform(-h, h), rng.uniform(-3 * h, 3 * h)])) for h in half
+    ]
     axes = [int(axis) for axis in rng.choice(np.arange(1, 33), 3, replace=False)]
-    frame = MachineFrame(*axes, str(rng.choice(list(METRES))), *home, float(rng.uniform(-4, 4)),
-                         *(bool(turned) for turned in rng.integers(0, 2, 3)),
-                         [None, 1000.0, 1234.5][seed % 3])
+    frame = MachineFrame(
+        *axes,
+        str(rng.choice(list(METRES))),
+        *home,
+        float(rng.uniform(-4, 4)),
+        *(bool(turned) for turned in rng.integers(0, 2, 3)),
+        [None, 1000.0, 1234.5][seed % 3],
+    )
     error_map = random_map(artifact, seed)
-    places = np.concatenate([rng.uniform(-1.5, 1.5, (2, 40)) * half[:, None],
-                             [artifact.x_m.ravel(), artifact.y_m.ravel()],
-                             half[:, None] * [[1, 1, -1, 0], [1, -1, 0, 1]]], axis=1)
+    places = np.concatenate(
+        [
+            rng.uniform(-1.5, 1.5, (2, 40)) * half[:, None],
+            [artifact.x_m.ravel(), artifact.y_m.ravel()],
+            half[:, None] * [[1, 1, -1, 0], [1, -1, 0, 1]],
+        ],
+        axis=1,
+    )
     return error_map, frame, places, bool(np.all(np.abs(home) <= half * (1 + 1e-12)))
 
 
 def metres(found, frame):
     """Return corrections by axis as stage corrections, m."""
-    return np.stack([frame.sign_x * found[frame.x_axis],
-                     frame.sign_y * found[frame.y_axis]]) * METRES[frame.unit]
+    return (
+        np.stack([frame.sign_x * found[frame.x_axis], frame.sign_y * found[frame.y_axis]])
+        * METRES[frame.unit]
+    )
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -67,8 +84,10 @@ def test_a_table_is_the_map_less_its_value_at_home(seed):
     error_map, frame, places, inside = case(seed)
     cal = written([table_xy(error_map, frame)], DECIMALS, [frame.comment()])
     again = vars(frame_from_comments(cal.comments))
-    assert all(again[name] == (pytest.approx(value, rel=1e-14) if isinstance(value, float)
-                               else value) for name, value in vars(frame).items())
+    assert all(
+        again[name] == (pytest.approx(value, rel=1e-14) if isinstance(value, float) else value)
+        for name, value in vars(frame).items()
+    )
     compensator, evaluator = Compensator(error_map), CalEvaluator(cal.tables)
     px, py = frame.to_machine(*places)
     found = evaluator.corrections({frame.x_axis: px, frame.y_axis: py})
@@ -81,12 +100,17 @@ def test_a_table_is_the_map_less_its_value_at_home(seed):
         for axis, value in zip(table.outputs, slow, strict=True):
             assert value == pytest.approx(found[axis][k], abs=1e-14 / METRES[frame.unit])
     # The controller stands where it was told to but for the bias, to first order in the slope.
-    stood = np.array(reached(compensator, frame, places,
-                             correct=plane_correction(evaluator, frame)))
+    stood = np.array(
+        reached(compensator, frame, places, correct=plane_correction(evaluator, frame))
+    )
     within = np.abs(places).max(axis=0) < 0.9 * min(np.abs(places[:, 40:]).max(axis=1))
     slope = 4 * np.abs([error_map.gx, error_map.gy]).max() / error_map.artifact.grid_pitch_m
-    np.testing.assert_allclose((stood - places)[:, within], (-bias[:, None] + 0 * places)[
-        :, within], rtol=0, atol=ROUNDING_M + 2 * slope * np.abs(bias).max() + 1e-17)
+    np.testing.assert_allclose(
+        (stood - places)[:, within],
+        (-bias[:, None] + 0 * places)[:, within],
+        rtol=0,
+        atol=ROUNDING_M + 2 * slope * np.abs(bias).max() + 1e-17,
+    )
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -97,7 +121,8 @@ def test_a_theta_table_is_the_map_less_its_value_at_home(seed):
     theta = np.append(np.linspace(-1, 1, 101) * turns * np.pi, error_map.artifact.theta_rad)
     compensator = Compensator(error_map)
     found = CalEvaluator(cal.tables, setup_of(frame)).corrections(
-        {frame.theta_axis: frame.theta_to_machine(theta)})[frame.theta_axis]
+        {frame.theta_axis: frame.theta_to_machine(theta)}
+    )[frame.theta_axis]
     want = compensator.error_theta(theta) - compensator.error_theta(frame.home_theta_rad)
     np.testing.assert_allclose(frame.sign_theta * np.deg2rad(found), want, rtol=0, atol=4.9e-11)
 
@@ -107,15 +132,18 @@ def test_1d_tables_add_up_to_the_2d_table_of_their_sum(seed):
     error_map, frame, places, inside = case(seed)
     artifact, rng = error_map.artifact, np.random.default_rng(seed)
     along = {"x": artifact.x_m[:, 0], "y": artifact.y_m[0]}
-    parts = {(a, c): np.round(rng.normal(0, 0.1, len(along[a])), 4) * 1e-6
-             for a in "xy" for c in "xy"}
+    parts = {
+        (a, c): np.round(rng.normal(0, 0.1, len(along[a])), 4) * 1e-6 for a in "xy" for c in "xy"
+    }
     fields = [parts["x", c][:, None] + parts["y", c] for c in "xy"]
     both = replace(error_map, gx=fields[0], gy=fields[1])
     px, py = frame.to_machine(*places)
     place = {frame.x_axis: px, frame.y_axis: py}
     plane = CalEvaluator(written([table_xy(both, frame)], DECIMALS).tables).corrections(place)
-    tables = [line_table(AxisCorrection(along[a], values), frame, along=a, corrected=c)
-              for (a, c), values in parts.items()]
+    tables = [
+        line_table(AxisCorrection(along[a], values), frame, along=a, corrected=c)
+        for (a, c), values in parts.items()
+    ]
     lines = CalEvaluator(written(tables, DECIMALS).tables)
     difference = metres(lines.corrections(place), frame) - metres(plane, frame)
     if not inside:  # 1D tables are always zero at home, a 2D table only where it holds home
@@ -130,10 +158,15 @@ def test_galvo_tables_and_tables_in_counts_say_the_same(seed):
     table, unit_m, counts = table_xy(error_map, frame), METRES[frame.unit], 12345.0
     galvo = replace(table, galvo=True, offset_row=None, offset_col=None)
     in_counts = replace(
-        table, pos_unit=None, cor_unit=Unit(UnitWord.COUNTS, 7.0),
-        values=table.values * (1e-6 / unit_m * counts * 7.0), sample_row=table.sample_row * counts,
-        sample_col=table.sample_col * counts, offset_row=table.offset_row * counts,
-        offset_col=table.offset_col * counts)
+        table,
+        pos_unit=None,
+        cor_unit=Unit(UnitWord.COUNTS, 7.0),
+        values=table.values * (1e-6 / unit_m * counts * 7.0),
+        sample_row=table.sample_row * counts,
+        sample_col=table.sample_col * counts,
+        offset_row=table.offset_row * counts,
+        offset_col=table.offset_col * counts,
+    )
     place = {1: places[0] / unit_m, 2: places[1] / unit_m}
     want = CalEvaluator([table]).corrections(place)
     setup = MachineSetup({axis: AxisSetup(counts) for axis in (1, 2)})

@@ -16,9 +16,11 @@ from test.support.cal_tables import tables_1d, tables_2d, tables_galvo
 WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 
 
-@given(tables=st.lists(tables_1d(), min_size=1, max_size=3)
-       | st.lists(tables_2d(), min_size=1, max_size=2)
-       | st.lists(tables_galvo(), min_size=1, max_size=1))
+@given(
+    tables=st.lists(tables_1d(), min_size=1, max_size=3)
+    | st.lists(tables_2d(), min_size=1, max_size=2)
+    | st.lists(tables_galvo(), min_size=1, max_size=1)
+)
 def test_read_write_read_keeps_the_meaning_in_strict_form(tables):
     first = parse_cal(cal_text(tables, comments=["from a test"]).encode(), "f")
     assert first.of(Severity.ERROR) == first.of(Severity.TOLERATED) == []
@@ -43,13 +45,19 @@ def test_comments_cannot_break_out_of_their_line():
     assert text.startswith("; a :END  b\n;\n:START 1\n")
 
 
-@pytest.mark.parametrize(("tables", "what"), [
-    ([], "it has no tables"),
-    ([Table1D(0, 1.0, np.zeros(2))], "axis 0 is not in 1..32"),
-    ([Table1D(1, 0.0, np.zeros(2))], "sample dist is zero"),
-    ([Table1D(1, 1.0, np.zeros(2))] * 9, "more than 8 tables correct axis 1"),
-    ([Table1D(1, 1.0, np.zeros(2)), Table2D(2, 1, (1, 2), 1.0, 1.0, np.zeros((3, 3, 2)))],
-     "a 2D table in a file of 1D tables")])
+@pytest.mark.parametrize(
+    ("tables", "what"),
+    [
+        ([], "it has no tables"),
+        ([Table1D(0, 1.0, np.zeros(2))], "axis 0 is not in 1..32"),
+        ([Table1D(1, 0.0, np.zeros(2))], "sample dist is zero"),
+        ([Table1D(1, 1.0, np.zeros(2))] * 9, "more than 8 tables correct axis 1"),
+        (
+            [Table1D(1, 1.0, np.zeros(2)), Table2D(2, 1, (1, 2), 1.0, 1.0, np.zeros((3, 3, 2)))],
+            "a 2D table in a file of 1D tables",
+        ),
+    ],
+)
 def test_tables_that_break_a_rule_are_not_written(tables, what):
     with pytest.raises(InputError, match=what):
         cal_text(tables)
@@ -70,17 +78,20 @@ def test_a_serial_number_is_always_quoted(serial):
     assert cal.tables[0].serial_number == serial and not cal.findings
 
 
-@pytest.mark.parametrize(("table", "what"), [
-    (replace(PLAIN, serial_number='a"b'), "unknown keyword"),
-    (replace(PLAIN, serial_number="a\nb"), "a stray quote in the serial number"),
-    (replace(PLAIN, offset=float("nan")), "OFFSET: 'nan' is not a number"),
-    (replace(PLAIN, sample_dist=float("inf")), "SAMPLEDIST: 'inf' is not a number"),
-    (replace(PLAIN, home_direction="cw"), "table 1 holds what the format cannot say"),
-    (replace(PLAIN, values=np.zeros((2, 2))), "table 1 holds what the format cannot say"),
-    (replace(PLAIN, values=np.zeros(0)), "the table has no correction values"),
-    (replace(PLANE, galvo=True, offset_row=1.0), "table 1 holds what the format cannot say"),
-    (replace(PLANE, output_axes=(1, 2, 3)), "6 values on the line"),
-])
+@pytest.mark.parametrize(
+    ("table", "what"),
+    [
+        (replace(PLAIN, serial_number='a"b'), "unknown keyword"),
+        (replace(PLAIN, serial_number="a\nb"), "a stray quote in the serial number"),
+        (replace(PLAIN, offset=float("nan")), "OFFSET: 'nan' is not a number"),
+        (replace(PLAIN, sample_dist=float("inf")), "SAMPLEDIST: 'inf' is not a number"),
+        (replace(PLAIN, home_direction="cw"), "table 1 holds what the format cannot say"),
+        (replace(PLAIN, values=np.zeros((2, 2))), "table 1 holds what the format cannot say"),
+        (replace(PLAIN, values=np.zeros(0)), "the table has no correction values"),
+        (replace(PLANE, galvo=True, offset_row=1.0), "table 1 holds what the format cannot say"),
+        (replace(PLANE, output_axes=(1, 2, 3)), "6 values on the line"),
+    ],
+)
 @pytest.mark.parametrize("decimals", [None, 5])
 def test_what_would_read_back_differently_is_not_written(table, what, decimals):
     with pytest.raises(InputError) as caught:

@@ -20,17 +20,24 @@ from test.support.sessions import cdr_of, events_of, small_plan
 
 DAY_NS = 86400 * 10**9
 SETTINGS = settings_of("measurement_collector")
-LINE = (f"{COMMAND_TOPIC}, {ENCODER_TOPIC}, {DETECTION_TOPIC}: what was stamped more than 60 s "
-        "ahead of its reception was not used; set the clock that stamps it")
+LINE = (
+    f"{COMMAND_TOPIC}, {ENCODER_TOPIC}, {DETECTION_TOPIC}: what was stamped more than 60 s "
+    "ahead of its reception was not used; set the clock that stamps it"
+)
 
 
 def run_of(seed, begin_ns):
     """Return the events of a run that begins then and names itself."""
     events = events_of(small_plan(), seed)
     by = begin_ns - events[0].stamp_ns
-    return [replace(event, stamp_ns=event.stamp_ns + by,
-                    **({"run_id": str(begin_ns)} if isinstance(event, Command) else {}))
-            for event in events]
+    return [
+        replace(
+            event,
+            stamp_ns=event.stamp_ns + by,
+            **({"run_id": str(begin_ns)} if isinstance(event, Command) else {}),
+        )
+        for event in events
+    ]
 
 
 AHEAD, HONEST = run_of(5, START_NS + DAY_NS), run_of(6, START_NS)
@@ -52,8 +59,12 @@ def live(events):
     hands = Hands()
     hands.pass_time(5.0)
     session = CollectingSession(SETTINGS, hands.ports)
-    reception = Reception(session, JournalKeeper("", {}, SETTINGS, hands.ports),
-                          say=hands.ports.say, refuse=lambda place, error: None)
+    reception = Reception(
+        session,
+        JournalKeeper("", {}, SETTINGS, hands.ports),
+        say=hands.ports.say,
+        refuse=lambda place, error: None,
+    )
     for event in events:
         if isinstance(event, Command):
             reception.command(cdr_of(event), False)
@@ -73,10 +84,13 @@ def test_a_bag_with_a_run_ahead_is_what_the_live_collector_made_of_it(tmp_path, 
     measurements, _ = session.collector.collect()
     assert found.measurements.run_id == measurements.run_id == str(START_NS)
     assert found.measurements.rejected == measurements.rejected == session.collector.unusable
-    assert Counter(found.measurements.rejected) == Counter({
-        "command_from_the_future": sum(isinstance(e, Command) for e in AHEAD),
-        "from_the_future": sum(isinstance(e, Detection) for e in AHEAD),
-        "encoder_sample_from_the_future": sum(isinstance(e, EncoderSample) for e in AHEAD)})
+    assert Counter(found.measurements.rejected) == Counter(
+        {
+            "command_from_the_future": sum(isinstance(e, Command) for e in AHEAD),
+            "from_the_future": sum(isinstance(e, Detection) for e in AHEAD),
+            "encoder_sample_from_the_future": sum(isinstance(e, EncoderSample) for e in AHEAD),
+        }
+    )
     for view, other in zip(found.measurements.views, measurements.views, strict=True):
         assert view.dx.tolist() == other.dx.tolist()
     assert found.lost == found.findings == [LINE]
@@ -90,19 +104,33 @@ def test_how_far_ahead_of_its_logging_a_stamp_may_lie(tmp_path, late_s, refused)
     bag = recorded(tmp_path, HONEST, 0)
     with BagWriter(tmp_path / "other") as writer:
         writer.add_topic(f"/{DETECTION_TOPIC}", INPUT_TOPICS[DETECTION_TOPIC], [])
-        writer.write(f"/{DETECTION_TOPIC}", event_fields(stray, "stage")[1],
-                     stray.stamp_ns + round(late_s * 1e9))
+        writer.write(
+            f"/{DETECTION_TOPIC}",
+            event_fields(stray, "stage")[1],
+            stray.stamp_ns + round(late_s * 1e9),
+        )
     (tmp_path / "other" / "other_0.mcap").rename(bag / "bag_1.mcap")
     (bag / "metadata.yaml").unlink()
     rejected = collect_bag(bag, SETTINGS).measurements.all_rejected()
     assert rejected == {"from_the_future" if refused else "outside_every_view": 1}
 
 
-@pytest.mark.parametrize("received_ns, lines", [
-    (START_NS, [f"{COMMAND_TOPIC}: stamped more than 60 s ahead of its log time: a live collector "
-                "refuses it; set the clock that stamps, or the recorder's"]), (0, [])])
+@pytest.mark.parametrize(
+    "received_ns, lines",
+    [
+        (
+            START_NS,
+            [
+                f"{COMMAND_TOPIC}: stamped more than 60 s ahead of its log time: a live collector "
+                "refuses it; set the clock that stamps, or the recorder's"
+            ],
+        ),
+        (0, []),
+    ],
+)
 def test_a_bag_whose_times_of_logging_are_of_another_clock_is_read_by_its_stamps(
-        tmp_path, received_ns, lines):
+    tmp_path, received_ns, lines
+):
     found = collect_bag(recorded(tmp_path, AHEAD, received_ns), SETTINGS)
     assert found.measurements.run_id == str(START_NS + DAY_NS)
     assert found.measurements.all_rejected() == {}

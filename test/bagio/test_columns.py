@@ -31,16 +31,34 @@ def events():
 
 def contract_fields(command):
     """Return the fields of a command that every version of the message has."""
-    return [getattr(command, name) for name in (
-        "phase", "plan_id", "view_index", "view_name", "rotation", "translation_x",
-        "translation_y", "grid", "angular", "repeats", "grid_size", "grid_pitch", "angular_count")]
+    return [
+        getattr(command, name)
+        for name in (
+            "phase",
+            "plan_id",
+            "view_index",
+            "view_name",
+            "rotation",
+            "translation_x",
+            "translation_y",
+            "grid",
+            "angular",
+            "repeats",
+            "grid_size",
+            "grid_pitch",
+            "angular_count",
+        )
+    ]
 
 
 def one_by_one(path):
     """Return all inputs of a bag as sorted texts, and what was lost."""
     reader = BagReader(path)
-    turn = {ENCODER_TOPIC: encoder_sample, DETECTION_TOPIC: detection,
-            COMMAND_TOPIC: contract_fields}
+    turn = {
+        ENCODER_TOPIC: encoder_sample,
+        DETECTION_TOPIC: detection,
+        COMMAND_TOPIC: contract_fields,
+    }
     found = sorted(repr(turn[topic](message)) for topic, _, message in decoded(reader))
     return found, reader.lost
 
@@ -50,9 +68,12 @@ def by_columns(path):
     for topic, item in reader.columns():
         if topic == ENCODER_TOPIC:
             speeds = [()] * len(item) if item.velocities is None else item.velocities.tolist()
-            out += [EncoderSample(stamp, item.names, tuple(position), tuple(speed))
-                    for stamp, position, speed in zip(item.stamps_ns.tolist(),
-                                                      item.positions.tolist(), speeds, strict=True)]
+            out += [
+                EncoderSample(stamp, item.names, tuple(position), tuple(speed))
+                for stamp, position, speed in zip(
+                    item.stamps_ns.tolist(), item.positions.tolist(), speeds, strict=True
+                )
+            ]
         elif topic == DETECTION_TOPIC:
             out += [Detection(*row) for row in item.tolist()]
         else:
@@ -67,12 +88,27 @@ def check(path, n_expected, lost=()):
     assert said == list(lost)
 
 
-@pytest.mark.parametrize("foreign", [
-    Foreign(), Foreign({"chunk_size": 1}), Foreign({"use_chunking": False}), Foreign(little=False),
-    Foreign({"chunk_size": 900}, others=True), Foreign(types=bags.contract_types(EXTRA)),
-    Foreign(schemas=False)],
-    ids=["plain", "a chunk a message", "no chunks", "big endian", "others", "more fields",
-         "no definitions"])
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        Foreign(),
+        Foreign({"chunk_size": 1}),
+        Foreign({"use_chunking": False}),
+        Foreign(little=False),
+        Foreign({"chunk_size": 900}, others=True),
+        Foreign(types=bags.contract_types(EXTRA)),
+        Foreign(schemas=False),
+    ],
+    ids=[
+        "plain",
+        "a chunk a message",
+        "no chunks",
+        "big endian",
+        "others",
+        "more fields",
+        "no definitions",
+    ],
+)
 def test_columns_hold_what_the_messages_hold(tmp_path, events, foreign):
     check(foreign.write(tmp_path / "x.mcap", events), len(events))
 
@@ -107,8 +143,10 @@ def test_without_definitions_only_a_type_of_one_length_may_have_a_tail(tmp_path,
     assert (found, sorted(lost)) == (one_by_one(path)[0], sorted(one_by_one(path)[1]))
     n_found = sum(text.startswith("EncoderSample") for text in found)
     assert n_found == n_samples
-    assert any("messages on stage/mark_detections could not be decoded: the bag has no" in line
-               for line in lost)
+    assert any(
+        "messages on stage/mark_detections could not be decoded: the bag has no" in line
+        for line in lost
+    )
 
 
 class Damaged(Foreign):
@@ -140,8 +178,10 @@ def test_damaged_payloads_are_counted_alike(tmp_path, events):
 
 
 def test_joints_that_differ_in_number_are_kept_apart(tmp_path):
-    samples = [EncoderSample(10**9 + i, ("x", "y", "theta")[:i % 3 + 1], (0.5,) * (i % 3 + 1))
-               for i in range(300)]
+    samples = [
+        EncoderSample(10**9 + i, ("x", "y", "theta")[: i % 3 + 1], (0.5,) * (i % 3 + 1))
+        for i in range(300)
+    ]
     samples.append(EncoderSample(5, ("x", "y"), (1.0,)))
     check(Foreign().write(tmp_path / "x.mcap", samples), 301)
 
@@ -172,16 +212,22 @@ def write_topics(path, chunks, *, crcs=True, compression=CompressionType.NONE):
     return path
 
 
-CHUNKS = [[("/camera", 5)], [("/stage/joint_states", 7), ("/camera", 2)], [("/camera", 30)],
-          [("/lidar", 1), ("/camera", 2)], [("/cell2/stage/joint_states", 3)]]
+CHUNKS = [
+    [("/camera", 5)],
+    [("/stage/joint_states", 7), ("/camera", 2)],
+    [("/camera", 30)],
+    [("/lidar", 1), ("/camera", 2)],
+    [("/cell2/stage/joint_states", 3)],
+]
 
 
 @pytest.fixture
 def opened(monkeypatch):
     """Count the chunks that are looked into."""
     seen = []
-    monkeypatch.setattr(mcap_chunk, "chunk_items", lambda chunk: seen.append(1)
-                        or chunk_items(chunk))
+    monkeypatch.setattr(
+        mcap_chunk, "chunk_items", lambda chunk: seen.append(1) or chunk_items(chunk)
+    )
     return seen
 
 
@@ -217,7 +263,7 @@ def test_a_chunk_that_is_passed_but_cut_short_is_found_out(tmp_path, opened):
         passed = mcap_chunk.read_summary(file).needless(lambda topic: "joint" in topic)
     (place, end), *_ = passed.items()
     assert len(passed) == 3 and data[place] == Opcode.CHUNK
-    path.write_bytes(data[:place + 1] + struct.pack("<Q", end - place) + data[place + 9:])
+    path.write_bytes(data[: place + 1] + struct.pack("<Q", end - place) + data[place + 9 :])
     assert sum(len(block) for _, block in reader.columns()) == 7
     assert len(opened) == 3 and len(reader.lost) <= 1
 
@@ -261,19 +307,23 @@ def test_a_chunk_gives_what_the_library_gives(seed):
         choice = rng.integers(6)
         size = int(rng.integers(0, 40))
         if choice < 3:
-            parts += [message(int(rng.integers(3)), rng.bytes(size), int(rng.integers(2**62)))
-                      for _ in range(rng.integers(1, (3, 90, 400)[choice]))]
+            parts += [
+                message(int(rng.integers(3)), rng.bytes(size), int(rng.integers(2**62)))
+                for _ in range(rng.integers(1, (3, 90, 400)[choice]))
+            ]
         elif choice == 3:
             period = int(rng.integers(2, 90))
             sizes = rng.integers(0, 40, period) if choice == 3 else np.arange(3)
-            parts += [message(i % 3, rng.bytes(int(sizes[i % len(sizes)])))
-                      for i in range(int(rng.integers(60, 700)))]
+            parts += [
+                message(i % 3, rng.bytes(int(sizes[i % len(sizes)])))
+                for i in range(int(rng.integers(60, 700)))
+            ]
         else:
             parts.append((CHANNEL, SCHEMA, record(0x99, rng.bytes(size + 1)))[rng.integers(3)])
     data = b"".join(parts)
     expected = breakup_chunk(FakeChunk(data))
     assert flat(chunk_items(FakeChunk(data))) == expected
-    between = len(b"".join(parts[:len(parts) // 2]))
+    between = len(b"".join(parts[: len(parts) // 2]))
     for cut in (*rng.integers(0, len(data), 2), between):
         outcomes = []
         for read in (lambda chunk: flat(chunk_items(chunk)), breakup_chunk):
@@ -289,15 +339,28 @@ def test_records_between_messages_keep_their_place():
     kinds = [type(item) for item in chunk_items(FakeChunk(data))]
     assert kinds == [MessageBlock, Channel, MessageBlock, Schema]
     assert [m.data for m in flat(chunk_items(FakeChunk(data))) if isinstance(m, Message)] == [
-        b"a", b"b", b"c"]
+        b"a",
+        b"b",
+        b"c",
+    ]
 
 
 def test_runs_are_taken_at_once(monkeypatch):
     data = b"".join(message(1, bytes(20)) for _ in range(5000))
     singles = []
     unpack = mcap_salvage.HEAD.unpack_from
-    monkeypatch.setattr(mcap_salvage, "HEAD", type("Head", (), {
-        "size": 9, "unpack_from": staticmethod(lambda d, at: singles.append(at) or unpack(d, at))}))
+    monkeypatch.setattr(
+        mcap_salvage,
+        "HEAD",
+        type(
+            "Head",
+            (),
+            {
+                "size": 9,
+                "unpack_from": staticmethod(lambda d, at: singles.append(at) or unpack(d, at)),
+            },
+        ),
+    )
     [block] = chunk_items(FakeChunk(data))
     assert len(block) == 5000
     assert singles == [0, 51, 102]  # three tell the length of those behind them
@@ -316,26 +379,46 @@ def test_messages_in_a_row_are_found_up_to_what_stands_behind_them(lengths, n, b
     assert block.fronts["channel"].tolist() == [i % 3 for i in range(n)]
 
 
-@pytest.mark.parametrize("pattern", [(20, 40), (20, 40, 40, 40, 40, 40, 40, 40, 20), tuple(
-    range(1, 65))])
+@pytest.mark.parametrize(
+    "pattern", [(20, 40), (20, 40, 40, 40, 40, 40, 40, 40, 20), tuple(range(1, 65))]
+)
 def test_lengths_that_come_again_are_taken_at_once(monkeypatch, pattern):
     lengths = [pattern[i % len(pattern)] for i in range(6000)]
     lengths[3000] += 1  # one visit is another: the rest is found again
     data = b"".join(message(1, bytes([i % 251]) * length) for i, length in enumerate(lengths))
     looked = []
     unpack = mcap_salvage.HEAD.unpack_from
-    monkeypatch.setattr(mcap_salvage, "HEAD", type("Head", (), {
-        "size": 9, "unpack_from": staticmethod(lambda d, at: looked.append(at) or unpack(d, at))}))
+    monkeypatch.setattr(
+        mcap_salvage,
+        "HEAD",
+        type(
+            "Head",
+            (),
+            {
+                "size": 9,
+                "unpack_from": staticmethod(lambda d, at: looked.append(at) or unpack(d, at)),
+            },
+        ),
+    )
     [block] = chunk_items(FakeChunk(data))
     assert block.payloads.length.tolist() == lengths
     assert [data[0] for data in block.payloads] == [i % 251 for i in range(6000)]
     assert len(looked) < 1000
 
 
-@pytest.mark.parametrize("sizes, period", [
-    ([7, 7, 7], [7]), ([7, 7, 8], []), ([1, 2, 1, 2], [1, 2]), ([1, 2, 1, 2, 1], [2, 1]),
-    ([1, 2, 1], []), ([1, 1, 2, 1, 1, 2], [1, 1, 2]), (list(range(64)) * 2, list(range(64))),
-    (list(range(65)) * 2, [])])
+@pytest.mark.parametrize(
+    "sizes, period",
+    [
+        ([7, 7, 7], [7]),
+        ([7, 7, 8], []),
+        ([1, 2, 1, 2], [1, 2]),
+        ([1, 2, 1, 2, 1], [2, 1]),
+        ([1, 2, 1], []),
+        ([1, 1, 2, 1, 1, 2], [1, 1, 2]),
+        (list(range(64)) * 2, list(range(64))),
+        (list(range(65)) * 2, []),
+    ],
+)
 def test_a_period_is_one_that_came_twice(sizes, period):
     assert mcap_chunk._period(np.array(sizes)).tolist() == period
 

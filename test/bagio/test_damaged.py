@@ -32,8 +32,11 @@ def test_a_later_cut_never_reads_less_and_every_loss_is_said(tmp_path):
         file = tmp_path / "cut.mcap"
         file.write_bytes(DATA[:size])
         count, lost = read(file)
-        assert len(lost) == 1 and (str(size) in lost[0] or "no message is lost" in lost[0]
-                                   or "without its footer" in lost[0])
+        assert len(lost) == 1 and (
+            str(size) in lost[0]
+            or "no message is lost" in lost[0]
+            or "without its footer" in lost[0]
+        )
         counts.append(count)
     assert counts == sorted(counts)
     assert counts[0] < TOTAL / 10 and counts[-1] == TOTAL
@@ -57,7 +60,7 @@ def test_flipped_bytes_end_in_a_result_or_in_one_line(tmp_path, capsys, seed):
 
 def test_a_truncated_bag_gives_the_result_of_what_is_there(tmp_path, capsys):
     file = tmp_path / "cut.mcap"
-    file.write_bytes(DATA[:int(len(DATA) * 0.35)])
+    file.write_bytes(DATA[: int(len(DATA) * 0.35)])
     assert main(["solve", str(file), "--quiet"]) in (3, 4)
     assert "truncated" in capsys.readouterr().err
     count, lost = read(file)
@@ -83,7 +86,7 @@ def records(data):
 
 def relength(data, at, change):
     length = struct.unpack_from("<Q", data, at + 1)[0]
-    return data[:at + 1] + struct.pack("<Q", (length + change) % 2**64) + data[at + 9:]
+    return data[: at + 1] + struct.pack("<Q", (length + change) % 2**64) + data[at + 9 :]
 
 
 def damaged(folder, data):
@@ -97,14 +100,15 @@ def damaged(folder, data):
 @pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
 def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, options):
     path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}).write(
-        tmp_path / "x.mcap", events)
+        tmp_path / "x.mcap", events
+    )
     data = path.read_bytes()
     whole, lost = damaged(tmp_path, data)
     assert lost == [] and len(whole) == len(events)
     chunks = [at for opcode, at, _ in records(data) if opcode == Opcode.CHUNK]
     assert len(chunks) > 5
     for at in (chunks[0], chunks[3], chunks[-1]):
-        for change in (1, -1, 700, -700, 10**6, 2**62, -10**6):
+        for change in (1, -1, 700, -700, 10**6, 2**62, -(10**6)):
             found, lost = damaged(tmp_path, relength(data, at, change))
             assert found == whole, change
             assert len(lost) <= 1 and (lost or change > 0)
@@ -113,24 +117,27 @@ def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
-def test_a_destroyed_chunk_costs_its_own_messages_and_no_more(tmp_path, events, compression,
-                                                             options):
+def test_a_destroyed_chunk_costs_its_own_messages_and_no_more(
+    tmp_path, events, compression, options
+):
     path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}).write(
-        tmp_path / "x.mcap", events)
+        tmp_path / "x.mcap", events
+    )
     data = path.read_bytes()
     whole, _ = damaged(tmp_path, data)
     for number in (3, 0) if not options else (3,):  # the first one declares the topics
         chunks = [(at, length) for op, at, length in records(data) if op == Opcode.CHUNK]
         (at, length), (behind, _) = chunks[number], chunks[number + 1]
-        broken = data[:at] + bytes(9 + length) + data[at + 9 + length:]
+        broken = data[:at] + bytes(9 + length) + data[at + 9 + length :]
         found, lost = damaged(tmp_path, broken)
         missing = len(whole) - len(found)
         assert 0 < missing < 100
         front = next(i for i, item in enumerate(whole) if found[i] != item)
-        assert found == whole[:front] + whole[front + missing:]
+        assert found == whole[:front] + whole[front + missing :]
         assert lost[0].startswith(f"the file is damaged from byte {at} to {behind}: 0 messages")
-        assert lost[1:] == ([] if options else
-                            [f"{missing} of {len(whole)} messages of the file are lost"])
+        assert lost[1:] == (
+            [] if options else [f"{missing} of {len(whole)} messages of the file are lost"]
+        )
 
 
 @pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
@@ -144,13 +151,14 @@ def test_a_wrong_length_without_chunks_costs_one_message(tmp_path, events, optio
     for number in (0, 100, len(places) - 1):
         found, lost = damaged(tmp_path, relength(data, places[number], change))
         # the payload may still decode, with its end missing or more behind it
-        assert found in (whole, whole[:number] + whole[number + 1:])
+        assert found in (whole, whole[:number] + whole[number + 1 :])
         assert lost
 
 
 def test_a_chunk_whose_checksum_fails_is_not_believed_in_part(tmp_path, events):
     path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS["none"]}).write(
-        tmp_path / "x.mcap", events)
+        tmp_path / "x.mcap", events
+    )
     data = bytearray(path.read_bytes())
     whole, _ = damaged(tmp_path, data)
     _, at, length = [r for r in records(data) if r[0] == Opcode.CHUNK][3]
@@ -168,20 +176,38 @@ def test_damage_behind_the_last_message_costs_none_and_is_said_as_such(tmp_path)
     """The data section has its end; of what follows, up to the closing magic, a part is gone."""
     file = tmp_path / "x.mcap"
     end = max(at for opcode, at, _ in records(DATA) if opcode == Opcode.DATA_END)
-    for cut, line in ((end + 13 + 5, "the end of the file is damaged, after the last message: no "
-                       "message is lost"),
-                      (end, "the file ends without its footer, as when a recorder is killed: every "
-                       "message that was written is read")):
+    for cut, line in (
+        (
+            end + 13 + 5,
+            "the end of the file is damaged, after the last message: no message is lost",
+        ),
+        (
+            end,
+            "the file ends without its footer, as when a recorder is killed: every "
+            "message that was written is read",
+        ),
+    ):
         file.write_bytes(DATA[:cut])
         assert read(file) == (TOTAL, [line])
 
 
-@pytest.mark.parametrize(("names", "message"), [
-    (["b_0.db3", "metadata.yaml"], "a bag with sqlite3 storage; convert it with `ros2 "
-     "bag convert -i BAG "),
-    (["notes.txt"], "no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP "
-     "storage"),
-    ([], "no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP storage")])
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (
+            ["b_0.db3", "metadata.yaml"],
+            "a bag with sqlite3 storage; convert it with `ros2 bag convert -i BAG ",
+        ),
+        (
+            ["notes.txt"],
+            "no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP storage",
+        ),
+        (
+            [],
+            "no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP storage",
+        ),
+    ],
+)
 def test_a_folder_without_mcap_files_is_refused(tmp_path, names, message):
     for name in names:
         (tmp_path / name).write_text("")
@@ -211,7 +237,8 @@ def test_a_file_of_a_bag_that_is_no_mcap_file_costs_itself(tmp_path, how, place)
     (tmp_path / f"b_{1 - place}.mcap").write_bytes(DATA)
     reader, whole = BagReader(tmp_path), BagReader(SOURCE)
     assert [topic for topic, *_ in getattr(reader, how)()] == [
-        topic for topic, *_ in getattr(whole, how)()]
+        topic for topic, *_ in getattr(whole, how)()
+    ]
     assert reader.lost == [f"the file b_{place}.mcap was not read: not an MCAP file"]
     assert reader.topics == whole.topics
 

@@ -34,8 +34,10 @@ BIG = 3 * FREE
 SMALL_FREE = 4 << 20
 PACK = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 UNPACK = {"zstd": zstd_chunk, "lz4": lz4_chunk}
-LOOSE = {"zstd": lambda data: zstandard.ZstdCompressor(write_content_size=False).compress(data),
-         "lz4": lambda data: lz4.frame.compress(data, store_size=False)}
+LOOSE = {
+    "zstd": lambda data: zstandard.ZstdCompressor(write_content_size=False).compress(data),
+    "lz4": lambda data: lz4.frame.compress(data, store_size=False),
+}
 
 
 @pytest.fixture
@@ -75,6 +77,7 @@ def test_lz4_is_fed_in_blocks(monkeypatch):
         def decompress(self, data, max_length=-1):
             fed.append(len(data))
             return super().decompress(data, max_length)
+
     monkeypatch.setattr(mcap_salvage.lz4.frame, "LZ4FrameDecompressor", Decoder)
     data = np.random.default_rng(2).bytes(5 * mcap_salvage.BLOCK + 7)
     packed = LOOSE["lz4"](data)
@@ -86,8 +89,11 @@ def test_what_is_declared_is_a_limit_beyond_the_free_size(tight):
     data = np.random.default_rng(1).bytes(2 * tight)
     for name, pack in PACK.items():
         assert UNPACK[name](pack(data), len(data)) == data
-        with pytest.raises(TooLargeError, match=r"^it would decompress to 8 MB, more than the 4 MB "
-                           r"that its size, the file and the memory allow$"):
+        with pytest.raises(
+            TooLargeError,
+            match=r"^it would decompress to 8 MB, more than the 4 MB "
+            r"that its size, the file and the memory allow$",
+        ):
             UNPACK[name](pack(data), len(data) // 2)
 
 
@@ -134,8 +140,11 @@ def bomb_chunk(name, size):
 
 @pytest.mark.parametrize("name", PACK)
 def test_a_bomb_in_a_bag_costs_itself_and_one_line(tmp_path, events, tight, name):
-    data = Foreign({"compression": COMPRESSIONS["none"]}).write(tmp_path / "x.mcap",
-                                                                events).read_bytes()
+    data = (
+        Foreign({"compression": COMPRESSIONS["none"]})
+        .write(tmp_path / "x.mcap", events)
+        .read_bytes()
+    )
     at = data.index(bytes([Opcode.DATA_END]) + struct.pack("<Q", 4))
     path = tmp_path / "bomb.mcap"
     path.write_bytes(data[:at] + bomb_chunk(name, 5 * tight) + data[at:])
@@ -144,16 +153,21 @@ def test_a_bomb_in_a_bag_costs_itself_and_one_line(tmp_path, events, tight, name
     [line] = reader.lost
     assert line.startswith("the chunk that ends at byte ")
     limit = {"zstd": 4, "lz4": 17}[name]  # LZ4 squeezes zeros 243 times, zstd without end
-    assert line.endswith(f" was not read: it would decompress to 21 MB, more than the {limit} MB "
-                         "that its size, the file and the memory allow")
+    assert line.endswith(
+        f" was not read: it would decompress to 21 MB, more than the {limit} MB "
+        "that its size, the file and the memory allow"
+    )
 
 
 @pytest.mark.parametrize("name", PACK)
 @pytest.mark.parametrize("pack", [PACK, LOOSE], ids=["told", "not told"])
 def test_a_bomb_that_is_cut_off_gives_nothing(tmp_path, events, tight, name, pack, monkeypatch):
     monkeypatch.setitem(PACK, name, pack[name])
-    data = Foreign({"compression": COMPRESSIONS["none"]}).write(tmp_path / "x.mcap",
-                                                                events).read_bytes()
+    data = (
+        Foreign({"compression": COMPRESSIONS["none"]})
+        .write(tmp_path / "x.mcap", events)
+        .read_bytes()
+    )
     at = data.index(bytes([Opcode.DATA_END]) + struct.pack("<Q", 4))
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[:at] + bomb_chunk(name, 5 * tight)[:-7])
@@ -172,19 +186,26 @@ def test_a_compressed_message_that_is_a_bomb_is_counted(tmp_path, events, tight)
     path = Bombs().write(tmp_path / "x.mcap", events)
     for read in (BagReader.columns, BagReader.cdr_messages):
         reader = BagReader(path)
-        assert {topic for topic, *_ in read(reader)} == {"stage/joint_states",
-                                                         "stage/mark_detections"}
+        assert {topic for topic, *_ in read(reader)} == {
+            "stage/joint_states",
+            "stage/mark_detections",
+        }
         n_commands = sum(hasattr(event, "phase") for event in events)
-        assert reader.lost == [f"{n_commands} messages on /selfcal/view_command were not "
-                               "decompressed: they would become too large"]
+        assert reader.lost == [
+            f"{n_commands} messages on /selfcal/view_command were not "
+            "decompressed: they would become too large"
+        ]
 
 
 @pytest.mark.parametrize("told", [True, False])
 def test_a_file_that_is_a_bomb_is_refused(tmp_path, tight, told):
     path = tmp_path / "x.mcap.zstd"
     path.write_bytes(zstandard.ZstdCompressor(write_content_size=told).compress(bytes(5 * tight)))
-    with pytest.raises(InputError, match=r"x\.mcap\.zstd: it would decompress to \d+ MB, more than "
-                       r"the 4 MB that .* allow; if it is a bag, decompress it with zstd -d$"):
+    with pytest.raises(
+        InputError,
+        match=r"x\.mcap\.zstd: it would decompress to \d+ MB, more than "
+        r"the 4 MB that .* allow; if it is a bag, decompress it with zstd -d$",
+    ):
         list(decoded(BagReader(path)))
 
 
@@ -204,8 +225,13 @@ def test_solve_of_a_bomb_takes_no_memory(tmp_path, events):
     paths = [tmp_path / f"{name}.mcap" for name in PACK]
     for path in paths:
         path.write_bytes(data[:8] + bomb_chunk(path.stem, 5 * FREE))
-    done = subprocess.run([sys.executable, "-c", LIMITED, *map(str, paths)], text=True,
-                          check=False, capture_output=True, cwd=Path(__file__).parents[2])
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, *map(str, paths)],
+        text=True,
+        check=False,
+        capture_output=True,
+        cwd=Path(__file__).parents[2],
+    )
     assert done.stdout.split() == ["4", "4"], done.stderr
     assert done.stderr.count("it would decompress to 336 MB") == 2
     assert "Traceback" not in done.stderr
@@ -217,6 +243,9 @@ def test_a_bag_of_sqlite_is_told_how_to_become_mcap(tmp_path, place):
     file.parent.mkdir()
     file.write_bytes(b"SQLite format 3\0" + bytes(100))
     path = file if place == "file" else file.parent
-    with pytest.raises(InputError, match=r"a bag with sqlite3 storage; convert it with `ros2 bag "
-                       r"convert -i BAG -o OPTIONS\.yaml`"):
+    with pytest.raises(
+        InputError,
+        match=r"a bag with sqlite3 storage; convert it with `ros2 bag "
+        r"convert -i BAG -o OPTIONS\.yaml`",
+    ):
         list(decoded(BagReader(path)))

@@ -73,10 +73,18 @@ def test_chunks_and_compression(tmp_path, events, expected, compression, chunk_s
     check(foreign.write(tmp_path / "x.mcap", events), expected)
 
 
-@pytest.mark.parametrize("options", [
-    {"use_chunking": False}, {"use_chunking": False, **NO_SUMMARY}, NO_SUMMARY,
-    {"enable_crcs": False}, {"enable_data_crcs": True}, {**NO_SUMMARY, "enable_crcs": False}],
-    ids=["no chunks", "no chunks, no summary", "no summary", "no crc", "data crc", "bare"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"use_chunking": False},
+        {"use_chunking": False, **NO_SUMMARY},
+        NO_SUMMARY,
+        {"enable_crcs": False},
+        {"enable_data_crcs": True},
+        {**NO_SUMMARY, "enable_crcs": False},
+    ],
+    ids=["no chunks", "no chunks, no summary", "no summary", "no crc", "data crc", "bare"],
+)
 @pytest.mark.parametrize("footer", [True, False])
 def test_what_mcap_leaves_open(tmp_path, events, expected, options, footer):
     path = Foreign(options, footer=footer).write(tmp_path / "x.mcap", events)
@@ -115,12 +123,12 @@ def test_the_writer_of_rosbags(tmp_path, events, expected):
 def test_a_bag_in_many_files_whose_channels_differ(tmp_path, events, expected, metadata):
     parts = bags.split(events, 12)
     for number, part in enumerate(parts):
-        Foreign(others=True).write(tmp_path / "bag" / f"part_{number}.mcap", part,
-                                   order=number % 4)
+        Foreign(others=True).write(tmp_path / "bag" / f"part_{number}.mcap", part, order=number % 4)
     names = [f"part_{number}.mcap" for number in range(len(parts))]
     if metadata:
-        (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(
-            {"rosbag2_bagfile_information": {"relative_file_paths": names}}))
+        (tmp_path / "bag" / "metadata.yaml").write_text(
+            yaml.safe_dump({"rosbag2_bagfile_information": {"relative_file_paths": names}})
+        )
     assert [file.name for file in BagReader(tmp_path / "bag").files] == names
     check(tmp_path / "bag", expected)
 
@@ -160,23 +168,30 @@ def test_what_follows_the_end_of_a_file_and_is_no_other_is_said(tmp_path, events
 
 
 def test_a_recording_behind_strange_bytes_is_read(tmp_path, events, expected):
-    one, two = (Foreign().write(tmp_path / f"{number}.mcap", part, order=number).read_bytes()
-                for number, part in enumerate(bags.split(events, 2)))
+    one, two = (
+        Foreign().write(tmp_path / f"{number}.mcap", part, order=number).read_bytes()
+        for number, part in enumerate(bags.split(events, 2))
+    )
     (tmp_path / "bag.mcap").write_bytes(one + bytes(50) + two)
     result, lost = solved(tmp_path / "bag.mcap")
     assert result == expected
     assert lost == ["50 bytes after the end of the recording are not MCAP and were not used"]
 
 
-@pytest.mark.parametrize(("order", "where"), [
-    ([0, 0], "b.mcap"), ([1, 0], "b.mcap"), ([0, 1], ""), ("joined", "a.mcap from byte")])
+@pytest.mark.parametrize(
+    ("order", "where"),
+    [([0, 0], "b.mcap"), ([1, 0], "b.mcap"), ([0, 1], ""), ("joined", "a.mcap from byte")],
+)
 def test_copies_and_files_out_of_order_are_not_called_steps_of_a_clock(
-        tmp_path, events, expected, order, where):
+    tmp_path, events, expected, order, where
+):
     halves = [events, events] if order in ([0, 0], "joined") else bags.split(events, 2)
     names = "ab" if order != [1, 0] else "ba"
     (tmp_path / "bag").mkdir()
-    files = [Foreign().write(tmp_path / "bag" / f"{name}.mcap", half)
-             for name, half in zip(names, halves, strict=True)]
+    files = [
+        Foreign().write(tmp_path / "bag" / f"{name}.mcap", half)
+        for name, half in zip(names, halves, strict=True)
+    ]
     if order == "joined":
         files[0].write_bytes(files[0].read_bytes() + files[1].read_bytes())
         files[1].unlink()
@@ -188,8 +203,9 @@ def test_copies_and_files_out_of_order_are_not_called_steps_of_a_clock(
 
 
 def listing(bag, *files) -> None:
-    (bag / "metadata.yaml").write_text(yaml.safe_dump(
-        {"rosbag2_bagfile_information": {"relative_file_paths": list(files)}}))
+    (bag / "metadata.yaml").write_text(
+        yaml.safe_dump({"rosbag2_bagfile_information": {"relative_file_paths": list(files)}})
+    )
 
 
 def test_a_file_that_metadata_does_not_list_is_said(tmp_path, events, expected):
@@ -212,8 +228,11 @@ def test_files_that_were_renamed_are_read(tmp_path, events, expected):
 def test_the_missing_files_of_a_bag_without_any_are_named(tmp_path):
     (tmp_path / "bag").mkdir()
     listing(tmp_path / "bag", "a_0.mcap", "a_1.mcap")
-    with pytest.raises(InputError, match=r"no \.mcap file in this folder; a_0\.mcap, a_1\.mcap, "
-                       "which metadata.yaml lists, is missing"):
+    with pytest.raises(
+        InputError,
+        match=r"no \.mcap file in this folder; a_0\.mcap, a_1\.mcap, "
+        "which metadata.yaml lists, is missing",
+    ):
         BagReader(tmp_path / "bag")
 
 
@@ -235,9 +254,17 @@ def test_a_file_that_metadata_lists_but_nobody_has_is_said(tmp_path, events, exp
     assert lost == ["the file b.mcap, which metadata.yaml lists, is missing"]
 
 
-@pytest.mark.parametrize("text", ["", "a: [", "rosbag2_bagfile_information: 5", "[1, 2]",
-                                  "rosbag2_bagfile_information: {relative_file_paths: 3}",
-                                  "rosbag2_bagfile_information: {relative_file_paths: [3]}"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "a: [",
+        "rosbag2_bagfile_information: 5",
+        "[1, 2]",
+        "rosbag2_bagfile_information: {relative_file_paths: 3}",
+        "rosbag2_bagfile_information: {relative_file_paths: [3]}",
+    ],
+)
 def test_damaged_metadata_is_said_and_not_used(tmp_path, events, expected, text):
     Foreign().write(tmp_path / "bag" / "a.mcap", events)
     (tmp_path / "bag" / "metadata.yaml").write_text(text)
@@ -258,15 +285,17 @@ def test_two_cells_in_one_bag(tmp_path, events, expected):
     other = events_of(small_plan("0, 90, ty"), seed=8)
     for name, content in (("cell1", events), ("cell2", other)):
         Foreign(namespace=f"/{name}").write(tmp_path / "bag" / f"{name}.mcap", content)
-    with pytest.raises(InputError, match="topics of two cells, '/cell1' and '/cell2'; "
-                       "choose one with --namespace"):
+    with pytest.raises(
+        InputError, match="topics of two cells, '/cell1' and '/cell2'; choose one with --namespace"
+    ):
         solved(tmp_path / "bag")
     check(tmp_path / "bag", expected, namespace="cell1")
     result, lost = solved(tmp_path / "bag", namespace="/cell2")
     assert result == result_to_dict(worded(calibrate(collected(other)[1], Options())))
     assert lost == []
-    with pytest.raises(NoDataError, match="no topics of the cell '/cell3'; choose one of "
-                       "/cell1, /cell2"):
+    with pytest.raises(
+        NoDataError, match="no topics of the cell '/cell3'; choose one of /cell1, /cell2"
+    ):
         solved(tmp_path / "bag", namespace="cell3")
 
 
@@ -282,8 +311,9 @@ def test_the_cell_in_the_root_can_be_chosen(tmp_path, events, expected, namespac
         solved(tmp_path / "bag" / "xcell2.mcap", namespace=namespace)
 
 
-@pytest.mark.parametrize("more", ["", "uint32 grid_size_y\n",
-                                  "uint32 grid_size_y\nuint32 views_planned\n"])
+@pytest.mark.parametrize(
+    "more", ["", "uint32 grid_size_y\n", "uint32 grid_size_y\nuint32 views_planned\n"]
+)
 def test_without_definitions_messages_of_every_version_are_read(tmp_path, events, expected, more):
     types = bags.contract_types(command=bags.COMMAND + more)
     path = Foreign(types=types, schemas=False).write(tmp_path / "x.mcap", events)
@@ -301,39 +331,58 @@ def test_without_definitions_what_does_not_fit_is_said(tmp_path, events):
     assert sorted(reader.lost) == [
         f"{count} messages on {topic} could not be decoded: the bag has no definition of {name}, "
         "and they do not fit the one known here"
-        for count, topic, name in ((n_seen, "stage/mark_detections", bags.DETECTION_TYPE),
-                                   (9, "selfcal/view_command", bags.COMMAND_TYPE))]
+        for count, topic, name in (
+            (n_seen, "stage/mark_detections", bags.DETECTION_TYPE),
+            (9, "selfcal/view_command", bags.COMMAND_TYPE),
+        )
+    ]
 
 
-TYPES = {"command": ("selfcal/view_command", bags.COMMAND),
-         "detection": ("stage/mark_detections", bags.DETECTION)}
+TYPES = {
+    "command": ("selfcal/view_command", bags.COMMAND),
+    "detection": ("stage/mark_detections", bags.DETECTION),
+}
 
 
-@pytest.mark.parametrize(("which", "old", "new"), [
-    ("detection", "float64 offset_x", "string offset_x"),
-    ("detection", "uint8 kind", "string kind"),
-    ("detection", "float32 score", "float64[] score"),
-    ("detection", "int32 m", "std_msgs/Header m"),
-    ("command", "string plan_id", "uint32 plan_id"),
-    ("command", "uint32 angular_count", "uint32 angular_count\nstring views_planned"),
-    ("command", "uint32 grid_size", "uint32[3] grid_size")])
+@pytest.mark.parametrize(
+    ("which", "old", "new"),
+    [
+        ("detection", "float64 offset_x", "string offset_x"),
+        ("detection", "uint8 kind", "string kind"),
+        ("detection", "float32 score", "float64[] score"),
+        ("detection", "int32 m", "std_msgs/Header m"),
+        ("command", "string plan_id", "uint32 plan_id"),
+        ("command", "uint32 angular_count", "uint32 angular_count\nstring views_planned"),
+        ("command", "uint32 grid_size", "uint32[3] grid_size"),
+    ],
+)
 def test_a_field_of_another_type_is_named(tmp_path, events, which, old, new):
     topic, text = TYPES[which]
     assert old in text
     types = bags.contract_types(**{which: text.replace(old + "\n", new + "\n")})
     kept = [e for e in events if isinstance(e, EncoderSample)]
-    kept.append(next(e for e in events if isinstance(e, Detection | Command)
-                     and isinstance(e, Detection) == (which == "detection")))
+    kept.append(
+        next(
+            e
+            for e in events
+            if isinstance(e, Detection | Command)
+            and isinstance(e, Detection) == (which == "detection")
+        )
+    )
     path = Foreign(types=types).write(tmp_path / "x.mcap", kept, spoil=True)
     field = new.split()[-1]
-    with pytest.raises(InputError, match=f"topic /{topic}: another version of .*: the field "
-                       f"'{field}' has another type; record the bag with"):
+    with pytest.raises(
+        InputError,
+        match=f"topic /{topic}: another version of .*: the field "
+        f"'{field}' has another type; record the bag with",
+    ):
         solved(path)
 
 
 def test_a_header_of_another_kind_is_named(tmp_path, events):
-    types = bags.contract_types(detection=bags.DETECTION.replace(
-        "std_msgs/Header header", "builtin_interfaces/Time header"))
+    types = bags.contract_types(
+        detection=bags.DETECTION.replace("std_msgs/Header header", "builtin_interfaces/Time header")
+    )
     path = Foreign(types=types).write(tmp_path / "x.mcap", events, spoil=True)
     with pytest.raises(InputError, match="the field 'header' has another type"):
         solved(path)
@@ -358,15 +407,18 @@ def test_bags_that_rosbag2_compressed(tmp_path, events, expected, mode):
 def test_a_compressed_file_beside_its_plain_one_is_read_once(tmp_path, events, expected):
     bag = bags.rosbags_bag(tmp_path / "bag", events, CompressionMode.FILE)
     [file] = bag.glob("*.mcap.zstd")
-    file.with_suffix("").write_bytes(zstandard.ZstdDecompressor().stream_reader(
-        file.read_bytes()).read())
+    file.with_suffix("").write_bytes(
+        zstandard.ZstdDecompressor().stream_reader(file.read_bytes()).read()
+    )
     check(bag, expected)
     (bag / "metadata.yaml").unlink()
     check(bag, expected)
 
 
-@pytest.mark.parametrize("spoil", [lambda data: data[:len(data) * 9 // 10],
-                                   lambda data: data[:-900] + bytes(50) + data[-850:]])
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda data: data[: len(data) * 9 // 10], lambda data: data[:-900] + bytes(50) + data[-850:]],
+)
 def test_a_compressed_file_that_is_damaged_is_read_as_far_as_it_goes(tmp_path, spoil):
     events = events_of(small_plan())
     bag = bags.rosbags_bag(tmp_path / "bag", events, CompressionMode.FILE)
@@ -394,8 +446,11 @@ def test_a_message_whose_compression_is_damaged_is_counted(tmp_path, events):
 
 def test_a_file_listed_twice_is_read_once(tmp_path, events, expected):
     Foreign().write(tmp_path / "bag" / "a.mcap", events)
-    (tmp_path / "bag" / "metadata.yaml").write_text(yaml.safe_dump(
-        {"rosbag2_bagfile_information": {"relative_file_paths": ["a.mcap", "a.mcap"]}}))
+    (tmp_path / "bag" / "metadata.yaml").write_text(
+        yaml.safe_dump(
+            {"rosbag2_bagfile_information": {"relative_file_paths": ["a.mcap", "a.mcap"]}}
+        )
+    )
     check(tmp_path / "bag", expected)
 
 
@@ -407,23 +462,34 @@ def test_a_folder_with_the_name_of_a_file_is_no_file(tmp_path, events, expected)
 
 def played(path):
     """Return the result of the bytes that a player sends, decoded by the own types."""
-    messages = [(topic, typestore().deserialize_cdr(data, INPUT_TOPICS[topic]))
-                for topic, _, data in BagReader(path).cdr_messages()]
+    messages = [
+        (topic, typestore().deserialize_cdr(data, INPUT_TOPICS[topic]))
+        for topic, _, data in BagReader(path).cdr_messages()
+    ]
     collector = Collector(VALUES)
-    feed = {ENCODER_TOPIC: lambda m: collector.add_encoder(to_model.encoder_sample(m)),
-            DETECTION_TOPIC: lambda m: collector.add_detection(to_model.detection(m)),
-            COMMAND_TOPIC: lambda m: collector.add_command(to_model.command(m))}
+    feed = {
+        ENCODER_TOPIC: lambda m: collector.add_encoder(to_model.encoder_sample(m)),
+        DETECTION_TOPIC: lambda m: collector.add_detection(to_model.detection(m)),
+        COMMAND_TOPIC: lambda m: collector.add_command(to_model.command(m)),
+    }
     for topic, message in messages:
         feed[topic](message)
     return calibrated(collector.collect()[0])
 
 
-@pytest.mark.parametrize("options", [
-    {}, {"types": bags.contract_types(EXTRA)}, {"schemas": False},
-    {"types": bags.contract_types(command=bags.COMMAND + "uint32 grid_size_y\n")}],
-    ids=["contract", "more fields", "no definitions", "one version back"])
-def test_the_bytes_to_play_are_of_the_own_types_and_give_the_same(tmp_path, events, expected,
-                                                                 options):
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"types": bags.contract_types(EXTRA)},
+        {"schemas": False},
+        {"types": bags.contract_types(command=bags.COMMAND + "uint32 grid_size_y\n")},
+    ],
+    ids=["contract", "more fields", "no definitions", "one version back"],
+)
+def test_the_bytes_to_play_are_of_the_own_types_and_give_the_same(
+    tmp_path, events, expected, options
+):
     path = Foreign(**options).write(tmp_path / "x.mcap", events)
     assert played(path) == expected
 

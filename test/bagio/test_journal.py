@@ -44,8 +44,9 @@ def raw(event, tail=b"\x81\x9f\x93\x01"):
     """Return topic and bytes of an event, as a raw subscription hands them over."""
     topic, fields = event_fields(event, "stage")
     name = INPUT_TOPICS[topic]
-    return f"/{topic}", bytes(typestore().serialize_cdr(build(typestore(), name, fields),
-                                                        name)) + tail
+    return f"/{topic}", bytes(
+        typestore().serialize_cdr(build(typestore(), name, fields), name)
+    ) + tail
 
 
 def declared(writer):
@@ -62,15 +63,21 @@ def record(writer, events):
 
 
 def samples(n, first=0):
-    return [EncoderSample(NOW + i, ("x", "y", "theta"), (i * 1e-3, 0.0, 0.0))
-            for i in range(first, first + n)]
+    return [
+        EncoderSample(NOW + i, ("x", "y", "theta"), (i * 1e-3, 0.0, 0.0))
+        for i in range(first, first + n)
+    ]
 
 
 def stamps(path):
     """Return the stamps of the encoder samples in a journal, and what was lost."""
     reader = BagReader(path)
-    found = [stamp - NOW for _, block in reader.columns() if hasattr(block, "stamps_ns")
-             for stamp in block.stamps_ns.tolist()]
+    found = [
+        stamp - NOW
+        for _, block in reader.columns()
+        if hasattr(block, "stamps_ns")
+        for stamp in block.stamps_ns.tolist()
+    ]
     return sorted(found), reader.lost
 
 
@@ -122,7 +129,8 @@ def test_metadata_counts_what_every_file_holds(tmp_path, events):
     assert [file["message_count"] for file in about["files"]] == [7, 5]
     by_topic = {t["topic_metadata"]["name"]: t for t in about["topics_with_message_count"]}
     assert {name: topic["message_count"] for name, topic in by_topic.items()} == {
-        f"/{topic}": 12 * (topic == ENCODER_TOPIC) for topic in INPUT_TOPICS}
+        f"/{topic}": 12 * (topic == ENCODER_TOPIC) for topic in INPUT_TOPICS
+    }
     assert by_topic["/stage/joint_states"]["topic_metadata"]["offered_qos_profiles"] == [QOS]
 
 
@@ -160,9 +168,18 @@ while True:
 def test_killed_at_any_instant_what_was_flushed_is_there_and_the_next_one_goes_on(tmp_path):
     first = 0
     for n_lines in (1, 40, 7):
-        child = subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path), str(first),
-                                  str(Path(__file__).parents[2])], text=True,
-                                 stdout=subprocess.PIPE)
+        child = subprocess.Popen(
+            [
+                sys.executable,
+                "-c",
+                WRITER,
+                str(tmp_path),
+                str(first),
+                str(Path(__file__).parents[2]),
+            ],
+            text=True,
+            stdout=subprocess.PIPE,
+        )
         told = [int(child.stdout.readline()) for _ in range(n_lines)]
         child.send_signal(signal.SIGKILL)
         told += [int(line) for line in child.stdout.read().split("\n")[:-1]]
@@ -187,12 +204,19 @@ def test_a_file_cut_anywhere_is_finished_and_holds_what_is_whole(tmp_path):
         record(writer, samples(3))
     [file] = writer.path.glob("*.mcap")
     data = file.read_bytes()
-    places = [place for place in range(len(data)) if data[place] == Opcode.MESSAGE
-              and data[place + 1:place + 9] == struct.pack("<Q", 22 + len(raw(samples(1)[0])[1]))]
+    places = [
+        place
+        for place in range(len(data))
+        if data[place] == Opcode.MESSAGE
+        and data[place + 1 : place + 9] == struct.pack("<Q", 22 + len(raw(samples(1)[0])[1]))
+    ]
     assert len(places) == 3
     ends = [*places[1:], data.index(bytes([Opcode.DATA_END]) + struct.pack("<Q", 4))]
-    for cut in (*range(places[0], ends[-1] + 30), *range(ends[-1] + 30, len(data), 199),
-                *range(len(data) - 3, len(data) + 1)):
+    for cut in (
+        *range(places[0], ends[-1] + 30),
+        *range(ends[-1] + 30, len(data), 199),
+        *range(len(data) - 3, len(data) + 1),
+    ):
         file.write_bytes(data[:cut])
         content = journal_file.finish_file(file, "selfcal/view_command")
         n_whole = sum(end <= cut for end in ends)
@@ -208,7 +232,7 @@ def test_damage_in_the_middle_is_not_cut_off(tmp_path):
     data = file.read_bytes()
     size = 31 + len(raw(samples(1)[0])[1])
     at = data.index(b"\x05" + struct.pack("<Q", size - 9)) + 10 * size
-    damaged = data[:at] + b"\0" * 20 + data[at + 20:]
+    damaged = data[:at] + b"\0" * 20 + data[at + 20 :]
     file.write_bytes(damaged)
     with resume(tmp_path) as again:
         assert file.read_bytes() == damaged
@@ -218,10 +242,17 @@ def test_damage_in_the_middle_is_not_cut_off(tmp_path):
     assert "damaged" in lost[0]
 
 
-@pytest.mark.parametrize(("phases", "goes_on"), [
-    ((), True), ((Phase.PLACE,), True), ((Phase.PLACE, Phase.MEASURE), True),
-    ((Phase.PLACE, Phase.MEASURE, Phase.DONE), False), ((Phase.MEASURE, Phase.ABORT), False),
-    ((Phase.DONE, Phase.PLACE), True)])
+@pytest.mark.parametrize(
+    ("phases", "goes_on"),
+    [
+        ((), True),
+        ((Phase.PLACE,), True),
+        ((Phase.PLACE, Phase.MEASURE), True),
+        ((Phase.PLACE, Phase.MEASURE, Phase.DONE), False),
+        ((Phase.MEASURE, Phase.ABORT), False),
+        ((Phase.DONE, Phase.PLACE), True),
+    ],
+)
 @pytest.mark.parametrize("reverse", [False, True])
 def test_the_plan_that_is_running_is_taken_up(tmp_path, phases, goes_on, reverse):
     commands = [command(phase, NOW + i) for i, phase in enumerate(phases)]
@@ -268,8 +299,9 @@ def test_the_journal_written_last_counts(tmp_path):
         assert again.path == old.path
 
 
-@pytest.mark.parametrize("name", ["session", "journal", "journal_of_mine",
-                                  "journal_20261127T102030Z_copy"])
+@pytest.mark.parametrize(
+    "name", ["session", "journal", "journal_of_mine", "journal_20261127T102030Z_copy"]
+)
 def test_a_recording_beside_the_journals_is_left_alone(tmp_path, name):
     """Written last and of an unfinished run, as by a recorder that runs."""
     with declared(BagWriter(tmp_path / name)) as recorder:
@@ -288,8 +320,11 @@ def test_a_recording_beside_the_journals_is_left_alone(tmp_path, name):
 def test_a_journal_has_one_writer(tmp_path):
     with declared(start(tmp_path, NOW)) as writer:
         record(writer, samples(1))
-        with pytest.raises(InputError, match=f"^{writer.path}: another process writes this "
-                           "journal; end it or name another folder$"):
+        with pytest.raises(
+            InputError,
+            match=f"^{writer.path}: another process writes this "
+            "journal; end it or name another folder$",
+        ):
             resume(tmp_path)
     resume(tmp_path).close()
 
@@ -327,12 +362,15 @@ def test_a_full_disk_is_said_and_leaves_no_half_message(tmp_path, monkeypatch, n
     def full(fd, data):
         if not room[0]:
             raise OSError(errno.ENOSPC, "No space left on device")
-        data, room[0] = data[:room[0]], room[0] - min(len(data), room[0])
+        data, room[0] = data[: room[0]], room[0] - min(len(data), room[0])
         return plain(fd, data)
 
     monkeypatch.setattr(journal_file.os, "write", full)
-    with pytest.raises(InputError, match=r"the journal cannot be written \(No space left on "
-                       r"device\); free some space or name another folder$"):
+    with pytest.raises(
+        InputError,
+        match=r"the journal cannot be written \(No space left on "
+        r"device\); free some space or name another folder$",
+    ):
         record(writer, samples(3, 100))
     assert writer.n_lost == 3
     monkeypatch.undo()
@@ -406,8 +444,10 @@ def test_a_message_longer_than_a_stretch_is_passed(tmp_path):
         record(writer, samples(2, 1))
     with resume(tmp_path):
         assert information(writer.path)["message_count"] == 3
-    assert stamps(writer.path) == ([1, 2], [
-        "1 messages on stage/joint_states could not be decoded: they are longer than 8192 bytes"])
+    assert stamps(writer.path) == (
+        [1, 2],
+        ["1 messages on stage/joint_states could not be decoded: they are longer than 8192 bytes"],
+    )
 
 
 def test_nothing_follows_a_torn_record_that_cannot_be_taken_back(tmp_path, monkeypatch):
@@ -418,7 +458,7 @@ def test_nothing_follows_a_torn_record_that_cannot_be_taken_back(tmp_path, monke
     def full(fd, data):
         if not room[0]:
             raise OSError(errno.EIO, "Input/output error")
-        data, room[0] = data[:room[0]], room[0] - min(len(data), room[0])
+        data, room[0] = data[: room[0]], room[0] - min(len(data), room[0])
         return plain(fd, data)
 
     def truncate(fd, size):
@@ -443,19 +483,22 @@ def test_nothing_follows_a_torn_record_that_cannot_be_taken_back(tmp_path, monke
 
 @pytest.mark.parametrize("torn", [0, 1, 40])
 def test_a_file_that_grows_as_fast_as_it_is_read_ends_where_it_was_opened(
-        tmp_path, monkeypatch, torn):
+    tmp_path, monkeypatch, torn
+):
     monkeypatch.setattr("selfcal_ros.bagio.mcap_chunk.STRETCH", 2000)
     with declared(start(tmp_path, NOW)) as writer:
         record(writer, samples(200))
         [file] = writer.path.glob("*.mcap")
         data = file.read_bytes()
     grows = tmp_path / "grows.mcap"
-    grows.write_bytes(data[:len(data) - torn])  # of the last record a part may be missing
+    grows.write_bytes(data[: len(data) - torn])  # of the last record a part may be missing
     stream, found = McapStream(grows), []
     for block in islice(stream.blocks(), 1000):
         found += block.fronts["log_time"].tolist()
         with grows.open("ab") as end:
             end.write(data[-2000:])
     assert found == [NOW + number + 5 for number in range(200 - (torn > 0))]
-    assert stream.lost == [f"the file is still being written: the messages in its first "
-                           f"{len(data) - torn} bytes are read"]
+    assert stream.lost == [
+        f"the file is still being written: the messages in its first "
+        f"{len(data) - torn} bytes are read"
+    ]

@@ -42,7 +42,7 @@ def test_messages_are_played_by_their_times(tmp_path, events, shuffle):
 def test_equal_times_stay_in_the_order_of_the_file(tmp_path):
     samples = [EncoderSample(stamp, (name,), (0.5,)) for name in "zyx" for stamp in (7, 5, 5)]
     path = Foreign().write(tmp_path / "x.mcap", samples)
-    names = [data[data.index(b"somewhere") + 20:] for _, _, data in Playlist(path)]
+    names = [data[data.index(b"somewhere") + 20 :] for _, _, data in Playlist(path)]
     stamps = [stamp for _, stamp, _ in Playlist(path)]
     assert stamps == [1005] * 6 + [1007] * 3
     assert [next(chr(c) for c in name if c in b"xyz") for name in names] == list("zzyyxxzyx")
@@ -97,8 +97,11 @@ def test_images_beside_detections_are_said_not_to_be_played(tmp_path, events):
                 writer.add_topic(topic, INPUT_TOPICS[topic], [])
             writer.write(topic, fields, event.stamp_ns)
         writer.add_topic("/stage/image", IMAGE_TYPES["raw"], [])
-        writer.write("/stage/image", from_model.image(
-            np.zeros((2, 2), np.uint8), "mono8", 10**9, "camera"), 10**9)
+        writer.write(
+            "/stage/image",
+            from_model.image(np.zeros((2, 2), np.uint8), "mono8", 10**9, "camera"),
+            10**9,
+        )
     playlist = Playlist(tmp_path / "bag")
     assert len(playlist) == len(events) and playlist.transport == ""
     [line] = playlist.lost

@@ -17,24 +17,38 @@ from selfcal_ros.errors import InputError
 
 HEADER = "std_msgs/msg/Header"
 JOINTS = "sensor_msgs/msg/JointState"
-KNOWN = "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\n" \
-        "float64[] effort\n"
+KNOWN = (
+    "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\n"
+    "float64[] effort\n"
+)
 
 
 def store_of(joints, header="builtin_interfaces/Time stamp\nstring frame_id\n"):
     store = get_typestore(Stores.EMPTY)
-    store.register({**get_types_from_msg(joints, JOINTS), **get_types_from_msg(header, HEADER),
-                    "builtin_interfaces/msg/Time": typestore().fielddefs[
-                        "builtin_interfaces/msg/Time"]})
+    store.register(
+        {
+            **get_types_from_msg(joints, JOINTS),
+            **get_types_from_msg(header, HEADER),
+            "builtin_interfaces/msg/Time": typestore().fielddefs["builtin_interfaces/msg/Time"],
+        }
+    )
     return store
 
 
-@pytest.mark.parametrize(("joints", "same"), [
-    (KNOWN, True), ("int32 MOST=3\n" + KNOWN, True), (KNOWN + "float64 more\n", False),
-    (KNOWN.replace("effort", "torque"), False),
-    (KNOWN.replace("float64[] e", "float32[] e"), False),
-    (KNOWN.replace("string[] name\nfloat64[] position", "float64[] position\nstring[] name"),
-     False)])
+@pytest.mark.parametrize(
+    ("joints", "same"),
+    [
+        (KNOWN, True),
+        ("int32 MOST=3\n" + KNOWN, True),
+        (KNOWN + "float64 more\n", False),
+        (KNOWN.replace("effort", "torque"), False),
+        (KNOWN.replace("float64[] e", "float32[] e"), False),
+        (
+            KNOWN.replace("string[] name\nfloat64[] position", "float64[] position\nstring[] name"),
+            False,
+        ),
+    ],
+)
 def test_fields_and_their_order_decide_and_constants_do_not(joints, same):
     assert same_layout(store_of(joints), JOINTS) is same
 
@@ -53,8 +67,11 @@ def test_a_schema_is_read_anew_where_any_of_it_differs_and_refused_wherever_it_s
         assert found.fielddefs[name][1][1][1][1][0] == ("float32" if "32" in other else "float64")
         assert (name in store.fielddefs) == (name == "pkg/msg/T")
     for where in ("bag 1", "bag 2"):
-        with pytest.raises(InputError, match=rf"^{where}: the definition of pkg/msg/T cannot be "
-                           r"read \(.+\); record the bag again$"):
+        with pytest.raises(
+            InputError,
+            match=rf"^{where}: the definition of pkg/msg/T cannot be "
+            r"read \(.+\); record the bag again$",
+        ):
             store_of_schema("pkg/msg/T", "ros2msg", "float64", where)
 
 
@@ -70,18 +87,25 @@ def test_common_types_are_those_of_jazzy(name):
 
 
 def test_a_type_that_nobody_knows_is_refused():
-    with pytest.raises(InputError, match=r"^bag: the bag has no definition of a/msg/B; record it "
-                       r"with message definitions$"):
+    with pytest.raises(
+        InputError,
+        match=r"^bag: the bag has no definition of a/msg/B; record it "
+        r"with message definitions$",
+    ):
         store_of_schema("a/msg/B", "", "", "bag")
-    with pytest.raises(InputError, match=r"^topic t: no definition of a/msg/B; record only topics "
-                       r"of known types$"):
+    with pytest.raises(
+        InputError,
+        match=r"^topic t: no definition of a/msg/B; record only topics "
+        r"of known types$",
+    ):
         definition_of("t", "a/msg/B")
 
 
 def test_shorter_stores_hold_as_many_fields_as_their_publisher_knew():
     name, last = "selfcal_msgs/msg/ViewCommand", "plan_id"
     every = [field for field, _ in typestore().fielddefs[name][1]]
-    kept = [[field for field, _ in store.fielddefs[name][1]]
-            for store in shorter_stores(name, last)]
+    kept = [
+        [field for field, _ in store.fielddefs[name][1]] for store in shorter_stores(name, last)
+    ]
     assert kept == [every[:count] for count in range(len(every) - 1, every.index(last), -1)]
     assert kept

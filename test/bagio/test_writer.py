@@ -62,17 +62,28 @@ def test_the_reader_of_mcap_finds_every_message(tmp_path, events, compression):
     with file.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         header, summary = reader.get_header(), reader.get_summary()
-        found = [(channel.topic, schema.name, message.log_time, message.publish_time)
-                 for schema, channel, message in reader.iter_messages(log_time_order=False)]
+        found = [
+            (channel.topic, schema.name, message.log_time, message.publish_time)
+            for schema, channel, message in reader.iter_messages(log_time_order=False)
+        ]
         stream.seek(0)
-        chunks = [record.compression for record in StreamReader(
-            stream, emit_chunks=True, validate_crcs=True).records if hasattr(record, "compression")]
-    assert found == [(f"/{topic}", INPUT_TOPICS[topic], at, at) for topic, at in (
-        (event_fields(event, "")[0], event.stamp_ns + SHIFT_NS) for event in events)]
+        chunks = [
+            record.compression
+            for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records
+            if hasattr(record, "compression")
+        ]
+    assert found == [
+        (f"/{topic}", INPUT_TOPICS[topic], at, at)
+        for topic, at in (
+            (event_fields(event, "")[0], event.stamp_ns + SHIFT_NS) for event in events
+        )
+    ]
     assert (header.profile, header.library) == ("ros2", "selfcal_ros")
     assert summary.statistics.message_count == len(events)
-    assert {channel.topic: summary.statistics.channel_message_counts.get(number, 0)
-            for number, channel in summary.channels.items()} == counted(events)
+    assert {
+        channel.topic: summary.statistics.channel_message_counts.get(number, 0)
+        for number, channel in summary.channels.items()
+    } == counted(events)
     assert set(chunks) == {"" if compression == "none" else compression}
 
 
@@ -117,24 +128,44 @@ def test_metadata_is_what_rosbag2_writes_in_jazzy(tmp_path, events):
     duration = {"nanoseconds": events[-1].stamp_ns + SHIFT_NS - first}
     topics = info.pop("topics_with_message_count")
     assert info == {
-        "version": 9, "storage_identifier": "mcap", "duration": duration, "starting_time": start,
-        "message_count": len(events), "compression_format": "", "compression_mode": "",
+        "version": 9,
+        "storage_identifier": "mcap",
+        "duration": duration,
+        "starting_time": start,
+        "message_count": len(events),
+        "compression_format": "",
+        "compression_mode": "",
         "relative_file_paths": ["bag_0.mcap"],
-        "files": [{"path": "bag_0.mcap", "starting_time": start, "duration": duration,
-                   "message_count": len(events)}],
-        "custom_data": None, "ros_distro": "jazzy"}
+        "files": [
+            {
+                "path": "bag_0.mcap",
+                "starting_time": start,
+                "duration": duration,
+                "message_count": len(events),
+            }
+        ],
+        "custom_data": None,
+        "ros_distro": "jazzy",
+    }
     assert {entry["topic_metadata"]["name"]: entry["message_count"] for entry in topics} == (
-        counted(events))
+        counted(events)
+    )
     for entry in topics:
         assert set(entry) == {"topic_metadata", "message_count"}
         about = entry["topic_metadata"]
-        assert set(about) == {"name", "type", "serialization_format", "offered_qos_profiles",
-                              "type_description_hash"}
+        assert set(about) == {
+            "name",
+            "type",
+            "serialization_format",
+            "offered_qos_profiles",
+            "type_description_hash",
+        }
         assert about["serialization_format"] == "cdr"
         assert about["type_description_hash"] == hash_of(about["type"])
     types = {entry["topic_metadata"]["name"]: entry["topic_metadata"]["type"] for entry in topics}
     assert types == {f"/{t}": name for t, name in INPUT_TOPICS.items()} | {
-        "/notes": "std_msgs/msg/String"}
+        "/notes": "std_msgs/msg/String"
+    }
     assert topics[-1]["topic_metadata"]["type_description_hash"] == STRING_HASH
 
 
@@ -142,11 +173,16 @@ def test_metadata_is_what_rosbag2_writes_in_jazzy(tmp_path, events):
 @pytest.mark.parametrize("local", [True, False])
 def test_a_qos_profile_has_the_words_of_jazzy(reliable, local):
     assert list(qos_profile(reliable=reliable, transient_local=local, depth=3).items()) == [
-        ("history", "keep_last"), ("depth", 3),
+        ("history", "keep_last"),
+        ("depth", 3),
         ("reliability", "reliable" if reliable else "best_effort"),
-        ("durability", "transient_local" if local else "volatile"), ("deadline", FOREVER),
-        ("lifespan", FOREVER), ("liveliness", "automatic"), ("liveliness_lease_duration", FOREVER),
-        ("avoid_ros_namespace_conventions", False)]
+        ("durability", "transient_local" if local else "volatile"),
+        ("deadline", FOREVER),
+        ("lifespan", FOREVER),
+        ("liveliness", "automatic"),
+        ("liveliness_lease_duration", FOREVER),
+        ("avoid_ros_namespace_conventions", False),
+    ]
 
 
 def test_times_are_the_first_and_the_last_in_any_order(tmp_path):
@@ -157,7 +193,9 @@ def test_times_are_the_first_and_the_last_in_any_order(tmp_path):
         assert writer.counts == {"/notes": 4}
     info = metadata(tmp_path / "bag")
     assert (info["starting_time"], info["duration"]) == (
-        {"nanoseconds_since_epoch": 20}, {"nanoseconds": 70})
+        {"nanoseconds_since_epoch": 20},
+        {"nanoseconds": 70},
+    )
 
 
 def test_a_bag_without_messages_is_a_bag(tmp_path):
@@ -172,8 +210,12 @@ def test_a_bag_without_messages_is_a_bag(tmp_path):
 
 
 def test_a_type_that_is_not_known_is_refused(tmp_path):
-    with BagWriter(tmp_path / "bag") as writer, pytest.raises(
-            InputError, match="topic /a: no definition of b/msg/C; record only topics of known"):
+    with (
+        BagWriter(tmp_path / "bag") as writer,
+        pytest.raises(
+            InputError, match="topic /a: no definition of b/msg/C; record only topics of known"
+        ),
+    ):
         writer.add_topic("/a", "b/msg/C", [])
 
 
@@ -204,11 +246,15 @@ def test_closing_twice_is_closing_once(tmp_path):
     assert (tmp_path / "bag" / "metadata.yaml").stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize(("target", "said"), [
-    ("folder", "exists already; remove it or name another folder"),
-    ("file", "exists already; remove it or name another folder"),
-    ("file/bag", "cannot be created (Not a directory); name a writable folder"),
-    ("n" * 300, "cannot be created (File name too long); name a writable folder")])
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("folder", "exists already; remove it or name another folder"),
+        ("file", "exists already; remove it or name another folder"),
+        ("file/bag", "cannot be created (Not a directory); name a writable folder"),
+        ("n" * 300, "cannot be created (File name too long); name a writable folder"),
+    ],
+)
 def test_where_no_bag_can_be_made(tmp_path, target, said):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()
@@ -236,8 +282,14 @@ def test_a_full_disk_is_one_line(tmp_path, act):
     writer.add_topic("/notes", "std_msgs/msg/String", [])
     writer.write("/notes", {"data": "x"}, 1)
     writer._mcap._Writer__stream = FullDisk(writer._file)
-    with pytest.raises(InputError, match=r"bag: cannot be written \(No space left on device\); "
-                       "free some space or name another folder"):
-        {"flush": writer.flush, "close": writer.close,
-         "write": lambda: writer.write("/notes", {"data": "x" * 300_000}, 1)}[act]()
+    with pytest.raises(
+        InputError,
+        match=r"bag: cannot be written \(No space left on device\); "
+        "free some space or name another folder",
+    ):
+        {
+            "flush": writer.flush,
+            "close": writer.close,
+            "write": lambda: writer.write("/notes", {"data": "x" * 300_000}, 1),
+        }[act]()
     writer._file.close()

@@ -31,8 +31,9 @@ def result_of(noise_seed, *, moved_m=0.0, artifact=PLATE):
     g = truth.g.copy()
     g[0, 1, 2] += moved_m
     rng = np.random.default_rng([2, noise_seed])
-    readings = simulate_measurements(replace(truth, g=g), hu_plan(artifact, 4), rng, sigma_m=20e-9,
-                                     sigma_theta_rad=2e-5)
+    readings = simulate_measurements(
+        replace(truth, g=g), hu_plan(artifact, 4), rng, sigma_m=20e-9, sigma_theta_rad=2e-5
+    )
     return solve_joint(readings, BARE).result
 
 
@@ -41,8 +42,16 @@ def shelf(folder, results):
     out = []
     for number, result in enumerate(results):
         write_json(folder / f"{number}.json", result_to_dict(result))
-        out.append({"bag": f"bag {number:02}", "result": f"{number}.json", "exit_code": 0,
-                    "qualified": True, "message": "", "quantities": {"sigma_xy_um": 0.02}})
+        out.append(
+            {
+                "bag": f"bag {number:02}",
+                "result": f"{number}.json",
+                "exit_code": 0,
+                "qualified": True,
+                "message": "",
+                "quantities": {"sigma_xy_um": 0.02},
+            }
+        )
     return out
 
 
@@ -54,10 +63,14 @@ def test_maps_that_changed_are_named_and_no_others(tmp_path):
     assert text.startswith("2 of 20 maps differ from old.json: bag 02 (p = ") and "bag 07" in text
     found = compare(result_of(0), maps[2])
     assert records[2]["baseline"]["p"] == probability(found)
-    assert records[2]["quantities"] == pytest.approx({
-        "sigma_xy_um": 0.02, "difference_from_baseline_rms_um": found.rms_m * 1e6,
-        "difference_from_baseline_largest_um": found.max_m * 1e6,
-        "theta_difference_from_baseline_rms_arcsec": np.degrees(found.rms_theta_rad) * 3600})
+    assert records[2]["quantities"] == pytest.approx(
+        {
+            "sigma_xy_um": 0.02,
+            "difference_from_baseline_rms_um": found.rms_m * 1e6,
+            "difference_from_baseline_largest_um": found.max_m * 1e6,
+            "theta_difference_from_baseline_rms_arcsec": np.degrees(found.rms_theta_rad) * 3600,
+        }
+    )
     rows = list(csv.DictReader(io.StringIO(csv_text(records))))
     assert rows[2]["changed"] == "true" and rows[3]["changed"] == "false"
     assert float(rows[2]["baseline_p"]) == records[2]["baseline"]["adjusted_p"]
@@ -78,7 +91,8 @@ def test_bags_without_a_map_remain_as_they_are(tmp_path):
     reason = records[2]["not_compared"]
     assert "lattice" in reason or "plate" in reason
     assert sentence(records, "old.json") == (
-        f"0 of 1 maps differ from old.json; not compared: 1 ({reason})")
+        f"0 of 1 maps differ from old.json; not compared: 1 ({reason})"
+    )
     rows = list(csv.DictReader(io.StringIO(csv_text(records))))
     assert [row["not_compared"] for row in rows] == ["", "", reason]
 
@@ -86,8 +100,15 @@ def test_bags_without_a_map_remain_as_they_are(tmp_path):
 def test_without_uncertainties_nothing_is_tested(tmp_path):
     known = replace(result_of(0), noise=replace(result_of(0).noise, sigma_xy=np.nan))
     emap = known.error_map
-    none = replace(known, error_map=replace(emap, u_gx=emap.u_gx * np.nan, u_gy=emap.u_gy * np.nan,
-                                            u_g_theta=emap.u_g_theta * np.nan))
+    none = replace(
+        known,
+        error_map=replace(
+            emap,
+            u_gx=emap.u_gx * np.nan,
+            u_gy=emap.u_gy * np.nan,
+            u_g_theta=emap.u_g_theta * np.nan,
+        ),
+    )
     (record,) = compared(shelf(tmp_path, [none]), tmp_path, none, "old.json")
     assert record["baseline"] is None
     assert record["quantities"]["difference_from_baseline_largest_um"] == 0.0
@@ -108,8 +129,21 @@ def test_a_batch_without_any_map_of_the_baseline_is_written(tmp_path, capsys):
     """The bags are solved for hours: the table must not be lost for it."""
     write_json(tmp_path / "old.json", result_to_dict(worded(result_of(0))))
     out = tmp_path / "out"
-    assert main(["batch", "bags/hu_noise", "-o", str(out), "--workers", "1",
-                 "--baseline", str(tmp_path / "old.json")]) == 0
+    assert (
+        main(
+            [
+                "batch",
+                "bags/hu_noise",
+                "-o",
+                str(out),
+                "--workers",
+                "1",
+                "--baseline",
+                str(tmp_path / "old.json"),
+            ]
+        )
+        == 0
+    )
     assert "0 of 0 maps differ from" in capsys.readouterr().out
     (row,) = csv.DictReader((out / "table.csv").read_text().splitlines())
     assert row["not_compared"] and row["changed"] == row["baseline_p"] == ""
@@ -120,8 +154,22 @@ def test_maps_that_are_not_compared_are_counted(tmp_path, capsys):
     (tmp_path / "other").mkdir()
     bag = small_bag(tmp_path / "other")
     assert main(["solve", str(bag), "--quiet", "-o", str(tmp_path / "old.json")]) == 0
-    assert main(["batch", str(bag), "bags/hu_noise", "-o", str(out), "--workers", "1",
-                 "--baseline", str(tmp_path / "old.json")]) == 0
+    assert (
+        main(
+            [
+                "batch",
+                str(bag),
+                "bags/hu_noise",
+                "-o",
+                str(out),
+                "--workers",
+                "1",
+                "--baseline",
+                str(tmp_path / "old.json"),
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "0 of 1 maps differ from" in said
     assert "; not compared: 1 (" in said

@@ -68,26 +68,39 @@ def test_good_bags_are_solved_as_solve_does_and_bad_ones_are_passed(shelf, tmp_p
     assert batch(shelf, "-o", out, "--workers", 1) == 2
     printed = capsys.readouterr()
     assert printed.out.splitlines()[0] == (
-        "6 bags: 4 calibrated, 4 of them qualified, 2 without a result; 0 were done before")
+        "6 bags: 4 calibrated, 4 of them qualified, 2 without a result; 0 were done before"
+    )
     lines = sorted(printed.err.splitlines())
     assert len(lines) == 2
-    assert lines[0].startswith(f"selfcal batch: {shelf / 'few.mcap'}: the marks that were read do "
-                               "not identify the stage")
-    assert lines[1] == (f"selfcal batch: {shelf / 'text.mcap'}: not an MCAP file; give an .mcap "
-                        "file or a rosbag2 folder")
+    assert lines[0].startswith(
+        f"selfcal batch: {shelf / 'few.mcap'}: the marks that were read do not identify the stage"
+    )
+    assert lines[1] == (
+        f"selfcal batch: {shelf / 'text.mcap'}: not an MCAP file; give an .mcap "
+        "file or a rosbag2 folder"
+    )
     assert main(["solve", str(shelf / "a.mcap"), "--quiet", "-o", str(tmp_path / "a.json")]) == 0
     record = next(r for r in content(out)["records"] if r["bag"].endswith("a.mcap"))
-    ours, theirs = (json.loads(path.read_text()) for path in
-                    (out / record["result"], tmp_path / "a.json"))
+    ours, theirs = (
+        json.loads(path.read_text()) for path in (out / record["result"], tmp_path / "a.json")
+    )
     for result in (ours, theirs):
         assert result["provenance"].pop("created")
     assert ours == theirs
     assert record["quantities"]["nonorthogonality_arcsec"] == pytest.approx(
-        np.degrees(theirs["error_map"]["nonorthogonality"]) * 3600, rel=1e-12)
+        np.degrees(theirs["error_map"]["nonorthogonality"]) * 3600, rel=1e-12
+    )
     assert {r["bag"]: r["exit_code"] for r in content(out)["records"]} == {
-        str(shelf / name): code for name, code in (
-            ("a.mcap", 0), ("b.mcap", 0), ("deep/c.mcap", 0), ("deep/deeper/d.mcap", 0),
-            ("few.mcap", 3), ("text.mcap", 2))}
+        str(shelf / name): code
+        for name, code in (
+            ("a.mcap", 0),
+            ("b.mcap", 0),
+            ("deep/c.mcap", 0),
+            ("deep/deeper/d.mcap", 0),
+            ("few.mcap", 3),
+            ("text.mcap", 2),
+        )
+    }
 
 
 def test_robust_bags_are_solved_as_robust_solve_does(shelf, tmp_path):
@@ -95,8 +108,9 @@ def test_robust_bags_are_solved_as_robust_solve_does(shelf, tmp_path):
     bag = shelf / "a.mcap"
     assert batch(bag, "-o", out, "--workers", 1, "--robust") == 0
     assert main(["solve", str(bag), "--robust", "--quiet", "-o", str(alone)]) == 0
-    ours, theirs = (json.loads(path.read_text()) for path in
-                    (out / content(out)["records"][0]["result"], alone))
+    ours, theirs = (
+        json.loads(path.read_text()) for path in (out / content(out)["records"][0]["result"], alone)
+    )
     for result in (ours, theirs):
         assert result["provenance"].pop("created")
     assert ours == theirs
@@ -120,7 +134,8 @@ def test_only_what_is_new_is_done(shelf, tmp_path, capsys):
     second = stamps(out)
     assert len(second) == 3 and first.items() <= second.items()
     assert sorted(r["bag"] for r in told["records"]) == [
-        str(mine / name) for name in ("b.mcap", "c.mcap", "moved.mcap")]
+        str(mine / name) for name in ("b.mcap", "c.mcap", "moved.mcap")
+    ]
     assert batch(mine, "-o", out, "--workers", 1, "--model", "plate_scale:1e-6") == 0
     third = stamps(out)
     assert len(third) == 6 and second.items() <= third.items()
@@ -149,8 +164,11 @@ def test_redo_solves_a_bag_again_that_is_known_by_its_content_alone(shelf, tmp_p
         shutil.copy(shelf / "a.mcap", name)
     assert batch(*names, "-o", tmp_path / "out", "--workers", 1) == 0
     solved = []
-    monkeypatch.setattr(jobs, "solved", lambda job, source, right=jobs.solved: (
-        solved.append(job.bag.name), right(job, source))[1])
+    monkeypatch.setattr(
+        jobs,
+        "solved",
+        lambda job, source, right=jobs.solved: (solved.append(job.bag.name), right(job, source))[1],
+    )
     assert batch(*names, "-o", tmp_path / "out", "--workers", 1) == 0
     assert not solved
     assert batch(*names, "-o", tmp_path / "out", "--workers", 1, "--redo") == 0
@@ -163,11 +181,22 @@ def test_killed_in_the_middle_it_does_only_the_rest(tmp_path):
     bags.mkdir()
     for seed in range(12):
         Foreign().write(bags / f"{seed}.mcap", events_of(small_plan(), seed))
-    command = [sys.executable, "-m", "selfcal_ros", "batch", str(bags), "-o", str(out),
-               "--workers", "2"]
+    command = [
+        sys.executable,
+        "-m",
+        "selfcal_ros",
+        "batch",
+        str(bags),
+        "-o",
+        str(out),
+        "--workers",
+        "2",
+    ]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
-        wait_until(lambda: running.poll() is not None
-                   or len(list((out / RECORDS).glob("*.json"))) >= 3, "three records")
+        wait_until(
+            lambda: running.poll() is not None or len(list((out / RECORDS).glob("*.json"))) >= 3,
+            "three records",
+        )
         running.send_signal(signal.SIGKILL)
     assert running.returncode == -signal.SIGKILL
     assert batch(bags, "-o", out, "--workers", 2) == 0
@@ -180,14 +209,23 @@ def test_killed_in_the_middle_it_does_only_the_rest(tmp_path):
 def test_two_batches_do_not_work_in_one_folder(shelf, tmp_path, capsys):
     with opened(tmp_path / "out"):
         assert batch(shelf / "a.mcap", "-o", tmp_path / "out") == 2
-    assert capsys.readouterr().err == (f"selfcal batch: {tmp_path / 'out'}: another batch works in "
-                                       "this folder; wait for it to end or name another folder\n")
+    assert capsys.readouterr().err == (
+        f"selfcal batch: {tmp_path / 'out'}: another batch works in "
+        "this folder; wait for it to end or name another folder\n"
+    )
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (["--workers", "0"], "--workers: 0 is not a number of workers; give 1 to 1024"),
-    (["--dask", "x.mcap"], "--dask: 'x.mcap' is not the address of a scheduler; write HOST:PORT, "
-     "or --dask local in front of a bag")])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--workers", "0"], "--workers: 0 is not a number of workers; give 1 to 1024"),
+        (
+            ["--dask", "x.mcap"],
+            "--dask: 'x.mcap' is not the address of a scheduler; write HOST:PORT, "
+            "or --dask local in front of a bag",
+        ),
+    ],
+)
 def test_options_that_cannot_be(shelf, tmp_path, capsys, options, message):
     assert batch(shelf / "a.mcap", "-o", tmp_path / "out", *options) == 2
     assert capsys.readouterr().err == f"selfcal batch: {message}\n"
@@ -198,7 +236,8 @@ def test_a_bag_is_no_folder_for_results(tmp_path, capsys):
     for folder in (bag, bag / "results"):
         assert batch(bag, "-o", folder) == 2
         assert capsys.readouterr().err == (
-            f"selfcal batch: {folder}: it is in the bag {bag}; name another folder\n")
+            f"selfcal batch: {folder}: it is in the bag {bag}; name another folder\n"
+        )
     assert {path.suffix for path in bag.iterdir()} == {".mcap", ".yaml", ".json"}
 
 
@@ -228,7 +267,8 @@ def top(tmp_path):
 
 
 def test_bags_are_found_below_1500_folders_and_links_to_themselves_are_passed(
-        shelf, top, tmp_path, monkeypatch, capsys):
+    shelf, top, tmp_path, monkeypatch, capsys
+):
     with monkeypatch.context() as here:
         here.chdir(top)
         for _ in range(1500):
@@ -246,8 +286,18 @@ def test_bags_are_found_below_1500_folders_and_links_to_themselves_are_passed(
     assert "udcff.mcap" in (out / "index.html").read_text()
 
 
-@pytest.mark.parametrize(("codes", "code"), [
-    ((), 0), ((0, 0), 0), ((0, 5), 5), ((5, 0, 4), 4), ((4, 3, 5), 3), ((5, 2, 3), 2), ((2, 1), 1)])
+@pytest.mark.parametrize(
+    ("codes", "code"),
+    [
+        ((), 0),
+        ((0, 0), 0),
+        ((0, 5), 5),
+        ((5, 0, 4), 4),
+        ((4, 3, 5), 3),
+        ((5, 2, 3), 2),
+        ((2, 1), 1),
+    ],
+)
 def test_the_worst_bag_gives_the_exit_code(codes, code):
     assert exit_code([{"exit_code": one} for one in codes]) == code
 
@@ -260,41 +310,56 @@ def _empty(folder: Path) -> Path:
 def records(number: int = 30, change: int = 18, **more) -> list[dict]:
     """Return records of one plan, a day apart, whose squareness steps by 1 arcsec."""
     values = np.random.default_rng(2).normal(0, 0.1, number) + (np.arange(number) >= change)
-    return [{"bag": f"/bags/{day:02}", "exit_code": 0, "qualified": True, "message": "Qualified",
-             "plan_id": "p", "plate": [5, 5, 0.01, 8], "sha256": str(day), "run_id": "",
-             "first_exposure": f"2026-03-{day + 1:02}T12:00:00.000+00:00",
-             "quantities": {"nonorthogonality_arcsec": value, "sigma_xy_um": None}, **more}
-            for day, value in enumerate(values)]
+    return [
+        {
+            "bag": f"/bags/{day:02}",
+            "exit_code": 0,
+            "qualified": True,
+            "message": "Qualified",
+            "plan_id": "p",
+            "plate": [5, 5, 0.01, 8],
+            "sha256": str(day),
+            "run_id": "",
+            "first_exposure": f"2026-03-{day + 1:02}T12:00:00.000+00:00",
+            "quantities": {"nonorthogonality_arcsec": value, "sigma_xy_um": None},
+            **more,
+        }
+        for day, value in enumerate(values)
+    ]
 
 
 def test_a_change_is_named_between_bags_in_which_the_quantity_is_known():
     gap = records()
     for record in gap[14:18]:
         record["quantities"]["nonorthogonality_arcsec"] = None
-    series, = series_of(gap)
-    line, = series.sentences()
+    (series,) = series_of(gap)
+    (line,) = series.sentences()
     assert line.startswith("nonorthogonality: changed between 2026-03-14 12:00 and 2026-03-19 ")
     found = batch_json(gap, [series], 0)["series"][0]["courses"]["nonorthogonality_arcsec"]
     assert [day[:10] for day in found["change_between"]] == ["2026-03-14", "2026-03-19"]
     # the dashed line: half way from day 13 to day 18 of 29
     place = 64 + (560 - 64 - 14) * 15.5 / 29
     assert f'class="s-bad" d="M{place:.1f} ' in page_html(gap, [series], ["30 bags"])
-    steady = [record | {"quantities": {"x_um": 1.0 if day > 4 else None}}
-              for day, record in enumerate(records())]
-    series, = series_of(steady)
+    steady = [
+        record | {"quantities": {"x_um": 1.0 if day > 4 else None}}
+        for day, record in enumerate(records())
+    ]
+    (series,) = series_of(steady)
     (course,) = batch_json(steady, [series], 0)["series"][0]["courses"].values()
     assert course["finding"] == "none" and course["change_between"] is None
 
 
 def test_a_change_is_named_with_its_date_whatever_the_order_of_the_bags():
     shuffled = np.random.default_rng(4).permutation(np.array(records(), dtype=object)).tolist()
-    series, = series_of(shuffled)
-    line, = series.sentences()
-    assert line.startswith("nonorthogonality: changed between 2026-03-18 12:00 and 2026-03-19 "
-                           "12:00 by +1")
+    (series,) = series_of(shuffled)
+    (line,) = series.sentences()
+    assert line.startswith(
+        "nonorthogonality: changed between 2026-03-18 12:00 and 2026-03-19 12:00 by +1"
+    )
     head, plan, said = summary_lines(shuffled, [series], 4)
-    assert head == ("30 bags: 30 calibrated, 30 of them qualified, 0 without a result; 4 were done "
-                    "before")
+    assert head == (
+        "30 bags: 30 calibrated, 30 of them qualified, 0 without a result; 4 were done before"
+    )
     assert plan == "plan p, 30 bags from 2026-03-01 12:00 to 2026-03-30 12:00:"
     assert said == f"  {line}"
 
@@ -311,12 +376,17 @@ def test_the_table_has_a_line_a_bag_in_the_order_of_time():
     known[1] |= {"causes": [{"name": "drift", "view": "run 2: shift x"}, {"name": "slip"}]}
     rows = list(csv.DictReader(io.StringIO(csv_text([failed, *known[::-1]]))))
     assert [(row["cause"], row["cause_view"]) for row in rows[:3]] == [
-        ("", ""), ("drift", "run 2: shift x"), ("", "")]
+        ("", ""),
+        ("drift", "run 2: shift x"),
+        ("", ""),
+    ]
     assert [row["bag"] for row in rows] == [f"/bags/{day:02}" for day in range(30)] + [
-        failed["bag"]]
+        failed["bag"]
+    ]
     assert (rows[0]["qualified"], rows[0]["sigma_xy_um"], rows[30]["qualified"]) == ("true", "", "")
     assert float(rows[0]["nonorthogonality_arcsec"]) == pytest.approx(
-        records()[0]["quantities"]["nonorthogonality_arcsec"], rel=1e-15)
+        records()[0]["quantities"]["nonorthogonality_arcsec"], rel=1e-15
+    )
 
 
 class Page(html.parser.HTMLParser):
@@ -375,9 +445,13 @@ def test_quantities_with_an_uncertainty_have_bars_and_no_course_of_it():
 def test_plots_of_one_kind_share_a_scale_and_few_come_first():
     found = records()
     for day, record in enumerate(found):
-        record["quantities"] |= {"max_error_um": 0.7 + 0.01 * (day % 3), "rms_error_um": 0.2,
-                                 "rms_uncertainty_um": 0.01, "sigma_xy_um": 0.02}
-    series, = series_of(found)
+        record["quantities"] |= {
+            "max_error_um": 0.7 + 0.01 * (day % 3),
+            "rms_error_um": 0.2,
+            "rms_uncertainty_um": 0.01,
+            "sigma_xy_um": 0.02,
+        }
+    (series,) = series_of(found)
     spans = _common_spans(series)
     assert spans["max_error_um"] == spans["rms_error_um"] != spans["sigma_xy_um"]
     low, high = spans["max_error_um"]
@@ -388,7 +462,12 @@ def test_plots_of_one_kind_share_a_scale_and_few_come_first():
     assert re.match(r"<summary>(\d) further quantities", more)[1] == str(more.count("<figure>"))
     head = re.search(r"<thead><tr>(.*?)</tr>", text)[1]
     assert re.findall(r"<th[^>]*>(.*?)</th>", head) == [
-        "bag", "first exposure", "verdict", "max error, µm", "nonorthogonality, arcsec"]
+        "bag",
+        "first exposure",
+        "verdict",
+        "max error, µm",
+        "nonorthogonality, arcsec",
+    ]
 
 
 def test_limits_are_three_robust_standard_deviations_about_the_median():

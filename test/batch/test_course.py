@@ -19,12 +19,108 @@ from selfcal_ros.batch.course import (
     step_of,
 )
 
-NILE = [1120, 1160, 963, 1210, 1160, 1160, 813, 1230, 1370, 1140, 995, 935, 1110, 994, 1020, 960,
-        1180, 799, 958, 1140, 1100, 1210, 1150, 1250, 1260, 1220, 1030, 1100, 774, 840, 874, 694,
-        940, 833, 701, 916, 692, 1020, 1050, 969, 831, 726, 456, 824, 702, 1120, 1100, 832, 764,
-        821, 768, 845, 864, 862, 698, 845, 744, 796, 1040, 759, 781, 865, 845, 944, 984, 897, 822,
-        1010, 771, 676, 649, 846, 812, 742, 801, 1040, 860, 874, 848, 890, 744, 749, 838, 1050,
-        918, 986, 797, 923, 975, 815, 1020, 906, 901, 1170, 912, 746, 919, 718, 714, 740]
+NILE = [
+    1120,
+    1160,
+    963,
+    1210,
+    1160,
+    1160,
+    813,
+    1230,
+    1370,
+    1140,
+    995,
+    935,
+    1110,
+    994,
+    1020,
+    960,
+    1180,
+    799,
+    958,
+    1140,
+    1100,
+    1210,
+    1150,
+    1250,
+    1260,
+    1220,
+    1030,
+    1100,
+    774,
+    840,
+    874,
+    694,
+    940,
+    833,
+    701,
+    916,
+    692,
+    1020,
+    1050,
+    969,
+    831,
+    726,
+    456,
+    824,
+    702,
+    1120,
+    1100,
+    832,
+    764,
+    821,
+    768,
+    845,
+    864,
+    862,
+    698,
+    845,
+    744,
+    796,
+    1040,
+    759,
+    781,
+    865,
+    845,
+    944,
+    984,
+    897,
+    822,
+    1010,
+    771,
+    676,
+    649,
+    846,
+    812,
+    742,
+    801,
+    1040,
+    860,
+    874,
+    848,
+    890,
+    744,
+    749,
+    838,
+    1050,
+    918,
+    986,
+    797,
+    923,
+    975,
+    815,
+    1020,
+    906,
+    901,
+    1170,
+    912,
+    746,
+    919,
+    718,
+    714,
+    740,
+]
 """Yearly flow of the Nile, 1871 to 1970: the change of 1898 that every text on the subject has."""
 
 
@@ -44,8 +140,16 @@ def test_the_change_of_the_nile_is_found():
 def u_of(values) -> float:
     """His definition: max over t of |sum over i <= t < j of sgn(x_i - x_j)|, in plain loops."""
     n = len(values)
-    return max(abs(sum((values[i] > values[j]) - (values[i] < values[j]) for i in range(t)
-                       for j in range(t, n))) for t in range(1, n))
+    return max(
+        abs(
+            sum(
+                (values[i] > values[j]) - (values[i] < values[j])
+                for i in range(t)
+                for j in range(t, n)
+            )
+        )
+        for t in range(1, n)
+    )
 
 
 @pytest.mark.parametrize("values", [(1, 2, 3, 6, 4, 5), (2, 2, 3, 1, 4, 4), (3, 1, 4, 2, 6, 5)])
@@ -85,10 +189,15 @@ def test_clean_batches_name_nothing_as_often_as_promised():
     draws, alarms = rng(7), 0
     for _ in range(400):
         days = np.cumsum(draws.exponential(1.0, 20))
-        table = {"a": draws.normal(size=20), "b": draws.lognormal(size=20),
-                 "c": draws.integers(0, 4, 20).astype(float)}
-        alarms += any(course.finding is not CourseKind.NONE for course in
-                      courses(days, table, orders=499).values())
+        table = {
+            "a": draws.normal(size=20),
+            "b": draws.lognormal(size=20),
+            "c": draws.integers(0, 4, 20).astype(float),
+        }
+        alarms += any(
+            course.finding is not CourseKind.NONE
+            for course in courses(days, table, orders=499).values()
+        )
     low, high = stats.binom.interval(0.9973, 400, COURSE_LEVEL)
     assert 0.4 * low <= alarms <= high
 
@@ -96,9 +205,15 @@ def test_clean_batches_name_nothing_as_often_as_promised():
 @pytest.mark.usefixtures("probabilities_alone")
 def test_each_test_alone_keeps_its_level():
     draws = rng(3)
-    p = np.array([[c.p_trend, c.p_change] for c in (
-        course_of(np.arange(25.0), draws.normal(size=25), draws, orders=499)
-        for _ in range(400))])
+    p = np.array(
+        [
+            [c.p_trend, c.p_change]
+            for c in (
+                course_of(np.arange(25.0), draws.normal(size=25), draws, orders=499)
+                for _ in range(400)
+            )
+        ]
+    )
     low, high = stats.binom.interval(0.9973, 400, COURSE_LEVEL)
     for column in (p <= COURSE_LEVEL).sum(axis=0):
         assert low <= column <= high
@@ -108,10 +223,14 @@ def test_each_test_alone_keeps_its_level():
 def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
     days, noise = np.arange(40.0), rng(5).normal(0, 0.1, (3, 40))
     step = sign * np.where(days < 25, 0.0, 1.0)
-    found = courses(days, {"line": noise[0] + sign * 0.02 * days, "step": noise[1] + step,
-                           "rest": noise[2]})
+    found = courses(
+        days, {"line": noise[0] + sign * 0.02 * days, "step": noise[1] + step, "rest": noise[2]}
+    )
     assert [course.finding for course in found.values()] == [
-        CourseKind.TREND, CourseKind.CHANGE, CourseKind.NONE]
+        CourseKind.TREND,
+        CourseKind.CHANGE,
+        CourseKind.NONE,
+    ]
     slope, low, high = found["line"].slope_per_day
     assert low < sign * 0.02 < high and high - low < 0.02 and low <= slope <= high
     assert found["line"].adjusted_p < 1e-6  # Mann and Kendall's, not that of 9,999 orders
@@ -120,11 +239,18 @@ def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
     assert found["step"].after - found["step"].before == pytest.approx(sign * 1.0, abs=0.1)
 
 
-@pytest.mark.parametrize(("trend", "change", "kind"), [
-    (0.01, 0.2, CourseKind.TREND), (0.2, 0.01, CourseKind.CHANGE),
-    (0.01, 0.01, CourseKind.CHANGE), (0.2, 0.2, CourseKind.NONE)])
+@pytest.mark.parametrize(
+    ("trend", "change", "kind"),
+    [
+        (0.01, 0.2, CourseKind.TREND),
+        (0.2, 0.01, CourseKind.CHANGE),
+        (0.01, 0.01, CourseKind.CHANGE),
+        (0.2, 0.2, CourseKind.NONE),
+    ],
+)
 def test_the_form_of_the_values_decides_only_between_two_significant_tests(
-        monkeypatch, trend, change, kind):
+    monkeypatch, trend, change, kind
+):
     monkeypatch.setattr(course, "_adjusted", lambda p: np.array([[trend, change]]))
     step = np.repeat([0.0, 1.0], FEWEST)
     [found] = courses(np.arange(2.0 * FEWEST), {"step": step}, orders=99).values()

@@ -72,8 +72,18 @@ def run(args: argparse.Namespace) -> dict[str, float]:
             index = second // per_view
             view = View(f"v{index}", 0.0, (0.0, 0.0), angular=False, repeats=10_000)
             for phase, before in ((Phase.PLACE, 2), (Phase.MEASURE, 1)):
-                collector.add_command(Command(START_NS + second * S - before, phase, "bench",
-                                              index, view, plate, args.views, "1"))
+                collector.add_command(
+                    Command(
+                        START_NS + second * S - before,
+                        phase,
+                        "bench",
+                        index,
+                        view,
+                        plate,
+                        args.views,
+                        "1",
+                    )
+                )
         begun = time.process_time()
         for tenth in range(blocks):
             since = second + tenth / blocks + np.arange(round(args.rate / blocks)) * step
@@ -91,17 +101,27 @@ def run(args: argparse.Namespace) -> dict[str, float]:
                 item.missing  # noqa: B018 (a status names them)
             costs.append(time.perf_counter() - begun)
             cpus.append(time.process_time() - cpu)
-    digest = hashlib.sha256("".join(readings_digest(item.readings, measurements.rejected)
-                                    for item in progress.values()).encode()).hexdigest()
+    digest = hashlib.sha256(
+        "".join(
+            readings_digest(item.readings, measurements.rejected) for item in progress.values()
+        ).encode()
+    ).hexdigest()
     used = sum(view.used for view in measurements.views)
-    return {"hours": args.hours, "rate": args.rate, "samples": collector.received["encoder"],
-            "detections": collector.received["detection"], "used": used,
-            "status_median_ms": 1e3 * float(np.median(costs)),
-            "status_p99_ms": 1e3 * float(np.quantile(costs, 0.99)),
-            "status_max_ms": 1e3 * max(costs), "status_cpu_median_ms": 1e3 * float(np.median(cpus)),
-            "status_cpu_max_ms": 1e3 * max(cpus), "feeding_cpu_s": busy,
-            "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            "digest": digest[:16]}
+    return {
+        "hours": args.hours,
+        "rate": args.rate,
+        "samples": collector.received["encoder"],
+        "detections": collector.received["detection"],
+        "used": used,
+        "status_median_ms": 1e3 * float(np.median(costs)),
+        "status_p99_ms": 1e3 * float(np.quantile(costs, 0.99)),
+        "status_max_ms": 1e3 * max(costs),
+        "status_cpu_median_ms": 1e3 * float(np.median(cpus)),
+        "status_cpu_max_ms": 1e3 * max(cpus),
+        "feeding_cpu_s": busy,
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "digest": digest[:16],
+    }
 
 
 def main() -> None:

@@ -30,9 +30,18 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 RATES = (500, 1000, 2000, 10000)
-METHODS = {"selfcal": ["-m", "selfcal_ros.nodes.compensator", "--ros-args", "-p", "map:={map}",
-                       "--log-level", "error"],
-           "rclpy + RegularGridInterpolator": [__file__, "--rival", "{map}"]}
+METHODS = {
+    "selfcal": [
+        "-m",
+        "selfcal_ros.nodes.compensator",
+        "--ros-args",
+        "-p",
+        "map:={map}",
+        "--log-level",
+        "error",
+    ],
+    "rclpy + RegularGridInterpolator": [__file__, "--rival", "{map}"],
+}
 PITCH_M, SIZE, LINES = 0.01, 21, 72
 SITE, THETA = (3, 15), 0.4
 STAMP = struct.Struct("<iI")
@@ -69,14 +78,16 @@ def rival(path: str) -> None:
 
     g = result_from_dict(read_json(path), path).error_map
     sites = (np.arange(SIZE) - SIZE // 2) * PITCH_M
-    field = RegularGridInterpolator((sites, sites), np.stack([g.gx, g.gy], axis=-1),
-                                    bounds_error=False, fill_value=None)
+    field = RegularGridInterpolator(
+        (sites, sites), np.stack([g.gx, g.gy], axis=-1), bounds_error=False, fill_value=None
+    )
     lines = np.arange(LINES + 1) * 2 * np.pi / LINES
     closed = np.append(g.g_theta, g.g_theta[:1])
     rclpy.init()
     node = rclpy.create_node("compensator")
-    publisher = node.create_publisher(names.CORRECTED.type, names.CORRECTED.name,
-                                      qos_profile_sensor_data)
+    publisher = node.create_publisher(
+        names.CORRECTED.type, names.CORRECTED.name, qos_profile_sensor_data
+    )
 
     def on_sample(message) -> None:
         x, y, theta = message.position
@@ -86,8 +97,10 @@ def rival(path: str) -> None:
             angle = theta - np.interp(angle % (2 * np.pi), lines, closed)
         message.position = [*true, angle]
         publisher.publish(message)
-    node.create_subscription(names.ENCODER.type, names.ENCODER.name, on_sample,
-                             names.ENCODER_EITHER[1].qos)
+
+    node.create_subscription(
+        names.ENCODER.type, names.ENCODER.name, on_sample, names.ENCODER_EITHER[1].qos
+    )
     with contextlib.suppress(ExternalShutdownException, RCLError):  # the driver ends it
         rclpy.spin(node)
 
@@ -104,14 +117,18 @@ def drive(method: str, rate: int, seconds: float) -> dict:
         os.environ.update(environment)
         path = f"{folder}/map.json"
         write_json(path, result_to_dict(result_of(error_map())))
-        node = subprocess.Popen([sys.executable, *(word.format(map=path)
-                                                   for word in METHODS[method])],
-                                env=os.environ | {"PYTHONPATH": str(ROOT)})
+        node = subprocess.Popen(
+            [sys.executable, *(word.format(map=path) for word in METHODS[method])],
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+        )
         try:
             os.sched_setaffinity(node.pid, processors[-1:])
             os.sched_setaffinity(0, processors[:1])
-            return {"benchmark": f"compensate {rate} Hz", "method": method,
-                    **play(rate, seconds, node.pid)}
+            return {
+                "benchmark": f"compensate {rate} Hz",
+                "method": method,
+                **play(rate, seconds, node.pid),
+            }
         finally:
             node.terminate()
             node.wait()
@@ -127,15 +144,21 @@ def play(rate: int, seconds: float, pid: int) -> dict:
     rclpy.init()
     node = rclpy.create_node("driver")
     out = node.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
-    heard = node.create_subscription(names.CORRECTED.type, names.CORRECTED.name, lambda _: None,
-                                     names.CORRECTED.qos, raw=True)
+    heard = node.create_subscription(
+        names.CORRECTED.type, names.CORRECTED.name, lambda _: None, names.CORRECTED.qos, raw=True
+    )
     health = names.of_node("compensator", names.HEALTH)
     said = node.create_subscription(health.type, health.name, lambda _: None, health.qos)
     found = error_map()
     true = (np.array(SITE) - SIZE // 2) * PITCH_M
     indicated = true + np.array([found.gx[SITE], found.gy[SITE]])
-    data = bytearray(serialize_message(names.ENCODER.type(
-        name=["x", "y", "theta"], position=[*indicated, THETA], velocity=[0.0] * 3)))
+    data = bytearray(
+        serialize_message(
+            names.ENCODER.type(
+                name=["x", "y", "theta"], position=[*indicated, THETA], velocity=[0.0] * 3
+            )
+        )
+    )
     ages, newest = [], b""
 
     def publish() -> None:
@@ -170,10 +193,17 @@ def play(rate: int, seconds: float, pid: int) -> dict:
     told = said.handle.take_message(health.type, False)
     skipped = {item.key: item.value for item in told[0].values}["skipped"] if told else None
     error = np.abs(np.array(deserialize_message(newest, heard.msg_type).position[:2]) - true)
-    row = {"n": total, "seconds": float(np.median(ages)), "peak_mb": round(peak_mb(pid), 1),
-           "max_error": float(error.max()), "cpu_seconds": used,
-           "seconds_99": float(np.quantile(ages, 0.99)), "seconds_max": max(ages),
-           "corrected": len(ages), "skipped": skipped}
+    row = {
+        "n": total,
+        "seconds": float(np.median(ages)),
+        "peak_mb": round(peak_mb(pid), 1),
+        "max_error": float(error.max()),
+        "cpu_seconds": used,
+        "seconds_99": float(np.quantile(ages, 0.99)),
+        "seconds_max": max(ages),
+        "corrected": len(ages),
+        "skipped": skipped,
+    }
     rclpy.shutdown()
     return row
 
@@ -189,19 +219,28 @@ def strangers(rate: int, seconds: float) -> dict:
         path = f"{folder}/map.json"
         write_json(path, result_to_dict(result_of(error_map())))
         module, *words = METHODS["selfcal"][1:]
-        with process(module, [word.format(map=path) for word in words],
-                     environment | {"PYTHONPATH": str(ROOT)}) as node:
+        with process(
+            module,
+            [word.format(map=path) for word in words],
+            environment | {"PYTHONPATH": str(ROOT)},
+        ) as node:
             command = [sys.executable, __file__, "--seconds", str(seconds), "--stranger"]
-            listener = subprocess.Popen([*command, "listen", str(rate)], env=environment,
-                                        stdout=subprocess.PIPE, text=True)
+            listener = subprocess.Popen(
+                [*command, "listen", str(rate)], env=environment, stdout=subprocess.PIPE, text=True
+            )
             idle = cpu_s(node.pid)
             subprocess.run([*command, "publish", str(rate)], env=environment, check=True)
             used = cpu_s(node.pid) - idle
             row = json.loads(listener.communicate()[0])
-            return {"benchmark": f"compensate {rate} Hz", "method": STRANGERS,
-                    "n": round(rate * seconds), "peak_mb": round(peak_mb(node.pid), 1),
-                    "max_error": None, "cpu_seconds": used,
-                    **row}
+            return {
+                "benchmark": f"compensate {rate} Hz",
+                "method": STRANGERS,
+                "n": round(rate * seconds),
+                "peak_mb": round(peak_mb(node.pid), 1),
+                "max_error": None,
+                "cpu_seconds": used,
+                **row,
+            }
 
 
 def publish_as_stranger(rate: int, seconds: float) -> None:
@@ -243,8 +282,13 @@ def listen_as_stranger(rate: int, seconds: float) -> None:
     def take(message) -> None:
         stamp = message.header.stamp
         ages.append((time.time_ns() - stamp.sec * 10**9 - stamp.nanosec) * 1e-9)
-    node.create_subscription(names.CORRECTED.type, names.CORRECTED.name, take, QoSProfile(
-        depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT))
+
+    node.create_subscription(
+        names.CORRECTED.type,
+        names.CORRECTED.name,
+        take,
+        QoSProfile(depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT),
+    )
     health = names.of_node("compensator", names.HEALTH)
     node.create_subscription(health.type, health.name, told.append, health.qos)
     while not ages:
@@ -253,9 +297,17 @@ def listen_as_stranger(rate: int, seconds: float) -> None:
     while time.monotonic() < end:
         rclpy.spin_once(node, timeout_sec=0.1)
     skipped = {item.key: item.value for item in told[-1].values}["skipped"] if told else None
-    print(json.dumps({"seconds": float(np.median(ages)), "corrected": len(ages),
-                      "seconds_99": float(np.quantile(ages, 0.99)), "seconds_max": max(ages),
-                      "skipped": skipped}))
+    print(
+        json.dumps(
+            {
+                "seconds": float(np.median(ages)),
+                "corrected": len(ages),
+                "seconds_99": float(np.quantile(ages, 0.99)),
+                "seconds_max": max(ages),
+                "skipped": skipped,
+            }
+        )
+    )
 
 
 def cpu_s(pid: int) -> float:
@@ -266,24 +318,34 @@ def cpu_s(pid: int) -> float:
 
 def peak_mb(pid: int) -> float:
     """Return the largest resident memory of a process."""
-    [line] = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines()
-              if line.startswith("VmHWM"))
+    [line] = (
+        line
+        for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+        if line.startswith("VmHWM")
+    )
     return int(line.split()[1]) / 1024
 
 
 def measured(method: str, rate: int, seconds: float) -> dict:
     """Return the row of `drive` or `strangers` in a process of its own."""
-    done = subprocess.run([sys.executable, __file__, "--worker", method, str(rate), "--seconds",
-                           str(seconds)], stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, __file__, "--worker", method, str(rate), "--seconds", str(seconds)],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
     return json.loads(done.stdout)
 
 
 def show(row: dict) -> None:
     """Print a row with the figures that the other benchmarks do not have; CPU is a sample's."""
-    print(f"{row['benchmark']:<20} {row['method']:<32} {1e3 * row['seconds']:10.3f} "
-          f"{1e3 * row['seconds_99']:9.2f} {1e3 * row['seconds_max']:9.1f} "
-          f"{row['corrected']:>7}/{row['n']:>7} {row['skipped'] or '':>8} "
-          f"{1e6 * row['cpu_seconds'] / row['corrected']:10.0f}", flush=True)
+    print(
+        f"{row['benchmark']:<20} {row['method']:<32} {1e3 * row['seconds']:10.3f} "
+        f"{1e3 * row['seconds_99']:9.2f} {1e3 * row['seconds_max']:9.1f} "
+        f"{row['corrected']:>7}/{row['n']:>7} {row['skipped'] or '':>8} "
+        f"{1e6 * row['cpu_seconds'] / row['corrected']:10.0f}",
+        flush=True,
+    )
 
 
 def main() -> None:
@@ -302,11 +364,18 @@ def main() -> None:
         act(int(args.stranger[1]), args.seconds)
     elif args.worker:
         method, rate = args.worker[0], int(args.worker[1])
-        print(json.dumps(strangers(rate, args.seconds) if method == STRANGERS
-                         else drive(method, rate, args.seconds)))
+        print(
+            json.dumps(
+                strangers(rate, args.seconds)
+                if method == STRANGERS
+                else drive(method, rate, args.seconds)
+            )
+        )
     else:
-        print(f"{'':<20} {'method':<32} {'median ms':>10} {'99 % ms':>9} {'max ms':>9} "
-              f"{'corrected':>15} {'skipped':>8} {'us of CPU':>10}")
+        print(
+            f"{'':<20} {'method':<32} {'median ms':>10} {'99 % ms':>9} {'max ms':>9} "
+            f"{'corrected':>15} {'skipped':>8} {'us of CPU':>10}"
+        )
         for rate in map(int, args.rates.split(",")):
             for method in METHODS:
                 show(measured(method, rate, args.seconds))

@@ -32,9 +32,18 @@ CORNER_PX = 17.0
 
 def camera(mark: str, ratio: float) -> Camera:
     """Return the camera of a row; noise is that of reading alone."""
-    return Camera(width=1280, height=1024, pixel_size_m=PIXEL_M, mark=mark, contrast=CONTRAST,
-                  mark_size_m=SIZE_PX * PIXEL_M, mark_width_m=SIZE_PX * PIXEL_M / 5,
-                  read_noise=CONTRAST / ratio, shot_noise=0.0, encoding="mono16")
+    return Camera(
+        width=1280,
+        height=1024,
+        pixel_size_m=PIXEL_M,
+        mark=mark,
+        contrast=CONTRAST,
+        mark_size_m=SIZE_PX * PIXEL_M,
+        mark_width_m=SIZE_PX * PIXEL_M / 5,
+        read_noise=CONTRAST / ratio,
+        shot_noise=0.0,
+        encoding="mono16",
+    )
 
 
 def drawn(mark: str, ratio: float, number: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -64,10 +73,15 @@ def bound_px(mark: str, ratio: float) -> float:
 
 def ours(mark: str, images: list[np.ndarray]) -> list[np.ndarray]:
     """Return the places found by this package, px."""
-    detector = MarkDetector(DetectorSettings(
-        pixel_size=PIXEL_M, mark=mark, mark_size=SIZE_PX * PIXEL_M))
-    return [np.array([(found.u, found.v) for found in detector.marks(
-        Picture(image, 65535))[0]]).reshape(-1, 2) for image in images]
+    detector = MarkDetector(
+        DetectorSettings(pixel_size=PIXEL_M, mark=mark, mark_size=SIZE_PX * PIXEL_M)
+    )
+    return [
+        np.array(
+            [(found.u, found.v) for found in detector.marks(Picture(image, 65535))[0]]
+        ).reshape(-1, 2)
+        for image in images
+    ]
 
 
 def opencv(mark: str, images: list[np.ndarray]) -> list[np.ndarray]:
@@ -107,8 +121,14 @@ def rows(number: int):
         for ratio in RATIOS:
             images, places = drawn(mark, ratio, number)
             for method in (OURS, *([RIVALS[mark]] if mark in RIVALS else [])):
-                row = {"benchmark": f"detect {mark} {ratio}", "method": method, "n": number,
-                       "seconds": None, "peak_mb": None, "max_error": None}
+                row = {
+                    "benchmark": f"detect {mark} {ratio}",
+                    "method": method,
+                    "n": number,
+                    "seconds": None,
+                    "peak_mb": None,
+                    "max_error": None,
+                }
                 if method != OURS and find_spec("cv2") is None:
                     yield {**row, "note": "not installed"}
                     continue
@@ -117,14 +137,19 @@ def rows(number: int):
                 found = find(mark, images)
                 cpu = (time.process_time() - began) / number
                 missed = missed_px(found, places)
-                seconds, _ = median_time(lambda find=find, mark=mark, image=images[:1]: find(
-                    mark, image), once=False)
-                yield {**row, "seconds": seconds, "cpu_seconds": cpu,
-                       "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-                       "max_error": float(np.abs(missed).max(initial=0.0)) * PIXEL_M,
-                       "found": len(missed) / (9 * number),
-                       "rms_px": float(np.sqrt(np.square(missed).mean())) if len(missed) else None,
-                       "bound_px": bound_px(mark, ratio)}
+                seconds, _ = median_time(
+                    lambda find=find, mark=mark, image=images[:1]: find(mark, image), once=False
+                )
+                yield {
+                    **row,
+                    "seconds": seconds,
+                    "cpu_seconds": cpu,
+                    "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                    "max_error": float(np.abs(missed).max(initial=0.0)) * PIXEL_M,
+                    "found": len(missed) / (9 * number),
+                    "rms_px": float(np.sqrt(np.square(missed).mean())) if len(missed) else None,
+                    "bound_px": bound_px(mark, ratio),
+                }
 
 
 MANY = (10, 32, 84)
@@ -137,8 +162,9 @@ def drawn_many(side: int) -> tuple[np.ndarray, np.ndarray]:
     """Return an image of side x side marks at random phases, and their places (n, 2), px."""
     rng = np.random.default_rng(side)
     width = MANY_PITCH_PX * (side + 1)
-    cell = replace(camera("disc", MANY_RATIO), width=width, height=width,
-                   mark_size_m=MANY_SIZE_PX * PIXEL_M)
+    cell = replace(
+        camera("disc", MANY_RATIO), width=width, height=width, mark_size_m=MANY_SIZE_PX * PIXEL_M
+    )
     along = (np.arange(side) - (side - 1) / 2) * MANY_PITCH_PX
     lattice = np.stack(np.meshgrid(along, along)).reshape(2, -1)
     offsets = (lattice + rng.uniform(-0.5, 0.5, lattice.shape)) * PIXEL_M
@@ -147,8 +173,11 @@ def drawn_many(side: int) -> tuple[np.ndarray, np.ndarray]:
 
 def ours_many(image: np.ndarray) -> np.ndarray:
     """Return the places found by this package, px."""
-    detector = MarkDetector(DetectorSettings(
-        pixel_size=PIXEL_M, mark="disc", mark_size=MANY_SIZE_PX * PIXEL_M, max_marks=image.size))
+    detector = MarkDetector(
+        DetectorSettings(
+            pixel_size=PIXEL_M, mark="disc", mark_size=MANY_SIZE_PX * PIXEL_M, max_marks=image.size
+        )
+    )
     return np.array([(found.u, found.v) for found in detector.marks(Picture(image, 65535))[0]])
 
 
@@ -179,8 +208,14 @@ def rows_of_many():
     for side in MANY:
         image, places = drawn_many(side)
         for method, find in methods.items():
-            row = {"benchmark": "detect many", "method": method, "n": side * side,
-                   "seconds": None, "peak_mb": None, "max_error": None}
+            row = {
+                "benchmark": "detect many",
+                "method": method,
+                "n": side * side,
+                "seconds": None,
+                "peak_mb": None,
+                "max_error": None,
+            }
             if method == RIVALS["disc"] and find_spec("cv2") is None:
                 yield {**row, "note": "not installed"}
                 continue
@@ -189,18 +224,24 @@ def rows_of_many():
             cpu = time.process_time() - began
             missed = missed_px([found], [places])
             seconds, _ = median_time(lambda find=find, image=image: find(image), once=False)
-            yield {**row, "seconds": seconds, "cpu_seconds": cpu,
-                   "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-                   "max_error": float(np.abs(missed).max(initial=0.0)) * PIXEL_M,
-                   "found": len(missed) / side**2,
-                   "rms_px": float(np.sqrt(np.square(missed).mean())) if len(missed) else None,
-                   "bound_px": None}
+            yield {
+                **row,
+                "seconds": seconds,
+                "cpu_seconds": cpu,
+                "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                "max_error": float(np.abs(missed).max(initial=0.0)) * PIXEL_M,
+                "found": len(missed) / side**2,
+                "rms_px": float(np.sqrt(np.square(missed).mean())) if len(missed) else None,
+                "bound_px": None,
+            }
 
 
 def show(row: dict) -> None:
     """Print one line of the table."""
-    print(f"{row['benchmark']:<17} {row['method']:<36} {row['n']:>7} {row['seconds']:12.6f} "
-          f"{row['peak_mb']:10.0f} {row['max_error']:12.1e} {row['cpu_seconds']:10.3f}  "
-          f"{row['found']:.1%} found, rms {row['rms_px']:.4f} px"
-          + (f", {row['rms_px'] / row['bound_px']:.2f} of the bound" if row["bound_px"] else ""),
-          flush=True)
+    print(
+        f"{row['benchmark']:<17} {row['method']:<36} {row['n']:>7} {row['seconds']:12.6f} "
+        f"{row['peak_mb']:10.0f} {row['max_error']:12.1e} {row['cpu_seconds']:10.3f}  "
+        f"{row['found']:.1%} found, rms {row['rms_px']:.4f} px"
+        + (f", {row['rms_px'] / row['bound_px']:.2f} of the bound" if row["bound_px"] else ""),
+        flush=True,
+    )

@@ -44,8 +44,9 @@ def encoder_part(n_samples: int) -> tuple[Recording, Truth]:
     plan, truth, measurements, repeats = simulated(21 if n_samples >= 200_000 else 5, 3)
     n_visits = sum(len(view.m) for view in measurements.views)
     visit_ns = n_samples * ENCODER_NS // n_visits
-    return recording(plan, measurements, repeats=repeats, visit_ns=visit_ns,
-                     encoder_ns=ENCODER_NS), truth
+    return recording(
+        plan, measurements, repeats=repeats, visit_ns=visit_ns, encoder_ns=ENCODER_NS
+    ), truth
 
 
 def detection_part(n_detections: int) -> tuple[Recording, Truth]:
@@ -53,8 +54,7 @@ def detection_part(n_detections: int) -> tuple[Recording, Truth]:
     size = 401 if n_detections >= 10**6 else 21 if n_detections >= 3000 else 5
     plan, truth, measurements, _ = simulated(size, 1)
     repeats = max(1, round(n_detections / sum(len(view.m) for view in measurements.views)))
-    return recording(plan, measurements, repeats=repeats, visit_ns=50_000_000,
-                     encoder_ns=0), truth
+    return recording(plan, measurements, repeats=repeats, visit_ns=50_000_000, encoder_ns=0), truth
 
 
 class Taken(NamedTuple):
@@ -65,7 +65,9 @@ class Taken(NamedTuple):
 
 
 PARTS: dict[str, Callable[[int], tuple[Recording, Truth]]] = {
-    ENCODER: encoder_part, DETECTIONS: detection_part}
+    ENCODER: encoder_part,
+    DETECTIONS: detection_part,
+}
 
 
 MESSAGES = Path(__file__).parents[2] / "msg_defs" / "msg"
@@ -123,22 +125,25 @@ def by_pybag(bag: Path) -> int:
     from pybag.mcap_reader import McapFileReader
 
     with McapFileReader.from_file(next(bag.glob("*.mcap"))) as reader:
-        return sum(1 for _ in reader.messages(list(reader.get_topics()),
-                                              in_log_time_order=False))
+        return sum(1 for _ in reader.messages(list(reader.get_topics()), in_log_time_order=False))
 
 
 def by_us(bag: Path) -> int:
     """Decode every message into columns, without keeping them."""
     from selfcal_ros.bagio.reader import BagReader
 
-    return sum(1 if topic.endswith("command") else len(item)
-               for topic, item in BagReader(bag).columns())
+    return sum(
+        1 if topic.endswith("command") else len(item) for topic, item in BagReader(bag).columns()
+    )
 
 
 PEERS: dict[str, tuple[str, Callable[[Path], int]]] = {
-    "rosbags": ("rosbags", by_rosbags), "mcap (not decoded)": ("mcap", by_mcap),
-    "mcap-ros2-support": ("mcap_ros2", by_mcap_ros2), "pybag-sdk": ("pybag", by_pybag),
-    "selfcal (columns)": ("selfcal_ros", by_us)}
+    "rosbags": ("rosbags", by_rosbags),
+    "mcap (not decoded)": ("mcap", by_mcap),
+    "mcap-ros2-support": ("mcap_ros2", by_mcap_ros2),
+    "pybag-sdk": ("pybag", by_pybag),
+    "selfcal (columns)": ("selfcal_ros", by_us),
+}
 METHODS = {ENCODER: (SOLVE, *PEERS), DETECTIONS: (READ, SOLVE_ONLY)}
 
 
@@ -153,10 +158,22 @@ def worker(benchmark: str, method: str, bag: Path) -> dict:
     error, who = None, resource.RUSAGE_SELF
     if method == SOLVE:
         who, out = resource.RUSAGE_CHILDREN, bag.with_name(f"{bag.name}_result.json")
-        taken, _ = timed(lambda: subprocess.run(
-            [sys.executable, "-m", "selfcal_ros", "solve", str(bag), "--quiet", "--force",
-             "-o", str(out)],
-            check=True))
+        taken, _ = timed(
+            lambda: subprocess.run(
+                [
+                    sys.executable,
+                    "-m",
+                    "selfcal_ros",
+                    "solve",
+                    str(bag),
+                    "--quiet",
+                    "--force",
+                    "-o",
+                    str(out),
+                ],
+                check=True,
+            )
+        )
         error = error_of(json.loads(out.read_text())["error_map"], bag)
     elif method in (READ, SOLVE_ONLY):
         taken, error = in_parts(bag, method)
@@ -164,9 +181,15 @@ def worker(benchmark: str, method: str, bag: Path) -> dict:
         taken, count = timed(lambda: PEERS[method][1](bag))
         if count != total:
             raise RuntimeError(f"{method} met {count} of {total} messages")
-    return {"benchmark": benchmark, "method": method, "n": total, "seconds": taken.wall_s,
-            "peak_mb": round(resource.getrusage(who).ru_maxrss / 1024, 1), "max_error": error,
-            "cpu_seconds": taken.cpu_s}
+    return {
+        "benchmark": benchmark,
+        "method": method,
+        "n": total,
+        "seconds": taken.wall_s,
+        "peak_mb": round(resource.getrusage(who).ru_maxrss / 1024, 1),
+        "max_error": error,
+        "cpu_seconds": taken.cpu_s,
+    }
 
 
 def in_parts(bag: Path, method: str) -> tuple[Taken, float | None]:
@@ -194,12 +217,18 @@ def timed(run: Callable) -> tuple[Taken, object]:
 
 def cpu_seconds() -> float:
     """Return the processor time of this process and of those it waited for, kernel included."""
-    return sum(used.ru_utime + used.ru_stime for used in map(
-        resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))
+    return sum(
+        used.ru_utime + used.ru_stime
+        for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    )
 
 
 def error_of(found: dict, bag: Path) -> float:
     """Return the largest difference of a map from the truth beside the bag, m."""
     truth = np.load(bag / "truth.npy")
-    return float(np.abs(np.stack([np.array(found["gx"], dtype=float),
-                                  np.array(found["gy"], dtype=float)]) - truth).max())
+    return float(
+        np.abs(
+            np.stack([np.array(found["gx"], dtype=float), np.array(found["gy"], dtype=float)])
+            - truth
+        ).max()
+    )

@@ -29,9 +29,14 @@ CHUNK_BYTES = 1 << 20
 REST = 0.4
 """Part of a visit during which the stage rests, on either side of the exposure."""
 MAGIC = b"\x89MCAP0\r\n"
-FRONT = np.dtype({"names": ["opcode", "length", "channel", "sequence", "log", "publish"],
-                  "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
-                  "offsets": [0, 1, 9, 11, 15, 23], "itemsize": 31})
+FRONT = np.dtype(
+    {
+        "names": ["opcode", "length", "channel", "sequence", "log", "publish"],
+        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+        "offsets": [0, 1, 9, 11, 15, 23],
+        "itemsize": 31,
+    }
+)
 ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
 
@@ -73,19 +78,32 @@ def recording(plan, measurements, *, repeats: int, visit_ns: int, encoder_ns: in
         middle = now + visit_ns * np.arange(len(i)) + visit_ns // 2
         rest = int(REST * visit_ns)
         shift = ((np.arange(repeats) - repeats // 2) * (rest // repeats))[None, :]
-        rows = {"stamp": middle[:, None] + shift + 1, "m": readings.m[:, None],
-                "n": readings.n[:, None], "x": readings.dx[:, None], "y": readings.dy[:, None]}
-        columns.append({name: np.broadcast_to(value, (len(i), repeats)).ravel()
-                        for name, value in rows.items()})
+        rows = {
+            "stamp": middle[:, None] + shift + 1,
+            "m": readings.m[:, None],
+            "n": readings.n[:, None],
+            "x": readings.dx[:, None],
+            "y": readings.dy[:, None],
+        }
+        columns.append(
+            {
+                name: np.broadcast_to(value, (len(i), repeats)).ravel()
+                for name, value in rows.items()
+            }
+        )
         ends = np.column_stack([middle - rest, middle + rest]).ravel()
         knots.append((ends, np.repeat(i * pitch, 2), np.repeat(j * pitch, 2)))
-        stamps.append(ends if not encoder_ns else
-                      np.arange(now, now + visit_ns * len(i), encoder_ns))
+        stamps.append(
+            ends if not encoder_ns else np.arange(now, now + visit_ns * len(i), encoder_ns)
+        )
         now = int(now + visit_ns * len(i) + PAUSE_NS)
     commands.append(Command(now, Phase.DONE, plan.plan_id, len(plan.views)))
     return Recording(
-        commands, {name: np.concatenate([c[name] for c in columns]) for name in columns[0]},
-        np.concatenate(stamps), tuple(np.concatenate(part) for part in zip(*knots, strict=True)))
+        commands,
+        {name: np.concatenate([c[name] for c in columns]) for name in columns[0]},
+        np.concatenate(stamps),
+        tuple(np.concatenate(part) for part in zip(*knots, strict=True)),
+    )
 
 
 def _rows(event, topic: str, channel: int, stamps: np.ndarray) -> tuple:
@@ -98,13 +116,18 @@ def _rows(event, topic: str, channel: int, stamps: np.ndarray) -> tuple:
     payload = bytes(typestore().serialize_cdr(build(typestore(), name, values), name))
     layout = layout_of(fields_of(typestore(), name), payload)
     size = FRONT.itemsize + len(payload)
-    formats = [(code if count is None else (code, (count,)), FRONT.itemsize + at)
-               for code, at, count in layout.values.values()]
-    dtype = np.dtype({
-        "names": [*FRONT.names, *layout.values],
-        "formats": [*(FRONT[n] for n in FRONT.names), *(f for f, _ in formats)],
-        "offsets": [*(FRONT.fields[n][1] for n in FRONT.names), *(at for _, at in formats)],
-        "itemsize": size})
+    formats = [
+        (code if count is None else (code, (count,)), FRONT.itemsize + at)
+        for code, at, count in layout.values.values()
+    ]
+    dtype = np.dtype(
+        {
+            "names": [*FRONT.names, *layout.values],
+            "formats": [*(FRONT[n] for n in FRONT.names), *(f for f, _ in formats)],
+            "offsets": [*(FRONT.fields[n][1] for n in FRONT.names), *(at for _, at in formats)],
+            "itemsize": size,
+        }
+    )
     rows = np.frombuffer(bytearray((bytes(FRONT.itemsize) + payload) * len(stamps)), dtype=dtype)
     rows["opcode"], rows["length"] = Opcode.MESSAGE, size - 9
     rows["channel"], rows["log"], rows["publish"] = channel, stamps, stamps
@@ -115,8 +138,7 @@ def _rows(event, topic: str, channel: int, stamps: np.ndarray) -> tuple:
 def encoder_rows(part: Recording, stamps: np.ndarray, channel: int) -> np.ndarray:
     """Return the records of the encoder's samples at some stamps."""
     zero = (0.0,) * 3
-    rows = _rows(EncoderSample(0, ("x", "y", "theta"), zero, zero), ENCODER_TOPIC,
-                 channel, stamps)
+    rows = _rows(EncoderSample(0, ("x", "y", "theta"), zero, zero), ENCODER_TOPIC, channel, stamps)
     t, *axes = part.knots
     for axis, values in enumerate(axes):
         rows["position"][:, axis] = np.interp(stamps - START_NS, t - START_NS, values)
@@ -129,8 +151,12 @@ def encoder_rows(part: Recording, stamps: np.ndarray, channel: int) -> np.ndarra
 def detection_rows(part: Recording, chosen: slice, channel: int) -> np.ndarray:
     """Return the records of some detections."""
     columns = {name: values[chosen] for name, values in part.detections.items()}
-    rows = _rows(Detection(0, Kind.GRID, True, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.9),
-                 DETECTION_TOPIC, channel, columns["stamp"])
+    rows = _rows(
+        Detection(0, Kind.GRID, True, 0, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.9),
+        DETECTION_TOPIC,
+        channel,
+        columns["stamp"],
+    )
     rows["m"], rows["n"] = columns["m"], columns["n"]
     rows["offset_x"], rows["offset_y"] = columns["x"], columns["y"]
     return rows
@@ -152,7 +178,8 @@ def interleaved(tables: list[np.ndarray]) -> tuple[bytes, dict[int, np.ndarray]]
         at = place[which == number]
         width = rows.itemsize
         np.ndarray((len(out) - width + 1,), f"V{width}", out, strides=(1,))[at] = rows.view(
-            f"V{width}")
+            f"V{width}"
+        )
         index[int(rows["channel"][0])] = np.rec.fromarrays([rows["log"], at], dtype=ENTRY)
     return out.tobytes(), index
 
@@ -171,10 +198,18 @@ class _Mcap:
         self.declared = []
         for number, (topic, name) in enumerate(INPUT_TOPICS.items(), start=1):
             text = store.generate_msgdef(name, ros_version=2)[0]
-            self.declared.append(Schema(id=number, name=name, encoding="ros2msg",
-                                        data=text.encode()))
-            self.declared.append(Channel(id=number, topic=f"/{topic}", message_encoding="cdr",
-                                         metadata={}, schema_id=number))
+            self.declared.append(
+                Schema(id=number, name=name, encoding="ros2msg", data=text.encode())
+            )
+            self.declared.append(
+                Channel(
+                    id=number,
+                    topic=f"/{topic}",
+                    message_encoding="cdr",
+                    metadata={},
+                    schema_id=number,
+                )
+            )
         self.front = self._bytes(self.declared)
 
     @staticmethod
@@ -203,28 +238,51 @@ class _Mcap:
         for channel, entries in index.items():
             offsets[channel] = self.file.tell()
             raw = entries.tobytes()
-            self.file.write(struct.pack("<BQHI", Opcode.MESSAGE_INDEX, len(raw) + 6, channel,
-                                        len(raw)) + raw)
+            self.file.write(
+                struct.pack("<BQHI", Opcode.MESSAGE_INDEX, len(raw) + 6, channel, len(raw)) + raw
+            )
             self.counts[channel] = self.counts.get(channel, 0) + len(entries)
-        self.chunks.append(ChunkIndex(
-            chunk_length=end - start, chunk_start_offset=start, compression=name.decode(),
-            compressed_size=len(packed), message_end_time=max(times),
-            message_index_length=self.file.tell() - end, message_index_offsets=offsets,
-            message_start_time=min(times), uncompressed_size=len(data)))
+        self.chunks.append(
+            ChunkIndex(
+                chunk_length=end - start,
+                chunk_start_offset=start,
+                compression=name.decode(),
+                compressed_size=len(packed),
+                message_end_time=max(times),
+                message_index_length=self.file.tell() - end,
+                message_index_offsets=offsets,
+                message_start_time=min(times),
+                uncompressed_size=len(data),
+            )
+        )
         self.times += times
 
     def finish(self) -> int:
         """Write the summary and return the number of messages."""
         self.file.write(struct.pack("<BQI", Opcode.DATA_END, 4, 0))
         start, total = self.file.tell(), sum(self.counts.values())
-        summary = self._bytes([*self.declared, *self.chunks, Statistics(
-            attachment_count=0, channel_count=3, channel_message_counts=self.counts,
-            chunk_count=len(self.chunks), message_count=total, message_end_time=max(self.times),
-            message_start_time=min(self.times), metadata_count=0, schema_count=3)])
+        summary = self._bytes(
+            [
+                *self.declared,
+                *self.chunks,
+                Statistics(
+                    attachment_count=0,
+                    channel_count=3,
+                    channel_message_counts=self.counts,
+                    chunk_count=len(self.chunks),
+                    message_count=total,
+                    message_end_time=max(self.times),
+                    message_start_time=min(self.times),
+                    metadata_count=0,
+                    schema_count=3,
+                ),
+            ]
+        )
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0)
         crc = zlib.crc32(footer, zlib.crc32(summary))
-        self._record_end(summary, Footer(summary_start=start, summary_offset_start=0,
-                                         summary_crc=crc))
+        self._record_end(
+            summary, Footer(summary_start=start, summary_offset_start=0, summary_crc=crc)
+        )
         return total
 
     def _record_end(self, summary: bytes, footer: Footer) -> None:
@@ -239,20 +297,31 @@ def write_bag(folder: Path, part: Recording, *, compress: bool = True) -> int:
     name = f"{folder.name}_0.mcap"
     n_samples, n_marks = len(part.stamps_ns), len(part.detections["stamp"])
     n_chunks = max(1, (n_samples * 170 + n_marks * 100) // CHUNK_BYTES)
-    edges = np.quantile(np.concatenate([part.stamps_ns[::7], part.detections["stamp"][::7]]),
-                        np.linspace(0, 1, n_chunks + 1)[1:-1]).astype(np.int64)
-    cuts = {"encoder": np.searchsorted(part.stamps_ns, edges),
-            "marks": np.searchsorted(part.detections["stamp"], edges)}
+    edges = np.quantile(
+        np.concatenate([part.stamps_ns[::7], part.detections["stamp"][::7]]),
+        np.linspace(0, 1, n_chunks + 1)[1:-1],
+    ).astype(np.int64)
+    cuts = {
+        "encoder": np.searchsorted(part.stamps_ns, edges),
+        "marks": np.searchsorted(part.detections["stamp"], edges),
+    }
     ids = {topic: number for number, topic in enumerate(INPUT_TOPICS, start=1)}
     with (folder / name).open("wb") as file:
         writer = _Mcap(file, compress)
         writer.chunk(*_commands(part.commands, ids[COMMAND_TOPIC]))
         for k in range(n_chunks):
-            encoder, marks = (slice(0 if k == 0 else cut[k - 1], None if k == n_chunks - 1
-                                    else cut[k]) for cut in cuts.values())
-            writer.chunk(*interleaved([
-                encoder_rows(part, part.stamps_ns[encoder], ids[ENCODER_TOPIC]),
-                detection_rows(part, marks, ids[DETECTION_TOPIC])]))
+            encoder, marks = (
+                slice(0 if k == 0 else cut[k - 1], None if k == n_chunks - 1 else cut[k])
+                for cut in cuts.values()
+            )
+            writer.chunk(
+                *interleaved(
+                    [
+                        encoder_rows(part, part.stamps_ns[encoder], ids[ENCODER_TOPIC]),
+                        detection_rows(part, marks, ids[DETECTION_TOPIC]),
+                    ]
+                )
+            )
         total = writer.finish()
     _metadata(folder, name, writer, ids)
     return total
@@ -266,20 +335,56 @@ def _commands(commands: list[Command], channel: int) -> tuple[bytes, dict[int, n
         message = build(typestore(), name, from_model.command(command, "stage"))
         payload = bytes(typestore().serialize_cdr(message, name))
         entries.append((command.stamp_ns, len(out)))
-        out += struct.pack("<BQHIQQ", Opcode.MESSAGE, 22 + len(payload), channel, 0,
-                           command.stamp_ns, command.stamp_ns) + payload
+        out += (
+            struct.pack(
+                "<BQHIQQ",
+                Opcode.MESSAGE,
+                22 + len(payload),
+                channel,
+                0,
+                command.stamp_ns,
+                command.stamp_ns,
+            )
+            + payload
+        )
     return bytes(out), {channel: np.array(entries, dtype=ENTRY)}
 
 
 def _metadata(folder: Path, name: str, writer: _Mcap, ids: dict[str, int]) -> None:
     start, total = min(writer.times), sum(writer.counts.values())
-    topics = [{"message_count": writer.counts.get(ids[topic], 0), "topic_metadata": {
-        "name": f"/{topic}", "type": kind, "serialization_format": "cdr",
-        "offered_qos_profiles": [], "type_description_hash": ""}}
-        for topic, kind in INPUT_TOPICS.items()]
-    about = {"duration": {"nanoseconds": max(writer.times) - start},
-             "starting_time": {"nanoseconds_since_epoch": start}, "message_count": total}
-    (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": {
-        "version": 9, "storage_identifier": "mcap", **about, "topics_with_message_count": topics,
-        "compression_format": "", "compression_mode": "", "relative_file_paths": [name],
-        "files": [{"path": name, **about}], "custom_data": None, "ros_distro": "jazzy"}}))
+    topics = [
+        {
+            "message_count": writer.counts.get(ids[topic], 0),
+            "topic_metadata": {
+                "name": f"/{topic}",
+                "type": kind,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": [],
+                "type_description_hash": "",
+            },
+        }
+        for topic, kind in INPUT_TOPICS.items()
+    ]
+    about = {
+        "duration": {"nanoseconds": max(writer.times) - start},
+        "starting_time": {"nanoseconds_since_epoch": start},
+        "message_count": total,
+    }
+    (folder / "metadata.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "rosbag2_bagfile_information": {
+                    "version": 9,
+                    "storage_identifier": "mcap",
+                    **about,
+                    "topics_with_message_count": topics,
+                    "compression_format": "",
+                    "compression_mode": "",
+                    "relative_file_paths": [name],
+                    "files": [{"path": name, **about}],
+                    "custom_data": None,
+                    "ros_distro": "jazzy",
+                }
+            }
+        )
+    )

@@ -19,9 +19,15 @@ def jacobian(grid: GridSystem) -> csr_matrix:
     site = grid.views.site_index.reshape(grid.n_views, -1)[view, mark]
     back = PHASES[-np.array([pose.q for pose in grid.views.poses]) % 4][view]
     z, n, one = grid.views.z.ravel()[mark], grid.n_sites, np.ones(len(mark), dtype=complex)
-    entries = ((2 * site, back), (2 * site + 1, 1j * back), (2 * n + 2 * mark, one),
-               (2 * n + 2 * mark + 1, 1j * one), (4 * n + 3 * view, 1j * z),
-               (4 * n + 3 * view + 1, one), (4 * n + 3 * view + 2, 1j * one))
+    entries = (
+        (2 * site, back),
+        (2 * site + 1, 1j * back),
+        (2 * n + 2 * mark, one),
+        (2 * n + 2 * mark + 1, 1j * one),
+        (4 * n + 3 * view, 1j * z),
+        (4 * n + 3 * view + 1, one),
+        (4 * n + 3 * view + 2, 1j * one),
+    )
     rows, cols, data = [], [], []
     for column, value in entries:
         for part, values in ((0, value.real), (1, value.imag)):
@@ -38,8 +44,15 @@ def pinned(grid: GridSystem) -> np.ndarray:
     """Return the columns that stay when seven numbers are held: the sparse choice of a datum."""
     n, (nx, ny) = grid.n_sites, grid.views.shape
     middle, edge = (nx // 2) * ny + ny // 2, (nx - 1) * ny + ny // 2
-    held = [2 * middle, 2 * middle + 1, 2 * edge, 2 * edge + 1, 2 * n + 2 * middle,
-            2 * n + 2 * middle + 1, 2 * n + 2 * edge + 1]
+    held = [
+        2 * middle,
+        2 * middle + 1,
+        2 * edge,
+        2 * edge + 1,
+        2 * n + 2 * middle,
+        2 * n + 2 * middle + 1,
+        2 * n + 2 * edge + 1,
+    ]
     return np.setdiff1d(np.arange(4 * n + 3 * grid.n_views), held)
 
 
@@ -54,15 +67,19 @@ class Rival:
         self.right = np.column_stack([values.real, values.imag]).ravel()
         self.keep = pinned(self.grid)
         self.full, self.matrix = matrix, matrix[:, self.keep].tocsc()
-        self._run = {"numpy.linalg.lstsq": self._dense, "scipy lsmr": self._lsmr,
-                     "scipy splu": self._splu, "gtsam": self._gtsam,
-                     "pyceres": self._pyceres}[name]
+        self._run = {
+            "numpy.linalg.lstsq": self._dense,
+            "scipy lsmr": self._lsmr,
+            "scipy splu": self._splu,
+            "gtsam": self._gtsam,
+            "pyceres": self._pyceres,
+        }[name]
         if name == "gtsam":
             self._graph = self._gtsam_graph()
 
     def solve(self) -> np.ndarray:
         """Return G, (2, nx, ny), in no particular datum."""
-        field = self._run()[:2 * self.grid.n_sites].reshape(*self.grid.views.shape, 2)
+        field = self._run()[: 2 * self.grid.n_sites].reshape(*self.grid.views.shape, 2)
         return np.moveaxis(field, -1, 0)
 
     def _spread(self, kept: np.ndarray) -> np.ndarray:
@@ -76,15 +93,20 @@ class Rival:
     def _lsmr(self) -> np.ndarray:
         from scipy.sparse.linalg import lsmr
 
-        return self._spread(lsmr(self.matrix, self.right, atol=1e-14, btol=1e-14, conlim=0,
-                                 maxiter=100_000)[0])
+        return self._spread(
+            lsmr(self.matrix, self.right, atol=1e-14, btol=1e-14, conlim=0, maxiter=100_000)[0]
+        )
 
     def _splu(self) -> np.ndarray:
         from scipy.sparse.linalg import splu
 
         normal = (self.matrix.T @ self.matrix).tocsc()
-        factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                      options={"SymmetricMode": True})
+        factor = splu(
+            normal,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
         return self._spread(factor.solve(self.matrix.T @ self.right))
 
     def _gtsam_graph(self):
@@ -94,19 +116,28 @@ class Rival:
         view, mark = np.nonzero(self.grid.read.reshape(self.grid.n_views, -1))
         site = self.grid.views.site_index.reshape(self.grid.n_views, -1)[view, mark]
         z, unit = self.grid.views.z.ravel(), gtsam.noiseModel.Unit.Create(2)
-        turns = [np.array([[p.real, -p.imag], [p.imag, p.real]]) for p in
-                 (PHASES[-pose.q % 4] for pose in self.grid.views.poses)]
+        turns = [
+            np.array([[p.real, -p.imag], [p.imag, p.real]])
+            for p in (PHASES[-pose.q % 4] for pose in self.grid.views.poses)
+        ]
         rights = self.right.reshape(-1, 2)
-        for row, (v, m, s) in enumerate(zip(view.tolist(), mark.tolist(), site.tolist(),
-                                            strict=True)):
+        for row, (v, m, s) in enumerate(
+            zip(view.tolist(), mark.tolist(), site.tolist(), strict=True)
+        ):
             turn = np.array([[-z[m].imag, 1, 0], [z[m].real, 0, 1]])
-            graph.add(gtsam.JacobianFactor(s, turns[v], n + m, np.eye(2), 2 * n + v, turn,
-                                           rights[row], unit))
+            graph.add(
+                gtsam.JacobianFactor(
+                    s, turns[v], n + m, np.eye(2), 2 * n + v, turn, rights[row], unit
+                )
+            )
         held = np.setdiff1d(np.arange(self.full.shape[1]), self.keep)
         for node in sorted(set((held // 2).tolist())):
             rows = np.eye(2)[[h % 2 for h in held if h // 2 == node]]
-            graph.add(gtsam.JacobianFactor(node, rows, np.zeros(len(rows)),
-                                           gtsam.noiseModel.Unit.Create(len(rows))))
+            graph.add(
+                gtsam.JacobianFactor(
+                    node, rows, np.zeros(len(rows)), gtsam.noiseModel.Unit.Create(len(rows))
+                )
+            )
         return graph
 
     def _gtsam(self) -> np.ndarray:

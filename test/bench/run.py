@@ -35,10 +35,16 @@ from selfcal_ros.errors import InputError  # noqa: E402
 from selfcal_ros.outputs import write_json  # noqa: E402
 
 SIZES = (11, 21, 51, 101, 201, 401)
-OURS = {"solve": "selfcal", "without noise": "selfcal", "re-solve": "selfcal (factored plan)",
-        "uncertainty": "selfcal (uncertainty map)", "missing": "selfcal (3 % of the marks missing)",
-        "five views": "selfcal (defaults but causes)", "terms": "selfcal (all terms)",
-        "general": "selfcal (six general views)"}
+OURS = {
+    "solve": "selfcal",
+    "without noise": "selfcal",
+    "re-solve": "selfcal (factored plan)",
+    "uncertainty": "selfcal (uncertainty map)",
+    "missing": "selfcal (3 % of the marks missing)",
+    "five views": "selfcal (defaults but causes)",
+    "terms": "selfcal (all terms)",
+    "general": "selfcal (six general views)",
+}
 MAX_SIZE = {"re-solve": 201, "uncertainty": 401, "five views": 101, "terms": 101, "general": 101}
 GENERAL = ("scipy lsmr", "scipy splu")
 NOISE_M = 20e-9
@@ -63,8 +69,7 @@ def readings(size: int, missing: float = 0.0, noise_m: float = NOISE_M):
     rng = np.random.default_rng(size)
     # the papers' linear plate, which the rivals' equations know, too
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(rotation="linear"))
-    return truth, simulate_measurements(
-        truth, plan, rng, missing=missing, sigma_m=noise_m)
+    return truth, simulate_measurements(truth, plan, rng, missing=missing, sigma_m=noise_m)
 
 
 def error_of(field, truth) -> float:
@@ -106,7 +111,8 @@ def ours(benchmark: str, data) -> tuple:
     else:
         calibrate(data, quick)
         seconds, found = median_time(
-            lambda: calibrate(data, replace(quick, uncertainty=True)).error_map, once=False)
+            lambda: calibrate(data, replace(quick, uncertainty=True)).error_map, once=False
+        )
     return seconds, np.stack([found.gx, found.gy])
 
 
@@ -114,32 +120,63 @@ def worker(benchmark: str, method: str, size: int) -> dict:
     """Measure one method in this process."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_LIMIT_MB * 2**20,) * 2)
     if benchmark in ("five views", "terms", "general"):
-        seconds, error = (general.solved(size, method) if benchmark == "general" else
-                          with_terms.solved(size, benchmark == "terms"))
+        seconds, error = (
+            general.solved(size, method)
+            if benchmark == "general"
+            else with_terms.solved(size, benchmark == "terms")
+        )
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        return {"benchmark": benchmark, "method": method, "n": size, "seconds": seconds,
-                "peak_mb": round(peak, 1), "max_error": error}
-    truth, data = readings(size, MISSING if benchmark == "missing" else 0.0,
-                           0.0 if benchmark == "without noise" else NOISE_M)
+        return {
+            "benchmark": benchmark,
+            "method": method,
+            "n": size,
+            "seconds": seconds,
+            "peak_mb": round(peak, 1),
+            "max_error": error,
+        }
+    truth, data = readings(
+        size,
+        MISSING if benchmark == "missing" else 0.0,
+        0.0 if benchmark == "without noise" else NOISE_M,
+    )
     if method in OURS.values():
         seconds, field = ours(benchmark, data)
     else:
         seconds, field = median_time(Rival(method, data).solve, once=size > 11)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return {"benchmark": benchmark, "method": method, "n": size, "seconds": seconds,
-            "peak_mb": round(peak, 1), "max_error": error_of(field, truth)}
+    return {
+        "benchmark": benchmark,
+        "method": method,
+        "n": size,
+        "seconds": seconds,
+        "peak_mb": round(peak, 1),
+        "max_error": error_of(field, truth),
+    }
 
 
 def measure(benchmark: str, method: str, size: int) -> dict:
     """Run one worker in a process of its own; a row without figures says why."""
-    row = {"benchmark": benchmark, "method": method, "n": size, "seconds": None,
-           "peak_mb": None, "max_error": None}
+    row = {
+        "benchmark": benchmark,
+        "method": method,
+        "n": size,
+        "seconds": None,
+        "peak_mb": None,
+        "max_error": None,
+    }
     if not installed(method):
         return {**row, "note": "not installed"}
     command = [sys.executable, __file__, "--worker", benchmark, method, str(size)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT_S,
-                              cwd=ROOT, check=False, env={**os.environ})
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            text=True,
+            timeout=TIME_LIMIT_S,
+            cwd=ROOT,
+            check=False,
+            env={**os.environ},
+        )
     except subprocess.TimeoutExpired:
         return {**row, "note": f"skipped: more than {TIME_LIMIT_S:.0f} s"}
     if done.returncode:
@@ -170,21 +207,36 @@ def measure_ingest(benchmark: str, number: int):
     """Yield a row for each way to read the bag of a benchmark."""
     bag, total = ingest.prepared(benchmark, number, ROOT / "build" / "ingest")
     for method in ingest.METHODS[benchmark]:
-        row = {"benchmark": benchmark, "method": method, "n": total, "seconds": None,
-               "peak_mb": None, "max_error": None}
+        row = {
+            "benchmark": benchmark,
+            "method": method,
+            "n": total,
+            "seconds": None,
+            "peak_mb": None,
+            "max_error": None,
+        }
         if ingest.missing(method):
             yield {**row, "note": "not installed"}
             continue
         command = [sys.executable, __file__, "--ingest-worker", benchmark, method, str(bag)]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT,
-                                  timeout=ingest.MAX_SECONDS)
+            done = subprocess.run(
+                command,
+                capture_output=True,
+                text=True,
+                check=False,
+                cwd=ROOT,
+                timeout=ingest.MAX_SECONDS,
+            )
         except subprocess.TimeoutExpired:
             yield {**row, "note": f"skipped: more than {ingest.MAX_SECONDS:.0f} s"}
             continue
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        yield (json.loads(done.stdout.splitlines()[-1]) if not done.returncode
-               else {**row, "note": f"failed: {last}"})
+        yield (
+            json.loads(done.stdout.splitlines()[-1])
+            if not done.returncode
+            else {**row, "note": f"failed: {last}"}
+        )
 
 
 def measure_compensation(seconds: float):
@@ -192,9 +244,15 @@ def measure_compensation(seconds: float):
     rows = [(rate, method) for rate in compensate.RATES for method in compensate.METHODS]
     for rate, method in [*rows, (compensate.STRANGER_RATE, compensate.STRANGERS)]:
         if find_spec("rclpy") is None:
-            yield {"benchmark": f"compensate {rate} Hz", "method": method,
-                   "n": round(rate * seconds), "seconds": None, "peak_mb": None,
-                   "max_error": None, "note": "not installed"}
+            yield {
+                "benchmark": f"compensate {rate} Hz",
+                "method": method,
+                "n": round(rate * seconds),
+                "seconds": None,
+                "peak_mb": None,
+                "max_error": None,
+                "note": "not installed",
+            }
         else:
             yield compensate.measured(method, rate, seconds)
 
@@ -216,14 +274,31 @@ def main() -> int:
     parser.add_argument("--sizes", default=",".join(map(str, SIZES)))
     parser.add_argument("--methods", default=",".join(("selfcal", *RIVALS)))
     parser.add_argument("-o", "--output", default=str(ROOT / "build" / "bench.json"))
-    parser.add_argument("--ingest", type=int, default=3_600_000,
-                        help="encoder messages of the bag that is read; 0 = leave it out")
-    parser.add_argument("--detections", type=int, default=3_200_000,
-                        help="detections of the other bag that is read; 0 = leave it out")
-    parser.add_argument("--compensate", type=float, default=5.0, metavar="SECONDS",
-                        help="time for which each compensator gets samples; 0 = leave it out")
-    parser.add_argument("--images", type=int, default=12, help="images in which marks are "
-                        "detected; 0 = leave it out")
+    parser.add_argument(
+        "--ingest",
+        type=int,
+        default=3_600_000,
+        help="encoder messages of the bag that is read; 0 = leave it out",
+    )
+    parser.add_argument(
+        "--detections",
+        type=int,
+        default=3_200_000,
+        help="detections of the other bag that is read; 0 = leave it out",
+    )
+    parser.add_argument(
+        "--compensate",
+        type=float,
+        default=5.0,
+        metavar="SECONDS",
+        help="time for which each compensator gets samples; 0 = leave it out",
+    )
+    parser.add_argument(
+        "--images",
+        type=int,
+        default=12,
+        help="images in which marks are detected; 0 = leave it out",
+    )
     parser.add_argument("--ingest-worker", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("--worker", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -238,15 +313,25 @@ def main() -> int:
     for method in methods:
         if method not in ("selfcal", *RIVALS):
             raise InputError("--methods", f"'{method}' is unknown", "see --help")
-    print(f"{'benchmark':<17} {'method':<36} {'N':>7} {'seconds':>12} {'peak MB':>10} "
-          f"{'max error m':>12} {'CPU s':>10}")
+    print(
+        f"{'benchmark':<17} {'method':<36} {'N':>7} {'seconds':>12} {'peak MB':>10} "
+        f"{'max error m':>12} {'CPU s':>10}"
+    )
     rows, given_up = [], set()
     sizes = [int(size) for size in args.sizes.split(",") if size]
     for benchmark, method, size in jobs(sizes, methods):
         if (benchmark, method) in given_up:
-            rows.append({"benchmark": benchmark, "method": method, "n": size, "seconds": None,
-                         "peak_mb": None, "max_error": None,
-                         "note": "skipped: beyond its limit at a smaller N"})
+            rows.append(
+                {
+                    "benchmark": benchmark,
+                    "method": method,
+                    "n": size,
+                    "seconds": None,
+                    "peak_mb": None,
+                    "max_error": None,
+                    "note": "skipped: beyond its limit at a smaller N",
+                }
+            )
         else:
             rows.append(measure(benchmark, method, size))
             if "skipped" in rows[-1].get("note", ""):

@@ -30,14 +30,18 @@ def bench(tmp_path, monkeypatch, capsys):
         if command[1] != run.__file__ or command[4] in OF_THEIR_OWN:
             return start(command, **how)
         kind, benchmark, method, last = command[2:]
-        row = (run.worker(benchmark, method, int(last)) if kind == "--worker"
-               else ingest.worker(benchmark, method, Path(last)))
+        row = (
+            run.worker(benchmark, method, int(last))
+            if kind == "--worker"
+            else ingest.worker(benchmark, method, Path(last))
+        )
         return subprocess.CompletedProcess(command, 0, json.dumps(row), "")
 
     def measured(*args):
         target = tmp_path / "bench.json"
-        monkeypatch.setattr(sys, "argv", [str(RUN), "-o", str(target), "--compensate", "0",
-                                          "--images", "0", *args])
+        monkeypatch.setattr(
+            sys, "argv", [str(RUN), "-o", str(target), "--compensate", "0", "--images", "0", *args]
+        )
         assert run.main() == 0
         return capsys.readouterr().out, json.loads(target.read_text())
 
@@ -48,11 +52,24 @@ def bench(tmp_path, monkeypatch, capsys):
 def test_every_method_is_measured_and_exact(bench):
     out, rows = bench("--sizes", "7", "--ingest", "0", "--detections", "0")
     methods = {row["method"] for row in rows}
-    assert {"selfcal", "numpy.linalg.lstsq", "scipy lsmr", "scipy splu", "gtsam",
-            "pyceres"} <= methods
+    assert {
+        "selfcal",
+        "numpy.linalg.lstsq",
+        "scipy lsmr",
+        "scipy splu",
+        "gtsam",
+        "pyceres",
+    } <= methods
     assert {row["benchmark"] for row in rows} == {
-        "solve", "without noise", "re-solve", "uncertainty", "missing", "five views", "terms",
-        "general"}
+        "solve",
+        "without noise",
+        "re-solve",
+        "uncertainty",
+        "missing",
+        "five views",
+        "terms",
+        "general",
+    }
     ours = next(row["max_error"] for row in rows if row["benchmark"] == "solve")
     for row in rows:
         assert row.keys() >= KEYS and row["n"] == 7
@@ -78,8 +95,15 @@ def test_every_way_to_read_meets_every_message(bench):
     by_method = {row["method"]: row for row in rows}
     assert {row["benchmark"] for row in rows} == {"ingest", "ingest detections"}
     assert by_method.keys() == {
-        "selfcal solve", "selfcal (columns)", "selfcal (reading)", "selfcal (solving)", "rosbags",
-        "mcap (not decoded)", "mcap-ros2-support", "pybag-sdk"}
+        "selfcal solve",
+        "selfcal (columns)",
+        "selfcal (reading)",
+        "selfcal (solving)",
+        "rosbags",
+        "mcap (not decoded)",
+        "mcap-ros2-support",
+        "pybag-sdk",
+    }
     for method, row in by_method.items():
         assert row.keys() >= KEYS and method in out
         if row["seconds"] is None:
@@ -104,7 +128,8 @@ def test_without_ros_compensators_are_left_out_with_a_reason(bench, monkeypatch)
     _, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--compensate", "2")
     assert [(row["benchmark"], row["n"], row["note"]) for row in rows[::2]] == [
         (f"compensate {rate} Hz", 2 * rate, "not installed")
-        for rate in (500, 1000, 2000, 10000, 2000)]
+        for rate in (500, 1000, 2000, 10000, 2000)
+    ]
     assert rows[-1]["method"] == "selfcal, by strangers"
     assert all(row.keys() >= KEYS for row in rows)
 
@@ -116,7 +141,9 @@ def test_marks_are_found_at_the_bound(bench, monkeypatch):
     monkeypatch.setattr(detecting, "MANY", (5,))
     out, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--images", "2")
     assert [row["benchmark"] for row in rows if row["method"] == "selfcal"] == [
-        *(f"detect {mark} 50" for mark in ("disc", "ring", "cross", "corner")), "detect many"]
+        *(f"detect {mark} 50" for mark in ("disc", "ring", "cross", "corner")),
+        "detect many",
+    ]
     for row in rows:
         if row["benchmark"] == "detect many":
             assert row["seconds"] is None or row["found"] == 1.0

@@ -21,20 +21,29 @@ from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.truth import simulate_measurements
 
 TERMS = "microscope,drift,plate_scale,plate_shape:30e-9,approach"
-VIEWS = (("as it is", 0, 0.0, 0.0), ("90", 1, 0.0, 0.0), ("+x", 0, 0.01, 0.0),
-         ("-x", 0, -0.01, 0.0), ("+y", 0, 0.0, 0.01))
+VIEWS = (
+    ("as it is", 0, 0.0, 0.0),
+    ("90", 1, 0.0, 0.0),
+    ("+x", 0, 0.01, 0.0),
+    ("-x", 0, -0.01, 0.0),
+    ("+y", 0, 0.0, 0.01),
+)
 
 
 def readings(size: int) -> Measurements:
     """Return five views, each visited there and back, with offsets, times and approaches."""
-    views = tuple(View(name, turns * np.pi / 2, (x, y), True, False, 4, "x_back_y_back")
-                  for name, turns, x, y in VIEWS)
+    views = tuple(
+        View(name, turns * np.pi / 2, (x, y), True, False, 4, "x_back_y_back")
+        for name, turns, x, y in VIEWS
+    )
     plan = Plan("terms", Artifact(size, 0.01, 0), views)
     rng = np.random.default_rng(size)
-    truth = random_truth(plan.artifact, len(views), rng,
-                         Spread(encoder="independent", rotation="finite"))
-    cell = CellSettings(sigma_xy_m=20e-9, stop_sigma_m=20e-6, servo_sigma_m=0,
-                        servo_sigma_theta_rad=0)
+    truth = random_truth(
+        plan.artifact, len(views), rng, Spread(encoder="independent", rotation="finite")
+    )
+    cell = CellSettings(
+        sigma_xy_m=20e-9, stop_sigma_m=20e-6, servo_sigma_m=0, servo_sigma_theta_rad=0
+    )
     return simulate_measurements(truth, plan, rng, settings=cell, visits=True)
 
 

@@ -33,18 +33,41 @@ def desk(tmp_path, monkeypatch):
 
 def table(path) -> tuple[list[str], np.ndarray]:
     head, *rows = path.read_text().splitlines()
-    return head.split(","), np.array([[float(cell or "nan") for cell in row.split(",")]
-                                      for row in rows])
+    return head.split(","), np.array(
+        [[float(cell or "nan") for cell in row.split(",")] for row in rows]
+    )
 
 
 @pytest.mark.parametrize("inverse", [False, True])
 def test_each_point_is_followed_by_its_correction_and_u(desk, capsys, inverse):
-    assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "edge",
-                 *["--inverse"] * inverse]) == 0
+    assert (
+        main(
+            [
+                "apply",
+                "R.json",
+                "p.csv",
+                "-o",
+                "o.csv",
+                "--outside",
+                "edge",
+                *["--inverse"] * inverse,
+            ]
+        )
+        == 0
+    )
     head, rows = table(desk / "o.csv")
     end = "true" if inverse else "command"
-    assert head == ["x", "y", "theta", f"x_{end}", f"y_{end}", f"theta_{end}",
-                    "u_x", "u_y", "u_theta"]
+    assert head == [
+        "x",
+        "y",
+        "theta",
+        f"x_{end}",
+        f"y_{end}",
+        f"theta_{end}",
+        "u_x",
+        "u_y",
+        "u_theta",
+    ]
     x, y, theta = rows[:, :3].T
     use = Compensator(MAP)
     wanted = use.correct(x, y) if inverse else use.command(x, y)
@@ -60,23 +83,40 @@ def test_each_point_is_followed_by_its_correction_and_u(desk, capsys, inverse):
     assert err.splitlines() == [
         "selfcal apply: points outside the field, corrected as the nearest point of its edge, "
         "where u is not known: 1",
-        "selfcal apply: points next to unknown sites or lines, left empty: 1"]
+        "selfcal apply: points next to unknown sites or lines, left empty: 1",
+    ]
 
 
 def test_there_and_back_is_where_it_was(desk):
     (desk / "p.csv").write_text("X, Y\n0.011,-0.017\n")
     assert main(["apply", "R.json", "p.csv", "-o", "there.csv"]) == 0
-    (x, y), = table(desk / "there.csv")[1][:, 2:4]
+    ((x, y),) = table(desk / "there.csv")[1][:, 2:4]
     (desk / "q.csv").write_text(f"x,y\n{float(x)!r},{float(y)!r}\n")
     assert main(["apply", "R.json", "q.csv", "-o", "back.csv", "--inverse"]) == 0
-    np.testing.assert_allclose(table(desk / "back.csv")[1][0, 2:4], (0.011, -0.017), rtol=0,
-                               atol=1e-16)
+    np.testing.assert_allclose(
+        table(desk / "back.csv")[1][0, 2:4], (0.011, -0.017), rtol=0, atol=1e-16
+    )
 
 
 def test_stdout_json_and_bicubic(desk, capsys):
     write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3))))
-    assert main(["apply", "R.json", "p.csv", "-o", "-", "--json", "--method", "bicubic",
-                 "--outside", "edge"]) == 0
+    assert (
+        main(
+            [
+                "apply",
+                "R.json",
+                "p.csv",
+                "-o",
+                "-",
+                "--json",
+                "--method",
+                "bicubic",
+                "--outside",
+                "edge",
+            ]
+        )
+        == 0
+    )
     text = json.loads(capsys.readouterr().out)["csv"]
     (desk / "o.csv").write_text(text)
     use = Compensator(random_map(Artifact(5, 0.01, 8), 3), method="bicubic")
@@ -93,26 +133,34 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
     assert head == ["x1", "y1", "x2", "y2", "length", "error", "u"]
     error, u = StageMap(result).length_error(*rows[:, :4].T.reshape(2, 2, 2))
     np.testing.assert_array_equal(
-        rows[:, 4:].T, [[np.hypot(0.04, 0.01), 0.05], [error[0], np.nan], [u[0], np.nan]])
+        rows[:, 4:].T, [[np.hypot(0.04, 0.01), 0.05], [error[0], np.nan], [u[0], np.nan]]
+    )
     *lines, outside = capsys.readouterr().err.splitlines()
     for line, anywhere in zip(lines, (True, False), strict=True):
         a, b = StageMap(result).length_uncertainty(anywhere=anywhere)
         where = "anywhere in the field" if anywhere else "of two nodes"
-        assert (f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L"
-                in line)
+        assert (
+            f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L" in line
+        )
     assert outside.startswith("selfcal apply: points outside the field, left empty (")
     assert main(["apply", "R.json", "d.csv", "-o", "x.csv", "--inverse"]) == 2
     assert "the ends of distances are true positions" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("", "p.csv:1: the header is not x,y or x,y,theta"),
-    ("a,b\n1,2\n", "p.csv:1: the header is not x,y or x,y,theta"),
-    ("x,y\n", "p.csv: it has no points"),
-    ("x,y\n1,2,3\n", "p.csv:2: not 2 positions; give x,y in m and rad"),
-    ("x,y\n\n1,nan\n", "p.csv:3: not 2 positions"), ("x,y\n1,inf\n", "p.csv:2: not 2 positions"),
-    ("x,y\n1,z\n", "p.csv:2: not 2 positions"),
-    ("x,y\n1,1_0e-3\n", "p.csv:2: not 2 positions"), ("x,y\n1,٠.٠١\n", "p.csv:2: not 2 positions")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "p.csv:1: the header is not x,y or x,y,theta"),
+        ("a,b\n1,2\n", "p.csv:1: the header is not x,y or x,y,theta"),
+        ("x,y\n", "p.csv: it has no points"),
+        ("x,y\n1,2,3\n", "p.csv:2: not 2 positions; give x,y in m and rad"),
+        ("x,y\n\n1,nan\n", "p.csv:3: not 2 positions"),
+        ("x,y\n1,inf\n", "p.csv:2: not 2 positions"),
+        ("x,y\n1,z\n", "p.csv:2: not 2 positions"),
+        ("x,y\n1,1_0e-3\n", "p.csv:2: not 2 positions"),
+        ("x,y\n1,٠.٠١\n", "p.csv:2: not 2 positions"),
+    ],
+)
 def test_a_bad_table_is_one_line(desk, capsys, text, message):
     (desk / "p.csv").write_text(text)
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv"]) == 2
@@ -138,16 +186,25 @@ def test_beyond_the_edge_nothing_is_known(desk, capsys, inverse):
     np.testing.assert_array_equal(np.isfinite(edge[:, 6:]), known[:, 3:])
 
 
-@pytest.mark.parametrize(("text", "words", "code"), [
-    ("x,y\n10,-5\n0,0\n", (), 2), ("x,y\n10,-5\n0,0\n", ("--outside", "edge"), 2),
-    ("x1,y1,x2,y2\n10,-5,0,0\n", (), 2), ("x,y\n0.021,0\n0,0\n", (), 5),
-    ("x,y\n0.021,0\n0,0\n", ("--outside", "edge"), 0), ("x,y\n10,-5\n0.01,0\n", (), 5),
-    ("x,y\n0,0\n", (), 0)])
+@pytest.mark.parametrize(
+    ("text", "words", "code"),
+    [
+        ("x,y\n10,-5\n0,0\n", (), 2),
+        ("x,y\n10,-5\n0,0\n", ("--outside", "edge"), 2),
+        ("x1,y1,x2,y2\n10,-5,0,0\n", (), 2),
+        ("x,y\n0.021,0\n0,0\n", (), 5),
+        ("x,y\n0.021,0\n0,0\n", ("--outside", "edge"), 0),
+        ("x,y\n10,-5\n0.01,0\n", (), 5),
+        ("x,y\n0,0\n", (), 0),
+    ],
+)
 def test_points_in_mm_are_asked_about(desk, capsys, text, words, code):
     (desk / "p.csv").write_text(text)
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", *words]) == code
-    asked = ("p.csv: all points lie outside the field (x from -20 to 20 mm, y from -20 to 20 mm), "
-             "up to (")
+    asked = (
+        "p.csv: all points lie outside the field (x from -20 to 20 mm, y from -20 to 20 mm), "
+        "up to ("
+    )
     assert (asked in (err := capsys.readouterr().err)) is (code == 2)
     assert ("m: is it in mm?; give positions in m" in err) is (code == 2)
 
@@ -158,10 +215,14 @@ def test_a_table_of_excel_is_read_and_its_national_forms_are_named(desk, capsys)
     assert main(words) == 0
     np.testing.assert_array_equal(table(desk / "o.csv")[1][:, :2], [[0.01, -0.005], [0, 0]])
     for text, message in (
-            ("x;y\n0,01;-0,005\n", "p.csv:1: columns are separated by semicolons (and the numbers "
-             "have decimal commas?); save the table with commas between columns and points in"),
-            ("x\ty\n0.01\t0\n", "p.csv:1: columns are separated by tabs"),
-            ('x,y\n"0,01","-0,005"\n', "p.csv:2: '0,01' has a decimal comma; save the table")):
+        (
+            "x;y\n0,01;-0,005\n",
+            "p.csv:1: columns are separated by semicolons (and the numbers "
+            "have decimal commas?); save the table with commas between columns and points in",
+        ),
+        ("x\ty\n0.01\t0\n", "p.csv:1: columns are separated by tabs"),
+        ('x,y\n"0,01","-0,005"\n', "p.csv:2: '0,01' has a decimal comma; save the table"),
+    ):
         (desk / "p.csv").write_text(text)
         assert main(words) == 2
         assert message in capsys.readouterr().err
@@ -170,8 +231,9 @@ def test_a_table_of_excel_is_read_and_its_national_forms_are_named(desk, capsys)
 def test_outside_refused_and_not_qualified(desk, capsys):
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "refuse"]) == 2
     assert "outside the calibrated field" in capsys.readouterr().err
-    doubt = replace(result_of(MAP), verdict=Verdict(
-        Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."))
+    doubt = replace(
+        result_of(MAP), verdict=Verdict(Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy.")
+    )
     write_json("R.json", result_to_dict(doubt))
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "edge"]) == 5
     assert "too noisy" in capsys.readouterr().err and (desk / "o.csv").exists()
@@ -185,7 +247,8 @@ def test_bicubic_is_advised_where_it_halves_u_between_the_nodes(desk, capsys):
     for g, at, advised in ((wave, 0.005, True), (noise, 0.005, False), (wave, 0.01, False)):
         (desk / "d.csv").write_text(f"x,y\n{at},{at}\n0.02,{-at}\n")
         u = np.full(wave.shape, 1e-9)
-        write_json("R.json", result_to_dict(result_of(replace(
-            emap, gx=g, gy=g[::-1], u_gx=u, u_gy=u))))
+        write_json(
+            "R.json", result_to_dict(result_of(replace(emap, gx=g, gy=g[::-1], u_gx=u, u_gy=u)))
+        )
         assert main(["apply", "R.json", "d.csv", "-o", "o.csv", "--force"]) == 0
         assert ("with --method bicubic" in capsys.readouterr().err) is advised

@@ -30,18 +30,26 @@ def verb_of(words):
     return f"selfcal {first} {second}" if first in ("cal", "plan") else f"selfcal {first}"
 
 
-@pytest.mark.parametrize("words", [
-    "plot R.json -o out.svg", "table R.json -o out.csv", "report R.json -o out.html",
-    "apply R.json points.csv -o out.csv", "export siemens R.json -o out.ini --unit mm",
-    "cal export R.json -o out.cal", "solve bags/hu_exact --quiet -o out.json",
-    "cal orthogonality R.json -o out.cal"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "plot R.json -o out.svg",
+        "table R.json -o out.csv",
+        "report R.json -o out.html",
+        "apply R.json points.csv -o out.csv",
+        "export siemens R.json -o out.ini --unit mm",
+        "cal export R.json -o out.cal",
+        "solve bags/hu_exact --quiet -o out.json",
+        "cal orthogonality R.json -o out.cal",
+    ],
+)
 def test_no_output_replaces_a_file_unless_it_is_told_to(desk, capsys, words):
     out = words.split()[words.split().index("-o") + 1]
     (desk / out).write_text("mine")
     assert main(words.split()) == 2
     assert capsys.readouterr().err == (
-        f"{verb_of(words)}: {out}: the file exists; name another file, or replace it "
-        "with --force\n")
+        f"{verb_of(words)}: {out}: the file exists; name another file, or replace it with --force\n"
+    )
     assert (desk / out).read_text() == "mine"
     assert main([*words.split(), "--force"]) in (0, 5)
     assert (desk / out).read_text() != "mine"
@@ -54,33 +62,81 @@ def test_an_empty_file_and_a_device_are_written(desk):
 
 
 def test_kinds_are_seen_in_the_files(desk):
-    assert [kind_of(name) for name in (
-        "bags/demo", "bags/demo/demo_0.mcap", "R.json", "config/plans/hu.yaml",
-        "config/simulations/demo.yaml", "config/params/cell.yaml", "stage.cal", "points.csv",
-        "part.nc", "nothing", "config", "bags/manifest.yaml")] == [
-        "a bag", "a bag", "a result", "a plan", "a simulation", "a parameter file of nodes",
-        "a calibration file", "a table of numbers", "a G-code program", "", "", ""]
+    assert [
+        kind_of(name)
+        for name in (
+            "bags/demo",
+            "bags/demo/demo_0.mcap",
+            "R.json",
+            "config/plans/hu.yaml",
+            "config/simulations/demo.yaml",
+            "config/params/cell.yaml",
+            "stage.cal",
+            "points.csv",
+            "part.nc",
+            "nothing",
+            "config",
+            "bags/manifest.yaml",
+        )
+    ] == [
+        "a bag",
+        "a bag",
+        "a result",
+        "a plan",
+        "a simulation",
+        "a parameter file of nodes",
+        "a calibration file",
+        "a table of numbers",
+        "a G-code program",
+        "",
+        "",
+        "",
+    ]
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    ("apply points.csv R.json -o o.csv", "points.csv: is a table of numbers, and R.json is a "
-     "result: they are swapped; write `selfcal apply R.json points.csv -o o.csv`"),
-    ("recheck bags/demo R.json", "bags/demo: is a bag, and R.json is a result: they are swapped; "
-     "write `selfcal recheck R.json bags/demo`"),
-    ("cal verify stage.cal R.json", "stage.cal: is a calibration file, and R.json is a result: "
-     "they are swapped; write `selfcal cal verify R.json stage.cal`"),
-    ("solve R.json", "R.json: is a result, and a bag is needed here; `selfcal report R.json` "
-     "shows it"),
-    ("report bags/demo", "bags/demo: is a bag, and a result is needed here; a map is computed "
-     "from it with `selfcal solve bags/demo -o RESULT.json`"),
-    ("plan check config/simulations/demo.yaml", "config/simulations/demo.yaml: is a simulation, "
-     "and a plan is needed here; `selfcal simulate "
-     "config/simulations/demo.yaml -o BAG` writes "
-     "its bag"),
-    ("solve bags/demo --params config/plans/hu.yaml", "config/plans/hu.yaml: is a plan, and a "
-     "parameter file of nodes is needed here; `selfcal plan check "
-     "config/plans/hu.yaml` says "
-     "what it determines")])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            "apply points.csv R.json -o o.csv",
+            "points.csv: is a table of numbers, and R.json is a "
+            "result: they are swapped; write `selfcal apply R.json points.csv -o o.csv`",
+        ),
+        (
+            "recheck bags/demo R.json",
+            "bags/demo: is a bag, and R.json is a result: they are swapped; "
+            "write `selfcal recheck R.json bags/demo`",
+        ),
+        (
+            "cal verify stage.cal R.json",
+            "stage.cal: is a calibration file, and R.json is a result: "
+            "they are swapped; write `selfcal cal verify R.json stage.cal`",
+        ),
+        (
+            "solve R.json",
+            "R.json: is a result, and a bag is needed here; `selfcal report R.json` shows it",
+        ),
+        (
+            "report bags/demo",
+            "bags/demo: is a bag, and a result is needed here; a map is computed "
+            "from it with `selfcal solve bags/demo -o RESULT.json`",
+        ),
+        (
+            "plan check config/simulations/demo.yaml",
+            "config/simulations/demo.yaml: is a simulation, "
+            "and a plan is needed here; `selfcal simulate "
+            "config/simulations/demo.yaml -o BAG` writes "
+            "its bag",
+        ),
+        (
+            "solve bags/demo --params config/plans/hu.yaml",
+            "config/plans/hu.yaml: is a plan, and a "
+            "parameter file of nodes is needed here; `selfcal plan check "
+            "config/plans/hu.yaml` says "
+            "what it determines",
+        ),
+    ],
+)
 def test_a_file_in_the_place_of_another_is_named(desk, capsys, words, said):
     assert main(words.split()) == 2
     printed = capsys.readouterr()

@@ -74,9 +74,14 @@ def test_export_check_eval_verify(run):
     assert found["sites"]["after"]["max"] < 1e-10 and found["between"]["points"] == 36
 
 
-@pytest.mark.parametrize("wiring", [
-    ["--home-x", "-30", "--home-y", "-30"], ["--reverse-x", "--unit", "um", "--home-y", "5e3"],
-    ["--reverse-y", "--unit", "m", "--x-axis", "5", "--y-axis", "4"]])
+@pytest.mark.parametrize(
+    "wiring",
+    [
+        ["--home-x", "-30", "--home-y", "-30"],
+        ["--reverse-x", "--unit", "um", "--home-y", "5e3"],
+        ["--reverse-y", "--unit", "m", "--x-axis", "5", "--y-axis", "4"],
+    ],
+)
 def test_verify_takes_the_wiring_from_the_file(run, wiring):
     assert run("export", "r.json", "-o", "f.cal", *wiring)[0] == 0
     code, out, _ = run("verify", "r.json", "f.cal", "--json")
@@ -95,10 +100,14 @@ def test_verify_of_a_file_without_our_comments_takes_options(run):
     assert wrong["sites"]["after"]["max"] > 1e-8
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("home-x=0", "home-x=nan", "home position: nan is not a position"),
-    ("theta-counts-per-unit=1000", "theta-counts-per-unit=0", "0.0 is not a positive number"),
-    ("y-axis=2", "y-axis=1", "the indices [1, 1, 3] are not distinct")])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("home-x=0", "home-x=nan", "home position: nan is not a position"),
+        ("theta-counts-per-unit=1000", "theta-counts-per-unit=0", "0.0 is not a positive number"),
+        ("y-axis=2", "y-axis=1", "the indices [1, 1, 3] are not distinct"),
+    ],
+)
 def test_a_wiring_in_the_file_without_sense_is_named(run, tmp_path, old, new, message):
     run("export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--counts-per-unit", "3=1000")
     text = (tmp_path / "f.cal").read_text()
@@ -120,8 +129,9 @@ def test_a_file_with_the_wrong_sign_is_refused_by_verify(run):
     one_line(err, "bad.cal: the tables make the machine worse; check signs")
 
 
-@pytest.mark.parametrize("option, text", [
-    ("--home-x", "5_0"), ("--home-x", "٥"), ("--x-axis", "1_1"), ("--x-axis", "٣")])
+@pytest.mark.parametrize(
+    "option, text", [("--home-x", "5_0"), ("--home-x", "٥"), ("--x-axis", "1_1"), ("--x-axis", "٣")]
+)
 def test_an_option_is_a_plain_number(run, option, text):
     """Python's float() and int() read 5_0 as 50 and the digits of every script."""
     code, _, err = run("export", "r.json", "-o", "f.cal", option, text)
@@ -143,11 +153,16 @@ def with_a_wrong_entry(text: str) -> str:
     return "".join(lines)
 
 
-@pytest.mark.parametrize("spoil", [
-    with_a_wrong_entry,
-    lambda text: text.replace("CORUNIT=PRIMARY/1000", "CORUNIT=PRIMARY/1000000"),
-    lambda text: text.replace("OFFSETROW=30", "OFFSETROW=35"),
-    lambda text: text.replace("=30\n", "=-30\n"), without_last_row])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        with_a_wrong_entry,
+        lambda text: text.replace("CORUNIT=PRIMARY/1000", "CORUNIT=PRIMARY/1000000"),
+        lambda text: text.replace("OFFSETROW=30", "OFFSETROW=35"),
+        lambda text: text.replace("=30\n", "=-30\n"),
+        without_last_row,
+    ],
+)
 def test_a_table_that_is_not_that_of_the_map_does_not_pass(run, tmp_path, spoil):
     """None of these makes the machine worse."""
     run("export", "r.json", "-o", "f.cal")
@@ -156,8 +171,12 @@ def test_a_table_that_is_not_that_of_the_map_does_not_pass(run, tmp_path, spoil)
     assert spoil(right) != right and run("check", "bad.cal")[0] == 0
     code, out, err = run("verify", "r.json", "bad.cal")
     assert code == 5 and "49 sites" in out
-    one_line(err, "bad.cal: the tables leave ", "% of the error at the sites",
-             "they are not those of this map; check offset, unit")
+    one_line(
+        err,
+        "bad.cal: the tables leave ",
+        "% of the error at the sites",
+        "they are not those of this map; check offset, unit",
+    )
 
 
 def test_a_theta_table_that_does_nothing_does_not_pass(run, tmp_path):
@@ -172,13 +191,25 @@ def test_a_theta_table_that_does_nothing_does_not_pass(run, tmp_path):
 
 def test_theta_goes_into_a_file_of_its_own(run):
     code, out, err = run("export", "r.json", "-o", "f.cal", "--theta-axis", "3")
-    assert code == 0 and out.splitlines()[:2] == ["f.cal: 2D table for x and y",
-                                                  "f_theta.cal: 1D table for theta"]
+    assert code == 0 and out.splitlines()[:2] == [
+        "f.cal: 2D table for x and y",
+        "f_theta.cal: 1D table for theta",
+    ]
     one_line(err, "--counts-per-unit 3=COUNTS makes it roll over")
     (table,) = load_cal("f_theta.cal").tables
     assert table.rollover is None and len(table.values) == 49
-    code, out, err = run("export", "r.json", "-o", "g.cal", "--theta-axis", "3", "--theta-output",
-                         "t.cal", "--counts-per-unit", "3=1000")
+    code, out, err = run(
+        "export",
+        "r.json",
+        "-o",
+        "g.cal",
+        "--theta-axis",
+        "3",
+        "--theta-output",
+        "t.cal",
+        "--counts-per-unit",
+        "3=1000",
+    )
     assert code == 0 and err == ""
     (table,) = load_cal("t.cal").tables
     assert table.rollover == 360_000 and len(table.values) == 25
@@ -187,8 +218,9 @@ def test_theta_goes_into_a_file_of_its_own(run):
     assert code == 0 and json.loads(out) == {"3": pytest.approx(want, abs=1e-8)}
     code, out, _ = run("verify", "r.json", "t.cal")
     assert code == 0 and "24 angular lines, rms, arcsec" in out
-    code, _, err = run("export", "r.json", "-o", "h.cal", "--theta-axis", "3", "--theta-output",
-                       "./h.cal")
+    code, _, err = run(
+        "export", "r.json", "-o", "h.cal", "--theta-axis", "3", "--theta-output", "./h.cal"
+    )
     assert code == 2
     one_line(err, "a 1D and a 2D table cannot share a file")
 
@@ -227,7 +259,8 @@ def test_results_that_cannot_be_exported(run):
 def test_files_that_are_loaded_together_are_added(run, tmp_path):
     for number, values in enumerate(("0 2 5", "0 -1 1")):
         (tmp_path / f"{number}.cal").write_text(
-            f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n:END\n")
+            f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n:END\n"
+        )
     code, out, _ = run("eval", "0.cal", "1.cal", "--position", "1=15")
     assert code == 0 and json.loads(out) == {"1": (2 + 5) / 2 + (-1 + 1) / 2}
     (tmp_path / "copy.cal").write_text("; of another day\n" + (tmp_path / "0.cal").read_text())
@@ -241,8 +274,10 @@ def test_each_of_several_pipes_is_read_once(run, tmp_path):
     pipes = []
     for values in ("0 2 5", "0 -1 1"):
         end, start = os.pipe()
-        os.write(start, f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n"
-                 ":END\n".encode())
+        os.write(
+            start,
+            f":START 1 POSUNIT=PRIMARY CORUNIT=PRIMARY SAMPLEDIST=10\n{values}\n:END\n".encode(),
+        )
         os.close(start)
         pipes.append(f"/dev/fd/{end}")
     code, out, _ = run("eval", *pipes, "--position", "1=15")
@@ -256,8 +291,10 @@ def test_verify_loads_all_files(run):
     run("export", "r.json", "-o", "f.cal", *wiring, "--counts-per-unit", "3=1000")
     both = json.loads(run("verify", "r.json", "f.cal", "f_theta.cal", "--json")[1])
     assert list(both) == ["sites", "between", "lines"]
-    assert all(both[place]["after"]["rms"] < 1e-2 * both[place]["before"]["rms"]
-               for place in ("sites", "lines"))
+    assert all(
+        both[place]["after"]["rms"] < 1e-2 * both[place]["before"]["rms"]
+        for place in ("sites", "lines")
+    )
     run("accuracy", "r.json", "--along", "x", "-o", "x.cal", *wiring[:4])
     twice = json.loads(run("verify", "r.json", "f.cal", "x.cal", "--json")[1])
     assert twice["sites"]["after"]["rms"] > 1e2 * both["sites"]["after"]["rms"]
@@ -293,17 +330,27 @@ def test_a_table_names_what_its_uncertainty_assumes(run, grade):
     assert "; verdict: Good; U assumes a plate that bends by 0.005 um\n" in text
 
 
-@pytest.mark.parametrize(("args", "message"), [
-    (["--x-axis", "0"], "--x-axis: 0 is not in 1..32"),
-    (["--x-axis", "2"], "the indices [2, 2] are not distinct"),
-    (["--home-x", "nan"], "--home-x: nan is not a position"),
-    (["--theta-axis", "3", "--counts-per-unit", "4=1000"], "axis 4 is not the theta axis; write"),
-    (["--counts-per-unit", "3=1000"], "axis 3 is not the theta axis; name --theta-axis"),
-    (["--theta-output", "t.cal"], "--theta-output: no theta table is written; name --theta-axis"),
-    (["--home-theta", "0"], "--home-theta: there is no theta axis; name --theta-axis"),
-    (["--reverse-theta"], "--reverse-theta: there is no theta axis; name --theta-axis"),
-    (["--theta-axis", "3", "--counts-per-unit", "3=0"], "'0' is not a positive number"),
-    (["--theta-axis", "3", "--counts-per-unit", "1000"], "'1000' is not AXIS=VALUE")])
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--x-axis", "0"], "--x-axis: 0 is not in 1..32"),
+        (["--x-axis", "2"], "the indices [2, 2] are not distinct"),
+        (["--home-x", "nan"], "--home-x: nan is not a position"),
+        (
+            ["--theta-axis", "3", "--counts-per-unit", "4=1000"],
+            "axis 4 is not the theta axis; write",
+        ),
+        (["--counts-per-unit", "3=1000"], "axis 3 is not the theta axis; name --theta-axis"),
+        (
+            ["--theta-output", "t.cal"],
+            "--theta-output: no theta table is written; name --theta-axis",
+        ),
+        (["--home-theta", "0"], "--home-theta: there is no theta axis; name --theta-axis"),
+        (["--reverse-theta"], "--reverse-theta: there is no theta axis; name --theta-axis"),
+        (["--theta-axis", "3", "--counts-per-unit", "3=0"], "'0' is not a positive number"),
+        (["--theta-axis", "3", "--counts-per-unit", "1000"], "'1000' is not AXIS=VALUE"),
+    ],
+)
 def test_options_of_export_without_sense(run, args, message):
     code, _, err = run("export", "r.json", "-o", "f.cal", *args)
     assert code == 2
@@ -330,15 +377,29 @@ def test_check_strict_refuses_what_is_tolerated(run, tmp_path):
 
 
 def test_eval_refuses_a_length_of_an_axis_that_turns(run):
-    assert run("export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--theta-output",
-               "t.cal", "--counts-per-unit", "3=1000")[0] == 0
+    assert (
+        run(
+            "export",
+            "r.json",
+            "-o",
+            "f.cal",
+            "--theta-axis",
+            "3",
+            "--theta-output",
+            "t.cal",
+            "--counts-per-unit",
+            "3=1000",
+        )[0]
+        == 0
+    )
     counts = "--counts-per-unit", "3=1000"
     assert run("eval", "t.cal", "--position", "3=10", *counts)[0] == 0
     for text in (without_comments, str):  # told by where the table rolls over, or by its comments
         code, out, err = run("eval", text("t.cal"), "--position", "3=10mm", *counts)
         assert (code, out) == (2, "")
-        one_line(err, "'3=10mm' is a length, and axis 3 is rotary; write 3=10.5, in its primary "
-                      "unit")
+        one_line(
+            err, "'3=10mm' is a length, and axis 3 is rotary; write 3=10.5, in its primary unit"
+        )
     assert run("export", "r.json", "-o", "g.cal", "--theta-axis", "3")[0] == 0
     code, _, err = run("eval", "g_theta.cal", "--position", "3=10mm")
     assert code == 2
@@ -365,8 +426,9 @@ def test_a_table_of_a_map_without_uncertainty_says_so(run):
 
 
 def test_check_gi4(run, tmp_path):
-    (tmp_path / "g.cal").write_text(":GALVO2D 2 1 1 2 1024 1024 65\n"
-                                    + ("0 " * 130 + "\n") * 65 + ":END\n")
+    (tmp_path / "g.cal").write_text(
+        ":GALVO2D 2 1 1 2 1024 1024 65\n" + ("0 " * 130 + "\n") * 65 + ":END\n"
+    )
     assert run("check", "--gi4", "g.cal")[0] == 0
     code, _, err = run("check", "g.cal", "--gi4", "--scanner-bits", "20")
     assert code == 2
@@ -377,11 +439,17 @@ def test_check_gi4(run, tmp_path):
     one_line(err, "--scanner-bits: it belongs to a GI4; add --gi4")
 
 
-@pytest.mark.parametrize(("args", "want"), [
-    (["1=10"], 4e-3), (["1=5"], 2e-3), (["1=99"], -6e-3),
-    (["1=10", "--temperature", "25"], 4e-3 - 10 * 1e-5 * 5),
-    (["1=110", "--home-direction", "1=CCW"], 4e-3 - 0.0),
-    (["1=7", "--home-offset", "1=3"], 4e-3 - 1.2e-3)])
+@pytest.mark.parametrize(
+    ("args", "want"),
+    [
+        (["1=10"], 4e-3),
+        (["1=5"], 2e-3),
+        (["1=99"], -6e-3),
+        (["1=10", "--temperature", "25"], 4e-3 - 10 * 1e-5 * 5),
+        (["1=110", "--home-direction", "1=CCW"], 4e-3 - 0.0),
+        (["1=7", "--home-offset", "1=3"], 4e-3 - 1.2e-3),
+    ],
+)
 def test_eval_options(run, tmp_path, args, want):
     (tmp_path / "f.cal").write_text(CAL_1D)
     code, out, err = run("eval", "f.cal", "--position", *args)
@@ -389,8 +457,9 @@ def test_eval_options(run, tmp_path, args, want):
 
 
 def test_eval_counts(run, tmp_path):
-    (tmp_path / "f.cal").write_text(":START 2 SAMPLEDIST=100 REFERENCEAXIS=1 "
-                                    "ABSOLUTEFEEDBACKOFFSET=0\n0\n10\n:END\n")
+    (tmp_path / "f.cal").write_text(
+        ":START 2 SAMPLEDIST=100 REFERENCEAXIS=1 ABSOLUTEFEEDBACKOFFSET=0\n0\n10\n:END\n"
+    )
     code, _, err = run("eval", "f.cal", "--position", "1=1")
     assert code == 2
     one_line(err, "axis 1: POSUNIT of the table of line 1 is in counts")
@@ -398,21 +467,26 @@ def test_eval_counts(run, tmp_path):
     assert json.loads(run("eval", "f.cal", "--position", "1=1", *counts)[1]) == {"2": 0.005}
     moved = [*counts, "--absolute-feedback-offset", "1=-100"]
     assert json.loads(run("eval", "f.cal", "--position", "1=-1", *moved)[1]) == {
-        "2": pytest.approx(-0.005)}
+        "2": pytest.approx(-0.005)
+    }
 
 
-@pytest.mark.parametrize(("args", "message"), [
-    ([], "--position: no position given"),
-    (["--position", "2=1"], "axis 1: its position is needed"),
-    (["--position", "1"], "'1' is not AXIS=VALUE"),
-    (["--position", "33=1"], "'33=1' is not AXIS=VALUE"),
-    (["--position", "1=x"], "'x' is not a number"),
-    (["--position", "1=1_0"], "'1_0' is not a number"),
-    (["--position", "1=inf"], "'inf' is not a number"),
-    (["--position", "1=1", "--position", "1=2"], "axis 1 is given twice"),
-    (["--position", "1=1", "--home-direction", "1=UP"], "'UP' is not a home direction"),
-    (["--position", "1=1", "--temperature", "nan"], "is not a temperature"),
-    (["--position", "1=1", "--temperature", "296"], "is it in K?")])
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ([], "--position: no position given"),
+        (["--position", "2=1"], "axis 1: its position is needed"),
+        (["--position", "1"], "'1' is not AXIS=VALUE"),
+        (["--position", "33=1"], "'33=1' is not AXIS=VALUE"),
+        (["--position", "1=x"], "'x' is not a number"),
+        (["--position", "1=1_0"], "'1_0' is not a number"),
+        (["--position", "1=inf"], "'inf' is not a number"),
+        (["--position", "1=1", "--position", "1=2"], "axis 1 is given twice"),
+        (["--position", "1=1", "--home-direction", "1=UP"], "'UP' is not a home direction"),
+        (["--position", "1=1", "--temperature", "nan"], "is not a temperature"),
+        (["--position", "1=1", "--temperature", "296"], "is it in K?"),
+    ],
+)
 def test_eval_without_sense(run, tmp_path, args, message):
     (tmp_path / "f.cal").write_text(CAL_1D)
     code, out, err = run("eval", "f.cal", *args)
@@ -425,10 +499,26 @@ def test_the_example_of_the_source(run):
     rows = [line.split() for line in out.splitlines() if line.startswith("  ")]
     assert code == 0 and "-22.5 µm" in out
     assert [row for row in rows if row[0] != "position"] == [
-        ["0", "0"], ["900", "-22.5"], ["-450", "0"], ["450", "-22.5"], ["-450", "11.25"],
-        ["450", "-11.25"]]
-    code, out, _ = run("orthogonality", "--measured=-5um", "--over", "200mm", "--travel", "900mm",
-                       "--home", "end", "--json", "--unit", "um")
+        ["0", "0"],
+        ["900", "-22.5"],
+        ["-450", "0"],
+        ["450", "-22.5"],
+        ["-450", "11.25"],
+        ["450", "-11.25"],
+    ]
+    code, out, _ = run(
+        "orthogonality",
+        "--measured=-5um",
+        "--over",
+        "200mm",
+        "--travel",
+        "900mm",
+        "--home",
+        "end",
+        "--json",
+        "--unit",
+        "um",
+    )
     assert json.loads(out)["tables"] == {"end": [[0.0, 0.0], [900000.0, 22.5]]}
     square = ["orthogonality", "--measured", "5um", "--over", "200mm", "--travel", "900mm"]
     assert run(*square, "--home", "middle", "-o", "o.cal")[0] == 0
@@ -439,13 +529,20 @@ def test_the_example_of_the_source(run):
     assert json.loads(out) == {"2": pytest.approx(-11.25e-3)}
 
 
-@pytest.mark.parametrize(("args", "message"), [
-    (["--measured", "5um"], "the measurement is not complete"),
-    (["--measured", "5", "--over", "1m", "--travel", "1m"], "'5' is not a length"),
-    (["--measured", "5um", "--over", "0m", "--travel", "1m"], "not a positive length"),
-    (["--measured", "5um", "--over", "1m", "--travel", "1m", "-o", "o.cal"], "give end, middle"),
-    (["--measured", "5um", "--over", "1m", "--travel", "1m", "--home-x", "1"], "use --home"),
-    (["r.json", "--over", "1m"], "exclude each other")])
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["--measured", "5um"], "the measurement is not complete"),
+        (["--measured", "5", "--over", "1m", "--travel", "1m"], "'5' is not a length"),
+        (["--measured", "5um", "--over", "0m", "--travel", "1m"], "not a positive length"),
+        (
+            ["--measured", "5um", "--over", "1m", "--travel", "1m", "-o", "o.cal"],
+            "give end, middle",
+        ),
+        (["--measured", "5um", "--over", "1m", "--travel", "1m", "--home-x", "1"], "use --home"),
+        (["r.json", "--over", "1m"], "exclude each other"),
+    ],
+)
 def test_orthogonality_without_sense(run, args, message):
     code, _, err = run("orthogonality", *args)
     assert code == 2
@@ -469,9 +566,14 @@ def test_lines_from_a_result_and_from_measured_errors(run, tmp_path):
     one_line(err, "a.cal: the file exists")
 
 
-@pytest.mark.parametrize("args", [
-    ["accuracy", "d.csv"], ["straightness", "d.csv"],
-    ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m"]])
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["accuracy", "d.csv"],
+        ["straightness", "d.csv"],
+        ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m"],
+    ],
+)
 def test_force_without_a_file_to_replace_is_refused(run, tmp_path, args):
     (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
     assert run(*args)[0] == 0
@@ -480,10 +582,15 @@ def test_force_without_a_file_to_replace_is_refused(run, tmp_path, args):
     one_line(err, "--force: it replaces a file, and none is named; name one with -o")
 
 
-@pytest.mark.parametrize("args", [
-    ["accuracy", "d.csv", "--home-x", "-50"], ["accuracy", "d.csv", "--reverse-x"],
-    ["straightness", "d.csv", "--along", "y", "--home-y", "5"],
-    ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m", "--reverse-y"]])
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["accuracy", "d.csv", "--home-x", "-50"],
+        ["accuracy", "d.csv", "--reverse-x"],
+        ["straightness", "d.csv", "--along", "y", "--home-y", "5"],
+        ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m", "--reverse-y"],
+    ],
+)
 def test_what_was_measured_is_in_the_controllers_own_coordinates(run, tmp_path, args):
     (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
     code, out, err = run(*args)
@@ -500,8 +607,11 @@ def test_all_outputs_of_an_export_are_checked_first(run, tmp_path):
     assert code == 2
     one_line(err, "r.json: would be overwritten")
     (tmp_path / "d.csv").write_text("position,error\n0,0\n10,1\n20,3\n")
-    for verb, source in (("orthogonality", "r.json"), ("accuracy", "r.json"),
-                         ("straightness", "d.csv")):
+    for verb, source in (
+        ("orthogonality", "r.json"),
+        ("accuracy", "r.json"),
+        ("straightness", "d.csv"),
+    ):
         before = (tmp_path / source).read_bytes()
         code, _, err = run(verb, source, "-o", source, "--force")
         assert code == 2 and (tmp_path / source).read_bytes() == before
@@ -511,12 +621,13 @@ def test_all_outputs_of_an_export_are_checked_first(run, tmp_path):
 def test_bad_paths_and_bad_plots(run, tmp_path):
     run("export", "r.json", "-o", "f.cal")
     (tmp_path / "x.json").write_text("{}")
-    for args, message in ((["check", "none.cal"], "none.cal: no such file"),
-                          (["eval", ".", "--position", "1=0"], "cannot be read"),
-                          (["export", "x.json", "-o", "g.cal"], "not a result of schema"),
-                          (["export", "r.json", "-o", "no/g.cal"], "cannot be written"),
-                          (["verify", "r.json", "f.cal", "--plot", "f.gif"],
-                           "not a picture format by its suffix")):
+    for args, message in (
+        (["check", "none.cal"], "none.cal: no such file"),
+        (["eval", ".", "--position", "1=0"], "cannot be read"),
+        (["export", "x.json", "-o", "g.cal"], "not a result of schema"),
+        (["export", "r.json", "-o", "no/g.cal"], "cannot be written"),
+        (["verify", "r.json", "f.cal", "--plot", "f.gif"], "not a picture format by its suffix"),
+    ):
         code, _, err = run(*args)
         assert code == 2
         one_line(err, message)

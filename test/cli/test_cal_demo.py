@@ -26,13 +26,34 @@ def result_path(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("wiring", [
-    [], ["--home-x", "-50", "--home-y", "-50"], ["--reverse-x", "--reverse-theta"],
-    ["--reverse-y", "--home-x", "50", "--unit", "um", "--home-y", "-50000"]])
+@pytest.mark.parametrize(
+    "wiring",
+    [
+        [],
+        ["--home-x", "-50", "--home-y", "-50"],
+        ["--reverse-x", "--reverse-theta"],
+        ["--reverse-y", "--home-x", "50", "--unit", "um", "--home-y", "-50000"],
+    ],
+)
 def test_the_demo_makes_its_machine_true(result_path, tmp_path, capsys, wiring):
     target = tmp_path / "stage.cal"
-    assert main(["cal", "export", str(result_path), "-o", str(target), "--theta-axis", "3",
-                 "--counts-per-unit", "3=1000", *wiring]) == 0
+    assert (
+        main(
+            [
+                "cal",
+                "export",
+                str(result_path),
+                "-o",
+                str(target),
+                "--theta-axis",
+                "3",
+                "--counts-per-unit",
+                "3=1000",
+                *wiring,
+            ]
+        )
+        == 0
+    )
     capsys.readouterr()
     assert main(["cal", "verify", str(result_path), str(target), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -48,10 +69,14 @@ def test_the_true_stage_of_the_demo_keeps_the_calibration_error_alone(tmp_path):
     cal = load_cal(target)
     result = result_from_dict(read_json(result_path), str(result_path))
     truth = read_truth(BAG)
-    stage = replace(result.error_map, gx=np.array(truth["gx"]), gy=np.array(truth["gy"]),
-                    g_theta=np.array(truth["g_theta"]))
+    stage = replace(
+        result.error_map,
+        gx=np.array(truth["gx"]),
+        gy=np.array(truth["gy"]),
+        g_theta=np.array(truth["g_theta"]),
+    )
     found = verify_tables(stage, cal.tables, frame_from_comments(cal.comments)).sites
-    u = np.sqrt(np.mean(result.error_map.u_gx ** 2 + result.error_map.u_gy ** 2))
+    u = np.sqrt(np.mean(result.error_map.u_gx**2 + result.error_map.u_gy**2))
     # 242 residuals: their rms is within 4 standard deviations, 0.18, of the stated uncertainty.
     assert found.rms("after") == pytest.approx(u, rel=0.25)
     assert found.rms("before") > 20 * found.rms("after")

@@ -33,10 +33,18 @@ def bag_of(path, camera, sign=-1):
         writer.add_topic(f"/{IMAGE_TOPICS['raw']}", IMAGE_TYPES["raw"], [])
         for number, (move, values) in enumerate(zip(MOVES, views(camera, sign), strict=True), 1):
             for stamp in (number * 10**9 - 10**7, number * 10**9 + 10**7):
-                writer.write(f"/{ENCODER_TOPIC}", from_model.joint_state(EncoderSample(
-                    stamp, ("theta", "y", "x"), (0.0, move[1], move[0])), "stage"), stamp)
-            writer.write(f"/{IMAGE_TOPICS['raw']}", from_model.image(
-                values, "mono8", number * 10**9, "camera"), number * 10**9)
+                writer.write(
+                    f"/{ENCODER_TOPIC}",
+                    from_model.joint_state(
+                        EncoderSample(stamp, ("theta", "y", "x"), (0.0, move[1], move[0])), "stage"
+                    ),
+                    stamp,
+                )
+            writer.write(
+                f"/{IMAGE_TOPICS['raw']}",
+                from_model.image(values, "mono8", number * 10**9, "camera"),
+                number * 10**9,
+            )
     return path
 
 
@@ -45,8 +53,10 @@ def init(source, output, *more):
 
 
 @pytest.mark.parametrize("sense, sign", [("microscope_moves", -1), ("plate_moves", 1)])
-@pytest.mark.parametrize("turn, mirror", [
-    (0.0, False), (30.0, False), (-140.0, False), (0.0, True), (75.0, True), (180.0, True)])
+@pytest.mark.parametrize(
+    "turn, mirror",
+    [(0.0, False), (30.0, False), (-140.0, False), (0.0, True), (75.0, True), (180.0, True)],
+)
 def test_the_camera_is_found_within_its_uncertainty(tmp_path, capsys, turn, mirror, sense, sign):
     camera = Camera(width=200, height=180, pixel_size_m=2.6e-6, turn_deg=turn, mirror=mirror)
     bag_of(tmp_path / "bag", camera, sign)
@@ -71,8 +81,10 @@ def test_a_folder_of_files_with_positions_serves_as_well(tmp_path):
     (tmp_path / "p.csv").write_text("\n".join(rows))
     assert init(tmp_path / "bag", tmp_path / "a.yaml") == 0
     assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 0
-    found = [read_yaml(tmp_path / name)["mark_detector"]["ros__parameters"]
-             for name in ("a.yaml", "b.yaml")]
+    found = [
+        read_yaml(tmp_path / name)["mark_detector"]["ros__parameters"]
+        for name in ("a.yaml", "b.yaml")
+    ]
     assert found[0].pop("pixel_size") == pytest.approx(found[1].pop("pixel_size"), rel=1e-9)
     assert found[0].pop("turn") == pytest.approx(found[1].pop("turn"), abs=1e-9)
     assert found[0] == found[1]
@@ -82,8 +94,19 @@ def test_the_detector_takes_the_file_that_it_writes(tmp_path):
     camera = Camera(width=200, height=180, pixel_size_m=2.6e-6, turn_deg=30.0, mirror=True)
     bag_of(tmp_path / "bag", camera)
     assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 0
-    assert main(["detect", str(tmp_path / "bag"), "-o", str(tmp_path / "found"), "--params",
-                 str(tmp_path / "nodes.yaml")]) == 0
+    assert (
+        main(
+            [
+                "detect",
+                str(tmp_path / "bag"),
+                "-o",
+                str(tmp_path / "found"),
+                "--params",
+                str(tmp_path / "nodes.yaml"),
+            ]
+        )
+        == 0
+    )
 
 
 def test_images_that_are_not_used_are_said(tmp_path, capsys, monkeypatch):
@@ -99,6 +122,7 @@ def test_images_that_are_not_used_are_said(tmp_path, capsys, monkeypatch):
             self.write_raw(topic, b"\0\1\0\0", stamp_ns)
         else:
             write(self, topic, message, stamp_ns)
+
     monkeypatch.setattr(BagWriter, "write", torn)
     bag_of(tmp_path / "bag", camera)
     assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 0
@@ -119,8 +143,12 @@ def test_moves_by_a_whole_pitch_are_refused(tmp_path, capsys, monkeypatch):
     """Each image looks like the one before: what a calibration's images show."""
     moves = [(x * 2e-4, y * 2e-4) for x in range(3) for y in range(3)]
     monkeypatch.setattr(f"{__name__}.MOVES", moves)
-    monkeypatch.setattr(f"{__name__}.views", lambda camera, sign: [camera.image(
-        MARKS, np.random.default_rng(number)) for number in range(len(moves))])
+    monkeypatch.setattr(
+        f"{__name__}.views",
+        lambda camera, sign: [
+            camera.image(MARKS, np.random.default_rng(number)) for number in range(len(moves))
+        ],
+    )
     bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
     assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 2
     [line] = capsys.readouterr().err.splitlines()
@@ -138,16 +166,21 @@ def table_of(folder, factor_x, factor_y):
     (folder / "p.csv").write_text("\n".join(rows))
 
 
-@pytest.mark.parametrize(("factor", "options", "by_moves", "by_mark"), [
-    (1e3, [], "2.6e+03", "2.63"), (1.0, ["--mark-size", "50"], "2.6", "2.63e+06")])
-def test_positions_or_marks_in_other_units_are_refused(tmp_path, capsys, factor, options, by_moves,
-                                                       by_mark):
+@pytest.mark.parametrize(
+    ("factor", "options", "by_moves", "by_mark"),
+    [(1e3, [], "2.6e+03", "2.63"), (1.0, ["--mark-size", "50"], "2.6", "2.63e+06")],
+)
+def test_positions_or_marks_in_other_units_are_refused(
+    tmp_path, capsys, factor, options, by_moves, by_mark
+):
     table_of(tmp_path, factor, factor)
-    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv"),
-                *options) == 2
+    assert (
+        init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv"), *options) == 2
+    )
     [line] = capsys.readouterr().err.splitlines()
-    assert (f"a pixel has {by_moves} µm, by the size of the marks over their pixels "
-            f"{by_mark} µm; ") in line
+    assert (
+        f"a pixel has {by_moves} µm, by the size of the marks over their pixels {by_mark} µm; "
+    ) in line
     assert not (tmp_path / "b.yaml").exists()
 
 
@@ -158,8 +191,9 @@ def test_exchanged_axes_with_one_of_them_short_are_refused(tmp_path, capsys):
     assert "the image of the motion is sheared by 33" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("count, problem", [
-    (0, "no row below the heading"), (1, "move the stage in x and y")])
+@pytest.mark.parametrize(
+    "count, problem", [(0, "no row below the heading"), (1, "move the stage in x and y")]
+)
 def test_too_few_images_are_said_so(tmp_path, capsys, count, problem):
     camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
     rows = ["file,x,y"]

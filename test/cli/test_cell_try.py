@@ -19,24 +19,32 @@ from selfcal_ros.vision.drawing import COLOUR
 from test.support.cells import CELL, Jumping, write_cell
 from test.support.faults import Spoilt
 
-PLATE = ("plan: {plan_id: c, artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}, "
-         "views: [{name: a}]}\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n")
+PLATE = (
+    "plan: {plan_id: c, artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}, "
+    "views: [{name: a}]}\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
+)
 CAMERA = "camera: {width: 220, height: 200, pixel_size: 2.0e-6, mark_size: 50.0e-6, MORE}\n"
 MARKS = "detector: {mark: disc, mark_size: 50.0e-6}\n"
 
 
 def write(folder, more="turn: 3.0", *, physics="", cell=MARKS, sense="microscope_moves"):
     return write_cell(
-        folder, cell=f"{CELL}{cell}sense: {sense}\n",
+        folder,
+        cell=f"{CELL}{cell}sense: {sense}\n",
         simulation=f"{PLATE}physics: {{{physics}}}\ncell: {{sense: {sense}}}\n"
-                   f"{CAMERA.replace('MORE', more)}")
+        f"{CAMERA.replace('MORE', more)}",
+    )
 
 
 @pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
 @pytest.mark.parametrize(("turn", "mirror"), [(3.0, False), (-140.0, False), (75.0, True)])
 def test_camera_and_backlash_are_found_within_their_uncertainty(tmp_path, turn, mirror, sense):
-    cell, machine = write(tmp_path, f"turn: {turn}, mirror: {str(mirror).lower()}",
-                          physics="backlash_x: 2.5e-6", sense=sense)
+    cell, machine = write(
+        tmp_path,
+        f"turn: {turn}, mirror: {str(mirror).lower()}",
+        physics="backlash_x: 2.5e-6",
+        sense=sense,
+    )
     trial = Trial(cell, machine, Jumping())
     _, marks = trial.look()
     assert len(marks) == 1
@@ -98,13 +106,17 @@ def test_nothing_moves_or_is_written_without_a_yes(tmp_path, monkeypatch, capsys
     assert "there is nobody to ask" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("fault", "error", "said"), [
-    ("late by one frame", MachineError, "the image is late by one frame"),
-    ("stands still", MachineError, "nothing moved"),
-    ("position in mm", MachineError, "is it mm for m?"),
-    ("x is reversed", MachineError, "x is reversed"),
-    ("x and y are exchanged", MachineError, "the axes are exchanged"),
-    ("last image again", MachineError, "returns the last image again")])
+@pytest.mark.parametrize(
+    ("fault", "error", "said"),
+    [
+        ("late by one frame", MachineError, "the image is late by one frame"),
+        ("stands still", MachineError, "nothing moved"),
+        ("position in mm", MachineError, "is it mm for m?"),
+        ("x is reversed", MachineError, "x is reversed"),
+        ("x and y are exchanged", MachineError, "the axes are exchanged"),
+        ("last image again", MachineError, "returns the last image again"),
+    ],
+)
 def test_what_is_wrong_is_named_and_the_stage_stopped(tmp_path, fault, error, said):
     cell, machine = write(tmp_path)
     spoilt = Spoilt(machine, fault, after=5 if "image" in fault else 0)

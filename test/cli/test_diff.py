@@ -30,8 +30,13 @@ def files(tmp_path):
     truth = random_truth(artifact, 4, np.random.default_rng(1))
     out = []
     for seed in (1, 2):
-        readings = simulate_measurements(truth, hu_plan(artifact), np.random.default_rng(seed),
-                                         sigma_m=2e-8, sigma_theta_rad=2e-5)
+        readings = simulate_measurements(
+            truth,
+            hu_plan(artifact),
+            np.random.default_rng(seed),
+            sigma_m=2e-8,
+            sigma_theta_rad=2e-5,
+        )
         result = calibrate(readings, Options())
         if seed == 2:
             emap = result.error_map
@@ -49,14 +54,18 @@ def test_both_maps_and_their_difference_are_drawn(files, tmp_path, capsys, monke
     text = [item.text for item in picture.items if hasattr(item, "text")]
     assert picture.says == "verdict: not significant, the maps agree within their uncertainties"
     assert [line for line in text if line in ("A", "B, in the datum of A", "B − A")] == [
-        "A", "B, in the datum of A", "B − A"]
+        "A",
+        "B, in the datum of A",
+        "B − A",
+    ]
     assert "B − A in θ in arcsec, outwards = counter-clockwise" in text
     a, b = (result_from_dict(read_json(file), file) for file in files)
     found = compare(a, b)
     difference = {"gx": found.dx, "gy": found.dy, "g_theta": found.d_theta}
     shown = []
-    monkeypatch.setattr(maps, "error_map", lambda result, **_: shown.append(result) or Drawing(
-        "", "", 10, 10))
+    monkeypatch.setattr(
+        maps, "error_map", lambda result, **_: shown.append(result) or Drawing("", "", 10, 10)
+    )
     maps.difference_picture(a, b, difference, "")
     of_a, of_b, of_both = (result.error_map for result in shown)
     np.testing.assert_array_equal(of_a.gx, a.error_map.gx)
@@ -73,8 +82,10 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert "translation (+1, " in text and "not significant" in text and "theta  rms" in text
     assert main(["diff", *files, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert f"XY     rms {found['rms_um']:.5f} µm per axis   largest {found['max_um']:.5f} µm on" \
+    assert (
+        f"XY     rms {found['rms_um']:.5f} µm per axis   largest {found['max_um']:.5f} µm on"
         in text
+    )
     both = np.abs([found["dx"], found["dy"]]) * 1e6
     assert found["max_um"] == pytest.approx(both.max())
     assert found["rms_um"] == pytest.approx(np.sqrt(np.mean(both**2)))
@@ -85,8 +96,9 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert 1e-3 < test["p"] < 1 and len(found["dx"]) == 5 and found["significant"] is False
     assert f"largest |z| {test['largest_z']:.2f}, limit {test['z_limit']:.2f}, p = " in text
     assert f"Mahalanobis distance^2/dof {test['chi2_ratio']:.3f}, {test['dof']:.0f} dof" in text
-    assert text.splitlines()[-1] == ("verdict: not significant, the maps agree within their "
-                                     "uncertainties")
+    assert text.splitlines()[-1] == (
+        "verdict: not significant, the maps agree within their uncertainties"
+    )
 
 
 def test_plates_are_compared_as_the_stages_are(files, tmp_path, capsys):
@@ -106,27 +118,35 @@ def test_plates_are_compared_as_the_stages_are(files, tmp_path, capsys):
 
 def test_the_grades_of_both_and_what_enlarged_them_are_shown(files, capsys):
     enlarged = result_from_dict(read_json(files[1]), "b")
-    verdict = Verdict(Grade.ENLARGED, enlarged_by=(
-        Enlargement("drift", 3e-9, 9e-9),
-        Enlargement("reading", np.radians(1 / 3600), np.radians(2 / 3600), "rad")),
-        sentence="Good within an enlarged U: a drift")
+    verdict = Verdict(
+        Grade.ENLARGED,
+        enlarged_by=(
+            Enlargement("drift", 3e-9, 9e-9),
+            Enlargement("reading", np.radians(1 / 3600), np.radians(2 / 3600), "rad"),
+        ),
+        sentence="Good within an enlarged U: a drift",
+    )
     write_json(files[1], result_to_dict(replace(enlarged, verdict=verdict)))
     assert main(["diff", *files]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[-3] == "A      grade: good"
     assert lines[-2] == (
         "B      grade: enlarged; U enlarged by drift: u 0.00300 µm rms, 0.00900 µm largest; "
-        "U enlarged by reading: u 1.00 arcsec rms, 2.00 arcsec largest")
+        "U enlarged by reading: u 1.00 arcsec rms, 2.00 arcsec largest"
+    )
     assert main(["diff", *files, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["grade"] == {"a": "good", "b": "enlarged"}
     assert found["enlarged_by"]["a"] == []
-    assert found["enlarged_by"]["b"][0] == {"name": "drift", "u_rms": 3e-9, "u_max": 9e-9,
-                                            "unit": "m"}
+    assert found["enlarged_by"]["b"][0] == {
+        "name": "drift",
+        "u_rms": 3e-9,
+        "u_max": 9e-9,
+        "unit": "m",
+    }
 
 
-def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files, tmp_path,
-                                                                           capsys):
+def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files, tmp_path, capsys):
     data = read_json(files[1])
     data["error_map"]["gy"][2][3] += 1e-6
     other = str(tmp_path / "other.json")
@@ -138,19 +158,32 @@ def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files
     write_json(other, with_digests(data))
     assert main(["diff", files[0], other]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
-        "verdict: none, no uncertainties to test against")
+        "verdict: none, no uncertainties to test against"
+    )
 
 
 def test_a_result_that_is_not_qualified_is_named(files, tmp_path, capsys):
     """Its uncertainties are enlarged, so that it agrees with much: that is told beside it."""
     data = read_json(files[1])
     data["verdict"] |= {
-        "qualified": False, "grade": "not_qualified", "sentence": "Not qualified: because"}
+        "qualified": False,
+        "grade": "not_qualified",
+        "sentence": "Not qualified: because",
+    }
     bad, laser = str(tmp_path / "bad.json"), str(tmp_path / "laser.json")
     write_json(bad, with_digests(data))
-    write_json(laser, {"ex_x": [], "error_map_equivalent": {
-        "nonorthogonality": 1e-6, "u_nonorthogonality": 1e-7, "scale_difference": None,
-        "u_scale_difference": None}})
+    write_json(
+        laser,
+        {
+            "ex_x": [],
+            "error_map_equivalent": {
+                "nonorthogonality": 1e-6,
+                "u_nonorthogonality": 1e-7,
+                "scale_difference": None,
+                "u_scale_difference": None,
+            },
+        },
+    )
     for arguments in ((files[0], bad), (bad, files[0]), (bad, laser), (files[0], bad, "--json")):
         assert main(["diff", *arguments]) == 0
         assert capsys.readouterr().err == f"selfcal diff: {bad}: Not qualified: because\n"
@@ -173,10 +206,12 @@ def test_keep_scale_is_for_maps_that_have_one(files, tmp_path, capsys):
     """Scales of 50 µm/m apart: one is measured, the other a convention, which is no difference."""
     for number, error in enumerate((0.0, 5e-5)):
         data = read_json(files[number])
-        data["error_map"]["gx"] = (np.array(data["error_map"]["gx"])
-                                   + error * 0.01 * np.arange(-2, 3)[:, None]).tolist()
-        data["error_map"]["gy"] = (np.array(data["error_map"]["gy"])
-                                   + error * 0.01 * np.arange(-2, 3)).tolist()
+        data["error_map"]["gx"] = (
+            np.array(data["error_map"]["gx"]) + error * 0.01 * np.arange(-2, 3)[:, None]
+        ).tolist()
+        data["error_map"]["gy"] = (
+            np.array(data["error_map"]["gy"]) + error * 0.01 * np.arange(-2, 3)
+        ).tolist()
         if error:
             data["reference"] = {"kind": "artifact", "relative_error": error, "u_relative": 1e-7}
         write_json(files[number], with_digests(data))
@@ -187,7 +222,8 @@ def test_keep_scale_is_for_maps_that_have_one(files, tmp_path, capsys):
         printed = capsys.readouterr()
         assert printed.out == "" and printed.err == (
             f"selfcal diff: --keep-scale: {bare} has no reference length, so its magnification is "
-            "unknown; omit it, or solve with --reference\n")
+            "unknown; omit it, or solve with --reference\n"
+        )
     assert main(["diff", files[1], files[1], "--keep-scale"]) == 0
     assert "scale +0 µm/m" in capsys.readouterr().out
 
@@ -205,9 +241,18 @@ def test_another_lattice_is_bad_input(files, tmp_path, capsys):
 
 def test_result_against_the_laser(files, tmp_path, capsys):
     laser = tmp_path / "laser.json"
-    write_json(laser, {"ex_x": [], "error_map_equivalent": {
-        "nonorthogonality": 1e-6, "u_nonorthogonality": 1e-7, "scale_difference": -2e-6,
-        "u_scale_difference": 1e-7}})
+    write_json(
+        laser,
+        {
+            "ex_x": [],
+            "error_map_equivalent": {
+                "nonorthogonality": 1e-6,
+                "u_nonorthogonality": 1e-7,
+                "scale_difference": -2e-6,
+                "u_scale_difference": 1e-7,
+            },
+        },
+    )
     assert main(["diff", files[0], str(laser)]) == 0
     out = capsys.readouterr().out
     assert re.search(r"nonorthogonality: \S+ and \+1 µrad, difference ", out)
@@ -216,11 +261,13 @@ def test_result_against_the_laser(files, tmp_path, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["nonorthogonality"]["laser"] == 1e-6 and found["grade"] == {"a": "good"}
     assert found["nonorthogonality"]["difference"] == pytest.approx(
-        1e-6 - found["nonorthogonality"]["map"])
+        1e-6 - found["nonorthogonality"]["map"]
+    )
     assert main(["diff", files[0], str(laser), "--keep-scale"]) == 2
     assert capsys.readouterr().err == (
         f"selfcal diff: --keep-scale: for {laser} squareness and scale difference are compared, "
-        "not the magnification; omit it\n")
+        "not the magnification; omit it\n"
+    )
 
 
 def test_files_that_are_no_results(files, tmp_path, capsys):
@@ -243,6 +290,11 @@ def test_symbols_are_spelled_out_where_stdout_cannot_take_them(files, monkeypatc
 
 def test_rounding_errors_are_zero(files, capsys):
     assert main(["diff", files[0], files[0]]) == 0
-    assert capsys.readouterr().out.splitlines()[0].startswith(
-        "B minus A, datum difference removed: translation (+0, +0) µm, rotation +0 arcsec, "
-        "scale +0 µm/m")
+    assert (
+        capsys.readouterr()
+        .out.splitlines()[0]
+        .startswith(
+            "B minus A, datum difference removed: translation (+0, +0) µm, rotation +0 arcsec, "
+            "scale +0 µm/m"
+        )
+    )

@@ -12,11 +12,14 @@ from selfcal_ros.files import read_json
 from test.support.details import simulated_details
 from test.support.verbs import simulate, two_and_a_view
 
-VIEWS = [{"name": "0", "repeats": 2}, {"name": "90", "rotation_deg": 90, "repeats": 2},
-         {"name": "180", "rotation_deg": 180, "repeats": 2},
-         {"name": "tx", "translation_pitch": [-1, 0], "repeats": 2},
-         {"name": "ty", "translation_pitch": [0, 1], "repeats": 2},
-         {"name": "line", "rotation_deg": 45, "grid": False}]
+VIEWS = [
+    {"name": "0", "repeats": 2},
+    {"name": "90", "rotation_deg": 90, "repeats": 2},
+    {"name": "180", "rotation_deg": 180, "repeats": 2},
+    {"name": "tx", "translation_pitch": [-1, 0], "repeats": 2},
+    {"name": "ty", "translation_pitch": [0, 1], "repeats": 2},
+    {"name": "line", "rotation_deg": 45, "grid": False},
+]
 PLATE = {"grid_size": [6, 4], "grid_pitch": 0.01, "angular_count": 8}
 PLAN = {"plan_id": "even", "artifact": PLATE, "views": VIEWS}
 MACHINE = {"seed": 5, "truth": {"correlation": 4, "phi": 1e-4}}
@@ -40,8 +43,20 @@ def test_a_bag_without_noise_gives_the_truth(tmp_path, sense, with_ids):
     cell = {"with_ids": with_ids, "sense": sense, "servo_sigma": 0.0, "servo_sigma_theta": 0.0}
     simulate(tmp_path, "exact", PLAN, seed=5, cell=cell, truth={"phi": 1e-4})
     on_its_targets = 5  # where all offsets might have the other sign: not qualified
-    assert main(["solve", str(tmp_path / "exact"), "--sense", sense, "--quiet", "-o",
-                 str(tmp_path / "r.json")]) == on_its_targets
+    assert (
+        main(
+            [
+                "solve",
+                str(tmp_path / "exact"),
+                "--sense",
+                sense,
+                "--quiet",
+                "-o",
+                str(tmp_path / "r.json"),
+            ]
+        )
+        == on_its_targets
+    )
     found, truth = (read_json(tmp_path / name) for name in ("r.json", "exact/truth.json"))
     for axis in ("gx", "gy"):
         difference = np.array(found["error_map"][axis]) - np.array(truth[axis])
@@ -72,19 +87,26 @@ def test_tables_of_controllers_have_the_nodes_at_their_places(said):
         said("export", kind, "one.json", "-o", f"{kind}.txt", "--unit", "mm", "--verify", *counts)
     emap = read_json("one.json")["error_map"]
     gx, gy = np.array(emap["gx"]), np.array(emap["gy"])
-    rows = [numbers(line) for line in Path("kmotion.txt").read_text().splitlines()
-            if line and line[0] in "-0123456789"]
+    rows = [
+        numbers(line)
+        for line in Path("kmotion.txt").read_text().splitlines()
+        if line and line[0] in "-0123456789"
+    ]
     assert rows[:3] == [[4, 6], [10, 10], [-25, -15]]
     for row in (rows[3], rows[-1]):
         j, i = int(row[0]), int(row[1])
-        assert row[2:4] == pytest.approx([1e3 * (X[i] + gx[i, j]), 1e3 * (Y[j] + gy[i, j])],
-                                         abs=1e-8)
+        assert row[2:4] == pytest.approx(
+            [1e3 * (X[i] + gx[i, j]), 1e3 * (Y[j] + gy[i, j])], abs=1e-8
+        )
     assert rows[-1][:2] == [3, 5]
     beckhoff = Path("beckhoff_x.txt").read_text()
     assert "start_position_master1 -250000" in beckhoff  # 0.1 um
     assert "last_index_master1 5" in beckhoff and "last_index_master2 3" in beckhoff
-    axis = [numbers(line) for line in Path("linuxcnc_x.txt").read_text().splitlines()
-            if line and line[0] in "-0123456789"]
+    axis = [
+        numbers(line)
+        for line in Path("linuxcnc_x.txt").read_text().splitlines()
+        if line and line[0] in "-0123456789"
+    ]
     assert [row[0] for row in axis] == (1e3 * X).tolist()
     siemens = Path("siemens.txt").read_text()
     assert "$AN_CEC_MIN[0]=-25" in siemens and "$AN_CEC_MAX[0]=25" in siemens
@@ -108,10 +130,14 @@ def test_results_are_compared_combined_and_rechecked(said):
 
 
 def test_every_other_verb_takes_the_result(said):
-    for words in (["plot", "one.json", "-o", "map.svg"], ["report", "one.json", "-o", "r.html"],
-                  ["iso230", "one"],
-                  ["certificate", "one.json", simulated_details(Path.cwd()), "-o", "c.xml"],
-                  ["batch", "one", "two", "-o", "many"], ["plan", "check", "one_plan.yaml"]):
+    for words in (
+        ["plot", "one.json", "-o", "map.svg"],
+        ["report", "one.json", "-o", "r.html"],
+        ["iso230", "one"],
+        ["certificate", "one.json", simulated_details(Path.cwd()), "-o", "c.xml"],
+        ["batch", "one", "two", "-o", "many"],
+        ["plan", "check", "one_plan.yaml"],
+    ):
         said(*words)
     assert read_json("many/batch.json")["qualified"] == 2
     assert "axis x at y = 5 mm, 6 positions from -25 to 25 mm" in said("iso230", "one")

@@ -30,20 +30,29 @@ def run(line: str) -> int:
     return main(["export", *line.split()])
 
 
-@pytest.mark.parametrize(("name", "files"), [
-    ("kmotion", ["t.txt"]), ("pmac", ["t.txt"]), ("beckhoff", ["t_x.txt", "t_y.txt"]),
-    ("linuxcnc", ["t_x.txt", "t_y.txt"]), ("siemens", ["t.txt"])])
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("kmotion", ["t.txt"]),
+        ("pmac", ["t.txt"]),
+        ("beckhoff", ["t_x.txt", "t_y.txt"]),
+        ("linuxcnc", ["t_x.txt", "t_y.txt"]),
+        ("siemens", ["t.txt"]),
+    ],
+)
 def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
     line = f"{name} R.json -o t.txt --verify " + PMAC * (name == "pmac")
     assert run(line) == 0
     out = capsys.readouterr().out.splitlines()
-    assert out[:len(files)] == files and all(Path(file).is_file() for file in files)
+    assert out[: len(files)] == files and all(Path(file).is_file() for file in files)
     assert out[len(files)].startswith("residual true - commanded")
     assert out[len(files) + 7] == "to put it into use:" and all(
-        line.startswith(f"  {number}. ") for number, line in enumerate(out[len(files) + 8:], 1))
+        line.startswith(f"  {number}. ") for number, line in enumerate(out[len(files) + 8 :], 1)
+    )
     before, after = map(float, out[len(files) + 1].split()[-2:])
-    assert before > 0.1 and after < (0.0001 if (len(files) == 1 and name != "siemens")
-                                     or name == "beckhoff" else 0.99 * before)
+    assert before > 0.1 and after < (
+        0.0001 if (len(files) == 1 and name != "siemens") or name == "beckhoff" else 0.99 * before
+    )
     assert run(line) == 2
     assert "the file exists" in capsys.readouterr().err
     assert run(line + " --force --json") == 0
@@ -53,8 +62,14 @@ def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
     assert found["residuals"]["sites"]["after"]["rms"] == pytest.approx(1e-6 * after, abs=1e-12)
 
 
-@pytest.mark.parametrize("line", ["export kmotion R.json -o t.txt", "cal export R.json -o t.cal",
-                                  "cal straightness R.json -o s.cal"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "export kmotion R.json -o t.txt",
+        "cal export R.json -o t.cal",
+        "cal straightness R.json -o s.cal",
+    ],
+)
 def test_a_step_between_neighbours_that_is_not_plausible_is_asked_about(capsys, line):
     """One node of 150 um, the others of a few: 1 % of the pitch is 100 um."""
     gx = MAP.gx.copy()
@@ -62,9 +77,12 @@ def test_a_step_between_neighbours_that_is_not_plausible_is_asked_about(capsys, 
     write_json("R.json", result_to_dict(result_of(replace(MAP, gx=gx))))
     assert main(line.split()) == 2
     err = capsys.readouterr().err
-    assert re.search(r": R.json: gx changes by 1[45]\d(\.\d)? um from the node at \((0|10), -10\) "
-                     r"mm to the next along x, 10 mm away: is it real\?; check the readings there; "
-                     r"if it is, add --steep\n$", err)
+    assert re.search(
+        r": R.json: gx changes by 1[45]\d(\.\d)? um from the node at \((0|10), -10\) "
+        r"mm to the next along x, 10 mm away: is it real\?; check the readings there; "
+        r"if it is, add --steep\n$",
+        err,
+    )
     assert not list(Path().glob("?.*t*"))
     assert main([*line.split(), "--steep"]) == 0
     gx[3, 1] -= 60e-6
@@ -72,14 +90,29 @@ def test_a_step_between_neighbours_that_is_not_plausible_is_asked_about(capsys, 
     assert main([*line.split(), "--force"]) == 0
 
 
-@pytest.mark.parametrize(("name", "said"), [
-    ("kmotion", ("Tool Setup, Trajectory Planner: enter t.txt",)),
-    ("pmac", ("send t.txt to the controller, then I51=1", "Mxx69 of motors 3 and 4")),
-    ("beckhoff", ("t_x.txt and t_y.txt to the compensation lists of axes 3 and 4",
-                  "lr_param.crosscomp2 1")),
-    ("linuxcnc", ("[JOINT_2] write COMP_FILE = t_x.txt and COMP_FILE_TYPE = 0, under [JOINT_3] "
-                  "COMP_FILE = t_y.txt", "halcmd getp joint.2.backlash-corr")),
-    ("siemens", ("MD32710 $MA_CEC_ENABLE of axes AX3 and AX4",))])
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("kmotion", ("Tool Setup, Trajectory Planner: enter t.txt",)),
+        ("pmac", ("send t.txt to the controller, then I51=1", "Mxx69 of motors 3 and 4")),
+        (
+            "beckhoff",
+            (
+                "t_x.txt and t_y.txt to the compensation lists of axes 3 and 4",
+                "lr_param.crosscomp2 1",
+            ),
+        ),
+        (
+            "linuxcnc",
+            (
+                "[JOINT_2] write COMP_FILE = t_x.txt and COMP_FILE_TYPE = 0, under [JOINT_3] "
+                "COMP_FILE = t_y.txt",
+                "halcmd getp joint.2.backlash-corr",
+            ),
+        ),
+        ("siemens", ("MD32710 $MA_CEC_ENABLE of axes AX3 and AX4",)),
+    ],
+)
 def test_the_checklist_names_files_axes_and_the_place_to_look_at(capsys, name, said):
     """The place is that of the largest correction, relative to the controller's zero."""
     line = f"{name} R.json -o t.txt --json --unit mm --x-axis 3 --y-axis 4 --home-x 10 "
@@ -87,8 +120,11 @@ def test_the_checklist_names_files_axes_and_the_place_to_look_at(capsys, name, s
     assert run(line + counts * (name == "pmac")) == 0
     *steps, look = json.loads(capsys.readouterr().out)["checklist"]
     assert all(any(part in step for step in steps) for part in said)
-    found = re.match(r"the correction is largest at x = (\S+) mm, y = (\S+) mm: relative to zero "
-                     r"the axes go (\S+) um and (\S+) um further there; measure it", look)
+    found = re.match(
+        r"the correction is largest at x = (\S+) mm, y = (\S+) mm: relative to zero "
+        r"the axes go (\S+) um and (\S+) um further there; measure it",
+        look,
+    )
     x, y, cx, cy = map(float, found.groups())
     if name in ("linuxcnc", "siemens"):
         return  # they hold a part of the map
@@ -103,8 +139,12 @@ def test_what_remains_is_said_before_the_table_of_linuxcnc_is_written(capsys):
     assert run("linuxcnc R.json -o t.txt --home-x 5 --verify") == 0
     out, err = capsys.readouterr()
     before, after = map(float, out.splitlines()[3].split()[-2:])
-    assert "cannot hold the whole map: left at the nodes on a simulated controller: " \
-           f"{after:.3g} um rms" in err and f"of {before:.3g} um rms" in err
+    assert (
+        "cannot hold the whole map: left at the nodes on a simulated controller: "
+        f"{after:.3g} um rms"
+        in err
+        and f"of {before:.3g} um rms" in err
+    )
     rows = [list(map(float, row.split())) for row in Path("t_x.txt").read_text().splitlines()[:5]]
     at, forward, _ = np.array(rows).T
     means = 1e3 * MAP.gx.mean(axis=1)
@@ -116,8 +156,13 @@ def test_what_remains_is_said_before_the_table_of_linuxcnc_is_written(capsys):
 
 def test_kmotion_is_in_inches_unless_told_otherwise(capsys):
     assert run("kmotion R.json -o inch.txt") == run("kmotion R.json -o mm.txt --unit mm") == 0
-    first = [float(line.split(",")[0]) for line in (
-        Path("inch.txt").read_text().splitlines()[2], Path("mm.txt").read_text().splitlines()[2])]
+    first = [
+        float(line.split(",")[0])
+        for line in (
+            Path("inch.txt").read_text().splitlines()[2],
+            Path("mm.txt").read_text().splitlines()[2],
+        )
+    ]
     assert first == [pytest.approx(-20 / 25.4), -20]
 
 
@@ -134,14 +179,21 @@ def test_onto_combines_with_the_active_table(capsys):
     assert re.fullmatch(r"selfcal export: R.json:1: .*\n", capsys.readouterr().err)
 
 
-@pytest.mark.parametrize(("line", "message"), [
-    ("kmotion R.json -o t.txt --negate", "--negate: the sense of kmotion is known; leave it out"),
-    ("siemens R.json -o t.txt --integers", "--integers: siemens needs none"),
-    ("pmac R.json -o t.txt --counts-per-unit 1=5", "--counts-per-unit: it is given for [1]"),
-    ("pmac R.json -o t.txt", "--counts-per-unit: PMAC's tables are in counts"),
-    ("kmotion R.json -o R.json", "R.json: would be overwritten"),
-    ("linuxcnc R.json -o t.txt --onto a", "a: no such file"),
-    ("siemens R.json -o t.txt --y-axis 1", "axes: the indices [1, 1] are not distinct")])
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (
+            "kmotion R.json -o t.txt --negate",
+            "--negate: the sense of kmotion is known; leave it out",
+        ),
+        ("siemens R.json -o t.txt --integers", "--integers: siemens needs none"),
+        ("pmac R.json -o t.txt --counts-per-unit 1=5", "--counts-per-unit: it is given for [1]"),
+        ("pmac R.json -o t.txt", "--counts-per-unit: PMAC's tables are in counts"),
+        ("kmotion R.json -o R.json", "R.json: would be overwritten"),
+        ("linuxcnc R.json -o t.txt --onto a", "a: no such file"),
+        ("siemens R.json -o t.txt --y-axis 1", "axes: the indices [1, 1] are not distinct"),
+    ],
+)
 def test_what_is_not_possible_is_one_line(capsys, line, message):
     assert run(line) == 2
     err = capsys.readouterr().err
@@ -157,24 +209,41 @@ def test_integers_are_for_the_old_controller():
 
 
 def test_holes_are_filled_on_request_and_the_file_says_so(capsys):
-    write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01), 3,
-                                                             unknown=((1, 1),)))))
+    write_json(
+        "R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01), 3, unknown=((1, 1),))))
+    )
     assert run("siemens R.json -o t.txt") == 2
     assert "1 sites are unknown" in capsys.readouterr().err
     assert run("siemens R.json -o t.txt --fill") == 0
-    assert capsys.readouterr().err.startswith("selfcal export: 1 unknown sites filled from their "
-                                              "neighbours\n")
+    assert capsys.readouterr().err.startswith(
+        "selfcal export: 1 unknown sites filled from their neighbours\n"
+    )
     assert "1 sites were not measured" in Path("t.txt").read_text()
 
 
 def test_not_qualified_is_code_5_and_not_identified_code_3(capsys):
     found = result_of(MAP)
-    write_json("R.json", result_to_dict(replace(found, verdict=Verdict(
-        Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy.", reasons=("too noisy",)))))
+    write_json(
+        "R.json",
+        result_to_dict(
+            replace(
+                found,
+                verdict=Verdict(
+                    Grade.NOT_QUALIFIED,
+                    sentence="Not qualified: too noisy.",
+                    reasons=("too noisy",),
+                ),
+            )
+        ),
+    )
     assert run("kmotion R.json -o t.txt") == 5
     assert "too noisy" in capsys.readouterr().err and "NOT QUALIFIED" in Path("t.txt").read_text()
-    write_json("R.json", result_to_dict(replace(found, observability=replace(
-        found.observability, identifiable=False))))
+    write_json(
+        "R.json",
+        result_to_dict(
+            replace(found, observability=replace(found.observability, identifiable=False))
+        ),
+    )
     assert run("kmotion R.json -o u.txt") == 3 and not Path("u.txt").exists()
 
 
@@ -196,15 +265,25 @@ def test_cal_export_combines_too(capsys):
 def test_the_counts_of_pmac_are_those_of_their_motors(axes):
     """Six cells of 10 mm along x with 1000 counts in a mm, along y with 3000."""
     x, y = axes
-    assert run(f"pmac R.json -o t.txt --x-axis {x} --y-axis {y} --counts-per-unit {x}=1000 "
-               f"--counts-per-unit {y}=3000") == 0
+    assert (
+        run(
+            f"pmac R.json -o t.txt --x-axis {x} --y-axis {y} --counts-per-unit {x}=1000 "
+            f"--counts-per-unit {y}=3000"
+        )
+        == 0
+    )
     heads = re.findall(r"DEFINE COMP (.*)", Path("t.txt").read_text())
     assert {head.split(",", 4)[4] for head in heads} == {"60000,180000"}
 
 
-@pytest.mark.parametrize(("options", "offset"), [
-    ("--home-theta 30", 390.0), ("--home-theta 30 --counts-per-unit 3=1000", 30.0),
-    ("--home-theta 30 --reverse-theta --counts-per-unit 3=1000", -30.0)])
+@pytest.mark.parametrize(
+    ("options", "offset"),
+    [
+        ("--home-theta 30", 390.0),
+        ("--home-theta 30 --counts-per-unit 3=1000", 30.0),
+        ("--home-theta 30 --reverse-theta --counts-per-unit 3=1000", -30.0),
+    ],
+)
 def test_the_home_of_theta_is_in_degrees_of_the_stage(options, offset):
     """The first line of the stage, at 0 or at -360 degrees, is that far below the home."""
     write_json("T.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3))))

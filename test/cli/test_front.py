@@ -62,12 +62,14 @@ def test_every_help_has_an_example_that_is_understood(verb):
 
 
 def test_verbs_are_registered_as_those_of_other_packages_are(tmp_path):
-    subprocess.run([sys.executable, "setup.py", "-q", "egg_info", "--egg-base", tmp_path],
-                   cwd=ROOT, check=True)
+    subprocess.run(
+        [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", tmp_path], cwd=ROOT, check=True
+    )
     [folder] = tmp_path.iterdir()
     registered = metadata.PathDistribution(folder).entry_points.select(group="selfcal.verbs")
     assert {point.name: point.value for point in registered} == {
-        name: module_of(name) for name in VERBS}
+        name: module_of(name) for name in VERBS
+    }
 
 
 @pytest.fixture
@@ -75,13 +77,16 @@ def another_package(tmp_path, monkeypatch):
     """Install a package with the verbs hello, and solve, which exists."""
     folder = tmp_path / "hello_verbs-1.dist-info"
     folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: hello-verbs\nVersion: 1\n"
-                                     "Summary: greet a stage\n")
+    (folder / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: hello-verbs\nVersion: 1\nSummary: greet a stage\n"
+    )
     (folder / "entry_points.txt").write_text(
-        "[selfcal.verbs]\nhello = hello_verb\nsolve = hello_verb\n")
+        "[selfcal.verbs]\nhello = hello_verb\nsolve = hello_verb\n"
+    )
     (tmp_path / "hello_verb.py").write_text(
         "def configure(parser):\n    parser.add_argument('name')\n"
-        "def run(args):\n    print('hello', args.name)\n    return 5\n")
+        "def run(args):\n    print('hello', args.name)\n    return 5\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
 
 
@@ -111,8 +116,13 @@ def test_a_narrow_terminal_breaks_lines_between_words():
 def test_a_closed_stream_is_not_a_fault(tmp_path, closed, words, code):
     """The shell closes what `>&-` says; nothing else may take the place of a closed stream."""
     close = " ".join(f"{stream}{'<' if stream == 0 else '>'}&-" for stream in closed)
-    done = subprocess.run(["bash", "-c", f'"$0" -c "$2" {words} {close}', *SELFCAL],
-                          cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", f'"$0" -c "$2" {words} {close}', *SELFCAL],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == code
     assert "Traceback" not in done.stderr and not list(tmp_path.iterdir())
 
@@ -123,8 +133,7 @@ def test_nobody_reads_what_is_printed(words, code):
     reader, writer = os.pipe()
     os.close(reader)
     with open(writer, "wb", closefd=True) as pipe:
-        done = subprocess.run([*SELFCAL, *words.split()], stdout=pipe,
-                              stderr=pipe, check=False)
+        done = subprocess.run([*SELFCAL, *words.split()], stdout=pipe, stderr=pipe, check=False)
     assert done.returncode == code
 
 

@@ -37,16 +37,21 @@ def run(line: str) -> int:
 def test_points_are_commanded_with_the_error_added(capsys):
     assert run("in.nc R.json -o out.nc --decimals 6") == 0
     assert capsys.readouterr().out == "written: out.nc, 2 moves as 2\n"
-    form = r"; command: selfcal .*\n; result: R.json\n; sha256 of the result: \w{64}\n" \
+    form = (
+        r"; command: selfcal .*\n; result: R.json\n; sha256 of the result: \w{64}\n"
         r"G21 G90\nG0 X(\S+) Y(\S+) ; begin\nG1 X(\S+) Y(\S+) F100\n"
+    )
     found = map(float, re.fullmatch(form, Path("out.nc").read_text()).groups())
-    assert list(found) == pytest.approx([
-        1e3 * MAP.gx[2, 2], 1e3 * MAP.gy[2, 2], 10 + 1e3 * MAP.gx[3, 2], 1e3 * MAP.gy[3, 2]],
-        abs=6e-7)
+    assert list(found) == pytest.approx(
+        [1e3 * MAP.gx[2, 2], 1e3 * MAP.gy[2, 2], 10 + 1e3 * MAP.gx[3, 2], 1e3 * MAP.gy[3, 2]],
+        abs=6e-7,
+    )
 
 
-@pytest.mark.parametrize(("options", "site", "sign"), [
-    ("--home-x -10 --home-y 20", (1, 4), 1), ("--reverse-x --home-x 10", (3, 2), -1)])
+@pytest.mark.parametrize(
+    ("options", "site", "sign"),
+    [("--home-x -10 --home-y 20", (1, 4), 1), ("--reverse-x --home-x 10", (3, 2), -1)],
+)
 def test_the_programs_zero_and_the_sense_of_the_axes(options, site, sign, capsys):
     assert run(f"in.nc R.json -o - --decimals 6 {options}") == 0
     first = capsys.readouterr().out.splitlines()[4].split()
@@ -61,12 +66,16 @@ def test_the_json_has_the_program_and_the_unit_is_that_of_home_alone(capsys):
     assert float(word[1:]) / 1e3 == pytest.approx(0.01 + MAP.gx[4, 2], abs=1e-9)
 
 
-@pytest.mark.parametrize(("line", "message"), [
-    ("in.nc R.json -o in.nc", "in.nc: would be overwritten"),
-    ("in.nc R.json -o o.nc --tolerance 0", "--tolerance, --decimals: 0.0 um, 5; give"),
-    ("in.nc R.json -o o.nc --decimals 12", "--tolerance, --decimals: 1.0 um, 12; give"),
-    ("in.nc R.json -o o.nc --decimals 2", "--decimals: 2 round by more than 1 um; give more"),
-    ("bad.nc R.json -o o.nc", "bad.nc:1: G92 is not in the list of codes")])
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("in.nc R.json -o in.nc", "in.nc: would be overwritten"),
+        ("in.nc R.json -o o.nc --tolerance 0", "--tolerance, --decimals: 0.0 um, 5; give"),
+        ("in.nc R.json -o o.nc --decimals 12", "--tolerance, --decimals: 1.0 um, 12; give"),
+        ("in.nc R.json -o o.nc --decimals 2", "--decimals: 2 round by more than 1 um; give more"),
+        ("bad.nc R.json -o o.nc", "bad.nc:1: G92 is not in the list of codes"),
+    ],
+)
 def test_what_is_not_possible_is_one_line(capsys, line, message):
     Path("bad.nc").write_text("G92 X0 Y0\n")
     assert run(line) == 2
@@ -86,8 +95,9 @@ def test_the_path_is_within_the_tolerance_however_sharply_the_map_bends(gain, um
         assert run(f"in.nc R.json -o - --decimals 7 --tolerance {um} --steep") == 0
         words = re.findall(r"X(\S+) Y(\S+)", capsys.readouterr().out)
         points = np.array(words, float) * 1e-3
-        way = np.concatenate([a + np.linspace(0, 1, 200)[:, None] * (b - a)
-                              for a, b in pairwise(points)])
+        way = np.concatenate(
+            [a + np.linspace(0, 1, 200)[:, None] * (b - a) for a, b in pairwise(points)]
+        )
         way = np.stack(stage.correct(*way.T), axis=1)
         along = np.subtract(end, begin) / math.dist(begin, end)
         across = (way - np.multiply(begin, 1e-3)) @ [-along[1], along[0]]
@@ -96,8 +106,15 @@ def test_the_path_is_within_the_tolerance_however_sharply_the_map_bends(gain, um
 
 
 def test_not_qualified_is_code_5(capsys):
-    write_json("R.json", result_to_dict(replace(result_of(MAP), verdict=Verdict(
-        Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."))))
+    write_json(
+        "R.json",
+        result_to_dict(
+            replace(
+                result_of(MAP),
+                verdict=Verdict(Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."),
+            )
+        ),
+    )
     assert run("in.nc R.json -o o.nc") == 5
     assert "too noisy" in capsys.readouterr().err and Path("o.nc").exists()
 

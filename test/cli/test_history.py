@@ -29,12 +29,18 @@ def write(path, *, day=0, bow_m=0.0, noise_m=1e-9, **changes):
     truth = random_truth(ARTIFACT, 4, np.random.default_rng(1))
     bow = bow_m * (ARTIFACT.m / 2.0) ** 2 - bow_m * 0.5
     truth = replace(truth, g=truth.g + np.stack([0 * bow, bow]))
-    readings = simulate_measurements(truth, hu_plan(ARTIFACT), np.random.default_rng(day + 5),
-                                     sigma_m=noise_m, sigma_theta_rad=1e-6)
+    readings = simulate_measurements(
+        truth,
+        hu_plan(ARTIFACT),
+        np.random.default_rng(day + 5),
+        sigma_m=noise_m,
+        sigma_theta_rad=1e-6,
+    )
     result = calibrate(readings, Options())
     when = (BEGAN + timedelta(days=day)).isoformat()
-    result = replace(result, provenance=replace(result.provenance, extra={"first_exposure": when}),
-                     **changes)
+    result = replace(
+        result, provenance=replace(result.provenance, extra={"first_exposure": when}), **changes
+    )
     write_json(path, result_to_dict(result))
     return path
 
@@ -59,7 +65,9 @@ def test_calibrations_are_listed_in_the_order_of_their_measurement(folder, capsy
     (folder / "notes.json").write_text("not JSON")
     found = told(folder, capsys)
     assert [entry["file"] for entry in found["entries"]] == [
-        str(folder / "results" / "b.json"), str(folder / "a.json")]
+        str(folder / "results" / "b.json"),
+        str(folder / "a.json"),
+    ]
     first, second = found["entries"]
     assert first["not_compared"] is None and found["active"] is None
     assert second["changed"]
@@ -84,8 +92,9 @@ def test_the_next_is_due_when_the_drift_reaches_u(folder, capsys):
     per_day = 2e-8 * np.sqrt(np.mean(((ARTIFACT.m / 2.0) ** 2 - 0.5) ** 2) / 2)
     assert drift["clear"] and drift["per_day_m"] == pytest.approx(per_day, rel=0.2)
     due = datetime.fromisoformat(drift["due"])
-    assert (due - BEGAN).total_seconds() / 86400 == pytest.approx(limit / drift["per_day_m"],
-                                                                  abs=1e-3)
+    assert (due - BEGAN).total_seconds() / 86400 == pytest.approx(
+        limit / drift["per_day_m"], abs=1e-3
+    )
 
 
 def test_without_drift_it_is_not_due_before_one_could_have_been_missed(folder, capsys):
@@ -132,8 +141,10 @@ def test_what_cannot_be_is_refused_in_a_line(folder, tmp_path, capsys):
     write(folder / "a.json")
     bad = write(folder / "bad.json", day=1)
     result = read_result(bad)
-    write_json(bad, result_to_dict(replace(
-        result, verdict=replace(result.verdict, grade=Grade.NOT_QUALIFIED))))
+    write_json(
+        bad,
+        result_to_dict(replace(result, verdict=replace(result.verdict, grade=Grade.NOT_QUALIFIED))),
+    )
     assert "is not qualified" in refused(folder, "--activate", "bad.json")
     assert "no such file" in refused(folder, "--activate", "c.json")
     outside = write(tmp_path / "c.json")

@@ -12,13 +12,22 @@ from selfcal_ros.cli.verbs import EXAMPLES
 from test.support.terminals import SELFCAL, in_terminal
 from tools.mistakes import desk
 
-ELSEWHERE = {"up": "needs ROS", "monitor": "needs ROS", "call": "needs a cell",
-             "cell check": "needs a cell", "cell try": "asks before each motion",
-             "measure": "test/cli/test_measure.py", "replay": "test/tools/test_demo.py",
-             "camera init": "needs a bag of its own", "recheck": "test/cli/test_recheck.py",
-             "diff": "below", "combine": "below", "verify": "test/cli/test_verify.py",
-             "history": "test/cli/test_history.py",
-             "reproduce": "slow: test/cli/test_reproduce_verb.py"}
+ELSEWHERE = {
+    "up": "needs ROS",
+    "monitor": "needs ROS",
+    "call": "needs a cell",
+    "cell check": "needs a cell",
+    "cell try": "asks before each motion",
+    "measure": "test/cli/test_measure.py",
+    "replay": "test/tools/test_demo.py",
+    "camera init": "needs a bag of its own",
+    "recheck": "test/cli/test_recheck.py",
+    "diff": "below",
+    "combine": "below",
+    "verify": "test/cli/test_verify.py",
+    "history": "test/cli/test_history.py",
+    "reproduce": "slow: test/cli/test_reproduce_verb.py",
+}
 """Verbs whose example is not run here, and why."""
 SHORTER = {"plan new": " --minutes 30"}
 """What spares an example a search."""
@@ -56,7 +65,8 @@ def test_the_monitor_in_a_terminal_ends_by_its_key():
 def test_a_cell_is_brought_up_on_a_terminal_and_ends_by_its_key(tmp_path):
     plan = shlex.split(EXAMPLES["up"])[3]
     with desk():
-        code, said = in_terminal([*SELFCAL, "up", "--plan", plan, "--simulate", "--results",
-                                  str(tmp_path)], keys=b"q")
+        code, said = in_terminal(
+            [*SELFCAL, "up", "--plan", plan, "--simulate", "--results", str(tmp_path)], keys=b"q"
+        )
     assert code == 0, said[-2000:]
     assert "Traceback" not in said

@@ -43,9 +43,13 @@ def test_a_run_that_is_killed_is_resumed_to_the_same_map(tmp_path):
     whole = tmp_path / "whole"
     prepare(whole, marks=3)
     assert measured(whole).returncode == 0
-    for number, cut in enumerate([
-            Cut("in a move", 50), Cut("half of a message written", 150),
-            Cut("before a file is on the disk", 1)]):
+    for number, cut in enumerate(
+        [
+            Cut("in a move", 50),
+            Cut("half of a message written", 150),
+            Cut("before a file is on the disk", 1),
+        ]
+    ):
         folder = tmp_path / str(number)
         prepare(folder, marks=3)
         assert measured(folder, cut).returncode == -signal.SIGKILL
@@ -58,14 +62,29 @@ def test_a_run_that_is_killed_is_resumed_to_the_same_map(tmp_path):
         assert found.away < 4
 
 
-@pytest.mark.parametrize(("words", "cell", "said"), [
-    (["--yes"], CELL.replace("robot", "person"), "--yes, but a person places the plate"),
-    ([], CELL, "there is nobody to ask: it is not a terminal; give --yes")])
+@pytest.mark.parametrize(
+    ("words", "cell", "said"),
+    [
+        (["--yes"], CELL.replace("robot", "person"), "--yes, but a person places the plate"),
+        ([], CELL, "there is nobody to ask: it is not a terminal; give --yes"),
+    ],
+)
 def test_nobody_who_could_answer(tmp_path, capsys, monkeypatch, words, cell, said):
     monkeypatch.setattr("sys.stdin", io.StringIO())
     write_cell(tmp_path, cell=cell)
-    assert main(["measure", str(tmp_path / "plan.yaml"), str(tmp_path / "cell.yaml"), "-o",
-                 str(tmp_path / "bag"), *words]) == 2
+    assert (
+        main(
+            [
+                "measure",
+                str(tmp_path / "plan.yaml"),
+                str(tmp_path / "cell.yaml"),
+                "-o",
+                str(tmp_path / "bag"),
+                *words,
+            ]
+        )
+        == 2
+    )
     assert said in capsys.readouterr().err
     assert not (tmp_path / "bag").exists()
 
@@ -74,8 +93,9 @@ def test_a_measurement_goes_on_when_nobody_reads_it(tmp_path):
     """As in `selfcal measure ... | head -1`."""
     write_cell(tmp_path)
     command = [*SELFCAL, "measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE,
-                          stderr=subprocess.PIPE) as measure:
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as measure:
         measure.stdout.readline()
         measure.stdout.close()
         assert measure.stderr.read() == b""
@@ -112,8 +132,11 @@ def write_left_alone(folder, name, module):
     write_cell(folder)
     (folder / f"{module}.py").write_text(LEFT_ALONE.replace("SIGNAL", name))
     cell = folder / "cell.yaml"
-    cell.write_text(cell.read_text().replace(
-        "machine: simulated\nsimulated:", f"machine: {module}:LeftAlone\nLeftAlone:"))
+    cell.write_text(
+        cell.read_text().replace(
+            "machine: simulated\nsimulated:", f"machine: {module}:LeftAlone\nLeftAlone:"
+        )
+    )
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
@@ -132,10 +155,13 @@ def test_a_stop_before_the_first_reading_names_no_bag(tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
     write_left_alone(tmp_path, "SIGTERM", "left_at_once")
     module = tmp_path / "left_at_once.py"
-    module.write_text(module.read_text() + """
+    module.write_text(
+        module.read_text()
+        + """
     def __init__(self, *args, **kwargs):
         raise KeyboardInterrupt
-""")
+"""
+    )
     assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes"]) == 130
     assert "stopped; nothing was measured yet" in capsys.readouterr().err
 

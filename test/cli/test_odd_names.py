@@ -14,24 +14,40 @@ from selfcal_ros.aerotech.read import load_cal
 from selfcal_ros.cli.main import main
 from selfcal_ros.outputs import to_ascii
 
-VIEWS = {"run 1: rest": (0, [0, 0]), "run 1: turn x": (90, [0, 0]), "run 2: shift x": (0, [1, 0]),
-         "run 2: shift y": (0, [0, 1])}
+VIEWS = {
+    "run 1: rest": (0, [0, 0]),
+    "run 1: turn x": (90, [0, 0]),
+    "run 2: shift x": (0, [1, 0]),
+    "run 2: shift y": (0, [0, 1]),
+}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A session whose plate has another size in each view, solved in a batch of one bag."""
     folder = tmp_path_factory.mktemp("odd")
-    plan = {"plan_id": "odd", "artifact": {"grid_size": 7, "grid_pitch": 0.01, "angular_count": 0},
-            "views": [{"name": name, "rotation_deg": turn, "translation_pitch": shift,
-                       "repeats": 2} for name, (turn, shift) in VIEWS.items()]}
+    plan = {
+        "plan_id": "odd",
+        "artifact": {"grid_size": 7, "grid_pitch": 0.01, "angular_count": 0},
+        "views": [
+            {"name": name, "rotation_deg": turn, "translation_pitch": shift, "repeats": 2}
+            for name, (turn, shift) in VIEWS.items()
+        ],
+    }
     (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
-    (folder / "sim.yaml").write_text(yaml.safe_dump({
-        "plan": str(folder / "plan.yaml"), "seed": 3, "noise": {"sigma_xy": 2.0e-8},
-        "physics": {"plate_scale": 5.0e-6}}))
+    (folder / "sim.yaml").write_text(
+        yaml.safe_dump(
+            {
+                "plan": str(folder / "plan.yaml"),
+                "seed": 3,
+                "noise": {"sigma_xy": 2.0e-8},
+                "physics": {"plate_scale": 5.0e-6},
+            }
+        )
+    )
     assert main(["simulate", str(folder / "sim.yaml"), "-o", str(folder / "bag")]) == 0
     main(["batch", str(folder / "bag"), "-o", str(folder / "batch"), "--workers", "1"])
-    result, = (folder / "batch" / "results").iterdir()
+    (result,) = (folder / "batch" / "results").iterdir()
     (folder / "r.json").write_text(result.read_text())
     return folder
 
@@ -42,7 +58,7 @@ def test_a_program_reads_which_view_to_measure_again(folder):
     assert {"view": cause["view"]} in cause["remedies"]
     (record,) = json.loads((folder / "batch" / "batch.json").read_text())["records"]
     assert record["causes"][0] == cause
-    row, = csv.DictReader(io.StringIO((folder / "batch" / "table.csv").read_text()))
+    (row,) = csv.DictReader(io.StringIO((folder / "batch" / "table.csv").read_text()))
     assert (row["cause"], row["cause_view"]) == ("plate_strain", cause["view"])
 
 

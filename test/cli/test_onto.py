@@ -39,9 +39,13 @@ def machine_of(options, **kwargs):
     given = dict(re.findall(r"--(home-\w|unit) (\S+)", options))
     unit_m = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "in": 0.0254}[given.get("unit", "mm")]
     nodes = [half * np.linspace(-1, 1, n) for half, n in ((0.02, 5), (0.03, 7))]
-    return Machine(nodes, np.stack([kwargs["emap"].gx, kwargs["emap"].gy]),
-                   [float(given.get(f"home-{axis}", 0)) * unit_m for axis in "xy"],
-                   [-1 if f"--reverse-{axis}" in options else 1 for axis in "xy"], unit_m)
+    return Machine(
+        nodes,
+        np.stack([kwargs["emap"].gx, kwargs["emap"].gy]),
+        [float(given.get(f"home-{axis}", 0)) * unit_m for axis in "xy"],
+        [-1 if f"--reverse-{axis}" in options else 1 for axis in "xy"],
+        unit_m,
+    )
 
 
 def measured(machine, table):
@@ -51,8 +55,15 @@ def measured(machine, table):
     write_json("R.json", result_to_dict(result_of(replace(G, gx=gx, gy=gy))))
 
 
-@pytest.mark.parametrize("options", [
-    "", "--home-x -10 --home-y 20", "--reverse-x", "--reverse-y --home-x 10 --x-axis 3 --y-axis 1"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        "",
+        "--home-x -10 --home-y 20",
+        "--reverse-x",
+        "--reverse-y --home-x 10 --x-axis 3 --y-axis 1",
+    ],
+)
 def test_cal_export_replaces_the_active_table(tmp_path, monkeypatch, capsys, options):
     """Noise-free: what is left at the nodes is the rounding of 0.01 nm, of x, y and home."""
     monkeypatch.chdir(tmp_path)
@@ -85,14 +96,21 @@ def sayable(name, emap):
     return replace(emap, gx=gx, gy=gy)
 
 
-WIRED = ["", "--home-x {-10} --home-y {20} --reverse-x", "--reverse-y --home-x {10}",
-         "--home-x {5} --reverse-x --reverse-y", "--x-axis 3 --y-axis 1 --home-y {-15}"]
+WIRED = [
+    "",
+    "--home-x {-10} --home-y {20} --reverse-x",
+    "--reverse-y --home-x {10}",
+    "--home-x {5} --reverse-x --reverse-y",
+    "--x-axis 3 --y-axis 1 --home-y {-15}",
+]
 """Lengths in braces are mm."""
-ACTIVE = {"of the same nodes": (Artifact(5, 0.01, 0, 7), ""),
-          "of a finer pitch": (Artifact(13, 0.005, 0, 17), ""),
-          "of a wider field": (Artifact(5, 0.0175, 0, 7), ""),
-          "of a part of the field": (Artifact(3, 0.0125, 0, 5), ""),
-          "of another origin": (Artifact(7, 0.01, 0, 9), "--home-x {2} --home-y {-3.5}")}
+ACTIVE = {
+    "of the same nodes": (Artifact(5, 0.01, 0, 7), ""),
+    "of a finer pitch": (Artifact(13, 0.005, 0, 17), ""),
+    "of a wider field": (Artifact(5, 0.0175, 0, 7), ""),
+    "of a part of the field": (Artifact(3, 0.0125, 0, 5), ""),
+    "of another origin": (Artifact(7, 0.01, 0, 9), "--home-x {2} --home-y {-3.5}"),
+}
 
 
 PAIRS = [(w, a) for w in range(len(WIRED)) for a, _ in enumerate(ACTIVE) if (w + 2 * a) % 5 < 2]
@@ -107,8 +125,9 @@ def options_of(text, unit):
 
 @pytest.mark.parametrize(("wired", "active"), PAIRS)
 @pytest.mark.parametrize("name", READERS)
-def test_a_replaced_table_leaves_the_rounding_of_its_digits(tmp_path, monkeypatch, capsys, name,
-                                                            wired, active):
+def test_a_replaced_table_leaves_the_rounding_of_its_digits(
+    tmp_path, monkeypatch, capsys, name, wired, active
+):
     """Measured with a table active, whatever its nodes; at the nodes of the map and between."""
     monkeypatch.chdir(tmp_path)
     units = ["mm", "um", "m", *(["in"] if name != "cal" else [])]
@@ -119,8 +138,10 @@ def test_a_replaced_table_leaves_the_rounding_of_its_digits(tmp_path, monkeypatc
     machine = machine_of(options, emap=sayable(name, G))
     counts = [2e6 * machine.unit_m / 1e-3] * 2
     if name == "pmac":
-        options += "".join(f" --counts-per-unit {axis}={counts[0]!r}" for axis in (
-            (3, 1) if "axis" in options else (1, 2)))
+        options += "".join(
+            f" --counts-per-unit {axis}={counts[0]!r}"
+            for axis in ((3, 1) if "axis" in options else (1, 2))
+        )
     subtract = {"subtract": True} if name in ("beckhoff", "siemens") and wired % 2 else {}
     more = [*options.split(), *(["--negate"] if subtract else [])]
     verb = ["cal", "export"] if name == "cal" else ["export", name]
@@ -129,7 +150,8 @@ def test_a_replaced_table_leaves_the_rounding_of_its_digits(tmp_path, monkeypatc
         files = sorted(Path().glob(f"{file}*.txt"))
         unit = {"unit_m": machine.unit_m} if name == "beckhoff" else {}
         return [str(path) for path in files], READERS[name](
-            [path.read_text() for path in files], counts, **unit, **subtract)
+            [path.read_text() for path in files], counts, **unit, **subtract
+        )
 
     write_json("Old.json", result_to_dict(result_of(sayable(name, random_map(plate, 5, gain=20)))))
     assert main([*verb, "Old.json", "-o", "old.txt", *more, *moved.split()]) == 0
@@ -154,21 +176,43 @@ def test_a_table_that_does_not_fit_is_refused_as_such(tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
     write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01), 3))))
     write_json("S.json", result_to_dict(result_of(random_map(Artifact(5, 1e-5), 4, gain=0.5))))
-    assert main([*verb, "S.json", "-o", "small", *(["--unit", "mm"] if "kmotion" in verb else [])
-                 ]) == 0
+    assert (
+        main([*verb, "S.json", "-o", "small", *(["--unit", "mm"] if "kmotion" in verb else [])])
+        == 0
+    )
     if "cal" in verb:
         text = Path("small").read_text().replace("PRIMARY/1000", "PRIMARY/0.01")
         Path("small").write_text(text.replace("2D 2 1 1 2 0.01 0.01", "2D 2 1 1 2 10 10"))
     capsys.readouterr()
-    assert main([*verb, "R.json", "-o", "new", "--onto", "small",
-                 *(["--unit", "mm"] if "kmotion" in verb else [])]) == 2
-    where = ("the active table covers only part of the field: x from -0.02 to 0.02, y from "
-             "-0.02 to 0.02 mm, the map x from -20 to 20, y from -20 to 20; beyond it the table "
-             if "kmotion" in verb else "the active table ")
-    mend = ("name the table of this stage, in this unit (--unit)" if "kmotion" in verb
-            else "is it that of this stage, in this unit?")
+    assert (
+        main(
+            [
+                *verb,
+                "R.json",
+                "-o",
+                "new",
+                "--onto",
+                "small",
+                *(["--unit", "mm"] if "kmotion" in verb else []),
+            ]
+        )
+        == 2
+    )
+    where = (
+        "the active table covers only part of the field: x from -0.02 to 0.02, y from "
+        "-0.02 to 0.02 mm, the map x from -20 to 20, y from -20 to 20; beyond it the table "
+        if "kmotion" in verb
+        else "the active table "
+    )
+    mend = (
+        "name the table of this stage, in this unit (--unit)"
+        if "kmotion" in verb
+        else "is it that of this stage, in this unit?"
+    )
     assert re.fullmatch(
         rf"selfcal (cal export|export): --onto: {re.escape(where)}changes by up to "
         rf"[\d.e+]+ mm between "
-        rf"neighbouring sites 10 mm apart; {re.escape(mend)}\n", capsys.readouterr().err)
+        rf"neighbouring sites 10 mm apart; {re.escape(mend)}\n",
+        capsys.readouterr().err,
+    )
     assert not Path("new").exists()

@@ -11,12 +11,16 @@ from selfcal_ros.files import sha256_of
 from test.support.pages import ROOT
 
 EXPORTS = {
-    "s.cal": "cal export r.json -o s.cal", "o.cal": "cal orthogonality r.json -o o.cal",
-    "k.txt": "export kmotion r.json -o k.txt", "c.ini": "export siemens r.json -o c.ini",
+    "s.cal": "cal export r.json -o s.cal",
+    "o.cal": "cal orthogonality r.json -o o.cal",
+    "k.txt": "export kmotion r.json -o k.txt",
+    "c.ini": "export siemens r.json -o c.ini",
     "p.pmc": "export pmac r.json -o p.pmc --counts-per-unit 1=20000 --counts-per-unit 2=20000",
-    "b_x.lis": "export beckhoff r.json -o b.lis", "l_y.txt": "export linuxcnc r.json -o l.txt",
+    "b_x.lis": "export beckhoff r.json -o b.lis",
+    "l_y.txt": "export linuxcnc r.json -o l.txt",
     "g.nc": "gcode in.nc r.json -o g.nc --dialect grbl",
-    "dcc.xml": "certificate r.json details.yaml -o dcc.xml"}
+    "dcc.xml": "certificate r.json details.yaml -o dcc.xml",
+}
 
 
 @pytest.fixture(scope="module")

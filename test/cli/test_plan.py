@@ -32,11 +32,14 @@ def once(function):
         if asked not in known:
             known[asked] = function(*args, **how)
         return known[asked]
+
     return found
 
 
-ONCE = {name: once(getattr(plan_verb, name))
-        for name in ("check_plan", "predict_plan", "_judge", "plan_budget")}
+ONCE = {
+    name: once(getattr(plan_verb, name))
+    for name in ("check_plan", "predict_plan", "_judge", "plan_budget")
+}
 
 
 @pytest.fixture(autouse=True)
@@ -49,8 +52,9 @@ def shipped(name):
     return str(PLANS[0].parent / f"{name}.yaml")
 
 
-@pytest.mark.parametrize("path", [path for path in PLANS if path.stem != "recheck"],
-                         ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", [path for path in PLANS if path.stem != "recheck"], ids=lambda p: p.stem
+)
 def test_every_shipped_plan_is_what_its_name_says(path, capsys):
     deficient = path.stem.startswith("deficient_")
     assert main(["plan", "check", str(path), "--json"]) == (3 if deficient else 0)
@@ -84,8 +88,10 @@ def test_check_tells_what_nothing_checks(tmp_path, capsys):
     text = Path(shipped("hu")).read_text().replace("size: 11", "size: 11, grid_size_y: 5")
     (tmp_path / "long.yaml").write_text(text)
     assert main(["plan", "check", str(tmp_path / "long.yaml")]) == 0
-    assert ("\n30 sites depend on single readings that no other reading checks: another view "
-            "would check them\n") in capsys.readouterr().out
+    assert (
+        "\n30 sites depend on single readings that no other reading checks: another view "
+        "would check them\n"
+    ) in capsys.readouterr().out
 
 
 def test_check_in_words(capsys):
@@ -101,10 +107,16 @@ def test_check_in_words(capsys):
 
 def test_nodes_that_stay_unknown_are_counted(tmp_path, capsys):
     """A turn of 5 deg determines 45 of 81 nodes: an independent dense solution says so as well."""
-    plan = {"plan_id": "p", "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 0},
-            "map": {"grid_size": 9, "interpolation": "bicubic"},
-            "views": [{"name": "a"}, {"name": "b", "rotation_deg": 5},
-                      {"name": "c", "translation_pitch": [1, 0]}]}
+    plan = {
+        "plan_id": "p",
+        "artifact": {"grid_size": 11, "grid_pitch": 0.01, "angular_count": 0},
+        "map": {"grid_size": 9, "interpolation": "bicubic"},
+        "views": [
+            {"name": "a"},
+            {"name": "b", "rotation_deg": 5},
+            {"name": "c", "translation_pitch": [1, 0]},
+        ],
+    }
     (tmp_path / "plan.yaml").write_text(json.dumps(plan))
     spec = {"plan": "plan.yaml", "seed": 5, "noise": {"sigma_xy": 2e-8}}
     (tmp_path / "spec.yaml").write_text(json.dumps(spec))
@@ -125,22 +137,50 @@ def test_check_judges_every_term(capsys):
     assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma", "20nm"]) == 0
     found = json.loads(capsys.readouterr().out)
     terms = {term["name"]: term for term in found["terms"]}
-    assert list(terms) == ["microscope", "drift", "plate_scale", "plate_shape", "approach",
-                           "plate_strain"]
-    assert {"name", "told", "unseen_modes", "size", "unit", "effect_rms_m", "effect_max_m",
-            "power"} < set(terms["drift"])
+    assert list(terms) == [
+        "microscope",
+        "drift",
+        "plate_scale",
+        "plate_shape",
+        "approach",
+        "plate_strain",
+    ]
+    assert {
+        "name",
+        "told",
+        "unseen_modes",
+        "size",
+        "unit",
+        "effect_rms_m",
+        "effect_max_m",
+        "power",
+    } < set(terms["drift"])
     assert (terms["plate_shape"]["told"], terms["plate_shape"]["unseen_modes"]) == (False, 7)
     assert terms["drift"]["told"] is True and terms["drift"]["unit"] == "m"
     assert terms["plate_shape"]["effect_rms_m"] == pytest.approx(31.66e-9, abs=1e-11)
     assert found["predicted"]["rms_gain_xy_with_terms"] == found["predicted"]["rms_gain_xy"]
     # half the noise notices more; an effect does not depend on noise, and grows with its size
-    assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma", "10e-9",
-                 "--against", "plate_shape:20e-9"]) == 0
+    assert (
+        main(
+            [
+                "plan",
+                "check",
+                shipped("hu_repeated"),
+                "--json",
+                "--sigma",
+                "10e-9",
+                "--against",
+                "plate_shape:20e-9",
+            ]
+        )
+        == 0
+    )
     other = {term["name"]: term for term in json.loads(capsys.readouterr().out)["terms"]}
     assert other["approach"]["power"] > terms["approach"]["power"]
     assert other["approach"]["effect_rms_m"] == pytest.approx(terms["approach"]["effect_rms_m"])
     assert other["plate_shape"]["effect_rms_m"] == pytest.approx(
-        2 * terms["plate_shape"]["effect_rms_m"])
+        2 * terms["plate_shape"]["effect_rms_m"]
+    )
     assert main(["plan", "check", shipped("deficient_shifts"), "--json"]) == 3
     assert json.loads(capsys.readouterr().out)["terms"] == []
 
@@ -151,8 +191,9 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
     text = capsys.readouterr().out
     assert "  XY with drift: rms 0.8905   largest 1.2154\n" in text
     assert "  drift        free   yes" in text
-    assert ("assumed: order there_and_back; drifts of degree 1; 0.02 µm noise of one reading;"
-            in text)
+    assert (
+        "assumed: order there_and_back; drifts of degree 1; 0.02 µm noise of one reading;" in text
+    )
     assert main(["plan", "check", shipped("qiao"), *asked, "--drift-degree", "2"]) == 3
     text = capsys.readouterr().out
     assert "  - drift: 2 modes of the stage look like it\n" in text
@@ -166,8 +207,10 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(yaml.safe_dump(data | {"model_terms": ["plate_shape"]}))
     assert main(["plan", "check", str(path)]) == 3
-    assert ("  - plate_shape: add views shifted both ways along both axes, and one "
-            "along a diagonal, or give it a size") in capsys.readouterr().out
+    assert (
+        "  - plate_shape: add views shifted both ways along both axes, and one "
+        "along a diagonal, or give it a size"
+    ) in capsys.readouterr().out
     assert main(["plan", "check", str(path), "--model", "plate_shape:30e-9"]) == 0
     assert "XY with plate_shape:3e-08: rms" in capsys.readouterr().out
 
@@ -181,16 +224,22 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     assert list(lines) == ["reading noise", "microscope", "plate_shape", "plate_strain", "drift"]
     assert lines["drift"]["removal"]["text"].startswith("visit the marks in the order ")
     assert lines["plate_shape"]["removal"]["text"].startswith(
-        "add an unturned view shifted by -1 pitch along X")
+        "add an unturned view shifted by -1 pitch along X"
+    )
     microscope = lines["microscope"]
     assert (microscope["quantity"], microscope["u"], microscope["source"]) == (
-        "xy", 0.01, "default")
+        "xy",
+        0.01,
+        "default",
+    )
     assert 0.05 < microscope["share"] < 0.5 and sum(
-        line["share"] for line in lines.values()) == pytest.approx(1)
+        line["share"] for line in lines.values()
+    ) == pytest.approx(1)
     assert microscope["removal"]["kind"] == "check_stops"
     assert microscope["removal"]["effect_rms"] < 0.2 * microscope["effect_rms"]
-    assert found["U_xy"] == pytest.approx(2 * math.hypot(*(
-        line["effect_rms"] for line in lines.values())))
+    assert found["U_xy"] == pytest.approx(
+        2 * math.hypot(*(line["effect_rms"] for line in lines.values()))
+    )
     assert found["U_xy_noise"] == pytest.approx(2 * lines["reading noise"]["effect_rms"])
     assert main(asked) == 0
     text = capsys.readouterr().out
@@ -199,13 +248,29 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     assert 2 * found["U_xy"] < larger < 3 * found["U_xy"]
     assert f"from noise alone 35.6 nm; {larger * 1e9:.3g} nm if all that is assumed" in text
     assert main([*asked, "--model", "none", "--json"]) == 0
-    assert [line["component"] for line in json.loads(capsys.readouterr().out)["budget"][
-        "lines"]] == ["reading noise"]
+    assert [
+        line["component"] for line in json.loads(capsys.readouterr().out)["budget"]["lines"]
+    ] == ["reading noise"]
     # what the plan declares takes the place of the default; lines have a budget of their own
-    assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma-theta", "0.04arcsec",
-                 "--model", "plate_strain:3e-7"]) == 0
-    lines = {(line["quantity"], line["component"]): line for line in json.loads(
-        capsys.readouterr().out)["budget"]["lines"]}
+    assert (
+        main(
+            [
+                "plan",
+                "check",
+                shipped("hu_repeated"),
+                "--json",
+                "--sigma-theta",
+                "0.04arcsec",
+                "--model",
+                "plate_strain:3e-7",
+            ]
+        )
+        == 0
+    )
+    lines = {
+        (line["quantity"], line["component"]): line
+        for line in json.loads(capsys.readouterr().out)["budget"]["lines"]
+    }
     strain, circle = lines["xy", "plate_strain"], lines["theta", "line_eccentricity"]
     assert (strain["source"], strain["removal"]["kind"]) == ("declared", "certificate")
     assert strain["removal"]["text"].startswith("declare a smaller plate_strain:SIZE")
@@ -214,9 +279,27 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
 
 def test_check_stops_are_a_next_step_where_the_microscope_costs_most(capsys, tmp_path):
     out = tmp_path / "next.yaml"
-    assert main(["plan", "suggest", shipped("qiao"), "--placing", "0.02deg", "--stage-error",
-                 "10um", "--sigma", "1nm", "--against", "plate_shape:1e-12", "--json", "-o",
-                 str(out)]) == 0
+    assert (
+        main(
+            [
+                "plan",
+                "suggest",
+                shipped("qiao"),
+                "--placing",
+                "0.02deg",
+                "--stage-error",
+                "10um",
+                "--sigma",
+                "1nm",
+                "--against",
+                "plate_shape:1e-12",
+                "--json",
+                "-o",
+                str(out),
+            ]
+        )
+        == 0
+    )
     first = json.loads(capsys.readouterr().out)["suggestions"][0]
     assert first["text"] == "add check_stops: {marks: 5, offset: 20e-6}"
     assert (first["view"], first["visit_order"]) == (None, None)
@@ -227,8 +310,10 @@ def test_check_stops_are_a_next_step_where_the_microscope_costs_most(capsys, tmp
 def test_an_order_that_is_cut_off_is_said(capsys):
     asked = ["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back", "--repeats"]
     assert main([*asked, "3"]) == 0
-    assert ("  the order x_back_y_back needs 4 repeats: it is truncated in the views 'identity', "
-            "'rot90', 'shift_x'\n") in capsys.readouterr().out
+    assert (
+        "  the order x_back_y_back needs 4 repeats: it is truncated in the views 'identity', "
+        "'rot90', 'shift_x'\n"
+    ) in capsys.readouterr().out
     assert main([*asked, "4"]) == 0
     assert "truncated" not in capsys.readouterr().out
 
@@ -246,22 +331,31 @@ def test_a_plan_of_a_known_plate_leaves_open_whether_it_is_identified(capsys):
     assert json.loads(capsys.readouterr().out)["identifiable"] is None
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["--sigma", "20 miles"], "--sigma: '20 miles' is not a positive length; give m, or a number "
-     "and one of m, mm, um, nm"),
-    (["--sigma=-1nm"], "--sigma: '-1nm' is not a positive length"),
-    (["--stop-error", "0"], "--stop-error: '0' is not a positive length"),
-    (["--stage-error=-1nm"], "--stage-error: '-1nm' is not a positive length"),
-    (["--sigma-theta", "3 turns"], "--sigma-theta: '3 turns' is not a positive angle; give rad, "
-     "or a number and one of rad, mrad, urad, deg, arcsec"),
-    (["--placing", "0"], "--placing: '0' is not a positive angle"),
-    (["--drift-degree", "10"], "--drift-degree: 10 is not a degree of a drift; give 1 to 9"),
-    (["--drift-degree", "0"], "--drift-degree: 0 is not a degree of a drift; give 1 to 9"),
-    (["--order", "spiral"], "--order: 'spiral' is not a visiting order"),
-    (["--model", "creep"], "--model: the term 'creep' is unknown"),
-    (["--against", "drift"], "--against: drift: a size is missing; write drift:SIZE"),
-    (["--repeats", "0"], "--repeats: 0 is not positive; give 1 or more"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--sigma", "20 miles"],
+            "--sigma: '20 miles' is not a positive length; give m, or a number "
+            "and one of m, mm, um, nm",
+        ),
+        (["--sigma=-1nm"], "--sigma: '-1nm' is not a positive length"),
+        (["--stop-error", "0"], "--stop-error: '0' is not a positive length"),
+        (["--stage-error=-1nm"], "--stage-error: '-1nm' is not a positive length"),
+        (
+            ["--sigma-theta", "3 turns"],
+            "--sigma-theta: '3 turns' is not a positive angle; give rad, "
+            "or a number and one of rad, mrad, urad, deg, arcsec",
+        ),
+        (["--placing", "0"], "--placing: '0' is not a positive angle"),
+        (["--drift-degree", "10"], "--drift-degree: 10 is not a degree of a drift; give 1 to 9"),
+        (["--drift-degree", "0"], "--drift-degree: 0 is not a degree of a drift; give 1 to 9"),
+        (["--order", "spiral"], "--order: 'spiral' is not a visiting order"),
+        (["--model", "creep"], "--model: the term 'creep' is unknown"),
+        (["--against", "drift"], "--against: drift: a size is missing; write drift:SIZE"),
+        (["--repeats", "0"], "--repeats: 0 is not positive; give 1 or more"),
+    ],
+)
 def test_bad_options_of_check(arguments, message, capsys):
     assert main(["plan", "check", shipped("qiao"), *arguments]) == 2
     error = capsys.readouterr().err
@@ -275,8 +369,23 @@ def test_lengths_with_and_without_a_unit(text):
 
 def test_suggest_next_views(capsys, tmp_path):
     out = tmp_path / "next.yaml"
-    assert main(["plan", "suggest", shipped("qiao"), "--json", "--top", "2", "-o", str(out),
-                 "--against", "none"]) == 0
+    assert (
+        main(
+            [
+                "plan",
+                "suggest",
+                shipped("qiao"),
+                "--json",
+                "--top",
+                "2",
+                "-o",
+                str(out),
+                "--against",
+                "none",
+            ]
+        )
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)
     assert len(found["suggestions"]) == 2
     assert found["now"]["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)
@@ -316,12 +425,22 @@ def test_suggest_against_terms(capsys, tmp_path):
 def test_the_best_plan_is_judged_as_it_is_written(capsys, tmp_path):
     """With the order and the repeats of the plan's grid views, which tell a drift."""
     plan, out = tmp_path / "plan.yaml", tmp_path / "best.yaml"
-    plan.write_text(yaml.safe_dump({
-        "plan_id": "p", "visit_order": "x_back_y_back", "model_terms": ["drift"],
-        "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 4}, "views": [
-            {"name": "a", "repeats": 4}, {"name": "b", "rotation_deg": 90, "repeats": 4},
-            {"name": "c", "translation_pitch": [1, 0], "repeats": 4},
-            {"name": "l", "rotation_deg": 90, "grid": False, "repeats": 1}]}))
+    plan.write_text(
+        yaml.safe_dump(
+            {
+                "plan_id": "p",
+                "visit_order": "x_back_y_back",
+                "model_terms": ["drift"],
+                "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 4},
+                "views": [
+                    {"name": "a", "repeats": 4},
+                    {"name": "b", "rotation_deg": 90, "repeats": 4},
+                    {"name": "c", "translation_pitch": [1, 0], "repeats": 4},
+                    {"name": "l", "rotation_deg": 90, "grid": False, "repeats": 1},
+                ],
+            }
+        )
+    )
     assert main(["plan", "suggest", str(plan), "--views", "4", "--json", "-o", str(out)]) == 0
     best = json.loads(capsys.readouterr().out)
     assert best["deficiency"] == 0
@@ -332,8 +451,7 @@ def test_the_best_plan_is_judged_as_it_is_written(capsys, tmp_path):
     # by default the terms that are assumed of every measurement count, too
     of_model = found["predicted"]["rms_u_xy_um_with_terms"] * 1e-6
     assert best["u_rms_m"] > 1.0001 * of_model
-    assert main(["plan", "suggest", str(plan), "--views", "4", "--json", "--against",
-                 "none"]) == 0
+    assert main(["plan", "suggest", str(plan), "--views", "4", "--json", "--against", "none"]) == 0
     assert json.loads(capsys.readouterr().out)["u_rms_m"] < 1.0001 * of_model
 
 
@@ -347,26 +465,34 @@ def test_suggest_does_not_write_over_its_plan(capsys, tmp_path):
 
 def test_suggest_the_best_plan(capsys, tmp_path):
     out = tmp_path / "best.yaml"
-    assert main(["plan", "suggest", shipped("deficient_no_line"), "--views", "4", "-o",
-                 str(out)]) == 0
+    assert (
+        main(["plan", "suggest", shipped("deficient_no_line"), "--views", "4", "-o", str(out)]) == 0
+    )
     assert "best plan of 4 views" in capsys.readouterr().out
     assert main(["plan", "check", str(out), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["predicted"]["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)
-    assert main(["plan", "suggest", shipped("qiao"), "--views", "3", "--json", "--against",
-                 "none"]) == 0
+    assert (
+        main(["plan", "suggest", shipped("qiao"), "--views", "3", "--json", "--against", "none"])
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)
     assert len(found["views"]) == 3
     assert found["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["suggest", "--views", "2"], "--views: 2 views cannot identify the stage; give 3 or more"),
-    (["suggest", "--top", "0"], "--top: 0 is not positive"),
-    (["suggest", "--views", "4", "--top", "2"],
-     "--top: with --views one plan is found, not a list; omit it"),
-    (["suggest", "-o", "/no/such/folder/p.yaml"], "cannot be written"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["suggest", "--views", "2"], "--views: 2 views cannot identify the stage; give 3 or more"),
+        (["suggest", "--top", "0"], "--top: 0 is not positive"),
+        (
+            ["suggest", "--views", "4", "--top", "2"],
+            "--top: with --views one plan is found, not a list; omit it",
+        ),
+        (["suggest", "-o", "/no/such/folder/p.yaml"], "cannot be written"),
+    ],
+)
 def test_bad_arguments(arguments, message, capsys):
     assert main(["plan", arguments[0], shipped("qiao"), *arguments[1:]]) == 2
     assert message in capsys.readouterr().err
@@ -424,14 +550,17 @@ def test_a_large_field_is_said_to_be_predicted_on_a_smaller_one(monkeypatch):
     monkeypatch.setattr(f"{where}.PROXY_SIZE", 5)
     assert field_note(predict_plan(plan, ThetaDatum.ZERO_MEAN), plan) == (
         "predicted for a field of 5 x 5 sites; XY is about 5 % larger for each doubling of the "
-        "field")
+        "field"
+    )
 
 
 def test_images_tell_the_camera_and_suffice_with_two_turns(tmp_path, capsys):
-    plan = {"plan_id": "camera", "artifact": {"grid_size": 7, "grid_pitch": 1e-3,
-                                              "angular_count": 0},
-            "views": [{"name": "a"}, {"name": "b", "rotation_deg": 90}],
-            "image": {"nx": 3, "ny": 3}}
+    plan = {
+        "plan_id": "camera",
+        "artifact": {"grid_size": 7, "grid_pitch": 1e-3, "angular_count": 0},
+        "views": [{"name": "a"}, {"name": "b", "rotation_deg": 90}],
+        "image": {"nx": 3, "ny": 3},
+    }
     (tmp_path / "p.yaml").write_text(yaml.safe_dump(plan))
     assert main(["plan", "check", str(tmp_path / "p.yaml")]) == 0
     told = capsys.readouterr().out

@@ -17,8 +17,10 @@ from test.support.terminals import SELFCAL, in_terminal
 STAGE = ["--travel", "50mm", "--marks", "5", "--pitch", "10mm"]
 CAMERA = ["--travel", "2mm", "--marks", "3", "--pitch", "0.2mm", "--field", "0.6x0.3mm"]
 
-ONCE = {name: cache(getattr(plan_new, name))  # the same plates in all tests
-        for name in ("best_plan", "_u_of_reading", "_budget", "_next")}
+ONCE = {
+    name: cache(getattr(plan_new, name))  # the same plates in all tests
+    for name in ("best_plan", "_u_of_reading", "_budget", "_next")
+}
 
 CELLS = Path(__file__).parents[2] / "config/cells"
 PAGES = Path(__file__).parents[2] / "docs/start"
@@ -35,8 +37,11 @@ def elsewhere(tmp_path, monkeypatch, jumping_clocks):
         monkeypatch.setattr(plan_new, name, known)
 
 
-@pytest.mark.parametrize(("options", "minutes"), [
-    ([*STAGE, "--lines", "8"], "26"), (CAMERA, "18")], ids=["lines", "camera"])
+@pytest.mark.parametrize(
+    ("options", "minutes"),
+    [([*STAGE, "--lines", "8"], "26"), (CAMERA, "18")],
+    ids=["lines", "camera"],
+)
 def test_its_plan_is_checked_drawn_and_measured(options, minutes, capsys):
     assert new(*options, "--minutes", minutes, "--json") == 0
     promised = json.loads(capsys.readouterr().out)
@@ -70,13 +75,15 @@ def test_the_time_is_kept_and_used(capsys):
     marks = sum(view["repeats"] * (25 - 5 * any(view["translation_pitch"])) for view in views)
     assert found["20"]["exposures"] == marks + 20 * len(views)  # 5 marks from four sides
     assert found["20"]["minutes"] == pytest.approx(
-        5 * len(views) + found["20"]["exposures"] * 2 / 60)
+        5 * len(views) + found["20"]["exposures"] * 2 / 60
+    )
 
 
 @pytest.mark.parametrize("machine", SHIPPED)
 def test_the_cell_of_every_machine_can_be_read(machine):
     assert machine in {"simulated", *plan_new.OWN_KEYS}, (
-        "add its keys to OWN_KEYS of cli/plan_new.py")
+        "add its keys to OWN_KEYS of cli/plan_new.py"
+    )
     assert new(*STAGE, "--minutes", "30", "--machine", machine) == 0
     cell = read_cell("cell.yaml")
     assert cell.machine == machine and cell.limits["x"] == (-0.025, 0.025)
@@ -88,20 +95,27 @@ def test_the_cell_of_every_machine_can_be_read(machine):
     assert read_yaml("cell.yaml")[machine].keys() <= next(iter(own.values())).keys()
     pages = "".join(page.read_text() for page in PAGES.glob("machine*.md"))
     assert any(f"config/cells/{path.name}" in pages for path in own), (
-        f"describe it in docs/start/machine_{machine}.md and link that from machines.md")
+        f"describe it in docs/start/machine_{machine}.md and link that from machines.md"
+    )
 
 
-@pytest.mark.parametrize(("options", "line"), [
-    ([*STAGE, "--travel", "40mm"], "40 mm along x, and 5 marks with their check stops need 40.04 "
-     "mm; take 4 marks"),
-    ([*STAGE, "--travel", "60x30mm"], "30 mm along y"),
-    ([*STAGE, "--minutes", "3"], "the shortest plan takes 20: 3 placings of 5 minutes"),
-    ([*STAGE, "--lines", "8", "--field", "30mm"], "lines are not found in images"),
-    ([*STAGE, "--pitch", "10"], "'10' has no unit; write for example 10mm"),
-    ([*STAGE, "--marks", "2"], "is not a number from 3"),
-    ([*STAGE, "--marks", "٧"], "'٧' is not a whole number"),
-    (["--marks", "5"], "--travel: is missing, and there is nobody to ask"),
-    ([*STAGE, "--placing", "dog"], "person, robot")])
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [
+        (
+            [*STAGE, "--travel", "40mm"],
+            "40 mm along x, and 5 marks with their check stops need 40.04 mm; take 4 marks",
+        ),
+        ([*STAGE, "--travel", "60x30mm"], "30 mm along y"),
+        ([*STAGE, "--minutes", "3"], "the shortest plan takes 20: 3 placings of 5 minutes"),
+        ([*STAGE, "--lines", "8", "--field", "30mm"], "lines are not found in images"),
+        ([*STAGE, "--pitch", "10"], "'10' has no unit; write for example 10mm"),
+        ([*STAGE, "--marks", "2"], "is not a number from 3"),
+        ([*STAGE, "--marks", "٧"], "'٧' is not a whole number"),
+        (["--marks", "5"], "--travel: is missing, and there is nobody to ask"),
+        ([*STAGE, "--placing", "dog"], "person, robot"),
+    ],
+)
 def test_what_cannot_work_is_refused_in_a_line(options, line, capsys):
     assert new(*options) == 2
     err = capsys.readouterr().err
@@ -120,8 +134,9 @@ def test_nothing_is_overwritten(capsys):
 
 def test_a_person_is_asked_in_a_terminal(tmp_path):
     answers = b"fifty\n50mm\n5\n10mm\n\n\nrobot\n4\n1\n\n"
-    code, said = in_terminal([*SELFCAL, "plan", "new", "-o", "plan.yaml"], folder=tmp_path,
-                             keys=answers)
+    code, said = in_terminal(
+        [*SELFCAL, "plan", "new", "-o", "plan.yaml"], folder=tmp_path, keys=answers
+    )
     assert code == 0, said
     assert "'fifty' has no unit" in said and "it identifies the stage" in said
     assert "placings of 0.5 minutes" in said and "exposures of 1 s" in said

@@ -52,8 +52,9 @@ def test_marks_are_found_where_they_are_drawn(plan, tmp_path, mark):
     assert main(["plate", plan, "-o", str(file), "--mark", mark, "--mark-size", "3e-4"]) == 0
     image, _ = rendered(file.read_text())
     image = np.round(gaussian_filter(image, 0.7) * 256).astype(np.uint16)
-    detector = MarkDetector(DetectorSettings.checked(
-        {"pixel_size": 1e-5, "mark": mark, "mark_size": 3e-4}, "test"))
+    detector = MarkDetector(
+        DetectorSettings.checked({"pixel_size": 1e-5, "mark": mark, "mark_size": 3e-4}, "test")
+    )
     marks, _ = detector.marks(Picture(image, 65535))
     found = np.array(sorted((found.v, found.u) for found in marks))
     assert len(found) == 9
@@ -75,8 +76,10 @@ def photographed(svg, rng, *, turn, centre, mirror):
 
     Outlines and texts are drawn turned and shifted by PIL, 16 x 16 points a pixel.
     """
-    drawn = [np.array([point.split(",") for point in outline[1:].split("L")], dtype=float)
-             for outline in re.search(r'<path d="([^"]*)"', svg)[1].split("Z")[:-1]]
+    drawn = [
+        np.array([point.split(",") for point in outline[1:].split("L")], dtype=float)
+        for outline in re.search(r'<path d="([^"]*)"', svg)[1].split("Z")[:-1]
+    ]
     marks = np.array([outline.mean(axis=0) for outline in drawn[:30]])  # the first are the marks
     middle = (marks.min(axis=0) + marks.max(axis=0)) / 2
 
@@ -91,10 +94,12 @@ def photographed(svg, rng, *, turn, centre, mirror):
     for outline in drawn:
         draw.polygon([tuple(point) for point in (pixel(outline) + 0.5) * FINE], fill=30)
     for x, y, size, text in re.findall(
-            r'<text x="([\d.-]+)" y="([\d.-]+)" font-size="([\d.]+)"[^>]*>([^<]*)<', svg):
+        r'<text x="([\d.-]+)" y="([\d.-]+)" font-size="([\d.]+)"[^>]*>([^<]*)<', svg
+    ):
         at = pixel(np.array([[float(x), float(y)]]))[0] * FINE
-        draw.text(tuple(at), text, fill=30, font=ImageFont.load_default(
-            float(size) * PITCH_PX * FINE))
+        draw.text(
+            tuple(at), text, fill=30, font=ImageFont.load_default(float(size) * PITCH_PX * FINE)
+        )
     grey = np.asarray(image, dtype=float).reshape(IMAGE_PX, FINE, IMAGE_PX, FINE)
     grey = gaussian_filter(grey.mean(axis=(1, 3)), rng.uniform(0.5, 1.5))
     grey = grey + rng.normal(0, 0.5, grey.shape)
@@ -108,14 +113,18 @@ def identify(svg, seed):
     markers = [(x, y) for x in np.arange(6) - 2.5 for y in (-3, 3)]
     markers += [(x, y) for x in (-3.5, 3.5) for y in np.arange(5) - 2.0]
     centre = markers[rng.integers(len(markers))] + rng.uniform(-1.2, 1.2, 2)
-    picture, pixels = photographed(svg, rng, turn=rng.uniform(0, 2 * np.pi), centre=centre,
-                                   mirror=mirror)
-    settings = DetectorSettings.checked({"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4,
-                                         "mirror": mirror, "aruco": "6x5"}, "test")
+    picture, pixels = photographed(
+        svg, rng, turn=rng.uniform(0, 2 * np.pi), centre=centre, mirror=mirror
+    )
+    settings = DetectorSettings.checked(
+        {"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4, "mirror": mirror, "aruco": "6x5"},
+        "test",
+    )
     found = ImageDetector(settings).take_picture(picture, 1)
     inside = np.flatnonzero(((pixels > 15) & (pixels < IMAGE_PX - 16)).all(axis=1))
-    wanted = {(m - 3, n - 2): pixels[m * 5 + n] for m in range(6) for n in range(5)
-              if m * 5 + n in inside}
+    wanted = {
+        (m - 3, n - 2): pixels[m * 5 + n] for m in range(6) for n in range(5) if m * 5 + n in inside
+    }
     assert all(each.has_id for each in found)
     told = {(each.m, each.n): each for each in found}
     assert len(told) == len(found) and wanted.keys() <= told.keys()
@@ -131,8 +140,20 @@ def test_a_camera_knows_which_marks_it_sees(tmp_path):
     pytest.importorskip("cv2")
     (tmp_path / "seen.yaml").write_text(SEEN)
     file = tmp_path / "seen.svg"
-    assert main(["plate", str(tmp_path / "seen.yaml"), "-o", str(file), "--aruco",
-                 "--mark-size", "3e-4"]) == 0
+    assert (
+        main(
+            [
+                "plate",
+                str(tmp_path / "seen.yaml"),
+                "-o",
+                str(file),
+                "--aruco",
+                "--mark-size",
+                "3e-4",
+            ]
+        )
+        == 0
+    )
     assert sum(identify(file.read_text(), seed) for seed in range(10)) > 30
 
 
@@ -158,8 +179,9 @@ def test_rows_and_columns_are_numbered(plan, tmp_path):
     assert np.allclose(np.diff([float(x) for x, _, _ in columns]), 1.0, atol=0.1)
     assert np.allclose(np.diff([float(y) for _, y, _ in rows]), -1.0)  # n upwards, the page down
     height = float(re.search(r'viewBox="0 0 [\d.]+ ([\d.]+)"', file.read_text())[1])
-    assert all(float(y) < height for y in re.findall(r'<text x="[\d.-]+" y="([\d.-]+)"',
-                                                     file.read_text()))
+    assert all(
+        float(y) < height for y in re.findall(r'<text x="[\d.-]+" y="([\d.-]+)"', file.read_text())
+    )
 
 
 def test_the_file_is_true_to_size(plan, tmp_path, capsys):

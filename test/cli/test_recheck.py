@@ -13,21 +13,28 @@ from selfcal_ros.files import read_json
 
 EXACT = Path(__file__).parents[2] / "bags/hu_exact"
 PLAN = {"plan_id": "first", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8}}
-SEEDS = {"seed": 3, "truth": {"phi": 1e-4, "t": 1e-5},
-         "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-6}}
+SEEDS = {
+    "seed": 3,
+    "truth": {"phi": 1e-4, "t": 1e-5},
+    "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-6},
+}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A calibration, a view of its stage, one of a stage that has changed, and the result."""
     folder = tmp_path_factory.mktemp("recheck")
-    first = [{"name": "identity"}, {"name": "rot90", "rotation_deg": 90},
-             {"name": "line", "rotation_deg": 45, "grid": False},
-             {"name": "shift_x", "translation_pitch": [1, 0]}]
+    first = [
+        {"name": "identity"},
+        {"name": "rot90", "rotation_deg": 90},
+        {"name": "line", "rotation_deg": 45, "grid": False},
+        {"name": "shift_x", "translation_pitch": [1, 0]},
+    ]
     for name, views, more in (
-            ("first", first, {"noise_seed": 1}),
-            ("same", [{"name": "again"}], {"noise_seed": 2}),
-            ("bent", [{"name": "again"}], {"noise_seed": 2, "physics": {"stage_bend": 2e-7}})):
+        ("first", first, {"noise_seed": 1}),
+        ("same", [{"name": "again"}], {"noise_seed": 2}),
+        ("bent", [{"name": "again"}], {"noise_seed": 2, "physics": {"stage_bend": 2e-7}}),
+    ):
         spec = SEEDS | more | {"plan": PLAN | {"views": views, "plan_id": name}}
         (folder / f"{name}.yaml").write_text(json.dumps(spec))  # YAML, too
         assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
@@ -37,8 +44,10 @@ def folder(tmp_path_factory):
 
 def test_a_stage_that_is_as_it_was(folder, capsys):
     out = folder / "same.json"
-    assert main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", str(out),
-                 "--budget"]) == 0
+    assert (
+        main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", str(out), "--budget"])
+        == 0
+    )
     text = capsys.readouterr().out
     assert text.startswith("Still good: no change since r.json beyond its uncertainty (p = ")
     assert "change since" in text and "against the plate (k=1)" in text
@@ -58,7 +67,8 @@ def test_the_calibrations_own_recording_is_refused(folder, capsys):
     assert main(["recheck", str(folder / "r.json"), str(folder / "first")]) == 2
     assert capsys.readouterr().err == (
         f"selfcal recheck: {folder / 'first'}: the recording that {folder / 'r.json'} was computed "
-        "from: it would be compared with itself; record a new view of the plate\n")
+        "from: it would be compared with itself; record a new view of the plate\n"
+    )
 
 
 def test_a_stage_that_has_changed(folder, capsys):
@@ -66,8 +76,10 @@ def test_a_stage_that_has_changed(folder, capsys):
     seen = ["recheck", str(folder / "r.json"), str(folder / "bent"), "-o", str(out)]
     assert main(seen) == 5
     assert "a single pass cannot tell a change from drift" in capsys.readouterr().err
-    assert main([*seen, "--force", "--model", "drift:1e-9",
-                 "--report", str(folder / "bent.html")]) == 0
+    assert (
+        main([*seen, "--force", "--model", "drift:1e-9", "--report", str(folder / "bent.html")])
+        == 0
+    )
     text = capsys.readouterr().out
     assert text.startswith("Changed since r.json: calibrate again, provided this is the same ")
     assert "and the camera was not touched (if it was, declare it: --microscope 0.01); " in text
@@ -78,8 +90,9 @@ def test_a_stage_that_has_changed(folder, capsys):
     assert "Changed since r.json" in (folder / "bent.html").read_text()
 
 
-@pytest.mark.parametrize("option", ["--validate", "--robust", "--method=law",
-                                    "--uncertainty=never"])
+@pytest.mark.parametrize(
+    "option", ["--validate", "--robust", "--method=law", "--uncertainty=never"]
+)
 def test_options_that_one_view_cannot_use_are_not_there(option, folder, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["recheck", str(folder / "r.json"), str(folder / "same"), option])
@@ -87,10 +100,12 @@ def test_options_that_one_view_cannot_use_are_not_there(option, folder, capsys):
     assert f"the option {option.partition('=')[0]} is unknown" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("option", "where"), [("--validate", "--validate"),
-                                               ("--robust", "robust")])
-def test_a_plan_of_a_known_plate_refuses_what_needs_more_than_one_view(option, where, folder,
-                                                                       capsys):
+@pytest.mark.parametrize(
+    ("option", "where"), [("--validate", "--validate"), ("--robust", "robust")]
+)
+def test_a_plan_of_a_known_plate_refuses_what_needs_more_than_one_view(
+    option, where, folder, capsys
+):
     plan = {"plan_id": "m", "artifact_from": str(folder / "r.json"), "views": [{"name": "again"}]}
     (folder / "view.yaml").write_text(json.dumps(SEEDS | {"noise_seed": 4, "plan": plan}))
     if not (folder / "view").exists():
@@ -133,14 +148,19 @@ def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
     assert one == other
     u = np.array([one["error_map"]["u_gx"], one["error_map"]["u_gy"]])
     assert np.sqrt(np.mean(u**2)) / one["noise"]["sigma_xy"] == pytest.approx(
-        wanted["rms_gain_xy"], rel=1e-3)
+        wanted["rms_gain_xy"], rel=1e-3
+    )
     assert one["recheck"]["u_rms"] / one["noise"]["sigma_xy"] == pytest.approx(
-        wanted["rms_gain_change"], rel=1e-3)
+        wanted["rms_gain_change"], rel=1e-3
+    )
 
 
 def test_nodes_that_a_shifted_plate_does_not_reach_are_counted(folder, capsys):
-    plan = {"plan_id": "beside", "artifact_from": "r.json",
-            "views": [{"name": "beside", "translation_pitch": [1, 0]}]}
+    plan = {
+        "plan_id": "beside",
+        "artifact_from": "r.json",
+        "views": [{"name": "beside", "translation_pitch": [1, 0]}],
+    }
     (folder / "beside.yaml").write_text(json.dumps(plan))
     assert main(["plan", "check", str(folder / "beside.yaml"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["unknown_sites"] == 5

@@ -15,17 +15,45 @@ from test.support.bags import Foreign
 from test.support.sessions import events_of, small_bag, small_plan
 
 KEYS = {
-    "": {"schema": str, "plan_id": str, "artifact": dict, "views": list, "error_map": dict,
-         "artifact_map": dict, "observability": dict, "noise": dict, "rejected": dict,
-         "input": dict},
+    "": {
+        "schema": str,
+        "plan_id": str,
+        "artifact": dict,
+        "views": list,
+        "error_map": dict,
+        "artifact_map": dict,
+        "observability": dict,
+        "noise": dict,
+        "rejected": dict,
+        "input": dict,
+    },
     "artifact": {"grid_size": int, "grid_pitch": float, "angular_count": int},
-    "error_map": {"gx": list, "gy": list, "u_gx": list, "u_gy": list, "g_theta": list,
-                  "u_g_theta": list, "nonorthogonality": float, "scale_difference": float,
-                  "datum_theta": str},
-    "artifact_map": {"ax": list, "ay": list, "a_theta": list, "u_ax": list, "u_ay": list,
-                     "u_a_theta": list},
-    "observability": {"rank": int, "unknowns": int, "deficiency": int, "identifiable": bool,
-                      "modes": list},
+    "error_map": {
+        "gx": list,
+        "gy": list,
+        "u_gx": list,
+        "u_gy": list,
+        "g_theta": list,
+        "u_g_theta": list,
+        "nonorthogonality": float,
+        "scale_difference": float,
+        "datum_theta": str,
+    },
+    "artifact_map": {
+        "ax": list,
+        "ay": list,
+        "a_theta": list,
+        "u_ax": list,
+        "u_ay": list,
+        "u_a_theta": list,
+    },
+    "observability": {
+        "rank": int,
+        "unknowns": int,
+        "deficiency": int,
+        "identifiable": bool,
+        "modes": list,
+    },
     "noise": {"sigma_xy": float, "sigma_theta": float},
     "input": {"file": str, "sha256": str},
 }
@@ -64,17 +92,31 @@ def test_the_terms_of_the_plan_travel_in_the_bag_and_options_win(tmp_path):
     plan = replace(small_plan(), model_terms=("plate_scale:1e-06",))
     bag = small_bag(tmp_path, plan)
     found = {}
-    for name, options in {"plan": (), "options": ("--model", "drift:1e-08"),
-                          "none": ("--model", "none")}.items():
+    for name, options in {
+        "plan": (),
+        "options": ("--model", "drift:1e-08"),
+        "none": ("--model", "none"),
+    }.items():
         out = tmp_path / f"{name}.json"
         assert solve(bag, *options, output=out) in (0, 5)
         result = json.loads(out.read_text())
-        found[name] = ([term["name"] for term in result["model"]["terms"]],
-                       result["provenance"].get("model_terms_from"))
-    assumed = ["microscope", "plate_shape", "plate_strain", "line_eccentricity", "line_scale",
-               "rotation"]
-    assert found == {"plan": (["plate_scale", *assumed], "plan"),
-                     "options": (["drift", *assumed], "options"), "none": ([], None)}
+        found[name] = (
+            [term["name"] for term in result["model"]["terms"]],
+            result["provenance"].get("model_terms_from"),
+        )
+    assumed = [
+        "microscope",
+        "plate_shape",
+        "plate_strain",
+        "line_eccentricity",
+        "line_scale",
+        "rotation",
+    ]
+    assert found == {
+        "plan": (["plate_scale", *assumed], "plan"),
+        "options": (["drift", *assumed], "options"),
+        "none": ([], None),
+    }
 
 
 def test_what_is_no_bag(tmp_path, capsys):
@@ -88,12 +130,18 @@ def test_what_is_no_bag(tmp_path, capsys):
         f"{empty}: the file is empty; record the bag again",
         f"{folder}: no .mcap file in this folder; give an MCAP file or a rosbag2 folder with MCAP "
         "storage",
-        f"{tmp_path / 'none'}: no such file or folder; check the path"]
+        f"{tmp_path / 'none'}: no such file or folder; check the path",
+    ]
 
 
-@pytest.mark.parametrize(("kind", "topic"), [
-    (Command, "selfcal/view_command"), (Detection, "stage/mark_detections"),
-    (EncoderSample, "stage/joint_states")])
+@pytest.mark.parametrize(
+    ("kind", "topic"),
+    [
+        (Command, "selfcal/view_command"),
+        (Detection, "stage/mark_detections"),
+        (EncoderSample, "stage/joint_states"),
+    ],
+)
 def test_a_topic_without_messages(tmp_path, capsys, events, kind, topic):
     path = Foreign().write(tmp_path / "x.mcap", without(events, kind))
     assert refused(capsys, 4, path).startswith(f"{path}: no message on {topic}; record this topic")
@@ -106,16 +154,24 @@ def test_commands_without_measure(tmp_path, capsys, events):
 
 
 def test_commands_that_cannot_be_used_are_given_with_the_reason(tmp_path, capsys, events):
-    off = [replace(e, view=replace(e.view, translation_m=(0.003, 0.0)))
-           if isinstance(e, Command) and e.view else e for e in events]
+    off = [
+        replace(e, view=replace(e.view, translation_m=(0.003, 0.0)))
+        if isinstance(e, Command) and e.view
+        else e
+        for e in events
+    ]
     said = refused(capsys, 4, Foreign().write(tmp_path / "x.mcap", off))
     assert "no MEASURE command that can be used (a view command was not used: view '" in said
     assert said.count("0.3 is not a whole number of pitch steps") == said.count("view '")
 
 
-@pytest.mark.parametrize(("names", "field", "typename"), [
-    ("detection", "float64 offset_theta", "selfcal_msgs/msg/MarkDetection"),
-    ("command", "uint32 repeats", "selfcal_msgs/msg/ViewCommand")])
+@pytest.mark.parametrize(
+    ("names", "field", "typename"),
+    [
+        ("detection", "float64 offset_theta", "selfcal_msgs/msg/MarkDetection"),
+        ("command", "uint32 repeats", "selfcal_msgs/msg/ViewCommand"),
+    ],
+)
 def test_another_version_of_a_message(tmp_path, capsys, events, names, field, typename):
     text = {"detection": bags.DETECTION, "command": bags.COMMAND}[names]
     types = bags.contract_types(**{names: text.replace(field + "\n", "")})
@@ -137,12 +193,15 @@ def test_bags_of_ros1_and_topics_of_another_type(tmp_path, capsys, events):
     ros1 = Foreign(encoding="ros1").write(tmp_path / "ros1.mcap", events)
     assert refused(capsys, 2, ros1).endswith(
         "message encoding 'ros1' instead of cdr; convert the bag to ROS 2, e.g. with "
-        "rosbags-convert")
+        "rosbags-convert"
+    )
     wrong = Foreign(renamed={"stage/joint_states": "sensor_msgs/msg/Range"}).write(
-        tmp_path / "wrong.mcap", events)
+        tmp_path / "wrong.mcap", events
+    )
     assert refused(capsys, 2, wrong) == (
         f"{wrong}: topic /stage/joint_states: type sensor_msgs/msg/Range instead of "
-        "sensor_msgs/msg/JointState; remap the topic or record the right one")
+        "sensor_msgs/msg/JointState; remap the topic or record the right one"
+    )
 
 
 def test_two_cells_name_the_option_and_the_option_works(tmp_path, capsys, events):
@@ -167,14 +226,20 @@ def test_a_plan_that_does_not_identify_the_stage(tmp_path, capsys):
 
 
 def test_nothing_usable(tmp_path, capsys, events):
-    moved = [e if not isinstance(e, EncoderSample) else EncoderSample(
-        e.stamp_ns - 10**12, e.names, e.positions) for e in events]
+    moved = [
+        e
+        if not isinstance(e, EncoderSample)
+        else EncoderSample(e.stamp_ns - 10**12, e.names, e.positions)
+        for e in events
+    ]
     line = refused(capsys, 4, Foreign().write(tmp_path / "x.mcap", moved))
     count = len([e for e in events if isinstance(e, Detection)])
-    assert (f"none of {count} detections became a reading (rejected: no_encoder_sample_near "
-            f"{count})") in line
-    assert line.strip().endswith("the detections are stamped about 1000 s after the encoder "
-                                 "samples; stamp both by one clock")
+    assert (
+        f"none of {count} detections became a reading (rejected: no_encoder_sample_near {count})"
+    ) in line
+    assert line.strip().endswith(
+        "the detections are stamped about 1000 s after the encoder samples; stamp both by one clock"
+    )
 
 
 def test_a_wrong_sense_is_said_before_any_advice_on_views(capsys):
@@ -183,9 +248,12 @@ def test_a_wrong_sense_is_said_before_any_advice_on_views(capsys):
     assert first.startswith(
         "selfcal solve: bags/hu_noise: 1745 of 2240 detections were rejected as "
         "stage_not_at_mark: the stage is indicated at minus the marks' sites; the sense is "
-        "reversed: measurement_sense microscope_moves (--sense microscope_moves)")
-    assert last.startswith("selfcal solve: bags/hu_noise: correct this first; as it is, the marks "
-                           "that were read do not identify the stage")
+        "reversed: measurement_sense microscope_moves (--sense microscope_moves)"
+    )
+    assert last.startswith(
+        "selfcal solve: bags/hu_noise: correct this first; as it is, the marks "
+        "that were read do not identify the stage"
+    )
 
 
 def check_keys(found):
@@ -199,8 +267,15 @@ def check_keys(found):
         assert [len(row) for row in found["error_map"][name]] == [size] * size
     assert len(found["error_map"]["g_theta"]) == len(found["error_map"]["u_g_theta"]) == count
     for view in found["views"]:
-        assert {"name", "rotation", "translation_x", "translation_y", "misalignment", "used",
-                "rejected"} <= set(view)
+        assert {
+            "name",
+            "rotation",
+            "translation_x",
+            "translation_y",
+            "misalignment",
+            "used",
+            "rejected",
+        } <= set(view)
         assert set(view["misalignment"]) == {"phi", "tx", "ty"}
 
 
@@ -237,14 +312,18 @@ def test_the_same_bits_every_time_and_for_file_and_folder(tmp_path, bag, plain):
 
 def params(tmp_path, **nodes):
     path = tmp_path / "nodes.yaml"
-    path.write_text(yaml.safe_dump({name: {"ros__parameters": values}
-                                    for name, values in nodes.items()}))
+    path.write_text(
+        yaml.safe_dump({name: {"ros__parameters": values} for name, values in nodes.items()})
+    )
     return str(path)
 
 
 def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys, bag, plain):
-    path = params(tmp_path, solver={"theta_datum": "xy_axes", "misalignment_model": "linear"},
-                  measurement_collector={"measurement_sense": "plate_moves"})
+    path = params(
+        tmp_path,
+        solver={"theta_datum": "xy_axes", "misalignment_model": "linear"},
+        measurement_collector={"measurement_sense": "plate_moves"},
+    )
     assert solve(bag, "--params", path) == 2
     by_file = capsys.readouterr().err
     assert solve(bag, "--sense", "plate_moves") == 2
@@ -253,8 +332,9 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
     sense = ("--sense", "microscope_moves")
     papers = ("--theta-datum", "xy_axes", "--misalignment", "linear")
     linear = {"codes": (0, 5)}  # whether the readings contradict it is another question
-    assert (result_of(tmp_path, bag, "--params", path, *sense, **linear)
-            == result_of(tmp_path, bag, *papers, **linear))
+    assert result_of(tmp_path, bag, "--params", path, *sense, **linear) == result_of(
+        tmp_path, bag, *papers, **linear
+    )
     mine = ("--theta-datum", "zero_mean", "--misalignment", "rigid")
     assert plain == result_of(tmp_path, bag, *mine)
     assert plain == result_of(tmp_path, bag, "--params", path, *sense, *mine)
@@ -266,11 +346,13 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
 
 def test_the_law_is_linear_and_says_so(tmp_path, capsys, bag):
     law = result_of(tmp_path, bag, "--method", "law", codes=(0, 5))
-    assert law == result_of(tmp_path, bag, "--method", "law", "--misalignment", "linear",
-                            codes=(0, 5))
+    assert law == result_of(
+        tmp_path, bag, "--method", "law", "--misalignment", "linear", codes=(0, 5)
+    )
     capsys.readouterr()
     assert refused(capsys, 2, bag, "--method", "law", "--misalignment", "rigid") == (
-        "--misalignment: Hu's law is linear, not rigid; omit it, or use --method joint")
+        "--misalignment: Hu's law is linear, not rigid; omit it, or use --method joint"
+    )
 
 
 def test_the_uncertainty_map_on_request(tmp_path, bag, plain):
@@ -286,8 +368,10 @@ def test_numbers_in_a_parameter_file_are_read_as_the_nodes_read_them(tmp_path, b
     path.write_text(text % "6e0")
     assert result_of(tmp_path, bag, "--params", str(path)) == plain
     path.write_text(text % "10e-1")
-    assert json.loads(result_of(tmp_path, bag, "--params", str(path)))["rejected"] != (
-        json.loads(plain)["rejected"])
+    assert (
+        json.loads(result_of(tmp_path, bag, "--params", str(path)))["rejected"]
+        != (json.loads(plain)["rejected"])
+    )
 
 
 def test_methods(tmp_path):
@@ -298,12 +382,19 @@ def test_methods(tmp_path):
     assert (joint["method"], law["method"]) == ("joint", "law")
 
 
-@pytest.mark.parametrize(("values", "message"), [
-    ({"solver": {"methode": "joint"}}, "methode: solver has no such parameter"),
-    ({"solver": {"method": "best"}}, "method: 'best' is not known; choose one of joint, law"),
-    ({"measurement_collector": {"min_score": 7.0}}, "min_score: 7.0 is outside 0.0 to 1.0"),
-    ({"measurement_collector": {"min_score": "much"}}, "min_score: 'much' is not of type float"),
-    ({"colector": {"min_score": 0.5}}, "colector: no node of this package")])
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"solver": {"methode": "joint"}}, "methode: solver has no such parameter"),
+        ({"solver": {"method": "best"}}, "method: 'best' is not known; choose one of joint, law"),
+        ({"measurement_collector": {"min_score": 7.0}}, "min_score: 7.0 is outside 0.0 to 1.0"),
+        (
+            {"measurement_collector": {"min_score": "much"}},
+            "min_score: 'much' is not of type float",
+        ),
+        ({"colector": {"min_score": 0.5}}, "colector: no node of this package"),
+    ],
+)
 def test_bad_parameters(tmp_path, capsys, bag, values, message):
     path = params(tmp_path, **values)
     line = refused(capsys, 2, bag, "--params", path)
@@ -313,12 +404,14 @@ def test_bad_parameters(tmp_path, capsys, bag, values, message):
 def test_parameter_files_that_cannot_be_read(tmp_path, capsys, bag):
     assert "no such file" in refused(capsys, 2, bag, "--params", str(tmp_path / "none.yaml"))
     (tmp_path / "bad.yaml").write_text("solver:\n  a: [1\n")
-    assert "bad.yaml:3:1: not YAML" in refused(capsys, 2, bag, "--params",
-                                               str(tmp_path / "bad.yaml"))
+    assert "bad.yaml:3:1: not YAML" in refused(
+        capsys, 2, bag, "--params", str(tmp_path / "bad.yaml")
+    )
 
 
-@pytest.mark.parametrize("options", [("--method", "best"), ("--theta-datum", "up"),
-                                     ("--sense", "none"), ("--nonsense",)])
+@pytest.mark.parametrize(
+    "options", [("--method", "best"), ("--theta-datum", "up"), ("--sense", "none"), ("--nonsense",)]
+)
 def test_bad_options(capsys, bag, options):
     with pytest.raises(SystemExit) as stop:
         solve(bag, *options)

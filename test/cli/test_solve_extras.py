@@ -17,6 +17,7 @@ def solved(tmp_path, capsys):
         out = tmp_path / "result.json"
         code = main(["solve", str(BAGS / bag), "-o", str(out), *options])
         return code, json.loads(out.read_text()), capsys.readouterr()
+
     return solve
 
 
@@ -36,8 +37,10 @@ def test_the_law_cannot_hold_readings_out(capsys, tmp_path):
     assert main([*args, "-o", str(tmp_path / "r.json")]) == 2
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == (
-        "", "selfcal solve: --validate: Hu's law needs every reading and cannot hold any out; "
-        "solve with --method joint\n")
+        "",
+        "selfcal solve: --validate: Hu's law needs every reading and cannot hold any out; "
+        "solve with --method joint\n",
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -45,7 +48,8 @@ def test_without_an_uncertainty_map_the_budget_is_one_line(solved):
     code, result, printed = solved("hu_noise", "--uncertainty", "never", "--budget")
     assert code == 0 and result["budget"] == []
     assert printed.out.splitlines()[-1] == (
-        "no budget: the uncertainty map was not computed (--uncertainty always)")
+        "no budget: the uncertainty map was not computed (--uncertainty always)"
+    )
     assert "reading noise" not in printed.out and printed.err == ""
 
 

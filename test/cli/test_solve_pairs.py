@@ -24,10 +24,18 @@ from selfcal_ros.files import read_json
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 
 FACTORS = {
-    "model": ([], ["--model", "microscope"], ["--model", "drift", "--model", "plate_scale:1e-6"],
-              ["--model", "plate_shape:3e-8,approach"], ["--model", "none"]),
-    "reference": ([], ["--reference", "artifact:{plate}:3e-7"],
-                  ["--reference", "stage_x:{axis}:1e-7", "--certificate", "No. 7"]),
+    "model": (
+        [],
+        ["--model", "microscope"],
+        ["--model", "drift", "--model", "plate_scale:1e-6"],
+        ["--model", "plate_shape:3e-8,approach"],
+        ["--model", "none"],
+    ),
+    "reference": (
+        [],
+        ["--reference", "artifact:{plate}:3e-7"],
+        ["--reference", "stage_x:{axis}:1e-7", "--certificate", "No. 7"],
+    ),
     "uncertainty": ([], ["--uncertainty", "never"], ["--uncertainty", "always"]),
     "misalignment": ([], ["--misalignment", "linear"], ["--misalignment", "rigid"]),
     "method": ([], ["--method", "law"]),
@@ -39,22 +47,50 @@ FACTORS = {
     "budget": ([], ["--budget"]),
     "report": ([], ["--report", "r.html"]),
     "quiet": ([], ["--quiet"]),
-    "json": ([], ["--json"])}
-ASSUMED = {"microscope", "plate_shape", "plate_strain", "line_eccentricity", "line_scale",
-           "rotation"}
+    "json": ([], ["--json"]),
+}
+ASSUMED = {
+    "microscope",
+    "plate_shape",
+    "plate_strain",
+    "line_eccentricity",
+    "line_scale",
+    "rotation",
+}
 """What is in the model unless it is none, or linear."""
-CLASHES = {("reference", 1), ("reference", 2), ("model", 1), ("model", 2), ("model", 3),
-           ("misalignment", 2), ("robust", 1), ("validate", 1)}
+CLASHES = {
+    ("reference", 1),
+    ("reference", 2),
+    ("model", 1),
+    ("model", 2),
+    ("model", 3),
+    ("misalignment", 2),
+    ("robust", 1),
+    ("validate", 1),
+}
 """What Hu's law does not go together with."""
 VIEWS = [("a", 0, (0, 0)), ("b", 90, (0, 0)), ("c", 0, (1, 0)), ("d", 0, (-1, 0)), ("e", 0, (0, 1))]
 SIGMA_M, SIGMA_RAD = 2e-8, 1e-5
 BAGS = {
     # axes that the rotary encoder continues, stops on the marks, visits from all sides
-    "five": (VIEWS, 4, "x_back_y_back@plate", {"encoder": "xy_axes", "phi": 5e-3},
-             {}, {"lost": 0.05}),
+    "five": (
+        VIEWS,
+        4,
+        "x_back_y_back@plate",
+        {"encoder": "xy_axes", "phi": 5e-3},
+        {},
+        {"lost": 0.05},
+    ),
     # Hu's views, marks without names, stops on them, each reached from one side, other axes
-    "hu": (VIEWS[:3], 2, "raster", {"encoder": "independent", "phi": 1e-5, "t": 3e-6},
-           {"with_ids": False}, {})}
+    "hu": (
+        VIEWS[:3],
+        2,
+        "raster",
+        {"encoder": "independent", "phi": 1e-5, "t": 3e-6},
+        {"with_ids": False},
+        {},
+    ),
+}
 GAIN = {"gx": 6.0, "gy": 6.0, "g_theta": 1.0}
 """Largest standard uncertainty over the noise of one reading, whatever terms are in the model."""
 
@@ -69,8 +105,13 @@ def clash(row: Row) -> bool:
 
 def pairs_of(factors) -> set[tuple[str, int, str, int]]:
     """Return each two levels of two factors, those that contradict each other left out."""
-    return {(a, i, b, j) for a, b in combinations(factors, 2) for i in range(len(factors[a]))
-            for j in range(len(factors[b])) if not clash({a: i, b: j})}
+    return {
+        (a, i, b, j)
+        for a, b in combinations(factors, 2)
+        for i in range(len(factors[a]))
+        for j in range(len(factors[b]))
+        if not clash({a: i, b: j})
+    }
 
 
 def covering(factors) -> list[Row]:
@@ -86,7 +127,10 @@ def covering(factors) -> list[Row]:
             row[name] = max(
                 (level for level in range(len(factors[name])) if not clash({**row, name: level})),
                 key=lambda level, name=name: (
-                    len(left & pairs_in({**row, name: level}, factors)), -level))
+                    len(left & pairs_in({**row, name: level}, factors)),
+                    -level,
+                ),
+            )
         left -= pairs_in(row, factors)
         rows.append(row)
     return rows
@@ -119,35 +163,76 @@ def test_each_two_values_of_options_meet(bag):
 def bags(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bags")
     for number, (name, (views, repeats, order, truth, cell, faults)) in enumerate(BAGS.items()):
-        plan = {"plan_id": name, "visit_order": order, "artifact": {
-            "grid_size": 5, "grid_pitch": 0.01, "angular_count": 8}, "views": [
-                *({"name": view, "rotation_deg": turn, "translation_pitch": list(shift),
-                   "repeats": repeats} for view, turn, shift in views),
-                {"name": "l", "rotation_deg": 45, "grid": False, "repeats": repeats}]}
-        (folder / f"{name}.yaml").write_text(yaml.safe_dump({
-            "plan": plan, "seed": 32 + number, "cell": cell, "faults": faults,
-            "truth": {"rotation": "linear" if name == "hu" else "finite", **truth},
-            "noise": {"sigma_xy": SIGMA_M, "sigma_theta": SIGMA_RAD}}))
+        plan = {
+            "plan_id": name,
+            "visit_order": order,
+            "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8},
+            "views": [
+                *(
+                    {
+                        "name": view,
+                        "rotation_deg": turn,
+                        "translation_pitch": list(shift),
+                        "repeats": repeats,
+                    }
+                    for view, turn, shift in views
+                ),
+                {"name": "l", "rotation_deg": 45, "grid": False, "repeats": repeats},
+            ],
+        }
+        (folder / f"{name}.yaml").write_text(
+            yaml.safe_dump(
+                {
+                    "plan": plan,
+                    "seed": 32 + number,
+                    "cell": cell,
+                    "faults": faults,
+                    "truth": {"rotation": "linear" if name == "hu" else "finite", **truth},
+                    "noise": {"sigma_xy": SIGMA_M, "sigma_theta": SIGMA_RAD},
+                }
+            )
+        )
         assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
     return folder
 
 
-@pytest.mark.parametrize(("bag", "words"), [
-    *(("hu", words_of({"method": 1, name: level}, plate=0, axis=0))
-      for name, level in sorted(CLASHES)),
-    ("hu", ["--certificate", "No. 7"]), ("five", ["--method", "law"])], ids=str)
+@pytest.mark.parametrize(
+    ("bag", "words"),
+    [
+        *(
+            ("hu", words_of({"method": 1, name: level}, plate=0, axis=0))
+            for name, level in sorted(CLASHES)
+        ),
+        ("hu", ["--certificate", "No. 7"]),
+        ("five", ["--method", "law"]),
+    ],
+    ids=str,
+)
 def test_options_that_contradict_each_other(bags, bag, words, tmp_path, capsys):
     capsys.readouterr()
-    assert main(["solve", str(bags / bag), "-o", str(tmp_path / "o.json"), "--report",
-                 str(tmp_path / "r.html"), *words]) == 2
+    assert (
+        main(
+            [
+                "solve",
+                str(bags / bag),
+                "-o",
+                str(tmp_path / "o.json"),
+                "--report",
+                str(tmp_path / "r.html"),
+                *words,
+            ]
+        )
+        == 2
+    )
     printed = capsys.readouterr()
     assert printed.out == "" and printed.err.startswith("selfcal solve: ")
     assert printed.err.count("\n") == 1 and "; " in printed.err
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("bag", "number"), [
-    (bag, number) for bag, rows in ROWS.items() for number in range(len(rows))])
+@pytest.mark.parametrize(
+    ("bag", "number"), [(bag, number) for bag, rows in ROWS.items() for number in range(len(rows))]
+)
 def test_options_in_pairs(bags, bag, number, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(validation, "N_DRAWS", 16)
@@ -184,8 +269,10 @@ def test_options_in_pairs(bags, bag, number, tmp_path, monkeypatch, capsys):
 def scales(truth):
     """Return the least-squares scale of the plate and the slope of Gx along x: known lengths."""
     x = np.arange(-2, 3)[:, None] * 0.01 * np.ones((1, 5))
-    return {"plate": (truth["ax"] * x + truth["ay"] * x.T).sum() / (x**2 + x.T**2).sum(),
-            "axis": (truth["gx"] * x).sum() / (x**2).sum()}
+    return {
+        "plate": (truth["ax"] * x + truth["ay"] * x.T).sum() / (x**2 + x.T**2).sum(),
+        "axis": (truth["gx"] * x).sum() / (x**2).sum(),
+    }
 
 
 def assert_as_asked(data, row):
@@ -197,18 +284,24 @@ def assert_as_asked(data, row):
     given = ",".join(FACTORS["model"][row["model"]][1::2]).replace("none", "")
     names = {text.split(":")[0] for text in given.split(",") if text}
     bare = linear or row["model"] == 4
-    assert {term["name"] for term in data["model"]["terms"]
-            if term["source"] != "readings"} == names | (set() if bare else ASSUMED)
+    assert {
+        term["name"] for term in data["model"]["terms"] if term["source"] != "readings"
+    } == names | (set() if bare else ASSUMED)
     degrees = {2 if row["params"] else 3} if "drift" in given else set()
-    assert {sum(item["view"] == "a" and item["component"].startswith("x")
-                for item in term["estimates"])
-            for term in data["model"]["terms"] if term["name"] == "drift"} == degrees
+    assert {
+        sum(item["view"] == "a" and item["component"].startswith("x") for item in term["estimates"])
+        for term in data["model"]["terms"]
+        if term["name"] == "drift"
+    } == degrees
     kind = (None, "artifact", "stage_x")[row["reference"]]
     assert (data["reference"] or {}).get("kind") == kind
     assert (data["reference"] or {}).get("certificate", "") == "No. 7" * (row["reference"] == 2)
     never = row["uncertainty"] == 1
     assert ("outliers" in data, "validation" in data, bool(data["budget"])) == (
-        bool(row["robust"]), bool(row["validate"]), not never)
+        bool(row["robust"]),
+        bool(row["validate"]),
+        not never,
+    )
 
 
 def assert_true(data, truth, row, *, wrong_xy):

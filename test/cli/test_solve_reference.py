@@ -44,28 +44,51 @@ def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
 
 
 def test_the_distance_of_two_marks_is_met(tmp_path):
-    plate = solved(tmp_path, "--reference", "marks:-5,0:5,0:0.1000002:1e-8", "--robust",
-                   "--validate", "--certificate", "PTB 1", "--reference-at", "20:0:0:0")
+    plate = solved(
+        tmp_path,
+        "--reference",
+        "marks:-5,0:5,0:0.1000002:1e-8",
+        "--robust",
+        "--validate",
+        "--certificate",
+        "PTB 1",
+        "--reference-at",
+        "20:0:0:0",
+    )
     assert plate["ax"][10, 5] - plate["ax"][0, 5] == pytest.approx(2e-7, abs=1e-12)
     assert plate["u_gx"][0, 5] == pytest.approx(0.05 * 1e-7, rel=0.05)
     reference = json.loads((tmp_path / "r.json").read_text())["reference"]
     assert reference["marks"] == [[-5, 0], [5, 0]]
     assert main(["export", "kmotion", str(tmp_path / "r.json"), "-o", str(tmp_path / "t")]) == 0
-    assert ("reference length: distance of the marks (-5, 0) and (5, 0), relative error 2e-06, "
-            "u 1e-07 (PTB 1)") in (tmp_path / "t").read_text()
+    assert (
+        "reference length: distance of the marks (-5, 0) and (5, 0), relative error 2e-06, "
+        "u 1e-07 (PTB 1)"
+    ) in (tmp_path / "t").read_text()
 
 
 def test_a_certificate_of_nothing_is_refused(capsys):
     assert main(["solve", BAG, "--certificate", "PTB 123"]) == 2
     assert capsys.readouterr().err == (
         "selfcal solve: --certificate: it belongs to a reference length, and none is given; "
-        "name the length with --reference KIND:ERROR:U\n")
+        "name the length with --reference KIND:ERROR:U\n"
+    )
 
 
-@pytest.mark.parametrize("text", ["artifact", "artifact:x:1", "moon:1e-6:1e-7", "artifact:1:0",
-                                  "artifact:2_0e-7:1e-7", "marks:-0_5,0:5,0:0.1:0",
-                                  "marks:-5,0:5,0:0.1_0:0", "marks", "marks:0,0:0,0:1e-3:0",
-                                  "marks:-6,0:5,0:0.11:0"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "artifact",
+        "artifact:x:1",
+        "moon:1e-6:1e-7",
+        "artifact:1:0",
+        "artifact:2_0e-7:1e-7",
+        "marks:-0_5,0:5,0:0.1:0",
+        "marks:-5,0:5,0:0.1_0:0",
+        "marks",
+        "marks:0,0:0,0:1e-3:0",
+        "marks:-6,0:5,0:0.11:0",
+    ],
+)
 def test_a_bad_reference_is_one_line(capsys, text):
     assert main(["solve", BAG, "--reference", text]) == 2
     err = capsys.readouterr().err

@@ -28,7 +28,7 @@ def run(capsys, *args):
 def test_table_1_case_c_through_the_command(tmp_path, capsys):
     # Laser along the machine's own diagonals, a = b = 10 mm, Ex(y) = 0.1 mm.
     r_pp, r_np = np.hypot(10.1, 10), np.hypot(9.9, 10)
-    row = (10.1 * 10 / r_pp, (10.1 * 0.1 + 100) / r_pp, 9.9 * 10 / r_np, (100 - 9.9 * .1) / r_np)
+    row = (10.1 * 10 / r_pp, (10.1 * 0.1 + 100) / r_pp, 9.9 * 10 / r_np, (100 - 9.9 * 0.1) / r_np)
     table, out = tmp_path / "c.csv", tmp_path / "out.json"
     table.write_text("block,rx_pp,ry_pp,rx_np,ry_np\n1," + ",".join(f"{r:.9f}" for r in row))
     code, text, _ = run(capsys, table, "--method", "conventional", "-o", out)
@@ -43,8 +43,9 @@ def test_table_1_case_c_through_the_command(tmp_path, capsys):
 def test_the_example_gives_what_its_truth_says(method, tmp_path, capsys):
     truth = json.loads((CONFIG / "case_study_truth.json").read_text())
     out = tmp_path / "out.json"
-    code, _, err = run(capsys, EXAMPLE, "--method", method, "--step-x", "10", "--step-y", "10",
-                       "-o", out)
+    code, _, err = run(
+        capsys, EXAMPLE, "--method", method, "--step-x", "10", "--step-y", "10", "-o", out
+    )
     result = json.loads(out.read_text())
     assert (code, err) == (0, "")
     for key in ("squareness", "straightness_x", "straightness_y"):
@@ -76,15 +77,17 @@ def test_body_diagonals_are_told_by_their_columns(tmp_path, capsys):
     data = simulate_step_diagonal(machine, Measurement(setups, LaserNoise(repeats=2)), rng)
     table, out = tmp_path / "d.csv", tmp_path / "out.json"
     write_table(table, data)
-    code, text, err = run(capsys, table, "--method", "new", "--step-x", 10, "--step-y", 20,
-                          "--step-z", 5, "-o", out)
+    code, text, err = run(
+        capsys, table, "--method", "new", "--step-x", 10, "--step-y", 20, "--step-z", 5, "-o", out
+    )
     result = json.loads(out.read_text())
     assert code == 0 and "squareness_xz" in text and "straightness_z_in_x" in text
     assert "repeats are identical" in err
     for j, axis in enumerate("xyz"):
         for c, direction in enumerate("xyz"):
-            np.testing.assert_allclose(result[f"e{direction}_{axis}"],
-                                       machine.errors_m[j, :, c] * 1e3, atol=1e-6)
+            np.testing.assert_allclose(
+                result[f"e{direction}_{axis}"], machine.errors_m[j, :, c] * 1e3, atol=1e-6
+            )
 
 
 def test_one_diagonal_on_request(capsys):
@@ -93,44 +96,67 @@ def test_one_diagonal_on_request(capsys):
     assert code == 0 and result["diagonals"] == ["pp"] and result["closure"]["lengths"] is None
     code, text, err = run(capsys, EXAMPLE, "--method", "conventional", "--diagonals", "np")
     assert code == 2 and not text
-    assert err == ("selfcal step-diagonal: diagonals: only np measured; the conventional "
-                   "formulation needs every diagonal; measure the others\n")
+    assert err == (
+        "selfcal step-diagonal: diagonals: only np measured; the conventional "
+        "formulation needs every diagonal; measure the others\n"
+    )
 
 
-@pytest.mark.parametrize(("extra", "message"), [
-    (("--step-x", "-10"), "--step-x: -10 mm is not a length; give the nominal step in mm, greater"),
-    (("--step-y", "0"), "--step-y: 0 mm is not a length"),
-    (("--step-y", "nan"), "--step-y: nan mm is not a length"),
-    (("--step-x", "1e-320"), "--step-x: 9.99989e-321 mm is not a length"),
-    (("--step-x", "inf"), "--step-x: inf mm is not a length"),
-    (("--step-x", "20"), "case_study.csv:8: rx_pp: "),
-    (("--diagonals", "pp,qq"), "--diagonals: 'qq' is unknown or named twice"),
-    (("--diagonals", "pp,pp"), "--diagonals: 'pp' is unknown or named twice"),
-])
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (
+            ("--step-x", "-10"),
+            "--step-x: -10 mm is not a length; give the nominal step in mm, greater",
+        ),
+        (("--step-y", "0"), "--step-y: 0 mm is not a length"),
+        (("--step-y", "nan"), "--step-y: nan mm is not a length"),
+        (("--step-x", "1e-320"), "--step-x: 9.99989e-321 mm is not a length"),
+        (("--step-x", "inf"), "--step-x: inf mm is not a length"),
+        (("--step-x", "20"), "case_study.csv:8: rx_pp: "),
+        (("--diagonals", "pp,qq"), "--diagonals: 'qq' is unknown or named twice"),
+        (("--diagonals", "pp,pp"), "--diagonals: 'pp' is unknown or named twice"),
+    ],
+)
 def test_bad_arguments_are_one_line_and_exit_code_2(capsys, extra, message):
     code, text, err = run(capsys, EXAMPLE, "--method", "new", *extra)
     assert code == 2 and not text and err.count("\n") == 1
     assert message in err
 
 
-@pytest.mark.parametrize(("args", "message"), [
-    (("d.csv", "--method", "new", "-o", "d.csv"), "d.csv: would be overwritten"),
-    (("d.csv", "--method", "new", "-o", "a.json", "--cal", "a.json"), "a.json: would be over"),
-    (("d.csv", "--method", "new", "-o", "no/a.json", "--cal", "a.cal"), "no/a.json: cannot be wr"),
-    (("d.csv", "--method", "new", "-o", "a.json", "--plot", "a.png", "--cal", "old.cal"),
-     "old.cal: the file exists"),
-    (("d.csv", "--method", "new", "--save-csv", "a.csv"), "--save-csv: nothing would be written"),
-    (("d.csv", "--method", "new", "--truth", "a.json"), "--truth: nothing would be written"),
-    (("--simulate", "s.yaml", "-o", "s.yaml"), "s.yaml: would be overwritten"),
-    (("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"), "./a.csv: would be over"),
-    (("--simulate", "s.yaml", "--plot", "a.png"), "--plot: nothing would be written"),
-    (("--simulate", "s.yaml", "--cal", "a.cal"), "--cal: nothing would be written"),
-])
-def test_outputs_are_refused_before_anything_is_written(tmp_path, monkeypatch, capsys, args,
-                                                        message):
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("d.csv", "--method", "new", "-o", "d.csv"), "d.csv: would be overwritten"),
+        (("d.csv", "--method", "new", "-o", "a.json", "--cal", "a.json"), "a.json: would be over"),
+        (
+            ("d.csv", "--method", "new", "-o", "no/a.json", "--cal", "a.cal"),
+            "no/a.json: cannot be wr",
+        ),
+        (
+            ("d.csv", "--method", "new", "-o", "a.json", "--plot", "a.png", "--cal", "old.cal"),
+            "old.cal: the file exists",
+        ),
+        (
+            ("d.csv", "--method", "new", "--save-csv", "a.csv"),
+            "--save-csv: nothing would be written",
+        ),
+        (("d.csv", "--method", "new", "--truth", "a.json"), "--truth: nothing would be written"),
+        (("--simulate", "s.yaml", "-o", "s.yaml"), "s.yaml: would be overwritten"),
+        (("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"), "./a.csv: would be over"),
+        (("--simulate", "s.yaml", "--plot", "a.png"), "--plot: nothing would be written"),
+        (("--simulate", "s.yaml", "--cal", "a.cal"), "--cal: nothing would be written"),
+    ],
+)
+def test_outputs_are_refused_before_anything_is_written(
+    tmp_path, monkeypatch, capsys, args, message
+):
     monkeypatch.chdir(tmp_path)
-    for name, text in (("d.csv", EXAMPLE.read_text()), ("old.cal", ""),
-                       ("s.yaml", EXAMPLE.with_suffix(".yaml").read_text())):
+    for name, text in (
+        ("d.csv", EXAMPLE.read_text()),
+        ("old.cal", ""),
+        ("s.yaml", EXAMPLE.with_suffix(".yaml").read_text()),
+    ):
         (tmp_path / name).write_text(text)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     code, _, err = run(capsys, *args)
@@ -138,12 +164,29 @@ def test_outputs_are_refused_before_anything_is_written(tmp_path, monkeypatch, c
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-@pytest.mark.parametrize("extra", [
-    ("--laser-topic", "/l"), ("--laser-field", "data"), ("--laser-unit", "mm"),
-    ("--laser-sign", "-1"), ("--position-topic", "/p"), ("--joints", "a,b"),
-    ("--rest-tolerance", "3"), ("--min-rest", "1"), ("--settle", "0.2"), ("--step-z", "5"),
-    ("--x-axis", "3"), ("--y-axis", "3"), ("--unit", "um"), ("--home-x", "0"), ("--home-y", "1"),
-    ("--reverse-x",), ("--reverse-y",), ("--force",)])
+@pytest.mark.parametrize(
+    "extra",
+    [
+        ("--laser-topic", "/l"),
+        ("--laser-field", "data"),
+        ("--laser-unit", "mm"),
+        ("--laser-sign", "-1"),
+        ("--position-topic", "/p"),
+        ("--joints", "a,b"),
+        ("--rest-tolerance", "3"),
+        ("--min-rest", "1"),
+        ("--settle", "0.2"),
+        ("--step-z", "5"),
+        ("--x-axis", "3"),
+        ("--y-axis", "3"),
+        ("--unit", "um"),
+        ("--home-x", "0"),
+        ("--home-y", "1"),
+        ("--reverse-x",),
+        ("--reverse-y",),
+        ("--force",),
+    ],
+)
 def test_options_that_would_do_nothing_are_refused(capsys, extra):
     """A sign or unit of the laser that is given and not used looks as if the result had it."""
     code, out, err = run(capsys, EXAMPLE, "--method", "new", *extra)
@@ -155,10 +198,14 @@ def test_options_that_would_do_nothing_are_refused(capsys, extra):
 def test_bad_tables_are_one_line_with_their_exit_code(tmp_path, capsys):
     table = tmp_path / "d.csv"
     for text, expected, message in (
-            ("", 4, "the table is empty"),
-            ("block,rx_pp,ry_pp,rx_np,ry_np\n1,7,7,7,7\n", 2, "'ex_x', 'ey_y' is missing"),
-            ("block,rx_pp,ry_pp,rx_np,ry_np,ex_x,ey_y\n1,7,7,7,7,0,0\n2,7,7,7,7,0,0\n", 2,
-             "equal in every block")):
+        ("", 4, "the table is empty"),
+        ("block,rx_pp,ry_pp,rx_np,ry_np\n1,7,7,7,7\n", 2, "'ex_x', 'ey_y' is missing"),
+        (
+            "block,rx_pp,ry_pp,rx_np,ry_np,ex_x,ey_y\n1,7,7,7,7,0,0\n2,7,7,7,7,0,0\n",
+            2,
+            "equal in every block",
+        ),
+    ):
         table.write_text(text)
         code, _, err = run(capsys, table, "--method", "new")
         assert code == expected and err.count("\n") == 1 and message in err
@@ -173,8 +220,9 @@ def test_a_form_belongs_to_the_new_formulation(capsys):
 
 def test_the_profiles_are_drawn(tmp_path, capsys):
     picture = tmp_path / "profiles.png"
-    code, _, _ = run(capsys, EXAMPLE, "--method", "new", "--plot", picture,
-                     "-o", tmp_path / "o.json")
+    code, _, _ = run(
+        capsys, EXAMPLE, "--method", "new", "--plot", picture, "-o", tmp_path / "o.json"
+    )
     assert code == 0 and picture.read_bytes().startswith(b"\x89PNG")
 
 
@@ -195,15 +243,31 @@ def test_the_corrections_are_written_as_tables(tmp_path, capsys):
     from selfcal_ros.aerotech.read import load_cal
 
     cal = tmp_path / "s.cal"
-    args = (EXAMPLE, "--method", "new", "--cal", cal, "--x-axis", 3, "--y-axis", 4,
-            "-o", tmp_path / "o.json")
+    args = (
+        EXAMPLE,
+        "--method",
+        "new",
+        "--cal",
+        cal,
+        "--x-axis",
+        3,
+        "--y-axis",
+        4,
+        "-o",
+        tmp_path / "o.json",
+    )
     assert run(capsys, *args)[0] == 0
     tables = load_cal(cal).tables
     assert [(t.axis, t.reference, len(t.values)) for t in tables] == [
-        (3, 3, 7), (4, 3, 7), (3, 4, 7), (4, 4, 7)]
+        (3, 3, 7),
+        (4, 3, 7),
+        (3, 4, 7),
+        (4, 4, 7),
+    ]
     result = json.loads((tmp_path / "o.json").read_text())
-    np.testing.assert_allclose(tables[0].values, [-1e3 * e for e in
-                                                  result["profiles"]["px_x"]["error"]], atol=1e-5)
+    np.testing.assert_allclose(
+        tables[0].values, [-1e3 * e for e in result["profiles"]["px_x"]["error"]], atol=1e-5
+    )
     code, _, err = run(capsys, *args)
     assert code == 2 and "the file exists" in err
     code, _, err = run(capsys, *args, "--force")
@@ -216,15 +280,28 @@ def recorded_bag(path, **options):
     from test.support.laser_bags import write_laser_bag
 
     setups = {"pp": SetUp(mirror_rad=(5e-4,)), "np": SetUp(mirror_rad=(-5e-4,))}
-    return write_laser_bag(path, recorded(case_study_machine(), setups,
-                                          rng=np.random.default_rng(4)), **options)
+    return write_laser_bag(
+        path, recorded(case_study_machine(), setups, rng=np.random.default_rng(4)), **options
+    )
 
 
 def test_a_bag_gives_the_same_as_the_table_of_its_blocks(tmp_path, capsys):
     bag, table = recorded_bag(tmp_path / "bag"), tmp_path / "blocks.csv"
     out, again = tmp_path / "a.json", tmp_path / "b.json"
-    code, _, err = run(capsys, bag, "--method", "new", "--laser-topic", "/cell/laser",
-                       "--position-topic", "/cell/axes", "--save-csv", table, "-o", out)
+    code, _, err = run(
+        capsys,
+        bag,
+        "--method",
+        "new",
+        "--laser-topic",
+        "/cell/laser",
+        "--position-topic",
+        "/cell/axes",
+        "--save-csv",
+        table,
+        "-o",
+        out,
+    )
     assert code == 0 and "complete runs: np 1, pp 1, x 1, y 1" in err
     assert run(capsys, table, "--method", "new", "-o", again)[0] == 0
     one, other = (json.loads(path.read_text()) for path in (out, again))
@@ -235,11 +312,21 @@ def test_a_bag_gives_the_same_as_the_table_of_its_blocks(tmp_path, capsys):
     assert len(one["input"]["sha256"]) == 64
 
 
-@pytest.mark.parametrize(("extra", "message"), [
-    ((), "--laser-topic: a bag needs it; name the topic"),
-    (("--laser-topic", "cell/laser"), "--position-topic: a bag needs it"),
-    (("--laser-topic", "a", "--position-topic", "b", "--joints", "x"), "--joints: 'x' is not two"),
-    (("--laser-topic", "a", "--position-topic", "b", "--settle", "nan"), "--settle: nan is not")])
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ((), "--laser-topic: a bag needs it; name the topic"),
+        (("--laser-topic", "cell/laser"), "--position-topic: a bag needs it"),
+        (
+            ("--laser-topic", "a", "--position-topic", "b", "--joints", "x"),
+            "--joints: 'x' is not two",
+        ),
+        (
+            ("--laser-topic", "a", "--position-topic", "b", "--settle", "nan"),
+            "--settle: nan is not",
+        ),
+    ],
+)
 def test_bag_options_are_checked(tmp_path, capsys, extra, message):
     (tmp_path / "b.mcap").write_bytes(b"")
     code, _, err = run(capsys, tmp_path / "b.mcap", "--method", "new", *extra)
@@ -259,20 +346,25 @@ def test_a_diagonal_that_was_not_run_is_named(tmp_path, capsys):
 
 def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
     table, truth = tmp_path / "d.csv", tmp_path / "t.json"
-    assert run(capsys, "--simulate", CONFIG / "case_study.yaml", "-o", table,
-               "--truth", truth)[0] == 0
+    assert (
+        run(capsys, "--simulate", CONFIG / "case_study.yaml", "-o", table, "--truth", truth)[0] == 0
+    )
 
     def rows(path):
         return [line for line in path.read_text().splitlines() if line[0] != "#"]
 
     made, shipped = rows(table), rows(EXAMPLE)
     assert made[0] == shipped[0] and len(made) == len(shipped) == 19
-    np.testing.assert_allclose([list(map(float, row.split(","))) for row in made[1:]],
-                               [list(map(float, row.split(","))) for row in shipped[1:]], atol=2e-8)
+    np.testing.assert_allclose(
+        [list(map(float, row.split(","))) for row in made[1:]],
+        [list(map(float, row.split(","))) for row in shipped[1:]],
+        atol=2e-8,
+    )
     shipped_truth = json.loads((CONFIG / "case_study_truth.json").read_text())
     for key in ("ex_x", "ey_x", "ex_y", "ey_y", "squareness", "straightness_x", "straightness_y"):
-        np.testing.assert_allclose(json.loads(truth.read_text())[key], shipped_truth[key],
-                                   atol=1e-11)
+        np.testing.assert_allclose(
+            json.loads(truth.read_text())[key], shipped_truth[key], atol=1e-11
+        )
     assert run(capsys, "--simulate", CONFIG / "case_study.yaml")[1] == table.read_text()
     code, _, err = run(capsys, EXAMPLE, "--simulate", CONFIG / "case_study.yaml")
     assert code == 2 and "writes data and reads none" in err
@@ -280,10 +372,13 @@ def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
 
 def test_the_body_diagonals_of_the_example(tmp_path, capsys):
     table, truth = tmp_path / "d.csv", tmp_path / "t.json"
-    assert run(capsys, "--simulate", CONFIG / "body_diagonals.yaml", "-o", table,
-               "--truth", truth)[0] == 0
-    code, text, _ = run(capsys, table, "--method", "new", "--step-x", 10, "--step-y", 8,
-                        "--step-z", 5)
+    assert (
+        run(capsys, "--simulate", CONFIG / "body_diagonals.yaml", "-o", table, "--truth", truth)[0]
+        == 0
+    )
+    code, text, _ = run(
+        capsys, table, "--method", "new", "--step-x", 10, "--step-y", 8, "--step-z", 5
+    )
     result, expected = json.loads(text), json.loads(truth.read_text())
     assert code == 0
     for key in (key for key in expected if key.startswith(("e", "sq", "st"))):

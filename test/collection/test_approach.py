@@ -123,8 +123,10 @@ STEPS, PLACES = st.sampled_from([1, 10, 99, 101]), st.sampled_from([0.0] * 20 + 
 
 
 @settings(max_examples=20)
-@given(st.lists(st.tuples(STEPS, PLACES), min_size=40, max_size=80),
-       st.lists(st.integers(0, 2000), min_size=1, max_size=12, unique=True))
+@given(
+    st.lists(st.tuples(STEPS, PLACES), min_size=40, max_size=80),
+    st.lists(st.integers(0, 2000), min_size=1, max_size=12, unique=True),
+)
 def test_it_is_what_a_search_backwards_finds(steps, asked_at):
     at = np.cumsum([step for step, _ in steps]).tolist()
     samples = list(zip(at, (p for _, p in steps), strict=True))

@@ -24,8 +24,9 @@ def moved(cell, joint, about_ns, *, speed=None, drift=0.0):
         positions, told = list(sample.positions), [0.0] * 3
         positions[index] += drift * (20 * MS + min(max(away, -20 * MS), 20 * MS)) / 1e9
         told[index] = (speed or 0.0) * (abs(away) <= 20 * MS)
-        cell.samples[at] = replace(sample, positions=tuple(positions),
-                                   velocities=() if speed is None else tuple(told))
+        cell.samples[at] = replace(
+            sample, positions=tuple(positions), velocities=() if speed is None else tuple(told)
+        )
 
 
 @pytest.mark.parametrize(("drift", "moving"), [(0.1, True), (-0.1, True), (0.004, False)])
@@ -48,8 +49,9 @@ def test_an_angular_reading_while_x_or_y_moves(joint, drift, moving):
     at = cell.detections[cell.angular(4)].stamp_ns
     moved(cell, joint, at, drift=drift)
     found, _ = collect(cell.events)
-    near = [d.k for d in cell.detections
-            if d.kind == Kind.ANGULAR and abs(d.stamp_ns - at) <= 20 * MS]
+    near = [
+        d.k for d in cell.detections if d.kind == Kind.ANGULAR and abs(d.stamp_ns - at) <= 20 * MS
+    ]
     assert found.all_rejected() == ({"stage_moving": len(near)} if moving else {})
     assert set(found.views[0].k) == set(range(8)) - set(near if moving else ())
 
@@ -82,8 +84,10 @@ def test_a_stage_without_theta_encoder_reads_the_grid():
 def test_a_theta_encoder_that_falls_silent_or_contradicts_itself_does_not_touch_the_grid():
     cell = scene(count=0)
     half = cell.detections[12].stamp_ns
-    silent = [s if s.stamp_ns < half else EncoderSample(s.stamp_ns, ("x", "y"), s.positions[:2])
-              for s in cell.samples]
+    silent = [
+        s if s.stamp_ns < half else EncoderSample(s.stamp_ns, ("x", "y"), s.positions[:2])
+        for s in cell.samples
+    ]
     echo = [EncoderSample(s.stamp_ns, ("theta",), (0.5,)) for s in cell.samples]
     for samples in (silent, [*cell.samples, *echo]):
         found, _ = collect([*cell.commands, *samples, *cell.detections])
@@ -95,9 +99,14 @@ def test_noise_of_an_unneeded_joint_is_no_motion(size):
     cell, rng = scene(count=0), np.random.default_rng(1)
     told = rng.normal(0, 100 * size, len(cell.samples))
     for velocities in (False, True):
-        noisy = [replace(s, positions=(*s.positions[:2], rng.normal(0, size)),
-                         velocities=(0.0, 0.0, rate) if velocities else ())
-                 for s, rate in zip(cell.samples, told, strict=True)]
+        noisy = [
+            replace(
+                s,
+                positions=(*s.positions[:2], rng.normal(0, size)),
+                velocities=(0.0, 0.0, rate) if velocities else (),
+            )
+            for s, rate in zip(cell.samples, told, strict=True)
+        ]
         found, _ = collect([*cell.commands, *noisy, *cell.detections])
         assert found.all_rejected() == {}
 
@@ -136,8 +145,7 @@ def steps(rng, motion, *, sigma, speeds=False):
     joint, position = JointTrack(LIMITS), 0.0
     for number in range(400):
         rate = motion(number)
-        joint.add(number * 2 * MS, position + rng.normal(0, sigma),
-                  rate if speeds else math.nan)
+        joint.add(number * 2 * MS, position + rng.normal(0, sigma), rate if speeds else math.nan)
         position += rate * 2e-3
     return joint
 
@@ -148,8 +156,12 @@ def test_motion_is_found_beside_noise_and_noise_alone_is_not(sigma, speeds):
     between = np.arange(400) * 2 * MS + MS
     still = steps(np.random.default_rng(1), lambda number: 0.0, sigma=sigma, speeds=speeds)
     assert not (still.moving(between[:-1]) == Reason.MOVING).any()
-    some = steps(np.random.default_rng(1), lambda number: 5.0 * (100 <= number < 300),
-                 sigma=sigma, speeds=speeds)
+    some = steps(
+        np.random.default_rng(1),
+        lambda number: 5.0 * (100 <= number < 300),
+        sigma=sigma,
+        speeds=speeds,
+    )
     found = some.moving(between[:-1]) == Reason.MOVING
     assert found[100:300].all()
     assert not found[:99].any() and not found[301:].any()
@@ -187,7 +199,8 @@ def test_the_noise_is_that_beside_each_exposure_however_many_are_asked_for():
     asked = np.sort(rng.choice(stamps[100:-100], 3000, replace=False)) + 3 * MS
     series = track.between(stamps[0], stamps[-1])
     at_once = series.moving(asked, series.query(asked)[1])[::10]
-    one_by_one = np.concatenate([series.moving(one, series.query(one)[1])
-                                 for one in np.split(asked[::10], 300)])
+    one_by_one = np.concatenate(
+        [series.moving(one, series.query(one)[1]) for one in np.split(asked[::10], 300)]
+    )
     assert 0.2 < at_once.mean() < 0.8
     np.testing.assert_array_equal(at_once, one_by_one)

@@ -48,8 +48,9 @@ def test_steps_are_found_in_messages_that_come_one_by_one(by_ns):
         assert 0 < stamps[at - 1] + 5 * MS - step.before_ns <= 11 * 5 * MS
 
 
-@pytest.mark.parametrize("by_ns, number", [(101 * MS, 1), (99 * MS, 0), (-101 * MS, 1),
-                                           (-99 * MS, 0)])
+@pytest.mark.parametrize(
+    "by_ns, number", [(101 * MS, 1), (99 * MS, 0), (-101 * MS, 1), (-99 * MS, 0)]
+)
 def test_the_limit(by_ns, number):
     assert len(found(stepped(1500, by_ns), TRUE)) == number
 
@@ -103,9 +104,10 @@ def mixed():
 def late_then_dropped(late_s=0.425, start=400, stop=1000):
     """Messages wait 0.425 s in a queue, which is then emptied: those that wait are lost."""
     lost = round(late_s * 200)
-    kept = np.r_[TRUE[:stop], TRUE[stop + lost:]]
-    delay = np.where((np.arange(len(kept)) >= start) & (np.arange(len(kept)) < stop),
-                     round(late_s * S), MS)
+    kept = np.r_[TRUE[:stop], TRUE[stop + lost :]]
+    delay = np.where(
+        (np.arange(len(kept)) >= start) & (np.arange(len(kept)) < stop), round(late_s * S), MS
+    )
     return kept, kept + delay
 
 
@@ -113,7 +115,7 @@ def late_for_long():
     """The same for 10 s; then a second time."""
     stamps, received = late_then_dropped(stop=2400)
     again = np.where(np.arange(len(stamps)) >= 2600, 425 * MS, 0)
-    kept = np.r_[:2700, 2785:len(stamps)]
+    kept = np.r_[:2700, 2785 : len(stamps)]
     again[2700:] = 0
     return stamps[kept], (received + again)[kept]
 
@@ -123,9 +125,11 @@ def faster():
     return TRUE, TRUE[0] + (TRUE - TRUE[0]) // 8
 
 
-@pytest.mark.parametrize("case", [bundles, hole, stall, transport, shuffled, mixed, faster,
-                                  late_then_dropped, late_for_long],
-                         ids=lambda case: case.__name__)
+@pytest.mark.parametrize(
+    "case",
+    [bundles, hole, stall, transport, shuffled, mixed, faster, late_then_dropped, late_for_long],
+    ids=lambda case: case.__name__,
+)
 def test_what_only_looks_like_a_step_is_none(case):
     assert found(*case()) == []
     assert found(*case(), pieces=500) == []
@@ -133,17 +137,32 @@ def test_what_only_looks_like_a_step_is_none(case):
 
 def timeline():
     plate, view = Artifact(5, 0.01, 8), View("identity")
-    return build_timeline([
-        Command(TRUE[0], Phase.PLACE, "plan", 0, view, plate),
-        Command(TRUE[1000], Phase.MEASURE, "plan", 0, view, plate),
-        Command(TRUE[2000], Phase.DONE, "plan", 1, None, None)])
+    return build_timeline(
+        [
+            Command(TRUE[0], Phase.PLACE, "plan", 0, view, plate),
+            Command(TRUE[1000], Phase.MEASURE, "plan", 0, view, plate),
+            Command(TRUE[2000], Phase.DONE, "plan", 1, None, None),
+        ]
+    )
 
 
-@pytest.mark.parametrize("at, by_ns, words", [
-    (1500, -S, "stepped back by 1 s in view 'identity', at 1700000007.500 s: what was stamped "
-     "since may be missing or counted in an earlier view; let clocks slew, not step,"),
-    (500, 37 * S, "stepped ahead by 37 s between views, at 1700000002.500 s: what was stamped "
-     "since may be missing or counted in a later view;")])
+@pytest.mark.parametrize(
+    "at, by_ns, words",
+    [
+        (
+            1500,
+            -S,
+            "stepped back by 1 s in view 'identity', at 1700000007.500 s: what was stamped "
+            "since may be missing or counted in an earlier view; let clocks slew, not step,",
+        ),
+        (
+            500,
+            37 * S,
+            "stepped ahead by 37 s between views, at 1700000002.500 s: what was stamped "
+            "since may be missing or counted in a later view;",
+        ),
+    ],
+)
 def test_the_line_says_whose_clock_how_much_and_where(at, by_ns, words):
     step = ClockStep(int(TRUE[at]), by_ns)
     later = ClockStep(step.before_ns + MS, by_ns + MS)
@@ -155,7 +174,9 @@ def test_steps_of_two_clocks_are_two_lines():
     ahead, back = (ClockStep(int(TRUE[9]), by_ns) for by_ns in (S, -S))
     lines = step_lines({"a": [ahead], "b": [back]}, timeline())
     assert [line.split(" by ")[0] for line in lines] == [
-        "the clock that stamps a stepped ahead", "the clock that stamps b stepped back"]
+        "the clock that stamps a stepped ahead",
+        "the clock that stamps b stepped back",
+    ]
     assert step_lines({"a": []}, timeline()) == []
 
 
@@ -185,6 +206,8 @@ def test_a_quick_stream_that_overlaps_a_slow_one_is_no_step():
     slow = TRUE[0] + np.arange(300) * S
     both = np.concatenate([slow, slow[-1] - 10 * S + np.arange(300) * 5 * MS])
     assert found(both, both) == []
-    (step,) = found(np.concatenate([TRUE[:300], TRUE[:300] - 10 * S]),
-                    np.concatenate([TRUE[:300], TRUE[:300] - 10 * S]))
+    (step,) = found(
+        np.concatenate([TRUE[:300], TRUE[:300] - 10 * S]),
+        np.concatenate([TRUE[:300], TRUE[:300] - 10 * S]),
+    )
     assert abs(step.by_ns + 11.5 * S) < 60 * MS

@@ -42,8 +42,9 @@ def lost_marks(events, **parameters):
 
 @pytest.mark.parametrize("sense", list(Sense))
 def test_the_readings_are_the_deviations_of_the_truth(sense):
-    cell = scene("0, 90, tx, 270", line=True, sense=sense, servo_sigma_m=0.0,
-                 servo_sigma_theta_rad=0.0)
+    cell = scene(
+        "0, 90, tx, 270", line=True, sense=sense, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0
+    )
     found, progress = collect(cell.events, measurement_sense=str(sense))
     assert found.sense is sense
     assert all(item.complete and item.coverage == 1.0 for item in progress.values())
@@ -54,8 +55,9 @@ def test_the_readings_are_the_deviations_of_the_truth(sense):
             expected = grid_deviation(cell.truth, index, view, sense=sense)
             at = np.stack([readings.m, readings.n]) + 2
             assert len(readings.m) == np.isfinite(expected[0]).sum()
-            np.testing.assert_allclose(np.stack([readings.dx, readings.dy]), expected[:, *at],
-                                       rtol=0, atol=ROUNDING_M)
+            np.testing.assert_allclose(
+                np.stack([readings.dx, readings.dy]), expected[:, *at], rtol=0, atol=ROUNDING_M
+            )
         expected = angular_deviation(cell.truth, index, view, sense=sense)
         assert readings.k.tolist() == list(range(8))
         np.testing.assert_allclose(readings.dtheta, expected, rtol=0, atol=2e-15)
@@ -120,7 +122,8 @@ def test_an_encoder_that_tells_of_motion_in_its_velocity(rate, moving):
     d = cell.detections[cell.grid(6)]
     cell.samples = [
         replace(s, velocities=(0.0, rate if abs(s.stamp_ns - d.stamp_ns) < 3 * MS else 0.0, 0.0))
-        for s in cell.samples]
+        for s in cell.samples
+    ]
     rejected, lost = lost_marks(cell.events)
     assert lost == ({mark_of(d)} if moving else set())
     assert rejected == ({"stage_moving": 1} if moving else {})
@@ -143,8 +146,11 @@ def test_samples_that_contradict_each_other_at_one_stamp():
 def test_a_clock_that_steps_back_makes_samples_interleave():
     cell = scene()
     d = cell.detections[cell.grid(12)]
-    echo = [EncoderSample(s.stamp_ns + MS, s.names, (0.0499, 0.0499, 1.0)) for s in cell.samples
-            if abs(s.stamp_ns - d.stamp_ns) < 30 * MS]
+    echo = [
+        EncoderSample(s.stamp_ns + MS, s.names, (0.0499, 0.0499, 1.0))
+        for s in cell.samples
+        if abs(s.stamp_ns - d.stamp_ns) < 30 * MS
+    ]
     rejected, lost = lost_marks([*cell.events, *echo])
     assert rejected == {"encoder_contradiction": len(lost)}
     assert len(lost) == 6
@@ -153,15 +159,19 @@ def test_a_clock_that_steps_back_makes_samples_interleave():
 
 def test_a_stepped_clock_is_never_used_silently():
     cell = scene("0, 90", repeats=3)
-    arrivals, _ = apply_faults(sorted(cell.events, key=lambda e: e.stamp_ns),
-                               Faults(clock_step_s=0.1555), np.random.default_rng(1))
+    arrivals, _ = apply_faults(
+        sorted(cell.events, key=lambda e: e.stamp_ns),
+        Faults(clock_step_s=0.1555),
+        np.random.default_rng(1),
+    )
     found, _ = collect([event for _, event in arrivals])
     assert found.all_rejected()["encoder_contradiction"] > 3
     for index, readings in enumerate(found.views):
         expected = grid_deviation(cell.truth, index, readings.view)
         at = np.stack([readings.m, readings.n]) + 2
-        np.testing.assert_allclose(np.stack([readings.dx, readings.dy]), expected[:, *at],
-                                   rtol=0, atol=2e-11)
+        np.testing.assert_allclose(
+            np.stack([readings.dx, readings.dy]), expected[:, *at], rtol=0, atol=2e-11
+        )
 
 
 @pytest.mark.parametrize("phase", [Phase.DONE, Phase.ABORT])
@@ -214,8 +224,9 @@ def test_a_view_placed_again_but_not_measured_keeps_its_readings():
 
 def test_views_of_another_plan():
     cell = scene("0, 90")
-    other = [replace(c, plan_id="other", stamp_ns=c.stamp_ns)
-             for c in cell.commands if c.view_index == 0]
+    other = [
+        replace(c, plan_id="other", stamp_ns=c.stamp_ns) for c in cell.commands if c.view_index == 0
+    ]
     cell.commands = [*other, *(c for c in cell.commands if c.view_index != 0)]
     found, progress = collect(cell.events)
     assert found.all_rejected() == {"other_plan": 33}
@@ -225,10 +236,13 @@ def test_views_of_another_plan():
 
 def test_one_plan_has_one_plate():
     cell = scene("0, 90")
-    wider = [replace(c, artifact=Artifact(5, 0.011, 8)) if c.view_index == 0 and c.view else c
-             for c in cell.commands]
-    wider = [replace(c, view=replace(c.view, translation_m=(0.0, 0.0))) if c.view else c
-             for c in wider]
+    wider = [
+        replace(c, artifact=Artifact(5, 0.011, 8)) if c.view_index == 0 and c.view else c
+        for c in cell.commands
+    ]
+    wider = [
+        replace(c, view=replace(c.view, translation_m=(0.0, 0.0))) if c.view else c for c in wider
+    ]
     with pytest.raises(InputError, match="a different plate from the rest of plan '0, 90'"):
         collect([*wider, *cell.samples, *cell.detections])
 
@@ -255,39 +269,53 @@ def test_no_measure_command_is_no_data():
         assert caught.value.exit_code == 4
 
 
-@pytest.mark.parametrize(("sample", "reason"), [
-    (EncoderSample(START_NS, ("a", "b"), (0.0, 0.0)), "encoder_sample_unknown_joint"),
-    (EncoderSample(START_NS, (), ()), "encoder_sample_unknown_joint"),
-    (EncoderSample(START_NS, ("x", "y"), (0.0, math.nan)), "encoder_sample_not_finite"),
-    (EncoderSample(START_NS, ("x",), (-math.inf,)), "encoder_sample_not_finite"),
-    (EncoderSample(START_NS, ("x", "y"), (0.0,)), "encoder_sample_malformed"),
-    (EncoderSample(START_NS, ("x",), (0.0,), (0.0, 0.0)), "encoder_sample_malformed")])
+@pytest.mark.parametrize(
+    ("sample", "reason"),
+    [
+        (EncoderSample(START_NS, ("a", "b"), (0.0, 0.0)), "encoder_sample_unknown_joint"),
+        (EncoderSample(START_NS, (), ()), "encoder_sample_unknown_joint"),
+        (EncoderSample(START_NS, ("x", "y"), (0.0, math.nan)), "encoder_sample_not_finite"),
+        (EncoderSample(START_NS, ("x",), (-math.inf,)), "encoder_sample_not_finite"),
+        (EncoderSample(START_NS, ("x", "y"), (0.0,)), "encoder_sample_malformed"),
+        (EncoderSample(START_NS, ("x",), (0.0,), (0.0, 0.0)), "encoder_sample_malformed"),
+    ],
+)
 def test_encoder_samples_that_cannot_be_used(sample, reason):
     assert lost_marks([*scene().events, sample]) == ({reason: 1}, set())
 
 
 def test_one_joint_in_each_message_and_joints_of_other_machines():
     cell = scene()
-    apart = [EncoderSample(s.stamp_ns, (name, "gripper"), (position, 99.0))
-             for s in cell.samples for name, position in zip(s.names, s.positions, strict=True)]
+    apart = [
+        EncoderSample(s.stamp_ns, (name, "gripper"), (position, 99.0))
+        for s in cell.samples
+        for name, position in zip(s.names, s.positions, strict=True)
+    ]
     assert lost_marks([*cell.commands, *cell.detections, *apart]) == ({}, set())
-    shuffled = [EncoderSample(s.stamp_ns, ("z", *s.names[::-1]), (7.0, *s.positions[::-1]),
-                              (5.0, 0.0, 0.0, 0.0)) for s in cell.samples]
+    shuffled = [
+        EncoderSample(
+            s.stamp_ns, ("z", *s.names[::-1]), (7.0, *s.positions[::-1]), (5.0, 0.0, 0.0, 0.0)
+        )
+        for s in cell.samples
+    ]
     assert lost_marks([*cell.commands, *cell.detections, *shuffled]) == ({}, set())
 
 
 def test_names_of_joints_are_parameters():
     cell = scene()
     renamed = [replace(s, names=("ax1", "ax2", "c")) for s in cell.samples]
-    assert lost_marks([*cell.commands, *cell.detections, *renamed],
-                      joint_x="ax1", joint_y="ax2", joint_theta="c") == ({}, set())
+    assert lost_marks(
+        [*cell.commands, *cell.detections, *renamed], joint_x="ax1", joint_y="ax2", joint_theta="c"
+    ) == ({}, set())
 
 
 @pytest.mark.parametrize("turns", [-1, 1, 3])
 def test_theta_may_be_indicated_in_any_turn(turns):
     cell, plain = scene(), table(collect(scene().events)[0].views[0])
-    cell.samples = [replace(s, positions=(*s.positions[:2], s.positions[2] + turns * 2 * math.pi))
-                    for s in cell.samples]
+    cell.samples = [
+        replace(s, positions=(*s.positions[:2], s.positions[2] + turns * 2 * math.pi))
+        for s in cell.samples
+    ]
     found, _ = collect(cell.events)
     assert found.all_rejected() == {}
     read = table(found.views[0])
@@ -296,27 +324,48 @@ def test_theta_may_be_indicated_in_any_turn(turns):
 
 def test_theta_that_wraps_between_two_samples_stands_still():
     cell = scene()
-    at_zero = [s for s in cell.samples if s.positions[0] == s.positions[1] == 0.0
-               and abs(s.positions[2]) < 1e-6]
+    at_zero = [
+        s
+        for s in cell.samples
+        if s.positions[0] == s.positions[1] == 0.0 and abs(s.positions[2]) < 1e-6
+    ]
     flipped = {id(s) for s in at_zero[::2]}
-    cell.samples = [replace(s, positions=(*s.positions[:2], s.positions[2] + 2 * math.pi))
-                    if id(s) in flipped else s for s in cell.samples]
+    cell.samples = [
+        replace(s, positions=(*s.positions[:2], s.positions[2] + 2 * math.pi))
+        if id(s) in flipped
+        else s
+        for s in cell.samples
+    ]
     found, _ = collect(cell.events)
     assert len(flipped) >= 2
     assert found.all_rejected() == {}
-    assert abs(table(found.views[0])["line", 0][0] - angular_deviation(
-        cell.truth, 0, cell.plan.views[0])[0]) < 1e-9
+    assert (
+        abs(
+            table(found.views[0])["line", 0][0]
+            - angular_deviation(cell.truth, 0, cell.plan.views[0])[0]
+        )
+        < 1e-9
+    )
 
 
 NOISY = {"sigma_xy_m": 2e-8, "sigma_theta_rad": 2e-6}
-EVERYTHING = Faults(lost=0.03, duplicated=0.05, outliers=0.02, low_score=0.02, not_finite=0.02,
-                    unknown_mark=0.02, clock_step_s=0.1555, encoder_gap_s=0.3)
+EVERYTHING = Faults(
+    lost=0.03,
+    duplicated=0.05,
+    outliers=0.02,
+    low_score=0.02,
+    not_finite=0.02,
+    unknown_mark=0.02,
+    clock_step_s=0.1555,
+    encoder_gap_s=0.3,
+)
 
 
 def spoilt_events(**settings):
     cell = scene("0, 90, tx", line=True, repeats=3, **NOISY, **settings)
-    arrivals, _ = apply_faults(sorted(cell.events, key=lambda e: e.stamp_ns), EVERYTHING,
-                               np.random.default_rng(8))
+    arrivals, _ = apply_faults(
+        sorted(cell.events, key=lambda e: e.stamp_ns), EVERYTHING, np.random.default_rng(8)
+    )
     return [event for _, event in arrivals]
 
 
@@ -378,8 +427,13 @@ def test_collecting_early_does_not_change_what_is_collected_later():
     with pytest.raises(NoDataError):
         collector.collect()
     for event in events[1:6] + events[40:]:
-        (collector.add_command if isinstance(event, Command) else
-         collector.add_detection if isinstance(event, Detection) else collector.add_encoder)(event)
+        (
+            collector.add_command
+            if isinstance(event, Command)
+            else collector.add_detection
+            if isinstance(event, Detection)
+            else collector.add_encoder
+        )(event)
         if collector.timeline.artifact is not None and isinstance(event, Detection):
             collector.collect()
     found, _ = collector.collect()

@@ -11,11 +11,18 @@ from selfcal_ros.model.artifact import Artifact
 from test.support.collecting import collect, gathered, scene, table
 
 ODD = [
-    ({"translation_m": (1e17, 0.0)}, {}, "view '0' translation: 1e+19 pitches are "
-     "beyond every field; is it in mm? give the translation in metres"),
+    (
+        {"translation_m": (1e17, 0.0)},
+        {},
+        "view '0' translation: 1e+19 pitches are "
+        "beyond every field; is it in mm? give the translation in metres",
+    ),
     ({"translation_m": (0.0, -1e300)}, {}, "view '0' translation: -"),
-    ({"grid": False, "angular": False}, {},
-     "view command 0: neither grid nor angular marks are requested; set one to true"),
+    (
+        {"grid": False, "angular": False},
+        {},
+        "view command 0: neither grid nor angular marks are requested; set one to true",
+    ),
     ({"repeats": 2**32 - 1}, {}, "view command 0: 4294967295 repeats; ask for 1 to 1000000"),
     ({"repeats": 0}, {}, "view command 0: 0 repeats; ask for 1 to 1000000"),
     ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 1000 views; "),
@@ -43,11 +50,16 @@ def test_limits_themselves_are_kept():
     cell = scene(count=0)
     measure = cell.commands[1]
     collector = gathered([])
-    collector.add_command(replace(measure, view_index=1000, views_planned=1000,
-                                  view=replace(measure.view, repeats=1_000_000)))
+    collector.add_command(
+        replace(
+            measure,
+            view_index=1000,
+            views_planned=1000,
+            view=replace(measure.view, repeats=1_000_000),
+        )
+    )
     collector.add_command(Command(0, Phase.ABORT, "p", 1000))
-    collector.add_command(replace(measure, view=replace(
-        measure.view, translation_m=(1000.0, 0.0))))
+    collector.add_command(replace(measure, view=replace(measure.view, translation_m=(1000.0, 0.0))))
     assert collector.received["command"] == 3
 
 
@@ -74,9 +86,18 @@ def test_minus_zero_is_zero(field):
     assert table(found.views[0]) == table(want.views[0])
 
 
-@pytest.mark.parametrize(("run_id", "good"), [
-    ("", True), ("x", True), ("50", True), ("49", True), ("51", False), ("9" * 20, False),
-    ("9" * 21, True)])
+@pytest.mark.parametrize(
+    ("run_id", "good"),
+    [
+        ("", True),
+        ("x", True),
+        ("50", True),
+        ("49", True),
+        ("51", False),
+        ("9" * 20, False),
+        ("9" * 21, True),
+    ],
+)
 def test_a_run_does_not_begin_after_its_own_command(run_id, good):
     ends = Command(50, Phase.DONE, "p", run_id=run_id)
     if good:

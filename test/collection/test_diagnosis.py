@@ -24,21 +24,23 @@ S = 1_000_000_000
 def findings(events, **parameters):
     """Return view_index (None = all) -> the line that is said."""
     collector = gathered(events, **parameters)
-    return {index: str(finding)
-            for index, finding in collector.findings(*collector.collect()).items()}
+    return {
+        index: str(finding) for index, finding in collector.findings(*collector.collect()).items()
+    }
 
 
 def with_positions(cell, change):
     """Let every encoder sample indicate change(x, y)."""
-    cell.samples = [replace(s, positions=(*change(*s.positions[:2]), s.positions[2]))
-                    for s in cell.samples]
+    cell.samples = [
+        replace(s, positions=(*change(*s.positions[:2]), s.positions[2])) for s in cell.samples
+    ]
     return cell.events
 
 
 def with_changed_ids(cell, change, view=None):
     """Let the detections of a view (None = all) have the ids change(m, n)."""
     stamps = [*(c.stamp_ns for c in cell.commands[::2]), 1 << 62]
-    begin, end = (0, stamps[-1]) if view is None else stamps[view:view + 2]
+    begin, end = (0, stamps[-1]) if view is None else stamps[view : view + 2]
     for index, d in enumerate(cell.detections):
         if begin < d.stamp_ns < end:
             m, n = change(d.m, d.n)
@@ -58,10 +60,13 @@ def test_nothing_is_said_of_good_readings():
 def test_joints_of_other_names_are_named():
     cell = scene(count=0)
     cell.samples = [replace(s, names=("X1", "Y1", "theta")) for s in cell.samples]
-    assert findings(cell.events) == {None: (
-        "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample of the "
-        "joint 'x', 'y' arrived; joints received: 'theta', 'X1', 'Y1'; set joint_x, joint_y, "
-        "joint_theta")}
+    assert findings(cell.events) == {
+        None: (
+            "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample of the "
+            "joint 'x', 'y' arrived; joints received: 'theta', 'X1', 'Y1'; set joint_x, joint_y, "
+            "joint_theta"
+        )
+    }
     cell.samples = [replace(s, names=("x", "Y1", "theta")) for s in cell.samples]
     assert "'y' arrived; joints received: 'x', 'theta', 'Y1';" in findings(cell.events)[None]
     cell.samples = []
@@ -72,46 +77,62 @@ def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
     cell = scene("0", line=True)
     samples = cell.samples
     for names, came in ((("x", "y", "rz"), "'x', 'y', 'rz'"), (("x", "y"), "'x', 'y'")):
-        cell.samples = [replace(s, names=names, positions=s.positions[:len(names)])
-                        for s in samples]
+        cell.samples = [
+            replace(s, names=names, positions=s.positions[: len(names)]) for s in samples
+        ]
         found = findings(cell.events)
         assert list(found) == [1]
         assert found[1].startswith(
             "8 of 8 detections were rejected as no_encoder_sample_near: no encoder sample of the "
-            f"joint 'theta' arrived; joints received: {came};")
+            f"joint 'theta' arrived; joints received: {came};"
+        )
 
 
 @pytest.mark.parametrize("sense", list(Sense))
 def test_the_other_sense(sense):
     other = next(s for s in Sense if s is not sense)
-    assert findings(scene(count=0, sense=sense).events, measurement_sense=str(other)) == {None: (
-        "24 of 25 detections were rejected as stage_not_at_mark: the "
-        "plate lies turned by 180°, "
-        "not by 0° (or its ids are those of other marks); turn it as "
-        "planned and measure this view "
-        "again, or correct its pose in the plan; or, if it lies as "
-        "planned: the stage is indicated "
-        "at minus the marks' sites; the "
-        f"sense is reversed: measurement_sense {sense} (--sense {sense})")}
+    assert findings(scene(count=0, sense=sense).events, measurement_sense=str(other)) == {
+        None: (
+            "24 of 25 detections were rejected as stage_not_at_mark: the "
+            "plate lies turned by 180°, "
+            "not by 0° (or its ids are those of other marks); turn it as "
+            "planned and measure this view "
+            "again, or correct its pose in the plan; or, if it lies as "
+            "planned: the stage is indicated "
+            "at minus the marks' sites; the "
+            f"sense is reversed: measurement_sense {sense} (--sense {sense})"
+        )
+    }
 
 
 def test_the_only_view_asks_for_the_pose_before_the_joints():
     """A plate at 90 degrees looks like exchanged joints of which one has the wrong sign."""
     text = findings(with_positions(scene(count=0), lambda x, y: (-y, x)))[None]
     assert text.index("the plate lies turned by 90°, not by 0°") < text.index(
-        "or, if it lies as planned: x and y are exchanged and y is indicated with the wrong sign")
+        "or, if it lies as planned: x and y are exchanged and y is indicated with the wrong sign"
+    )
 
 
-@pytest.mark.parametrize(("change", "text"), [
-    (lambda x, y: (y, x), "x and y are exchanged; exchange joint_x and joint_y"),
-    (lambda x, y: (-x, y), "x is indicated with the wrong sign; reverse the sign of x"),
-    (lambda x, y: (x, -y), "y is indicated with the wrong sign; reverse the sign of y"),
-    (lambda x, y: (1e3 * x, 1e3 * y), "the indicated positions are 1000 times those of the "
-     "marks: they are in mm; publish joint positions in metres"),
-    (lambda x, y: (1e6 * x, 1e6 * y), "a million times those of the marks: they are in µm"),
-    (lambda x, y: (1e-3 * x, 1e-3 * y), "a thousandth of those of the marks"),
-    (lambda x, y: (1e3 * y, 1e3 * x), "they are in mm and x and y are exchanged; publish joint "
-     "positions in metres, and exchange joint_x and joint_y")])
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda x, y: (y, x), "x and y are exchanged; exchange joint_x and joint_y"),
+        (lambda x, y: (-x, y), "x is indicated with the wrong sign; reverse the sign of x"),
+        (lambda x, y: (x, -y), "y is indicated with the wrong sign; reverse the sign of y"),
+        (
+            lambda x, y: (1e3 * x, 1e3 * y),
+            "the indicated positions are 1000 times those of the "
+            "marks: they are in mm; publish joint positions in metres",
+        ),
+        (lambda x, y: (1e6 * x, 1e6 * y), "a million times those of the marks: they are in µm"),
+        (lambda x, y: (1e-3 * x, 1e-3 * y), "a thousandth of those of the marks"),
+        (
+            lambda x, y: (1e3 * y, 1e3 * x),
+            "they are in mm and x and y are exchanged; publish joint "
+            "positions in metres, and exchange joint_x and joint_y",
+        ),
+    ],
+)
 def test_positions_that_are_not_what_they_should_be(change, text):
     found = findings(with_positions(scene(count=0, servo_sigma_m=0.0), change))[None]
     assert text in found
@@ -125,36 +146,62 @@ def test_a_placed_plate_is_diagnosed_as_one_on_the_lattice():
     assert found.endswith("x is indicated with the wrong sign; reverse the sign of x")
 
 
-@pytest.mark.parametrize(("deg", "shift", "text"), [
-    (-37, (0.013, -0.007), "the plate lies turned by 323°, not by 37° {ids}; turn it counter-"),
-    (127, (0.013, -0.007), "the plate lies turned by 127°, not by 37° {ids}; turn it as planned "),
-    (307.6, (0.013, -0.007), "the plate lies turned by 307°, not by 37° {ids}; turn it as "),
-    (0, (0.013, -0.007), "the plate lies turned by 0°, not by 37° {ids}; turn it as planned "),
-    (37, (0.0, 0.0), "the plate lies shifted by (+0, +0) pitches, not by (+1.3, -0.7) pitches "
-     "{ids}; "),
-    (37, (-0.013, 0.007), "the plate lies shifted by (-1.3, +0.7) pitches, not by (+1.3, -0.7)")])
+@pytest.mark.parametrize(
+    ("deg", "shift", "text"),
+    [
+        (-37, (0.013, -0.007), "the plate lies turned by 323°, not by 37° {ids}; turn it counter-"),
+        (
+            127,
+            (0.013, -0.007),
+            "the plate lies turned by 127°, not by 37° {ids}; turn it as planned ",
+        ),
+        (307.6, (0.013, -0.007), "the plate lies turned by 307°, not by 37° {ids}; turn it as "),
+        (0, (0.013, -0.007), "the plate lies turned by 0°, not by 37° {ids}; turn it as planned "),
+        (
+            37,
+            (0.0, 0.0),
+            "the plate lies shifted by (+0, +0) pitches, not by (+1.3, -0.7) pitches {ids}; ",
+        ),
+        (
+            37,
+            (-0.013, 0.007),
+            "the plate lies shifted by (-1.3, +0.7) pitches, not by (+1.3, -0.7)",
+        ),
+    ],
+)
 def test_ids_show_how_a_placed_plate_lies(deg, shift, text):
     """In one view; the others are placed as planned."""
     plan = placed_plan(7)
     lies = (None, None, View("37", np.deg2rad(deg), shift), None)
     rng = np.random.default_rng(3)
     truth = replace(random_truth(plan.artifact, 4, rng), placed=lies)
-    found = findings(plan_events(truth, plan, settings=CellSettings(follow_mark=True), rng=rng,
-                                 start_ns=START_NS))
+    found = findings(
+        plan_events(
+            truth, plan, settings=CellSettings(follow_mark=True), rng=rng, start_ns=START_NS
+        )
+    )
     assert list(found) == [2]
     ids = "(or its ids are those of other marks)"
     assert f": {text.format(ids=ids)}" in found[2]
-    assert found[2].endswith("other views are as planned: leave the joints and the sense as they "
-                             "are")
+    assert found[2].endswith(
+        "other views are as planned: leave the joints and the sense as they are"
+    )
 
 
-@pytest.mark.parametrize(("change", "text"), [
-    (lambda m, n: (n, m), "the ids have m and n exchanged, or the plate lies upside down"),
-    (lambda m, n: (-n, -m), "the ids have m and n exchanged and both reversed, or"),
-    (lambda m, n: (-m, n), "the ids have m reversed, or the plate lies upside down"),
-    (lambda m, n: (m, -n), "the ids have n reversed, or the plate lies upside down"),
-    (lambda m, n: (-m, -n), "the plate lies turned by 270°, not by 90° (or its ids are those of"),
-    (lambda m, n: (m + 1, n), "the plate lies shifted by (+0, -1) pitches, not by (+0, +0)")])
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda m, n: (n, m), "the ids have m and n exchanged, or the plate lies upside down"),
+        (lambda m, n: (-n, -m), "the ids have m and n exchanged and both reversed, or"),
+        (lambda m, n: (-m, n), "the ids have m reversed, or the plate lies upside down"),
+        (lambda m, n: (m, -n), "the ids have n reversed, or the plate lies upside down"),
+        (
+            lambda m, n: (-m, -n),
+            "the plate lies turned by 270°, not by 90° (or its ids are those of",
+        ),
+        (lambda m, n: (m + 1, n), "the plate lies shifted by (+0, -1) pitches, not by (+0, +0)"),
+    ],
+)
 def test_ids_of_one_view_do_not_blame_the_joints(change, text):
     """The joints are right in the other views: to change them would break these."""
     cell = scene("0, 90, tx", count=0)
@@ -177,8 +224,10 @@ def test_offsets_that_are_no_numbers_do_not_hide_the_ids_of_a_view(value):
 def test_ids_mirrored_in_all_views_may_be_the_joints():
     found = findings(with_changed_ids(scene("0, 90, tx", count=0), lambda m, n: (n, m)))
     assert list(found) == [None]
-    assert "the ids have m and n exchanged, or the plate lies upside down; correct the ids" in (
-        found[None])
+    assert (
+        "the ids have m and n exchanged, or the plate lies upside down; correct the ids"
+        in (found[None])
+    )
 
 
 def test_exchanged_views_are_named_in_both():
@@ -186,8 +235,11 @@ def test_exchanged_views_are_named_in_both():
     lies = (None, plan.views[2], plan.views[1], None)
     rng = np.random.default_rng(3)
     truth = replace(random_truth(plan.artifact, 4, rng), placed=lies)
-    found = findings(plan_events(truth, plan, settings=CellSettings(follow_mark=True), rng=rng,
-                                 start_ns=START_NS))
+    found = findings(
+        plan_events(
+            truth, plan, settings=CellSettings(follow_mark=True), rng=rng, start_ns=START_NS
+        )
+    )
     assert sorted(found) == [1, 2]
     for index, other in ((1, "37"), (2, "90")):
         assert f"as planned for view '{other}'" in found[index]
@@ -196,8 +248,11 @@ def test_exchanged_views_are_named_in_both():
 
 def test_mm_are_named_though_the_stage_seems_to_jump():
     rng = np.random.default_rng(1)
-    found = findings(with_positions(scene(count=0), lambda x, y: tuple(
-        1e3 * np.array([x, y]) + rng.normal(0, 2e-4, 2))))[None]
+    found = findings(
+        with_positions(
+            scene(count=0), lambda x, y: tuple(1e3 * np.array([x, y]) + rng.normal(0, 2e-4, 2))
+        )
+    )[None]
     assert "rejected as encoder_contradiction: the indicated positions are 1000 times" in found
     assert "they are in mm" in found
 
@@ -207,7 +262,8 @@ def test_a_parked_stage():
     assert found == (
         "25 of 25 detections were rejected as stage_not_at_mark: the stage did not move: it is "
         "indicated at x = 0.0301 m, y = -0.002 m at all of them; name the joints that move, in "
-        "joint_x and joint_y")
+        "joint_x and joint_y"
+    )
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -216,8 +272,9 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
     cell = scene(count=0, repeats=3, sense=sense)
     last = cell.detections[30].stamp_ns
     place = next(s.positions for s in cell.samples if s.stamp_ns > last)
-    cell.samples = [s if s.stamp_ns < last else replace(s, positions=place, velocities=())
-                    for s in cell.samples]
+    cell.samples = [
+        s if s.stamp_ns < last else replace(s, positions=place, velocities=()) for s in cell.samples
+    ]
     found = findings(cell.events, measurement_sense=str(sense))[None]
     where = f"x = {place[0]:.6g} m, y = {place[1]:.6g} m"
     assert f"stage_not_at_mark: the stage has stopped: it is indicated at {where} at each" in found
@@ -225,9 +282,14 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
 
 
 @pytest.mark.parametrize("sense", list(Sense))
-@pytest.mark.parametrize(("exposures", "where"), [
-    (1, "the mark 1 detection later"), (3, "the mark 3 detections later"),
-    (-2, "the mark 2 detections earlier")])
+@pytest.mark.parametrize(
+    ("exposures", "where"),
+    [
+        (1, "the mark 1 detection later"),
+        (3, "the mark 3 detections later"),
+        (-2, "the mark 2 detections earlier"),
+    ],
+)
 def test_stamps_of_another_exposure(exposures, where, sense):
     cell = scene(count=0, repeats=3, sense=sense)
     step = cell.detections[1].stamp_ns - cell.detections[0].stamp_ns
@@ -238,14 +300,24 @@ def test_stamps_of_another_exposure(exposures, where, sense):
     assert found.endswith("with the time of the exposure, by one clock")
 
 
-@pytest.mark.parametrize(("positions", "said"), [
-    ((), "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample came "
-     "that can be used, {} were rejected as "
-     "encoder_sample_malformed; give each name of a joint "
-     "state its position"),
-    ((np.nan, np.inf, np.nan), "25 of 25 detections were rejected as no_encoder_sample_near: no "
-     "encoder sample came that can be used, {} were rejected as encoder_sample_not_finite; "
-     "publish positions that are finite")])
+@pytest.mark.parametrize(
+    ("positions", "said"),
+    [
+        (
+            (),
+            "25 of 25 detections were rejected as no_encoder_sample_near: no encoder sample came "
+            "that can be used, {} were rejected as "
+            "encoder_sample_malformed; give each name of a joint "
+            "state its position",
+        ),
+        (
+            (np.nan, np.inf, np.nan),
+            "25 of 25 detections were rejected as no_encoder_sample_near: no "
+            "encoder sample came that can be used, {} were rejected as encoder_sample_not_finite; "
+            "publish positions that are finite",
+        ),
+    ],
+)
 def test_joint_states_that_cannot_be_used(positions, said):
     cell = scene(count=0)
     cell.samples = [replace(s, positions=positions, velocities=()) for s in cell.samples]
@@ -258,26 +330,33 @@ def test_positions_that_nothing_explains():
     assert "m from the sites of the detected marks (median); check joint_x" in found
 
 
-@pytest.mark.parametrize(("ahead_s", "side"), [(5.0, "after"), (37.0, "after"),
-                                               (-3600.0, "before")])
+@pytest.mark.parametrize(
+    ("ahead_s", "side"), [(5.0, "after"), (37.0, "after"), (-3600.0, "before")]
+)
 def test_a_clock_of_its_own(ahead_s, side):
     cell = scene(count=0)
     shift = round(ahead_s * S)
     cell.samples = [replace(s, stamp_ns=s.stamp_ns - shift) for s in cell.samples]
-    assert findings(cell.events) == {None: (
-        "25 of 25 detections were rejected as "
-        "no_encoder_sample_near: the detections are stamped "
-        f"about {abs(ahead_s):g} s {side} the encoder samples; stamp both by one clock")}
+    assert findings(cell.events) == {
+        None: (
+            "25 of 25 detections were rejected as "
+            "no_encoder_sample_near: the detections are stamped "
+            f"about {abs(ahead_s):g} s {side} the encoder samples; stamp both by one clock"
+        )
+    }
 
 
-@pytest.mark.parametrize(("ahead_s", "side"), [(37.0, "after the last"),
-                                               (-37.0, "before the first")])
+@pytest.mark.parametrize(
+    ("ahead_s", "side"), [(37.0, "after the last"), (-37.0, "before the first")]
+)
 def test_commands_by_another_clock(ahead_s, side):
     cell = scene(count=0)
     cell.commands = [replace(c, stamp_ns=c.stamp_ns - round(ahead_s * S)) for c in cell.commands]
     found = findings(cell.events)[None]
-    assert found.startswith("25 of 25 detections were rejected as outside_every_view: all "
-                            f"detections are stamped {side} view command, about 37 s off; sync")
+    assert found.startswith(
+        "25 of 25 detections were rejected as outside_every_view: all "
+        f"detections are stamped {side} view command, about 37 s off; sync"
+    )
 
 
 def test_an_encoder_that_sends_too_seldom():
@@ -285,7 +364,8 @@ def test_an_encoder_that_sends_too_seldom():
     cell.samples = cell.samples[::75]
     assert findings(cell.events)[None].endswith(
         "the encoder sends a sample every 0.15 s, and max_encoder_gap is 0.1 s; send them more "
-        "often, or raise max_encoder_gap")
+        "often, or raise max_encoder_gap"
+    )
 
 
 def test_a_view_is_named_where_the_session_as_a_whole_is_good():
@@ -295,8 +375,9 @@ def test_a_view_is_named_where_the_session_as_a_whole_is_good():
     for index, d in enumerate(cell.detections):
         if begin < d.stamp_ns < end:
             cell.spoil(index, m=77)
-    assert findings(cell.events) == {1: "25 of 25 detections were rejected as unknown_mark: "
-                                     + REMEDY[Reason.UNKNOWN_MARK]}
+    assert findings(cell.events) == {
+        1: "25 of 25 detections were rejected as unknown_mark: " + REMEDY[Reason.UNKNOWN_MARK]
+    }
 
 
 def test_what_is_no_fault_does_not_count():
@@ -318,11 +399,18 @@ def test_every_reason_has_its_remedy_without_further_evidence(reason):
 
 def test_marks_on_one_line_do_not_tell_x_from_y():
     marks = np.arange(-5, 6).astype(complex)
-    named = NamedMarks("0", View("0", 0.0, (0.0, 0.0)).on_stage(Artifact(11, 0.01, 0)), marks,
-                       -marks, 0 * marks, 0 * marks)
+    named = NamedMarks(
+        "0",
+        View("0", 0.0, (0.0, 0.0)).on_stage(Artifact(11, 0.01, 0)),
+        marks,
+        -marks,
+        0 * marks,
+        0 * marks,
+    )
     assert named.away(-marks) > 1
-    told = diagnose(Evidence({"stage_not_at_mark": 10}, 0, marks=(named,), pitch_m=0.01,
-                             limit_m=0.006))
+    told = diagnose(
+        Evidence({"stage_not_at_mark": 10}, 0, marks=(named,), pitch_m=0.01, limit_m=0.006)
+    )
     assert told.text == REMEDY[Reason.NOT_AT_MARK]
 
 
@@ -347,9 +435,12 @@ def test_an_encoder_that_ends_early_is_not_another_clock():
 
 def declared(cell, *size):
     """Return the messages with another number of marks in the plan, e.g. 8 or 8, 5."""
-    commands = [c if c.artifact is None else replace(
-        c, artifact=replace(c.artifact, grid_size=size[0], grid_size_y=(*size, 0)[1]))
-        for c in cell.commands]
+    commands = [
+        c
+        if c.artifact is None
+        else replace(c, artifact=replace(c.artifact, grid_size=size[0], grid_size_y=(*size, 0)[1]))
+        for c in cell.commands
+    ]
     return [*commands, *cell.samples, *cell.detections]
 
 
@@ -368,17 +459,27 @@ def test_an_encoder_that_stands_still_in_the_middle_of_a_small_plate():
     stop = cell.detections[13]  # of the second pass over nine marks, the fifth
     place = next(s.positions for s in cell.samples if s.stamp_ns > stop.stamp_ns)
     assert (stop.m, stop.n) == (0, 0)
-    cell.samples = [s if s.stamp_ns < stop.stamp_ns else replace(s, positions=place, velocities=())
-                    for s in cell.samples]
+    cell.samples = [
+        s if s.stamp_ns < stop.stamp_ns else replace(s, positions=place, velocities=())
+        for s in cell.samples
+    ]
     assert "the stage has stopped: it is indicated at" in findings(cell.events)[None]
 
 
-@pytest.mark.parametrize(("plate", "size", "said"), [
-    ((7,), (5,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 5 x 5; corr"),
-    ((7,), (9,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 9 x 9; corr"),
-    ((6,), (7,), "the ids are those of 6 x 6 marks (m -3 to 2, n -3 to 2), not of 7 x 7; corr"),
-    ((7, 5), (5, 7), "those of 7 x 5 marks (m -3 to 3, n -2 to 2), not of 5 x 7 (the sides are "
-                     "exchanged); correct grid_size in the plan")])
+@pytest.mark.parametrize(
+    ("plate", "size", "said"),
+    [
+        ((7,), (5,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 5 x 5; corr"),
+        ((7,), (9,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 9 x 9; corr"),
+        ((6,), (7,), "the ids are those of 6 x 6 marks (m -3 to 2, n -3 to 2), not of 7 x 7; corr"),
+        (
+            (7, 5),
+            (5, 7),
+            "those of 7 x 5 marks (m -3 to 3, n -2 to 2), not of 5 x 7 (the sides are "
+            "exchanged); correct grid_size in the plan",
+        ),
+    ],
+)
 def test_a_plate_of_another_size_is_named_by_its_ids(plate, size, said):
     plan = plan_of("0, 180, tx, ty", plate[0], size_y=(*plate, 0)[1])
     events = declared(scene(plan), *size)
@@ -412,6 +513,7 @@ def test_the_cause_of_many_rejections_is_stated_with_a_result():
     assert rejections({"unknown_mark": 10, "duplicate": 500, "stage_moving": 99}, 90) == []
     assert rejections({"low_score": 4, "unknown_mark": 8}, 90) == [
         f"12 of 102 detections were rejected, 8 of them as unknown_mark: "
-        f"{REMEDY[Reason.UNKNOWN_MARK]}"]
+        f"{REMEDY[Reason.UNKNOWN_MARK]}"
+    ]
     (line,) = rejections({"from_the_future": 50}, 50)
     assert line.startswith("50 detections rejected as from_the_future")

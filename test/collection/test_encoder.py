@@ -58,8 +58,15 @@ def test_an_exact_stamp_gives_the_sample_itself():
 def test_outside_the_samples_and_in_gaps_there_is_no_position():
     joint = track([(0, 0.0), (1, 0.0), (101.001, 0.0), (102, 0.0), (202, 0.0)])
     positions, reasons = ask(joint, -0.001, 0.5, 50, 101.5, 150, 202, 202.001)
-    assert reasons == [Reason.NO_ENCODER, None, Reason.NO_ENCODER, None, None, None,
-                       Reason.NO_ENCODER]
+    assert reasons == [
+        Reason.NO_ENCODER,
+        None,
+        Reason.NO_ENCODER,
+        None,
+        None,
+        None,
+        Reason.NO_ENCODER,
+    ]
     assert [math.isnan(p) for p in positions] == [True, False, True, False, False, False, True]
 
 
@@ -86,9 +93,16 @@ def test_a_speed_just_below_the_limit_is_at_rest():
     assert ask(track([(0, 0.0), (10, 0.0101)]), 5)[1] == [Reason.MOVING]
 
 
-@pytest.mark.parametrize(("speeds", "reason"), [
-    ((0.0, 0.0), None), ((1.1, 0.0), Reason.MOVING), ((0.0, -1.1), Reason.MOVING),
-    ((NAN, 1.1), None), ((math.inf, 0.0), None)])
+@pytest.mark.parametrize(
+    ("speeds", "reason"),
+    [
+        ((0.0, 0.0), None),
+        ((1.1, 0.0), Reason.MOVING),
+        ((0.0, -1.1), Reason.MOVING),
+        ((NAN, 1.1), None),
+        ((math.inf, 0.0), None),
+    ],
+)
 def test_told_speeds_count_where_both_samples_tell_them(speeds, reason):
     joint = track([(0, 0.0, speeds[0]), (10, 0.0, speeds[1])])
     assert ask(joint, 5)[1] == [reason]
@@ -129,16 +143,34 @@ def test_an_angle_is_interpolated_across_the_seam():
     assert ask(straight, 5)[1] == [Reason.MOVING]
 
 
-@pytest.mark.parametrize(("angles", "reason"), [
-    ((0.0, 2 * math.pi), None), ((0.0, math.pi), Reason.CONTRADICTION),
-    ((0.0, math.pi, 2 * math.pi), Reason.CONTRADICTION)])
+@pytest.mark.parametrize(
+    ("angles", "reason"),
+    [
+        ((0.0, 2 * math.pi), None),
+        ((0.0, math.pi), Reason.CONTRADICTION),
+        ((0.0, math.pi, 2 * math.pi), Reason.CONTRADICTION),
+    ],
+)
 def test_angles_of_one_stamp_agree_on_the_circle(angles, reason):
     joint = track([(0, 0.0), (20, 0.0), *((10, angle) for angle in angles)], CIRCLE)
     assert ask(joint, 10)[1] == [reason]
 
 
-@given(st.permutations([(0, 0.0), (10, 1e-3), (10, 1e-3), (20, 5e-2, 0.0), (20, 5e-2, 2.0),
-                        (30, 2e-3), (40, 2e-3), (40, 3e-3), (200, 0.0)]))
+@given(
+    st.permutations(
+        [
+            (0, 0.0),
+            (10, 1e-3),
+            (10, 1e-3),
+            (20, 5e-2, 0.0),
+            (20, 5e-2, 2.0),
+            (30, 2e-3),
+            (40, 2e-3),
+            (40, 3e-3),
+            (200, 0.0),
+        ]
+    )
+)
 def test_the_order_of_arrival_changes_nothing(samples):
     at = [-1, 0, 3, 10, 15, 20, 25, 35, 40, 41, 100, 200]
     want = track(sorted(samples))

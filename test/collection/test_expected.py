@@ -47,8 +47,11 @@ def test_missing_marks_of_a_placed_plate_are_named(turn, a, b, read):
     view = View("v", turn, (a * 0.01, b * 0.01), angular=False)
     inside = view.pose.in_field(plate)
     done = inside & (read >> np.arange(25) & 1 > 0).reshape(5, 5)
-    missing = missing_marks(plate, view, ViewReadings(
-        view, plate.m[done], plate.n[done], count=np.ones(done.sum(), dtype=int)))
+    missing = missing_marks(
+        plate,
+        view,
+        ViewReadings(view, plate.m[done], plate.n[done], count=np.ones(done.sum(), dtype=int)),
+    )
     lost = inside & ~done
     assert missing == Missing(tuple(plate.m[lost].tolist()), tuple(plate.n[lost].tolist()))
     assert expected_marks(plate, view) == (inside.sum(), 0)
@@ -93,8 +96,9 @@ def test_a_large_plate_of_which_little_was_read_takes_no_room():
 def test_a_view_of_lines_alone_lacks_no_grid_marks():
     view = View("v", np.pi / 12, grid=False)
     plate = Artifact(5, 0.01, 24)
-    missing = missing_marks(plate, view, ViewReadings(view, k=np.array([0, 2]),
-                                                      count_theta=np.array([1, 1])))
+    missing = missing_marks(
+        plate, view, ViewReadings(view, k=np.array([0, 2]), count_theta=np.array([1, 1]))
+    )
     assert (missing.m, missing.n) == ((), ())
     assert missing.k == (1, *range(3, 24))
 
@@ -113,15 +117,21 @@ OFF_M = 1e-4
 def with_outliers(repeats, marks, lines=(), **settings):
     """Return a scene in which so many repeats of the first marks and lines are outliers."""
     cell = scene(repeats=repeats, sigma_xy_m=2e-8, sigma_theta_rad=2e-6)
-    for field, kind, numbers, by in (("offset_x", Kind.GRID, marks, OFF_M),
-                                     ("offset_theta", Kind.ANGULAR, lines, 1e-2)):
+    for field, kind, numbers, by in (
+        ("offset_x", Kind.GRID, marks, OFF_M),
+        ("offset_theta", Kind.ANGULAR, lines, 1e-2),
+    ):
         for mark, count in enumerate(numbers):
             named = sorted({(d.m, d.n, d.k) for d in cell.detections if d.kind == kind})[mark]
-            mine = [i for i, d in enumerate(cell.detections)
-                    if d.kind == kind and (d.m, d.n, d.k) == named]
+            mine = [
+                i
+                for i, d in enumerate(cell.detections)
+                if d.kind == kind and (d.m, d.n, d.k) == named
+            ]
             for turn, index in enumerate(mine[:count]):
-                cell.spoil(index, **{field: getattr(cell.detections[index], field)
-                                     + by * (1 + turn)})
+                cell.spoil(
+                    index, **{field: getattr(cell.detections[index], field) + by * (1 + turn)}
+                )
     return cell
 
 
@@ -131,11 +141,19 @@ def test_outliers_do_not_keep_a_mark_open_where_enough_is_left(least):
     cell = with_outliers(5, (1, 2, 3))
     _, progress = collect(cell.events, min_repeats=least)
     found = progress[0]
-    counts = dict(zip(zip(found.readings.m.tolist(), found.readings.n.tolist(), strict=True),
-                      found.readings.count.tolist(), strict=True))
+    counts = dict(
+        zip(
+            zip(found.readings.m.tolist(), found.readings.n.tolist(), strict=True),
+            found.readings.count.tolist(),
+            strict=True,
+        )
+    )
     assert counts[-2, -2] == 4 and counts[-2, -1] == 3 and (-2, 0) not in counts
-    wanted = [mark for mark, count in (((-2, -2), 4), ((-2, -1), 3), ((-2, 0), 0))
-              if count < (least or 5) or count < 1]
+    wanted = [
+        mark
+        for mark, count in (((-2, -2), 4), ((-2, -1), 3), ((-2, 0), 0))
+        if count < (least or 5) or count < 1
+    ]
     assert list(zip(found.missing.m, found.missing.n, strict=True)) == wanted
     assert found.grid_done == 25 - len(wanted)
     assert not found.complete

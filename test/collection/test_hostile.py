@@ -25,8 +25,14 @@ def stepped_between_views(count, seed):
     place, measure = (c for c in cell.commands if c.view is not None and c.view_index == 1)
     last = [d for d in cell.detections if d.stamp_ns < place.stamp_ns][-1]
     step = measure.stamp_ns - last.stamp_ns + 5 * MS
-    return cell, last, [replace(e, stamp_ns=e.stamp_ns - step)
-                        if e.stamp_ns >= place.stamp_ns else e for e in cell.events]
+    return (
+        cell,
+        last,
+        [
+            replace(e, stamp_ns=e.stamp_ns - step) if e.stamp_ns >= place.stamp_ns else e
+            for e in cell.events
+        ],
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 5, 8])
@@ -69,14 +75,14 @@ def test_few_repeats_of_clean_readings_are_kept_beside_the_scatter_of_marks():
 def test_few_repeats_are_judged_only_beside_enough_marks():
     key, values = np.array([0, 1, 2, 0]), np.array([[1.0, -1.0, 1.0, 90.0]]) * 1e-7
     for residual in (None, values):
-        assert not reduce_repeats(key, values, np.zeros(4), limit=6.0,
-                                  residual=residual).outlier.any()
+        assert not reduce_repeats(
+            key, values, np.zeros(4), limit=6.0, residual=residual
+        ).outlier.any()
     key = np.append(np.arange(20), 0)
     values = np.append(np.tile([1.0, -1.0], 10), 90.0)[None] * 1e-7
     found = reduce_repeats(key, values, np.zeros(21), limit=6.0, residual=values)
     assert np.flatnonzero(found.outlier).tolist() == [0, 20]
-    assert not reduce_repeats(key, values, np.zeros(21), limit=0.0,
-                              residual=values).outlier.any()
+    assert not reduce_repeats(key, values, np.zeros(21), limit=0.0, residual=values).outlier.any()
 
 
 @pytest.mark.parametrize("shift_ns", [-START_NS, -2 * START_NS, 2**62])
@@ -97,8 +103,12 @@ def test_a_view_placed_and_moved_again_begins_anew_at_any_time(shift_ns):
     at = cell.detections[9].stamp_ns + 1
     other = replace(cell.commands[1].view, translation_m=(0.01, 0.0))
     place, measure, _ = cell.commands
-    events = [*cell.events, replace(measure, stamp_ns=at, view=other),
-              replace(place, stamp_ns=at + 1), replace(measure, stamp_ns=at + 2)]
+    events = [
+        *cell.events,
+        replace(measure, stamp_ns=at, view=other),
+        replace(place, stamp_ns=at + 1),
+        replace(measure, stamp_ns=at + 2),
+    ]
     found, progress = collect([replace(e, stamp_ns=e.stamp_ns + shift_ns) for e in events])
     assert found.all_rejected() == {"superseded_by_redo": 10}
     assert progress[0].view == cell.commands[1].view

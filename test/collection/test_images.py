@@ -42,8 +42,9 @@ def test_a_reading_has_the_error_of_the_stage_where_it_stands(sense):
         there = np.stack([(x - cx), (y - cy)]) * 1e-3 - sign * shot.truth.g[:, i, j]
         offset = place - beside - there
         at = view.visits.mark
-        np.testing.assert_allclose([view.visits.offset_x, view.visits.offset_y], offset[:, at],
-                                   atol=1e-14)
+        np.testing.assert_allclose(
+            [view.visits.offset_x, view.visits.offset_y], offset[:, at], atol=1e-14
+        )
         read += len(view.m)
         assert (view.count == 2).all()
         assert len(view.k) == (8 if (cx, cy) == (0, 0) else 0)
@@ -67,8 +68,9 @@ def test_the_order_of_arrival_changes_nothing():
         np.testing.assert_array_equal([one.dx, one.dy], [other.dx, other.dy])
 
 
-def displaced(plan, t_m, *, ids, follow=False, sense=Sense.MICROSCOPE_MOVES,
-              shown=lambda detection: True):
+def displaced(
+    plan, t_m, *, ids, follow=False, sense=Sense.MICROSCOPE_MOVES, shown=lambda detection: True
+):
     """Return truth, readings and progress of plates at `t_m`, from the detections `shown`."""
     shot = scene(plan, with_ids=ids, follow_mark=follow, sense=sense, t_m=t_m, **QUIET)
     kept = [d for d in shot.detections if shown(d)]
@@ -105,8 +107,10 @@ def test_the_map_of_a_displaced_plate_is_that_of_the_one_in_place(ids):
 @pytest.mark.parametrize("pixels", [0.75, 1.2])
 def test_a_camera_of_another_scale_loses_no_cell(pixels):
     shot = scene(PLAN, **QUIET)
-    moved = [replace(d, offset_x=pixels * d.offset_x, offset_y=pixels * d.offset_y)
-             for d in shot.detections]
+    moved = [
+        replace(d, offset_x=pixels * d.offset_x, offset_y=pixels * d.offset_y)
+        for d in shot.detections
+    ]
     measurements, _ = collect([*shot.commands, *shot.samples, *moved])
     assert not measurements.all_rejected()
     assert all(len(view.m) for view in measurements.views if view.view.grid)
@@ -114,8 +118,9 @@ def test_a_camera_of_another_scale_loses_no_cell(pixels):
 
 def test_of_a_part_of_the_image_ids_tell_the_cells():
     """Only the two left columns of each image are visible: they could be the two right ones."""
-    _, told, progress = displaced(PLAN, (0.6e-3, 0.0), ids=True,
-                                  shown=lambda d: d.offset_x < 1.1e-3)
+    _, told, progress = displaced(
+        PLAN, (0.6e-3, 0.0), ids=True, shown=lambda d: d.offset_x < 1.1e-3
+    )
     assert not told.all_rejected()
     assert {view.view.cell[0] for view in told.views if view.used and view.view.grid} == {-1, 0}
     assert not any(view.complete for view in list(progress.values())[:3])
@@ -130,8 +135,10 @@ def test_a_stage_that_follows_a_plate_a_pitch_away_is_named_and_no_mark_misnamed
 def test_four_columns_in_images_of_a_plan_of_three_are_counted():
     shot = scene(image_plan(7, marks=5), **QUIET)
     plan = image_plan(7, marks=3)
-    commands = [replace(c, view=replace(c.view, image=plan.views[0].image)) if c.view else c
-                for c in shot.commands]
+    commands = [
+        replace(c, view=replace(c.view, image=plan.views[0].image)) if c.view else c
+        for c in shot.commands
+    ]
     kept = [d for d in shot.detections if d.offset_x > -1.5e-3]
     measurements, _ = collect([*commands, *shot.samples, *kept])
     rejected = measurements.all_rejected()
@@ -144,8 +151,10 @@ def test_marks_beyond_the_image_of_the_plan_are_named():
     wide = scene(image_plan(7, marks=5), **QUIET)
     narrow = image_plan(7, marks=3)
     shown, _ = collect(scene(narrow, **QUIET).events)
-    commands = [replace(c, view=replace(c.view, image=narrow.views[0].image)) if c.view else c
-                for c in wide.commands]
+    commands = [
+        replace(c, view=replace(c.view, image=narrow.views[0].image)) if c.view else c
+        for c in wide.commands
+    ]
     measurements, _ = collect([*commands, *wide.samples, *wide.detections])
     rest = len(wide.detections) - sum(view.used for view in shown.views)
     assert measurements.all_rejected() == {str(Reason.OUTSIDE_IMAGE): rest}
@@ -155,8 +164,9 @@ def test_marks_beyond_the_image_of_the_plan_are_named():
 
 def test_without_an_image_in_the_plan_other_marks_are_named():
     shot = scene(image_plan(7), **QUIET)
-    commands = [replace(c, view=replace(c.view, image=None)) if c.view else c
-                for c in shot.commands]
+    commands = [
+        replace(c, view=replace(c.view, image=None)) if c.view else c for c in shot.commands
+    ]
     measurements, _ = collect([*commands, *shot.samples, *shot.detections])
     assert measurements.all_rejected() == {str(Reason.SEVERAL): len(shot.detections) - 2 * 49}
 

@@ -22,15 +22,24 @@ from selfcal_ros.model.readings import readings_digest, session_digest
 from selfcal_ros.simulation.spec import Faults, apply_faults
 from test.support.collecting import collect, digest, scene
 
-FAULTS = Faults(lost=0.02, duplicated=0.03, outliers=0.02, low_score=0.01, not_finite=0.01,
-                unknown_mark=0.01, clock_step_s=0.1555, encoder_gap_s=0.3)
+FAULTS = Faults(
+    lost=0.02,
+    duplicated=0.03,
+    outliers=0.02,
+    low_score=0.01,
+    not_finite=0.01,
+    unknown_mark=0.01,
+    clock_step_s=0.1555,
+    encoder_gap_s=0.3,
+)
 SMALL = Limits(block=32, in_memory=2)
 
 
 def a_session(repeats=2):
     cell = scene("0, 90, tx", line=True, repeats=repeats, sigma_xy_m=2e-8, sigma_theta_rad=2e-6)
-    arrivals, _ = apply_faults(sorted(cell.events, key=lambda e: e.stamp_ns), FAULTS,
-                               np.random.default_rng(5))
+    arrivals, _ = apply_faults(
+        sorted(cell.events, key=lambda e: e.stamp_ns), FAULTS, np.random.default_rng(5)
+    )
     redo = [replace(c, stamp_ns=c.stamp_ns + 70_000_000) for c in cell.commands[:2]]
     return [*(event for _, event in arrivals), *redo]
 
@@ -44,21 +53,34 @@ def fresh(store=SMALL, **parameters):
 
 
 def add(collector, event):
-    (collector.add_command if isinstance(event, Command) else collector.add_detection
-     if isinstance(event, Detection) else collector.add_encoder)(event)
+    (
+        collector.add_command
+        if isinstance(event, Command)
+        else collector.add_detection
+        if isinstance(event, Detection)
+        else collector.add_encoder
+    )(event)
 
 
 def digest_of(collector):
     measurements, progress = collector.collect()
-    return session_digest({index: readings_digest(item.readings, measurements.rejected)
-                           for index, item in progress.items()})
+    return session_digest(
+        {
+            index: readings_digest(item.readings, measurements.rejected)
+            for index, item in progress.items()
+        }
+    )
 
 
 def late(seed, spread):
     """Return the session with every message late by up to `spread` places."""
     draw = random.Random(seed)
-    return [event for _, event in sorted(
-        ((at + draw.uniform(0, spread), at), event) for at, event in enumerate(EVENTS))]
+    return [
+        event
+        for _, event in sorted(
+            ((at + draw.uniform(0, spread), at), event) for at, event in enumerate(EVENTS)
+        )
+    ]
 
 
 def test_commands_of_a_run_with_another_plate_that_come_after_its_detections():
@@ -67,8 +89,10 @@ def test_commands_of_a_run_with_another_plate_that_come_after_its_detections():
     begin = cell.commands[0].stamp_ns
     place, measure = (replace(command, run_id=str(begin)) for command in cell.commands[:2])
     wide = replace(cell.plan.artifact, grid_pitch_m=1.5 * cell.plan.artifact.grid_pitch_m)
-    later = [replace(command, stamp_ns=command.stamp_ns + 1, run_id=str(begin + 1), artifact=wide)
-             for command in (place, measure)]
+    later = [
+        replace(command, stamp_ns=command.stamp_ns + 1, run_id=str(begin + 1), artifact=wide)
+        for command in (place, measure)
+    ]
     events = [place, measure, *(e for e in cell.events if not isinstance(e, Command)), *later]
     collector = fresh()
     for event in events:
@@ -79,8 +103,11 @@ def test_commands_of_a_run_with_another_plate_that_come_after_its_detections():
 
 
 @settings(max_examples=8)
-@given(seed=st.integers(0, 2**32), spread=st.sampled_from([0, 5, 200, 10**6]),
-       asked=st.sets(st.integers(0, len(EVENTS)), max_size=8))
+@given(
+    seed=st.integers(0, 2**32),
+    spread=st.sampled_from([0, 5, 200, 10**6]),
+    asked=st.sets(st.integers(0, len(EVENTS)), max_size=8),
+)
 def test_what_is_asked_on_the_way_changes_nothing(seed, spread, asked):
     collector = fresh()
     for at, event in enumerate(late(seed, spread)):
@@ -90,7 +117,7 @@ def test_what_is_asked_on_the_way_changes_nothing(seed, spread, asked):
                 so_far = digest_of(collector)
             except NoDataError:
                 continue
-            assert so_far == digest(late(seed, spread)[:at + 1])
+            assert so_far == digest(late(seed, spread)[: at + 1])
     assert digest_of(collector) == WANTED
 
 
@@ -105,7 +132,7 @@ def blocks(events, size):
     """Return the events in blocks of messages of one form, in the order of their arrival."""
     out = []
     for start in range(0, len(events), size):
-        part = events[start:start + size]
+        part = events[start : start + size]
         samples: dict[tuple, list[EncoderSample]] = {}
         for event in part:
             if isinstance(event, EncoderSample):
@@ -119,11 +146,29 @@ def blocks(events, size):
 def feed_block(collector, kind, names, group):
     if kind == "encoder":
         speeds = np.array([e.velocities for e in group]) if group[0].velocities else None
-        collector.add_encoder_block(np.array([e.stamp_ns for e in group]), names,
-                                    np.array([e.positions for e in group]), speeds)
+        collector.add_encoder_block(
+            np.array([e.stamp_ns for e in group]),
+            names,
+            np.array([e.positions for e in group]),
+            speeds,
+        )
     elif kind == "detection":
-        rows = [(d.stamp_ns, d.kind, d.has_id, d.m, d.n, d.k, d.offset_x, d.offset_y,
-                 d.offset_theta, d.sigma, d.score) for d in group]
+        rows = [
+            (
+                d.stamp_ns,
+                d.kind,
+                d.has_id,
+                d.m,
+                d.n,
+                d.k,
+                d.offset_x,
+                d.offset_y,
+                d.offset_theta,
+                d.sigma,
+                d.score,
+            )
+            for d in group
+        ]
         collector.add_detection_block(np.array(rows, dtype=DETECTION))
     else:
         for command in group:
@@ -134,8 +179,12 @@ def feed_block(collector, kind, names, group):
 @pytest.mark.parametrize("speeds", [False, True])
 def test_blocks_give_what_single_messages_give(size, speeds):
     rng = np.random.default_rng(2)
-    events = [replace(e, velocities=tuple(rng.normal(0, 1e-5, 3).tolist()))
-              if speeds and isinstance(e, EncoderSample) else e for e in EVENTS]
+    events = [
+        replace(e, velocities=tuple(rng.normal(0, 1e-5, 3).tolist()))
+        if speeds and isinstance(e, EncoderSample)
+        else e
+        for e in EVENTS
+    ]
     single, blocked = fresh(), fresh()
     for event in events:
         add(single, event)
@@ -146,18 +195,27 @@ def test_blocks_give_what_single_messages_give(size, speeds):
     assert blocked.unusable == single.unusable
 
 
-@pytest.mark.parametrize(("names", "positions", "velocities", "reasons"), [
-    (("a", "b"), [[0.0, 0.0]] * 3, None, {"encoder_sample_unknown_joint": 3}),
-    ((), np.zeros((3, 0)), None, {"encoder_sample_unknown_joint": 3}),
-    (("x", "y"), [[0.0]] * 3, None, {"encoder_sample_malformed": 3}),
-    (("x",), [[0.0]] * 3, [[0.0, 0.0]] * 3, {"encoder_sample_malformed": 3}),
-    (("x", "y"), [[0.0, np.nan], [np.inf, np.nan], [1.0, 2.0]], None,
-     {"encoder_sample_not_finite": 2})])
+@pytest.mark.parametrize(
+    ("names", "positions", "velocities", "reasons"),
+    [
+        (("a", "b"), [[0.0, 0.0]] * 3, None, {"encoder_sample_unknown_joint": 3}),
+        ((), np.zeros((3, 0)), None, {"encoder_sample_unknown_joint": 3}),
+        (("x", "y"), [[0.0]] * 3, None, {"encoder_sample_malformed": 3}),
+        (("x",), [[0.0]] * 3, [[0.0, 0.0]] * 3, {"encoder_sample_malformed": 3}),
+        (
+            ("x", "y"),
+            [[0.0, np.nan], [np.inf, np.nan], [1.0, 2.0]],
+            None,
+            {"encoder_sample_not_finite": 2},
+        ),
+    ],
+)
 def test_blocks_that_cannot_be_used_are_counted(names, positions, velocities, reasons):
     collector = fresh()
     positions = np.array(positions)
-    collector.add_encoder_block(np.arange(3), names, positions,
-                                None if velocities is None else np.array(velocities))
+    collector.add_encoder_block(
+        np.arange(3), names, positions, None if velocities is None else np.array(velocities)
+    )
     assert collector.unusable == reasons
     assert collector.received == {"encoder": 3, "detection": 0, "command": 0}
     finite = np.isfinite(positions) if "not_finite" in str(reasons) else np.zeros((3, 2))
@@ -168,15 +226,22 @@ def looks(monkeypatch):
     """Return a list that fills with the number of exposures of each look at the encoder."""
     looked_up: list = []
     plain = Exposures._look_up
-    monkeypatch.setattr(Exposures, "_look_up", lambda self, group: (
-        looked_up.append(len(group)), plain(self, group)))
+    monkeypatch.setattr(
+        Exposures,
+        "_look_up",
+        lambda self, group: (looked_up.append(len(group)), plain(self, group)),
+    )
     return looked_up
 
 
 def without_theta(events, after_ns):
     """Return the events with no sample of theta after a stamp."""
-    return [replace(e, names=e.names[:2], positions=e.positions[:2]) if isinstance(
-        e, EncoderSample) and e.stamp_ns > after_ns else e for e in events]
+    return [
+        replace(e, names=e.names[:2], positions=e.positions[:2])
+        if isinstance(e, EncoderSample) and e.stamp_ns > after_ns
+        else e
+        for e in events
+    ]
 
 
 @pytest.mark.parametrize("at_once", [True, False])
@@ -259,8 +324,12 @@ def test_a_sample_that_comes_after_hours_finds_its_exposure():
             add(collector, event)
     before = collector.collect()[0].all_rejected()
     assert before["no_encoder_sample_near"] >= 10
-    hours = [EncoderSample(cell.samples[-1].stamp_ns + 2_000_000 * k, ("x", "y", "theta"),
-                           (0.0, 0.0, 0.0)) for k in range(200, 700)]
+    hours = [
+        EncoderSample(
+            cell.samples[-1].stamp_ns + 2_000_000 * k, ("x", "y", "theta"), (0.0, 0.0, 0.0)
+        )
+        for k in range(200, 700)
+    ]
     for event in [*hours, *beside]:
         add(collector, event)
     assert collector.collect()[0].all_rejected() == {}

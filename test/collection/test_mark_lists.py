@@ -25,8 +25,12 @@ from test.support.mark_lists import HALF_M, lattice, rings, scatter
 RULES = IdentityRules(1e-3, 0.5, 0.02)
 VIEW = View("v", np.radians(37), (4e-3, -7e-3))
 GOOD = "id,x,y\n1,-0.05,-0.05\n2,0.05,-0.05\n3,-0.05,0.05\n4,0.05,0.05\n5,0.0,0.01\n"
-PLAN = {"plan_id": "p", "artifact": {"marks": "marks.csv", "angular_count": 8},
-        "map": {"grid_size": 3}, "views": [{"name": "a"}]}
+PLAN = {
+    "plan_id": "p",
+    "artifact": {"marks": "marks.csv", "angular_count": 8},
+    "map": {"grid_size": 3},
+    "views": [{"name": "a"}],
+}
 
 
 def planned(folder, text: str, **changes):
@@ -36,8 +40,11 @@ def planned(folder, text: str, **changes):
 
 def test_a_plan_reads_its_marks_from_a_table(tmp_path):
     """In any order, with further columns; a plan written back has them in it."""
-    plan = planned(tmp_path, "# plate 7\nname,Y_m,id,x_m\n"
-                   "a,-0.05,9,-0.05\nb,-0.05,-2,0.05\n\nc,0.05,3,-0.05\nd,0.05,40,0.05\n")
+    plan = planned(
+        tmp_path,
+        "# plate 7\nname,Y_m,id,x_m\n"
+        "a,-0.05,9,-0.05\nb,-0.05,-2,0.05\n\nc,0.05,3,-0.05\nd,0.05,40,0.05\n",
+    )
     marks = plan.artifact.marks
     assert marks.ids == (-2, 3, 9, 40)
     assert (marks.x_m[1], marks.y_m[1]) == (-0.05, 0.05)
@@ -51,44 +58,64 @@ def test_a_plan_reads_its_marks_from_a_table(tmp_path):
     assert plan_from_dict(plan_to_dict(moved), "again") == moved
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("id,x\n1,0\n", r"marks.csv:1: no column y; begin with the line id,x,y \(x and y in m\)"),
-    ("", r"marks.csv:1: no column id, x, y"),
-    (GOOD + "6,0.01\n", r"marks.csv:7: 2 cells, not 3; correct the line"),
-    (GOOD + "6,a,0\n", r"marks.csv:7: x 'a' is not a number"),
-    (GOOD + "6,0.0_1,0\n", r"marks.csv:7: x '0.0_1' is not a number"),
-    (GOOD + "1_0,0,0\n", r"marks.csv:7: id '1_0' is not a whole number"),
-    (GOOD + "b,0,0\n", r"marks.csv:7: id 'b' is not a whole number"),
-    (GOOD + "1.0,0,0\n", r"marks.csv:7: id '1.0' is not a whole number"),
-    (GOOD + "3,0.02,0\n", r"marks.csv:7: the id 3 is used already in .*marks.csv:4"),
-    (GOOD + "6,0.05,0.05\n", r"marks.csv:7: marks 4 and 6 lie at one place"),
-    (GOOD + "6,nan,0\n", r"marks.csv:7: mark 6 has no place \(nan, 0\)"),
-    (GOOD + "6,0,inf\n", r"marks.csv:7: mark 6 has no place"),
-    (GOOD + "6,20.5,0\n", r"marks.csv:7: .*beyond every plate \(2 m\); is it in mm\?"),
-    (GOOD + f"{2**31},0,0\n", r"marks.csv:7: id 2147483648 is no 32 bit integer"),
-    ("id,x,y\n1,0,0\n2,0,0.1\n3,0.1,0\n", r"marks.csv: 3 marks, not 4 to 10000"),
-    ("id,x,y\n1,-.1,0\n2,-.05,0\n3,0.05,0\n4,.1,1e-6\n", r"marks.csv: all marks lie on one line"),
-    ("id,x,y\n1,0,0\n2,0,0.1\n3,0.1,0\n4,0.1,0.1\n", r"marks.csv: the marks lie about "
-     r"\(0.05, 0.05\) m, not about the plate's centre; count x and y from the centre"),
-    (b"id,x,y\n1,0,\xff\n", r"marks.csv: byte 11: not UTF-8 text"),
-])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("id,x\n1,0\n", r"marks.csv:1: no column y; begin with the line id,x,y \(x and y in m\)"),
+        ("", r"marks.csv:1: no column id, x, y"),
+        (GOOD + "6,0.01\n", r"marks.csv:7: 2 cells, not 3; correct the line"),
+        (GOOD + "6,a,0\n", r"marks.csv:7: x 'a' is not a number"),
+        (GOOD + "6,0.0_1,0\n", r"marks.csv:7: x '0.0_1' is not a number"),
+        (GOOD + "1_0,0,0\n", r"marks.csv:7: id '1_0' is not a whole number"),
+        (GOOD + "b,0,0\n", r"marks.csv:7: id 'b' is not a whole number"),
+        (GOOD + "1.0,0,0\n", r"marks.csv:7: id '1.0' is not a whole number"),
+        (GOOD + "3,0.02,0\n", r"marks.csv:7: the id 3 is used already in .*marks.csv:4"),
+        (GOOD + "6,0.05,0.05\n", r"marks.csv:7: marks 4 and 6 lie at one place"),
+        (GOOD + "6,nan,0\n", r"marks.csv:7: mark 6 has no place \(nan, 0\)"),
+        (GOOD + "6,0,inf\n", r"marks.csv:7: mark 6 has no place"),
+        (GOOD + "6,20.5,0\n", r"marks.csv:7: .*beyond every plate \(2 m\); is it in mm\?"),
+        (GOOD + f"{2**31},0,0\n", r"marks.csv:7: id 2147483648 is no 32 bit integer"),
+        ("id,x,y\n1,0,0\n2,0,0.1\n3,0.1,0\n", r"marks.csv: 3 marks, not 4 to 10000"),
+        (
+            "id,x,y\n1,-.1,0\n2,-.05,0\n3,0.05,0\n4,.1,1e-6\n",
+            r"marks.csv: all marks lie on one line",
+        ),
+        (
+            "id,x,y\n1,0,0\n2,0,0.1\n3,0.1,0\n4,0.1,0.1\n",
+            r"marks.csv: the marks lie about "
+            r"\(0.05, 0.05\) m, not about the plate's centre; count x and y from the centre",
+        ),
+        (b"id,x,y\n1,0,\xff\n", r"marks.csv: byte 11: not UTF-8 text"),
+    ],
+)
 def test_bad_tables_are_refused_in_one_line(tmp_path, text, said):
     with pytest.raises(InputError, match=said) as error:
         planned(tmp_path, text)
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("changes", "said"), [
-    ({"artifact": {"marks": "gone.csv"}}, "gone.csv: no such file"),
-    ({"artifact": {"marks": "marks.csv", "grid_size": 5}}, "marks and grid_size are both given"),
-    ({"artifact": {"marks": 5}}, "artifact: marks: 5 is not of type dict"),
-    ({"artifact": {"marks": {"id": [1], "x": [0.0], "y": []}}}, "not as many numbers each"),
-    ({"map": {}}, r"artifact marks: 5 marks are too few to choose the nodes of the map; give them "
-     r"in the plan, e.g. map: \{grid_size: 3\}"),
-    ({"views": [{"name": "a", "translation_pitch": [1, 0]}]},
-     r"translation_pitch: a list of marks has no pitch; give translation_mm"),
-    ({"image": {"nx": 3, "ny": 3}}, "images show the cells of a lattice, the plate is a list"),
-])
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"artifact": {"marks": "gone.csv"}}, "gone.csv: no such file"),
+        (
+            {"artifact": {"marks": "marks.csv", "grid_size": 5}},
+            "marks and grid_size are both given",
+        ),
+        ({"artifact": {"marks": 5}}, "artifact: marks: 5 is not of type dict"),
+        ({"artifact": {"marks": {"id": [1], "x": [0.0], "y": []}}}, "not as many numbers each"),
+        (
+            {"map": {}},
+            r"artifact marks: 5 marks are too few to choose the nodes of the map; give them "
+            r"in the plan, e.g. map: \{grid_size: 3\}",
+        ),
+        (
+            {"views": [{"name": "a", "translation_pitch": [1, 0]}]},
+            r"translation_pitch: a list of marks has no pitch; give translation_mm",
+        ),
+        ({"image": {"nx": 3, "ny": 3}}, "images show the cells of a lattice, the plate is a list"),
+    ],
+)
 def test_plans_that_a_list_cannot_have_are_refused(tmp_path, changes, said):
     with pytest.raises(InputError, match=said):
         planned(tmp_path, GOOD, **changes)
@@ -101,9 +128,16 @@ def test_the_nodes_of_the_map_are_chosen_from_the_marks():
         assert plate.field_half_m == pytest.approx((HALF_M, HALF_M))
     at = np.stack(np.meshgrid(np.linspace(-1, 1, 30), np.linspace(-0.3, 0.3, 9)))
     marks = marks_of(range(270), at[0].ravel(), at[1].ravel())
-    plan = plan_from_dict({"plan_id": "p", "artifact": {"marks": {
-        "id": list(marks.ids), "x": list(marks.x_m), "y": list(marks.y_m)}},
-        "views": [{"name": "a"}]}, "f")
+    plan = plan_from_dict(
+        {
+            "plan_id": "p",
+            "artifact": {
+                "marks": {"id": list(marks.ids), "x": list(marks.x_m), "y": list(marks.y_m)}
+            },
+            "views": [{"name": "a"}],
+        },
+        "f",
+    )
     field = plan.artifact.field
     assert field.shape == (21, 7) and plan.artifact.field_half_m == pytest.approx((1, 0.3))
 
@@ -118,15 +152,26 @@ def read(plate: Artifact, rng, *, turn=3e-4, shift=(40e-6, -25e-6)):
 
 
 def identified(plate, where, marks, has_id, rules=RULES):
-    return identify_grid(plate, VIEW, where, ids=np.where(has_id, marks, 0),
-                         has_id=np.full(where.shape[1], has_id), rules=rules)
+    return identify_grid(
+        plate,
+        VIEW,
+        where,
+        ids=np.where(has_id, marks, 0),
+        has_id=np.full(where.shape[1], has_id),
+        rules=rules,
+    )
 
 
 @pytest.mark.parametrize("with_ids", [True, False])
 @pytest.mark.parametrize("name", ["rings", "scatter", "holes", "lattice", "even"])
 def test_marks_are_identified(name, with_ids):
-    plate = {"rings": rings, "scatter": scatter, "holes": lambda: lattice(7, (0, 8, 24, 33)),
-             "lattice": lambda: lattice(7), "even": lambda: lattice(8)}[name]()
+    plate = {
+        "rings": rings,
+        "scatter": scatter,
+        "holes": lambda: lattice(7, (0, 8, 24, 33)),
+        "lattice": lambda: lattice(7),
+        "even": lambda: lattice(8),
+    }[name]()
     where, marks = read(plate, np.random.default_rng(1))
     found = identified(plate, where, marks, with_ids)
     assert not found.reasons.any()
@@ -149,8 +194,12 @@ def test_marks_that_may_be_confused_are_rejected_and_named():
     """Two marks nearer to each other than the pose is known: only their ids tell them apart."""
     plate = scatter()
     marks, near = plate.marks, int(np.hypot(*plate.marks.places_m).argmin())
-    twin = replace(plate, marks=marks_of([*marks.ids, 999], [*marks.x_m, marks.x_m[near] + 30e-6],
-                                         [*marks.y_m, marks.y_m[near]]))
+    twin = replace(
+        plate,
+        marks=marks_of(
+            [*marks.ids, 999], [*marks.x_m, marks.x_m[near] + 30e-6], [*marks.y_m, marks.y_m[near]]
+        ),
+    )
     where, ids = read(twin, np.random.default_rng(3))
     found = identified(twin, where, ids, False)
     pair = np.isin(ids[0], [999, marks.ids[near]])
@@ -188,13 +237,15 @@ def test_every_mark_is_visited_once_in_lines_one_distance_wide():
     found = visit_sequence(plate, View("v"), order="serpentine")
     steps = np.hypot(*np.diff([found.i, found.j], axis=1))
     assert steps.mean() < 0.5 * np.hypot(*np.diff(plate.marks.places_m)).mean() / (
-        plate.grid_pitch_m)
+        plate.grid_pitch_m
+    )
 
 
 def test_a_measurement_with_an_id_that_is_not_listed_is_refused():
     plate = scatter()
-    good = ViewReadings(VIEW, plate.m[:3, 0], plate.n[:3, 0], *np.zeros((2, 3)),
-                        np.ones(3, dtype=int))
+    good = ViewReadings(
+        VIEW, plate.m[:3, 0], plate.n[:3, 0], *np.zeros((2, 3)), np.ones(3, dtype=int)
+    )
     check_view(good, plate, 0)
     with pytest.raises(InputError, match="an id that is not in the list of marks"):
         check_view(replace(good, m=good.m + 1), plate, 0)

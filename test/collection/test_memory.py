@@ -25,8 +25,9 @@ print(first, pages())
 
 
 def test_arrays_made_again_take_no_new_pages():
-    done = subprocess.run([sys.executable, "-c", PAGES_OF], capture_output=True, text=True,
-                          check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PAGES_OF], capture_output=True, text=True, check=True
+    )
     without, kept = map(int, done.stdout.split())
     if without < 1000:
         pytest.skip("this allocator keeps what is freed by itself")

@@ -31,7 +31,7 @@ GRID_FAULTS = {
     "zero score": ({"score": 0.0}, Reason.LOW_SCORE),
     "m off the plate": ({"m": 3}, Reason.UNKNOWN_MARK),
     "n off the plate": ({"n": -3}, Reason.UNKNOWN_MARK),
-    "extreme id": ({"m": -2**31, "n": 2**31 - 1}, Reason.UNKNOWN_MARK),
+    "extreme id": ({"m": -(2**31), "n": 2**31 - 1}, Reason.UNKNOWN_MARK),
     "one pitch off": ({"offset_x": PITCH}, Reason.TOO_FAR),
     "1 mm off": ({"offset_y": -1e-3}, Reason.TOO_FAR),
     "absurdly far": ({"offset_x": 1e300}, Reason.TOO_FAR),
@@ -154,8 +154,14 @@ def test_what_does_not_concern_a_kind_is_not_looked_at():
     plain, odd = scene(), scene()
     for index in range(len(odd.detections)):
         grid = odd.detections[index].kind == Kind.GRID
-        odd.spoil(index, **({"offset_theta": math.nan, "k": 99} if grid
-                            else {"offset_x": math.inf, "offset_y": math.nan, "m": 99, "n": -99}))
+        odd.spoil(
+            index,
+            **(
+                {"offset_theta": math.nan, "k": 99}
+                if grid
+                else {"offset_x": math.inf, "offset_y": math.nan, "m": 99, "n": -99}
+            ),
+        )
     found, _ = collect(odd.events)
     assert found.all_rejected() == {}
     assert table(found.views[0]) == table(collect(plain.events)[0].views[0])
@@ -254,19 +260,31 @@ def test_kinds_that_the_view_does_not_measure_are_not_in_view():
 def stage_position(spoilt, index):
     """Return where the stage stood at a detection: x, y, theta."""
     stamp = spoilt.detections[index].stamp_ns
-    return max((s for s in spoilt.samples if s.stamp_ns <= stamp),
-               key=lambda s: s.stamp_ns).positions
+    return max(
+        (s for s in spoilt.samples if s.stamp_ns <= stamp), key=lambda s: s.stamp_ns
+    ).positions
 
 
-@pytest.mark.parametrize(("offset", "reason"), [
-    ((0.5, 0.0), Reason.AMBIGUOUS), ((0.0, -0.5), Reason.AMBIGUOUS), ((0.5, 0.5), Reason.AMBIGUOUS),
-    ((0.4, 0.0), Reason.AMBIGUOUS), ((0.2, 0.0), Reason.TOO_FAR), ((0.06, 0.0), Reason.TOO_FAR)])
+@pytest.mark.parametrize(
+    ("offset", "reason"),
+    [
+        ((0.5, 0.0), Reason.AMBIGUOUS),
+        ((0.0, -0.5), Reason.AMBIGUOUS),
+        ((0.5, 0.5), Reason.AMBIGUOUS),
+        ((0.4, 0.0), Reason.AMBIGUOUS),
+        ((0.2, 0.0), Reason.TOO_FAR),
+        ((0.06, 0.0), Reason.TOO_FAR),
+    ],
+)
 def test_a_mark_without_id_between_marks(offset, reason):
     spoilt = scene(with_ids=False)
     index = spoilt.grid(12)
     x, y, _ = stage_position(spoilt, index)
-    spoilt.spoil(index, offset_x=offset[0] * PITCH - x + round(x / PITCH) * PITCH,
-                 offset_y=offset[1] * PITCH - y + round(y / PITCH) * PITCH)
+    spoilt.spoil(
+        index,
+        offset_x=offset[0] * PITCH - x + round(x / PITCH) * PITCH,
+        offset_y=offset[1] * PITCH - y + round(y / PITCH) * PITCH,
+    )
     found, _ = collect(spoilt.events)
     assert found.all_rejected() == {str(reason): 1}
     assert len(found.views[0].m) == 24
@@ -279,8 +297,9 @@ def test_a_mark_without_id_far_off_the_plate_is_too_far():
     assert found.all_rejected() == {"too_far_from_nominal": 1}
 
 
-@pytest.mark.parametrize(("lines", "reason"), [
-    (0.5, Reason.AMBIGUOUS), (-0.4, Reason.AMBIGUOUS), (0.3, Reason.TOO_FAR)])
+@pytest.mark.parametrize(
+    ("lines", "reason"), [(0.5, Reason.AMBIGUOUS), (-0.4, Reason.AMBIGUOUS), (0.3, Reason.TOO_FAR)]
+)
 def test_a_line_without_id_between_lines(lines, reason):
     spoilt = scene(with_ids=False)
     spoilt.spoil(spoilt.angular(2), offset_theta=lines * 2 * math.pi / 8)

@@ -24,8 +24,14 @@ def readings(marks, repeats, rng, *, components=2):
 def rejected_of_clean(marks, repeats, views, *, components=2, limit=LIMIT):
     """Return how many of all clean readings of many views are rejected, and how many there are."""
     rng = np.random.default_rng([marks, repeats])
-    bad = sum(int(reduce_repeats(*readings(marks, repeats, rng, components=components),
-                                 limit=limit).outlier.sum()) for _ in range(views))
+    bad = sum(
+        int(
+            reduce_repeats(
+                *readings(marks, repeats, rng, components=components), limit=limit
+            ).outlier.sum()
+        )
+        for _ in range(views)
+    )
     return bad, marks * repeats * views
 
 
@@ -34,15 +40,27 @@ def test_of_clean_readings_fewer_than_one_in_100000_are_rejected():
 
     A scale that is a tenth too small takes 1 in 20,000, which is seen.
     """
-    found = [rejected_of_clean(marks, repeats, views, limit=5.0) for repeats in range(2, 8)
-             for marks, views in ((40_000 // repeats, 2), (121, 30))]
+    found = [
+        rejected_of_clean(marks, repeats, views, limit=5.0)
+        for repeats in range(2, 8)
+        for marks, views in ((40_000 // repeats, 2), (121, 30))
+    ]
     bad, total = np.sum(found, axis=0)
     assert bad <= binom.ppf(0.999, total, 1e-5)
 
 
-@pytest.mark.parametrize(("marks", "repeats", "components", "views"), [
-    (6, 2, 2, 500), (8, 2, 2, 300), (9, 2, 2, 150), (9, 3, 2, 100), (9, 7, 2, 50), (24, 2, 1, 100),
-    (24, 5, 1, 50)])
+@pytest.mark.parametrize(
+    ("marks", "repeats", "components", "views"),
+    [
+        (6, 2, 2, 500),
+        (8, 2, 2, 300),
+        (9, 2, 2, 150),
+        (9, 3, 2, 100),
+        (9, 7, 2, 50),
+        (24, 2, 1, 100),
+        (24, 5, 1, 50),
+    ],
+)
 def test_views_with_few_pairs_of_repeats_reject_no_more(marks, repeats, components, views):
     """The limit grows with few pairs: even one of 4.5 is then as safe as 6 is with many."""
     bad, total = rejected_of_clean(marks, repeats, views, components=components, limit=4.5)
@@ -50,10 +68,14 @@ def test_views_with_few_pairs_of_repeats_reject_no_more(marks, repeats, componen
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize(("marks", "cut"), [  # limit / 0.6745 sqrt(2) (1 + 4/sqrt(2n) + 8/2n)
-    (6, 6 / 0.9538725524 * (1 + 4 / 12**0.5 + 8 / 12)),
-    (9, 6 / 0.9538725524 * (1 + 4 / 18**0.5 + 8 / 18)),
-    (100, 6 / 0.9538725524 * (1 + 4 / 200**0.5 + 8 / 200))])
+@pytest.mark.parametrize(
+    ("marks", "cut"),
+    [  # limit / 0.6745 sqrt(2) (1 + 4/sqrt(2n) + 8/2n)
+        (6, 6 / 0.9538725524 * (1 + 4 / 12**0.5 + 8 / 12)),
+        (9, 6 / 0.9538725524 * (1 + 4 / 18**0.5 + 8 / 18)),
+        (100, 6 / 0.9538725524 * (1 + 4 / 200**0.5 + 8 / 200)),
+    ],
+)
 def test_where_an_outlier_begins_is_as_by_hand(marks, cut, side):
     """Marks read at -1, 0 and 1: half of their pairs differ by no more than 1."""
     key, values = np.repeat(np.arange(marks), 3), np.tile([-1.0, 0.0, 1.0], marks)
@@ -85,7 +107,7 @@ def one_spoilt_mark(repeats, offsets, *, marks=100):
     """Return which repeats of mark 0 are outliers when `offsets` (x) are added to the first."""
     key, values, sigma = readings(marks, repeats, np.random.default_rng(4))
     at = np.flatnonzero(key == 0)
-    values[0, at[:len(offsets)]] += offsets
+    values[0, at[: len(offsets)]] += offsets
     means = reduce_repeats(key, values, sigma, limit=LIMIT)
     assert not means.outlier[key != 0].any()
     return means.outlier[at].tolist(), means.key.tolist()
@@ -145,7 +167,7 @@ def test_mean_count_repeatability_and_degrees_of_freedom_as_by_hand():
     assert means.dof == 2 * (3 + 0 + 1 + 4)
     groups = [values[:, key == k] for k in (3, 5, 8, 9)]
     np.testing.assert_allclose(means.mean.T, [g.mean(axis=1) for g in groups], rtol=1e-14)
-    squares = sum(((g - g.mean(axis=1, keepdims=True))**2).sum() for g in groups)
+    squares = sum(((g - g.mean(axis=1, keepdims=True)) ** 2).sum() for g in groups)
     assert means.sigma == pytest.approx(np.sqrt(squares / means.dof), rel=1e-12)
     assert means.u.shape == (0,)
 
@@ -163,7 +185,7 @@ def test_declared_sigmas_weigh_the_mean_and_tell_its_uncertainty():
     values = np.array([[1.0, 2.0, 4.0, 5.0, 7.0, 9.0]])
     sigma = np.array([1.0, 2.0, 0.5, 1.0, 0.0, 3.0])
     means = reduce_repeats(key, values, sigma, limit=0.0)
-    weights = 1 / sigma[:3]**2
+    weights = 1 / sigma[:3] ** 2
     assert means.mean[0, 0] == pytest.approx(np.average(values[0, :3], weights=weights), rel=1e-14)
     assert means.mean[0, 1] == 6.0  # one of its repeats declares none: not weighted
     np.testing.assert_allclose(means.u, [1 / np.sqrt(weights.sum()), np.nan, 3.0], rtol=1e-14)
@@ -173,8 +195,9 @@ def test_declared_sigmas_weigh_the_mean_and_tell_its_uncertainty():
 def test_equal_repeats_give_back_the_same_bits(value, repeats, sigma):
     key = np.repeat(np.arange(5), repeats)
     for declared in (0.0, sigma):
-        means = reduce_repeats(key, np.full((2, len(key)), value), np.full(len(key), declared),
-                               limit=LIMIT)
+        means = reduce_repeats(
+            key, np.full((2, len(key)), value), np.full(len(key), declared), limit=LIMIT
+        )
         assert (means.mean == value).all()
         assert not means.outlier.any()
         assert means.sigma == 0 or repeats == 1
@@ -196,8 +219,9 @@ def test_a_sensor_that_resolves_no_finer_than_its_step_has_no_outliers_of_one_st
     assert 0.02 < (np.abs(values - 0.01 * np.stack([key, -key])) > step / 2).mean() < 0.25
     assert not means.outlier.any()
     values[0, 77] += 4.2 * step
-    assert np.flatnonzero(reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT,
-                                         extent=1.21).outlier).tolist() == [77]
+    assert np.flatnonzero(
+        reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT, extent=1.21).outlier
+    ).tolist() == [77]
 
 
 def test_repeats_equal_to_the_bit_keep_their_degrees_of_freedom():
@@ -210,8 +234,9 @@ def test_outliers_of_exact_readings_are_no_steps_of_a_sensor():
     key = np.tile(np.arange(50), 4)
     values = np.zeros((2, 200))
     values[0, [3, 60, 130]] = [1e-6, 2.3e-6, 4.1e-6]
-    assert np.flatnonzero(reduce_repeats(key, values, np.zeros(200), limit=LIMIT,
-                                         extent=0.1).outlier).tolist() == [3, 60, 130]
+    assert np.flatnonzero(
+        reduce_repeats(key, values, np.zeros(200), limit=LIMIT, extent=0.1).outlier
+    ).tolist() == [3, 60, 130]
 
 
 def test_a_thousand_repeats_do_not_cost_their_square():
@@ -259,5 +284,6 @@ def test_medians_are_those_of_numpy_to_the_bit(count, of):
 
 
 def test_distances():
-    np.testing.assert_array_equal(distances(np.array([[3e-9, -5.0, 0.0], [4e-9, 12.0, 0.0]])),
-                                  [5e-9, 13.0, 0.0])
+    np.testing.assert_array_equal(
+        distances(np.array([[3e-9, -5.0, 0.0], [4e-9, 12.0, 0.0]])), [5e-9, 13.0, 0.0]
+    )

@@ -31,9 +31,14 @@ def lines(count, degrees, *, named=(), rules=RULES, phi_rad=None, scatter=0.0):
     has_id = np.isin(k, named)
     noise = np.random.default_rng(4).normal(0, scatter, count)
     return k, identify_angular(
-        Artifact(5, 0.01, count), View("v", 0.0, (0.0, 0.0), False, True),
-        k * 2 * pi / count + np.deg2rad(degrees) + noise, ids=np.where(has_id, k, 0),
-        has_id=has_id, rules=rules, phi_rad=phi_rad)
+        Artifact(5, 0.01, count),
+        View("v", 0.0, (0.0, 0.0), False, True),
+        k * 2 * pi / count + np.deg2rad(degrees) + noise,
+        ids=np.where(has_id, k, 0),
+        has_id=has_id,
+        rules=rules,
+        phi_rad=phi_rad,
+    )
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.3, 0.51, -0.7, 1.0, -1.4])
@@ -51,12 +56,22 @@ def test_few_named_lines_tell_the_rotation_to_all_others(degrees, named):
     np.testing.assert_allclose(found.deviation, np.deg2rad(degrees), atol=1e-14)
 
 
-@pytest.mark.parametrize(("stated", "degrees", "reason"), [
-    (0.45, 0.44, None), (0.45, -0.44, None), (0.46, 0.0, Reason.ROTATION),
-    (0.2, 0.24, None), (0.2, 0.3, Reason.ROTATION), (0.2, -0.3, Reason.ROTATION),
-    (0.2, 0.7, Reason.ROTATION), (0.0, 0.1, None)])
+@pytest.mark.parametrize(
+    ("stated", "degrees", "reason"),
+    [
+        (0.45, 0.44, None),
+        (0.45, -0.44, None),
+        (0.46, 0.0, Reason.ROTATION),
+        (0.2, 0.24, None),
+        (0.2, 0.3, Reason.ROTATION),
+        (0.2, -0.3, Reason.ROTATION),
+        (0.2, 0.7, Reason.ROTATION),
+        (0.0, 0.1, None),
+    ],
+)
 def test_a_stated_largest_rotation_below_half_a_line_makes_the_nearest_line_the_one(
-        stated, degrees, reason):
+    stated, degrees, reason
+):
     k, found = lines(360, degrees, rules=replace(RULES, max_rotation_rad=np.deg2rad(stated)))
     assert set(found.reasons) == {reason}
     if reason is None:
@@ -103,8 +118,9 @@ def session(phi_deg, *, with_ids=False, **parameters):
     phi[-1] = np.deg2rad(phi_deg)
     truth = replace(truth, phi_rad=phi)
     cell = CellSettings(with_ids=with_ids, servo_sigma_theta_rad=0.0)
-    events = plan_events(truth, plan, settings=cell, rng=np.random.default_rng(2),
-                         start_ns=START_NS)
+    events = plan_events(
+        truth, plan, settings=cell, rng=np.random.default_rng(2), start_ns=START_NS
+    )
     return truth, plan, collect(events, **parameters)[0]
 
 
@@ -118,14 +134,21 @@ def test_a_view_of_fine_lines_alone_is_never_identified_silently(phi_deg):
         np.testing.assert_allclose(found.views[index].dtheta, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(("phi_deg", "remedy"), [
-    (0.6, {"with_ids": True}), (-0.8, {"with_ids": True}),
-    (0.4, {"max_rotation": 0.0078}), (-0.4, {"max_rotation": 0.0078})])
+@pytest.mark.parametrize(
+    ("phi_deg", "remedy"),
+    [
+        (0.6, {"with_ids": True}),
+        (-0.8, {"with_ids": True}),
+        (0.4, {"max_rotation": 0.0078}),
+        (-0.4, {"max_rotation": 0.0078}),
+    ],
+)
 def test_each_remedy_that_the_advice_names_works(phi_deg, remedy):
     truth, plan, found = session(phi_deg, **remedy)
     assert found.all_rejected() == {}
-    np.testing.assert_allclose(found.views[3].dtheta, angular_deviation(truth, 3, plan.views[3]),
-                               atol=1e-12)
+    np.testing.assert_allclose(
+        found.views[3].dtheta, angular_deviation(truth, 3, plan.views[3]), atol=1e-12
+    )
 
 
 def test_the_advice_is_one_line_with_the_count():
@@ -137,8 +160,19 @@ def test_the_advice_is_one_line_with_the_count():
         assert remedy in line
 
 
-def turned(degrees, *, named, size=101, pitch=0.001, kept=1.0, offset=(1e-4, -5e-5), seed=0,
-           rules=RULES, where=lambda m, n: m == m, placed_deg=0.0):
+def turned(
+    degrees,
+    *,
+    named,
+    size=101,
+    pitch=0.001,
+    kept=1.0,
+    offset=(1e-4, -5e-5),
+    seed=0,
+    rules=RULES,
+    where=lambda m, n: m == m,
+    placed_deg=0.0,
+):
     """Return marks of a turned plate of which few carry ids, and what they are taken for.
 
     The plan asks for a turn by `placed_deg`, over a map that reaches beyond the plate.
@@ -157,13 +191,15 @@ def turned(degrees, *, named, size=101, pitch=0.001, kept=1.0, offset=(1e-4, -5e
     nominal = np.stack(view.on_stage(artifact).turned(*marks * pitch))
     read = nominal + Rigid(np.deg2rad(degrees), *offset).at(nominal)
     read += rng.normal(0, 5e-7, read.shape)
-    return marks, identify_grid(artifact, view, read, ids=np.where(has_id, marks, 0),
-                                has_id=has_id, rules=rules)
+    return marks, identify_grid(
+        artifact, view, read, ids=np.where(has_id, marks, 0), has_id=has_id, rules=rules
+    )
 
 
 @pytest.mark.parametrize("named", [1, 2, 3, "corner"])
-@pytest.mark.parametrize(("degrees", "offset"), [
-    (0.7, (1e-4, -5e-5)), (-2.0, (1e-4, -5e-5)), (0.7, (2.3e-3, -1.4e-3))])
+@pytest.mark.parametrize(
+    ("degrees", "offset"), [(0.7, (1e-4, -5e-5)), (-2.0, (1e-4, -5e-5)), (0.7, (2.3e-3, -1.4e-3))]
+)
 def test_few_named_marks_are_anchors_of_all_others(named, degrees, offset):
     for seed in range(3):
         marks, found = turned(degrees, named=named, offset=offset, seed=seed)
@@ -204,9 +240,16 @@ def test_no_mark_is_ever_taken_for_another(seed):
     offset = rng.uniform(-1, 1, 2) * pitch * (2.5 if named else 0.25)
     side = rng.integers(-25, 10)
     marks, found = turned(
-        np.rad2deg(rng.uniform(-1, 1) * largest), named=named, size=51, pitch=pitch,
-        offset=offset, kept=float(rng.choice([1, 0.3, 0.05])), seed=seed,
-        rules=IdentityRules(5e-4, 0.5, largest), where=lambda m, n: (m > side) | (n < -22))
+        np.rad2deg(rng.uniform(-1, 1) * largest),
+        named=named,
+        size=51,
+        pitch=pitch,
+        offset=offset,
+        kept=float(rng.choice([1, 0.3, 0.05])),
+        seed=seed,
+        rules=IdentityRules(5e-4, 0.5, largest),
+        where=lambda m, n: (m > side) | (n < -22),
+    )
     good = found.reasons == None  # noqa: E711
     np.testing.assert_array_equal(found.index[:, good], marks[:, good])
     assert set(found.reasons) <= {None, Reason.ROTATION, Reason.AMBIGUOUS}
@@ -255,14 +298,21 @@ def test_a_rotation_is_told_to_the_lines_only_where_enough_marks_agree_on_it():
     assert nine.phi_error_rad == pytest.approx(one.phi_error_rad)
     assert nine.offset_error_m == pytest.approx(one.offset_error_m)
     assert fit_motion(p, off + 1.0).known(0.01, 0.035).phi_error_rad == pytest.approx(
-        one.phi_error_rad)
+        one.phi_error_rad
+    )
 
 
 def test_named_marks_of_a_plate_that_was_put_in_a_quarter_turn_off_are_too_far():
     artifact = Artifact(5, 0.01, 0)
     marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
-    found = identify_grid(artifact, View("v"), np.stack([-marks[1], marks[0]]) * 0.01, ids=marks,
-                          has_id=np.ones(25, bool), rules=RULES)
+    found = identify_grid(
+        artifact,
+        View("v"),
+        np.stack([-marks[1], marks[0]]) * 0.01,
+        ids=marks,
+        has_id=np.ones(25, bool),
+        rules=RULES,
+    )
     good = found.reasons == None  # noqa: E711
     assert good.sum() == 1 and (marks[:, good] == 0).all()
     assert set(found.reasons[~good]) == {Reason.TOO_FAR}
@@ -280,8 +330,15 @@ def test_the_median_on_a_circle_does_not_depend_on_where_it_is_cut(centre):
 def test_grid_marks_that_disagree_leave_fine_lines_unread():
     plan = plan_of("0", 5, count=360)
     truth = random_truth(plan.artifact, 1, np.random.default_rng(1))
-    events = list(plan_events(truth, plan, settings=CellSettings(with_ids=False),
-                              rng=np.random.default_rng(2), start_ns=START_NS))
+    events = list(
+        plan_events(
+            truth,
+            plan,
+            settings=CellSettings(with_ids=False),
+            rng=np.random.default_rng(2),
+            start_ns=START_NS,
+        )
+    )
     grid = [e for e in events if getattr(e, "kind", None) == Kind.GRID]
     few = [e for e in events if e not in grid[3:]]
     few[few.index(grid[2])] = replace(grid[2], offset_y=grid[2].offset_y + 4e-4)

@@ -25,7 +25,9 @@ def stored(parts, *, speeds):
         v = p + 0.5 if speeds and number % 3 else None
         if number % 2:
             for at in range(len(t)):
-                store.add_block(t[at:at + 1], p[at:at + 1], None if v is None else v[at:at + 1])
+                store.add_block(
+                    t[at : at + 1], p[at : at + 1], None if v is None else v[at : at + 1]
+                )
         else:
             store.add_block(t, p, v)
         every += rows((t, p, np.full(len(t), -1.0) if v is None else v))
@@ -33,8 +35,13 @@ def stored(parts, *, speeds):
 
 
 @settings(max_examples=30)
-@given(st.lists(STAMPS, max_size=12), st.integers(-5, 305), st.integers(0, 100),
-       st.integers(1, 6), st.booleans())
+@given(
+    st.lists(STAMPS, max_size=12),
+    st.integers(-5, 305),
+    st.integers(0, 100),
+    st.integers(1, 6),
+    st.booleans(),
+)
 def test_what_is_near_is_all_of_it_and_its_neighbours(parts, start, width, beside, speeds):
     store, every = stored(parts, speeds=speeds)
     end = start + width
@@ -44,7 +51,8 @@ def test_what_is_near_is_all_of_it_and_its_neighbours(parts, start, width, besid
     after = [t for t in stamps if t > end][:beside]
     low, high = min([*before, start]), max([*after, end])
     assert [row for row in found if low <= row[0] <= high] == [
-        row for row in every if low <= row[0] <= high]
+        row for row in every if low <= row[0] <= high
+    ]
     assert set(found) <= set(every)
     assert len(store) == len(every)
     assert store.span() == ((stamps[0], stamps[-1]) if stamps else None)
@@ -147,6 +155,7 @@ def test_without_a_file_all_stays_in_memory_and_it_is_said(monkeypatch, step):
     monkeypatch.setattr(module.tempfile, "TemporaryFile", opened)
     store = SampleStore(Limits(block=10, in_memory=1))
     store.add_block(np.arange(100), np.arange(100.0))
-    assert store.problem == ("encoder samples stay in memory: no temporary file can be written "
-                             "(No space left on device)")
+    assert store.problem == (
+        "encoder samples stay in memory: no temporary file can be written (No space left on device)"
+    )
     assert rows(store.near(0, 100, 1)) == [(k, float(k), -1.0) for k in range(100)]

@@ -40,8 +40,10 @@ def sequencer_in(state):
 
 
 FITS = {  # (state, request) -> phase of the command, its view, state after
-    **{(state, "start"): (PLACE, 0, State.PLACING)
-       for state in (State.IDLE, State.DONE, State.ABORTED)},
+    **{
+        (state, "start"): (PLACE, 0, State.PLACING)
+        for state in (State.IDLE, State.DONE, State.ABORTED)
+    },
     (State.PLACING, "confirm"): (MEASURE, 0, State.MEASURING),
     (State.PLACING, "redo"): (PLACE, 0, State.PLACING),
     (State.PLACING, "skip"): (PLACE, 1, State.PLACING),
@@ -86,13 +88,21 @@ def test_a_whole_plan():
         commands += sequencer.confirm()
         commands += sequencer.status(PLAN.plan_id, index, True)
     assert [(c.phase, c.view_index) for c in commands] == [
-        (PLACE, 0), (MEASURE, 0), (PLACE, 1), (MEASURE, 1), (PLACE, 2), (MEASURE, 2), (DONE, 3)]
+        (PLACE, 0),
+        (MEASURE, 0),
+        (PLACE, 1),
+        (MEASURE, 1),
+        (PLACE, 2),
+        (MEASURE, 2),
+        (DONE, 3),
+    ]
     assert sequencer.state is State.DONE
     assert sequencer.skipped == []
 
 
-@pytest.mark.parametrize("status", [("other", 0, True), (PLAN.plan_id, 1, True),
-                                    (PLAN.plan_id, 0, False)])
+@pytest.mark.parametrize(
+    "status", [("other", 0, True), (PLAN.plan_id, 1, True), (PLAN.plan_id, 0, False)]
+)
 def test_a_status_that_is_not_of_the_current_view_or_incomplete_is_ignored(status):
     sequencer = sequencer_in(State.MEASURING)
     assert sequencer.status(*status) == []
@@ -139,9 +149,14 @@ def test_the_sequencer_yields_to_recorded_commands_in_any_state():
         assert sequencer.state is State.FOLLOWING
 
 
-@pytest.mark.parametrize(("state", "remedy"), [
-    (State.IDLE, "start a plan first"), (State.DONE, "start a plan first"),
-    (State.MEASURING, "redo_view has the plate placed again")])
+@pytest.mark.parametrize(
+    ("state", "remedy"),
+    [
+        (State.IDLE, "start a plan first"),
+        (State.DONE, "start a plan first"),
+        (State.MEASURING, "redo_view has the plate placed again"),
+    ],
+)
 def test_a_confirmation_out_of_place_says_what_to_do(state, remedy):
     with pytest.raises(InputError, match=f"confirm_view does not fit while {state}; {remedy}$"):
         sequencer_in(state).confirm()

@@ -19,13 +19,15 @@ def test_clean_readings_of_small_views_are_kept():
     """Even at a limit of 4.5: below 1 in 100,000 of 18,000, two or more happen once in 70."""
     rng, key, bad = np.random.default_rng(18), np.repeat(np.arange(6), 3), 0
     for _ in range(1000):
-        bad += reduce_repeats(key, rng.normal(0, 2e-8, (1, 18)), np.zeros(18),
-                              limit=4.5).outlier.sum()
+        bad += reduce_repeats(
+            key, rng.normal(0, 2e-8, (1, 18)), np.zeros(18), limit=4.5
+        ).outlier.sum()
     assert bad <= 1
 
 
-@pytest.mark.parametrize(("marks", "repeats", "components"), [
-    (5, 2, 2), (5, 3, 1), (4, 2, 2), (11, 2, 1)])
+@pytest.mark.parametrize(
+    ("marks", "repeats", "components"), [(5, 2, 2), (5, 3, 1), (4, 2, 2), (11, 2, 1)]
+)
 def test_fewer_pairs_than_tell_an_outlier_reject_nothing_at_all(marks, repeats, components):
     """However far it is off: whatever the noise does, no clean reading is lost."""
     key, rng = np.repeat(np.arange(marks), repeats), np.random.default_rng(1)
@@ -56,8 +58,10 @@ def test_what_differs_by_the_rounding_of_positions_is_no_outlier():
 
 def test_a_measure_in_another_pose_supersedes_what_was_read_in_the_first():
     artifact = Artifact(3, 0.01)
-    commands = [Command(stamp, Phase.MEASURE, "p", 0, View("v", 0.0, (shift, 0.0)), artifact)
-                for stamp, shift in ((10, 0.0), (20, 0.01), (30, 0.01))]
+    commands = [
+        Command(stamp, Phase.MEASURE, "p", 0, View("v", 0.0, (shift, 0.0)), artifact)
+        for stamp, shift in ((10, 0.0), (20, 0.01), (30, 0.01))
+    ]
     timeline = build_timeline(commands)
     assert [i.reason for i in timeline.intervals] == [Reason.SUPERSEDED, None, None]
     assert timeline.views[0].translation_m == (0.01, 0.0)

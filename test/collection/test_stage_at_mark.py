@@ -19,14 +19,19 @@ def led_astray(cell, index, shift_m):
     d = cell.detections[index]
     cell.spoil(index, offset_x=d.offset_x - shift_m)
     near = 4_900_000
-    cell.samples = [replace(s, positions=(s.positions[0] + shift_m, *s.positions[1:]))
-                    if abs(s.stamp_ns - d.stamp_ns) <= near else s for s in cell.samples]
+    cell.samples = [
+        replace(s, positions=(s.positions[0] + shift_m, *s.positions[1:]))
+        if abs(s.stamp_ns - d.stamp_ns) <= near
+        else s
+        for s in cell.samples
+    ]
     return cell
 
 
 @pytest.mark.parametrize("with_ids", [True, False])
-@pytest.mark.parametrize(("shift", "kept"), [(0.55, True), (-0.55, True), (0.62, False),
-                                             (-0.62, False), (2.0, False)])
+@pytest.mark.parametrize(
+    ("shift", "kept"), [(0.55, True), (-0.55, True), (0.62, False), (-0.62, False), (2.0, False)]
+)
 def test_a_stage_that_stands_beside_the_mark(with_ids, shift, kept):
     # half a pitch, and 0.035 rad times the radius of 2.83 pitches: 0.599 pitches
     whole = table(collect(scene(count=0, with_ids=with_ids).events)[0].views[0])
@@ -96,8 +101,15 @@ def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(wit
     for at in cell.detections:
         for other in cell.detections:
             away = [0.01 * (getattr(other, k) - getattr(at, k)) for k in "mn"]
-            seen.append(replace(other, stamp_ns=at.stamp_ns, has_id=with_ids,
-                                offset_x=at.offset_x + away[0], offset_y=at.offset_y + away[1]))
+            seen.append(
+                replace(
+                    other,
+                    stamp_ns=at.stamp_ns,
+                    has_id=with_ids,
+                    offset_x=at.offset_x + away[0],
+                    offset_y=at.offset_y + away[1],
+                )
+            )
     events = [*cell.commands, *cell.samples, *seen]
     collector = gathered(events, measurement_sense=str(sense))
     found, progress = collector.collect()
@@ -105,8 +117,10 @@ def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(wit
     assert table(found.views[0]) == table(plain.views[0])
     assert progress[0].complete
     (line,) = [str(item) for item in collector.findings(found, progress).values()]
-    assert line.startswith("600 of 625 detections were rejected as other_mark_of_one_exposure: an "
-                           "exposure shows several marks, but the plan expects one; state in the")
+    assert line.startswith(
+        "600 of 625 detections were rejected as other_mark_of_one_exposure: an "
+        "exposure shows several marks, but the plan expects one; state in the"
+    )
 
 
 def test_two_marks_of_one_exposure_with_the_stage_at_neither_are_not_at_their_mark():

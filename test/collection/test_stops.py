@@ -48,8 +48,14 @@ def checked(*, repeats=3, microscope=((0, 0), (0, 0)), turn=0, **settings):
     truth = replace(truth, microscope=np.array(microscope, dtype=float))
     how = CellSettings(**({"sigma_xy_m": NOISE} | settings))
     events = list(plan_events(truth, plan, settings=how, rng=rng, start_ns=START_NS))
-    return Scene(plan, truth, *([event for event in events if isinstance(event, kind)]
-                                for kind in (Command, EncoderSample, Detection)))
+    return Scene(
+        plan,
+        truth,
+        *(
+            [event for event in events if isinstance(event, kind)]
+            for kind in (Command, EncoderSample, Detection)
+        ),
+    )
 
 
 def progress_of(scene, **parameters):
@@ -65,12 +71,17 @@ def test_check_stops_are_visits_with_the_opposite_offset(sense, turn):
     assert readings.rejected == {}
     assert (progress.complete, progress.check_done, progress.needed) == (True, MARKS, 0)
     visits = readings.visits
-    last = np.argsort(visits.stamp_ns)[FIRST:FIRST + 4 * MARKS]
+    last = np.argsort(visits.stamp_ns)[FIRST : FIRST + 4 * MARKS]
     assert visits.count[last].tolist() == [1] * 4 * MARKS
     mark = visits.mark[last].reshape(4, MARKS)
     assert (mark == mark[0]).all()
-    usual = np.stack([np.median(row.reshape(-1)[visits.mark == k]) for k in mark[0]
-                      for row in (visits.offset_x, visits.offset_y)]).reshape(MARKS, 2)
+    usual = np.stack(
+        [
+            np.median(row.reshape(-1)[visits.mark == k])
+            for k in mark[0]
+            for row in (visits.offset_x, visits.offset_y)
+        ]
+    ).reshape(MARKS, 2)
     seen = np.stack([visits.offset_x, visits.offset_y], axis=1)[last].reshape(4, MARKS, 2)
     # the microscope stops at +x of the mark and sees it at -x; the plate at +x carries it to +x
     sign = 1 if sense is Sense.PLATE_MOVES else -1
@@ -78,10 +89,17 @@ def test_check_stops_are_visits_with_the_opposite_offset(sense, turn):
     np.testing.assert_allclose(seen - usual, np.broadcast_to(want, seen.shape), atol=3e-7)
 
 
-@pytest.mark.parametrize("microscope", [
-    ((0.01, -0.003), (0.007, 0.01)), ((-2, 0), (0, -2)), ((-0.5, 0), (0, -0.5)),
-    ((1, 0), (0, 1)), ((-1, 1), (1, -1))],
-    ids=["scale and turn", "other sign", "pixels doubled", "pixels halved", "axes exchanged"])
+@pytest.mark.parametrize(
+    "microscope",
+    [
+        ((0.01, -0.003), (0.007, 0.01)),
+        ((-2, 0), (0, -2)),
+        ((-0.5, 0), (0, -0.5)),
+        ((1, 0), (0, 1)),
+        ((-1, 1), (1, -1)),
+    ],
+    ids=["scale and turn", "other sign", "pixels doubled", "pixels halved", "axes exchanged"],
+)
 def test_no_microscope_makes_outliers_or_noise_of_check_stops(microscope):
     readings, progress = progress_of(checked(microscope=microscope, servo_sigma_m=0.0))
     assert readings.rejected == {}
@@ -139,19 +157,23 @@ def test_the_order_of_arrival_changes_nothing_on_the_way():
 
 def test_a_view_without_check_stops_asks_for_none_and_one_with_them_waits():
     scene = checked()
-    del scene.detections[FIRST:FIRST + 4 * MARKS]
+    del scene.detections[FIRST : FIRST + 4 * MARKS]
     readings, progress = progress_of(scene)
     assert (progress.grid_done, progress.check_done, progress.complete) == (25, 0, False)
     assert progress.needed == MARKS
-    timeline = gathered([replace(c, view=c.view and replace(
-        c.view, check_marks=0, check_offset_m=0.0)) for c in scene.commands]).timeline
+    timeline = gathered(
+        [
+            replace(c, view=c.view and replace(c.view, check_marks=0, check_offset_m=0.0))
+            for c in scene.commands
+        ]
+    ).timeline
     assert view_progress(timeline, 0, readings).complete
 
 
 def test_stops_that_scatter_like_check_stops_ask_for_none():
     """Nobody can count there, and the scatter itself shows the microscope."""
     scene = checked(stop_sigma_m=10e-6)
-    del scene.detections[FIRST:FIRST + 4 * MARKS]
+    del scene.detections[FIRST : FIRST + 4 * MARKS]
     _, progress = progress_of(scene)
     assert (progress.complete, progress.check_done) == (True, MARKS)
 
@@ -166,8 +188,9 @@ def test_which_stops_are_aside():
     key = np.array([0, 0, 0, 0, 0, 1, 1, 2])
     place = np.array([[0, 20, -20, 0, 0, 3, 3, 20], [0, 0, 0, 20, -20, 4, 4, 20]]) * 1e-6
     aside = stage_aside(key, place, OFFSET)
-    np.testing.assert_allclose(aside, np.array([[0, 20, -20, 0, 0, 0, 0, 0],
-                                                [0, 0, 0, 20, -20, 0, 0, 0]]) * 1e-6)
+    np.testing.assert_allclose(
+        aside, np.array([[0, 20, -20, 0, 0, 0, 0, 0], [0, 0, 0, 20, -20, 0, 0, 0]]) * 1e-6
+    )
     assert not stage_aside(key[:0], place[:, :0], OFFSET).any()
     assert not stage_aside(key, place / 2.5, OFFSET).any()  # too near
     assert not stage_aside(key, place * 1.6, OFFSET).any()  # too far
@@ -180,16 +203,30 @@ def test_which_stops_are_aside():
 def test_a_stop_on_one_side_alone_is_a_repeat():
     """Two marks with two repeats each, about one of them a third stop at +x; then one at -x too."""
     one_side = np.array([[0, 0, 20, 0, 0], [0, 0, 0, 0, 0]]) * 1e-6
-    for place, mark, extra in ((one_side, [0, 0, 0, 1, 1], 0),
-                               (np.hstack([one_side, [[-20e-6], [0]]]), [0, 0, 0, 1, 1, 0], 2)):
+    for place, mark, extra in (
+        (one_side, [0, 0, 0, 1, 1], 0),
+        (np.hstack([one_side, [[-20e-6], [0]]]), [0, 0, 0, 1, 1, 0], 2),
+    ):
         n = len(mark)
-        visits = GridVisits(**{field.name: np.zeros(n) for field in fields(GridVisits)
-                           if field.default is MISSING and field.default_factory is MISSING}
-                        | {"mark": np.array(mark), "count": np.ones(n, int), "dx": place[0],
-                           "dy": place[1], "offset_x": np.zeros(n), "offset_y": np.zeros(n)})
+        visits = GridVisits(
+            **{
+                field.name: np.zeros(n)
+                for field in fields(GridVisits)
+                if field.default is MISSING and field.default_factory is MISSING
+            }
+            | {
+                "mark": np.array(mark),
+                "count": np.ones(n, int),
+                "dx": place[0],
+                "dy": place[1],
+                "offset_x": np.zeros(n),
+                "offset_y": np.zeros(n),
+            }
+        )
         count = np.bincount(mark)
-        readings = replace(progress_of(checked())[0], m=np.arange(2), n=np.arange(2), count=count,
-                           visits=visits)
+        readings = replace(
+            progress_of(checked())[0], m=np.arange(2), n=np.arange(2), count=count, visits=visits
+        )
         view = View("0", check_marks=1, check_offset_m=OFFSET)
         stops, done = count_stops(view, readings)
         assert stops.tolist() == (count - [extra, 0]).tolist() and done == 0
@@ -200,8 +237,13 @@ WIDE = View("90", np.pi / 2, (0.01, 0.0), image=ImageCells(3, 5, 0.01))
 
 def test_cells_are_numbered_in_their_order_and_what_lies_beyond_them_is_none():
     cells = {x + 1j * y: number for number, (x, y) in enumerate(WIDE.image.cells)}
-    every = np.array([x + 1j * y for x in (-10**6, *range(-9, 10), 10**6)
-                      for y in (-10**6, *range(-9, 10), 10**6)])
+    every = np.array(
+        [
+            x + 1j * y
+            for x in (-(10**6), *range(-9, 10), 10**6)
+            for y in (-(10**6), *range(-9, 10), 10**6)
+        ]
+    )
     assert numbers_of(WIDE, every).tolist() == [cells.get(cell, -1) for cell in every]
 
 
@@ -213,15 +255,19 @@ def test_the_place_of_a_cell_is_as_many_pitches_off_along_the_rows_of_the_plate(
         place = rows * 0.01 * cells
         offset = np.stack([(place + beside_m).real, (place + beside_m).imag])
         np.testing.assert_allclose(cells_of(view, offset), cells, atol=1e-12)
-        np.testing.assert_allclose(places_of_cells(view, offset), [place.real, place.imag],
-                                   atol=1e-15)
+        np.testing.assert_allclose(
+            places_of_cells(view, offset), [place.real, place.imag], atol=1e-15
+        )
 
 
 def test_displacements_are_medians_of_a_cell_less_that_on_the_axis():
     away = np.array([[1, 2, 9, 5, 5, 6, 40], [0, -1, -1, 3, 4, 9, 40]]) * 1e-6
     number = np.array([7, 7, 7, 2, 2, 2, -1])  # on the axis, in cell 2, beyond the image
-    np.testing.assert_allclose(middles(WIDE, number, away) * 1e6, [
-        [0, 0, 0, 3, 3, 3, 0], [0, 0, 0, 5, 5, 5, 0]], atol=1e-12)
+    np.testing.assert_allclose(
+        middles(WIDE, number, away) * 1e6,
+        [[0, 0, 0, 3, 3, 3, 0], [0, 0, 0, 5, 5, 5, 0]],
+        atol=1e-12,
+    )
     assert not middles(WIDE, np.array([1, 2]), away[:, :2]).any()  # none on the axis
 
 
@@ -229,15 +275,17 @@ def test_marks_that_the_cells_show_are_those_seen_from_each_stop():
     """One by one: stops where a mark of the plate lies in the field, and the cell that sees it."""
     plate = Artifact(7, 0.01, 0, 5)
     view = replace(WIDE, rotation_rad=0.0)
-    for cell, sub, shown in zip(view.image.cells, view.sub_views, marks_shown(plate, view),
-                                strict=True):
+    for cell, sub, shown in zip(
+        view.image.cells, view.sub_views, marks_shown(plate, view), strict=True
+    ):
         stops = [(m, n) for m in range(-3, 4) for n in range(-2, 3) if -3 <= m + 1 <= 3]
         expected = {(m + cell[0], n + cell[1]) for m, n in stops}
         expected = {(m, n) for m, n in expected if abs(m) <= 3 and abs(n) <= 2}
         assert {(m - 3, n - 2) for m, n in np.argwhere(shown).tolist()} == expected, cell
         again = np.argwhere(beside(shown, plate, sub, -1)) - (3, 2)
         assert set(map(tuple, again.tolist())) == {
-            (m - cell[0], n - cell[1]) for m, n in expected}, cell
+            (m - cell[0], n - cell[1]) for m, n in expected
+        }, cell
 
 
 def test_what_is_taken_off_is_exactly_what_the_stops_show():

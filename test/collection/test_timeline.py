@@ -29,13 +29,23 @@ def owners(commands, *stamps):
     out = []
     for number in timeline.assign(np.array(stamps, dtype=np.int64)).tolist():
         interval = timeline.intervals[number] if number >= 0 else None
-        out.append("before" if interval is None
-                   else interval.reason if interval.view_index is None else interval.view_index)
+        out.append(
+            "before"
+            if interval is None
+            else interval.reason
+            if interval.view_index is None
+            else interval.view_index
+        )
     return out
 
 
-WHOLE = [command(10, PLACE), command(20, MEASURE), command(30, PLACE, 1), command(40, MEASURE, 1),
-         command(50, DONE, 3)]
+WHOLE = [
+    command(10, PLACE),
+    command(20, MEASURE),
+    command(30, PLACE, 1),
+    command(40, MEASURE, 1),
+    command(50, DONE, 3),
+]
 OUT, OLD, OTHER = Reason.OUTSIDE_VIEWS, Reason.SUPERSEDED, Reason.OTHER_PLAN
 RUN = Reason.OTHER_RUN
 
@@ -46,7 +56,17 @@ def of_run(commands, run_id):
 
 def test_a_view_lasts_from_its_stamp_to_just_before_the_next():
     assert owners(WHOLE, 9, 10, 19, 20, 29, 30, 40, 49, 50, 10**18) == [
-        "before", OUT, OUT, 0, 0, OUT, 1, 1, OUT, OUT]
+        "before",
+        OUT,
+        OUT,
+        0,
+        0,
+        OUT,
+        1,
+        1,
+        OUT,
+        OUT,
+    ]
 
 
 def test_what_the_timeline_says_of_itself():
@@ -96,16 +116,25 @@ def test_only_the_last_of_many_redos_counts():
 
 
 def test_a_view_measured_again_without_place_has_two_intervals():
-    commands = [command(10, PLACE), command(20, MEASURE), command(30, PLACE, 1),
-                command(40, MEASURE, 1), command(50, MEASURE)]
+    commands = [
+        command(10, PLACE),
+        command(20, MEASURE),
+        command(30, PLACE, 1),
+        command(40, MEASURE, 1),
+        command(50, MEASURE),
+    ]
     assert owners(commands, 20, 40, 50) == [0, 1, 0]
     assert len(build_timeline(commands).of_view(0)) == 2
 
 
 def test_another_pose_stays_superseded_when_its_view_goes_on():
     shifted = replace(PLAN.views[0], translation_m=(0.01, 0.0))
-    commands = [command(10, PLACE), command(20, MEASURE), command(30, MEASURE, view=shifted),
-                command(40, MEASURE, view=shifted)]
+    commands = [
+        command(10, PLACE),
+        command(20, MEASURE),
+        command(30, MEASURE, view=shifted),
+        command(40, MEASURE, view=shifted),
+    ]
     assert owners(commands, 20, 30, 40) == [OLD, 0, 0]
 
 
@@ -128,8 +157,11 @@ def test_views_planned_is_at_least_what_was_seen():
 
 def test_two_plates_in_one_plan_are_refused():
     odd = command(40, MEASURE, 1, artifact=Artifact(7, 0.01))
-    with pytest.raises(InputError, match=r"^view command of '0': describes a different plate from "
-                       r"the rest of plan '0, 90, tx'; use one plate in one plan$"):
+    with pytest.raises(
+        InputError,
+        match=r"^view command of '0': describes a different plate from "
+        r"the rest of plan '0, 90, tx'; use one plate in one plan$",
+    ):
         build_timeline([*WHOLE[:2], odd])
 
 
@@ -163,8 +195,10 @@ def test_without_any_place_a_second_measure_of_view_0_after_others_is_another_ru
 
 
 def test_runs_that_are_named_are_kept_apart_by_their_names():
-    first, second = of_run(WHOLE, "a"), [replace(c, stamp_ns=c.stamp_ns + 100, run_id="b")
-                                         for c in WHOLE[2:4]]
+    first, second = (
+        of_run(WHOLE, "a"),
+        [replace(c, stamp_ns=c.stamp_ns + 100, run_id="b") for c in WHOLE[2:4]],
+    )
     assert owners([*first, *second], 20, 40, 135, 140) == [RUN, RUN, OUT, 1]
     assert build_timeline([*first, *second]).run_id == "b"
     going_on = [replace(c, stamp_ns=c.stamp_ns + 100, run_id="a") for c in WHOLE[2:4]]
@@ -173,8 +207,11 @@ def test_runs_that_are_named_are_kept_apart_by_their_names():
 
 def test_two_runs_may_have_two_plates_and_two_numbers_of_views():
     other = Artifact(7, 0.01)
-    again = [command(60, PLACE, artifact=other), command(70, MEASURE, artifact=other),
-             command(80, DONE, 1, views_planned=1)]
+    again = [
+        command(60, PLACE, artifact=other),
+        command(70, MEASURE, artifact=other),
+        command(80, DONE, 1, views_planned=1),
+    ]
     again = [replace(c, views_planned=1) for c in again]
     timeline = build_timeline([*WHOLE, *again])
     assert (timeline.artifact, timeline.views_planned) == (other, 1)
@@ -187,8 +224,9 @@ def test_the_order_of_arrival_changes_no_run(commands):
     assert timeline == build_timeline(sorted(commands, key=lambda c: c.stamp_ns))
 
 
-@pytest.mark.parametrize("heard", [slice(1, None), slice(2, None), slice(3, 4), slice(0, 2),
-                                   slice(0, None)])
+@pytest.mark.parametrize(
+    "heard", [slice(1, None), slice(2, None), slice(3, 4), slice(0, 2), slice(0, None)]
+)
 def test_a_run_is_named_by_its_first_command_and_not_before_that_can_have_come(heard):
     """Commands arrive in any order: what is called an earlier run would be left aside for good."""
     known = heard.start == 0
@@ -210,10 +248,20 @@ def stray(stamp, phase, run_id="", index=0, **fields):
     return command(stamp, phase, index, run_id=run_id, **fields)
 
 
-@pytest.mark.parametrize("odd", [
-    stray(25, MEASURE, index=2), stray(25, PLACE), stray(25, ABORT), stray(25, DONE),
-    stray(25, MEASURE, "7"), stray(25, MEASURE, "24"), stray(25, MEASURE, "x"),
-    stray(25, MEASURE, plan_id="other"), stray(25, MEASURE, "10", plan_id="other")])
+@pytest.mark.parametrize(
+    "odd",
+    [
+        stray(25, MEASURE, index=2),
+        stray(25, PLACE),
+        stray(25, ABORT),
+        stray(25, DONE),
+        stray(25, MEASURE, "7"),
+        stray(25, MEASURE, "24"),
+        stray(25, MEASURE, "x"),
+        stray(25, MEASURE, plan_id="other"),
+        stray(25, MEASURE, "10", plan_id="other"),
+    ],
+)
 def test_a_command_of_no_run_that_has_begun_changes_nothing_within_one_that_has(odd):
     clean, timeline = build_timeline(RUN_10), build_timeline([odd, *RUN_10])
     assert timeline == replace(clean, strays=(odd,))
@@ -222,13 +270,23 @@ def test_a_command_of_no_run_that_has_begun_changes_nothing_within_one_that_has(
     assert open_run == replace(build_timeline(RUN_10[:2]), strays=(odd,))
 
 
-@pytest.mark.parametrize(("events", "run_id"), [
-    ([*RUN_10[:2], stray(25, MEASURE, "25", index=2)], "25"),  # another one begins
-    ([*RUN_10, stray(60, PLACE), stray(70, MEASURE)], "60"),  # behind the end
-    ([*of_run(WHOLE[1:-1], "10"), stray(45, MEASURE, "7")], "7"),  # no begin is there
-    ([*of_run(WHOLE[:2], "5"), stray(25, MEASURE, "7")], "7"),
-    ([*RUN_10[:2], *of_run([command(25, PLACE), command(26, MEASURE)], "25"),
-      stray(28, MEASURE, "10", index=1)], "10")])  # two that have begun take turns
+@pytest.mark.parametrize(
+    ("events", "run_id"),
+    [
+        ([*RUN_10[:2], stray(25, MEASURE, "25", index=2)], "25"),  # another one begins
+        ([*RUN_10, stray(60, PLACE), stray(70, MEASURE)], "60"),  # behind the end
+        ([*of_run(WHOLE[1:-1], "10"), stray(45, MEASURE, "7")], "7"),  # no begin is there
+        ([*of_run(WHOLE[:2], "5"), stray(25, MEASURE, "7")], "7"),
+        (
+            [
+                *RUN_10[:2],
+                *of_run([command(25, PLACE), command(26, MEASURE)], "25"),
+                stray(28, MEASURE, "10", index=1),
+            ],
+            "10",
+        ),
+    ],
+)  # two that have begun take turns
 def test_a_command_is_no_stray_where_it_may_be_meant(events, run_id):
     timeline = build_timeline(events)
     assert (timeline.run_id, timeline.strays) == (run_id, ())

@@ -19,8 +19,15 @@ NOISE = {"sigma_xy_m": 2e-8, "servo_sigma_m": 3e-8}
 
 def in_pairs(cell, *, size=1e-7):
     """Let every mark be exposed twice in each dwell; the second 1 ms later and off by `size`."""
-    again = [replace(d, stamp_ns=d.stamp_ns + 1000 * US, offset_x=d.offset_x + size,
-                     offset_y=d.offset_y - 2 * size) for d in cell.detections]
+    again = [
+        replace(
+            d,
+            stamp_ns=d.stamp_ns + 1000 * US,
+            offset_x=d.offset_x + size,
+            offset_y=d.offset_y - 2 * size,
+        )
+        for d in cell.detections
+    ]
     cell.detections = sorted(cell.detections + again, key=lambda d: d.stamp_ns)
     return cell
 
@@ -98,8 +105,12 @@ def test_an_outlier_is_in_no_visit_and_still_ends_the_one_of_another_mark():
     index = 12
     d, before = cell.detections[index], cell.detections[index - 1]
     # the mark before is seen again once this one has been seen, in the same dwell: two visits
-    again = replace(before, stamp_ns=d.stamp_ns + 100, offset_x=before.offset_x + (
-        before.m - d.m) * 0.01, offset_y=before.offset_y + (before.n - d.n) * 0.01)
+    again = replace(
+        before,
+        stamp_ns=d.stamp_ns + 100,
+        offset_x=before.offset_x + (before.m - d.m) * 0.01,
+        offset_y=before.offset_y + (before.n - d.n) * 0.01,
+    )
     cell.detections.append(again)
     whole = collect(cell.events, max_stage_distance=0.02)[0].views[0]
     cell.spoil(index, offset_x=d.offset_x + 2e-6)
@@ -131,9 +142,15 @@ def test_a_visit_whose_exposures_were_approached_differently_has_no_one_approach
     key = np.array([7, 7, 4, 4, 4, 7])
     values = np.arange(12.0).reshape(2, 6)
     means = reduce_repeats(key, values, np.zeros(6), limit=0.0)
-    visits = grid_visits(means, key, np.zeros(6), stamps_ns=np.arange(6) * 10, deviation=values,
-                         offset=-values, approach=np.array([[1, -1, 1, 1, 1, -1],
-                                                            [1, 1, 0, 0, -1, 0]], dtype=np.int8))
+    visits = grid_visits(
+        means,
+        key,
+        np.zeros(6),
+        stamps_ns=np.arange(6) * 10,
+        deviation=values,
+        offset=-values,
+        approach=np.array([[1, -1, 1, 1, 1, -1], [1, 1, 0, 0, -1, 0]], dtype=np.int8),
+    )
     assert visits.mark.tolist() == [0, 1, 1]
     assert visits.stamp_ns.tolist() == [30, 5, 50]
     assert visits.count.tolist() == [3, 2, 1]
@@ -153,8 +170,17 @@ def test_without_grid_marks_there_are_no_visits():
 def test_the_digest_covers_the_visits():
     readings = collect(in_pairs(scene(repeats=2)).events)[0].views[0]
     whole = readings_digest(readings, {})
-    for name in ("mark", "dx", "dy", "count", "stamp_ns", "offset_x", "offset_y", "approach_x",
-                 "approach_y"):
+    for name in (
+        "mark",
+        "dx",
+        "dy",
+        "count",
+        "stamp_ns",
+        "offset_x",
+        "offset_y",
+        "approach_x",
+        "approach_y",
+    ):
         column = getattr(readings.visits, name).copy()
         column[3] += 1
         changed = replace(readings, visits=replace(readings.visits, **{name: column}))

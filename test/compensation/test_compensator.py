@@ -35,16 +35,19 @@ def test_bilinear_is_the_weighted_mean_of_four_corners(x, y):
     i, j = min(int(s), 9), min(int(t), 9)
     u, v = s - i, t - j
     for got, field in zip(OF_MAP["bilinear"].error(x, y), (MAP.gx, MAP.gy), strict=True):
-        want = ((1 - u) * (1 - v) * field[i, j] + u * (1 - v) * field[i + 1, j]
-                + (1 - u) * v * field[i, j + 1] + u * v * field[i + 1, j + 1])
+        want = (
+            (1 - u) * (1 - v) * field[i, j]
+            + u * (1 - v) * field[i + 1, j]
+            + (1 - u) * v * field[i, j + 1]
+            + u * v * field[i + 1, j + 1]
+        )
         assert got == pytest.approx(want, rel=0, abs=1e-19)
 
 
 @given(x=inside, y=inside)
 def test_bicubic_is_the_interpolating_spline(x, y):
     sites = np.arange(-5, 6) * 0.01
-    for got, field in zip(OF_MAP["bicubic"].error(x, y), (MAP.gx, MAP.gy),
-                          strict=True):
+    for got, field in zip(OF_MAP["bicubic"].error(x, y), (MAP.gx, MAP.gy), strict=True):
         assert got == pytest.approx(RectBivariateSpline(sites, sites, field).ev(x, y), abs=1e-17)
 
 
@@ -52,8 +55,9 @@ def test_bicubic_is_the_interpolating_spline(x, y):
 @given(x=st.floats(-0.2, 0.2), y=st.floats(-0.2, 0.2))
 def test_correct_undoes_command_anywhere(method, x, y):
     compensator = OF_MAP[method]
-    np.testing.assert_allclose(compensator.correct(*compensator.command(x, y)), (x, y),
-                               rtol=0, atol=1e-16)
+    np.testing.assert_allclose(
+        compensator.correct(*compensator.command(x, y)), (x, y), rtol=0, atol=1e-16
+    )
 
 
 def test_correct_undoes_command_for_a_steep_map_and_at_sites():
@@ -159,23 +163,30 @@ def test_bicubic_refuses_unknown_sites_and_lines():
 def test_theta_is_periodic_and_inverts(method, theta, turns):
     compensator = OF_MAP[method]
     assert compensator.error_theta(theta + 2 * np.pi * turns) == pytest.approx(
-        compensator.error_theta(theta), abs=1e-14)
+        compensator.error_theta(theta), abs=1e-14
+    )
     assert compensator.correct_theta(compensator.command_theta(theta)) == pytest.approx(
-        theta, abs=3e-14)
+        theta, abs=3e-14
+    )
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_theta_gives_the_lines_themselves_and_the_mean_between_them(method):
     compensator = Compensator(MAP, method=method)
     lines = np.arange(-24, 48)
-    np.testing.assert_allclose(compensator.error_theta(lines * np.pi / 12), MAP.g_theta[lines % 24],
-                               rtol=0, atol=1e-16)
+    np.testing.assert_allclose(
+        compensator.error_theta(lines * np.pi / 12), MAP.g_theta[lines % 24], rtol=0, atol=1e-16
+    )
     if method == "bilinear":
         assert compensator.error_theta(-np.pi / 24) == pytest.approx(
-            (MAP.g_theta[23] + MAP.g_theta[0]) / 2, abs=1e-16)
-        assert compensator.uncertainty_theta(-np.pi / 24) == pytest.approx(np.hypot(
-            (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2, error_halfway(
-                MAP.g_theta, MAP.u_g_theta, ring=True)[0]))
+            (MAP.g_theta[23] + MAP.g_theta[0]) / 2, abs=1e-16
+        )
+        assert compensator.uncertainty_theta(-np.pi / 24) == pytest.approx(
+            np.hypot(
+                (MAP.u_g_theta[23] + MAP.u_g_theta[0]) / 2,
+                error_halfway(MAP.g_theta, MAP.u_g_theta, ring=True)[0],
+            )
+        )
         assert compensator.uncertainty_theta(-np.pi / 12) == pytest.approx(MAP.u_g_theta[23])
 
 
@@ -255,8 +266,9 @@ def test_a_spline_that_is_too_steep_between_its_sites_is_refused():
     back = compensator.correct(*compensator.command(x, y))
     np.testing.assert_allclose(back, (x, y), rtol=0, atol=1e-16)
     theta = np.linspace(-4, 4, 99)
-    np.testing.assert_allclose(compensator.correct_theta(compensator.command_theta(theta)), theta,
-                               rtol=0, atol=4e-15)
+    np.testing.assert_allclose(
+        compensator.correct_theta(compensator.command_theta(theta)), theta, rtol=0, atol=4e-15
+    )
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -266,8 +278,10 @@ def test_the_largest_slope_of_the_spline(seed):
     s, t = np.meshgrid(np.linspace(1e-5, 6 - 1e-5, 301), np.linspace(1e-5, 4 - 1e-5, 201))
     s, t = s.ravel(), t.ravel()
     step = 1e-6
-    slopes = [np.abs(np.subtract(cells.at(s + a, t + b), cells.at(s - a, t - b))) / (2 * step)
-              for a, b in ((step, 0), (0, step))]
+    slopes = [
+        np.abs(np.subtract(cells.at(s + a, t + b), cells.at(s - a, t - b))) / (2 * step)
+        for a, b in ((step, 0), (0, step))
+    ]
     assert cells.steepest() == pytest.approx(np.max(slopes[0] + slopes[1]), rel=0.1)
 
 
@@ -294,8 +308,9 @@ def test_a_point_is_corrected_to_the_bit_as_an_array_of_one(which, x, y):
 @given(theta=st.floats(-20.0, 20.0))
 def test_an_angle_is_corrected_to_the_bit_as_an_array_of_one(which, theta):
     compensator = OF_POINTS[which]
-    np.testing.assert_array_equal(compensator.correct_angle(theta),
-                                  compensator.correct_theta(theta))
+    np.testing.assert_array_equal(
+        compensator.correct_angle(theta), compensator.correct_theta(theta)
+    )
 
 
 def test_points_outside_are_refused_on_request_and_angles_without_lines():
@@ -312,8 +327,9 @@ def test_points_outside_are_refused_on_request_and_angles_without_lines():
 def test_cubic_pieces_are_those_of_scipy(count, periodic):
     values = np.random.default_rng(count).normal(size=(count, 2))
     closed = np.concatenate([values, values[:1]]) if periodic else values
-    want = CubicSpline(np.arange(len(closed)), closed,
-                       bc_type="periodic" if periodic else "not-a-knot").c[::-1]
+    want = CubicSpline(
+        np.arange(len(closed)), closed, bc_type="periodic" if periodic else "not-a-knot"
+    ).c[::-1]
     np.testing.assert_allclose(cubic_pieces(values, periodic=periodic), want, atol=1e-14)
 
 
@@ -322,8 +338,9 @@ def test_a_fourier_series_goes_through_the_lines_in_their_order():
     plate = Artifact(3, 0.01, 8, harmonics=2)
     wanted = lambda t: 1e-6 * (np.cos(t) - 2 * np.sin(t) + 3 * np.sin(2 * t))  # noqa: E731
     emap, zero = random_map(plate, 1), np.zeros(8)
-    stage = Compensator(ErrorMap(plate, emap.gx, emap.gy, emap.u_gx, emap.u_gy,
-                                 wanted(plate.theta_rad), zero))
+    stage = Compensator(
+        ErrorMap(plate, emap.gx, emap.gy, emap.u_gx, emap.u_gy, wanted(plate.theta_rad), zero)
+    )
     angle = np.linspace(-3, 9, 25)
     np.testing.assert_allclose(stage.error_theta(angle), wanted(angle), atol=1e-18)
     assert stage.correct_angle(0.7 + wanted(0.7)) == pytest.approx(0.7, abs=1e-15)

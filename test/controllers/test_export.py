@@ -18,10 +18,13 @@ from test.support.maps import random_map, result_of
 PLATE = Artifact(7, 0.01, 0, 5)
 COUNTS = 2e6  # in a mm: a sixteenth is 0.03 nm
 FRAMES = [
-    MachineFrame(), MachineFrame(2, 1), MachineFrame(4, 7, unit="m", home_x_m=-0.03, home_y_m=0.01),
+    MachineFrame(),
+    MachineFrame(2, 1),
+    MachineFrame(4, 7, unit="m", home_x_m=-0.03, home_y_m=0.01),
     MachineFrame(3, 1, unit="um", home_x_m=0.0123, reverse_x=True),
     MachineFrame(1, 2, unit="in", home_y_m=-0.0271, reverse_y=True),
-    MachineFrame(5, 6, home_x_m=0.003, home_y_m=0.05, reverse_x=True, reverse_y=True)]
+    MachineFrame(5, 6, home_x_m=0.003, home_y_m=0.05, reverse_x=True, reverse_y=True),
+]
 
 
 def wiring_of(frame, name, **kwargs) -> Wiring:
@@ -72,17 +75,24 @@ WRONG = {
     "home_y": lambda w: replace(w, frame=replace(w.frame, home_y_m=w.frame.home_y_m - 0.01)),
     "reverse_x": lambda w: replace(w, frame=replace(w.frame, reverse_x=not w.frame.reverse_x)),
     "reverse_y": lambda w: replace(w, frame=replace(w.frame, reverse_y=not w.frame.reverse_y)),
-    "axes": lambda w: replace(w, frame=replace(w.frame, x_axis=w.frame.y_axis,
-                                               y_axis=w.frame.x_axis)),
+    "axes": lambda w: replace(
+        w, frame=replace(w.frame, x_axis=w.frame.y_axis, y_axis=w.frame.x_axis)
+    ),
     "unit": lambda w: replace(w, frame=replace(w.frame, unit="um")),
     "counts": lambda w: replace(w, counts=w.counts and w.counts[::-1]),
-    "negate": lambda w: replace(w, negate=not w.negate)}
-HAS = {"axes": ("pmac", "beckhoff", "siemens"), "unit": ("kmotion", "linuxcnc", "siemens"),
-       "counts": ("pmac",), "negate": ("beckhoff", "siemens")}
+    "negate": lambda w: replace(w, negate=not w.negate),
+}
+HAS = {
+    "axes": ("pmac", "beckhoff", "siemens"),
+    "unit": ("kmotion", "linuxcnc", "siemens"),
+    "counts": ("pmac",),
+    "negate": ("beckhoff", "siemens"),
+}
 
 
-@pytest.mark.parametrize(("name", "what"), [
-    (name, what) for what in WRONG for name in HAS.get(what, FORMATS)])
+@pytest.mark.parametrize(
+    ("name", "what"), [(name, what) for what in WRONG for name in HAS.get(what, FORMATS)]
+)
 @pytest.mark.parametrize("frame", [FRAMES[0], FRAMES[5]])
 def test_a_file_does_not_correct_a_machine_that_is_wired_otherwise(name, what, frame):
     """With another sign, sense, order, direction, home, unit the error is not taken away."""
@@ -121,33 +131,46 @@ def test_a_long_axis_of_linuxcnc_has_as_many_lines_as_it_may():
 def test_beckhoff_is_told_of_more_points_than_it_expects(size, said):
     emap = random_map(Artifact(size, 1e-3), 1, gain=0.01)
     texts = FORMATS["beckhoff"].write(emap, Wiring(FRAMES[0]))
-    assert [line.split()[1] for lines in texts.values() for line in lines
-            if "max_points" in line] == said
+    assert [
+        line.split()[1] for lines in texts.values() for line in lines if "max_points" in line
+    ] == said
 
 
 def test_digits_are_those_of_the_rounding_and_zero_has_no_sign():
-    assert [fixed(v, 1e-3) for v in (-1e-12, 1.0, -1.25)] == ["0.00000000", "1.00000000",
-                                                           "-1.25000000"]
+    assert [fixed(v, 1e-3) for v in (-1e-12, 1.0, -1.25)] == [
+        "0.00000000",
+        "1.00000000",
+        "-1.25000000",
+    ]
     assert [fixed(1.0, unit) for unit in (1.0, 1e-6, 0.0254)] == [
-        "1." + 11 * "0", "1.00000", "1.0000000000"]
+        "1." + 11 * "0",
+        "1.00000",
+        "1.0000000000",
+    ]
 
 
-@pytest.mark.parametrize(("name", "text", "message"), [
-    ("linuxcnc", "0 0 0\n1 1\n", "file:2: '1 1' is not of the form"),
-    ("linuxcnc", "0 0 0\n1 1 1e20\n", "file:2: a number is too large"),
-    ("linuxcnc", "0 0 0\n0 1 1\n", "file: 2 lines, or positions that do not increase"),
-    ("linuxcnc", "0 0 0\n1 1 2\n", "file: forward and reverse differ"),
-    ("kmotion", "2,2\n1,1\n0,0\n0,0,1,1,0\n0,1,1,1,0\n1,0,1,1,0\n1,2,1,1,0",
-     "file:7: row 1, column 2 is not in the table"),
-    ("kmotion", "1,2\n1,1\n0,0", "file: 1 rows and 2 columns"),
-    ("kmotion", "2,2\n1,0\n0,0", "file: 2 rows and 2 columns, spacing [1.0, 0.0]"),
-    ("pmac", "#1\n5 5 5", "file:2: '5 5 5' is not part of a table"),
-    ("pmac", "DEFINE COMP 1.1,#1D,#3D,#1,9,9\n1 2 3", "file:1: motors (1, 3, 1) are not those"),
-    ("pmac", "DEFINE COMP 1.1,#1D,#2D,#1,9,9\n1 2", "file:1: 2 entries for 1.1; 3 belong")])
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("linuxcnc", "0 0 0\n1 1\n", "file:2: '1 1' is not of the form"),
+        ("linuxcnc", "0 0 0\n1 1 1e20\n", "file:2: a number is too large"),
+        ("linuxcnc", "0 0 0\n0 1 1\n", "file: 2 lines, or positions that do not increase"),
+        ("linuxcnc", "0 0 0\n1 1 2\n", "file: forward and reverse differ"),
+        (
+            "kmotion",
+            "2,2\n1,1\n0,0\n0,0,1,1,0\n0,1,1,1,0\n1,0,1,1,0\n1,2,1,1,0",
+            "file:7: row 1, column 2 is not in the table",
+        ),
+        ("kmotion", "1,2\n1,1\n0,0", "file: 1 rows and 2 columns"),
+        ("kmotion", "2,2\n1,0\n0,0", "file: 2 rows and 2 columns, spacing [1.0, 0.0]"),
+        ("pmac", "#1\n5 5 5", "file:2: '5 5 5' is not part of a table"),
+        ("pmac", "DEFINE COMP 1.1,#1D,#3D,#1,9,9\n1 2 3", "file:1: motors (1, 3, 1) are not those"),
+        ("pmac", "DEFINE COMP 1.1,#1D,#2D,#1,9,9\n1 2", "file:1: 2 entries for 1.1; 3 belong"),
+    ],
+)
 def test_a_reader_names_the_line_and_what_is_wrong(name, text, message):
     with pytest.raises(InputError) as raised:
-        loaded(name, [Source(text, "file")] * len(FORMATS[name].parts),
-               wiring_of(FRAMES[0], name))
+        loaded(name, [Source(text, "file")] * len(FORMATS[name].parts), wiring_of(FRAMES[0], name))
     assert str(raised.value).startswith(message)
 
 
@@ -157,8 +180,10 @@ def test_negated_values_are_for_a_machine_that_subtracts(name):
     plain = export(name, result_of(emap), wiring_of(FRAMES[0], name), "out.txt")
     made = export(name, result_of(emap), wiring_of(FRAMES[0], name, negate=True), "out.txt")
     assert made.residuals[0].largest("after") < 3e-11
-    added, subtracted = (loaded(name, sources_of(files), wiring_of(FRAMES[0], name))(
-        np.array(3.0), np.array(-7.0)) for files in (plain, made))
+    added, subtracted = (
+        loaded(name, sources_of(files), wiring_of(FRAMES[0], name))(np.array(3.0), np.array(-7.0))
+        for files in (plain, made)
+    )
     np.testing.assert_allclose(added, np.negative(subtracted), rtol=0, atol=1e-8)
 
 
@@ -168,8 +193,9 @@ def test_what_cannot_be_said_remains_and_the_file_says_how_much(name):
     made = export(name, result_of(emap), Wiring(FRAMES[0]), "out.txt")
     rest = [g - g.mean(axis=axis, keepdims=True) for g, axis in ((emap.gx, 1), (emap.gy, 0))]
     if name == "siemens":
-        rest = [g - g.mean(axis=1 - axis, keepdims=True)
-                for g, axis in zip(rest, (1, 0), strict=True)]
+        rest = [
+            g - g.mean(axis=1 - axis, keepdims=True) for g, axis in zip(rest, (1, 0), strict=True)
+        ]
     left = np.sqrt(sum((g - g.mean()).var() for g in rest))
     sites = made.residuals[0]
     assert sites.rms("after") == pytest.approx(left, rel=1e-3) and left > 5e-8
@@ -183,9 +209,21 @@ def test_the_comment_tells_where_a_file_comes_from(name):
     for text in made.files.values():
         mark = FORMATS[name].comment
         said = "\n".join(line for line in text.splitlines() if line.startswith(mark))
-        for part in ("demo.mcap", "abab", "plan: demo", "datum: no translation", "reference length",
-                     "standard uncertainty", "written by selfcal", "verdict: good", "2 sites were",
-                     "added to the command", FORMATS[name].what, "left at the nodes", "machine: "):
+        for part in (
+            "demo.mcap",
+            "abab",
+            "plan: demo",
+            "datum: no translation",
+            "reference length",
+            "standard uncertainty",
+            "written by selfcal",
+            "verdict: good",
+            "2 sites were",
+            "added to the command",
+            FORMATS[name].what,
+            "left at the nodes",
+            "machine: ",
+        ):
             assert part in said, part
         assert ("sense is not documented" in said) == (name in ("beckhoff", "siemens"))
         first = text.splitlines()[0]
@@ -195,8 +233,12 @@ def test_the_comment_tells_where_a_file_comes_from(name):
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_map_with_holes_is_refused(name):
     with pytest.raises(InputError, match="1 sites are unknown, and a table has no holes"):
-        export(name, result_of(random_map(PLATE, 1, unknown=((0, 0),))),
-               wiring_of(FRAMES[0], name), "out.txt")
+        export(
+            name,
+            result_of(random_map(PLATE, 1, unknown=((0, 0),))),
+            wiring_of(FRAMES[0], name),
+            "out.txt",
+        )
 
 
 @pytest.mark.parametrize("frame", [FRAMES[0], FRAMES[2], FRAMES[5]])
@@ -238,16 +280,26 @@ def test_what_an_active_table_bends_between_the_nodes_is_said(frame):
     bump = np.where(np.arange(len(y)) % 2, 2e-6 / frame.unit_m, 0.0)
     active = Grid((x[0], y[0]), (x[1] - x[0], y[1] - y[0]), np.tile(bump, (len(x), 1)), "hold")
     for also, bent in ((0.0, 2e-6), (5e-6, 2e-6)):  # a slope is no bend
-        made = export("kmotion", result_of(emap), wiring, "out.txt", active=lambda px, py, s=also: (
-            active.at(px, py) + s * px, 0 * px))
+        made = export(
+            "kmotion",
+            result_of(emap),
+            wiring,
+            "out.txt",
+            active=lambda px, py, s=also: (active.at(px, py) + s * px, 0 * px),
+        )
         assert made.bent_m == pytest.approx(bent, rel=1e-6)
         assert made.residuals[0].largest("after") < rounding("kmotion", frame) * 2
         assert "bends between the nodes of the map, up to 2 um, is lost" in made.files["out.txt"]
-    assert export("kmotion", result_of(emap), wiring, "o", active=export_of(
-        "kmotion", emap, wiring)).bent_m < 1e-10
+    assert (
+        export(
+            "kmotion", result_of(emap), wiring, "o", active=export_of("kmotion", emap, wiring)
+        ).bent_m
+        < 1e-10
+    )
 
 
 def export_of(name, emap, wiring):
     form = FORMATS[name]
-    return form.read([Source("\n".join(lines), part)
-                      for part, lines in form.write(emap, wiring).items()], wiring)
+    return form.read(
+        [Source("\n".join(lines), part) for part, lines in form.write(emap, wiring).items()], wiring
+    )

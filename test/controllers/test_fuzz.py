@@ -13,8 +13,29 @@ from selfcal_ros.model.artifact import Artifact
 from test.controllers.test_export import FRAMES, wiring_of
 from test.support.maps import random_map
 
-ODD = ("", "nan", "1e999", "-1", "0", "99999999999999999999", "x", "µ", ",", ";", "#", "/*", "[",
-       "0x10", "1.5", "\0", "--3", " ", "3 3", "1e-400", "4001")
+ODD = (
+    "",
+    "nan",
+    "1e999",
+    "-1",
+    "0",
+    "99999999999999999999",
+    "x",
+    "µ",
+    ",",
+    ";",
+    "#",
+    "/*",
+    "[",
+    "0x10",
+    "1.5",
+    "\0",
+    "--3",
+    " ",
+    "3 3",
+    "1e-400",
+    "4001",
+)
 
 
 def damaged(text: str, rng: random.Random) -> str:
@@ -34,8 +55,11 @@ def damaged(text: str, rng: random.Random) -> str:
             lines[at] = "".join(words) if rng.random() < 0.5 else " ".join(words)
         else:
             place = rng.randrange(len(lines[at]) + 1)
-            lines[at] = lines[at][:place] + rng.choice([*ODD, chr(rng.randrange(1, 300))]) \
-                + lines[at][place + rng.randrange(3):]
+            lines[at] = (
+                lines[at][:place]
+                + rng.choice([*ODD, chr(rng.randrange(1, 300))])
+                + lines[at][place + rng.randrange(3) :]
+            )
         lines = lines or [""]
     return "\n".join(lines)
 
@@ -43,13 +67,17 @@ def damaged(text: str, rng: random.Random) -> str:
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_damaged_file_is_read_or_refused_in_one_line(name):
     wiring, rng = wiring_of(FRAMES[0], name), random.Random(1)
-    texts = ["\n".join(lines) for lines in FORMATS[name].write(
-        random_map(Artifact(3, 0.01), 1), wiring).values()]
+    texts = [
+        "\n".join(lines)
+        for lines in FORMATS[name].write(random_map(Artifact(3, 0.01), 1), wiring).values()
+    ]
     at, refused = np.linspace(-15.0, 15.0, 7), 0
     for _ in range(600):
         spoilt = rng.randrange(len(texts))
-        sources = [Source(damaged(text, rng) if n == spoilt else text, "file")
-                   for n, text in enumerate(texts)]
+        sources = [
+            Source(damaged(text, rng) if n == spoilt else text, "file")
+            for n, text in enumerate(texts)
+        ]
         try:
             found = loaded(name, sources, wiring)(at, at[::-1])
         except InputError as error:

@@ -22,8 +22,11 @@ from test.support.maps import random_map
 
 MAP = random_map(Artifact(11, 0.01), 4, gain=20.0)  # errors of some 5 um, from site to site
 FRAME = MachineFrame(unit="m", home_x_m=-0.003, home_y_m=0.005)
-FRAMES = [FRAME, MachineFrame(unit="m", home_x_m=0.01, reverse_x=True),
-          MachineFrame(unit="m", home_y_m=-0.02, reverse_y=True)]
+FRAMES = [
+    FRAME,
+    MachineFrame(unit="m", home_x_m=0.01, reverse_x=True),
+    MachineFrame(unit="m", home_y_m=-0.02, reverse_y=True),
+]
 CORRECTIONS = {frame: wanted(MAP, Wiring(frame)) for frame in FRAMES}
 STAGE = Compensator(MAP)
 ROUNDING_MM = 3e-5
@@ -104,13 +107,23 @@ G1 Z1
 G1 X0 Y30 Z5
 M84 X Y E
 """
-PROGRAMS = [(MILL, "linuxcnc"), (LASER, "grbl"), (PRINTER, "marlin"),
-            (re.sub("M20[15].*", "M400", PRINTER).replace("M84 X Y E", "M84"), "klipper")]
+PROGRAMS = [
+    (MILL, "linuxcnc"),
+    (LASER, "grbl"),
+    (PRINTER, "marlin"),
+    (re.sub("M20[15].*", "M400", PRINTER).replace("M84 X Y E", "M84"), "klipper"),
+]
 
 
 def rewriter_of(dialect: str, *, um: float = 1.0, frame=FRAME, **kwargs) -> Rewriter:
-    return Rewriter(CORRECTIONS[frame], dialect=dialect, tolerance_m=um * 1e-6,
-                    step_m=MAP.artifact.grid_pitch_m / 32, decimals=6, **kwargs)
+    return Rewriter(
+        CORRECTIONS[frame],
+        dialect=dialect,
+        tolerance_m=um * 1e-6,
+        step_m=MAP.artifact.grid_pitch_m / 32,
+        decimals=6,
+        **kwargs,
+    )
 
 
 def corrected(text: str, dialect: str, **kwargs) -> str:
@@ -125,8 +138,12 @@ def reached(points_mm: np.ndarray, frame=FRAME) -> np.ndarray:
 
 def pieces(text: str, dialect: str, *, um: float = 1.0, frame=FRAME, seen=FRAME, **kwargs) -> int:
     """Run both programs as `seen` wires the stage; return the number of pieces."""
-    return run_both(text, rewriter_of(dialect, um=um, frame=frame, **kwargs),
-                    lambda points: reached(points, seen), um * 1e-3 + ROUNDING_MM)
+    return run_both(
+        text,
+        rewriter_of(dialect, um=um, frame=frame, **kwargs),
+        lambda points: reached(points, seen),
+        um * 1e-3 + ROUNDING_MM,
+    )
 
 
 @pytest.mark.parametrize(("program", "dialect"), PROGRAMS, ids=lambda value: value[:8])
@@ -152,12 +169,18 @@ def test_every_line_of_a_move_names_its_command(program, dialect):
     assert len(moves) > 100 and all(re.search(r"[GM]\d", line) for line in moves)
 
 
-SAID = {"linuxcnc": "G21 G90 G17\nG64 Q0\nF300\nG0 X0 Y0 Z5\n",
-        "grbl": "G21 G90 G17\nF300\nG0 X0 Y0 Z5\n",
-        **dict.fromkeys(("marlin", "klipper"), "G21\nG90\nM82\nG0 X0 Y0 Z5\nG92 E0\n")}
+SAID = {
+    "linuxcnc": "G21 G90 G17\nG64 Q0\nF300\nG0 X0 Y0 Z5\n",
+    "grbl": "G21 G90 G17\nF300\nG0 X0 Y0 Z5\n",
+    **dict.fromkeys(("marlin", "klipper"), "G21\nG90\nM82\nG0 X0 Y0 Z5\nG92 E0\n"),
+}
 KNOWN = {code.partition(".")[0] for codes in DIALECTS.values() for code in codes}
-ALL = [f"{letter}{number}{part}" for letter in "GM" for number in range(201)
-       for part in ("", *(".1", ".2", ".3", ".4", ".5")[:5 * (f"{letter}{number}" in KNOWN)])]
+ALL = [
+    f"{letter}{number}{part}"
+    for letter in "GM"
+    for number in range(201)
+    for part in ("", *(".1", ".2", ".3", ".4", ".5")[: 5 * (f"{letter}{number}" in KNOWN)])
+]
 FOLLOWING = ["", " X10 Y7", " P1", " Z2", " E1", " H1", " Z-1 R2 X3", " X10 R8", " X10 I5"]
 
 
@@ -173,12 +196,25 @@ def test_no_code_of_a_dialect_leads_the_stage_elsewhere(dialect):
             except InputError:
                 continue
             known.add(code)
-            for after in ("G1 X12", "G0 X3 Y4\nG1 X9 Y5 Z1")[:1 + ("X" in words)]:
+            for after in ("G1 X12", "G0 X3 Y4\nG1 X9 Y5 Z1")[: 1 + ("X" in words)]:
                 with contextlib.suppress(InputError):
                     ran += pieces(f"{text}\n{after}", dialect, um=50.0) > 0
     assert ran > 50 and known >= {"G0", "G1", "G2", "G3", "G4", "G28", "G90", "G21"}
-    assert not known & {"G10", "G20", "G29.1", "G52", "G68", "G93", "G41", "M206", "M98", "$H",
-                        "O100", "SET_GCODE_OFFSET X=2", "PARK"}
+    assert not known & {
+        "G10",
+        "G20",
+        "G29.1",
+        "G52",
+        "G68",
+        "G93",
+        "G41",
+        "M206",
+        "M98",
+        "$H",
+        "O100",
+        "SET_GCODE_OFFSET X=2",
+        "PARK",
+    }
     assert ("T1" in known) == (dialect in ("linuxcnc", "grbl"))  # it only names the next tool
     machine, unknown = Machine(dialect), set()
     for code in known:
@@ -196,20 +232,63 @@ def test_codes_that_change_no_place_are_inert(dialect):
     assert inert <= {*INERT[dialect].split(), "G95"}
 
 
-NUMBERS = st.one_of(st.integers(-40, 40).map(str), st.floats(-40, 40).map("{:.3f}".format),
-                    st.sampled_from(["1.", "+.5", "-0", "5 5", "1e3", "1..2", "--1", "#1", "[2]"]))
-WORDS = st.one_of(st.tuples(st.sampled_from("XYZXYZEIJRFPKLST"), NUMBERS).map("".join),
-                  st.tuples(st.sampled_from("xyUVWABC"), NUMBERS).map(" ".join))
-ANY_CODE = st.sampled_from([
-    "G0", "G1", "G2", "G3", "G4", "G10", "G18", "G20", "G28", "G30", "G38.2", "G41", "G43", "G49",
-    "G53", "G55", "G64", "G73", "G80", "G81", "G82", "G90", "G91", "G92", "G93", "M0", "M2", "M3",
-    "M6", "M18", "M82", "M83", "M84", "M205", "M206", "T1"])
+NUMBERS = st.one_of(
+    st.integers(-40, 40).map(str),
+    st.floats(-40, 40).map("{:.3f}".format),
+    st.sampled_from(["1.", "+.5", "-0", "5 5", "1e3", "1..2", "--1", "#1", "[2]"]),
+)
+WORDS = st.one_of(
+    st.tuples(st.sampled_from("XYZXYZEIJRFPKLST"), NUMBERS).map("".join),
+    st.tuples(st.sampled_from("xyUVWABC"), NUMBERS).map(" ".join),
+)
+ANY_CODE = st.sampled_from(
+    [
+        "G0",
+        "G1",
+        "G2",
+        "G3",
+        "G4",
+        "G10",
+        "G18",
+        "G20",
+        "G28",
+        "G30",
+        "G38.2",
+        "G41",
+        "G43",
+        "G49",
+        "G53",
+        "G55",
+        "G64",
+        "G73",
+        "G80",
+        "G81",
+        "G82",
+        "G90",
+        "G91",
+        "G92",
+        "G93",
+        "M0",
+        "M2",
+        "M3",
+        "M6",
+        "M18",
+        "M82",
+        "M83",
+        "M84",
+        "M205",
+        "M206",
+        "T1",
+    ]
+)
 LINES = st.builds(
     lambda before, codes, words, between, after: before + between.join([*codes, *words]) + after,
     st.sampled_from(["", "", "", "/", "N5 "]),
     st.lists(ANY_CODE | st.sampled_from(["G0", "G1", "G2", "G3"]), max_size=2),
-    st.lists(WORDS, max_size=4), st.sampled_from([" ", ""]),
-    st.sampled_from(["", "", "; X9", "(G91)"]))
+    st.lists(WORDS, max_size=4),
+    st.sampled_from([" ", ""]),
+    st.sampled_from(["", "", "; X9", "(G91)"]),
+)
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
@@ -308,12 +387,15 @@ klipper | G1 X5 (a) | 1: '(' does
 """
 """Dialect, program (+: its modes are said; //: end of line), line and reason."""
 CASES = [tuple(part.strip() for part in row.split(" | ")) for row in REFUSED.strip().splitlines()]
-CASES += [("marlin", "\tG1 X5", "1: '\\t' does not belong to a word of marlin"),
-          ("grbl", "(\u212a)", "1: '\u212a' acts on grbl even in"),
-          ("marlin", "; a\rG1 X5", "1: '\\r' acts"),
-          ("grbl", f"+G0 X0 Y0\nG1 X9 F{'0' * 70}9", "5: the corrected line is too long")]
+CASES += [
+    ("marlin", "\tG1 X5", "1: '\\t' does not belong to a word of marlin"),
+    ("grbl", "(\u212a)", "1: '\u212a' acts on grbl even in"),
+    ("marlin", "; a\rG1 X5", "1: '\\r' acts"),
+    ("grbl", f"+G0 X0 Y0\nG1 X9 F{'0' * 70}9", "5: the corrected line is too long"),
+]
 BEFORE = dict.fromkeys(("grbl", "linuxcnc"), "G21 G90\nG17\nF9\n") | dict.fromkeys(
-    ("marlin", "klipper"), "G21\nG90\nM82\n")
+    ("marlin", "klipper"), "G21\nG90\nM82\n"
+)
 
 
 @pytest.mark.parametrize(("dialect", "text", "message"), CASES)
@@ -329,8 +411,9 @@ def test_what_cannot_be_corrected_is_one_line(dialect, text, message):
 def test_increments_do_not_add_up_their_rounding():
     steps = "".join("G1 X0.3333 Y0.1\n" for _ in range(60))
     text = f"G21 G90\nG0 X0 Y0\nG91 F9\n{steps}"
-    rewriter = Rewriter(wanted(MAP, Wiring(FRAME)), dialect="grbl", tolerance_m=5e-4, step_m=3e-4,
-                        decimals=3)
+    rewriter = Rewriter(
+        wanted(MAP, Wiring(FRAME)), dialect="grbl", tolerance_m=5e-4, step_m=3e-4, decimals=3
+    )
     machine = Machine("grbl")
     for line in corrected_program(text, "a.nc", rewriter).splitlines():
         machine.run(line)
@@ -363,10 +446,16 @@ def test_the_page_lists_the_known_codes_with_their_words():
     page = (Path(__file__).parents[2] / "docs/guides/controllers.md").read_text()
     rows = [re.split(r"\s*\|\s*", line)[1:-1] for line in page.splitlines() if line[:2] == "| "]
     head = next(row for row in rows if row[1:] == list(DIALECTS))
-    listed = {(dialect, name, words, row[0].partition(":")[0])
-              for row in rows[rows.index(head) + 1:] if len(row) == len(head)
-              for dialect, cell in zip(DIALECTS, row[1:], strict=True)
-              for names, words in re.findall(r"([GM][^;()]*)(?:\((\w+)\))?", cell)
-              for name in names.split()}
-    assert listed == {(dialect, code.name, code.words, code.does)
-                      for dialect, codes in DIALECTS.items() for code in codes.values()}
+    listed = {
+        (dialect, name, words, row[0].partition(":")[0])
+        for row in rows[rows.index(head) + 1 :]
+        if len(row) == len(head)
+        for dialect, cell in zip(DIALECTS, row[1:], strict=True)
+        for names, words in re.findall(r"([GM][^;()]*)(?:\((\w+)\))?", cell)
+        for name in names.split()
+    }
+    assert listed == {
+        (dialect, code.name, code.words, code.does)
+        for dialect, codes in DIALECTS.items()
+        for code in codes.values()
+    }

@@ -14,10 +14,11 @@ DECIMALS_MM = 1.5e-4
 PROGRAMS = {
     "modes": MILL,
     "relative": "%\nG21 G90 G17 G61\nF300 G0 X0 Y0 Z9\nG91 G1 X20 Z-1\nG90 g3 x16 y 4 i-4\nG2 J5\n"
-                "G91\nG0 X-1 Y-1\nN9 G1 Y-3 (c) X.5 ; d\nG90 G1 X+.5 Y1.\n%\n",
+    "G91\nG0 X-1 Y-1\nN9 G1 Y-3 (c) X.5 ; d\nG90 G1 X+.5 Y1.\n%\n",
     "cycles": "G21 G90 G17 G64 P0.01 Q0\nG0 X0 Y0 Z9 F100\nG99 G83 X5 Z-4 R2 Q1\nY6\n"
-              "G98 G82 X7 R3 P.1 Z-1\nX3\nG0 Z9\nG73 X1 Y2 Z-1 R1 Q1\nG0 Z4\nG1 X9 Y9 Z3\nM2\n",
-    "inches": "G20 G90 G17 G64\nG0 X0 Y0 Z.3 F9\nG1 X1.5\nG2 X.75 Y.75 I-0.75\nM30\n"}
+    "G98 G82 X7 R3 P.1 Z-1\nX3\nG0 Z9\nG73 X1 Y2 Z-1 R1 Q1\nG0 Z4\nG1 X9 Y9 Z3\nM2\n",
+    "inches": "G20 G90 G17 G64\nG0 X0 Y0 Z.3 F9\nG1 X1.5\nG2 X.75 Y.75 I-0.75\nM30\n",
+}
 
 
 @pytest.mark.skipif(not RS274, reason="LinuxCNC is not installed")

@@ -35,8 +35,9 @@ class Measured:
 
     def __init__(self) -> None:
         plan, rng = hu_plan(Artifact(9, 0.008), repeats=2), np.random.default_rng(27)
-        truth = random_truth(plan.artifact, len(plan.views), rng,
-                             Spread(g_m=4e-6, correlation_pitches=3.0))
+        truth = random_truth(
+            plan.artifact, len(plan.views), rng, Spread(g_m=4e-6, correlation_pitches=3.0)
+        )
         self.result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=80e-9))
         nodes = plan.artifact.x_m[:, 0]
         self._g = [RectBivariateSpline(nodes, nodes, part) for part in truth.g]
@@ -64,8 +65,9 @@ def stage():
 def corrected(stage: Measured, path: Path, sign: float = 1.0):
     """Yield each line of a program and those that replace it."""
     correct = wanted(stage.result.error_map, Wiring(FRAME, negate=sign < 0))
-    rewriter = Rewriter(correct, dialect=DIALECTS[path.suffix], tolerance_m=TOLERANCE_M,
-                        step_m=0.25e-3, decimals=6)
+    rewriter = Rewriter(
+        correct, dialect=DIALECTS[path.suffix], tolerance_m=TOLERANCE_M, step_m=0.25e-3, decimals=6
+    )
     for number, line in enumerate(path.read_text().splitlines(), 1):
         yield line, rewriter.line(line, f"{path.name}:{number}")
 
@@ -81,14 +83,20 @@ def distances(stage: Measured, path: Path, sign: float = 1.0) -> tuple[np.ndarra
             if len(ideal) > 1:  # a cycle: the hole
                 ideal, made = ideal[-2:-1], made[-2:-1]
             whole = ideal[0].points[:, :2] * 1e-3
-            way = stage.reached(1e-3 * np.vstack([m.points[0] + np.linspace(0, 1, 8)[:, None] * (
-                m.points[-1] - m.points[0]) for m in made])[:, :2])
+            way = stage.reached(
+                1e-3
+                * np.vstack(
+                    [
+                        m.points[0] + np.linspace(0, 1, 8)[:, None] * (m.points[-1] - m.points[0])
+                        for m in made
+                    ]
+                )[:, :2]
+            )
             pairs = [(way[-1:], whole[-1:])]
             if known and not ideal[0].rapid:
                 pairs += [(way[::6], whole), (whole[::40], way)]
             for some, path_of in pairs:
-                off += [farthest(point[None], np.vstack([path_of, path_of[-1:]]))
-                        for point in some]
+                off += [farthest(point[None], np.vstack([path_of, path_of[-1:]])) for point in some]
                 limits.append(stage.expanded(some))
             known = True
         known &= not ideal or len(ideal[-1].points) > 1
@@ -111,8 +119,11 @@ def test_with_the_opposite_sign_it_is_far_outside(stage):
 
 def kept(line: str) -> list[str]:
     """Return the words of a line but those of its way."""
-    return sorted(re.sub(r"\s", "", word) for word in TOKEN.findall(line) if word[0] in "(;" or (
-        word[0] not in "XYZIJR" and not re.fullmatch("G0?[0-3]", word)))
+    return sorted(
+        re.sub(r"\s", "", word)
+        for word in TOKEN.findall(line)
+        if word[0] in "(;" or (word[0] not in "XYZIJR" and not re.fullmatch("G0?[0-3]", word))
+    )
 
 
 @pytest.mark.parametrize("path", PROGRAMS, ids=lambda path: path.stem)

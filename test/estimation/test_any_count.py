@@ -27,17 +27,24 @@ SIGMA_RAD = 2e-5
 
 def plan(count, lines=1):
     pitch = 0.01
-    return Plan("any", Artifact(5, pitch, count), (
-        View("first", repeats=3), View("quarter", math.pi / 2, angular=not count % 4, repeats=3),
-        View("shift", 0.0, (pitch, 0.0), repeats=3),
-        View("lines", lines * math.tau / count, grid=False, repeats=3)))
+    return Plan(
+        "any",
+        Artifact(5, pitch, count),
+        (
+            View("first", repeats=3),
+            View("quarter", math.pi / 2, angular=not count % 4, repeats=3),
+            View("shift", 0.0, (pitch, 0.0), repeats=3),
+            View("lines", lines * math.tau / count, grid=False, repeats=3),
+        ),
+    )
 
 
 def measured(count, seed=1, sigma_rad=SIGMA_RAD, lines=1, sense=Sense.MICROSCOPE_MOVES):
     rng, views = np.random.default_rng(seed), plan(count, lines)
     truth = random_truth(views.artifact, 4, rng, Spread(phi_rad=1e-3))
-    return truth, simulate_measurements(truth, views, rng, sigma_m=20e-9 * bool(sigma_rad),
-                                        sigma_theta_rad=sigma_rad, sense=sense)
+    return truth, simulate_measurements(
+        truth, views, rng, sigma_m=20e-9 * bool(sigma_rad), sigma_theta_rad=sigma_rad, sense=sense
+    )
 
 
 def error_of(result, truth):
@@ -52,7 +59,8 @@ def test_readings_without_noise_give_the_truth(count, sense):
     result = calibrate(readings, BARE)
     assert np.abs(error_of(result, truth)).max() < 1e-12
     assert result.artifact_map.a_theta == pytest.approx(
-        truth.a_theta - truth.a_theta.mean() + result.artifact_map.a_theta.mean(), abs=1e-12)
+        truth.a_theta - truth.a_theta.mean() + result.artifact_map.a_theta.mean(), abs=1e-12
+    )
 
 
 @pytest.mark.parametrize("count", [7, 10])
@@ -66,7 +74,8 @@ def test_u_is_that_of_the_errors(count):
     assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.2
     predicted = predict_plan(plan(count), ThetaDatum.ZERO_MEAN).rms_theta
     assert result.error_map.u_g_theta.mean() == pytest.approx(
-        predicted * SIGMA_RAD / math.sqrt(3), rel=0.3)
+        predicted * SIGMA_RAD / math.sqrt(3), rel=0.3
+    )
 
 
 def test_lines_with_a_common_divisor_hide_harmonics():
@@ -86,8 +95,11 @@ def test_views_off_the_lines_measure_the_grid_alone():
     with pytest.raises(InputError, match=r"2\.5 is not a whole number of angular line"):
         replace(found.views[1], angular=True).lattice_pose(artifact)
     _, ranked = rank_next(found)
-    turned = [item.view for item in ranked if item.view and item.view.grid
-              and round(math.degrees(item.view.rotation_rad)) % 180]
+    turned = [
+        item.view
+        for item in ranked
+        if item.view and item.view.grid and round(math.degrees(item.view.rotation_rad)) % 180
+    ]
     assert turned and not any(view.angular for view in turned)
 
 

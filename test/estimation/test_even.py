@@ -28,10 +28,15 @@ def mixed_plan(text, nx, ny, **how):
     """Return a plan whose quarter turns are shifted by half a pitch if one side is even."""
     plan = plan_of(text, nx, size_y=ny, **how)
     beside = plan.artifact.quarter_shift * plan.artifact.grid_pitch_m
-    return replace(plan, views=tuple(
-        view if round(view.rotation_rad / (np.pi / 2)) % 2 == 0 or not view.grid else
-        replace(view, translation_m=tuple(along + beside for along in view.translation_m))
-        for view in plan.views))
+    return replace(
+        plan,
+        views=tuple(
+            view
+            if round(view.rotation_rad / (np.pi / 2)) % 2 == 0 or not view.grid
+            else replace(view, translation_m=tuple(along + beside for along in view.translation_m))
+            for view in plan.views
+        ),
+    )
 
 
 def measured(plan, seed, *, sigma_m=20e-9, **how):
@@ -46,8 +51,9 @@ def measured(plan, seed, *, sigma_m=20e-9, **how):
 def test_the_dense_solution_is_the_same(size, text, finite):
     """Map, plate, misalignments and u, in the datum of the product."""
     _, readings = measured(plan_of(text, size), size, linear=not finite)
-    result = calibrate(readings, Options(
-        assumed=(), misalignment_model="rigid" if finite else "linear"))
+    result = calibrate(
+        readings, Options(assumed=(), misalignment_model="rigid" if finite else "linear")
+    )
     want, emap = solve(readings, finite=finite), result.error_map
     assert np.abs(emap.gx + 1j * emap.gy - want.field).max() < 1e-13
     plate = result.artifact_map
@@ -59,9 +65,21 @@ def test_the_dense_solution_is_the_same(size, text, finite):
     assert u == pytest.approx(want.u_field, rel=1e-6)
 
 
-@pytest.mark.parametrize("text", [
-    "0, 90, tx", "0, tx, ty", "0, 90, tx2", "0, tx2, ty2", "0, 180, tx", "0, 90, 180",
-    "0, 180, -tx, tx", "0, 90", "0, tx", "0"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0, 90, tx",
+        "0, tx, ty",
+        "0, 90, tx2",
+        "0, tx2, ty2",
+        "0, 180, tx",
+        "0, 90, 180",
+        "0, 180, -tx, tx",
+        "0, 90",
+        "0, tx",
+        "0",
+    ],
+)
 @pytest.mark.parametrize("size", [(4, 0), (6, 0), (4, 6), (5, 4)])
 def test_the_rank_is_that_of_the_dense_matrix(size, text):
     """Of plans that identify the stage and of those that do not."""
@@ -78,8 +96,10 @@ def test_readings_without_noise_give_the_truth(size, sense):
     result = calibrate(readings)
     emap = result.error_map
     assert np.abs([emap.gx - truth.g[0], emap.gy - truth.g[1]]).max() < 1e-15
-    assert np.abs([result.artifact_map.ax - truth.a[0],
-                   result.artifact_map.ay - truth.a[1]]).max() < 1e-15
+    assert (
+        np.abs([result.artifact_map.ax - truth.a[0], result.artifact_map.ay - truth.a[1]]).max()
+        < 1e-15
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -104,16 +124,18 @@ def test_images_of_nine_marks_give_the_map(sense, with_ids):
     assert all(view.grid_done == view.grid_expected for view in progress.values())
     found = calibrate(readings)
     np.testing.assert_allclose([found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11)
-    np.testing.assert_allclose([found.artifact_map.ax, found.artifact_map.ay], shot.truth.a,
-                               atol=2e-11)
+    np.testing.assert_allclose(
+        [found.artifact_map.ax, found.artifact_map.ay], shot.truth.a, atol=2e-11
+    )
 
 
 def test_errors_lie_in_u():
     """Over 40 machines, between the limits of a binomial count (alike within a machine)."""
     inside = squares = number = 0.0
     for seed in range(40):
-        plan = mixed_plan("0, 90, tx, ty", *((8, 0), (6, 4), (7, 6), (4, 0))[seed % 4], count=8,
-                          line=True)
+        plan = mixed_plan(
+            "0, 90, tx, ty", *((8, 0), (6, 4), (7, 6), (4, 0))[seed % 4], count=8, line=True
+        )
         truth, readings = measured(plan, seed, sigma_theta_rad=1e-6)
         result = solve_joint(readings, BARE).result
         emap, k = result.error_map, result.noise.k_xy
@@ -139,10 +161,14 @@ def test_no_site_lies_on_an_axis():
 
 def test_a_quarter_turn_of_mixed_sides_is_half_a_pitch_beside():
     plan = plan_of("0, 90, tx", 8, size_y=5)
-    with pytest.raises(InputError, match=r"rows of 8 x 5 marks lie between rows at a shift of 0 "
-                                         r"pitch; shift it by \[0.5, 0.5\] pitch"):
+    with pytest.raises(
+        InputError,
+        match=r"rows of 8 x 5 marks lie between rows at a shift of 0 "
+        r"pitch; shift it by \[0.5, 0.5\] pitch",
+    ):
         plan.views[1].on_stage(plan.artifact)
     seen = check_plan(replace(plan, views=(plan.views[0], plan.views[2]))).observability
-    assert in_words(seen.advice)[0] == ("add a view turned by 90 deg and shifted by +0.5 pitch "
-                                        "along X and +0.5 pitch along Y")
+    assert in_words(seen.advice)[0] == (
+        "add a view turned by 90 deg and shifted by +0.5 pitch along X and +0.5 pitch along Y"
+    )
     assert check_plan(mixed_plan("0, 90, tx", 8, 5)).observability.identifiable

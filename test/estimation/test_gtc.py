@@ -21,26 +21,39 @@ gtc = pytest.importorskip("GTC")
 @pytest.mark.parametrize("u_scale", [1e-7, 1e-6, 1e-5])
 def test_the_budget_of_a_map_has_u_dof_and_k_of_gtc(u_scale):
     artifact, rng = Artifact(5, 0.01, 8), np.random.default_rng(1)
-    readings = simulate_measurements(random_truth(artifact, 4, rng), hu_plan(artifact, 2), rng,
-                                     sigma_m=2e-8, sigma_theta_rad=2e-5)
-    for budget in budgets(calibrate(readings, bare(causes=False, reference=ReferenceLength(
-            "artifact", 0.0, u_scale)))):
-        total = sum(gtc.ureal(0, line.effect_rms, line.dof) for line in budget.lines
-                    if line.effect_rms > 0)
+    readings = simulate_measurements(
+        random_truth(artifact, 4, rng),
+        hu_plan(artifact, 2),
+        rng,
+        sigma_m=2e-8,
+        sigma_theta_rad=2e-5,
+    )
+    for budget in budgets(
+        calibrate(readings, bare(causes=False, reference=ReferenceLength("artifact", 0.0, u_scale)))
+    ):
+        total = sum(
+            gtc.ureal(0, line.effect_rms, line.dof) for line in budget.lines if line.effect_rms > 0
+        )
         assert budget.u_rms == pytest.approx(gtc.uncertainty(total), rel=1e-12)
         assert budget.dof == pytest.approx(gtc.dof(total), rel=0.02)
         assert budget.k == pytest.approx(gtc.rp.k_factor(gtc.dof(total), 95.45), rel=2e-3)
 
 
-@pytest.mark.parametrize(("u", "dof"), [((2.0, 1.0), (5.0, 8.0)), ((1.0, 1.0), (3.0, np.inf)),
-                                        ((0.3, 4.0), (60.0, 2.5))])
+@pytest.mark.parametrize(
+    ("u", "dof"), [((2.0, 1.0), (5.0, 8.0)), ((1.0, 1.0), (3.0, np.inf)), ((0.3, 4.0), (60.0, 2.5))]
+)
 def test_the_deviation_of_a_run_has_the_dof_of_gtc(u, dof):
-    runs = [RunValues(np.array([9.0 * (i == 0), 0, 0, 0]), one**2 * np.eye(4), np.zeros((4, 4)),
-                      True, many) for i, (one, many) in enumerate(zip(u, dof, strict=True))]
+    runs = [
+        RunValues(
+            np.array([9.0 * (i == 0), 0, 0, 0]), one**2 * np.eye(4), np.zeros((4, 4)), True, many
+        )
+        for i, (one, many) in enumerate(zip(u, dof, strict=True))
+    ]
     e_n = mean_of(runs, np.zeros((4, 0)), np.zeros((4, 0))).deviations[0].e_n[0]
     difference = gtc.ureal(9.0, u[0], dof[0]) - gtc.ureal(0.0, u[1], dof[1])
-    assert e_n == pytest.approx(9.0 / (coverage_factor(gtc.dof(difference))
-                                       * gtc.uncertainty(difference)), rel=1e-6)
+    assert e_n == pytest.approx(
+        9.0 / (coverage_factor(gtc.dof(difference)) * gtc.uncertainty(difference)), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("warmer", [-3.0, 0.0, 0.4])

@@ -24,8 +24,9 @@ def test_two_turns_give_the_map(sense):
     found = calibrate(measurements)
     np.testing.assert_allclose([found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11)
     for view, result in zip(measurements.views, found.views, strict=True):
-        assert result.phi == pytest.approx(shot.truth.phi_rad[int(view.view.plan_view == "90")],
-                                           abs=1e-7)
+        assert result.phi == pytest.approx(
+            shot.truth.phi_rad[int(view.view.plan_view == "90")], abs=1e-7
+        )
 
 
 def test_two_turns_are_predicted_to_be_enough():

@@ -29,8 +29,12 @@ BARE = Options(assumed=())
 LINEAR = Options(assumed=(), misalignment_model="linear")
 COUNT = 8
 HOLES = (0, 3, 17, 24, 25, 31, 40, 48)
-PLATES = {"rings": rings, "scatter": scatter, "holes": lambda: lattice(7, HOLES),
-          "even": lambda: lattice(8)}
+PLATES = {
+    "rings": rings,
+    "scatter": scatter,
+    "holes": lambda: lattice(7, HOLES),
+    "even": lambda: lattice(8),
+}
 
 
 @pytest.mark.parametrize("how", ["bilinear", "bicubic"])
@@ -38,8 +42,9 @@ PLATES = {"rings": rings, "scatter": scatter, "holes": lambda: lattice(7, HOLES)
 def test_readings_without_noise_give_the_truth(name, how):
     """Stage and plate: the sign of each place, turn and shift matters."""
     artifact = PLATES[name]()
-    artifact = replace(artifact, map_grid=replace(
-        artifact.map_grid, interpolation=Interpolation(how)))
+    artifact = replace(
+        artifact, map_grid=replace(artifact.map_grid, interpolation=Interpolation(how))
+    )
     found, truth = readings(artifact, SIX, np.random.default_rng(1), sigma=0.0)
     result = calibrate(found, BARE)
     assert result.error_map.valid.sum() >= 21
@@ -59,10 +64,12 @@ def test_the_dense_solution_is_the_same(name):
     known = result.error_map.valid
     field, u = (both[:, known] for both in dense(found, known))
     assert np.stack([result.error_map.gx, result.error_map.gy])[:, known] == pytest.approx(
-        field, abs=1e-13)
+        field, abs=1e-13
+    )
     lack = adequacy_of(fit_joint(found, LINEAR)).effect(result).xy[:, known]
     assert np.stack([result.error_map.u_gx, result.error_map.u_gy])[:, known] == pytest.approx(
-        np.hypot(u * result.noise.sigma_xy, lack), rel=1e-5)
+        np.hypot(u * result.noise.sigma_xy, lack), rel=1e-5
+    )
 
 
 def as_list(found: Measurements, artifact: Artifact) -> Measurements:
@@ -70,8 +77,10 @@ def as_list(found: Measurements, artifact: Artifact) -> Measurements:
     half = found.artifact.half
     order = np.lexsort((artifact.y_m[:, 0].round(6), artifact.x_m[:, 0].round(6)))
     ids = artifact.m[order, 0].reshape(found.artifact.shape)
-    views = tuple(replace(view, m=ids[view.m + half[0], view.n + half[1]],
-                          n=np.zeros_like(view.n)) for view in found.views)
+    views = tuple(
+        replace(view, m=ids[view.m + half[0], view.n + half[1]], n=np.zeros_like(view.n))
+        for view in found.views
+    )
     return replace(found, artifact=artifact, views=views)
 
 
@@ -82,9 +91,15 @@ def test_a_lattice_as_a_list_gives_the_same_numbers():
     listed = lattice(9)
     scale = half / (max(listed.reach) * listed.grid_pitch_m)
     assert scale == pytest.approx(0.8)
-    listed = replace(listed, map_grid=one.artifact.map_grid, marks=replace(
-        listed.marks, x_m=tuple(scale * x for x in listed.marks.x_m),
-        y_m=tuple(scale * y for y in listed.marks.y_m)))
+    listed = replace(
+        listed,
+        map_grid=one.artifact.map_grid,
+        marks=replace(
+            listed.marks,
+            x_m=tuple(scale * x for x in listed.marks.x_m),
+            y_m=tuple(scale * y for y in listed.marks.y_m),
+        ),
+    )
     two = as_list(one, listed)
     a, b = calibrate(one), calibrate(two)
     for name in ("gx", "gy", "u_gx", "u_gy"):
@@ -92,11 +107,14 @@ def test_a_lattice_as_a_list_gives_the_same_numbers():
     order = np.lexsort((listed.y_m[:, 0].round(6), listed.x_m[:, 0].round(6)))
     for name in ("ax", "ay", "u_ax", "u_ay"):
         assert getattr(b.artifact_map, name)[order, 0] == pytest.approx(
-            getattr(a.artifact_map, name).ravel(), abs=1e-15)
+            getattr(a.artifact_map, name).ravel(), abs=1e-15
+        )
     assert b.noise.sigma_xy == pytest.approx(a.noise.sigma_xy, rel=1e-9)
     assert b.observability.rank == a.observability.rank
     assert (b.verdict.grade, [c.name for c in b.verdict.causes]) == (
-        a.verdict.grade, [c.name for c in a.verdict.causes])
+        a.verdict.grade,
+        [c.name for c in a.verdict.causes],
+    )
     assert b.artifact_map.magnification == pytest.approx(a.artifact_map.magnification, abs=1e-14)
 
 
@@ -110,7 +128,8 @@ def test_errors_of_stage_and_plate_lie_in_u(name):
         assert result.verdict.qualified
         known = result.error_map.valid
         z = error_in_datum(result.error_map, truth) / np.stack(
-            [result.error_map.u_gx, result.error_map.u_gy])
+            [result.error_map.u_gx, result.error_map.u_gy]
+        )
         squares += float((z[:, known] ** 2).sum())
         inside += int((np.abs(z[:, known]) < result.noise.k_xy).sum())
         number += 2 * int(known.sum())
@@ -148,9 +167,16 @@ def test_a_result_keeps_its_marks():
 
 
 def views_of(artifact: Artifact, poses) -> tuple[View, ...]:
-    return tuple(View(f"v{i}", np.radians(turn), tuple(
-        step * artifact.grid_pitch_m for step in shift), True, False)
-        for i, (turn, shift) in enumerate(poses))
+    return tuple(
+        View(
+            f"v{i}",
+            np.radians(turn),
+            tuple(step * artifact.grid_pitch_m for step in shift),
+            True,
+            False,
+        )
+        for i, (turn, shift) in enumerate(poses)
+    )
 
 
 def test_a_plan_is_judged_as_the_dense_solution():
@@ -167,8 +193,11 @@ def test_a_plan_is_judged_as_the_dense_solution():
 def test_three_views_determine_a_lattice_of_even_sides(nodes, gain):
     """As docs/guides/identifiability.md says: 0, 90 deg and a shift by a pitch."""
     artifact = lattice(8, nodes=nodes)
-    views = (View("0", 0.0), View("90", np.pi / 2),
-             View("shift", 0.0, (artifact.grid_pitch_m, 0.0)))
+    views = (
+        View("0", 0.0),
+        View("90", np.pi / 2),
+        View("shift", 0.0, (artifact.grid_pitch_m, 0.0)),
+    )
     plan = Plan("even", artifact, views)
     assert check_plan(plan).observability.identifiable
     assert predict_plan(plan, ThetaDatum.ZERO_MEAN).rms_xy == pytest.approx(gain, abs=1e-4)
@@ -186,8 +215,9 @@ def test_three_nodes_a_side_are_determined_as_the_dense_solution_says(how, poses
     assert np.stack([found.ux, found.uy]) == pytest.approx(u, rel=1e-5)
 
 
-@pytest.mark.parametrize("poses", [THREE[:1], ((0, (0, 0)), (90, (0, 0))),
-                                   ((0, (0, 0)), (180, (0, 0)), (0, (1, 0)))])
+@pytest.mark.parametrize(
+    "poses", [THREE[:1], ((0, (0, 0)), (90, (0, 0))), ((0, (0, 0)), (180, (0, 0)), (0, (1, 0)))]
+)
 def test_three_nodes_a_side_are_not_determined_by_turns_or_shifts_alone(poses):
     artifact = lattice(4, nodes=3)
     assert not check_plan(Plan("p", artifact, views_of(artifact, poses))).observability.identifiable
@@ -199,12 +229,16 @@ def test_a_plan_that_shows_too_little_is_refused():
     with pytest.raises(NotIdentifiableError, match="do not identify"):
         calibrate(found, BARE)
     seen = check_plan(Plan("p", artifact, views_of(artifact, THREE[:1]))).observability
-    assert not seen.identifiable and any(
-        "mm along X" in text for text in in_words(seen.advice))
+    assert not seen.identifiable and any("mm along X" in text for text in in_words(seen.advice))
 
 
 def test_no_turn_makes_plans_of_a_list_equal():
     """A lattice looks the same after a quarter turn, scattered marks do not."""
-    keys = [[equivalent_key(artifact, views_of(artifact, [(0, (0, 0)), (turn, (0, 0))]))
-             for turn in (90, 270)] for artifact in (scatter(), plate(9, 5))]
+    keys = [
+        [
+            equivalent_key(artifact, views_of(artifact, [(0, (0, 0)), (turn, (0, 0))]))
+            for turn in (90, 270)
+        ]
+        for artifact in (scatter(), plate(9, 5))
+    ]
     assert keys[0][0] != keys[0][1] and keys[1][0] == keys[1][1]

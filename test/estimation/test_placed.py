@@ -44,7 +44,8 @@ def test_the_dense_solution_is_the_same():
     assert np.stack([result.error_map.gx, result.error_map.gy]) == pytest.approx(field, abs=1e-15)
     lack = adequacy_of(fit_joint(found, LINEAR)).effect(result).xy
     assert np.stack([result.error_map.u_gx, result.error_map.u_gy]) == pytest.approx(
-        np.hypot(u * result.noise.sigma_xy, lack), rel=1e-6)
+        np.hypot(u * result.noise.sigma_xy, lack), rel=1e-6
+    )
 
 
 def test_on_the_lattice_the_map_is_that_of_the_lattice():
@@ -52,8 +53,9 @@ def test_on_the_lattice_the_map_is_that_of_the_lattice():
     poses = ((0, (0, 0)), (90, (0, 0)), (0, (1, 0)), (180, (0, 1)))
     placed, _ = readings(plate(7, 7), poses, np.random.default_rng(3))
     one = calibrate(placed, BARE).error_map
-    other = calibrate(replace(placed, artifact=replace(placed.artifact, map_grid=None)),
-                      BARE).error_map
+    other = calibrate(
+        replace(placed, artifact=replace(placed.artifact, map_grid=None)), BARE
+    ).error_map
     assert one.gx == pytest.approx(other.gx, abs=1e-14)
     assert one.gy == pytest.approx(other.gy, abs=1e-14)
     assert one.u_gx == pytest.approx(other.u_gx, rel=1e-6)
@@ -68,8 +70,9 @@ def test_what_moves_turns_the_map():
     assert moved.gx == pytest.approx(-stage.gx[::-1, ::-1], abs=1e-18)
 
 
-@pytest.mark.parametrize(("poses", "how"), [(SIX, "bicubic"), (SIX, "bilinear"),
-                                            (THREE, "bicubic")])
+@pytest.mark.parametrize(
+    ("poses", "how"), [(SIX, "bicubic"), (SIX, "bilinear"), (THREE, "bicubic")]
+)
 def test_errors_lie_in_u(poses, how):
     """z of all nodes over many sessions, and the part inside of U.
 
@@ -83,7 +86,8 @@ def test_errors_lie_in_u(poses, how):
         assert result.verdict.qualified
         known = result.error_map.valid
         z = error_in_datum(result.error_map, truth) / np.stack(
-            [result.error_map.u_gx, result.error_map.u_gy])
+            [result.error_map.u_gx, result.error_map.u_gy]
+        )
         squares += float((z[:, known] ** 2).sum())
         inside += int((np.abs(z[:, known]) < result.noise.k_xy).sum())
         number += 2 * int(known.sum())
@@ -108,14 +112,23 @@ def test_nodes_that_no_reading_tells_are_unknown():
     assert np.nanmax(np.abs(error_in_datum(emap, truth))) < 1e-11
 
 
-@pytest.mark.parametrize(("turn", "shift", "nodes", "count"), [
-    (5, (1, 0), 9, 45), (5, (1, 0), 7, 27), (37, (1, 0), 9, 81), (37, (1.3, -0.7), 7, 43),
-    (37, (1.3, -0.7), 9, 69)])
-def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(turn, shift, nodes,
-                                                                             count):
+@pytest.mark.parametrize(
+    ("turn", "shift", "nodes", "count"),
+    [
+        (5, (1, 0), 9, 45),
+        (5, (1, 0), 7, 27),
+        (37, (1, 0), 9, 81),
+        (37, (1.3, -0.7), 7, 43),
+        (37, (1.3, -0.7), 9, 69),
+    ],
+)
+def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(
+    turn, shift, nodes, count
+):
     """As a dense least squares has it, at nodes of the datum and at others; half of them do."""
-    found, _ = readings(plate(11, nodes), ((0, (0, 0)), (turn, (0, 0)), (0, shift)),
-                        np.random.default_rng(10))
+    found, _ = readings(
+        plate(11, nodes), ((0, (0, 0)), (turn, (0, 0)), (0, shift)), np.random.default_rng(10)
+    )
     half = (nodes - 1) / 2
     known = np.abs(np.indices((nodes, nodes)) - half).max(axis=0) < 0.7499 * half
     for _ in range(2):
@@ -147,8 +160,11 @@ def test_a_result_keeps_plate_and_map_apart():
     found, _ = readings(plate(11, 7), SIX, np.random.default_rng(7))
     result = calibrate(found, BARE)
     data = result_to_dict(worded(result))
-    assert data["map"] == {"grid_size": 7, "grid_pitch": pytest.approx(1 / 60),
-                           "interpolation": "bicubic"}
+    assert data["map"] == {
+        "grid_size": 7,
+        "grid_pitch": pytest.approx(1 / 60),
+        "interpolation": "bicubic",
+    }
     again = result_from_dict(data, "RESULT.json")
     assert again.plate == found.artifact and again.artifact == found.artifact.field
     assert again.plate.map_grid == MapGrid(7, 0.1 / 6, Interpolation.BICUBIC)
@@ -160,10 +176,14 @@ def waves(rng, length):
     k, at = rng.normal(size=(2, 150, 2)) / length / 10e-3, rng.uniform(0, 2 * np.pi, (2, 150))
 
     def stage(z):
-        x, y = (np.cos(np.multiply.outer(z.real, along) + np.multiply.outer(z.imag, across)
-                       + start).sum(axis=-1) for (along, across), start in zip(
-                           k.swapaxes(1, 2), at, strict=True))
+        x, y = (
+            np.cos(
+                np.multiply.outer(z.real, along) + np.multiply.outer(z.imag, across) + start
+            ).sum(axis=-1)
+            for (along, across), start in zip(k.swapaxes(1, 2), at, strict=True)
+        )
         return 1e-6 * np.sqrt(2 / 150) * (x + 1j * y)
+
     return stage
 
 
@@ -192,11 +212,16 @@ def test_a_bilinear_map_of_a_curved_stage_is_rough_and_not_a_bent_plate(bent):
     inside = []
     for seed in range(2):
         rng = np.random.default_rng([seed, 9])
-        found, truth = readings(plate(9, 7, "bilinear"), SIX, rng, sigma=0.02e-6,
-                                stage=waves(rng, 3))
+        found, truth = readings(
+            plate(9, 7, "bilinear"), SIX, rng, sigma=0.02e-6, stage=waves(rng, 3)
+        )
         if bent:
-            views = [replace(v, dy=v.dy + (v.view.name == found.views[1].view.name) * 2e-6
-                             * (v.m / 4) ** 2) for v in found.views]
+            views = [
+                replace(
+                    v, dy=v.dy + (v.view.name == found.views[1].view.name) * 2e-6 * (v.m / 4) ** 2
+                )
+                for v in found.views
+            ]
             found = replace(found, views=tuple(views))
         result = trusted(found, BARE)
         named = [cause.name for cause in result.verdict.causes]
@@ -210,11 +235,19 @@ def test_a_bilinear_map_of_a_curved_stage_is_rough_and_not_a_bent_plate(bent):
 
 def test_terms_do_not_size_the_lack_of_fit_of_a_map_that_suffices():
     """A finer map hardly determines the microscope beside it: 5 µm followed from its value."""
-    plan = plan_from_dict({
-        "plan_id": "p", "artifact": {"grid_size": 9, "grid_pitch": 0.008, "angular_count": 0},
-        "map": {"grid_size": 7, "interpolation": "bicubic"}, "views": [
-            {"name": "a", "repeats": 2}, {"name": "b", "rotation_deg": 90, "repeats": 2},
-            {"name": "c", "rotation_deg": 37, "translation_mm": [6, -4], "repeats": 2}]}, "")
+    plan = plan_from_dict(
+        {
+            "plan_id": "p",
+            "artifact": {"grid_size": 9, "grid_pitch": 0.008, "angular_count": 0},
+            "map": {"grid_size": 7, "interpolation": "bicubic"},
+            "views": [
+                {"name": "a", "repeats": 2},
+                {"name": "b", "rotation_deg": 90, "repeats": 2},
+                {"name": "c", "rotation_deg": 37, "translation_mm": [6, -4], "repeats": 2},
+            ],
+        },
+        "",
+    )
     spread = Spread(rotation="finite", correlation_pitches=4.0)
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -230,7 +263,8 @@ def test_a_map_that_was_tried_is_the_remedy():
     found, _ = readings(plate(9, 7, "bilinear"), SIX, rng, sigma=0.02e-6, stage=wave)
     (cause,) = calibrate(found, Options(assumed=())).verdict.causes
     assert cause.name == "roughness" and [
-        (remedy.kind, remedy.value) for remedy in cause.remedies] == [("map", "7:bicubic")]
+        (remedy.kind, remedy.value) for remedy in cause.remedies
+    ] == [("map", "7:bicubic")]
     better = replace(found, artifact=with_nodes(found.artifact, "7:bicubic", ""))
     assert better.artifact.field.grid_pitch_m == found.artifact.field.grid_pitch_m
     assert calibrate(better, Options(assumed=())).verdict.grade == "good"
@@ -270,8 +304,7 @@ def test_readings_are_turned_back_into_the_stage_frame(turn):
     step = np.zeros(len(views[2].m))
     step[40] = 1e-6
     moved = [*views[:2], replace(views[2], dx=views[2].dx + step), *views[3:]]
-    before, after = (prepare(replace(found, views=tuple(each)), BARE)[0]
-                     for each in (views, moved))
+    before, after = (prepare(replace(found, views=tuple(each)), BARE)[0] for each in (views, moved))
     change = (after.grid.y - before.grid.y)[2] * before.to_stage[2]
     at = views[2].m[40] + 5, views[2].n[40] + 5
     assert before.turn_rad == pytest.approx(turn, abs=0.01)
@@ -285,9 +318,13 @@ def test_a_map_of_too_many_nodes_says_that_their_number_was_not_tested(nodes, sa
     assert ("roughness_untested" in [finding.name for finding in found]) is said
 
 
-@pytest.mark.parametrize(("poses", "said"), [
-    (((0, (0, 0)), (5, (0, 0)), (0, (1, 0))), True),
-    (((0, (0, 0)), (5, (0, 0)), (0, (1, 0)), (90, (0, 0))), False)])
+@pytest.mark.parametrize(
+    ("poses", "said"),
+    [
+        (((0, (0, 0)), (5, (0, 0)), (0, (1, 0))), True),
+        (((0, (0, 0)), (5, (0, 0)), (0, (1, 0)), (90, (0, 0))), False),
+    ],
+)
 def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, said):
     """A finer map of 15 x 15 nodes has 450 unknowns, and three views 460 equations for it."""
     measurements, _ = readings(plate(11, 9), poses, np.random.default_rng(5))

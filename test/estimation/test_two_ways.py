@@ -32,34 +32,46 @@ from test.support.two_ways import (
 
 SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
 WIDE = Artifact(9, 0.01, 8, 5)
-CASES = {"square": plan_of("0,90,180,2ty,90+tx", Artifact(7, 0.01, 12), lines=1),
-         "wide": plan_of("0,90,tx,-tx,ty", WIDE, lines=1),
-         "circle of 360": plan_of("0,90,tx", Artifact(5, 0.01, 360), lines=1)}
+CASES = {
+    "square": plan_of("0,90,180,2ty,90+tx", Artifact(7, 0.01, 12), lines=1),
+    "wide": plan_of("0,90,tx,-tx,ty", WIDE, lines=1),
+    "circle of 360": plan_of("0,90,tx", Artifact(5, 0.01, 360), lines=1),
+}
 
 
 def measured(plan, seed=3, *, spread=None, **how):
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, spread)
-    return truth, simulate_measurements(truth, plan, rng, **{
-        "sigma_m": SIGMA_M, "sigma_theta_rad": SIGMA_RAD} | how)
+    return truth, simulate_measurements(
+        truth, plan, rng, **{"sigma_m": SIGMA_M, "sigma_theta_rad": SIGMA_RAD} | how
+    )
 
 
 def require_same(found, wanted, *, unit=1.0):
     for key, value in wanted.items():
         factor = unit if key.startswith(("gx", "gy", "u_gx", "u_gy")) else 1.0
         size = np.nanmax(abs(value), initial=1e-30)
-        np.testing.assert_allclose(found[key] / factor, value, rtol=0, atol=1e-7 * size,
-                                   err_msg=key)
+        np.testing.assert_allclose(
+            found[key] / factor, value, rtol=0, atol=1e-7 * size, err_msg=key
+        )
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(("kind", "turned_kind", "missing"), [
-    (None, None, 0.0), (None, None, 0.1), ("stage_x", "stage_y", 0.0),
-    ("artifact", "artifact", 0.1)])
+@pytest.mark.parametrize(
+    ("kind", "turned_kind", "missing"),
+    [
+        (None, None, 0.0),
+        (None, None, 0.1),
+        ("stage_x", "stage_y", 0.0),
+        ("artifact", "artifact", 0.1),
+    ],
+)
 def test_order_turn_mirror_and_unit_change_nothing_but_the_frame(name, kind, turned_kind, missing):
     _, readings = measured(CASES[name], missing=missing)
-    options, of_turned = (bare(reference=ReferenceLength(
-        of, 3e-6, 1e-7) if of else None) for of in (kind, turned_kind))
+    options, of_turned = (
+        bare(reference=ReferenceLength(of, 3e-6, 1e-7) if of else None)
+        for of in (kind, turned_kind)
+    )
     wanted = maps_of(solve_joint(readings, options).result)
     require_same(maps_of(solve_joint(permuted(readings), options).result), wanted)
     backwards = replace(readings, views=readings.views[::-1])
@@ -67,16 +79,23 @@ def test_order_turn_mirror_and_unit_change_nothing_but_the_frame(name, kind, tur
     require_same(turned_back(solve_joint(turned(readings), of_turned).result), wanted)
     require_same(mirrored_back(solve_joint(mirrored(readings), options).result), wanted)
     for unit in (50.0, 0.001):
-        require_same(maps_of(solve_joint(scaled(readings, unit), options).result), wanted,
-                     unit=unit)
+        require_same(
+            maps_of(solve_joint(scaled(readings, unit), options).result), wanted, unit=unit
+        )
 
 
 @pytest.mark.parametrize("sense", Sense)
 def test_the_angular_datum_decides_nothing_about_outliers(sense):
     """The stage does not satisfy the axis conditions: no fault of any single reading."""
     _, readings = measured(hu_plan(Artifact(7, 0.01, 24)), sigma_theta_rad=2e-6, sense=sense)
-    views = [replace(view, dtheta=view.dtheta + 2e-4 * (((view.k + view.view.lattice_pose(
-        readings.artifact).turn_lines) % 24) == 0)) for view in readings.views]
+    views = [
+        replace(
+            view,
+            dtheta=view.dtheta
+            + 2e-4 * (((view.k + view.view.lattice_pose(readings.artifact).turn_lines) % 24) == 0),
+        )
+        for view in readings.views
+    ]
     bent = replace(readings, views=tuple(views))
     found = [clean(bent, bare(datum_theta=datum)) for datum in ("xy_axes", "zero_mean")]
     assert found[0].removed == found[1].removed == ()
@@ -87,8 +106,9 @@ def test_the_angular_datum_decides_nothing_about_outliers(sense):
 def test_robust_knows_finite_rotations_of_a_rough_plate():
     """A plate error of 20 um turned by a degree moves 0.3 um: seventeen times the noise."""
     spread = Spread(a_m=20e-6, phi_rad=0.02)
-    truth, readings = measured(plan_of("0,90,180,tx,ty", Artifact(9, 0.01)), spread=spread,
-                               linear=True)
+    truth, readings = measured(
+        plan_of("0,90,180,tx,ty", Artifact(9, 0.01)), spread=spread, linear=True
+    )
     bent = with_finite_rotations(readings, truth)
     result = robust_calibrate(bent, BARE)
     assert result.extra["outliers"]["removed"] == [] and result.extra["slips"] == []
@@ -105,8 +125,9 @@ def few_draws(monkeypatch):
 @pytest.mark.parametrize("sense", Sense)
 def test_validation_predicts_by_the_model_that_was_fitted(sense, few_draws):
     plan = plan_of("0,90,180,tx,ty", Artifact(7, 0.01))
-    truth, readings = measured(plan, sense=sense, spread=Spread(a_m=20e-6, phi_rad=0.02),
-                               linear=True)
+    truth, readings = measured(
+        plan, sense=sense, spread=Spread(a_m=20e-6, phi_rad=0.02), linear=True
+    )
     wanted = validate(readings, bare(misalignment_model="linear"), folds=1)
     bent = with_finite_rotations(readings, truth)
     for one, two in zip(validate(bent, BARE, folds=1), wanted, strict=True):
@@ -134,9 +155,17 @@ def test_views_with_too_few_readings_to_tell_are_not_called_noisy():
         assert noisy_views(residuals_of(readings, BARE), readings) == ()
 
 
-@pytest.mark.parametrize(("sigma_m", "sigma_rad", "limit_m"), [
-    (2e-8, 0.0, 3e-8), (1e-3, 0.0, 1.5e-3), (1e-6, 1e-13, 1.5e-6), (0.0, 2e-5, 1e-12),
-    (1e-15, 1e-3, 1e-12), (0.0, 0.0, 1e-16)])
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_rad", "limit_m"),
+    [
+        (2e-8, 0.0, 3e-8),
+        (1e-3, 0.0, 1.5e-3),
+        (1e-6, 1e-13, 1.5e-6),
+        (0.0, 2e-5, 1e-12),
+        (1e-15, 1e-3, 1e-12),
+        (0.0, 0.0, 1e-16),
+    ],
+)
 def test_one_kind_of_readings_may_be_exact(sigma_m, sigma_rad, limit_m):
     """Twenty orders of magnitude between the weights shall not lose what the lighter one tells."""
     truth, readings = measured(CASES["square"], sigma_m=sigma_m, sigma_theta_rad=sigma_rad)
@@ -152,8 +181,9 @@ def test_a_view_that_was_never_read_is_missed_by_name():
     """Planned, but without a reading: the advice must not count on it."""
     _, readings = measured(CASES["square"])
     gone = {1, 4}  # both views turned by a quarter
-    views = tuple(ViewReadings(view.view) if i in gone else view
-                  for i, view in enumerate(readings.views))
+    views = tuple(
+        ViewReadings(view.view) if i in gone else view for i, view in enumerate(readings.views)
+    )
     with refused("add a view turned by 90 deg"):
         calibrate(replace(readings, views=views), BARE)
 
@@ -168,8 +198,10 @@ def test_readings_of_zero_alone_take_a_reference():
 
 def test_a_line_of_a_fine_circle_that_is_read_once_cannot_be_checked():
     _, readings = measured(CASES["circle of 360"])
-    views = tuple(subset(view, np.ones(len(view.m), dtype=bool), (view.k != 7) | (row == 0))
-                  for row, view in enumerate(readings.views))
+    views = tuple(
+        subset(view, np.ones(len(view.m), dtype=bool), (view.k != 7) | (row == 0))
+        for row, view in enumerate(readings.views)
+    )
     left = residuals_of(replace(readings, views=views), BARE)
     assert left.lines.redundancy[0, 7] < 1e-9 and np.isnan(left.lines.squares[0, 7])
     assert left.lines.redundancy.sum() == pytest.approx(left.lines.dof)
@@ -188,18 +220,37 @@ def numbers_of(result):
     return np.concatenate([maps_of(result)[key].ravel() for key in ("gx", "gy", "g_theta")])
 
 
-@pytest.mark.parametrize(("plan", "sense", "missing", "options"), [
-    (SHIFTS, Sense.PLATE_MOVES, 0.2, PAPERS), (FOUR, Sense.MICROSCOPE_MOVES, 0.0, PAPERS),
-    (FOUR, Sense.PLATE_MOVES, 0.0, LINEAR)])
+@pytest.mark.parametrize(
+    ("plan", "sense", "missing", "options"),
+    [
+        (SHIFTS, Sense.PLATE_MOVES, 0.2, PAPERS),
+        (FOUR, Sense.MICROSCOPE_MOVES, 0.0, PAPERS),
+        (FOUR, Sense.PLATE_MOVES, 0.0, LINEAR),
+    ],
+)
 def test_uncertainties_are_those_of_every_reading_moved_in_turn(plan, sense, missing, options):
-    _, readings = measured(plan, sense=sense, missing=missing, sigma_m=0.0, sigma_theta_rad=0.0,
-                           spread=Spread(encoder="xy_axes"), linear=True)
-    readings = replace(readings, views=tuple(
-        replace(view, sigma_xy=SIGMA_M, dof_xy=1000, sigma_theta=SIGMA_RAD, dof_theta=1000)
-        for view in readings.views))
+    _, readings = measured(
+        plan,
+        sense=sense,
+        missing=missing,
+        sigma_m=0.0,
+        sigma_theta_rad=0.0,
+        spread=Spread(encoder="xy_axes"),
+        linear=True,
+    )
+    readings = replace(
+        readings,
+        views=tuple(
+            replace(view, sigma_xy=SIGMA_M, dof_xy=1000, sigma_theta=SIGMA_RAD, dof_theta=1000)
+            for view in readings.views
+        ),
+    )
     quick = replace(options, uncertainty=False, causes=False)
-    answers = responses(lambda moved: numbers_of(solve_joint(moved, quick).result), readings,
-                        sizes_of(readings, SIGMA_M, SIGMA_RAD))
+    answers = responses(
+        lambda moved: numbers_of(solve_joint(moved, quick).result),
+        readings,
+        sizes_of(readings, SIGMA_M, SIGMA_RAD),
+    )
     found = maps_of(calibrate(readings, options))
     u = np.concatenate([found["u_" + key].ravel() for key in ("gx", "gy", "g_theta")])
     known = np.isfinite(u)
@@ -207,13 +258,22 @@ def test_uncertainties_are_those_of_every_reading_moved_in_turn(plan, sense, mis
     np.testing.assert_allclose(u[known], np.sqrt((answers[:, known] ** 2).sum(axis=0)), rtol=1e-6)
 
 
-@pytest.mark.parametrize(("plan", "sense", "missing"), [
-    (SHIFTS, Sense.PLATE_MOVES, 0.2), (CASES["square"], Sense.MICROSCOPE_MOVES, 0.0)])
+@pytest.mark.parametrize(
+    ("plan", "sense", "missing"),
+    [(SHIFTS, Sense.PLATE_MOVES, 0.2), (CASES["square"], Sense.MICROSCOPE_MOVES, 0.0)],
+)
 def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(plan, sense, missing):
     """Finite rotations of a plate that errs by 20 um, noise told by the residuals alone."""
     rng = np.random.default_rng(11)
-    truth, clean = measured(plan, sense=sense, missing=missing, sigma_m=0.0, sigma_theta_rad=0.0,
-                            spread=ROUGH, linear=True)
+    truth, clean = measured(
+        plan,
+        sense=sense,
+        missing=missing,
+        sigma_m=0.0,
+        sigma_theta_rad=0.0,
+        spread=ROUGH,
+        linear=True,
+    )
     clean = with_finite_rotations(clean, truth)
     options = bare(causes=False)
     wanted, squares = maps_of(calibrate(clean, options)), {"xy": [], "theta": []}

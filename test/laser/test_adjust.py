@@ -15,8 +15,10 @@ from selfcal_ros.laser.simulation import (
 
 def measurement(steps):
     machine = random_machine(steps, 3, np.random.default_rng(1), sigma_m=2e-5)
-    setups = {name: SetUp(mirror_rad=(2e-3 * (k + 1), -1e-3 * k))
-              for k, name in enumerate(DIAGONALS[len(steps)])}
+    setups = {
+        name: SetUp(mirror_rad=(2e-3 * (k + 1), -1e-3 * k))
+        for k, name in enumerate(DIAGONALS[len(steps)])
+    }
     return simulate_step_diagonal(machine, Measurement(setups), np.random.default_rng(2))
 
 
@@ -26,9 +28,11 @@ def test_model_derivatives_are_those_of_the_model(steps):
     geometry, found = Geometry(data), adjust(data)
     by_errors, by_tilt = geometry.derivatives(found.errors_m, found.tilt)
     np.testing.assert_allclose(
-        by_errors, jacobian(lambda e: geometry.readings(e, found.tilt), found.errors_m), atol=1e-8)
+        by_errors, jacobian(lambda e: geometry.readings(e, found.tilt), found.errors_m), atol=1e-8
+    )
     np.testing.assert_allclose(
-        by_tilt, jacobian(lambda t: geometry.readings(found.errors_m, t), found.tilt), atol=1e-10)
+        by_tilt, jacobian(lambda t: geometry.readings(found.errors_m, t), found.tilt), atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("steps", [(0.01, 0.006), (0.01, 0.008, 0.006)])
@@ -52,8 +56,9 @@ def test_solution_derivatives_are_those_of_the_solution(steps, pick):
     found = adjust(data)
 
     def solve(readings, linear):
-        return adjust(StepDiagonal(data.steps_m, data.diagonals, readings[None],
-                                   linear[None])).errors_m
+        return adjust(
+            StepDiagonal(data.steps_m, data.diagonals, readings[None], linear[None])
+        ).errors_m
 
     readings, linear = data.readings_m, data.linear_mean_m
     expected = jacobian(lambda r: solve(r, linear), readings)

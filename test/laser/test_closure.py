@@ -23,8 +23,9 @@ from selfcal_ros.laser.simulation import (
 
 @pytest.mark.parametrize("steps", [(0.01, 0.006), (0.03, 0.04), (0.01, 0.008, 0.006)])
 @pytest.mark.parametrize(("distance_m", "linear_m"), [(2e-8, 0.0), (0.0, 2e-8), (1e-8, 3e-8)])
-def test_the_uncertainty_of_the_lengths_is_that_of_readings_and_linear_errors(steps, distance_m,
-                                                                              linear_m):
+def test_the_uncertainty_of_the_lengths_is_that_of_readings_and_linear_errors(
+    steps, distance_m, linear_m
+):
     rng = np.random.default_rng(4)
     noise = LaserNoise(distance_m=distance_m, linear_m=linear_m, repeats=3)
     data = simulate_step_diagonal(random_machine(steps, 3, rng), Measurement({}, noise), rng)
@@ -36,6 +37,8 @@ def test_the_uncertainty_of_the_lengths_is_that_of_readings_and_linear_errors(st
 
     by_readings = jacobian(lambda r: closure(r, data.linear_mean_m), data.readings_m)
     by_linear = jacobian(lambda e: closure(data.readings_m, e), data.linear_mean_m)
-    variance = (by_readings @ reading_covariance(data, reading_noise(data)) @ by_readings.T
-                + by_linear @ linear_covariance(data, linear_noise(data)) @ by_linear.T)
+    variance = (
+        by_readings @ reading_covariance(data, reading_noise(data)) @ by_readings.T
+        + by_linear @ linear_covariance(data, linear_noise(data)) @ by_linear.T
+    )
     assert u == pytest.approx(np.sqrt(variance[0, 0]), rel=1e-4, abs=1e-15)

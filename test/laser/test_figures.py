@@ -24,8 +24,11 @@ def test_bars_are_as_long_as_u_with_the_k_of_the_repeats():
     found = identify(data, Choice(Method.NEW, Form.EXACT))
     drawing = profiles_figure(found, data)
     dots = [item.centres for item in drawing.items if isinstance(item, Discs)]
-    bars = [item.lines for item in drawing.items if isinstance(item, Line)
-            and item.stroke == "c0" and len(item.lines) == found.n_blocks + 1]
+    bars = [
+        item.lines
+        for item in drawing.items
+        if isinstance(item, Line) and item.stroke == "c0" and len(item.lines) == found.n_blocks + 1
+    ]
     assert len(dots) == len(bars) == 4
     profile, u = profile_m(found, 0, 1), u_profile_m(found, 0, 1)
     up = dots[1][0][1] - np.array([y for _, y in dots[1]])  # from the start, upwards

@@ -29,13 +29,20 @@ from test.support.maps import first_order
 
 
 def measured(machine, noise=None):
-    return simulate_step_diagonal(machine, Measurement({}, noise or LaserNoise()),
-                                  np.random.default_rng(7))
+    return simulate_step_diagonal(
+        machine, Measurement({}, noise or LaserNoise()), np.random.default_rng(7)
+    )
 
 
-@pytest.mark.parametrize("frame", [
-    MachineFrame(1, 2), MachineFrame(3, 5, unit="um", home_x_m=0.02, home_y_m=-0.01),
-    MachineFrame(2, 1, reverse_x=True, home_x_m=0.06), MachineFrame(1, 2, reverse_y=True)])
+@pytest.mark.parametrize(
+    "frame",
+    [
+        MachineFrame(1, 2),
+        MachineFrame(3, 5, unit="um", home_x_m=0.02, home_y_m=-0.01),
+        MachineFrame(2, 1, reverse_x=True, home_x_m=0.06),
+        MachineFrame(1, 2, reverse_y=True),
+    ],
+)
 def test_a_corrected_machine_is_straight_square_and_true(frame):
     machine = case_study_machine()
     found = identify_ibaraki(measured(machine))
@@ -51,9 +58,14 @@ def test_a_corrected_machine_is_straight_square_and_true(frame):
     cy = frame.sign_y * add[frame.y_axis] * frame.unit_m
     residual = error + np.stack([cx, cy], axis=1)
     # Left is what no table of straightness knows: a shift, and the turn of the X axis' line.
-    turned = np.stack([np.concatenate([np.ones(49), np.zeros(49)]),
-                       np.concatenate([np.zeros(49), np.ones(49)]),
-                       np.concatenate([-y, x])], axis=1)
+    turned = np.stack(
+        [
+            np.concatenate([np.ones(49), np.zeros(49)]),
+            np.concatenate([np.zeros(49), np.ones(49)]),
+            np.concatenate([-y, x]),
+        ],
+        axis=1,
+    )
     values = residual.T.ravel()
     left = values - turned @ np.linalg.lstsq(turned, values, rcond=None)[0]
     assert np.abs(left).max() < 0.02e-9
@@ -98,8 +110,9 @@ def test_uncertainties_follow():
 @pytest.mark.parametrize("steps_m", [(0.01, 0.016), (0.016, 0.01)])
 def test_the_uncertainty_of_o_is_the_spread_of_measurements_with_unequal_steps(steps_m):
     machine, noise = StepMachine(steps_m, np.zeros((2, 4, 2))), LaserNoise(1e-8, 0, 1e-8, 400)
-    spread = scatter_of(machine, lambda data: np.array([
-        map_equivalent(identify_ibaraki(data)).nonorthogonality]))(noise)
+    spread = scatter_of(
+        machine, lambda data: np.array([map_equivalent(identify_ibaraki(data)).nonorthogonality])
+    )(noise)
     found = map_equivalent(identify_ibaraki(measured(machine, noise)))
     assert found.u_nonorthogonality == pytest.approx(spread[0], rel=0.05)
 

@@ -23,8 +23,9 @@ NM = 1e-9
 
 
 def simulated(noise, seed=3):
-    return simulate_step_diagonal(case_study_machine(), Measurement({}, noise),
-                                  np.random.default_rng(seed))
+    return simulate_step_diagonal(
+        case_study_machine(), Measurement({}, noise), np.random.default_rng(seed)
+    )
 
 
 def test_time_order_of_np_starts_with_the_last_block_of_x():
@@ -50,8 +51,9 @@ def test_the_covariance_is_that_of_the_mean_readings():
     drawn = simulated(LaserNoise(10 * NM, 5 * NM, 8 * NM, repeats=2000), seed=4)
     many = simulated(LaserNoise(10 * NM, 5 * NM, 8 * NM, repeats=200))
     for samples, model in (
-            (drawn.samples_m, reading_covariance(many, reading_noise(many))),
-            (drawn.linear_m, linear_covariance(many, linear_noise(many)))):
+        (drawn.samples_m, reading_covariance(many, reading_noise(many))),
+        (drawn.linear_m, linear_covariance(many, linear_noise(many))),
+    ):
         expected = np.cov(samples.reshape(2000, -1).T) / 200
         np.testing.assert_allclose(model, expected, atol=0.12 * expected.max())
 
@@ -71,16 +73,21 @@ def test_diagonals_with_fewer_complete_runs_keep_their_correlation():
     assert noise.correlation == pytest.approx(-0.5, abs=0.01)
     assert noise.dof == 39 * 12 + 24 * 12
     # The sum of a run is the difference of two distances, however many steps it has.
-    sums = [np.ones(12) @ reading_covariance(fewer, noise)[k:k + 12, k:k + 12] @ np.ones(12)
-            for k in (0, 12)]
-    np.testing.assert_allclose(sums, [2 * (10 * NM)**2 / 40, 2 * (10 * NM)**2 / 25], rtol=0.2)
+    sums = [
+        np.ones(12) @ reading_covariance(fewer, noise)[k : k + 12, k : k + 12] @ np.ones(12)
+        for k in (0, 12)
+    ]
+    np.testing.assert_allclose(sums, [2 * (10 * NM) ** 2 / 40, 2 * (10 * NM) ** 2 / 25], rtol=0.2)
 
 
 def test_rows_that_only_others_have_filled_change_nothing():
     full = simulated(LaserNoise(distance_m=10 * NM, linear_m=5 * NM, repeats=4))
     rows = np.full((3, *full.samples_m.shape[1:]), np.nan)
-    padded = replace(full, samples_m=np.concatenate([full.samples_m, rows]),
-                     linear_m=np.concatenate([full.linear_m, rows[:, 0]]))
+    padded = replace(
+        full,
+        samples_m=np.concatenate([full.samples_m, rows]),
+        linear_m=np.concatenate([full.linear_m, rows[:, 0]]),
+    )
     assert reading_noise(padded) == reading_noise(full)
     assert linear_noise(padded) == linear_noise(full)
 

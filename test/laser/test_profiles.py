@@ -32,7 +32,9 @@ def test_profiles_start_at_zero_and_end_at_the_sum():
     np.testing.assert_array_equal(profile_m(found, 1, 0), [0, 6, 14, 24])
     np.testing.assert_allclose(positions_m(found, 1), [0, 0.02, 0.04, 0.06])
     assert slope(found, 1, 0, ReferenceLine.END_POINTS) == pytest.approx(24 / 0.06)
-    assert slope(found, 1, 0) == pytest.approx(np.polyfit([0, .02, .04, .06], [0, 6, 14, 24], 1)[0])
+    assert slope(found, 1, 0) == pytest.approx(
+        np.polyfit([0, 0.02, 0.04, 0.06], [0, 6, 14, 24], 1)[0]
+    )
     assert u_profile_m(found, 1, 0) is None
 
 
@@ -78,10 +80,12 @@ def test_a_turn_of_the_machine_changes_neither_straightness_nor_squareness(seed,
     turned = step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
     one, other = identified((0.01, 0.01), errors), identified((0.01, 0.01), turned)
     assert squareness(one, line=line).value == pytest.approx(
-        squareness(other, line=line).value, abs=1e-11)
+        squareness(other, line=line).value, abs=1e-11
+    )
     for axis in (0, 1):
         assert straightness(one, axis, 1 - axis, line).value == pytest.approx(
-            straightness(other, axis, 1 - axis, line).value, abs=1e-11)
+            straightness(other, axis, 1 - axis, line).value, abs=1e-11
+        )
 
 
 def test_uncertainties_against_monte_carlo():
@@ -92,10 +96,14 @@ def test_uncertainties_against_monte_carlo():
     found = identified((0.01, 0.02), base.reshape(2, 6, 2), covariance)
     draws = base + rng.multivariate_normal(np.zeros(24), covariance, 4000)
     drawn = [identified((0.01, 0.02), d.reshape(2, 6, 2)) for d in draws]
-    for value, of in ((squareness(found).u, squareness),
-                      (squareness(found, line=ReferenceLine.END_POINTS).u,
-                       lambda d: squareness(d, line=ReferenceLine.END_POINTS)),
-                      (straightness(found, 1, 0).u, lambda d: straightness(d, 1, 0))):
+    for value, of in (
+        (squareness(found).u, squareness),
+        (
+            squareness(found, line=ReferenceLine.END_POINTS).u,
+            lambda d: squareness(d, line=ReferenceLine.END_POINTS),
+        ),
+        (straightness(found, 1, 0).u, lambda d: straightness(d, 1, 0)),
+    ):
         assert value == pytest.approx(np.std([of(d).value for d in drawn]), rel=0.05)
     assert u_slope(found, 1, 1) == pytest.approx(np.std([slope(d, 1, 1) for d in drawn]), rel=0.05)
     assert u_slope(drawn[0], 1, 1) is None

@@ -35,8 +35,12 @@ def u_of(function, found):
     for index in range(found.errors_m.size):
         shift = np.zeros(found.errors_m.size)
         shift[index] = 1e-9
-        up, down = (function(replace(found, errors_m=found.errors_m + sign * shift.reshape(
-            found.errors_m.shape))) for sign in (1, -1))
+        up, down = (
+            function(
+                replace(found, errors_m=found.errors_m + sign * shift.reshape(found.errors_m.shape))
+            )
+            for sign in (1, -1)
+        )
         gradient.append((up - down) / 2e-9)
     return np.sqrt(np.array(gradient) @ found.covariance @ gradient)
 
@@ -56,9 +60,11 @@ def test_squareness(found, line):
 
 def test_squareness_and_straightness_are_reported_in_mm_with_their_u(found):
     out, line = geometry(found, ReferenceLine.END_POINTS), ReferenceLine.END_POINTS
-    for name, value in (("squareness", squareness(found, line=line)),
-                        ("straightness_x", straightness(found, 0, 1, line)),
-                        ("straightness_y", straightness(found, 1, 0, line))):
+    for name, value in (
+        ("squareness", squareness(found, line=line)),
+        ("straightness_x", straightness(found, 0, 1, line)),
+        ("straightness_y", straightness(found, 1, 0, line)),
+    ):
         assert (out[name], out[f"u_{name}"]) == pytest.approx((1e3 * value.value, 1e3 * value.u))
 
 

@@ -17,5 +17,6 @@ def test_the_length_of_a_diagonal_gives_the_other_side_of_the_triangle():
 def test_a_diagonal_not_longer_than_its_step_is_refused_by_its_block(r, block):
     with pytest.raises(InputError) as raised:
         eq3(np.array(r), np.array([3.0, 3.0]), np.array([4.0, 4.0]))
-    assert str(raised.value) == (f"block {block}: the diagonal is shorter than the Y step; check "
-                                 "the units and the steps")
+    assert str(raised.value) == (
+        f"block {block}: the diagonal is shorter than the Y step; check the units and the steps"
+    )

@@ -18,14 +18,17 @@ from test.support.laser import linear_of, planar, random_errors
 
 
 def simulate(machine, setups=None, noise=None, seed=0):
-    return simulate_step_diagonal(machine, Measurement(setups or {}, noise or LaserNoise()),
-                                  np.random.default_rng(seed))
+    return simulate_step_diagonal(
+        machine, Measurement(setups or {}, noise or LaserNoise()), np.random.default_rng(seed)
+    )
 
 
 def test_the_traced_beam_agrees_with_the_formula_of_the_method():
     errors = random_errors(6, np.random.default_rng(1))
-    setups = {"pp": SetUp(laser_rad=(7e-4,), mirror_rad=(-9e-4,)),
-              "np": SetUp(laser_rad=(-3e-4,), mirror_rad=(5e-4,))}
+    setups = {
+        "pp": SetUp(laser_rad=(7e-4,), mirror_rad=(-9e-4,)),
+        "np": SetUp(laser_rad=(-3e-4,), mirror_rad=(5e-4,)),
+    }
     data = simulate(StepMachine((0.01, 0.007), errors), setups)
     expected = planar((0.01, 0.007), errors, laser_rad=(7e-4, -3e-4), mirror_rad=(-9e-4, 5e-4))
     np.testing.assert_allclose(data.readings_m, expected.readings_m, atol=1e-15)
@@ -37,8 +40,9 @@ def test_a_perfect_machine_gives_nominal_readings_on_every_diagonal(dim):
     steps = (0.01, 0.02, 0.005)[:dim]
     data = simulate(StepMachine(steps, np.zeros((dim, 3, dim))))
     nominal = np.square(steps) / np.linalg.norm(steps)
-    np.testing.assert_allclose(data.readings_m, np.broadcast_to(
-        nominal[:, None], data.readings_m.shape), rtol=1e-13)
+    np.testing.assert_allclose(
+        data.readings_m, np.broadcast_to(nominal[:, None], data.readings_m.shape), rtol=1e-13
+    )
 
 
 def test_a_laser_along_the_nominal_diagonal_does_not_follow_the_machine():
@@ -106,8 +110,9 @@ def test_a_random_machine_is_in_the_datum_of_the_results():
     machine = random_machine((0.01, 0.02, 0.03), 4, np.random.default_rng(0))
     np.testing.assert_allclose(machine.truth_m(), machine.errors_m, atol=1e-18)
     assert machine.errors_m[0, 0, 1] == machine.errors_m[0, 0, 2] == machine.errors_m[1, 0, 2] == 0
-    np.testing.assert_allclose(identify_ibaraki(simulate(machine)).errors_m, machine.errors_m,
-                               atol=1e-13)
+    np.testing.assert_allclose(
+        identify_ibaraki(simulate(machine)).errors_m, machine.errors_m, atol=1e-13
+    )
 
 
 def test_a_rotation_keeps_lengths_and_turns_counter_clockwise():

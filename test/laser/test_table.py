@@ -63,8 +63,9 @@ def test_a_table_that_lacks_a_body_diagonal_is_one_of_three_axes_still(tmp_path)
 @pytest.mark.parametrize("steps", [(0.01, 0.01), (0.01, 0.02, 0.005)])
 def test_writing_and_reading_gives_the_same_measurement(tmp_path, steps):
     rng = np.random.default_rng(2)
-    data = simulate_step_diagonal(random_machine(steps, 4, rng),
-                                  Measurement({}, LaserNoise(1e-8, 0, 1e-8, 2)), rng)
+    data = simulate_step_diagonal(
+        random_machine(steps, 4, rng), Measurement({}, LaserNoise(1e-8, 0, 1e-8, 2)), rng
+    )
     path = tmp_path / "out.csv"
     write_table(path, data, ["two repeats"])
     assert dimension_of(path) == len(steps)
@@ -87,16 +88,16 @@ def test_diagonals_and_axes_of_unequal_repeats_lose_nothing(tmp_path, repeats):
     samples = 7.07e-3 + rng.normal(0, 1e-8, (max(repeats[:2]), 2, 2, 3))
     linear = rng.normal(0, 1e-8, (max(repeats[2:]), 2, 3))
     for index in range(2):
-        samples[repeats[index]:, index] = np.nan
-        linear[repeats[2 + index]:, index] = np.nan
+        samples[repeats[index] :, index] = np.nan
+        linear[repeats[2 + index] :, index] = np.nan
     path = tmp_path / "out.csv"
     write_table(path, StepDiagonal((0.01, 0.01), DIAGONALS[2], samples, linear))
     back, _ = read_table(path, RequiredColumns((0.01, 0.01), DIAGONALS[2], True))
     rows = max(repeats)
     for got, want in ((back.samples_m, samples), (back.linear_m, linear)):
         assert got.shape[0] == rows
-        np.testing.assert_allclose(got[:len(want)], want, atol=0.6e-11)
-        assert np.isnan(got[len(want):]).all()
+        np.testing.assert_allclose(got[: len(want)], want, atol=0.6e-11)
+        assert np.isnan(got[len(want) :]).all()
 
 
 ROW = f"1,{GOOD}\n"
@@ -104,51 +105,93 @@ HOSTILE = {
     "empty": ("", NoDataError, "the table is empty"),
     "header only": (HEAD + "\n", NoDataError, "the table has a header only"),
     "missing block": (f"{HEAD}\n1,{GOOD}\n3,{GOOD}\n", InputError, "block 2 is missing"),
-    "missing block from zero": (f"{HEAD}\n0,{GOOD}\n2,{GOOD}\n", InputError,
-                                "block 1 is missing; measure every block from 0 to 2"),
+    "missing block from zero": (
+        f"{HEAD}\n0,{GOOD}\n2,{GOOD}\n",
+        InputError,
+        "block 1 is missing; measure every block from 0 to 2",
+    ),
     "first block missing": (f"{HEAD}\n2,{GOOD}\n", InputError, "block 1 is missing"),
     "nan": (HEAD + "\n1,nan,7,7,7,0,0\n", InputError, "d.csv:2: rx_pp: 'nan' is not a finite"),
     "inf": (HEAD + "\n1,7,inf,7,7,0,0\n", InputError, "d.csv:2: ry_pp: 'inf' is not a finite"),
     "text": (HEAD + "\n1,7,7,seven,7,0,0\n", InputError, "d.csv:2: rx_np: 'seven' is not a num"),
     "underscore": (HEAD + "\n1,7_0,7,7,7,0,0\n", InputError, "rx_pp: '7_0' is not a number"),
     "empty cell": (HEAD + "\n1,7,7,,7,0,0\n", InputError, "d.csv:2: rx_np: the cell is empty"),
-    "empty cell of a repeat": (f"{HEAD}\n{ROW}1,7,7,,7,0,0\n", InputError,
-                               "d.csv:3: rx_np: the cell is empty"),
-    "diagonal never read": (f"{HEAD}\n{ROW}2,7,7,,,0,0\n2,7,7,,,0,0\n", InputError,
-                            "d.csv:3: rx_np: the cell is empty"),
-    "micrometres": (HEAD + "\n1,7071.1,7,7,7,0,0\n", InputError,
-                    "rx_pp: 7071.1 where 7.07107 mm is nominal: it looks like micrometres"),
-    "mixed units": (f"{HEAD}\n{ROW}2,7,0.0070711,7,7,0,0\n", InputError,
-                    "d.csv:3: ry_pp: 0.0070711 where 7.07107 mm is nominal: it looks like metres"),
+    "empty cell of a repeat": (
+        f"{HEAD}\n{ROW}1,7,7,,7,0,0\n",
+        InputError,
+        "d.csv:3: rx_np: the cell is empty",
+    ),
+    "diagonal never read": (
+        f"{HEAD}\n{ROW}2,7,7,,,0,0\n2,7,7,,,0,0\n",
+        InputError,
+        "d.csv:3: rx_np: the cell is empty",
+    ),
+    "micrometres": (
+        HEAD + "\n1,7071.1,7,7,7,0,0\n",
+        InputError,
+        "rx_pp: 7071.1 where 7.07107 mm is nominal: it looks like micrometres",
+    ),
+    "mixed units": (
+        f"{HEAD}\n{ROW}2,7,0.0070711,7,7,0,0\n",
+        InputError,
+        "d.csv:3: ry_pp: 0.0070711 where 7.07107 mm is nominal: it looks like metres",
+    ),
     "nanometres": (HEAD + "\n1,7071100,7,7,7,0,0\n", InputError, "looks like nanometres"),
     "inches": (HEAD + "\n1,0.2784,7,7,7,0,0\n", InputError, "looks like inches"),
-    "sign of np": (HEAD + "\n1,7,7,-7,7,0,0\n", InputError,
-                   "rx_np: -7 where 7.07107 mm is nominal: the sign is wrong; readings are"),
+    "sign of np": (
+        HEAD + "\n1,7,7,-7,7,0,0\n",
+        InputError,
+        "rx_np: -7 where 7.07107 mm is nominal: the sign is wrong; readings are",
+    ),
     "zero": (HEAD + "\n1,0,7,7,7,0,0\n", InputError, "rx_pp: 0 where 7.07107 mm is nominal; check"),
     "other step": (HEAD + "\n1,14.1,7,7,7,0,0\n", InputError, "check the unit and --step-x"),
-    "linear in um": (HEAD + "\n1,7,7,7,7,0.9,0\n", InputError,
-                     "ex_x: a linear error of 0.9 mm in a step of 10 mm; it looks like micromet"),
-    "linear is the step": (HEAD + "\n1,7,7,7,7,10.0001,0\n", InputError,
-                           "it looks like the step itself"),
+    "linear in um": (
+        HEAD + "\n1,7,7,7,7,0.9,0\n",
+        InputError,
+        "ex_x: a linear error of 0.9 mm in a step of 10 mm; it looks like micromet",
+    ),
+    "linear is the step": (
+        HEAD + "\n1,7,7,7,7,10.0001,0\n",
+        InputError,
+        "it looks like the step itself",
+    ),
     "linear nan": (HEAD + "\n1,7,7,7,7,nan,0\n", InputError, "ex_x: 'nan' is not a finite"),
-    "linear never given": (HEAD + "\n1,7,7,7,7,,0\n", InputError,
-                           "linear errors: a block has no value"),
+    "linear never given": (
+        HEAD + "\n1,7,7,7,7,,0\n",
+        InputError,
+        "linear errors: a block has no value",
+    ),
     "short line": (HEAD + "\n1,7,7,7\n", InputError, "d.csv:2: 4 cells where the header has 7"),
     "block 1.5": (HEAD + "\n1.5,7,7,7,7,0,0\n", InputError, "'1.5' is not a block number"),
     "negative block": (HEAD + "\n-1,7,7,7,7,0,0\n", InputError, "'-1' is not a block number"),
     "huge block": (HEAD + "\n1000000,7,7,7,7,0,0\n", InputError, "is not a block number"),
     "twice": ("block,rx_pp,rx_pp\n1,7,7\n", InputError, "the column 'rx_pp' appears twice"),
     "no block": ("rx_pp,ry_pp,rx_np,ry_np\n7,7,7,7\n", InputError, "column 'block' is missing"),
-    "one diagonal": ("block,rx_pp,ry_pp,ex_x,ey_y\n1,7,7,0,0\n", InputError,
-                     "d.csv:1: no readings of the diagonal np; measure every diagonal"),
-    "one column": ("block,rx_pp,ry_pp,rx_np,ex_x,ey_y\n1,7,7,7,0,0\n", InputError,
-                   "the column 'ry_np' is missing"),
-    "no linear": ("block,rx_pp,ry_pp,rx_np,ry_np\n1,7,7,7,7\n", InputError,
-                  "the column 'ex_x', 'ey_y' is missing; the new formulation needs the linear"),
-    "one linear": ("block,rx_pp,ry_pp,rx_np,ry_np,ex_x\n1,7,7,7,7,0\n", InputError,
-                   "the column 'ey_y' is missing"),
-    "long cell": (f"{HEAD}\n{'1' * 140_000},7\n", InputError, "d.csv:2: not a line of a table "
-                  "(field larger than field limit (131072)); correct the line"),
+    "one diagonal": (
+        "block,rx_pp,ry_pp,ex_x,ey_y\n1,7,7,0,0\n",
+        InputError,
+        "d.csv:1: no readings of the diagonal np; measure every diagonal",
+    ),
+    "one column": (
+        "block,rx_pp,ry_pp,rx_np,ex_x,ey_y\n1,7,7,7,0,0\n",
+        InputError,
+        "the column 'ry_np' is missing",
+    ),
+    "no linear": (
+        "block,rx_pp,ry_pp,rx_np,ry_np\n1,7,7,7,7\n",
+        InputError,
+        "the column 'ex_x', 'ey_y' is missing; the new formulation needs the linear",
+    ),
+    "one linear": (
+        "block,rx_pp,ry_pp,rx_np,ry_np,ex_x\n1,7,7,7,7,0\n",
+        InputError,
+        "the column 'ey_y' is missing",
+    ),
+    "long cell": (
+        f"{HEAD}\n{'1' * 140_000},7\n",
+        InputError,
+        "d.csv:2: not a line of a table (field larger than field limit (131072)); correct the line",
+    ),
     "semicolons": ("block;rx_pp\n1;7,07\n", InputError, "separated by semicolons"),
 }
 

@@ -75,8 +75,9 @@ def test_new_finds_all_errors_whatever_the_mirrors(dim, n):
     data = StepDiagonal(steps, NAMES[dim], np.array([readings]), linear(errors)[None])
     np.testing.assert_allclose(identify_ibaraki(data).errors_m, errors, rtol=0, atol=1e-14)
     for name in NAMES[2] if dim == 2 else ():
-        np.testing.assert_allclose(identify_ibaraki(data.pick([name])).errors_m, errors, rtol=0,
-                                   atol=1e-14)
+        np.testing.assert_allclose(
+            identify_ibaraki(data.pick([name])).errors_m, errors, rtol=0, atol=1e-14
+        )
 
 
 @pytest.mark.parametrize(("dim", "n"), CASES)

@@ -37,8 +37,9 @@ def exact_nominal(steps, errors):
 def test_table_1_of_the_source(case):
     given_mm, estimated_mm, decimals = TABLE_1[case]
     found = identify_wang(planar((0.01, 0.01), one_block(*given_mm)))
-    np.testing.assert_allclose(found.errors_m.ravel() / MM, estimated_mm,
-                               atol=0.5 * 10.0**-decimals)
+    np.testing.assert_allclose(
+        found.errors_m.ravel() / MM, estimated_mm, atol=0.5 * 10.0**-decimals
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -69,8 +70,9 @@ def test_a_turn_of_the_whole_machine_changes_nothing():
     turn = 1e-4
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     turned = step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
-    np.testing.assert_allclose(identify_wang(exact_nominal((0.01, 0.01), turned)).errors_m,
-                               errors, atol=1e-15)
+    np.testing.assert_allclose(
+        identify_wang(exact_nominal((0.01, 0.01), turned)).errors_m, errors, atol=1e-15
+    )
 
 
 def test_equal_readings_are_said_and_the_new_formulation_refuses_them():
@@ -83,15 +85,25 @@ def test_equal_readings_are_said_and_the_new_formulation_refuses_them():
         assert np.isfinite(identify(data, choice).errors_m).all()
 
 
-@pytest.mark.parametrize(("steps", "blocks", "spoil_m", "equal"), [
-    ((0.01, 0.01), 3, 0.0, True), ((0.01, 0.01), 2, 0.0, True), ((0.01, 0.01), 1, 0.0, False),
-    ((0.01, 0.011), 3, 0.0, False), ((0.01, 0.01), 3, 1e-8, False)])
-def test_readings_are_equal_where_all_axes_read_the_same_in_two_or_more_blocks(steps, blocks,
-                                                                              spoil_m, equal):
+@pytest.mark.parametrize(
+    ("steps", "blocks", "spoil_m", "equal"),
+    [
+        ((0.01, 0.01), 3, 0.0, True),
+        ((0.01, 0.01), 2, 0.0, True),
+        ((0.01, 0.01), 1, 0.0, False),
+        ((0.01, 0.011), 3, 0.0, False),
+        ((0.01, 0.01), 3, 1e-8, False),
+    ],
+)
+def test_readings_are_equal_where_all_axes_read_the_same_in_two_or_more_blocks(
+    steps, blocks, spoil_m, equal
+):
     samples = np.full((1, 2, 2, blocks), 7.0711e-3)
     samples[0, 1, 0, -1] += spoil_m
-    assert readings_are_equal(StepDiagonal(steps, DIAGONALS[2], samples,
-                                           np.zeros((1, 2, blocks)))) is equal
+    assert (
+        readings_are_equal(StepDiagonal(steps, DIAGONALS[2], samples, np.zeros((1, 2, blocks))))
+        is equal
+    )
 
 
 def test_table_1_case_b_holds_in_many_blocks():
@@ -99,14 +111,16 @@ def test_table_1_case_b_holds_in_many_blocks():
     data = planar((0.01, 0.01), np.repeat(one_block(*given), 6, axis=1))
     assert readings_are_equal(data)
     found = identify(data, Choice(Method.CONVENTIONAL)).errors_m
-    np.testing.assert_allclose(found / MM, np.repeat(one_block(*estimated) / MM, 6, axis=1),
-                               atol=1e-9)
+    np.testing.assert_allclose(
+        found / MM, np.repeat(one_block(*estimated) / MM, 6, axis=1), atol=1e-9
+    )
 
 
 def test_one_diagonal_is_refused():
     data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(0))).pick(["pp"])
-    with pytest.raises(InputError, match="only pp measured; the conventional formulation needs "
-                                         "every diagonal"):
+    with pytest.raises(
+        InputError, match="only pp measured; the conventional formulation needs every diagonal"
+    ):
         identify_wang(data)
 
 
@@ -125,8 +139,9 @@ def test_no_uncertainty_without_repeats_and_the_propagated_one_with_them():
 
 def test_jacobian_of_a_product():
     at = np.array([[2.0, 3.0]])
-    np.testing.assert_allclose(jacobian(lambda x: np.array([x[0, 0] * x[0, 1]]), at),
-                               [[3.0, 2.0]], rtol=1e-7)
+    np.testing.assert_allclose(
+        jacobian(lambda x: np.array([x[0, 0] * x[0, 1]]), at), [[3.0, 2.0]], rtol=1e-7
+    )
 
 
 def test_body_diagonals_are_weighted_by_their_repeats():
@@ -135,8 +150,10 @@ def test_body_diagonals_are_weighted_by_their_repeats():
     samples[:, 0] += 1e-8  # ppp is off, and measured nine times; the others once
     heavy = samples.copy()
     heavy[1:, 1:] = np.nan
-    residual = [identify_wang(StepDiagonal(machine.steps_m, DIAGONALS[3], each))
-                for each in (samples, heavy)]
+    residual = [
+        identify_wang(StepDiagonal(machine.steps_m, DIAGONALS[3], each))
+        for each in (samples, heavy)
+    ]
     off = [np.abs(found.errors_m - machine.errors_m).max() for found in residual]
     # Four readings for three components: ppp alone pulls with 1/4 of its misfit left over, with
     # ninefold weight with 1/28, so that the component along ppp follows more.

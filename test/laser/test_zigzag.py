@@ -51,10 +51,12 @@ def test_repeats_of_a_whole_recording_become_samples():
     one = recording(noise_m=10e-9)
     other = recorded(case_study_machine(), {}, rng=np.random.default_rng(5), noise_m=10e-9)
     gap = int(one.laser_ns[-1]) + 10**9
-    both = Recording(np.concatenate([one.laser_ns, other.laser_ns + gap]),
-                  np.concatenate([one.laser_m, other.laser_m]),
-                  np.concatenate([one.position_ns, other.position_ns + gap]),
-                  np.concatenate([one.position_m, other.position_m]))
+    both = Recording(
+        np.concatenate([one.laser_ns, other.laser_ns + gap]),
+        np.concatenate([one.laser_m, other.laser_m]),
+        np.concatenate([one.position_ns, other.position_ns + gap]),
+        np.concatenate([one.position_m, other.position_m]),
+    )
     cut = cut_zigzag(both, RULE)
     assert cut.runs == {"np": 2, "pp": 2, "x": 2, "y": 2}
     assert cut.data.samples_m.shape == (2, 2, 2, 6) and cut.data.counts.min() == 2
@@ -65,11 +67,15 @@ def test_runs_that_were_repeated_more_often_than_others_keep_all_samples():
     until = 13 * 1_200_000_000  # one diagonal alone
     laser, position = other.laser_ns < until, other.position_ns < until
     gap = int(one.laser_ns[-1]) + 10**9
-    cut = cut_zigzag(Recording(
-        np.concatenate([one.laser_ns, other.laser_ns[laser] + gap]),
-        np.concatenate([one.laser_m, other.laser_m[laser]]),
-        np.concatenate([one.position_ns, other.position_ns[position] + gap]),
-        np.concatenate([one.position_m, other.position_m[position]])), RULE)
+    cut = cut_zigzag(
+        Recording(
+            np.concatenate([one.laser_ns, other.laser_ns[laser] + gap]),
+            np.concatenate([one.laser_m, other.laser_m[laser]]),
+            np.concatenate([one.position_ns, other.position_ns[position] + gap]),
+            np.concatenate([one.position_m, other.position_m[position]]),
+        ),
+        RULE,
+    )
     assert cut.runs == {"np": 1, "pp": 2, "x": 1, "y": 1}
     exact = cut_zigzag(recording(), RULE).data.readings_m
     np.testing.assert_allclose(cut.data.samples_m[1, 0], exact[0], atol=1e-14)
@@ -96,9 +102,12 @@ def test_the_mean_of_a_rest_leaves_the_moves_out():
 def test_a_recording_of_the_diagonals_only_has_no_linear_errors():
     series = recording()
     until = 26 * 1_200_000_000
-    short = Recording(series.laser_ns[series.laser_ns < until], series.laser_m[
-        series.laser_ns < until], series.position_ns[series.position_ns < until],
-        series.position_m[series.position_ns < until])
+    short = Recording(
+        series.laser_ns[series.laser_ns < until],
+        series.laser_m[series.laser_ns < until],
+        series.position_ns[series.position_ns < until],
+        series.position_m[series.position_ns < until],
+    )
     cut = cut_zigzag(short, RULE)
     assert cut.runs == {"np": 1, "pp": 1} and cut.data.linear_m is None
     assert cut.notes == ("1 move(s) that are not one step of one axis",)
@@ -107,8 +116,15 @@ def test_a_recording_of_the_diagonals_only_has_no_linear_errors():
 def test_linear_errors_of_some_axes_only_are_left_out_and_said():
     series, until = recording(), 33 * 1_200_000_000  # rests of pp, np: 13 each, of x: 7
     laser, position = series.laser_ns < until, series.position_ns < until
-    cut = cut_zigzag(Recording(series.laser_ns[laser], series.laser_m[laser],
-                               series.position_ns[position], series.position_m[position]), RULE)
+    cut = cut_zigzag(
+        Recording(
+            series.laser_ns[laser],
+            series.laser_m[laser],
+            series.position_ns[position],
+            series.position_m[position],
+        ),
+        RULE,
+    )
     said = "linear errors of some axes only: not used"
     assert cut.runs == {"np": 1, "pp": 1, "x": 1} and cut.data.linear_m is None
     assert said in cut.notes and said not in cut_zigzag(series, RULE).notes
@@ -132,16 +148,34 @@ def test_runs_over_different_places_are_refused():
         cut_zigzag(series, RULE)
 
 
-@pytest.mark.parametrize(("spoil", "kind", "message"), [
-    (lambda s: replace(s, laser_m=np.where(np.arange(len(s.laser_m)) == 7, np.nan, s.laser_m)),
-     InputError, "laser: sample 7 is not finite"),
-    (lambda s: replace(s, laser_ns=s.laser_ns[:0], laser_m=s.laser_m[:0]), NoDataError,
-     "laser: no samples; check the topic"),
-    (lambda s: replace(s, position_m=s.position_m * 1000), NoDataError,
-     "recording: no run along a diagonal; check topics, joints, steps"),
-    (lambda s: replace(s, laser_m=s.laser_m * 1000), InputError,
-     "run pp, x move, block 1: 7067.64 where 7.07107 mm is "
-     "nominal: it looks like micrometres")])
+@pytest.mark.parametrize(
+    ("spoil", "kind", "message"),
+    [
+        (
+            lambda s: replace(
+                s, laser_m=np.where(np.arange(len(s.laser_m)) == 7, np.nan, s.laser_m)
+            ),
+            InputError,
+            "laser: sample 7 is not finite",
+        ),
+        (
+            lambda s: replace(s, laser_ns=s.laser_ns[:0], laser_m=s.laser_m[:0]),
+            NoDataError,
+            "laser: no samples; check the topic",
+        ),
+        (
+            lambda s: replace(s, position_m=s.position_m * 1000),
+            NoDataError,
+            "recording: no run along a diagonal; check topics, joints, steps",
+        ),
+        (
+            lambda s: replace(s, laser_m=s.laser_m * 1000),
+            InputError,
+            "run pp, x move, block 1: 7067.64 where 7.07107 mm is "
+            "nominal: it looks like micrometres",
+        ),
+    ],
+)
 def test_a_spoilt_recording_is_one_clear_line(spoil, kind, message):
     with pytest.raises(kind) as caught:
         cut_zigzag(spoil(recording()), RULE)
@@ -155,8 +189,11 @@ def test_both_ends_of_a_rest_are_left_out(edge):
     creeping = phase < 80_000_000 if edge == "start" else (phase > 900_000_000) & (phase < 10**9)
     creeping &= rest % 2 == 1  # of every rest alike it would cancel in the readings
     spoilt = replace(series, laser_m=series.laser_m + 1e-6 * creeping)
-    np.testing.assert_allclose(cut_zigzag(spoilt, RULE).data.readings_m,
-                               cut_zigzag(series, RULE).data.readings_m, atol=1e-14)
+    np.testing.assert_allclose(
+        cut_zigzag(spoilt, RULE).data.readings_m,
+        cut_zigzag(series, RULE).data.readings_m,
+        atol=1e-14,
+    )
     with_all = cut_zigzag(spoilt, replace(RULE, settle_s=0.0)).data.readings_m
     assert np.abs(with_all - cut_zigzag(series, RULE).data.readings_m).max() > 10e-9
 
@@ -175,8 +212,10 @@ def test_single_laser_samples_beside_their_rest_are_left_out_and_said(noise_m, s
     want = cut_zigzag(replace(series, laser_m=quiet), RULE)
     atol = 3 * noise_m / np.sqrt(len(in_rest) / 50) + 1e-14
     np.testing.assert_allclose(cut.data.readings_m, want.data.readings_m, atol=atol)
-    assert cut.notes == (f"{len(in_rest[::50])} outlying laser sample(s) within a rest are left "
-                         "out", *want.notes)
+    assert cut.notes == (
+        f"{len(in_rest[::50])} outlying laser sample(s) within a rest are left out",
+        *want.notes,
+    )
     assert not any("jump" in note for note in want.notes)
 
 
@@ -185,8 +224,10 @@ def rests_by_trying_every_start(series, rule):
     found, start, stamps = [], 0, series.position_ns
     while start < len(stamps):
         end = start + 1
-        while end < len(stamps) and np.ptp(series.position_m[start:end + 1],
-                                           axis=0).max() <= rule.rest_tolerance_m:
+        while (
+            end < len(stamps)
+            and np.ptp(series.position_m[start : end + 1], axis=0).max() <= rule.rest_tolerance_m
+        ):
             end += 1
         if stamps[end - 1] - stamps[start] >= rule.min_rest_s * 1e9:
             found.append(int(stamps[start]))
@@ -205,8 +246,9 @@ def test_rests_of_creeping_axes_are_those_of_the_definition(seed, creep, jumps):
     stamps = np.arange(300) * 20_000_000
     series = Recording(stamps, np.zeros(300), stamps, walk)
     rule = CutRule((0.01, 0.01), min_rest_s=0.2, settle_s=0.0)
-    assert [rest.start_ns for rest in find_rests(series, rule)] == \
-        rests_by_trying_every_start(series, rule)
+    assert [rest.start_ns for rest in find_rests(series, rule)] == rests_by_trying_every_start(
+        series, rule
+    )
 
 
 def test_a_rest_without_laser_samples_does_not_count():

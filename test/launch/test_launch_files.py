@@ -15,8 +15,15 @@ ARGUMENTS = {
     "simulated_cell.launch.py": SHARED | {"bag", "camera", "journal"},
 }
 STARTED = {
-    "calibrate.launch.py": {"measurement_collector", "solver", "pose_sequencer", "compensator",
-                            "mark_detector", "cell_driver", "foxglove_bridge"},
+    "calibrate.launch.py": {
+        "measurement_collector",
+        "solver",
+        "pose_sequencer",
+        "compensator",
+        "mark_detector",
+        "cell_driver",
+        "foxglove_bridge",
+    },
     "replay.launch.py": {"bag_player"},
     "simulated_cell.launch.py": {"bag_recorder", "stage_simulator"},
 }
@@ -38,6 +45,7 @@ def description():
         module = module_from_spec(spec)
         spec.loader.exec_module(module)
         return module.generate_launch_description()
+
     return load
 
 
@@ -49,8 +57,9 @@ def test_every_launch_file_is_known_here():
 def test_it_states_its_arguments(description, path):
     from launch.actions import DeclareLaunchArgument
 
-    stated = [entity for entity in description(path).entities
-              if isinstance(entity, DeclareLaunchArgument)]
+    stated = [
+        entity for entity in description(path).entities if isinstance(entity, DeclareLaunchArgument)
+    ]
     assert {argument.name for argument in stated} == ARGUMENTS[path.name]
     assert all(argument.description for argument in stated)
 
@@ -93,16 +102,29 @@ def parameters_of(description, **given: str) -> list[dict]:
     found = []
     for path in FILES:
         context = LaunchContext()
-        context.launch_configurations.update({
-            argument: "" for arguments in ARGUMENTS.values() for argument in arguments}
-            | {"rate": "1.0", "use_sim_time": "false"} | given)
+        context.launch_configurations.update(
+            {argument: "" for arguments in ARGUMENTS.values() for argument in arguments}
+            | {"rate": "1.0", "use_sim_time": "false"}
+            | given
+        )
         for entity in description(path).entities:
-            if (isinstance(entity, Node) and entity.node_package == "selfcal_ros"
-                    and not (entity.node_executable in once and entity.condition
-                             and not entity.condition.evaluate(context))):
+            if (
+                isinstance(entity, Node)
+                and entity.node_package == "selfcal_ros"
+                and not (
+                    entity.node_executable in once
+                    and entity.condition
+                    and not entity.condition.evaluate(context)
+                )
+            ):
                 rows = [row for row in entity._Node__parameters if isinstance(row, dict)]
-                found.append({key: value for row in evaluate_parameters(context, rows)
-                              for key, value in row.items()})
+                found.append(
+                    {
+                        key: value
+                        for row in evaluate_parameters(context, rows)
+                        for key, value in row.items()
+                    }
+                )
     return found
 
 
@@ -114,21 +136,27 @@ def test_a_name_like_a_date_or_a_number_stays_text(description, name):
 
 def test_simulated_time_is_for_every_node(description):
     rows = parameters_of(description, use_sim_time="true")
-    assert len(rows) == sum(len(nodes - {"foxglove_bridge", "cell_driver"})
-                            for nodes in STARTED.values())
+    assert len(rows) == sum(
+        len(nodes - {"foxglove_bridge", "cell_driver"}) for nodes in STARTED.values()
+    )
     assert all(row["use_sim_time"] is True for row in rows)
 
 
-@pytest.mark.parametrize(("sense", "placing"), [("plate_moves", "person"),
-                                                ("microscope_moves", "robot")])
+@pytest.mark.parametrize(
+    ("sense", "placing"), [("plate_moves", "person"), ("microscope_moves", "robot")]
+)
 def test_collector_and_sequencer_are_told_what_the_cell_states(
-        description, tmp_path, sense, placing):
+    description, tmp_path, sense, placing
+):
     cell = tmp_path / "cell.yaml"
-    cell.write_text(f"machine: simulated\nsimulated: {{simulation: sim.yaml}}\nsense: {sense}\n"
-                    f"placing: {placing}\nlimits: {{x: [-1, 1], y: [-1, 1], theta: [-7, 7]}}\n")
+    cell.write_text(
+        f"machine: simulated\nsimulated: {{simulation: sim.yaml}}\nsense: {sense}\n"
+        f"placing: {placing}\nlimits: {{x: [-1, 1], y: [-1, 1], theta: [-7, 7]}}\n"
+    )
     rows = parameters_of(description, cell=str(cell))
     assert [row["cell"] for row in rows if "cell" in row] == [str(cell)]
     assert [row["measurement_sense"] for row in rows if "measurement_sense" in row] == [sense]
     assert [row["auto_confirm"] for row in rows if "auto_confirm" in row] == [placing == "robot"]
-    assert not any({"measurement_sense", "auto_confirm"} & row.keys()
-                   for row in parameters_of(description))
+    assert not any(
+        {"measurement_sense", "auto_confirm"} & row.keys() for row in parameters_of(description)
+    )

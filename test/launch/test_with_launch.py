@@ -16,13 +16,21 @@ from test.support.waiting import wait_until
 ROOT = Path(__file__).parents[2]
 NEEDED = ("rclpy", "selfcal_msgs", "launch", "launch_ros", "launch_testing")
 MISSING = [name for name in NEEDED if find_spec(name) is None]
-pytestmark = [pytest.mark.ros,
-              pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}")]
-PLAN = {"plan_id": "small", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8},
-        "views": [{"name": "identity"}, {"name": "turned", "rotation_deg": 90},
-                  {"name": "line", "rotation_deg": 45, "grid": False},
-                  {"name": "shifted", "translation_pitch": [1, 0]},
-                  {"name": "back", "translation_pitch": [-1, 0]}]}
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.skipif(bool(MISSING), reason=f"needs {' and '.join(MISSING)}"),
+]
+PLAN = {
+    "plan_id": "small",
+    "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8},
+    "views": [
+        {"name": "identity"},
+        {"name": "turned", "rotation_deg": 90},
+        {"name": "line", "rotation_deg": 45, "grid": False},
+        {"name": "shifted", "translation_pitch": [1, 0]},
+        {"name": "back", "translation_pitch": [-1, 0]},
+    ],
+}
 
 
 @pytest.fixture
@@ -34,14 +42,26 @@ def run(monkeypatch, tmp_path):
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
     monkeypatch.setenv("ROS_HOME", str(tmp_path / "ros_home"))
     with domain() as environment:
+
         def call(*words: str) -> subprocess.CompletedProcess:
-            return subprocess.run([sys.executable, *words], check=False, capture_output=True,
-                                  text=True, timeout=400, cwd=ROOT,
-                                  env=os.environ | dict(environment))
+            return subprocess.run(
+                [sys.executable, *words],
+                check=False,
+                capture_output=True,
+                text=True,
+                timeout=400,
+                cwd=ROOT,
+                env=os.environ | dict(environment),
+            )
+
         yield call
         home = f"ROS_HOME={tmp_path / 'ros_home'}".encode()
-        wait_until(lambda: not [path for path in Path("/proc").glob("[0-9]*/environ")
-                                if holds(path, home)], "the end of all that was launched")
+        wait_until(
+            lambda: (
+                not [path for path in Path("/proc").glob("[0-9]*/environ") if holds(path, home)]
+            ),
+            "the end of all that was launched",
+        )
 
 
 def holds(path: Path, what: bytes) -> bool:
@@ -70,16 +90,29 @@ def launched(run, name: str, *arguments: str) -> subprocess.CompletedProcess:
     return run("-c", LAUNCH, f"launch/{name}", *arguments)
 
 
-@pytest.mark.parametrize("arguments", [
-    ["params:=config/params/simulated_cell.yaml"],
-    ["params:=config/params/simulated_camera.yaml", "plan:=config/plans/camera.yaml",
-     "camera:=config/simulations/camera.yaml", "namespace:=cell2"]],
-    ids=["detections", "images, in a namespace"])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["params:=config/params/simulated_cell.yaml"],
+        [
+            "params:=config/params/simulated_camera.yaml",
+            "plan:=config/plans/camera.yaml",
+            "camera:=config/simulations/camera.yaml",
+            "namespace:=cell2",
+        ],
+    ],
+    ids=["detections", "images, in a namespace"],
+)
 def test_a_whole_calibration(run, tmp_path, arguments):
     plan = tmp_path / "plan.yaml"
     plan.write_text(yaml.safe_dump(PLAN))
-    done = run("-m", "launch_testing.launch_test", "test/launch/whole_calibration.py",
-               f"plan:={plan}", *arguments)
+    done = run(
+        "-m",
+        "launch_testing.launch_test",
+        "test/launch/whole_calibration.py",
+        f"plan:={plan}",
+        *arguments,
+    )
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-6000:]
 
 
@@ -110,10 +143,14 @@ def test_a_parameter_file_that_is_not_there_starts_nothing(run, tmp_path, file):
     assert done.returncode == 1
 
 
-@pytest.mark.parametrize(("file", "argument", "problem"), [
-    ("calibrate", "compensate:=2", '"compensate" provided value "2" is not valid'),
-    ("calibrate", "detect:=maybe", '"detect" provided value "maybe" is not valid'),
-    ("replay", "rate:=fast", "rate:=fast: not a number; give the speed")])
+@pytest.mark.parametrize(
+    ("file", "argument", "problem"),
+    [
+        ("calibrate", "compensate:=2", '"compensate" provided value "2" is not valid'),
+        ("calibrate", "detect:=maybe", '"detect" provided value "maybe" is not valid'),
+        ("replay", "rate:=fast", "rate:=fast: not a number; give the speed"),
+    ],
+)
 def test_a_wrong_value_starts_nothing(run, file, argument, problem):
     """Nodes that it had started would go on without the launch; `run` waits for their end."""
     done = launched(run, f"{file}.launch.py", argument, "bag:=x", "journal:=none")

@@ -24,12 +24,19 @@ ARGUMENTS = {"plan": None, "params": None, "camera": "", "namespace": ""}
 
 def generate_test_description() -> LaunchDescription:
     share = Path(get_package_share_directory("selfcal_ros"))
-    return LaunchDescription([
-        *(DeclareLaunchArgument(name, default_value=value) for name, value in ARGUMENTS.items()),
-        IncludeLaunchDescription(
-            PythonLaunchDescriptionSource(str(share / "launch/simulated_cell.launch.py")),
-            launch_arguments={name: LaunchConfiguration(name) for name in ARGUMENTS}.items()),
-        launch_testing.actions.ReadyToTest()])
+    return LaunchDescription(
+        [
+            *(
+                DeclareLaunchArgument(name, default_value=value)
+                for name, value in ARGUMENTS.items()
+            ),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(str(share / "launch/simulated_cell.launch.py")),
+                launch_arguments={name: LaunchConfiguration(name) for name in ARGUMENTS}.items(),
+            ),
+            launch_testing.actions.ReadyToTest(),
+        ]
+    )
 
 
 class TestCalibration(unittest.TestCase):
@@ -49,8 +56,11 @@ class TestCalibration(unittest.TestCase):
         heard = {}
         for topic in (names.SUMMARY, names.ERROR_MAP):
             self.node.create_subscription(
-                topic.type, topic.name, lambda message, name=topic.name: heard.update(
-                    {name: message}), topic.qos)
+                topic.type,
+                topic.name,
+                lambda message, name=topic.name: heard.update({name: message}),
+                topic.qos,
+            )
         deadline = time.monotonic() + PATIENCE_S
         while not self.is_done(heard.get(names.SUMMARY.name)):
             assert time.monotonic() < deadline, f"the plan was not measured in time: {heard}"

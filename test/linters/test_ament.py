@@ -28,6 +28,9 @@ def test_pep257(monkeypatch):
 
 
 def test_setup_cfg_leaves_out_of_the_ament_docstrings_what_is_left_out_here():
-    line = next(line for line in (ROOT / "setup.cfg").read_text().splitlines()
-                if line.startswith("extend-ignore"))
+    line = next(
+        line
+        for line in (ROOT / "setup.cfg").read_text().splitlines()
+        if line.startswith("extend-ignore")
+    )
     assert set(DOCSTRINGS) <= set(line.split("=")[1].strip().split(","))

@@ -31,8 +31,9 @@ LIMITS = "limits: {x: [-1, 1], y: [-1, 1]}\n"
 
 
 def test_a_cell_with_all_its_keys(tmp_path):
-    (tmp_path / "cell.yaml").write_text(CELL + (
-        "sense: plate_moves\norigin: {x: 0.1}\ndetector: {mark: ring, mark_size: 4.0e-5}\n"))
+    (tmp_path / "cell.yaml").write_text(
+        CELL + ("sense: plate_moves\norigin: {x: 0.1}\ndetector: {mark: ring, mark_size: 4.0e-5}\n")
+    )
     cell = read_cell(tmp_path / "cell.yaml")
     assert (cell.machine, cell.sense, cell.placing) == ("simulated", Sense.PLATE_MOVES, "robot")
     assert cell.limits["x"] == (-0.01, 0.01)
@@ -42,16 +43,23 @@ def test_a_cell_with_all_its_keys(tmp_path):
     assert (cell.detector.mark, cell.settle.patience) == ("ring", 1.0)
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("machine: simulated\n", "cell.yaml: limits: the travel of x is not limited"),
-    (LIMITS, "the key 'machine' is missing"),
-    (f"{LIMITS}machine: simulated\nlimit: 3\n", "limit: unknown key; did you mean 'limits'?"),
-    (f"{LIMITS}machine: simulated\nsettle: {{tim: 3}}\n", "tim: unknown key; did you mean 'time'?"),
-    (f"{LIMITS}machine: simulated\nsettle: {{time: -3}}\n", "-3.0 is outside"),
-    (f"{LIMITS}machine: simulated\norigin: {{x: low}}\n", "'low' is not of type float"),
-    (f"{LIMITS}machine: simulated\nplacing: hand\n", "choose one of person, robot"),
-    (f"{LIMITS}machine: simulated\ndetector: {{autostart: true}}\n", "autostart: unknown key"),
-    ("machine: simulated\nlimits: {x: [1, -1], y: [-1, 1]}\n", "[1, -1] is not [low, high]")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("machine: simulated\n", "cell.yaml: limits: the travel of x is not limited"),
+        (LIMITS, "the key 'machine' is missing"),
+        (f"{LIMITS}machine: simulated\nlimit: 3\n", "limit: unknown key; did you mean 'limits'?"),
+        (
+            f"{LIMITS}machine: simulated\nsettle: {{tim: 3}}\n",
+            "tim: unknown key; did you mean 'time'?",
+        ),
+        (f"{LIMITS}machine: simulated\nsettle: {{time: -3}}\n", "-3.0 is outside"),
+        (f"{LIMITS}machine: simulated\norigin: {{x: low}}\n", "'low' is not of type float"),
+        (f"{LIMITS}machine: simulated\nplacing: hand\n", "choose one of person, robot"),
+        (f"{LIMITS}machine: simulated\ndetector: {{autostart: true}}\n", "autostart: unknown key"),
+        ("machine: simulated\nlimits: {x: [1, -1], y: [-1, 1]}\n", "[1, -1] is not [low, high]"),
+    ],
+)
 def test_a_wrong_key_is_named(tmp_path, text, said):
     (tmp_path / "cell.yaml").write_text(text)
     with pytest.raises(InputError) as error:
@@ -62,35 +70,44 @@ def test_a_wrong_key_is_named(tmp_path, text, said):
 def test_a_class_beside_the_file_gets_the_keys_under_its_name(tmp_path):
     (tmp_path / "my_own_stage.py").write_text(OWN)
     (tmp_path / "cell.yaml").write_text(
-        f"machine: my_own_stage:Mine\nMine: {{port: COM3, speed: 2.0}}\n{LIMITS}")
+        f"machine: my_own_stage:Mine\nMine: {{port: COM3, speed: 2.0}}\n{LIMITS}"
+    )
     machine = open_machine(read_cell(tmp_path / "cell.yaml"))
     assert (machine.port, machine.speed) == ("COM3", 2.0)
 
 
-@pytest.mark.parametrize(("text", "said"), [
-    ("machine: simulatd\n", "there is no machine 'simulatd'; did you mean 'simulated'?"),
-    ("machine: no_such_module:Mine\n", "put no_such_module.py beside cell.yaml"),
-    ("machine: own_stage:Yours\n", "own_stage.py) has no 'Yours'"),
-    ("machine: own_stage:Mine\nMine: {prot: 1}\n", "prot: unknown key; did you mean 'port'?"),
-    ("machine: own_stage:Mine\n", "Mine: the key 'port' is missing"),
-    ("machine: code:Stage\n", "code.py) has no 'Stage'"),  # of Python, not beside the file
-    ("machine: own_stage:Far\n", "JSONDecodeError: Expecting value: line 1 column 1 (char 0) "
-     "(own_stage.py, line "),
-    ("machine: own_stage:Deaf\n", "RuntimeError: no answer (own_stage.py, line "),
-    ("machine: own_stage:Half\n", "own_stage:Half has no 'move_to'"),
-    ("machine: own_stage:Odd\n", "the axes of own_stage:Odd are ('y', 'x')"),
-    ("machine: broken_stage:Mine\n", "ZeroDivisionError"),
-    ("machine: lacking_stage:Mine\n", "needs the module not_installed_anywhere")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("machine: simulatd\n", "there is no machine 'simulatd'; did you mean 'simulated'?"),
+        ("machine: no_such_module:Mine\n", "put no_such_module.py beside cell.yaml"),
+        ("machine: own_stage:Yours\n", "own_stage.py) has no 'Yours'"),
+        ("machine: own_stage:Mine\nMine: {prot: 1}\n", "prot: unknown key; did you mean 'port'?"),
+        ("machine: own_stage:Mine\n", "Mine: the key 'port' is missing"),
+        ("machine: code:Stage\n", "code.py) has no 'Stage'"),  # of Python, not beside the file
+        (
+            "machine: own_stage:Far\n",
+            "JSONDecodeError: Expecting value: line 1 column 1 (char 0) (own_stage.py, line ",
+        ),
+        ("machine: own_stage:Deaf\n", "RuntimeError: no answer (own_stage.py, line "),
+        ("machine: own_stage:Half\n", "own_stage:Half has no 'move_to'"),
+        ("machine: own_stage:Odd\n", "the axes of own_stage:Odd are ('y', 'x')"),
+        ("machine: broken_stage:Mine\n", "ZeroDivisionError"),
+        ("machine: lacking_stage:Mine\n", "needs the module not_installed_anywhere"),
+    ],
+)
 def test_a_machine_that_cannot_be_had(tmp_path, monkeypatch, text, said):
     (tmp_path / "own_stage.py").write_text(
         OWN + "\nclass Half:\n    axes = ('x', 'y')\n    position = 1\n"
         "\nclass Far(Mine):\n    def __init__(self): import json; json.loads('')\n"
         "\nclass Deaf(Mine):\n    def __init__(self): import driver_of_apt; driver_of_apt.ask()\n"
-        "\nclass Odd(Mine):\n    axes = ('y', 'x')\n    def __init__(self): pass\n")
+        "\nclass Odd(Mine):\n    axes = ('y', 'x')\n    def __init__(self): pass\n"
+    )
     (tmp_path / "dist-packages").mkdir()
     monkeypatch.syspath_prepend(tmp_path / "dist-packages")
     (tmp_path / "dist-packages/driver_of_apt.py").write_text(
-        "def ask():\n    raise RuntimeError('no answer')\n")
+        "def ask():\n    raise RuntimeError('no answer')\n"
+    )
     (tmp_path / "broken_stage.py").write_text("1 / 0\n")
     (tmp_path / "lacking_stage.py").write_text("import not_installed_anywhere\n")
     (tmp_path / "cell.yaml").write_text(text + LIMITS)
@@ -105,22 +122,31 @@ def test_the_simulated_machine_is_found_by_its_name(tmp_path):
 
 def test_values_are_written_and_the_rest_is_kept(tmp_path):
     path = tmp_path / "cell.yaml"
-    path.write_text("# my cell\nmachine: simulated  # here\n"
-                    "detector: {mark_size: 5.0e-5, turn: 1}\nlimits:\n  x: [-1, 1]  # of the nut\n"
-                    "  y: [-1, 1]\n")
+    path.write_text(
+        "# my cell\nmachine: simulated  # here\n"
+        "detector: {mark_size: 5.0e-5, turn: 1}\nlimits:\n  x: [-1, 1]  # of the nut\n"
+        "  y: [-1, 1]\n"
+    )
     with_values(path, "detector", {"turn": 2.5, "mirror": True}, {"turn": "u 0.1"})
     with_values(path, "found", {"backlash_x": {"value": 1e-6, "u": 2e-8}}, {})
     assert path.read_text() == (
         "# my cell\nmachine: simulated  # here\ndetector:\n  mark_size: 5.0e-05\n"
         "  turn: 2.5  # u 0.1\n  mirror: true\nlimits:\n  x: [-1, 1]  # of the nut\n"
-        "  y: [-1, 1]\nfound:\n  backlash_x: {value: 1.0e-06, u: 2.0e-08}\n")
+        "  y: [-1, 1]\nfound:\n  backlash_x: {value: 1.0e-06, u: 2.0e-08}\n"
+    )
     assert read_yaml(path)["found"]["backlash_x"]["u"] == 2e-8
     assert read_cell(path).detector.turn == 2.5
 
 
-@pytest.mark.parametrize(("axis", "value", "said"), [
-    ("x", 0.0101, "beyond the limits -0.01 to 0.01"), ("x", -0.0101, "beyond the limits"),
-    ("y", float("nan"), "not a position"), ("z", 0.0, "moves z, which has no limits")])
+@pytest.mark.parametrize(
+    ("axis", "value", "said"),
+    [
+        ("x", 0.0101, "beyond the limits -0.01 to 0.01"),
+        ("x", -0.0101, "beyond the limits"),
+        ("y", float("nan"), "not a position"),
+        ("z", 0.0, "moves z, which has no limits"),
+    ],
+)
 def test_limits(tmp_path, axis, value, said):
     (tmp_path / "cell.yaml").write_text(CELL)
     cell = read_cell(tmp_path / "cell.yaml")
@@ -129,8 +155,11 @@ def test_limits(tmp_path, axis, value, said):
         cell.require_limits(axis, value, "a move")
 
 
-@pytest.mark.parametrize("path", sorted(
-    (Path(__file__).parents[2] / "config/cells").glob("*.yaml")), ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "path",
+    sorted((Path(__file__).parents[2] / "config/cells").glob("*.yaml")),
+    ids=lambda path: path.name,
+)
 def test_the_shipped_cells_have_only_known_keys(path):
     cell = read_cell(path)
     check_keys(class_of(cell), cell)

@@ -32,10 +32,18 @@ def cell(tmp_path):
     def command(*phases: Phase) -> None:
         with driver._turn:  # its thread takes none of them up before the last
             for phase in phases:
-                driver.take_command(Command(
-                    next(stamps), phase, plan.plan_id, view=plan.views[0],
-                    artifact=plan.artifact, views_planned=len(plan.views)))
+                driver.take_command(
+                    Command(
+                        next(stamps),
+                        phase,
+                        plan.plan_id,
+                        view=plan.views[0],
+                        artifact=plan.artifact,
+                        views_planned=len(plan.views),
+                    )
+                )
         wait_until(lambda: not driver.busy, f"the end of {phases}")
+
     yield driver, said, machine, command
     driver.close()
 
@@ -46,11 +54,14 @@ def test_nothing_is_measured_on_a_plate_that_the_robot_did_not_place(cell):
 
     def drop(placing):
         raise MachineError("the gripper is empty", "robot")
+
     machine.place = drop
     command(Phase.PLACE)
     command(Phase.MEASURE)
-    assert said == ["robot: the gripper is empty", "view 'identity': the robot has not placed the "
-                    "plate; redo_view has it placed again"]
+    assert said == [
+        "robot: the gripper is empty",
+        "view 'identity': the robot has not placed the plate; redo_view has it placed again",
+    ]
     assert not any(isinstance(event, Detection) for event in driver.events)
     machine.place = place
     command(Phase.PLACE)
@@ -76,6 +87,7 @@ def test_a_machine_that_does_not_answer_is_named_until_it_does(cell):
         asked.set()
         answers.wait()
         return position()
+
     machine.position = silent
     asked.wait()
     assert not driver.trouble
@@ -102,6 +114,7 @@ def test_a_machine_that_is_stopped_while_it_is_asked_is_not_silent_later(cell):
         answers.set()
         wait_until(lambda: driver._visitor._asked is None, "the answer")
         answered.set()
+
     machine.position, machine.stop = late, stops_and_waits
     asked.wait()
     driver._visitor.stop()
@@ -119,8 +132,18 @@ def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
     wait_until(lambda: len(driver.events) >= told + 3, "positions at rest")
     driver._clock.ns += 10 * PATIENCE_NS
     wait_until(lambda: driver.events[-1].stamp_ns > driver._clock.ns - PATIENCE_NS, "a later one")
-    driver.take_status(SimpleNamespace(complete=False, view_index=0, run_id="", missing_m=[1],
-                                       missing_n=[0], missing_k=[], check_done=0, check_expected=0))
+    driver.take_status(
+        SimpleNamespace(
+            complete=False,
+            view_index=0,
+            run_id="",
+            missing_m=[1],
+            missing_n=[0],
+            missing_k=[],
+            check_done=0,
+            check_expected=0,
+        )
+    )
     wait_until(lambda: not driver.busy, "the visit")
     again = list(driver.events)[told:]
     assert [(event.m, event.n) for event in again if isinstance(event, Detection)] == [(1, 0)]

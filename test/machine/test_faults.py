@@ -40,7 +40,8 @@ AT_THE_FIRST_MOVE = [
     ("turns the other way", "the opposite direction: theta is reversed"),
     ("theta in degrees", "57 times as far: is it degrees for rad?"),
     ("rotary drive is off", "theta was sent .* nothing moved"),
-    ("position lacks an axis", "its position is")]
+    ("position lacks an axis", "its position is"),
+]
 
 
 @pytest.mark.parametrize(("fault", "said"), AT_THE_FIRST_MOVE)
@@ -58,13 +59,15 @@ AT_THE_FIRST_MARK = [
     ("mirrored", "the opposite direction: x is reversed"),
     ("turned by 180 degrees", "the opposite direction: x is reversed"),
     ("turned by 90 degrees", "y moved instead: the axes are exchanged"),
-    ("late by one frame", "late by one frame"), ("late by two frames", "late by one frame"),
+    ("late by one frame", "late by one frame"),
+    ("late by two frames", "late by one frame"),
     ("of sixteen bits", "black, grey values up to 2.. of 65535.*full_scale"),
     ("of half the size", "nothing is seen at the first 5 stops.*pixel_size"),
     ("no image", "nothing is seen at the first 5 stops; the machine returns no images"),
     ("offsets in um", "is it um for m?"),
     ("offsets are reversed", "the opposite direction: x is reversed"),
-    ("offsets are exchanged", "y moved instead: the axes are exchanged")]
+    ("offsets are exchanged", "y moved instead: the axes are exchanged"),
+]
 
 
 @pytest.mark.parametrize(("fault", "said"), AT_THE_FIRST_MARK)
@@ -95,29 +98,37 @@ OF_THE_STAGE = [
     ("creeps at rest", "y (does not come to rest|moved by)"),
     ("replies of another axis", "it answers for the other axis"),
     ("zero lost at rest", "x has changed by 3000 um at rest, without a command"),
-    ("moved by hand", "y has changed by 50 um at rest, without a command")]
+    ("moved by hand", "y has changed by 50 um at rest, without a command"),
+]
 OF_IMAGES = [
     ("no answer of the camera", "machine.image: TimeoutError: no answer in 5 s"),
     ("camera disconnected", "machine.image: OSError"),
     ("last image again", "returns the last image again"),
     ("late by one frame", "late by one frame"),
     ("torn image", "nothing is seen at the last 5 stops"),
-    ("black", "the image is black"), ("saturated", "the image is saturated"),
-    ("blank", "the image is blank"), ("empty", "an image is uint8 \\(0, 150\\)"),
+    ("black", "the image is black"),
+    ("saturated", "the image is saturated"),
+    ("blank", "the image is blank"),
+    ("empty", "an image is uint8 \\(0, 150\\)"),
     ("noise alone", "nothing is seen at the last 5 stops"),
     ("out of focus", "nothing is seen at the last 5 stops .rejected: no_fit"),
-    ("colour", "an image is uint8 \\(140, 150, 3\\)"), ("of floats", "an image is float64"),
+    ("colour", "an image is uint8 \\(140, 150, 3\\)"),
+    ("of floats", "an image is float64"),
     ("of half the size", "an image is 75 x 70 uint8, those before were 150 x 140 uint8"),
     ("of sixteen bits", "an image is 150 x 140 uint16, those before"),
     ("no image", "it returns no image any more"),
     ("stamp of the future", "the stamp of an exposure"),
-    ("stamp of the past", "the stamp of an exposure")]
+    ("stamp of the past", "the stamp of an exposure"),
+]
 
 
-@pytest.mark.parametrize(("fault", "said", "camera"), [
-    *((*fault, False) for fault in OF_THE_STAGE), *((*fault, True) for fault in OF_IMAGES)])
+@pytest.mark.parametrize(
+    ("fault", "said", "camera"),
+    [*((*fault, False) for fault in OF_THE_STAGE), *((*fault, True) for fault in OF_IMAGES)],
+)
 def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
-        tmp_path, fault, said, camera):
+    tmp_path, fault, said, camera
+):
     cell, machine = write_cell(tmp_path, camera=camera)
     spoilt = Spoilt(machine, fault, after=ONSET)
     with pytest.raises((MachineError, NoDataError), match=said):
@@ -128,8 +139,10 @@ def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
     assert sum(int(view.count.sum()) for view in readings.views) >= 8
 
 
-@pytest.mark.parametrize(("fault", "camera"), [
-    ("connection lost in a move", False), ("zero lost at rest", False), ("out of focus", True)])
+@pytest.mark.parametrize(
+    ("fault", "camera"),
+    [("connection lost in a move", False), ("zero lost at rest", False), ("out of focus", True)],
+)
 def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(tmp_path, fault, camera):
     cell, machine = write_cell(tmp_path, camera=camera)
     with pytest.raises((MachineError, NoDataError)):
@@ -140,8 +153,12 @@ def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(tmp_path, faul
     assert np.abs(away).max() < 5e-8
 
 
-HARMLESS = {"position one reading old": False, "ends a little short": False,
-            "light is failing": True, "camera was knocked": True}
+HARMLESS = {
+    "position one reading old": False,
+    "ends a little short": False,
+    "light is failing": True,
+    "camera was knocked": True,
+}
 """Faults, and whether they are the camera's."""
 
 
@@ -159,7 +176,8 @@ def test_a_fault_that_the_readings_allow_for_leaves_the_map_right(tmp_path, faul
 NOT_SHOWN_BY_THE_POSITION = [
     ("backlash of 5 um", 0, r"lie (4|5)[.]?\d* um apart in x and (4|5)[.]?\d* um in y: backlash"),
     ("steps were lost once", 40, r"[+]20 um in x and .* steps were lost"),
-    ("loses steps", 0, r"the marks run away by [+]\d+ um in x")]
+    ("loses steps", 0, r"the marks run away by [+]\d+ um in x"),
+]
 
 
 @pytest.mark.parametrize(("fault", "after", "said"), NOT_SHOWN_BY_THE_POSITION)
@@ -175,8 +193,10 @@ def test_what_no_position_shows_is_named_from_the_repeats(tmp_path, fault, after
 
 def test_marks_of_exchanged_names_and_bad_ones_are_named_with_the_reason(tmp_path):
     cell, machine = write_cell(tmp_path, plan=PLAN.replace("grid_size: 3", "grid_size: 5"))
-    for fault, said in (("m and n are exchanged", "the ids have m and n exchanged"),
-                        ("score is low", "rejected as low_score")):
+    for fault, said in (
+        ("m and n are exchanged", "the ids have m and n exchanged"),
+        ("score is low", "rejected as low_score"),
+    ):
         with pytest.raises(NoDataError, match=said):
             run_of(tmp_path, Spoilt(machine, fault), cell, Jumping()).measure()
         (tmp_path / "bag").rename(tmp_path / fault)
@@ -203,9 +223,13 @@ def test_lines_of_the_wrong_sense_are_refused_when_the_map_is_solved(tmp_path):
         away_from(machine.truth, tmp_path / "bag")
 
 
-@pytest.mark.parametrize(("name", "value", "said"), [
-    ("image", np.zeros((140, 150), np.uint8), "it returns ndarray; return Image"),
-    ("offsets", None, "it returns None; return a list of Offset")])
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("image", np.zeros((140, 150), np.uint8), "it returns ndarray; return Image"),
+        ("offsets", None, "it returns None; return a list of Offset"),
+    ],
+)
 def test_a_class_that_returns_something_else(tmp_path, name, value, said):
     cell, machine = write_cell(tmp_path)
     setattr(machine, name, lambda: value)
@@ -271,8 +295,11 @@ def test_a_stage_that_cannot_be_stopped_is_said(tmp_path):
             raise OSError("no route to host")
 
     spoilt = Deaf(machine, "connection lost in a move", ONSET)
-    with pytest.raises(MachineError, match=r"connection was lost.* and it cannot be stopped .no "
-                       r"route to host.; use the emergency stop"):
+    with pytest.raises(
+        MachineError,
+        match=r"connection was lost.* and it cannot be stopped .no "
+        r"route to host.; use the emergency stop",
+    ):
         run_of(tmp_path, spoilt, cell).measure()
 
 

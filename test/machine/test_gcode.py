@@ -26,16 +26,19 @@ def quick_controllers(monkeypatch, jumping_clocks):
         monkeypatch.setattr(gcode, name, getattr(gcode, name) / 20)
 
 
-@pytest.mark.parametrize(("dialect", "over"), [
-    ("grbl", over_pty), *((dialect, over_tcp) for dialect in KINDS if dialect != "grbl")])
+@pytest.mark.parametrize(
+    ("dialect", "over"),
+    [("grbl", over_pty), *((dialect, over_tcp) for dialect in KINDS if dialect != "grbl")],
+)
 def test_a_plan_is_measured_by_a_controller(tmp_path, dialect, over):
     cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
     firmware = KINDS[dialect]()
     with over(firmware) as port:
         machine = WithPlate(simulated, port=port, dialect=dialect)
         try:
-            Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
-                Agreeing()).measure()
+            Run(
+                read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+            ).measure()
         finally:
             machine.close()
     away, _ = away_from(simulated.truth, tmp_path / "bag")
@@ -79,11 +82,18 @@ def test_an_alarm_in_the_middle_stops_and_is_named(dialect):
         machine.close()
 
 
-@pytest.mark.parametrize(("fault", "said"), [
-    ("garbage", "is not an answer; check baud"), ("digits lost", "is not a position; check baud"),
-    ("line cut", "it reports 1 axes|no machine position|is not a position"),
-    ("reset", "the controller was reset: it says 'Grbl 1.1h"), ("alarm", "in state 'alarm'"),
-    ("never idle", "the move has not ended in"), ("silent", "no status report|no answer")])
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("garbage", "is not an answer; check baud"),
+        ("digits lost", "is not a position; check baud"),
+        ("line cut", "it reports 1 axes|no machine position|is not a position"),
+        ("reset", "the controller was reset: it says 'Grbl 1.1h"),
+        ("alarm", "in state 'alarm'"),
+        ("never idle", "the move has not ended in"),
+        ("silent", "no status report|no answer"),
+    ],
+)
 def test_a_controller_that_fails_in_the_middle_of_a_view(tmp_path, monkeypatch, fault, said):
     monkeypatch.setattr(gcode, "PATIENCE_S", 0.3)
     cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
@@ -91,8 +101,9 @@ def test_a_controller_that_fails_in_the_middle_of_a_view(tmp_path, monkeypatch, 
     with over_tcp(firmware) as port:
         machine = WithPlate(simulated, port=port, dialect="grbl")
         with pytest.raises(MachineError, match=said):
-            Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
-                Agreeing()).measure()
+            Run(
+                read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+            ).measure()
         machine.close()
     assert firmware.stopped >= 2 or fault == "silent"  # feed hold and reset
     readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
@@ -111,10 +122,14 @@ def test_a_lost_connection_is_named(over, monkeypatch):
         machine.close()
 
 
-@pytest.mark.parametrize(("keys", "said"), [
-    ({"dialect": "grbel"}, "the dialect 'grbel' is unknown"),
-    ({"feed": 0.0}, "a feed of 0.0 mm/min"),
-    ({"port": "/dev/there_is_none"}, "the port cannot be opened")])
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"dialect": "grbel"}, "the dialect 'grbel' is unknown"),
+        ({"feed": 0.0}, "a feed of 0.0 mm/min"),
+        ({"port": "/dev/there_is_none"}, "the port cannot be opened"),
+    ],
+)
 def test_keys_that_cannot_be(keys, said):
     with pytest.raises(MachineError, match=said):
         GcodeMachine(**{"port": "socket://127.0.0.1:1", "dialect": "grbl", "feed": 1.0} | keys)

@@ -35,14 +35,16 @@ def test_a_real_linuxcnc_measures_a_plan_and_loads_the_tables(tmp_path):
     emap = random_map(Artifact(5, 0.005, 0, 5), 1)
     emap = replace(emap, gx=emap.gx[:, :1] + 0 * emap.gx, gy=emap.gy[:1] + 0 * emap.gy)
     with tempfile.TemporaryDirectory() as folder:
-        for name, text in export("linuxcnc", result_of(emap), Wiring(MachineFrame()),
-                                 "comp.txt").files.items():
+        for name, text in export(
+            "linuxcnc", result_of(emap), Wiring(MachineFrame()), "comp.txt"
+        ).files.items():
             Path(folder, name).write_text(text)
         with linuxcnc.running(Path(folder)) as port:
             machine = WithPlate(simulated, port=port, dialect="linuxcnc")
             try:
-                Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
-                    Agreeing()).measure()
+                Run(
+                    read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+                ).measure()
                 check_limits(machine)
                 check_tables(machine, emap)
             finally:
@@ -63,7 +65,11 @@ def check_tables(machine, emap):
     for i, x in enumerate((-0.01, -0.005, 0.0, 0.005, 0.01)):
         j, y = 4 - i, -x
         machine.move_to((x, y))
-        wanted = (1e3 * (x + emap.gx[i, 0] - emap.gx[2, 0]),
-                  1e3 * (y + emap.gy[0, j] - emap.gy[0, 2]))
-        wait_until(lambda wanted=wanted: linuxcnc.motors() == pytest.approx(wanted, abs=1e-7),
-                   f"motors at {wanted} mm")
+        wanted = (
+            1e3 * (x + emap.gx[i, 0] - emap.gx[2, 0]),
+            1e3 * (y + emap.gy[0, j] - emap.gy[0, 2]),
+        )
+        wait_until(
+            lambda wanted=wanted: linuxcnc.motors() == pytest.approx(wanted, abs=1e-7),
+            f"motors at {wanted} mm",
+        )

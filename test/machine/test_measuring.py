@@ -18,8 +18,14 @@ from test.support.faults import Spoilt
 
 
 def run_of(folder, machine, cell, clock=None, desk=None) -> Run:
-    return Run(read_plan(folder / "plan.yaml"), cell, machine, folder / "bag", desk or Agreeing(),
-               clock or Jumping())
+    return Run(
+        read_plan(folder / "plan.yaml"),
+        cell,
+        machine,
+        folder / "bag",
+        desk or Agreeing(),
+        clock or Jumping(),
+    )
 
 
 def away_from(truth, bag, settings=None) -> tuple[np.ndarray, object]:
@@ -30,8 +36,12 @@ def away_from(truth, bag, settings=None) -> tuple[np.ndarray, object]:
     x, y = sites.x_m.ravel(), sites.y_m.ravel()
     one, zero = np.ones_like(x), np.zeros_like(x)
     columns = np.array([[*one, *zero], [*zero, *one], [*-y, *x], [*x, *y]]).T
-    away = np.concatenate([result.error_map.gx.ravel() - truth.g[0].ravel(),
-                           result.error_map.gy.ravel() - truth.g[1].ravel()])
+    away = np.concatenate(
+        [
+            result.error_map.gx.ravel() - truth.g[0].ravel(),
+            result.error_map.gy.ravel() - truth.g[1].ravel(),
+        ]
+    )
     return away - columns @ np.linalg.lstsq(columns, away, rcond=None)[0], result
 
 
@@ -39,8 +49,11 @@ def away_from(truth, bag, settings=None) -> tuple[np.ndarray, object]:
 @pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
 def test_the_map_is_right_within_its_uncertainty(tmp_path, camera, sense):
     cell, machine = write_cell(
-        tmp_path, camera=camera, cell=f"{CELL}sense: {sense}\norigin: {{x: 0.0005}}\n",
-        simulation=f"{SIMULATION}cell: {{sense: {sense}}}\n")
+        tmp_path,
+        camera=camera,
+        cell=f"{CELL}sense: {sense}\norigin: {{x: 0.0005}}\n",
+        simulation=f"{SIMULATION}cell: {{sense: {sense}}}\n",
+    )
     machine._position[0] = 0.0005
 
     class Shifted(Spoilt):
@@ -113,8 +126,9 @@ def test_nothing_moves_while_the_plate_is_placed(tmp_path):
 
 
 def test_a_plate_that_is_not_there_is_noticed_at_the_first_stops(tmp_path):
-    cell, machine = write_cell(tmp_path, simulation=SIMULATION.replace("t: 5.0e-6", "t: 9.0e-4"),
-                               camera=True)
+    cell, machine = write_cell(
+        tmp_path, simulation=SIMULATION.replace("t: 5.0e-6", "t: 9.0e-4"), camera=True
+    )
     spoilt = Spoilt(machine)
     with pytest.raises(NoDataError, match="nothing is seen at the first 5 stops"):
         run_of(tmp_path, spoilt, cell).measure()
@@ -143,8 +157,10 @@ def test_marks_that_were_missed_are_visited_again(tmp_path):
             return [] if self.n_seen % 5 == 0 else super().offsets()
 
     run_of(tmp_path, Forgetful(machine), cell).measure()
-    counts = [view.count.min() for view in collect_bag(
-        tmp_path / "bag", CollectorSettings()).measurements.views]
+    counts = [
+        view.count.min()
+        for view in collect_bag(tmp_path / "bag", CollectorSettings()).measurements.views
+    ]
     assert min(counts) >= 2
 
 
@@ -165,11 +181,13 @@ def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
 
     desk = Agreeing()
     run_of(tmp_path, Rehomed(machine), cell, Jumping(Jumping().ns + 10**12), desk).measure(
-        resume=True)
+        resume=True
+    )
     assert any("its marks lie" in line and "measured anew" in line for line in desk.lines)
     readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
     assert readings.views[0].rejected.get("superseded_by_redo", 0) > 0 or (
-        readings.rejected.get("superseded_by_redo", 0) > 0)
+        readings.rejected.get("superseded_by_redo", 0) > 0
+    )
     assert calibrate(readings).verdict.qualified
 
 
@@ -195,8 +213,12 @@ def test_a_clock_that_was_set_back_does_not_continue(tmp_path):
 def test_a_plate_that_is_laid_otherwise_than_asked_is_noticed_and_laid_anew(tmp_path):
     *head, turned, shifted = PLAN.replace("grid_size: 3", "grid_size: 5").splitlines()
     plan = "\n".join([*head, shifted, turned])
-    cell, machine = write_cell(tmp_path, plan=plan, cell=CELL.replace("robot", "person"),
-                               simulation=f"{SIMULATION}cell: {{with_ids: false}}\n")
+    cell, machine = write_cell(
+        tmp_path,
+        plan=plan,
+        cell=CELL.replace("robot", "person"),
+        simulation=f"{SIMULATION}cell: {{with_ids: false}}\n",
+    )
 
     class Careless(Agreeing):
         """Turns the plate of the last view the other way the first time."""

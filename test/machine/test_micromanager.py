@@ -35,8 +35,9 @@ def test_the_example_finds_the_map_within_its_uncertainty(tmp_path, config):
     cell = read_cell(tmp_path / "cell.yaml")
     machine = open_machine(cell)
     try:
-        Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
-            Agreeing()).measure()
+        Run(
+            read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+        ).measure()
     finally:
         machine.close()
     away, result = away_from(machine.plate.truth, tmp_path / "bag", collector_settings(cell))
@@ -84,9 +85,13 @@ def test_a_stage_that_does_not_arrive_in_time_is_stopped(config):
         machine.close()
 
 
-@pytest.mark.parametrize(("name", "other", "said"), [
-    ("Core,XYStage,Stage", "Core,XYStage,", "no XY stage"),
-    ("DXYStage", "NoStage", "cannot be loaded")])
+@pytest.mark.parametrize(
+    ("name", "other", "said"),
+    [
+        ("Core,XYStage,Stage", "Core,XYStage,", "no XY stage"),
+        ("DXYStage", "NoStage", "cannot be loaded"),
+    ],
+)
 def test_a_configuration_that_does_not_do(config, name, other, said):
     path = Path(config)
     path.write_text(path.read_text().replace(name, other))

@@ -48,8 +48,9 @@ def test_a_plan_is_measured_to_its_true_map(tmp_path, devices):
     devices.camera = Detector(name="camera")
     machine = OphydMachine("beamline:x", "beamline:y", detector="beamline:camera", image="frame")
     machine.place = simulated.place
-    Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing(),
-        Jumping()).measure()
+    Run(
+        read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing(), Jumping()
+    ).measure()
     away, result = away_from(simulated.truth, tmp_path / "bag")
     assert result.verdict.qualified
     assert np.abs(away).max() < 5e-8
@@ -64,10 +65,14 @@ def test_positions_are_in_the_unit_of_the_motors(devices):
     assert machine.image() is None
 
 
-@pytest.mark.parametrize(("keys", "said"), [
-    ({"x": "beamline:z"}, "'beamline:z' cannot be had"),
-    ({"x": "no_such_lab:x"}, "'no_such_lab:x' cannot be had"),
-    ({"unit": "inch"}, "the unit 'inch' is unknown")])
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"x": "beamline:z"}, "'beamline:z' cannot be had"),
+        ({"x": "no_such_lab:x"}, "'no_such_lab:x' cannot be had"),
+        ({"unit": "inch"}, "the unit 'inch' is unknown"),
+    ],
+)
 def test_keys_that_cannot_be(devices, keys, said):
     with pytest.raises(MachineError, match=said):
         OphydMachine(**{"x": "beamline:x", "y": "beamline:y"} | keys)

@@ -28,14 +28,27 @@ EXACT = CellSettings(servo_sigma_m=0.0, servo_sigma_theta_rad=0.0)
 AT_HOME = {"x": 0.0, "y": 0.0, "theta": 0.1}
 
 
-def visited(plan: Plan, settings: CellSettings, *, spread: Spread | None = None,
-            begin: Position = AT_HOME, **how):
+def visited(
+    plan: Plan,
+    settings: CellSettings,
+    *,
+    spread: Spread | None = None,
+    begin: Position = AT_HOME,
+    **how,
+):
     """Return the machine of a plan, and what it tells of each view, reached from `begin`."""
     camera, clock = how.pop("camera", None), SimulatedClock(START_NS)
-    machine = SimulatedMachine.of(Simulation(
-        plan, 3, spread or Spread(), settings, camera=camera), clock)
-    cell = Cell("cell", "simulated", {}, dict.fromkeys(AXES, (-10.0, 10.0)), sense=settings.sense,
-                settle=Settle(arrival=np.inf, arrival_theta=np.inf))
+    machine = SimulatedMachine.of(
+        Simulation(plan, 3, spread or Spread(), settings, camera=camera), clock
+    )
+    cell = Cell(
+        "cell",
+        "simulated",
+        {},
+        dict.fromkeys(AXES, (-10.0, 10.0)),
+        sense=settings.sense,
+        settle=Settle(arrival=np.inf, arrival_theta=np.inf),
+    )
     how = {"step_ns": 2_000_000} | how
     visitor, told = Visitor(machine, cell, clock, **how), []
     for index, view in enumerate(plan.views):
@@ -54,8 +67,9 @@ def of_kind(kind, events):
 def test_exposures_come_in_their_period_with_samples_at_their_rate(period_s, rate_hz):
     """The stage rests 60 % of the period; two samples before and after an exposure are alike."""
     settings = replace(EXACT, exposure_period_s=period_s, encoder_rate_hz=rate_hz)
-    _, [told] = visited(Plan("p", PLATE, (View("a", repeats=2),)), settings,
-                        step_ns=round(1e9 / rate_hz))
+    _, [told] = visited(
+        Plan("p", PLATE, (View("a", repeats=2),)), settings, step_ns=round(1e9 / rate_hz)
+    )
     stamps = np.array([event.stamp_ns for event in told])
     assert (np.diff(stamps) > 0).all()
     exposed = np.array([event.stamp_ns for event in of_kind(Detection, told)])
@@ -66,7 +80,7 @@ def test_exposures_come_in_their_period_with_samples_at_their_rate(period_s, rat
     assert np.diff(at).mean() > 0.7e9 / rate_hz
     places = np.array([sample.positions for sample in samples])
     for index in np.searchsorted(at, exposed):
-        assert (places[index - 2:index + 2] == places[index]).all()
+        assert (places[index - 2 : index + 2] == places[index]).all()
 
 
 def test_all_repeats_of_a_mark_one_after_another_are_one_visit():
@@ -89,8 +103,9 @@ def test_a_stage_that_follows_its_marks_has_them_on_the_axis(sense):
     view = View("a", np.pi / 2, check_marks=2, check_offset_m=2e-5)
     spread = Spread(t_m=1e-4, phi_rad=1e-2)
     for follows in (True, False):
-        _, [told] = visited(Plan("p", PLATE, (view,)), replace(settings, follow_mark=follows),
-                            spread=spread)
+        _, [told] = visited(
+            Plan("p", PLATE, (view,)), replace(settings, follow_mark=follows), spread=spread
+        )
         seen = of_kind(Detection, told)
         away = np.array([np.hypot(item.offset_x, item.offset_y) for item in seen if not item.kind])
         angle = np.array([item.offset_theta for item in seen if item.kind])
@@ -138,11 +153,27 @@ def test_a_camera_shows_marks_in_images_and_lines_by_an_own_sensor():
 
 
 SPREAD = Spread(
-    microscope_scale=5e-3, microscope_rotation_rad=2e-3, microscope_axes="y-x", line_factor=-1.0,
-    microscope_distortion=1e-3, optical_tilt_x_rad=5e-3, backlash_x_m=4e-8, backlash_y_m=-3e-8,
-    backlash_growth_m=3e-8, settling_m=1e-8, stage_bend_m=1e-8, stage_yaw_rad=1e-5,
-    plate_scale=1e-6, plate_shape_m=3e-8, plate_strain=1e-6, plate_tilt_rad=1e-3, plate_bow_m=5e-6,
-    line_eccentricity_rad=1e-5, drift_linear_m=1e-7, drift_walk_m=1e-7)
+    microscope_scale=5e-3,
+    microscope_rotation_rad=2e-3,
+    microscope_axes="y-x",
+    line_factor=-1.0,
+    microscope_distortion=1e-3,
+    optical_tilt_x_rad=5e-3,
+    backlash_x_m=4e-8,
+    backlash_y_m=-3e-8,
+    backlash_growth_m=3e-8,
+    settling_m=1e-8,
+    stage_bend_m=1e-8,
+    stage_yaw_rad=1e-5,
+    plate_scale=1e-6,
+    plate_shape_m=3e-8,
+    plate_strain=1e-6,
+    plate_tilt_rad=1e-3,
+    plate_bow_m=5e-6,
+    line_eccentricity_rad=1e-5,
+    drift_linear_m=1e-7,
+    drift_walk_m=1e-7,
+)
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -150,18 +181,38 @@ SPREAD = Spread(
 def test_a_visited_machine_reads_as_its_bag_without_noise(how, sense):
     """The stage comes to each view from below, as that of a bag does."""
     plan = plan_of("0, 90, -tx", 5, size_y=3, count=8, line=True, repeats=3)
-    plan = replace(plan, views=tuple(replace(
-        view, check_marks=2 * view.grid, check_offset_m=2e-5 * view.grid) for view in plan.views))
+    plan = replace(
+        plan,
+        views=tuple(
+            replace(view, check_marks=2 * view.grid, check_offset_m=2e-5 * view.grid)
+            for view in plan.views
+        ),
+    )
     settings = replace(EXACT, sense=sense, **how)
-    machine, told = visited(plan, settings, spread=SPREAD, consecutive=settings.consecutive,
-                            begin={"x": -0.5, "y": -0.5, "theta": 0.1})
-    bag = plan_events(machine.truth, plan, settings=settings, rng=np.random.default_rng(4),
-                      start_ns=START_NS)
+    machine, told = visited(
+        plan,
+        settings,
+        spread=SPREAD,
+        consecutive=settings.consecutive,
+        begin={"x": -0.5, "y": -0.5, "theta": 0.1},
+    )
+    bag = plan_events(
+        machine.truth, plan, settings=settings, rng=np.random.default_rng(4), start_ns=START_NS
+    )
     offline, _ = collect(bag, measurement_sense=str(sense), outlier_limit=0.0)
     live = []
     for index, events in enumerate(told):
-        live.append(Command(events[0].stamp_ns - 1, Phase.MEASURE, plan.plan_id, index,
-                            plan.views[index], plan.artifact, len(plan.views)))
+        live.append(
+            Command(
+                events[0].stamp_ns - 1,
+                Phase.MEASURE,
+                plan.plan_id,
+                index,
+                plan.views[index],
+                plan.artifact,
+                len(plan.views),
+            )
+        )
         live += events
     found, _ = collect(live, measurement_sense=str(sense), outlier_limit=0.0)
     for one, other in zip(offline.views, found.views, strict=True):
@@ -172,5 +223,6 @@ def test_a_visited_machine_reads_as_its_bag_without_noise(how, sense):
         np.testing.assert_allclose(one.dtheta, other.dtheta, atol=4e-15)
         if one.view.grid:
             for name in ("approach_x", "approach_y"):
-                np.testing.assert_array_equal(getattr(one.visits, name),
-                                              getattr(other.visits, name))
+                np.testing.assert_array_equal(
+                    getattr(one.visits, name), getattr(other.visits, name)
+                )

@@ -47,8 +47,10 @@ def streamed(webcam):
             self.end_headers()
             with suppress(OSError):
                 for frame in webcam.frames():
-                    self.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d"
-                                     b"\r\n\r\n%s\r\n" % (len(frame), frame))
+                    self.wfile.write(
+                        b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d"
+                        b"\r\n\r\n%s\r\n" % (len(frame), frame)
+                    )
 
         def log_message(self, *_):
             """Say nothing."""

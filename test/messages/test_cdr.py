@@ -26,19 +26,37 @@ def header(stamp_ns, frame="stage", store=STORE):
     return store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
 
 
-def joint_state(stamp_ns, names=("x", "y", "theta"), positions=(1.0, -2.0, 3.0), velocities=(),
-                effort=(), frame="stage"):
-    return STORE.types[JOINTS](header=header(stamp_ns, frame), name=list(names), position=np.array(
-        positions, dtype=float), velocity=np.array(velocities, dtype=float),
-        effort=np.array(effort, dtype=float))
+def joint_state(
+    stamp_ns,
+    names=("x", "y", "theta"),
+    positions=(1.0, -2.0, 3.0),
+    velocities=(),
+    effort=(),
+    frame="stage",
+):
+    return STORE.types[JOINTS](
+        header=header(stamp_ns, frame),
+        name=list(names),
+        position=np.array(positions, dtype=float),
+        velocity=np.array(velocities, dtype=float),
+        effort=np.array(effort, dtype=float),
+    )
 
 
 def mark(stamp_ns, rng):
     return STORE.types[MARK](
-        header=header(stamp_ns), kind=int(rng.integers(3)), has_id=bool(rng.integers(2)),
-        m=int(rng.integers(-9, 9)), n=int(rng.integers(-9, 9)), k=int(rng.integers(2**32)),
-        offset_x=rng.normal(), offset_y=rng.normal(), offset_theta=rng.normal(),
-        sigma=rng.normal(), score=float(np.float32(rng.uniform())))
+        header=header(stamp_ns),
+        kind=int(rng.integers(3)),
+        has_id=bool(rng.integers(2)),
+        m=int(rng.integers(-9, 9)),
+        n=int(rng.integers(-9, 9)),
+        k=int(rng.integers(2**32)),
+        offset_x=rng.normal(),
+        offset_y=rng.normal(),
+        offset_theta=rng.normal(),
+        sigma=rng.normal(),
+        score=float(np.float32(rng.uniform())),
+    )
 
 
 def as_cdr(message, little=True, tail=b"", name=JOINTS, store=STORE):
@@ -53,10 +71,18 @@ def blocks_of(data, fields=JOINT_STATE, tail=None):
 
 def samples(blocks):
     """Return the samples of blocks as tuples, in the order of their stamps."""
-    return sorted((stamp, block.names, tuple(position),
-                   () if block.velocities is None else tuple(block.velocities[i].tolist()))
-                  for block in blocks for i, (stamp, position) in enumerate(zip(
-                      block.stamps_ns.tolist(), block.positions.tolist(), strict=True)))
+    return sorted(
+        (
+            stamp,
+            block.names,
+            tuple(position),
+            () if block.velocities is None else tuple(block.velocities[i].tolist()),
+        )
+        for block in blocks
+        for i, (stamp, position) in enumerate(
+            zip(block.stamps_ns.tolist(), block.positions.tolist(), strict=True)
+        )
+    )
 
 
 def test_the_fields_are_those_of_the_definitions():
@@ -65,8 +91,15 @@ def test_the_fields_are_those_of_the_definitions():
 
 texts = st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\0"), max_size=9)
 numbers = st.lists(st.floats(allow_nan=False), max_size=4)
-states = st.tuples(st.lists(texts, max_size=4), numbers, numbers, numbers, texts, st.booleans(),
-                   st.binary(max_size=9))
+states = st.tuples(
+    st.lists(texts, max_size=4),
+    numbers,
+    numbers,
+    numbers,
+    texts,
+    st.booleans(),
+    st.binary(max_size=9),
+)
 
 
 @settings(deadline=None, max_examples=30)
@@ -92,9 +125,22 @@ def test_detections_of_both_byte_orders():
     tables = [detection_table(group) for group in groups]
     assert len(tables) == 2 and not len(rest)
     rows = sorted(row for table in tables for row in table.tolist())
-    assert rows == [(1_700_000_000_999_999_999 + 10**9 * i, m.kind, m.has_id, m.m, m.n, m.k,
-                     m.offset_x, m.offset_y, m.offset_theta, m.sigma, m.score)
-                    for i, m in enumerate(marks)]
+    assert rows == [
+        (
+            1_700_000_000_999_999_999 + 10**9 * i,
+            m.kind,
+            m.has_id,
+            m.m,
+            m.n,
+            m.k,
+            m.offset_x,
+            m.offset_y,
+            m.offset_theta,
+            m.sigma,
+            m.score,
+        )
+        for i, m in enumerate(marks)
+    ]
 
 
 def test_a_stamp_before_1970_is_negative():
@@ -106,18 +152,29 @@ def test_a_stamp_before_1970_is_negative():
 
 def test_fields_before_between_and_behind_the_known_ones():
     store = get_typestore(Stores.ROS2_JAZZY)
-    text = ("uint8 first\nPart[] parts\nstd_msgs/Header header\nstring[2] pair\nstring[] name\n"
-            "float64[] velocity\nbool b\nfloat64[] position\nPart[2] two\nPart one\n" + "=" * 80
-            + "\nMSG: pkg/Part\nuint8 a\nfloat64 b\nstring c\nint16[3] d\n")
+    text = (
+        "uint8 first\nPart[] parts\nstd_msgs/Header header\nstring[2] pair\nstring[] name\n"
+        "float64[] velocity\nbool b\nfloat64[] position\nPart[2] two\nPart one\n"
+        + "=" * 80
+        + "\nMSG: pkg/Part\nuint8 a\nfloat64 b\nstring c\nint16[3] d\n"
+    )
     store.register(get_types_from_msg(text, "pkg/msg/Odd"))
     part = store.types["pkg/msg/Part"]
     parts = [part(1, 2.0, "three", np.array([4, 5, 6], dtype=np.int16))] * 3
     data = []
     for i in range(6):
         message = store.types["pkg/msg/Odd"](
-            first=7, parts=parts[:i % 2], header=header(i, store=store), pair=["a", "bc"],
-            name=["x", "y"], velocity=np.array([0.5, i]), b=True, position=np.array([i, -1.0]),
-            two=parts[:2], one=parts[0])
+            first=7,
+            parts=parts[: i % 2],
+            header=header(i, store=store),
+            pair=["a", "bc"],
+            name=["x", "y"],
+            velocity=np.array([0.5, i]),
+            b=True,
+            position=np.array([i, -1.0]),
+            two=parts[:2],
+            one=parts[0],
+        )
         data.append(as_cdr(message, i < 4, name="pkg/msg/Odd", store=store))
     blocks, rest = blocks_of(data, fields_of(store, "pkg/msg/Odd"))
     assert not len(rest) and len(blocks) == 4
@@ -153,15 +210,27 @@ def test_no_part_of_a_message_is_taken_for_a_whole_one(little):
     assert rest.tolist() == list(range(len(cut)))
 
 
-@pytest.mark.parametrize("spoil", [
-    lambda d: b"\0\2" + d[2:], lambda d: b"\1\1" + d[2:],
-    lambda d: d.replace(b"theta\0", b"theta!"),
-    lambda d: d.replace(b"theta", b"\xff\xfe\xff\xfe\xff"),
-    lambda d: d.replace(b"stage\0", b"stage\1"),
-    lambda d: d.replace(b"\6\0\0\0stage", b"\0\0\0\0stage"),
-    lambda d: d.replace(b"\3\0\0\0\2\0\0\0x", b"\xff\xff\xff\x7f\2\0\0\0x")],
-    ids=["XCDR", "encapsulation", "no end of a name", "no UTF-8", "no end of the frame",
-         "text of length 0", "very many names"])
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda d: b"\0\2" + d[2:],
+        lambda d: b"\1\1" + d[2:],
+        lambda d: d.replace(b"theta\0", b"theta!"),
+        lambda d: d.replace(b"theta", b"\xff\xfe\xff\xfe\xff"),
+        lambda d: d.replace(b"stage\0", b"stage\1"),
+        lambda d: d.replace(b"\6\0\0\0stage", b"\0\0\0\0stage"),
+        lambda d: d.replace(b"\3\0\0\0\2\0\0\0x", b"\xff\xff\xff\x7f\2\0\0\0x"),
+    ],
+    ids=[
+        "XCDR",
+        "encapsulation",
+        "no end of a name",
+        "no UTF-8",
+        "no end of the frame",
+        "text of length 0",
+        "very many names",
+    ],
+)
 def test_damaged_messages_are_left_to_rosbags_which_refuses_them(spoil):
     good = as_cdr(joint_state(5))
     bad = spoil(good)
@@ -182,25 +251,31 @@ def test_how_much_may_stand_behind_the_last_field():
 
 def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
     tried = []
-    monkeypatch.setattr(cdr, "layout_of",
-                        lambda fields, data: tried.append(1) or layout_of(fields, data))
+    monkeypatch.setattr(
+        cdr, "layout_of", lambda fields, data: tried.append(1) or layout_of(fields, data)
+    )
     data = [as_cdr(joint_state(i, frame=f"{i:05d}")) for i in range(640)]
     blocks, rest = blocks_of(data)
     assert len(tried) == len(blocks) == cdr.FREE_TRIES + 640 // cdr.WORTH
     assert len(rest) == 640 - len(blocks)
-    assert samples(blocks) == [(i, ("x", "y", "theta"), (1.0, -2.0, 3.0), ())
-                               for i in sorted(set(range(640)) - set(rest.tolist()))]
+    assert samples(blocks) == [
+        (i, ("x", "y", "theta"), (1.0, -2.0, 3.0), ())
+        for i in sorted(set(range(640)) - set(rest.tolist()))
+    ]
 
 
 def test_known_layouts_are_not_walked_again(monkeypatch):
     decoder = ColumnDecoder(JOINT_STATE)
-    data = [as_cdr(joint_state(i, names=("x", "y", "theta")[i % 3:][:1], positions=[i]))
-            for i in range(30)]
+    data = [
+        as_cdr(joint_state(i, names=("x", "y", "theta")[i % 3 :][:1], positions=[i]))
+        for i in range(30)
+    ]
     groups, _ = decoder.decode(Payloads.joined(data))
     assert sorted(len(group) for group in groups) == [10, 10, 10]
     monkeypatch.setattr(cdr, "layout_of", None)
     assert samples(map(encoder_block, decoder.decode(Payloads.joined(data))[0])) == samples(
-        map(encoder_block, groups))
+        map(encoder_block, groups)
+    )
 
 
 def test_the_memory_of_layouts_is_bounded():
@@ -217,14 +292,17 @@ def test_the_memory_of_layouts_is_bounded():
 
 def test_long_messages_have_few_layouts_and_longer_ones_none(monkeypatch):
     """Names of random length: each message would have a layout of its own, of 1 ms a kB."""
+
     def named(length):
         shortest = len(as_cdr(joint_state(0, names=[""])))
         return as_cdr(joint_state(0, names=["x" * (length - shortest)]))
+
     longest = named(cdr.MAX_LENGTH - 4) + bytes(4)
     assert len(longest) == cdr.MAX_LENGTH
     decoder = ColumnDecoder(JOINT_STATE)
-    groups, rest = decoder.decode(Payloads.joined([longest, *(
-        named(length) for length in range(4004, 4404, 8))]))
+    groups, rest = decoder.decode(
+        Payloads.joined([longest, *(named(length) for length in range(4004, 4404, 8))])
+    )
     assert [len(group.layout.example) for group in groups] == [4004, 4012, 4020]
     assert len(rest) == 48
     for length in range(2000, cdr.MAX_LENGTH, 100):
@@ -251,8 +329,13 @@ def test_nothing_gives_nothing():
 @pytest.mark.parametrize("little", [True, False])
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_of_a_joint_state_the_positions_alone_are_replaced(little, count):
-    before = joint_state(7, names=("a", "bcd", "theta"), positions=np.arange(count) + 0.5,
-                         velocities=[1.0, 2.0], effort=[3.0])
+    before = joint_state(
+        7,
+        names=("a", "bcd", "theta"),
+        positions=np.arange(count) + 0.5,
+        velocities=[1.0, 2.0],
+        effort=[3.0],
+    )
     editor, data = PositionEditor(), as_cdr(before, little, tail=b"tail")
     assert editor.read(data) == (("a", "bcd", "theta"), tuple(before.position))
     after = editor.replaced(data, (-before.position).tolist())
@@ -262,14 +345,17 @@ def test_of_a_joint_state_the_positions_alone_are_replaced(little, count):
 
 def test_an_editor_keeps_the_layouts_of_several_publishers_apart(monkeypatch):
     editor = PositionEditor()
-    data = [as_cdr(joint_state(i, names=("x", "y", "theta")[i:][:1], positions=[float(i)]))
-            for i in range(3)]
+    data = [
+        as_cdr(joint_state(i, names=("x", "y", "theta")[i:][:1], positions=[float(i)]))
+        for i in range(3)
+    ]
     for _ in range(2):
         for number, message in enumerate(data):
             [name], [position] = editor.read(message)
             assert (name, position) == (("x", "y", "theta")[number], number)
-            assert editor.replaced(message, [9.0]) == as_cdr(joint_state(
-                number, names=[name], positions=[9.0]))
+            assert editor.replaced(message, [9.0]) == as_cdr(
+                joint_state(number, names=[name], positions=[9.0])
+            )
         monkeypatch.setattr(cdr, "layout_of", None)  # each is walked once
     monkeypatch.undo()
     for i in range(cdr.MAX_KNOWN + 9):

@@ -20,7 +20,8 @@ DIGESTS = {
     "msg/ViewStatus": "dabeb340d728d3906bba72272115879851a10f9337af2ceec9b9d2ce8c8e2081",
     "srv/Correct": "f6e689693a9a1de1152400264b3b08f0f26e9ab76ea1d710cf40fc18ccdee083",
     "srv/LoadMap": "1475f229bca1248672e8744d8dbf89532af7d1453953770658b722725854787e",
-    "srv/SaveMap": "d77bfe5723fb152967572be0153525fb12568d4873e503dc7c04d05a333d9bd2"}
+    "srv/SaveMap": "d77bfe5723fb152967572be0153525fb12568d4873e503dc7c04d05a333d9bd2",
+}
 HASHES = {f"selfcal_msgs/{name}": f"RIHS01_{digest}" for name, digest in DIGESTS.items()}
 """RIHS01 (REP-2011) of every type, which a further key of a plan must not change: `plan_keys`."""
 ROOT = Path(__file__).parents[2] / "msg_defs"
@@ -35,7 +36,8 @@ def test_every_definition_is_held():
 @pytest.mark.parametrize("name", [name for name in HASHES if "/msg/" in name])
 def test_messages_are_those_of_version_1(name):
     assert hash_of(name) == HASHES[name], (
-        "undo the change in msg_defs: a key of a plan travels by PLAN_KEYS in model/view.py")
+        "undo the change in msg_defs: a key of a plan travels by PLAN_KEYS in model/view.py"
+    )
 
 
 @pytest.mark.ros

@@ -15,12 +15,16 @@ def stage(seed, pitches):
     """Return an error of x and y as sums of waves of at least so many pitches, about 1 um."""
     rng = np.random.default_rng(seed)
     k = rng.normal(size=(2, WAVES, 2))
-    k *= (2 * np.pi / pitches * rng.uniform(0.2, 1, (2, WAVES))
-          / np.linalg.norm(k, axis=-1))[..., None] / PITCH_M
+    k *= (2 * np.pi / pitches * rng.uniform(0.2, 1, (2, WAVES)) / np.linalg.norm(k, axis=-1))[
+        ..., None
+    ] / PITCH_M
     phase, size = rng.uniform(0, 2 * np.pi, (2, WAVES)), rng.normal(0, 4e-7, (2, WAVES))
-    return lambda x, y: [np.sum(s * np.cos(np.multiply.outer(x, a[:, 0])
-                                           + np.multiply.outer(y, a[:, 1]) + p), axis=-1)
-                         for a, p, s in zip(k, phase, size, strict=True)]
+    return lambda x, y: [
+        np.sum(
+            s * np.cos(np.multiply.outer(x, a[:, 0]) + np.multiply.outer(y, a[:, 1]) + p), axis=-1
+        )
+        for a, p, s in zip(k, phase, size, strict=True)
+    ]
 
 
 def shares_in_u(size, pitches, method):
@@ -28,13 +32,19 @@ def shares_in_u(size, pitches, method):
     artifact, found = Artifact(size, PITCH_M), []
     for seed in range(30):
         rng, error = np.random.default_rng([seed, 1]), stage(seed, pitches)
-        g = [part + rng.normal(0, NOISE_M, artifact.shape)
-             for part in error(artifact.x_m, artifact.y_m)]
+        g = [
+            part + rng.normal(0, NOISE_M, artifact.shape)
+            for part in error(artifact.x_m, artifact.y_m)
+        ]
         u = np.full(artifact.shape, NOISE_M)
         used = Compensator(ErrorMap(artifact, *g, u, u, np.zeros(0), np.zeros(0)), method=method)
         x, y = rng.uniform(-1, 1, (2, 200)) * artifact.half[0] * PITCH_M
-        found.append(np.mean(np.abs(np.subtract(used.error(x, y), error(x, y)))
-                             <= 2 * np.array(used.uncertainty(x, y))))
+        found.append(
+            np.mean(
+                np.abs(np.subtract(used.error(x, y), error(x, y)))
+                <= 2 * np.array(used.uncertainty(x, y))
+            )
+        )
     return np.array(found)
 
 
@@ -56,8 +66,11 @@ def test_a_bicubic_map_of_a_smooth_stage_is_worth_more_between_the_nodes():
 
 @pytest.mark.parametrize("method", ["bilinear", "bicubic"])
 def test_a_map_with_x_and_y_exchanged_has_its_errors_between_nodes_exchanged(method):
-    rng, artifact, other = np.random.default_rng(5), Artifact(9, PITCH_M, 0, 7), Artifact(
-        7, PITCH_M, 0, 9)
+    rng, artifact, other = (
+        np.random.default_rng(5),
+        Artifact(9, PITCH_M, 0, 7),
+        Artifact(7, PITCH_M, 0, 9),
+    )
     g = rng.normal(0, 1e-7, (2, *artifact.shape))
     u = 1e-8 * rng.uniform(1, 9, (2, *artifact.shape))
     one = ErrorMap(artifact, *g, *u, np.zeros(0), np.zeros(0))
@@ -102,8 +115,9 @@ def test_each_node_of_a_ring_counts_once(cubic):
     found = error_halfway(wave, 0 * wave, cubic=cubic, ring=True)
     assert found == pytest.approx((shrunk * left / np.sqrt(2), shrunk * left))
     for steps in range(8):
-        assert error_halfway(np.roll(wave, steps), 0 * wave, cubic=cubic, ring=True
-                             ) == pytest.approx(found)
+        assert error_halfway(
+            np.roll(wave, steps), 0 * wave, cubic=cubic, ring=True
+        ) == pytest.approx(found)
 
 
 def test_unknown_nodes_are_left_out():

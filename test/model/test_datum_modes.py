@@ -13,9 +13,12 @@ PLATE = Artifact(9, 0.005, 8, 7)  # rectangular
 def half_axes(artifact):
     """Return the sites (i, j) of +X, +Y, -X, -Y, and which component counts with which sign."""
     hx, hy = artifact.half
-    return [([(i, hy) for i in range(hx + 1, 2 * hx + 1)], 1, 1),
-            ([(hx, j) for j in range(hy + 1, 2 * hy + 1)], 0, -1),
-            ([(i, hy) for i in range(hx)], 1, 1), ([(hx, j) for j in range(hy)], 0, -1)]
+    return [
+        ([(i, hy) for i in range(hx + 1, 2 * hx + 1)], 1, 1),
+        ([(hx, j) for j in range(hy + 1, 2 * hy + 1)], 0, -1),
+        ([(i, hy) for i in range(hx)], 1, 1),
+        ([(hx, j) for j in range(hy)], 0, -1),
+    ]
 
 
 def slopes_of(artifact, g, known):
@@ -40,7 +43,8 @@ def test_slopes_are_those_of_a_straight_line_through_each_half_axis():
     everywhere = np.ones(PLATE.shape, dtype=bool)
     for column in range(3):
         assert found[:, column] == pytest.approx(
-            slopes_of(PLATE, g[..., column], everywhere), rel=1e-9)
+            slopes_of(PLATE, g[..., column], everywhere), rel=1e-9
+        )
 
 
 def test_a_half_axis_of_one_site_has_no_slope():

@@ -11,12 +11,22 @@ from selfcal_ros.model.kept import Covariance, Factors, ImagesKept, Kept, kept_f
 MAP, PLATE, LINES = (3, 2), (4, 5), 6
 RNG = np.random.default_rng(1)
 FULL = Kept(
-    Factors(("drift", "slip"), RNG.normal(size=(2, 2, *MAP)),
-            {"plate": RNG.normal(size=(3, 2, *PLATE)), "lines": RNG.normal(size=(3, 2, LINES)),
-             "microscope": RNG.normal(size=(3, 4))}, 1, RNG.random((2, *PLATE))),
-    {"drift": RNG.random(LINES)}, RNG.random(2),
+    Factors(
+        ("drift", "slip"),
+        RNG.normal(size=(2, 2, *MAP)),
+        {
+            "plate": RNG.normal(size=(3, 2, *PLATE)),
+            "lines": RNG.normal(size=(3, 2, LINES)),
+            "microscope": RNG.normal(size=(3, 4)),
+        },
+        1,
+        RNG.random((2, *PLATE)),
+    ),
+    {"drift": RNG.random(LINES)},
+    RNG.random(2),
     ImagesKept(0.25, 80.0, (0, 0, 1), ((0, 0), (1, -1), (0, 0))),
-    {"xy": Covariance.of(np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18)})
+    {"xy": Covariance.of(np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18)},
+)
 
 
 def test_json_keeps_all_of_it_to_the_last_bit():
@@ -28,8 +38,9 @@ def test_json_keeps_all_of_it_to_the_last_bit():
     np.testing.assert_array_equal(found.factors.of_map, FULL.factors.of_map)
     np.testing.assert_array_equal(found.factors.beside["lines"], FULL.factors.beside["lines"])
     np.testing.assert_array_equal(found.angular["drift"], FULL.angular["drift"])
-    np.testing.assert_allclose(found.covariances["xy"].matrix(2),
-                               np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18, rtol=1e-6)
+    np.testing.assert_allclose(
+        found.covariances["xy"].matrix(2), np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18, rtol=1e-6
+    )
 
 
 def test_a_covariance_without_noise_is_kept():
@@ -53,31 +64,52 @@ def test_what_is_infinite_or_unknown_is_kept():
     """Marks without noise of their own, as in images without noise; lines without a map."""
     images = ImagesKept(1.0, np.inf, (0,), ((0, 0),))
     kept = Kept(angular={"drift": np.full(LINES, np.nan)}, images=images)
-    found = kept_from_dict(json.loads(json.dumps(kept.to_dict(), allow_nan=False)), MAP, PLATE,
-                           LINES)
+    found = kept_from_dict(
+        json.loads(json.dumps(kept.to_dict(), allow_nan=False)), MAP, PLATE, LINES
+    )
     assert found.images == images
     assert np.isnan(found.angular["drift"]).all()
 
 
-@pytest.mark.parametrize(("where", "value", "message"), [
-    (("covariance_terms", "factors"), [[[1.0, 2.0]]], "covariance_terms: no factors of this latt"),
-    (("covariance_terms", "factors"), "no", "covariance_terms: no factors of this lattice"),
-    (("covariance_terms", "terms"), ["drift"], "covariance_terms: no factors of this lattice"),
-    (("covariance_terms", "beside", "plate"), [1.0, 2.0], "covariance_terms: no plate of this"),
-    (("covariance_terms", "beside", "lines"), None, "None is not of type list"),
-    (("covariance_terms", "beside", "microscope"), [[0.0] * 4], "beside the map of other factors"),
-    (("covariance_terms", "beside", "with_map"), 3, "beside the map of other factors"),
-    (("covariance_terms", "beside", "with_map"), -1, "beside the map of other factors"),
-    (("covariance_terms", "effects_on_plate"), [[None]], "covariance_terms: no effects on the pl"),
-    (("angular_terms", "drift"), [0.1] * (LINES + 1), "angular_terms: no contributions to these"),
-    (("angular_terms", "drift"), "no", "angular_terms: no contributions to these lines"),
-    (("first_order_added",), [0.1], "first_order_added: not two variances"),
-    (("map_covariance", "xy"), [1.0, None], "map_covariance: not a triangle of numbers"),
-    (("map_covariance", "scale_xy"), "1", "'1' is not a number"),
-    (("images", "share"), 1.5, "images: no noise of images"),
-    (("images", "share"), None, "images: no noise of images"),
-    (("images", "dof_mark"), -1.0, "images: no noise of images"),
-    (("images", "step"), [[0], [1], [0]], "images: no noise of images")])
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        (
+            ("covariance_terms", "factors"),
+            [[[1.0, 2.0]]],
+            "covariance_terms: no factors of this latt",
+        ),
+        (("covariance_terms", "factors"), "no", "covariance_terms: no factors of this lattice"),
+        (("covariance_terms", "terms"), ["drift"], "covariance_terms: no factors of this lattice"),
+        (("covariance_terms", "beside", "plate"), [1.0, 2.0], "covariance_terms: no plate of this"),
+        (("covariance_terms", "beside", "lines"), None, "None is not of type list"),
+        (
+            ("covariance_terms", "beside", "microscope"),
+            [[0.0] * 4],
+            "beside the map of other factors",
+        ),
+        (("covariance_terms", "beside", "with_map"), 3, "beside the map of other factors"),
+        (("covariance_terms", "beside", "with_map"), -1, "beside the map of other factors"),
+        (
+            ("covariance_terms", "effects_on_plate"),
+            [[None]],
+            "covariance_terms: no effects on the pl",
+        ),
+        (
+            ("angular_terms", "drift"),
+            [0.1] * (LINES + 1),
+            "angular_terms: no contributions to these",
+        ),
+        (("angular_terms", "drift"), "no", "angular_terms: no contributions to these lines"),
+        (("first_order_added",), [0.1], "first_order_added: not two variances"),
+        (("map_covariance", "xy"), [1.0, None], "map_covariance: not a triangle of numbers"),
+        (("map_covariance", "scale_xy"), "1", "'1' is not a number"),
+        (("images", "share"), 1.5, "images: no noise of images"),
+        (("images", "share"), None, "images: no noise of images"),
+        (("images", "dof_mark"), -1.0, "images: no noise of images"),
+        (("images", "step"), [[0], [1], [0]], "images: no noise of images"),
+    ],
+)
 def test_what_is_damaged_is_refused(where, value, message):
     data = json.loads(json.dumps(FULL.to_dict()))
     inner = data

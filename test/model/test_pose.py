@@ -28,11 +28,21 @@ def test_the_nearest_mark_of_a_plate_with_an_even_and_an_odd_side():
     np.testing.assert_array_equal([m, n], [tall.m.ravel(), tall.n.ravel()])
 
 
-@pytest.mark.parametrize(("degrees", "shift", "fits"), [
-    (0, 0.0, True), (0, 0.5, False), (90, 0.0, False), (90, 0.5, True), (180, 0.0, True),
-    (270, 0.5, True), (270, 1.0, False)])
+@pytest.mark.parametrize(
+    ("degrees", "shift", "fits"),
+    [
+        (0, 0.0, True),
+        (0, 0.5, False),
+        (90, 0.0, False),
+        (90, 0.5, True),
+        (180, 0.0, True),
+        (270, 0.5, True),
+        (270, 1.0, False),
+    ],
+)
 def test_a_plate_with_an_even_and_an_odd_side_fits_after_a_quarter_turn_and_half_a_pitch(
-        degrees, shift, fits):
+    degrees, shift, fits
+):
     view = View("v", math.radians(degrees), (shift * 0.01, shift * 0.01), True, False)
     assert view.is_on_lattice(Artifact(8, 0.01, grid_size_y=5)) is fits
 
@@ -42,7 +52,8 @@ def test_places_turn_counter_clockwise_and_shift() -> None:
     pose = View("a", math.radians(37), (2e-3, -1e-3)).pose
     place = pose.places(PLATE, np.array([3]), np.array([0]))
     assert place[0] == pytest.approx(
-        complex(0.03 * math.cos(math.radians(37)) + 2e-3, 0.03 * math.sin(math.radians(37)) - 1e-3))
+        complex(0.03 * math.cos(math.radians(37)) + 2e-3, 0.03 * math.sin(math.radians(37)) - 1e-3)
+    )
 
 
 @pytest.mark.parametrize("quarter", range(-3, 8))
@@ -93,8 +104,14 @@ def test_maps_of_two_nodes_a_side_are_refused() -> None:
 TURNS = st.sampled_from([0.0, 37.0, 45.0, 90.0, -90.0, 180.0, 211.0, 1e-4])
 
 
-@given(st.integers(3, 9), st.integers(3, 9), TURNS, st.floats(-6, 6), st.floats(-6, 6),
-       st.sampled_from([3, 4, 5, 9]))
+@given(
+    st.integers(3, 9),
+    st.integers(3, 9),
+    TURNS,
+    st.floats(-6, 6),
+    st.floats(-6, 6),
+    st.sampled_from([3, 4, 5, 9]),
+)
 def test_marks_in_the_field_of_a_map_are_counted_by_rows(nx, ny, turn, a, b, nodes):
     """The same marks as in `Pose.in_field`, row by row."""
     plate = Artifact(nx, 0.01, 0, ny, MapGrid(nodes, 0.012))
@@ -123,11 +140,21 @@ def test_turning_back_undoes_a_turn(degrees):
         np.testing.assert_allclose(pose.turned_back(*turned), [2, -3], atol=1e-12)
 
 
-@pytest.mark.parametrize(("view", "message"), [
-    (View("v", math.nan), "view 'v' rotation: nan is not an angle; give a finite turn"),
-    (View("v", 0.0, (math.inf, 0.0)), "view 'v' translation: (inf, 0.0) are not two lengths; give"),
-    (View("v", 0.0, (0.0, -2e3)), "view 'v' translation: -200000 pitches are beyond every field"),
-    (View("v", 0.1), "view 'v' rotation: 0.381972 is not a whole number of angular line steps")])
+@pytest.mark.parametrize(
+    ("view", "message"),
+    [
+        (View("v", math.nan), "view 'v' rotation: nan is not an angle; give a finite turn"),
+        (
+            View("v", 0.0, (math.inf, 0.0)),
+            "view 'v' translation: (inf, 0.0) are not two lengths; give",
+        ),
+        (
+            View("v", 0.0, (0.0, -2e3)),
+            "view 'v' translation: -200000 pitches are beyond every field",
+        ),
+        (View("v", 0.1), "view 'v' rotation: 0.381972 is not a whole number of angular line steps"),
+    ],
+)
 def test_poses_that_no_map_allows(view, message):
     """Not finite, far beyond every field, or between two lines that are to be read."""
     plate = Artifact(11, 0.01, 24, map_grid=MapGrid(7, 0.01))
@@ -136,9 +163,15 @@ def test_poses_that_no_map_allows(view, message):
     assert str(caught.value).startswith(message)
 
 
-@pytest.mark.parametrize(("shift", "refused"), [
-    ((MAX_SHIFT, 0.0), False), ((0.0, -MAX_SHIFT), False), ((MAX_SHIFT + 1, 0.0), True),
-    ((0.0, -MAX_SHIFT - 1), True)])
+@pytest.mark.parametrize(
+    ("shift", "refused"),
+    [
+        ((MAX_SHIFT, 0.0), False),
+        ((0.0, -MAX_SHIFT), False),
+        ((MAX_SHIFT + 1, 0.0), True),
+        ((0.0, -MAX_SHIFT - 1), True),
+    ],
+)
 def test_a_shift_along_one_axis_is_enough_to_be_refused(shift, refused):
     """100 000 pitches are the last that are taken."""
     view = View("v", 0.0, (shift[0] * 0.5, shift[1] * 0.5))

@@ -47,8 +47,17 @@ def assert_same(a, b):
         np.testing.assert_array_equal(getattr(a.error_map, name), getattr(b.error_map, name))
     for name in ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta"):
         np.testing.assert_array_equal(getattr(a.artifact_map, name), getattr(b.artifact_map, name))
-    for name in ("plan_id", "observability", "rejected", "input", "warnings", "method", "sense",
-                 "extra", "artifact"):
+    for name in (
+        "plan_id",
+        "observability",
+        "rejected",
+        "input",
+        "warnings",
+        "method",
+        "sense",
+        "extra",
+        "artifact",
+    ):
         assert getattr(a, name) == getattr(b, name)
     for name in ("nonorthogonality", "scale_difference", "datum_theta"):
         np.testing.assert_equal(getattr(a.error_map, name), getattr(b.error_map, name))
@@ -59,8 +68,13 @@ def assert_same(a, b):
 @pytest.mark.parametrize(("lines", "size_y"), [(24, 0), (0, 0), (8, 7)])
 def test_a_result_survives_its_json_to_the_last_bit(lines, size_y):
     result, _ = known_result(11, lines, size_y=size_y)
-    result = replace(result, warnings=("a", "b"), sense="plate_moves", method="law",
-                     extra={"more": [{"quantity": "x", "u_k1_m": 2.5e-9, "dof": 7}]})
+    result = replace(
+        result,
+        warnings=("a", "b"),
+        sense="plate_moves",
+        method="law",
+        extra={"more": [{"quantity": "x", "u_k1_m": 2.5e-9, "dof": 7}]},
+    )
     assert_same(through_json(result), result)
 
 
@@ -76,8 +90,11 @@ def test_unknown_places_are_null_and_come_back_as_nan():
     result, _ = known_result()
     result.error_map.gx[2, 3] = result.error_map.u_gy[0, 0] = np.nan
     result.error_map.g_theta[5] = np.nan
-    result = replace(result, views=(replace(result.views[0], phi=np.nan), *result.views[1:]),
-                     noise=replace(result.noise, sigma_theta=np.nan))
+    result = replace(
+        result,
+        views=(replace(result.views[0], phi=np.nan), *result.views[1:]),
+        noise=replace(result.noise, sigma_theta=np.nan),
+    )
     data = result_to_dict(result)
     assert data["error_map"]["gx"][2][3] is None
     assert data["views"][0]["misalignment"]["phi"] is None
@@ -88,11 +105,25 @@ def test_unknown_places_are_null_and_come_back_as_nan():
 
 def test_an_unidentified_plan_has_maps_of_nulls():
     view = View("a")
-    measured = Measurements("p", Artifact(3, 0.01, 4), (
-        ViewReadings(view, used=9, rejected={"duplicate": 2}),), rejected={"outside_every_view": 1})
-    result = worded(unidentified_result(
-        measured, Observability(25, 39, 14, False, (Finding("in_words", text="m"),),
-                                (Finding("in_words", text="add tx"),))))
+    measured = Measurements(
+        "p",
+        Artifact(3, 0.01, 4),
+        (ViewReadings(view, used=9, rejected={"duplicate": 2}),),
+        rejected={"outside_every_view": 1},
+    )
+    result = worded(
+        unidentified_result(
+            measured,
+            Observability(
+                25,
+                39,
+                14,
+                False,
+                (Finding("in_words", text="m"),),
+                (Finding("in_words", text="add tx"),),
+            ),
+        )
+    )
     again = through_json(result)
     assert_same(again, result)
     assert np.isnan(again.error_map.gx).all()
@@ -123,27 +154,32 @@ def damaged(path, value):
     return data
 
 
-@pytest.mark.parametrize(("path", "value", "message"), [
-    (("error_map",), KeyError, "the key 'error_map' is missing"),
-    (("error_map", "gx"), [[1.0]], "gx has the shape (1, 1), not (5, 5)"),
-    (("error_map", "g_theta"), [], "g_theta has the shape (0,), not (8,)"),
-    (("error_map", "gy"), [[0.0] * 4 + [-1e308]] * 5, "gy has values beyond 1000"),
-    (("error_map", "nonorthogonality"), "0", "'0' is not a number"),
-    (("error_map", "datum_theta"), "free", "'free' is not a valid ThetaDatum"),
-    (("plan_id",), 3, "3 is not of type str"),
-    (("views", 0, "rotation"), None, "the pose of view 'identity' is not finite"),
-    (("views", 0, "used"), True, "True is not of type int"),
-    (("noise", "sigma_xy"), "small", "'small' is not a number"),
-    (("rejected",), {"a": "many"}, "'many' is not of type int"),
-    (("warnings",), "one", "'one' is not of type list"),
-    (("observability", "identifiable"), 1, "1 is not of type bool"),
-    (("observability", "unchecked_sites"), 1.5, "1.5 is not of type int"),
-    (("views",), 3, "'int' object is not iterable")])
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("error_map",), KeyError, "the key 'error_map' is missing"),
+        (("error_map", "gx"), [[1.0]], "gx has the shape (1, 1), not (5, 5)"),
+        (("error_map", "g_theta"), [], "g_theta has the shape (0,), not (8,)"),
+        (("error_map", "gy"), [[0.0] * 4 + [-1e308]] * 5, "gy has values beyond 1000"),
+        (("error_map", "nonorthogonality"), "0", "'0' is not a number"),
+        (("error_map", "datum_theta"), "free", "'free' is not a valid ThetaDatum"),
+        (("plan_id",), 3, "3 is not of type str"),
+        (("views", 0, "rotation"), None, "the pose of view 'identity' is not finite"),
+        (("views", 0, "used"), True, "True is not of type int"),
+        (("noise", "sigma_xy"), "small", "'small' is not a number"),
+        (("rejected",), {"a": "many"}, "'many' is not of type int"),
+        (("warnings",), "one", "'one' is not of type list"),
+        (("observability", "identifiable"), 1, "1 is not of type bool"),
+        (("observability", "unchecked_sites"), 1.5, "1.5 is not of type int"),
+        (("views",), 3, "'int' object is not iterable"),
+    ],
+)
 def test_damaged_results_are_refused(path, value, message):
     with pytest.raises(InputError) as caught:
         result_from_dict(damaged(path, value), "f.json")
-    assert str(caught.value) == (f"f.json: damaged result ({message}); "
-                                 "write it again with `selfcal solve`")
+    assert str(caught.value) == (
+        f"f.json: damaged result ({message}); write it again with `selfcal solve`"
+    )
 
 
 @pytest.mark.parametrize("data", [None, [], {}, {"schema": "selfcal.result/2"}])
@@ -152,9 +188,19 @@ def test_other_json_is_no_result(data):
         result_from_dict(data, "f")
 
 
-@pytest.mark.parametrize(("error", "u", "is_one"), [
-    (0.099, 0.0, True), (-0.099, 0.099, True), (0.1, 0.0, False), (-0.1, 0.0, False),
-    (0.15, 0.0, False), (0.0, 0.1, False), (0.0, 0.15, False), (0.0, -1e-9, False)])
+@pytest.mark.parametrize(
+    ("error", "u", "is_one"),
+    [
+        (0.099, 0.0, True),
+        (-0.099, 0.099, True),
+        (0.1, 0.0, False),
+        (-0.1, 0.0, False),
+        (0.15, 0.0, False),
+        (0.0, 0.1, False),
+        (0.0, 0.15, False),
+        (0.0, -1e-9, False),
+    ],
+)
 def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
     data = result_to_dict(known_result()[0])
     data["reference"] = {"kind": "stage_x", "relative_error": error, "u_relative": u}
@@ -165,19 +211,39 @@ def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
         result_from_dict(data, "r")
 
 
-CAUSE = Cause("drift", 5e-8, 1e-9, "m", 1e-7, "tx", "x", (1, -2), {"part": "x x2"}, "drift along x",
-              effect_rms=2e-9, effect_max=6e-9, told=False,
-              remedies=(Remedy("model", "drift:8e-8"), Remedy("view", "tx")))
+CAUSE = Cause(
+    "drift",
+    5e-8,
+    1e-9,
+    "m",
+    1e-7,
+    "tx",
+    "x",
+    (1, -2),
+    {"part": "x x2"},
+    "drift along x",
+    effect_rms=2e-9,
+    effect_max=6e-9,
+    told=False,
+    remedies=(Remedy("model", "drift:8e-8"), Remedy("view", "tx")),
+)
 
 
 @pytest.mark.parametrize("grade", Grade)
 def test_a_grade_with_its_causes_and_terms_comes_back(grade):
     failed = Finding("noise_contradicted", 3e-8, unit="m", details={"stated": 1e-8}, text="noisy")
-    verdict = Verdict(grade, (failed,), (CAUSE,), (
-        Enlargement("drift", 3e-9, 9e-9), Enlargement("rotation", 1e-6, 2e-6, "rad")),
-        "So it is", ("why",))
-    terms = (TermResult("plate_strain", 7e-8, (), 2e-7, "default"),
-             TermResult("drift", 5e-8, (), None, "readings"))
+    verdict = Verdict(
+        grade,
+        (failed,),
+        (CAUSE,),
+        (Enlargement("drift", 3e-9, 9e-9), Enlargement("rotation", 1e-6, 2e-6, "rad")),
+        "So it is",
+        ("why",),
+    )
+    terms = (
+        TermResult("plate_strain", 7e-8, (), 2e-7, "default"),
+        TermResult("drift", 5e-8, (), None, "readings"),
+    )
     result = replace(known_result()[0], verdict=verdict, model=ModelResult("rigid", terms))
     data = result_to_dict(result)["verdict"]
     assert (data["grade"], data["qualified"]) == (str(grade), grade != "not_qualified")
@@ -210,13 +276,17 @@ def edited(path, change):
     path.write_text(json.dumps(data))
 
 
-@pytest.mark.parametrize(("key", "change"), [
-    ("error_map", lambda data: data["error_map"]["gx"][2].__setitem__(2, 1e-3)),
-    ("artifact", lambda data: data["artifact"].__setitem__("grid_pitch", 0.011)),
-    ("verdict", lambda data: data["verdict"].__setitem__("sentence", "Good")),
-    ("provenance", lambda data: data["provenance"].__setitem__("version", "0")),
-    ("remark", lambda data: data.__setitem__("remark", "better now")),
-    ("budget", lambda data: data["digest"].pop("budget"))])
+@pytest.mark.parametrize(
+    ("key", "change"),
+    [
+        ("error_map", lambda data: data["error_map"]["gx"][2].__setitem__(2, 1e-3)),
+        ("artifact", lambda data: data["artifact"].__setitem__("grid_pitch", 0.011)),
+        ("verdict", lambda data: data["verdict"].__setitem__("sentence", "Good")),
+        ("provenance", lambda data: data["provenance"].__setitem__("version", "0")),
+        ("remark", lambda data: data.__setitem__("remark", "better now")),
+        ("budget", lambda data: data["digest"].pop("budget")),
+    ],
+)
 def test_a_file_that_was_edited_is_refused_with_the_key(key, change, tmp_path):
     path = written_file(tmp_path)
     edited(path, change)
@@ -232,8 +302,9 @@ def test_layout_and_time_of_creation_are_no_edits(tmp_path):
 
 
 @pytest.mark.parametrize("version", ["0.4.0", "0.10.0", "1.0.0", "unknown"])
-@pytest.mark.parametrize("remove", [lambda data: data.pop("digest"),
-                                    lambda data: data.__setitem__("digest", "none")])
+@pytest.mark.parametrize(
+    "remove", [lambda data: data.pop("digest"), lambda data: data.__setitem__("digest", "none")]
+)
 def test_a_file_whose_digests_were_removed_is_refused(version, remove, tmp_path):
     path = written_file(tmp_path)
     edited(path, lambda data: data["provenance"].__setitem__("version", version))
@@ -242,10 +313,15 @@ def test_a_file_whose_digests_were_removed_is_refused(version, remove, tmp_path)
         read_result(path)
 
 
-@pytest.mark.parametrize("older", [
-    lambda data: data["provenance"].__setitem__("version", "0.1.0"),
-    lambda data: data["provenance"].__setitem__("version", "0.3.11"),
-    lambda data: data["provenance"].pop("version"), lambda data: data.pop("provenance")])
+@pytest.mark.parametrize(
+    "older",
+    [
+        lambda data: data["provenance"].__setitem__("version", "0.1.0"),
+        lambda data: data["provenance"].__setitem__("version", "0.3.11"),
+        lambda data: data["provenance"].pop("version"),
+        lambda data: data.pop("provenance"),
+    ],
+)
 def test_a_file_of_a_version_without_digests_is_not_qualified(older, tmp_path):
     path = written_file(tmp_path)
     before = read_result(path)
@@ -253,12 +329,18 @@ def test_a_file_of_a_version_without_digests_is_not_qualified(older, tmp_path):
     found = read_result(path)
     assert before.verdict.qualified and not found.verdict.qualified
     assert found.verdict.reasons[0] == (
-        "the file has no digests, so whether it was edited cannot be checked")
+        "the file has no digests, so whether it was edited cannot be checked"
+    )
     np.testing.assert_array_equal(found.error_map.gx, before.error_map.gx)
 
 
-@pytest.mark.parametrize(("kind", "marks", "name"), [
-    ("stage_x", None, "stage_x"), ("artifact", (), "artifact"),
-    ("marks", ((-5, 0), (5, 0)), "distance of the marks (-5, 0) and (5, 0)")])
+@pytest.mark.parametrize(
+    ("kind", "marks", "name"),
+    [
+        ("stage_x", None, "stage_x"),
+        ("artifact", (), "artifact"),
+        ("marks", ((-5, 0), (5, 0)), "distance of the marks (-5, 0) and (5, 0)"),
+    ],
+)
 def test_a_reference_is_named_by_its_kind_or_its_marks(kind, marks, name):
     assert ReferenceLength(kind, 1e-6, marks=marks).name == name

@@ -34,15 +34,37 @@ ALONG_Y = [(i, j) for j in (-2, -1, 0, 1, 2) for i in (-1, 0, 1)]
 def test_the_orders_written_out():
     assert sites("raster") == ALONG_X
     assert sites("serpentine") == [
-        (-1, -2), (-1, -1), (-1, 0), (-1, 1), (-1, 2), (0, 2), (0, 1), (0, 0), (0, -1), (0, -2),
-        (1, -2), (1, -1), (1, 0), (1, 1), (1, 2)]
+        (-1, -2),
+        (-1, -1),
+        (-1, 0),
+        (-1, 1),
+        (-1, 2),
+        (0, 2),
+        (0, 1),
+        (0, 0),
+        (0, -1),
+        (0, -2),
+        (1, -2),
+        (1, -1),
+        (1, 0),
+        (1, 1),
+        (1, 2),
+    ]
     four = View("v", repeats=4)
     # where a pass ends on the mark on which the next begins, that is one visit of two exposures
     assert sites("there_and_back", view=four) == [
-        *ALONG_X, *ALONG_X[-2::-1], *ALONG_X[1:], *ALONG_X[-2::-1]]
+        *ALONG_X,
+        *ALONG_X[-2::-1],
+        *ALONG_X[1:],
+        *ALONG_X[-2::-1],
+    ]
     assert sites("x_then_y", view=four) == 2 * (ALONG_X + ALONG_Y)
     assert sites("x_back_y_back", view=four) == [
-        *ALONG_X, *ALONG_X[-2::-1], *ALONG_Y[1:], *ALONG_Y[-2::-1]]
+        *ALONG_X,
+        *ALONG_X[-2::-1],
+        *ALONG_Y[1:],
+        *ALONG_Y[-2::-1],
+    ]
     assert sorted(sites("random")) == sorted(ALONG_X)
     assert sites("random") != ALONG_X
 
@@ -81,7 +103,11 @@ def test_of_the_plate_the_same_marks_follow_each_other_in_every_view():
     turned = View("v", math.pi / 2)
     assert marks("raster@plate", plate=plate, view=turned) == marks("raster", plate=plate)
     assert sites("raster@plate", plate=plate, view=turned)[:4] == [
-        (1, -1), (0, -1), (-1, -1), (1, 0)]
+        (1, -1),
+        (0, -1),
+        (-1, -1),
+        (1, 0),
+    ]
 
 
 def test_marks_off_the_field_are_not_visited():
@@ -91,7 +117,13 @@ def test_marks_off_the_field_are_not_visited():
     # lines still turn about at their own ends
     raised = View("v", 0.0, (0.0, 0.01))
     assert sites("serpentine", view=raised)[:6] == [
-        (-1, -1), (-1, 0), (-1, 1), (-1, 2), (0, 2), (0, 1)]
+        (-1, -1),
+        (-1, 0),
+        (-1, 1),
+        (-1, 2),
+        (0, 2),
+        (0, 1),
+    ]
 
 
 @pytest.mark.parametrize("suffix", ["", "@plate"])
@@ -99,8 +131,9 @@ def test_marks_off_the_field_are_not_visited():
 @pytest.mark.parametrize("consecutive", [True, False])
 def test_every_mark_is_exposed_as_often_as_the_view_asks(order, suffix, consecutive):
     plate, view = Artifact(5, 0.01, 0, 7), View("v", math.pi, (0.01, -0.02), repeats=5)
-    found = visit_sequence(plate, view, order=order + suffix, consecutive=consecutive,
-                           rng=np.random.default_rng(2))
+    found = visit_sequence(
+        plate, view, order=order + suffix, consecutive=consecutive, rng=np.random.default_rng(2)
+    )
     assert (abs(found.i) <= 2).all() and (abs(found.j) <= 3).all()
     np.testing.assert_array_equal(found.i, -found.m + 1)
     np.testing.assert_array_equal(found.j, -found.n - 2)
@@ -128,14 +161,16 @@ def test_a_random_order_needs_chance():
         visit_sequence(PLATE, View("v"), order="random")
 
 
-@pytest.mark.parametrize("text", ["spiral", "raster@stage", "@plate", "raster@plate@plate",
-                                  "Raster"])
+@pytest.mark.parametrize(
+    "text", ["spiral", "raster@stage", "@plate", "raster@plate@plate", "Raster"]
+)
 def test_orders_that_are_not_known(text):
     with pytest.raises(InputError) as caught:
         parse_order(text, "here")
     assert str(caught.value) == (
         f"here: '{text}' is not a visiting order; use one of raster, serpentine, there_and_back, "
-        "x_then_y, x_back_y_back, random, if need be with @plate")
+        "x_then_y, x_back_y_back, random, if need be with @plate"
+    )
 
 
 def test_text_and_order_are_one():
@@ -147,7 +182,14 @@ def test_text_and_order_are_one():
 
 def test_the_side_from_which_a_place_is_reached():
     assert approach_signs(np.array([2.0, 2.0, 3.0, 3.0, 1.0, 1.0, 5.0])).tolist() == [
-        0, 0, 1, 1, -1, -1, 1]
+        0,
+        0,
+        1,
+        1,
+        -1,
+        -1,
+        1,
+    ]
     assert approach_signs(np.array([0.0, 0.1, 1.0, 0.9, 0.0]), 0.2).tolist() == [0, 0, 1, 1, -1]
     assert approach_signs(np.array([0.0, 0.2, 0.0]), 0.2).tolist() == [0, 0, 0]
     assert approach_signs(np.zeros(0)).tolist() == []
@@ -174,12 +216,16 @@ def test_check_stops_come_half_way_side_by_side_in_the_same_order(repeats, befor
     found = visit_sequence(PLATE, replace(CHECKED, repeats=repeats), order="raster")
     where = list(zip(found.i, found.j, strict=True))
     stops = slice(15 * before, 15 * before + 12)
-    assert where[:stops.start] == before * ALONG_X
-    assert where[stops.stop:] == (repeats - before) * ALONG_X
+    assert where[: stops.start] == before * ALONG_X
+    assert where[stops.stop :] == (repeats - before) * ALONG_X
     one = [(0, 0), (0, 1), (-1, -1)]  # of two as near the first
     assert where[stops] == 4 * one
     assert (found.aside_m[:, stops] * 1e5).T.tolist() == [
-        *3 * [[2, 0]], *3 * [[-2, 0]], *3 * [[0, 2]], *3 * [[0, -2]]]
+        *3 * [[2, 0]],
+        *3 * [[-2, 0]],
+        *3 * [[0, 2]],
+        *3 * [[0, -2]],
+    ]
     assert np.count_nonzero(found.aside_m) == 12
     assert found.count.tolist() == len(found) * [1]
     assert found.time.tolist() == list(range(len(found)))
@@ -202,10 +248,14 @@ def test_check_stops_are_along_the_axes_of_the_stage_whatever_the_turn():
     turned = visit_sequence(Artifact(5, 0.01, 0), view)
     straight = visit_sequence(Artifact(5, 0.01, 0), CHECKED)
     assert turned.aside_m.tolist() == straight.aside_m.tolist()
-    assert turned.i[turned.aside_m.any(axis=0)].tolist() == straight.i[
-        straight.aside_m.any(axis=0)].tolist()
-    assert turned.m[turned.aside_m.any(axis=0)].tolist() == straight.j[
-        straight.aside_m.any(axis=0)].tolist()  # the mark that lies there
+    assert (
+        turned.i[turned.aside_m.any(axis=0)].tolist()
+        == straight.i[straight.aside_m.any(axis=0)].tolist()
+    )
+    assert (
+        turned.m[turned.aside_m.any(axis=0)].tolist()
+        == straight.j[straight.aside_m.any(axis=0)].tolist()
+    )  # the mark that lies there
 
 
 def test_a_view_without_grid_marks_has_no_check_stops():

@@ -28,8 +28,9 @@ def test_a_parameter_of_an_unknown_type_is_a_failure_of_each_that_was_asked_for(
     first, *others = (result.reason for result in answer.results)
     assert first.startswith("Invalid access to undeclared parameter")
     assert others == ["ValueError: 99 is not a valid Parameter.Type"] * 2
-    answer = graph.call(SetParametersAtomically, "solver/set_parameters_atomically",
-                        parameters=[STRANGE])
+    answer = graph.call(
+        SetParametersAtomically, "solver/set_parameters_atomically", parameters=[STRANGE]
+    )
     assert (answer.result.successful, answer.result.reason) == (False, others[0])
     assert "solver" not in graph.call(ListParameters, "solver/list_parameters").result.names
     told = node.refusals.diagnosis()
@@ -103,6 +104,7 @@ def test_spin_goes_on_after_an_error(ros_environment):
             if len(called) == 3:
                 until.set_result(None)
             raise ZeroDivisionError
+
         node.create_timer(0.01, raising)
         running.spin(node, until)
         assert called == [0, 1, 2]

@@ -35,8 +35,22 @@ from test.support.sessions import plan_file, small_plan
 
 SECOND = 10**9
 STEP_NS = 40_000_000
-CHECKS = ["publishers", "joints", "encoder rate", "encoder clock", "abort", "detection clock",
-          "rest", "ids", "marks", "check stops", "signs", "theta", "revisits", "old commands"]
+CHECKS = [
+    "publishers",
+    "joints",
+    "encoder rate",
+    "encoder clock",
+    "abort",
+    "detection clock",
+    "rest",
+    "ids",
+    "marks",
+    "check stops",
+    "signs",
+    "theta",
+    "revisits",
+    "old commands",
+]
 
 
 class FaultyCell(StageSimulator):
@@ -51,8 +65,9 @@ class FaultyCell(StageSimulator):
         now = self.get_clock().now().nanoseconds
         if now:
             super()._on_timer()
-        elif not all(self.count_subscribers(topic.name)
-                     for topic in (names.ENCODER, names.DETECTIONS)):
+        elif not all(
+            self.count_subscribers(topic.name) for topic in (names.ENCODER, names.DETECTIONS)
+        ):
             return  # time begins when somebody listens
         second, nanosecond = divmod(now + STEP_NS if now else time.time_ns(), SECOND)
         self._clock_voice.publish(Clock(clock=Time(sec=second, nanosec=nanosecond)))
@@ -73,8 +88,9 @@ class FaultyCell(StageSimulator):
 
     def _measure(self, command, again):
         if self.fault == "no check stops":
-            command = replace(command, view=replace(
-                command.view, check_marks=0, check_offset_m=0.0))
+            command = replace(
+                command, view=replace(command.view, check_marks=0, check_offset_m=0.0)
+            )
         super()._measure(command, again)
 
     def tell(self, event):
@@ -82,8 +98,11 @@ class FaultyCell(StageSimulator):
         self.number += is_detection
         if self.fault == "loses" and is_detection and self.number % 7 == 0:
             return
-        shift = {"detections ahead": 3 * SECOND * is_detection, "all behind": -5 * SECOND,
-                 "while it moves": 5_000_000 * is_detection}.get(self.fault, 0)
+        shift = {
+            "detections ahead": 3 * SECOND * is_detection,
+            "all behind": -5 * SECOND,
+            "while it moves": 5_000_000 * is_detection,
+        }.get(self.fault, 0)
         if self.fault == "other joints" and isinstance(event, EncoderSample):
             event = replace(event, names=("a", "b", "c"))
         if "turned" in self.fault and is_detection and event.kind == 0:
@@ -105,23 +124,31 @@ class Checker(CellChecker):
     """Waits by the time of the cell."""
 
     def ports(self, publish):
-        return replace(super().ports(publish),
-                       now_s=lambda: self.get_clock().now().nanoseconds / SECOND)
+        return replace(
+            super().ports(publish), now_s=lambda: self.get_clock().now().nanoseconds / SECOND
+        )
 
 
 @pytest.fixture
 def short(monkeypatch):
     """Let the check wait for less: this cell exposes a hundred times a second."""
-    for name, seconds in (("LISTEN_S", 0.5), ("WATCH_S", 0.5), ("REVISIT_S", 3.0),
-                          ("STALL_S", 1.0)):
+    for name, seconds in (
+        ("LISTEN_S", 0.5),
+        ("WATCH_S", 0.5),
+        ("REVISIT_S", 3.0),
+        ("STALL_S", 1.0),
+    ):
         monkeypatch.setattr(cell_check, name, seconds)
 
 
 def checked(graph, fault="", checker=(), plan=None, **cell):
     """Return the node that has checked a cell, and its items by name."""
     graph.node(partial(FaultyCell, fault), servo_sigma=1e-9, use_sim_time=True, **cell)
-    node = graph.node(partial(Checker, plan or small_plan(), settle_s=0.2, patience_s=5.0),
-                      use_sim_time=True, **dict(checker))
+    node = graph.node(
+        partial(Checker, plan or small_plan(), settle_s=0.2, patience_s=5.0),
+        use_sim_time=True,
+        **dict(checker),
+    )
     graph.until(node.finished.done, "the end of the check")
     return node, {item.name: item for item in node.session.items}
 
@@ -178,13 +205,17 @@ def test_a_cell_without_ids_passes_and_that_is_said(graph):
 
 
 @pytest.mark.usefixtures("short")
-@pytest.mark.parametrize(("cell", "figure", "remedy"), [
-    ({"microscope_axes": "-x-y"}, "offsets of the other sign", "reverse the sign"),
-    ({"microscope_axes": "-xy"}, "offsets of the other sign: offset_x", "reverse the sign"),
-    ({"microscope_axes": "yx"}, "exchanged axes", "along the stage's axes"),
-    ({"microscope_pixels": 2.0}, "offsets in wrong units", "correct the pixel size"),
-    ({"microscope_pixels": 0.5}, "offsets in wrong units", "correct the pixel size")],
-    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "")
+@pytest.mark.parametrize(
+    ("cell", "figure", "remedy"),
+    [
+        ({"microscope_axes": "-x-y"}, "offsets of the other sign", "reverse the sign"),
+        ({"microscope_axes": "-xy"}, "offsets of the other sign: offset_x", "reverse the sign"),
+        ({"microscope_axes": "yx"}, "exchanged axes", "along the stage's axes"),
+        ({"microscope_pixels": 2.0}, "offsets in wrong units", "correct the pixel size"),
+        ({"microscope_pixels": 0.5}, "offsets in wrong units", "correct the pixel size"),
+    ],
+    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
+)
 def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
     node, items = checked(graph, **cell)
     assert "signs" in failed(items)
@@ -194,21 +225,25 @@ def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
 
 
 @pytest.mark.usefixtures("short")
-@pytest.mark.parametrize(("fault", "name", "figure"), [
-    ("deaf", "commands", "0 detections in 5 s after MEASURE"),
-    ("goes on after ABORT", "abort", "detections later than"),
-    ("acts again", "old commands", "detections after a finished MEASURE was sent again"),
-    ("never revisits", "revisits", "not measured again within 3 s"),
-    ("no check stops", "check stops", "0 of 5 marks from all four sides"),
-    ("loses", "marks", "of 9 marks"),
-    ("detections ahead", "detection clock", "stamps -2"),
-    ("all behind", "encoder clock", "stamps 5"),
-    ("while it moves", "rest", "exposures while the stage moved"),
-    ("other joints", "joints", "heard a, b, c"),
-    ("wrong ids", "ids", "m and n are exchanged"),
-    ("reversed offset_theta", "theta", ": offset_theta has the other sign"),
-    ("turned 90", "signs", "the offsets are turned by +90."),
-    ("turned -30", "signs", "the offsets are turned by -30.")])
+@pytest.mark.parametrize(
+    ("fault", "name", "figure"),
+    [
+        ("deaf", "commands", "0 detections in 5 s after MEASURE"),
+        ("goes on after ABORT", "abort", "detections later than"),
+        ("acts again", "old commands", "detections after a finished MEASURE was sent again"),
+        ("never revisits", "revisits", "not measured again within 3 s"),
+        ("no check stops", "check stops", "0 of 5 marks from all four sides"),
+        ("loses", "marks", "of 9 marks"),
+        ("detections ahead", "detection clock", "stamps -2"),
+        ("all behind", "encoder clock", "stamps 5"),
+        ("while it moves", "rest", "exposures while the stage moved"),
+        ("other joints", "joints", "heard a, b, c"),
+        ("wrong ids", "ids", "m and n are exchanged"),
+        ("reversed offset_theta", "theta", ": offset_theta has the other sign"),
+        ("turned 90", "signs", "the offsets are turned by +90."),
+        ("turned -30", "signs", "the offsets are turned by -30."),
+    ],
+)
 def test_a_fault_of_the_cell_is_named(graph, fault, name, figure):
     node, items = checked(graph, fault, exposure_period=0.04 if "ABORT" in fault else 0.01)
     assert name in failed(items), items
@@ -222,11 +257,13 @@ def test_a_fault_of_the_cell_is_named(graph, fault, name, figure):
 def test_a_check_that_an_error_ends_has_failed(graph, monkeypatch):
     def fails(*_):
         raise InputError("view 'check'", "does not lie on the lattice", "shift it")
+
     monkeypatch.setattr(cell_check, "explaining", fails)
     node, items = checked(graph, "wrong ids")
     assert failed(items) == {"check"}
     assert items["check"].figure == (
-        "ended by an error: view 'check': does not lie on the lattice; shift it")
+        "ended by an error: view 'check': does not lie on the lattice; shift it"
+    )
     assert node.exit_code == ExitCode.NOT_QUALIFIED
 
 
@@ -239,8 +276,9 @@ def test_reversed_ids_of_an_even_side_are_named(graph):
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize(("sense", "deg"), [("microscope_moves", "-45"), ("plate_moves", "+45")])
 def test_lines_that_are_counted_from_another_one_are_named(graph, sense, deg):
-    _, items = checked(graph, "k shifted", measurement_sense=sense,
-                       checker={"measurement_sense": sense})
+    _, items = checked(
+        graph, "k shifted", measurement_sense=sense, checker={"measurement_sense": sense}
+    )
     assert items["ids"].figure.startswith(f"theta is indicated {deg}° from where the lines are (")
 
 
@@ -272,41 +310,82 @@ def test_a_sequencer_beside_it_is_refused(graph):
 def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd):
     """The cell tells the offsets of doubled pixels."""
     plan = plan_file(tmp_path, small_plan())
-    with process("selfcal_ros.nodes.stage_simulator", [
-            "--ros-args", "-r", "__ns:=/left", "-p", "microscope_pixels:=2.0"], ros_environment):
+    with process(
+        "selfcal_ros.nodes.stage_simulator",
+        ["--ros-args", "-r", "__ns:=/left", "-p", "microscope_pixels:=2.0"],
+        ros_environment,
+    ):
         assert main(["cell", "check", "--plan", plan, "--namespace", "left"]) == 5
     said = capfd.readouterr().out
-    assert [re.match("(pass|FAIL)  (.*?): ", line)[2] for line in said.splitlines()[:-1]
-            if not line.startswith(" ")] == [name for name in CHECKS if name != "theta"]
+    assert [
+        re.match("(pass|FAIL)  (.*?): ", line)[2]
+        for line in said.splitlines()[:-1]
+        if not line.startswith(" ")
+    ] == [name for name in CHECKS if name != "theta"]
     assert "FAIL  signs: offsets in wrong units" in said
     assert said.splitlines()[-1].endswith(" of 13 checks failed")
 
 
-@pytest.mark.parametrize(("code", "words", "said"), [
-    (0, [], "pass  rest: still\nall 1 checks passed: the cell is ready for a calibration\n"),
-    (0, ["--json"], {"passed": True, "items": [
-        {"name": "rest", "passed": True, "figure": "still", "remedy": "", "follows": ""}]}),
-    (5, ["--json"], {"passed": False, "items": [
-        {"name": "rest", "passed": False, "figure": "moves", "remedy": "wait",
-         "follows": ""}]}),
-    (5, [], "FAIL  rest: moves\n      wait\n1 of 1 checks failed\n")])
+@pytest.mark.parametrize(
+    ("code", "words", "said"),
+    [
+        (0, [], "pass  rest: still\nall 1 checks passed: the cell is ready for a calibration\n"),
+        (
+            0,
+            ["--json"],
+            {
+                "passed": True,
+                "items": [
+                    {"name": "rest", "passed": True, "figure": "still", "remedy": "", "follows": ""}
+                ],
+            },
+        ),
+        (
+            5,
+            ["--json"],
+            {
+                "passed": False,
+                "items": [
+                    {
+                        "name": "rest",
+                        "passed": False,
+                        "figure": "moves",
+                        "remedy": "wait",
+                        "follows": "",
+                    }
+                ],
+            },
+        ),
+        (5, [], "FAIL  rest: moves\n      wait\n1 of 1 checks failed\n"),
+    ],
+)
 def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
-    item = {"name": "rest", "passed": not code, "figure": "moves" if code else "still",
-            "remedy": "wait" if code else "", "follows": ""}
+    item = {
+        "name": "rest",
+        "passed": not code,
+        "figure": "moves" if code else "still",
+        "remedy": "wait" if code else "",
+        "follows": "",
+    }
 
     @contextmanager
     def child(*_, **__):
         yield SimpleNamespace(stdout=[json.dumps(item)], wait=lambda: code)
+
     monkeypatch.setattr(cell, "process", child)
     assert main(["cell", "check", "--plan", plan_file(tmp_path, small_plan()), *words]) == code
     found = capfd.readouterr().out
     assert (json.loads(found) if words else found) == said
 
 
-@pytest.mark.parametrize(("words", "said"), [
-    (["--settle", "-1"], "--settle: -1 s is not a waiting time; give 0 or more"),
-    (["--patience", "nan"], "--patience: nan s is not a waiting time; give 0 or more"),
-    (["--params", "none.yaml"], "none.yaml")])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--settle", "-1"], "--settle: -1 s is not a waiting time; give 0 or more"),
+        (["--patience", "nan"], "--patience: nan s is not a waiting time; give 0 or more"),
+        (["--params", "none.yaml"], "none.yaml"),
+    ],
+)
 def test_bad_options_of_the_verb(tmp_path, capsys, words, said):
     plan = plan_file(tmp_path, small_plan())
     assert main(["cell", "check", "--plan", plan, *words]) == 2
@@ -316,6 +395,8 @@ def test_bad_options_of_the_verb(tmp_path, capsys, words, said):
 @pytest.mark.usefixtures("short")
 def test_the_response_of_each_axis_is_its_own(graph):
     _, items = checked(graph, microscope_stretch=0.02)
-    x, y = (float(part.split()[1]) for part in items["signs"].figure.removeprefix(
-        "offset against stage ").split(", ")[:2])
+    x, y = (
+        float(part.split()[1])
+        for part in items["signs"].figure.removeprefix("offset against stage ").split(", ")[:2]
+    )
     assert (x, y) == (pytest.approx(-1 / 1.02, abs=3e-3), pytest.approx(-1 / 0.98, abs=3e-3))

@@ -21,38 +21,42 @@ from test.support.chaos import (
 
 
 def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(
-        ros_environment, tmp_path, forks):
+    ros_environment, tmp_path, forks
+):
     lines, wrong = one_round(2, ros_environment, tmp_path, kills=1, forks=forks)
     assert wrong == []
     assert [line.partition(":")[0] for line in lines] == ["quiet_messages", "lost_messages"]
     assert all(" used + " in line for line in lines)
-    assert [line.rpartition("killed ")[2] for line in lines] == [
-        "measurement_collector", "solver"]
+    assert [line.rpartition("killed ")[2] for line in lines] == ["measurement_collector", "solver"]
 
 
 def test_a_disk_that_is_full_for_a_while_costs_its_part_of_the_journal_alone(
-        ros_environment, tmp_path, forks):
+    ros_environment, tmp_path, forks
+):
     line, wrong = full_disk(3, ros_environment, tmp_path, forks=forks)
     assert wrong == []
     assert " used + " in line
 
 
 def test_a_run_whose_sequencers_are_killed_is_taken_up_in_its_view(
-        ros_environment, tmp_path, forks):
+    ros_environment, tmp_path, forks
+):
     line, wrong = killed_sequencers(6, ros_environment, tmp_path, kills=2, forks=forks)
     assert wrong == []
     assert line.startswith("killed in views ")
 
 
 def test_a_run_after_one_that_was_stamped_a_day_ahead_is_as_if_that_had_not_been(
-        ros_environment, tmp_path, forks):
+    ros_environment, tmp_path, forks
+):
     line, wrong = clock_ahead(4, ros_environment, tmp_path, kills=1, forks=forks)
     assert wrong == []
     assert " used + " in line
 
 
 def test_a_cell_among_strangers_who_would_harm_gives_the_map_of_the_undisturbed_run(
-        ros_environment, tmp_path, forks):
+    ros_environment, tmp_path, forks
+):
     line, wrong = attacked(5, ros_environment, tmp_path, forks=forks)
     assert wrong == []
     assert " used + " in line
@@ -82,8 +86,7 @@ def test_the_judgement_sees_a_detection_that_is_not_accounted_for_and_another_ma
     told = story(cell, HARMLESS, np.random.default_rng(1), kills=0)
     sent = sum(isinstance(event, Detection) for event in told.arriving)
     nothing = {name: [0.0] for name in ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")}
-    cell.found = {"views": [{"used": sent - 1}], "rejected": {"duplicate": 2},
-                  "error_map": nothing}
+    cell.found = {"views": [{"used": sent - 1}], "rejected": {"duplicate": 2}, "error_map": nothing}
     told.judge()
     assert told.faults[0] == f"{sent} detections sent, {sent - 1} used and 2 rejected"
     assert "gx is not that of these messages" in told.faults

@@ -24,9 +24,14 @@ def run_of(begin_ns: int, seed: int) -> list:
     """Return the messages of a run that begins then."""
     events = events_of(PLAN, seed)
     by = begin_ns - events[0].stamp_ns
-    return [replace(event, stamp_ns=event.stamp_ns + by,
-                    **({"run_id": str(begin_ns)} if isinstance(event, Command) else {}))
-            for event in events]
+    return [
+        replace(
+            event,
+            stamp_ns=event.stamp_ns + by,
+            **({"run_id": str(begin_ns)} if isinstance(event, Command) else {}),
+        )
+        for event in events
+    ]
 
 
 def test_an_honest_run_after_one_a_day_ahead_is_the_map_that_is_saved(graph, tmp_path):
@@ -37,13 +42,20 @@ def test_an_honest_run_after_one_a_day_ahead_is_the_map_that_is_saved(graph, tmp
     maps, received = graph.listen(names.ERROR_MAP), collector.session.collector.received
     ahead, honest = run_of(now + DAY_NS, 5), run_of(now - 3600 * 10**9, 6)
     begin = next(e for e in honest if isinstance(e, Command) and e.phase == Phase.MEASURE)
-    forged = [replace(begin, stamp_ns=begin.stamp_ns + 10**8, run_id=run_id)
-              for run_id in ("", "17")]
+    forged = [
+        replace(begin, stamp_ns=begin.stamp_ns + 10**8, run_id=run_id) for run_id in ("", "17")
+    ]
     publish_events(graph, ahead)
     graph.until(lambda: sum(received.values()) == len(ahead), "the run that is ahead")
     publish_events(graph, [*honest, *forged])
-    graph.until(lambda: maps and maps[-1].run_id == str(now - 3600 * 10**9)
-                and len([*collector.session.collector.timeline.views]) == 4, "a map")
+    graph.until(
+        lambda: (
+            maps
+            and maps[-1].run_id == str(now - 3600 * 10**9)
+            and len([*collector.session.collector.timeline.views]) == 4
+        ),
+        "a map",
+    )
     graph.until(lambda: sum(received.values()) == len(ahead) + len(honest) + 2, "all of it")
     wanted = calibrate(collected(honest)[1]).error_map
     graph.until(lambda: list(maps[-1].gx) == wanted.gx.ravel().tolist(), "the map of the run")
@@ -51,7 +63,10 @@ def test_an_honest_run_after_one_a_day_ahead_is_the_map_that_is_saved(graph, tmp
     assert answer.success and f"run {now - 3600 * 10**9}; readings " in answer.message
     assert "WARNING" not in answer.message
     assert not collector.session.collector.unusable.keys() ^ {
-        "command_from_the_future", "encoder_sample_from_the_future", "from_the_future"}
+        "command_from_the_future",
+        "encoder_sample_from_the_future",
+        "from_the_future",
+    }
     graph.remove(collector)
     [journal] = journals.iterdir()
     found = collect_bag(journal, settings_of("measurement_collector")).measurements

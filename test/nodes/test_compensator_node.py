@@ -30,17 +30,27 @@ PLACES = [(0.0, 0.0, 0.0), (0.0123, -0.0071, 0.4), (0.02, 0.02, 3.0), (0.09, -0.
 
 
 def summary():
-    return fill(names.SUMMARY.type(), {"header": from_model.header(1, "stage"), "qualified": True,
-                                       "views_done": 4, "views_planned": 4})
+    return fill(
+        names.SUMMARY.type(),
+        {
+            "header": from_model.header(1, "stage"),
+            "qualified": True,
+            "views_done": 4,
+            "views_planned": 4,
+        },
+    )
 
 
 def latch_map(graph, error_map=MAP) -> None:
-    publisher = graph.hand.create_publisher(names.ERROR_MAP.type, names.ERROR_MAP.name,
-                                            names.ERROR_MAP.qos)
-    publisher.publish(fill(names.ERROR_MAP.type(), from_model.error_map(
-        result_of(error_map), 1, "stage")))
-    summaries = graph.hand.create_publisher(names.SUMMARY.type, names.SUMMARY.name,
-                                            names.SUMMARY.qos)
+    publisher = graph.hand.create_publisher(
+        names.ERROR_MAP.type, names.ERROR_MAP.name, names.ERROR_MAP.qos
+    )
+    publisher.publish(
+        fill(names.ERROR_MAP.type(), from_model.error_map(result_of(error_map), 1, "stage"))
+    )
+    summaries = graph.hand.create_publisher(
+        names.SUMMARY.type, names.SUMMARY.name, names.SUMMARY.qos
+    )
     summaries.publish(summary())
 
 
@@ -51,8 +61,9 @@ def map_file(folder) -> str:
 
 
 def sample(*position: float, name=("x", "y", "theta")):
-    return names.ENCODER.type(name=list(name), position=list(position),
-                              velocity=[0.5] * len(position))
+    return names.ENCODER.type(
+        name=list(name), position=list(position), velocity=[0.5] * len(position)
+    )
 
 
 def correct(graph, messages: list) -> list:
@@ -149,9 +160,15 @@ def test_after_a_standstill_the_newest_sample_comes_first(graph, tmp_path, count
     assert heard[1].header.stamp.nanosec == count
     publisher.publish(sample(0.02, 0.0, 0.0))
     graph.until(lambda: len(heard) == 3, "the answer to one that comes alone")
-    assert node.session.counts == {"corrected": 3, "without_map": 0, "refused": 0,
-                                   "skipped": count - 1, "commands": 0, "commands_refused": 0,
-                                   "outside": 0}
+    assert node.session.counts == {
+        "corrected": 3,
+        "without_map": 0,
+        "refused": 0,
+        "skipped": count - 1,
+        "commands": 0,
+        "commands_refused": 0,
+        "outside": 0,
+    }
 
 
 @pytest.mark.usefixtures("quick_beat")
@@ -165,8 +182,12 @@ def test_what_is_not_corrected_is_counted_and_not_published(graph, tmp_path):
     publisher.publish(sample(0.0, 0.0, 0.0))
     graph.until(lambda: len(heard) == 1, "the good sample")
     wanted = {"corrected": "1", "without_map": "0", "refused": "2"}
-    graph.until(lambda: said and wanted.items() <= {
-        v.key: v.value for v in said[-1].status[0].values}.items(), "the counts")
+    graph.until(
+        lambda: (
+            said and wanted.items() <= {v.key: v.value for v in said[-1].status[0].values}.items()
+        ),
+        "the counts",
+    )
     assert node.get_name() == "compensator"
 
 
@@ -176,16 +197,19 @@ def test_places_beside_unknown_sites_and_no_numbers_are_refused(graph):
     latch_map(graph, random_map(Artifact(5, 0.01, 8), 3, unknown=[(2, 2)]))
     said: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
-    graph.until(lambda: said and said[-1].status[0].message.startswith(
-        "correcting by the map of plan "), "the map")
+    graph.until(
+        lambda: said and said[-1].status[0].message.startswith("correcting by the map of plan "),
+        "the map",
+    )
     heard, publisher = graph.listen(names.CORRECTED), graph.publisher(names.ENCODER)
     for place in ((0.002, 0.002, 0.0), (math.nan, 0.0, 0.0), (0.0, 0.0, math.inf)):
         publisher.publish(sample(*place))
     publisher.publish(sample(0.015, 0.015, 0.0))
     graph.until(lambda: heard, "the good sample")
     assert heard[0].position[0] == pytest.approx(0.015, abs=1e-5)
-    graph.until(lambda: {v.key: v.value for v in said[-1].status[0].values}["refused"] == "3",
-                "the counts")
+    graph.until(
+        lambda: {v.key: v.value for v in said[-1].status[0].values}["refused"] == "3", "the counts"
+    )
 
 
 @pytest.mark.usefixtures("quick_beat")
@@ -212,10 +236,16 @@ def test_a_second_publisher_of_maps_is_named(graph):
 
 def publish_map(graph, by, error_map, stamp_ns: int) -> None:
     """Publish a map and its summary by a node."""
-    summary = {"header": from_model.header(stamp_ns, "stage"), "qualified": True, "views_done": 4,
-               "views_planned": 4}
-    for topic, fields in ((names.ERROR_MAP, from_model.error_map(
-            result_of(error_map), stamp_ns, "stage")), (names.SUMMARY, summary)):
+    summary = {
+        "header": from_model.header(stamp_ns, "stage"),
+        "qualified": True,
+        "views_done": 4,
+        "views_planned": 4,
+    }
+    for topic, fields in (
+        (names.ERROR_MAP, from_model.error_map(result_of(error_map), stamp_ns, "stage")),
+        (names.SUMMARY, summary),
+    ):
         publisher = by.create_publisher(topic.type, topic.name, topic.qos)
         publisher.publish(fill(topic.type(), fields))
 
@@ -233,9 +263,16 @@ def test_a_map_of_a_second_node_is_not_used_until_one_is_left(graph, leaves):
     graph.until(lambda: node.session.compensator is not None, "the map of the solver")
     first = node.session.compensator
     publish_map(graph, others["intruder"], OTHER, 2)
-    graph.until(lambda: any(KEPT in status.message and status.level == b"\x01"
-                            and "2 publishers: /intruder, /solver" in status.message
-                            for array in heard for status in array.status), "the warning")
+    graph.until(
+        lambda: any(
+            KEPT in status.message
+            and status.level == b"\x01"
+            and "2 publishers: /intruder, /solver" in status.message
+            for array in heard
+            for status in array.status
+        ),
+        "the warning",
+    )
     graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] > 0, "the refusal")
     graph.remove(others[leaves])
     kept = {"intruder": MAP, "solver": OTHER}[leaves]
@@ -273,8 +310,12 @@ def test_many_summaries_take_no_map_away_and_the_oldest_are_counted(graph, monke
     summaries, more = graph.publisher(names.SUMMARY), compensator.MOST_WAITING + 2
     for number in range(1, more + 1):
         summaries.publish(summary())
-        graph.until(lambda number=number: node.refusals.counts[names.SUMMARY.name] + len(
-            node._maps._waiting) == number + 2, f"summary {number}")
+        graph.until(
+            lambda number=number: (
+                node.refusals.counts[names.SUMMARY.name] + len(node._maps._waiting) == number + 2
+            ),
+            f"summary {number}",
+        )
     assert node.refusals.counts[names.SUMMARY.name] == 3
     assert [topic for _, topic, _ in node._maps._waiting].count(names.ERROR_MAP.name) == 1
     monkeypatch.setattr(compensator, "ALONE_S", 0.0)
@@ -290,8 +331,13 @@ def test_a_malformed_map_does_not_end_the_node(graph):
 
 
 def test_the_bench_takes_corrected_samples(ros_environment):
-    done = subprocess.run([sys.executable, BENCH, "--worker", "selfcal", "100", "--seconds", "0.2"],
-                          capture_output=True, text=True, check=True, timeout=PATIENCE_S)
+    done = subprocess.run(
+        [sys.executable, BENCH, "--worker", "selfcal", "100", "--seconds", "0.2"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=PATIENCE_S,
+    )
     row = json.loads(done.stdout)
     assert (row["benchmark"], row["method"], row["n"]) == ("compensate 100 Hz", "selfcal", 20)
     assert row["corrected"] > 0

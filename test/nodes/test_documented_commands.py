@@ -53,8 +53,10 @@ def test_launch_files_have_the_arguments_that_are_given():
     for package, name, *arguments in lines("launch"):
         assert package == "selfcal_ros"
         text = (ROOT / "launch" / name).read_text()
-        for path in ("selfcal_ros/nodes/launching.py",
-                     *re.findall(r"launch/\w+\.launch\.py", text)):
+        for path in (
+            "selfcal_ros/nodes/launching.py",
+            *re.findall(r"launch/\w+\.launch\.py", text),
+        ):
             text += (ROOT / path).read_text()  # an included file's arguments may be given, too
         for argument in arguments:
             assert re.search(rf'rgument\(\s*"{argument.partition(":=")[0]}"', text), argument
@@ -75,15 +77,21 @@ def test_topics_services_and_actions_exist_with_their_types(cell):
     topics = [plain(words[1:])[-1] for words in lines("topic")]
     actions = [plain(words[1:]) for words in lines("action")]
     wanted_services = {(name, of) for name, of, *_ in services} | {
-        (f"{name}/_action/send_goal", f"{of}_SendGoal") for name, of, *_ in actions}
+        (f"{name}/_action/send_goal", f"{of}_SendGoal") for name, of, *_ in actions
+    }
     assert len(wanted_services) >= 5
     assert topics
     hand = cell.hand
-    cell.until(lambda: wanted_services <= {
-        (name, of) for name, types in hand.get_service_names_and_types() for of in types},
-        f"{wanted_services}")
-    cell.until(lambda: set(topics) <= {name for name, _ in hand.get_topic_names_and_types()},
-               f"{topics}")
+    cell.until(
+        lambda: (
+            wanted_services
+            <= {(name, of) for name, types in hand.get_service_names_and_types() for of in types}
+        ),
+        f"{wanted_services}",
+    )
+    cell.until(
+        lambda: set(topics) <= {name for name, _ in hand.get_topic_names_and_types()}, f"{topics}"
+    )
     for _, of, *request in services:
         fields = yaml.safe_load(request[0]) if request else {}
         assert interface(of).Request(**fields)
@@ -103,8 +111,9 @@ def test_what_is_recorded_are_the_topics_of_a_bag():
     from selfcal_ros.topics import INPUT_TOPICS
 
     recorded = next(words for words in lines("bag") if words[0] == "record" and len(words) > 4)
-    assert {word[1:] for word in plain(recorded) if word.startswith("/") and word != "/tmp/session"
-            } == set(INPUT_TOPICS)
+    assert {
+        word[1:] for word in plain(recorded) if word.startswith("/") and word != "/tmp/session"
+    } == set(INPUT_TOPICS)
     for words in lines("bag"):
         for word in words:
             if word.startswith(("config/", "bags/")):

@@ -31,8 +31,9 @@ def away_from(machine, gx, gy, size: int) -> tuple[np.ndarray, float]:
     x, y = (0.01 * part.ravel() for part in np.meshgrid(index, index, indexing="ij"))
     true = np.array([machine.error(*at) for at in zip(x, y, strict=True)]).T.ravel()
     away = np.array([gx, gy]).ravel() - true
-    columns = np.array([np.r_[x * 0 + 1, y * 0], np.r_[x * 0, y * 0 + 1], np.r_[-y, x],
-                        np.r_[x, y]]).T
+    columns = np.array(
+        [np.r_[x * 0 + 1, y * 0], np.r_[x * 0, y * 0 + 1], np.r_[-y, x], np.r_[x, y]]
+    ).T
     return away - columns @ np.linalg.lstsq(columns, away, rcond=None)[0], float(np.ptp(true))
 
 
@@ -40,22 +41,28 @@ SMALL = EXAMPLES.parent / "config/plans/small.yaml"
 
 
 @pytest.mark.usefixtures("jumping_clocks")
-@pytest.mark.parametrize(("plan", "cell", "size", "most"), [
-    (SMALL, "cell", 5, 2e-8), (EXAMPLES / "camera_plan.yaml", "camera_cell", 3, 1e-7)])
+@pytest.mark.parametrize(
+    ("plan", "cell", "size", "most"),
+    [(SMALL, "cell", 5, 2e-8), (EXAMPLES / "camera_plan.yaml", "camera_cell", 3, 1e-7)],
+)
 def test_an_example_is_measured_without_ros(tmp_path, monkeypatch, plan, cell, size, most):
     monkeypatch.chdir(tmp_path)
     path = EXAMPLES / f"{cell}.yaml"
     assert main(["measure", str(plan), str(path), "-o", "bag", "--yes"]) == 0
     result = json.loads(Path("bag.json").read_text())
-    away, span = away_from(open_machine(read_cell(path)), result["error_map"]["gx"],
-                           result["error_map"]["gy"], size)
+    away, span = away_from(
+        open_machine(read_cell(path)), result["error_map"]["gx"], result["error_map"]["gy"], size
+    )
     assert np.abs(away).max() < most < 0.3 * span
 
 
 @pytest.mark.parametrize("size", [5, 4])
 def test_the_same_class_is_driven_under_ros(graph, tmp_path, size):
-    for source, name in ((EXAMPLES / "cell.py", "cell.py"), (EXAMPLES / "cell.yaml", "cell.yaml"),
-                         (SMALL, "plan.yaml")):
+    for source, name in (
+        (EXAMPLES / "cell.py", "cell.py"),
+        (EXAMPLES / "cell.yaml", "cell.yaml"),
+        (SMALL, "plan.yaml"),
+    ):
         shutil.copy(source, tmp_path / name)
     for name, old in (("cell.yaml", "marks: 5"), ("plan.yaml", "grid_size: 5")):
         path = tmp_path / name
@@ -66,16 +73,26 @@ def test_the_same_class_is_driven_under_ros(graph, tmp_path, size):
     try:
         graph.node(MeasurementCollector)
         graph.node(Solver)
-        graph.node(PoseSequencer, plan=str(tmp_path / "plan.yaml"), auto_confirm=True,
-                   auto_start=True)
-        graph.until(lambda: summaries and summaries[-1].views_done == 4 and maps
-                    and maps[-1].header.stamp == summaries[-1].header.stamp, "the final map")
+        graph.node(
+            PoseSequencer, plan=str(tmp_path / "plan.yaml"), auto_confirm=True, auto_start=True
+        )
+        graph.until(
+            lambda: (
+                summaries
+                and summaries[-1].views_done == 4
+                and maps
+                and maps[-1].header.stamp == summaries[-1].header.stamp
+            ),
+            "the final map",
+        )
     finally:
         driver.close()
     assert summaries[-1].identifiable, summaries[-1].state
-    assert {(status.view_index, status.check_expected, status.check_done)
-            for status in statuses if status.complete} == {
-        (0, 5, 5), (1, 5, 5), (2, 0, 0), (3, 5, 5)}
+    assert {
+        (status.view_index, status.check_expected, status.check_done)
+        for status in statuses
+        if status.complete
+    } == {(0, 5, 5), (1, 5, 5), (2, 0, 0), (3, 5, 5)}
     machine = open_machine(read_cell(tmp_path / "cell.yaml"))
     away, span = away_from(machine, maps[-1].gx, maps[-1].gy, size)
     assert np.abs(away).max() < 2e-8 < 0.1 * span
@@ -91,9 +108,15 @@ def test_a_command_latched_anew_is_not_carried_out_again_and_abort_stops(graph):
         marks = graph.listen(names.DETECTIONS)
 
         def command(stamp_ns: int, phase: Phase) -> ViewCommand:
-            return fill(names.COMMAND.type(), from_model.command(Command(
-                stamp_ns, phase, "p", 0, View("a", angular=False), Artifact(5, 0.01, 8), 1),
-                "stage"))
+            return fill(
+                names.COMMAND.type(),
+                from_model.command(
+                    Command(
+                        stamp_ns, phase, "p", 0, View("a", angular=False), Artifact(5, 0.01, 8), 1
+                    ),
+                    "stage",
+                ),
+            )
 
         commands.publish(command(7, Phase.MEASURE))
         graph.until(lambda: len(marks) > 3, "the first marks")
@@ -113,13 +136,22 @@ def test_a_command_latched_anew_is_not_carried_out_again_and_abort_stops(graph):
 def test_a_machine_that_fails_is_named_in_the_health(graph, tmp_path):
     shutil.copy(EXAMPLES / "cell.py", tmp_path / "cell.py")
     (tmp_path / "cell.yaml").write_text(
-        (EXAMPLES / "cell.yaml").read_text().replace("y: [-0.03", "y: [-0.005"))
+        (EXAMPLES / "cell.yaml").read_text().replace("y: [-0.03", "y: [-0.005")
+    )
     driver = graph.node(CellDriver, cell=str(tmp_path / "cell.yaml"))
     try:
         commands = graph.publisher(names.COMMAND)
-        commands.publish(fill(names.COMMAND.type(), from_model.command(Command(
-            7, Phase.MEASURE, "p", 0, View("a", angular=False), Artifact(5, 0.01, 8), 1),
-            "stage")))
+        commands.publish(
+            fill(
+                names.COMMAND.type(),
+                from_model.command(
+                    Command(
+                        7, Phase.MEASURE, "p", 0, View("a", angular=False), Artifact(5, 0.01, 8), 1
+                    ),
+                    "stage",
+                ),
+            )
+        )
         graph.until(lambda: "beyond the limits" in driver.diagnosis().message, "the reason")
         assert driver.diagnosis().level == 2
     finally:

@@ -49,14 +49,29 @@ from test.support.ports import Hands, settings_of
 from test.support.sessions import cdr_of, collected, events_of, plan_file, small_bag, small_plan
 
 PLAN = small_plan("0, 90, tx", repeats=1)
-TEXT_FIELDS = ("stamp.sec", "nanosec", "_id", "view_name", "reasons", "_terms", "_counts",
-               "missing_m", "stamp", "approach_x", "approach_y", "session_notes")
+TEXT_FIELDS = (
+    "stamp.sec",
+    "nanosec",
+    "_id",
+    "view_name",
+    "reasons",
+    "_terms",
+    "_counts",
+    "missing_m",
+    "stamp",
+    "approach_x",
+    "approach_y",
+    "session_notes",
+)
 ALONG_Y = ("dy", "_y")
 """Fields that are solved as those along x are, which are tried."""
 MILD = (2, 4001, 4.2e-3)
 """Numbers that a cell may well send: other tests solve such, and search for their causes."""
-HEARD_BY = {EncoderSample: (names.ENCODER, 3), Detection: (names.DETECTIONS, 2),
-            Command: (names.COMMAND, 5)}
+HEARD_BY = {
+    EncoderSample: (names.ENCODER, 3),
+    Detection: (names.DETECTIONS, 2),
+    Command: (names.COMMAND, 5),
+}
 """How many of the nodes hear what a cell says."""
 IMAGES = names.image_topics("raw", 100)[0]
 LATER_NS = 10_000_000_000_000_000
@@ -75,19 +90,36 @@ def good():
 
     def event(kind):
         return next(e for e in events if isinstance(e, kind))
+
     return [
         (names.ENCODER, from_model.joint_state(event(EncoderSample), "stage")),
         (names.MOTION, from_model.joint_state(event(EncoderSample), "stage")),
         (names.DETECTIONS, from_model.detection(event(Detection), "stage")),
-        (names.COMMAND, from_model.command(
-            next(e for e in events if isinstance(e, Command) and e.phase == 1), "stage")),
+        (
+            names.COMMAND,
+            from_model.command(
+                next(e for e in events if isinstance(e, Command) and e.phase == 1), "stage"
+            ),
+        ),
         (names.STATUS, from_model.view_status(view, PLAN.plan_id, stamp, "stage")),
         (names.MEASUREMENT, from_model.view_measurement(view, measurements, stamp, "stage")),
-        (names.ERROR_MAP, from_model.error_map(
-            result_of(random_map(PLAN.artifact, 3)), stamp, "stage")),
-        (names.SUMMARY, {"header": from_model.header(stamp, "stage"), "qualified": True,
-                        "state": "Calibrated.", "views_done": 3, "views_planned": 3,
-                        "advice": ["none"], "causes": ["none"]})]
+        (
+            names.ERROR_MAP,
+            from_model.error_map(result_of(random_map(PLAN.artifact, 3)), stamp, "stage"),
+        ),
+        (
+            names.SUMMARY,
+            {
+                "header": from_model.header(stamp, "stage"),
+                "qualified": True,
+                "state": "Calibrated.",
+                "views_done": 3,
+                "views_planned": 3,
+                "advice": ["none"],
+                "causes": ["none"],
+            },
+        ),
+    ]
 
 
 @pytest.fixture
@@ -98,6 +130,7 @@ def refused(monkeypatch):
     def note(self, place, error):
         found.append((place, error))
         add(self, place, error)
+
     monkeypatch.setattr(Refusals, "add", note)
     return found
 
@@ -111,7 +144,8 @@ def cell(graph, refused, tmp_path, monkeypatch):
         graph.node(PoseSequencer, plan=plan_file(tmp_path, PLAN)),
         graph.node(Solver, result_folder=str(tmp_path)),
         graph.node(CompensatorNode, require_qualified=False),
-        graph.node(BagRecorder, bag=str(tmp_path / "bag"), all_topics=True)]
+        graph.node(BagRecorder, bag=str(tmp_path / "bag"), all_topics=True),
+    ]
     graph.add(monitor_session.MonitorSession("", context=graph.context))
     play(graph, events_of(PLAN))  # what is spoilt below belongs to this run
     graph.until(lambda: nodes[2].session.result is not None, "a map")
@@ -126,12 +160,22 @@ def all_kinds(graph, cell, tmp_path):
     bag = str(small_bag(tmp_path / "beside"))
     graph.node(partial(StageSimulator, namespace="beside"))
     graph.node(partial(MarkDetectorNode, namespace="beside"), **DETECTS)
-    graph.node(partial(BagPlayer, namespace="beside"), bag=bag, wait_for_subscribers=3600.0,
-               beside_others=True)
+    graph.node(
+        partial(BagPlayer, namespace="beside"),
+        bag=bag,
+        wait_for_subscribers=3600.0,
+        beside_others=True,
+    )
     graph.node(partial(CellDriver, namespace="driven"), cell=str(SIMULATED_CELL))
     graph.node(partial(CellChecker, PLAN, namespace="beside", settle_s=0.0, patience_s=3600.0))
-    graph.add(ReplaySession(partial(Player, bag=bag, rate=1.0, seed=-1, beside_others=True),
-                            "none.json", namespace="replay", context=graph.context))
+    graph.add(
+        ReplaySession(
+            partial(Player, bag=bag, rate=1.0, seed=-1, beside_others=True),
+            "none.json",
+            namespace="replay",
+            context=graph.context,
+        )
+    )
     nodes = [node for node in graph.nodes if node is not graph.hand]
     assert {type(node) for node in nodes} == set(kinds())
     return nodes
@@ -142,14 +186,20 @@ def kinds():
     for file in sorted(Path(every_node.__file__).parent.glob("*.py")):
         if "\ndef main(" in file.read_text():
             module = importlib.import_module(f"{every_node.__name__}.{file.stem}")
-            yield from (item for item in vars(module).values() if isinstance(item, type)
-                        and issubclass(item, Guarded) and item.__module__ == module.__name__)
+            yield from (
+                item
+                for item in vars(module).values()
+                if isinstance(item, type)
+                and issubclass(item, Guarded)
+                and item.__module__ == module.__name__
+            )
 
 
 def play(graph, events) -> None:
     """Publish the messages of a run, once all nodes that are to hear them do."""
-    voices = {kind: graph.publisher(topic, readers=readers)
-              for kind, (topic, readers) in HEARD_BY.items()}
+    voices = {
+        kind: graph.publisher(topic, readers=readers) for kind, (topic, readers) in HEARD_BY.items()
+    }
     for event in events:
         voices[type(event)].publish(cdr_of(event))
 
@@ -189,14 +239,20 @@ def everybody_is_well(graph, cell, refused, capsys, begun=0) -> None:
     events = good_run()
     play(graph, events[begun:])
     expected = calibrate(collected(events)[1]).error_map.gx
-    graph.until(lambda: solver.session.result is not None and np.array_equal(
-        solver.session.result.error_map.gx, expected), "the map of a good run")
+    graph.until(
+        lambda: (
+            solver.session.result is not None
+            and np.array_equal(solver.session.result.error_map.gx, expected)
+        ),
+        "the map of a good run",
+    )
     capsys.readouterr()
     said: list = []
 
     def shown() -> bool:
         said.extend(map(json.loads, capsys.readouterr().out.splitlines()))
         return any(line["picture"]["map"] for line in said if "picture" in line)
+
     graph.until(shown, "the picture of the map")
 
 
@@ -212,37 +268,60 @@ def hostile_to(topic, fields):
 
 def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, good, capfd):
     status = dict.fromkeys(("view", "command_stamp", "views", "run_id"), "1")
-    private = [(names.of_node(node, names.HEALTH), worst(names.HEALTH.type(
-        level=b"\1", name=node, message="as told", values=[
-            KeyValue(key=key, value=value) for key, value in status.items()])))
-        for node in monitor_session.WATCHED]
+    private = [
+        (
+            names.of_node(node, names.HEALTH),
+            worst(
+                names.HEALTH.type(
+                    level=b"\1",
+                    name=node,
+                    message="as told",
+                    values=[KeyValue(key=key, value=value) for key, value in status.items()],
+                )
+            ),
+        )
+        for node in monitor_session.WATCHED
+    ]
     for topic, fields in good:
         send(graph, topic, hostile_to(topic, fields))
     for topic, messages in private:
         send(graph, topic, (message for _, message in messages))
-    strange = [(names.of_node(node, topic), [message for _, message in worst(message)])
-               for node, topic, message in (
-        ("measurement_collector", names.RECEIVED, names.RECEIVED.type(data=[1, 2, 3])),
-        ("solver", names.SOLVED, names.SOLVED.type(data="digest")))]
+    strange = [
+        (names.of_node(node, topic), [message for _, message in worst(message)])
+        for node, topic, message in (
+            ("measurement_collector", names.RECEIVED, names.RECEIVED.type(data=[1, 2, 3])),
+            ("solver", names.SOLVED, names.SOLVED.type(data="digest")),
+        )
+    ]
     image = from_model.image(np.full((40, 40), 90), "mono8", 10**8, "camera")
     strange.append((IMAGES, [message for _, message in worst(fill(IMAGES.type(), image))]))
-    heard = set().union(*(subscribed(node) for node in all_kinds
-                          if not isinstance(node, CellDriver)))  # its commands move a machine
+    heard = set().union(
+        *(subscribed(node) for node in all_kinds if not isinstance(node, CellDriver))
+    )  # its commands move a machine
     for space in ("/beside", "/replay"):
-        for topic, messages in [*((topic, hostile_to(topic, fields)) for topic, fields in good),
-                                *strange]:
+        for topic, messages in [
+            *((topic, hostile_to(topic, fields)) for topic, fields in good),
+            *strange,
+        ]:
             if f"{space}/{topic.name}" in heard:
                 send(graph, replace(topic, name=f"{space}/{topic.name}"), messages)
-    foreign = DiagnosticStatus(level=b"\2", name="of others", message="as told", values=[
-        KeyValue(key="key", value="1")])
-    send(graph, names.DIAGNOSTICS, (message for _, message in worst(
-        names.DIAGNOSTICS.type(status=[foreign]))))
+    foreign = DiagnosticStatus(
+        level=b"\2", name="of others", message="as told", values=[KeyValue(key="key", value="1")]
+    )
+    send(
+        graph,
+        names.DIAGNOSTICS,
+        (message for _, message in worst(names.DIAGNOSTICS.type(status=[foreign]))),
+    )
     everybody_is_well(graph, cell, refused, capfd)
     places = {place for place, _ in refused}
     assert {names.COMMAND.name, names.MEASUREMENT.name, names.ERROR_MAP.name} <= places
     assert any("longer than 8192 bytes" in str(error) for _, error in refused)
-    sent = {f"{space}/{topic.name}" for space in ("", "/beside", "/replay")
-            for topic, _ in [*good, *private, *strange]} | {names.DIAGNOSTICS.name}
+    sent = {
+        f"{space}/{topic.name}"
+        for space in ("", "/beside", "/replay")
+        for topic, _ in [*good, *private, *strange]
+    } | {names.DIAGNOSTICS.name}
     only_recorded = {f"/{names.CORRECTED.name}"}  # the recorder looks into no message
     assert heard - only_recorded <= sent
     assert {f"/{topic.name}" for topic, _ in [*good, *private]} <= heard
@@ -264,8 +343,10 @@ def test_torn_bytes_end_nothing(graph, cell, refused, good, capfd):
 def test_numbers_of_readings_at_their_worst_are_solved_or_refused_in_one_line():
     plan = plan_of("0, 90, tx", 3, count=4)
     _, measurements, progress = collected(events_of(plan))
-    views = [fill(names.MEASUREMENT.type(), from_model.view_measurement(
-        view, measurements, 5, "stage")) for view in progress.values()]
+    views = [
+        fill(names.MEASUREMENT.type(), from_model.view_measurement(view, measurements, 5, "stage"))
+        for view in progress.values()
+    ]
     answers, solved = Counter(), set()
     for name, spoilt in worst(views[1]):
         if name.endswith(TEXT_FIELDS) or isinstance(getattr(spoilt, name, None), str):
@@ -294,8 +375,11 @@ RAISED_BY_RCLPY = {"set_parameters", "set_parameters_atomically"}
 """Services of rclpy whose own callback raises something at the worst requests."""
 ACTION = "/pose_sequencer/run_calibration/_action"
 TEXT = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="x")
-BASES = {"parameters": [[Parameter(name=name, value=TEXT)] for name in (
-    "hardware_id", "use_sim_time")], "names": [["none"]], "prefixes": [["none"]]}
+BASES = {
+    "parameters": [[Parameter(name=name, value=TEXT)] for name in ("hardware_id", "use_sim_time")],
+    "names": [["none"]],
+    "prefixes": [["none"]],
+}
 """What stands in the sequences of a request whose elements are spoilt."""
 
 
@@ -307,8 +391,15 @@ def traps(tmp_path):
         file.truncate(120_000_000)
     (tmp_path / "deep").write_text("[" * 100_000)
     (tmp_path / "long").write_text("- 1\n" * 1_000_000)
-    return [*(str(tmp_path / name) for name in ("pipe", "large", "deep", "long", "")),
-            "/dev/zero", "/dev/stdin", "/proc/kmsg", "/proc/self/mem", "/proc/self/pagemap", "a\0b"]
+    return [
+        *(str(tmp_path / name) for name in ("pipe", "large", "deep", "long", "")),
+        "/dev/zero",
+        "/dev/stdin",
+        "/proc/kmsg",
+        "/proc/self/mem",
+        "/proc/self/pagemap",
+        "a\0b",
+    ]
 
 
 def requests_of(kind, traps):
@@ -334,6 +425,7 @@ def reached(graph, kind, name, hello=None):
         asked.append(client.call_async(hello or kind.Request()))
         graph.executor.spin_once(timeout_sec=0.02)
         return any(one.done() for one in asked)
+
     graph.until(is_answered, f"an answer of {name}")
     return client
 
@@ -343,8 +435,10 @@ def ask(graph, client, requests):
     answers, requests = [], iter(requests)
     while group := list(islice(requests, AT_ONCE // 4)):  # services have queues of 10
         futures = [client.call_async(request) for request in group]
-        graph.until(lambda asked=futures: all(one.done() for one in asked),
-                    f"answers of {client.service_name}")
+        graph.until(
+            lambda asked=futures: all(one.done() for one in asked),
+            f"answers of {client.service_name}",
+        )
         answers += [one.result() for one in futures]
     return answers
 
@@ -379,9 +473,12 @@ def asked_to_end(goal):
 
 
 def test_each_request_at_its_worst_is_answered_and_ends_nothing(
-        graph, cell, all_kinds, refused, traps, capfd):
-    asked, called = Counter(), {*(f"{ACTION}/{part}" for part in (
-        "send_goal", "get_result", "cancel_goal"))}
+    graph, cell, all_kinds, refused, traps, capfd
+):
+    asked, called = (
+        Counter(),
+        {*(f"{ACTION}/{part}" for part in ("send_goal", "get_result", "cancel_goal"))},
+    )
     half = len(good_run()) // 2
     play(graph, good_run()[:half])
     for node in all_kinds:
@@ -394,14 +491,21 @@ def test_each_request_at_its_worst_is_answered_and_ends_nothing(
     assert len(asked) == len(all_kinds) and min(asked.values()) > 200, asked
 
     def offered():
-        return {name for node in all_kinds for name, _ in node.get_service_names_and_types_by_node(
-            node.get_name(), node.get_namespace())}
+        return {
+            name
+            for node in all_kinds
+            for name, _ in node.get_service_names_and_types_by_node(
+                node.get_name(), node.get_namespace()
+            )
+        }
+
     graph.until(lambda: offered() == called, "the services that were called, and no other")
     graph.call(Trigger, "pose_sequencer/abort")  # or it rejects goals
     results = results_of(graph, traps)
     assert {result.error_code for result in results} == {2}
     odd = [(place, error) for place, error in refused if not isinstance(error, SelfcalError)]
     assert {place for place, _ in odd} == RAISED_BY_RCLPY, [
-        (place, error) for place, error in odd if place not in RAISED_BY_RCLPY] or odd
+        (place, error) for place, error in odd if place not in RAISED_BY_RCLPY
+    ] or odd
     refused.clear()
     everybody_is_well(graph, cell, refused, capfd, half)

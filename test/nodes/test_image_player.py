@@ -38,39 +38,82 @@ DETECTS = {"pixel_size": 6e-6, "mark_size": 7.2e-5, "turn": 1.5}
 def found(tmp_path_factory):
     """Return the bag of the detections that `selfcal detect` finds."""
     folder = tmp_path_factory.mktemp("found") / "bag"
-    assert main(["detect", str(BAG), "-o", str(folder), "--pixel-size", "6e-6", "--mark-size",
-                 "7.2e-5", "--turn", "1.5"]) == 0
+    assert (
+        main(
+            [
+                "detect",
+                str(BAG),
+                "-o",
+                str(folder),
+                "--pixel-size",
+                "6e-6",
+                "--mark-size",
+                "7.2e-5",
+                "--turn",
+                "1.5",
+            ]
+        )
+        == 0
+    )
     return folder
 
 
 def test_images_that_are_played_give_the_map_of_detect_and_solve(graph, found):
-    maps, solved = graph.listen(names.ERROR_MAP), graph.listen(
-        names.of_node("solver", names.SOLVED))
+    maps, solved = (
+        graph.listen(names.ERROR_MAP),
+        graph.listen(names.of_node("solver", names.SOLVED)),
+    )
     detector = graph.node(MarkDetectorNode, **DETECTS)
     collector = graph.node(MeasurementCollector)
     graph.node(Solver)
     player = graph.node(BagPlayer, bag=str(BAG), rate=0.0, seed=3)
     most = []
-    graph.until(lambda: most.append(player.player.sent["image"] - (
-        player.player.taken or 0)) or player.finished.done(), "the end of the bag")
+    graph.until(
+        lambda: (
+            most.append(player.player.sent["image"] - (player.player.taken or 0))
+            or player.finished.done()
+        ),
+        "the end of the bag",
+    )
     assert player.exit_code == ExitCode.DONE
     assert player.player.sent["image"] == 100 and "detection" not in player.player.sent
     assert max(most) <= WAITING_IMAGES
     received = collector.session.collector.received
-    graph.until(lambda: list(received.values()) == [
-        player.player.sent["encoder"], 676, player.player.sent["command"]], "all detections")
+    graph.until(
+        lambda: (
+            list(received.values())
+            == [player.player.sent["encoder"], 676, player.player.sent["command"]]
+        ),
+        "all detections",
+    )
     digest = collector._finish()
     graph.until(lambda: solved and solved[-1].data == digest and maps, "the map of all readings")
     assert not detector.losses.counts
     offline = calibrate(collect_bag(found, CollectorSettings.checked({}, "test"))[0]).error_map
-    np.testing.assert_array_equal([maps[-1].gx, maps[-1].gy],
-                                  [offline.gx.ravel(), offline.gy.ravel()])
+    np.testing.assert_array_equal(
+        [maps[-1].gx, maps[-1].gy], [offline.gx.ravel(), offline.gy.ravel()]
+    )
 
 
 def test_compressed_images_are_played_to_a_detector_alone(graph, tmp_path):
     rewritten(BAG, tmp_path / "bag", compressed)
-    assert main(["detect", str(tmp_path / "bag"), "-o", str(tmp_path / "found"), "--pixel-size",
-                 "6e-6", "--mark-size", "7.2e-5", "--turn", "1.5"]) == 0
+    assert (
+        main(
+            [
+                "detect",
+                str(tmp_path / "bag"),
+                "-o",
+                str(tmp_path / "found"),
+                "--pixel-size",
+                "6e-6",
+                "--mark-size",
+                "7.2e-5",
+                "--turn",
+                "1.5",
+            ]
+        )
+        == 0
+    )
     expected = [data for _, _, data in BagReader(tmp_path / "found").cdr_messages()]
     heard = graph.listen(names.DETECTIONS)
     graph.node(MarkDetectorNode, transport="compressed", **DETECTS)
@@ -84,8 +127,12 @@ def test_nothing_is_played_without_a_detector(graph):
     graph.node(MeasurementCollector)
     player = graph.node(BagPlayer, bag=str(BAG), rate=0.0, wait_for_subscribers=0.5)
     assert player.diagnosis().message == "waiting for /measurement_collector"
-    graph.until(lambda: player.diagnosis().message == "waiting for /mark_detector"
-                or player.finished.done(), "the collector")
+    graph.until(
+        lambda: (
+            player.diagnosis().message == "waiting for /mark_detector" or player.finished.done()
+        ),
+        "the collector",
+    )
     graph.until(player.finished.done, "the end of patience")
     assert player.exit_code == ExitCode.BAD_INPUT
     assert player.player.played == 0
@@ -134,13 +181,30 @@ def of_two_cells(folder):
 
 
 def test_processes_give_the_result_of_detect_and_solve_bit_for_bit(
-        ros_environment, found, tmp_path, capfd):
+    ros_environment, found, tmp_path, capfd
+):
     """Options win over the parameter file: one pixel size in it is wrong."""
     params, replayed, solved = (tmp_path / name for name in ("p.yaml", "replayed", "solved"))
     params.write_text(PARAMS)
     bag, common = of_two_cells(tmp_path / "bag"), ["--params", str(params), "--quiet", "-o"]
-    assert main(["replay", str(bag), "--namespace", "cell2", "--fast", "--shuffle", "3",
-                 "--pixel-size", "6e-6", *common, str(replayed)]) == 0
+    assert (
+        main(
+            [
+                "replay",
+                str(bag),
+                "--namespace",
+                "cell2",
+                "--fast",
+                "--shuffle",
+                "3",
+                "--pixel-size",
+                "6e-6",
+                *common,
+                str(replayed),
+            ]
+        )
+        == 0
+    )
     assert main(["solve", str(found), *common, str(solved)]) == 0
     said = capfd.readouterr()
     assert "ERROR" not in said.out + said.err
@@ -158,8 +222,10 @@ def test_the_detector_of_a_replay_gets_all_its_parameters(monkeypatch, tmp_path)
     """How images reach it is not what the file says of a live cell."""
     rewritten(BAG, tmp_path / "bag", compressed, "cell2/")
     params, started = tmp_path / "p.yaml", {}
-    params.write_text("mark_detector: {ros__parameters: {pixel_size: 6.0e-6, mark_size: 7.2e-5, "
-                      "max_waiting: 1, autostart: false, max_blur: 0.2}}")
+    params.write_text(
+        "mark_detector: {ros__parameters: {pixel_size: 6.0e-6, mark_size: 7.2e-5, "
+        "max_waiting: 1, autostart: false, max_blur: 0.2}}"
+    )
 
     @contextmanager
     def process(module, given, *_, **__):
@@ -167,25 +233,59 @@ def test_the_detector_of_a_replay_gets_all_its_parameters(monkeypatch, tmp_path)
         if module.endswith("mark_detector"):
             started["file"] = read_yaml(given[given.index("--params-file") + 1])
         yield SimpleNamespace(stdout=[], wait=lambda: 4)
+
     monkeypatch.setattr(replay_verb, "process", process)
-    assert main(["replay", str(tmp_path / "bag"), "--namespace", "cell2", "--params", str(params),
-                 "--turn", "1.5", "--mirror"]) == 4
+    assert (
+        main(
+            [
+                "replay",
+                str(tmp_path / "bag"),
+                "--namespace",
+                "cell2",
+                "--params",
+                str(params),
+                "--turn",
+                "1.5",
+                "--mirror",
+            ]
+        )
+        == 4
+    )
     values = started["file"]["mark_detector"]["ros__parameters"]
     assert values == DetectorSettings.checked(values, "test").__dict__
-    told = {"pixel_size": 6e-6, "mark_size": 7.2e-5, "turn": 1.5, "mirror": True, "max_blur": 0.2,
-            "transport": "compressed", "max_waiting": 32, "autostart": True}
+    told = {
+        "pixel_size": 6e-6,
+        "mark_size": 7.2e-5,
+        "turn": 1.5,
+        "mirror": True,
+        "max_blur": 0.2,
+        "transport": "compressed",
+        "max_waiting": 32,
+        "autostart": True,
+    }
     assert {name: values[name] for name in told} == told
     assert list(started) == ["mark_detector", "file", *replay_verb.NODES, "replay_session"]
 
 
-@pytest.mark.parametrize(("options", "problem"), [
-    ([], "has images and no detections: options: pixel_size and "
-         "mark_size: are not set; give them "
-     "in m; `selfcal camera init` finds the size of a pixel"),
-    (["--pixel-size", "6e-6"], "has images and no detections: options: mark_size: is not set; give "
-     "it in m"),
-    (["--pixel-size", "6e-6", "--mark-size", "7.2e-6"], "options: mark_size: 1.2 pixels; a mark "
-     "has 6 to 2000 pixels")])
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (
+            [],
+            "has images and no detections: options: pixel_size and "
+            "mark_size: are not set; give them "
+            "in m; `selfcal camera init` finds the size of a pixel",
+        ),
+        (
+            ["--pixel-size", "6e-6"],
+            "has images and no detections: options: mark_size: is not set; give it in m",
+        ),
+        (
+            ["--pixel-size", "6e-6", "--mark-size", "7.2e-6"],
+            "options: mark_size: 1.2 pixels; a mark has 6 to 2000 pixels",
+        ),
+    ],
+)
 def test_replay_of_images_says_which_options_are_missing(options, problem, capsys):
     assert main(["replay", str(BAG), *options]) == 2
     [line] = capsys.readouterr().err.splitlines()
@@ -196,39 +296,69 @@ def test_options_for_images_are_refused_where_none_are_played(found, capsys):
     assert main(["replay", str(found), "--mark-size", "7.2e-5"]) == 2
     assert capsys.readouterr().err == (
         f"selfcal replay: --mark-size: no images of {found} are played; leave it out; it is for "
-        "bags with images and no detections\n")
+        "bags with images and no detections\n"
+    )
 
 
 def test_no_image_is_played_before_the_detections_are_heard(graph, monkeypatch):
     """The detector is connected to the collector last: detections until then would be lost."""
     node = graph.node(MarkDetectorNode, **DETECTS)
     count, connected = node._detections.get_subscription_count, []
-    monkeypatch.setattr(node._detections, "get_subscription_count",
-                        lambda: count() if connected else 0)
+    monkeypatch.setattr(
+        node._detections, "get_subscription_count", lambda: count() if connected else 0
+    )
     node._tell_taken()
     graph.node(MeasurementCollector)
     player = graph.node(BagPlayer, bag=str(BAG), rate=0.0)
-    graph.until(lambda: player.player.taken is not None and player.player.unheard() == [
-        names.DETECTIONS.name] and count(), "all but the connection")
+    graph.until(
+        lambda: (
+            player.player.taken is not None
+            and player.player.unheard() == [names.DETECTIONS.name]
+            and count()
+        ),
+        "all but the connection",
+    )
     assert player.player.played == 0
     connected.append(True)
     graph.until(lambda: player.player.played > 0, "the first message")
 
 
-@pytest.mark.parametrize(("mark", "ends", "fault", "code", "line"), [
-    ("5e-5", 3, "", 3, ""),
-    ("5e-5", 3, "view 'b': the plate lies otherwise", 2, "view 'b': the plate lies otherwise"),
-    ("5e-4", 4, "", 4, "no dark disc of 250 px was found; what repeats is 25 px")])
+@pytest.mark.parametrize(
+    ("mark", "ends", "fault", "code", "line"),
+    [
+        ("5e-5", 3, "", 3, ""),
+        ("5e-5", 3, "view 'b': the plate lies otherwise", 2, "view 'b': the plate lies otherwise"),
+        ("5e-4", 4, "", 4, "no dark disc of 250 px was found; what repeats is 25 px"),
+    ],
+)
 def test_the_code_of_images_is_that_of_detect_and_solve(
-        monkeypatch, tmp_path, capsys, mark, ends, fault, code, line):
+    monkeypatch, tmp_path, capsys, mark, ends, fault, code, line
+):
     """The nodes find a plan not identified, or no mark; what the images show tells why."""
-    simulate(tmp_path, "images", {
-        "plan_id": "p", "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 0},
-        "views": [{"name": "a", "repeats": 1}, {"name": "b", "rotation_deg": 90, "repeats": 1}]},
-        camera={}, truth={"g": 2e-7, "a": 2e-7, "t": 1e-6, "phi": 1e-5})
+    simulate(
+        tmp_path,
+        "images",
+        {
+            "plan_id": "p",
+            "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 0},
+            "views": [{"name": "a", "repeats": 1}, {"name": "b", "rotation_deg": 90, "repeats": 1}],
+        },
+        camera={},
+        truth={"g": 2e-7, "a": 2e-7, "t": 1e-6, "phi": 1e-5},
+    )
     unidentified = tmp_path / "unidentified.json"
-    assert main(["solve", str(small_bag(tmp_path, small_plan("0, 90"))), "--quiet", "-o",
-                 str(unidentified)]) == 3
+    assert (
+        main(
+            [
+                "solve",
+                str(small_bag(tmp_path, small_plan("0, 90"))),
+                "--quiet",
+                "-o",
+                str(unidentified),
+            ]
+        )
+        == 3
+    )
     capsys.readouterr()
 
     @contextmanager
@@ -240,9 +370,22 @@ def test_the_code_of_images_is_that_of_detect_and_solve(
     def collected(bag, *_, **__):
         assert Playlist(Path(bag)).counts["stage/mark_detections"] >= 18
         return BagSession(None, {}, [], [fault] if fault else [])
+
     monkeypatch.setattr(replay_verb, "process", process)
     monkeypatch.setattr(replay_verb, "collect_bag", collected)
-    assert main(["replay", str(tmp_path / "images"), "--fast", "--pixel-size", "2e-6",
-                 "--mark-size", mark]) == code
+    assert (
+        main(
+            [
+                "replay",
+                str(tmp_path / "images"),
+                "--fast",
+                "--pixel-size",
+                "2e-6",
+                "--mark-size",
+                mark,
+            ]
+        )
+        == code
+    )
     said = capsys.readouterr().err
     assert line in said and said.count("\n") == bool(line)

@@ -38,30 +38,44 @@ class Site:
         (folder / "plan.yaml").write_text(PLAN.replace("REPEATS", str(repeats)))
         self.marks = [repeats * marks for marks in MARKS]
         self.maps, self.summaries, self.commands, self.statuses = (
-            graph.listen(self.topic(topic)) for topic in (
-                names.ERROR_MAP, names.SUMMARY, names.COMMAND, names.STATUS))
+            graph.listen(self.topic(topic))
+            for topic in (names.ERROR_MAP, names.SUMMARY, names.COMMAND, names.STATUS)
+        )
         self.parameters = {
-            MeasurementCollector: {"journal": str(folder), "status_period": 0.05,
-                                   "measurement_sense": "plate_moves" if cell.get("plate_moves")
-                                   else "microscope_moves"},
+            MeasurementCollector: {
+                "journal": str(folder),
+                "status_period": 0.05,
+                "measurement_sense": "plate_moves"
+                if cell.get("plate_moves")
+                else "microscope_moves",
+            },
             # its stage stops on the marks: nothing in the readings shows the offsets' sign
             Solver: {"model_terms": ["microscope:0.01:0.01:0.002"]},
-            PoseSequencer: {"plan": str(folder / "plan.yaml"), "auto_confirm": True,
-                            "settle_time": 0.0}}
+            PoseSequencer: {
+                "plan": str(folder / "plan.yaml"),
+                "auto_confirm": True,
+                "settle_time": 0.0,
+            },
+        }
         self.cell_options = cell
 
     def topic(self, topic):
-        return names.Topic(f"/{self.namespace}/{topic.name}".replace("//", "/"), topic.type,
-                           topic.qos)
+        return names.Topic(
+            f"/{self.namespace}/{topic.name}".replace("//", "/"), topic.type, topic.qos
+        )
 
     def start_cell(self):
-        self.cell = self.graph.add(IndependentCell(
-            context=self.graph.context, namespace=self.namespace, **self.cell_options))
+        self.cell = self.graph.add(
+            IndependentCell(
+                context=self.graph.context, namespace=self.namespace, **self.cell_options
+            )
+        )
 
     def start(self, *kinds):
         for kind in kinds:
-            self.nodes[kind] = self.graph.node(partial(kind, namespace=self.namespace),
-                                               **self.parameters[kind])
+            self.nodes[kind] = self.graph.node(
+                partial(kind, namespace=self.namespace), **self.parameters[kind]
+            )
         return self
 
     def begin(self, hold_at=None):
@@ -77,27 +91,38 @@ class Site:
         self.start(kind)
 
     def ask(self, service):
-        return self.graph.call(Trigger, f"/{self.namespace}/pose_sequencer/{service}".replace(
-            "//", "/"))
+        return self.graph.call(
+            Trigger, f"/{self.namespace}/pose_sequencer/{service}".replace("//", "/")
+        )
 
     def until_held(self):
         """Wait until the cell waits and the collector has what was sent."""
         self.graph.until(lambda: self.cell.held, "the middle of a view")
         received = self.nodes[MeasurementCollector].session.collector.received
-        self.graph.until(lambda: received["detection"] == sum(self.marks[:self.cell.view])
-                         + self.cell.exposed, "what was sent")
+        self.graph.until(
+            lambda: received["detection"] == sum(self.marks[: self.cell.view]) + self.cell.exposed,
+            "what was sent",
+        )
 
     def release(self):
         self.cell.hold_at = None
 
     def until_done(self):
-        self.graph.until(lambda: self.commands and self.commands[-1].phase
-                         == names.COMMAND.type.DONE, "the end of the plan")
+        self.graph.until(
+            lambda: self.commands and self.commands[-1].phase == names.COMMAND.type.DONE,
+            "the end of the plan",
+        )
         run = self.commands[-1].run_id
-        self.graph.until(lambda: self.summaries and self.summaries[-1].views_done == VIEWS
-                         and self.summaries[-1].run_id == run and self.maps
-                         and self.maps[-1].header.stamp == self.summaries[-1].header.stamp,
-                         "the final map")
+        self.graph.until(
+            lambda: (
+                self.summaries
+                and self.summaries[-1].views_done == VIEWS
+                and self.summaries[-1].run_id == run
+                and self.maps
+                and self.maps[-1].header.stamp == self.summaries[-1].header.stamp
+            ),
+            "the final map",
+        )
         assert self.summaries[-1].qualified, self.summaries[-1].state
 
     def check(self, size=1.0):
@@ -114,13 +139,21 @@ class Site:
 
     def measured(self):
         """Return the commanded views in their order."""
-        return [command.view_index for command in self.commands
-                if command.phase == names.COMMAND.type.MEASURE]
+        return [
+            command.view_index
+            for command in self.commands
+            if command.phase == names.COMMAND.type.MEASURE
+        ]
 
 
-@pytest.mark.parametrize("cell", [
-    {"ids": False, "joints": ("spindle", "theta", "y", "z", "x")},
-    {"plate_moves": True, "ids": False}], ids="-".join)
+@pytest.mark.parametrize(
+    "cell",
+    [
+        {"ids": False, "joints": ("spindle", "theta", "y", "z", "x")},
+        {"plate_moves": True, "ids": False},
+    ],
+    ids="-".join,
+)
 def test_it_is_calibrated_to_its_true_error(graph, tmp_path, cell):
     site = Site(graph, tmp_path, repeats=2, **cell).begin()
     site.check()
@@ -132,8 +165,10 @@ def test_the_wrong_sense_is_no_map(graph, tmp_path):
     site.parameters[MeasurementCollector]["measurement_sense"] = "microscope_moves"
     site.begin()
     health = graph.listen(names.of_node("measurement_collector", names.HEALTH))
-    graph.until(lambda: any("measurement_sense plate_moves" in told.message for told in health),
-                "the right sense")
+    graph.until(
+        lambda: any("measurement_sense plate_moves" in told.message for told in health),
+        "the right sense",
+    )
     assert site.maps == []
 
 
@@ -144,8 +179,10 @@ def test_two_cells_side_by_side(graph, tmp_path):
     right.check(-2.0)
 
 
-@pytest.mark.parametrize("kind, view", [
-    (MeasurementCollector, 0), (MeasurementCollector, 3), (Solver, 3), (PoseSequencer, 3)])
+@pytest.mark.parametrize(
+    "kind, view",
+    [(MeasurementCollector, 0), (MeasurementCollector, 3), (Solver, 3), (PoseSequencer, 3)],
+)
 def test_a_node_that_is_restarted_within_a_view(graph, tmp_path, kind, view):
     site = Site(graph, tmp_path).begin(hold_at=(view, 4))
     site.until_held()
@@ -154,8 +191,13 @@ def test_a_node_that_is_restarted_within_a_view(graph, tmp_path, kind, view):
         site.ask("start")  # takes up the run, at once or as soon as it has heard all of them
         graph.until(lambda: site.nodes[PoseSequencer].session.run_id, "the run")
     elif kind is MeasurementCollector:
-        graph.until(lambda: site.cell.marks.get_subscription_count() == 1
-                    and site.cell.encoder.get_subscription_count() == 1, "the new collector")
+        graph.until(
+            lambda: (
+                site.cell.marks.get_subscription_count() == 1
+                and site.cell.encoder.get_subscription_count() == 1
+            ),
+            "the new collector",
+        )
     site.release()
     site.check()
     assert len({command.run_id for command in site.commands}) == 1
@@ -169,7 +211,8 @@ def test_redo_measures_a_view_anew(graph, tmp_path):
     site.check()
     assert site.measured() == [0, 0, 1, 2, 3]
     assert site.nodes[MeasurementCollector].session.collector.collect()[0].rejected == {
-        "superseded_by_redo": 7}
+        "superseded_by_redo": 7
+    }
 
 
 def test_a_run_after_an_abort_is_that_run_alone(graph, tmp_path):
@@ -199,8 +242,11 @@ def test_all_of_them_may_come_late(graph, tmp_path):
     site.parameters[PoseSequencer]["auto_start"] = True
     site.start(PoseSequencer)
     health = graph.listen(names.of_node("pose_sequencer", names.HEALTH))
-    for start in (partial(site.start, Solver), partial(site.start, MeasurementCollector),
-                  site.start_cell):
+    for start in (
+        partial(site.start, Solver),
+        partial(site.start, MeasurementCollector),
+        site.start_cell,
+    ):
         health.clear()
         graph.until(lambda: any("waiting for" in told.message for told in health), "a sign of it")
         assert site.commands == []

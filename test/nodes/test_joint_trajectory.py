@@ -52,18 +52,31 @@ class Controller(Node):
     def _show(self) -> None:
         stamp_ns = time.time_ns()
         self._simulated.move_to((*self.at, 0.0))
-        self._images.publish(fill(Image(), from_model.image(
-            self._simulated.image().pixels, "mono8", stamp_ns, "camera")))
+        self._images.publish(
+            fill(
+                Image(),
+                from_model.image(self._simulated.image().pixels, "mono8", stamp_ns, "camera"),
+            )
+        )
 
 
 @pytest.fixture
 def controller(graph, tmp_path):
     """Return the controller, spinning in a thread of its own, its cell and simulated machine."""
-    plan = PLAN.replace("marks: 3", "marks: 2").replace("90, repeats: 2", "90").replace(
-        "[1, 0], repeats: 2", "[1, 0]")
-    cell, simulated = write_cell(tmp_path, camera=True, plan=plan, simulation=(
-        "plan: plan.yaml\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
-        "cell: {servo_sigma: 0.0}\n"))
+    plan = (
+        PLAN.replace("marks: 3", "marks: 2")
+        .replace("90, repeats: 2", "90")
+        .replace("[1, 0], repeats: 2", "[1, 0]")
+    )
+    cell, simulated = write_cell(
+        tmp_path,
+        camera=True,
+        plan=plan,
+        simulation=(
+            "plan: plan.yaml\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
+            "cell: {servo_sigma: 0.0}\n"
+        ),
+    )
     context = rclpy.Context()
     rclpy.init(context=context)
     node = Controller(simulated, context)
@@ -86,8 +99,9 @@ def test_a_plan_is_measured_by_a_controller_to_its_true_map(controller, tmp_path
     machine = JointTrajectoryMachine(**KEYS, timeout=20.0)
     machine.place = simulated.place
     try:
-        Run(read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag",
-            Agreeing()).measure()
+        Run(
+            read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+        ).measure()
         before = len(node.goals)
         machine.stop()
         deadline = time.monotonic() + 20
@@ -100,10 +114,14 @@ def test_a_plan_is_measured_by_a_controller_to_its_true_map(controller, tmp_path
     assert np.abs(away).max() < 5e-8
 
 
-@pytest.mark.parametrize(("keys", "said"), [
-    ({"controller": "other"}, "other/joint_trajectory: no controller listens"),
-    ({"joints": ["gx", "gz"]}, "joint_states: no message in 1 s"),
-    ({"joints": ["gx"]}, "1 joints")])
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"controller": "other"}, "other/joint_trajectory: no controller listens"),
+        ({"joints": ["gx", "gz"]}, "joint_states: no message in 1 s"),
+        ({"joints": ["gx"]}, "1 joints"),
+    ],
+)
 def test_what_is_not_there_is_named(controller, keys, said):
     with pytest.raises(MachineError, match=said):
         JointTrajectoryMachine(**KEYS | keys, timeout=1.0)

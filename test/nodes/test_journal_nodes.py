@@ -34,8 +34,7 @@ def undisturbed(events):
 
 def same(found, expected):
     for name in ("gx", "gy", "u_gx", "g_theta"):
-        np.testing.assert_array_equal(np.array(found[name], dtype=float),
-                                      getattr(expected, name))
+        np.testing.assert_array_equal(np.array(found[name], dtype=float), getattr(expected, name))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +49,8 @@ def run_of_list():
 
 @pytest.mark.parametrize("which", ["run", "run_of_list"])
 def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_same(
-        cell, which, request):
+    cell, which, request
+):
     run = request.getfixturevalue(which)
     cell.inside["solver"] = None
     cell.start("solver", result_folder=cell.folder)
@@ -63,10 +63,14 @@ def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_sam
         cell.start_collector()
         done, newest = cut, [event for event in run[:cut] if isinstance(event, Command)][-1]
         heard = cell.graph.listen(names.of_node("measurement_collector", names.HEALTH))
-        cell.graph.until(lambda newest=newest, heard=heard: any(
-            {"phase": Phase(newest.phase).name, "view": str(newest.view_index)}.items()
-            <= {value.key: value.value for value in message.values}.items()
-            for message in heard), "the view in which it was")
+        cell.graph.until(
+            lambda newest=newest, heard=heard: any(
+                {"phase": Phase(newest.phase).name, "view": str(newest.view_index)}.items()
+                <= {value.key: value.value for value in message.values}.items()
+                for message in heard
+            ),
+            "the view in which it was",
+        )
     cell.send(run, first=done)
     cell.until_told(run)
     same(cell.saved()["error_map"], undisturbed(run))
@@ -75,18 +79,23 @@ def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_sam
     offline = collect_bag(journal, VALUES)
     [lost] = offline.lost
     assert re.match(r"journal_\w+_2\.mcap: the file ends without its footer,", lost)
-    same(read_json(cell.folder / "map.json")["error_map"],
-         calibrate(offline.measurements, Options()).error_map)
+    same(
+        read_json(cell.folder / "map.json")["error_map"],
+        calibrate(offline.measurements, Options()).error_map,
+    )
 
 
 def test_a_solver_killed_after_a_view_gets_all_readings_again(cell, run):
-    second = next(n for n, event in enumerate(run) if isinstance(event, Command)
-                  and (event.phase, event.view_index) == (Phase.PLACE, 1))
+    second = next(
+        n
+        for n, event in enumerate(run)
+        if isinstance(event, Command) and (event.phase, event.view_index) == (Phase.PLACE, 1)
+    )
     cell.inside["measurement_collector"] = None
     cell.start("solver", result_folder=cell.folder)
     cell.start_collector()
     measured = cell.graph.listen(names.MEASUREMENT)
-    cell.send(run[:second + 1])
+    cell.send(run[: second + 1])
     cell.graph.until(lambda: measured, "the first view")
     cell.kill("solver")
     cell.start("solver", result_folder=cell.folder)

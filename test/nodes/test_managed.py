@@ -27,20 +27,28 @@ from selfcal_ros.sessions.health import Diagnosis, Level
 from test.support.cameras import DETECTS, camera
 from test.support.sessions import decoded, plan_file, small_plan
 
-MANAGED = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
-           "solver": Solver, "compensator": CompensatorNode, "mark_detector": MarkDetectorNode}
+MANAGED = {
+    "measurement_collector": MeasurementCollector,
+    "pose_sequencer": PoseSequencer,
+    "solver": Solver,
+    "compensator": CompensatorNode,
+    "mark_detector": MarkDetectorNode,
+}
 NEEDED = {"mark_detector": DETECTS}
 
 
 def entities(node) -> dict[str, int]:
     """Return how many entities of each kind a node holds."""
-    return {kind: len(list(getattr(node, kind))) for kind in (
-        "publishers", "subscriptions", "services", "clients", "timers", "waitables")}
+    return {
+        kind: len(list(getattr(node, kind)))
+        for kind in ("publishers", "subscriptions", "services", "clients", "timers", "waitables")
+    }
 
 
 def change(graph, node: str, transition: int) -> bool:
-    return graph.call(ChangeState, f"{node}/change_state",
-                      transition=Transition(id=transition)).success
+    return graph.call(
+        ChangeState, f"{node}/change_state", transition=Transition(id=transition)
+    ).success
 
 
 def state(graph, node: str) -> str:
@@ -52,8 +60,12 @@ def test_ten_bring_ups_and_tear_downs_leave_nothing_behind(graph, name):
     images = camera(graph)
     node = graph.node(MANAGED[name], autostart=False, **NEEDED.get(name, {}))
     graph.until(lambda: node.get_publishers_info_by_topic(images.topic_name), "the camera")
-    steps = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE,
-             Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+    steps = (
+        Transition.TRANSITION_CONFIGURE,
+        Transition.TRANSITION_ACTIVATE,
+        Transition.TRANSITION_DEACTIVATE,
+        Transition.TRANSITION_CLEANUP,
+    )
     bare, full, sessions = entities(node), [], []
     for _ in range(10):
         for step in steps:
@@ -78,6 +90,7 @@ def test_there_is_no_session_but_from_configuring_to_taking_down(graph, name):
             node.session.diagnosis()
         assert type(info.value) is SelfcalError
         return str(info.value)
+
     line = f"{name}: there is no session while unconfigured; configure the node first"
     assert refused() == line
     assert change(graph, name, Transition.TRANSITION_CONFIGURE)
@@ -91,8 +104,9 @@ def test_there_is_no_session_but_from_configuring_to_taking_down(graph, name):
 
 
 def test_an_active_node_works_as_one_that_starts_by_itself(graph, tmp_path):
-    graph.node(PoseSequencer, autostart=False, plan=plan_file(tmp_path, small_plan()),
-               start_checks=False)
+    graph.node(
+        PoseSequencer, autostart=False, plan=plan_file(tmp_path, small_plan()), start_checks=False
+    )
     assert change(graph, "pose_sequencer", Transition.TRANSITION_CONFIGURE)
     heard = graph.listen(names.COMMAND)
     assert change(graph, "pose_sequencer", Transition.TRANSITION_ACTIVATE)
@@ -112,8 +126,10 @@ def test_an_error_in_a_transition_is_told_and_can_be_mended(graph, tmp_path):
     assert not change(graph, "pose_sequencer", Transition.TRANSITION_CONFIGURE)
     assert state(graph, "pose_sequencer") == "unconfigured"
     line = f"unconfigured: {plan}: no such file; check the path"
-    graph.until(lambda: any(s.message == line and s.level == DiagnosticStatus.ERROR
-                            for s in health), "the reason")
+    graph.until(
+        lambda: any(s.message == line and s.level == DiagnosticStatus.ERROR for s in health),
+        "the reason",
+    )
     plan_file(tmp_path, small_plan())
     assert change(graph, "pose_sequencer", Transition.TRANSITION_CONFIGURE)
     assert state(graph, "pose_sequencer") == "inactive"
@@ -122,6 +138,7 @@ def test_an_error_in_a_transition_is_told_and_can_be_mended(graph, tmp_path):
 def test_an_internal_error_in_a_transition_is_told_too(graph, monkeypatch):
     def broken(self):
         raise ZeroDivisionError("within")
+
     monkeypatch.setattr(Solver, "configure", broken)
     node = graph.node(Solver, autostart=False)
     assert not change(graph, "solver", Transition.TRANSITION_CONFIGURE)
@@ -142,8 +159,9 @@ def test_a_transition_that_does_not_exist_is_refused_and_ends_nothing(graph):
     assert state(graph, "solver") == "active"
     assert change(graph, "solver", Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert state(graph, "solver") == "finalized"
-    assert node.diagnosis() == Diagnosis(Level.ERROR, "finalized: shut down on request; end "
-                                         "this process and start the node again")
+    assert node.diagnosis() == Diagnosis(
+        Level.ERROR, "finalized: shut down on request; end this process and start the node again"
+    )
 
 
 def test_an_inactive_node_says_so(graph):
@@ -152,8 +170,15 @@ def test_an_inactive_node_says_so(graph):
 
 
 def test_work_goes_on_under_a_simulated_time_that_stands_still(graph, tmp_path):
-    graph.node(PoseSequencer, use_sim_time=True, plan=plan_file(tmp_path, small_plan()),
-               start_checks=False, auto_start=True, auto_confirm=True, settle_time=0.0)
+    graph.node(
+        PoseSequencer,
+        use_sim_time=True,
+        plan=plan_file(tmp_path, small_plan()),
+        start_checks=False,
+        auto_start=True,
+        auto_confirm=True,
+        settle_time=0.0,
+    )
     heard = graph.listen(names.COMMAND)
     graph.until(lambda: len(heard) == 2, "PLACE and MEASURE")
 
@@ -192,11 +217,11 @@ def test_whatever_a_message_does_is_counted_and_told(graph):
 
     def broken(_):
         raise OverflowError("int too large")
+
     guarded = node.guarded(broken, "selfcal/view_command")
     assert guarded(None) is None
     told = node.refusals.diagnosis()
-    assert told.values == {"refused selfcal/view_command": 1,
-                           "refused selfcal/view_measurement": 1}
+    assert told.values == {"refused selfcal/view_command": 1, "refused selfcal/view_measurement": 1}
     assert "selfcal/view_command: cannot be used (OverflowError: int too large)" in told.message
 
 
@@ -208,9 +233,14 @@ def test_a_publisher_that_cannot_be_heard_is_named(graph):
     heard: list = []
     topic = names.of_node("measurement_collector", names.HEALTH)
     graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
-    graph.until(lambda: any("stage/mark_detections: no messages are received from /hand ("
-                            in s.message and s.level == DiagnosticStatus.ERROR for s in heard),
-                "its name")
+    graph.until(
+        lambda: any(
+            "stage/mark_detections: no messages are received from /hand (" in s.message
+            and s.level == DiagnosticStatus.ERROR
+            for s in heard
+        ),
+        "its name",
+    )
     assert node.get_name() == "measurement_collector"
 
 
@@ -222,8 +252,9 @@ def test_two_solvers_are_named(graph):
     topic = names.of_node("solver", names.HEALTH)
     graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
     line = "selfcal/error_map has 2 publishers: /hand, /solver; only one is allowed"
-    graph.until(lambda: any(line in s.message and s.level == DiagnosticStatus.WARN
-                            for s in heard), line)
+    graph.until(
+        lambda: any(line in s.message and s.level == DiagnosticStatus.WARN for s in heard), line
+    )
     assert first.get_name() == "solver"
 
 

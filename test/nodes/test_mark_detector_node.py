@@ -30,9 +30,12 @@ def bag(tmp_path_factory):
         writer.add_topic("/stage/image", IMAGE_TYPES["raw"], [])
         for number in range(30):
             marks = np.array([[-6e-5, 7e-5], [0.0, 3e-5]]) + rng.uniform(-1e-5, 1e-5, (2, 1))
-            values = CAMERA.image(marks, rng)[:100 if number == 4 else 120]
-            writer.write("/stage/image", from_model.image(
-                values, "mono8", (number + 1) * 10**8, "camera"), (number + 1) * 10**8)
+            values = CAMERA.image(marks, rng)[: 100 if number == 4 else 120]
+            writer.write(
+                "/stage/image",
+                from_model.image(values, "mono8", (number + 1) * 10**8, "camera"),
+                (number + 1) * 10**8,
+            )
     return path
 
 
@@ -44,8 +47,11 @@ def images(bag):
 def offline(bag, output):
     options = ["--pixel-size", "2e-6", "--mark-size", "5e-5", "--turn", "25"]
     assert main(["detect", str(bag), "-o", str(output), *options]) == 0
-    return [deserialize_message(data, names.DETECTIONS.type)
-            for topic, _, data in BagReader(output).cdr_messages() if topic == DETECTION_TOPIC]
+    return [
+        deserialize_message(data, names.DETECTIONS.type)
+        for topic, _, data in BagReader(output).cdr_messages()
+        if topic == DETECTION_TOPIC
+    ]
 
 
 @pytest.mark.parametrize("reliable", [True, False])

@@ -22,11 +22,17 @@ from test.support.cameras import DETECTS
 from test.support.sessions import plan_file, small_bag, small_plan
 
 PARAMS = Path(__file__).parents[2] / "config" / "params"
-NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
-         "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
-         "mark_detector": MarkDetectorNode,
-         "bag_recorder": BagRecorder, "cell_driver": CellDriver,
-         "stage_simulator": StageSimulator}
+NODES = {
+    "measurement_collector": MeasurementCollector,
+    "pose_sequencer": PoseSequencer,
+    "solver": Solver,
+    "compensator": CompensatorNode,
+    "bag_player": BagPlayer,
+    "mark_detector": MarkDetectorNode,
+    "bag_recorder": BagRecorder,
+    "cell_driver": CellDriver,
+    "stage_simulator": StageSimulator,
+}
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +45,13 @@ def files(tmp_path_factory):
 @pytest.fixture
 def needed(files, tmp_path):
     """Return the parameters without which a node cannot run."""
-    return {"bag_player": {"bag": files["bag"]},
-            "bag_recorder": {"bag": str(tmp_path / "recorded")},
-            "mark_detector": DETECTS,
-            "cell_driver": {"cell": str(PARAMS.parent / "cells/simulated.yaml")},
-            "pose_sequencer": {"plan": files["plan"]}}
+    return {
+        "bag_player": {"bag": files["bag"]},
+        "bag_recorder": {"bag": str(tmp_path / "recorded")},
+        "mark_detector": DETECTS,
+        "cell_driver": {"cell": str(PARAMS.parent / "cells/simulated.yaml")},
+        "pose_sequencer": {"plan": files["plan"]},
+    }
 
 
 def test_the_table_covers_every_node():
@@ -78,8 +86,10 @@ def test_an_unknown_parameter_is_refused_with_the_known_names(graph, needed, nam
     assert first in message
 
 
-@pytest.mark.parametrize("value, problem", [
-    (-1.0, "-1.0 is outside 0.0 to 3600.0 s"), ("soon", "'soon' is not of type float")])
+@pytest.mark.parametrize(
+    "value, problem",
+    [(-1.0, "-1.0 is outside 0.0 to 3600.0 s"), ("soon", "'soon' is not of type float")],
+)
 def test_a_value_that_cannot_be_is_refused(graph, value, problem):
     with pytest.raises(InputError, match=f"parameters of pose_sequencer: settle_time: {problem}"):
         graph.node(PoseSequencer, settle_time=value)
@@ -92,17 +102,22 @@ def test_a_whole_number_is_taken_where_a_number_is_wanted(graph):
     assert node.get_parameter("settle_time").type_ is RosParameter.Type.DOUBLE
 
 
-@pytest.mark.parametrize("namespace, name", [*(("/", name) for name in NODES),
-                                             ("/cell1", "pose_sequencer")])
+@pytest.mark.parametrize(
+    "namespace, name", [*(("/", name) for name in NODES), ("/cell1", "pose_sequencer")]
+)
 @pytest.mark.parametrize("file", sorted(PARAMS.glob("*.yaml")), ids=lambda path: path.name)
-def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name,
-                                                              namespace):
+def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name, namespace):
     """As ROS reads them: a bare y is true, and `name:` does not hold in a namespace."""
     stated = overrides_in(yaml.safe_load(file.read_text()), name, str(file))
     given = {key: value for key, value in needed.get(name, {}).items() if not stated.get(key)}
     more = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
-    node = graph.add(NODES[name](context=graph.context, namespace=namespace, cli_args=[
-        "--ros-args", "--params-file", str(file), *more]))
+    node = graph.add(
+        NODES[name](
+            context=graph.context,
+            namespace=namespace,
+            cli_args=["--ros-args", "--params-file", str(file), *more],
+        )
+    )
     for key in stated.keys() - given.keys():
         assert node.get_parameter(key).value == stated[key]
     if name in ("bag_recorder", "cell_driver"):
@@ -113,20 +128,23 @@ def test_a_word_that_the_file_makes_a_bool_is_refused_with_the_mend(graph, tmp_p
     file = tmp_path / "cell.yaml"
     file.write_text("measurement_collector: {ros__parameters: {joint_x: y}}")
     with pytest.raises(InputError, match="joint_x: True is not of type str; put it in quotes"):
-        MeasurementCollector(context=graph.context, cli_args=[
-            "--ros-args", "--params-file", str(file)])
+        MeasurementCollector(
+            context=graph.context, cli_args=["--ros-args", "--params-file", str(file)]
+        )
 
 
 def test_a_dump_of_all_parameters_is_a_file_that_a_node_takes(graph, tmp_path):
     """As `ros2 param dump` writes it: a joint called y comes out bare, and ROS reads it as true."""
     first = graph.node(MeasurementCollector, max_speed=0.25)
-    told = {name: parameter.value for name, parameter in
-            first.get_parameters_by_prefix("").items()}
+    told = {name: parameter.value for name, parameter in first.get_parameters_by_prefix("").items()}
     file = tmp_path / "dump.yaml"
     file.write_text(yaml.dump({"/**": {"ros__parameters": told}}, default_flow_style=False))
     assert "joint_y: y\n" in file.read_text()
-    second = graph.add(MeasurementCollector(context=graph.context, cli_args=[
-        "--ros-args", "--params-file", str(file)]))
+    second = graph.add(
+        MeasurementCollector(
+            context=graph.context, cli_args=["--ros-args", "--params-file", str(file)]
+        )
+    )
     assert {name: second.get_parameter(name).value for name in told} == told
 
 

@@ -23,12 +23,25 @@ def player_of(count: int, sent: list, rate: float, topic: str = next(iter(KINDS)
     """Return a player of so many messages, a second apart; what it publishes goes to `sent`."""
     played = Player.__new__(Player)
     messages = iter([(topic, T0 + number * 10**9, number) for number in range(count)])
-    for name, value in {"playlist": range(count), "_at": 0, "_began": None, "rate": rate,
-                        "_messages": messages, "_next": next(messages), "_first_ns": T0,
-                        "heard": None, "sent": Counter(dict.fromkeys(KINDS.values(), 0)),
-                        "_before": 0, "_published_s": 0.0, "_created_s": 0.0, "_looked_s": 0.0,
-                        "node": None, "alone_on": [], "_own": [],
-                        "_publishers": {topic: SimpleNamespace(publish=sent.append)}}.items():
+    for name, value in {
+        "playlist": range(count),
+        "_at": 0,
+        "_began": None,
+        "rate": rate,
+        "_messages": messages,
+        "_next": next(messages),
+        "_first_ns": T0,
+        "heard": None,
+        "sent": Counter(dict.fromkeys(KINDS.values(), 0)),
+        "_before": 0,
+        "_published_s": 0.0,
+        "_created_s": 0.0,
+        "_looked_s": 0.0,
+        "node": None,
+        "alone_on": [],
+        "_own": [],
+        "_publishers": {topic: SimpleNamespace(publish=sent.append)},
+    }.items():
         setattr(played, name, value)
     return played
 
@@ -38,8 +51,10 @@ def tell(played: Player, received: int) -> None:
     played._on_received(SimpleNamespace(data=[received, 0, 0]))
 
 
-@pytest.mark.parametrize(("rate", "counts"), [
-    (1.0, [1, 1, 2, 3, 5]), (2.0, [1, 2, 3, 5, 5]), (0.5, [1, 1, 1, 2, 4]), (0.0, [5] * 5)])
+@pytest.mark.parametrize(
+    ("rate", "counts"),
+    [(1.0, [1, 1, 2, 3, 5]), (2.0, [1, 2, 3, 5, 5]), (0.5, [1, 1, 1, 2, 4]), (0.0, [5] * 5)],
+)
 def test_messages_are_due_at_their_own_distances_over_the_rate(monkeypatch, rate, counts):
     """Five messages, a second apart; looked at after 0, 0.5, 1, 2 and 6 s."""
     now, sent = [70.0], []
@@ -103,8 +118,13 @@ def test_images_are_sent_as_the_detector_takes_them(monkeypatch):
     sent: list = []
     played = player_of(20, sent, rate=0.0, topic="stage/image")
     played.sent = {IMAGES: 0}
-    for taken, total in ((30, WAITING_IMAGES), (30, WAITING_IMAGES), (32, WAITING_IMAGES + 2),
-                         (0, 2 * WAITING_IMAGES + 2), (3, 2 * WAITING_IMAGES + 5)):
+    for taken, total in (
+        (30, WAITING_IMAGES),
+        (30, WAITING_IMAGES),
+        (32, WAITING_IMAGES + 2),
+        (0, 2 * WAITING_IMAGES + 2),
+        (3, 2 * WAITING_IMAGES + 5),
+    ):
         played._on_taken(SimpleNamespace(data=[taken, 0, 1]))
         played.step()
         assert len(sent) == total == played.sent[IMAGES]
@@ -115,8 +135,14 @@ def test_all_has_arrived_once_the_detections_of_all_images_have():
     played = player_of(2, [], rate=0.0, topic="stage/image")
     played.sent = {"encoder": 4, "command": 1, IMAGES: 2}
     arrived = []
-    for found, heard in (([1, 3, 1], [4, 3, 1]), ([2, 5, 1], [4, 3, 1]), ([2, 5, 1], [4, 5, 0]),
-                         ([2, 5, 1], [3, 5, 1]), ([2], [4, 5, 1]), ([1, 5, 1], [4, 5, 1])):
+    for found, heard in (
+        ([1, 3, 1], [4, 3, 1]),
+        ([2, 5, 1], [4, 3, 1]),
+        ([2, 5, 1], [4, 5, 0]),
+        ([2, 5, 1], [3, 5, 1]),
+        ([2], [4, 5, 1]),
+        ([1, 5, 1], [4, 5, 1]),
+    ):
         played._on_taken(SimpleNamespace(data=found))
         played._on_received(SimpleNamespace(data=heard))
         arrived.append(played.arrived)

@@ -22,14 +22,25 @@ from test.support.cameras import DETECTS, camera
 from test.support.sessions import plan_file, small_bag, small_plan
 
 POLICY = ElementTree.parse(Path(__file__).parents[2] / "config/sros2/policy.xml").getroot()
-NODES = {"measurement_collector": MeasurementCollector, "pose_sequencer": PoseSequencer,
-         "solver": Solver, "compensator": CompensatorNode, "bag_player": BagPlayer,
-         "mark_detector": MarkDetectorNode,
-         "bag_recorder": BagRecorder, "cell_driver": CellDriver,
-         "stage_simulator": StageSimulator}
+NODES = {
+    "measurement_collector": MeasurementCollector,
+    "pose_sequencer": PoseSequencer,
+    "solver": Solver,
+    "compensator": CompensatorNode,
+    "bag_player": BagPlayer,
+    "mark_detector": MarkDetectorNode,
+    "bag_recorder": BagRecorder,
+    "cell_driver": CellDriver,
+    "stage_simulator": StageSimulator,
+}
 SIMULATED_CELL = Path(__file__).parents[2] / "config/cells/simulated.yaml"
-KINDS = (("topics", "publish"), ("topics", "subscribe"), ("services", "reply"),
-         ("services", "request"), ("actions", "execute"))
+KINDS = (
+    ("topics", "publish"),
+    ("topics", "subscribe"),
+    ("services", "reply"),
+    ("services", "request"),
+    ("actions", "execute"),
+)
 
 
 def granted(node: str) -> dict[tuple[str, str], set[str]]:
@@ -53,15 +64,22 @@ def used(graph, node: str) -> dict[tuple[str, str], set[str]]:
 
     def of(list_by_node, **kwargs) -> set[str]:
         return {name for name, _ in list_by_node(node, "/", **kwargs)}
+
     found = {
         ("topics", "publish"): of(hand.get_publisher_names_and_types_by_node),
         ("topics", "subscribe"): of(hand.get_subscriber_names_and_types_by_node),
         ("services", "reply"): of(hand.get_service_names_and_types_by_node),
-        ("services", "request"): of(hand.get_client_names_and_types_by_node)}
-    actions = {name.partition("/_action/")[0] for names_ in found.values() for name in names_
-               if "/_action/" in name}
-    found = {kind: {name for name in names_ if "/_action/" not in name}
-             for kind, names_ in found.items()}
+        ("services", "request"): of(hand.get_client_names_and_types_by_node),
+    }
+    actions = {
+        name.partition("/_action/")[0]
+        for names_ in found.values()
+        for name in names_
+        if "/_action/" in name
+    }
+    found = {
+        kind: {name for name in names_ if "/_action/" not in name} for kind, names_ in found.items()
+    }
     found["topics", "subscribe"] |= {"/clock"}  # with use_sim_time
     if node == "mark_detector":  # with transport compressed
         found["topics", "subscribe"] |= {"/stage/image/compressed"}
@@ -73,11 +91,13 @@ def used(graph, node: str) -> dict[tuple[str, str], set[str]]:
 
 @pytest.mark.parametrize("name", NODES)
 def test_a_node_is_granted_what_it_does_and_nothing_else(graph, tmp_path, name):
-    parameters = {"bag_player": {"bag": str(small_bag(tmp_path)), "rate": 0.001},
-                  "bag_recorder": {"bag": str(tmp_path / "new")},
-                  "mark_detector": DETECTS,
-                  "cell_driver": {"cell": str(SIMULATED_CELL)},
-                  "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())}}
+    parameters = {
+        "bag_player": {"bag": str(small_bag(tmp_path)), "rate": 0.001},
+        "bag_recorder": {"bag": str(tmp_path / "new")},
+        "mark_detector": DETECTS,
+        "cell_driver": {"cell": str(SIMULATED_CELL)},
+        "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())},
+    }
     graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
     camera(graph)
     node = graph.node(NODES[name], **parameters.get(name, {}))
@@ -97,18 +117,24 @@ def test_the_monitor_is_granted_what_it_does_and_nothing_else(graph):
 
         def _listen(self):
             """Leave stdin alone."""
+
     assert monitor_session.REQUESTS
     node = graph.add(Monitor(context=graph.context))
     wanted = granted("monitor")
     own = node.get_name()
 
     def done() -> dict:
-        return {kind: {name.replace(f"/{own}/", "/monitor/") for name in names_}
-                for kind, names_ in used(graph, own).items()}
+        return {
+            kind: {name.replace(f"/{own}/", "/monitor/") for name in names_}
+            for kind, names_ in used(graph, own).items()
+        }
+
     graph.until(lambda: done() == wanted, f"granted {wanted}, used {done()}")
 
 
 def test_each_node_has_an_enclave_of_its_own():
-    paths = {enclave.get("path"): [p.get("node") for p in enclave.iter("profile")]
-             for enclave in POLICY.iter("enclave")}
+    paths = {
+        enclave.get("path"): [p.get("node") for p in enclave.iter("profile")]
+        for enclave in POLICY.iter("enclave")
+    }
     assert paths == {f"/selfcal/{node}": [node] for node in (*NODES, "monitor")}

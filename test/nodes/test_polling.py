@@ -15,8 +15,11 @@ class Queue:
         self.handle, self.waiting, self.n_publishers = self, [], n_publishers
 
     def take_message(self, kind, raw):
-        return (b"", {"publication_sequence_number": self.waiting.pop(0),
-                      "received_timestamp": 1}) if self.waiting else None
+        return (
+            (b"", {"publication_sequence_number": self.waiting.pop(0), "received_timestamp": 1})
+            if self.waiting
+            else None
+        )
 
     def get_publisher_count(self):
         return self.n_publishers

@@ -36,9 +36,14 @@ class Group:
         self.running: list[subprocess.Popen | Fork] = []
 
     def start(self, *command: str) -> subprocess.Popen:
-        process = subprocess.Popen([sys.executable, *command], env=self.environment,
-                                   stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                                   start_new_session=True)
+        process = subprocess.Popen(
+            [sys.executable, *command],
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
         self.running.append(process)
         return process
 
@@ -52,7 +57,8 @@ class Group:
         (folder / "site").mkdir()
         (folder / "site" / "sitecustomize.py").write_text(code)
         self.environment["PYTHONPATH"] = os.pathsep.join(
-            [str(folder / "site"), self.environment.get("PYTHONPATH", "")])
+            [str(folder / "site"), self.environment.get("PYTHONPATH", "")]
+        )
 
     def close(self) -> None:
         for process in self.running:
@@ -83,26 +89,40 @@ def ended(process: subprocess.Popen | Fork) -> tuple[int, str, str]:
     return process.returncode, out, err
 
 
-SIGNALS = {"measurement_collector": signal.SIGINT, "pose_sequencer": signal.SIGTERM,
-           "solver": signal.SIGTERM, "compensator": signal.SIGINT, "mark_detector": signal.SIGTERM,
-           "bag_player": signal.SIGTERM, "cell_driver": signal.SIGINT,
-           "bag_recorder": signal.SIGTERM, "stage_simulator": signal.SIGINT}
+SIGNALS = {
+    "measurement_collector": signal.SIGINT,
+    "pose_sequencer": signal.SIGTERM,
+    "solver": signal.SIGTERM,
+    "compensator": signal.SIGINT,
+    "mark_detector": signal.SIGTERM,
+    "bag_player": signal.SIGTERM,
+    "cell_driver": signal.SIGINT,
+    "bag_recorder": signal.SIGTERM,
+    "stage_simulator": signal.SIGINT,
+}
 """One for each node: all of them take both through the same lines; `selfcal up` sends SIGTERM."""
 
 
 def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
-    needed = {"bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001", "-p", "beside_others:=true"],
-              "bag_recorder": ["-p", f"bag:={recorded}"],
-              "cell_driver": ["-p", f"cell:={SIMULATED_CELL}"],
-              "mark_detector": ["-p", "pixel_size:=2e-6", "-p", "mark_size:=5e-5"],
-              "pose_sequencer": ["-p", f"plan:={plan_file(tmp_path, small_plan())}"]}
+    needed = {
+        "bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001", "-p", "beside_others:=true"],
+        "bag_recorder": ["-p", f"bag:={recorded}"],
+        "cell_driver": ["-p", f"cell:={SIMULATED_CELL}"],
+        "mark_detector": ["-p", "pixel_size:=2e-6", "-p", "mark_size:=5e-5"],
+        "pose_sequencer": ["-p", f"plan:={plan_file(tmp_path, small_plan())}"],
+    }
     diagnostics: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 100)
     processes = {name: group.node(name, *needed.get(name, [])) for name in NODE_PARAMETERS}
     graph.until(lambda: set(NODE_PARAMETERS) <= set(graph.hand.get_node_names()), "all nodes")
-    graph.until(lambda: {status.name for m in diagnostics for status in m.status}
-                >= set(NODE_PARAMETERS) - {"bag_player"}, "their diagnostics")
+    graph.until(
+        lambda: (
+            {status.name for m in diagnostics for status in m.status}
+            >= set(NODE_PARAMETERS) - {"bag_player"}
+        ),
+        "their diagnostics",
+    )
     for name, process in processes.items():
         process.send_signal(SIGNALS[name])
     for name, process in processes.items():
@@ -127,9 +147,19 @@ def test_a_signal_that_comes_again_and_again_changes_nothing(graph, group):
 
 
 def test_a_player_ends_by_itself_when_the_bag_is_played(group, tmp_path):
-    code, _, err = ended(group.start(
-        "-m", "selfcal_ros.nodes.bag_player", "--ros-args", "-p", f"bag:={small_bag(tmp_path)}",
-        "-p", "rate:=0.0", "-p", "wait_for_subscribers:=0.0"))
+    code, _, err = ended(
+        group.start(
+            "-m",
+            "selfcal_ros.nodes.bag_player",
+            "--ros-args",
+            "-p",
+            f"bag:={small_bag(tmp_path)}",
+            "-p",
+            "rate:=0.0",
+            "-p",
+            "wait_for_subscribers:=0.0",
+        )
+    )
     assert code == 0
     assert "played" in err
 
@@ -139,14 +169,23 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
     file.write_text(yaml.safe_dump({"compensator": {"ros__parameters": {"joint_tetha": "c"}}}))
     not_ros = "arguments after --ros-args: "
     cases = [
-        ("compensator", ["-p", "metod:=joint"],
-         "parameters of compensator: metod: compensator has no such parameter", ""),
+        (
+            "compensator",
+            ["-p", "metod:=joint"],
+            "parameters of compensator: metod: compensator has no such parameter",
+            "",
+        ),
         ("pose_sequencer", ["-p", "plan:=/no/plan.yaml"], "/no/plan.yaml: no such file", ""),
         ("bag_player", ["-p", "bag:=/no/bag"], "/no/bag: no such file or folder", ""),
-        ("compensator", ["--params-file", str(file)], "joint_tetha: compensator has no such "
-         "parameter; did you mean 'joint_theta'? known are", ""),
+        (
+            "compensator",
+            ["--params-file", str(file)],
+            "joint_tetha: compensator has no such parameter; did you mean 'joint_theta'? known are",
+            "",
+        ),
         ("compensator", ["--params-file", "/no/p.yaml"], "Couldn't parse params file", not_ros),
-        ("compensator", ["--bogus"], "['--bogus']", not_ros)]
+        ("compensator", ["--bogus"], "['--bogus']", not_ros),
+    ]
     processes = [group.node(node, *words) for node, words, _, _ in cases]
     for process, (_, _, problem, begin) in zip(processes, cases, strict=True):
         code, _, err = ended(process)
@@ -162,8 +201,16 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
 def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group):
     bag, nodes = small_bag(tmp_path), NODES[1:2]  # and the session: a first and a last child
     some = f"from selfcal_ros.cli import replay; replay.NODES = {nodes}; "
-    replay = group.start("-c", some + SELFCAL, "replay", str(bag), "--rate", "0.001",
-                         "--domain", group.environment["ROS_DOMAIN_ID"])
+    replay = group.start(
+        "-c",
+        some + SELFCAL,
+        "replay",
+        str(bag),
+        "--rate",
+        "0.001",
+        "--domain",
+        group.environment["ROS_DOMAIN_ID"],
+    )
     graph.until(lambda: {"bag_player", *nodes} <= set(graph.hand.get_node_names()), "the nodes")
     (os.killpg if whole_group else os.kill)(replay.pid, signal.SIGINT)
     code, _, err = ended(replay)
@@ -189,9 +236,16 @@ sys.exit(start.{command}())
 
 def test_a_signal_while_a_node_is_imported_ends_it_cleanly(group):
     """Again and again: before the first library, between them, and before the last module."""
-    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_IMPORTING.format(
-        modules=("numpy", "rclpy", "selfcal_ros.nodes.running"), argv=["compensator"],
-        command="compensator")))
+    code, out, err = ended(
+        group.start(
+            "-c",
+            INTERRUPT_WHILE_IMPORTING.format(
+                modules=("numpy", "rclpy", "selfcal_ros.nodes.running"),
+                argv=["compensator"],
+                command="compensator",
+            ),
+        )
+    )
     assert (code, out, err) == (0, "", "")
 
 
@@ -225,16 +279,28 @@ sys.meta_path[sys.meta_path.index(PathFinder)] = Finder()
 """
 
 
-@pytest.mark.parametrize(("module", "remedy"), [
-    ("selfcal_msgs", "run `make setup`, or in the workspace `colcon build --base-paths "
-     "src/selfcal_ros src/selfcal_ros/msg_defs` and source install/setup.bash"),
-    ("threadpoolctl", "`sudo apt install python3-threadpoolctl`, or with pip")])
-@pytest.mark.parametrize(("words", "who"), [
-    (["-m", "selfcal_ros.nodes.solver"], "selfcal"),
-    (["-c", "from selfcal_ros import start; start.pose_sequencer()"], "selfcal"),
-    (["-m", "selfcal_ros", "monitor"], "selfcal monitor")])
+@pytest.mark.parametrize(
+    ("module", "remedy"),
+    [
+        (
+            "selfcal_msgs",
+            "run `make setup`, or in the workspace `colcon build --base-paths "
+            "src/selfcal_ros src/selfcal_ros/msg_defs` and source install/setup.bash",
+        ),
+        ("threadpoolctl", "`sudo apt install python3-threadpoolctl`, or with pip"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("words", "who"),
+    [
+        (["-m", "selfcal_ros.nodes.solver"], "selfcal"),
+        (["-c", "from selfcal_ros import start; start.pose_sequencer()"], "selfcal"),
+        (["-m", "selfcal_ros", "monitor"], "selfcal monitor"),
+    ],
+)
 def test_whatever_needs_a_module_that_is_not_there_says_what_brings_it(
-        group, tmp_path, module, remedy, words, who):
+    group, tmp_path, module, remedy, words, who
+):
     group.customize(tmp_path, HIDING.format(module=module))
     code, out, err = ended(group.start(*words))
     assert (code, out) == (2, "")
@@ -243,8 +309,14 @@ def test_whatever_needs_a_module_that_is_not_there_says_what_brings_it(
 
 @pytest.mark.parametrize("module", ["argparse", "selfcal_ros.cli.solve", "selfcal_ros.errors"])
 def test_a_signal_while_the_command_is_imported_is_one_line(group, module):
-    code, out, err = ended(group.start("-c", INTERRUPT_WHILE_IMPORTING.format(
-        modules=(module,), argv=["selfcal", "solve", "none"], command="selfcal")))
+    code, out, err = ended(
+        group.start(
+            "-c",
+            INTERRUPT_WHILE_IMPORTING.format(
+                modules=(module,), argv=["selfcal", "solve", "none"], command="selfcal"
+            ),
+        )
+    )
     assert (out, err) == ("", "selfcal: interrupted\n")
     # the interpreter may repeat the signal for its parent: a shell has 130 for both
     assert code in (128 + signal.SIGINT, -signal.SIGINT)
@@ -275,17 +347,27 @@ def test_a_replay_interrupted_while_its_nodes_are_imported_is_one_line(group, tm
     assert (code, out, err) == (128 + signal.SIGINT, "", "selfcal replay: interrupted\n")
 
 
-INTERRUPTED_DEMO = INTERRUPT_WHILE_IMPORTING.partition("from selfcal_ros")[0] + """
+INTERRUPTED_DEMO = (
+    INTERRUPT_WHILE_IMPORTING.partition("from selfcal_ros")[0]
+    + """
 import runpy
 runpy.run_path({demo!r}, run_name="__main__")
 """
+)
 
 
-@pytest.mark.parametrize("module, who", [
-    ("selfcal_ros.bagio.offline", "demo"), ("selfcal_ros.cli.processes", "selfcal")])
+@pytest.mark.parametrize(
+    "module, who", [("selfcal_ros.bagio.offline", "demo"), ("selfcal_ros.cli.processes", "selfcal")]
+)
 def test_a_demo_that_is_interrupted_is_one_line(group, module, who):
-    code, _, err = ended(group.start("-c", INTERRUPTED_DEMO.format(
-        modules=(module,), demo=str(Path(__file__).parents[2] / "tools/demo.py"))))
+    code, _, err = ended(
+        group.start(
+            "-c",
+            INTERRUPTED_DEMO.format(
+                modules=(module,), demo=str(Path(__file__).parents[2] / "tools/demo.py")
+            ),
+        )
+    )
     assert (code, err) == (128 + signal.SIGINT, f"{who}: interrupted\n")
 
 
@@ -319,13 +401,22 @@ def test_a_node_without_a_home_says_so(monkeypatch, capsys):
     monkeypatch.setattr(running, "complete_on_signal", lambda _: None)
     monkeypatch.setattr(running, "ignore_signals", lambda: None)
     assert running.run(lambda: pytest.fail("made"), []) == 2
-    assert capsys.readouterr().err == ("selfcal: HOME: is not set, and ROS keeps its log there; "
-                                       "set it, or ROS_LOG_DIR\n")
+    assert capsys.readouterr().err == (
+        "selfcal: HOME: is not set, and ROS keeps its log there; set it, or ROS_LOG_DIR\n"
+    )
 
 
 def test_shared_memory_of_nodes_that_are_gone_is_removed_and_no_other(tmp_path):
-    for name in ("fastrtps_1", "fastrtps_1_el", "fastrtps_port7", "fastrtps_port7_el",
-                 "sem.fastrtps_port7_mutex", "fastrtps_2", "fastrtps_2_el", "other_el"):
+    for name in (
+        "fastrtps_1",
+        "fastrtps_1_el",
+        "fastrtps_port7",
+        "fastrtps_port7_el",
+        "sem.fastrtps_port7_mutex",
+        "fastrtps_2",
+        "fastrtps_2_el",
+        "other_el",
+    ):
         (tmp_path / name).touch()
     with (tmp_path / "fastrtps_2_el").open("rb") as alive:
         fcntl.flock(alive, fcntl.LOCK_EX)

@@ -21,9 +21,15 @@ KINDS = {"history": HistoryPolicy, "reliability": ReliabilityPolicy, "durability
 
 def overrides() -> dict[str, QoSProfile]:
     """Read the file as ros2bag does."""
-    return {topic.removeprefix("/"): QoSProfile(**{
-        key: KINDS[key].get_from_short_key(value) if key in KINDS else value
-        for key, value in profile.items()}) for topic, profile in read_yaml(FILE).items()}
+    return {
+        topic.removeprefix("/"): QoSProfile(
+            **{
+                key: KINDS[key].get_from_short_key(value) if key in KINDS else value
+                for key, value in profile.items()
+            }
+        )
+        for topic, profile in read_yaml(FILE).items()
+    }
 
 
 def test_every_input_has_the_depth_of_the_own_recorder():

@@ -27,13 +27,14 @@ from test.support.sessions import decoded, small_bag
 
 def stamps(bag: Path) -> list[tuple[str, int]]:
     """Return topic and header stamp of every message of a bag, in the order of the file."""
-    return [(topic, m.header.stamp.sec * 10**9 + m.header.stamp.nanosec)
-            for topic, _, m in decoded(BagReader(bag))]
+    return [
+        (topic, m.header.stamp.sec * 10**9 + m.header.stamp.nanosec)
+        for topic, _, m in decoded(BagReader(bag))
+    ]
 
 
 def content(bag: Path) -> Counter:
-    return Counter((topic, repr(message)) for topic, _, message in
-                   decoded(BagReader(bag)))
+    return Counter((topic, repr(message)) for topic, _, message in decoded(BagReader(bag)))
 
 
 def digests(bag: Path) -> list[str]:
@@ -45,12 +46,15 @@ def is_a_rosbag2_bag(recorded: Path) -> None:
     """Check what other readers want to know of a recording."""
     info = yaml.safe_load((recorded / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert (info["version"], info["storage_identifier"]) == (9, "mcap")
-    counts = {t["topic_metadata"]["name"]: t["message_count"]
-              for t in info["topics_with_message_count"]}
+    counts = {
+        t["topic_metadata"]["name"]: t["message_count"] for t in info["topics_with_message_count"]
+    }
     expected = Counter(f"/{topic}" for topic, _ in stamps(recorded))
     assert {name: n for name, n in counts.items() if n} == expected
-    qos = {t["topic_metadata"]["name"]: t["topic_metadata"]["offered_qos_profiles"][0]
-           for t in info["topics_with_message_count"]}
+    qos = {
+        t["topic_metadata"]["name"]: t["topic_metadata"]["offered_qos_profiles"][0]
+        for t in info["topics_with_message_count"]
+    }
     assert qos["/selfcal/view_command"]["durability"] == "transient_local"
     assert qos["/stage/mark_detections"]["durability"] == "volatile"
     with (recorded / info["relative_file_paths"][0]).open("rb") as stream:
@@ -70,15 +74,18 @@ def bag(tmp_path_factory):
 @pytest.fixture
 def played(graph, tmp_path, bag):
     """Return a function that plays the bag into a recorder: (recorded, player)."""
+
     def play(**parameters):
         recorder = graph.node(BagRecorder, bag=str(tmp_path / "recorded"))
-        player = graph.node(BagPlayer, bag=str(bag), **({
-            "rate": 0.0, "listener": "bag_recorder"} | parameters))
+        player = graph.node(
+            BagPlayer, bag=str(bag), **({"rate": 0.0, "listener": "bag_recorder"} | parameters)
+        )
         graph.until(player.finished.done, "the end of the bag")
         total = player.player.total
         graph.until(lambda: sum(recorder._writer.counts.values()) >= total, "the last message")
         recorder.close()
         return tmp_path / "recorded", player
+
     return play
 
 
@@ -120,17 +127,18 @@ def test_an_encoder_that_comes_back_with_best_effort_is_recorded(graph, tmp_path
     first.publish(names.ENCODER.type(name=["x"], position=[0.25]))
     graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the first sample")
     graph.hand.destroy_publisher(first)
-    graph.publisher(names.ENCODER_EITHER[1]).publish(
-        names.ENCODER.type(name=["x"], position=[0.5]))
+    graph.publisher(names.ENCODER_EITHER[1]).publish(names.ENCODER.type(name=["x"], position=[0.5]))
     graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 2, "the second sample")
     recorder.close()
 
 
 def test_a_player_does_not_take_the_collector_of_another_cell_for_its_own(graph, bag):
     player = graph.node(BagPlayer, bag=str(bag), rate=0.001).player
-    own, other = (graph.hand.create_publisher(topic.type, f"{cell}{topic.name}", topic.qos)
-                  for topic in [names.of_node("measurement_collector", names.RECEIVED)]
-                  for cell in ("", "/cell2/"))
+    own, other = (
+        graph.hand.create_publisher(topic.type, f"{cell}{topic.name}", topic.qos)
+        for topic in [names.of_node("measurement_collector", names.RECEIVED)]
+        for cell in ("", "/cell2/")
+    )
     other.publish(names.RECEIVED.type(data=[9, 9, 9]))
     own.publish(names.RECEIVED.type(data=[8, 8]))  # not the collector's form
     own.publish(names.RECEIVED.type(data=[7, 7, 7]))
@@ -142,8 +150,9 @@ def endless(node, name: str, topics=names.INPUTS, **qos) -> list:
     """Have `node` listen to topics of the cell whatever they are; return what it hears."""
     heard: list = []
     for topic in topics:
-        node.create_subscription(topic.type, name + topic.name, heard.append, **(
-            {"qos_profile": topic.qos} | qos))
+        node.create_subscription(
+            topic.type, name + topic.name, heard.append, **({"qos_profile": topic.qos} | qos)
+        )
     return heard
 
 
@@ -152,8 +161,13 @@ def test_nothing_is_lost_beside_strangers_who_listen_before_the_collector(graph,
     heard = endless(graph.hand, "")
     endless(graph.add(Node("echo", context=graph.context)), "", qos_profile=qos_profile_sensor_data)
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0)
-    graph.until(lambda: all(publisher.get_subscription_count() == 2
-                            for publisher in player.player._publishers.values()), "the strangers")
+    graph.until(
+        lambda: all(
+            publisher.get_subscription_count() == 2
+            for publisher in player.player._publishers.values()
+        ),
+        "the strangers",
+    )
     looks: list = []
     player.every(0.01, lambda: looks.append(player.player.played))
     graph.until(lambda: len(looks) > 5, "looks at the player")
@@ -173,11 +187,17 @@ def test_a_player_whose_listener_does_not_come_ends_and_has_played_nothing(graph
     player.say = lambda level, line: lines.append((level, line))
     graph.until(player.finished.done, "its end")
     assert (player.exit_code, player.player.played, heard) == (ExitCode.BAD_INPUT, 0, [])
-    assert lines == [(Level.ERROR, (
-        "bag_player: /measurement_collector does not listen to stage/joint_states, "
-        "stage/mark_detections, selfcal/view_command after 0.2 s, "
-        "nothing was played; start it, "
-        "name another node as listener, or set listener to '' to play without waiting"))]
+    assert lines == [
+        (
+            Level.ERROR,
+            (
+                "bag_player: /measurement_collector does not listen to stage/joint_states, "
+                "stage/mark_detections, selfcal/view_command after 0.2 s, "
+                "nothing was played; start it, "
+                "name another node as listener, or set listener to '' to play without waiting"
+            ),
+        )
+    ]
 
 
 @pytest.mark.parametrize("parameters", [{"listener": ""}, {"wait_for_subscribers": 0.0}])
@@ -187,16 +207,23 @@ def test_a_player_that_waits_for_nobody_plays_at_once(graph, bag, parameters):
     assert (player.exit_code, player.player.done) == (ExitCode.DONE, True)
 
 
-@pytest.mark.parametrize("listener, heard", [
-    ("measurement_collector", False), ("/cell2/measurement_collector", True)])
+@pytest.mark.parametrize(
+    "listener, heard", [("measurement_collector", False), ("/cell2/measurement_collector", True)]
+)
 def test_a_listener_is_one_by_name_and_namespace(graph, bag, listener, heard):
     other = graph.add(Node("measurement_collector", namespace="cell2", context=graph.context))
     endless(other, "/")
     player = graph.node(BagPlayer, bag=str(bag), rate=0.001, listener=listener).player
-    graph.until(lambda: all(publisher.get_subscription_count()
-                            for publisher in player._publishers.values()), "the subscriptions")
-    named = [f"{info.node_namespace}/{info.node_name}" for info in
-             graph.hand.get_subscriptions_info_by_topic("stage/joint_states")]
+    graph.until(
+        lambda: all(
+            publisher.get_subscription_count() for publisher in player._publishers.values()
+        ),
+        "the subscriptions",
+    )
+    named = [
+        f"{info.node_namespace}/{info.node_name}"
+        for info in graph.hand.get_subscriptions_info_by_topic("stage/joint_states")
+    ]
     assert named == ["/cell2/measurement_collector"]
     assert (player.unheard() == []) is heard
 
@@ -218,7 +245,8 @@ def test_nothing_is_played_beside_somebody_elses_publisher(graph, bag):
 
 def test_a_node_named_as_one_of_selfcal_is_a_stranger_on_what_is_played(graph, bag):
     graph.add(Node("measurement_collector", context=graph.context)).create_publisher(
-        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos
+    )
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
     lines: list = []
     player.say = lambda level, line: lines.append(line)
@@ -236,12 +264,14 @@ def test_a_bag_is_played_beside_others_where_that_is_asked_for(graph, bag):
 
 def test_one_own_sequencer_is_no_stranger_and_two_are(graph, bag):
     graph.add(Node("pose_sequencer", context=graph.context)).create_publisher(
-        names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos)
+        names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos
+    )
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="", wait_for_subscribers=0.0)
     graph.until(player.finished.done, "the end of the bag")
     assert player.player.done
     graph.add(Node("pose_sequencer", context=graph.context)).create_publisher(
-        names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos)
+        names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos
+    )
     graph.remove(player)
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
     graph.until(player.finished.done, "its end")
@@ -265,13 +295,15 @@ def test_a_listener_of_one_topic_alone_is_not_enough(graph, bag):
 
 
 def test_a_collector_that_a_stranger_has_hear_with_best_effort_is_waited_for(graph, bag):
-    driver = graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name,
-                                         names.ENCODER_EITHER[1].qos)
+    driver = graph.hand.create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER_EITHER[1].qos
+    )
     graph.node(MeasurementCollector)
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, beside_others=True).player
     graph.until(lambda: len(player.unheard()) == 1, "the collector")
     assert player.unheard() == [
-        "stage/joint_states reliably (another publisher offers best effort)"]
+        "stage/joint_states reliably (another publisher offers best effort)"
+    ]
     graph.hand.destroy_publisher(driver)
     graph.until(lambda: player.done, "the end of the bag")
 
@@ -284,8 +316,13 @@ def test_a_bag_that_goes_away_while_it_is_played_ends_the_player_with_a_line(gra
     graph.until(player.finished.done, "its end")
     assert (player.exit_code, player.player.played) == (ExitCode.BAD_INPUT, 1)
     total = player.player.total
-    assert lines == [(Level.ERROR, f"{bag}: {total} messages when it was opened, 1 now; play a bag "
-                                   "that is not being changed")]
+    assert lines == [
+        (
+            Level.ERROR,
+            f"{bag}: {total} messages when it was opened, 1 now; play a bag "
+            "that is not being changed",
+        )
+    ]
 
 
 def test_what_was_flushed_survives_a_crash(graph, tmp_path):
@@ -323,8 +360,10 @@ def test_a_bag_without_our_topics_is_refused(graph, tmp_path):
 
 
 def test_a_remapped_topic_is_recorded_under_the_name_of_the_contract(graph, tmp_path):
-    recorder = graph.node(partial(BagRecorder, cli_args=[
-        "--ros-args", "-r", "stage/mark_detections:=/robot/marks"]), bag=str(tmp_path / "bag"))
+    recorder = graph.node(
+        partial(BagRecorder, cli_args=["--ros-args", "-r", "stage/mark_detections:=/robot/marks"]),
+        bag=str(tmp_path / "bag"),
+    )
     marks = graph.publisher(replace(names.DETECTIONS, name="/robot/marks"))
     marks.publish(names.DETECTIONS.type(m=3))
     graph.until(lambda: sum(recorder._writer.counts.values()) == 1, "the detection")
@@ -332,6 +371,8 @@ def test_a_remapped_topic_is_recorded_under_the_name_of_the_contract(graph, tmp_
     [(topic, _, message)] = decoded(BagReader(tmp_path / "bag"))
     assert (topic, message.m) == (names.DETECTIONS.name, 3)
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
-        assert {channel.metadata["heard_on"] for channel in make_reader(
-            stream).get_summary().channels.values() if "heard_on" in channel.metadata} == {
-            "/robot/marks"}
+        assert {
+            channel.metadata["heard_on"]
+            for channel in make_reader(stream).get_summary().channels.values()
+            if "heard_on" in channel.metadata
+        } == {"/robot/marks"}

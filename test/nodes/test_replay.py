@@ -50,13 +50,18 @@ REJECTED = {"low_score": 0.05, "unknown_mark": 0.05, "outliers": 0.05}
 def ordered_plan():
     """Return a plan that states in which order its marks are visited."""
     plan = small_plan(repeats=4)
-    return replace(plan, views=tuple(replace(view, visit_order="x_back_y_back@plate")
-                                     for view in plan.views))
+    return replace(
+        plan, views=tuple(replace(view, visit_order="x_back_y_back@plate") for view in plan.views)
+    )
 
 
-PLANS = {"on the lattice": ordered_plan(), "placed": placed_plan(count=8, repeats=2),
-         "images": image_plan(5, count=8, repeats=2), "a list of marks": listed_plan(),
-         "even sides": image_plan(6, count=8, repeats=2)}
+PLANS = {
+    "on the lattice": ordered_plan(),
+    "placed": placed_plan(count=8, repeats=2),
+    "images": image_plan(5, count=8, repeats=2),
+    "a list of marks": listed_plan(),
+    "even sides": image_plan(6, count=8, repeats=2),
+}
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +70,10 @@ def solved(request, tmp_path_factory):
 
     On the lattice, unless a test names another of `PLANS`.
     """
-    folder, plan = tmp_path_factory.mktemp("replay"), PLANS[getattr(
-        request, "param", "on the lattice")]
+    folder, plan = (
+        tmp_path_factory.mktemp("replay"),
+        PLANS[getattr(request, "param", "on the lattice")],
+    )
     ordered = bool(plan.views[0].visit_order)
     bag = small_bag(folder, plan, correlation=4.0, **REJECTED if ordered else {})
     assert selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) == 0
@@ -79,15 +86,19 @@ def two_cells(tmp_path_factory):
     """Return a bag of two cells."""
     bag = tmp_path_factory.mktemp("two_cells") / "bag"
     for name, plan in (("", "0, 90, tx"), ("/cell2", "0, 90, ty")):
-        Foreign(namespace=name).write(bag / f"x{name.strip('/')}.mcap",
-                                      events_of(small_plan(plan, repeats=1)))
+        Foreign(namespace=name).write(
+            bag / f"x{name.strip('/')}.mcap", events_of(small_plan(plan, repeats=1))
+        )
     return bag
 
 
 def played(graph, bag, folder, *, rate=0.0, seed=-1, cell=None):
     """Return a session that has played a bag into the nodes, all of them in this process."""
-    for node, parameters in ((MeasurementCollector, {}), (PoseSequencer, {}),
-                             (Solver, {"result_folder": str(folder)})):
+    for node, parameters in (
+        (MeasurementCollector, {}),
+        (PoseSequencer, {}),
+        (Solver, {"result_folder": str(folder)}),
+    ):
         graph.node(node, **parameters)
     player = partial(Player, bag=str(bag), rate=rate, seed=seed, namespace=cell)
     session = graph.add(ReplaySession(player, str(folder / "saved.json"), context=graph.context))
@@ -98,17 +109,19 @@ def played(graph, bag, folder, *, rate=0.0, seed=-1, cell=None):
 def result_text(session, bag, folder, cell=None):
     """Return the text of the result that the command would write."""
     of_bag = bag_lines(bag, settings_of("measurement_collector"), cell)
-    data = replay_verb.with_bag(read_json(folder / "saved.json"), of_bag,
-                                session.player.playlist.lost, bag_input(str(bag)))
+    data = replay_verb.with_bag(
+        read_json(folder / "saved.json"), of_bag, session.player.playlist.lost, bag_input(str(bag))
+    )
     write_json(folder / "replayed.json", data)
     return undated((folder / "replayed.json").read_text())
 
 
-@pytest.mark.parametrize(("solved", "options"), [
-    ("on the lattice", {"rate": 50.0}),
-    *((name, {"seed": 3}) for name in PLANS)], indirect=["solved"])
-def test_a_session_gives_the_result_of_solve_bit_for_bit(
-        graph, solved, tmp_path, options, capfd):
+@pytest.mark.parametrize(
+    ("solved", "options"),
+    [("on the lattice", {"rate": 50.0}), *((name, {"seed": 3}) for name in PLANS)],
+    indirect=["solved"],
+)
+def test_a_session_gives_the_result_of_solve_bit_for_bit(graph, solved, tmp_path, options, capfd):
     bag, expected = solved
     session = played(graph, bag, tmp_path, **options)
     assert session.exit_code == 0
@@ -123,10 +136,23 @@ def test_a_session_gives_the_result_of_solve_bit_for_bit(
 @pytest.mark.parametrize("cell", ["/", "/cell2"])
 def test_one_of_two_cells_is_played(graph, two_cells, tmp_path, cell):
     session = played(graph, two_cells, tmp_path, cell=cell)
-    assert selfcal(["solve", str(two_cells), "--namespace", cell, "--quiet", "-o",
-                    str(tmp_path / "solved.json")]) == 0
+    assert (
+        selfcal(
+            [
+                "solve",
+                str(two_cells),
+                "--namespace",
+                cell,
+                "--quiet",
+                "-o",
+                str(tmp_path / "solved.json"),
+            ]
+        )
+        == 0
+    )
     assert result_text(session, two_cells, tmp_path, cell) == undated(
-        (tmp_path / "solved.json").read_text())
+        (tmp_path / "solved.json").read_text()
+    )
 
 
 def test_of_two_cells_one_must_be_named(graph, two_cells):
@@ -135,19 +161,28 @@ def test_of_two_cells_one_must_be_named(graph, two_cells):
         ReplaySession(player, "saved.json", context=graph.context)
 
 
-@pytest.mark.parametrize(("options", "arguments"), [
-    ([], ["1.0", "-1", ""]), (["--fast"], ["0.0", "-1", ""]),
-    (["--rate", "50"], ["50.0", "-1", ""]), (["--shuffle", "3"], ["1.0", "3", ""]),
-    (["--namespace", "/"], ["1.0", "-1", "/"]),
-    (["--namespace", "cell2"], ["1.0", "-1", "/cell2"])], ids=" ".join)
+@pytest.mark.parametrize(
+    ("options", "arguments"),
+    [
+        ([], ["1.0", "-1", ""]),
+        (["--fast"], ["0.0", "-1", ""]),
+        (["--rate", "50"], ["50.0", "-1", ""]),
+        (["--shuffle", "3"], ["1.0", "3", ""]),
+        (["--namespace", "/"], ["1.0", "-1", "/"]),
+        (["--namespace", "cell2"], ["1.0", "-1", "/cell2"]),
+    ],
+    ids=" ".join,
+)
 def test_what_a_session_is_told_and_that_its_code_is_that_of_the_command(
-        monkeypatch, two_cells, solved, options, arguments):
+    monkeypatch, two_cells, solved, options, arguments
+):
     started, bag = {}, str(two_cells if "cell2" in options else solved[0])
 
     @contextmanager
     def process(module, given, *_, **__):
         started[module.removeprefix("selfcal_ros.nodes.")] = given
         yield SimpleNamespace(stdout=["progress 3 4\n"], wait=lambda: 4)
+
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", bag, *options]) == 4
     assert list(started) == [*replay_verb.NODES, "replay_session"]
@@ -172,8 +207,10 @@ def test_a_deficient_bag_ends_with_code_3_and_the_result_of_solve(graph, tmp_pat
 
 def test_a_bag_without_marks_ends_at_once_as_by_solve(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(replay_verb, "process", None)  # no node is started
-    bag = Foreign().write(tmp_path / "x.mcap", [
-        event for event in events_of(small_plan()) if not isinstance(event, Detection)])
+    bag = Foreign().write(
+        tmp_path / "x.mcap",
+        [event for event in events_of(small_plan()) if not isinstance(event, Detection)],
+    )
     assert selfcal(["solve", str(bag)]) == 4
     said = capsys.readouterr().err
     assert "no message on stage/mark_detections; record this topic too" in said
@@ -182,17 +219,27 @@ def test_a_bag_without_marks_ends_at_once_as_by_solve(monkeypatch, tmp_path, cap
 
 
 def test_detections_that_are_all_rejected_end_the_session_with_code_4(graph, tmp_path, capfd):
-    bag = Foreign().write(tmp_path / "x.mcap", [
-        replace(event, score=1e-3) if isinstance(event, Detection) else event
-        for event in events_of(small_plan())])
+    bag = Foreign().write(
+        tmp_path / "x.mcap",
+        [
+            replace(event, score=1e-3) if isinstance(event, Detection) else event
+            for event in events_of(small_plan())
+        ],
+    )
     assert played(graph, bag, tmp_path).exit_code == 4
     assert "selfcal replay: plan '0, 90, tx': no grid mark was read" in capfd.readouterr().err
 
 
 def test_a_plate_placed_otherwise_is_bad_input_as_by_solve(monkeypatch, tmp_path, capsys):
-    plan = {"plan_id": "p", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 0},
-            "views": [{"name": "a", "repeats": 2}, {"name": "b", "rotation_deg": 90, "repeats": 2},
-                      {"name": "c", "translation_pitch": [1, 0], "repeats": 2}]}
+    plan = {
+        "plan_id": "p",
+        "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 0},
+        "views": [
+            {"name": "a", "repeats": 2},
+            {"name": "b", "rotation_deg": 90, "repeats": 2},
+            {"name": "c", "translation_pitch": [1, 0], "repeats": 2},
+        ],
+    }
     simulate(tmp_path, "turned", plan, placed=[{"name": "b", "rotation_deg": 180}])
     simulate(tmp_path, "deficient", plan | {"views": plan["views"][:2]})
 
@@ -203,6 +250,7 @@ def test_a_plate_placed_otherwise_is_bad_input_as_by_solve(monkeypatch, tmp_path
             assert selfcal(["solve", given[0], "--quiet", "-o", given[3]]) in (2, 3)
             capsys.readouterr()
         yield SimpleNamespace(stdout=[], wait=lambda: 3)
+
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", str(tmp_path / "turned"), "--fast"]) == 2
     [line] = capsys.readouterr().err.splitlines()
@@ -226,12 +274,16 @@ def test_a_clock_that_stepped_is_said_once_as_solve_says_it(monkeypatch, tmp_pat
             print("what the nodes say", file=sys.stderr)
             write_json(given[3], solved | {"warnings": solved["warnings"] if noted else others})
         yield SimpleNamespace(stdout=[], wait=lambda: 0)
+
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", bag, "--fast", "--quiet", "-o", str(folder / "replayed.json")]) == 0
     assert capsys.readouterr().err.splitlines() == [
-        line.replace("selfcal solve: ", "selfcal replay: "), "what the nodes say"]
+        line.replace("selfcal solve: ", "selfcal replay: "),
+        "what the nodes say",
+    ]
     assert undated((folder / "replayed.json").read_text()) == undated(
-        (folder / "solved.json").read_text())
+        (folder / "solved.json").read_text()
+    )
     params = folder / "p.yaml"
     params.write_text("measurement_collector: {ros__parameters: {clock_limit: 5.0}}")
     assert selfcal(["replay", bag, "--fast", "--quiet", "--params", str(params)]) == 0
@@ -249,6 +301,7 @@ def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, caps
         if module.endswith("replay_session"):
             write_json(given[3], read_json(tmp_path / "solved.json"))
         yield SimpleNamespace(stdout=[], wait=lambda: 0)
+
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == 0
     assert capsys.readouterr().err == said.replace("selfcal solve: ", "selfcal replay: ")
@@ -256,12 +309,22 @@ def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, caps
 
 @pytest.mark.parametrize(("plan", "code"), [("0, 90, tx, ty", 0), ("0, 90, tx", 2)])
 def test_a_lost_command_is_said_once_whether_or_not_it_spoils_the_map(
-        monkeypatch, tmp_path, capsys, plan, code):
+    monkeypatch, tmp_path, capsys, plan, code
+):
     bag, plan = tmp_path / "lost.mcap", small_plan(plan, repeats=4)
     index = next(i for i, view in enumerate(plan.views) if view.name == "tx")
-    Foreign().write(bag, [event for event in events_of(plan) if not (
-        isinstance(event, Command) and event.phase == Phase.MEASURE
-        and event.view_index == index)])
+    Foreign().write(
+        bag,
+        [
+            event
+            for event in events_of(plan)
+            if not (
+                isinstance(event, Command)
+                and event.phase == Phase.MEASURE
+                and event.view_index == index
+            )
+        ],
+    )
     solved = tmp_path / "solved.json"
     assert selfcal(["solve", str(bag), "--quiet", "-o", str(solved)]) == code
     lost = capsys.readouterr().err.splitlines()[0]
@@ -272,12 +335,14 @@ def test_a_lost_command_is_said_once_whether_or_not_it_spoils_the_map(
         if module.endswith("replay_session"):
             write_json(given[3], read_json(solved))
         yield SimpleNamespace(stdout=[], wait=lambda: 3 if code else 0)
+
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == code
     first, *others = capsys.readouterr().err.splitlines()
     assert first == lost.replace("selfcal solve: ", "selfcal replay: ")
-    assert others == [f"selfcal replay: {bag}: not identified, for the reason said first; "
-                      "correct this first"] * bool(code)
+    assert others == [
+        f"selfcal replay: {bag}: not identified, for the reason said first; correct this first"
+    ] * bool(code)
 
 
 def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypatch, tmp_path):
@@ -286,8 +351,11 @@ def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypa
     with BagWriter(tmp_path / "more") as writer:
         writer.add_topic(f"/{names.DETECTIONS.name}", "selfcal_msgs/msg/MarkDetection", [])
         late = next(e for e in events_of(small_plan()) if isinstance(e, Detection))
-        writer.write(f"/{names.DETECTIONS.name}", event_fields(
-            replace(late, stamp_ns=late.stamp_ns + 86400 * 10**9), "stage")[1], late.stamp_ns)
+        writer.write(
+            f"/{names.DETECTIONS.name}",
+            event_fields(replace(late, stamp_ns=late.stamp_ns + 86400 * 10**9), "stage")[1],
+            late.stamp_ns,
+        )
     (tmp_path / "more" / "more_0.mcap").rename(bag / "bag_1.mcap")
     (bag / "metadata.yaml").unlink()
     assert selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")]) == 0
@@ -300,12 +368,15 @@ def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypa
     def process(module, given, *_, **__):
         if module.endswith("replay_session"):
             write_json(given[3], solved | {"rejected": {}, "warnings": before})
-        yield SimpleNamespace(stdout=[f"lost {text}" for text in Playlist(bag).lost],
-                              wait=lambda: 0)
+        yield SimpleNamespace(
+            stdout=[f"lost {text}" for text in Playlist(bag).lost], wait=lambda: 0
+        )
+
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", str(bag), "--fast", "--quiet", "-o", str(tmp_path / "r.json")]) == 0
     assert undated((tmp_path / "r.json").read_text()) == undated(
-        (tmp_path / "solved.json").read_text())
+        (tmp_path / "solved.json").read_text()
+    )
 
 
 def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_last(graph):
@@ -319,6 +390,7 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
         saved.append(told[-1])
         response.success = True
         return response
+
     graph.hand.create_service(Trigger, "measurement_collector/finish", answer)
     graph.hand.create_service(SaveMap, "solver/save_map", save)
     solver = graph.hand.create_publisher(String, "solver/solved", names.SOLVED.qos)
@@ -326,11 +398,22 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
     def tell(text):
         told.append(text)
         solver.publish(String(data=text))
+
     tell("of three views")
-    player = SimpleNamespace(listener="", unheard=list, detector="", unseen=list, done=True,
-                             step=lambda: None, played=1, total=1, arrived=True, alone_on=[],
-                             is_alone=lambda: True,
-                             playlist=SimpleNamespace(lost=[]))
+    player = SimpleNamespace(
+        listener="",
+        unheard=list,
+        detector="",
+        unseen=list,
+        done=True,
+        step=lambda: None,
+        played=1,
+        total=1,
+        arrived=True,
+        alone_on=[],
+        is_alone=lambda: True,
+        playlist=SimpleNamespace(lost=[]),
+    )
     session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
     graph.hand.create_timer(0.005, lambda: turns.append(session._digest))
     graph.until(lambda: turns.count("of all views") > 20, "the session to wait for the solver")
@@ -339,11 +422,17 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
     assert (saved, session.exit_code) == (["of all views"], 0)
 
 
-@pytest.mark.parametrize(("topic", "played"), [
-    (names.ENCODER, "stage/joint_states"), (names.ERROR_MAP, "selfcal/error_map"),
-    (names.MOTION, "stage/command")])
+@pytest.mark.parametrize(
+    ("topic", "played"),
+    [
+        (names.ENCODER, "stage/joint_states"),
+        (names.ERROR_MAP, "selfcal/error_map"),
+        (names.MOTION, "stage/command"),
+    ],
+)
 def test_a_session_plays_nothing_where_somebody_else_publishes(
-        graph, solved, tmp_path, capfd, topic, played):
+    graph, solved, tmp_path, capfd, topic, played
+):
     graph.hand.create_publisher(topic.type, topic.name, topic.qos)
     heard = graph.listen(names.DETECTIONS)
     player = partial(Player, bag=str(solved[0]), rate=0.0, seed=-1)
@@ -353,15 +442,29 @@ def test_a_session_plays_nothing_where_somebody_else_publishes(
     assert (session.exit_code, heard) == (2, [])
     assert capfd.readouterr().err == (
         f"selfcal replay: ROS domain {domain}: /hand publishes {played} as well; 0 messages were "
-        "played; end it, or play in another ROS domain\n")
+        "played; end it, or play in another ROS domain\n"
+    )
 
 
 def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
     player = SimpleNamespace(
-        listener="", unheard=list, detector="", unseen=list, done=True, step=lambda: None,
-        played=5, total=5, arrived=False, alone_on=[], is_alone=lambda: True, overheard=True,
-        taken=None, sent={"encoder": 3, "detection": 2}, heard={"encoder": 9, "detection": 2},
-        playlist=SimpleNamespace(lost=[]))
+        listener="",
+        unheard=list,
+        detector="",
+        unseen=list,
+        done=True,
+        step=lambda: None,
+        played=5,
+        total=5,
+        arrived=False,
+        alone_on=[],
+        is_alone=lambda: True,
+        overheard=True,
+        taken=None,
+        sent={"encoder": 3, "detection": 2},
+        heard={"encoder": 9, "detection": 2},
+        playlist=SimpleNamespace(lost=[]),
+    )
     graph.hand.create_service(Trigger, "measurement_collector/finish", lambda _, answer: answer)
     graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
     session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
@@ -369,16 +472,30 @@ def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
     assert session.exit_code == 2
     assert capfd.readouterr().err == (
         "selfcal replay: the nodes heard somebody else as well: 9 of 3 encoder messages received, "
-        "2 of 2 detection messages received; play in a ROS domain of its own\n")
+        "2 of 2 detection messages received; play in a ROS domain of its own\n"
+    )
 
 
 def test_nothing_is_played_before_the_nodes_listen(graph):
     deaf, steps, turns = ["encoder"], [], []
     player = SimpleNamespace(
-        listener="/measurement_collector", unheard=lambda: turns.append(1) or deaf, detector="",
-        unseen=list, done=True, step=lambda: steps.append(1), played=5, total=5, arrived=False,
-        alone_on=[], is_alone=lambda: True, overheard=True, taken=None, sent={}, heard={},
-        playlist=SimpleNamespace(lost=[]))
+        listener="/measurement_collector",
+        unheard=lambda: turns.append(1) or deaf,
+        detector="",
+        unseen=list,
+        done=True,
+        step=lambda: steps.append(1),
+        played=5,
+        total=5,
+        arrived=False,
+        alone_on=[],
+        is_alone=lambda: True,
+        overheard=True,
+        taken=None,
+        sent={},
+        heard={},
+        playlist=SimpleNamespace(lost=[]),
+    )
     graph.hand.create_service(Trigger, "measurement_collector/finish", lambda _, answer: answer)
     graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
     session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
@@ -389,11 +506,15 @@ def test_nothing_is_played_before_the_nodes_listen(graph):
     assert steps
 
 
-@pytest.mark.parametrize("options, problem", [
-    (["--domain", "233"], "--domain: 233 is not a ROS domain; give a number from 0 to 232"),
-    (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0"),
-    (["--shuffle", "-1"], "--shuffle: -1 is not a seed; give a number from 0 to 2147483648"),
-    (["--shuffle", "2147483649"], "--shuffle: 2147483649 is not a seed; give a number from 0")])
+@pytest.mark.parametrize(
+    "options, problem",
+    [
+        (["--domain", "233"], "--domain: 233 is not a ROS domain; give a number from 0 to 232"),
+        (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0"),
+        (["--shuffle", "-1"], "--shuffle: -1 is not a seed; give a number from 0 to 2147483648"),
+        (["--shuffle", "2147483649"], "--shuffle: 2147483649 is not a seed; give a number from 0"),
+    ],
+)
 def test_speeds_and_seeds_that_are_none(options, problem, capsys):
     assert selfcal(["replay", "bag", *options]) == 2
     assert problem in capsys.readouterr().err

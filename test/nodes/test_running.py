@@ -32,6 +32,7 @@ def test_what_a_node_has_loaded_is_not_gone_through_while_it_works(monkeypatch, 
     def make():
         made.append([[] for _ in range(1000)])
         return SimpleNamespace(destroy_node=lambda: None)
+
     assert running.run(make) == 0
     assert frozen[0] > 1000
     assert not any(found is made[0] for found in gc.get_objects())
@@ -52,8 +53,9 @@ hang()
 
 
 def test_a_node_that_hangs_when_it_is_to_end_is_ended_and_says_where():
-    done = subprocess.run([sys.executable, "-c", HANGING], capture_output=True, text=True,
-                          check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", HANGING], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1
     assert "Timeout" in done.stderr
     assert " in hang" in done.stderr
@@ -64,8 +66,9 @@ def test_messages_that_were_built_before_a_field_was_added_are_one_line(monkeypa
     assert start.missing_ros() == ""
     fields = selfcal_msgs.msg.ViewCommand.get_fields_and_field_types()
     older = {name: kind for name, kind in fields.items() if name != "plan_keys"}
-    monkeypatch.setattr(selfcal_msgs.msg, "ViewCommand", SimpleNamespace(
-        get_fields_and_field_types=lambda: older))
+    monkeypatch.setattr(
+        selfcal_msgs.msg, "ViewCommand", SimpleNamespace(get_fields_and_field_types=lambda: older)
+    )
     monkeypatch.setattr(start, "hold_interrupts", lambda held: None)
     with pytest.raises(SystemExit) as ended:
         start.begin_node()
@@ -73,12 +76,14 @@ def test_messages_that_were_built_before_a_field_was_added_are_one_line(monkeypa
     assert capsys.readouterr().err.startswith(
         "selfcal: environment: the selfcal_msgs in this environment is of another version: its "
         "ViewCommand has no plan_keys; build it again: run `make setup`, or in the workspace "
-        "`colcon build --base-paths src/")
+        "`colcon build --base-paths src/"
+    )
     monkeypatch.delattr(selfcal_msgs.msg, "ViewCommand")
     assert "its ViewCommand has no header" in start.missing_ros()
 
 
 def test_the_fields_of_a_message_are_those_that_are_built():
     for name, text in message_texts().items():
-        assert start.fields_of(text) == [*getattr(
-            selfcal_msgs.msg, name).get_fields_and_field_types()]
+        assert start.fields_of(text) == [
+            *getattr(selfcal_msgs.msg, name).get_fields_and_field_types()
+        ]

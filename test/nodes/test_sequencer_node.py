@@ -32,8 +32,9 @@ class Desk:
     def __init__(self, graph: Graph, folder, **parameters) -> None:
         self.graph = graph
         self.plan = plan_file(folder, PLAN)
-        self.node = graph.node(PoseSequencer, **(
-            {"plan": self.plan, "start_checks": False} | parameters))
+        self.node = graph.node(
+            PoseSequencer, **({"plan": self.plan, "start_checks": False} | parameters)
+        )
         self.heard = graph.listen(names.COMMAND)
         self.status = graph.publisher(names.STATUS)
 
@@ -48,20 +49,32 @@ class Desk:
         self.graph.until(lambda: len(self.heard) >= len(commands), f"{commands}")
         assert self.commands == list(commands)
 
-    def complete(self, index: int, *, plan_id: str = PLAN.plan_id, complete: bool = True,
-                 age_ns: int = 0) -> None:
+    def complete(
+        self, index: int, *, plan_id: str = PLAN.plan_id, complete: bool = True, age_ns: int = 0
+    ) -> None:
         stamp = to_model.stamp_ns(self.heard[-1]) - age_ns if self.heard else 0
-        self.status.publish(fill(names.STATUS.type(), {
-            "header": from_model.header(stamp, "stage"), "plan_id": plan_id,
-            "view_index": index, "complete": complete, "grid_expected": 25,
-            "grid_done": 25 if complete else 5, "angular_expected": 0,
-            "run_id": self.heard[-1].run_id if self.heard else ""}))
+        self.status.publish(
+            fill(
+                names.STATUS.type(),
+                {
+                    "header": from_model.header(stamp, "stage"),
+                    "plan_id": plan_id,
+                    "view_index": index,
+                    "complete": complete,
+                    "grid_expected": 25,
+                    "grid_done": 25 if complete else 5,
+                    "angular_expected": 0,
+                    "run_id": self.heard[-1].run_id if self.heard else "",
+                },
+            )
+        )
 
 
 def all_alive(graph: Graph, **values: str) -> None:
     """Let the companions tell from now on that all are there."""
-    graph.health("measurement_collector", **{
-        "encoder_heard": "yes", "detections_matched": "yes"} | values)
+    graph.health(
+        "measurement_collector", **{"encoder_heard": "yes", "detections_matched": "yes"} | values
+    )
     graph.health("solver")
 
 
@@ -94,9 +107,19 @@ def test_commands_carry_plan_plate_and_pose_with_growing_stamps(desk):
     commands = [to_model.command(message) for message in desk.heard]
     stamps = [command.stamp_ns for command in commands]
     assert stamps == sorted(set(stamps))
-    assert commands == [Command(stamp, phase, PLAN.plan_id, index, PLAN.views[index],
-                                PLAN.artifact, len(PLAN.views), str(stamps[0]))
-                        for stamp, (phase, index) in zip(stamps, desk.commands, strict=True)]
+    assert commands == [
+        Command(
+            stamp,
+            phase,
+            PLAN.plan_id,
+            index,
+            PLAN.views[index],
+            PLAN.artifact,
+            len(PLAN.views),
+            str(stamps[0]),
+        )
+        for stamp, (phase, index) in zip(stamps, desk.commands, strict=True)
+    ]
 
 
 def test_redo_skip_and_abort(desk):
@@ -109,10 +132,15 @@ def test_redo_skip_and_abort(desk):
     assert desk.ask("start").success
 
 
-@pytest.mark.parametrize("service, problem", [
-    ("confirm_view", "confirm_view does not fit while idle"),
-    ("redo_view", "nothing to redo while idle"), ("skip_view", "nothing to skip while idle"),
-    ("abort", "nothing to abort while idle")])
+@pytest.mark.parametrize(
+    "service, problem",
+    [
+        ("confirm_view", "confirm_view does not fit while idle"),
+        ("redo_view", "nothing to redo while idle"),
+        ("skip_view", "nothing to skip while idle"),
+        ("abort", "nothing to abort while idle"),
+    ],
+)
 def test_a_request_that_does_not_fit_is_refused_and_changes_nothing(desk, service, problem):
     answer = desk.ask(service)
     assert not answer.success
@@ -151,9 +179,18 @@ def test_the_run_of_another_sequencer_wins_over_its_own(desk):
     desk.ask("start")
     desk.expect((PLACE, 0))
     begun = desk.graph.hand.get_clock().now().nanoseconds
-    foreign = [Command(begun + 10 * number, phase, "other", index, PLAN.views[index],
-                       PLAN.artifact, run_id=str(begun)) for number, (index, phase) in
-               enumerate(product((0, 1), (PLACE, MEASURE)))]
+    foreign = [
+        Command(
+            begun + 10 * number,
+            phase,
+            "other",
+            index,
+            PLAN.views[index],
+            PLAN.artifact,
+            run_id=str(begun),
+        )
+        for number, (index, phase) in enumerate(product((0, 1), (PLACE, MEASURE)))
+    ]
     publisher = desk.graph.publisher(names.COMMAND, readers=2)
     for command in foreign:
         publisher.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
@@ -176,18 +213,24 @@ def test_a_start_waits_for_who_is_missing_and_names_them(graph, tmp_path):
     assert answer.success
     assert answer.message == (
         "waiting for measurement_collector (no sign of life), solver (no sign of life); starts "
-        "automatically when they are present")
+        "automatically when they are present"
+    )
     heard: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
     for said, values in (
-            ("waiting for the encoder (measurement_collector hears no sample), a publisher of "
-             "stage/mark_detections", {"encoder_heard": "no", "detections_matched": "no"}),
-            ("waiting for a publisher of stage/mark_detections",
-             {"encoder_heard": "yes", "detections_matched": "no"})):
+        (
+            "waiting for the encoder (measurement_collector hears no sample), a publisher of "
+            "stage/mark_detections",
+            {"encoder_heard": "no", "detections_matched": "no"},
+        ),
+        (
+            "waiting for a publisher of stage/mark_detections",
+            {"encoder_heard": "yes", "detections_matched": "no"},
+        ),
+    ):
         graph.health("solver")
         graph.health("measurement_collector", **values)
-        graph.until(lambda said=said: any(s.message == said for m in heard for s in m.status),
-                    said)
+        graph.until(lambda said=said: any(s.message == said for m in heard for s in m.status), said)
     assert desk.commands == []
     all_alive(graph)
     desk.expect((PLACE, 0))
@@ -213,14 +256,21 @@ def test_an_automatic_start_waits_too(graph, tmp_path):
 
 def test_a_restarted_sequencer_takes_up_the_run_in_its_view(graph, tmp_path):
     desk = Desk(graph, tmp_path, start_checks=True)
-    told = {"plan_id": PLAN.plan_id, "run_id": "17", "phase": "MEASURE", "view": "1",
-            "view_name": PLAN.views[1].name, "command_stamp": "1700"}
+    told = {
+        "plan_id": PLAN.plan_id,
+        "run_id": "17",
+        "phase": "MEASURE",
+        "view": "1",
+        "view_name": PLAN.views[1].name,
+        "command_stamp": "1700",
+    }
     all_alive(graph, **told)
     graph.until(lambda: not desk.node.session.missing(), "all of them")
     assert desk.ask("start").message == f"resumed run 17 in view '{PLAN.views[1].name}', MEASURE"
     desk.expect((MEASURE, 1))
     assert to_model.command(desk.heard[0]) == Command(
-        1700, MEASURE, PLAN.plan_id, 1, PLAN.views[1], PLAN.artifact, len(PLAN.views), "17")
+        1700, MEASURE, PLAN.plan_id, 1, PLAN.views[1], PLAN.artifact, len(PLAN.views), "17"
+    )
     desk.complete(1)
     desk.expect((MEASURE, 1), (PLACE, 2))
     assert desk.heard[1].run_id == "17"
@@ -228,17 +278,28 @@ def test_a_restarted_sequencer_takes_up_the_run_in_its_view(graph, tmp_path):
 
 def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch):
     said = []
-    monkeypatch.setattr(desk.node, "get_logger", lambda: SimpleNamespace(
-        info=lambda text: said.append(("info", text)),
-        warning=lambda text: said.append(("warning", text))))
+    monkeypatch.setattr(
+        desk.node,
+        "get_logger",
+        lambda: SimpleNamespace(
+            info=lambda text: said.append(("info", text)),
+            warning=lambda text: said.append(("warning", text)),
+        ),
+    )
     for level in ("info", "warning"):
         stamp = desk.node.get_clock().now().nanoseconds
-        message = fill(names.COMMAND.type(), from_model.command(Command(
-            stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp)), "stage"))
+        message = fill(
+            names.COMMAND.type(),
+            from_model.command(
+                Command(stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp)),
+                "stage",
+            ),
+        )
         desk.node.session.take_command(message)
         desk.node.session.take_command(message)
         assert [item for item in said if item[1].startswith("another publisher")] == [
-            (level, "another publisher sends view commands: following them; abort ends that")]
+            (level, "another publisher sends view commands: following them; abort ends that")
+        ]
         assert desk.ask("abort").success
         assert desk.ask("start").success
         said.clear()
@@ -246,10 +307,20 @@ def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch)
 
 def test_an_incomplete_view_is_redone_and_then_skipped(graph, tmp_path, monkeypatch):
     monkeypatch.setattr(pose_sequencer, "TICK_S", 0.005)
-    desk = Desk(graph, tmp_path, auto_start=True, auto_confirm=True, settle_time=0.0,
-                view_timeout=0.02, max_redos=1)
-    twice = [(phase, index) for index in range(len(PLAN.views))
-             for phase in (PLACE, MEASURE, PLACE, MEASURE)]
+    desk = Desk(
+        graph,
+        tmp_path,
+        auto_start=True,
+        auto_confirm=True,
+        settle_time=0.0,
+        view_timeout=0.02,
+        max_redos=1,
+    )
+    twice = [
+        (phase, index)
+        for index in range(len(PLAN.views))
+        for phase in (PLACE, MEASURE, PLACE, MEASURE)
+    ]
     desk.expect(*twice, (DONE, len(PLAN.views)))
 
 
@@ -257,11 +328,16 @@ class Actor(Desk):
     """A desk with an action client, and a solver that only saves."""
 
     def __init__(self, graph: Graph, folder, **parameters) -> None:
-        super().__init__(graph, folder, auto_confirm=True, settle_time=0.0,
-                         result_path=str(folder / "map.json"), **parameters)
+        super().__init__(
+            graph,
+            folder,
+            auto_confirm=True,
+            settle_time=0.0,
+            result_path=str(folder / "map.json"),
+            **parameters,
+        )
         self.saved, self.feedback = [], []
-        self.answer = SaveMap.Response(success=True, message="saved",
-                                       path=str(folder / "map.json"))
+        self.answer = SaveMap.Response(success=True, message="saved", path=str(folder / "map.json"))
         graph.hand.create_service(SaveMap, "solver/save_map", self._save)
         self.client = ActionClient(graph.hand, RunCalibration, "pose_sequencer/run_calibration")
         graph.until(self.client.server_is_ready, "the action server")
@@ -271,9 +347,13 @@ class Actor(Desk):
         return self.answer
 
     def send(self, plan_path: str = ""):
-        return self.graph.finish(self.client.send_goal_async(
-            RunCalibration.Goal(plan_path=plan_path),
-            feedback_callback=lambda m: self.feedback.append(m.feedback)), "the goal's response")
+        return self.graph.finish(
+            self.client.send_goal_async(
+                RunCalibration.Goal(plan_path=plan_path),
+                feedback_callback=lambda m: self.feedback.append(m.feedback),
+            ),
+            "the goal's response",
+        )
 
     def result(self, handle):
         answer = self.graph.finish(handle.get_result_async(), "the result")
@@ -281,8 +361,7 @@ class Actor(Desk):
 
     def measure_all(self) -> None:
         for index in range(len(PLAN.views)):
-            self.graph.until(lambda index=index: (MEASURE, index) in self.commands,
-                             f"view {index}")
+            self.graph.until(lambda index=index: (MEASURE, index) in self.commands, f"view {index}")
             self.complete(index)
 
 
@@ -416,12 +495,16 @@ def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
     status, result = actor.result(handle)
     assert status == GoalStatus.STATUS_ABORTED
     assert (result.error_code, result.map_path) == (4, "")
-    assert result.message == ("run_calibration: the solver has not saved the map in 0.1 s; check "
-                              "the solver, then call save_map")
+    assert result.message == (
+        "run_calibration: the solver has not saved the map in 0.1 s; check "
+        "the solver, then call save_map"
+    )
 
 
-@pytest.mark.parametrize("undone", [["deactivate", "cleanup"], ["shutdown"],
-                                    ["deactivate", "cleanup", "configure", "activate"]])
+@pytest.mark.parametrize(
+    "undone",
+    [["deactivate", "cleanup"], ["shutdown"], ["deactivate", "cleanup", "configure", "activate"]],
+)
 @pytest.mark.parametrize("saving", [False, True], ids=["measuring", "saving"])
 def test_a_goal_ends_with_a_result_when_the_node_is_cleaned_up(actor, undone, saving):
     """Its client waited for ever."""
@@ -438,8 +521,12 @@ def test_a_goal_ends_with_a_result_when_the_node_is_cleaned_up(actor, undone, sa
     assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, 4)
     assert result.message == (
         "run_calibration: pose_sequencer was cleaned up before the map was saved; "
-        + ("call solver/save_map" if saving else
-           "activate it again: its service start resumes the plan"))
+        + (
+            "call solver/save_map"
+            if saving
+            else "activate it again: its service start resumes the plan"
+        )
+    )
     if "activate" in undone:
         actor.heard.clear()
         later = actor.send()

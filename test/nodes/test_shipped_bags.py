@@ -43,8 +43,9 @@ def test_the_bytes_of_a_bag_give_what_the_manifest_says(graph, name):
     republish(graph, name, lambda: sum(received.values()))
     digest = collector._finish()
     graph.until(lambda: solved and solved[-1].data == digest, "a solution of all readings")
-    graph.until(lambda: summaries and summaries[-1].identifiable == expected["identifiable"],
-                "its summary")
+    graph.until(
+        lambda: summaries and summaries[-1].identifiable == expected["identifiable"], "its summary"
+    )
     if not expected["identifiable"]:
         assert not maps and summaries[-1].rank_deficiency == expected["deficiency"]
         return

@@ -33,12 +33,25 @@ def test_the_shipped_camera_cell_is_calibrated_live_as_offline(graph, tmp_path):
     graph.node(MeasurementCollector, **parameters("measurement_collector"))
     graph.node(Solver)
     graph.node(PoseSequencer, plan=PLAN, **parameters("pose_sequencer"))
-    graph.until(lambda: summaries and summaries[-1].views_done == 2 and maps
-                and maps[-1].header.stamp == summaries[-1].header.stamp, "the final map")
+    graph.until(
+        lambda: (
+            summaries
+            and summaries[-1].views_done == 2
+            and maps
+            and maps[-1].header.stamp == summaries[-1].header.stamp
+        ),
+        "the final map",
+    )
     assert summaries[-1].identifiable, summaries[-1].state
     # more than the plan's 100 where a busy machine was late, and marks were asked for again
-    graph.until(lambda: int(detector.session.diagnosis().values["images"])
-                == cell.diagnosis().values["image_sent"] >= 100, "all images")
+    graph.until(
+        lambda: (
+            int(detector.session.diagnosis().values["images"])
+            == cell.diagnosis().values["image_sent"]
+            >= 100
+        ),
+        "all images",
+    )
     counts = detector.session.diagnosis().values
     assert int(counts["marks"]) >= 2 * 2 * 169  # 25 stops, at the edges fewer than nine marks
     recorder.close()

@@ -45,13 +45,19 @@ def readings(plan: Plan, seed: int) -> tuple:
 def measured(plan: Plan = PLAN, seed: int = 5) -> tuple:
     """Return ViewMeasurement messages of a plan, and the readings behind them."""
     measurements, progress = readings(plan, seed)
-    return [fill(names.MEASUREMENT.type(), from_model.view_measurement(
-        view, measurements, 10 + index, "stage")) for index, view in progress.items()], measurements
+    return [
+        fill(
+            names.MEASUREMENT.type(),
+            from_model.view_measurement(view, measurements, 10 + index, "stage"),
+        )
+        for index, view in progress.items()
+    ], measurements
 
 
 @pytest.fixture
 def solve(graph, tmp_path):
     """Return a function that gives a fresh solver the views of a plan and waits for its word."""
+
     def run(plan=PLAN, **parameters):
         graph.node(Solver, result_folder=str(tmp_path), **parameters)
         maps, summaries = graph.listen(names.ERROR_MAP), graph.listen(names.SUMMARY)
@@ -61,6 +67,7 @@ def solve(graph, tmp_path):
             publisher.publish(message)
         graph.until(lambda: summaries and summaries[-1].views_done == len(messages), "all views")
         return maps, summaries, measurements
+
     return run
 
 
@@ -101,10 +108,16 @@ def test_a_solution_wakes_the_node_that_waits_for_it(solve, graph, monkeypatch):
 
 
 def test_what_solving_needs_is_loaded_before_there_is_another_thread_then_its_memory(
-        graph, monkeypatch):
+    graph, monkeypatch
+):
     calls: list[tuple[tuple, str, list[str]]] = []
-    monkeypatch.setattr(solver_module, "warm_up", lambda *marks: calls.append(
-        (marks, threading.current_thread().name, [one.name for one in threading.enumerate()])))
+    monkeypatch.setattr(
+        solver_module,
+        "warm_up",
+        lambda *marks: calls.append(
+            (marks, threading.current_thread().name, [one.name for one in threading.enumerate()])
+        ),
+    )
     graph.node(Solver)
     graph.until(lambda: len(calls) == 2, "both")
     (first, main, before), (then, worker, _) = calls
@@ -113,8 +126,7 @@ def test_what_solving_needs_is_loaded_before_there_is_another_thread_then_its_me
     assert then == (21,) and worker.startswith("solver")
 
 
-def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(
-        graph, monkeypatch):
+def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(graph, monkeypatch):
     gate, plain = threading.Event(), solver_module.solve
     monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(300) and plain(job))
     monkeypatch.setattr(solver_module, "SWEEP_S", 0.02)
@@ -131,13 +143,15 @@ def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(
 
 
 def test_save_map_waits_for_the_readings_that_came_before_while_the_node_works_on(
-        graph, tmp_path, monkeypatch):
+    graph, tmp_path, monkeypatch
+):
     gate, jobs, plain = threading.Event(), [], solver_module.solve
 
     def wait_and_solve(job):
         jobs.append(job)
         assert gate.wait(300)
         return plain(job)
+
     monkeypatch.setattr(solver_module, "solve", wait_and_solve)
     node = graph.node(Solver, result_folder=str(tmp_path))
     publisher, (messages, measurements) = graph.publisher(names.MEASUREMENT), measured()
@@ -161,7 +175,8 @@ def test_save_map_waits_for_the_readings_that_came_before_while_the_node_works_o
     assert [len(job.measurements.views) for job in jobs] == [1, len(messages)]
     np.testing.assert_array_equal(
         np.array(json.loads(path.read_text())["error_map"]["gx"], dtype=float),
-        calibrate(measurements).error_map.gx)
+        calibrate(measurements).error_map.gx,
+    )
 
 
 def test_a_save_that_waited_is_told_what_the_readings_contradict(graph, tmp_path, monkeypatch):
@@ -181,8 +196,10 @@ def test_a_save_that_waited_is_told_what_the_readings_contradict(graph, tmp_path
     gate.set()
     answer = graph.finish(future, "the answer")
     assert (answer.success, answer.error_code, answer.message) == (
-        False, 2, "selfcal/view_measurement: views of different plates in one plan; measure one "
-        "plate")
+        False,
+        2,
+        "selfcal/view_measurement: views of different plates in one plan; measure one plate",
+    )
 
 
 def test_a_late_joiner_gets_map_and_summary(solve, graph):
@@ -245,8 +262,10 @@ def test_a_view_measured_anew_replaces_the_old_one(graph):
     for message in [*old, *new]:
         publisher.publish(message)
     wanted = calibrate(measurements).error_map
-    graph.until(lambda: maps and np.array_equal(
-        to_model.error_map(maps[-1]).gx, wanted.gx, equal_nan=True), "the new map")
+    graph.until(
+        lambda: maps and np.array_equal(to_model.error_map(maps[-1]).gx, wanted.gx, equal_nan=True),
+        "the new map",
+    )
     graph.until(lambda: summaries and summaries[-1].views_done == len(new), "a summary of all")
 
 
@@ -319,13 +338,19 @@ def test_a_loaded_map_is_not_said_to_come_from_the_readings(solve, graph, tmp_pa
     assert graph.call(SaveMap, "solver/save_map", path=path).success
     assert graph.call(LoadMap, "solver/load_map", path=path).success
     answer = graph.call(SaveMap, "solver/save_map", path=path)
-    assert answer.message == (f"saved to {path}: plan '{PLAN.plan_id}', run {START_NS}; readings "
-                              "of a loaded map")
+    assert answer.message == (
+        f"saved to {path}: plan '{PLAN.plan_id}', run {START_NS}; readings of a loaded map"
+    )
 
 
 def command_of(plan_id: str, views_planned: int):
-    return fill(names.COMMAND.type(), from_model.command(Command(
-        1, Phase.MEASURE, plan_id, 0, PLAN.views[0], PLAN.artifact, views_planned), "stage"))
+    return fill(
+        names.COMMAND.type(),
+        from_model.command(
+            Command(1, Phase.MEASURE, plan_id, 0, PLAN.views[0], PLAN.artifact, views_planned),
+            "stage",
+        ),
+    )
 
 
 @pytest.mark.usefixtures("quick_beat")
@@ -346,8 +371,14 @@ def test_the_plan_is_known_whichever_topic_is_heard_first(graph):
     line = "1 of 4 views measured, not yet enough to identify the stage."
     assert summaries[-1].state == line
     assert not summaries[-1].identifiable
-    graph.until(lambda: any(s.message == line and s.level == DiagnosticStatus.OK
-                            for m in diagnostics for s in m.status), "no alarm")
+    graph.until(
+        lambda: any(
+            s.message == line and s.level == DiagnosticStatus.OK
+            for m in diagnostics
+            for s in m.status
+        ),
+        "no alarm",
+    )
 
 
 @pytest.mark.usefixtures("quick_beat")
@@ -361,8 +392,14 @@ def test_views_of_two_plates_are_an_alarm(graph, tmp_path):
     for message in messages[:2]:
         readings.publish(message)
     line = "selfcal/view_measurement: views of different plates in one plan; measure one plate"
-    graph.until(lambda: any(s.message == line and s.level == DiagnosticStatus.WARN
-                            for m in diagnostics for s in m.status), "the alarm")
+    graph.until(
+        lambda: any(
+            s.message == line and s.level == DiagnosticStatus.WARN
+            for m in diagnostics
+            for s in m.status
+        ),
+        "the alarm",
+    )
     answer = graph.call(SaveMap, "solver/save_map", path=str(tmp_path / "no.json"))
     assert (answer.success, answer.error_code, answer.message) == (False, 2, line)
 
@@ -376,11 +413,15 @@ def test_the_map_is_shown_as_markers_in_the_frame_of_the_map(solve, graph):
     vectors, uncertainty, legend = arrays[-1].markers
     assert {m.header.frame_id for m in arrays[-1].markers} == {"cell"}
     assert (vectors.type, uncertainty.type, legend.type) == (
-        Marker.LINE_LIST, Marker.CUBE_LIST, Marker.TEXT_VIEW_FACING)
+        Marker.LINE_LIST,
+        Marker.CUBE_LIST,
+        Marker.TEXT_VIEW_FACING,
+    )
     np.testing.assert_array_equal([(p.x, p.y, p.z) for p in vectors.points], shape.ends)
     np.testing.assert_array_equal([(p.x, p.y) for p in uncertainty.points], shape.sites[:, :2])
-    np.testing.assert_allclose([(c.r, c.g, c.b) for c in uncertainty.colors], shape.colours,
-                               rtol=1e-6)
+    np.testing.assert_allclose(
+        [(c.r, c.g, c.b) for c in uncertainty.colors], shape.colours, rtol=1e-6
+    )
     assert all(0 < m.color.a == m.pose.orientation.w for m in arrays[-1].markers)
     assert vectors.scale.x > 0 < legend.scale.z
     assert legend.text == shape.legend
@@ -398,8 +439,12 @@ def test_rejected_detections_are_shown_until_their_view_is_measured_without(grap
         readings.publish(message)
     graph.until(lambda: arrays and len(arrays[-1].markers) == 4, "the rejected detection")
     shown = arrays[-1].markers[-1]
-    assert (shown.ns, shown.id, shown.type, shown.action) == ("rejected", 1, Marker.POINTS,
-                                                              Marker.ADD)
+    assert (shown.ns, shown.id, shown.type, shown.action) == (
+        "rejected",
+        1,
+        Marker.POINTS,
+        Marker.ADD,
+    )
     assert [(p.x, p.y) for p in shown.points] == [(0.01, -0.02)] and shown.color.r > shown.color.g
     assert shown.header.frame_id == "cell"
     again, _ = measured()
@@ -444,8 +489,12 @@ def test_a_malformed_measurement_does_not_end_the_solver(graph):
     bad[2].reject_reasons = ["a reason without a count"]
     for message in [*bad, *messages]:
         publisher.publish(message)
-    graph.until(lambda: summaries and summaries[-1].identifiable
-                and summaries[-1].views_done == len(messages), "the good views")
+    graph.until(
+        lambda: (
+            summaries and summaries[-1].identifiable and summaries[-1].views_done == len(messages)
+        ),
+        "the good views",
+    )
     assert node.session.result is not None
 
 
@@ -458,5 +507,4 @@ def test_a_known_plate_gives_what_the_bag_gives(solve, graph, tmp_path):
     assert measurements.artifact_from == str(path)
     known = read_result(str(path))
     same_map(maps[-1], calibrate(measurements, Options(plate=known)).error_map)
-    assert summaries[-1].state.startswith(
-        ("Still good", "Changed", "Scale changed"))
+    assert summaries[-1].state.startswith(("Still good", "Changed", "Scale changed"))

@@ -59,16 +59,34 @@ def test_the_order_that_a_command_asks_for(graph):
     seen.clear()
     measure(graph, view)
     graph.until(lambda: len(seen) == 9, "9 marks again")
-    assert [(d.m, d.n) for d in seen] == [(-1, -1), (-1, 0), (-1, 1), (0, 1), (0, 0), (0, -1),
-                                          (1, -1), (1, 0), (1, 1)]
+    assert [(d.m, d.n) for d in seen] == [
+        (-1, -1),
+        (-1, 0),
+        (-1, 1),
+        (0, 1),
+        (0, 0),
+        (0, -1),
+        (1, -1),
+        (1, 0),
+        (1, 1),
+    ]
 
 
 def test_the_truth_that_its_parameters_ask_for_is_recorded(graph, tmp_path):
     path = tmp_path / "truth.json"
-    node = graph.node(StageSimulator, truth_path=str(path), microscope_rotation=2e-3,
-                      backlash_y=-1e-8, drift_walk=5e-8, plate_shape=3e-8, stop_sigma=5e-5,
-                      measurement_sense="plate_moves", encoder="independent", rotation="finite",
-                      **QUICK)
+    node = graph.node(
+        StageSimulator,
+        truth_path=str(path),
+        microscope_rotation=2e-3,
+        backlash_y=-1e-8,
+        drift_walk=5e-8,
+        plate_shape=3e-8,
+        stop_sigma=5e-5,
+        measurement_sense="plate_moves",
+        encoder="independent",
+        rotation="finite",
+        **QUICK,
+    )
     measure(graph, View("a"))
     graph.until(lambda: path.exists(), "the truth")
     truth = json.loads(path.read_text())

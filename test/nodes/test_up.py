@@ -36,9 +36,14 @@ class Screen:
 
     def __init__(self, environment: dict, *words: str, before: str = "") -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", before + SELFCAL, *words], env=environment, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            start_new_session=True)
+            [sys.executable, "-c", before + SELFCAL, *words],
+            env=environment,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
         self.lines: list[str] = []
         self._queue: queue.Queue = queue.Queue()
         threading.Thread(target=self._read, daemon=True).start()
@@ -83,6 +88,7 @@ def start(ros_environment):
     def run(*words: str, before: str = "") -> Screen:
         screens.append(Screen(ros_environment, *words, before=before))
         return screens[-1]
+
     yield run
     for screen in screens:
         screen.close()
@@ -90,8 +96,9 @@ def start(ros_environment):
 
 def processes_of(session: int) -> list[str]:
     """Return the processes of a session, each as its id and its arguments."""
-    return subprocess.run(["ps", "-o", "pid=,args=", "-s", str(session)], text=True,
-                          capture_output=True, check=False).stdout.splitlines()
+    return subprocess.run(
+        ["ps", "-o", "pid=,args=", "-s", str(session)], text=True, capture_output=True, check=False
+    ).stdout.splitlines()
 
 
 def pid_of(session: int, node: str) -> int:
@@ -124,8 +131,17 @@ def no_error_in(said: str) -> bool:
 
 def test_two_calibrations_by_words_the_other_past_the_death_of_two_nodes(start, tmp_path):
     (tmp_path / "plan.yaml").write_text(LINES_FIRST)
-    up = start("up", "--plan", str(tmp_path / "plan.yaml"), "--simulate", "--compensate",
-               "--results", str(tmp_path), "--bag", str(tmp_path / "bag"))
+    up = start(
+        "up",
+        "--plan",
+        str(tmp_path / "plan.yaml"),
+        "--simulate",
+        "--compensate",
+        "--results",
+        str(tmp_path),
+        "--bag",
+        str(tmp_path / "bag"),
+    )
     up.until("now: Press s to start the plan.")
     up.write("start")
     for view in VIEWS:
@@ -146,8 +162,9 @@ def test_two_calibrations_by_words_the_other_past_the_death_of_two_nodes(start, 
             os.kill(pid_of(up.process.pid, "solver"), signal.SIGKILL)
             up.until("solver ended with signal 9: restarted")
         up.write("confirm")
-    *_, line = up.until_all("now: Done. s starts another run.",
-                            "map: Good: error up to ", "saved: ")
+    *_, line = up.until_all(
+        "now: Done. s starts another run.", "map: Good: error up to ", "saved: "
+    )
     saved = Path(line.removeprefix("saved: "))
     assert saved.parent == tmp_path
     assert re.fullmatch(r"plan_simulated_\d{19}\.json", saved.name)
@@ -169,15 +186,24 @@ up.commands = lambda args, commands=up.commands: {
 """
 
 
-@pytest.mark.parametrize(("ending", "code"), [
-    (signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, 128 + signal.SIGTERM)])
+@pytest.mark.parametrize(
+    ("ending", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, 128 + signal.SIGTERM)]
+)
 def test_a_command_that_is_ended_takes_its_nodes_along(start, tmp_path, ending, code):
     """Of a kill it knows nothing: each node, and the screen's eyes, end by themselves."""
-    up = start("up", "--plan", plan_file(tmp_path, small_plan()), "--journal",
-               str(tmp_path / "journals"), before=ONE_NODE)
+    up = start(
+        "up",
+        "--plan",
+        plan_file(tmp_path, small_plan()),
+        "--journal",
+        str(tmp_path / "journals"),
+        before=ONE_NODE,
+    )
     up.until("pose_sequencer is not running")
-    wait_until(lambda: len(list((tmp_path / "journals").glob("journal_*/*.mcap"))) == 1,
-               "the collector's journal")
+    wait_until(
+        lambda: len(list((tmp_path / "journals").glob("journal_*/*.mcap"))) == 1,
+        "the collector's journal",
+    )
     up.process.send_signal(ending)
     assert up.process.wait(PATIENCE_S) == code
     wait_until(lambda: not processes_of(up.process.pid), "all nodes to end")
@@ -187,8 +213,14 @@ def test_a_command_that_is_ended_takes_its_nodes_along(start, tmp_path, ending, 
 def test_a_terminal_that_is_closed_takes_the_command_along(ros_environment):
     keyboard, terminal = os.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-c", SELFCAL, "monitor"], env=ros_environment | {"TERM": "xterm"},
-        stdin=terminal, stdout=terminal, stderr=subprocess.PIPE, text=True, start_new_session=True)
+        [sys.executable, "-c", SELFCAL, "monitor"],
+        env=ros_environment | {"TERM": "xterm"},
+        stdin=terminal,
+        stdout=terminal,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     os.close(terminal)
     drawn = b""
     while b"pose_sequencer is not running" not in drawn:
@@ -199,10 +231,16 @@ def test_a_terminal_that_is_closed_takes_the_command_along(ros_environment):
     assert not processes_of(process.pid)
 
 
-@pytest.mark.parametrize(("words", "folder"), [
-    ([], "state/selfcal/HERE/journals"), (["--simulate"], "state/selfcal/HERE/journals_simulated"),
-    (["--results", "other"], "state/selfcal/HERE_other/journals"), (["--journal", "own"], "own"),
-    (["--simulate", "--journal", "own"], "own")])
+@pytest.mark.parametrize(
+    ("words", "folder"),
+    [
+        ([], "state/selfcal/HERE/journals"),
+        (["--simulate"], "state/selfcal/HERE/journals_simulated"),
+        (["--results", "other"], "state/selfcal/HERE_other/journals"),
+        (["--journal", "own"], "own"),
+        (["--simulate", "--journal", "own"], "own"),
+    ],
+)
 def test_a_simulated_run_keeps_its_journals_apart(tmp_path, monkeypatch, words, folder):
     """Those of each folder of results, in none that the user works in."""
     monkeypatch.chdir(tmp_path)
@@ -218,8 +256,10 @@ def test_states_without_a_home_are_asked_for(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     assert str(up_verb.state_folder("/data")) == "/home/me/.local/state/selfcal/data"
     monkeypatch.delenv("HOME")
-    with pytest.raises(InputError, match="HOME: is not set, and journals are kept there; set it, "
-                                         "or give --journal FOLDER"):
+    with pytest.raises(
+        InputError,
+        match="HOME: is not set, and journals are kept there; set it, or give --journal FOLDER",
+    ):
         up_verb.state_folder("/data")
 
 
@@ -242,19 +282,34 @@ def test_a_request_without_a_cell_says_so(graph, monkeypatch, capsys):
     def answers() -> list[dict]:
         said.extend(map(json.loads, capsys.readouterr().out.splitlines()))
         return [line for line in said if "answer" in line]
+
     graph.until(answers, "the answer")
-    assert answers() == [{"success": False, "answer": "start: pose_sequencer does not answer; is "
-                          "it running in this namespace and ROS_DOMAIN_ID?"}]
+    assert answers() == [
+        {
+            "success": False,
+            "answer": "start: pose_sequencer does not answer; is "
+            "it running in this namespace and ROS_DOMAIN_ID?",
+        }
+    ]
 
 
-@pytest.mark.parametrize("words, line", [
-    (["--plan", "/no/plan.yaml"], "selfcal up: /no/plan.yaml: no such file; check the path"),
-    (["--plan", "PLAN", "--bag", "/tmp"], "selfcal up: /tmp: exists already; remove it or name "
-                                          "another folder"),
-    (["--plan", "PLAN", "--results", "/no"], "selfcal up: /no: is not a folder; name one that "
-                                             "exists")])
+@pytest.mark.parametrize(
+    "words, line",
+    [
+        (["--plan", "/no/plan.yaml"], "selfcal up: /no/plan.yaml: no such file; check the path"),
+        (
+            ["--plan", "PLAN", "--bag", "/tmp"],
+            "selfcal up: /tmp: exists already; remove it or name another folder",
+        ),
+        (
+            ["--plan", "PLAN", "--results", "/no"],
+            "selfcal up: /no: is not a folder; name one that exists",
+        ),
+    ],
+)
 def test_bad_input_is_one_line_before_anything_is_started(
-        tmp_path, monkeypatch, capsys, words, line):
+    tmp_path, monkeypatch, capsys, words, line
+):
     monkeypatch.setattr(supervising, "process", None)  # nothing can be started
     plan = plan_file(tmp_path, small_plan())
     assert selfcal(["up", *[plan if word == "PLAN" else word for word in words]]) == 2
@@ -275,14 +330,17 @@ class Child:
 @pytest.fixture
 def dying(monkeypatch):
     """Return a supervisor whose nodes end with the codes that are given, and its clock."""
+
     def make(codes: list, node: str = "solver"):
         left, clock = list(codes), SimpleNamespace(now=0.0)
 
         @contextlib.contextmanager
         def process(*_, **__):
             yield Child(left.pop(0) if left else None)
+
         monkeypatch.setattr(supervising, "process", process)
         return Supervisor({node: []}, {}, lambda: clock.now), clock
+
     return make
 
 
@@ -291,9 +349,9 @@ def test_a_node_that_dies_again_and_again_is_given_up(dying):
     with supervisor:
         for _ in range(MOST_RESTARTS + 3):
             supervisor.step()
-        assert supervisor.log == ["solver ended with signal 9: restarted"] * (
-            MOST_RESTARTS) + ["solver ended with signal 9, 6 times within 60 s: not "
-                              "restarted"]
+        assert supervisor.log == ["solver ended with signal 9: restarted"] * (MOST_RESTARTS) + [
+            "solver ended with signal 9, 6 times within 60 s: not restarted"
+        ]
 
 
 @pytest.mark.parametrize("seconds, kept", [(59.9, False), (60.0, True)])
@@ -307,9 +365,13 @@ def test_deaths_of_long_ago_do_not_count(dying, seconds, kept):
         assert supervisor.log[-1].endswith(": restarted") is kept
 
 
-@pytest.mark.parametrize("code, node, line", [
-    (2, "solver", "solver ended with code 2 and is not restarted"),
-    (-9, "bag_recorder", "bag_recorder ended with signal 9 and is not restarted")])
+@pytest.mark.parametrize(
+    "code, node, line",
+    [
+        (2, "solver", "solver ended with code 2 and is not restarted"),
+        (-9, "bag_recorder", "bag_recorder ended with signal 9 and is not restarted"),
+    ],
+)
 def test_what_would_only_fail_again_is_not_started_again(dying, code, node, line):
     supervisor, _ = dying([code], node)
     with supervisor:
@@ -323,7 +385,8 @@ def test_marks_are_detected_on_request(tmp_path):
     params.touch()
     for more, there in (([], False), (["--detect"], True)):
         args = build_parser("up").parse_args(
-            ["up", "--plan", "p.yaml", "--params", str(params), "--results", str(tmp_path), *more])
+            ["up", "--plan", "p.yaml", "--params", str(params), "--results", str(tmp_path), *more]
+        )
         nodes = up_verb.commands(args)
         assert ("mark_detector" in nodes) is there
     assert nodes["mark_detector"][1:] == ["--params-file", str(params)]

@@ -36,9 +36,14 @@ def measured(size=5, count=8, *, seed=1, repeats=1, sense=Sense.MICROSCOPE_MOVES
 CASES = [(5, 8, datum, sense) for datum in ThetaDatum for sense in Sense]
 
 
-@pytest.mark.parametrize(("size", "count", "datum", "sense"), [
-    *CASES, (11, 24, ThetaDatum.XY_AXES, Sense.PLATE_MOVES),
-    (15, 36, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)])
+@pytest.mark.parametrize(
+    ("size", "count", "datum", "sense"),
+    [
+        *CASES,
+        (11, 24, ThetaDatum.XY_AXES, Sense.PLATE_MOVES),
+        (15, 36, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES),
+    ],
+)
 def test_noise_free_readings_give_the_truth_back(size, count, datum, sense):
     truth, readings = measured(size, count, sense=sense)
     result = calibrate_by_law(readings, replace(LAW, datum_theta=datum))
@@ -75,8 +80,9 @@ def published_draws(n_draws):
     truth = random_truth(artifact, 4, rng, AS_PUBLISHED)
     errors = []
     for _ in range(n_draws):
-        readings = simulate_measurements(truth, hu_plan(artifact), rng, sigma_m=SIGMA_M,
-                                         sigma_theta_rad=SIGMA_RAD)
+        readings = simulate_measurements(
+            truth, hu_plan(artifact), rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD
+        )
         found = law.solve(hu_readings(artifact, hu_views(readings)))
         errors.append((found.g[..., 0] - truth.g, found.g_theta[:, 0] - truth.g_theta))
     return tuple(np.stack(part, axis=-1) for part in zip(*errors, strict=True))
@@ -97,9 +103,17 @@ def test_published_calibration_errors_lie_within_the_spread_of_200_draws():
 def test_uncertainty_is_that_of_every_reading_moved_in_turn(sense):
     """Each mean counts by its repeats, which differ from view to view."""
     _, readings = measured(5, 8, sense=sense)
-    readings = _known_noise(replace(readings, views=tuple(
-        replace(view, count=np.full(len(view.m), 1 + i), count_theta=np.full(8, 4 - i))
-        for i, view in enumerate(readings.views))), SIGMA_M, SIGMA_RAD)
+    readings = _known_noise(
+        replace(
+            readings,
+            views=tuple(
+                replace(view, count=np.full(len(view.m), 1 + i), count_theta=np.full(8, 4 - i))
+                for i, view in enumerate(readings.views)
+            ),
+        ),
+        SIGMA_M,
+        SIGMA_RAD,
+    )
     law = law_for(readings.artifact, ThetaDatum.XY_AXES, sense)
 
     def solve(moved):
@@ -117,8 +131,10 @@ def test_uncertainty_is_that_of_every_reading_moved_in_turn(sense):
 
 
 def _known_noise(readings, sigma_m, sigma_rad):
-    views = tuple(replace(v, sigma_xy=sigma_m, dof_xy=100, sigma_theta=sigma_rad, dof_theta=100)
-                  for v in readings.views)
+    views = tuple(
+        replace(v, sigma_xy=sigma_m, dof_xy=100, sigma_theta=sigma_rad, dof_theta=100)
+        for v in readings.views
+    )
     return replace(readings, views=views)
 
 
@@ -131,16 +147,20 @@ def test_exact_and_drawn_propagation_agree(monkeypatch):
         ratio = getattr(drawn.error_map, name) / getattr(exact.error_map, name)
         assert abs(np.sqrt((ratio**2).mean()) - 1) < 0.1
     assert drawn.noise.sigma_xy == pytest.approx(exact.noise.sigma_xy, rel=0.02)
-    assert drawn.findings == (
-        Finding("drawn_uncertainty", details={"draws": 400}),) and exact.findings == ()
+    assert (
+        drawn.findings == (Finding("drawn_uncertainty", details={"draws": 400}),)
+        and exact.findings == ()
+    )
 
 
 @pytest.mark.parametrize("exact_size", [21, 3])
 def test_an_uncertainty_map_that_is_not_wanted_is_not_there(monkeypatch, exact_size):
     monkeypatch.setattr("selfcal_ros.papers.law.EXACT_SIZE", exact_size)
     _, readings = measured(sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
-    wanted, plain = (calibrate_by_law(readings, replace(LAW, uncertainty=uncertainty)).error_map
-                     for uncertainty in (None, False))
+    wanted, plain = (
+        calibrate_by_law(readings, replace(LAW, uncertainty=uncertainty)).error_map
+        for uncertainty in (None, False)
+    )
     for name in ("gx", "gy", "g_theta"):
         assert np.array_equal(getattr(wanted, name), getattr(plain, name))
     for name in ("u_gx", "u_gy", "u_g_theta"):
@@ -153,8 +173,9 @@ def test_an_uncertainty_map_that_is_not_wanted_is_not_there(monkeypatch, exact_s
 def test_noise_of_one_reading_from_what_is_left_over():
     ratios = []
     for seed in range(12):
-        _, readings = measured(11, 24, seed=seed, repeats=3, sigma_m=SIGMA_M,
-                               sigma_theta_rad=SIGMA_RAD)
+        _, readings = measured(
+            11, 24, seed=seed, repeats=3, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD
+        )
         noise = calibrate_by_law(readings, LAW).noise
         assert noise.sigma_xy == noise.sigma_xy_repeats == pytest.approx(SIGMA_M)
         ratios.append((noise.sigma_xy_residuals / SIGMA_M, noise.sigma_theta_residuals / SIGMA_RAD))
@@ -163,16 +184,32 @@ def test_noise_of_one_reading_from_what_is_left_over():
     assert noise.dof_xy_residuals > 100 and noise.dof_theta_residuals > 15
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    (lambda v: v[:3], "Hu's view 3 (one pitch along +X with grid and lines) is missing"),
-    (lambda v: (v[0], v[2], v[3]), "Hu's view 1 (90 deg with grid and lines) is missing"),
-    (lambda v: (*v, v[0]), "view 'identity': is not one of Hu's four views, each once"),
-    (lambda v: (replace(v[0], m=v[0].m[1:], n=v[0].n[1:], dx=v[0].dx[1:], dy=v[0].dy[1:],
-                        count=v[0].count[1:]), *v[1:]),
-     "view 'identity': 24 of 25 grid marks were read"),
-    (lambda v: (v[0], v[1], replace(v[2], k=v[2].k[2:], dtheta=v[2].dtheta[2:]), v[3]),
-     "view 'line': 6 of 8 angular lines were read"),
-])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v: v[:3], "Hu's view 3 (one pitch along +X with grid and lines) is missing"),
+        (lambda v: (v[0], v[2], v[3]), "Hu's view 1 (90 deg with grid and lines) is missing"),
+        (lambda v: (*v, v[0]), "view 'identity': is not one of Hu's four views, each once"),
+        (
+            lambda v: (
+                replace(
+                    v[0],
+                    m=v[0].m[1:],
+                    n=v[0].n[1:],
+                    dx=v[0].dx[1:],
+                    dy=v[0].dy[1:],
+                    count=v[0].count[1:],
+                ),
+                *v[1:],
+            ),
+            "view 'identity': 24 of 25 grid marks were read",
+        ),
+        (
+            lambda v: (v[0], v[1], replace(v[2], k=v[2].k[2:], dtheta=v[2].dtheta[2:]), v[3]),
+            "view 'line': 6 of 8 angular lines were read",
+        ),
+    ],
+)
 def test_views_that_are_not_hus_are_refused(change, message):
     _, readings = measured()
     with pytest.raises(InputError) as refusal:
@@ -183,10 +220,12 @@ def test_views_that_are_not_hus_are_refused(change, message):
 def test_options_and_plates_that_the_law_does_not_know_are_refused():
     _, readings = measured()
     reference = ReferenceLength(ReferenceKind.ARTIFACT, 1e-6)
-    for change, message in (({"reference": reference}, "no reference length"),
-                            ({"terms": (ModelTerm("drift"),)}, "no terms besides stage and plate"),
-                            ({"robust": True}, "robust: Hu's law needs every reading"),
-                            ({"plate": calibrate_by_law(readings, LAW)}, "use a known plate")):
+    for change, message in (
+        ({"reference": reference}, "no reference length"),
+        ({"terms": (ModelTerm("drift"),)}, "no terms besides stage and plate"),
+        ({"robust": True}, "robust: Hu's law needs every reading"),
+        ({"plate": calibrate_by_law(readings, LAW)}, "use a known plate"),
+    ):
         with pytest.raises(InputError, match=message):
             calibrate_by_law(readings, replace(LAW, **change))
     with pytest.raises(InputError, match="square plate with 4, 8, 12"):

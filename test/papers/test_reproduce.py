@@ -34,21 +34,32 @@ def qiao():
 def test_figures_are_whole_and_their_keys_lie_beside_the_panels(hu, qiao):
     figures = [*hu_figures(hu), *qiao_figures(qiao)]
     assert [figure.name for figure in figures] == [
-        *(f"hu_figure_{number}" for number in range(4, 10)), "qiao_figure_3", "qiao_figure_4"]
+        *(f"hu_figure_{number}" for number in range(4, 10)),
+        "qiao_figure_3",
+        "qiao_figure_4",
+    ]
     for figure in figures:
         assert cut_off(figure) == [] and words_on_words(figure) == [], figure.name
         paths = [item for item in figure.items if isinstance(item, Path)]
         assert all(item.fill or item.width > 0 for item in paths), figure.name
-        panels = [(item.lines[0][0], item.lines[0][2]) for item in paths
-                  if item.stroke == "soft" and len(item.lines[0]) == 5]
-        draws = {round(float(x), 6) for item in figure.items if isinstance(item, Discs)
-                 for x, _ in item.centres}
+        panels = [
+            (item.lines[0][0], item.lines[0][2])
+            for item in paths
+            if item.stroke == "soft" and len(item.lines[0]) == 5
+        ]
+        draws = {
+            round(float(x), 6)
+            for item in figure.items
+            if isinstance(item, Discs)
+            for x, _ in item.centres
+        }
         ends = {round(float(x), 6) for item in paths if item.dash for x, _ in item.lines[0]}
         assert ends <= draws, figure.name  # levels reach from the first draw to the last
         keys = [item.lines[0][1] for item in paths if item.width == 1.4]
         assert bool(keys) == (figure in (figures[0], *figures[-2:]))
-        assert not any(low[0] < x < high[0] and low[1] < y < high[1]
-                       for x, y in keys for low, high in panels), figure.name
+        assert not any(
+            low[0] < x < high[0] and low[1] < y < high[1] for x, y in keys for low, high in panels
+        ), figure.name
 
 
 def test_hus_tables_lie_within_the_spread_of_draws(hu):
@@ -106,8 +117,17 @@ def test_progress_of_both_tables_counts_up_to_all_draws():
 
 def test_hus_text_shows_tables_and_figures(hu):
     text = hu_text(hu)
-    for word in ("Table 1", "Table 2", "Figure 6", "Figure 7", "Figure 8", "Figure 9", "0.0195",
-                 "0.01781", "std of 40 draws"):
+    for word in (
+        "Table 1",
+        "Table 2",
+        "Figure 6",
+        "Figure 7",
+        "Figure 8",
+        "Figure 9",
+        "0.0195",
+        "0.01781",
+        "std of 40 draws",
+    ):
         assert word in text
     series = text.split("Figure 8")[1].splitlines()[1]
     assert len(series.split(":")[1].split()) == 10

@@ -68,9 +68,9 @@ def test_report_is_whole_and_needs_nothing_from_outside():
 
 def test_a_browser_runs_the_script_of_the_page_and_no_other():
     html = html_of(known_result(5, 24)[0])
-    text, = re.findall(r"<script>(.*?)</script>", html, flags=re.DOTALL)
+    (text,) = re.findall(r"<script>(.*?)</script>", html, flags=re.DOTALL)
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
-    policy, = re.findall(r'Content-Security-Policy" content="([^"]*)"', html)
+    (policy,) = re.findall(r'Content-Security-Policy" content="([^"]*)"', html)
     assert f"script-src 'sha256-{digest}'" in policy
     assert not re.search(r"\bfetch\(|XMLHttpRequest\(\)|\beval\(|new Function", text)
 
@@ -79,15 +79,17 @@ def test_the_map_that_turns_has_the_numbers_of_the_result():
     result, _ = known_result(5, 0)
     gx = result.error_map.gx.copy()
     gx[1, 2] = np.nan
-    text, = re.findall(r'data-map="([^"]*)"', html_of(
-        replace(result, error_map=replace(result.error_map, gx=gx))))
+    (text,) = re.findall(
+        r'data-map="([^"]*)"', html_of(replace(result, error_map=replace(result.error_map, gx=gx)))
+    )
     found = json.loads(unescape(text))
     assert found["gx"][1][2] is None and found["gy"][1][2] is None
     assert found["gx"][0][3] == pytest.approx(1e6 * gx[0, 3], abs=1e-4)
     assert found["x"][0] == pytest.approx(1e3 * result.artifact.x_m[0, 0])
     assert found["u"][4][0] == pytest.approx(
         1e6 * result.noise.k_xy * max(result.error_map.u_gx[4, 0], result.error_map.u_gy[4, 0]),
-        abs=1e-4)
+        abs=1e-4,
+    )
 
 
 def test_large_and_unknown_maps_do_not_turn():
@@ -115,6 +117,7 @@ def test_a_pdf_is_the_page_printed(tmp_path, printer, monkeypatch):
         document = page.render()
         pages.extend(document.pages)
         return document.write_pdf()
+
     monkeypatch.setattr(printer.HTML, "write_pdf", counted)
     write_report(result, tmp_path / "a.pdf")
     assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF") and len(pages) > 3
@@ -134,9 +137,12 @@ def test_a_page_for_paper_has_its_colours_in_the_figures():
 
 def test_a_pdf_without_its_printer_is_refused_with_two_ways_out(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(InputError, match=r"a\.pdf: a PDF is printed by WeasyPrint, which is not "
-                       r"installed; pip install 'selfcal_ros\[pdf\]', or write a\.html and print "
-                       r"it in a browser$"):
+    with pytest.raises(
+        InputError,
+        match=r"a\.pdf: a PDF is printed by WeasyPrint, which is not "
+        r"installed; pip install 'selfcal_ros\[pdf\]', or write a\.html and print "
+        r"it in a browser$",
+    ):
         write_report(known_result(3, 0)[0], tmp_path / "a.pdf")
 
 
@@ -150,17 +156,25 @@ def test_a_printer_that_lacks_a_library_is_said_so(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("grade", list(Grade))
 def test_the_banner_has_the_colour_of_the_verdict(grade):
-    result = replace(known_result(3, 0)[0], verdict=Verdict(grade, sentence="Verdict"),
-                     warnings=("torn bag",))
+    result = replace(
+        known_result(3, 0)[0], verdict=Verdict(grade, sentence="Verdict"), warnings=("torn bag",)
+    )
     html = html_of(result)
     assert re.findall(r'<p class="verdict (\w+)">', html) == [str(grade)]
 
 
 def test_the_sentence_comes_first_and_the_maps_before_the_tables():
     html = html_of(with_residuals())
-    places = [html.index(text) for text in (
-        '<p class="verdict', "<th>stage</th>", "Error of the stage, G", "Uncertainty of the map, U",
-        "<h2>Verdict, drift and causes</h2>")]
+    places = [
+        html.index(text)
+        for text in (
+            '<p class="verdict',
+            "<th>stage</th>",
+            "Error of the stage, G",
+            "Uncertainty of the map, U",
+            "<h2>Verdict, drift and causes</h2>",
+        )
+    ]
     assert places == sorted(places)
 
 
@@ -182,9 +196,13 @@ def test_every_colour_of_a_figure_is_defined_for_light_and_dark():
 
 def test_figures_follow_what_the_result_keeps():
     bare, rich = (parsed(html_of(r)).text for r in (known_result(5, 24)[0], with_residuals()))
-    titles = ("Residuals of the grid readings by view", "Distribution of the grid residuals",
-              "Distribution of the angular residuals", "Mean residuals over the time",
-              "Positions of rejected grid readings")
+    titles = (
+        "Residuals of the grid readings by view",
+        "Distribution of the grid residuals",
+        "Distribution of the angular residuals",
+        "Mean residuals over the time",
+        "Positions of rejected grid readings",
+    )
     for title in titles:
         assert not any(title in text for text in bare)
         assert any(title in text for text in rich)
@@ -205,22 +223,49 @@ def test_both_kinds_of_uncertainty_are_told_with_what_each_is_for():
 
 def test_causes_come_as_a_table_with_one_unit_each():
     result, _ = known_result(3, 0)
-    causes = (Cause("drift", 8e-8, 3e-9, "m", 1e-9, "run 2: shift x", "x", remedies=(
-        Remedy("model", "drift:8e-8"), Remedy("action", "measure there and back"))),
-              Cause("noise", 2.0, 0.1, "m/m", 2e-4, "a"))
-    verdict = Verdict(Grade.NOT_QUALIFIED, causes=causes, reasons=("grid readings: too much",),
-                      sentence="Not qualified: most likely drift")
+    causes = (
+        Cause(
+            "drift",
+            8e-8,
+            3e-9,
+            "m",
+            1e-9,
+            "run 2: shift x",
+            "x",
+            remedies=(Remedy("model", "drift:8e-8"), Remedy("action", "measure there and back")),
+        ),
+        Cause("noise", 2.0, 0.1, "m/m", 2e-4, "a"),
+    )
+    verdict = Verdict(
+        Grade.NOT_QUALIFIED,
+        causes=causes,
+        reasons=("grid readings: too much",),
+        sentence="Not qualified: most likely drift",
+    )
     html = html_of(replace(result, verdict=verdict))
     banner = re.findall(r'<p class="verdict not_qualified">([^<]*)', html)[0]
     assert banner.startswith("Not qualified: most likely drift. Map as it is:")
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", html)
     at = cells.index("drift")
     what = "a drift of 0.0800 ± 0.0030 µm along x during view &#x27;run 2: shift x&#x27;"
-    assert cells[at:at + 7] == ["drift", what, "0.0800", "0.0030", "µm", "1e-09",
-                                "solve with --model drift:8e-8, or measure there and back"]
-    assert cells[at + 7:at + 14] == [
-        "noise", "2.00 times as much noise in view &#x27;a&#x27; as in the others", "2.00", "0.10",
-        "times", "0.0002", "measure the view again, and look for a source of vibration"]
+    assert cells[at : at + 7] == [
+        "drift",
+        what,
+        "0.0800",
+        "0.0030",
+        "µm",
+        "1e-09",
+        "solve with --model drift:8e-8, or measure there and back",
+    ]
+    assert cells[at + 7 : at + 14] == [
+        "noise",
+        "2.00 times as much noise in view &#x27;a&#x27; as in the others",
+        "2.00",
+        "0.10",
+        "times",
+        "0.0002",
+        "measure the view again, and look for a source of vibration",
+    ]
     assert "failed: grid readings: too much" in html
 
 
@@ -232,11 +277,20 @@ def test_the_report_of_a_large_field_stays_small():
 def test_report_says_everything():
     result, truth = known_result(5, 24)
     text = " ".join(parsed(html_of(result, truth)).text)
-    for expected in ("Stage calibration: plan hu", "Calibrated from 4 views", "shift_x",
-                     "Non-orthogonality".lower(), "scale difference", "no encoder sample",
-                     "Against the known truth", "zero_mean: the angular errors add up to zero",
-                     "ab" * 32,
-                     f"selfcal_ros {__version__}", "joint least squares", "add +G to a command"):
+    for expected in (
+        "Stage calibration: plan hu",
+        "Calibrated from 4 views",
+        "shift_x",
+        "Non-orthogonality".lower(),
+        "scale difference",
+        "no encoder sample",
+        "Against the known truth",
+        "zero_mean: the angular errors add up to zero",
+        "ab" * 32,
+        f"selfcal_ros {__version__}",
+        "joint least squares",
+        "add +G to a command",
+    ):
         assert expected in text, expected
 
 
@@ -244,12 +298,19 @@ def test_text_from_files_is_escaped():
     evil = '<script>alert("x")</script>'
     result, _ = known_result(3, 0)
     hostile = replace(
-        result, plan_id=evil, warnings=(evil,), rejected={evil: 1},
-        input={"file": evil, evil: evil}, method=evil, sense=evil,
+        result,
+        plan_id=evil,
+        warnings=(evil,),
+        rejected={evil: 1},
+        input={"file": evil, evil: evil},
+        method=evil,
+        sense=evil,
         extra={evil: evil, "outliers": [{evil: evil}]},
         views=(replace(result.views[0], name=evil),),
-        observability=Observability(1, 2, 1, False, (Finding("", text=evil),),
-                                    (Finding("", text=evil),)))
+        observability=Observability(
+            1, 2, 1, False, (Finding("", text=evil),), (Finding("", text=evil),)
+        ),
+    )
     page = parsed(html_of(hostile))
     assert page.tags.count("script") == 1  # that of the page
     assert evil in "".join(page.text)
@@ -257,8 +318,14 @@ def test_text_from_files_is_escaped():
 
 def test_a_deficient_plan_is_marked_and_comes_first():
     result, _ = known_result(3, 0)
-    seen = Observability(1, 3, 2, False, (Finding("", text="scale difference"),),
-                         (Finding("", text="add a view turned by 90 deg"),))
+    seen = Observability(
+        1,
+        3,
+        2,
+        False,
+        (Finding("", text="scale difference"),),
+        (Finding("", text="add a view turned by 90 deg"),),
+    )
     html = html_of(replace(result, observability=seen))
     assert '<p class="verdict not_qualified">Not a calibration: 2 modes' in html
     assert html.index("advice: add a view turned by 90 deg") < html.index("<h2>Map</h2>")
@@ -268,8 +335,15 @@ def test_a_deficient_plan_is_marked_and_comes_first():
 def test_unknown_maps_and_plates_without_lines():
     result, _ = known_result(3, 0)
     nothing = np.full((3, 3), np.nan)
-    emap = replace(result.error_map, gx=nothing, gy=nothing, u_gx=nothing, u_gy=nothing,
-                   nonorthogonality=np.nan, scale_difference=np.nan)
+    emap = replace(
+        result.error_map,
+        gx=nothing,
+        gy=nothing,
+        u_gx=nothing,
+        u_gy=nothing,
+        nonorthogonality=np.nan,
+        scale_difference=np.nan,
+    )
     page = parsed(html_of(replace(result, error_map=emap, views=())))
     assert page.tags.count("svg") == 4
     assert "not known" in " ".join(page.text)
@@ -277,13 +351,19 @@ def test_unknown_maps_and_plates_without_lines():
 
 
 def test_rows_and_numbers_are_tabulated_with_units():
-    rows = [{"view": "a", "rms_m": 1.7e-8, "mark": [1, -2]},
-            {"view": "b", "rms_m": 1.23e-6, "exceeds": True}]
-    sections = extra_sections({"left_over": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]},
-                               "validation": rows})
+    rows = [
+        {"view": "a", "rms_m": 1.7e-8, "mark": [1, -2]},
+        {"view": "b", "rms_m": 1.23e-6, "exceeds": True},
+    ]
+    sections = extra_sections(
+        {"left_over": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]}, "validation": rows}
+    )
     assert [s.title for s in sections] == ["Held-out validation", "Left over"]
-    assert sections[0].table == (("view", "rms in µm", "mark", "exceeds"),
-                                 ("a", "0.017", "1, -2", "–"), ("b", "1.230", "–", "yes"))
+    assert sections[0].table == (
+        ("view", "rms in µm", "mark", "exceeds"),
+        ("a", "0.017", "1, -2", "–"),
+        ("b", "1.230", "–", "yes"),
+    )
     assert sections[1].facts == (("largest in arcsec", "0.206"), ("n", "968"))
 
 
@@ -300,21 +380,28 @@ def test_extras_of_other_forms_are_left_to_the_file():
 
 def test_a_report_begins_with_stage_serial_number_operator_and_dates():
     result, _ = known_result(3, 8)
-    times = {"first_exposure": "2026-11-21T15:28:54.617+00:00",
-             "last_exposure": "2026-11-21T16:29:26.532+00:00", "stage": "bag's"}
+    times = {
+        "first_exposure": "2026-11-21T15:28:54.617+00:00",
+        "last_exposure": "2026-11-21T16:29:26.532+00:00",
+        "stage": "bag's",
+    }
     made = Provenance("2026-11-23T08:51:45+00:00", 3.0, "0.1.0", times)
     result = replace(result, provenance=made)
     found = heading(result, {"stage": "XY <1>", "operator": "N. N.", "serial_number": ""})
     assert found.facts == (
-        ("stage", "XY <1>"), ("serial number", "– (not given: --serial-number TEXT)"),
+        ("stage", "XY <1>"),
+        ("serial number", "– (not given: --serial-number TEXT)"),
         ("operator", "N. N."),
-        ("measured", "2026-11-21 15:28 to 16:29 UTC"), ("evaluated", "2026-11-23 08:51 UTC"))
+        ("measured", "2026-11-21 15:28 to 16:29 UTC"),
+        ("evaluated", "2026-11-23 08:51 UTC"),
+    )
     assert dict(heading(result, {}).facts)["stage"] == "bag's"
     html = report_html(result, [], found)
     assert html.index('class="verdict') < html.index("XY &lt;1&gt;") < html.index("N. N.")
     late = replace(made, extra={**times, "last_exposure": "2026-11-22T00:10:00.000+00:00"})
     assert dict(heading(replace(result, provenance=late), {}).facts)["measured"] == (
-        "2026-11-21 15:28 to 2026-11-22 00:10 UTC")
+        "2026-11-21 15:28 to 2026-11-22 00:10 UTC"
+    )
     bare = heading(replace(result, provenance=Provenance()), {})
     assert all(value.startswith("–") for _, value in bare.facts)
 

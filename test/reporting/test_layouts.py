@@ -14,9 +14,14 @@ from selfcal_ros.topics import IMAGE_TOPICS, MAP_MARKERS_TOPIC, PROGRESS_TOPIC
 ROOT = Path(__file__).parents[2]
 FOXGLOVE = ROOT / "config" / "foxglove" / "selfcal.json"
 RVIZ = ROOT / "config" / "rviz" / "selfcal.rviz"
-TYPES = {"/stage/mark_detections": "MarkDetection", "/selfcal/view_command": "ViewCommand",
-         "/selfcal/view_status": "ViewStatus", "/selfcal/view_measurement": "ViewMeasurement",
-         "/selfcal/error_map": "ErrorMap", "/selfcal/summary": "CalibrationSummary"}
+TYPES = {
+    "/stage/mark_detections": "MarkDetection",
+    "/selfcal/view_command": "ViewCommand",
+    "/selfcal/view_status": "ViewStatus",
+    "/selfcal/view_measurement": "ViewMeasurement",
+    "/selfcal/error_map": "ErrorMap",
+    "/selfcal/summary": "CalibrationSummary",
+}
 
 
 def fields_of(topic):
@@ -45,8 +50,9 @@ def foxglove():
 def test_every_foxglove_panel_is_placed_once(foxglove):
     placed = list(leaves(foxglove["layout"]))
     assert sorted(placed) == sorted(foxglove["configById"])
-    assert all(re.fullmatch(r"(3D|Plot|RawMessages|DiagnosticSummary|Image)!\w+", name)
-               for name in placed)
+    assert all(
+        re.fullmatch(r"(3D|Plot|RawMessages|DiagnosticSummary|Image)!\w+", name) for name in placed
+    )
 
 
 def test_every_foxglove_path_names_a_field_of_the_contract(foxglove):
@@ -61,7 +67,8 @@ def test_every_foxglove_path_names_a_field_of_the_contract(foxglove):
 
 def test_foxglove_shows_the_image_and_where_detections_were_rejected(foxglove):
     assert foxglove["configById"]["Image!camera"]["imageMode"]["imageTopic"] == (
-        f"/{IMAGE_TOPICS['raw']}")
+        f"/{IMAGE_TOPICS['raw']}"
+    )
     panel = foxglove["configById"]["Plot!rejected"]
     paths = [panel["xAxisPath"]["value"], panel["paths"][0]["value"]]
     assert paths == [f"/selfcal/view_measurement.rejected_{axis}[:]" for axis in "xy"]

@@ -35,14 +35,25 @@ def test_a_vector_points_from_the_nominal_site_along_the_error():
     np.testing.assert_allclose(tails[site], [[0.02, -0.01, 0.0]], atol=1e-15)  # m = 2, n = -1
     assert shape.factor == 20_000  # 0.5 um becomes the 10 mm of a pitch
     np.testing.assert_allclose(heads[site] - tails[site], [[6e-3, -8e-3, 0.0]], rtol=1e-12)
-    assert shape.legend == ("stage error (indicated - true), enlarged 20,000 x, longest 0.5 um; "
-                            "dark: u = 0.005 um (k=1)")
+    assert shape.legend == (
+        "stage error (indicated - true), enlarged 20,000 x, longest 0.5 um; "
+        "dark: u = 0.005 um (k=1)"
+    )
     assert shape.legend_at[1] < shape.sites[:, 1].min()
 
 
-@pytest.mark.parametrize("longest, factor", [
-    (0.9e-6, 10_000), (1e-6, 10_000), (1.1e-6, 5_000), (4e-6, 2_000), (5e-6, 2_000),
-    (0.0, 1), (0.02, 1)])
+@pytest.mark.parametrize(
+    "longest, factor",
+    [
+        (0.9e-6, 10_000),
+        (1e-6, 10_000),
+        (1.1e-6, 5_000),
+        (4e-6, 2_000),
+        (5e-6, 2_000),
+        (0.0, 1),
+        (0.02, 1),
+    ],
+)
 def test_the_enlargement_is_round_and_keeps_vectors_apart(longest, factor):
     assert enlargement(PITCH, longest) == pytest.approx(factor, rel=1e-12)
 
@@ -52,8 +63,13 @@ def test_the_colour_grows_darker_with_the_uncertainty():
     emap.u_gx[0, 0] = emap.u_gy[0, 0] = 0.0
     emap.u_gx[4, 4] = np.nan
     emap.u_gx[2, 2], emap.u_gy[2, 2] = 6e-9, 8e-9
-    colours = dict(zip(map(tuple, np.rint(map_geometry(emap).sites[:, :2] / PITCH).tolist()),
-                       map_geometry(emap).colours, strict=True))
+    colours = dict(
+        zip(
+            map(tuple, np.rint(map_geometry(emap).sites[:, :2] / PITCH).tolist()),
+            map_geometry(emap).colours,
+            strict=True,
+        )
+    )
     np.testing.assert_allclose(colours[-2, -2], CERTAIN)
     np.testing.assert_allclose(colours[0, 0], UNCERTAIN)
     np.testing.assert_allclose(colours[2, 2], UNKNOWN)
@@ -66,8 +82,7 @@ def test_unknown_sites_are_left_out():
 
 
 def test_a_map_without_any_site_is_an_empty_picture():
-    shape = map_geometry(random_map(Artifact(3, PITCH, 8), 3,
-                                    unknown=tuple(np.ndindex(3, 3))))
+    shape = map_geometry(random_map(Artifact(3, PITCH, 8), 3, unknown=tuple(np.ndindex(3, 3))))
     assert len(shape.sites) == len(shape.ends) == len(shape.colours) == 0
 
 

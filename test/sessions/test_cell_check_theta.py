@@ -14,27 +14,54 @@ ZERO = "lay the plate straight, set theta to 0"
 REVERSED = "reverse the sign of offset_theta"
 
 
-@pytest.mark.parametrize(("turn", "lines", "stops", "said", "remedy"), [
-    (5e-4, 5.1e-4, 0, "", ""), (-5e-4, -5.1e-4, 0, "", ""), (1e-3, 1.2e-3, 0, "", ""),
-    (5e-4, -5.1e-4, 0, "offset_theta has the other sign", REVERSED),
-    (-5e-4, 5.1e-4, 0, "offset_theta has the other sign", REVERSED),
-    (5e-4, -5.1e-4, -1, "offset_theta has the other sign", REVERSED),
-    (5e-4, -3e-3, 0, "neither the same nor the opposite turn", ZERO),  # another zero, or no offset
-    (5e-4, 0.0, 0, "neither the same nor the opposite turn", ZERO),
-    (5e-4, -3e-3, 1, "neither the same nor the opposite turn", ZERO),
-    (5e-4, -3e-3, -1, "", ""),
-    (1e-5, 1e-5, 0, "too little to tell the sign", STRAIGHT),
-    (1e-5, -1e-5, 0, "too little to tell the sign", STRAIGHT),
-    (1e-5, 1e-5, 1, "too little to tell the sign", STRAIGHT), (1e-5, 1e-5, -1, "", "")])
+@pytest.mark.parametrize(
+    ("turn", "lines", "stops", "said", "remedy"),
+    [
+        (5e-4, 5.1e-4, 0, "", ""),
+        (-5e-4, -5.1e-4, 0, "", ""),
+        (1e-3, 1.2e-3, 0, "", ""),
+        (5e-4, -5.1e-4, 0, "offset_theta has the other sign", REVERSED),
+        (-5e-4, 5.1e-4, 0, "offset_theta has the other sign", REVERSED),
+        (5e-4, -5.1e-4, -1, "offset_theta has the other sign", REVERSED),
+        (
+            5e-4,
+            -3e-3,
+            0,
+            "neither the same nor the opposite turn",
+            ZERO,
+        ),  # another zero, or no offset
+        (5e-4, 0.0, 0, "neither the same nor the opposite turn", ZERO),
+        (5e-4, -3e-3, 1, "neither the same nor the opposite turn", ZERO),
+        (5e-4, -3e-3, -1, "", ""),
+        (1e-5, 1e-5, 0, "too little to tell the sign", STRAIGHT),
+        (1e-5, -1e-5, 0, "too little to tell the sign", STRAIGHT),
+        (1e-5, 1e-5, 1, "too little to tell the sign", STRAIGHT),
+        (1e-5, 1e-5, -1, "", ""),
+    ],
+)
 def test_what_does_not_show_the_sign_of_the_lines_does_not_pass(turn, lines, stops, said, remedy):
     """`stops`: slope of the offsets of lines that scatter by 1 urad, 0 = no scatter."""
     check = CellCheck(small_plan(), settings_of("measurement_collector"), Hands().ports)
     m, n = (np.array(row).ravel() for row in np.meshgrid((-1, 0, 1), (-1, 0, 1)))
     pitch = check.plate.grid_pitch_m
     motion = RepeatMotion(8e-12 * np.array([[1, stops], [stops, stops**2]]), 8)
-    check._judge_theta(Measurements("cell_check", check.plate, (ViewReadings(
-        check.view, m, n, dx=1e-5 - turn * n * pitch, dy=2e-5 + turn * m * pitch,
-        dtheta=lines + np.array([1e-6, -1e-6]), motion_theta=motion),)))
+    check._judge_theta(
+        Measurements(
+            "cell_check",
+            check.plate,
+            (
+                ViewReadings(
+                    check.view,
+                    m,
+                    n,
+                    dx=1e-5 - turn * n * pitch,
+                    dy=2e-5 + turn * m * pitch,
+                    dtheta=lines + np.array([1e-6, -1e-6]),
+                    motion_theta=motion,
+                ),
+            ),
+        )
+    )
     [item] = check.items
     assert (item.name, item.passed) == ("theta", not said)
     assert item.figure.endswith(said or " mrad")

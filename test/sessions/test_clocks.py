@@ -8,8 +8,10 @@ from selfcal_ros.sessions.clocks import ClockWatch, RosTime
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
 
-NOTHING = ("use_sim_time is set but nothing is received on /clock: this node stamps everything "
-           "0; play the bag with --clock, or start the node without use_sim_time")
+NOTHING = (
+    "use_sim_time is set but nothing is received on /clock: this node stamps everything "
+    "0; play the bag with --clock, or start the node without use_sim_time"
+)
 
 
 def looked(*instants_ns: int, simulated: bool = True):
@@ -32,9 +34,15 @@ def offset_after(*delays_s: float, every_s: float, live: bool = True) -> int | N
     return watch.offset_ns
 
 
-@pytest.mark.parametrize(("delays", "offset_s"), [
-    ((0.003,), -0.003), ((0.004, 0.001, 0.002), -0.001), ((-37.0, -37.001), 37.001),
-    ((0.2, 0.3, 0.25), -0.2)])
+@pytest.mark.parametrize(
+    ("delays", "offset_s"),
+    [
+        ((0.003,), -0.003),
+        ((0.004, 0.001, 0.002), -0.001),
+        ((-37.0, -37.001), 37.001),
+        ((0.2, 0.3, 0.25), -0.2),
+    ],
+)
 def test_the_smallest_delay_is_the_offset_of_the_cells_clock(delays, offset_s):
     for every_s in (0.01, 0.5):  # in one tenth of a second, and in different ones
         assert offset_after(*delays, every_s=every_s) == round(offset_s * 1e9)
@@ -47,9 +55,15 @@ def test_an_offset_is_forgotten_after_two_seconds(later, offset_s):
     assert offset_after(-37.0, *[0.001] * later, every_s=0.5) == round(offset_s * 1e9)
 
 
-@pytest.mark.parametrize(("offset_s", "message"), [
-    (0.05, ""), (-0.05, ""), (0.051, "the cell's clock is 0.051 s ahead of this machine's: "),
-    (-2.0, "the cell's clock is 2 s behind this machine's: ")])
+@pytest.mark.parametrize(
+    ("offset_s", "message"),
+    [
+        (0.05, ""),
+        (-0.05, ""),
+        (0.051, "the cell's clock is 0.051 s ahead of this machine's: "),
+        (-2.0, "the cell's clock is 2 s behind this machine's: "),
+    ],
+)
 def test_an_offset_is_named_beyond_its_limit_in_either_direction(offset_s, message):
     watch = ClockWatch(limit_s=0.05)
     assert watch.diagnosis().values == {} and not watch.ahead
@@ -71,7 +85,7 @@ def test_a_slow_image_is_no_clock_that_is_behind(lead_s, offset_s):
     assert watch.offset_ns == (offset_s and round(offset_s * 1e9))
     assert bool(watch.diagnosis().message) is (offset_s is not None)
     watch.data(ENCODER_TOPIC, np.array([T0 - 10**6]), np.array(now), np.array([50 * 10**9]))
-    assert watch.offset_ns == max(-10**6, round((offset_s or -1.0) * 1e9))
+    assert watch.offset_ns == max(-(10**6), round((offset_s or -1.0) * 1e9))
 
 
 def test_the_clock_of_the_system_is_no_matter():
@@ -89,8 +103,18 @@ def test_a_clock_that_nobody_publishes_is_a_warning_and_one_line():
 def test_a_clock_that_moves_and_stands_is_told_at_each_change():
     found, said = looked(0, 7_000_000_000, 8_500_000_000, 8_500_000_000, 8_500_000_000, 9)
     assert [item.values["/clock"] for item in found] == [
-        "not heard", "moves", "moves", "stands", "stands", "moves"]
+        "not heard",
+        "moves",
+        "moves",
+        "stands",
+        "stands",
+        "moves",
+    ]
     assert [item.level for item in found] == [Level.WARN] + [Level.OK] * 5
     moves = (Level.OK, "stamps follow /clock (use_sim_time); work and health do not")
-    assert said == [(Level.WARN, NOTHING), moves, (
-        Level.OK, "/clock has stopped at 8.500 s; work and health continue, stamps do not"), moves]
+    assert said == [
+        (Level.WARN, NOTHING),
+        moves,
+        (Level.OK, "/clock has stopped at 8.500 s; work and health continue, stamps do not"),
+        moves,
+    ]

@@ -22,9 +22,15 @@ class Cell:
     def __init__(self, **parameters):
         self.published, self.said, self.now = [], [], 0.0
         values = CollectorSettings.checked(parameters, "test")
-        self.session = CollectingSession(values, Ports(
-            lambda output, fields: self.published.append((output, fields)),
-            lambda level, line: self.said.append((level, line)), self._now, lambda: 0))
+        self.session = CollectingSession(
+            values,
+            Ports(
+                lambda output, fields: self.published.append((output, fields)),
+                lambda level, line: self.said.append((level, line)),
+                self._now,
+                lambda: 0,
+            ),
+        )
 
     def _now(self):
         self.now += 1e-3
@@ -33,8 +39,13 @@ class Cell:
     def feed(self, events):
         collector = self.session.collector
         for event in events:
-            (collector.add_command if isinstance(event, Command) else collector.add_detection
-             if isinstance(event, Detection) else collector.add_encoder)(event)
+            (
+                collector.add_command
+                if isinstance(event, Command)
+                else collector.add_detection
+                if isinstance(event, Detection)
+                else collector.add_encoder
+            )(event)
         self.now += 10.0
         self.session._dirty = True
         self.session.tick()
@@ -56,9 +67,11 @@ def test_a_wrong_sense_is_said_once_while_the_view_is_measured():
     cell.wait()
     assert [level for level, _ in cell.said] == [Level.WARN]
     said = cell.said[0][1]  # one view does not tell both
-    assert said.startswith("12 of 12 detections were rejected as stage_not_at_mark: the plate lies "
-                           "turned by 180°, not by 0° (or its ids are those of other marks); turn "
-                           "it as planned")
+    assert said.startswith(
+        "12 of 12 detections were rejected as stage_not_at_mark: the plate lies "
+        "turned by 180°, not by 0° (or its ids are those of other marks); turn "
+        "it as planned"
+    )
     assert "the stage is indicated at minus the marks' sites; the sense is reversed" in said
     cell.feed(e for e in events.events if e.stamp_ns >= half)
     assert len(cell.said) == 1
@@ -86,7 +99,9 @@ def test_a_view_of_which_nothing_came_is_published_empty_when_it_is_over_as_offl
     events = without_first_view()
     cell = Cell().feed(events)
     assert [(fields["view_index"], len(fields["m"])) for fields in cell.of("measurement")] == [
-        (0, 0), (1, 25)]
+        (0, 0),
+        (1, 25),
+    ]
     assert [len(view.m) for view in gathered(events).collect()[0].views] == [0, 25]
     begun = [e for e in events if isinstance(e, Command)][:2]
     assert Cell().feed(begun).of("measurement") == []  # it is still to be measured
@@ -109,27 +124,43 @@ def test_status_names_the_run_and_what_is_missing():
     assert (status["run_id"], status["complete"]) == ("77", False)
 
 
-@pytest.mark.parametrize(("heard", "missed"), [
-    ([(0, Phase.MEASURE, True)], ["0"]),
-    ([(0, Phase.MEASURE, False)], []),
-    ([(0, Phase.PLACE, True), (0, Phase.MEASURE, True)], ["0"]),
-    ([(0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
-    ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False)], ["0"]),  # the redo has not begun
-    ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
-    ([(0, Phase.MEASURE, True), (1, Phase.PLACE, False), (1, Phase.MEASURE, False)], ["0"]),
-    ([(0, Phase.MEASURE, True), (0, Phase.MEASURE, False)], ["0"])])
+@pytest.mark.parametrize(
+    ("heard", "missed"),
+    [
+        ([(0, Phase.MEASURE, True)], ["0"]),
+        ([(0, Phase.MEASURE, False)], []),
+        ([(0, Phase.PLACE, True), (0, Phase.MEASURE, True)], ["0"]),
+        ([(0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
+        ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False)], ["0"]),  # the redo has not begun
+        ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
+        ([(0, Phase.MEASURE, True), (1, Phase.PLACE, False), (1, Phase.MEASURE, False)], ["0"]),
+        ([(0, Phase.MEASURE, True), (0, Phase.MEASURE, False)], ["0"]),
+    ],
+)
 def test_a_view_that_began_before_the_node_is_missed_until_it_is_measured_again(heard, missed):
     """Commands: view, phase, and whether it was published before this node listened."""
     events, cell = scene("0, 90", count=0), Cell()
     for number, (view, phase, is_older) in enumerate(heard):
         like = next(c for c in events.commands if (c.view_index, c.phase) == (view, phase))
-        cell.session.take_command(message("ViewCommand", from_model.command(
-            replace(like, stamp_ns=events.commands[0].stamp_ns + number), "stage")), is_older)
+        cell.session.take_command(
+            message(
+                "ViewCommand",
+                from_model.command(
+                    replace(like, stamp_ns=events.commands[0].stamp_ns + number), "stage"
+                ),
+            ),
+            is_older,
+        )
     assert list(cell.session.missed.values()) == missed
     late = heard[-1][2] or (Phase.MEASURE, True) in [item[1:] for item in heard]
-    assert [line for _, line in cell.said] == ([
-        "view '0' began before this node: earlier detections are missing here; "
-        "redo_view measures it again"] if late else [])
+    assert [line for _, line in cell.said] == (
+        [
+            "view '0' began before this node: earlier detections are missing here; "
+            "redo_view measures it again"
+        ]
+        if late
+        else []
+    )
     state = cell.session.diagnosis(detections_matched=True).message
     assert state.endswith("began before this node: 0") == bool(missed)
 
@@ -143,30 +174,51 @@ def test_a_second_run_is_published_anew(run_id):
     later = [replace(e, run_id=run_id) if isinstance(e, Command) else e for e in later]
     begin = next(e.stamp_ns for e in later if isinstance(e, Command) and e.view_index == 1)
     cell.feed(e for e in later if e.stamp_ns < begin)
-    second = cell.of("measurement")[len(first):]
+    second = cell.of("measurement")[len(first) :]
     assert [fields["view_index"] for fields in first] == [0, 1]
     assert [fields["view_index"] for fields in second] == [0]
-    assert first[0]["run_id"] != second[0]["run_id"] == (run_id or str(
-        events.commands[0].stamp_ns + 10**12))
+    assert (
+        first[0]["run_id"]
+        != second[0]["run_id"]
+        == (run_id or str(events.commands[0].stamp_ns + 10**12))
+    )
     assert second[0]["session_reject_reasons"] == ["other_run"]
 
 
 def test_a_run_with_two_plates_is_an_error_until_the_next_run():
     cell, events = Cell(), scene("0, 90", count=0)
     first = events.commands[0]
-    other = replace(first, artifact=replace(first.artifact, grid_size=7), view_index=1,
-                    stamp_ns=first.stamp_ns + 5, phase=Phase.MEASURE)
-    run = [replace(event, run_id="1") if isinstance(event, Command) else event
-           for event in events.events]
+    other = replace(
+        first,
+        artifact=replace(first.artifact, grid_size=7),
+        view_index=1,
+        stamp_ns=first.stamp_ns + 5,
+        phase=Phase.MEASURE,
+    )
+    run = [
+        replace(event, run_id="1") if isinstance(event, Command) else event
+        for event in events.events
+    ]
     cell.feed([*run, replace(other, run_id="1")])
     [(level, line)] = cell.said
     assert (level, line.partition("use one")[2]) == (
-        Level.ERROR, " plate in one plan; then start a new run")
+        Level.ERROR,
+        " plate in one plan; then start a new run",
+    )
     told = cell.session.diagnosis(detections_matched=True)
     assert told.level == Level.WARN and "describes a different plate" in told.message
     later = events.commands[-1].stamp_ns + 10**9
-    cell.feed([replace(first, stamp_ns=later, run_id=str(later), phase=Phase.MEASURE,
-                       artifact=replace(first.artifact, grid_size=7))])
+    cell.feed(
+        [
+            replace(
+                first,
+                stamp_ns=later,
+                run_id=str(later),
+                phase=Phase.MEASURE,
+                artifact=replace(first.artifact, grid_size=7),
+            )
+        ]
+    )
     assert len(cell.said) == 1
     told = cell.session.diagnosis(detections_matched=True)
     assert "another plate" not in told.message

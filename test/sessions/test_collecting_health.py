@@ -31,8 +31,12 @@ from test.support.truth import random_truth
 
 def as_message(fields: dict) -> object:
     """Return nested fields as an object with attributes."""
-    return SimpleNamespace(**{key: as_message(value) if isinstance(value, dict) else value
-                              for key, value in fields.items()})
+    return SimpleNamespace(
+        **{
+            key: as_message(value) if isinstance(value, dict) else value
+            for key, value in fields.items()
+        }
+    )
 
 
 class Desk:
@@ -40,8 +44,9 @@ class Desk:
 
     def __init__(self, **parameters) -> None:
         self.hands = Hands()
-        self.session = CollectingSession(settings_of("measurement_collector", **parameters),
-                                         self.hands.ports)
+        self.session = CollectingSession(
+            settings_of("measurement_collector", **parameters), self.hands.ports
+        )
 
     def feed(self, events: list, *, ahead_s: float = 0.0, run_id: str = "") -> None:
         """Give events; the cell's clock is ahead by so much, commands are on this machine's."""
@@ -67,7 +72,7 @@ def first_view(plan: str = "0", **changes) -> list:
     """Return the messages of the first view alone, still open."""
     events = events_of(small_plan(plan, repeats=1))
     commands = [index for index, event in enumerate(events) if isinstance(event, Command)]
-    return events[:commands[2]]
+    return events[: commands[2]]
 
 
 @pytest.mark.parametrize("seconds, published", [(0.49, 0), (0.5, 1)])
@@ -112,8 +117,11 @@ def test_a_view_is_published_when_it_is_complete_and_again_only_when_it_changes(
 def test_which_views_a_status_is_of():
     """The view that is measured, each that is not complete, and the last one when it is over."""
     desk, events = Desk(), events_of(small_plan("0, 90, tx", repeats=1))[:-1]  # no DONE
-    places = [n for n, event in enumerate(events) if isinstance(event, Command)
-              and event.phase == Phase.PLACE]
+    places = [
+        n
+        for n, event in enumerate(events)
+        if isinstance(event, Command) and event.phase == Phase.PLACE
+    ]
     views = [events[begin:end] for begin, end in zip(places, [*places[1:], None], strict=True)]
     views[1].remove(next(event for event in views[1] if isinstance(event, Detection)))
     views.append([replace(event, stamp_ns=event.stamp_ns + 10 * 10**9) for event in views[0]])
@@ -143,9 +151,13 @@ def test_a_step_that_is_found_behind_the_readings_is_sent_with_them_once():
     assert "the clock that stamps stage/joint_states stepped ahead by 1 s" in note
 
 
-@pytest.mark.parametrize("spoilt, lines", [
-    (1, ["view '0': 1 detection rejected as sigma_out_of_range: their sigma is"]),
-    (1000, ["74 of 74 detections were rejected as sigma_out_of_range: their sigma is"])])
+@pytest.mark.parametrize(
+    "spoilt, lines",
+    [
+        (1, ["view '0': 1 detection rejected as sigma_out_of_range: their sigma is"]),
+        (1000, ["74 of 74 detections were rejected as sigma_out_of_range: their sigma is"]),
+    ],
+)
 def test_what_would_correct_rejections_is_said_once_when_a_view_is_over(spoilt, lines):
     desk, events = Desk(), events_of(small_plan("0, 0", repeats=1))
     marks = [n for n, event in enumerate(events) if isinstance(event, Detection)]
@@ -157,21 +169,24 @@ def test_what_would_correct_rejections_is_said_once_when_a_view_is_over(spoilt, 
         desk.hands.pass_time(PATIENCE_S)
         desk.session.tick()
     said = [line for line in desk.hands.lines(Level.WARN) if "sigma_out_of_range" in line]
-    assert [text[:len(line)] for text, line in zip(said, lines, strict=True)] == lines
+    assert [text[: len(line)] for text, line in zip(said, lines, strict=True)] == lines
 
 
 def test_every_message_of_a_run_names_it():
     desk = Desk()
     desk.feed(events_of(small_plan("0", repeats=1)), run_id="17")
     desk.session.tick()
-    assert {fields["run_id"] for output, fields in desk.hands.published
-            if output != "progress"} == {"17"}
+    assert {
+        fields["run_id"] for output, fields in desk.hands.published if output != "progress"
+    } == {"17"}
     assert desk.told().values["run_id"] == "17"
     assert desk.told().values["phase"] == "DONE"
 
 
-@pytest.mark.parametrize("ahead_s, complete", [
-    (0.0, True), (0.1, True), (0.101, False), (1.0, False), (37.0, False), (-0.0001, True)])
+@pytest.mark.parametrize(
+    "ahead_s, complete",
+    [(0.0, True), (0.1, True), (0.101, False), (1.0, False), (37.0, False), (-0.0001, True)],
+)
 def test_a_view_is_not_called_complete_on_stamps_from_the_future(ahead_s, complete):
     desk = Desk(clock_limit=0.1)
     desk.feed(first_view(), ahead_s=ahead_s)
@@ -190,12 +205,15 @@ def test_a_clock_behind_is_told():
     assert "the cell's clock is 1 s behind this machine's" in desk.told().message
 
 
-@pytest.mark.parametrize("by_s, words", [(-1.0, "stepped back by 1 s in view '"),
-                                         (37.0, "stepped ahead by 37 s in view '")])
+@pytest.mark.parametrize(
+    "by_s, words",
+    [(-1.0, "stepped back by 1 s in view '"), (37.0, "stepped ahead by 37 s in view '")],
+)
 def test_a_clock_that_steps_within_a_view_is_said_once_and_told_to_the_end_of_the_run(by_s, words):
     desk, events = Desk(), events_of(small_plan("0, 90"))
-    half = next(n for n, event in enumerate(events)
-                if event.stamp_ns > events[0].stamp_ns + 4 * 10**8)
+    half = next(
+        n for n, event in enumerate(events) if event.stamp_ns > events[0].stamp_ns + 4 * 10**8
+    )
     desk.feed(events[:half], run_id="1")
     assert desk.told().level == Level.OK
     desk.feed(events[half:], ahead_s=by_s, run_id="1")
@@ -239,21 +257,35 @@ def solved_offline(folder):
 @pytest.mark.parametrize("by_s", [0.15, -0.3])
 def test_a_clock_that_stepped_is_in_the_live_result_as_in_the_offline_one(tmp_path, by_s):
     desk, events = Desk(), events_of(small_plan("0, 90, tx", repeats=4))
-    half = next(n for n, event in enumerate(events) if isinstance(event, Command)
-                and event.view_index == 1) + 400
-    later = [event if isinstance(event, Command) else replace(
-        event, stamp_ns=event.stamp_ns + round(by_s * 1e9)) for event in events[half:]]
+    half = (
+        next(
+            n
+            for n, event in enumerate(events)
+            if isinstance(event, Command) and event.view_index == 1
+        )
+        + 400
+    )
+    later = [
+        event
+        if isinstance(event, Command)
+        else replace(event, stamp_ns=event.stamp_ns + round(by_s * 1e9))
+        for event in events[half:]
+    ]
     desk.feed(events[:half])
     desk.session.tick()
     desk.feed(events[half:], ahead_s=by_s)
     desk.session.tick()
     desk.session.finish()
     live = solved_live(desk)
-    bag = logged(tmp_path / "bag", [*zip(
-        [*events[:half], *later], [event.stamp_ns for event in events], strict=True)])
+    bag = logged(
+        tmp_path / "bag",
+        [*zip([*events[:half], *later], [event.stamp_ns for event in events], strict=True)],
+    )
     offline = solved_offline(bag)
-    lines = [[re.sub(r"at \d+\.\d{3} s", "at T", line) for line in result.warnings
-              if "clock" in line] for result in (live, offline)]
+    lines = [
+        [re.sub(r"at \d+\.\d{3} s", "at T", line) for line in result.warnings if "clock" in line]
+        for result in (live, offline)
+    ]
     assert lines[0] == lines[1]
     assert len(lines[0]) == 1
     assert f"{'ahead' if by_s > 0 else 'back'} by {abs(by_s)} s in view '90', at T: " in lines[0][0]
@@ -263,8 +295,9 @@ def test_a_clock_that_stepped_is_in_the_live_result_as_in_the_offline_one(tmp_pa
     taken = take_up([*bag.glob("*.mcap")], again.session.settings)
     again.session.adopt(taken.collector, "journal", taken.steps)
     again.session.finish()
-    assert [line for line in offline.warnings if "clock" in line] == again.hands.of(
-        "measurement")[-1]["session_notes"]
+    assert [line for line in offline.warnings if "clock" in line] == again.hands.of("measurement")[
+        -1
+    ]["session_notes"]
 
 
 def test_no_step_no_note(tmp_path):
@@ -278,10 +311,19 @@ def test_a_clock_that_steps_with_this_machines_is_found_by_the_steady_clock(monk
     desk, events = Desk(), events_of(small_plan("0, 90"))
     half = len(events) // 2
     desk.feed(events[:half], run_id="1")
-    monkeypatch.setattr(Hands, "now_ns", property(
-        lambda hands: START_NS + round((hands.seconds - 137.0) * 1e9)))
-    desk.feed([replace(event, stamp_ns=event.stamp_ns - 37 * 10**9) if isinstance(event, Command)
-               else event for event in events[half:]], ahead_s=-37.0, run_id="1")
+    monkeypatch.setattr(
+        Hands, "now_ns", property(lambda hands: START_NS + round((hands.seconds - 137.0) * 1e9))
+    )
+    desk.feed(
+        [
+            replace(event, stamp_ns=event.stamp_ns - 37 * 10**9)
+            if isinstance(event, Command)
+            else event
+            for event in events[half:]
+        ],
+        ahead_s=-37.0,
+        run_id="1",
+    )
     desk.session.tick()
     assert "stepped back by 37 s" in desk.told().message
 
@@ -312,8 +354,13 @@ def test_a_gap_of_the_encoder_is_told_while_a_view_is_measured():
     events = first_view()
     encoder = [event for event in events if isinstance(event, EncoderSample)]
     cut = encoder[10].stamp_ns
-    desk.feed([event for event in events if isinstance(event, Command)
-               or not cut < event.stamp_ns < cut + 150_000_000])
+    desk.feed(
+        [
+            event
+            for event in events
+            if isinstance(event, Command) or not cut < event.stamp_ns < cut + 150_000_000
+        ]
+    )
     assert "s between encoder samples: exposures in it are rejected" in desk.told().message
     assert "between encoder samples" not in desk.told().message  # of the last second only
 
@@ -374,8 +421,11 @@ def closing(**parameters) -> tuple[Desk, list, list]:
     desk.hands.costs = 0.01
     desk.feed([event for event in events if event.stamp_ns < last])
     desk.session.tick()  # because of the command, whatever the period
-    return (desk, [event for event in events if event.stamp_ns == last],
-            [event for event in events if event.stamp_ns > last])
+    return (
+        desk,
+        [event for event in events if event.stamp_ns == last],
+        [event for event in events if event.stamp_ns > last],
+    )
 
 
 def test_a_complete_view_does_not_wait_because_the_last_status_was_dear():
@@ -408,8 +458,14 @@ def test_joints_that_tell_their_samples_apart_are_waited_for():
     for column, name in enumerate(block.names):
         assert not complete(desk)
         assert len(desk.hands.of("status")) == 1
-        desk.session.take_encoder(replace(block, names=(name,), velocities=None,
-                                          positions=block.positions[:, column:column + 1]))
+        desk.session.take_encoder(
+            replace(
+                block,
+                names=(name,),
+                velocities=None,
+                positions=block.positions[:, column : column + 1],
+            )
+        )
         desk.session.tick()
     assert complete(desk)
 
@@ -443,8 +499,11 @@ def test_detections_that_are_not_decoded_yet_are_reckoned_with(more, expected):
 def test_a_detection_counts_for_its_view_from_the_instant_of_its_command_on(after_ns, expected):
     desk, [last], _ = closing()
     begin = desk.session.collector.timeline.intervals[-1].start_ns
-    assert begin == next(event.stamp_ns for event in first_view() if isinstance(event, Command)
-                         and event.phase == Phase.MEASURE)
+    assert begin == next(
+        event.stamp_ns
+        for event in first_view()
+        if isinstance(event, Command) and event.phase == Phase.MEASURE
+    )
     desk.session.take_detections(detection_table(replace(last, stamp_ns=begin + after_ns)))
     assert desk.session.expects_end() is expected
 
@@ -457,21 +516,33 @@ def test_the_health_tells_what_a_status_costs():
     for spent in (0.001, 0.007, 0.002):
         desk.hands.costs, desk.hands.works = spent, spent / 2
         desk.hands.pass_time(1)
-        desk.session.take_detections(detection_table(next(
-            event for event in first_view() if isinstance(event, Detection))))
+        desk.session.take_detections(
+            detection_table(next(event for event in first_view() if isinstance(event, Detection)))
+        )
         desk.session.tick()
     assert [desk.told().values[name] for name in names] == ["2.0", "7.0", "3.5"]
 
 
-@pytest.mark.parametrize("limit, level", [(0.0, Level.OK), (0.00019, Level.WARN),
-                                          (0.00021, Level.OK)])
+@pytest.mark.parametrize(
+    "limit, level", [(0.0, Level.OK), (0.00019, Level.WARN), (0.00021, Level.OK)]
+)
 def test_the_jitter_of_the_encoder_is_told_and_held_against_its_limit(limit, level):
     desk = Desk(encoder_jitter_limit=limit)
     events = first_view()
-    stamps = {id(event): number for number, event in enumerate(
-        event for event in events if isinstance(event, EncoderSample))}
-    desk.feed([replace(event, stamp_ns=event.stamp_ns + 200_000 * (stamps[id(event)] % 2))
-               if id(event) in stamps else event for event in events])
+    stamps = {
+        id(event): number
+        for number, event in enumerate(
+            event for event in events if isinstance(event, EncoderSample)
+        )
+    }
+    desk.feed(
+        [
+            replace(event, stamp_ns=event.stamp_ns + 200_000 * (stamps[id(event)] % 2))
+            if id(event) in stamps
+            else event
+            for event in events
+        ]
+    )
     told = desk.told()
     assert float(told.values["encoder_jitter_s"]) == pytest.approx(2e-4, rel=0.01)
     assert told.level == level
@@ -498,8 +569,11 @@ def test_reversed_offsets_are_an_error_while_the_first_view_is_measured():
     rng = np.random.default_rng(4)
     plan = small_plan(repeats=6)
     cell = CellSettings(sigma_xy_m=1e-8, servo_sigma_m=5e-8, sigma_theta_rad=1e-5)
-    events = list(plan_events(random_truth(plan.artifact, 4, rng), plan, settings=cell, rng=rng,
-                              start_ns=START_NS))
+    events = list(
+        plan_events(
+            random_truth(plan.artifact, 4, rng), plan, settings=cell, rng=rng, start_ns=START_NS
+        )
+    )
     spoilt = [replace(e, offset_y=-e.offset_y) if isinstance(e, Detection) else e for e in events]
     end = next(i for i, e in enumerate(spoilt) if isinstance(e, Command) and e.view_index == 1)
     for event in spoilt[:end]:
@@ -527,6 +601,8 @@ def test_a_plate_laid_the_other_way_round_is_an_error_during_the_next_view():
         if desk.told().level is Level.ERROR:
             break
     (line,) = [line for level, line in desk.hands.said if level is Level.ERROR]
-    assert line == ("view '90': the plate lies turned by 270°, not by 90°; turn it counter-"
-                    "clockwise and measure this view again, or correct its pose in the plan")
+    assert line == (
+        "view '90': the plate lies turned by 270°, not by 90°; turn it counter-"
+        "clockwise and measure this view again, or correct its pose in the plan"
+    )
     assert last[2] < event.stamp_ns < last[3] and desk.told().message.startswith(line)

@@ -29,26 +29,51 @@ NAMES = ["x", "y", "theta"]
 
 
 def map_of(error_map=ONE, stamp_ns: int = START_NS, **changes) -> object:
-    return message("ErrorMap", from_model.error_map(result_of(error_map), stamp_ns, "stage")
-                   | {"run_id": "7"} | changes)
+    return message(
+        "ErrorMap",
+        from_model.error_map(result_of(error_map), stamp_ns, "stage") | {"run_id": "7"} | changes,
+    )
 
 
 def summary_of(stamp_ns: int = START_NS, **changes) -> object:
     numbers = dict.fromkeys(
-        ("max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
-         "rms_theta_uncertainty_arcsec", "rms_uncertainty_anywhere_um",
-         "max_uncertainty_anywhere_um"), 0.0)
-    return message("CalibrationSummary", {
-        "header": from_model.header(stamp_ns, "stage"), "state": "as it is", "views_done": 4,
-        "views_planned": 4, "identifiable": True, "rank_deficiency": 0, "advice": [],
-        "qualified": True, "causes": [], "run_id": "7", "grade": 2, **numbers} | changes)
+        (
+            "max_error_um",
+            "rms_error_um",
+            "rms_uncertainty_um",
+            "max_theta_error_arcsec",
+            "rms_theta_uncertainty_arcsec",
+            "rms_uncertainty_anywhere_um",
+            "max_uncertainty_anywhere_um",
+        ),
+        0.0,
+    )
+    return message(
+        "CalibrationSummary",
+        {
+            "header": from_model.header(stamp_ns, "stage"),
+            "state": "as it is",
+            "views_done": 4,
+            "views_planned": 4,
+            "identifiable": True,
+            "rank_deficiency": 0,
+            "advice": [],
+            "qualified": True,
+            "causes": [],
+            "run_id": "7",
+            "grade": 2,
+            **numbers,
+        }
+        | changes,
+    )
 
 
 class Desk:
     def __init__(self, **parameters) -> None:
         self.hands = Hands()
-        self.session = CompensatingSession(settings_of("compensator", **parameters),
-                                           self.hands.ports)
+        self.session = CompensatingSession(
+            settings_of("compensator", **parameters), self.hands.ports
+        )
 
     def x_at(self, x: float) -> float | None:
         corrected = self.session.correct(NAMES, [x, 0.0, 0.0])
@@ -68,9 +93,17 @@ def use(desk, error_map=ONE) -> Compensator:
 
 def commanded(desk, names, position, frame_id: str = "stage") -> list[float] | None:
     """Send a command through the session; return the positions that it passes on."""
-    message = build(typestore(), "sensor_msgs/msg/JointState", {
-        "header": from_model.header(5, frame_id), "name": list(names), "effort": [],
-        "position": list(position), "velocity": [0.5] * len(names)})
+    message = build(
+        typestore(),
+        "sensor_msgs/msg/JointState",
+        {
+            "header": from_model.header(5, frame_id),
+            "name": list(names),
+            "effort": [],
+            "position": list(position),
+            "velocity": [0.5] * len(names),
+        },
+    )
     data = bytes(typestore().serialize_cdr(message, "sensor_msgs/msg/JointState"))
     out = desk.session.command(data)
     if out is None:
@@ -85,18 +118,32 @@ def test_a_command_gets_the_error_added_and_all_else_stays(desk):
     by = use(desk)
     x, y = by.command(0.01, -0.013)
     assert commanded(desk, ["z", "y", "x", "theta"], [7.0, -0.013, 0.01, 0.4]) == [
-        7.0, y, x, by.command_theta(0.4)]
+        7.0,
+        y,
+        x,
+        by.command_theta(0.4),
+    ]
     assert abs(x - 0.01) > 1e-9 and desk.session.correct(NAMES, [float(x), float(y), 0.0])[0] == (
-        pytest.approx(0.01, abs=1e-15))
+        pytest.approx(0.01, abs=1e-15)
+    )
     assert commanded(desk, ["theta"], [0.4]) == [by.command_theta(0.4)]
     assert desk.session.counts["commands"] == 2
 
 
-@pytest.mark.parametrize("names, position", [
-    (["x"], [0.01]), (["y", "theta"], [0.01, 0.0]), (["z"], [3.0]), (["X", "Y"], [0.01, 0.0]),
-    (["x", "y", "x"], [0.01, 0.0, 0.01]), (["theta", "theta"], [0.1, 0.1]),
-    (NAMES, [math.nan, 0.0, 0.0]),
-    (NAMES, [0.0, 2e12, 0.0]), (NAMES, [-0.02, -0.02, 0.0])])
+@pytest.mark.parametrize(
+    "names, position",
+    [
+        (["x"], [0.01]),
+        (["y", "theta"], [0.01, 0.0]),
+        (["z"], [3.0]),
+        (["X", "Y"], [0.01, 0.0]),
+        (["x", "y", "x"], [0.01, 0.0, 0.01]),
+        (["theta", "theta"], [0.1, 0.1]),
+        (NAMES, [math.nan, 0.0, 0.0]),
+        (NAMES, [0.0, 2e12, 0.0]),
+        (NAMES, [-0.02, -0.02, 0.0]),
+    ],
+)
 def test_a_command_that_cannot_be_corrected_is_not_passed_on(desk, names, position):
     use(desk, random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),)))
     assert commanded(desk, names, position) is None
@@ -112,8 +159,10 @@ def test_joints_that_are_not_of_the_stage_are_named(desk):
     assert desk.session.correct(["gantry_x", "gantry_y"], [0.01, -0.005]) is None
     assert desk.session.correct(["x", "z"], [0.01, 0.0]) is None
     told = desk.session.diagnosis()
-    assert told.level == Level.WARN and (
-        "joints gantry_x, gantry_y are not of the stage (x, y, theta)") in told.message
+    assert (
+        told.level == Level.WARN
+        and ("joints gantry_x, gantry_y are not of the stage (x, y, theta)") in told.message
+    )
     assert desk.session.counts["refused"] == 2 and desk.session.counts["corrected"] == 0
     assert desk.session.diagnosis().level == Level.OK  # told once
 
@@ -124,8 +173,10 @@ def test_a_command_in_another_frame_is_named_once(desk, frame_id, said):
     assert commanded(desk, NAMES, [0.0, 0.0, 0.0], frame_id) is not None
     told = desk.session.diagnosis()
     assert told.level == (Level.WARN if said else Level.OK)
-    assert ("commands name the frame 'gantry', but are corrected as positions in 'stage'"
-            in told.message) is said
+    assert (
+        "commands name the frame 'gantry', but are corrected as positions in 'stage'"
+        in told.message
+    ) is said
     assert desk.session.diagnosis().level == Level.OK
 
 
@@ -144,8 +195,9 @@ def test_a_request_is_answered_with_corrections_and_u(desk, inverse):
     np.testing.assert_array_equal(found["theta"], turned)
     at = np.clip(wanted, -0.02, 0.02) if inverse else (x, y)  # y = -0.02 is on the edge
     np.testing.assert_array_equal([found["u_x"], found["u_y"]], by.uncertainty(*at))
-    np.testing.assert_array_equal(found["u_theta"],
-                                  by.uncertainty_theta(turned if inverse else theta))
+    np.testing.assert_array_equal(
+        found["u_theta"], by.uncertainty_theta(turned if inverse else theta)
+    )
     assert len(desk.session.answer(x, y, [], inverse=inverse)["theta"]) == 0
 
 
@@ -173,10 +225,15 @@ def test_positions_outside_the_field_are_counted_and_told_once(desk):
     assert desk.session.diagnosis().level == Level.OK
 
 
-@pytest.mark.parametrize("x, y, theta, message", [
-    ([0.0], [], [], "1 x, 0 y and 0 theta"), ([0.0], [0.0], [0.0, 1.0], "1 x, 1 y and 2 theta"),
-    ([math.nan], [0.0], [], "a position is not a number"),
-    ([-0.02], [-0.02], [], "next to an unknown site")])
+@pytest.mark.parametrize(
+    "x, y, theta, message",
+    [
+        ([0.0], [], [], "1 x, 0 y and 0 theta"),
+        ([0.0], [0.0], [0.0, 1.0], "1 x, 1 y and 2 theta"),
+        ([math.nan], [0.0], [], "a position is not a number"),
+        ([-0.02], [-0.02], [], "next to an unknown site"),
+    ],
+)
 def test_a_request_that_cannot_be_met_is_refused_as_a_whole(desk, x, y, theta, message):
     with pytest.raises(InputError, match="no error map yet"):
         desk.session.answer([0.0], [0.0], [], inverse=False)
@@ -185,10 +242,16 @@ def test_a_request_that_cannot_be_met_is_refused_as_a_whole(desk, x, y, theta, m
         desk.session.answer(x, y, theta, inverse=False)
 
 
-@pytest.mark.parametrize(("parameter", "stated", "whole", "used"), [
-    ("bilinear", "", True, "bilinear"), ("bicubic", "", True, "bicubic"),
-    ("bilinear", "bicubic", True, "bicubic"), ("bicubic", "bilinear", True, "bilinear"),
-    ("bicubic", "bicubic", False, "bilinear")])
+@pytest.mark.parametrize(
+    ("parameter", "stated", "whole", "used"),
+    [
+        ("bilinear", "", True, "bilinear"),
+        ("bicubic", "", True, "bicubic"),
+        ("bilinear", "bicubic", True, "bicubic"),
+        ("bicubic", "bilinear", True, "bilinear"),
+        ("bicubic", "bicubic", False, "bilinear"),
+    ],
+)
 def test_a_map_is_interpolated_as_it_was_estimated(parameter, stated, whole, used):
     desk = Desk(interpolation=parameter)
     known = ONE if whole else random_map(Artifact(5, 0.01, 8), 3, unknown=((0, 0),))
@@ -215,34 +278,48 @@ def test_a_map_that_is_older_than_the_one_in_use_is_used_with_a_warning(desk):
         desk.session.take_summary(summary_of(stamp_ns))
     assert desk.x_at(TWO.gx[2, 2]) == pytest.approx(0.0, abs=1e-8)
     assert desk.hands.lines(Level.WARN) == [
-        "the map of plan demo, run 7 is older than the one that it replaces, of plan demo, run 7"]
+        "the map of plan demo, run 7 is older than the one that it replaces, of plan demo, run 7"
+    ]
 
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
-    for take in [lambda: desk.session.take_map(map_of()),
-                 lambda: desk.session.take_summary(summary_of())][::order]:
+    for take in [
+        lambda: desk.session.take_map(map_of()),
+        lambda: desk.session.take_summary(summary_of()),
+    ][::order]:
         assert desk.x_at(0.0) is None
         take()
     assert desk.x_at(ONE.gx[2, 2]) == pytest.approx(0.0, abs=1e-8)
     assert desk.hands.lines(Level.OK)[-1] == (
-        "correcting by the map of plan demo, run 7 from now on")
+        "correcting by the map of plan demo, run 7 from now on"
+    )
     desk.hands.pass_time(12)
     told = desk.session.diagnosis()
     assert (told.level, told.message) == (Level.OK, "correcting by the map of plan demo, run 7")
     assert (told.values["since_s"], told.values["map_age_s"]) == ("12", "12")
 
 
-@pytest.mark.parametrize("the_map, the_summary, why", [
-    ({"qualified": False}, {}, "plan demo, run 7 is not qualified"),
-    ({"identifiable": False}, {}, "plan demo, run 7 is said to be qualified and not identified"),
-    ({}, {"qualified": False}, "plan demo, run 7 is not qualified: as it is"),
-    ({}, {"views_done": 3}, "plan demo, run 7 contains 3 of 4 views"),
-    ({}, {"run_id": "6"}, "no selfcal/summary says yet whether plan demo, run 7 is complete"),
-    ({}, {"stamp_ns": START_NS + 1},
-     "no selfcal/summary says yet whether plan demo, run 7 is complete")])
-def test_a_map_that_must_not_be_used_leaves_the_former_one_in_use(
-        desk, the_map, the_summary, why):
+@pytest.mark.parametrize(
+    "the_map, the_summary, why",
+    [
+        ({"qualified": False}, {}, "plan demo, run 7 is not qualified"),
+        (
+            {"identifiable": False},
+            {},
+            "plan demo, run 7 is said to be qualified and not identified",
+        ),
+        ({}, {"qualified": False}, "plan demo, run 7 is not qualified: as it is"),
+        ({}, {"views_done": 3}, "plan demo, run 7 contains 3 of 4 views"),
+        ({}, {"run_id": "6"}, "no selfcal/summary says yet whether plan demo, run 7 is complete"),
+        (
+            {},
+            {"stamp_ns": START_NS + 1},
+            "no selfcal/summary says yet whether plan demo, run 7 is complete",
+        ),
+    ],
+)
+def test_a_map_that_must_not_be_used_leaves_the_former_one_in_use(desk, the_map, the_summary, why):
     desk.session.take_map(map_of(TWO, START_NS - 5))
     desk.session.take_summary(summary_of(START_NS - 5))
     before = desk.x_at(0.01)
@@ -261,8 +338,10 @@ def stated(error_map):
 
 def exchanged(error_map):
     """Return a map with x and y exchanged, as positions and as errors."""
-    swapped = {name: getattr(error_map, other).T for name, other in (
-        ("gx", "gy"), ("gy", "gx"), ("u_gx", "u_gy"), ("u_gy", "u_gx"))}
+    swapped = {
+        name: getattr(error_map, other).T
+        for name, other in (("gx", "gy"), ("gy", "gx"), ("u_gx", "u_gy"), ("u_gy", "u_gx"))
+    }
     return replace(error_map, **swapped)
 
 
@@ -294,8 +373,16 @@ def test_a_map_with_changed_axes_leaves_the_former_one_in_use(change, qualified_
     assert desk.x_at(0.01) != before
 
 
-@pytest.mark.parametrize("name", ["max_error_um", "rms_error_um", "rms_uncertainty_um",
-                                  "max_theta_error_arcsec", "rms_theta_uncertainty_arcsec"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "max_error_um",
+        "rms_error_um",
+        "rms_uncertainty_um",
+        "max_theta_error_arcsec",
+        "rms_theta_uncertainty_arcsec",
+    ],
+)
 @pytest.mark.parametrize("qualified_only", [True, False])
 def test_a_map_that_its_summary_contradicts_leaves_the_former_one_in_use(name, qualified_only):
     desk = Desk(require_qualified=qualified_only)
@@ -348,8 +435,10 @@ def test_a_file_that_does_not_identify_the_stage_is_refused(tmp_path):
     data |= {"digest": digests_of(data)}
     path = tmp_path / "map.json"
     path.write_text(json.dumps(data))
-    with pytest.raises(InputError, match="the map is not qualified; measure again, or set "
-                                         "require_qualified to false"):
+    with pytest.raises(
+        InputError,
+        match="the map is not qualified; measure again, or set require_qualified to false",
+    ):
         Desk(map=str(path))
     assert Desk(map=str(path), require_qualified=False).x_at(0.0) is not None
 
@@ -372,19 +461,27 @@ MILLIRADIAN_REACH = 1e-3 / np.hypot(0.02, 0.02)
 """Angle by which the farthest of 5 x 5 sites of 10 mm moves by 1 mm, rad."""
 
 
-@pytest.mark.parametrize("changes, why", [
-    ({"gx": np.zeros(3)}, "gx has 3 values, the plate 25"),
-    ({"gx": with_value(ONE.gx, math.nan)}, "gx is not finite at 1 of the 25 valid sites"),
-    ({"u_gy": with_value(ONE.gy, -1e-9)}, "u_gy is negative"),
-    ({"gy": with_value(ONE.gy, -math.inf)}, "gy is not finite at 1 of the 25 valid sites"),
-    ({"g_theta": with_value(ONE.g_theta, math.inf)}, "g_theta is infinite"),
-    ({"g_theta": np.full(8, math.nan)}, "the error of no site or of no line is known"),
-    ({"valid": [False] * 25}, "the error of no site or of no line is known"),
-    ({"gx": with_value(ONE.gx, 2e-4)}, "mm to the next along x, 10 mm away: is it real?"),
-    ({"gy": np.full(25, -1.01e-3)},
-     "it corrects by up to 0.00101 m, max_correction is 0.001 m; check its units"),
-    ({"g_theta": with_value(ONE.g_theta, 1.01 * MILLIRADIAN_REACH)},
-     "it corrects by up to 0.00101 m, max_correction is 0.001 m; check its units")])
+@pytest.mark.parametrize(
+    "changes, why",
+    [
+        ({"gx": np.zeros(3)}, "gx has 3 values, the plate 25"),
+        ({"gx": with_value(ONE.gx, math.nan)}, "gx is not finite at 1 of the 25 valid sites"),
+        ({"u_gy": with_value(ONE.gy, -1e-9)}, "u_gy is negative"),
+        ({"gy": with_value(ONE.gy, -math.inf)}, "gy is not finite at 1 of the 25 valid sites"),
+        ({"g_theta": with_value(ONE.g_theta, math.inf)}, "g_theta is infinite"),
+        ({"g_theta": np.full(8, math.nan)}, "the error of no site or of no line is known"),
+        ({"valid": [False] * 25}, "the error of no site or of no line is known"),
+        ({"gx": with_value(ONE.gx, 2e-4)}, "mm to the next along x, 10 mm away: is it real?"),
+        (
+            {"gy": np.full(25, -1.01e-3)},
+            "it corrects by up to 0.00101 m, max_correction is 0.001 m; check its units",
+        ),
+        (
+            {"g_theta": with_value(ONE.g_theta, 1.01 * MILLIRADIAN_REACH)},
+            "it corrects by up to 0.00101 m, max_correction is 0.001 m; check its units",
+        ),
+    ],
+)
 def test_a_map_that_harms_leaves_the_former_one_in_use(desk, changes, why):
     use(desk, TWO)
     before = desk.session.correct(NAMES, [0.01, -0.01, 0.3])
@@ -412,8 +509,9 @@ def test_a_map_of_another_frame_leaves_the_former_one_in_use(desk, frame_id, use
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
 def test_max_correction_is_the_largest_error_that_is_used(factor):
-    largest = max(np.abs(ONE.gx).max(), np.abs(ONE.gy).max(),
-                  np.abs(ONE.g_theta).max() * np.hypot(0.02, 0.02))
+    largest = max(
+        np.abs(ONE.gx).max(), np.abs(ONE.gy).max(), np.abs(ONE.g_theta).max() * np.hypot(0.02, 0.02)
+    )
     desk = Desk(require_qualified=False, max_correction=factor * largest)
     taken = True
     try:
@@ -426,15 +524,17 @@ def test_max_correction_is_the_largest_error_that_is_used(factor):
 @pytest.mark.parametrize(("interpolation", "used"), [("bilinear", True), ("bicubic", False)])
 @pytest.mark.parametrize("changed", ["gx", "g_theta"])
 def test_a_spline_that_passes_beyond_the_limit_between_its_nodes_is_not_used(
-        interpolation, used, changed):
+    interpolation, used, changed
+):
     """Through 0, 1, 1, 0 it reaches 9/8 in the middle, one of a circle about as much."""
     error_map = random_map(Artifact(4, 0.01, 8), 3)
     plateau = np.zeros_like(getattr(error_map, changed))
     plateau[1:3] = {"gx": 0.95e-4, "g_theta": 0.95e-4 / np.hypot(0.015, 0.015)}[changed]
     desk = Desk(require_qualified=False, max_correction=1e-4)
     try:
-        desk.session.take_map(map_of(error_map, interpolation=interpolation,
-                                     **{changed: plateau.ravel()}))
+        desk.session.take_map(
+            map_of(error_map, interpolation=interpolation, **{changed: plateau.ravel()})
+        )
     except InputError as error:
         assert "max_correction is 0.0001 m" in str(error)
     assert (desk.session.compensator is not None) is used
@@ -444,8 +544,9 @@ def test_a_spline_that_passes_beyond_the_limit_between_its_nodes_is_not_used(
 def test_the_map_of_a_tiny_plate_does_not_turn_a_stage_by_any_angle(angle, used):
     desk, tiny = Desk(require_qualified=False), random_map(Artifact(5, 1e-6, 8), 3)
     try:
-        desk.session.take_map(map_of(tiny, gx=np.zeros(25), gy=np.zeros(25),
-                                     g_theta=np.full(8, angle)))
+        desk.session.take_map(
+            map_of(tiny, gx=np.zeros(25), gy=np.zeros(25), g_theta=np.full(8, angle))
+        )
     except InputError as error:
         assert "max_correction is 0.001 m" in str(error)
     assert (desk.session.compensator is not None) is used
@@ -459,8 +560,10 @@ def test_nan_where_the_map_is_not_valid_is_no_error(desk):
     assert desk.x_at(0.0) is not None
 
 
-@pytest.mark.parametrize("position, refused", [
-    (1e12, False), (-1.1e12, True), (1.7e308, True), (float("inf"), True), (float("nan"), True)])
+@pytest.mark.parametrize(
+    "position, refused",
+    [(1e12, False), (-1.1e12, True), (1.7e308, True), (float("inf"), True), (float("nan"), True)],
+)
 @pytest.mark.parametrize("joint", [0, 1, 2])
 def test_a_position_that_no_stage_has_is_refused(desk, joint, position, refused):
     desk.session.take_map(map_of())
@@ -476,10 +579,22 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 
 def sample(number: int, x: float = 0.01, names: Sequence[str] = NAMES) -> bytes:
     """Return the bytes of a sample with a stamp of its own."""
-    return bytes(typestore().serialize_cdr(build(typestore(), JOINT_STATE, {
-        "header": from_model.header(START_NS + number, "stage"), "name": names,
-        "position": np.array([x, 0.0, 0.0]), "velocity": np.array([1.0, 2.0, 3.0]),
-        "effort": np.zeros(0)}), JOINT_STATE))
+    return bytes(
+        typestore().serialize_cdr(
+            build(
+                typestore(),
+                JOINT_STATE,
+                {
+                    "header": from_model.header(START_NS + number, "stage"),
+                    "name": names,
+                    "position": np.array([x, 0.0, 0.0]),
+                    "velocity": np.array([1.0, 2.0, 3.0]),
+                    "effort": np.zeros(0),
+                },
+            ),
+            JOINT_STATE,
+        )
+    )
 
 
 def corrected(desk, samples: list[bytes], lost: int = 0, age_ms: float = 0.0) -> list:
@@ -508,22 +623,33 @@ def test_of_the_bytes_of_a_sample_the_positions_alone_change(busy):
     assert list(message.position) == busy.session.correct(NAMES, [0.01, 0.0, 0.0])
     assert message.position[0] != 0.01
     assert (message.name, list(message.velocity), message.header.frame_id, numbers([message])) == (
-        NAMES, [1.0, 2.0, 3.0], "stage", [7])
+        NAMES,
+        [1.0, 2.0, 3.0],
+        "stage",
+        [7],
+    )
 
 
-@pytest.mark.parametrize("waiting, lost, out", [
-    (KEEPS_UP, 0, range(KEEPS_UP)), (KEEPS_UP + 1, 0, [KEEPS_UP]),
-    (KEEPS_UP - 2, 2, range(KEEPS_UP - 2)), (KEEPS_UP - 2, 3, [KEEPS_UP - 3]), (0, 4, [])])
+@pytest.mark.parametrize(
+    "waiting, lost, out",
+    [
+        (KEEPS_UP, 0, range(KEEPS_UP)),
+        (KEEPS_UP + 1, 0, [KEEPS_UP]),
+        (KEEPS_UP - 2, 2, range(KEEPS_UP - 2)),
+        (KEEPS_UP - 2, 3, [KEEPS_UP - 3]),
+        (0, 4, []),
+    ],
+)
 def test_few_samples_are_corrected_in_order_and_of_many_the_newest_alone(busy, waiting, lost, out):
     found = corrected(busy, [sample(number) for number in range(waiting)], lost)
     assert numbers(found) == list(out)
     skipped = waiting + lost - len(out)
-    assert (busy.session.counts["corrected"], busy.session.counts["skipped"]) == (
-        len(out), skipped)
+    assert (busy.session.counts["corrected"], busy.session.counts["skipped"]) == (len(out), skipped)
     told = busy.session.diagnosis()
     assert told.level == (Level.WARN if skipped else Level.OK)
     assert told.message.startswith(f"{skipped} samples skipped since the last status: ") is (
-        skipped > 0)
+        skipped > 0
+    )
 
 
 def test_skipped_samples_are_a_warning_once_and_a_count_for_good(busy):
@@ -542,8 +668,9 @@ def test_the_age_of_corrected_samples_is_told_and_beyond_max_age_a_warning(busy,
     told = busy.session.diagnosis()
     assert told.level == level
     assert (told.values["age_ms"], told.values["age_ms_max"]) == ("2.00", f"{age_ms:.2f}")
-    assert ("a corrected position was 5.1 ms old when it was published, max_age is 5 ms"
-            in told.message) is (level == Level.WARN)
+    assert (
+        "a corrected position was 5.1 ms old when it was published, max_age is 5 ms" in told.message
+    ) is (level == Level.WARN)
     assert busy.session.diagnosis().level == Level.OK
 
 

@@ -20,16 +20,23 @@ CAMERA = Camera(width=90, height=80)
 def desk():
     sent = []
     ports = SimpleNamespace(publish=lambda output, fields: sent.append((output, fields)))
-    session = DetectingSession(DetectorSettings(pixel_size=2e-6, mark_size=5e-5, frame_id="f"),
-                               ports)
+    session = DetectingSession(
+        DetectorSettings(pixel_size=2e-6, mark_size=5e-5, frame_id="f"), ports
+    )
     return SimpleNamespace(session=session, sent=sent)
 
 
 def image(stamp, values, camera="eye"):
     header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp, nanosec=5), frame_id=camera)
-    return SimpleNamespace(header=header, height=values.shape[0], width=values.shape[1],
-                           encoding="mono8", is_bigendian=0, step=values.shape[1],
-                           data=values.tobytes())
+    return SimpleNamespace(
+        header=header,
+        height=values.shape[0],
+        width=values.shape[1],
+        encoding="mono8",
+        is_bigendian=0,
+        step=values.shape[1],
+        data=values.tobytes(),
+    )
 
 
 def drawn(marks=1):
@@ -52,16 +59,22 @@ def test_detections_have_frame_and_stamp_of_their_image(desk):
     assert "ms_per_image_max" not in desk.session.diagnosis().values  # since the last one
 
 
-@pytest.mark.parametrize("values, why", [
-    (drawn(0), "nothing looks like one: check mark, mark_size, pixel_size and polarity"),
-    (drawn()[25:], "most rejected as cut_off")])
+@pytest.mark.parametrize(
+    "values, why",
+    [
+        (drawn(0), "nothing looks like one: check mark, mark_size, pixel_size and polarity"),
+        (drawn()[25:], "most rejected as cut_off"),
+    ],
+)
 def test_images_without_marks_are_a_warning_with_its_likely_reason(desk, values, why):
     for number in range(MANY_EMPTY):
         assert desk.session.diagnosis().message != f"no mark in the last {number} images, {why}"
         desk.session.take(image(number + 1, values))
     found = desk.session.diagnosis()
     assert (found.level, found.message) == (
-        Level.WARN, f"no mark in the last {MANY_EMPTY} images, {why}")
+        Level.WARN,
+        f"no mark in the last {MANY_EMPTY} images, {why}",
+    )
     assert not desk.sent
 
 
@@ -135,9 +148,10 @@ def test_more_possible_marks_than_max_marks_refuse_the_image(desk):
     grid = np.stack(np.meshgrid([-1e-4, 0.0, 1e-4], [-5e-5, 5e-5])).reshape(2, -1)
     values = Camera(width=190, height=150).image(grid, np.random.default_rng(1))
     for most, marks in ((6, 6), (5, None)):
-        session = DetectingSession(DetectorSettings(
-            pixel_size=2e-6, mark_size=5e-5, max_marks=most), SimpleNamespace(
-            publish=lambda *given: desk.sent.append(given)))
+        session = DetectingSession(
+            DetectorSettings(pixel_size=2e-6, mark_size=5e-5, max_marks=most),
+            SimpleNamespace(publish=lambda *given: desk.sent.append(given)),
+        )
         if marks:
             session.take(image(1, values))
             assert len(desk.sent) == marks

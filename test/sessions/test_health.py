@@ -26,9 +26,14 @@ def hands():
 
 
 def test_the_worst_comes_first_and_nothing_twice():
-    assert merged(Diagnosis(Level.OK, "main", {"a": 1}), [
-        Diagnosis(Level.OK, "fine", {"b": 2}), Diagnosis(Level.ERROR, "bad"),
-        Diagnosis(Level.WARN, "main")]) == Diagnosis(Level.ERROR, "bad; main", {"a": 1, "b": 2})
+    assert merged(
+        Diagnosis(Level.OK, "main", {"a": 1}),
+        [
+            Diagnosis(Level.OK, "fine", {"b": 2}),
+            Diagnosis(Level.ERROR, "bad"),
+            Diagnosis(Level.WARN, "main"),
+        ],
+    ) == Diagnosis(Level.ERROR, "bad; main", {"a": 1, "b": 2})
 
 
 def test_a_flood_of_refusals_is_counted_and_logged_at_powers_of_ten(hands):
@@ -36,9 +41,11 @@ def test_a_flood_of_refusals_is_counted_and_logged_at_powers_of_ten(hands):
     for _ in range(1234):
         refusals.add("topic", InputError("topic", "bad", "correct it"))
     assert hands.lines(Level.ERROR) == ["topic: bad; correct it"] + [
-        f"topic: bad; correct it (refused {n} times)" for n in (2, 3, 4, 5, 10, 100, 1000)]
-    assert refusals.diagnosis() == Diagnosis(Level.WARN, "topic: bad; correct it",
-                                             {"refused topic": 1234})
+        f"topic: bad; correct it (refused {n} times)" for n in (2, 3, 4, 5, 10, 100, 1000)
+    ]
+    assert refusals.diagnosis() == Diagnosis(
+        Level.WARN, "topic: bad; correct it", {"refused topic": 1234}
+    )
 
 
 @pytest.mark.parametrize("seconds, level", [(9.9, Level.WARN), (10.0, Level.OK)])
@@ -49,7 +56,8 @@ def test_a_refusal_and_a_loss_are_warnings_for_a_while(hands, seconds, level):
     losses.add("topic", 3)
     losses.add("topic", 4)
     assert hands.lines(Level.ERROR) == [
-        "topic: cannot be used (ZeroDivisionError: \\x1b[2Jdivision)"]
+        "topic: cannot be used (ZeroDivisionError: \\x1b[2Jdivision)"
+    ]
     assert len(hands.lines(Level.WARN)) == 1
     hands.pass_time(seconds)
     assert refusals.diagnosis().level == losses.diagnosis().level == level
@@ -57,9 +65,14 @@ def test_a_refusal_and_a_loss_are_warnings_for_a_while(hands, seconds, level):
     assert (losses.diagnosis().message == "topic: 7 messages lost") is (level == Level.WARN)
 
 
-@pytest.mark.parametrize("told", [
-    [(5, "events"), (5, "numbers")], [(5, "numbers"), (5, "events")],
-    [(2, "numbers"), (5, "events"), (3, "numbers")]])
+@pytest.mark.parametrize(
+    "told",
+    [
+        [(5, "events"), (5, "numbers")],
+        [(5, "numbers"), (5, "events")],
+        [(2, "numbers"), (5, "events"), (3, "numbers")],
+    ],
+)
 def test_what_two_sources_tell_of_one_loss_counts_once(hands, told):
     losses = Losses(hands.ports.say, hands.ports.now_s)
     for number, source in told:
@@ -70,7 +83,9 @@ def test_what_two_sources_tell_of_one_loss_counts_once(hands, told):
     losses.add("other", 1)
     assert losses.counts == {"topic": 13, "other": 1}
     assert [line.partition(" messages")[0] for line in hands.lines(Level.WARN)] == [
-        f"topic: {told[0][0]}", "other: 1"]
+        f"topic: {told[0][0]}",
+        "other: 1",
+    ]
 
 
 def test_a_loss_that_the_other_source_reports_later_is_no_new_one(hands):
@@ -89,7 +104,8 @@ def test_what_was_published_while_nobody_listened_is_told_apart(hands):
     losses.add_unheard("topic", 4)
     assert losses.diagnosis().values == {"lost topic": 2, "lost topic, not listening": 11}
     assert hands.lines(Level.WARN)[1:] == [
-        "topic: 7 messages were published while this node was not listening"]
+        "topic: 7 messages were published while this node was not listening"
+    ]
 
 
 @pytest.mark.parametrize("seconds, there", [(3.0, True), (3.1, False)])
@@ -126,8 +142,10 @@ def test_a_stamp_of_the_future_does_not_hide_later_gaps(hands, ahead_ns):
     assert rate.take_gap_ns() == 9_000_000_000
 
 
-@pytest.mark.parametrize("stamps, gap", [
-    ([5], 0), ([5, 9, 20], 11), ([20, 5, 9], 0), ([5, 20, 9, 26], 15), ([9, 5, 12], 3)])
+@pytest.mark.parametrize(
+    "stamps, gap",
+    [([5], 0), ([5, 9, 20], 11), ([20, 5, 9], 0), ([5, 20, 9, 26], 15), ([9, 5, 12], 3)],
+)
 def test_a_gap_lies_between_a_stamp_and_the_newest_before(hands, stamps, gap):
     together, single = Rate(hands.ports.now_s), Rate(hands.ports.now_s)
     together.add(np.array(stamps))

@@ -29,21 +29,46 @@ PROGRESS = ViewProgress(1, VIEW, 121, 83, 24, 12, READ, 9)
 def test_a_view_that_is_measured_word_for_word():
     assert progress_line(COMMAND, PROGRESS) == (
         "view 2 of 4 'rot90': 83 of 121 marks, 12 of 24 lines, 3 rejected (stage_moving 2, "
-        "low_score 1), σ 19 nm")
+        "low_score 1), σ 19 nm"
+    )
 
 
-@pytest.mark.parametrize(("command", "view", "line"), [
-    (replace(COMMAND, phase=Phase.PLACE), None, "view 2 of 4 'rot90': the plate is to be placed"),
-    (replace(COMMAND, phase=Phase.DONE), PROGRESS, "plan 'hu' done"),
-    (replace(COMMAND, phase=Phase.ABORT), None, "plan 'hu' aborted"),
-    (replace(COMMAND, views_planned=0), replace(PROGRESS, readings=ViewReadings(VIEW)),
-     "view 2 'rot90': 83 of 121 marks, 12 of 24 lines"),
-    (COMMAND, replace(PROGRESS, grid_expected=0, readings=ViewReadings(
-        VIEW, sigma_theta=np.deg2rad(1.5 / 3600))),
-     "view 2 of 4 'rot90': 12 of 24 lines, σ 1.50 arcsec"),
-    (COMMAND, replace(PROGRESS, check_done=4, view=replace(VIEW, check_marks=5),
-                      readings=ViewReadings(VIEW)),
-     "view 2 of 4 'rot90': 83 of 121 marks, 12 of 24 lines, 4 of 5 check stops")])
+@pytest.mark.parametrize(
+    ("command", "view", "line"),
+    [
+        (
+            replace(COMMAND, phase=Phase.PLACE),
+            None,
+            "view 2 of 4 'rot90': the plate is to be placed",
+        ),
+        (replace(COMMAND, phase=Phase.DONE), PROGRESS, "plan 'hu' done"),
+        (replace(COMMAND, phase=Phase.ABORT), None, "plan 'hu' aborted"),
+        (
+            replace(COMMAND, views_planned=0),
+            replace(PROGRESS, readings=ViewReadings(VIEW)),
+            "view 2 'rot90': 83 of 121 marks, 12 of 24 lines",
+        ),
+        (
+            COMMAND,
+            replace(
+                PROGRESS,
+                grid_expected=0,
+                readings=ViewReadings(VIEW, sigma_theta=np.deg2rad(1.5 / 3600)),
+            ),
+            "view 2 of 4 'rot90': 12 of 24 lines, σ 1.50 arcsec",
+        ),
+        (
+            COMMAND,
+            replace(
+                PROGRESS,
+                check_done=4,
+                view=replace(VIEW, check_marks=5),
+                readings=ViewReadings(VIEW),
+            ),
+            "view 2 of 4 'rot90': 83 of 121 marks, 12 of 24 lines, 4 of 5 check stops",
+        ),
+    ],
+)
 def test_other_states(command, view, line):
     assert progress_line(command, view) == line
 
@@ -60,8 +85,10 @@ class Desk:
 
     def __init__(self):
         self.now, self.lines, self.statuses = 0.0, [], []
-        self.session = CollectingSession(CollectorSettings.checked({}, "test"), Ports(
-            self._publish, lambda level, line: None, lambda: self.now, lambda: 0))
+        self.session = CollectingSession(
+            CollectorSettings.checked({}, "test"),
+            Ports(self._publish, lambda level, line: None, lambda: self.now, lambda: 0),
+        )
 
     def _publish(self, output, fields):
         if output == "progress":
@@ -73,8 +100,9 @@ class Desk:
         collector: Collector = self.session.collector
         for event in events:
             if isinstance(event, Command):
-                self.session.take_command(message(
-                    "ViewCommand", from_model.command(event, "stage")), False)
+                self.session.take_command(
+                    message("ViewCommand", from_model.command(event, "stage")), False
+                )
             else:
                 add = {Detection: collector.add_detection, EncoderSample: collector.add_encoder}
                 add[type(event)](event)
@@ -101,8 +129,12 @@ def test_a_line_is_published_when_it_changes_and_at_most_twice_a_second():
 def test_missing_marks_are_named_if_few_or_if_the_view_is_stuck():
     events = scene(count=0)
     detections = {id(event) for event in events.detections[4:]}
-    begun = [event for event in events.events if id(event) not in detections
-             and not (isinstance(event, Command) and event.phase == Phase.DONE)]
+    begun = [
+        event
+        for event in events.events
+        if id(event) not in detections
+        and not (isinstance(event, Command) and event.phase == Phase.DONE)
+    ]
     desk = Desk()
     desk.feed(begun)
     desk.tick(1.0)

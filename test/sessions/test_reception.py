@@ -41,8 +41,11 @@ class Desk:
         self.session = CollectingSession(settings, self.hands.ports)
         self.keeper = JournalKeeper(settings.journal, TOPICS, settings, self.hands.ports)
         self.reception = Reception(
-            self.session, self.keeper, say=self.hands.ports.say,
-            refuse=lambda place, error: self.refused.update([f"{place}: {error}"]))
+            self.session,
+            self.keeper,
+            say=self.hands.ports.say,
+            refuse=lambda place, error: self.refused.update([f"{place}: {error}"]),
+        )
         self.reception.open(worker or AtOnce())
 
     def receive(self, events, *, is_older=False):
@@ -51,16 +54,21 @@ class Desk:
             if isinstance(event, Command):
                 self.reception.command(data, is_older)
             else:
-                (self.reception.detection if isinstance(event, Detection)
-                 else self.reception.encoder)(data, 0)
+                (
+                    self.reception.detection
+                    if isinstance(event, Detection)
+                    else self.reception.encoder
+                )(data, 0)
         return self
 
     def read(self):
         """Return a digest of each view, as the session has it now."""
         self.reception.drain()
         measurements, progress = self.session.collector.collect()
-        return {index: readings_digest(item.readings, measurements.rejected)
-                for index, item in progress.items()}
+        return {
+            index: readings_digest(item.readings, measurements.rejected)
+            for index, item in progress.items()
+        }
 
 
 class AtOnce:
@@ -94,8 +102,10 @@ def events():
 @pytest.fixture(scope="module")
 def expected(events):
     _, measurements, progress = collected(events)
-    return {index: readings_digest(item.readings, measurements.rejected)
-            for index, item in progress.items()}
+    return {
+        index: readings_digest(item.readings, measurements.rejected)
+        for index, item in progress.items()
+    }
 
 
 def test_bytes_give_the_readings_of_the_messages(events, expected):
@@ -114,8 +124,10 @@ def test_messages_that_are_too_long_are_counted_with_the_reason(events, expected
         desk.receive([event])
     desk.receive(events)
     assert desk.read() == expected
-    assert desk.refused == {f"decoding: 2 messages on {ENCODER_TOPIC}: they are longer than 8192 "
-                            "bytes: cannot be decoded; correct their publisher": 1}
+    assert desk.refused == {
+        f"decoding: 2 messages on {ENCODER_TOPIC}: they are longer than 8192 "
+        "bytes: cannot be decoded; correct their publisher": 1
+    }
 
 
 def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events, expected):
@@ -125,9 +137,11 @@ def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events,
     desk.reception.detection(b"", 0)
     desk.reception.command(b"\0\1\0\0" + b"\xff" * 40, False)
     assert desk.receive(events).read() == expected
-    assert desk.refused == {f"decoding: 1 messages on {COMMAND_TOPIC}; 2 messages on "
-                            f"{ENCODER_TOPIC}; 1 messages on {DETECTION_TOPIC}: cannot be "
-                            "decoded; correct their publisher": 1}
+    assert desk.refused == {
+        f"decoding: 1 messages on {COMMAND_TOPIC}; 2 messages on "
+        f"{ENCODER_TOPIC}; 1 messages on {DETECTION_TOPIC}: cannot be "
+        "decoded; correct their publisher": 1
+    }
 
 
 def test_a_command_that_cannot_be_used_is_refused_and_the_others_are_used(events, expected):
@@ -144,8 +158,14 @@ def test_what_is_received_is_in_the_journal_before_it_is_used(tmp_path, events, 
     used = []
     collector = desk.session.collector
     collector.add_detection_block = lambda table: used.append(
-        (len(table), desk.keeper.path.stat() and sum(
-            file.read_bytes().count(cdr_of(found)) for file in desk.keeper.path.glob("*.mcap"))))
+        (
+            len(table),
+            desk.keeper.path.stat()
+            and sum(
+                file.read_bytes().count(cdr_of(found)) for file in desk.keeper.path.glob("*.mcap")
+            ),
+        )
+    )
     found = next(event for event in events if isinstance(event, Detection))
     desk.receive([found]).reception.drain()
     assert used == [(1, 1)]
@@ -159,8 +179,10 @@ def test_the_journal_is_a_bag_that_gives_what_the_session_gave(tmp_path, events,
     offline = collect_bag(desk_path(tmp_path), values)
     bag = collect_bag(Foreign().write(tmp_path / "x.mcap", events), values)
     for session in (offline, bag):
-        assert {index: readings_digest(item.readings, session.measurements.rejected)
-                for index, item in session.views.items()} == expected
+        assert {
+            index: readings_digest(item.readings, session.measurements.rejected)
+            for index, item in session.views.items()
+        } == expected
     assert resume(tmp_path) is None  # the run is over
 
 
@@ -171,15 +193,22 @@ def desk_path(folder):
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_a_session_that_takes_up_a_journal_goes_on_as_if_nothing_had_been(
-        tmp_path, events, expected, share):
+    tmp_path, events, expected, share
+):
     cut = round(share * len(events))
     first = Desk(tmp_path).receive(events[:cut])
     first.reception.drain()
     first.keeper.close()
     second = Desk(tmp_path)
     assert second.reception.restoring
-    second.receive([event for event in events if isinstance(event, Command)
-                    and event.stamp_ns <= events[cut - 1].stamp_ns], is_older=True)  # latched
+    second.receive(
+        [
+            event
+            for event in events
+            if isinstance(event, Command) and event.stamp_ns <= events[cut - 1].stamp_ns
+        ],
+        is_older=True,
+    )  # latched
     second.receive(events[cut:])
     assert second.read() == expected
     assert not second.session.missed
@@ -202,19 +231,24 @@ def test_the_time_without_a_collector_is_told_in_the_view_that_it_tore(tmp_path,
         os.utime(path, ns=(written_ns, written_ns))
     second = Desk(tmp_path)
     second.reception.drain()
-    line = re.compile(r"view '0': detections of (\d+\.\d) s without a collector are lost, those of "
-                      "complete marks included")
+    line = re.compile(
+        r"view '0': detections of (\d+\.\d) s without a collector are lost, those of "
+        "complete marks included"
+    )
     told = second.session.diagnosis(detections_matched=True)
     assert told.level == Level.WARN
     assert away_s <= float(line.search(told.message)[1]) < away_s + 60
     assert [line.search(text)[0] for text in second.hands.lines(Level.OK)] == [
-        line.search(told.message)[0]]
+        line.search(told.message)[0]
+    ]
     second.receive([commands[2]]).reception.drain()
     assert not line.search(second.session.diagnosis(detections_matched=True).message)
 
 
-@pytest.mark.parametrize(("hours", "limit_s", "goes_on"), [
-    (23, 86400.0, True), (25, 86400.0, False), (25, 1e6, True), (1, 60.0, False)])
+@pytest.mark.parametrize(
+    ("hours", "limit_s", "goes_on"),
+    [(23, 86400.0, True), (25, 86400.0, False), (25, 1e6, True), (1, 60.0, False)],
+)
 def test_a_run_that_was_left_long_ago_is_not_taken_up(tmp_path, events, hours, limit_s, goes_on):
     first = Desk(tmp_path).receive(events[:200])
     first.reception.drain()
@@ -226,9 +260,14 @@ def test_a_run_that_was_left_long_ago_is_not_taken_up(tmp_path, events, hours, l
     assert second.reception.restoring == goes_on
     second.reception.drain()
     assert (sum(second.session.collector.received.values()) > 0) == goes_on
-    assert second.hands.lines(Level.WARN) == ([] if goes_on else [
-        f"{first_path(tmp_path)}: its run was left {hours} h ago and is not resumed; 'selfcal "
-        "solve' reads it, a larger journal_max_age resumes it"])
+    assert second.hands.lines(Level.WARN) == (
+        []
+        if goes_on
+        else [
+            f"{first_path(tmp_path)}: its run was left {hours} h ago and is not resumed; 'selfcal "
+            "solve' reads it, a larger journal_max_age resumes it"
+        ]
+    )
     assert (second.keeper.path == first_path(tmp_path)) == goes_on
 
 
@@ -241,8 +280,7 @@ def test_of_a_run_that_is_over_nothing_is_said_however_old(tmp_path, events):
     assert not second.hands.lines(Level.WARN)
 
 
-def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
-        tmp_path, events, expected):
+def test_what_comes_while_the_journal_is_read_is_written_and_held_back(tmp_path, events, expected):
     cut = len(events) // 2
     first = Desk(tmp_path).receive(events[:cut])
     first.reception.drain()
@@ -253,7 +291,9 @@ def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
         assert not second.reception.drain()
         told = second.reception.diagnosis()
         assert (told.level, told.message) == (
-            Level.WARN, f"reading the journal {first_path(tmp_path)}")
+            Level.WARN,
+            f"reading the journal {first_path(tmp_path)}",
+        )
         assert second.keeper.path == path
         second.receive(events[-6:-3] if path is None else events[-3:])
         assert not second.session.collector.received["encoder"]
@@ -264,11 +304,13 @@ def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
     second.reception.close()
     offline = collect_bag(desk_path(tmp_path), settings_of("measurement_collector"))
     assert sum(view.used for view in offline.measurements.views) == sum(
-        view.used for view in second.session.collector.collect()[0].views)
+        view.used for view in second.session.collector.collect()[0].views
+    )
 
 
 def test_what_comes_while_a_journal_whose_run_is_over_is_gone_through_is_in_the_next_one(
-        tmp_path, events, expected):
+    tmp_path, events, expected
+):
     Desk(tmp_path).receive(events).reception.close()
     worker = Later()
     second = Desk(tmp_path, worker).receive(events[:100])
@@ -279,12 +321,14 @@ def test_what_comes_while_a_journal_whose_run_is_over_is_gone_through_is_in_the_
     path = second.keeper.path
     second.reception.close()
     assert path != first_path(tmp_path)
-    assert sum(len(item) if hasattr(item, "__len__") else 1
-               for _, item in BagReader(path).columns()) == len(events)
+    assert sum(
+        len(item) if hasattr(item, "__len__") else 1 for _, item in BagReader(path).columns()
+    ) == len(events)
 
 
 def test_what_comes_while_a_run_that_was_left_is_looked_for_is_used_and_written(
-        tmp_path, events, expected):
+    tmp_path, events, expected
+):
     first = Desk(tmp_path).receive(events[:200])
     first.reception.drain()
     first.keeper.close()
@@ -301,7 +345,8 @@ def test_what_comes_while_a_run_that_was_left_is_looked_for_is_used_and_written(
 
 
 def test_a_collector_that_ends_while_a_journal_is_gone_through_writes_what_has_come(
-        tmp_path, events):
+    tmp_path, events
+):
     first = Desk(tmp_path).receive(events[:200])
     first.reception.drain()
     first.keeper.close()
@@ -310,8 +355,13 @@ def test_a_collector_that_ends_while_a_journal_is_gone_through_writes_what_has_c
     second.reception.drain()
     worker.finish()
     second.receive(events[260:270]).reception.close()
-    assert sum(len(item) if hasattr(item, "__len__") else 1
-               for _, item in BagReader(first_path(tmp_path)).columns()) == 270
+    assert (
+        sum(
+            len(item) if hasattr(item, "__len__") else 1
+            for _, item in BagReader(first_path(tmp_path)).columns()
+        )
+        == 270
+    )
 
 
 def test_a_journal_that_was_not_gone_through_is_let_go(tmp_path, events):
@@ -326,7 +376,8 @@ def test_a_journal_that_was_not_gone_through_is_let_go(tmp_path, events):
 
 
 def test_a_journal_that_cannot_be_read_is_refused_and_collecting_goes_on(
-        tmp_path, events, expected):
+    tmp_path, events, expected
+):
     first = Desk(tmp_path).receive(events[:50])
     first.reception.drain()
     first.keeper.close()
@@ -350,6 +401,7 @@ class FullDisk:
             if self.full:
                 raise OSError(28, "No space left on device")
             return write(fd, data)
+
         monkeypatch.setattr(journal_file.os, "write", guarded)
 
 
@@ -361,9 +413,11 @@ def test_a_full_disk_is_said_counted_and_ends_nothing(tmp_path, events, expected
         desk.receive([event]).reception.drain()
     told = desk.reception.diagnosis()
     assert (told.level, told.values["journal_lost"]) == (Level.WARN, 30)
-    assert told.message == (f"{desk.keeper.path}: the journal cannot be written (No space left on "
-                            "device); free some space or name another folder; 30 messages are not "
-                            "in the journal")
+    assert told.message == (
+        f"{desk.keeper.path}: the journal cannot be written (No space left on "
+        "device); free some space or name another folder; 30 messages are not "
+        "in the journal"
+    )
     disk.full = False
     desk.hands.pass_time(10)
     desk.receive(events[70:])
@@ -371,7 +425,8 @@ def test_a_full_disk_is_said_counted_and_ends_nothing(tmp_path, events, expected
     assert desk.hands.lines(Level.WARN) == [
         f"{desk.keeper.path}: the journal cannot be written (No space left on device); free some "
         "space or name another folder; collecting continues without it",
-        f"{desk.keeper.path}: the journal is written again; 30 messages are not in it"]
+        f"{desk.keeper.path}: the journal is written again; 30 messages are not in it",
+    ]
     told = desk.reception.diagnosis()
     assert (told.level, told.message) == (Level.WARN, "30 messages are not in the journal")
 
@@ -393,7 +448,8 @@ def test_a_disk_that_is_full_from_the_beginning_is_tried_again(tmp_path, events,
     assert desk.reception.diagnosis().message == "7 messages are not in the journal"
     assert [path.name for path in (tmp_path / "journals").iterdir()] == [desk.keeper.path.name]
     assert desk.hands.lines(Level.WARN)[1:] == [
-        f"{desk.keeper.path}: the journal is written again; 7 messages are not in it"]
+        f"{desk.keeper.path}: the journal is written again; 7 messages are not in it"
+    ]
 
 
 def test_a_folder_that_may_not_be_written_is_a_mistake_of_the_parameter(tmp_path):
@@ -427,18 +483,29 @@ class Locked:
         def refused(folder):
             self.asked += 1
             raise reason
+
         monkeypatch.setattr(journal, "resume", refused)
 
 
-@pytest.mark.parametrize(("reason", "in_health", "refused"), [
-    (InputError("journal_1", "another process writes this journal", "end it"),
-     "journal_1: another process writes this journal; end it; 90 "
-     "messages are not in the journal",
-     {}),
-    (ZeroDivisionError("within"), "no room; 90 messages are not in the journal",
-     {"journal: within": 1})])
+@pytest.mark.parametrize(
+    ("reason", "in_health", "refused"),
+    [
+        (
+            InputError("journal_1", "another process writes this journal", "end it"),
+            "journal_1: another process writes this journal; end it; 90 "
+            "messages are not in the journal",
+            {},
+        ),
+        (
+            ZeroDivisionError("within"),
+            "no room; 90 messages are not in the journal",
+            {"journal: within": 1},
+        ),
+    ],
+)
 def test_whatever_a_later_try_meets_what_has_come_is_used(
-        tmp_path, events, expected, monkeypatch, reason, in_health, refused):
+    tmp_path, events, expected, monkeypatch, reason, in_health, refused
+):
     Desk(tmp_path).keeper.close()  # a journal to go on with
     disk = FullDisk(monkeypatch)
     disk.full = True
@@ -447,7 +514,7 @@ def test_whatever_a_later_try_meets_what_has_come_is_used(
     locked = Locked(monkeypatch, reason)
     desk.hands.pass_time(10)
     for start in range(0, 90, 10):
-        desk.receive(events[start:start + 10]).reception.drain()
+        desk.receive(events[start : start + 10]).reception.drain()
     assert sum(desk.session.collector.received.values()) == 90
     assert locked.asked == 1  # not at every tick
     assert desk.refused == refused
@@ -461,7 +528,7 @@ def test_a_full_disk_and_a_slow_encoder_do_not_fill_the_log(tmp_path, events, mo
     disk, desk = FullDisk(monkeypatch), Desk(tmp_path)
     disk.full = True
     for tick in range(1000):  # 40 s, a message at every second look
-        desk.receive(events[tick:tick + 1] if tick % 2 else []).reception.drain()
+        desk.receive(events[tick : tick + 1] if tick % 2 else []).reception.drain()
         desk.hands.pass_time(0.04)
     assert len(desk.hands.lines(Level.WARN)) == 1
     assert desk.reception.diagnosis().values["journal_lost"] == 500
@@ -473,11 +540,13 @@ def test_a_full_disk_and_a_slow_encoder_do_not_fill_the_log(tmp_path, events, mo
     assert len(desk.hands.lines(Level.WARN)) == 1  # nothing was written
     desk.receive(events[:1]).reception.drain()
     assert desk.hands.lines(Level.WARN)[1:] == [
-        f"{desk.keeper.path}: the journal is written again; 500 messages are not in it"]
+        f"{desk.keeper.path}: the journal is written again; 500 messages are not in it"
+    ]
 
 
 def test_a_journal_is_taken_up_on_a_full_disk_and_gone_on_with_when_there_is_room(
-        tmp_path, events, expected, monkeypatch):
+    tmp_path, events, expected, monkeypatch
+):
     first = Desk(tmp_path).receive(events[:200])
     first.reception.drain()
     first.keeper.close()
@@ -497,8 +566,13 @@ def test_a_journal_is_taken_up_on_a_full_disk_and_gone_on_with_when_there_is_roo
     assert second.read() == expected
     assert second.reception.diagnosis().message == "60 messages are not in the journal"
     second.reception.close()
-    assert sum(len(item) if hasattr(item, "__len__") else 1 for _, item in
-               BagReader(first_path(tmp_path)).columns()) == len(events) - 60
+    assert (
+        sum(
+            len(item) if hasattr(item, "__len__") else 1
+            for _, item in BagReader(first_path(tmp_path)).columns()
+        )
+        == len(events) - 60
+    )
 
 
 def first_path(folder):
@@ -518,7 +592,8 @@ def test_a_journal_that_could_not_be_read_is_not_written_to(tmp_path, events, mo
         f"{tmp_path}: the journal cannot be written (Input/output error); free some space or "
         "name another folder; collecting continues without it",
         f"{tmp_path}: the journal cannot be read (Input/output error); correct that, then restart "
-        "the collector; the run is not resumed"]
+        "the collector; the run is not resumed",
+    ]
     second.hands.pass_time(10)
     second.reception.drain()
     second.receive(events[60:70]).reception.drain()
@@ -541,14 +616,16 @@ def two_files(folder, events, spoil):
 
 @pytest.mark.parametrize(("spoil", "n_read"), [(0, 70), (1, 50)])
 def test_a_file_of_a_journal_that_cannot_be_read_costs_itself(
-        tmp_path, events, monkeypatch, spoil, n_read):
+    tmp_path, events, monkeypatch, spoil, n_read
+):
     path, file = two_files(tmp_path, events, spoil)
     desk = Desk(tmp_path)
     desk.receive(events[120:130]).reception.drain()
     assert sum(desk.session.collector.received.values()) == n_read + 10
     assert not desk.refused
     assert desk.hands.lines(Level.WARN) == [
-        f"{path}: the file {file.name} was not read: not an MCAP file"]
+        f"{path}: the file {file.name} was not read: not an MCAP file"
+    ]
     desk.keeper.close()
     assert [len(list(path.glob("*.mcap")))] == [3]
 
@@ -560,8 +637,9 @@ def test_a_journal_none_of_whose_files_can_be_read_is_refused(tmp_path, events):
     desk = Desk(tmp_path)
     desk.receive(events[120:130]).reception.drain()
     assert sum(desk.session.collector.received.values()) == 10
-    assert desk.refused == {f"journal: {file}: not an MCAP file; give an .mcap file or a rosbag2 "
-                            "folder": 1}
+    assert desk.refused == {
+        f"journal: {file}: not an MCAP file; give an .mcap file or a rosbag2 folder": 1
+    }
 
 
 DAY_NS = 86400 * 10**9
@@ -570,9 +648,14 @@ DAY_NS = 86400 * 10**9
 def run_of(events, begin_ns):
     """Return the events of a run that begins then and names itself."""
     by = begin_ns - events[0].stamp_ns
-    return [replace(event, stamp_ns=event.stamp_ns + by,
-                    **({"run_id": str(begin_ns)} if isinstance(event, Command) else {}))
-            for event in events]
+    return [
+        replace(
+            event,
+            stamp_ns=event.stamp_ns + by,
+            **({"run_id": str(begin_ns)} if isinstance(event, Command) else {}),
+        )
+        for event in events
+    ]
 
 
 def digests(measurements):
@@ -586,16 +669,27 @@ def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_p
     desk.reception.drain()
     assert desk.session.collector.newest_command is None
     told = desk.session.diagnosis(detections_matched=True)
-    counts = [sum(isinstance(event, kind) for event in events)
-              for kind in (Command, Detection, EncoderSample)]
-    assert desk.session.collector.unusable == dict(zip((
-        "command_from_the_future", "from_the_future", "encoder_sample_from_the_future"),
-        counts, strict=True))
+    counts = [
+        sum(isinstance(event, kind) for event in events)
+        for kind in (Command, Detection, EncoderSample)
+    ]
+    assert desk.session.collector.unusable == dict(
+        zip(
+            ("command_from_the_future", "from_the_future", "encoder_sample_from_the_future"),
+            counts,
+            strict=True,
+        )
+    )
     assert told.level == Level.WARN
     assert {line.partition(": ")[0] for line in desk.refused} == set(INPUT_TOPICS)
-    assert all(re.search(r"stamped 864\d\d s ahead of this node's clock: not used; set the clock "
-                         "that stamps it; correctly stamped messages are used$", line)
-               for line in desk.refused)
+    assert all(
+        re.search(
+            r"stamped 864\d\d s ahead of this node's clock: not used; set the clock "
+            "that stamps it; correctly stamped messages are used$",
+            line,
+        )
+        for line in desk.refused
+    )
     desk.receive(honest).reception.drain()
     measurements, _ = desk.session.collector.collect()
     assert measurements.run_id == str(START_NS)
@@ -608,7 +702,8 @@ def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_p
 
 @pytest.mark.parametrize("by_s", [-5.0, 0.4])
 def test_a_clock_that_steps_shortly_before_the_end_is_told_live_as_of_the_journal(
-        tmp_path, monkeypatch, events, by_s):
+    tmp_path, monkeypatch, events, by_s
+):
     """Most messages come in a single look of the collector."""
     desk = Desk(tmp_path)
     monkeypatch.setattr(reception.time, "time_ns", lambda: desk.hands.now_ns)
@@ -619,8 +714,9 @@ def test_a_clock_that_steps_shortly_before_the_end_is_told_live_as_of_the_journa
         if isinstance(event, Command):
             desk.reception.command(data, False, event.stamp_ns)
         else:
-            (desk.reception.detection if isinstance(event, Detection)
-             else desk.reception.encoder)(data, event.stamp_ns)
+            (desk.reception.detection if isinstance(event, Detection) else desk.reception.encoder)(
+                data, event.stamp_ns
+            )
         if number == len(events) // 2 or event is events[-1]:
             desk.hands.seconds = 100.0 + (event.stamp_ns - START_NS) * 1e-9
             desk.reception.drain()
@@ -652,7 +748,8 @@ def test_without_a_clock_nothing_is_from_the_future(monkeypatch, events):
 
 
 def test_a_clock_that_was_set_back_is_a_warning_and_a_restart_ends_it(
-        tmp_path, monkeypatch, events):
+    tmp_path, monkeypatch, events
+):
     first = Desk(tmp_path)
     first.hands.seconds += 86400
     first.receive(run_of(events, START_NS + DAY_NS)[:300]).reception.drain()
@@ -663,9 +760,11 @@ def test_a_clock_that_was_set_back_is_a_warning_and_a_restart_ends_it(
     first.hands.pass_time(1.0)
     first.session.tick()
     told = first.session.diagnosis(detections_matched=True)
-    line = ("the newest view command is stamped 86399 s ahead of this machine's clock, which was "
-            "set back: no later run is shown; restart measurement_collector, which ignores such "
-            "a run, and start the plan again")
+    line = (
+        "the newest view command is stamped 86399 s ahead of this machine's clock, which was "
+        "set back: no later run is shown; restart measurement_collector, which ignores such "
+        "a run, and start the plan again"
+    )
     assert told.level == Level.WARN and line in told.message
     assert first.hands.lines(Level.WARN).count(line) == 1
     first.keeper.close()
@@ -686,8 +785,10 @@ def test_a_newer_run_that_is_not_shown_is_a_warning_until_it_is(events):
     desk.session.tick()
     told = desk.session.diagnosis(detections_matched=True)
     assert told.level == Level.WARN
-    assert (f"run {START_NS} is not shown: it began 30" in told.message
-            and "abort it, synchronise the clocks, and start it again" in told.message)
+    assert (
+        f"run {START_NS} is not shown: it began 30" in told.message
+        and "abort it, synchronise the clocks, and start it again" in told.message
+    )
     desk.receive(run_of(commands, START_NS + 50 * 10**9)[:2]).reception.drain()
     desk.hands.pass_time(1.0)
     desk.session.tick()
@@ -715,5 +816,6 @@ def test_a_forged_command_within_a_run_changes_nothing_and_is_a_warning(events):
     assert measurements.all_rejected() == {}
     told = desk.session.diagnosis(detections_matched=True)
     assert told.level == Level.WARN
-    assert ("1 view command of plan 'forged' arrived during a run, belonging to no run"
-            in told.message)
+    assert (
+        "1 view command of plan 'forged' arrived during a run, belonging to no run" in told.message
+    )

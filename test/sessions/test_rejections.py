@@ -37,8 +37,9 @@ class Late:
     def give(self, events: Iterable) -> None:
         for event in events:
             if isinstance(event, Command):
-                self.session.take_command(message(
-                    "ViewCommand", from_model.command(event, "stage")), False)
+                self.session.take_command(
+                    message("ViewCommand", from_model.command(event, "stage")), False
+                )
             elif isinstance(event, EncoderSample):
                 self.session.take_encoder(encoder_block(event))
             else:
@@ -65,8 +66,10 @@ class Late:
 def arrivals(late: type, by_s: float, *, plan: str = "0, 90, 180") -> list:
     events = scene(plan, count=0).events
     first = min(event.stamp_ns for event in events)
-    return [((event.stamp_ns - first) * 1e-9 + (by_s if isinstance(event, late) else 0.0), event)
-            for event in events]
+    return [
+        ((event.stamp_ns - first) * 1e-9 + (by_s if isinstance(event, late) else 0.0), event)
+        for event in events
+    ]
 
 
 @pytest.mark.parametrize("by_s", [0.0, 1.0, 3.0, 5.0])
@@ -95,9 +98,15 @@ def test_views_whose_commands_come_after_all_detections_are_no_fault(by_s):
 
 def offset(by_s: float) -> list:
     """Return the arrivals of a cell whose encoder is stamped earlier by so much."""
-    return [(when, replace(event, stamp_ns=event.stamp_ns - round(by_s * 1e9))
-             if isinstance(event, EncoderSample) else event)
-            for when, event in arrivals(EncoderSample, 0.0, plan="0")]
+    return [
+        (
+            when,
+            replace(event, stamp_ns=event.stamp_ns - round(by_s * 1e9))
+            if isinstance(event, EncoderSample)
+            else event,
+        )
+        for when, event in arrivals(EncoderSample, 0.0, plan="0")
+    ]
 
 
 @pytest.mark.parametrize("by_s", [5.0, 37.0])
@@ -147,10 +156,16 @@ def test_the_time_is_counted_anew_when_a_fault_comes_again():
 def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected():
     """The marks are read; the lines that remain are seen again and again, and never used."""
     cell, events = Late(), scene("0", count=8).events
-    lost = [event for event in events if isinstance(event, Detection) and event.k == 3
-            and event.kind == Kind.ANGULAR]
-    cell.give(event for event in events if event not in lost and not (
-        isinstance(event, Command) and event.phase == Phase.DONE))
+    lost = [
+        event
+        for event in events
+        if isinstance(event, Detection) and event.k == 3 and event.kind == Kind.ANGULAR
+    ]
+    cell.give(
+        event
+        for event in events
+        if event not in lost and not (isinstance(event, Command) and event.phase == Phase.DONE)
+    )
     cell.session.tick()
     for number in range(AT_LEAST):
         cell.give([replace(lost[0], offset_theta=0.3 + number * 1e-6)])
@@ -160,8 +175,10 @@ def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected()
     cell.hands.pass_time(PATIENCE_S)
     cell.session.tick()
     [line] = cell.hands.lines(Level.WARN)
-    assert line == (f"view '0': none of the last ones was used: {AT_LEAST} of {AT_LEAST} "
-                    f"detections were rejected as too_far_from_nominal: {REMEDY[Reason.TOO_FAR]}")
+    assert line == (
+        f"view '0': none of the last ones was used: {AT_LEAST} of {AT_LEAST} "
+        f"detections were rejected as too_far_from_nominal: {REMEDY[Reason.TOO_FAR]}"
+    )
     assert line in cell.session.diagnosis(detections_matched=True).message
     cell.give(lost)
     cell.hands.pass_time(STEP_S)
@@ -171,12 +188,16 @@ def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected()
 
 def test_lines_without_their_joint_are_told_although_the_marks_are_more():
     cell, events = Late(), scene("0", count=8).events
-    lines = [event for event in events if isinstance(event, Detection)
-             and event.kind == Kind.ANGULAR]
-    cell.give(replace(event, names=event.names[:2], positions=event.positions[:2], velocities=())
-              if isinstance(event, EncoderSample) else event
-              for event in events if event not in lines[1:] and not (
-                  isinstance(event, Command) and event.phase == Phase.DONE))
+    lines = [
+        event for event in events if isinstance(event, Detection) and event.kind == Kind.ANGULAR
+    ]
+    cell.give(
+        replace(event, names=event.names[:2], positions=event.positions[:2], velocities=())
+        if isinstance(event, EncoderSample)
+        else event
+        for event in events
+        if event not in lines[1:] and not (isinstance(event, Command) and event.phase == Phase.DONE)
+    )
     cell.session.tick()
     cell.give(lines[1:])
     for _ in range(2):
@@ -186,4 +207,5 @@ def test_lines_without_their_joint_are_told_although_the_marks_are_more():
     assert line == (
         "view '0': none of the last ones was used: 7 of 7 detections were rejected as no_encoder_"
         "sample_near: no encoder sample of the joint 'theta' arrived; joints received: 'x', 'y'; "
-        "set joint_x, joint_y, joint_theta")
+        "set joint_x, joint_y, joint_theta"
+    )

@@ -26,8 +26,11 @@ def times(samples):
 
 def run(resting, first, last, *, measuring=False):
     """Return which of the samples from `first` to before `last`, ten a second, are kept."""
-    return [time for number in range(first, last) for time in times(
-        resting.sample(b"", number * STEP_NS, measuring=measuring))]
+    return [
+        time
+        for number in range(first, last)
+        for time in times(resting.sample(b"", number * STEP_NS, measuring=measuring))
+    ]
 
 
 def bursts(*begins):
@@ -61,7 +64,7 @@ def test_a_clock_that_was_set_back_stops_nothing():
     run(resting, 10_000, 11_000)
     assert len(resting._held) == NEAR + 1
     kept = run(resting, 100, 2100)
-    assert kept[kept.index(100):] == bursts(100, 700, 1300)
+    assert kept[kept.index(100) :] == bursts(100, 700, 1300)
     assert len(resting._held) == NEAR + 1
 
 
@@ -108,8 +111,12 @@ def live(desk, events, idle_s):
 def first_exposure(events):
     """Return the first sample behind the first exposure, and the stamp of that; None without."""
     first = next((event.stamp_ns for event in events if isinstance(event, Detection)), None)
-    return first and (next(event for event in events if isinstance(event, EncoderSample)
-                           and event.stamp_ns > first), first)
+    return first and (
+        next(
+            event for event in events if isinstance(event, EncoderSample) and event.stamp_ns > first
+        ),
+        first,
+    )
 
 
 def test_a_journal_with_rests_gives_what_the_session_gave(tmp_path, events):
@@ -117,15 +124,22 @@ def test_a_journal_with_rests_gives_what_the_session_gave(tmp_path, events):
     desk = Desk(tmp_path, **gap)
     live(desk, events, idle_s=300)
     measurements, progress = desk.session.collector.collect()
-    expected = {index: readings_digest(item.readings, measurements.rejected)
-                for index, item in progress.items()}
+    expected = {
+        index: readings_digest(item.readings, measurements.rejected)
+        for index, item in progress.items()
+    }
     assert all(view.complete for view in progress.values())
     desk.reception.close()
     offline = collect_bag(desk_path(tmp_path), settings_of("measurement_collector", **gap))
-    assert {index: readings_digest(item.readings, offline.measurements.rejected)
-            for index, item in offline.views.items()} == expected
-    kept = sum(len(item) for topic, item in BagReader(desk_path(tmp_path)).columns()
-               if topic == ENCODER_TOPIC)
+    assert {
+        index: readings_digest(item.readings, offline.measurements.rejected)
+        for index, item in offline.views.items()
+    } == expected
+    kept = sum(
+        len(item)
+        for topic, item in BagReader(desk_path(tmp_path)).columns()
+        if topic == ENCODER_TOPIC
+    )
     samples = sum(isinstance(event, EncoderSample) for event in events)
     rests = 1 + sum(getattr(event, "phase", None) == Phase.MEASURE for event in events)
     # of each rest the two ends, and three bursts between them
@@ -134,8 +148,9 @@ def test_a_journal_with_rests_gives_what_the_session_gave(tmp_path, events):
 
 
 def count(path):
-    return sum(len(item) if hasattr(item, "__len__") else 1
-               for _, item in BagReader(path).columns())
+    return sum(
+        len(item) if hasattr(item, "__len__") else 1 for _, item in BagReader(path).columns()
+    )
 
 
 def test_a_run_that_is_taken_up_is_kept_whole_before_a_command_comes_again(tmp_path, events):

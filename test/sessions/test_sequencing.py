@@ -27,9 +27,13 @@ class Desk:
 
     def __init__(self, folder, **parameters) -> None:
         self.hands = Hands()
-        self.session = SequencingSession(settings_of("pose_sequencer", **(
-            {"plan": plan_file(folder, PLAN), "start_checks": False} | parameters)),
-            self.hands.ports)
+        self.session = SequencingSession(
+            settings_of(
+                "pose_sequencer",
+                **({"plan": plan_file(folder, PLAN), "start_checks": False} | parameters),
+            ),
+            self.hands.ports,
+        )
 
     @property
     def commands(self) -> list[tuple[Phase, int]]:
@@ -38,17 +42,36 @@ class Desk:
     def hear(self, node: str, **values: str) -> None:
         self.session.presence.take(node, Diagnosis(Level.OK, "", values))
 
-    def status(self, index: int = 0, *, done: int = 5, complete: bool = False, age_ns: int = 0,
-               **fields) -> None:
+    def status(
+        self, index: int = 0, *, done: int = 5, complete: bool = False, age_ns: int = 0, **fields
+    ) -> None:
         stamp = self.hands.of("command")[-1]["header"]["stamp"]
         stamp_ns = stamp["sec"] * 10**9 + stamp["nanosec"] - age_ns
-        self.session.take_status(SimpleNamespace(**({
-            "header": SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=stamp_ns)),
-            "plan_id": PLAN.plan_id, "view_index": index, "complete": complete,
-            "grid_expected": 25, "grid_done": done, "angular_expected": 0, "angular_done": 0,
-            "check_expected": 0, "check_done": 0,
-            "detections_used": done, "detections_rejected": 0, "missing_m": [], "missing_n": [],
-            "missing_k": [], "run_id": self.session.run_id} | fields)))
+        self.session.take_status(
+            SimpleNamespace(
+                **(
+                    {
+                        "header": SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=stamp_ns)),
+                        "plan_id": PLAN.plan_id,
+                        "view_index": index,
+                        "complete": complete,
+                        "grid_expected": 25,
+                        "grid_done": done,
+                        "angular_expected": 0,
+                        "angular_done": 0,
+                        "check_expected": 0,
+                        "check_done": 0,
+                        "detections_used": done,
+                        "detections_rejected": 0,
+                        "missing_m": [],
+                        "missing_n": [],
+                        "missing_k": [],
+                        "run_id": self.session.run_id,
+                    }
+                    | fields
+                )
+            )
+        )
 
 
 @pytest.fixture
@@ -80,14 +103,18 @@ def test_each_command_starts_the_coverage_of_its_view_anew(measuring):
     assert measuring.session.diagnosis().values["coverage"] == "0.400"
     measuring.session.act(measuring.session.machine.redo)
     assert (measuring.session.coverage, measuring.session.diagnosis().values["coverage"]) == (
-        0.0, "0.000")
+        0.0,
+        "0.000",
+    )
 
 
 def test_stamps_grow_where_the_clock_steps_back(measuring):
     measuring.hands.pass_time(-5)
     measuring.session.act(measuring.session.machine.redo)
-    stamps = [c["header"]["stamp"]["sec"] * 10**9 + c["header"]["stamp"]["nanosec"]
-              for c in measuring.hands.of("command")]
+    stamps = [
+        c["header"]["stamp"]["sec"] * 10**9 + c["header"]["stamp"]["nanosec"]
+        for c in measuring.hands.of("command")
+    ]
     assert stamps == [START_NS, START_NS + 1, START_NS + 2]
 
 
@@ -97,7 +124,7 @@ def test_a_clock_that_was_set_back_is_told_until_it_has_caught_up(measuring, bac
     measuring.session.tick()
     measuring.session.tick()
     words = f"this machine's clock is {back_s:.3g} s behind its own last command: it was set back"
-    assert [line[:len(words)] for line in measuring.hands.lines(Level.WARN)] == [words] * said
+    assert [line[: len(words)] for line in measuring.hands.lines(Level.WARN)] == [words] * said
     assert measuring.session.diagnosis().message.startswith(words) is bool(said)
     measuring.hands.pass_time(back_s)
     measuring.session.tick()
@@ -110,9 +137,17 @@ def test_a_status_counts_from_the_stamp_of_the_newest_command(measuring, age_ns,
     assert (measuring.commands[-1] == (PLACE, 1)) is moves
 
 
-@pytest.mark.parametrize("fields, moves", [
-    ({}, True), ({"run_id": "1"}, False), ({"run_id": ""}, False), ({"plan_id": "other"}, False),
-    ({"view_index": 1}, False), ({"complete": False}, False)])
+@pytest.mark.parametrize(
+    "fields, moves",
+    [
+        ({}, True),
+        ({"run_id": "1"}, False),
+        ({"run_id": ""}, False),
+        ({"plan_id": "other"}, False),
+        ({"view_index": 1}, False),
+        ({"complete": False}, False),
+    ],
+)
 def test_only_the_current_view_of_this_run_moves_it_on(measuring, fields, moves):
     measuring.status(**({"complete": True} | fields))
     assert (measuring.commands[-1] == (PLACE, 1)) is moves
@@ -127,8 +162,10 @@ def test_settle_time(tmp_path, seconds, confirmed):
     assert desk.commands == [(PLACE, 0)] + [(MEASURE, 0)] * confirmed
 
 
-@pytest.mark.parametrize("timeout, seconds, last", [
-    (10.0, 9.9, (MEASURE, 0)), (10.0, 10.0, (PLACE, 0)), (0.0, 1e6, (MEASURE, 0))])
+@pytest.mark.parametrize(
+    "timeout, seconds, last",
+    [(10.0, 9.9, (MEASURE, 0)), (10.0, 10.0, (PLACE, 0)), (0.0, 1e6, (MEASURE, 0))],
+)
 def test_view_timeout(tmp_path, timeout, seconds, last):
     desk = Desk(tmp_path, view_timeout=timeout, max_redos=1)
     desk.session.begin()
@@ -148,28 +185,58 @@ def test_redos_are_counted_by_view(tmp_path):
             desk.status(0, complete=True)  # the second view gets its redo all the same
         else:
             desk.session.tick()
-    assert desk.commands[:12] == [(PLACE, 0), (MEASURE, 0), (PLACE, 0), (MEASURE, 0), (PLACE, 1),
-                                  (MEASURE, 1), (PLACE, 1), (MEASURE, 1),  # and is skipped
-                                  (PLACE, 2), (MEASURE, 2), (PLACE, 2), (MEASURE, 2)]
+    assert desk.commands[:12] == [
+        (PLACE, 0),
+        (MEASURE, 0),
+        (PLACE, 0),
+        (MEASURE, 0),
+        (PLACE, 1),
+        (MEASURE, 1),
+        (PLACE, 1),
+        (MEASURE, 1),  # and is skipped
+        (PLACE, 2),
+        (MEASURE, 2),
+        (PLACE, 2),
+        (MEASURE, 2),
+    ]
 
 
-@pytest.mark.parametrize("values, missing", [
-    (READY, []),
-    (READY | {"encoder_heard": "no"}, ["the encoder (measurement_collector hears no sample)"]),
-    (READY | {"detections_matched": "no"}, ["a publisher of stage/mark_detections"]),
-    ({}, ["the encoder (measurement_collector hears no sample)",
-          "a publisher of stage/mark_detections"])])
+@pytest.mark.parametrize(
+    "values, missing",
+    [
+        (READY, []),
+        (READY | {"encoder_heard": "no"}, ["the encoder (measurement_collector hears no sample)"]),
+        (READY | {"detections_matched": "no"}, ["a publisher of stage/mark_detections"]),
+        (
+            {},
+            [
+                "the encoder (measurement_collector hears no sample)",
+                "a publisher of stage/mark_detections",
+            ],
+        ),
+    ],
+)
 def test_who_is_missing(tmp_path, values, missing):
     desk = Desk(tmp_path, start_checks=True)
-    assert desk.session.missing() == ["measurement_collector (no sign of life)",
-                                      "solver (no sign of life)"]
+    assert desk.session.missing() == [
+        "measurement_collector (no sign of life)",
+        "solver (no sign of life)",
+    ]
     desk.hear("measurement_collector", **values)
     desk.hear("solver")
     assert desk.session.missing() == missing
 
 
-@pytest.mark.parametrize("seconds, missing", [(PATIENCE_S, []), (
-    PATIENCE_S + 0.01, ["measurement_collector (no sign of life)", "solver (no sign of life)"])])
+@pytest.mark.parametrize(
+    "seconds, missing",
+    [
+        (PATIENCE_S, []),
+        (
+            PATIENCE_S + 0.01,
+            ["measurement_collector (no sign of life)", "solver (no sign of life)"],
+        ),
+    ],
+)
 def test_a_node_without_a_word_is_missing_after_a_while(tmp_path, seconds, missing):
     desk = Desk(tmp_path, start_checks=True)
     desk.hear("measurement_collector", **READY)
@@ -178,30 +245,45 @@ def test_a_node_without_a_word_is_missing_after_a_while(tmp_path, seconds, missi
     assert desk.session.missing() == missing
 
 
-TOLD = READY | {"plan_id": PLAN.plan_id, "run_id": "17", "phase": "MEASURE", "view": "1",
-                "view_name": PLAN.views[1].name, "command_stamp": "1700"}
+TOLD = READY | {
+    "plan_id": PLAN.plan_id,
+    "run_id": "17",
+    "phase": "MEASURE",
+    "view": "1",
+    "view_name": PLAN.views[1].name,
+    "command_stamp": "1700",
+}
 
 
-@pytest.mark.parametrize("values, parameters, command", [
-    (TOLD, {}, (MEASURE, 1)),
-    (TOLD | {"phase": "PLACE"}, {}, (PLACE, 1)),
-    (TOLD, {"resume": False}, (PLACE, 0)),
-    (TOLD | {"plan_id": "other"}, {}, (PLACE, 0)),
-    (TOLD | {"run_id": ""}, {}, (PLACE, 0)),
-    (TOLD | {"phase": "DONE"}, {}, (PLACE, 0)),
-    (TOLD | {"phase": "ABORT"}, {}, (PLACE, 0)),
-    (TOLD | {"view": "4"}, {}, (PLACE, 0)),
-    (TOLD | {"view": "-1"}, {}, (PLACE, 0)),
-    (TOLD | {"view": "\u0661"}, {}, (PLACE, 0)),
-    (TOLD | {"view": "9" * 5000}, {}, (PLACE, 0)),
-    (TOLD | {"command_stamp": str(START_NS + MAX_AHEAD_NS)}, {}, (MEASURE, 1)),
-    (TOLD | {"command_stamp": str(START_NS + MAX_AHEAD_NS + 1)}, {}, (PLACE, 0)),  # clock set back
-    (TOLD | {"command_stamp": ""}, {}, (PLACE, 0)),
-    (TOLD | {"command_stamp": "1e9"}, {}, (PLACE, 0)),
-    (TOLD | {"view_name": "other"}, {}, (PLACE, 0)),
-    (READY, {}, (PLACE, 0))])
+@pytest.mark.parametrize(
+    "values, parameters, command",
+    [
+        (TOLD, {}, (MEASURE, 1)),
+        (TOLD | {"phase": "PLACE"}, {}, (PLACE, 1)),
+        (TOLD, {"resume": False}, (PLACE, 0)),
+        (TOLD | {"plan_id": "other"}, {}, (PLACE, 0)),
+        (TOLD | {"run_id": ""}, {}, (PLACE, 0)),
+        (TOLD | {"phase": "DONE"}, {}, (PLACE, 0)),
+        (TOLD | {"phase": "ABORT"}, {}, (PLACE, 0)),
+        (TOLD | {"view": "4"}, {}, (PLACE, 0)),
+        (TOLD | {"view": "-1"}, {}, (PLACE, 0)),
+        (TOLD | {"view": "\u0661"}, {}, (PLACE, 0)),
+        (TOLD | {"view": "9" * 5000}, {}, (PLACE, 0)),
+        (TOLD | {"command_stamp": str(START_NS + MAX_AHEAD_NS)}, {}, (MEASURE, 1)),
+        (
+            TOLD | {"command_stamp": str(START_NS + MAX_AHEAD_NS + 1)},
+            {},
+            (PLACE, 0),
+        ),  # clock set back
+        (TOLD | {"command_stamp": ""}, {}, (PLACE, 0)),
+        (TOLD | {"command_stamp": "1e9"}, {}, (PLACE, 0)),
+        (TOLD | {"view_name": "other"}, {}, (PLACE, 0)),
+        (READY, {}, (PLACE, 0)),
+    ],
+)
 def test_a_run_is_taken_up_if_the_collector_tells_an_unfinished_one(
-        tmp_path, values, parameters, command):
+    tmp_path, values, parameters, command
+):
     desk = Desk(tmp_path, start_checks=True, **parameters)
     desk.hear("measurement_collector", **values)
     desk.hear("solver")
@@ -211,16 +293,42 @@ def test_a_run_is_taken_up_if_the_collector_tells_an_unfinished_one(
     assert desk.session.run_id == ("17" if resumed else str(START_NS))
 
 
-@pytest.mark.parametrize(("plate", "view", "goes_on"), [
-    ({}, {}, True), ({}, {"visit_order": "x_back_y@plate"}, True), ({"grid_size": 7}, {}, False),
-    ({"grid_pitch_m": 0.011}, {}, False), ({"angular_count": 12}, {}, False),
-    ({}, {"rotation_rad": np.pi}, False), ({}, {"translation_m": (0.0, 0.01)}, False),
-    ({}, {"repeats": 3}, False), ({}, {"grid": False}, False), ({}, {"angular": False}, False)])
+@pytest.mark.parametrize(
+    ("plate", "view", "goes_on"),
+    [
+        ({}, {}, True),
+        ({}, {"visit_order": "x_back_y@plate"}, True),
+        ({"grid_size": 7}, {}, False),
+        ({"grid_pitch_m": 0.011}, {}, False),
+        ({"angular_count": 12}, {}, False),
+        ({}, {"rotation_rad": np.pi}, False),
+        ({}, {"translation_m": (0.0, 0.01)}, False),
+        ({}, {"repeats": 3}, False),
+        ({}, {"grid": False}, False),
+        ({}, {"angular": False}, False),
+    ],
+)
 def test_a_plan_that_was_edited_begins_a_new_run(tmp_path, plate, view, goes_on):
     collector = CollectingSession(settings_of("measurement_collector"), Hands().ports)
-    collector.take_command(message("ViewCommand", from_model.command(Command(
-        START_NS, MEASURE, PLAN.plan_id, 1, replace(PLAN.views[1], **view),
-        replace(PLAN.artifact, **plate), len(PLAN.views), run_id="17"), "stage")), False)
+    collector.take_command(
+        message(
+            "ViewCommand",
+            from_model.command(
+                Command(
+                    START_NS,
+                    MEASURE,
+                    PLAN.plan_id,
+                    1,
+                    replace(PLAN.views[1], **view),
+                    replace(PLAN.artifact, **plate),
+                    len(PLAN.views),
+                    run_id="17",
+                ),
+                "stage",
+            ),
+        ),
+        False,
+    )
     told = collector.diagnosis(detections_matched=True).values
     desk = Desk(tmp_path, start_checks=True)
     desk.hear("measurement_collector", **{key: str(told[key]) for key in told} | READY)
@@ -245,14 +353,17 @@ def test_a_view_that_was_aborted_is_not_measured_already(tmp_path, short, known)
     desk = Desk(tmp_path, start_checks=True)
     count = np.full(25, 2)
     count[:short] = 1
-    view = from_model.command(Command(0, MEASURE, PLAN.plan_id, 0, PLAN.views[0],
-                                       PLAN.artifact), "stage")
-    desk.session.take_measurement(SimpleNamespace(**(view | {
-        "count": count, "count_theta": np.full(8, 2), "run_id": "17"})))
+    view = from_model.command(
+        Command(0, MEASURE, PLAN.plan_id, 0, PLAN.views[0], PLAN.artifact), "stage"
+    )
+    desk.session.take_measurement(
+        SimpleNamespace(**(view | {"count": count, "count_theta": np.full(8, 2), "run_id": "17"}))
+    )
     desk.hear("measurement_collector", **TOLD)
     desk.hear("solver")
     assert desk.session.begin() == (
-        f"resumed run 17 in view '{PLAN.views[1].name}', MEASURE{known}")
+        f"resumed run 17 in view '{PLAN.views[1].name}', MEASURE{known}"
+    )
 
 
 @pytest.mark.parametrize("seconds, said", [(4.99, False), (5.0, True)])
@@ -260,8 +371,10 @@ def test_a_view_that_stalls_names_its_missing_marks(measuring, seconds, said):
     measuring.status(done=23, missing_m=[-2, 1], missing_n=[0, 2])
     measuring.hands.pass_time(seconds)
     measuring.session.tick()
-    line = ("view '0' stalls at 92.0 %: missing 2 marks: (-2, 0), (1, 2); measurement_collector "
-            "gives no sign of life")
+    line = (
+        "view '0' stalls at 92.0 %: missing 2 marks: (-2, 0), (1, 2); measurement_collector "
+        "gives no sign of life"
+    )
     assert measuring.hands.lines(Level.WARN) == [line] * said
     assert measuring.session.diagnosis().level == (Level.WARN if said else Level.OK)
     measuring.session.tick()
@@ -275,7 +388,8 @@ def test_check_stops_that_are_missing_count_and_are_named(measuring):
     measuring.session.tick()
     assert measuring.hands.lines(Level.WARN) == [
         "view '0' stalls at 93.3 %: missing check stops of 2 marks (see check_marks of the view "
-        "command); measurement_collector gives no sign of life"]
+        "command); measurement_collector gives no sign of life"
+    ]
 
 
 def test_a_view_without_any_detection_stalls_too_and_the_collector_is_quoted(measuring):
@@ -283,7 +397,8 @@ def test_a_view_without_any_detection_stalls_too_and_the_collector_is_quoted(mea
     measuring.session.presence.take("measurement_collector", Diagnosis(Level.WARN, "clock"))
     measuring.session.tick()
     assert measuring.hands.lines(Level.WARN) == [
-        "view '0' stalls: no detection has arrived since MEASURE; measurement_collector: clock"]
+        "view '0' stalls: no detection has arrived since MEASURE; measurement_collector: clock"
+    ]
 
 
 def test_a_stall_ends_with_the_next_detection_and_a_slow_cell_gets_more_time(measuring):
@@ -317,7 +432,8 @@ def test_its_own_command_is_not_foreign(measuring):
 
 @pytest.mark.parametrize("seconds, said", [(PATIENCE_S, 0), (PATIENCE_S + 0.1, 1)])
 def test_a_companion_that_falls_silent_within_a_run_is_named_until_it_is_back(
-        measuring, seconds, said):
+    measuring, seconds, said
+):
     measuring.hear("solver")
     measuring.hands.pass_time(seconds)
     for _ in range(2):
@@ -334,17 +450,26 @@ def test_a_companion_that_falls_silent_within_a_run_is_named_until_it_is_back(
     assert len(measuring.hands.lines(Level.WARN)) == said  # no run, nobody is waited for
 
 
-@pytest.mark.parametrize(("later_ns", "run_id"), [
-    (-1, None), (0, None), (-10**18, ""), (1, ""), (1, "17"), (10**9, "no stamp")])
+@pytest.mark.parametrize(
+    ("later_ns", "run_id"),
+    [(-1, None), (0, None), (-(10**18), ""), (1, ""), (1, "17"), (10**9, "no stamp")],
+)
 @pytest.mark.parametrize("phase", [PLACE, MEASURE, Phase.DONE, Phase.ABORT])
 def test_a_forged_or_old_command_does_not_end_the_run_of_its_own_plan(
-        measuring, later_ns, run_id, phase):
+    measuring, later_ns, run_id, phase
+):
     """`run_id` None: the stamp itself, as of a run that begins."""
     stamp = measuring.session._commanded_ns + later_ns
     placed = phase in (PLACE, MEASURE)
-    foreign = Command(stamp, phase, "other", 0, PLAN.views[0] if placed else None,
-                      PLAN.artifact if placed else None,
-                      run_id=str(stamp) if run_id is None else run_id)
+    foreign = Command(
+        stamp,
+        phase,
+        "other",
+        0,
+        PLAN.views[0] if placed else None,
+        PLAN.artifact if placed else None,
+        run_id=str(stamp) if run_id is None else run_id,
+    )
     published = len(measuring.hands.published)
     for _ in range(2):
         measuring.session.take_command(message("ViewCommand", from_model.command(foreign, "f")))
@@ -352,7 +477,8 @@ def test_a_forged_or_old_command_does_not_end_the_run_of_its_own_plan(
     assert len(measuring.hands.published) == published
     assert measuring.hands.lines(Level.WARN) == [
         "another publisher sends view commands that begin no run later than this one: not "
-        "followed; find who sends them"]
+        "followed; find who sends them"
+    ]
 
 
 def test_a_command_of_the_future_is_refused_by_an_idle_sequencer_too(desk):

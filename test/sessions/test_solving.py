@@ -39,18 +39,30 @@ ASSUMED = [term.name for term in default_terms() if term.name != "yaw"]  # which
 
 def views_of(plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, **changes) -> list:
     """Return the ViewMeasurement messages of a run, stamps 10, 11, ...; with marks or without."""
-    _, measurements, progress = collected([
-        event for event in events_of(plan, seed)
-        if grid or not isinstance(event, Detection) or event.kind == Kind.ANGULAR])
-    return [message("ViewMeasurement", from_model.view_measurement(
-        view, measurements, 10 + index, "stage") | {"run_id": run_id} | changes)
-        for index, view in progress.items()]
+    _, measurements, progress = collected(
+        [
+            event
+            for event in events_of(plan, seed)
+            if grid or not isinstance(event, Detection) or event.kind == Kind.ANGULAR
+        ]
+    )
+    return [
+        message(
+            "ViewMeasurement",
+            from_model.view_measurement(view, measurements, 10 + index, "stage")
+            | {"run_id": run_id}
+            | changes,
+        )
+        for index, view in progress.items()
+    ]
 
 
-def command(views: int, run_id: str = "", plan_id: str = PLAN.plan_id,
-            phase: Phase = Phase.MEASURE) -> object:
-    told = Command(begun_ns(run_id) or 1, phase, plan_id, 0, PLAN.views[0], PLAN.artifact, views,
-                   run_id)
+def command(
+    views: int, run_id: str = "", plan_id: str = PLAN.plan_id, phase: Phase = Phase.MEASURE
+) -> object:
+    told = Command(
+        begun_ns(run_id) or 1, phase, plan_id, 0, PLAN.views[0], PLAN.artifact, views, run_id
+    )
     return message("ViewCommand", from_model.command(told, "stage"))
 
 
@@ -85,7 +97,9 @@ def test_the_solver_estimates_the_terms_that_the_plan_asks_for(desk):
     own = Desk(model_terms=["plate_shape:1e-08"])
     own.take(views_of(plan))
     assert [term.name for term in own.session.result.model.terms] == [
-        "plate_shape", *(name for name in ASSUMED if name != "plate_shape")]
+        "plate_shape",
+        *(name for name in ASSUMED if name != "plate_shape"),
+    ]
     assert own.session.result.provenance.extra["model_terms_from"] == "options"
     without = Desk(model_terms=["none"])
     without.take(views_of(plan))
@@ -104,9 +118,10 @@ def test_a_plan_with_a_known_plate_is_a_recheck_as_offline(desk, tmp_path):
     assert readings.artifact_from == path
     offline = worded(calibrate(readings, solver_options(SolverSettings.checked({}, ""), readings)))
     assert json.dumps(result_to_dict(replace(shown, run_id=offline.run_id))) == json.dumps(
-        result_to_dict(offline))
+        result_to_dict(offline)
+    )
     assert shown.recheck.of == path
-    told, = [fields["state"] for output, fields in desk.hands.published if output == "summary"]
+    (told,) = [fields["state"] for output, fields in desk.hands.published if output == "summary"]
     assert told.startswith("Still good: no change since first.json")
     lost = Desk()
     with pytest.raises(InputError, match="no such file"):
@@ -119,8 +134,9 @@ def test_the_robust_solver_leaves_out_a_reading_that_contradicts_the_others():
         views = views_of()
         views[1].dx[3] += 5e-6
         desk.take(views)
-    assert [(item["view"], item["kind"]) for item in robust.session.result.extra["outliers"][
-        "removed"]] == [(PLAN.views[1].name, "grid")]
+    assert [
+        (item["view"], item["kind"]) for item in robust.session.result.extra["outliers"]["removed"]
+    ] == [(PLAN.views[1].name, "grid")]
     assert robust.session.result.verdict.qualified
     assert not plain.session.result.verdict.qualified
     assert "outliers" not in plain.session.result.extra
@@ -175,15 +191,23 @@ def test_readings_of_two_runs_are_never_mixed(desk):
     assert desk.session.diagnosis().values["left_aside"] == 1
 
 
-@pytest.mark.parametrize("new, current, later", [
-    (PlanRun("a", "2"), PlanRun("a", "1"), True), (PlanRun("a", "1"), PlanRun("a", "2"), False),
-    (PlanRun("a", "10"), PlanRun("a", "9"), True), (PlanRun("b", "1"), PlanRun("a", "2"), False),
-    (PlanRun("b"), PlanRun("a", "2"), False), (PlanRun("a", "2"), PlanRun("a"), True),
-    (PlanRun("b"), PlanRun("a"), True), (PlanRun("b", "2"), PlanRun("a", "2"), False),
-    (PlanRun("a", "x"), PlanRun("a", "2"), False),
-    (PlanRun("a", "9" * 21), PlanRun("a", "2"), False),
-    (PlanRun("a", "2"), PlanRun("a", "9" * 21), True),
-    (PlanRun("a", "2"), PlanRun("a", "9" * 20), False)])
+@pytest.mark.parametrize(
+    "new, current, later",
+    [
+        (PlanRun("a", "2"), PlanRun("a", "1"), True),
+        (PlanRun("a", "1"), PlanRun("a", "2"), False),
+        (PlanRun("a", "10"), PlanRun("a", "9"), True),
+        (PlanRun("b", "1"), PlanRun("a", "2"), False),
+        (PlanRun("b"), PlanRun("a", "2"), False),
+        (PlanRun("a", "2"), PlanRun("a"), True),
+        (PlanRun("b"), PlanRun("a"), True),
+        (PlanRun("b", "2"), PlanRun("a", "2"), False),
+        (PlanRun("a", "x"), PlanRun("a", "2"), False),
+        (PlanRun("a", "9" * 21), PlanRun("a", "2"), False),
+        (PlanRun("a", "2"), PlanRun("a", "9" * 21), True),
+        (PlanRun("a", "2"), PlanRun("a", "9" * 20), False),
+    ],
+)
 def test_the_later_run_supersedes(new, current, later):
     assert supersedes(new, current) is later
 
@@ -240,11 +264,16 @@ def test_the_stamp_is_that_of_the_newest_reading(desk):
     assert desk.hands.of("map")[-1]["header"]["stamp"]["nanosec"] == 13
 
 
-@pytest.mark.parametrize("planned, level, line", [
-    (4, Level.OK, "1 of 4 views measured, not yet enough to identify the stage."),
-    (1, Level.WARN, None)])
+@pytest.mark.parametrize(
+    "planned, level, line",
+    [
+        (4, Level.OK, "1 of 4 views measured, not yet enough to identify the stage."),
+        (1, Level.WARN, None),
+    ],
+)
 def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(
-        tmp_path, planned, level, line):
+    tmp_path, planned, level, line
+):
     desk = Desk(result_folder=str(tmp_path))
     desk.session.take_command(command(planned))
     desk.take(views_of()[:1])
@@ -272,8 +301,9 @@ def test_after_done_no_view_is_to_come_and_the_missing_one_is_named(desk):
     last = desk.hands.of("summary")[-1]
     assert (last["views_done"], last["views_planned"]) == (1, 4)
     assert "do not identify the stage" in last["state"]
-    assert last["advice"] == [
-        advice.text for advice in desk.session.result.observability.advice] != []
+    assert (
+        last["advice"] == [advice.text for advice in desk.session.result.observability.advice] != []
+    )
     assert desk.session.diagnosis().level == Level.WARN
 
 
@@ -283,7 +313,8 @@ def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
     desk.session.take_command(command(4))
     desk.take(lines)
     assert desk.hands.said == [
-        (Level.OK, "1 of 4 views measured, not yet enough to identify the stage.")]
+        (Level.OK, "1 of 4 views measured, not yet enough to identify the stage.")
+    ]
     assert desk.hands.of("summary")[-1]["state"] == desk.hands.said[0][1]
     assert desk.hands.of("summary")[-1]["advice"] == ["3 views to come"]
     assert desk.session.diagnosis().level == Level.OK
@@ -357,9 +388,13 @@ def test_more_planned_views_are_told_and_fewer_change_nothing(desk):
     assert not desk.solve()
 
 
-@pytest.mark.parametrize("field, value, problem", [
-    ("dx", np.zeros(3), "m, n, dx, dy, count differ in length"),
-    ("reject_reasons", ["one"], "reject_reasons and reject_counts differ in length")])
+@pytest.mark.parametrize(
+    "field, value, problem",
+    [
+        ("dx", np.zeros(3), "m, n, dx, dy, count differ in length"),
+        ("reject_reasons", ["one"], "reject_reasons and reject_counts differ in length"),
+    ],
+)
 def test_readings_that_contradict_themselves_are_refused_at_once(desk, field, value, problem):
     bad = views_of()[0]
     setattr(bad, field, value)
@@ -402,15 +437,24 @@ def test_a_link_out_of_the_folder_is_outside(tmp_path):
         result_file("link/map.json", str(tmp_path / "in"))
 
 
-@pytest.mark.parametrize("plan_id, name", [
-    ("hu", "hu.json"), ("../../x", "_.._x.json"), ("/etc/passwd", "_etc_passwd.json"),
-    ("", "plan.json"), ("..", "plan.json"), ("a b\x1b[2J", "a_b__2J.json")])
+@pytest.mark.parametrize(
+    "plan_id, name",
+    [
+        ("hu", "hu.json"),
+        ("../../x", "_.._x.json"),
+        ("/etc/passwd", "_etc_passwd.json"),
+        ("", "plan.json"),
+        ("..", "plan.json"),
+        ("a b\x1b[2J", "a_b__2J.json"),
+    ],
+)
 def test_a_plan_names_no_file_elsewhere(plan_id, name):
     assert plan_file_name(plan_id) == name
 
 
-@pytest.mark.parametrize("run_id, name", [
-    ("17", "map_17.json"), ("", "map_run.json"), ("../../x", "map__.._x.json")])
+@pytest.mark.parametrize(
+    "run_id, name", [("17", "map_17.json"), ("", "map_run.json"), ("../../x", "map__.._x.json")]
+)
 def test_each_run_has_a_file_of_its_own_and_the_health_names_it(tmp_path, run_id, name):
     desk = Desk(save_path=str(tmp_path / "map_{run_id}.json"), result_folder=str(tmp_path))
     assert desk.session.diagnosis().values["saved"] == ""
@@ -463,11 +507,14 @@ def test_a_map_that_could_not_be_saved_is_saved_once_there_is_space(tmp_path):
 
 def test_only_regular_files_are_loaded(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    for path, problem in ((tmp_path / "pipe", "is not a regular file"),
-                          ("/dev/zero", "is not a regular file"),
-                          (tmp_path, "is a folder, and no map"), ("", "is empty"),
-                          (tmp_path / "no", "no such file; check the path"),
-                          ("a\0b", "cannot be read")):
+    for path, problem in (
+        (tmp_path / "pipe", "is not a regular file"),
+        ("/dev/zero", "is not a regular file"),
+        (tmp_path, "is a folder, and no map"),
+        ("", "is empty"),
+        (tmp_path / "no", "no such file; check the path"),
+        ("a\0b", "cannot be read"),
+    ):
         with pytest.raises(InputError, match=problem):
             read_result(str(path))
 
@@ -484,9 +531,13 @@ def test_a_map_is_saved_into_a_file_or_a_new_one_alone(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "old.json").touch()
-    for path, problem in (("pipe", "^pipe: is not a regular file; name another file$"),
-                          ("folder", "is not a regular file"), ("", "is empty"),
-                          ("a\0b", "is not a file name"), ("../x", "lies outside")):
+    for path, problem in (
+        ("pipe", "^pipe: is not a regular file; name another file$"),
+        ("folder", "is not a regular file"),
+        ("", "is empty"),
+        ("a\0b", "is not a file name"),
+        ("../x", "lies outside"),
+    ):
         with pytest.raises(InputError, match=problem):
             result_file(path, str(tmp_path))
     for path in ("old.json", "new.json"):
@@ -546,8 +597,9 @@ print(faults())
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another allocator")
 def test_memory_that_is_freed_is_kept_for_the_next_solution():
-    done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True,
-                          check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True
+    )
     before, after = map(int, done.stdout.split())
     assert before > 1000 > 100 > after  # how many depends on the free end of the heap
 
@@ -570,7 +622,8 @@ def test_a_saved_map_names_its_run_and_a_newer_one_that_is_not_in_it(tmp_path):
     line, _ = desk.session.save("map.json")
     assert line.endswith(
         f"; WARNING: the newer run {NOW + 7} of plan '{PLAN.plan_id}' is not in this map: none of "
-        "its readings has arrived; the health of measurement_collector says why")
+        "its readings has arrived; the health of measurement_collector says why"
+    )
     assert desk.session.diagnosis().level == Level.OK  # it may be measured just now
     desk.session.take_command(command(4, run_id=str(NOW + 7), phase=Phase.DONE))
     told = desk.session.diagnosis()
@@ -614,9 +667,16 @@ def test_while_views_are_to_come_no_view_is_advised(desk, phase):
 def test_the_cells_of_an_image_are_solved_together():
     plan = image_plan(5, count=8)
     _, measurements, progress = collected(events_of(plan))
-    messages = [message("ViewMeasurement", from_model.view_measurement(
-        replace(view, readings=part), measurements, 10 + index, "stage"))
-        for index, view in progress.items() for part in view.readings.parts]
+    messages = [
+        message(
+            "ViewMeasurement",
+            from_model.view_measurement(
+                replace(view, readings=part), measurements, 10 + index, "stage"
+            ),
+        )
+        for index, view in progress.items()
+        for part in view.readings.parts
+    ]
     assert len(messages) == 9 + 9 + 1
     desk = Desk()
     for item in messages[::-1][:-1]:
@@ -627,6 +687,9 @@ def test_the_cells_of_an_image_are_solved_together():
     expected = calibrate(measurements)
     np.testing.assert_array_equal(desk.session.result.error_map.gx, expected.error_map.gx)
     np.testing.assert_array_equal(desk.session.result.error_map.u_gx, expected.error_map.u_gx)
-    assert desk.session.digest() == session_digest({
-        index: view_digest(view.readings.parts, measurements.rejected)
-        for index, view in progress.items()})
+    assert desk.session.digest() == session_digest(
+        {
+            index: view_digest(view.readings.parts, measurements.rejected)
+            for index, view in progress.items()
+        }
+    )

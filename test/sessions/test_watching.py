@@ -32,27 +32,62 @@ def watch(hands):
 
 
 def command(index: int, stamp_ns: int = 5) -> object:
-    return message("ViewCommand", from_model.command(Command(
-        stamp_ns, Phase.MEASURE, PLAN.plan_id, index, PLAN.views[index], PLAN.artifact,
-        len(PLAN.views), "17"), "stage"))
+    return message(
+        "ViewCommand",
+        from_model.command(
+            Command(
+                stamp_ns,
+                Phase.MEASURE,
+                PLAN.plan_id,
+                index,
+                PLAN.views[index],
+                PLAN.artifact,
+                len(PLAN.views),
+                "17",
+            ),
+            "stage",
+        ),
+    )
 
 
 def status(index: int, missing: list, **fields) -> object:
-    return SimpleNamespace(**({
-        "plan_id": PLAN.plan_id, "view_index": index, "view_name": PLAN.views[index].name,
-        "complete": False, "grid_done": 25 - len(missing), "grid_expected": 25, "angular_done": 7,
-        "angular_expected": 8, "check_done": 2, "check_expected": 5,
-        "detections_used": 50, "reject_reasons": ["duplicate"],
-        "reject_counts": [2], "sigma_xy": 2e-8, "sigma_theta": float("nan"),
-        "missing_m": [m for m, _ in missing], "missing_n": [n for _, n in missing],
-        "missing_k": [3], "run_id": ""} | fields))
+    return SimpleNamespace(
+        **(
+            {
+                "plan_id": PLAN.plan_id,
+                "view_index": index,
+                "view_name": PLAN.views[index].name,
+                "complete": False,
+                "grid_done": 25 - len(missing),
+                "grid_expected": 25,
+                "angular_done": 7,
+                "angular_expected": 8,
+                "check_done": 2,
+                "check_expected": 5,
+                "detections_used": 50,
+                "reject_reasons": ["duplicate"],
+                "reject_counts": [2],
+                "sigma_xy": 2e-8,
+                "sigma_theta": float("nan"),
+                "missing_m": [m for m, _ in missing],
+                "missing_n": [n for _, n in missing],
+                "missing_k": [3],
+                "run_id": "",
+            }
+            | fields
+        )
+    )
 
 
 def test_before_anything_is_heard(watch):
     picture = json.loads(json.dumps(watch.picture()))
-    assert picture == {"health": {"measurement_collector": None, "pose_sequencer": None,
-                                  "solver": None},
-                       "command": None, "view": None, "summary": None, "map": None}
+    assert picture == {
+        "health": {"measurement_collector": None, "pose_sequencer": None, "solver": None},
+        "command": None,
+        "view": None,
+        "summary": None,
+        "map": None,
+    }
 
 
 def test_the_plate_is_drawn_in_its_own_frame_top_line_first(watch):
@@ -60,8 +95,7 @@ def test_the_plate_is_drawn_in_its_own_frame_top_line_first(watch):
     watch.take_status(status(0, [(-2, 2), (1, 0)]))
     view = watch.picture()["view"]
     assert view["plate"] == [".oooo", "ooooo", "ooo.o", "ooooo", "ooooo"]
-    assert (view["grid"], view["angular"], view["rejected"]) == ([23, 25], [7, 8],
-                                                                 {"duplicate": 2})
+    assert (view["grid"], view["angular"], view["rejected"]) == ([23, 25], [7, 8], {"duplicate": 2})
     assert view["repeatability_um"] == pytest.approx(0.02)
     assert view["repeatability_arcsec"] is None
     watch.take_status(status(0, [], sigma_theta=math.radians(2 / 3600)))
@@ -105,21 +139,37 @@ def test_a_node_is_gone_after_a_while(watch, hands, seconds, there):
     watch.take_health("compensator", Diagnosis(Level.WARN, "no map", {"a": "1"}))
     hands.pass_time(seconds)
     assert watch.picture()["health"]["compensator"] == (
-        {"level": 1, "message": "no map", "values": {"a": "1"}} if there else None)
+        {"level": 1, "message": "no map", "values": {"a": "1"}} if there else None
+    )
 
 
 def test_a_large_plate_shows_the_worst_of_the_marks_behind_a_sign(watch):
     plan = plan_of("0", 101)
-    watch.take_command(message("ViewCommand", from_model.command(Command(
-        5, Phase.MEASURE, plan.plan_id, 0, plan.views[0], plan.artifact, 1, "17"), "stage")))
-    watch.take_status(status(0, [(-50, -50), (0, 1), (50, 50)], plan_id=plan.plan_id,
-                             grid_expected=101**2, grid_done=101**2 - 3))
+    watch.take_command(
+        message(
+            "ViewCommand",
+            from_model.command(
+                Command(5, Phase.MEASURE, plan.plan_id, 0, plan.views[0], plan.artifact, 1, "17"),
+                "stage",
+            ),
+        )
+    )
+    watch.take_status(
+        status(
+            0,
+            [(-50, -50), (0, 1), (50, 50)],
+            plan_id=plan.plan_id,
+            grid_expected=101**2,
+            grid_done=101**2 - 3,
+        )
+    )
     view = watch.picture()["view"]
     assert view["plate_step"] == 3
     rows = view["plate"]
     assert {len(row) for row in rows} == {34} == {len(rows)}
-    missing = {(x, y) for y, row in enumerate(reversed(rows)) for x, sign in enumerate(row)
-               if sign == "."}
+    missing = {
+        (x, y) for y, row in enumerate(reversed(rows)) for x, sign in enumerate(row) if sign == "."
+    }
     assert missing == {(0, 0), ((0 + 50) // 3, (1 + 50) // 3), (33, 33)}
 
 
@@ -131,11 +181,19 @@ def test_marks_behind_the_last_that_is_named_are_not_known(watch):
 
 def test_long_texts_and_lists_are_cut(watch):
     watch.take_command(command(0))
-    watch.take_status(status(0, [], view_name="x" * 10**6, missing_k=[1] * 10**6,
-                             reject_reasons=[str(n) for n in range(1000)],
-                             reject_counts=[1] * 1000))
-    watch.take_health("solver", Diagnosis(Level.WARN, "y" * 10**6, {
-        str(n): "z" * 10**6 for n in range(300)}))
+    watch.take_status(
+        status(
+            0,
+            [],
+            view_name="x" * 10**6,
+            missing_k=[1] * 10**6,
+            reject_reasons=[str(n) for n in range(1000)],
+            reject_counts=[1] * 1000,
+        )
+    )
+    watch.take_health(
+        "solver", Diagnosis(Level.WARN, "y" * 10**6, {str(n): "z" * 10**6 for n in range(300)})
+    )
     picture = watch.picture()
     view, health = picture["view"], picture["health"]["solver"]
     assert view["view_name"] == f"{'x' * 3000} ... (1000000 characters) ... {'x' * 1000}"

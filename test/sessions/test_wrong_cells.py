@@ -118,7 +118,8 @@ class Cell(Bench):
             seen["offset_theta"] *= -1
         if self.fault.startswith("camera turned"):
             turned = np.exp(1j * np.deg2rad(float(self.fault.split()[2]))) * (
-                seen["offset_x"] + 1j * seen["offset_y"])
+                seen["offset_x"] + 1j * seen["offset_y"]
+            )
             seen = seen | {"offset_x": turned.real, "offset_y": turned.imag}
         if self.fault == "mirrored camera":
             seen = seen | {"offset_x": -seen["offset_x"]}
@@ -130,15 +131,20 @@ class Cell(Bench):
             seen = seen | {"offset_x": 0.0, "offset_y": 0.0}
         if self.fault == "offsets 1000 times too small":
             noise = self.noise.normal(scale=2e-8, size=2)
-            seen = seen | {key: 1e-3 * seen[key] + float(one) for key, one in
-                           zip(("offset_x", "offset_y"), noise, strict=True)}
+            seen = seen | {
+                key: 1e-3 * seen[key] + float(one)
+                for key, one in zip(("offset_x", "offset_y"), noise, strict=True)
+            }
         if self.fault == "backlash":
             seen = seen | {"offset_x": seen["offset_x"] + 1e-6 * self.came}
-        seen = seen | {"m and n exchanged": {"m": seen["n"], "n": seen["m"]},
-                       "m reversed": {"m": -seen["m"]}, "n reversed": {"n": -seen["n"]},
-                       "m and n reversed": {"m": -seen["m"], "n": -seen["n"]},
-                       "k reversed": {"k": -seen["k"] % 8},
-                       "k shifted": {"k": (seen["k"] + 1) % 8}}.get(self.fault, {})
+        seen = seen | {
+            "m and n exchanged": {"m": seen["n"], "n": seen["m"]},
+            "m reversed": {"m": -seen["m"]},
+            "n reversed": {"n": -seen["n"]},
+            "m and n reversed": {"m": -seen["m"], "n": -seen["n"]},
+            "k reversed": {"k": -seen["k"] % 8},
+            "k shifted": {"k": (seen["k"] + 1) % 8},
+        }.get(self.fault, {})
         seconds += {"stamped late": PERIOD_S, "old stamps": -30.0}.get(self.fault, 0.0)
         arrives = self.hands.seconds + 11.0 * (self.fault == "arrives late")
         self.late.append((arrives, SimpleNamespace(header=self.header(seconds), **seen)))
@@ -148,21 +154,34 @@ class Cell(Bench):
         return SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9))
 
 
-FIELDS = {"m": 0, "n": 0, "k": 0, "offset_x": 0.0, "offset_y": 0.0, "offset_theta": 0.0,
-          "sigma": 0.0}
+FIELDS = {
+    "m": 0,
+    "n": 0,
+    "k": 0,
+    "offset_x": 0.0,
+    "offset_y": 0.0,
+    "offset_theta": 0.0,
+    "sigma": 0.0,
+}
 
 
 def checked(fault="", statuses=(), joints=(), **cell):
     """Return the items of a check of a cell, beside nodes with these statuses, and other joints."""
     hands = Hands()
     bench = Cell(fault, hands, **cell)
-    check = bench.check = CellCheck(small_plan(), settings_of("measurement_collector"),
-                                    hands.ports, settle_s=0.2, patience_s=30.0)
+    check = bench.check = CellCheck(
+        small_plan(),
+        settings_of("measurement_collector"),
+        hands.ports,
+        settle_s=0.2,
+        patience_s=30.0,
+    )
     for status in statuses:
         check.take_diagnosis(*status)
     if joints:
-        check.take_encoder(SimpleNamespace(header=bench.header(0.0), name=joints,
-                                           position=[0.0] * len(joints)))
+        check.take_encoder(
+            SimpleNamespace(header=bench.header(0.0), name=joints, position=[0.0] * len(joints))
+        )
     while not check.done:
         hands.published.clear()
         check.tick()
@@ -197,11 +216,15 @@ WRONG = [
     ("offsets in mm", "ids", "the offsets are in mm"),
     ("reversed x", "ids", "x is indicated with the wrong sign"),
     ("m reversed", "ids", "m is counted against plate x (54"),
-    ("reversed x, no check stops", "ids", "m is counted against plate x, or x is indicated with "
-     "the wrong sign (34"),
+    (
+        "reversed x, no check stops",
+        "ids",
+        "m is counted against plate x, or x is indicated with the wrong sign (34",
+    ),
     ("n reversed", "ids", "n is counted against plate y (54"),
     ("m and n reversed", "ids", "m and n are counted against plate x and y (54"),
-    ("reversed theta", "ids", REVERSED_THETA), ("k reversed", "ids", REVERSED_THETA),
+    ("reversed theta", "ids", REVERSED_THETA),
+    ("k reversed", "ids", REVERSED_THETA),
     ("theta in degrees", "ids", "theta is indicated in degrees (54"),
     ("frozen theta", "ids", "theta does not move: it is indicated at 0 rad during the whole view"),
     ("another zero of theta", "ids", "theta is indicated +22.92° from where the lines are (54"),
@@ -212,23 +235,27 @@ WRONG = [
     ("stamped late", "ids", "each detection shows the mark of 1 exposure before its stamp"),
     ("repeats the last detection", "ids", "each detection shows the mark of 1 exposure before"),
     ("does not move", "ids", "the stage does not move: it is indicated at x = 0 mm, y = 0 mm"),
-    ("another view", "ids", "the marks are those of a plate turned by 90°")]
+    ("another view", "ids", "the marks are those of a plate turned by 90°"),
+]
 
 
-REMEDIES = {"theta reversed, straight": "turn the plate by 1 mrad and check again",
-            "laid straight": "turn the plate by 1 mrad and check again",
-            "arrives late": "publish each detection as soon as it is found",
-            "pixels too large": "divide pixel_size by this factor",
-            "no offsets": "measure the offset anew in each image, and publish it in m",
-            "offsets 1000 times too small": "measure the offset anew in each image",
-            "backlash": "repeats of a mark contradict each other; check the stage for backlash",
-            "old stamps": "stamp detections at the instant of exposure",
-            "reversed theta": "count k counter-clockwise; or reverse the sign of theta",
-            "theta in degrees": "publish theta in rad",
-            "frozen theta": "turn the stage to each line",
-            "k shifted": "count k from the line along plate x, and set theta to 0",
-            "m reversed": "m counts the marks along plate x",
-            "x and y exchanged": "exchange joint_x and joint_y", "reversed x": "reverse the sign"}
+REMEDIES = {
+    "theta reversed, straight": "turn the plate by 1 mrad and check again",
+    "laid straight": "turn the plate by 1 mrad and check again",
+    "arrives late": "publish each detection as soon as it is found",
+    "pixels too large": "divide pixel_size by this factor",
+    "no offsets": "measure the offset anew in each image, and publish it in m",
+    "offsets 1000 times too small": "measure the offset anew in each image",
+    "backlash": "repeats of a mark contradict each other; check the stage for backlash",
+    "old stamps": "stamp detections at the instant of exposure",
+    "reversed theta": "count k counter-clockwise; or reverse the sign of theta",
+    "theta in degrees": "publish theta in rad",
+    "frozen theta": "turn the stage to each line",
+    "k shifted": "count k from the line along plate x, and set theta to 0",
+    "m reversed": "m counts the marks along plate x",
+    "x and y exchanged": "exchange joint_x and joint_y",
+    "reversed x": "reverse the sign",
+}
 
 
 @pytest.mark.parametrize(("fault", "name", "figure"), WRONG, ids=[fault for fault, *_ in WRONG])
@@ -244,15 +271,21 @@ def test_a_wrong_cell_fails_once_and_what_follows_is_told_as_that(fault, name, f
 def test_a_unit_that_would_make_all_marks_one_is_not_named():
     """Without ids, positions a million times too large would all be those of one mark."""
     first = next(item for item in checked("millimetres", ids=False) if not item.passed)
-    assert first.figure.startswith("the indicated positions are 1000 times those of the marks: "
-                                   "they are in mm (")
+    assert first.figure.startswith(
+        "the indicated positions are 1000 times those of the marks: they are in mm ("
+    )
 
 
 def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
     hands = Hands()
     bench = Cell("stands still", hands)
-    check = bench.check = CellCheck(small_plan(), settings_of("measurement_collector"),
-                                    hands.ports, settle_s=0.2, patience_s=5.0)
+    check = bench.check = CellCheck(
+        small_plan(),
+        settings_of("measurement_collector"),
+        hands.ports,
+        settle_s=0.2,
+        patience_s=5.0,
+    )
     check.take_health("mark_detector", Level.ERROR, "no image")
     check.take_health("mark_detector", Level.OK, "")
     check.take_health("cell_driver", Level.ERROR, "first move: x is reversed; correct turn")
@@ -261,17 +294,28 @@ def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
         bench.tick()
         hands.pass_time(TICK_S)
     assert check.items[-1] == CheckItem(
-        "commands", False, "0 detections in 5 s after MEASURE: cell_driver: first move: x is "
-        "reversed", "correct turn")
+        "commands",
+        False,
+        "0 detections in 5 s after MEASURE: cell_driver: first move: x is reversed",
+        "correct turn",
+    )
 
 
 HOT = ("motor x", Level.ERROR, "too hot")
 
 
-@pytest.mark.parametrize("statuses, told", [
-    ([HOT], "ERROR on /diagnostics: motor x: too hot"),
-    ([HOT, ("motor x", Level.OK, "cooled")], ""), ([("fan", Level.WARN, "slow")], ""),
-    ([(f"axis {number}", Level.ERROR, "off") for number in range(7)], "axis 4: off; and 2 more")])
+@pytest.mark.parametrize(
+    "statuses, told",
+    [
+        ([HOT], "ERROR on /diagnostics: motor x: too hot"),
+        ([HOT, ("motor x", Level.OK, "cooled")], ""),
+        ([("fan", Level.WARN, "slow")], ""),
+        (
+            [(f"axis {number}", Level.ERROR, "off") for number in range(7)],
+            "axis 4: off; and 2 more",
+        ),
+    ],
+)
 def test_other_nodes_in_error_fail_the_check_of_a_right_cell(statuses, told):
     failed = [item for item in checked(statuses=statuses) if not item.passed]
     assert [item.name for item in failed] == ["diagnostics"] * bool(told)
@@ -302,18 +346,24 @@ def test_joints_without_end_do_not_hide_those_of_the_stage():
 def test_what_was_not_read_is_said_and_fails():
     statuses = [(f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)]
     statuses += [(name, Level.OK, "on") for name, _, _ in statuses[1:]]
-    item, = (item for item in checked(statuses=statuses) if not item.passed)
-    assert item.figure == ("ERROR on /diagnostics: axis 000: off; there were more than 100 names, "
-                           "and others were not read")
+    (item,) = (item for item in checked(statuses=statuses) if not item.passed)
+    assert item.figure == (
+        "ERROR on /diagnostics: axis 000: off; there were more than 100 names, "
+        "and others were not read"
+    )
 
 
 def test_a_status_that_is_known_is_read_however_many_there_are():
     statuses = [(f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)]
-    item, = (item for item in checked(statuses=[*statuses, ("axis 000", Level.ERROR, "hot")])
-             if not item.passed)
+    (item,) = (
+        item
+        for item in checked(statuses=[*statuses, ("axis 000", Level.ERROR, "hot")])
+        if not item.passed
+    )
     assert item.figure.startswith("ERROR on /diagnostics: axis 000: hot; axis 001: off; ")
-    assert item.figure.endswith("; and 95 more; there were more than 100 names, and others were "
-                                "not read")
+    assert item.figure.endswith(
+        "; and 95 more; there were more than 100 names, and others were not read"
+    )
 
 
 def test_two_publishers_are_the_only_fault():
@@ -331,9 +381,27 @@ def test_two_publishers_are_the_only_fault():
 
 
 def test_faults_that_have_nothing_to_do_with_each_other_stand_side_by_side():
-    items = [CheckItem(name, passed, name) for name, passed in (
-        ("rest", True), ("ids", False), ("marks", False), ("signs", False), ("theta", False))]
+    items = [
+        CheckItem(name, passed, name)
+        for name, passed in (
+            ("rest", True),
+            ("ids", False),
+            ("marks", False),
+            ("signs", False),
+            ("theta", False),
+        )
+    ]
     assert [(item.name, item.follows) for item in grouped(items, "signs")] == [
-        ("rest", ""), ("signs", ""), ("ids", "signs"), ("marks", "signs"), ("theta", "")]
+        ("rest", ""),
+        ("signs", ""),
+        ("ids", "signs"),
+        ("marks", "signs"),
+        ("theta", ""),
+    ]
     assert [(item.name, item.follows) for item in grouped(items, "")] == [
-        ("rest", ""), ("ids", ""), ("marks", "ids"), ("signs", "ids"), ("theta", "")]
+        ("rest", ""),
+        ("ids", ""),
+        ("marks", "ids"),
+        ("signs", "ids"),
+        ("theta", ""),
+    ]

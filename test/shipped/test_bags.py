@@ -40,7 +40,8 @@ def images(name, folder):
     """Return the detector's counts, and the bag of its detections in the images of a bag."""
     detector = ImageDetector(DetectorSettings.checked(MANIFEST[name]["detect"], name))
     ImageBag(BAGS / name).write_detected(
-        folder / name, detector.take, check=lambda: None, frame_id="stage")
+        folder / name, detector.take, check=lambda: None, frame_id="stage"
+    )
     return detector.counts.values(), folder / name
 
 
@@ -98,8 +99,11 @@ def test_every_site_lies_within_five_standard_uncertainties_of_the_truth(name, t
         assert abs(estimate.value) < 4 * estimate.u
     emap = result.error_map
     truth = read_truth(BAGS / name)
-    for found, u, true in ((emap.gx, emap.u_gx, truth["gx"]), (emap.gy, emap.u_gy, truth["gy"]),
-                           (emap.g_theta, emap.u_g_theta, truth["g_theta"])):
+    for found, u, true in (
+        (emap.gx, emap.u_gx, truth["gx"]),
+        (emap.gy, emap.u_gy, truth["gy"]),
+        (emap.g_theta, emap.u_g_theta, truth["g_theta"]),
+    ):
         assert np.isfinite(found).all()
         assert (np.abs(found - np.array(true)) <= 5 * u).all()
 
@@ -108,8 +112,11 @@ def test_the_stage_of_the_demo_is_known_between_its_nodes_too():
     """Its error is smooth, as that of a stage is: what is corrected anywhere is worth it."""
     result = calibrate(measured("demo").measurements)
     nodes, anywhere = (budget for budget in budgets(result) if budget.quantity == "xy")
-    assert nodes.U_max < anywhere.U_max < 0.16 * np.nanmax(np.hypot(
-        result.error_map.gx, result.error_map.gy))  # plates bent by 5 nm: 0.095 of 0.631 um
+    assert (
+        nodes.U_max
+        < anywhere.U_max
+        < 0.16 * np.nanmax(np.hypot(result.error_map.gx, result.error_map.gy))
+    )  # plates bent by 5 nm: 0.095 of 0.631 um
     said = summary_text(result)
     assert f"U {um(nodes.U_rms)} rms, {um(nodes.U_max)} largest (k=2" in said
     assert f"anywhere           U {um(anywhere.U_rms)} rms, at most {um(anywhere.U_max)}" in said

@@ -12,15 +12,20 @@ from selfcal_ros.cli.main import build_parser, main
 from test.support.pages import PAGES, ROOT, code_lines
 
 COMMAND = re.compile(r"^ *(?:\.venv/bin/)?(selfcal [a-z][^\n`]*?)(?: *# ?(.*))?$", re.M)
-FILES = (re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S),
-         re.compile(r"```\w+ title=\"(\w+\.\w+)\"\n(.*?)```", re.S))
+FILES = (
+    re.compile(r"```yaml\n# (\w+\.yaml)\n(.*?)```", re.S),
+    re.compile(r"```\w+ title=\"(\w+\.\w+)\"\n(.*?)```", re.S),
+)
 ONLY_PARSED = {
-    "up": "needs a terminal", "monitor": "needs a cell", "call": "needs a cell",
+    "up": "needs a terminal",
+    "monitor": "needs a cell",
+    "call": "needs a cell",
     "replay": "run by test/nodes/test_image_player.py",
     "reproduce": "takes minutes; run small by test/cli/test_reproduce_verb.py",
     "cell try": "asks a person; test/cli/test_cell_try.py",
     "measure examples/microscope": "needs pymmcore; run by test/machine/test_micromanager.py",
-    "cell check": "needs a cell; test/nodes/test_cell_check.py"}
+    "cell check": "needs a cell; test/nodes/test_cell_check.py",
+}
 """Verbs whose commands are parsed alone, and why."""
 PLACES = ("BAG", "/tmp/session", "$", "FILE.cal")
 """Words that stand for something of the reader's."""
@@ -40,7 +45,8 @@ def parsed_alone(command: str) -> bool:
     if words[1] == "report" and command.count(".pdf") and not find_spec("weasyprint"):
         return True  # nothing prints here
     return any(command.startswith(f"selfcal {verb}") for verb in ONLY_PARSED) or any(
-        word in PLACES or word[0] == "$" for word in words)
+        word in PLACES or word[0] == "$" for word in words
+    )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
@@ -106,15 +112,29 @@ def test_the_way_to_a_corrected_machine_is_whole():
     steps = commands((ROOT / "docs/start/drawing.md").read_text())
     assert not any(parsed_alone(command) for command, _ in steps)
     assert [(shlex.split(command)[1], code) for command, code in steps] == [
-        ("plan", 0), ("plan", 2), ("plan", 0), ("plate", 0), ("plate", 0), ("measure", 0),
-        ("history", 0), ("export", 0), ("measure", 0), ("measure", 5)]
+        ("plan", 0),
+        ("plan", 2),
+        ("plan", 0),
+        ("plate", 0),
+        ("plate", 0),
+        ("measure", 0),
+        ("history", 0),
+        ("export", 0),
+        ("measure", 0),
+        ("measure", 5),
+    ]
 
 
 def test_the_tutorial_is_run_from_its_beginning_to_its_end():
     steps = [command for command, _ in commands((ROOT / "docs/start/tutorial.md").read_text())]
     assert sum(not parsed_alone(command) for command in steps) == 9
     assert {shlex.split(command)[1] for command in steps} == {
-        "plan", "simulate", "solve", "cal", "up"}
+        "plan",
+        "simulate",
+        "solve",
+        "cal",
+        "up",
+    }
 
 
 def headings(text: str) -> set[str]:
@@ -136,8 +156,11 @@ def test_links_lead_to_files_and_headings(page):
 
 def test_what_faq_quotes_is_what_the_code_says():
     """Each quoted message occurs in the source, where values stand for its blanks."""
-    source = re.sub(r'"\s*\n?\s*f?"', "", "".join(
-        path.read_text() for path in sorted((ROOT / "selfcal_ros").rglob("*.py"))))
+    source = re.sub(
+        r'"\s*\n?\s*f?"',
+        "",
+        "".join(path.read_text() for path in sorted((ROOT / "selfcal_ros").rglob("*.py"))),
+    )
     quoted = re.findall(r"^### `(.+)`$", (ROOT / "docs/start/faq.md").read_text(), re.M)
     assert len(quoted) >= 12
     for message in quoted:

@@ -17,8 +17,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def shipped(folder, pattern="*.yaml"):
-    return pytest.mark.parametrize("path", sorted((ROOT / folder).glob(pattern)),
-                                   ids=lambda path: path.name)
+    return pytest.mark.parametrize(
+        "path", sorted((ROOT / folder).glob(pattern)), ids=lambda path: path.name
+    )
 
 
 @shipped("config/plans")
@@ -81,8 +82,14 @@ def test_every_node_belongs_to_one_group_of_the_aggregator(prefix):
     data = read_yaml(ROOT / "config/diagnostics/analyzers.yaml")
     groups = data["analyzers"]["ros__parameters"]["calibration"]["analyzers"]
     for node in NODE_PARAMETERS:
-        hits = [name for name, group in groups.items()
-                if any(re.search(pattern, prefix + node) for pattern in group["regex"])]
+        hits = [
+            name
+            for name, group in groups.items()
+            if any(re.search(pattern, prefix + node) for pattern in group["regex"])
+        ]
         assert len(hits) == 1, node
-    assert not [name for name, group in groups.items()
-                if any(re.search(pattern, "my_solver_2") for pattern in group["regex"])]
+    assert not [
+        name
+        for name, group in groups.items()
+        if any(re.search(pattern, "my_solver_2") for pattern in group["regex"])
+    ]

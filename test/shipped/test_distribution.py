@@ -19,13 +19,32 @@ from selfcal_ros.files import read_json
 from tools.sbom import bill, pins
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ("package.xml", "setup.py", "setup.cfg", "pyproject.toml", "MANIFEST.in", "README.md",
-           "LICENSE", "CHANGELOG.md", "msg_defs", "resource", "config", "launch", "selfcal_ros")
+SOURCES = (
+    "package.xml",
+    "setup.py",
+    "setup.cfg",
+    "pyproject.toml",
+    "MANIFEST.in",
+    "README.md",
+    "LICENSE",
+    "CHANGELOG.md",
+    "msg_defs",
+    "resource",
+    "config",
+    "launch",
+    "selfcal_ros",
+)
 
 
 def run(folder: Path, *words: str, **environment: str) -> str:
-    done = subprocess.run([sys.executable, *words], cwd=folder, check=False, text=True,
-                          capture_output=True, env=os.environ | environment)
+    done = subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        check=False,
+        text=True,
+        capture_output=True,
+        env=os.environ | environment,
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -36,8 +55,7 @@ def wheel(tmp_path_factory) -> Path:
     clone = tmp_path_factory.mktemp("clone")
     for name in SOURCES:
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, clone / name,
-                            ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(ROOT / name, clone / name, ignore=shutil.ignore_patterns("__pycache__"))
         else:
             shutil.copy(ROOT / name, clone / name)
     run(clone, "setup.py", "-q", "sdist", "-d", "dist")
@@ -47,8 +65,20 @@ def wheel(tmp_path_factory) -> Path:
     [source] = (clone / "unpacked").iterdir()
     for path in (ROOT / "msg_defs").rglob("*.*"):
         assert (source / path.relative_to(ROOT)).is_file(), path
-    run(source, "-m", "pip", "-q", "--disable-pip-version-check", "wheel", "--no-deps",
-        "--no-index", "--no-build-isolation", "-w", str(clone / "wheel"), ".")
+    run(
+        source,
+        "-m",
+        "pip",
+        "-q",
+        "--disable-pip-version-check",
+        "wheel",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "-w",
+        str(clone / "wheel"),
+        ".",
+    )
     [built] = (clone / "wheel").iterdir()
     return built
 
@@ -57,10 +87,11 @@ def test_the_wheel_holds_every_module_message_and_configuration(wheel):
     with zipfile.ZipFile(wheel) as file:
         names = file.namelist()
     for folder, pattern, place in (
-            ("selfcal_ros", "*.py", "selfcal_ros/"), ("msg_defs/msg", "*.msg",
-                                                      "selfcal_ros/msg_text/"),
-            ("config", "*.*", "share/selfcal_ros/config/"),
-            ("launch", "*.py", "share/selfcal_ros/launch/")):
+        ("selfcal_ros", "*.py", "selfcal_ros/"),
+        ("msg_defs/msg", "*.msg", "selfcal_ros/msg_text/"),
+        ("config", "*.*", "share/selfcal_ros/config/"),
+        ("launch", "*.py", "share/selfcal_ros/launch/"),
+    ):
         for path in (ROOT / folder).rglob(pattern):
             end = f"{place}{path.relative_to(ROOT / folder)}"
             assert any(name == end or name.endswith(f"/{end}") for name in names), end
@@ -77,20 +108,46 @@ def test_the_wheel_describes_itself(wheel):
     needs = {re.match(r"[\w-]+", text)[0] for text in about.get_all("Requires-Dist")}
     assert "numpy" in needs and "setuptools" not in needs
     assert about["Description-Content-Type"] == "text/markdown"
-    assert about.get_payload() == (ROOT / "README.md").read_text() or about.get_payload(
-        decode=True).decode().strip() == (ROOT / "README.md").read_text().strip()
+    assert (
+        about.get_payload() == (ROOT / "README.md").read_text()
+        or about.get_payload(decode=True).decode().strip()
+        == (ROOT / "README.md").read_text().strip()
+    )
     assert "Programming Language :: Python :: 3.13" in about.get_all("Classifier")
     assert about.get_all("Project-URL")
 
 
 def test_the_wheel_solves_a_bag_without_the_clone(wheel, tmp_path):
-    run(tmp_path, "-m", "pip", "-q", "--disable-pip-version-check", "install", "--no-deps",
-        "--no-index", "--no-compile", "--target", str(tmp_path / "site"), str(wheel))
+    run(
+        tmp_path,
+        "-m",
+        "pip",
+        "-q",
+        "--disable-pip-version-check",
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--no-compile",
+        "--target",
+        str(tmp_path / "site"),
+        str(wheel),
+    )
     place = {"PYTHONPATH": str(tmp_path / "site")}
-    assert run(tmp_path, "-c", "import selfcal_ros; print(selfcal_ros.__file__)", **place
-               ).startswith(str(tmp_path))
-    run(tmp_path, "-m", "selfcal_ros", "solve", str(ROOT / "bags/hu_noise"), "-o", "R.json",
-        "--report", "R.html", **place)
+    assert run(
+        tmp_path, "-c", "import selfcal_ros; print(selfcal_ros.__file__)", **place
+    ).startswith(str(tmp_path))
+    run(
+        tmp_path,
+        "-m",
+        "selfcal_ros",
+        "solve",
+        str(ROOT / "bags/hu_noise"),
+        "-o",
+        "R.json",
+        "--report",
+        "R.html",
+        **place,
+    )
     assert read_json(tmp_path / "R.json")["verdict"]["qualified"]
     assert (tmp_path / "R.html").stat().st_size > 10_000
 
@@ -98,8 +155,11 @@ def test_the_wheel_solves_a_bag_without_the_clone(wheel, tmp_path):
 @pytest.mark.parametrize("name", ["requirements.txt", "oldest.txt"])
 def test_every_pin_has_the_hashes_of_its_files(name):
     """pip refuses what has another hash, and a list in which one has none."""
-    lines = [line for line in (ROOT / "tools" / name).read_text().splitlines()
-             if not line.startswith("#")]
+    lines = [
+        line
+        for line in (ROOT / "tools" / name).read_text().splitlines()
+        if not line.startswith("#")
+    ]
     assert len(lines) > 20
     for line in lines:
         assert re.fullmatch(r"[a-z0-9.-]+==\S+( --hash=sha256:[0-9a-f]{64}){1,2}", line), line
@@ -111,8 +171,10 @@ def components() -> list[dict]:
 
 
 def test_the_bill_of_materials_lists_what_is_pinned():
-    assert {part["name"]: (part["version"], [digest["content"] for digest in part["hashes"]])
-            for part in components()} == pins()
+    assert {
+        part["name"]: (part["version"], [digest["content"] for digest in part["hashes"]])
+        for part in components()
+    } == pins()
 
 
 def installed(name: str) -> str | None:
@@ -122,17 +184,23 @@ def installed(name: str) -> str | None:
         return None
 
 
-@pytest.mark.skipif(any(installed(name) != pinned for name, (pinned, _) in pins().items()),
-                    reason="not the environment of `make setup`")
+@pytest.mark.skipif(
+    any(installed(name) != pinned for name, (pinned, _) in pins().items()),
+    reason="not the environment of `make setup`",
+)
 def test_the_bill_of_materials_is_current():
     assert read_json(ROOT / "sbom.json") == bill(), "run `make sbom`"
 
 
 def test_no_library_of_the_product_is_under_the_gpl():
-    licences = {part["name"]: part["licenses"][0]["expression"] for part in components()
-                if part["scope"] != "excluded"}
-    assert {"numpy", "scipy", "rosbags", "mcap", "matplotlib", "threadpoolctl",
-            "ros-rclpy"} <= set(licences)
+    licences = {
+        part["name"]: part["licenses"][0]["expression"]
+        for part in components()
+        if part["scope"] != "excluded"
+    }
+    assert {"numpy", "scipy", "rosbags", "mcap", "matplotlib", "threadpoolctl", "ros-rclpy"} <= set(
+        licences
+    )
     for name, licence in licences.items():
         assert licence, name
         assert re.fullmatch(r"[\w.-]+( (AND|OR) [\w.-]+)*", licence), f"{name}: not SPDX's"

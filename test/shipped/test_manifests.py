@@ -27,8 +27,11 @@ def known() -> dict[str, set[str]]:
 
 
 def declared(path: Path) -> set[str]:
-    return {str(child.text) for child in ElementTree.parse(path).getroot()
-            if child.tag.endswith("depend")}
+    return {
+        str(child.text)
+        for child in ElementTree.parse(path).getroot()
+        if child.tag.endswith("depend")
+    }
 
 
 def test_every_key_exists_and_none_is_kept_in_vain():
@@ -43,8 +46,11 @@ def test_ros_packages_that_are_imported_are_declared():
         for node in (*source(path).imports, *source(path).late):
             names = [alias.name for alias in node.names] if hasattr(node, "names") else []
             used |= {(getattr(node, "module", None) or names[0]).split(".")[0]}
-    ros = {name for name in used
-           if re.fullmatch(r"\w+_(msgs|interfaces|srvs|index_python)|rclpy|launch\w*", name)}
+    ros = {
+        name
+        for name in used
+        if re.fullmatch(r"\w+_(msgs|interfaces|srvs|index_python)|rclpy|launch\w*", name)
+    }
     assert len(ros) > 8
     assert ros <= declared(MANIFESTS[0])
 
@@ -69,8 +75,14 @@ def test_the_container_copies_what_exists_and_all_that_is_installed():
         copied |= set(sources)
     for name in copied:
         assert (ROOT / name).exists(), name
-    assert {"package.xml", "setup.py", "setup.cfg", "selfcal_ros", "msg_defs",
-            *re.findall(r'share\("(\w+)"\)', (ROOT / "setup.py").read_text())} <= copied
+    assert {
+        "package.xml",
+        "setup.py",
+        "setup.cfg",
+        "selfcal_ros",
+        "msg_defs",
+        *re.findall(r'share\("(\w+)"\)', (ROOT / "setup.py").read_text()),
+    } <= copied
     entry = ROOT / "docker/entrypoint.sh"
     assert entry.stat().st_mode & 0o111
     assert "source /ws/install/setup.bash" in entry.read_text()

@@ -24,8 +24,11 @@ def made():
 def test_pictures_are_made_by_the_tool_and_shown_in_the_documents(made):
     folder = ROOT / "docs/pictures"
     assert sorted(made) == sorted(path.name for path in folder.iterdir())
-    shown = {(page.parent / address).resolve() for page in PAGES
-             for _, address in PICTURE.findall(page.read_text())}
+    shown = {
+        (page.parent / address).resolve()
+        for page in PAGES
+        for _, address in PICTURE.findall(page.read_text())
+    }
     assert shown == {folder / name for name in made}
     assert all(len(text) < 100_000 for text in made.values())
 

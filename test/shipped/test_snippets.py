@@ -31,15 +31,18 @@ def run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def call(page: str, **given: object) -> dict:
-        block, = snippets(page)
+        (block,) = snippets(page)
         exec(compile(block, page, "exec"), given)
         return given
+
     return call
 
 
 def test_every_page_with_python_is_run_here():
     assert {page.name for page in PAGES if "```python" in page.read_text()} == {
-        "apply.md", "machines.md"}
+        "apply.md",
+        "machines.md",
+    }
 
 
 def test_machines(run, tmp_path):
@@ -92,11 +95,13 @@ def test_make_has_the_targets_that_are_named():
         assert words[1] in targets(), line
         # what is said beside the target is a variable that the Makefile reads
         for word in words[2:]:
-            assert re.search(rf"\$[({{](or \$\()?{word.split('=')[0]}\b",
-                             (ROOT / "Makefile").read_text()), line
+            assert re.search(
+                rf"\$[({{](or \$\()?{word.split('=')[0]}\b", (ROOT / "Makefile").read_text()
+            ), line
 
 
 def test_make_help_names_every_target():
-    said = subprocess.run(["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True,
-                          check=True).stdout
+    said = subprocess.run(
+        ["make", "-s", "help"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     assert set(re.findall(r"^make ([a-z0-9-]+) +\S", said, re.M)) == targets()

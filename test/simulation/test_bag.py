@@ -44,8 +44,9 @@ def test_the_whole_bag_has_its_name(simulation, tmp_path):
     assert {path.name for path in place.iterdir()} == {"bag_0.mcap", "metadata.yaml", "truth.json"}
     assert list(place.parent.iterdir()) == [place]
     assert read_truth(place)["seed"] == 7
-    with pytest.raises(InputError, match=f"^{place}: exists already; remove it or name another "
-                                         "folder$"):
+    with pytest.raises(
+        InputError, match=f"^{place}: exists already; remove it or name another folder$"
+    ):
         write_simulation(simulation, place)
 
 
@@ -61,6 +62,12 @@ def test_each_part_of_the_truth_is_written_under_its_name(tmp_path):
     write_truth(tmp_path / "truth.json", truth)
     written = json.loads((tmp_path / "truth.json").read_text())
     assert np.abs(truth.a[0] - truth.a[1]).max() > 0 < np.abs(truth.g[0] - truth.g[1]).max()
-    for name, value in (("gx", truth.g[0]), ("gy", truth.g[1]), ("ax", truth.a[0]),
-                        ("ay", truth.a[1]), ("phi", truth.phi_rad), ("t", truth.t_m)):
+    for name, value in (
+        ("gx", truth.g[0]),
+        ("gy", truth.g[1]),
+        ("ax", truth.a[0]),
+        ("ay", truth.a[1]),
+        ("phi", truth.phi_rad),
+        ("t", truth.t_m),
+    ):
         np.testing.assert_array_equal(written[name], value)

@@ -20,15 +20,23 @@ PLAN = plan_of("0, 90, tx", 5, count=8, line=True, repeats=2)
 def events_of(seed=1, **settings):
     rng = np.random.default_rng(seed)
     truth = random_truth(PLAN.artifact, len(PLAN.views), rng)
-    return list(plan_events(truth, PLAN, settings=CellSettings(**settings), rng=rng,
-                            start_ns=START_NS))
+    return list(
+        plan_events(truth, PLAN, settings=CellSettings(**settings), rng=rng, start_ns=START_NS)
+    )
 
 
 @pytest.mark.parametrize("sense", list(Sense))
 @pytest.mark.parametrize("servo", [0.0, 1.0])
 def test_noise_free_messages_give_back_the_deviations(sense, servo):
-    cell = scene("0, 90, 180, 270, tx, -ty", size=11, count=24, line=True, sense=sense,
-                 servo_sigma_m=servo * 2e-8, servo_sigma_theta_rad=servo * 1e-7)
+    cell = scene(
+        "0, 90, 180, 270, tx, -ty",
+        size=11,
+        count=24,
+        line=True,
+        sense=sense,
+        servo_sigma_m=servo * 2e-8,
+        servo_sigma_theta_rad=servo * 1e-7,
+    )
     found, _ = collect(cell.events, measurement_sense=str(sense))
     for index, readings in enumerate(found.views):
         angular = angular_deviation(cell.truth, index, readings.view, sense=sense)
@@ -49,7 +57,8 @@ def test_stamps_rise_and_every_view_is_placed_measured_and_done():
     assert stamps[0] == START_NS
     commands = [e for e in events if isinstance(e, Command)]
     assert [(c.phase, c.view_index) for c in commands] == [
-        (phase, i) for i in range(4) for phase in (Phase.PLACE, Phase.MEASURE)] + [(Phase.DONE, 4)]
+        (phase, i) for i in range(4) for phase in (Phase.PLACE, Phase.MEASURE)
+    ] + [(Phase.DONE, 4)]
     assert all(c.views_planned == 4 for c in commands)
 
 
@@ -75,8 +84,13 @@ def test_every_mark_in_the_field_is_seen_as_often_as_the_plan_asks():
 
 @pytest.mark.parametrize("declare", [True, False])
 def test_ids_and_sigma_are_told_only_when_asked(declare):
-    seen = [e for e in events_of(with_ids=False, declare_sigma=declare, sigma_xy_m=2e-8,
-                                 sigma_theta_rad=3e-6) if isinstance(e, Detection)]
+    seen = [
+        e
+        for e in events_of(
+            with_ids=False, declare_sigma=declare, sigma_xy_m=2e-8, sigma_theta_rad=3e-6
+        )
+        if isinstance(e, Detection)
+    ]
     assert {(d.has_id, d.m, d.n, d.k) for d in seen} == {(False, 0, 0, 0)}
     assert {(d.kind, d.sigma) for d in seen} == {(0, declare * 2e-8), (1, declare * 3e-6)}
 
@@ -95,19 +109,26 @@ def test_a_seed_determines_every_message():
 
 def test_a_view_lasts_as_long_as_its_exposures():
     truth = random_truth(PLAN.artifact, 4, np.random.default_rng(1))
-    events = list(view_events(truth, PLAN, 2, settings=CellSettings(), rng=np.random.default_rng(1),
-                              start_ns=START_NS))
+    events = list(
+        view_events(
+            truth, PLAN, 2, settings=CellSettings(), rng=np.random.default_rng(1), start_ns=START_NS
+        )
+    )
     exposures = 2 * (20 + 8)
     assert sum(isinstance(event, Detection) for event in events) == exposures
     assert events[0].stamp_ns == START_NS
     assert events[-1].stamp_ns - START_NS == (exposures + 1) * 10_000_000  # and the way there
 
 
-@pytest.mark.parametrize("settings", [{"encoder_rate_hz": 400.0}, {"exposure_period_s": 0.005},
-                                      {"encoder_rate_hz": 0.0}])
+@pytest.mark.parametrize(
+    "settings", [{"encoder_rate_hz": 400.0}, {"exposure_period_s": 0.005}, {"encoder_rate_hz": 0.0}]
+)
 def test_a_dwell_too_short_for_the_encoder_is_refused(settings):
-    with pytest.raises(InputError, match=r"^simulated cell: \d+ Hz gives fewer than 2.5 encoder "
-                       r"samples in a dwell of .* s; raise encoder_rate or exposure_period$"):
+    with pytest.raises(
+        InputError,
+        match=r"^simulated cell: \d+ Hz gives fewer than 2.5 encoder "
+        r"samples in a dwell of .* s; raise encoder_rate or exposure_period$",
+    ):
         CellSettings(**settings)
 
 
@@ -130,9 +151,14 @@ def test_a_view_that_asks_for_an_order_gets_it_and_others_that_of_the_cell():
     views = (replace(PLAN.views[0], visit_order="x_then_y"), PLAN.views[0])
     plan = replace(PLAN, views=views)
     settings = CellSettings(visit_order="raster@plate")
-    asked, free = ([(e.m, e.n) for e in view_events(truth, plan, index, settings=settings, rng=rng,
-                                                    start_ns=START_NS)
-                    if isinstance(e, Detection) and e.kind == Kind.GRID] for index in range(2))
+    asked, free = (
+        [
+            (e.m, e.n)
+            for e in view_events(truth, plan, index, settings=settings, rng=rng, start_ns=START_NS)
+            if isinstance(e, Detection) and e.kind == Kind.GRID
+        ]
+        for index in range(2)
+    )
     along_y = [(m, n) for n in range(-2, 3) for m in range(-2, 3)]
     assert free == sorted(along_y) * 2
     assert asked == sorted(along_y) + along_y

@@ -35,9 +35,19 @@ from test.support.collecting import START_NS, collect
 
 
 @SENSES
-@pytest.mark.parametrize(("axes", "told"), [
-    ("xy", (30, 7)), ("-x-y", (-30, -7)), ("-xy", (-30, 7)), ("x-y", (30, -7)), ("yx", (7, 30)),
-    ("-y-x", (-7, -30)), ("y-x", (7, -30)), ("-yx", (-7, 30))])
+@pytest.mark.parametrize(
+    ("axes", "told"),
+    [
+        ("xy", (30, 7)),
+        ("-x-y", (-30, -7)),
+        ("-xy", (-30, 7)),
+        ("x-y", (30, -7)),
+        ("yx", (7, 30)),
+        ("-y-x", (-7, -30)),
+        ("y-x", (7, -30)),
+        ("-yx", (-7, 30)),
+    ],
+)
 def test_axes_of_the_microscope_point_elsewhere(sense, axes, told):
     wiring = Spread(microscope_axes=axes, microscope_pixels=2.0).wiring
     found = measured(truth_with(t_m=one_view(30 * UM, 7 * UM), wiring=wiring), sense)
@@ -59,7 +69,7 @@ def test_lines_are_told_with_another_sign(sense):
 @SENSES
 def test_a_camera_distorts_with_the_cube_of_the_offset(sense):
     # 300, 400 um: half a millimetre from the axis, 1 % too long at 0.25 mm: 4 % there
-    truth = truth_with(t_m=one_view(300 * UM, -400 * UM), distortion=0.01 / (250 * UM)**2)
+    truth = truth_with(t_m=one_view(300 * UM, -400 * UM), distortion=0.01 / (250 * UM) ** 2)
     assert deviation(measured(truth, sense), 0, 0) == pytest.approx([312 * UM, -416 * UM])
     drawn = random_truth(PLATE, 1, np.random.default_rng(1), Spread(microscope_distortion=0.01))
     assert drawn.distortion == truth.distortion
@@ -82,7 +92,8 @@ def test_height_moves_a_mark_under_a_tilted_optical_axis(sense):
     tilted = truth_with(plate_tilt_rad=one_view(0.01, 0.0), optical_tilt_rad=lean)
     # about stage x: +y rises by 0.1 sin 0.01
     assert deviation(measured(tilted, sense), 0, 1) == pytest.approx(
-        [0.02 * 0.1 * sin(0.01), 0.1 * (cos(0.01) - 1) + 0.05 * 0.1 * sin(0.01)], rel=1e-9)
+        [0.02 * 0.1 * sin(0.01), 0.1 * (cos(0.01) - 1) + 0.05 * 0.1 * sin(0.01)], rel=1e-9
+    )
     bowed = truth_with(plate_bow_m=10 * UM, optical_tilt_rad=lean)
     found = measured(bowed, sense)
     assert deviation(found, 0, 0) == pytest.approx([0.2 * UM, 0.5 * UM])
@@ -99,8 +110,7 @@ def test_a_plate_is_strained_along_its_own_axes(sense):
     found = measured(truth, sense)
     assert deviation(found, 1, 0) == pytest.approx([1 * UM, 2 * UM])
     assert deviation(found, 0, 1) == pytest.approx([2 * UM, -4 * UM])
-    assert deviation(measured(truth, sense, view=QUARTER), 1, 0) == pytest.approx(
-        [-2 * UM, 1 * UM])
+    assert deviation(measured(truth, sense, view=QUARTER), 1, 0) == pytest.approx([-2 * UM, 1 * UM])
 
 
 def test_a_stage_bends_where_it_stands_whatever_lies_on_it():
@@ -128,8 +138,9 @@ def test_it_turns_as_at_its_place():
     truth, pitch = truth_with(yaw=yaw), PLATE.grid_pitch_m
     arm = np.array([[0.0], [2e-4]])
     for x, part in ((pitch, 1.0), (0.5 * pitch, 0.5), (-pitch, 0.0)):
-        seen = physics.offset_seen(truth, Sense.PLATE_MOVES, np.array([[x], [0.0]]),
-                                   np.zeros((2, 1)), arm)
+        seen = physics.offset_seen(
+            truth, Sense.PLATE_MOVES, np.array([[x], [0.0]]), np.zeros((2, 1)), arm
+        )
         assert seen[0, 0] == pytest.approx(-2e-7 * part, rel=1e-6, abs=1e-15)
 
 
@@ -142,10 +153,16 @@ def test_marks_that_no_cell_is_declared_for_turn_like_the_others(sense):
     found = []
     for image in (None, ImageCells(3, 3, PLATE.grid_pitch_m)):
         plan = Plan("yaw", PLATE, (View("v", angular=False, image=image),))
-        events = plan_events(truth, plan, settings=settings, rng=np.random.default_rng(1),
-                             start_ns=0)
-        found.append([one.offsets for one in exposures(truth, plan, camera, events, sense=sense)
-                      if isinstance(one, Exposure)])
+        events = plan_events(
+            truth, plan, settings=settings, rng=np.random.default_rng(1), start_ns=0
+        )
+        found.append(
+            [
+                one.offsets
+                for one in exposures(truth, plan, camera, events, sense=sense)
+                if isinstance(one, Exposure)
+            ]
+        )
     assert len(found[0]) == len(found[1]) == PLATE.m.size
     turned = 0.0
     for alone, together in zip(*found, strict=True):
@@ -159,8 +176,13 @@ def test_each_view_has_its_own_bend():
     bends[1, 0, 0] = 5 * UM
     truth = truth_with(stage_bend_m=bends, phi_rad=np.zeros(2), t_m=np.zeros((2, 2)))
     plan = Plan("p", PLATE, (View("a"), View("b")))
-    events = plan_events(truth, plan, settings=CellSettings(servo_sigma_m=0.0),
-                         rng=np.random.default_rng(1), start_ns=START_NS)
+    events = plan_events(
+        truth,
+        plan,
+        settings=CellSettings(servo_sigma_m=0.0),
+        rng=np.random.default_rng(1),
+        start_ns=START_NS,
+    )
     first, second = collect(events, outlier_limit=0.0)[0].views
     assert np.abs(first.dx).max() < 1e-15
     assert deviation(second, -1, 1) == pytest.approx([5 * UM, 0], abs=1e-15)
@@ -170,8 +192,9 @@ def test_each_view_has_its_own_bend():
 def test_backlash_grows_while_a_view_is_measured(sense):
     sign = 1 if sense is Sense.MICROSCOPE_MOVES else -1
     view = View("v", repeats=2)
-    found = measured(truth_with(backlash_growth_m=17 * UM), sense, view=view,
-                     visit_order="there_and_back").visits
+    found = measured(
+        truth_with(backlash_growth_m=17 * UM), sense, view=view, visit_order="there_and_back"
+    ).visits
     order = np.argsort(found.stamp_ns)
     # 18 exposures, of which the two in the middle are one visit: 8.5 um, from plus along x
     first, middle, last = order[0], order[8], order[-1]
@@ -206,8 +229,9 @@ def test_a_circle_off_the_axis_is_seen_at_another_angle(sense):
 
 
 def test_noise_of_y_is_its_own():
-    found = measured(truth_with(), view=View("v", repeats=400), sigma_xy_m=4 * UM,
-                     noise_ratio=0.25).visits
+    found = measured(
+        truth_with(), view=View("v", repeats=400), sigma_xy_m=4 * UM, noise_ratio=0.25
+    ).visits
     assert found.dx.std() == pytest.approx(4 * UM, rel=0.05)
     assert found.dy.std() == pytest.approx(1 * UM, rel=0.05)
 
@@ -228,12 +252,17 @@ def test_servo_scatter_is_motion_and_noise_of_the_encoder_is_none(sense):
 
 
 @SENSES
-@pytest.mark.parametrize(("turn", "mark", "error", "line"), [
-    (0.0, (0, 1), (2, 5), 1), (-pi / 2, (-1, 0), (5, -2), 2), (pi, (0, -1), (-2, -5), 3)])
+@pytest.mark.parametrize(
+    ("turn", "mark", "error", "line"),
+    [(0.0, (0, 1), (2, 5), 1), (-pi / 2, (-1, 0), (5, -2), 2), (pi, (0, -1), (-2, -5), 3)],
+)
 def test_a_plate_that_lies_otherwise_shows_another_mark(sense, turn, mark, error, line):
     """A quarter turn is commanded: mark (1, 0) is expected on site (0, 1), line 0 along +y."""
-    truth = truth_with(a=at(*mark, 2 * UM, 5 * UM), placed=(View("v", turn),),
-                       a_theta=np.array([0, 1e-5, 2e-5, 3e-5]))
+    truth = truth_with(
+        a=at(*mark, 2 * UM, 5 * UM),
+        placed=(View("v", turn),),
+        a_theta=np.array([0, 1e-5, 2e-5, 3e-5]),
+    )
     found = measured(truth, sense, view=QUARTER)
     assert deviation(found, 1, 0) == pytest.approx(UM * np.array(error))
     assert np.count_nonzero(np.abs(found.dx) > 1e-12) == 1
@@ -250,15 +279,17 @@ def test_where_the_plate_has_no_mark_none_is_read(sense):
     assert len(found.m) == 3 and found.visits.mark.tolist() == [0, 1, 2]
     assert deviation(found, -1, 0) == pytest.approx([0, 0], abs=1e-16)
     moved = truth_with(placed=(lies,), a=at(1, 0, 3 * UM, 0))
-    assert deviation(measured(moved, sense, view=View("v", 0.0, (0.1, 0.0))), -1, 0
-                     ) == pytest.approx([3 * UM, 0], abs=1e-16)
+    assert deviation(
+        measured(moved, sense, view=View("v", 0.0, (0.1, 0.0))), -1, 0
+    ) == pytest.approx([3 * UM, 0], abs=1e-16)
 
 
 def test_detections_name_the_mark_that_lies_there():
     plan = Plan("p", PLATE, (QUARTER,))
     truth = truth_with(placed=(View("v"),))
-    events = plan_events(truth, plan, settings=CellSettings(), rng=np.random.default_rng(1),
-                         start_ns=START_NS)
+    events = plan_events(
+        truth, plan, settings=CellSettings(), rng=np.random.default_rng(1), start_ns=START_NS
+    )
     seen = [event for event in events if isinstance(event, Detection)]
     # the stage goes along the sites line by line from (-1, -1): so do the marks that lie there
     assert [(d.m, d.n) for d in seen[:4]] == [(-1, -1), (-1, 0), (-1, 1), (0, 1)]
@@ -275,27 +306,38 @@ def test_views_share_what_pins_make_of_them():
 
 
 def test_a_wrong_pitch_is_an_error_of_the_plate():
-    plain, wrong = (random_truth(PLATE, 1, np.random.default_rng(3), Spread(pitch_error=size))
-                    for size in (0.0, 8e-4))
+    plain, wrong = (
+        random_truth(PLATE, 1, np.random.default_rng(3), Spread(pitch_error=size))
+        for size in (0.0, 8e-4)
+    )
     np.testing.assert_allclose(wrong.a[:, 2, 0] - plain.a[:, 2, 0], [8e-5, -8e-5], rtol=1e-9)
     np.testing.assert_array_equal(wrong.g, plain.g)
 
 
 def test_effects_of_views_are_drawn_with_their_sizes():
-    spread = Spread(plate_strain=1e-6, plate_tilt_rad=1e-3, stage_bend_m=1e-8,
-                    line_eccentricity_rad=1.5e-5)
+    spread = Spread(
+        plate_strain=1e-6, plate_tilt_rad=1e-3, stage_bend_m=1e-8, line_eccentricity_rad=1.5e-5
+    )
     truth = random_truth(PLATE, 4001, np.random.default_rng(5), spread)
     assert not truth.plate_strain[0].any()
     np.testing.assert_array_equal(truth.plate_strain, truth.plate_strain.transpose(0, 2, 1))
-    for values, size in ((truth.plate_strain, 1e-6), (truth.plate_tilt_rad, 1e-3),
-                         (truth.stage_bend_m, 1e-8), (truth.line_eccentricity_rad, 1.5e-5)):
+    for values, size in (
+        (truth.plate_strain, 1e-6),
+        (truth.plate_tilt_rad, 1e-3),
+        (truth.stage_bend_m, 1e-8),
+        (truth.line_eccentricity_rad, 1.5e-5),
+    ):
         np.testing.assert_allclose(values.std(axis=0), size, rtol=0.05)
 
 
 def test_one_machine_is_measured_twice():
     spread = Spread(drift_linear_m=1e-7, plate_scale=1e-6)
-    one, other = (random_truth(PLATE, 3, np.random.default_rng(1), spread,
-                               placing=np.random.default_rng(seed)) for seed in (2, 3))
+    one, other = (
+        random_truth(
+            PLATE, 3, np.random.default_rng(1), spread, placing=np.random.default_rng(seed)
+        )
+        for seed in (2, 3)
+    )
     for name in ("g", "a", "g_theta", "a_theta"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     for name in ("phi_rad", "t_m", "drift_m", "plate_scale"):

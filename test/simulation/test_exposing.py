@@ -9,10 +9,15 @@ from selfcal_ros.simulation.rendering import Exposure
 from selfcal_ros.simulation.spec import read_simulation
 
 SIM = {
-    "plan": {"plan_id": "p", "artifact": {"grid_size": 3, "grid_pitch": 1e-4, "angular_count": 0},
-             "views": [{"name": "a"}, {"name": "b", "rotation_deg": 90}]},
-    "truth": {"g": 0.0, "a": 0.0, "t": 0.0, "phi": 0.0}, "cell": {"servo_sigma": 0.0},
-    "camera": {"width": 100, "height": 100, "mark_size": 3e-5}}
+    "plan": {
+        "plan_id": "p",
+        "artifact": {"grid_size": 3, "grid_pitch": 1e-4, "angular_count": 0},
+        "views": [{"name": "a"}, {"name": "b", "rotation_deg": 90}],
+    },
+    "truth": {"g": 0.0, "a": 0.0, "t": 0.0, "phi": 0.0},
+    "cell": {"servo_sigma": 0.0},
+    "camera": {"width": 100, "height": 100, "mark_size": 3e-5},
+}
 
 
 def test_the_marks_around_lie_as_on_the_plate(tmp_path):

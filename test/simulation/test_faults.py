@@ -30,9 +30,16 @@ def assert_close_to_truth(cell, found):
         assert (np.abs(off) < 6 * 2e-6 / np.sqrt(readings.count_theta)).all()
 
 
-@pytest.mark.parametrize(("name", "reason"), [
-    ("duplicated", "duplicate"), ("low_score", "low_score"), ("not_finite", "not_finite"),
-    ("unknown_mark", "unknown_mark"), ("outliers", "outlier_among_repeats")])
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("duplicated", "duplicate"),
+        ("low_score", "low_score"),
+        ("not_finite", "not_finite"),
+        ("unknown_mark", "unknown_mark"),
+        ("outliers", "outlier_among_repeats"),
+    ],
+)
 def test_the_ledger_is_what_the_collector_rejects(name, reason):
     cell, arrivals, ledger = spoilt(Faults(**{name: 0.01}))
     found, _ = collect([event for _, event in arrivals])
@@ -53,15 +60,26 @@ def test_lost_detections_are_not_there():
 
 @pytest.mark.parametrize("ids", [True, False])
 def test_everything_at_once_is_counted_and_nothing_is_used_silently(ids):
-    faults = Faults(lost=0.03, duplicated=0.02, outliers=0.01, low_score=0.01, not_finite=0.01,
-                    delay_s=0.2, clock_step_s=0.1555, encoder_gap_s=0.4)
+    faults = Faults(
+        lost=0.03,
+        duplicated=0.02,
+        outliers=0.01,
+        low_score=0.01,
+        not_finite=0.01,
+        delay_s=0.2,
+        clock_step_s=0.1555,
+        encoder_gap_s=0.4,
+    )
     cell, arrivals, ledger = spoilt(faults, with_ids=ids)
     found, _ = collect([event for _, event in arrivals])
     rejected = found.all_rejected()
     assert rejected["no_encoder_sample_near"] > 20
     assert rejected["encoder_contradiction"] > 10
-    for name, reason in (("low_score", "low_score"), ("not_finite", "not_finite"),
-                         ("duplicated", "duplicate")):
+    for name, reason in (
+        ("low_score", "low_score"),
+        ("not_finite", "not_finite"),
+        ("duplicated", "duplicate"),
+    ):
         assert rejected[reason] == ledger[name]
     n_seen = sum(isinstance(event, Detection) for _, event in arrivals)
     assert n_seen == sum(v.used for v in found.views) + sum(rejected.values())

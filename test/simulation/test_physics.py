@@ -32,16 +32,19 @@ UM = 1e-6
 def truth_with(**fields):
     """Return a perfect machine, but for some fields of its truth."""
     nothing = np.zeros((2, 3, 3))
-    perfect = Truth(PLATE, nothing, nothing, np.zeros(4), np.zeros(4), np.zeros(1),
-                    np.zeros((1, 2)))
+    perfect = Truth(
+        PLATE, nothing, nothing, np.zeros(4), np.zeros(4), np.zeros(1), np.zeros((1, 2))
+    )
     return replace(perfect, **fields)
 
 
 def measured(truth, sense=Sense.MICROSCOPE_MOVES, *, view=None, **settings):
     """Return the readings of one view in raster order without noise."""
     view = view or View("v")
-    how = CellSettings(sense, **{"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0,
-                                 "visit_order": "raster", **settings})
+    how = CellSettings(
+        sense,
+        **{"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0, "visit_order": "raster", **settings},
+    )
     plan = Plan("p", truth.artifact, (view,))
     return simulate_measurements(truth, plan, np.random.default_rng(1), settings=how).views[0]
 
@@ -91,7 +94,8 @@ def test_the_papers_plate_does_not_shorten(sense):
     truth = truth_with(phi_rad=np.array([PHI]), a=at(1, 0, 0.01, 0.0), linear=True)
     assert deviation(measured(truth, sense), 1, 0) == pytest.approx([0.01, 0.1 * PHI])
     assert deviation(measured(truth, sense, view=QUARTER), 1, 0) == pytest.approx(
-        [-0.1 * PHI, 0.01])
+        [-0.1 * PHI, 0.01]
+    )
 
 
 @SENSES
@@ -108,12 +112,16 @@ def test_offsets_are_those_of_the_stage_frame(sense):
     truth = truth_with(t_m=one_view(3 * UM, -4 * UM))
     for view in (View("v"), QUARTER):
         assert deviation(measured(truth, sense, view=view), 1, -1) == pytest.approx(
-            [3 * UM, -4 * UM])
+            [3 * UM, -4 * UM]
+        )
 
 
 def test_the_stage_error_is_indicated_minus_true():
-    truth = truth_with(g=at(1, 0, 2 * UM, -3 * UM), a_theta=np.array([0, 0, 5e-6, 0]),
-                       g_theta=np.array([1e-6, 2e-6, 3e-6, 5e-6]))
+    truth = truth_with(
+        g=at(1, 0, 2 * UM, -3 * UM),
+        a_theta=np.array([0, 0, 5e-6, 0]),
+        g_theta=np.array([1e-6, 2e-6, 3e-6, 5e-6]),
+    )
     found = measured(truth)
     assert deviation(found, 1, 0) == pytest.approx([2 * UM, -3 * UM])
     assert deviation(found, -1, 0) == pytest.approx([0, 0], abs=1e-17)
@@ -130,8 +138,9 @@ def test_under_a_fixed_microscope_the_stage_stands_at_minus_the_mark():
     assert deviation(found, 1, 0) == pytest.approx([0, 0], abs=1e-17)
     # line 1 is read with the encoder at minus one line, which is line 3
     np.testing.assert_allclose(found.dtheta, [-1e-6, -5e-6, -3e-6, -2e-6])
-    np.testing.assert_allclose(measured(truth, Sense.PLATE_MOVES, view=QUARTER).dtheta,
-                               [-5e-6, -3e-6, -2e-6, -1e-6])
+    np.testing.assert_allclose(
+        measured(truth, Sense.PLATE_MOVES, view=QUARTER).dtheta, [-5e-6, -3e-6, -2e-6, -1e-6]
+    )
 
 
 @SENSES
@@ -148,8 +157,9 @@ def test_what_is_read_by_a_perfect_cell_is_the_plain_deviation(sense):
     for one in (readings, plain.views[1]):
         at = one.m + 1, one.n + 1
         np.testing.assert_allclose([one.dx, one.dy], want[:, *at], rtol=0, atol=1e-16)
-        np.testing.assert_allclose(one.dtheta, angular_deviation(truth, 1, view, sense=sense),
-                                   rtol=0, atol=4e-15)
+        np.testing.assert_allclose(
+            one.dtheta, angular_deviation(truth, 1, view, sense=sense), rtol=0, atol=4e-15
+        )
 
 
 def test_between_sites_the_stage_error_is_bilinear_and_goes_on_straight_outside():
@@ -166,8 +176,9 @@ def test_between_sites_the_stage_error_is_bilinear_and_goes_on_straight_outside(
 def test_between_lines_the_encoder_error_is_linear_and_the_circle_closes():
     truth = truth_with(g_theta=np.array([1e-6, 2e-6, 3e-6, 5e-6]))
     asked = np.array([0.0, 0.5, 3.0, 3.5, -0.25, 7.0]) * pi / 2
-    np.testing.assert_allclose(encoder_error(truth, asked),
-                               [1e-6, 1.5e-6, 5e-6, 3e-6, 2e-6, 5e-6], rtol=1e-9)
+    np.testing.assert_allclose(
+        encoder_error(truth, asked), [1e-6, 1.5e-6, 5e-6, 3e-6, 2e-6, 5e-6], rtol=1e-9
+    )
 
 
 @SENSES
@@ -213,10 +224,14 @@ def test_the_plate_bends_with_the_square_of_the_place(sense):
 
 
 @SENSES
-@pytest.mark.parametrize(("matrix", "seen"), [
-    ([[0.25, 0], [0, 0.25]], [800 * UM, 0]),        # a true length is 1.25 of the seen one
-    ([[0, -0.5], [0.5, 0]], [800 * UM, -400 * UM]),  # turned left, it sees things turned right
-    ([[0, 0], [0.5, 0]], [1000 * UM, -500 * UM])])
+@pytest.mark.parametrize(
+    ("matrix", "seen"),
+    [
+        ([[0.25, 0], [0, 0.25]], [800 * UM, 0]),  # a true length is 1.25 of the seen one
+        ([[0, -0.5], [0.5, 0]], [800 * UM, -400 * UM]),  # turned left, it sees things turned right
+        ([[0, 0], [0.5, 0]], [1000 * UM, -500 * UM]),
+    ],
+)
 def test_the_microscope_tells_offsets_in_its_own_way(sense, matrix, seen):
     truth = truth_with(t_m=one_view(1000 * UM, 0), microscope=np.array(matrix))
     assert deviation(measured(truth, sense), 0, 0) == pytest.approx(seen, abs=1e-16)
@@ -228,8 +243,7 @@ def test_the_microscope_tells_offsets_in_its_own_way(sense, matrix, seen):
 def test_the_parts_of_the_microscopes_matrix():
     np.testing.assert_array_equal(Spread(microscope_scale=3.0).microscope, [[3, 0], [0, 3]])
     np.testing.assert_array_equal(Spread(microscope_stretch=3.0).microscope, [[3, 0], [0, -3]])
-    np.testing.assert_array_equal(Spread(microscope_rotation_rad=3.0).microscope,
-                                  [[0, -3], [3, 0]])
+    np.testing.assert_array_equal(Spread(microscope_rotation_rad=3.0).microscope, [[0, -3], [3, 0]])
     np.testing.assert_array_equal(Spread(microscope_shear=3.0).microscope, [[0, 3], [3, 0]])
 
 
@@ -253,8 +267,12 @@ def test_backlash_of_a_stage_that_carries_the_plate():
     assert deviation(found, -1, -1) == pytest.approx([-2 * UM, -5 * UM])  # it came from minus
     assert deviation(found, -1, 0) == pytest.approx([-2 * UM, 5 * UM])
     assert deviation(found, 0, -1) == pytest.approx([2 * UM, -5 * UM])
-    signs = {(int(m), int(n)): (int(x), int(y)) for m, n, x, y in zip(
-        found.m, found.n, found.visits.approach_x, found.visits.approach_y, strict=True)}
+    signs = {
+        (int(m), int(n)): (int(x), int(y))
+        for m, n, x, y in zip(
+            found.m, found.n, found.visits.approach_x, found.visits.approach_y, strict=True
+        )
+    }
     assert [signs[mark] for mark in ((-1, -1), (-1, 0), (0, -1))] == [(1, 1), (1, -1), (-1, 1)]
 
 
@@ -274,8 +292,12 @@ def test_where_the_stage_stops_changes_the_offset_and_not_the_reading(sense):
     still = measured(truth, sense, view=view)
     found = measured(truth, sense, view=view, stop_sigma_m=50 * UM)
     np.testing.assert_allclose([found.dx, found.dy], [still.dx, still.dy], rtol=0, atol=1e-16)
-    apart = np.concatenate([found.visits.offset_x - still.visits.offset_x,
-                            found.visits.offset_y - still.visits.offset_y])
+    apart = np.concatenate(
+        [
+            found.visits.offset_x - still.visits.offset_x,
+            found.visits.offset_y - still.visits.offset_y,
+        ]
+    )
     assert apart.std() == pytest.approx(50 * UM, rel=4 / np.sqrt(2 * len(apart)))
 
 
@@ -292,8 +314,12 @@ def test_the_stage_error_is_that_of_the_place_where_the_stage_stops():
 
 @SENSES
 def test_a_stage_that_follows_the_mark_sees_no_offset(sense):
-    truth = truth_with(t_m=one_view(30 * UM, -7 * UM), phi_rad=np.array([1e-4]),
-                       a_theta=np.full(4, 5e-6), g_theta=np.array([1e-6, 2e-6, 3e-6, 5e-6]))
+    truth = truth_with(
+        t_m=one_view(30 * UM, -7 * UM),
+        phi_rad=np.array([1e-4]),
+        a_theta=np.full(4, 5e-6),
+        g_theta=np.array([1e-6, 2e-6, 3e-6, 5e-6]),
+    )
     found = measured(truth, sense, follow_mark=True)
     assert np.abs([found.visits.offset_x, found.visits.offset_y]).max() < 1e-15
     plain = measured(truth, sense)
@@ -333,17 +359,26 @@ def test_flicker_is_slower_than_a_visit():
 
 
 def test_what_is_drawn_has_the_size_that_is_asked_for():
-    spread = Spread(rotation="finite", plate_scale=1e-6, plate_shape_m=3e-8, drift_linear_m=1e-7,
-                    drift_quadratic_m=2e-7, drift_cubic_m=4e-7, drift_walk_m=5e-8,
-                    backlash_x_m=1e-8, backlash_y_m=-2e-8)
+    spread = Spread(
+        rotation="finite",
+        plate_scale=1e-6,
+        plate_shape_m=3e-8,
+        drift_linear_m=1e-7,
+        drift_quadratic_m=2e-7,
+        drift_cubic_m=4e-7,
+        drift_walk_m=5e-8,
+        backlash_x_m=1e-8,
+        backlash_y_m=-2e-8,
+    )
     truth = random_truth(PLATE, 4001, np.random.default_rng(5), spread)
     assert truth.plate_scale[0] == 0 and not truth.plate_shape_m[0].any()
     assert truth.plate_scale.std() == pytest.approx(1e-6, rel=0.05)
     np.testing.assert_allclose(truth.plate_shape_m.std(axis=0), 3e-8, rtol=0.05)
     np.testing.assert_allclose(truth.drift_m.std(axis=0), [[1e-7, 2e-7, 4e-7]] * 2, rtol=0.05)
     assert not truth.walk_m[:, :, 0].any()
-    np.testing.assert_allclose(truth.walk_m[:, :, [64, -1]].std(axis=0), [[2.5e-8, 5e-8]] * 2,
-                               rtol=0.05)
+    np.testing.assert_allclose(
+        truth.walk_m[:, :, [64, -1]].std(axis=0), [[2.5e-8, 5e-8]] * 2, rtol=0.05
+    )
     np.testing.assert_array_equal(truth.backlash_m, [1e-8, -2e-8])
     assert differs_by_visit(truth)
 
@@ -356,8 +391,10 @@ def test_nothing_beyond_the_basic_model_is_drawn_unasked():
 
 def test_a_rotary_encoder_that_owes_nothing_to_the_axes():
     artifact = Artifact(11, 0.01, 24)
-    draws = [random_truth(artifact, 4, np.random.default_rng(5), Spread(encoder=encoder))
-             for encoder in ("independent", "xy_axes")]
+    draws = [
+        random_truth(artifact, 4, np.random.default_rng(5), Spread(encoder=encoder))
+        for encoder in ("independent", "xy_axes")
+    ]
     assert abs(draws[0].g_theta.mean()) < 1e-19
     np.testing.assert_array_equal(draws[0].g, draws[1].g)
     moved = draws[0].g_theta - draws[1].g_theta
@@ -380,8 +417,11 @@ def test_a_plate_lies_at_any_turn_and_shift(sense):
     assert deviation(found, 0, 1) == pytest.approx([3 * UM, -4 * UM])
     # 0.8 * 1 - 0.6 * 2, 0.6 * 1 + 0.8 * 2 mm
     assert deviation(found, 1, 0) == pytest.approx([-0.4e-3 + 3 * UM, 2.2e-3 - 4 * UM])
-    turned = measured(replace(truth, a=at(0, 0, 0, 0), t_m=one_view(0, 0),
-                              phi_rad=np.array([PHI])), sense, view=ASKEW)
+    turned = measured(
+        replace(truth, a=at(0, 0, 0, 0), t_m=one_view(0, 0), phi_rad=np.array([PHI])),
+        sense,
+        view=ASKEW,
+    )
     # (0.08, 0.06) comes to (0.06, 0.08): the cosine is 0.96, the sine 0.28
     assert deviation(turned, 1, 0) == pytest.approx([-0.02, 0.02], rel=1e-12)
 
@@ -392,10 +432,12 @@ def test_between_nodes_the_stage_is_off_by_their_means():
     assert deviation(measured(truth, view=ASKEW), 1, 0) == pytest.approx([3 * UM, -3 * UM])
     # under a fixed microscope the stage stands at (-0.1, -0.05), and the mark is seen less
     assert deviation(measured(truth, Sense.PLATE_MOVES, view=ASKEW), 1, 0) == pytest.approx(
-        [0, 0], abs=1e-17)
+        [0, 0], abs=1e-17
+    )
     truth = replace(truth, g=at(-1, -1, 2 * UM, -6 * UM))
     assert deviation(measured(truth, Sense.PLATE_MOVES, view=ASKEW), 1, 0) == pytest.approx(
-        [-1 * UM, 3 * UM])
+        [-1 * UM, 3 * UM]
+    )
 
 
 @SENSES
@@ -409,8 +451,7 @@ def test_without_visits_a_placed_plate_reads_the_same(sense):
 def test_the_rows_of_a_placed_plate_are_visited_one_after_the_other():
     """Of the plate: lines of the stage's sites there are none."""
     visits = visit_sequence(PLACED, ASKEW, order="serpentine")
-    assert list(zip(visits.m, visits.n, strict=True)) == [
-        (-1, 0), (0, 1), (0, 0), (0, -1), (1, 0)]
+    assert list(zip(visits.m, visits.n, strict=True)) == [(-1, 0), (0, 1), (0, 0), (0, -1), (1, 0)]
     np.testing.assert_allclose([visits.i[-1], visits.j[-1]], [1.0, 0.5])
     turned = visit_sequence(PLACED, replace(ASKEW, rotation_rad=TURN + pi / 2), order="raster")
     assert (np.diff(turned.m) >= 0).all()
@@ -418,14 +459,17 @@ def test_the_rows_of_a_placed_plate_are_visited_one_after_the_other():
 
 def test_of_a_plate_placed_askew_the_nearest_marks_are_found():
     """It lies 5 mm aside and 0.1 rad further than commanded: no mark moves by half a pitch."""
-    truth = truth_with(artifact=PLACED, placed=(View("x", TURN + 0.1, (0.025, -0.01),
-                                                            angular=False),))
-    visits = grid_exposures(truth, 0, ASKEW, settings=CellSettings(servo_sigma_m=0.0),
-                            rng=np.random.default_rng(0))
+    truth = truth_with(
+        artifact=PLACED, placed=(View("x", TURN + 0.1, (0.025, -0.01), angular=False),)
+    )
+    visits = grid_exposures(
+        truth, 0, ASKEW, settings=CellSettings(servo_sigma_m=0.0), rng=np.random.default_rng(0)
+    )
     np.testing.assert_array_equal(visits.mark, [visits.visits.m, visits.visits.n])
     assert visits.there.all()
     place = truth.placed[0].pose.places(PLACED, *visits.mark) - ASKEW.pose.places(
-        PLACED, *visits.mark)
+        PLACED, *visits.mark
+    )
     np.testing.assert_allclose(visits.offset, [place.real, place.imag], atol=1e-15)
 
 

@@ -16,9 +16,15 @@ def grey(camera, offsets=CENTRE, **kwargs):
     return camera.image(offsets, np.random.default_rng(1), **kwargs) / 65535
 
 
-@pytest.mark.parametrize("mark, area", [
-    ("disc", np.pi / 4 * 25 ** 2), ("ring", np.pi * 5 * 20), ("cross", 2 * 25 * 5 - 25),
-    ("corner", 2 * 25 ** 2)])
+@pytest.mark.parametrize(
+    "mark, area",
+    [
+        ("disc", np.pi / 4 * 25**2),
+        ("ring", np.pi * 5 * 20),
+        ("cross", 2 * 25 * 5 - 25),
+        ("corner", 2 * 25**2),
+    ],
+)
 def test_area_and_centroid_are_those_of_the_mark(mark, area):
     camera = replace(PLAIN, mark=mark, blur_px=1.2)
     away = np.array([[3.3], [-2.6]]) * camera.pixel_size_m
@@ -35,7 +41,8 @@ def test_the_width_of_an_edge_is_that_of_blur_and_pixel():
     place = np.arange(len(edge))
     mean = (edge * place).sum() / edge.sum()
     assert (edge * (place - mean) ** 2).sum() / edge.sum() == pytest.approx(
-        1.5 ** 2 + 2 / 12, rel=0.05)
+        1.5**2 + 2 / 12, rel=0.05
+    )
 
 
 def test_noise_grows_with_light():

@@ -43,9 +43,19 @@ def test_the_figures_are_those_of_the_definitions():
     s_up, s_down = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.4, 0.1])
     found = bidirectional(up, down, s_up, s_down)
     expected = {
-        "M": 3.25 - 0.5, "B": 2.0, "mean B": (1.0 - 0.5 - 2.0) / 3, "E": 4.0 - 0.0,
-        "E+": 2.0, "E-": 4.0, "R+": 1.2, "R-": 1.6, "R": 0.6 + 0.2 + 2.0,
-        "A": 4.3 - -0.2, "A+": 3.4 - 0.8, "A-": 4.3 - -0.2}
+        "M": 3.25 - 0.5,
+        "B": 2.0,
+        "mean B": (1.0 - 0.5 - 2.0) / 3,
+        "E": 4.0 - 0.0,
+        "E+": 2.0,
+        "E-": 4.0,
+        "R+": 1.2,
+        "R-": 1.6,
+        "R": 0.6 + 0.2 + 2.0,
+        "A": 4.3 - -0.2,
+        "A+": 3.4 - 0.8,
+        "A-": 4.3 - -0.2,
+    }
     assert set(found) == set(expected)
     for name, value in expected.items():
         assert found[name] == pytest.approx(value), name
@@ -83,8 +93,12 @@ def measured(*, sense=Sense.MICROSCOPE_MOVES, sigma=0.0, seed=1, repeats=4, orde
     spread = Spread(backlash_x_m=BACKLASH_M[0], backlash_y_m=BACKLASH_M[1])
     plan = hu_plan(ARTIFACT, repeats)
     truth = random_truth(ARTIFACT, len(plan.views), rng, spread)
-    return truth, simulate_measurements(truth, plan, rng, settings=CellSettings(
-        sense, sigma, 0.0, servo_sigma_m=0.0, visit_order=order))
+    return truth, simulate_measurements(
+        truth,
+        plan,
+        rng,
+        settings=CellSettings(sense, sigma, 0.0, servo_sigma_m=0.0, visit_order=order),
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -121,12 +135,14 @@ def test_a_map_of_one_approach_more_than_the_other_is_moved_to_their_middle():
 def test_the_scatter_of_approaches_is_that_of_the_machine():
     _, readings = measured(sigma=30e-9, repeats=8)
     found = scatters(readings, 0).values()
-    s = np.sqrt(np.average([item.s_up_m**2 for item in found],
-                           weights=[item.dof_up for item in found]))
+    s = np.sqrt(
+        np.average([item.s_up_m**2 for item in found], weights=[item.dof_up for item in found])
+    )
     dof = sum(item.dof_up for item in found)
     assert dof > 200 and s == pytest.approx(30e-9, rel=4 / np.sqrt(2 * dof))
-    off = np.array([(item.reversal_m - 2 * BACKLASH_M[0]) / (item.u_reversal_m * 30e-9)
-                    for item in found])
+    off = np.array(
+        [(item.reversal_m - 2 * BACKLASH_M[0]) / (item.u_reversal_m * 30e-9) for item in found]
+    )
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=4 / np.sqrt(2 * len(off)))
 
 
@@ -137,9 +153,14 @@ def test_the_reversal_of_unequal_approaches_is_that_of_one_least_squares():
     fewer = []
     for view in readings.views:
         kept = rng.random(len(view.visits.mark)) > 1 / 3
-        own = replace(view.visits, **{name: values[kept]
-                                      for name, values in vars(view.visits).items()
-                                      if np.shape(values) == kept.shape})
+        own = replace(
+            view.visits,
+            **{
+                name: values[kept]
+                for name, values in vars(view.visits).items()
+                if np.shape(values) == kept.shape
+            },
+        )
         fewer.append(replace(view, visits=own))
         x, y = view.view.lattice_pose(ARTIFACT).site_of(view.m, view.n)
         for mark, value, sign in zip(own.mark, own.dx, own.approach_x, strict=True):
@@ -148,8 +169,11 @@ def test_the_reversal_of_unequal_approaches_is_that_of_one_least_squares():
     assert len(found) >= 20
     for site, item in found.items():
         rows = [row for row in visits[site] if row[2]]
-        both = [v for v in {row[0] for row in rows}
-                if {row[2] for row in rows if row[0] == v} == {1, -1}]
+        both = [
+            v
+            for v in {row[0] for row in rows}
+            if {row[2] for row in rows if row[0] == v} == {1, -1}
+        ]
         rows = [row for row in rows if row[0] in both]
         matrix = np.array([[sign / 2, *(v == view for v in both)] for view, _, sign in rows])
         inverse = np.linalg.inv(matrix.T @ matrix)
@@ -164,8 +188,9 @@ def solved(seed, truth=None):
     rng = np.random.default_rng(seed)
     plan = hu_plan(ARTIFACT, 2)
     truth = truth or random_truth(ARTIFACT, len(plan.views), np.random.default_rng(7))
-    return truth, calibrate(simulate_measurements(truth, plan, rng, sigma_m=2e-8),
-                            bare(causes=False))
+    return truth, calibrate(
+        simulate_measurements(truth, plan, rng, sigma_m=2e-8), bare(causes=False)
+    )
 
 
 def test_uncertainties_are_the_scatter_of_repeated_calibrations():
@@ -176,13 +201,15 @@ def test_uncertainties_are_the_scatter_of_repeated_calibrations():
     for seed in range(20):
         stage = StageMap(solved(seed, truth)[1])
         stage.halfway = np.zeros((2, 2))  # the truth is bilinear between its nodes
-        for name, of in (("difference", lambda s: diagonal_figures(s)[2].figures["length"]),
-                         ("G", lambda s: circle_figures(s, 0.03).figures["G"]),
-                         ("Fmax", lambda s: circle_figures(s, 0.03).figures["Fmax"]),
-                         ("Fmin", lambda s: circle_figures(s, 0.03).figures["Fmin"]),
-                         ("1 M", lambda s: diagonal_figures(s)[0].figures["M"]),
-                         ("2 M", lambda s: diagonal_figures(s)[1].figures["M"]),
-                         ("M", lambda s: axis_figures(s, 0, 0).figures["M"])):
+        for name, of in (
+            ("difference", lambda s: diagonal_figures(s)[2].figures["length"]),
+            ("G", lambda s: circle_figures(s, 0.03).figures["G"]),
+            ("Fmax", lambda s: circle_figures(s, 0.03).figures["Fmax"]),
+            ("Fmin", lambda s: circle_figures(s, 0.03).figures["Fmin"]),
+            ("1 M", lambda s: diagonal_figures(s)[0].figures["M"]),
+            ("2 M", lambda s: diagonal_figures(s)[1].figures["M"]),
+            ("M", lambda s: axis_figures(s, 0, 0).figures["M"]),
+        ):
             figure = of(stage)
             z[name].append((figure.value - of(exact).value) / figure.u)
     for name, values in z.items():
@@ -239,13 +266,16 @@ def test_the_uncertainty_of_the_repeatability_of_one_direction(name):
     assert found.u == pytest.approx(found.value * np.sqrt(2 - 2 * mean), rel=0.1)
 
 
-@pytest.mark.parametrize(("call", "message"), [
-    (lambda stage: axis_figures(stage, 0, 9), "line 9 along x: 0 positions are known"),
-    (lambda stage: axis_figures(stage, 1, 0, {}), "visit_order there_and_back"),
-    (lambda stage: circle_figures(stage, 0.04), "is not in the field; give one up to 0.03 m"),
-    (lambda stage: circle_figures(stage, -0.01), "is not in the field"),
-    (lambda stage: circle_figures(stage, float("nan")), "is not in the field"),
-])
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda stage: axis_figures(stage, 0, 9), "line 9 along x: 0 positions are known"),
+        (lambda stage: axis_figures(stage, 1, 0, {}), "visit_order there_and_back"),
+        (lambda stage: circle_figures(stage, 0.04), "is not in the field; give one up to 0.03 m"),
+        (lambda stage: circle_figures(stage, -0.01), "is not in the field"),
+        (lambda stage: circle_figures(stage, float("nan")), "is not in the field"),
+    ],
+)
 def test_what_cannot_be_given_is_refused(call, message):
     with pytest.raises(InputError, match=message):
         call(StageMap(result_of(random_map(ARTIFACT, 1))))
@@ -259,8 +289,10 @@ def test_a_path_over_unknown_sites_is_refused():
 
 def test_the_verb_leaves_out_what_crosses_unknown_sites_and_says_which(tmp_path, capsys):
     path = str(tmp_path / "r.json")
-    write_json(path, plain(result_to_dict(result_of(random_map(
-        ARTIFACT, 1, unknown=((0, 0), (0, 3), (5, 3)))))))
+    write_json(
+        path,
+        plain(result_to_dict(result_of(random_map(ARTIFACT, 1, unknown=((0, 0), (0, 3), (5, 3)))))),
+    )
     assert main(["iso230", path]) == 0
     out, err = capsys.readouterr()
     assert "axis x at y = 0 mm, 5 positions from -20 to 30 mm" in out
@@ -269,7 +301,8 @@ def test_the_verb_leaves_out_what_crosses_unknown_sites_and_says_which(tmp_path,
     assert err.splitlines() == [
         "selfcal iso230: circle of radius 30 mm: unknown sites on the path; measure them, or "
         "choose a smaller --radius; left out",
-        "selfcal iso230: diagonals: unknown sites on the path; measure them; left out"]
+        "selfcal iso230: diagonals: unknown sites on the path; measure them; left out",
+    ]
     assert main(["iso230", path, "--radius", "5", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [axis["left_out"] for axis in found["axes"]] == [[-0.03, 0.02], []]
@@ -310,8 +343,9 @@ def test_a_bag_without_approaches_from_both_sides_says_so(tmp_path, capsys, monk
     assert "without repeats" in both.out
 
 
-@pytest.mark.parametrize(("reversal_m", "spread_m", "unlike"), [
-    (0.0, 0.0, True), (1e-7, 0.0, True), (5e-8, 5e-8, False)])
+@pytest.mark.parametrize(
+    ("reversal_m", "spread_m", "unlike"), [(0.0, 0.0, True), (1e-7, 0.0, True), (5e-8, 5e-8, False)]
+)
 def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(reversal_m, spread_m, unlike):
     """150 machines with known reversal and scatter, five approaches from each side.
 
@@ -331,8 +365,13 @@ def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(reversal_m, spread_
             s = scatter[:, i] * np.sqrt(rng.chisquare(count - 1, 2) / (count - 1))
             noise = np.hypot(*scatter[:, i]) / np.sqrt(count)
             repeats[i - 5, 0] = Scatter(
-                reversal[i] + rng.normal(0, noise), np.sqrt(2 / count), *s, count - 1, count - 1,
-                0.0)
+                reversal[i] + rng.normal(0, noise),
+                np.sqrt(2 / count),
+                *s,
+                count - 1,
+                count - 1,
+                0.0,
+            )
         found = axis_figures(StageMap(result_of(emap)), 0, 0, repeats).figures
         mean = -truth[:, 5]
         true = bidirectional(mean - reversal / 2, mean + reversal / 2, *scatter)

@@ -58,14 +58,16 @@ uint32 angular_count
 ENCODER_TYPE = "sensor_msgs/msg/JointState"
 DETECTION_TYPE = "selfcal_msgs/msg/MarkDetection"
 COMMAND_TYPE = "selfcal_msgs/msg/ViewCommand"
-TOPICS = {"stage/joint_states": ENCODER_TYPE, "stage/mark_detections": DETECTION_TYPE,
-          "selfcal/view_command": COMMAND_TYPE}
+TOPICS = {
+    "stage/joint_states": ENCODER_TYPE,
+    "stage/mark_detections": DETECTION_TYPE,
+    "selfcal/view_command": COMMAND_TYPE,
+}
 UNKNOWN_TYPE = "somebody_msgs/msg/Thing"
 
 
 @cache
-def contract_types(more: str = "", detection: str = DETECTION,
-                   command: str = COMMAND) -> Typestore:
+def contract_types(more: str = "", detection: str = DETECTION, command: str = COMMAND) -> Typestore:
     """Return Jazzy's types and the contract's, `more` fields at the end of our two."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict = {}
@@ -85,24 +87,47 @@ def contract_message(store: Typestore, event: Event) -> tuple[str, str, object]:
     """Return topic, type and rosbags message of an event, from the contract's fields."""
     header = _stamp(store, event.stamp_ns)
     if isinstance(event, Detection):
-        values = {name: getattr(event, name) for name in (
-            "kind", "has_id", "m", "n", "k", "offset_x", "offset_y", "offset_theta", "sigma",
-            "score")}
+        values = {
+            name: getattr(event, name)
+            for name in (
+                "kind",
+                "has_id",
+                "m",
+                "n",
+                "k",
+                "offset_x",
+                "offset_y",
+                "offset_theta",
+                "sigma",
+                "score",
+            )
+        }
         topic, typename = "stage/mark_detections", DETECTION_TYPE
     elif isinstance(event, Command):
         view, plate = event.view or View("", grid=False, angular=False, repeats=0), event.artifact
         values = {
-            "phase": int(event.phase), "plan_id": event.plan_id, "view_index": event.view_index,
-            "view_name": view.name, "rotation": view.rotation_rad,
-            "translation_x": view.translation_m[0], "translation_y": view.translation_m[1],
-            "grid": view.grid, "angular": view.angular, "repeats": view.repeats,
+            "phase": int(event.phase),
+            "plan_id": event.plan_id,
+            "view_index": event.view_index,
+            "view_name": view.name,
+            "rotation": view.rotation_rad,
+            "translation_x": view.translation_m[0],
+            "translation_y": view.translation_m[1],
+            "grid": view.grid,
+            "angular": view.angular,
+            "repeats": view.repeats,
             "grid_size": plate.grid_size if plate else 0,
             "grid_pitch": plate.grid_pitch_m if plate else 0.0,
-            "angular_count": plate.angular_count if plate else 0}
+            "angular_count": plate.angular_count if plate else 0,
+        }
         topic, typename = "selfcal/view_command", COMMAND_TYPE
     else:
-        values = {"name": list(event.names), "position": np.array(event.positions),
-                  "velocity": np.array(event.velocities), "effort": np.array([])}
+        values = {
+            "name": list(event.names),
+            "position": np.array(event.positions),
+            "velocity": np.array(event.velocities),
+            "effort": np.array([]),
+        }
         topic, typename = "stage/joint_states", ENCODER_TYPE
     names = [name for name, _ in store.fielddefs[typename][1]]
     extra = {"temperature": 20.5, "operator": "somebody", "grid_size_y": 0, "views_planned": 3}
@@ -142,8 +167,9 @@ class Foreign:
     encoding: str = "cdr"
     renamed: dict[str, str] = field(default_factory=dict)
 
-    def write(self, path: Path, events: Iterable[Event], *, order: int = 0,
-              spoil: bool = False) -> Path:
+    def write(
+        self, path: Path, events: Iterable[Event], *, order: int = 0, spoil: bool = False
+    ) -> Path:
         """Write one MCAP file and return its path; `order` turns the order of the channels.
 
         `spoil` writes empty payloads, for types whose fields the events cannot fill.
@@ -196,21 +222,32 @@ def _empty(event: Event) -> tuple[str, bytes]:
     return topic, b"\0\1\0\0" + bytes(300)
 
 
-NO_SUMMARY = {"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False,
-              "use_statistics": False, "use_summary_offsets": False}
-COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4,
-                "zstd": CompressionType.ZSTD}
+NO_SUMMARY = {
+    "index_types": IndexType.NONE,
+    "repeat_channels": False,
+    "repeat_schemas": False,
+    "use_statistics": False,
+    "use_summary_offsets": False,
+}
+COMPRESSIONS = {
+    "none": CompressionType.NONE,
+    "lz4": CompressionType.LZ4,
+    "zstd": CompressionType.ZSTD,
+}
 
 
-def rosbags_bag(path: Path, events: Iterable[Event],
-                mode: CompressionMode = CompressionMode.NONE) -> Path:
+def rosbags_bag(
+    path: Path, events: Iterable[Event], mode: CompressionMode = CompressionMode.NONE
+) -> Path:
     """Write a folder by the Writer of rosbags, compressed as rosbag2 does."""
     store = contract_types()
     writer = RosbagsWriter(path, version=9, storage_plugin=StoragePlugin.MCAP)
     writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
-        links = {topic: writer.add_connection(f"/{topic}", typename, typestore=store)
-                 for topic, typename in TOPICS.items()}
+        links = {
+            topic: writer.add_connection(f"/{topic}", typename, typestore=store)
+            for topic, typename in TOPICS.items()
+        }
         for event in events:
             topic, typename, message = contract_message(store, event)
             writer.write(links[topic], event.stamp_ns, store.serialize_cdr(message, typename))
@@ -220,7 +257,7 @@ def rosbags_bag(path: Path, events: Iterable[Event],
 def split(events: list[Event], parts: int) -> list[list[Event]]:
     """Return the events in consecutive parts."""
     size = -(-len(events) // parts)
-    return [events[at:at + size] for at in range(0, len(events), size)]
+    return [events[at : at + size] for at in range(0, len(events), size)]
 
 
 def shuffled(events: list[Event], seed: int = 1) -> list[Event]:

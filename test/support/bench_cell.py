@@ -15,8 +15,10 @@ GRID, ANGULAR = 0, 1
 
 def error_m(x, y):
     """Return the stage's error where it is indicated at x, y (m): what is to be found, m."""
-    return (3e-7 * np.sin(120 * x) * np.cos(80 * y) + 1e-7 * np.cos(70 * y),
-            2e-7 * np.cos(90 * x + 60 * y) - 2e-7 * np.sin(50 * x))
+    return (
+        3e-7 * np.sin(120 * x) * np.cos(80 * y) + 1e-7 * np.cos(70 * y),
+        2e-7 * np.cos(90 * x + 60 * y) - 2e-7 * np.sin(50 * x),
+    )
 
 
 def error_rad(theta):
@@ -61,7 +63,7 @@ class Bench:
                 for k in range(view.angular_count):
                     yield self.line(view, k)
         if view.grid:
-            for mark in marks[:view.check_marks]:
+            for mark in marks[: view.check_marks]:
                 for side in SIDES:
                     yield from self.stops(view, *mark, view.check_offset * np.array(side))
 
@@ -79,13 +81,20 @@ class Bench:
         phi, tx, ty = self.laid
         c, s = np.cos(view.rotation + phi), np.sin(view.rotation + phi)
         centre = np.array(((c, -s), (s, c))) @ (
-            np.array((m, n)) * view.grid_pitch + self.plate[:, m, n])
+            np.array((m, n)) * view.grid_pitch + self.plate[:, m, n]
+        )
         centre += (view.translation_x + tx, view.translation_y + ty)
         true = p - self.size * np.array(error_m(*p))
         offset = centre - self.sign * true + self.rng.normal(0, NOISE_M, 2)
         return (*p, self.home[2]), {
-            "kind": GRID, "has_id": self.ids, "m": m * self.ids, "n": n * self.ids,
-            "offset_x": offset[0], "offset_y": offset[1], "score": 1.0}
+            "kind": GRID,
+            "has_id": self.ids,
+            "m": m * self.ids,
+            "n": n * self.ids,
+            "offset_x": offset[0],
+            "offset_y": offset[1],
+            "score": 1.0,
+        }
 
     def line(self, view, k):
         """See an angular line."""
@@ -94,8 +103,12 @@ class Bench:
         true = p - self.size * error_rad(p)
         offset = site + self.lines[k] + self.laid[0] - self.sign * true
         return (*self.home[:2], p), {
-            "kind": ANGULAR, "has_id": self.ids, "k": k * self.ids,
-            "offset_theta": offset + self.rng.normal(0, NOISE_RAD), "score": 1.0}
+            "kind": ANGULAR,
+            "has_id": self.ids,
+            "k": k * self.ids,
+            "offset_theta": offset + self.rng.normal(0, NOISE_RAD),
+            "score": 1.0,
+        }
 
 
 def largest_deviation(found, size: float = 1.0) -> tuple[float, float]:

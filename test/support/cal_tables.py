@@ -17,12 +17,13 @@ def maybe(strategy):
 
 
 def decimals(low, high, digits=3):
-    scale = 10 ** digits
+    scale = 10**digits
     return st.integers(int(low * scale), int(high * scale)).map(lambda n: n / scale)
 
 
-units = st.builds(Unit, st.sampled_from(list(UnitWord)),
-                  st.sampled_from([1.0, 1000.0, 3600.0, 7.0]))
+units = st.builds(
+    Unit, st.sampled_from(list(UnitWord)), st.sampled_from([1.0, 1000.0, 3600.0, 7.0])
+)
 distances = decimals(0.1, 40).flatmap(lambda d: st.sampled_from([d, -d]))
 offsets = decimals(-300, 300)
 rollovers = decimals(50, 4000)
@@ -42,18 +43,32 @@ booleans = st.booleans()
 
 @cache
 def values(*shape):
-    return st.integers(0, 2 ** 32 - 1).map(
-        lambda seed: np.round(np.random.default_rng(seed).normal(0, 5, shape), 4))
+    return st.integers(0, 2**32 - 1).map(
+        lambda seed: np.round(np.random.default_rng(seed).normal(0, 5, shape), 4)
+    )
 
 
 @st.composite
 def tables_1d(draw):
     return Table1D(
-        draw(axis), draw(distances), draw(values(draw(up_to_12))), draw(maybe(axis)),
-        draw(maybe(units)), draw(maybe(units)), draw(maybe(offsets)), draw(maybe(expansions)),
-        draw(maybe(references)), draw(booleans), draw(booleans), draw(maybe(rollovers)),
-        draw(maybe(ways)), draw(maybe(turns)), draw(maybe(feedbacks)), draw(maybe(lengths)),
-        draw(maybe(serials)))
+        draw(axis),
+        draw(distances),
+        draw(values(draw(up_to_12))),
+        draw(maybe(axis)),
+        draw(maybe(units)),
+        draw(maybe(units)),
+        draw(maybe(offsets)),
+        draw(maybe(expansions)),
+        draw(maybe(references)),
+        draw(booleans),
+        draw(booleans),
+        draw(maybe(rollovers)),
+        draw(maybe(ways)),
+        draw(maybe(turns)),
+        draw(maybe(feedbacks)),
+        draw(maybe(lengths)),
+        draw(maybe(serials)),
+    )
 
 
 @st.composite
@@ -61,18 +76,41 @@ def tables_2d(draw):
     shape = draw(up_to_6), draw(up_to_6), draw(two_or_three)
     row, column = draw(orders)[:2]
     return Table2D(
-        row, column, tuple(draw(orders)[:shape[2]]), draw(distances),
-        draw(distances), draw(values(*shape)), draw(maybe(units)), draw(maybe(units)),
-        draw(maybe(offsets)), draw(maybe(offsets)), draw(maybe(feedbacks)), draw(maybe(feedbacks)),
-        draw(booleans), draw(maybe(rollovers)), draw(maybe(rollovers)), draw(maybe(serials)))
+        row,
+        column,
+        tuple(draw(orders)[: shape[2]]),
+        draw(distances),
+        draw(distances),
+        draw(values(*shape)),
+        draw(maybe(units)),
+        draw(maybe(units)),
+        draw(maybe(offsets)),
+        draw(maybe(offsets)),
+        draw(maybe(feedbacks)),
+        draw(maybe(feedbacks)),
+        draw(booleans),
+        draw(maybe(rollovers)),
+        draw(maybe(rollovers)),
+        draw(maybe(serials)),
+    )
 
 
 @st.composite
 def tables_galvo(draw):
     shape = draw(odd), draw(odd), draw(two_or_three)
-    outputs = (1, 2, 3)[:shape[2]]
-    return Table2D(2, 1, outputs, abs(draw(distances)), abs(draw(distances)), draw(values(*shape)),
-                   draw(maybe(units)), draw(maybe(units)), negcor=draw(booleans), galvo=True)
+    outputs = (1, 2, 3)[: shape[2]]
+    return Table2D(
+        2,
+        1,
+        outputs,
+        abs(draw(distances)),
+        abs(draw(distances)),
+        draw(values(*shape)),
+        draw(maybe(units)),
+        draw(maybe(units)),
+        negcor=draw(booleans),
+        galvo=True,
+    )
 
 
 @st.composite

@@ -91,8 +91,14 @@ class WithPlate(GcodeMachine):
         return self._simulated.image()
 
 
-def write_cell(folder, *, plan: str = PLAN, simulation: str = SIMULATION, cell: str = CELL,
-               camera: bool = False):
+def write_cell(
+    folder,
+    *,
+    plan: str = PLAN,
+    simulation: str = SIMULATION,
+    cell: str = CELL,
+    camera: bool = False,
+):
     """Write plan.yaml, sim.yaml and cell.yaml; return the cell and its machine."""
     (folder / "plan.yaml").write_text(plan)
     (folder / "sim.yaml").write_text(simulation + (CAMERA if camera else ""))

@@ -67,8 +67,17 @@ from test.support.sessions import (
 )
 
 HARMLESS = Faults(duplicated=0.05, delay_s=0.05)
-HARMFUL = Faults(lost=0.05, duplicated=0.05, outliers=0.03, low_score=0.02, not_finite=0.02,
-                 unknown_mark=0.02, delay_s=0.05, clock_step_s=0.2, encoder_gap_s=0.3)
+HARMFUL = Faults(
+    lost=0.05,
+    duplicated=0.05,
+    outliers=0.03,
+    low_score=0.02,
+    not_finite=0.02,
+    unknown_mark=0.02,
+    delay_s=0.05,
+    clock_step_s=0.2,
+    encoder_gap_s=0.3,
+)
 CELLS = ("quiet_messages", "lost_messages")
 STEPS_S = (-5.0, -0.2, 0.2, 5.0)
 """By how much the clock of the second cell is set back, one in each round; < 0 = ahead."""
@@ -127,19 +136,26 @@ class Story:
         if isinstance(found, str):
             return self._refused(found, measurements)
         used = sum(view["used"] for view in found["views"])
-        rejected = sum(count for reason, count in found["rejected"].items()
-                       if not reason.startswith(("command_", "encoder_sample_")))
+        rejected = sum(
+            count
+            for reason, count in found["rejected"].items()
+            if not reason.startswith(("command_", "encoder_sample_"))
+        )
         if used + rejected != sent:
             self.faults.append(f"{sent} detections sent, {used} used and {rejected} rejected")
         self._compare(found, calibrate(measurements).error_map, "these messages")
         destroyed = sum(isinstance(event, Detection) for event in self.measured) - len(
-            {id(event) for event in self.arriving if isinstance(event, Detection)})
+            {id(event) for event in self.arriving if isinstance(event, Detection)}
+        )
         if not set(self.ledger) - {"duplicated"}:
-            self._compare(found, calibrate(collected(self.measured)[1]).error_map,
-                          "the undisturbed run")
-        return (f"{sent} detections = {used} used + {rejected} rejected; {max(destroyed, 0)} lost "
-                f"before, {named_missing(progress)} named as missing; "
-                f"killed {', '.join(node for _, node in self.kills)}")
+            self._compare(
+                found, calibrate(collected(self.measured)[1]).error_map, "the undisturbed run"
+            )
+        return (
+            f"{sent} detections = {used} used + {rejected} rejected; {max(destroyed, 0)} lost "
+            f"before, {named_missing(progress)} named as missing; "
+            f"killed {', '.join(node for _, node in self.kills)}"
+        )
 
     def _refused(self, message: str, measurements: object) -> str:
         try:
@@ -152,8 +168,11 @@ class Story:
 
     def _compare(self, found: dict, expected: object, what: str) -> None:
         for name in COMPARED:
-            if not np.array_equal(np.array(found["error_map"][name], dtype=float),
-                                  getattr(expected, name), equal_nan=True):
+            if not np.array_equal(
+                np.array(found["error_map"][name], dtype=float),
+                getattr(expected, name),
+                equal_nan=True,
+            ):
                 self.faults.append(f"{name} is not that of {what}")
 
 
@@ -174,8 +193,9 @@ def listen(cell: Cell) -> None:
     """
     stranger = cell.graph.add(Node(f"stranger_{cell.namespace}", context=cell.graph.context))
     for topic in (*names.INPUTS, *names.RESULTS):
-        stranger.create_subscription(topic.type, cell.name(topic.name), lambda _: None, topic.qos,
-                                     raw=True)
+        stranger.create_subscription(
+            topic.type, cell.name(topic.name), lambda _: None, topic.qos, raw=True
+        )
     cell.graph.until(lambda: all(cell.matched.values()), "the stranger")
 
 
@@ -185,8 +205,9 @@ def story(cell: Cell, faults: Faults, rng: np.random.Generator, kills: int) -> S
     arrivals, ledger = apply_faults(sorted(measured, key=lambda e: e.stamp_ns), faults, rng)
     arriving = [event for _, event in arrivals]
     cuts = np.sort(rng.integers(len(arriving) // 20, len(arriving), kills))
-    return Story(cell, measured, arriving, ledger,
-                 [(int(cut), str(rng.choice(NODES))) for cut in cuts])
+    return Story(
+        cell, measured, arriving, ledger, [(int(cut), str(rng.choice(NODES))) for cut in cuts]
+    )
 
 
 @contextlib.contextmanager
@@ -204,16 +225,19 @@ def cells(environment: dict, folder: Path, forks: Forks | None) -> Iterator[list
         graph.close()
 
 
-def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
-              forks: Forks | None = None) -> tuple[list[str], list[str]]:
+def one_round(
+    seed: int, environment: dict, folder: Path, *, kills: int = 3, forks: Forks | None = None
+) -> tuple[list[str], list[str]]:
     """Run a round of two cells; return a line for each, and what was wrong.
 
     With `forks`, nodes that are killed are forks, and those that are not run in this process.
     """
     rng = np.random.default_rng(seed)
     with cells(environment, folder, forks) as running:
-        stories = [story(cell, faults, rng, kills)
-                   for cell, faults in zip(running, faults_of(seed), strict=True)]
+        stories = [
+            story(cell, faults, rng, kills)
+            for cell, faults in zip(running, faults_of(seed), strict=True)
+        ]
         for one in stories:
             listen(one.cell)
             if forks:
@@ -227,8 +251,13 @@ def one_round(seed: int, environment: dict, folder: Path, *, kills: int = 3,
     return lines, wrong
 
 
-def full_disk(seed: int, environment: dict, folder: Path, *, forks: Forks | None = None,
-              ) -> tuple[str, list[str]]:
+def full_disk(
+    seed: int,
+    environment: dict,
+    folder: Path,
+    *,
+    forks: Forks | None = None,
+) -> tuple[str, list[str]]:
     """Measure in a cell whose disk is full for a third of the run; return a line, what was wrong.
 
     Each detection is used or rejected all the same, and each message is in the journal, or told by
@@ -256,28 +285,35 @@ def full_disk(seed: int, environment: dict, folder: Path, *, forks: Forks | None
         graph.until(lambda: told, "the health")
         lost = int({item.key: item.value for item in told[-1].values}["journal_lost"])
         cell.end("measurement_collector")
-        kept = sum(len(item) if hasattr(item, "__len__") else 1
-                   for _, item in BagReader(file.parent).columns())
+        kept = sum(
+            len(item) if hasattr(item, "__len__") else 1
+            for _, item in BagReader(file.parent).columns()
+        )
         received = sum(cell.told)
         if kept + lost != received or not 0 < lost < (last - first + WHILE_TRYING) * received:
-            one.faults.append(f"{received} messages received, {kept} in the journal and {lost} "
-                              "told as not in it")
+            one.faults.append(
+                f"{received} messages received, {kept} in the journal and {lost} told as not in it"
+            )
         return f"{line}; {kept} of {received} messages in the journal", one.faults
     finally:
         cell.close()
         graph.close()
 
 
-def killed_sequencers(seed: int, environment: dict, folder: Path, *, kills: int = 3,
-                      forks: Forks | None = None) -> tuple[str, list[str]]:
+def killed_sequencers(
+    seed: int, environment: dict, folder: Path, *, kills: int = 3, forks: Forks | None = None
+) -> tuple[str, list[str]]:
     """Measure in a cell that follows commands and whose sequencers are killed within views.
 
     Each one that is started takes up the run in its view, by the command that the last one gave;
     the map is the truth to the noise and, bit for bit, that of the journal.
     """
     rng, plan = np.random.default_rng(seed), small_plan("0, 90, tx", repeats=1)
-    exposures = [(index, number) for index, view in enumerate(plan.views)
-                 for number in range(FEWEST_MARKS * view.grid + FEWEST_LINES * view.angular)]
+    exposures = [
+        (index, number)
+        for index, view in enumerate(plan.views)
+        for number in range(FEWEST_MARKS * view.grid + FEWEST_LINES * view.angular)
+    ]
     stops = [exposures[place] for place in np.sort(rng.choice(len(exposures), kills, False))]
     graph = Graph(int(environment["ROS_DOMAIN_ID"]))
     cell = Cell(graph, environment, folder, "killed_sequencers", forks=forks)
@@ -299,18 +335,27 @@ def killed_sequencers(seed: int, environment: dict, folder: Path, *, kills: int 
         if (offline.run_id, offline.all_rejected()) != (run_id, {}):
             faults.append(f"run {offline.run_id}, rejected {offline.all_rejected()}")
         expected = calibrate(offline).error_map
-        faults += [f"{name} is not that of the journal" for name in COMPARED
-                   if not np.array_equal(np.array(saved["error_map"][name], dtype=float),
-                                         getattr(expected, name), equal_nan=True)]
-        return (f"killed in views {', '.join(str(view) for view, _ in stops)}; the map is off by "
-                f"{off_m:.1e} m, {off_rad:.1e} rad"), faults
+        faults += [
+            f"{name} is not that of the journal"
+            for name in COMPARED
+            if not np.array_equal(
+                np.array(saved["error_map"][name], dtype=float),
+                getattr(expected, name),
+                equal_nan=True,
+            )
+        ]
+        return (
+            f"killed in views {', '.join(str(view) for view, _ in stops)}; the map is off by "
+            f"{off_m:.1e} m, {off_rad:.1e} rad"
+        ), faults
     finally:
         cell.close()
         graph.close()
 
 
-def clock_ahead(seed: int, environment: dict, folder: Path, *, kills: int = 3,
-                forks: Forks | None = None) -> tuple[str, list[str]]:
+def clock_ahead(
+    seed: int, environment: dict, folder: Path, *, kills: int = 3, forks: Forks | None = None
+) -> tuple[str, list[str]]:
     """Measure in a cell after a run that was stamped a day ahead, and after a restart of its nodes.
 
     Nothing of that run hides this one, whose map is that of the undisturbed run; the collector
@@ -324,8 +369,7 @@ def clock_ahead(seed: int, environment: dict, folder: Path, *, kills: int = 3,
         one = story(cell, HARMLESS, rng, kills)
         one.start()
         ahead_ns = time.time_ns() + DAY_NS - one.measured[0].stamp_ns
-        cell.deliver([replace(event, stamp_ns=event.stamp_ns + ahead_ns)
-                      for event in one.measured])
+        cell.deliver([replace(event, stamp_ns=event.stamp_ns + ahead_ns) for event in one.measured])
         for node in NODES:
             cell.kill(node)
         cell.told, cell.newest_ns = (0, 0, 0), 0
@@ -352,8 +396,13 @@ BOMB_SIDE = 8000
 """Pixels of the side of an image of some kB."""
 
 
-def attacked(seed: int, environment: dict, folder: Path, *, forks: Forks | None = None,
-             ) -> tuple[str, list[str]]:
+def attacked(
+    seed: int,
+    environment: dict,
+    folder: Path,
+    *,
+    forks: Forks | None = None,
+) -> tuple[str, list[str]]:
     """Measure in a cell among strangers whose messages and files would harm.
 
     The map is that of the undisturbed run, the compensator corrects by no other, the recording
@@ -370,8 +419,9 @@ def attacked(seed: int, environment: dict, folder: Path, *, forks: Forks | None 
         saved = place / "by_itself.json"
         cell.start("solver", result_folder=place, save_path=saved)
         cell.start_collector()
-        compensator = graph.node(partial(CompensatorNode, namespace=cell.namespace),
-                                 require_qualified=False)
+        compensator = graph.node(
+            partial(CompensatorNode, namespace=cell.namespace), require_qualified=False
+        )
         cell.limit_files("solver", SMALL)
         one.play_to(rng.uniform(0.3, 0.5))
         _harm(cell, compensator, one.measured, seed)
@@ -384,8 +434,13 @@ def attacked(seed: int, environment: dict, folder: Path, *, forks: Forks | None 
         graph.until(saved.exists, "the result on a disk that has space")
         line = one.judge()
         gx = np.array(read_json(saved)["error_map"]["gx"], dtype=float)
-        graph.until(lambda: compensator.session.compensator is not None and np.array_equal(
-            compensator.session.compensator.error_map.gx, gx), "the map in the compensator")
+        graph.until(
+            lambda: (
+                compensator.session.compensator is not None
+                and np.array_equal(compensator.session.compensator.error_map.gx, gx)
+            ),
+            "the map in the compensator",
+        )
         if {file: file.read_bytes() for file in recording.iterdir()} != before:
             one.faults.append("the recording beside the journals has changed")
         return line, one.faults
@@ -420,17 +475,21 @@ def _harm(cell: Cell, compensator: CompensatorNode, events: list[Event], seed: i
         for value in values:
             count = refused[names.ERROR_MAP.name]
             spoilt = np.append(good[name][:-1], value)
-            publisher.publish(fill(names.ERROR_MAP.type(), good | {"qualified": True,
-                                                                   name: spoilt}))
-            cell.graph.until(lambda count=count: refused[names.ERROR_MAP.name] > count,
-                             f"the refusal of {value} in {name}")
+            publisher.publish(
+                fill(names.ERROR_MAP.type(), good | {"qualified": True, name: spoilt})
+            )
+            cell.graph.until(
+                lambda count=count: refused[names.ERROR_MAP.name] > count,
+                f"the refusal of {value} in {name}",
+            )
     cell.graph.hand.destroy_publisher(publisher)
 
 
 def _show_images(cell: Cell, faults: list[str]) -> None:
     """Publish images that must not be decoded; a detector refuses both, and lives."""
-    detector = cell.graph.node(partial(MarkDetectorNode, namespace=cell.namespace),
-                               **DETECTS, transport="compressed")
+    detector = cell.graph.node(
+        partial(MarkDetectorNode, namespace=cell.namespace), **DETECTS, transport="compressed"
+    )
     topic = names.image_topics("compressed", 10)[0]
     publisher, bomb = _speak(cell, topic), io.BytesIO()
     Image.new("1", (BOMB_SIDE, BOMB_SIDE)).save(bomb, "PNG")
@@ -448,8 +507,9 @@ def _show_images(cell: Cell, faults: list[str]) -> None:
 def _play(cell: Cell, folder: Path, faults: list[str]) -> None:
     """Have a player start in the cell, whose stage publishes: it plays nothing."""
     (folder / "other").mkdir()
-    player = cell.graph.node(partial(BagPlayer, namespace=cell.namespace), rate=0.0,
-                             bag=str(small_bag(folder / "other")))
+    player = cell.graph.node(
+        partial(BagPlayer, namespace=cell.namespace), rate=0.0, bag=str(small_bag(folder / "other"))
+    )
     cell.graph.until(player.finished.done, "the end of the player")
     if (player.exit_code, player.player.played) != (ExitCode.BAD_INPUT, 0):
         faults.append(f"{player.player.played} messages were played into the cell")
@@ -479,13 +539,16 @@ def _taken_up(cell: Cell, plan: Plan, stops: list[tuple[int, int]]) -> tuple[str
     wanted = list(range(stops[-1][0], len(plan.views)))
     measured = [item.view_index for item in commands if item.phase == ViewCommand.MEASURE]
     if measured != wanted or len(run_ids) != 1:
-        faults.append(f"views {measured} of runs {sorted(run_ids)} after the last kill instead of "
-                      f"{wanted} of one run")
+        faults.append(
+            f"views {measured} of runs {sorted(run_ids)} after the last kill instead of "
+            f"{wanted} of one run"
+        )
     return last.run_id, faults
 
 
 def start_sequencer(cell: Cell, plan: Plan) -> None:
     """Start a sequencer and have it begin, or take up, the run of a plan."""
-    cell.start("pose_sequencer", plan=plan_file(cell.folder, plan), auto_confirm=True,
-               settle_time=0.0)
+    cell.start(
+        "pose_sequencer", plan=plan_file(cell.folder, plan), auto_confirm=True, settle_time=0.0
+    )
     cell.answer(Trigger, "pose_sequencer/start", again_s=2.0)  # a second start changes nothing

@@ -48,23 +48,36 @@ class Scene:
         self.detections[index] = replace(self.detections[index], **fields)
 
 
-def scene(text: str | Plan = "0", *, size: int = 5, count: int = 8, line: bool = False,
-          repeats: int = 1, seed: int = 3, t_m: tuple[float, float] | None = None,
-          **settings: Any) -> Scene:
+def scene(
+    text: str | Plan = "0",
+    *,
+    size: int = 5,
+    count: int = 8,
+    line: bool = False,
+    repeats: int = 1,
+    seed: int = 3,
+    t_m: tuple[float, float] | None = None,
+    **settings: Any,
+) -> Scene:
     """Return the messages of a plan, or of one such as '0, 90, tx', on a stage with errors.
 
     `t_m` is the displacement of the plate in all views, random if not given.
     """
-    plan = text if isinstance(text, Plan) else plan_of(text, size, count=count, line=line,
-                                                       repeats=repeats)
+    plan = (
+        text
+        if isinstance(text, Plan)
+        else plan_of(text, size, count=count, line=line, repeats=repeats)
+    )
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng)
     if t_m is not None:
         truth = replace(truth, t_m=np.tile(t_m, (len(truth.t_m), 1)))
-    events = list(plan_events(truth, plan, settings=CellSettings(**settings), rng=rng,
-                              start_ns=START_NS))
-    kinds = [[e for e in events if isinstance(e, kind)]
-             for kind in (Command, EncoderSample, Detection)]
+    events = list(
+        plan_events(truth, plan, settings=CellSettings(**settings), rng=rng, start_ns=START_NS)
+    )
+    kinds = [
+        [e for e in events if isinstance(e, kind)] for kind in (Command, EncoderSample, Detection)
+    ]
     return Scene(plan, truth, *kinds)
 
 
@@ -80,9 +93,11 @@ def gathered(events: Iterable[Event], **parameters: Any) -> Collector:
         else:
             samples = [*alike]
             collector.add_encoder_block(
-                np.array([s.stamp_ns for s in samples]), joints[0],
+                np.array([s.stamp_ns for s in samples]),
+                joints[0],
                 np.array([s.positions for s in samples], dtype=float),
-                np.array([s.velocities for s in samples], dtype=float))
+                np.array([s.velocities for s in samples], dtype=float),
+            )
     return collector
 
 
@@ -93,8 +108,10 @@ def _alike(event: Event) -> tuple:
     return type(event), event.names, len(event.positions), len(event.velocities)
 
 
-def collect(events: Iterable[Event], **parameters: Any,
-            ) -> tuple[Measurements, dict[int, ViewProgress]]:
+def collect(
+    events: Iterable[Event],
+    **parameters: Any,
+) -> tuple[Measurements, dict[int, ViewProgress]]:
     """Return the readings of all events."""
     return gathered(events, **parameters).collect()
 
@@ -102,15 +119,20 @@ def collect(events: Iterable[Event], **parameters: Any,
 def digest(events: Iterable[Event], **parameters: Any) -> str:
     """Return one digest of everything that the events give."""
     measurements, progress = collect(events, **parameters)
-    return session_digest({index: readings_digest(item.readings, measurements.rejected)
-                           for index, item in progress.items()})
+    return session_digest(
+        {
+            index: readings_digest(item.readings, measurements.rejected)
+            for index, item in progress.items()
+        }
+    )
 
 
 def encoder_block(sample: EncoderSample) -> EncoderBlock:
     """Return a block of one sample."""
     velocities = np.array([sample.velocities]) if sample.velocities else None
-    return EncoderBlock(np.array([sample.stamp_ns]), sample.names, np.array([sample.positions]),
-                        velocities)
+    return EncoderBlock(
+        np.array([sample.stamp_ns]), sample.names, np.array([sample.positions]), velocities
+    )
 
 
 def detection_table(detection: Detection) -> np.ndarray:
@@ -120,9 +142,17 @@ def detection_table(detection: Detection) -> np.ndarray:
 
 def table(readings: ViewReadings) -> dict[tuple, tuple]:
     """Return mark -> what was read of it: ('grid', m, n) -> (dx, dy, count), ('line', k) -> ..."""
-    grid = zip(readings.m.tolist(), readings.n.tolist(), readings.dx.tolist(),
-               readings.dy.tolist(), readings.count.tolist(), strict=True)
-    lines = zip(readings.k.tolist(), readings.dtheta.tolist(), readings.count_theta.tolist(),
-                strict=True)
-    return ({("grid", m, n): (dx, dy, count) for m, n, dx, dy, count in grid}
-            | {("line", k): (value, count) for k, value, count in lines})
+    grid = zip(
+        readings.m.tolist(),
+        readings.n.tolist(),
+        readings.dx.tolist(),
+        readings.dy.tolist(),
+        readings.count.tolist(),
+        strict=True,
+    )
+    lines = zip(
+        readings.k.tolist(), readings.dtheta.tolist(), readings.count_theta.tolist(), strict=True
+    )
+    return {("grid", m, n): (dx, dy, count) for m, n, dx, dy, count in grid} | {
+        ("line", k): (value, count) for k, value, count in lines
+    }

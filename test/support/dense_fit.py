@@ -32,9 +32,11 @@ it; with them a microscope's turn and scale are those against the axes that it h
 NOTHING = 1e-8
 """Singular value of columns of unit length that is none."""
 
-MARKS = {"plate_scale": ("scale",), "plate_strain": ("scale", "stretch", "shear"),
-         "plate_shape": tuple(f"{form} {axis}" for form in ("z^2", "|z|^2", "z*^2")
-                                     for axis in "xy")}
+MARKS = {
+    "plate_scale": ("scale",),
+    "plate_strain": ("scale", "stretch", "shear"),
+    "plate_shape": tuple(f"{form} {axis}" for form in ("z^2", "|z|^2", "z*^2") for axis in "xy"),
+}
 
 
 class DenseFit:
@@ -47,8 +49,19 @@ class DenseFit:
     the sites all the same.
     """
 
-    def __init__(self, readings: Measurements, terms: tuple[ModelTerm, ...], sigma, *,
-                 degree=3, rigid=False, shared=1.0, places=True, contrast=0.0, correlation=()):
+    def __init__(
+        self,
+        readings: Measurements,
+        terms: tuple[ModelTerm, ...],
+        sigma,
+        *,
+        degree=3,
+        rigid=False,
+        shared=1.0,
+        places=True,
+        contrast=0.0,
+        correlation=(),
+    ):
         self.readings, self.sigma, self.rigid, self.shared = readings, sigma, rigid, shared
         self.contrast, self.correlation = contrast, correlation
         self.artifact = readings.artifact
@@ -58,10 +71,12 @@ class DenseFit:
         self.keys, self.size = self._coefficients(terms, degree)
         self._visits()
         self._lines()
-        ends = np.cumsum([0, 2 * self.n, 2 * self.n, self.K, self.K, 3 * len(readings.views),
-                          len(self.keys)])
+        ends = np.cumsum(
+            [0, 2 * self.n, 2 * self.n, self.K, self.K, 3 * len(readings.views), len(self.keys)]
+        )
         self.g, self.a, self.gt, self.at, self.pose, self.b = (
-            slice(*pair) for pair in pairwise(ends))
+            slice(*pair) for pair in pairwise(ends)
+        )
         self.offset, self.line_offset = self.seen, self.line_seen - self._left_by_lines()
         self.p = np.zeros(ends[-1])
         magnified = any(term in ("microscope", "line_scale") for term, *_ in self.keys)
@@ -89,16 +104,21 @@ class DenseFit:
             elif term.name == "approach":
                 mine = [(-1, "x"), (-1, "y")]
             elif term.name == "drift":
-                mine = [(v, f"{axis} P{order}") for v in grid for order in range(1, degree + 1)
-                        for axis in "xy"]
+                mine = [
+                    (v, f"{axis} P{order}")
+                    for v in grid
+                    for order in range(1, degree + 1)
+                    for axis in "xy"
+                ]
             elif term.name == "line_eccentricity":
-                mine = [(v, part) for v in lines[int(term.free):] for part in ("cos", "sin")]
+                mine = [(v, part) for v in lines[int(term.free) :] for part in ("cos", "sin")]
             elif term.name == "rotation":
                 both = [v for v in lines if v in grid]
-                mine = [(v, "turn") for v in both[int(term.free):] if len(both) > 1]
+                mine = [(v, "turn") for v in both[int(term.free) :] if len(both) > 1]
             else:  # a yaw has columns with images only
-                mine = [(v, part) for v in grid[int(term.free):]
-                        for part in MARKS.get(term.name, ())]
+                mine = [
+                    (v, part) for v in grid[int(term.free) :] for part in MARKS.get(term.name, ())
+                ]
             for v, part in mine:
                 if term.size_of(part):
                     keys.append((term.name, v, part))
@@ -114,12 +134,16 @@ class DenseFit:
             seen = view.visits
             first, last = seen.stamp_ns.min(), seen.stamp_ns.max()
             for name, values in (
-                    ("view", np.full(len(seen.mark), v)), ("m", view.m[seen.mark]),
-                    ("n", view.n[seen.mark]), ("y", seen.dx + 1j * seen.dy),
-                    ("weight", seen.count),
-                    ("tau", 2 * (seen.stamp_ns - first) / (last - first) - 1),
-                    ("o", seen.offset_x + 1j * seen.offset_y), ("sx", seen.approach_x),
-                    ("sy", seen.approach_y)):
+                ("view", np.full(len(seen.mark), v)),
+                ("m", view.m[seen.mark]),
+                ("n", view.n[seen.mark]),
+                ("y", seen.dx + 1j * seen.dy),
+                ("weight", seen.count),
+                ("tau", 2 * (seen.stamp_ns - first) / (last - first) - 1),
+                ("o", seen.offset_x + 1j * seen.offset_y),
+                ("sx", seen.approach_x),
+                ("sy", seen.approach_y),
+            ):
                 parts[name].append(values)
         found = {name: np.concatenate(values) for name, values in parts.items()}
         self.view, self.tau, self.seen = found["view"], found["tau"], found["o"]
@@ -143,11 +167,16 @@ class DenseFit:
         self.k = np.concatenate([view.k for _, view in views] or empty)
         self.line_view = np.concatenate([np.full(len(view.k), v) for v, view in views] or empty)
         self.line_y = np.concatenate([view.dtheta for _, view in views] or empty)
-        self.line_seen = np.concatenate([view.dtheta - view.axis_theta for _, view in views]
-                                        or empty)
+        self.line_seen = np.concatenate(
+            [view.dtheta - view.axis_theta for _, view in views] or empty
+        )
         self.line_weight = np.concatenate([view.count_theta for _, view in views] or empty)
-        turn = np.array([round(view.view.rotation_rad / (2 * np.pi / self.K)) if self.K else 0
-                         for view in self.readings.views])
+        turn = np.array(
+            [
+                round(view.view.rotation_rad / (2 * np.pi / self.K)) if self.K else 0
+                for view in self.readings.views
+            ]
+        )
         self.line_site = self.sign * (self.k + turn[self.line_view]) % max(self.K, 1)
 
     def _left_by_lines(self):
@@ -167,14 +196,18 @@ class DenseFit:
         field = g.reshape(self.artifact.shape)
         for _ in range(3):  # true = indicated - error
             true = (self.stage - error) / self.pitch
-            along = (splines_of(size)(part + half) for size, part, half in zip(
-                field.shape, (true.real, true.imag), (self.hx, self.hy), strict=True))
+            along = (
+                splines_of(size)(part + half)
+                for size, part, half in zip(
+                    field.shape, (true.real, true.imag), (self.hx, self.hy), strict=True
+                )
+            )
             error = np.einsum("vi,vj,ij->v", *along, field)
         return error
 
     def _predicted(self, p, at_sites=False):
         """What the model says of all readings: visits along x, along y, lines."""
-        g, a = (part[:self.n] + 1j * part[self.n:] for part in (p[self.g], p[self.a]))
+        g, a = (part[: self.n] + 1j * part[self.n :] for part in (p[self.g], p[self.a]))
         phi, x, y = p[self.pose].reshape(-1, 3).T
         strained, added, turned = (p[self.b] @ columns for columns in self._columns)
         quarter, body = self.quarter[self.view], a[self.mark] + strained
@@ -211,7 +244,8 @@ class DenseFit:
             form, axis = part.split()
             saddle, round_ = u * u - v * v, u * u + v * v
             return {"z^2": saddle + 2j * u * v, "|z|^2": round_, "z*^2": saddle - 2j * u * v}[
-                form] * (1 if axis == "x" else 1j)
+                form
+            ] * (1 if axis == "x" else 1j)
         x, y = z.real, z.imag
         return {"scale": x + 1j * y, "stretch": x - 1j * y, "shear": y + 1j * x}[part]
 
@@ -221,8 +255,12 @@ class DenseFit:
         if term == "approach":
             return self.sign * (self.sx if part == "x" else 1j * self.sy)
         x, y = self.offset.real, self.offset.imag
-        return -{"scale": x + 1j * y, "turn": -y + 1j * x, "stretch": x - 1j * y,
-                 "shear": y + 1j * x}[part]
+        return -{
+            "scale": x + 1j * y,
+            "turn": -y + 1j * x,
+            "stretch": x - 1j * y,
+            "shear": y + 1j * x,
+        }[part]
 
     @cached_property
     def _root(self):
@@ -235,8 +273,12 @@ class DenseFit:
 
     def _design(self, p, at_sites=True):
         unit = STEP * np.eye(len(p))
-        return np.array([(self._predicted(p + h, at_sites) - self._predicted(p - h, at_sites))
-                         / (2 * STEP) for h in unit]).T
+        return np.array(
+            [
+                (self._predicted(p + h, at_sites) - self._predicted(p - h, at_sites)) / (2 * STEP)
+                for h in unit
+            ]
+        ).T
 
     def _linearise(self):
         """Keep the equations about the unknowns as they are, and the covariance."""
@@ -244,8 +286,12 @@ class DenseFit:
         self.design = self._root[:, None] * self._design(p)
         prior = np.zeros((sized.sum(), len(p)))
         prior[np.arange(len(prior)), np.arange(len(p))[self.b][sized]] = 1 / self.size[sized]
-        held = np.concatenate([self._datum(np.unique(self.site)), np.roll(
-            self._datum(np.unique(self.mark))[:3], self.a.start - self.g.start, axis=1)])
+        held = np.concatenate(
+            [
+                self._datum(np.unique(self.site)),
+                np.roll(self._datum(np.unique(self.mark))[:3], self.a.start - self.g.start, axis=1),
+            ]
+        )
         held = held / (EXACTLY * self.sigma[0])
         solve = self._solved(np.concatenate([self.design, prior, held]), held)
         self.covariance, self._solve = solve @ self._noise(solve.shape[1]) @ solve.T, solve
@@ -255,14 +301,14 @@ class DenseFit:
         """Take a step to the least squares; keep unknowns and what is left."""
         rest = self._root * (self._values - self._predicted(self.p))
         known = np.concatenate([rest, -self._known @ self.p])
-        self.p = self.p + self._solve[:, :len(known)] @ known
+        self.p = self.p + self._solve[:, : len(known)] @ known
         left, n = self._values - self._predicted(self.p), len(self.y)
-        self.left = left[:n] + 1j * left[n:2 * n]
+        self.left = left[:n] + 1j * left[n : 2 * n]
 
     def with_places_in_covariance(self):
         """Let the covariance be that of the equations of the sites for readings at the places."""
         here = self._root[:, None] * self._design(self.p, at_sites=False)
-        more = self._solve[:, :len(here)] @ (here - self.design)
+        more = self._solve[:, : len(here)] @ (here - self.design)
         spread = np.linalg.inv(np.eye(len(self.p)) + more)
         self.covariance = spread @ self.covariance @ spread.T
 
@@ -270,10 +316,14 @@ class DenseFit:
         """Covariance of all rows, in units of their own noise."""
         n, noise = len(self.y), np.eye(n_rows)
         for start, part in ((0, self.contrast), (n, -self.contrast)):
-            noise[start:start + n, start:start + n] += part * np.eye(n)
+            noise[start : start + n, start : start + n] += part * np.eye(n)
             for v in set(self.view):
-                order = start + np.flatnonzero(self.view == v)[np.argsort(
-                    self.tau[self.view == v], kind="stable")]
+                order = (
+                    start
+                    + np.flatnonzero(self.view == v)[
+                        np.argsort(self.tau[self.view == v], kind="stable")
+                    ]
+                )
                 for lag, rho in enumerate(self.correlation, 1):
                     noise[order[:-lag], order[lag:]] += rho
                     noise[order[lag:], order[:-lag]] += rho
@@ -285,14 +335,17 @@ class DenseFit:
         Changes of the readings that add up to 1 with the columns of scale or stretch, and to 0 with
         all others, are unknowns of the size 2 `shared` visits (method eq. 7.11).
         """
-        feigned = [at for at, (term, _, part) in enumerate(self.keys, self.b.start)
-                   if term == "microscope" and part in ("scale", "stretch")]
-        changes = inverse_of(np.concatenate([self.design, held]))[feigned, :len(self.design)].T
+        feigned = [
+            at
+            for at, (term, _, part) in enumerate(self.keys, self.b.start)
+            if term == "microscope" and part in ("scale", "stretch")
+        ]
+        changes = inverse_of(np.concatenate([self.design, held]))[feigned, : len(self.design)].T
         more = np.zeros((len(rows) + len(feigned), len(feigned)))
-        more[:len(changes)] = changes
-        more[len(rows):] = np.eye(len(feigned)) / (2 * len(self.y) * self.shared)
+        more[: len(changes)] = changes
+        more[len(rows) :] = np.eye(len(feigned)) / (2 * len(self.y) * self.shared)
         rows = np.concatenate([rows, np.zeros((len(feigned), rows.shape[1]))])
-        return inverse_of(np.concatenate([rows, more], axis=1))[:len(self.p)]
+        return inverse_of(np.concatenate([rows, more], axis=1))[: len(self.p)]
 
     @property
     def squares(self):
@@ -307,15 +360,16 @@ class DenseFit:
         self.to_map = np.zeros((2 * self.n, len(self.p)))
         here = np.concatenate([sites, self.n + sites])
         self.to_map[here, here] = 1
-        self.to_map -= modes.T[:2 * self.n] @ modes
+        self.to_map -= modes.T[: 2 * self.n] @ modes
         return self._quantity(self.to_map, (2, *self.artifact.shape))
 
     def _datum(self, sites):
         """Translation, rotation and scale of the map over sites as orthonormal rows."""
         x, y = (part.ravel()[sites] for part in (self.artifact.x_m, self.artifact.y_m))
         one, zero = np.ones(len(sites)), np.zeros(len(sites))
-        modes = np.stack([np.concatenate(pair) for pair in (
-            (one, zero), (zero, one), (-y, x), (x, y))], axis=1)
+        modes = np.stack(
+            [np.concatenate(pair) for pair in ((one, zero), (zero, one), (-y, x), (x, y))], axis=1
+        )
         rows = np.zeros((4, len(self.p)))
         rows[:, np.concatenate([sites, self.n + sites])] = np.linalg.qr(modes)[0].T
         return rows
@@ -323,7 +377,7 @@ class DenseFit:
     def plate(self, known, sites):
         """Plate's map and its u, marks `known` without translation and rotation: (2, nx, ny)."""
         marks, sites = np.flatnonzero(known), np.flatnonzero(sites)
-        modes = self._datum(marks)[:3, :2 * self.n]
+        modes = self._datum(marks)[:3, : 2 * self.n]
         pick = np.zeros((2 * self.n, len(self.p)))
         pick[:, self.a] = np.eye(2 * self.n)
         x, y = self.artifact.x_m.ravel(), self.artifact.y_m.ravel()
@@ -337,11 +391,13 @@ class DenseFit:
         """Row of a rotation (2) or scale (3) of a map over nodes."""
         x, y = (part.ravel()[nodes] for part in (self.artifact.x_m, self.artifact.y_m))
         one, zero = np.ones(len(nodes)), np.zeros(len(nodes))
-        modes = np.stack([np.concatenate(pair) for pair in (
-            (one, zero), (zero, one), (-y, x), (x, y))], axis=1)
+        modes = np.stack(
+            [np.concatenate(pair) for pair in ((one, zero), (zero, one), (-y, x), (x, y))], axis=1
+        )
         row = np.zeros(len(self.p))
         row[np.arange(len(row))[where][np.concatenate([nodes, self.n + nodes])]] = np.linalg.pinv(
-            modes)[mode]
+            modes
+        )[mode]
         return row
 
     def plate_theta(self, lines, sites, marks):
@@ -371,9 +427,14 @@ class DenseFit:
         shape, rows = self.artifact.shape, []
         number = np.arange(self.n).reshape(shape)
         i, j = self.artifact.x_m, self.artifact.y_m
-        for line, (sites, along, part, sign) in enumerate((
-                (number[self.hx + 1:, self.hy], i, 1, 1), (number[self.hx, self.hy + 1:], j, 0, -1),
-                (number[:self.hx, self.hy], i, 1, 1), (number[self.hx, :self.hy], j, 0, -1))):
+        for line, (sites, along, part, sign) in enumerate(
+            (
+                (number[self.hx + 1 :, self.hy], i, 1, 1),
+                (number[self.hx, self.hy + 1 :], j, 0, -1),
+                (number[: self.hx, self.hy], i, 1, 1),
+                (number[self.hx, : self.hy], j, 0, -1),
+            )
+        ):
             x = along.ravel()[sites] - along.ravel()[sites].mean()
             slope = sign * (x / (x @ x)) @ self.to_map[part * self.n + sites]
             rows.append(slope - pick[line * self.K // 4])
@@ -382,11 +443,17 @@ class DenseFit:
     def _gain(self):
         """What the angular map makes of a misclosure, rotations of the grid's views held."""
         lines = 2 * len(self.y) + np.arange(len(self.k))
-        columns = np.r_[np.arange(len(self.p))[self.gt], np.arange(len(self.p))[self.at],
-                        [self.pose.start + 3 * v for v, view in enumerate(self.readings.views)
-                         if len(view.k) and not len(view.m)]]
+        columns = np.r_[
+            np.arange(len(self.p))[self.gt],
+            np.arange(len(self.p))[self.at],
+            [
+                self.pose.start + 3 * v
+                for v, view in enumerate(self.readings.views)
+                if len(view.k) and not len(view.m)
+            ],
+        ]
         solve = inverse_of(self.design[np.ix_(lines, columns)])
-        spread = (solve @ solve.T)[:self.K, :self.K] / self.sigma[1] ** 2
+        spread = (solve @ solve.T)[: self.K, : self.K] / self.sigma[1] ** 2
         b = np.eye(self.K)[np.arange(4) * self.K // 4]
         one = b.sum(axis=1)[:, None]
         border = np.block([[b @ spread @ b.T, one], [one.T, np.zeros((1, 1))]])
@@ -401,8 +468,10 @@ class DenseFit:
         """(value, standard uncertainty) of every coefficient by (term, view's name, component)."""
         names = [*(view.view.name for view in self.readings.views), ""]
         u = np.sqrt(np.diag(self.covariance)[self.b])
-        return {(str(term), names[v], part): (value, spread) for (term, v, part), value, spread
-                in zip(self.keys, self.p[self.b], u, strict=True)}
+        return {
+            (str(term), names[v], part): (value, spread)
+            for (term, v, part), value, spread in zip(self.keys, self.p[self.b], u, strict=True)
+        }
 
 
 @cache

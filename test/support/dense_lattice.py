@@ -60,8 +60,8 @@ def solve(measurements: Measurements, *, finite: bool) -> DenseSolution:
     length = np.abs(z).max() * pitch
     modes = np.stack([np.ones(n), 1j * np.ones(n), 1j * z, z]) / np.sqrt(n)
     ties = np.zeros((7, 4 * n + 3 * v))
-    ties[:4, :n], ties[:4, n:2 * n] = modes.real, modes.imag
-    ties[4:, 2 * n:3 * n], ties[4:, 3 * n:4 * n] = modes[:3].real, modes[:3].imag
+    ties[:4, :n], ties[:4, n : 2 * n] = modes.real, modes.imag
+    ties[4:, 2 * n : 3 * n], ties[4:, 3 * n : 4 * n] = modes[:3].real, modes[:3].imag
 
     out = np.zeros((len(seen), 4 * n + 3 * v), dtype=complex)
     out[row, site], out[row, n + site] = 1, 1j
@@ -72,21 +72,27 @@ def solve(measurements: Measurements, *, finite: bool) -> DenseSolution:
     inverse = np.linalg.pinv(np.vstack([design, ties]), rcond=1e-11)
 
     def model(x: np.ndarray) -> np.ndarray:
-        field, plate = x[:n] + 1j * x[n:2 * n], x[2 * n:3 * n] + 1j * x[3 * n:4 * n]
-        phi = x[4 * n:4 * n + v] / length
-        t = (x[4 * n + v:4 * n + 2 * v] + 1j * x[4 * n + 2 * v:])[view]
+        field, plate = x[:n] + 1j * x[n : 2 * n], x[2 * n : 3 * n] + 1j * x[3 * n : 4 * n]
+        phi = x[4 * n : 4 * n + v] / length
+        t = (x[4 * n + v : 4 * n + 2 * v] + 1j * x[4 * n + 2 * v :])[view]
         arm = z[mark] * pitch
-        moved = (np.exp(1j * phi[view]) * (arm + plate[mark]) - arm if finite else
-                 1j * phi[view] * arm + plate[mark])
+        moved = (
+            np.exp(1j * phi[view]) * (arm + plate[mark]) - arm
+            if finite
+            else 1j * phi[view] * arm + plate[mark]
+        )
         return field[site] + alpha * moved + t
 
     x = np.zeros(4 * n + 3 * v)
     for _ in range(STEPS if finite else 2):
-        rest = (seen - model(x)) * np.exp(-1j * x[4 * n:4 * n + v] / length * finite)[view]
+        rest = (seen - model(x)) * np.exp(-1j * x[4 * n : 4 * n + v] / length * finite)[view]
         x = x + inverse @ np.concatenate([rest.real, rest.imag, -ties @ x])
-    u = np.sqrt((inverse[:2 * n, :2 * len(seen)] ** 2).sum(axis=1)).reshape(2, nx, ny)
+    u = np.sqrt((inverse[: 2 * n, : 2 * len(seen)] ** 2).sum(axis=1)).reshape(2, nx, ny)
     return DenseSolution(
-        (x[:n] + 1j * x[n:2 * n]).reshape(nx, ny),
-        (x[2 * n:3 * n] + 1j * x[3 * n:4 * n]).reshape(nx, ny), x[4 * n:4 * n + v] / length,
-        x[4 * n + v:4 * n + 2 * v] + 1j * x[4 * n + 2 * v:], u,
-        int(np.linalg.matrix_rank(design, tol=1e-9)))
+        (x[:n] + 1j * x[n : 2 * n]).reshape(nx, ny),
+        (x[2 * n : 3 * n] + 1j * x[3 * n : 4 * n]).reshape(nx, ny),
+        x[4 * n : 4 * n + v] / length,
+        x[4 * n + v : 4 * n + 2 * v] + 1j * x[4 * n + 2 * v :],
+        u,
+        int(np.linalg.matrix_rank(design, tol=1e-9)),
+    )

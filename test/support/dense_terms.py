@@ -12,8 +12,10 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
 
 SIGMA = 20e-9
-TURNS = [np.array(rows) for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]],
-                                     [[0, 1], [-1, 0]])]
+TURNS = [
+    np.array(rows)
+    for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]])
+]
 
 
 def _inverse(matrix):
@@ -56,8 +58,15 @@ class Dense:
             exposures += weight
             self._reading(v, mark, stage, place * self.plan.artifact.grid_pitch_m, turn)
             self.weight += [weight] * 2
-            self.about.append((v, place * self.plan.artifact.grid_pitch_m / self.half, turn,
-                               np.array([offset.real, offset.imag]), came.copy()))
+            self.about.append(
+                (
+                    v,
+                    place * self.plan.artifact.grid_pitch_m / self.half,
+                    turn,
+                    np.array([offset.real, offset.imag]),
+                    came.copy(),
+                )
+            )
         self.times += list(2 * (np.array(times) - times[0]) / (times[-1] - times[0]) - 1)
 
     def _reading(self, v, mark, stage, place, turn):
@@ -67,10 +76,10 @@ class Dense:
         for axis in range(2):
             row = np.zeros(4 * sites + 3 * len(self.visits))
             row[2 * site + axis] = indicated
-            row[2 * sites + 2 * mark:2 * sites + 2 * mark + 2] = turn[axis]
+            row[2 * sites + 2 * mark : 2 * sites + 2 * mark + 2] = turn[axis]
             k = 4 * sites + 3 * v
             turned = turn @ place / self.half
-            row[k:k + 3] = (-turned[1], 1, 0) if axis == 0 else (turned[0], 0, 1)
+            row[k : k + 3] = (-turned[1], 1, 0) if axis == 0 else (turned[0], 0, 1)
             self.rows.append(row)
 
     def _indicated(self):
@@ -90,12 +99,15 @@ class Dense:
         out = []
         views = range(len(self.visits))
         if name == "microscope":
-            one = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]],
-                            [[1, 0], [0, -1]], [[0, 1], [1, 0]]])
+            one = np.array(
+                [[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[1, 0], [0, -1]], [[0, 1], [1, 0]]]
+            )
             out = [[-(e @ offset) for _, _, _, offset, _ in self.about] for e in one]
         elif name == "approach":
-            out = [[self._indicated() * np.array(h) * came for *_, came in self.about]
-                   for h in ((1, 0), (0, 1))]
+            out = [
+                [self._indicated() * np.array(h) * came for *_, came in self.about]
+                for h in ((1, 0), (0, 1))
+            ]
         elif name == "drift":
             of_view = np.array([about[0] for about in self.about])
             for v in views:
@@ -112,20 +124,35 @@ class Dense:
                 "plate_scale": [scale],
                 "plate_strain": [scale, scale * [[1], [-1]], scale[::-1]],
                 "plate_shape": [
-                    np.stack(each) for each in (
-                        (saddle, twice), (-twice, saddle), (round_, 0 * x), (0 * x, round_),
-                        (saddle, -twice), (twice, saddle))]}[name]
-            out = [np.einsum("rij,jr->ri", turns, shape) * (of_view == v)[:, None]
-                   for v in views[int(free):] for shape in shapes]
+                    np.stack(each)
+                    for each in (
+                        (saddle, twice),
+                        (-twice, saddle),
+                        (round_, 0 * x),
+                        (0 * x, round_),
+                        (saddle, -twice),
+                        (twice, saddle),
+                    )
+                ],
+            }[name]
+            out = [
+                np.einsum("rij,jr->ri", turns, shape) * (of_view == v)[:, None]
+                for v in views[int(free) :]
+                for shape in shapes
+            ]
         return np.array(out).reshape(len(out), -1).T
 
     def design(self, terms):
         """Weighted rows: unknowns, then the terms' coefficients; sizes as rows below."""
         blocks = [self.columns(t.name, free=t.free) for t in terms]
         whole = self.root[:, None] * np.hstack([self.base, *blocks])
-        sizes = np.concatenate([np.zeros(self.base.shape[1])] + [
-            np.full(block.shape[1], 0 if t.free else SIGMA / t.size)
-            for t, block in zip(terms, blocks, strict=True)])
+        sizes = np.concatenate(
+            [np.zeros(self.base.shape[1])]
+            + [
+                np.full(block.shape[1], 0 if t.free else SIGMA / t.size)
+                for t, block in zip(terms, blocks, strict=True)
+            ]
+        )
         prior = np.diag(sizes)[sizes > 0]
         return np.vstack([whole, prior])
 
@@ -135,13 +162,22 @@ class Dense:
         hx, hy = self.plan.artifact.half
         place = np.array([(i, j) for i in range(-hx, hx + 1) for j in range(-hy, hy + 1)])
         one, none = np.ones(len(place)), np.zeros(len(place))
-        modes = np.array([np.stack(pair, axis=1).ravel() for pair in (
-            (one, none), (none, one), (-place[:, 1], place[:, 0]), (place[:, 0], place[:, 1]))])
+        modes = np.array(
+            [
+                np.stack(pair, axis=1).ravel()
+                for pair in (
+                    (one, none),
+                    (none, one),
+                    (-place[:, 1], place[:, 0]),
+                    (place[:, 0], place[:, 1]),
+                )
+            ]
+        )
         q = np.linalg.qr(modes.T.astype(float))[0]
         return np.eye(len(q)) - q @ q.T
 
     def to_map(self, unknowns):
-        return self.datum @ unknowns[:2 * self.nx * self.ny]
+        return self.datum @ unknowns[: 2 * self.nx * self.ny]
 
     def n_unseen(self, terms):
         """Independent maps that can be added without changing any reading."""
@@ -152,7 +188,7 @@ class Dense:
         scaled = design / np.linalg.norm(design, axis=0)
         # the triangle has the singular values and right vectors of the whole
         _, size, right = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
-        null = right[(size > 1e-9 * size[0]).sum():].T / np.linalg.norm(design, axis=0)[:, None]
+        null = right[(size > 1e-9 * size[0]).sum() :].T / np.linalg.norm(design, axis=0)[:, None]
         maps = self.to_map(null / np.linalg.norm(null, axis=0))
         return int((np.linalg.svd(maps, compute_uv=False) > 1e-7).sum())
 
@@ -164,10 +200,10 @@ class Dense:
         design = self.design(terms)
         feigned = self._feigned(terms)
         more = np.zeros((len(design) + len(feigned.T), len(feigned.T)))
-        more[:len(feigned)] = feigned
-        more[len(design):] = np.eye(len(feigned.T)) / (SIGMA * len(self.weight))
+        more[: len(feigned)] = feigned
+        more[len(design) :] = np.eye(len(feigned.T)) / (SIGMA * len(self.weight))
         rows = np.vstack([design, np.zeros((len(feigned.T), design.shape[1]))])
-        return _inverse(np.hstack([rows, more]))[:design.shape[1]], design
+        return _inverse(np.hstack([rows, more]))[: design.shape[1]], design
 
     def _feigned(self, terms):
         """Changes of the readings that only scale or stretch of a microscope has (7.11)."""
@@ -187,14 +223,15 @@ class Dense:
     def effect(self, terms, name, size):
         solve, _ = self.solver(terms)
         column = self.root[:, None] * self.columns(name, free=False)
-        moved = self.to_map(solve[:, :len(column)] @ column) * size
+        moved = self.to_map(solve[:, : len(column)] @ column) * size
         spread = np.sqrt((moved**2).sum(axis=1))
         return np.sqrt((spread**2).mean()), spread.max()
 
     @staticmethod
     def _rank(design):
-        return np.linalg.matrix_rank(np.linalg.qr(design / np.linalg.norm(design, axis=0),
-                                                  mode="r"), tol=1e-9)
+        return np.linalg.matrix_rank(
+            np.linalg.qr(design / np.linalg.norm(design, axis=0), mode="r"), tol=1e-9
+        )
 
     def power(self, terms, name, size, level, draws=300):
         """Mean over drawn coefficients of the power of the noncentral F-test."""
@@ -209,5 +246,6 @@ class Dense:
         b = np.random.default_rng(5).normal(size=(draws, column.shape[1])) * size
         shift = ((left @ b.T) ** 2).sum(axis=0) / SIGMA**2
         limit = central_f.isf(level, rank, dof)
-        return float(np.mean(np.where(shift > 2000, 1.0, ncf.sf(
-            limit, rank, dof, np.minimum(shift, 2000)))))
+        return float(
+            np.mean(np.where(shift > 2000, 1.0, ncf.sf(limit, rank, dof, np.minimum(shift, 2000))))
+        )

@@ -21,8 +21,9 @@ class JointTrack(encoder.JointTrack):
         moves = series.moving(stamps_ns, series.query(stamps_ns)[1])
         return encoder.REASONS[np.where(moves, encoder.MOVING, encoder.GOOD)]
 
-    def approach(self, stamps_ns: np.ndarray, positions: np.ndarray, *,
-                 threshold: float) -> np.ndarray:
+    def approach(
+        self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float
+    ) -> np.ndarray:
         return encoder.filled(self._all().approach(stamps_ns, positions, threshold=threshold))
 
     def _all(self) -> encoder.JointSamples:

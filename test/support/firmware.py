@@ -85,7 +85,7 @@ class FaultyGrbl(Grbl):
         if byte != b"?" or self.reports < self.after:
             return right
         if self.fault == "garbage":
-            return right[:8] + bytes([0xf0, 0x9f, 0x07]) + right[12:]
+            return right[:8] + bytes([0xF0, 0x9F, 0x07]) + right[12:]
         if self.fault == "digits lost":
             return right.replace(b".000,", b".0x0,")
         if self.fault == "line cut":
@@ -112,8 +112,10 @@ class Marlin(Firmware):
             return b"echo:  M92 X80.00 Y80.00 Z400.00 E93.00\nok\n"
         if line == "M114 R":
             steps = {letter: round(value * self.PER_MM) for letter, value in self.at.items()}
-            return (f"X:{steps['X'] / 80:.2f} Y:{steps['Y'] / 80:.2f} Z:0.00 E:0.00 "
-                    f"Count X:{steps['X']} Y:{steps['Y']} Z:0\nok\n").encode()
+            return (
+                f"X:{steps['X'] / 80:.2f} Y:{steps['Y'] / 80:.2f} Z:0.00 E:0.00 "
+                f"Count X:{steps['X']} Y:{steps['Y']} Z:0\nok\n"
+            ).encode()
         if line == "M410":
             self.stopped += 1
         elif line.startswith("G1"):
@@ -149,8 +151,13 @@ class LinuxCnc(Firmware):
         if word == "hello":
             return echo + (b"HELLO ACK EMCNETSVR 1.1\r\n" if rest[0] == "EMC" else b"HELLO NAK\r\n")
         if line == "get abs_act_pos":
-            return echo + (f"ABS_ACT_POS {self.at['X']:.6f} {self.at['Y']:.6f} 0.000000 "
-                           f"{self.at['A']:.6f} 0.000000 0.000000\r\n").encode()
+            return (
+                echo
+                + (
+                    f"ABS_ACT_POS {self.at['X']:.6f} {self.at['Y']:.6f} 0.000000 "
+                    f"{self.at['A']:.6f} 0.000000 0.000000\r\n"
+                ).encode()
+            )
         if rest[:2] == ["echo", "off"]:
             self._echo = False
         elif rest[:2] == ["verbose", "on"]:
@@ -199,8 +206,11 @@ def over_pty(firmware):
     """Yield the name of a serial port with a firmware behind it."""
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
-    thread = threading.Thread(target=_talk, daemon=True, args=(
-        firmware, lambda: os.read(ours, 4096), lambda data: os.write(ours, data)))
+    thread = threading.Thread(
+        target=_talk,
+        daemon=True,
+        args=(firmware, lambda: os.read(ours, 4096), lambda data: os.write(ours, data)),
+    )
     thread.start()
     try:
         yield os.ttyname(theirs)

@@ -28,9 +28,20 @@ from typing import BinaryIO
 from selfcal_ros import sessions
 from selfcal_ros.cli.processes import PR_SET_PDEATHSIG, stop
 
-MESSAGES = ("diagnostic_msgs.msg", "geometry_msgs.msg", "rcl_interfaces.msg", "rcl_interfaces.srv",
-            "lifecycle_msgs.msg", "rosidl_generator_py", "selfcal_msgs.msg", "selfcal_msgs.srv",
-            "sensor_msgs.msg", "std_msgs.msg", "std_srvs.srv", "visualization_msgs.msg")
+MESSAGES = (
+    "diagnostic_msgs.msg",
+    "geometry_msgs.msg",
+    "rcl_interfaces.msg",
+    "rcl_interfaces.srv",
+    "lifecycle_msgs.msg",
+    "rosidl_generator_py",
+    "selfcal_msgs.msg",
+    "selfcal_msgs.srv",
+    "sensor_msgs.msg",
+    "std_msgs.msg",
+    "std_srvs.srv",
+    "visualization_msgs.msg",
+)
 
 BESIDE_THREADS = "error:This process:DeprecationWarning"
 """Python warns of a fork beside threads: no import may begin one."""
@@ -107,7 +118,9 @@ class Forks:
         with theirs:
             process = subprocess.Popen(
                 [sys.executable, "-W", BESIDE_THREADS, __file__, str(theirs.fileno())],
-                pass_fds=[theirs.fileno()], start_new_session=True)
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,
+            )
         self._open.callback(process.wait, 60)
         return self._open.enter_context(requests)
 

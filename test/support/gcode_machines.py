@@ -14,24 +14,42 @@ import numpy as np
 
 AXES = "XYZE"
 FRAMES = {f"G{54 + n}": np.array([7.0 * n, 3.0 * n, n, 0]) for n in range(6)} | {
-    "G59.1": np.array([50.0, 0, 0, 0]), "G59.2": np.array([0, 50.0, 0, 0]),
-    "G59.3": np.array([50.0, 50, 0, 0])}
+    "G59.1": np.array([50.0, 0, 0, 0]),
+    "G59.2": np.array([0, 50.0, 0, 0]),
+    "G59.3": np.array([50.0, 50, 0, 0]),
+}
 TOOLS = {0: np.zeros(4), 1: np.array([0, 0, 10.0, 0]), 2: np.array([3.0, -2, 12, 0])}
 STORED = {"G28": np.array([-31.0, 33, 40, 0]), "G30": np.array([29.0, -37, 45, 0])}
 PLACES = {"klipper": {"G28": STORED["G28"][:3], **dict.fromkeys(("M18", "M84"), (0.5, 0.5, 7))}}
 PLACES["marlin"] = PLACES["klipper"] | dict.fromkeys(
-    ("G29", "G34", "G27", "G30", "M600", "M125"), (11.0, -7, 3))
+    ("G29", "G34", "G27", "G30", "M600", "M125"), (11.0, -7, 3)
+)
 CHANGE = np.array([-44.0, -42, 60, 0])
 INERT = {
     "linuxcnc": "G8 G40 G94 G97 G98 G99 M3 M4 M5 M7 M8 M9 M48 M49 G91.1 M0 M1 M60",
     "grbl": "G40 G61 G91.1 G94 M3 M4 M5 M7 M8 M9 M0 M1",
     "marlin": "G17 G21 M0 M1 M17 M73 M75 M76 M77 M104 M105 M106 M107 M109 M114 M115 M117 M118 M119 "
-              "M140 M150 M155 M190 M201 M203 M204 M205 M220 M221 M300 M400 M500 M851 M900 M110",
+    "M140 M150 M155 M190 M201 M203 M204 M205 M220 M221 M300 M400 M500 M851 M900 M110",
     "klipper": "G17 G21 M104 M105 M106 M107 M109 M114 M115 M117 M118 M140 M190 M204 M220 M221 M400 "
-               "M73 M110 M119"}
+    "M73 M110 M119",
+}
 """Codes that change neither place, nor frame, nor mode."""
-ACTS = ["G0", "G1", "G2", "G3", "G80", "G4", "G28", "G30",
-        "G38.2", "G38.3", "G38.4", "G38.5", "G92", "G10"]
+ACTS = [
+    "G0",
+    "G1",
+    "G2",
+    "G3",
+    "G80",
+    "G4",
+    "G28",
+    "G30",
+    "G38.2",
+    "G38.3",
+    "G38.4",
+    "G38.5",
+    "G92",
+    "G10",
+]
 CYCLES = {"linuxcnc": ("G73", "G81", "G82", "G83", "G85", "G86", "G89"), "grbl": ()}
 
 
@@ -84,7 +102,7 @@ class Machine:
         if self.dialect == "klipper":
             parts = re.split("([A-Z_]+|[A-Z*])", line.upper())
             first = 3 if "".join(parts[:2]) == "N" else 0
-            name = "".join(parts[first:first + (2 if first else 3)]).strip()
+            name = "".join(parts[first : first + (2 if first else 3)]).strip()
             words = {parts[i]: parts[i + 1].strip() for i in range(1, len(parts), 2)}
         else:
             match = re.match(r"(?:N[-+\d]+ *)?([GMT]) *(\d+(?:\.\d+)?)(.*)", line)
@@ -124,8 +142,9 @@ class Machine:
         elif name in ("M206", "M218", "M665") or name.startswith(("SET_GCODE_OFFSET", "T")):
             self.shift[:2] += 4.0
         elif name not in ("G4", *INERT[self.dialect].split()):
-            raise Wrong("inches, if compiled in" if marlin and name == "G20" else
-                        f"not known: {name}")
+            raise Wrong(
+                "inches, if compiled in" if marlin and name == "G20" else f"not known: {name}"
+            )
 
     def _printer_move(self, name: str, words: dict) -> None:
         if None in [words.get(a, 0) for a in "XYZEFIJR"] or words.get("F", 1) <= 0:
@@ -183,8 +202,11 @@ class Machine:
             self._traced()
         acts = [code for code in codes if code in ACTS or code in CYCLES[self.dialect]]
         for code in codes:
-            if code not in acts and not self._mode(code, words) and not self._offset(
-                    code, words, scale):
+            if (
+                code not in acts
+                and not self._mode(code, words)
+                and not self._offset(code, words, scale)
+            ):
                 raise Wrong(f"not known: {code}")
         if len(acts) > 1:
             raise Wrong("two motions")
@@ -211,7 +233,8 @@ class Machine:
             self.merging = words.get("Q", p) if code == "G64" else 0.0
         else:
             return code in ("G53", "G20", "G21", "M2", "M30", *INERT[self.dialect].split()) or (
-                code == "M6" and linuxcnc)
+                code == "M6" and linuxcnc
+            )
         return True
 
     def _offset(self, code: str, words: dict, scale: float) -> bool:
@@ -256,8 +279,9 @@ class Machine:
         else:
             self._cycle(act, words, end, scale)
 
-    def _straight_or_arc(self, act: str, end: np.ndarray, words: dict, scale: float, *,
-                         machine: bool) -> None:
+    def _straight_or_arc(
+        self, act: str, end: np.ndarray, words: dict, scale: float, *, machine: bool
+    ) -> None:
         if act in ("G2", "G3"):
             self._arc_rules(words)
             if machine:
@@ -282,8 +306,12 @@ class Machine:
             raise Wrong("Z, R of the cycle")
         bottom, above = (self.sticky[k] * scale + self.offset[2] for k in "ZR")
         height = max(self.at[2], above)
-        for x, y, z, code in ((*self.at[:2], height, "G0"), (*end[:2], height, "G0"),
-                              (*end[:2], bottom, "G1"), (*end[:2], above, "G0")):
+        for x, y, z, code in (
+            (*self.at[:2], height, "G0"),
+            (*end[:2], height, "G0"),
+            (*end[:2], bottom, "G1"),
+            (*end[:2], above, "G0"),
+        ):
             self._go(code, np.array([x, y, z, self.at[3]]), {})
         # where it ends depends on G98 and G99: only a stated Z is safe
         self.at[2] = above if len(self.moves) % 2 else height
@@ -340,8 +368,10 @@ def run_both(text: str, rewriter, true, tolerance_mm: float, **kwargs) -> int:
     """
     dialect, pieces, known = rewriter.dialect, 0, False
     machine, second = Machine(dialect, **kwargs), Machine(dialect, corrected=True, **kwargs)
-    program = [(line, rewriter.line(line.removesuffix("\r"), f"a.nc:{number}"))
-               for number, line in enumerate(text.split("\n"), 1)]
+    program = [
+        (line, rewriter.line(line.removesuffix("\r"), f"a.nc:{number}"))
+        for number, line in enumerate(text.split("\n"), 1)
+    ]
     for line, lines in program:
         try:
             ideal = machine.run(line)
@@ -365,8 +395,12 @@ def run_both(text: str, rewriter, true, tolerance_mm: float, **kwargs) -> int:
         (whole,), zero = ideal, machine.zero if machine.zero is not None else np.zeros(4)
         assert {move.rapid for move in made} == {whole.rapid}
         assert {move.feed for move in made} == {whole.feed}
-        way = np.concatenate([m.points[0] + np.linspace(0, 1, 30)[:, None] * (
-            m.points[-1] - m.points[0]) for m in made])
+        way = np.concatenate(
+            [
+                m.points[0] + np.linspace(0, 1, 30)[:, None] * (m.points[-1] - m.points[0])
+                for m in made
+            ]
+        )
         if in_xy or known:
             way[:, :2] = true(way[:, :2] - zero[:2]) + zero[:2]
         assert np.abs(way[-1] - whole.points[-1]).max() < 3e-5

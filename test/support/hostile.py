@@ -9,8 +9,20 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 FLOATS = (math.nan, math.inf, -math.inf, -1.0, 0.0, 4.2e-3, 1e17, 1.7e308, 5e-324)
-TEXTS = ("", "no such", "../../outside", "/dev/zero", "\x1b[2J\x1b]0;title\x07", "\u202e\n\t\0",
-         "-1", "1e400", "\u00b2", "nan", "9" * 5000, "x" * 100_000)
+TEXTS = (
+    "",
+    "no such",
+    "../../outside",
+    "/dev/zero",
+    "\x1b[2J\x1b]0;title\x07",
+    "\u202e\n\t\0",
+    "-1",
+    "1e400",
+    "\u00b2",
+    "nan",
+    "9" * 5000,
+    "x" * 100_000,
+)
 WIDTHS = {"int8": 8, "uint8": 8, "octet": 8, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64}
 HEAD = 12
 """Bytes of the encapsulation and the stamp behind it."""
@@ -55,7 +67,7 @@ def _values(kind: str, value: Any) -> list:
     bits = WIDTHS[kind]
     if kind == "octet":
         return [b"\0", b"\xff"]
-    whole = [0, 2**bits - 1] if kind[0] == "u" else [0, -1, -2**(bits - 1), 2**(bits - 1) - 1]
+    whole = [0, 2**bits - 1] if kind[0] == "u" else [0, -1, -(2 ** (bits - 1)), 2 ** (bits - 1) - 1]
     return [*whole, 2, 4001] if bits > 8 else whole
 
 
@@ -85,7 +97,7 @@ def torn(message: Any, seed: int, number: int = 30) -> Iterator[bytes]:
     for cut in sorted(cuts):
         yield data[:cut]
     for at in range(HEAD, min(len(data) - 4, 4 * number), 4):
-        yield data[:at] + b"\xff\xff\xff\xff" + data[at + 4:]
+        yield data[:at] + b"\xff\xff\xff\xff" + data[at + 4 :]
     for _ in range(number):
         spoilt = bytearray(data)
         for at in rng.integers(HEAD, len(data), 3):

@@ -27,8 +27,9 @@ class IndependentCell(Bench, Node):
         As of `Bench`.
     """
 
-    def __init__(self, *, ids=True, plate_moves=False, joints=("x", "y", "theta"), size=1.0,
-                 seed=1, **kwargs) -> None:
+    def __init__(
+        self, *, ids=True, plate_moves=False, joints=("x", "y", "theta"), size=1.0, seed=1, **kwargs
+    ) -> None:
         Node.__init__(self, "independent_cell", **kwargs)
         Bench.__init__(self, ids=ids, plate_moves=plate_moves, size=size, seed=seed)
         self.joints = joints
@@ -36,12 +37,18 @@ class IndependentCell(Bench, Node):
         self.exposed, self.view = 0, 0
         self._work: list = []
         self._acted = self._idle = 0
-        self.marks = self.create_publisher(MarkDetection, "stage/mark_detections",
-                                           QoSProfile(depth=1000))
-        self.encoder = self.create_publisher(JointState, "stage/joint_states",
-                                             QoSProfile(depth=1000))
-        self.create_subscription(ViewCommand, "selfcal/view_command", self.on_command, QoSProfile(
-            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+        self.marks = self.create_publisher(
+            MarkDetection, "stage/mark_detections", QoSProfile(depth=1000)
+        )
+        self.encoder = self.create_publisher(
+            JointState, "stage/joint_states", QoSProfile(depth=1000)
+        )
+        self.create_subscription(
+            ViewCommand,
+            "selfcal/view_command",
+            self.on_command,
+            QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+        )
         self.create_timer(PERIOD_S, self.on_timer)
 
     def now_ns(self) -> int:
@@ -80,8 +87,10 @@ class IndependentCell(Bench, Node):
 
     def sample(self, position) -> JointState:
         where = dict(zip(("x", "y", "theta"), position, strict=True))
-        return JointState(name=list(self.joints), position=[
-            float(where.get(name, np.nan)) for name in self.joints])
+        return JointState(
+            name=list(self.joints),
+            position=[float(where.get(name, np.nan)) for name in self.joints],
+        )
 
     def send(self, publisher, message, stamp_ns: int) -> None:
         message.header.stamp = Time(nanoseconds=stamp_ns).to_msg()

@@ -44,28 +44,47 @@ class Cell:
     are `forks`, or started as new interpreters.
     """
 
-    def __init__(self, graph: Graph, environment: dict, folder: Path, namespace: str = "", *,
-                 forks: Forks | None = None) -> None:
+    def __init__(
+        self,
+        graph: Graph,
+        environment: dict,
+        folder: Path,
+        namespace: str = "",
+        *,
+        forks: Forks | None = None,
+    ) -> None:
         self.graph, self.environment, self.folder, self.forks = graph, environment, folder, forks
         self.inside: dict[str, Any] = {}
         self.namespace, self.running = namespace, {}
         self.processes = contextlib.ExitStack()
         self.told = (0, 0, 0)
         graph.hand.create_subscription(
-            names.RECEIVED.type, self.name("measurement_collector/received"), self._on_told,
-            names.RECEIVED.qos)
+            names.RECEIVED.type,
+            self.name("measurement_collector/received"),
+            self._on_told,
+            names.RECEIVED.qos,
+        )
         self.newest_ns, self.newest_told = 0, ""
         graph.hand.create_subscription(
-            names.HEALTH.type, self.name("measurement_collector/health"), self._on_health,
-            names.HEALTH.qos)
+            names.HEALTH.type,
+            self.name("measurement_collector/health"),
+            self._on_health,
+            names.HEALTH.qos,
+        )
         self.solved: list = []
         graph.hand.create_subscription(
-            names.SOLVED.type, self.name("solver/solved"), self.solved.append, names.SOLVED.qos)
+            names.SOLVED.type, self.name("solver/solved"), self.solved.append, names.SOLVED.qos
+        )
         self.matched = dict.fromkeys(KINDS, 0)
-        self.publishers = {kind: graph.hand.create_publisher(
-            topic.type, self.name(topic.name), topic.qos,
-            event_callbacks=PublisherEventCallbacks(matched=partial(self._on_matched, kind)))
-            for kind, topic in ROLES.items()}
+        self.publishers = {
+            kind: graph.hand.create_publisher(
+                topic.type,
+                self.name(topic.name),
+                topic.qos,
+                event_callbacks=PublisherEventCallbacks(matched=partial(self._on_matched, kind)),
+            )
+            for kind, topic in ROLES.items()
+        }
 
     def name(self, name: str) -> str:
         """Return a name of this cell as the hand of the graph sees it."""
@@ -79,21 +98,36 @@ class Cell:
 
     def _on_health(self, message: Any) -> None:
         self.newest_told = {value.key: value.value for value in message.values}.get(
-            "command_stamp", "")
+            "command_stamp", ""
+        )
 
     def start(self, node: str, **parameters: object) -> None:
         if node in self.inside:
             self.inside[node] = self.graph.node(
                 partial(NODES[node], namespace=self.namespace),
-                **{key: str(value) if isinstance(value, Path) else value
-                   for key, value in parameters.items()})
+                **{
+                    key: str(value) if isinstance(value, Path) else value
+                    for key, value in parameters.items()
+                },
+            )
             return
-        arguments = ["--ros-args", "-r", f"__ns:=/{self.namespace}", *(
-            word for key, value in parameters.items() for word in ("-p", f"{key}:={value}"))]
+        arguments = [
+            "--ros-args",
+            "-r",
+            f"__ns:=/{self.namespace}",
+            *(word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")),
+        ]
         self.running[node] = self.processes.enter_context(
-            self.forks.process(node, arguments, self.environment) if self.forks else process(
-                f"selfcal_ros.nodes.{node}", arguments, self.environment,
-                stderr=subprocess.PIPE, text=True))
+            self.forks.process(node, arguments, self.environment)
+            if self.forks
+            else process(
+                f"selfcal_ros.nodes.{node}",
+                arguments,
+                self.environment,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
 
     def start_collector(self) -> None:
         """Start it and wait until it knows what its journal holds."""
@@ -101,12 +135,16 @@ class Cell:
         heard = dict(self.matched)
         self.start("measurement_collector", journal=self.folder, status_period=0.1)
         # a reader that was killed counts as a reader for a while: wait for a new one
-        self.graph.until(lambda: all(self.matched[kind] > count for kind, count in heard.items()),
-                         "the collector")
+        self.graph.until(
+            lambda: all(self.matched[kind] > count for kind, count in heard.items()),
+            "the collector",
+        )
         if sum(before):
             # commands that are refused are not in it, and others are heard again
-            self.graph.until(lambda: all(map(ge, self.told[:2], before[:2])),
-                             f"what the journal holds: told {before} before")
+            self.graph.until(
+                lambda: all(map(ge, self.told[:2], before[:2])),
+                f"what the journal holds: told {before} before",
+            )
 
     def kill(self, node: str) -> None:
         running = self.running.pop(node)
@@ -124,8 +162,9 @@ class Cell:
 
     def limit_files(self, node: str, size: int) -> None:
         """Let the files of a node grow no larger than `size` bytes, as if the disk were full."""
-        resource.prlimit(self.running[node].pid, resource.RLIMIT_FSIZE,
-                         (size, resource.RLIM_INFINITY))
+        resource.prlimit(
+            self.running[node].pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY)
+        )
 
     def send(self, events: Sequence[Event], *, first: int = 0) -> None:
         """Publish events, those of which the collector has told nothing; commands are latched."""
@@ -133,8 +172,7 @@ class Cell:
         for index, event in enumerate(events):
             kind = type(event)
             number[kind] += 1
-            new = index >= first if kind is Command else number[kind] > self.told[
-                KINDS.index(kind)]
+            new = index >= first if kind is Command else number[kind] > self.told[KINDS.index(kind)]
             if kind is Command:
                 self.newest_ns = max(self.newest_ns, event.stamp_ns)
             if new:
@@ -175,8 +213,9 @@ class Cell:
         answer = self.answer(SaveMap, "solver/save_map", path=str(path))
         return read_json(path) if answer.success else answer.message
 
-    def answer(self, kind: type, name: str, *, again_s: float = 2 * IDLE_S,
-               **fields: object) -> Any:
+    def answer(
+        self, kind: type, name: str, *, again_s: float = 2 * IDLE_S, **fields: object
+    ) -> Any:
         """Call a service, again where a node that was killed seems to have taken the request."""
         client = self.graph.hand.create_client(kind, self.name(name))
         for _ in range(round(ATTEMPTS * 2 * IDLE_S / again_s)):

@@ -60,8 +60,9 @@ def scatter_of(machine, values_of):
     for name in ("samples_m", "linear_m"):
         whole = getattr(exact, name)
         moves = size * np.eye(whole.size).reshape(-1, *whole.shape)
-        answers[name] = np.array([(values_of(replace(exact, **{name: whole + move})) - base) / size
-                                  for move in moves])
+        answers[name] = np.array(
+            [(values_of(replace(exact, **{name: whole + move})) - base) / size for move in moves]
+        )
 
     def scatter(noise: LaserNoise):
         n = machine.n_blocks

@@ -15,9 +15,19 @@ from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan, View
 from test.support.truth import Truth, random_truth, simulate_measurements
 
-POSES = {"0": (0, 0, 0), "90": (1, 0, 0), "180": (2, 0, 0), "270": (3, 0, 0), "+tx": (0, 1, 0),
-         "tx": (0, 1, 0), "-tx": (0, -1, 0), "ty": (0, 0, 1), "90+tx": (1, 1, 0),
-         "270-2tx+ty": (3, -2, 1), "2ty": (0, 0, 2)}
+POSES = {
+    "0": (0, 0, 0),
+    "90": (1, 0, 0),
+    "180": (2, 0, 0),
+    "270": (3, 0, 0),
+    "+tx": (0, 1, 0),
+    "tx": (0, 1, 0),
+    "-tx": (0, -1, 0),
+    "ty": (0, 0, 1),
+    "90+tx": (1, 1, 0),
+    "270-2tx+ty": (3, -2, 1),
+    "2ty": (0, 0, 2),
+}
 
 
 def plan_of(names: str, artifact: Artifact, *, lines: int | None = None) -> Plan:
@@ -28,13 +38,15 @@ def plan_of(names: str, artifact: Artifact, *, lines: int | None = None) -> Plan
         q, a, b = POSES[name]
         views.append(View(name, q * pi / 2, (a * pitch, b * pitch), True, angular))
     if lines is not None:
-        views.append(View("lines", lines * 2 * pi / artifact.angular_count, (0.0, 0.0), False,
-                          True))
+        views.append(
+            View("lines", lines * 2 * pi / artifact.angular_count, (0.0, 0.0), False, True)
+        )
     return Plan(names, artifact, tuple(views))
 
 
-def measured_in_datum(plan: Plan, seed: int, calibrated: Callable[[Measurements], np.ndarray],
-                      **how: Any) -> tuple[Truth, Measurements]:
+def measured_in_datum(
+    plan: Plan, seed: int, calibrated: Callable[[Measurements], np.ndarray], **how: Any
+) -> tuple[Truth, Measurements]:
     """Return readings with missing marks, of a stage in the datum over the sites that they tell.
 
     A stage that is turned or grown against that datum by d gives the same readings to d times
@@ -58,7 +70,8 @@ def measured_in_datum(plan: Plan, seed: int, calibrated: Callable[[Measurements]
     return truth, simulate_measurements(truth, plan, again, **how)
 
 
-def in_datum(field: np.ndarray, known: np.ndarray, artifact: Artifact, *,
-             scale: bool) -> np.ndarray:
+def in_datum(
+    field: np.ndarray, known: np.ndarray, artifact: Artifact, *, scale: bool
+) -> np.ndarray:
     """Return `field` (2, nx, ny) in the datum over the known sites only."""
     return remove_modes(np.where(known, field, np.nan), datum_modes(artifact, scale=scale))

@@ -31,7 +31,8 @@ HOME_SEQUENCE = 0
 COMP_FILE = comp_{axis}.txt
 COMP_FILE_TYPE = 0
 """
-INI = """
+INI = (
+    """
 [EMC]
 VERSION = 1.1
 [DISPLAY]
@@ -57,7 +58,10 @@ CYCLE_TIME = 0.1
 [KINS]
 KINEMATICS = trivkins coordinates=XY
 JOINTS = 2
-""" + JOINT.format(letter="X", axis="x", number=0) + JOINT.format(letter="Y", axis="y", number=1)
+"""
+    + JOINT.format(letter="X", axis="x", number=0)
+    + JOINT.format(letter="Y", axis="y", number=1)
+)
 HAL = """
 loadrt [KINS]KINEMATICS
 loadrt [EMCMOT]EMCMOT servo_period_nsec=[EMCMOT]SERVO_PERIOD num_joints=[KINS]JOINTS
@@ -75,8 +79,15 @@ import hal
 reader = hal.component("reader")
 print(*(repr(hal.get_value(f"joint.{number}.motor-pos-cmd")) for number in (0, 1)))
 """
-SWITCHED_ON = ("verbose on", "enable EMCTOO", "estop off", "machine on", "mode manual",
-               "home 0", "home 1")
+SWITCHED_ON = (
+    "verbose on",
+    "enable EMCTOO",
+    "estop off",
+    "machine on",
+    "mode manual",
+    "home 0",
+    "home 1",
+)
 
 
 @contextlib.contextmanager
@@ -95,8 +106,13 @@ def running(folder: Path) -> Iterator[str]:
     (folder / "display").chmod(0o755)
     with (folder / "log").open("w") as log:
         process = subprocess.Popen(
-            [*_as_ordinary_user(folder), "linuxcnc", "-r", "machine.ini"], cwd=folder, stdout=log,
-            stderr=log, start_new_session=True, env={**os.environ, "HOME": str(folder)})
+            [*_as_ordinary_user(folder), "linuxcnc", "-r", "machine.ini"],
+            cwd=folder,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env={**os.environ, "HOME": str(folder)},
+        )
     try:
         wait_until(lambda: process.poll() is not None or _listens(number), "linuxcncrsh")
         assert process.poll() is None, (folder / "log").read_text()
@@ -112,8 +128,12 @@ def running(folder: Path) -> Iterator[str]:
 
 def motors() -> tuple[float, float]:
     """Return where its motors are commanded to be, mm: where its axes are, and the correction."""
-    done = subprocess.run([*_ordinary_user(), "/usr/bin/python3", "-I", "-c", MOTORS], check=True,
-                          capture_output=True, text=True)
+    done = subprocess.run(
+        [*_ordinary_user(), "/usr/bin/python3", "-I", "-c", MOTORS],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     x, y = done.stdout.split()
     return float(x), float(y)
 
@@ -142,8 +162,10 @@ def _switch_on(number: int) -> None:
         for words in SWITCHED_ON:
             answer = _answer(lines, f"set {words}", f"SET {words.split()[0].upper()} ")
             assert answer.endswith("ACK"), answer
-        wait_until(lambda: _answer(lines, "get joint_homed", "JOINT_HOMED").split()[1:3]
-                   == ["YES", "YES"], "homing")
+        wait_until(
+            lambda: _answer(lines, "get joint_homed", "JOINT_HOMED").split()[1:3] == ["YES", "YES"],
+            "homing",
+        )
 
 
 def _answer(lines: TextIO, words: str, beginning: str) -> str:

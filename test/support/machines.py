@@ -28,8 +28,9 @@ def weights(nodes, at, edge="hold"):
 
 def plane(x, y, values, edge="hold"):
     """Return the function that is bilinear between values at y (rows) and x (columns)."""
-    return lambda px, py: np.einsum("pr,pc,rc->p", weights(y, py, edge), weights(x, px, edge),
-                                    values)
+    return lambda px, py: np.einsum(
+        "pr,pc,rc->p", weights(y, py, edge), weights(x, px, edge), values
+    )
 
 
 def numbers_in(line):
@@ -40,11 +41,17 @@ def cal(texts, _counts):
     """Aerotech: one 2D table of positions in primary units, zero at home."""
     lines = [line for line in texts[0].splitlines() if line and line[0] not in ";"]
     row, column, *outputs, down, across, width = map(float, lines[0].split()[1:])
-    offset = {m[1]: float(m[2]) for line in lines
-              if (m := re.fullmatch(r":START2D OFFSET(ROW|COL)=(\S+)", line))}
+    offset = {
+        m[1]: float(m[2])
+        for line in lines
+        if (m := re.fullmatch(r":START2D OFFSET(ROW|COL)=(\S+)", line))
+    }
     assert ":START2D POSUNIT=PRIMARY" in lines
-    [um] = [float(m[1] or 1) for line in lines
-            if (m := re.fullmatch(r":START2D CORUNIT=PRIMARY(?:/(\S+))?", line))]
+    [um] = [
+        float(m[1] or 1)
+        for line in lines
+        if (m := re.fullmatch(r":START2D CORUNIT=PRIMARY(?:/(\S+))?", line))
+    ]
     values = np.array([line.split() for line in lines if line[0] != ":"], dtype=float)
     values = values.reshape(len(values), -1, 2) / um
     assert values.shape[1] == width and outputs == [column, row]
@@ -57,6 +64,7 @@ def cal(texts, _counts):
 
     def add(px, py):
         return np.stack([f(px, py) - f(np.zeros(1), np.zeros(1)) for f in fields], axis=-1)
+
     return add
 
 
@@ -66,7 +74,7 @@ def kmotion(texts, _counts):
     rows, columns = map(int, lines[0])
     (dx, dy), (x0, y0) = lines[1:3]
     commands = np.full((rows, columns, 2), np.nan)
-    for row, column, *command in lines[3:3 + rows * columns]:
+    for row, column, *command in lines[3 : 3 + rows * columns]:
         commands[int(row), int(column)] = command[:2]
     x, y = x0 + dx * np.arange(columns), y0 + dy * np.arange(rows)
     fields = [plane(x, y, commands[:, :, axis], "extrapolate") for axis in (0, 1)]
@@ -82,18 +90,27 @@ def pmac(texts, counts):
         if not match:
             continue
         rows, columns, row_motor, column_motor, target, row_span, column_span = map(
-            int, match.groups())
+            int, match.groups()
+        )
         found = [0.0]
-        for more in lines[at + 1:]:
+        for more in lines[at + 1 :]:
             if not re.fullmatch(r"[-\d ]+", more):
                 break
             found += map(float, more.split())
         order = [row_motor, column_motor]
-        fields[target] = plane(np.linspace(0, row_span, columns + 1),
-                               np.linspace(0, column_span, rows + 1),
-                               np.reshape(found, (rows + 1, columns + 1)) / 16, "roll")
-    return lambda px, py: np.stack([fields[motor](px * counts[0], py * counts[1]) / per
-                                    for motor, per in zip(order, counts, strict=True)], axis=-1)
+        fields[target] = plane(
+            np.linspace(0, row_span, columns + 1),
+            np.linspace(0, column_span, rows + 1),
+            np.reshape(found, (rows + 1, columns + 1)) / 16,
+            "roll",
+        )
+    return lambda px, py: np.stack(
+        [
+            fields[motor](px * counts[0], py * counts[1]) / per
+            for motor, per in zip(order, counts, strict=True)
+        ],
+        axis=-1,
+    )
 
 
 def beckhoff(texts, _counts, unit_m=1e-3, subtract=False):
@@ -102,8 +119,11 @@ def beckhoff(texts, _counts, unit_m=1e-3, subtract=False):
     for text in texts:
         found = dict(re.findall(r"^kw\.crosscomp2\.(\w+) (\S+)$", text, re.M))
         step = float(found["interval"])
-        x, y = (float(found[f"start_position_master{n}"]) + step * np.arange(
-            int(found[f"last_index_master{n}"]) + 1) for n in (1, 2))
+        x, y = (
+            float(found[f"start_position_master{n}"])
+            + step * np.arange(int(found[f"last_index_master{n}"]) + 1)
+            for n in (1, 2)
+        )
         values = np.full((len(y), len(x)), np.nan)
         for j, i, value in re.findall(r"table\[(\d+)\]\[(\d+)\]\.correction (\S+)", text):
             values[int(j), int(i)] = float(value)
@@ -118,8 +138,13 @@ def linuxcnc(texts, _counts):
     for text in texts:
         lines = text.split("\n\n")[0].splitlines()
         joints.append(np.array([line.split() for line in lines], dtype=float).T)
-    return lambda px, py: np.stack([np.interp(p, nominal, nominal - forward) for p, (
-        nominal, forward, _) in zip((px, py), joints, strict=True)], axis=-1)
+    return lambda px, py: np.stack(
+        [
+            np.interp(p, nominal, nominal - forward)
+            for p, (nominal, forward, _) in zip((px, py), joints, strict=True)
+        ],
+        axis=-1,
+    )
 
 
 def siemens(texts, _counts, subtract=False):
@@ -129,8 +154,13 @@ def siemens(texts, _counts, subtract=False):
     found = []
     for table in tables:
         get = dict(re.findall(rf"^\$AN_CEC_(\w+)\[{table}\]=(\S+)$", text, re.M))
-        values = [float(v) for _, v in sorted((int(n), v) for n, v in re.findall(
-            rf"^\$AN_CEC\[{table},(\d+)\]=(\S+)$", text, re.M))]
+        values = [
+            float(v)
+            for _, v in sorted(
+                (int(n), v)
+                for n, v in re.findall(rf"^\$AN_CEC\[{table},(\d+)\]=(\S+)$", text, re.M)
+            )
+        ]
         at = float(get["MIN"]) + float(get["STEP"]) * np.arange(len(values))
         assert abs(at[-1] - float(get["MAX"])) < 1e-6
         found.append((get["INPUT_AXIS"], get["OUTPUT_AXIS"], at, values))
@@ -141,11 +171,18 @@ def siemens(texts, _counts, subtract=False):
         for source, target, at, values in found:
             out[:, names.index(target)] += np.interp((px, py)[names.index(source)], at, values)
         return -out if subtract else out
+
     return add
 
 
-READERS = {"cal": cal, "kmotion": kmotion, "pmac": pmac, "beckhoff": beckhoff,
-           "linuxcnc": linuxcnc, "siemens": siemens}
+READERS = {
+    "cal": cal,
+    "kmotion": kmotion,
+    "pmac": pmac,
+    "beckhoff": beckhoff,
+    "linuxcnc": linuxcnc,
+    "siemens": siemens,
+}
 
 
 class Machine:
@@ -195,8 +232,12 @@ class Machine:
 
     def off(self, table, *, between=False, sense=1):
         """Return the largest residual at the nodes, or within cells, without the common shift."""
-        x, y = (np.sort(np.concatenate([at[:-1] + 0.3 * np.diff(at), at[:-1] + 0.8 * np.diff(at)]))
-                if between else at for at in self.nodes)
+        x, y = (
+            np.sort(np.concatenate([at[:-1] + 0.3 * np.diff(at), at[:-1] + 0.8 * np.diff(at)]))
+            if between
+            else at
+            for at in self.nodes
+        )
         points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
         found = self.reached(points, table, sense) - points
         return float(np.abs(found - found.mean(axis=0)).max())

@@ -41,6 +41,12 @@ def map_covariance(measurements: Measurements, options: Options) -> MapCovarianc
     """Return the covariance of the map that `calibrate` gives for the same arguments."""
     model = fit_joint(measurements, replace(options, uncertainty=True))
     problem, found = model.problem, model.found
-    field = Covariance(problem.system, found.inverse, options.reference, terms=model.spread,
-                       half_width_m=problem.half_width_m, sigma_m=found.xy.sigma)
+    field = Covariance(
+        problem.system,
+        found.inverse,
+        options.reference,
+        terms=model.spread,
+        half_width_m=problem.half_width_m,
+        sigma_m=found.xy.sigma,
+    )
     return MapCovariance(measurements.artifact, field, found.xy.sigma, measurements.sense)

@@ -9,8 +9,9 @@ from selfcal_ros.model.result import ArtifactMap, CalibrationResult, Noise, Obse
 from test.support.truth import random_truth
 
 
-def random_map(artifact: Artifact, seed: int, *, unknown: tuple = (),
-               gain: float = 1.0) -> ErrorMap:
+def random_map(
+    artifact: Artifact, seed: int, *, unknown: tuple = (), gain: float = 1.0
+) -> ErrorMap:
     """Return a random error map, with NaN at the sites (i, j) in `unknown`."""
     rng = np.random.default_rng(seed)
     truth = random_truth(artifact, 0, rng)
@@ -26,9 +27,15 @@ def result_of(error_map: ErrorMap, *, sense: str = "microscope_moves") -> Calibr
     """Return a result that holds `error_map` and little else."""
     shape, count = error_map.artifact.shape, error_map.artifact.angular_count
     return CalibrationResult(
-        "demo", error_map, ArtifactMap(np.zeros(shape), np.zeros(shape), np.zeros(count)), (),
-        Observability(1, 1, 0, True), Noise(1e-9, 1e-7),
-        input={"file": "demo.mcap", "sha256": "ab" * 32}, sense=sense)
+        "demo",
+        error_map,
+        ArtifactMap(np.zeros(shape), np.zeros(shape), np.zeros(count)),
+        (),
+        Observability(1, 1, 0, True),
+        Noise(1e-9, 1e-7),
+        input={"file": "demo.mcap", "sha256": "ab" * 32},
+        sense=sense,
+    )
 
 
 def first_order(artifact, gx_m, gy_m):

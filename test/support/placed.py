@@ -13,8 +13,14 @@ from selfcal_ros.model.view import View
 
 PITCH_M = 10e-3
 
-SIX = ((0, (0, 0)), (90, (0, 0)), (37, (0.6, -0.7)), (211, (-1.2, 0.6)), (0, (1, 0)),
-       (135, (0.4, 1.1)))
+SIX = (
+    (0, (0, 0)),
+    (90, (0, 0)),
+    (37, (0.6, -0.7)),
+    (211, (-1.2, 0.6)),
+    (0, (1, 0)),
+    (135, (0.4, 1.1)),
+)
 """Turns, deg, and shifts, pitches, that determine every node of a map."""
 
 THREE = ((0, (0, 0)), (90, (0, 0)), (37, (1.3, -0.7)))
@@ -23,8 +29,9 @@ THREE = ((0, (0, 0)), (90, (0, 0)), (37, (1.3, -0.7)))
 def plate(marks: int, nodes: int, interpolation: str = "bicubic", **kwargs) -> Artifact:
     """Return a plate whose map spans it with `nodes` nodes a side."""
     pitch = (marks - 1) * PITCH_M / (nodes - 1)
-    return Artifact(marks, PITCH_M, map_grid=MapGrid(nodes, pitch, Interpolation(interpolation)),
-                    **kwargs)
+    return Artifact(
+        marks, PITCH_M, map_grid=MapGrid(nodes, pitch, Interpolation(interpolation)), **kwargs
+    )
 
 
 def cardinal(nodes: np.ndarray, at: np.ndarray, interpolation: str) -> np.ndarray:
@@ -37,8 +44,10 @@ def rows(artifact: Artifact, places_m: np.ndarray) -> np.ndarray:
     """Return the rows that lead from the map's nodes to places, dense (P, nodes)."""
     field, how = artifact.field, artifact.map_grid.interpolation
     along = [np.arange(-half, half + 1.0) * field.grid_pitch_m for half in field.half]
-    x, y = (cardinal(nodes, at, how) for nodes, at in zip(
-        along, (places_m.real, places_m.imag), strict=True))
+    x, y = (
+        cardinal(nodes, at, how)
+        for nodes, at in zip(along, (places_m.real, places_m.imag), strict=True)
+    )
     return (x[:, :, None] * y[:, None, :]).reshape(len(places_m), -1)
 
 
@@ -50,8 +59,18 @@ class Truth:
     plate: np.ndarray
 
 
-def readings(artifact: Artifact, poses, rng, *, sigma=20e-9, size=1e-6, turn=3e-4, shift=3e-6,
-             linear=False, stage=None) -> tuple[Measurements, Truth]:
+def readings(
+    artifact: Artifact,
+    poses,
+    rng,
+    *,
+    sigma=20e-9,
+    size=1e-6,
+    turn=3e-4,
+    shift=3e-6,
+    linear=False,
+    stage=None,
+) -> tuple[Measurements, Truth]:
     """Return readings of views at `poses`, one repeat each, and their truth.
 
     Parameters
@@ -59,34 +78,48 @@ def readings(artifact: Artifact, poses, rng, *, sigma=20e-9, size=1e-6, turn=3e-
     stage : callable, optional
         The stage's error at places, m; without it random nodes and the map's own spline.
     """
+
     def complex_normal(shape):
         return rng.normal(size=shape) + 1j * rng.normal(size=shape)
 
     nodes = artifact.field.x_m + 1j * artifact.field.y_m
     field = size * complex_normal(artifact.field.shape) if stage is None else stage(nodes)
     if stage is None:  # a stage that turns as a whole turns the offsets seen: of second order
-        x, y = remove_modes(np.stack([field.real, field.imag]),
-                            datum_modes(artifact.field, scale=True))
+        x, y = remove_modes(
+            np.stack([field.real, field.imag]), datum_modes(artifact.field, scale=True)
+        )
         field = x + 1j * y
     plate_error, views = size * complex_normal(artifact.shape), []
     for number, (degrees, pitches) in enumerate(poses):
-        view = View(f"view {number}", np.radians(degrees),
-                    tuple(pitch * artifact.grid_pitch_m for pitch in pitches), True, False)
+        view = View(
+            f"view {number}",
+            np.radians(degrees),
+            tuple(pitch * artifact.grid_pitch_m for pitch in pitches),
+            True,
+            False,
+        )
         inside = view.pose.in_field(artifact)
         m, n = artifact.m[inside], artifact.n[inside]
         at, mark = view.pose.places(artifact, m, n), (artifact.x_m + 1j * artifact.y_m)[inside]
-        phase, phi, t = np.exp(1j * view.rotation_rad), turn * rng.normal(), shift * (
-            complex_normal(()))
+        phase, phi, t = (
+            np.exp(1j * view.rotation_rad),
+            turn * rng.normal(),
+            shift * (complex_normal(())),
+        )
         of_stage = rows(artifact, at) @ field.ravel() if stage is None else stage(at)
-        lies = phase * (1j * phi * mark + plate_error[inside]) + t if linear else (
-            phase * np.exp(1j * phi) * (mark + plate_error[inside]) - phase * mark + t)
+        lies = (
+            phase * (1j * phi * mark + plate_error[inside]) + t
+            if linear
+            else (phase * np.exp(1j * phi) * (mark + plate_error[inside]) - phase * mark + t)
+        )
         seen = lies + of_stage + sigma * complex_normal(len(m))
         views.append(ViewReadings(view, m, n, seen.real, seen.imag, np.ones(len(m), dtype=int)))
     return Measurements("placed", artifact, tuple(views)), Truth(field, plate_error)
 
 
-def dense(measurements: Measurements,
-          known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def dense(
+    measurements: Measurements, known: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return G in its datum and its standard uncertainty for unit noise, (2, nx, ny) each.
 
     The datum is that of the `known` nodes, of all unless they are given.
@@ -99,12 +132,17 @@ def dense(measurements: Measurements,
     blocks, values = [], []
     for number, view in enumerate(measurements.views):
         phase, (a, b) = np.exp(1j * view.view.rotation_rad), view.view.translation_m
-        own = np.array([(mark == each.reshape(2, -1).T).all(axis=1) for mark in zip(
-            view.m, view.n, strict=True)], dtype=float)  # each mark by its name
+        own = np.array(
+            [
+                (mark == each.reshape(2, -1).T).all(axis=1)
+                for mark in zip(view.m, view.n, strict=True)
+            ],
+            dtype=float,
+        )  # each mark by its name
         w = rows(artifact, phase * (own @ z) + complex(a, b))
         here = np.zeros((len(own), 3 * len(measurements.views)), dtype=complex)
         here[:, 3 * number] = phase * 1j * (own @ z) / z.real.max()
-        here[:, 3 * number + 1:3 * number + 3] = 1, 1j
+        here[:, 3 * number + 1 : 3 * number + 3] = 1, 1j
         row = np.hstack([w, 1j * w, phase * own, 1j * phase * own, here])
         blocks += [row.real, row.imag]
         values += [view.dx, view.dy]
@@ -112,10 +150,14 @@ def dense(measurements: Measurements,
     inverse = np.linalg.pinv(design, rcond=1e-10)
     modes = datum_modes(artifact.field, scale=True).reshape(4, -1).T
     there = np.tile(np.ones(n, dtype=bool) if known is None else known.ravel(), 2)
-    projected = inverse[:2 * n] - modes @ np.linalg.lstsq(
-        modes[there], inverse[:2 * n][there], rcond=None)[0]
-    return ((projected @ y).reshape(2, *artifact.field.shape),
-            np.sqrt((projected**2).sum(axis=1)).reshape(2, *artifact.field.shape))
+    projected = (
+        inverse[: 2 * n]
+        - modes @ np.linalg.lstsq(modes[there], inverse[: 2 * n][there], rcond=None)[0]
+    )
+    return (
+        (projected @ y).reshape(2, *artifact.field.shape),
+        np.sqrt((projected**2).sum(axis=1)).reshape(2, *artifact.field.shape),
+    )
 
 
 def error_in_datum(emap, truth: Truth) -> np.ndarray:

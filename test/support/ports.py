@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ports of a session that a test holds in its hands: what was published, said, and the time."""
 
-
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.writer import build
 from selfcal_ros.collection.settings.nodes import NODE_SETTINGS, Settings
@@ -18,10 +17,14 @@ class Hands:
         self.worked, self.works = 0.0, 0.0
         self.published: list[tuple[str, dict]] = []
         self.said: list[tuple[Level, str]] = []
-        self.ports = Ports(self._publish,
-                           lambda level, line: self.said.append((level, line)),
-                           lambda: self.seconds, lambda: self.now_ns, lambda: self.worked,
-                           lambda: self.now_ns)
+        self.ports = Ports(
+            self._publish,
+            lambda level, line: self.said.append((level, line)),
+            lambda: self.seconds,
+            lambda: self.now_ns,
+            lambda: self.worked,
+            lambda: self.now_ns,
+        )
 
     def _publish(self, output: str, fields: dict) -> None:
         """Take what is published; a status takes the time `costs`, and the CPU time `works`."""

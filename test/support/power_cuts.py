@@ -55,8 +55,14 @@ class SurvivingStage(SimulatedMachine):
         half.write_text(json.dumps(placing.command.view_index))
         os.replace(half, self._note)
 """
-POINTS = ("in a move", "between two moves", "in an exposure", "half of a message written",
-          "before a file is on the disk", "before a file has its name")
+POINTS = (
+    "in a move",
+    "between two moves",
+    "in an exposure",
+    "half of a message written",
+    "before a file is on the disk",
+    "before a file has its name",
+)
 
 
 class Cut(NamedTuple):
@@ -76,9 +82,12 @@ class Ended(NamedTuple):
 def prepare(folder: Path, marks: int = 5) -> None:
     """Write the plan of so many marks a side, machine and simulation into a new folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in (("plan.yaml", PLAN.replace("grid_size: 3", f"grid_size: {marks}")),
-                       ("sim.yaml", SIMULATION), ("cell.yaml", CELL),
-                       ("surviving_stage.py", STAGE)):
+    for name, text in (
+        ("plan.yaml", PLAN.replace("grid_size: 3", f"grid_size: {marks}")),
+        ("sim.yaml", SIMULATION),
+        ("cell.yaml", CELL),
+        ("surviving_stage.py", STAGE),
+    ):
         (folder / name).write_text(text)
 
 
@@ -108,8 +117,12 @@ def detections(folder: Path) -> list[bytes]:
     bag = folder / "bag"
     if not any(bag.glob("*.mcap")):
         return []
-    return [row.tobytes() for topic, item in BagReader(bag).columns()
-            if topic.strip("/") == DETECTION_TOPIC for row in item]
+    return [
+        row.tobytes()
+        for topic, item in BagReader(bag).columns()
+        if topic.strip("/") == DETECTION_TOPIC
+        for row in item
+    ]
 
 
 class Outcome(NamedTuple):
@@ -133,9 +146,13 @@ def outcome(folder: Path, whole: Path, before: list[bytes]) -> Outcome:
         away.append(np.subtract(result["error_map"][axis], other["error_map"][axis]))
         u.append(np.hypot(result["error_map"][f"u_{axis}"], other["error_map"][f"u_{axis}"]))
     distance = np.abs(np.array(away))
-    return Outcome((Counter(before) - after).total(), sum(n - 1 for n in after.values()),
-                   float((distance / np.array(u)).max()), float(distance.max()),
-                   bool(result["verdict"]["qualified"]))
+    return Outcome(
+        (Counter(before) - after).total(),
+        sum(n - 1 for n in after.values()),
+        float((distance / np.array(u)).max()),
+        float(distance.max()),
+        bool(result["verdict"]["qualified"]),
+    )
 
 
 def main(folder: Path, cut: Cut | None) -> None:
@@ -160,13 +177,14 @@ def main(folder: Path, cut: Cut | None) -> None:
             if is_due(here):
                 kill()
             return function(*args)
+
         setattr(owner, name, acting)
 
     write = os.write
 
     def writing(descriptor, data):
         if is_due("half of a message written"):
-            write(descriptor, data[:len(data) // 2])
+            write(descriptor, data[: len(data) // 2])
             kill()
         return write(descriptor, data)
 
@@ -176,8 +194,12 @@ def main(folder: Path, cut: Cut | None) -> None:
     cut_before(SimulatedMachine, "offsets", "in an exposure")
     cut_before(os, "fsync", "before a file is on the disk")
     cut_before(Path, "replace", "before a file has its name")
-    with (contextlib.chdir(folder), Path("said.txt").open("w") as said,
-          contextlib.redirect_stdout(said), contextlib.redirect_stderr(said)):
+    with (
+        contextlib.chdir(folder),
+        Path("said.txt").open("w") as said,
+        contextlib.redirect_stdout(said),
+        contextlib.redirect_stderr(said),
+    ):
         code = selfcal(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"])
         Path("passages.json").write_text(json.dumps(passed))
     raise SystemExit(code)

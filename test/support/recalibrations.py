@@ -24,7 +24,7 @@ def with_values(readings: Measurements, values: np.ndarray) -> Measurements:
     views, at = [], 0
     for view in readings.views:
         n, k = len(view.m), len(view.k)
-        dx, dy, dtheta = np.split(values[at:at + 2 * n + k], [n, 2 * n])
+        dx, dy, dtheta = np.split(values[at : at + 2 * n + k], [n, 2 * n])
         views.append(replace(view, dx=dx, dy=dy, dtheta=dtheta))
         at += 2 * n + k
     return replace(readings, views=tuple(views))
@@ -32,14 +32,21 @@ def with_values(readings: Measurements, values: np.ndarray) -> Measurements:
 
 def sizes_of(readings: Measurements, sigma_m: float, sigma_rad: float) -> np.ndarray:
     """Return the standard deviation of each reading, a mean over its repeats."""
-    return np.concatenate([part for v in readings.views for part in (
-        *2 * [np.broadcast_to(sigma_m / np.sqrt(v.count), len(v.m))],
-        np.broadcast_to(sigma_rad / np.sqrt(v.count_theta), len(v.k)))])
+    return np.concatenate(
+        [
+            part
+            for v in readings.views
+            for part in (
+                *2 * [np.broadcast_to(sigma_m / np.sqrt(v.count), len(v.m))],
+                np.broadcast_to(sigma_rad / np.sqrt(v.count_theta), len(v.k)),
+            )
+        ]
+    )
 
 
-def responses(solve: Callable[[Measurements], np.ndarray], readings: Measurements,
-              steps: np.ndarray) -> np.ndarray:
+def responses(
+    solve: Callable[[Measurements], np.ndarray], readings: Measurements, steps: np.ndarray
+) -> np.ndarray:
     """Return what a step of each reading adds to the solution, (readings, numbers)."""
     values, start = values_of(readings), solve(readings)
-    return np.array([solve(with_values(readings, values + row)) - start
-                     for row in np.diag(steps)])
+    return np.array([solve(with_values(readings, values + row)) - start for row in np.diag(steps)])

@@ -31,12 +31,25 @@ SIGMA_M, SIGMA_RAD = 0.02e-6, np.deg2rad(0.001)
 def noise_of(lines: int) -> Noise:
     """Return the noise of five repeats; nothing is known of theta on a plate without lines."""
     theta = (SIGMA_RAD, 384, 44) if lines else (float("nan"), 0, 0)
-    return Noise(SIGMA_M, theta[0], SIGMA_M, theta[0], 1.02 * SIGMA_M, 0.98 * theta[0],
-                 2904, theta[1], 220, theta[2], dof_xy=2904, dof_theta=theta[1])
+    return Noise(
+        SIGMA_M,
+        theta[0],
+        SIGMA_M,
+        theta[0],
+        1.02 * SIGMA_M,
+        0.98 * theta[0],
+        2904,
+        theta[1],
+        220,
+        theta[2],
+        dof_xy=2904,
+        dof_theta=theta[1],
+    )
 
 
-def known_result(size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int = 0,
-                 noisy: bool = True) -> tuple[CalibrationResult, dict[str, np.ndarray]]:
+def known_result(
+    size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int = 0, noisy: bool = True
+) -> tuple[CalibrationResult, dict[str, np.ndarray]]:
     """Return a result whose map is a random truth plus noise of its stated uncertainty."""
     artifact = Artifact(size, 0.01, lines, size_y)
     rng = np.random.default_rng(seed)
@@ -49,15 +62,30 @@ def known_result(size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int 
     g_theta = truth.g_theta + rng.normal(0, 1, lines) * (u_theta if noisy else 0)
     nonorthogonality, scale = first_order(artifact, gx, gy)
     emap = ErrorMap(artifact, gx, gy, u, u.copy(), g_theta, u_theta, nonorthogonality, scale)
-    views = tuple(ViewResult(v.name, v.rotation_rad, *v.translation_m, truth.phi_rad[i],
-                             *truth.t_m[i], used=600 + i, rejected=i,
-                             read_grid=int(v.grid), read_angular=int(v.angular))
-                  for i, v in enumerate(plan.views))
+    views = tuple(
+        ViewResult(
+            v.name,
+            v.rotation_rad,
+            *v.translation_m,
+            truth.phi_rad[i],
+            *truth.t_m[i],
+            used=600 + i,
+            rejected=i,
+            read_grid=int(v.grid),
+            read_angular=int(v.angular),
+        )
+        for i, v in enumerate(plan.views)
+    )
     result = CalibrationResult(
-        plan.plan_id, emap, ArtifactMap(*truth.a, truth.a_theta), views,
+        plan.plan_id,
+        emap,
+        ArtifactMap(*truth.a, truth.a_theta),
+        views,
         Observability(9, 9, 0, True),
         noise_of(lines),
-        {"no_encoder_sample": 3, "outlier": 12}, {"file": "bags/hu.mcap", "sha256": "ab" * 32})
+        {"no_encoder_sample": 3, "outlier": 12},
+        {"file": "bags/hu.mcap", "sha256": "ab" * 32},
+    )
     return result, {"gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta}
 
 
@@ -65,16 +93,33 @@ def with_residuals(size: int = 5, lines: int = 24, *, size_y: int = 0) -> Calibr
     """Return a result that keeps residuals, their course, and places of rejection."""
     result, _ = known_result(size, lines, size_y=size_y)
     rng, shape = np.random.default_rng(2), result.artifact.shape
-    rows = [{"view": v.name, "dx": rng.normal(0, 1e-8, shape), "dy": rng.normal(0, 1e-8, shape),
-             "dtheta": rng.normal(0, 1e-6, lines),
-             "course": {"time_s": np.arange(20.0), "dx": rng.normal(0, 1e-8, 20),
-                        "dy": rng.normal(0, 1e-8, 20), "count": np.full(20, 9)}}
-            for v in result.views]
-    rejected = [{"view": result.views[0].name, "reason": ["low_score", "too_far_from_nominal"],
-                 "x": [0.01, -0.02], "y": [0.02, 0.0]}]
+    rows = [
+        {
+            "view": v.name,
+            "dx": rng.normal(0, 1e-8, shape),
+            "dy": rng.normal(0, 1e-8, shape),
+            "dtheta": rng.normal(0, 1e-6, lines),
+            "course": {
+                "time_s": np.arange(20.0),
+                "dx": rng.normal(0, 1e-8, 20),
+                "dy": rng.normal(0, 1e-8, 20),
+                "count": np.full(20, 9),
+            },
+        }
+        for v in result.views
+    ]
+    rejected = [
+        {
+            "view": result.views[0].name,
+            "reason": ["low_score", "too_far_from_nominal"],
+            "x": [0.01, -0.02],
+            "y": [0.02, 0.0],
+        }
+    ]
     removed = {"removed": [{"view": result.views[1].name, "kind": "grid", "mark": [1, 0]}]}
-    return replace(result, extra={"residuals": {"views": rows}, "rejected_at": rejected,
-                                  "outliers": removed})
+    return replace(
+        result, extra={"residuals": {"views": rows}, "rejected_at": rejected, "outliers": removed}
+    )
 
 
 def trusted(measurements: Measurements, options: Options) -> CalibrationResult:
@@ -90,8 +135,10 @@ def covered(result: CalibrationResult, g: np.ndarray) -> float:
     return float(inside[:, emap.valid].mean())
 
 
-def chapters_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None = None,
-                ) -> list[Chapter]:
+def chapters_of(
+    result: CalibrationResult,
+    truth: dict[str, np.ndarray] | None = None,
+) -> list[Chapter]:
     """Return the chapters of the report that `selfcal report` writes."""
     return chapters(result, truth_arrays(result.error_map, truth))
 

@@ -60,8 +60,10 @@ class Graph:
     def publisher(self, topic: Topic, *, readers: int = 1) -> Any:
         """Return a publisher once `readers` subscribers have found it."""
         publisher = self.hand.create_publisher(topic.type, topic.name, topic.qos)
-        self.until(lambda: publisher.get_subscription_count() >= readers,
-                   f"{readers} subscribers of {topic.name}")
+        self.until(
+            lambda: publisher.get_subscription_count() >= readers,
+            f"{readers} subscribers of {topic.name}",
+        )
         return publisher
 
     def health(self, node: str, **values: str) -> None:
@@ -78,9 +80,14 @@ class Graph:
 
     def _tell(self) -> None:
         for node, values in self._alive.items():
-            self._voices[node].publish(names.HEALTH.type(
-                level=b"\0", name=node, message="as told", values=[
-                    KeyValue(key=key, value=value) for key, value in values.items()]))
+            self._voices[node].publish(
+                names.HEALTH.type(
+                    level=b"\0",
+                    name=node,
+                    message="as told",
+                    values=[KeyValue(key=key, value=value) for key, value in values.items()],
+                )
+            )
 
     def until(self, condition: Callable[[], Any], what: str) -> None:
         """Spin until `condition` holds; fail when patience ends."""
@@ -110,8 +117,9 @@ class Graph:
 
 def publish_events(graph: Graph, events: Iterable[Event], *, readers: int = 1) -> dict[str, int]:
     """Publish simulated messages on the topics of the cell; return how many, by topic."""
-    publishers = {topic.name: (topic, graph.publisher(topic, readers=readers))
-                  for topic in names.INPUTS}
+    publishers = {
+        topic.name: (topic, graph.publisher(topic, readers=readers)) for topic in names.INPUTS
+    }
     counts = dict.fromkeys(publishers, 0)
     for event in events:
         name, fields = event_fields(event, "stage")

@@ -17,8 +17,14 @@ def ways_of(path) -> list[tuple[bool, np.ndarray]]:
 
     RuntimeError if the program is stopped. Coordinates have four decimals.
     """
-    done = subprocess.run([RS274, "-g", str(path)], capture_output=True, text=True, timeout=60,
-                          cwd=path.parent, check=False)
+    done = subprocess.run(
+        [RS274, "-g", str(path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=path.parent,
+        check=False,
+    )
     if done.returncode or done.stderr.strip() != "executing":
         raise RuntimeError(done.stderr)
     at, unit, ways = np.zeros(3), 1.0, []
@@ -39,13 +45,16 @@ def ways_of(path) -> list[tuple[bool, np.ndarray]]:
 
 def _arc(start: np.ndarray, numbers: list[float], unit: float) -> np.ndarray:
     """Return points of ARC_FEED in XY: end x, y, centre x, y, turns, end z."""
-    x, y, cx, cy, turns, z = (value * factor for value, factor in zip(
-        numbers, (unit,) * 4 + (1, unit), strict=True))
+    x, y, cx, cy, turns, z = (
+        value * factor for value, factor in zip(numbers, (unit,) * 4 + (1, unit), strict=True)
+    )
     first, last = (math.atan2(b - cy, a - cx) for a, b in (start[:2], (x, y)))
     sweep = (last - first) * np.sign(turns) % (2 * math.pi)
     sweep = (sweep if sweep > 1e-4 else 2 * math.pi) + (abs(turns) - 1) * 2 * math.pi
     way = np.linspace(0, 1, 1000)
     radius = np.hypot(start[0] - cx, start[1] - cy) * (1 - way) + np.hypot(x - cx, y - cy) * way
     angle = first + np.sign(turns) * sweep * way
-    return np.stack([cx + radius * np.cos(angle), cy + radius * np.sin(angle),
-                     start[2] + way * (z - start[2])], axis=1)
+    return np.stack(
+        [cx + radius * np.cos(angle), cy + radius * np.sin(angle), start[2] + way * (z - start[2])],
+        axis=1,
+    )

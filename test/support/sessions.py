@@ -41,8 +41,9 @@ def events_of(plan: Plan, seed: int = 5) -> list[Event]:
     """Return all messages of a plan measured on a stage with errors."""
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng)
-    return list(plan_events(truth, plan, settings=CellSettings(**NOISE), rng=rng,
-                            start_ns=START_NS))
+    return list(
+        plan_events(truth, plan, settings=CellSettings(**NOISE), rng=rng, start_ns=START_NS)
+    )
 
 
 def collected(events: list[Event]) -> tuple[Collector, Measurements, dict[int, ViewProgress]]:
@@ -60,8 +61,10 @@ def cdr_of(event: Event) -> bytes:
 
 def decoded(reader: BagReader) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, time of logging in ns and message of every input message of a bag."""
-    decoders = {topic: ChannelDecoder(topic, name, (typestore(),), Counter(), told=True)
-                for topic, name in INPUT_TOPICS.items()}
+    decoders = {
+        topic: ChannelDecoder(topic, name, (typestore(),), Counter(), told=True)
+        for topic, name in INPUT_TOPICS.items()
+    }
     for topic, logged_ns, data in reader.cdr_messages():
         yield topic, logged_ns, decoders[topic].one(data)
 
@@ -73,26 +76,35 @@ def plan_file(folder: Path, plan: Plan) -> str:
     return str(path)
 
 
-def small_bag(folder: Path, plan: Plan | None = None, *, correlation: float = 0.0,
-              **faults: float) -> Path:
+def small_bag(
+    folder: Path, plan: Plan | None = None, *, correlation: float = 0.0, **faults: float
+) -> Path:
     """Write a simulated bag with noise and faults, and return its folder.
 
     The errors of the stage are correlated over as many pitches.
     """
     plan_file(folder, plan or small_plan())
     simulation = folder / "simulation.yaml"
-    simulation.write_text(yaml.safe_dump({
-        "plan": "plan.yaml", "seed": 7, "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-5},
-        "truth": {"correlation": correlation},
-        "faults": {"lost": 0.02, "duplicated": 0.02, "delay": 0.05, **faults}}))
+    simulation.write_text(
+        yaml.safe_dump(
+            {
+                "plan": "plan.yaml",
+                "seed": 7,
+                "noise": {"sigma_xy": 2e-8, "sigma_theta": 2e-5},
+                "truth": {"correlation": correlation},
+                "faults": {"lost": 0.02, "duplicated": 0.02, "delay": 0.05, **faults},
+            }
+        )
+    )
     write_simulation(read_simulation(simulation), folder / "bag")
     return folder / "bag"
 
 
 def stepped_bag(folder: Path, step_s: float) -> Path:
     """Write a bag in whose midst the clock of stage and microscope steps back, and return it."""
-    arrivals, _ = apply_faults(events_of(small_plan()), Faults(clock_step_s=step_s),
-                               np.random.default_rng(1))
+    arrivals, _ = apply_faults(
+        events_of(small_plan()), Faults(clock_step_s=step_s), np.random.default_rng(1)
+    )
     with BagWriter(folder / "bag") as writer:
         for topic, typename in INPUT_TOPICS.items():
             writer.add_topic(f"/{topic}", typename, [])

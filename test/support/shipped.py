@@ -20,7 +20,9 @@ def require_map(name: str, emap: ErrorMap) -> None:
     Processors round differently: marks in images move by some 1e-7 pixels.
     """
     expected = MANIFEST[name]["expected"]
-    found = {"max_error_um": map_figures(emap).max_error_m * 1e6,
-             "nonorthogonality_urad": emap.nonorthogonality * 1e6,
-             "scale_difference_ppm": emap.scale_difference * 1e6}
+    found = {
+        "max_error_um": map_figures(emap).max_error_m * 1e6,
+        "nonorthogonality_urad": emap.nonorthogonality * 1e6,
+        "scale_difference_ppm": emap.scale_difference * 1e6,
+    }
     assert found == pytest.approx({key: expected[key] for key in found}, abs=5e-4)

@@ -11,8 +11,11 @@ import math
 
 def per_unit(word, divisor, axis):
     """Primary units in one unit of a file; `axis` is a dict of its setup."""
-    size = {"PRIMARY": 1.0, "COUNTS": 1.0 / axis.get("counts", math.nan),
-            "SECONDARY": axis.get("secondary", math.nan) / axis.get("counts", math.nan)}
+    size = {
+        "PRIMARY": 1.0,
+        "COUNTS": 1.0 / axis.get("counts", math.nan),
+        "SECONDARY": axis.get("secondary", math.nan) / axis.get("counts", math.nan),
+    }
     return size[word] / divisor
 
 
@@ -54,9 +57,11 @@ def slow_1d(table, at, axes, temperature=None):
     # A point of the stage keeps its place; home moves, so its coordinate moves the other way.
     if table.home_direction is not None:
         before = (table.home_offset or 0.0) + (table.full_travel or 0.0) * (
-            table.home_direction == "CW")
+            table.home_direction == "CW"
+        )
         now = ref.get("offset", table.home_offset or 0.0) + (table.full_travel or 0.0) * (
-            ref.get("direction", table.home_direction) == "CW")
+            ref.get("direction", table.home_direction) == "CW"
+        )
         positions = [p + before - now for p in positions]
     if table.absolute_feedback_offset is not None and "feedback" in ref:
         move = (ref["feedback"] - table.absolute_feedback_offset) / ref["counts"]
@@ -66,8 +71,9 @@ def slow_1d(table, at, axes, temperature=None):
     sign = -1 if table.negcor else 1
     values = [sign * v * per_unit(*word, out) for v in table.values]
     rollover = None if table.rollover is None else table.rollover / ref["counts"]
-    correction = (interpolate(positions, values, wrap(positions, at, rollover))
-                  - interpolate(positions, values, wrap(positions, 0.0, rollover)))
+    correction = interpolate(positions, values, wrap(positions, at, rollover)) - interpolate(
+        positions, values, wrap(positions, 0.0, rollover)
+    )
     if None not in (table.expand_coeff, table.material_temp, temperature):
         correction -= at * table.expand_coeff * (temperature - table.material_temp)
     return correction, positions, rollover
@@ -78,10 +84,23 @@ def slow_2d(table, row_at, column_at, axes):
     word = unit_of(table.pos_unit)
     tracks = []
     for axis, sample, offset, roll, feedback, count in (
-            (table.row_axis, table.sample_row, table.offset_row, table.rollover_row,
-             table.absolute_feedback_offset_row, table.values.shape[0]),
-            (table.column_axis, table.sample_col, table.offset_col, table.rollover_col,
-             table.absolute_feedback_offset_col, table.values.shape[1])):
+        (
+            table.row_axis,
+            table.sample_row,
+            table.offset_row,
+            table.rollover_row,
+            table.absolute_feedback_offset_row,
+            table.values.shape[0],
+        ),
+        (
+            table.column_axis,
+            table.sample_col,
+            table.offset_col,
+            table.rollover_col,
+            table.absolute_feedback_offset_col,
+            table.values.shape[1],
+        ),
+    ):
         setup = axes[axis]
         size = per_unit(*word, setup)
         if table.galvo:
@@ -92,19 +111,27 @@ def slow_2d(table, row_at, column_at, axes):
             positions = [p + (setup["feedback"] - feedback) / setup["counts"] for p in positions]
         tracks.append((positions, None if roll is None else roll / setup["counts"]))
     (rows, row_roll), (columns, column_roll) = tracks
-    slack = [1e-9 * abs(sample * per_unit(*word, axes[axis])) for sample, axis in
-             ((table.sample_row, table.row_axis), (table.sample_col, table.column_axis))]
+    slack = [
+        1e-9 * abs(sample * per_unit(*word, axes[axis]))
+        for sample, axis in (
+            (table.sample_row, table.row_axis),
+            (table.sample_col, table.column_axis),
+        )
+    ]
     zeros = [wrap(p, 0.0, r) for p, r in tracks]
-    inside = all(min(p) - s <= z <= max(p) + s
-                 for (p, _), z, s in zip(tracks, zeros, slack, strict=True))
+    inside = all(
+        min(p) - s <= z <= max(p) + s for (p, _), z, s in zip(tracks, zeros, slack, strict=True)
+    )
     sign = -1 if table.negcor else 1
     corrections = []
     for number, output in enumerate(table.output_axes):
         size = sign * per_unit(*unit_of(table.cor_unit), axes[output])
 
         def at(row, column, number=number, size=size):
-            along = [interpolate(columns, [v * size for v in line[:, number]], column)
-                     for line in table.values]
+            along = [
+                interpolate(columns, [v * size for v in line[:, number]], column)
+                for line in table.values
+            ]
             return interpolate(rows, along, row)
 
         value = at(wrap(rows, row_at, row_roll), wrap(columns, column_at, column_roll))

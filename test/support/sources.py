@@ -31,5 +31,7 @@ def source(path: Path) -> Source:
     nodes = list(ast.walk(tree))
     imports = [node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom)]
     return Source(
-        text, tuple(node for node in imports if node in tree.body),
-        tuple(node for node in imports if node not in tree.body))
+        text,
+        tuple(node for node in imports if node in tree.body),
+        tuple(node for node in imports if node not in tree.body),
+    )

@@ -17,19 +17,35 @@ from selfcal_ros.simulation import cell
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import rotate
 
-__all__ = ["Spread", "Truth", "angular_deviation", "grid_deviation", "hu_plan", "random_truth",
-           "rotate", "simulate_measurements"]
+__all__ = [
+    "Spread",
+    "Truth",
+    "angular_deviation",
+    "grid_deviation",
+    "hu_plan",
+    "random_truth",
+    "rotate",
+    "simulate_measurements",
+]
 
 FIRST_STAMP_NS = 1_700_000_000_000_000_000
 BETWEEN_VIEWS_NS = 60_000_000_000
 """Time to place the plate again."""
 
 
-def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
-                          sigma_m: float = 0.0, sigma_theta_rad: float = 0.0,
-                          sense: Sense = Sense.MICROSCOPE_MOVES, missing: float = 0.0,
-                          linear: bool | None = None, visits: bool = False,
-                          settings: cell.CellSettings | None = None) -> Measurements:
+def simulate_measurements(
+    truth: Truth,
+    plan: Plan,
+    rng: np.random.Generator,
+    *,
+    sigma_m: float = 0.0,
+    sigma_theta_rad: float = 0.0,
+    sense: Sense = Sense.MICROSCOPE_MOVES,
+    missing: float = 0.0,
+    linear: bool | None = None,
+    visits: bool = False,
+    settings: cell.CellSettings | None = None,
+) -> Measurements:
     """Return the readings of all views, with noise and missing marks.
 
     Parameters
@@ -51,48 +67,89 @@ def simulate_measurements(truth: Truth, plan: Plan, rng: np.random.Generator, *,
     """
     truth = truth if linear is None else replace(truth, linear=linear)
     if visits or settings or differs_by_visit(truth) or any(view.image for view in plan.views):
-        settings = settings or cell.CellSettings(sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0,
-                                                 servo_sigma_theta_rad=0.0)
+        settings = settings or cell.CellSettings(
+            sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0
+        )
         return _by_visit(truth, plan, rng, settings=settings, missing=missing)
-    return white.simulate_measurements(truth, plan, rng, sigma_m=sigma_m, sense=sense,
-                                       sigma_theta_rad=sigma_theta_rad, missing=missing)
+    return white.simulate_measurements(
+        truth,
+        plan,
+        rng,
+        sigma_m=sigma_m,
+        sense=sense,
+        sigma_theta_rad=sigma_theta_rad,
+        missing=missing,
+    )
 
 
 def differs_by_visit(truth: Truth) -> bool:
     """Return whether visits of a mark differ by more than noise."""
-    return bool(truth.placed) or any(np.any(values) for values in (
-        truth.microscope, truth.wiring - np.eye(2), truth.line_factor - 1, truth.distortion,
-        truth.backlash_m, truth.backlash_growth_m, truth.settling_m, truth.drift_m, truth.walk_m))
+    return bool(truth.placed) or any(
+        np.any(values)
+        for values in (
+            truth.microscope,
+            truth.wiring - np.eye(2),
+            truth.line_factor - 1,
+            truth.distortion,
+            truth.backlash_m,
+            truth.backlash_growth_m,
+            truth.settling_m,
+            truth.drift_m,
+            truth.walk_m,
+        )
+    )
 
 
-def _of_cell(exposures: cell.GridExposures, artifact: Artifact,
-             sub_view: View) -> cell.GridExposures:
+def _of_cell(
+    exposures: cell.GridExposures, artifact: Artifact, sub_view: View
+) -> cell.GridExposures:
     """Return the exposures as those of the marks in a cell, offsets from its place."""
     if sub_view.cell is None:
         return exposures
     visits = exposures.visits
     seen = next((one for one in exposures.others if one.cell == sub_view.cell), None) or cell.Seen(
-        (0, 0), exposures.offset, np.stack([visits.m, visits.n]), exposures.there)
+        (0, 0), exposures.offset, np.stack([visits.m, visits.n]), exposures.there
+    )
     m, n = seen.mark
     place = np.array([[sub_view.cell_m.real], [sub_view.cell_m.imag]])
-    return replace(exposures, visits=replace(visits, m=m, n=n), offset=seen.offset - place,
-                   mark=seen.mark, there=seen.there, others=())
+    return replace(
+        exposures,
+        visits=replace(visits, m=m, n=n),
+        offset=seen.offset - place,
+        mark=seen.mark,
+        there=seen.there,
+        others=(),
+    )
 
 
-def _by_visit(truth: Truth, plan: Plan, rng: np.random.Generator, *, settings: cell.CellSettings,
-              missing: float) -> Measurements:
+def _by_visit(
+    truth: Truth,
+    plan: Plan,
+    rng: np.random.Generator,
+    *,
+    settings: cell.CellSettings,
+    missing: float,
+) -> Measurements:
     views: list[ViewReadings] = []
     start_ns = FIRST_STAMP_NS
     for item in enumerate(plan.views):
-        made = measured_view(truth, item, rng, settings=settings, missing=missing,
-                             start_ns=start_ns).parts
+        made = measured_view(
+            truth, item, rng, settings=settings, missing=missing, start_ns=start_ns
+        ).parts
         views += made
         start_ns += (sum(part.used for part in made) + 1) * settings.period_ns + BETWEEN_VIEWS_NS
     return Measurements(plan.plan_id, plan.artifact, tuple(views), settings.sense)
 
 
-def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator, *,
-                  settings: cell.CellSettings, missing: float, start_ns: int) -> ViewReadings:
+def measured_view(
+    truth: Truth,
+    item: tuple[int, View],
+    rng: np.random.Generator,
+    *,
+    settings: cell.CellSettings,
+    missing: float,
+    start_ns: int,
+) -> ViewReadings:
     """Return the readings of a view, with its visits, as from the collector.
 
     Marks are those that the view expects, as for detections without ids.
@@ -117,13 +174,26 @@ def measured_view(truth: Truth, item: tuple[int, View], rng: np.random.Generator
     if view.grid:
         exposures = cell.grid_exposures(truth, index, view, settings=settings, rng=rng)
         lost = _lost(rng, missing, truth.artifact.shape)
-        parts = [_grid(part, truth, _of_cell(exposures, truth.artifact, part.view),
-                       settings=settings, lost=lost, start_ns=start_ns) for part in parts]
+        parts = [
+            _grid(
+                part,
+                truth,
+                _of_cell(exposures, truth.artifact, part.view),
+                settings=settings,
+                lost=lost,
+                start_ns=start_ns,
+            )
+            for part in parts
+        ]
     if view.angular and truth.artifact.angular_count:
         found = cell.angular_exposures(truth, index, view, settings=settings, rng=rng)
         lines = _lost(rng, missing, truth.artifact.angular_count)
-        parts = [_angular(part, truth, found, sense=settings.sense, lost=lines)
-                 if part.view.angular else part for part in parts]
+        parts = [
+            _angular(part, truth, found, sense=settings.sense, lost=lines)
+            if part.view.angular
+            else part
+            for part in parts
+        ]
     parts = [replace(part, used=int(part.count.sum() + part.count_theta.sum())) for part in parts]
     return parts[0] if len(parts) == 1 else replace(ViewReadings(view), cells=tuple(parts))
 
@@ -139,8 +209,15 @@ def _read(sense: Sense, found: cell.GridExposures | cell.AngularExposures) -> np
     return found.position + found.offset
 
 
-def _grid(readings: ViewReadings, truth: Truth, found: cell.GridExposures, *,
-          settings: cell.CellSettings, lost: np.ndarray, start_ns: int) -> ViewReadings:
+def _grid(
+    readings: ViewReadings,
+    truth: Truth,
+    found: cell.GridExposures,
+    *,
+    settings: cell.CellSettings,
+    lost: np.ndarray,
+    start_ns: int,
+) -> ViewReadings:
     visits, artifact = found.visits, truth.artifact
     kept = ~lost[artifact.index(visits.m, visits.n)] & found.there
     key = artifact.flat(visits.m, visits.n)
@@ -154,29 +231,60 @@ def _grid(readings: ViewReadings, truth: Truth, found: cell.GridExposures, *,
     by_visit, sigma_visit, dof_visit = _means(deviation, visit, count)
     readings_of = np.bincount(mark, count).astype(int)
     by_mark, _, _ = _means(deviation, of_mark, readings_of)
-    steady, fitted = without_aside(of_mark, deviation, found.offset[:, here],
-                                   readings.view.check_offset_m)
+    steady, fitted = without_aside(
+        of_mark, deviation, found.offset[:, here], readings.view.check_offset_m
+    )
     _, sigma, dof = _means(steady, of_mark, readings_of, fitted)
     offset, _, _ = _means(found.offset[:, here], visit, count)
-    motion = repeat_motion(of_mark, (_read(settings.sense, found) - found.offset)[:, here],
-                           found.offset[:, here], np.zeros(len(of_mark), dtype=bool))
+    motion = repeat_motion(
+        of_mark,
+        (_read(settings.sense, found) - found.offset)[:, here],
+        found.offset[:, here],
+        np.zeros(len(of_mark), dtype=bool),
+    )
     # the stage moves to the first mark one period after the view begins
     first = start_ns + settings.period_ns + settings.exposure_ns
     stamp = first + np.rint(visits.time[kept] * settings.period_ns).astype(np.int64)
-    order, (m, n) = np.lexsort((stamp, mark)), artifact.marks_at(*np.divmod(marks,
-                                                                            artifact.shape[1]))
+    order, (m, n) = (
+        np.lexsort((stamp, mark)),
+        artifact.marks_at(*np.divmod(marks, artifact.shape[1])),
+    )
     dx, dy, ox, oy = (row[order] for row in (*by_visit, *offset))
     approach = found.approach[:, kept][:, order]
     return replace(
-        readings, m=m, n=n, dx=by_mark[0],
-        dy=by_mark[1], count=readings_of, sigma_xy=sigma, dof_xy=dof,
+        readings,
+        m=m,
+        n=n,
+        dx=by_mark[0],
+        dy=by_mark[1],
+        count=readings_of,
+        sigma_xy=sigma,
+        dof_xy=dof,
         motion=motion,
-        visits=GridVisits(mark[order], dx, dy, count[order], stamp[order], ox, oy, approach[0],
-                          approach[1], sigma_m=sigma_visit, dof=dof_visit))
+        visits=GridVisits(
+            mark[order],
+            dx,
+            dy,
+            count[order],
+            stamp[order],
+            ox,
+            oy,
+            approach[0],
+            approach[1],
+            sigma_m=sigma_visit,
+            dof=dof_visit,
+        ),
+    )
 
 
-def _angular(readings: ViewReadings, truth: Truth, found: cell.AngularExposures, *, sense: Sense,
-             lost: np.ndarray) -> ViewReadings:
+def _angular(
+    readings: ViewReadings,
+    truth: Truth,
+    found: cell.AngularExposures,
+    *,
+    sense: Sense,
+    lost: np.ndarray,
+) -> ViewReadings:
     count = truth.artifact.angular_count
     turn = readings.view.on_stage(truth.artifact).s
     nominal = (found.k + turn) % count * (2 * np.pi / count)
@@ -187,12 +295,24 @@ def _angular(readings: ViewReadings, truth: Truth, found: cell.AngularExposures,
     (mean,), sigma, dof = _means(deviation, line, repeats)
     motion = repeat_motion(line, deviation - offset, offset, np.zeros(len(line), dtype=bool))
     about = np.angle(np.exp(1j * (deviation - offset))).mean()
-    return replace(readings, axis_theta=float(about), k=lines, dtheta=mean, count_theta=repeats,
-                   sigma_theta=sigma, dof_theta=dof, motion_theta=motion)
+    return replace(
+        readings,
+        axis_theta=float(about),
+        k=lines,
+        dtheta=mean,
+        count_theta=repeats,
+        sigma_theta=sigma,
+        dof_theta=dof,
+        motion_theta=motion,
+    )
 
 
-def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray, fitted: int = 0,
-           ) -> tuple[np.ndarray, float, int]:
+def _means(
+    values: np.ndarray,
+    group: np.ndarray,
+    count: np.ndarray,
+    fitted: int = 0,
+) -> tuple[np.ndarray, float, int]:
     """Return means (c, groups), the pooled standard deviation of one value, and its dof.
 
     Parameters

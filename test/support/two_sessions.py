@@ -21,8 +21,16 @@ class TwoSessions:
     without; `known`: nodes of the later map, all by default.
     """
 
-    def __init__(self, before: Measurements, after: Measurements, grid, sigma, microscope=(),
-                 known=None, sigma_theta=1.0):
+    def __init__(
+        self,
+        before: Measurements,
+        after: Measurements,
+        grid,
+        sigma,
+        microscope=(),
+        known=None,
+        sigma_theta=1.0,
+    ):
         self.grid, self.sigma = grid, sigma
         self.n, self.marks = grid.field.m.size, grid.m.size
         views = [*((0, view) for view in before.views), *((1, view) for view in after.views)]
@@ -44,7 +52,7 @@ class TwoSessions:
                 session.append(np.full(len(view.k), of))
         prior = np.zeros((self.e, size))
         if self.e:
-            prior[:, -self.e:] = np.diag(1 / np.array(microscope))
+            prior[:, -self.e :] = np.diag(1 / np.array(microscope))
         design = np.vstack([*blocks, prior])
         y = np.concatenate([*values, np.zeros(self.e)])
         early = np.concatenate([*session, np.zeros(self.e)]) == 0
@@ -54,9 +62,9 @@ class TwoSessions:
         self.y, whole = y, placed.datum_modes(grid.field, scale=True).reshape(4, -1).T
         here = np.full(2 * self.n, True) if known is None else np.tile(known.ravel(), 2)
         # both sessions with the scale in which the earlier map has none
-        grown = np.outer(whole[:, 3], np.linalg.pinv(whole)[3] @ both[:2 * self.n])
-        before = without(old[:2 * self.n], whole)
-        after = (both[2 * self.n:4 * self.n] - grown)[here]
+        grown = np.outer(whole[:, 3], np.linalg.pinv(whole)[3] @ both[: 2 * self.n])
+        before = without(old[: 2 * self.n], whole)
+        after = (both[2 * self.n : 4 * self.n] - grown)[here]
         self.scale = np.linalg.pinv(whole[here])[3] @ (after - before[here])
         of_lines = np.stack([old[self.lines], both[self.lines]]).reshape(2, 3, self.K, len(y))
         of_lines = of_lines - of_lines.sum(axis=2, keepdims=True) / max(self.K, 1)
@@ -72,15 +80,15 @@ class TwoSessions:
         phase = np.exp(1j * view.view.rotation_rad)
         row = np.zeros((len(view.m), size), dtype=complex)
         w = placed.rows(self.grid, self.sign * at) * self.sign
-        row[:, 2 * n * of:2 * n * of + n], row[:, 2 * n * of + n:2 * n * of + 2 * n] = w, 1j * w
+        row[:, 2 * n * of : 2 * n * of + n], row[:, 2 * n * of + n : 2 * n * of + 2 * n] = w, 1j * w
         own = np.zeros((len(view.m), marks))
         (hx, hy), ny = self.grid.half, self.grid.shape[1]
         own[np.arange(len(view.m)), (view.m + hx) * ny + view.n + hy] = 1
-        row[:, 4 * n:4 * n + marks] = phase * own
-        row[:, 4 * n + marks:4 * n + 2 * marks] = 1j * phase * own
+        row[:, 4 * n : 4 * n + marks] = phase * own
+        row[:, 4 * n + marks : 4 * n + 2 * marks] = 1j * phase * own
         first = 4 * n + 2 * marks + 3 * number
         z = (view.m + 1j * view.n) * pitch / (pitch * max(hx, hy))
-        row[:, first:first + 3] = np.stack([phase * 1j * z, 1 + 0 * z, 1j + 0 * z], axis=1)
+        row[:, first : first + 3] = np.stack([phase * 1j * z, 1 + 0 * z, 1j + 0 * z], axis=1)
         if self.e:  # one visit of each mark
             o = np.zeros(len(view.m), dtype=complex)
             o[view.visits.mark] = view.visits.offset_x + 1j * view.visits.offset_y

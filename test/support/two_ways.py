@@ -14,9 +14,16 @@ from test.support.truth import Truth
 def maps_of(result: CalibrationResult) -> dict[str, np.ndarray]:
     """Return the maps, uncertainties and first-order parts of a result by name."""
     emap = result.error_map
-    return {"gx": emap.gx, "gy": emap.gy, "u_gx": emap.u_gx, "u_gy": emap.u_gy,
-            "g_theta": emap.g_theta, "u_g_theta": emap.u_g_theta,
-            "o": np.array(emap.nonorthogonality), "r": np.array(emap.scale_difference)}
+    return {
+        "gx": emap.gx,
+        "gy": emap.gy,
+        "u_gx": emap.u_gx,
+        "u_gy": emap.u_gy,
+        "g_theta": emap.g_theta,
+        "u_g_theta": emap.u_g_theta,
+        "o": np.array(emap.nonorthogonality),
+        "r": np.array(emap.scale_difference),
+    }
 
 
 def permuted(readings: Measurements, seed: int = 5) -> Measurements:
@@ -25,27 +32,42 @@ def permuted(readings: Measurements, seed: int = 5) -> Measurements:
     views = []
     for view in readings.views:
         grid, lines = rng.permutation(len(view.m)), rng.permutation(len(view.k))
-        views.append(replace(
-            view, **{name: getattr(view, name)[grid] for name in ("m", "n", "dx", "dy", "count")},
-            **{name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")},
-            u=view.u[grid] if len(view.u) else view.u,
-            u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta))
+        views.append(
+            replace(
+                view,
+                **{name: getattr(view, name)[grid] for name in ("m", "n", "dx", "dy", "count")},
+                **{name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")},
+                u=view.u[grid] if len(view.u) else view.u,
+                u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta,
+            )
+        )
     return replace(readings, views=tuple(views))
 
 
 def turned(readings: Measurements) -> Measurements:
     """Return the readings with stage, plate and plan turned by 90 deg together."""
     old = readings.artifact
-    artifact = Artifact(old.shape[1], old.grid_pitch_m, old.angular_count,
-                        old.shape[0] if old.grid_size_y else 0)
-    return replace(readings, artifact=artifact,
-                   views=tuple(_turned(view, old.angular_count) for view in readings.views))
+    artifact = Artifact(
+        old.shape[1], old.grid_pitch_m, old.angular_count, old.shape[0] if old.grid_size_y else 0
+    )
+    return replace(
+        readings,
+        artifact=artifact,
+        views=tuple(_turned(view, old.angular_count) for view in readings.views),
+    )
 
 
 def _turned(view: ViewReadings, lines: int) -> ViewReadings:
     x, y = view.view.translation_m
-    return replace(view, view=replace(view.view, translation_m=(-y, x)), m=-view.n, n=view.m,
-                   dx=-view.dy, dy=view.dx, k=(view.k + lines // 4) % max(lines, 1))
+    return replace(
+        view,
+        view=replace(view.view, translation_m=(-y, x)),
+        m=-view.n,
+        n=view.m,
+        dx=-view.dy,
+        dy=view.dx,
+        k=(view.k + lines // 4) % max(lines, 1),
+    )
 
 
 def turned_back(result: CalibrationResult) -> dict[str, np.ndarray]:
@@ -64,8 +86,16 @@ def mirrored(readings: Measurements) -> Measurements:
     for view in readings.views:
         x, y = view.view.translation_m
         pose = replace(view.view, rotation_rad=-view.view.rotation_rad, translation_m=(x, -y))
-        views.append(replace(view, view=pose, n=-view.n, dy=-view.dy, dtheta=-view.dtheta,
-                             k=-view.k % max(readings.artifact.angular_count, 1)))
+        views.append(
+            replace(
+                view,
+                view=pose,
+                n=-view.n,
+                dy=-view.dy,
+                dtheta=-view.dtheta,
+                k=-view.k % max(readings.artifact.angular_count, 1),
+            )
+        )
     return replace(readings, views=tuple(views))
 
 
@@ -82,13 +112,22 @@ def mirrored_back(result: CalibrationResult) -> dict[str, np.ndarray]:
 def scaled(readings: Measurements, factor: float) -> Measurements:
     """Return the readings of a stage that is `factor` times as large, errors and all."""
     old = readings.artifact
-    views = tuple(replace(
-        view, view=replace(view.view, translation_m=tuple(
-            value * factor for value in view.view.translation_m)),
-        dx=view.dx * factor, dy=view.dy * factor, u=view.u * factor,
-        sigma_xy=view.sigma_xy * factor) for view in readings.views)
-    return replace(readings, views=views, artifact=replace(
-        old, grid_pitch_m=old.grid_pitch_m * factor))
+    views = tuple(
+        replace(
+            view,
+            view=replace(
+                view.view, translation_m=tuple(value * factor for value in view.view.translation_m)
+            ),
+            dx=view.dx * factor,
+            dy=view.dy * factor,
+            u=view.u * factor,
+            sigma_xy=view.sigma_xy * factor,
+        )
+        for view in readings.views
+    )
+    return replace(
+        readings, views=views, artifact=replace(old, grid_pitch_m=old.grid_pitch_m * factor)
+    )
 
 
 def with_finite_rotations(readings: Measurements, truth: Truth) -> Measurements:

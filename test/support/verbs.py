@@ -14,8 +14,9 @@ def simulate(folder: Path, name: str, plan: dict, **machine: object) -> None:
     assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
 
 
-def two_and_a_view(folder: Path, plan: dict, seeds: tuple[int, int, int],
-                   **machine: object) -> Path:
+def two_and_a_view(
+    folder: Path, plan: dict, seeds: tuple[int, int, int], **machine: object
+) -> Path:
     """Return the folder with two calibrations, results one.json, two.json, and one view: again.
 
     All of one machine and plate, with the seeds of their noise.
@@ -24,6 +25,8 @@ def two_and_a_view(folder: Path, plan: dict, seeds: tuple[int, int, int],
         views = plan["views"][:1] if name == "again" else plan["views"]
         simulate(folder, name, plan | {"views": views}, noise_seed=seed, **machine)
         if name != "again":
-            assert main(["solve", str(folder / name), "-o", str(folder / f"{name}.json"),
-                         "--quiet"]) == 0
+            assert (
+                main(["solve", str(folder / name), "-o", str(folder / f"{name}.json"), "--quiet"])
+                == 0
+            )
     return folder

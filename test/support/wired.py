@@ -26,7 +26,8 @@ def smooth_error(rng):
     for axis in range(2):
         for along in (x, y):
             field[axis] += rng.normal(0, 0.3e-6) * np.sin(
-                rng.uniform(1, 2.5) * np.pi * along + rng.uniform(0, 6))
+                rng.uniform(1, 2.5) * np.pi * along + rng.uniform(0, 6)
+            )
     return field
 
 
@@ -37,8 +38,9 @@ def smooth_angle(rng):
 
 
 def calibrated(truth, rng):
-    readings = simulate_measurements(truth, hu_plan(ARTIFACT), rng, sigma_m=SIGMA_M,
-                                     sigma_theta_rad=SIGMA_RAD)
+    readings = simulate_measurements(
+        truth, hu_plan(ARTIFACT), rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD
+    )
     return calibrate(readings, bare(causes=False))
 
 
@@ -69,6 +71,9 @@ def machine(seed, wiring):
         table, angle = smooth_error(rng), smooth_angle(rng)
     elif wiring == "old":
         table = table + 0.5 * smooth_error(rng)
-    after = replace(random_truth(ARTIFACT, 4, rng), g=first.g - factor * table,
-                    g_theta=first.g_theta - factor * angle)
+    after = replace(
+        random_truth(ARTIFACT, 4, rng),
+        g=first.g - factor * table,
+        g_theta=first.g_theta - factor * angle,
+    )
     return before, calibrated(after, rng), factor

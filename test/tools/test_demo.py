@@ -24,6 +24,7 @@ def picture(size, fill):
 def test_shades_stand_where_the_errors_are_with_y_upwards():
     def fill(gx):
         gx[2, 0], gx[0, 2], gx[1, 1] = 2e-6, -1e-6, np.nan
+
     lines = picture(3, fill)
     assert lines[:3] == ["  +    ", "    ?  ", "      @"]
     assert lines[3].startswith("  length of the error: from ' ' = 0 to '@' = 2 µm;")

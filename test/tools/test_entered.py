@@ -56,7 +56,12 @@ def test_each_function_counts_once_in_the_order_of_first_calls(first):
 
     found = entered.walk(call, first)
     assert [name for *_, name in found.functions] == [
-        "outer", "Box.__init__", "double", "never_first", "inner"]
+        "outer",
+        "Box.__init__",
+        "double",
+        "never_first",
+        "inner",
+    ]
     assert found.files == {first / "first.py", first / "second.py"}
     assert [path.name for path in found.loaded] == ["first.py", "second.py"]
     assert found.returns == 1  # to `inner`, after first.py was left for second.py

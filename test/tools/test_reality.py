@@ -41,10 +41,15 @@ from tools.reality.runs import (
 def test_the_plan_that_resists_turns_and_shifts_both_ways():
     plan = resistant()
     poses = {view.name: view.lattice_pose(plan.artifact) for view in plan.views}
-    assert {name: (pose.quarter_turns, pose.shift) for name, pose in poses.items()
-            if name != "line"} == {
-        "identity": (0, (0, 0)), "rot90": (1, (0, 0)), "shift_x": (0, (1, 0)),
-        "shift_-x": (0, (-1, 0)), "shift_y": (0, (0, 1))}
+    assert {
+        name: (pose.quarter_turns, pose.shift) for name, pose in poses.items() if name != "line"
+    } == {
+        "identity": (0, (0, 0)),
+        "rot90": (1, (0, 0)),
+        "shift_x": (0, (1, 0)),
+        "shift_-x": (0, (-1, 0)),
+        "shift_y": (0, (0, 1)),
+    }
     assert (poses["line"].shift, poses["line"].turn_lines) == ((0, 0), 1)
     assert [view.grid for view in plan.views] == [True] * 5 + [False]
     assert all(view.angular for view in plan.views)
@@ -53,24 +58,36 @@ def test_the_plan_that_resists_turns_and_shifts_both_ways():
 def test_a_site_that_is_wrong_by_more_than_its_u_is_counted_and_sized():
     plan, rng = resistant(1), np.random.default_rng(3)
     truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
-    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9,
-                                             sigma_theta_rad=1e-5))
-    right = compared(replace(result, error_map=replace(
-        result.error_map, gx=truth.g[0].copy(), gy=truth.g[1].copy(),
-        g_theta=truth.g_theta + 1e-3)), truth)
+    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9, sigma_theta_rad=1e-5))
+    right = compared(
+        replace(
+            result,
+            error_map=replace(
+                result.error_map,
+                gx=truth.g[0].copy(),
+                gy=truth.g[1].copy(),
+                g_theta=truth.g_theta + 1e-3,
+            ),
+        ),
+        truth,
+    )
     assert right.error_m < 1e-15 and right.within == 1.0
     assert right.z_theta < 1e-6  # a common angle is no error
     gx = truth.g[0].copy()
     gx[3, 4] += 2e-7
-    wrong = compared(replace(result, error_map=replace(
-        result.error_map, gx=gx, gy=truth.g[1].copy())), truth)
+    wrong = compared(
+        replace(result, error_map=replace(result.error_map, gx=gx, gy=truth.g[1].copy())), truth
+    )
     assert wrong.error_m == pytest.approx(2e-7, rel=0.05)
     assert wrong.within == pytest.approx(1 - 1 / 242, abs=1e-9)
 
 
 def test_cases_have_the_stop_errors_that_their_names_say():
-    said = [(case.name, case.settings.stop_sigma_m) for case in every_case()
-            if "stop errors" in case.name]
+    said = [
+        (case.name, case.settings.stop_sigma_m)
+        for case in every_case()
+        if "stop errors" in case.name
+    ]
     assert len(said) == 6
     for name, stop_m in said:
         assert stop_m == pytest.approx(float(name.split("stop errors ")[1].split(" um")[0]) * 1e-6)
@@ -86,8 +103,10 @@ def test_one_mark_of_the_second_view_is_misread():
     truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
     readings = simulate_measurements(truth, plan, rng)
     spoilt = misread(3e-7)(readings, rng)
-    away = [np.hypot(b.dx - a.dx, b.dy - a.dy)
-            for a, b in zip(readings.views, spoilt.views, strict=True)]
+    away = [
+        np.hypot(b.dx - a.dx, b.dy - a.dy)
+        for a, b in zip(readings.views, spoilt.views, strict=True)
+    ]
     assert [np.count_nonzero(one > 1e-12) for one in away] == [0, 1, 0, 0, 0, 0]
     assert away[1].max() == pytest.approx(3e-7, rel=1e-6)
 
@@ -100,8 +119,9 @@ def test_lines_of_the_second_view_are_turned_and_no_mark():
     moved = [b.dtheta - a.dtheta for a, b in zip(readings.views, turned.views, strict=True)]
     assert [float(np.abs(one).max()) for one in moved] == pytest.approx([0, 2e-6, 0, 0, 0, 0])
     assert moved[1] == pytest.approx(np.full(24, -2e-6))
-    assert all(np.array_equal(a.dx, b.dx)
-               for a, b in zip(readings.views, turned.views, strict=True))
+    assert all(
+        np.array_equal(a.dx, b.dx) for a, b in zip(readings.views, turned.views, strict=True)
+    )
 
 
 def test_a_creep_is_alike_in_all_views_and_comes_to_rest():
@@ -133,14 +153,19 @@ def test_every_case_has_a_name_of_its_own_and_can_be_drawn():
 def read_once(case):
     """Return one of the cells of a case, with every mark read once."""
     drawn = case.draw(np.random.default_rng(5), case) if case.draw else case
-    return replace(drawn, plan=replace(drawn.plan, views=tuple(
-        replace(view, repeats=1) for view in drawn.plan.views)))
+    return replace(
+        drawn,
+        plan=replace(
+            drawn.plan, views=tuple(replace(view, repeats=1) for view in drawn.plan.views)
+        ),
+    )
 
 
 def test_one_machine_is_measured_again_with_other_noise():
     case = Case("clean", plan=resistant(1))
     (one, first, _), (_, again, _), (other, second, _) = (
-        measured(case, 3, part) for part in (1, 1, 2))
+        measured(case, 3, part) for part in (1, 1, 2)
+    )
     np.testing.assert_array_equal(one.g, other.g)
     np.testing.assert_array_equal(first.views[0].dx, again.views[0].dx)
     assert not np.array_equal(first.views[0].dx, second.views[0].dx)
@@ -163,14 +188,19 @@ def test_readings_of_a_bag_are_those_of_the_cell_and_say_what_is_wrong():
     np.testing.assert_allclose(collected.views[0].dx, direct.views[0].dx, atol=1e-15)
     _, _, said = measured(replace(case, change=laid(1, -90.0, (0, 0))), 0, 1)
     assert said == (
-        "the plate lies turned by 270°, not by 90° (or its ids are those of other marks)",)
+        "the plate lies turned by 270°, not by 90° (or its ids are those of other marks)",
+    )
 
 
 def test_advice_is_followed_until_none_is_left():
-    scaled_up = replace(next(
-        case for case in every_case()
-        if case.name == "check stops: scale of the microscope +5 %, plates turned by 0.05 deg"),
-        plan=checked(resistant(2)))
+    scaled_up = replace(
+        next(
+            case
+            for case in every_case()
+            if case.name == "check stops: scale of the microscope +5 %, plates turned by 0.05 deg"
+        ),
+        plan=checked(resistant(2)),
+    )
     course = run_case(scaled_up, 0)
     assert course.first.grade == "enlarged" and course.first.causes[0] == "microscope"
     (step,) = course.steps
@@ -202,12 +232,21 @@ def test_how_many_angles_outside_make_a_map_wrong(outside, holds):
     """Of 24: 7 outside come in 8 of 100,000 clean maps, 6 in 7 of 10,000."""
     plan, rng = resistant(1), np.random.default_rng(3)
     truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
-    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9,
-                                             sigma_theta_rad=1e-5))
+    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9, sigma_theta_rad=1e-5))
     off = np.where(np.arange(24) < outside, 1e-3, 0.0)  # the others: -0.3e-3 from the mean
-    found = compared(replace(result, error_map=replace(
-        result.error_map, gx=truth.g[0].copy(), gy=truth.g[1].copy(),
-        g_theta=truth.g_theta + off, u_g_theta=np.full(24, 2e-4))), truth)
+    found = compared(
+        replace(
+            result,
+            error_map=replace(
+                result.error_map,
+                gx=truth.g[0].copy(),
+                gy=truth.g[1].copy(),
+                g_theta=truth.g_theta + off,
+                u_g_theta=np.full(24, 2e-4),
+            ),
+        ),
+        truth,
+    )
     assert found.holds is holds
 
 
@@ -232,37 +271,65 @@ def test_a_row_says_what_comes_after_the_advice():
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_noise_of_the_encoders_gives_no_wrong_map_that_is_accepted(seed):
     """It looks like a scale of the microscope, far beyond its size, that no test determines."""
-    case, = (c for c in every_case() if c.name.startswith("encoders with 20 nm of noise"))
+    (case,) = (c for c in every_case() if c.name.startswith("encoders with 20 nm of noise"))
     first = run_case(case, seed).first
     assert first.holds or first.grade == "not_qualified"
 
 
 def test_lines_of_the_other_sign_are_not_taken_for_a_microscope_turned_over():
     """A scale of -1 would explain them here: a size beyond all that is plausible is a fault."""
-    case, = (c for c in every_case() if c.name.startswith("offsets of the other sign, lines alone"))
+    (case,) = (
+        c for c in every_case() if c.name.startswith("offsets of the other sign, lines alone")
+    )
     first = run_case(case, 30).first
     assert (first.grade, first.causes) == ("refused", ("WiringError",))
 
 
 def test_the_page_lists_the_cases_with_more_wrong_runs_than_one_in_twenty():
-    first = Summary(40, {"good": 1, "enlarged": 39}, 2, (3, 7), 2e-8, within=0.97, u_within=0.0035,
-                    within_x=0.96, within_y=0.98, within_theta=math.nan, z_xy=0.889,
-                    z_theta=math.nan, causes=(("microscope", 39), ("drift", 1)))
+    first = Summary(
+        40,
+        {"good": 1, "enlarged": 39},
+        2,
+        (3, 7),
+        2e-8,
+        within=0.97,
+        u_within=0.0035,
+        within_x=0.96,
+        within_y=0.98,
+        within_theta=math.nan,
+        z_xy=0.889,
+        z_theta=math.nan,
+        causes=(("microscope", 39), ("drift", 1)),
+    )
     advised = replace(first, grades={"good": 40}, wrong=0)
-    text = table([("scale, 3 urad", [first, advised]), ("turned", [replace(first, wrong=0)]),
-                  ("bent", [replace(first, wrong=3)])])
+    text = table(
+        [
+            ("scale, 3 urad", [first, advised]),
+            ("turned", [replace(first, wrong=0)]),
+            ("bent", [replace(first, wrong=3)]),
+        ]
+    )
     assert text[1:] == ["| bent | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (3) |  | microscope |"]
     assert text[0].count("|") == 2 * text[1].count("|")
     assert row("scale, 3 urad", first, advised) == (
-        "| scale, 3 µrad | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) | 40/0/0/0 (0) | microscope |")
+        "| scale, 3 µrad | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) | 40/0/0/0 (0) | microscope |"
+    )
 
 
 def test_the_record_has_each_case_at_first_and_after_the_advice():
-    bad = Run("enlarged", 3e-8, within=0.5, within_theta=math.nan, z_xy=2.0, holds=False,
-              causes=("drift",))
+    bad = Run(
+        "enlarged",
+        3e-8,
+        within=0.5,
+        within_theta=math.nan,
+        z_xy=2.0,
+        holds=False,
+        causes=("drift",),
+    )
     courses = {0: Course(bad, ("--model drift",), Run("good", 1e-8, within=1.0)), 1: Course(bad)}
-    first, advised = (dict(zip(COLUMNS, line, strict=True))
-                      for line in record(Case("bent by 3 urad"), courses))
+    first, advised = (
+        dict(zip(COLUMNS, line, strict=True)) for line in record(Case("bent by 3 urad"), courses)
+    )
     assert (first["effect"], first["runs"]) == ("bent by 3 µrad", "2")
     assert first["largest_error_nm"] == "30"
     assert (first["in_u_xy"], first["in_u_theta"], first["enlarged"]) == ("50", "", "2")

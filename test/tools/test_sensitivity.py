@@ -15,8 +15,16 @@ BY_NAME = {fault.name: fault for fault in FAULTS}
 
 def effects(name, size=None):
     fault, machine = BY_NAME[name], case_study_machine()
-    return [effect_of(fault, fault.size if size is None else size, machine, method=method,
-                      rng=np.random.default_rng(0)) for method in Method]
+    return [
+        effect_of(
+            fault,
+            fault.size if size is None else size,
+            machine,
+            method=method,
+            rng=np.random.default_rng(0),
+        )
+        for method in Method
+    ]
 
 
 def test_the_new_formulation_does_not_see_the_mirror():
@@ -57,7 +65,8 @@ def test_noise_of_the_linear_measurement_cancels_between_the_diagonals():
     conventional, new = effects("noise of the linear measurement, 3 repeats")
     assert new.transverse_m < 0.01 * NM and new.linear_m > 5 * NM
     assert conventional.linear_m == pytest.approx(
-        effects("none: laser along the machine's own diagonal")[0].linear_m)
+        effects("none: laser along the machine's own diagonal")[0].linear_m
+    )
 
 
 def test_the_unit_of_the_laser_on_one_diagonal_leans_the_axes():
@@ -72,15 +81,19 @@ def test_what_is_no_fault_has_no_size():
 
 
 def test_random_faults_are_repeated_as_often_as_their_names_say():
-    repeats = [fault.apply(case_study_machine(), fault.size)[1].noise.repeats
-               for fault in FAULTS if fault.random]
+    repeats = [
+        fault.apply(case_study_machine(), fault.size)[1].noise.repeats
+        for fault in FAULTS
+        if fault.random
+    ]
     assert repeats == [3, 3]
 
 
 def test_the_table_has_a_line_for_every_row():
     values = dict.fromkeys(("linear_m", "transverse_m", "squareness_m", "straightness_m"), 1e-6)
-    rows = [{"fault": "mirror off", "size": 1e-3, "unit": "rad", "conventional": values,
-             "new": values}] * 2
+    rows = [
+        {"fault": "mirror off", "size": 1e-3, "unit": "rad", "conventional": values, "new": values}
+    ] * 2
     lines = sensitivity_text(rows).splitlines()
     assert len(lines) == 4 and lines[2].split()[2:] == ["0.001", "rad", *["1.0000"] * 8]
 
@@ -89,26 +102,37 @@ def test_the_sweep_is_over_the_angles_of_laser_and_mirror(monkeypatch):
     monkeypatch.setattr(tool, "SWEEP", (1e-4, 1e-3))
     rows = sweep(case_study_machine(), np.random.default_rng(0))
     assert [row["fault"] for row in rows] == [
-        "mirror off, pp", "mirror off, pp and np equally", "laser off, pp",
-        "laser off, pp and np equally", "laser and mirror off, pp",
-        "laser and mirror off, pp and np equally"]
+        "mirror off, pp",
+        "mirror off, pp and np equally",
+        "laser off, pp",
+        "laser off, pp and np equally",
+        "laser and mirror off, pp",
+        "laser and mirror off, pp and np equally",
+    ]
     for row in rows:
         assert row["size"] == [1e-4, 1e-3]
         for place, size in enumerate(row["size"]):
             expected = effects(row["fault"], size)
             assert [row[str(method)][place] for method in Method] == [
-                pytest.approx(vars(one)) for one in expected]
+                pytest.approx(vars(one)) for one in expected
+            ]
 
 
 def test_curves_stand_over_powers_of_ten():
     effect = dict.fromkeys(("linear_m", "transverse_m", "squareness_m"), 1e-9)
     nothing = dict.fromkeys(effect, 0.0)
-    curves = [{"fault": "mirror off", "size": [1e-4, 1e-3, 1e-2],
-               "conventional": [nothing, effect, dict.fromkeys(effect, 1e-6)],
-               "new": [nothing] * 3}]
+    curves = [
+        {
+            "fault": "mirror off",
+            "size": [1e-4, 1e-3, 1e-2],
+            "conventional": [nothing, effect, dict.fromkeys(effect, 1e-6)],
+            "new": [nothing] * 3,
+        }
+    ]
     drawing = sensitivity_figure(curves)
-    low, middle, high = next(item.lines[0] for item in drawing.items if isinstance(item, Line)
-                             and item.dash)
+    low, middle, high = next(
+        item.lines[0] for item in drawing.items if isinstance(item, Line) and item.dash
+    )
     assert middle[0] - low[0] == pytest.approx(high[0] - middle[0])
     assert low[1] - middle[1] == pytest.approx(middle[1] - high[1])  # 1 pm, 1 nm, 1 um
     words = {item.text for item in drawing.items if isinstance(item, Label)}

@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-TOOLS = [path for path in sorted((ROOT / "tools").glob("*.py"))
-         if "argparse.ArgumentParser" in path.read_text(encoding="utf-8")]
+TOOLS = [
+    path
+    for path in sorted((ROOT / "tools").glob("*.py"))
+    if "argparse.ArgumentParser" in path.read_text(encoding="utf-8")
+]
 
 
 EACH = """
@@ -30,8 +33,14 @@ for tool in tools:
 
 
 def test_each_tool_starts_and_says_what_it_takes():
-    started = subprocess.run([sys.executable, "-c", EACH, *map(str, TOOLS)], cwd=ROOT, text=True,
-                             capture_output=True, check=False, timeout=120)
+    started = subprocess.run(
+        [sys.executable, "-c", EACH, *map(str, TOOLS)],
+        cwd=ROOT,
+        text=True,
+        capture_output=True,
+        check=False,
+        timeout=120,
+    )
     assert started.returncode == 0, started.stderr
     said = started.stdout.split("ended with 0\n")
     assert said.pop() == ""

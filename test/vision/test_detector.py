@@ -15,14 +15,27 @@ PIXEL = 2e-6
 
 
 def camera(mark="disc", size=25.0, **more):
-    return Camera(**({"width": 121, "height": 111, "mark": mark, "encoding": "mono16",
-                      "mark_size_m": size * PIXEL, "mark_width_m": size * PIXEL / 5,
-                      "read_noise": 0.0, "shot_noise": 0.0} | more))
+    return Camera(
+        **(
+            {
+                "width": 121,
+                "height": 111,
+                "mark": mark,
+                "encoding": "mono16",
+                "mark_size_m": size * PIXEL,
+                "mark_width_m": size * PIXEL / 5,
+                "read_noise": 0.0,
+                "shot_noise": 0.0,
+            }
+            | more
+        )
+    )
 
 
 def detector(mark="disc", size=25.0, **more):
-    return MarkDetector(DetectorSettings(**({
-        "pixel_size": PIXEL, "mark": mark, "mark_size": size * PIXEL} | more)))
+    return MarkDetector(
+        DetectorSettings(**({"pixel_size": PIXEL, "mark": mark, "mark_size": size * PIXEL} | more))
+    )
 
 
 def picture(values):
@@ -52,8 +65,9 @@ def test_bias_is_below_a_two_hundredth_of_a_pixel_at_all_phases(mark, polarity, 
     levels = {"ground": 0.8} if polarity == "dark" else {"ground": 0.1}
     cell = camera(mark, polarity=polarity, blur_px=0.6, vignetting=vignetting, **levels)
     phases = (np.stack(np.meshgrid(np.arange(4), np.arange(4))).reshape(2, -1).T / 4 - 0.4) * PIXEL
-    missed, _ = errors(cell, detector(mark, polarity=polarity), phases + 20 * PIXEL,
-                       np.random.default_rng(3))
+    missed, _ = errors(
+        cell, detector(mark, polarity=polarity), phases + 20 * PIXEL, np.random.default_rng(3)
+    )
     assert np.abs(missed).max() < 0.005
 
 
@@ -64,9 +78,15 @@ def test_errors_over_their_uncertainty_have_unit_variance(mark):
     for number in range(50):
         size, bright = rng.uniform(14, 40), number % 2 == 1
         noise = 0.6 / np.exp(rng.uniform(np.log(10), np.log(200)))
-        cell = camera(mark, size, polarity="bright" if bright else "dark",
-                      ground=0.15 if bright else 0.8, blur_px=rng.uniform(0.6, 0.06 * size),
-                      read_noise=noise * rng.uniform(0.2, 1), shot_noise=noise)
+        cell = camera(
+            mark,
+            size,
+            polarity="bright" if bright else "dark",
+            ground=0.15 if bright else 0.8,
+            blur_px=rng.uniform(0.6, 0.06 * size),
+            read_noise=noise * rng.uniform(0.2, 1),
+            shot_noise=noise,
+        )
         found = detector(mark, size, polarity=cell.polarity)
         ratios.append(errors(cell, found, rng.uniform(-9, 9, (1, 2)) * PIXEL, rng)[1])
     square = np.square(np.concatenate(ratios))
@@ -78,8 +98,9 @@ def test_thin_lines_are_found_though_their_width_and_contrast_are_hard_to_tell_a
     rng, ratios = np.random.default_rng(3), []
     for _ in range(60):
         size = rng.uniform(7, 12)
-        cell = camera("ring", size, blur_px=0.7,
-                      read_noise=0.6 / np.exp(rng.uniform(np.log(20), np.log(200))))
+        cell = camera(
+            "ring", size, blur_px=0.7, read_noise=0.6 / np.exp(rng.uniform(np.log(20), np.log(200)))
+        )
         found = detector("ring", size)
         ratios.append(errors(cell, found, rng.uniform(-3, 3, (1, 2)) * PIXEL, rng)[1])
     square = np.square(np.concatenate(ratios))
@@ -95,9 +116,14 @@ def test_pixels_are_counted_from_the_centre_of_the_first_one_and_rows_run_down()
     [mark] = detector(**given).marks(picture(values))[0]
     assert (mark.u, mark.v) == pytest.approx((30, 14), abs=1e-6)
     left, up = -20 * PIXEL, 26 * PIXEL  # the axis is at (50, 40)
-    for turn, mirror, expected in ((0.0, False, (left, up)), (0.0, True, (-left, up)),
-                                   (90.0, False, (-up, left)), (90.0, True, (-up, -left)),
-                                   (180.0, False, (-left, -up)), (-90.0, False, (up, -left))):
+    for turn, mirror, expected in (
+        (0.0, False, (left, up)),
+        (0.0, True, (-left, up)),
+        (90.0, False, (-up, left)),
+        (90.0, True, (-up, -left)),
+        (180.0, False, (-left, -up)),
+        (-90.0, False, (up, -left)),
+    ):
         eye = detector(**given, turn=turn, mirror=mirror)
         [found] = eye.detections(eye.marks(picture(values))[0], values.shape, 7)
         assert (found.offset_x, found.offset_y) == pytest.approx(expected, abs=1e-11)
@@ -122,7 +148,8 @@ def test_the_simulated_camera_and_the_detector_agree_on_turn_and_mirror():
         away = rng.uniform(-40, 40, 2) * PIXEL
         u, v = cell.pixels_of(away[:, None])[:, 0]
         assert offset(u, v, (111, 121), detector(**pose).settings) == pytest.approx(
-            tuple(away), abs=1e-15)
+            tuple(away), abs=1e-15
+        )
 
 
 def test_sigma_is_the_uncertainty_in_metres():
@@ -130,8 +157,7 @@ def test_sigma_is_the_uncertainty_in_metres():
     image = picture(cell.image(np.zeros((2, 1)), np.random.default_rng(2)))
     [mark], _ = detector().marks(image)
     [found] = detector().detections([mark], image.values.shape, 0)
-    assert found.sigma == pytest.approx(
-        PIXEL * np.sqrt((mark.u_u ** 2 + mark.u_v ** 2) / 2), rel=1e-12)
+    assert found.sigma == pytest.approx(PIXEL * np.sqrt((mark.u_u**2 + mark.u_v**2) / 2), rel=1e-12)
     assert found.score == mark.score > 0.98
 
 
@@ -141,7 +167,7 @@ def drawn(away=(0.0, 0.0), rng=None, **more):
 
 
 def disc(values, column, row, radius, level):
-    v, u = np.mgrid[:values.shape[0], :values.shape[1]]
+    v, u = np.mgrid[: values.shape[0], : values.shape[1]]
     values[np.hypot(u - column, v - row) <= radius] = round(level * 65535)
     return values
 
@@ -151,18 +177,24 @@ def test_a_good_mark_has_no_fault():
     assert len(marks) == 1 and not faults
 
 
-@pytest.mark.parametrize("reason, values", [
-    ("cut_off", drawn((52, 0))), ("cut_off", drawn((0, -49))),
-    ("defocused", drawn(blur_px=5.0)),
-    ("wrong_size", drawn(size=33.0)), ("wrong_size", drawn(size=18.0)),
-    ("dirt", disc(drawn(), 60, 41, 3, 0.05)),  # on the edge: darker than a mark
-    ("dirt", disc(drawn(), 43, 55, 3, 0.3)),  # beside, as dark as a mark
-    ("broken", disc(drawn(), 66, 55, 4, 0.75)),  # a piece is missing
-    ("reflection", disc(drawn(), 60, 55, 4, 0.99)),
-    ("reflection", disc(drawn(), 70, 50, 4, 0.99)),
-    ("reflection", disc(drawn(), 80, 50, 1, 0.99)),  # at the rim of the window
-    ("saturated", drawn(ground=1.2, contrast=0.9)),
-    ("weak", drawn(ground=0.5, contrast=0.08, shot_noise=0.1))])
+@pytest.mark.parametrize(
+    "reason, values",
+    [
+        ("cut_off", drawn((52, 0))),
+        ("cut_off", drawn((0, -49))),
+        ("defocused", drawn(blur_px=5.0)),
+        ("wrong_size", drawn(size=33.0)),
+        ("wrong_size", drawn(size=18.0)),
+        ("dirt", disc(drawn(), 60, 41, 3, 0.05)),  # on the edge: darker than a mark
+        ("dirt", disc(drawn(), 43, 55, 3, 0.3)),  # beside, as dark as a mark
+        ("broken", disc(drawn(), 66, 55, 4, 0.75)),  # a piece is missing
+        ("reflection", disc(drawn(), 60, 55, 4, 0.99)),
+        ("reflection", disc(drawn(), 70, 50, 4, 0.99)),
+        ("reflection", disc(drawn(), 80, 50, 1, 0.99)),  # at the rim of the window
+        ("saturated", drawn(ground=1.2, contrast=0.9)),
+        ("weak", drawn(ground=0.5, contrast=0.08, shot_noise=0.1)),
+    ],
+)
 def test_a_bad_mark_is_rejected_with_its_reason(reason, values):
     settings = {"max_sigma_px": 0.05} if reason == "weak" else {}
     marks, faults = detector(**settings).marks(picture(values))
@@ -185,9 +217,13 @@ def test_the_full_scale_of_a_camera_of_12_bits_can_be_given():
 
 def test_nothing_is_found_where_there_is_nothing():
     rng = np.random.default_rng(1)
-    for values in (np.zeros((100, 120), np.uint8), np.full((9, 9), 255, np.uint8),
-                   np.zeros((1, 1), np.uint8), np.zeros((2, 4000), np.uint16),
-                   rng.integers(90, 110, (200, 200)).astype(np.uint8)):
+    for values in (
+        np.zeros((100, 120), np.uint8),
+        np.full((9, 9), 255, np.uint8),
+        np.zeros((1, 1), np.uint8),
+        np.zeros((2, 4000), np.uint16),
+        rng.integers(90, 110, (200, 200)).astype(np.uint8),
+    ):
         assert detector().marks(picture(values)) == ([], {})
 
 
@@ -198,13 +234,20 @@ def test_nine_marks_are_found_row_by_row():
     marks, faults = detector().marks(picture(image))
     assert not faults
     assert np.array([(mark.u - 150, 140 - mark.v) for mark in marks]) == pytest.approx(
-        lattice.T, abs=0.01)
+        lattice.T, abs=0.01
+    )
 
 
-@pytest.mark.parametrize("wrong, problem", [
-    ({"pixel_size": 0.0}, "pixel_size: is not set"), ({"size": 0.0}, "mark_size: is not set"),
-    ({"size": 3.0}, "mark_size: 3 pixels"), ({"size": 1e5}, "mark_size: 1e"),
-    ({"mark": "ring", "mark_width": 13 * PIXEL}, "mark_width: at least half")])
+@pytest.mark.parametrize(
+    "wrong, problem",
+    [
+        ({"pixel_size": 0.0}, "pixel_size: is not set"),
+        ({"size": 0.0}, "mark_size: is not set"),
+        ({"size": 3.0}, "mark_size: 3 pixels"),
+        ({"size": 1e5}, "mark_size: 1e"),
+        ({"mark": "ring", "mark_width": 13 * PIXEL}, "mark_width: at least half"),
+    ],
+)
 def test_impossible_sizes_are_refused(wrong, problem):
     with pytest.raises(InputError, match=problem):
         detector(**wrong)

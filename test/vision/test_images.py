@@ -17,9 +17,19 @@ from selfcal_ros.vision.images import decoded, picture_of
 
 
 def message(values, encoding, **more):
-    return SimpleNamespace(**({
-        "height": values.shape[0], "width": values.shape[1], "encoding": encoding,
-        "is_bigendian": 0, "step": values.strides[0], "data": values.tobytes()} | more))
+    return SimpleNamespace(
+        **(
+            {
+                "height": values.shape[0],
+                "width": values.shape[1],
+                "encoding": encoding,
+                "is_bigendian": 0,
+                "step": values.strides[0],
+                "data": values.tobytes(),
+            }
+            | more
+        )
+    )
 
 
 GREY = np.arange(12, dtype=np.uint8).reshape(3, 4)
@@ -35,8 +45,9 @@ def test_grey_images(kind, encoding):
 def test_the_order_of_bytes_and_padded_rows_are_obeyed():
     big = (GREY.astype(np.uint16) * 1000).astype(">u2")
     padded = np.concatenate([big, np.zeros((3, 5), ">u2")], axis=1).astype(">u2")
-    found = picture_of(message(big, "mono16", is_bigendian=1, data=padded.tobytes(),
-                               step=padded.strides[0]))
+    found = picture_of(
+        message(big, "mono16", is_bigendian=1, data=padded.tobytes(), step=padded.strides[0])
+    )
     assert (found.values == big).all()
 
 
@@ -53,17 +64,26 @@ def test_encoded_images(kind, full):
     file = io.BytesIO()
     Image.fromarray(values).save(file, "PNG")
     data = np.frombuffer(file.getvalue(), np.uint8)  # as rosbags gives it
-    for found in (picture_of(SimpleNamespace(format="png", data=data)),
-                  decoded(file.getvalue(), "a.png")):
+    for found in (
+        picture_of(SimpleNamespace(format="png", data=data)),
+        decoded(file.getvalue(), "a.png"),
+    ):
         assert (found.values == values).all()
         assert (found.values.dtype, found.full_scale) == (kind, full)
 
 
-@pytest.mark.parametrize("wrong, problem", [
-    ({"encoding": "bayer_rggb8"}, "encoding 'bayer_rggb8'"), ({"height": 4}, "12 bytes in rows"),
-    ({"width": 5}, "12 bytes"), ({"height": 0}, "12 bytes"), ({"step": 0}, "in rows of 0"),
-    ({"height": 2**32 - 1, "width": 2**32 - 1, "step": 2**32 - 1}, "are not 4294967295"),
-    ({"data": b""}, "0 bytes")])
+@pytest.mark.parametrize(
+    "wrong, problem",
+    [
+        ({"encoding": "bayer_rggb8"}, "encoding 'bayer_rggb8'"),
+        ({"height": 4}, "12 bytes in rows"),
+        ({"width": 5}, "12 bytes"),
+        ({"height": 0}, "12 bytes"),
+        ({"step": 0}, "in rows of 0"),
+        ({"height": 2**32 - 1, "width": 2**32 - 1, "step": 2**32 - 1}, "are not 4294967295"),
+        ({"data": b""}, "0 bytes"),
+    ],
+)
 def test_impossible_images_are_refused(wrong, problem):
     with pytest.raises(InputError, match=problem):
         picture_of(message(GREY, **({"encoding": "mono8"} | wrong)))
@@ -82,13 +102,16 @@ def test_what_cannot_be_decoded_is_refused(data):
         decoded(data, "f.png")
 
 
-EPS = (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n%%EndComments\n"
-       b"0 setgray 20 20 60 60 rectfill showpage\n%%EOF\n")
+EPS = (
+    b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n%%EndComments\n"
+    b"0 setgray 20 20 60 60 rectfill showpage\n%%EOF\n"
+)
 
 
 def test_no_format_is_decoded_that_needs_a_program(monkeypatch):
     def run(*_, **__):
         pytest.fail("a program was started")
+
     monkeypatch.setattr(subprocess, "Popen", run)
     monkeypatch.setattr(os, "system", run)
     assert EpsImagePlugin.EpsImageFile(io.BytesIO(EPS)).size == (100, 100)  # Pillow would take it
@@ -105,11 +128,14 @@ def saved(picture, kind="PNG", **more) -> bytes:
 def test_a_size_is_checked_before_an_image_is_decoded(monkeypatch):
     def refuse(shape):
         raise InputError("a.png", f"of {shape}")
+
     data = saved(Image.fromarray(GREY))
     monkeypatch.setattr(Image.Image, "load", lambda _: pytest.fail("decoded"))
-    for asked in (lambda: decoded(data, "a.png", refuse),
-                  lambda: picture_of(SimpleNamespace(format="png", data=data), refuse),
-                  lambda: picture_of(message(GREY, "mono8"), refuse)):
+    for asked in (
+        lambda: decoded(data, "a.png", refuse),
+        lambda: picture_of(SimpleNamespace(format="png", data=data), refuse),
+        lambda: picture_of(message(GREY, "mono8"), refuse),
+    ):
         with pytest.raises(InputError, match=r"of \(3, 4\)"):
             asked()
 
@@ -142,23 +168,41 @@ def tiff(values, *tags) -> bytes:
     order, entry = (">", ">HHIHxx") if values.dtype.byteorder == ">" else ("<", "<HHII")
     data = values.tobytes() + bytes(values.nbytes % 2)
     height, width = values.shape[:2]
-    entries = {256: width, 257: height, 258: 8 * values.itemsize, 259: 1, 262: 1, 273: 8, 277: 1,
-               278: height, 279: values.nbytes, **dict(tags)}
+    entries = {
+        256: width,
+        257: height,
+        258: 8 * values.itemsize,
+        259: 1,
+        262: 1,
+        273: 8,
+        277: 1,
+        278: height,
+        279: values.nbytes,
+        **dict(tags),
+    }
     kind = 3 if order == ">" else 4
-    directory = b"".join(struct.pack(entry, tag, kind, 1, value)
-                         for tag, value in sorted(entries.items()))
+    directory = b"".join(
+        struct.pack(entry, tag, kind, 1, value) for tag, value in sorted(entries.items())
+    )
     head = struct.pack(f"{order}2sHI", b"II" if order == "<" else b"MM", 42, 8 + len(data))
     return head + data + struct.pack(f"{order}H", len(entries)) + directory + bytes(4)
 
 
 def png(colour, depth, rows) -> bytes:
     """Return a PNG of rows of bytes, of 4 pixels, written as its specification says."""
+
     def chunk(name, data):
-        return struct.pack(">I", len(data)) + name + data + struct.pack(
-            ">I", zlib.crc32(name + data))
-    return b"\x89PNG\r\n\x1a\n" + b"".join([
-        chunk(b"IHDR", struct.pack(">IIBBBBB", 4, len(rows), depth, colour, 0, 0, 0)),
-        chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows))), chunk(b"IEND", b"")])
+        return (
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        )
+
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        [
+            chunk(b"IHDR", struct.pack(">IIBBBBB", 4, len(rows), depth, colour, 0, 0, 0)),
+            chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows))),
+            chunk(b"IEND", b""),
+        ]
+    )
 
 
 WIDE = GREY.astype("<u2") * 300
@@ -189,16 +233,21 @@ def test_white_is_0_in_8_bits_is_turned_round():
     assert (decoded(tiff(GREY, (262, 0)), "f.tif").values == 255 - GREY).all()
 
 
-@pytest.mark.parametrize(("data", "problem"), [
-    (tiff(WIDE, (262, 0)), "white is 0"), (tiff(GREY, (339, 2)), "signed values"),
-    (tiff(WIDE - 1, (339, 2)), "values beyond 16 bits"),
-    (tiff(GREY, (256, 2)), "6 rows of pixels instead of 3"),
-    (tiff(WIDE, (257, 2)), "3 rows of pixels instead of 2"),
-    (tiff(GREY, (274, 6)), "its EXIF orientation is not 1"),
-    (png(2, 16, COLOUR_16), "16 bits in the mode RGB"),
-    (png(4, 16, GREY_ALPHA_16), "16 bits in the mode"),
-    (saved(Image.fromarray(VEILED)), "transparent pixels"),
-    (saved(Image.fromarray(GREY), transparency=3), "transparent pixels")])
+@pytest.mark.parametrize(
+    ("data", "problem"),
+    [
+        (tiff(WIDE, (262, 0)), "white is 0"),
+        (tiff(GREY, (339, 2)), "signed values"),
+        (tiff(WIDE - 1, (339, 2)), "values beyond 16 bits"),
+        (tiff(GREY, (256, 2)), "6 rows of pixels instead of 3"),
+        (tiff(WIDE, (257, 2)), "3 rows of pixels instead of 2"),
+        (tiff(GREY, (274, 6)), "its EXIF orientation is not 1"),
+        (png(2, 16, COLOUR_16), "16 bits in the mode RGB"),
+        (png(4, 16, GREY_ALPHA_16), "16 bits in the mode"),
+        (saved(Image.fromarray(VEILED)), "transparent pixels"),
+        (saved(Image.fromarray(GREY), transparency=3), "transparent pixels"),
+    ],
+)
 def test_pixels_that_would_be_turned_cut_or_inverted_are_refused(data, problem):
     with pytest.raises(InputError, match=rf"^f: cannot be decoded as an image \({problem}"):
         decoded(data, "f")

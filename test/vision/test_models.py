@@ -19,22 +19,28 @@ def test_derivatives_are_those_of_the_shape(mark):
     for column in range(2 + len(p)):
         change = np.zeros(2 + len(p))
         change[column] = STEP
-        plus, minus = (model.shape(u - sign * change[0], v - sign * change[1],
-                                   p + sign * change[2:])[0] for sign in (1, -1))
+        plus, minus = (
+            model.shape(u - sign * change[0], v - sign * change[1], p + sign * change[2:])[0]
+            for sign in (1, -1)
+        )
         assert by[column] == pytest.approx((plus - minus) / (2 * STEP), abs=3e-5)
 
 
 def test_an_edge_is_a_step_blurred_by_a_gaussian_and_the_pixel():
     u = np.linspace(0.0, 20.0, 1001)
     shape, _ = MODELS["disc"].shape(u, np.zeros_like(u), np.array([20.0, 1.1]))
-    assert shape == pytest.approx(ndtr((10 - u) / np.sqrt(1.1 ** 2 + 1 / 12)), abs=1e-7)
+    assert shape == pytest.approx(ndtr((10 - u) / np.sqrt(1.1**2 + 1 / 12)), abs=1e-7)
 
 
-@pytest.mark.parametrize("mark, inside, outside", [
-    ("disc", [(0, 0), (9, 0), (6, -6)], [(11, 0), (8, 8)]),
-    ("ring", [(8, 0), (-5.5, 5.5)], [(0, 0), (4, 0), (11, 0)]),
-    ("cross", [(0, 0), (9, 0), (0, -9), (2, 2)], [(4, 4), (11, 0), (9, 4)]),
-    ("corner", [(3, 3), (-3, -3)], [(3, -3), (-3, 3)])])
+@pytest.mark.parametrize(
+    "mark, inside, outside",
+    [
+        ("disc", [(0, 0), (9, 0), (6, -6)], [(11, 0), (8, 8)]),
+        ("ring", [(8, 0), (-5.5, 5.5)], [(0, 0), (4, 0), (11, 0)]),
+        ("cross", [(0, 0), (9, 0), (0, -9), (2, 2)], [(4, 4), (11, 0), (9, 4)]),
+        ("corner", [(3, 3), (-3, -3)], [(3, -3), (-3, 3)]),
+    ],
+)
 def test_shapes_are_one_inside_and_zero_outside(mark, inside, outside):
     model = MODELS[mark]
     p = model.start(20.0, 5.0, 0.0, 0.1)

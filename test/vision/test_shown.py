@@ -9,7 +9,7 @@ from selfcal_ros.vision.shown import spots_in
 
 def spots(side, *, dark, pitch=60, shape=(300, 360)):
     """Return an image of discs on a lattice, half of the ground in a slope, with noise."""
-    v, u = np.mgrid[:shape[0], :shape[1]].astype(float)
+    v, u = np.mgrid[: shape[0], : shape[1]].astype(float)
     away = np.hypot((u % pitch) - pitch / 2, (v % pitch) - pitch / 2)
     inside = away <= side / 2
     ground, mark = (180.0, 60.0) if dark else (60.0, 180.0)

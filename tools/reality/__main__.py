@@ -19,27 +19,51 @@ from selfcal_ros.units import NM_PER_M
 from tools.reality.cases import Case
 from tools.reality.runs import GRADES, Course, Summary, every_case, once, rows
 
-HEADER = ("| effect | in U: XY, θ, % | error / u: XY, θ | grades (wrong) | after the advice | "
-          "first cause |\n|---|---|---|---|---|---|")
-COLUMNS = ("effect", "after_advice", "runs", "largest_error_nm", "in_u_xy", "u_in_u_xy", "in_u_x",
-           "in_u_y", "in_u_theta", "error_over_u_xy", "error_over_u_theta", *GRADES, "wrong",
-           "first_cause", "runs_of_cause")
+HEADER = (
+    "| effect | in U: XY, θ, % | error / u: XY, θ | grades (wrong) | after the advice | "
+    "first cause |\n|---|---|---|---|---|---|"
+)
+COLUMNS = (
+    "effect",
+    "after_advice",
+    "runs",
+    "largest_error_nm",
+    "in_u_xy",
+    "u_in_u_xy",
+    "in_u_x",
+    "in_u_y",
+    "in_u_theta",
+    "error_over_u_xy",
+    "error_over_u_theta",
+    *GRADES,
+    "wrong",
+    "first_cause",
+    "runs_of_cause",
+)
 WRONG = 0.05
 """Part of the runs of a case that may be wrong and accepted; the page lists cases with more."""
 
 SHOWN = {
-    "plates turned by": "φσ", "um": "µm", " deg": "°", "urad": "µrad",
+    "plates turned by": "φσ",
+    "um": "µm",
+    " deg": "°",
+    "urad": "µrad",
     "of the other sign": "with the wrong sign",
     "stage that never scatters": "stage without scatter",
-    "laid by hand": "placed by hand", "after each laying down": "after each placement",
+    "laid by hand": "placed by hand",
+    "after each laying down": "after each placement",
     "marks that lie 1 mm beside": "marks 1 mm away from",
-    "marks that lie 2 mm beside": "marks 2 mm away from", "alike in": "the same in",
+    "marks that lie 2 mm beside": "marks 2 mm away from",
+    "alike in": "the same in",
     "beside white noise": "plus white noise",
     "declared 800 µm/m wrong": "declared wrong by 800 µm/m",
-    "to the other side": "in the opposite direction", "all of them": "all of these",
-    "nothing, and no noise": "no effect, no noise", "stops: nothing": "stops: no effect",
+    "to the other side": "in the opposite direction",
+    "all of them": "all of these",
+    "nothing, and no noise": "no effect, no noise",
+    "stops: nothing": "stops: no effect",
     "ids: nothing": "ids: no effect",
-    "microscope as its default uncertainty says": "microscope drawn from its default uncertainty"}
+    "microscope as its default uncertainty says": "microscope drawn from its default uncertainty",
+}
 """Text of a case's name -> how the table shows it. Seeds depend on the name itself."""
 
 
@@ -60,51 +84,90 @@ def row(name: str, found: Summary, advised: Summary | None = None) -> str:
     within_theta = f"{100 * found.within_theta:.1f}"
     cause = found.causes[0][0] if found.causes else "–"
     after = grades(advised) if advised else ""
-    text = (f"| {shown(name)} | {within_xy}, {within_theta} | "
-            f"{found.z_xy:.2f}, {found.z_theta:.2f} | {grades(found)} | {after} | {cause} |")
+    text = (
+        f"| {shown(name)} | {within_xy}, {within_theta} | "
+        f"{found.z_xy:.2f}, {found.z_theta:.2f} | {grades(found)} | {after} | {cause} |"
+    )
     return text.replace("nan ± nan", "–").replace("nan", "–")
 
 
 def table(cases: list[tuple[str, list[Summary]]]) -> list[str]:
     """Return the page's table: the cases with more wrong and accepted runs than `WRONG`."""
-    return [HEADER, *(row(name, found, *advised)
-                      for name, (found, *advised) in cases if found.wrong > WRONG * found.runs)]
+    return [
+        HEADER,
+        *(
+            row(name, found, *advised)
+            for name, (found, *advised) in cases
+            if found.wrong > WRONG * found.runs
+        ),
+    ]
 
 
 def record(case: Case, courses: dict[int, Course]) -> Iterator[list[str]]:
     """Yield the lines of a case for the table of all cases, of `COLUMNS`."""
     followed = sum(bool(course.steps) for course in courses.values())
     for (_, found), advised in zip(rows(case, courses), ("", str(followed)), strict=False):
-        numbers = (found.error_m * NM_PER_M, 100 * found.within, 200 * found.u_within,
-                   100 * found.within_x, 100 * found.within_y, 100 * found.within_theta,
-                   found.z_xy, found.z_theta)
+        numbers = (
+            found.error_m * NM_PER_M,
+            100 * found.within,
+            200 * found.u_within,
+            100 * found.within_x,
+            100 * found.within_y,
+            100 * found.within_theta,
+            found.z_xy,
+            found.z_theta,
+        )
         cause, count = found.causes[0] if found.causes else ("", "")
-        yield [shown(case.name), advised, str(found.runs),
-               *(f"{number:.3g}" if math.isfinite(number) else "" for number in numbers),
-               *(str(found.grades.get(grade, 0)) for grade in GRADES), str(found.wrong),
-               cause, str(count)]
+        yield [
+            shown(case.name),
+            advised,
+            str(found.runs),
+            *(f"{number:.3g}" if math.isfinite(number) else "" for number in numbers),
+            *(str(found.grades.get(grade, 0)) for grade in GRADES),
+            str(found.wrong),
+            cause,
+            str(count),
+        ]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=40, help="runs of each case (default: 40); "
-                        "25 times as many of the clean population, 5 times of the others")
+    parser.add_argument(
+        "--runs",
+        type=int,
+        default=40,
+        help="runs of each case (default: 40); "
+        "25 times as many of the clean population, 5 times of the others",
+    )
     parser.add_argument("--first", type=int, default=0, help="seed of the first run (default: 0)")
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
-    parser.add_argument("--only", action="append", help="only cases whose name contains this text; "
-                        "may be given again for others")
+    parser.add_argument(
+        "--only",
+        action="append",
+        help="only cases whose name contains this text; may be given again for others",
+    )
     parser.add_argument("--list", action="store_true", help="list the cases and do nothing")
-    parser.add_argument("-o", "--output", help="write the table to this page, between its marks, "
-                        "and all cases to the .csv beside it; or every run to a .json")
+    parser.add_argument(
+        "-o",
+        "--output",
+        help="write the table to this page, between its marks, "
+        "and all cases to the .csv beside it; or every run to a .json",
+    )
     args = parser.parse_args()
     every = every_case()
-    chosen = [i for i, case in enumerate(every)
-              if not args.only or any(text in case.name for text in args.only)]
+    chosen = [
+        i
+        for i, case in enumerate(every)
+        if not args.only or any(text in case.name for text in args.only)
+    ]
     if args.list:
         print("\n".join(every[i].name for i in chosen))
         return 0
-    jobs = [(index, args.first + run) for index in chosen
-            for run in range(args.runs * every[index].times)]
+    jobs = [
+        (index, args.first + run)
+        for index in chosen
+        for run in range(args.runs * every[index].times)
+    ]
     cases: list[tuple[str, list[Summary]]] = []
     lines, done = [list(COLUMNS)], []
     for index, courses in finished(jobs, check_workers(args.workers)):
@@ -155,9 +218,11 @@ def finished(jobs: list[tuple[int, int]], workers: int):
 
 
 def as_json(case: Case, courses: dict[int, Course]) -> dict:
-    return {"case": case.name, "rows": [{"row": name, **asdict(summary)}
-                                        for name, summary in rows(case, courses)],
-            "runs": [{"seed": seed, **asdict(course)} for seed, course in courses.items()]}
+    return {
+        "case": case.name,
+        "rows": [{"row": name, **asdict(summary)} for name, summary in rows(case, courses)],
+        "runs": [{"seed": seed, **asdict(course)} for seed, course in courses.items()],
+    }
 
 
 if __name__ == "__main__":

@@ -123,27 +123,34 @@ def measured(case: Case, seed: int, part: int) -> tuple[Truth, Measurements, tup
     What is said is why most detections of a view were rejected.
     """
     machine, placing = _rng(case, seed, 0), _rng(case, seed, part)
-    truth = random_truth(case.plan.artifact, len(case.plan.views), machine, case.spread,
-                         placing=placing)
+    truth = random_truth(
+        case.plan.artifact, len(case.plan.views), machine, case.spread, placing=placing
+    )
     truth = case.change(truth, placing)
     if case.messages:
         return truth, *_collected(truth, case, placing)
-    readings = simulate_measurements(truth, case.plan, placing, settings=case.settings,
-                                     visits=True, missing=case.missing)
+    readings = simulate_measurements(
+        truth, case.plan, placing, settings=case.settings, visits=True, missing=case.missing
+    )
     return truth, case.spoil(readings, placing), ()
 
 
-def _collected(truth: Truth, case: Case, rng: np.random.Generator,
-               ) -> tuple[Measurements, tuple[str, ...]]:
+def _collected(
+    truth: Truth,
+    case: Case,
+    rng: np.random.Generator,
+) -> tuple[Measurements, tuple[str, ...]]:
     """Return the readings, and what is said of them, as `selfcal solve` has them from a bag."""
-    collector = gathered(plan_events(truth, case.plan, settings=case.settings, rng=rng,
-                                     start_ns=FIRST_STAMP_NS),
-                         measurement_sense=str(case.settings.sense))
+    collector = gathered(
+        plan_events(truth, case.plan, settings=case.settings, rng=rng, start_ns=FIRST_STAMP_NS),
+        measurement_sense=str(case.settings.sense),
+    )
     measurements, views = collector.collect()
     findings = collector.findings(measurements, views).values()
     return measurements, tuple(
         str(found).partition("stage_not_at_mark: ")[2].partition("; ")[0] or str(found)
-        for found in findings)
+        for found in findings
+    )
 
 
 def _calibrated(readings: Measurements, options: Options) -> CalibrationResult | str:
@@ -165,15 +172,27 @@ def compared(result: CalibrationResult | str, truth: Truth, said: tuple[str, ...
     theta = theta - np.nanmean(theta) if np.isfinite(theta).any() else theta
     k = result.noise.k_xy
     within, z_xy = _covered(error, np.stack([emap.u_gx, emap.u_gy]), k)
-    within_x, within_y = (_covered(each, u, k)[0] for each, u in zip(
-        error, (emap.u_gx, emap.u_gy), strict=True))
+    within_x, within_y = (
+        _covered(each, u, k)[0] for each, u in zip(error, (emap.u_gx, emap.u_gy), strict=True)
+    )
     within_theta, z_theta = _covered(theta, emap.u_g_theta, result.noise.k_theta)
     n_theta = int(np.isfinite(theta).sum())
-    holds = not (within < limit(int(np.isfinite(error).sum()))
-                 or within_theta < binom.ppf(BY_CHANCE, n_theta, COVERAGE) / max(n_theta, 1))
-    return Run(grade_of(result), float(np.nanmax(np.abs(error))), within, within_theta, z_xy,
-               z_theta, holds, (*said, *(cause.name for cause in result.verdict.causes)), within_x,
-               within_y)
+    holds = not (
+        within < limit(int(np.isfinite(error).sum()))
+        or within_theta < binom.ppf(BY_CHANCE, n_theta, COVERAGE) / max(n_theta, 1)
+    )
+    return Run(
+        grade_of(result),
+        float(np.nanmax(np.abs(error))),
+        within,
+        within_theta,
+        z_xy,
+        z_theta,
+        holds,
+        (*said, *(cause.name for cause in result.verdict.causes)),
+        within_x,
+        within_y,
+    )
 
 
 def limit(n_errors: int) -> float:
@@ -239,11 +258,18 @@ def summarise(runs: list[Run], seeds: list[int]) -> Summary:
     wrong = tuple(seed for seed, run in zip(seeds, runs, strict=True) if run.wrong)
     within = _values(kept, "within")
     return Summary(
-        len(runs), dict(Counter(run.grade for run in runs)), len(wrong), wrong,
-        float(np.median(_values(kept, "error_m"))), float(within.mean()),
-        float(within.std() / np.sqrt(len(within))), *(
-            float(_values(kept, name).mean()) for name in ("within_x", "within_y", "within_theta")),
-        rms(_values(kept, "z_xy")), rms(_values(kept, "z_theta")), tuple(causes.most_common(3)))
+        len(runs),
+        dict(Counter(run.grade for run in runs)),
+        len(wrong),
+        wrong,
+        float(np.median(_values(kept, "error_m"))),
+        float(within.mean()),
+        float(within.std() / np.sqrt(len(within))),
+        *(float(_values(kept, name).mean()) for name in ("within_x", "within_y", "within_theta")),
+        rms(_values(kept, "z_xy")),
+        rms(_values(kept, "z_theta")),
+        tuple(causes.most_common(3)),
+    )
 
 
 def _values(runs: list[Run], name: str) -> np.ndarray:
@@ -259,5 +285,7 @@ def rows(case: Case, courses: dict[int, Course]) -> Iterator[tuple[str, Summary]
     yield case.name, summarise([courses[seed].first for seed in seeds], seeds)
     followed = sum(bool(course.steps) for course in courses.values())
     if followed:
-        yield (f"after the advice ({followed} of {len(seeds)} followed)",
-               summarise([courses[seed].end for seed in seeds], seeds))
+        yield (
+            f"after the advice ({followed} of {len(seeds)} followed)",
+            summarise([courses[seed].end for seed in seeds], seeds),
+        )

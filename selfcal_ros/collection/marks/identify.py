@@ -63,9 +63,17 @@ class MarkAssignment:
     phi_error_rad: float = float("inf")
 
 
-def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids: np.ndarray,
-                  has_id: np.ndarray, rules: IdentityRules, stage_m: np.ndarray | None = None,
-                  beside_m: np.ndarray | None = None) -> MarkAssignment:
+def identify_grid(
+    artifact: Artifact,
+    view: View,
+    reading_m: np.ndarray,
+    *,
+    ids: np.ndarray,
+    has_id: np.ndarray,
+    rules: IdentityRules,
+    stage_m: np.ndarray | None = None,
+    beside_m: np.ndarray | None = None,
+) -> MarkAssignment:
     """Identify grid marks and return their deviations from the nominal places of the view.
 
     A mark is rejected if the stage is not at its site, and not used for the others.
@@ -91,11 +99,15 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     reasons = np.full(reading_m.shape[1], None, dtype=object)
     if not view.grid:
         reasons[:] = Reason.NOT_IN_VIEW
-        return MarkAssignment(ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons,
-                          rigids.Rigid())
+        return MarkAssignment(
+            ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons, rigids.Rigid()
+        )
     named_unknown = has_id & ~artifact.has(*ids)
-    marks = np.where(has_id & ~named_unknown, ids,
-                     np.array([[artifact.marks.ids[0]], [0]]) if artifact.marks else 0)
+    marks = np.where(
+        has_id & ~named_unknown,
+        ids,
+        np.array([[artifact.marks.ids[0]], [0]]) if artifact.marks else 0,
+    )
     reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)  # squares stay finite
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
     limit_m = rules.stage_limit_m(artifact) + view.check_offset_m
@@ -122,9 +134,14 @@ def identify_grid(artifact: Artifact, view: View, reading_m: np.ndarray, *, ids:
     astray |= _astray(pose, marks, stage_m, artifact, limit_m, among=free & ~far)
     stop = site if beside_m is None else np.round(site - beside_m / pitch, 9)
     beyond = pose.beyond_field(stop, artifact) & ~unsure
-    for where, reason in ((far, Reason.TOO_FAR), (astray, Reason.NOT_AT_MARK),
-                          (ambiguous, Reason.AMBIGUOUS), (unsure, Reason.ROTATION),
-                          (beyond, Reason.NOT_IN_VIEW), (named_unknown, Reason.UNKNOWN_MARK)):
+    for where, reason in (
+        (far, Reason.TOO_FAR),
+        (astray, Reason.NOT_AT_MARK),
+        (ambiguous, Reason.AMBIGUOUS),
+        (unsure, Reason.ROTATION),
+        (beyond, Reason.NOT_IN_VIEW),
+        (named_unknown, Reason.UNKNOWN_MARK),
+    ):
         reasons[where] = reason
     return MarkAssignment(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
 
@@ -134,8 +151,15 @@ def _at_most_two(numbers: np.ndarray) -> bool:
     return not len(numbers) or bool(((numbers == numbers.min()) | (numbers == numbers.max())).all())
 
 
-def _astray(pose: StagePose, marks: np.ndarray, stage_m: np.ndarray | None, artifact: Artifact,
-            limit_m: float, *, among: np.ndarray) -> np.ndarray:
+def _astray(
+    pose: StagePose,
+    marks: np.ndarray,
+    stage_m: np.ndarray | None,
+    artifact: Artifact,
+    limit_m: float,
+    *,
+    among: np.ndarray,
+) -> np.ndarray:
     """Return which of the `among` marks (2, n) have the stage too far from their sites."""
     if stage_m is None or not among.any():
         return np.zeros(marks.shape[1], dtype=bool)
@@ -148,8 +172,11 @@ def _astray(pose: StagePose, marks: np.ndarray, stage_m: np.ndarray | None, arti
     return astray & among
 
 
-def _nearest(pose: StagePose, centred: np.ndarray, artifact: Artifact,
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _nearest(
+    pose: StagePose,
+    centred: np.ndarray,
+    artifact: Artifact,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return nearest mark (2, n), distance ratio to the second nearest, distance in m.
 
     Also, of a list of marks, the distance of the two nearest ones from each other, m.
@@ -171,9 +198,14 @@ def _nearest(pose: StagePose, centred: np.ndarray, artifact: Artifact,
     return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch, every
 
 
-def _settle(pose: StagePose, centred: np.ndarray, artifact: Artifact, ids: np.ndarray,
-            kinds: tuple[np.ndarray, np.ndarray],
-            rules: IdentityRules) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
+def _settle(
+    pose: StagePose,
+    centred: np.ndarray,
+    artifact: Artifact,
+    ids: np.ndarray,
+    kinds: tuple[np.ndarray, np.ndarray],
+    rules: IdentityRules,
+) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
     """Return the estimate of the view's own motion, extended outwards from unambiguous marks.
 
     Far from the centre a rotational misalignment may exceed half a pitch. So marks without ids
@@ -184,8 +216,11 @@ def _settle(pose: StagePose, centred: np.ndarray, artifact: Artifact, ids: np.nd
     about = _about(pose, ids, artifact)
     use, fit = named, rigids.fit_motion(*rigids.columns_where(named, about, centred - about))
     innermost = _innermost_of_list if artifact.marks else _innermost
-    known = (fit.known(pitch, rules.max_rotation_rad) if named.any() else
-             innermost(_rows(pose, artifact), centred[:, free], artifact, rules.max_rotation_rad))
+    known = (
+        fit.known(pitch, rules.max_rotation_rad)
+        if named.any()
+        else innermost(_rows(pose, artifact), centred[:, free], artifact, rules.max_rotation_rad)
+    )
     while free.any():
         nominal = known.rigid.undo(centred)
         nearest, ratio, _, apart = _nearest(pose, nominal, artifact)
@@ -198,8 +233,7 @@ def _settle(pose: StagePose, centred: np.ndarray, artifact: Artifact, ids: np.nd
         fit = rigids.fit_motion(*rigids.columns_where(use, about, centred - about))
         known = fit.known(pitch, rules.max_rotation_rad)
     whole = named.any() or artifact.marks
-    return (known, fit) if whole else _folded(
-        _rows(pose, artifact), known, fit, pitch)
+    return (known, fit) if whole else _folded(_rows(pose, artifact), known, fit, pitch)
 
 
 def _rows(pose: StagePose, artifact: Artifact) -> StagePose:
@@ -211,24 +245,32 @@ def _rows(pose: StagePose, artifact: Artifact) -> StagePose:
     return LatticePose(0, (0, 0), None) if alike else pose
 
 
-def _innermost(rows: StagePose, centred: np.ndarray, artifact: Artifact,
-               max_rotation_rad: float) -> rigids.MotionEstimate:
+def _innermost(
+    rows: StagePose, centred: np.ndarray, artifact: Artifact, max_rotation_rad: float
+) -> rigids.MotionEstimate:
     """Return the offset at the innermost mark from marks around it, up to whole pitches."""
     pitch = artifact.grid_pitch_m
     if not centred.shape[1]:
         return rigids.MotionEstimate(phi_error_rad=max_rotation_rad)
     centre = centred[:, np.argmin(np.hypot(*centred))]
     near = np.hypot(*(centred - centre[:, None])) * max_rotation_rad <= SURE * pitch
-    offset = np.array([
-        _middle((row - off * pitch) * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
-        for row, off in zip(rows.turned_back(*centred[:, near]), artifact.off_centre, strict=True)])
+    offset = np.array(
+        [
+            _middle((row - off * pitch) * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
+            for row, off in zip(
+                rows.turned_back(*centred[:, near]), artifact.off_centre, strict=True
+            )
+        ]
+    )
     x, y = map(float, rows.turned(*offset))
-    return rigids.MotionEstimate(rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0,
-                          max_rotation_rad)
+    return rigids.MotionEstimate(
+        rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0, max_rotation_rad
+    )
 
 
-def _innermost_of_list(pose: StagePose, centred: np.ndarray, artifact: Artifact,
-                       max_rotation_rad: float) -> rigids.MotionEstimate:
+def _innermost_of_list(
+    pose: StagePose, centred: np.ndarray, artifact: Artifact, max_rotation_rad: float
+) -> rigids.MotionEstimate:
     """Return the offset with which most detections near the innermost one lie on marks of a list.
 
     The smallest one of those with nearly as many: a list may have parts like a lattice.
@@ -244,16 +286,22 @@ def _innermost_of_list(pose: StagePose, centred: np.ndarray, artifact: Artifact,
     among = marks.tree.query(some.T, CANDIDATES)[1]
     offsets = (some[:, :, None] - marks.places_m[:, among]).reshape(2, -1)
     there = some[:, None] - offsets[:, :, None]
-    hits = (marks.tree.query(there.reshape(2, -1).T)[0].reshape(len(offsets[0]), -1)
-            < ON_MARK * pitch).sum(axis=1)
+    hits = (
+        marks.tree.query(there.reshape(2, -1).T)[0].reshape(len(offsets[0]), -1) < ON_MARK * pitch
+    ).sum(axis=1)
     away = np.where(hits >= 0.9 * hits.max(), np.hypot(*offsets), np.inf)
     x, y = map(float, pose.turned(*offsets[:, int(away.argmin())]))
-    return rigids.MotionEstimate(rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])),
-                                 ON_MARK * pitch, max_rotation_rad)
+    return rigids.MotionEstimate(
+        rigids.Rigid(0.0, x, y),
+        (float(centre[0]), float(centre[1])),
+        ON_MARK * pitch,
+        max_rotation_rad,
+    )
 
 
-def _folded(rows: StagePose, known: rigids.MotionEstimate, fit: rigids.RigidFit,
-            pitch: float) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
+def _folded(
+    rows: StagePose, known: rigids.MotionEstimate, fit: rigids.RigidFit, pitch: float
+) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
     """Return the motion whose offset at the plate's centre is below half a pitch.
 
     Marks without ids determine it only up to whole pitches, and not at all if they are so far out
@@ -263,8 +311,10 @@ def _folded(rows: StagePose, known: rigids.MotionEstimate, fit: rigids.RigidFit,
         return replace(known, offset_error_m=float("inf")), fit
     offset = rows.turned_back(*np.array([known.rigid.tx_m, known.rigid.ty_m]))
     x, y = map(float, rows.turned(*np.rint(np.array(offset) / pitch) * pitch))
-    moved = [replace(rigid, tx_m=rigid.tx_m - x, ty_m=rigid.ty_m - y)
-             for rigid in (known.rigid, fit.rigid)]
+    moved = [
+        replace(rigid, tx_m=rigid.tx_m - x, ty_m=rigid.ty_m - y)
+        for rigid in (known.rigid, fit.rigid)
+    ]
     return replace(known, rigid=moved[0]), replace(fit, rigid=moved[1])
 
 
@@ -272,9 +322,16 @@ def _about(pose: StagePose, marks: np.ndarray, artifact: Artifact) -> np.ndarray
     return np.stack(pose.turned(*artifact.places(*marks))) * artifact.grid_pitch_m
 
 
-def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *, ids: np.ndarray,
-                     has_id: np.ndarray, rules: IdentityRules, phi_rad: float | None,
-                     ) -> MarkAssignment:
+def identify_angular(
+    artifact: Artifact,
+    view: View,
+    reading_rad: np.ndarray,
+    *,
+    ids: np.ndarray,
+    has_id: np.ndarray,
+    rules: IdentityRules,
+    phi_rad: float | None,
+) -> MarkAssignment:
     """Identify angular lines and return their deviations, wrapped to (-pi, pi].
 
     Parameters
@@ -297,8 +354,9 @@ def identify_angular(artifact: Artifact, view: View, reading_rad: np.ndarray, *,
     count = artifact.angular_count
     if not count or not view.angular:
         reasons[:] = Reason.NOT_IN_VIEW
-        return MarkAssignment(np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)),
-                          reasons, rigids.Rigid())
+        return MarkAssignment(
+            np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)), reasons, rigids.Rigid()
+        )
     step = 2 * np.pi / count
     whole, part = divmod(view.on_stage(artifact).s, 1)
     base, between = int(whole), part * step  # a turn between two lines only for a Fourier map
@@ -328,8 +386,9 @@ def _nearest_line_is_sure(phi_rad: float, step_rad: float, max_rotation_rad: flo
     Lines determine a rotation only up to whole steps. The apparent rotation is the true one if
     every possible rotation is below half a step, and the apparent one is possible.
     """
-    return (max_rotation_rad <= HALF_A_LINE * step_rad
-            and abs(phi_rad) <= max(max_rotation_rad, step_rad / 4))
+    return max_rotation_rad <= HALF_A_LINE * step_rad and abs(phi_rad) <= max(
+        max_rotation_rad, step_rad / 4
+    )
 
 
 def _middle(angles_rad: np.ndarray, period_rad: float) -> float:

@@ -59,8 +59,8 @@ def row_medians(values: np.ndarray) -> np.ndarray:
     half = values.shape[-1] // 2
     rising = np.sort(values, axis=-1)
     if values.shape[-1] % 2:
-        return rising[..., half:half + 1]
-    return (rising[..., half - 1:half] + rising[..., half:half + 1]) / 2
+        return rising[..., half : half + 1]
+    return (rising[..., half - 1 : half] + rising[..., half : half + 1]) / 2
 
 
 def distances(away: np.ndarray) -> np.ndarray:
@@ -86,9 +86,16 @@ class Means:
     companions: np.ndarray
 
 
-def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
-                   limit: float, extent: float = 0.0, residual: np.ndarray | None = None,
-                   steady: tuple[np.ndarray, int] | None = None) -> Means:
+def reduce_repeats(
+    key: np.ndarray,
+    values: np.ndarray,
+    sigma: np.ndarray,
+    *,
+    limit: float,
+    extent: float = 0.0,
+    residual: np.ndarray | None = None,
+    steady: tuple[np.ndarray, int] | None = None,
+) -> Means:
     """Reject outliers and average the repeats of every mark.
 
     Parameters
@@ -120,8 +127,7 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     """
     outlier, (judged, fitted) = np.zeros(len(key), dtype=bool), steady or (values, 0)
     if limit > 0 and len(key):
-        outlier = _outliers(key, judged, _relative(sigma), (limit, extent),
-                            residual)
+        outlier = _outliers(key, judged, _relative(sigma), (limit, extent), residual)
     means = average(key[~outlier], values[:, ~outlier], sigma[~outlier])
     if fitted:
         told = average(key[~outlier], judged[:, ~outlier], sigma[~outlier])
@@ -131,8 +137,9 @@ def reduce_repeats(key: np.ndarray, values: np.ndarray, sigma: np.ndarray, *,
     return replace(means, outlier=outlier)
 
 
-def average(key: np.ndarray, values: np.ndarray, sigma: np.ndarray,
-            companions: np.ndarray | None = None) -> Means:
+def average(
+    key: np.ndarray, values: np.ndarray, sigma: np.ndarray, companions: np.ndarray | None = None
+) -> Means:
     """Average the readings of each key; arguments as for `reduce_repeats`, none is an outlier.
 
     `companions` (e, n) are averaged likewise, without effect on the repeatability.
@@ -141,8 +148,9 @@ def average(key: np.ndarray, values: np.ndarray, sigma: np.ndarray,
     declared = np.bincount(inverse, sigma > 0, len(marks)) == count
     best = np.full(len(marks), np.inf)  # weights relative to a mark's best reading stay finite
     np.minimum.at(best, inverse, sigma)
-    weight = np.where(declared[inverse] & (sigma > 0),
-                      (best[inverse] / np.where(sigma > 0, sigma, 1)) ** 2, 1.0)
+    weight = np.where(
+        declared[inverse] & (sigma > 0), (best[inverse] / np.where(sigma > 0, sigma, 1)) ** 2, 1.0
+    )
     total = np.bincount(inverse, weight, len(marks))
     mean = _means(values, weight, inverse, total)
     rest = values - mean[:, inverse]
@@ -165,16 +173,21 @@ def _distinct(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return marks, np.repeat(inverse, length), count
 
 
-def _means(values: np.ndarray, weight: np.ndarray, inverse: np.ndarray,
-           total: np.ndarray) -> np.ndarray:
+def _means(
+    values: np.ndarray, weight: np.ndarray, inverse: np.ndarray, total: np.ndarray
+) -> np.ndarray:
     """Return weighted means relative to each mark's first repeat: exact if repeats are equal."""
     if not len(inverse):
         return np.zeros((len(values), 0))
     first = np.full(len(total), len(inverse))
     np.minimum.at(first, inverse, np.arange(len(inverse)))
     base = values[:, first]
-    return base + np.array([np.bincount(inverse, weight * (row - b[inverse]), len(total)) / total
-                            for row, b in zip(values, base, strict=True)])
+    return base + np.array(
+        [
+            np.bincount(inverse, weight * (row - b[inverse]), len(total)) / total
+            for row, b in zip(values, base, strict=True)
+        ]
+    )
 
 
 def _relative(sigma: np.ndarray) -> np.ndarray:
@@ -185,8 +198,13 @@ def _relative(sigma: np.ndarray) -> np.ndarray:
     return np.where(declared, sigma, np.median(sigma[declared])) / np.median(sigma[declared])
 
 
-def _outliers(key: np.ndarray, values: np.ndarray, relative: np.ndarray,
-              limits: tuple[float, float], residual: np.ndarray | None) -> np.ndarray:
+def _outliers(
+    key: np.ndarray,
+    values: np.ndarray,
+    relative: np.ndarray,
+    limits: tuple[float, float],
+    residual: np.ndarray | None,
+) -> np.ndarray:
     groups = groups_of(key)
     limit, extent = limits
     scale, pairs = _pair_scale(groups, values, relative)
@@ -224,7 +242,7 @@ def _parts(group: np.ndarray, width: int) -> Iterator[np.ndarray]:
     """Yield the marks of a group in parts, for work with `width` numbers per mark."""
     size = max(1, PART // width)
     for start in range(0, len(group), size):
-        yield group[start:start + size]
+        yield group[start : start + size]
 
 
 def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> float:
@@ -252,30 +270,43 @@ def pairs_of(count: int) -> tuple[np.ndarray, np.ndarray]:
     return i, (i + np.repeat(lags, count)) % count
 
 
-def _pair_scale(groups: list[np.ndarray], values: np.ndarray,
-                relative: np.ndarray) -> tuple[float, int]:
+def _pair_scale(
+    groups: list[np.ndarray], values: np.ndarray, relative: np.ndarray
+) -> tuple[float, int]:
     """Return the robust standard deviation of one reading, and the number of pairs."""
     if not groups:
         return float("nan"), 0
-    every = np.empty(len(values) * sum(len(group) * len(pairs_of(group.shape[1])[0])
-                                       for group in groups))
+    every = np.empty(
+        len(values) * sum(len(group) * len(pairs_of(group.shape[1])[0]) for group in groups)
+    )
     done, alike = 0, bool((relative == 1).all())  # as where no sigma is declared
     for group in groups:
         i, j = pairs_of(group.shape[1])
         for part in _parts(group, len(i)):
             weights, repeats = relative[part], np.take(values, part, axis=1)
-            norm = np.sqrt(2) if alike else np.hypot(np.take(weights, i, axis=1),
-                                                     np.take(weights, j, axis=1))
+            norm = (
+                np.sqrt(2)
+                if alike
+                else np.hypot(np.take(weights, i, axis=1), np.take(weights, j, axis=1))
+            )
             apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
-            every[done:done + apart.size] = (np.abs(apart) / norm).ravel()
+            every[done : done + apart.size] = (np.abs(apart) / norm).ravel()
             done += apart.size
     independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
     return median(every, overwrite=True) / 0.6744897501960817, independent
 
 
-def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: np.ndarray,
-                deviation: np.ndarray, offset: np.ndarray, approach: np.ndarray,
-                step_m: float = np.inf) -> GridVisits | None:
+def grid_visits(
+    means: Means,
+    key: np.ndarray,
+    sigma: np.ndarray,
+    *,
+    stamps_ns: np.ndarray,
+    deviation: np.ndarray,
+    offset: np.ndarray,
+    approach: np.ndarray,
+    step_m: float = np.inf,
+) -> GridVisits | None:
     """Return the visits behind the means of a view's grid marks; None without any.
 
     A visit is a run of successive exposures of one mark: it ends with an exposure of another mark,
@@ -316,11 +347,22 @@ def grid_visits(means: Means, key: np.ndarray, sigma: np.ndarray, *, stamps_ns: 
     offset_x, offset_y, since = found.companions[:, order]
     came_x, came_y = (
         np.where(_differs(row[kept], visit, first), 0, row[kept][first]).astype(np.int8)[order]
-        for row in approach)
+        for row in approach
+    )
     return GridVisits(
-        mark[order], found.mean[0, order], found.mean[1, order], found.count[order],
-        stamps_ns[first][order] + np.rint(since).astype(np.int64), offset_x, offset_y, came_x,
-        came_y, u=found.u[order] if len(found.u) else found.u, sigma_m=found.sigma, dof=found.dof)
+        mark[order],
+        found.mean[0, order],
+        found.mean[1, order],
+        found.count[order],
+        stamps_ns[first][order] + np.rint(since).astype(np.int64),
+        offset_x,
+        offset_y,
+        came_x,
+        came_y,
+        u=found.u[order] if len(found.u) else found.u,
+        sigma_m=found.sigma,
+        dof=found.dof,
+    )
 
 
 def _differs(values: np.ndarray, visit: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -328,8 +370,9 @@ def _differs(values: np.ndarray, visit: np.ndarray, first: np.ndarray) -> np.nda
     return np.bincount(visit, values != values[first][visit], len(first)) > 0
 
 
-def repeat_motion(key: np.ndarray, place: np.ndarray, offset: np.ndarray,
-                  outlier: np.ndarray) -> RepeatMotion | None:
+def repeat_motion(
+    key: np.ndarray, place: np.ndarray, offset: np.ndarray, outlier: np.ndarray
+) -> RepeatMotion | None:
     """Return the response of the offsets of the marks to the stage; None without repeats.
 
     Outliers are excluded unless the stage had moved as well: offsets of the wrong sign or scale
@@ -355,8 +398,9 @@ def repeat_motion(key: np.ndarray, place: np.ndarray, offset: np.ndarray,
     if free <= 0:
         return None
     about = np.concatenate([_about_means(key, place), _about_means(key, offset)])
-    slow = _about_means(key, np.polynomial.legendre.legvander(
-        np.linspace(-1, 1, len(key)), SLOW)[:, 1:].T)
+    slow = _about_means(
+        key, np.polynomial.legendre.legvander(np.linspace(-1, 1, len(key)), SLOW)[:, 1:].T
+    )
     trend = np.linalg.lstsq(slow @ slow.T, slow @ about.T, rcond=None)[0]
     change = np.diff(about - trend.T @ slow)
     return RepeatMotion(change @ change.T / 2, 2 * free // 3)  # neighbours share a reading

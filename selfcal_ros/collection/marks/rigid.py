@@ -30,8 +30,9 @@ class Rigid:
     def at(self, p: np.ndarray) -> np.ndarray:
         """Return the deviation at nominal positions `p` (2, n) about the plate centre."""
         turn, one = np.sin(self.phi_rad), np.cos(self.phi_rad) - 1
-        return np.stack([one * p[0] - turn * p[1] + self.tx_m,
-                         turn * p[0] + one * p[1] + self.ty_m])
+        return np.stack(
+            [one * p[0] - turn * p[1] + self.tx_m, turn * p[0] + one * p[1] + self.ty_m]
+        )
 
     def undo(self, q: np.ndarray) -> np.ndarray:
         """Return the nominal positions (2, n) of marks read at `q`."""
@@ -96,8 +97,9 @@ class RigidFit:
         """Largest error of the rotation, from the scatter of the marks; inf below three."""
         if self.marks < 3 or not self.power_m2:
             return float("inf")
-        return FEW_MARKS_COVERAGE * float(np.sqrt(
-            self.squares_m2 / (2 * self.marks - 3) / self.power_m2))
+        return FEW_MARKS_COVERAGE * float(
+            np.sqrt(self.squares_m2 / (2 * self.marks - 3) / self.power_m2)
+        )
 
     def known(self, pitch_m: float, max_rotation_rad: float) -> MotionEstimate:
         """Return the estimate from the fit combined with prior knowledge.
@@ -113,10 +115,12 @@ class RigidFit:
             found = scatter / np.sqrt(self.power_m2)
             weight = max_rotation_rad**2 / (max_rotation_rad**2 + found**2)
             error = weight * found + (1 - weight) * max_rotation_rad
-        rigid = _through(weight * self.rigid.phi_rad, self.centre_m,
-                         self.rigid.at(np.array(self.centre_m)))
-        return MotionEstimate(rigid, self.centre_m,
-                              float(scatter * np.sqrt(1 + 1 / max(self.marks, 1))), float(error))
+        rigid = _through(
+            weight * self.rigid.phi_rad, self.centre_m, self.rigid.at(np.array(self.centre_m))
+        )
+        return MotionEstimate(
+            rigid, self.centre_m, float(scatter * np.sqrt(1 + 1 / max(self.marks, 1))), float(error)
+        )
 
 
 def _through(phi_rad: float, centre: tuple[float, float], deviation: np.ndarray) -> Rigid:
@@ -173,8 +177,10 @@ def _median_motion(p: np.ndarray, deviation: np.ndarray) -> Rigid:
     return _through(phi_rad, tuple(middle), offset)
 
 
-def _least_squares(p: np.ndarray, deviation: np.ndarray,
-                   ) -> tuple[Rigid, tuple[float, float], float]:
+def _least_squares(
+    p: np.ndarray,
+    deviation: np.ndarray,
+) -> tuple[Rigid, tuple[float, float], float]:
     """Return the motion, the centre of the marks and the sum of squared distances from it."""
     middle, mean = p.mean(axis=1), deviation.mean(axis=1)
     arm = p - middle[:, None]

@@ -29,8 +29,12 @@ NEAR = 0.3
 """Distance, in pitches, within which a shift is taken to be a likely one."""
 SURELY = 0.5
 """Largest ratio of the distances of the marks from their places, found over planned pose."""
-MIRRORS = {0: "{n} reversed", 90: "{m} and {n} exchanged", 180: "{m} reversed",
-           270: "{m} and {n} exchanged and both reversed"}
+MIRRORS = {
+    0: "{n} reversed",
+    90: "{m} and {n} exchanged",
+    180: "{m} reversed",
+    270: "{m} and {n} exchanged and both reversed",
+}
 """Turn, deg, of the mirrored marks (m, -n) -> what the ids are."""
 
 
@@ -93,14 +97,17 @@ class SeenPose:
     def text(self, others: str) -> str:
         """Return what is wrong, and the remedy, in one line; `others`: what other views show."""
         if self.mirrored:
-            return (f"{self.mirror}, or the plate lies upside down; correct the ids, or place "
-                    f"the plate as planned and measure this view again{others}")
+            return (
+                f"{self.mirror}, or the plate lies upside down; correct the ids, or place "
+                f"the plate as planned and measure this view again{others}"
+            )
         error = said(self.pose)
         return f"{error.what} (or its ids are those of other marks); {error.remedy}{others}"
 
 
-def seen_poses(views: Mapping[int, NamedMarks], limit: float,
-               max_rotation_rad: float) -> dict[int, SeenPose]:
+def seen_poses(
+    views: Mapping[int, NamedMarks], limit: float, max_rotation_rad: float
+) -> dict[int, SeenPose]:
     """Return view_index -> how its marks are seen, of views that show it.
 
     Parameters
@@ -120,11 +127,16 @@ def texts(seen: Mapping[int, SeenPose]) -> dict[int, str]:
     """Return view_index -> what is wrong with views that are not seen as planned."""
     wrong = {index: one for index, one in seen.items() if not one.planned}
     right = len(wrong) < len(seen)
-    others = "; other views are as planned: leave the joints and the sense as they are" if (
-        right) else ""
+    others = (
+        "; other views are as planned: leave the joints and the sense as they are"
+        if (right)
+        else ""
+    )
     exchanged = dict(_exchanged(wrong))
-    return {index: f"{exchanged[index]}{others}" if index in exchanged else one.text(others)
-            for index, one in wrong.items()}
+    return {
+        index: f"{exchanged[index]}{others}" if index in exchanged else one.text(others)
+        for index, one in wrong.items()
+    }
 
 
 def mirrored_alike(seen: Iterable[SeenPose]) -> str:
@@ -139,15 +151,23 @@ def _exchanged(wrong: Mapping[int, SeenPose]) -> Iterator[tuple[int, str]]:
     for index, one in wrong.items():
         for other, seen in wrong.items():
             if other != index and not one.mirrored and _lies_as(one, seen) and _lies_as(seen, one):
-                yield index, (f"the plate lies as planned for view '{seen.pose.view}', and there "
-                              "as planned for this one: the views are exchanged; measure them in "
-                              "the order of the plan, or exchange them in the plan")
+                yield (
+                    index,
+                    (
+                        f"the plate lies as planned for view '{seen.pose.view}', and there "
+                        "as planned for this one: the views are exchanged; measure them in "
+                        "the order of the plan, or exchange them in the plan"
+                    ),
+                )
 
 
 def _lies_as(one: SeenPose, other: SeenPose) -> bool:
     a, b = one.pose, other.pose
-    return not other.mirrored and a.found_deg == b.planned_deg and bool(
-        np.hypot(*np.subtract(a.found_shift, b.planned_shift)) < NEAR)
+    return (
+        not other.mirrored
+        and a.found_deg == b.planned_deg
+        and bool(np.hypot(*np.subtract(a.found_shift, b.planned_shift)) < NEAR)
+    )
 
 
 def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> SeenPose | None:
@@ -157,8 +177,11 @@ def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> Seen
     pose, axis = view.pose, view.stage + view.cells
     planned = float(np.quantile(np.abs(axis - view.sites), 0.9))
     as_planned = Misplaced.of(view.view, pose, pose)
-    fits = [(*_fitted(view.marks, at, mirrored), mirrored) for mirrored in (False, True)
-            for at in (axis, axis + view.offsets)]
+    fits = [
+        (*_fitted(view.marks, at, mirrored), mirrored)
+        for mirrored in (False, True)
+        for at in (axis, axis + view.offsets)
+    ]
     turn, shift, left, mirrored = min(fits, key=lambda fit: fit[2])
     if planned <= limit and left > SURELY * planned:
         return SeenPose(as_planned, planned=True, mirrored=False)
@@ -166,16 +189,21 @@ def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> Seen
         return None
     if mirrored:
         back = np.degrees(np.angle(turn)) - pose.turn_deg
-        return SeenPose(as_planned, planned=False, mirrored=True,
-                        mirror=_mirror(back, listed=view.listed))
-    found = replace(as_planned, found_deg=_turn(turn, pose, max_rotation_rad),
-                    found_shift=_shift(shift, pose))
+        return SeenPose(
+            as_planned, planned=False, mirrored=True, mirror=_mirror(back, listed=view.listed)
+        )
+    found = replace(
+        as_planned, found_deg=_turn(turn, pose, max_rotation_rad), found_shift=_shift(shift, pose)
+    )
     same = (found.found_deg, found.found_shift) == (found.planned_deg, found.planned_shift)
     return SeenPose(found, planned=same, mirrored=False)
 
 
-def _fitted(marks: np.ndarray, at: np.ndarray, mirrored: bool,
-            ) -> tuple[complex, complex, float]:
+def _fitted(
+    marks: np.ndarray,
+    at: np.ndarray,
+    mirrored: bool,
+) -> tuple[complex, complex, float]:
     """Return the turn, the shift and what nine of ten distances are below, pitches."""
     z = marks.conj() if mirrored else marks
     free, weight = np.stack([np.ones(len(z)), z], axis=1), np.ones((len(z), 1))

@@ -71,12 +71,17 @@ def shift_of(view: View, offset_m: np.ndarray, away_m: np.ndarray) -> complex:
         Measured offsets minus those expected with the stage at its site, of the known marks.
     """
     steps, known = _steps(view, offset_m), _steps(view, away_m)
-    part = complex(*(float(np.angle(np.exp(2j * np.pi * axis).mean())) / (2 * np.pi)
-                     for axis in (steps.real, steps.imag)))
+    part = complex(
+        *(
+            float(np.angle(np.exp(2j * np.pi * axis).mean())) / (2 * np.pi)
+            for axis in (steps.real, steps.imag)
+        )
+    )
     cells, known = _rounded(steps - part), known - part
     nx, ny = (view.image.nx, view.image.ny) if view.image else (1, 1)
-    return part + complex(middle_of(cells.real, nx, known.real),
-                          middle_of(cells.imag, ny, known.imag))
+    return part + complex(
+        middle_of(cells.real, nx, known.real), middle_of(cells.imag, ny, known.imag)
+    )
 
 
 def middle_of(numbers: np.ndarray, width: int, known: np.ndarray | None = None) -> int:
@@ -119,8 +124,11 @@ def middles(view: View, number: np.ndarray, away_m: np.ndarray) -> np.ndarray:
     out, cells = np.zeros_like(away_m), np.unique(number[number >= 0])
     for cell in cells if axis in cells else ():
         out[:, number == cell] = np.median(away_m[:, number == cell], axis=1, keepdims=True)
-    return out - np.where(number >= 0, np.median(
-        away_m[:, number == axis], axis=1, keepdims=True), 0) if out.any() else out
+    return (
+        out - np.where(number >= 0, np.median(away_m[:, number == axis], axis=1, keepdims=True), 0)
+        if out.any()
+        else out
+    )
 
 
 @lru_cache(64)
@@ -193,7 +201,7 @@ def _scatter(key: np.ndarray, place_m: np.ndarray) -> float:
     """
     apart = [np.zeros((2, 0))]
     for group in groups_of(key):
-        some = group[::-(-len(group) // LOOKED_AT)]
+        some = group[:: -(-len(group) // LOOKED_AT)]
         i, j = pairs_of(some.shape[1])
         apart.append(np.abs(place_m[:, some[:, i]] - place_m[:, some[:, j]]).reshape(2, -1))
     every = np.concatenate(apart, axis=1)
@@ -203,15 +211,17 @@ def _scatter(key: np.ndarray, place_m: np.ndarray) -> float:
 def _medians(key: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the (lower) median of the values of each key, for each element (n,)."""
     order = np.lexsort((values, key))
-    _, first, inverse, count = np.unique(key[order], return_index=True, return_inverse=True,
-                                         return_counts=True)
+    _, first, inverse, count = np.unique(
+        key[order], return_index=True, return_inverse=True, return_counts=True
+    )
     out = np.empty(len(values))
     out[order] = values[order][first + (count - 1) // 2][inverse]
     return out
 
 
-def without_aside(key: np.ndarray, deviation_m: np.ndarray, offset_m: np.ndarray,
-                  check_offset_m: float) -> tuple[np.ndarray, int]:
+def without_aside(
+    key: np.ndarray, deviation_m: np.ndarray, offset_m: np.ndarray, check_offset_m: float
+) -> tuple[np.ndarray, int]:
     """Return deviations minus the microscope's error from check stops, and its parameter count.
 
     A microscope with a wrong scale, turn or sign reads a mark differently from a check stop. This
@@ -251,12 +261,18 @@ def count_stops(view: View, readings: ViewReadings) -> tuple[np.ndarray, int]:
     visits = readings.visits
     if not view.check_marks or visits is None:
         return readings.count, 0
-    aside = stage_aside(visits.mark, np.stack([visits.dx - visits.offset_x,
-                                               visits.dy - visits.offset_y]), view.check_offset_m)
+    aside = stage_aside(
+        visits.mark,
+        np.stack([visits.dx - visits.offset_x, visits.dy - visits.offset_y]),
+        view.check_offset_m,
+    )
     if aside is None:
         return readings.count, view.check_marks
-    sides = [np.bincount(visits.mark, sign * row > 0, len(readings.m)) > 0
-             for row in aside for sign in (1, -1)]
+    sides = [
+        np.bincount(visits.mark, sign * row > 0, len(readings.m)) > 0
+        for row in aside
+        for sign in (1, -1)
+    ]
     n_sides = np.sum(sides, axis=0)
     off = aside.any(axis=0) & (n_sides[visits.mark] > 1)
     extra = np.bincount(visits.mark, visits.count * off, len(readings.m)).astype(np.int64)

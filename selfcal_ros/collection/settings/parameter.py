@@ -40,27 +40,45 @@ class Parameter:
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-            raise InputError(f"{where}: {self.name}", f"{value!r} is not of type {kind.__name__}",
-                             "put it in quotes" if kind is str else mend_of(value, kind))
+            raise InputError(
+                f"{where}: {self.name}",
+                f"{value!r} is not of type {kind.__name__}",
+                "put it in quotes" if kind is str else mend_of(value, kind),
+            )
         if kind is list and not all(isinstance(item, str) for item in value):
-            raise InputError(f"{where}: {self.name}", f"{value!r} is not a list of strings",
-                             "put each item in quotes")
+            raise InputError(
+                f"{where}: {self.name}",
+                f"{value!r} is not a list of strings",
+                "put each item in quotes",
+            )
         if self.choices and value not in self.choices:
-            raise InputError(f"{where}: {self.name}", f"{value!r} is not known",
-                             f"choose one of {', '.join(self.choices)}")
+            raise InputError(
+                f"{where}: {self.name}",
+                f"{value!r} is not known",
+                f"choose one of {', '.join(self.choices)}",
+            )
         if kind in (int, float) and not (
-                (self.low is None or value >= self.low)
-                and (self.high is None or value <= self.high)):
-            raise InputError(f"{where}: {self.name}", f"{value} is outside {self.low} to "
-                             f"{self.high} {self.unit}".rstrip(), "correct the value")
+            (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+        ):
+            raise InputError(
+                f"{where}: {self.name}",
+                f"{value} is outside {self.low} to {self.high} {self.unit}".rstrip(),
+                "correct the value",
+            )
         return value
 
 
-def declared(default: Any, description: str, unit: str = "", low: float | None = None,
-             high: float | None = None, *, choices: tuple[str, ...] = ()) -> Any:
+def declared(
+    default: Any,
+    description: str,
+    unit: str = "",
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    choices: tuple[str, ...] = (),
+) -> Any:
     """Return a field of a dataclass of settings, see `Parameter`."""
-    about = {"description": description, "unit": unit, "low": low, "high": high,
-             "choices": choices}
+    about = {"description": description, "unit": unit, "low": low, "high": high, "choices": choices}
     if isinstance(default, list):
         return field(default_factory=default.copy, metadata=about)
     return field(default=default, metadata=about)
@@ -77,8 +95,9 @@ class Settings:
     """
 
     NODE: ClassVar[str]
-    hardware_id: str = declared("", "name or serial number of the stage, in the health; empty = "
-                                "the namespace, or 'stage'")
+    hardware_id: str = declared(
+        "", "name or serial number of the stage, in the health; empty = the namespace, or 'stage'"
+    )
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
@@ -86,8 +105,10 @@ class Settings:
         own = [item for item in fields(cls) if item.name in cls.__annotations__]
         shared = [item for item in fields(cls) if item.name not in cls.__annotations__]
         defaults = cls()
-        return tuple(Parameter(item.name, getattr(defaults, item.name), **item.metadata)
-                     for item in (*own, *shared))
+        return tuple(
+            Parameter(item.name, getattr(defaults, item.name), **item.metadata)
+            for item in (*own, *shared)
+        )
 
     @classmethod
     def checked(cls, overrides: Mapping[str, Any], where: str) -> Self:
@@ -104,8 +125,9 @@ class Settings:
             if name in ROS_OWN or name.startswith("qos_overrides."):
                 continue
             if name not in table:
-                raise InputError(f"{where}: {name}", f"{cls.NODE} has no such parameter",
-                                 known_are(name, table))
+                raise InputError(
+                    f"{where}: {name}", f"{cls.NODE} has no such parameter", known_are(name, table)
+                )
             values[name] = table[name].check(value, where)
         return cls(**values)
 
@@ -114,5 +136,6 @@ class Settings:
 class ManagedSettings(Settings):
     """The parameters of a managed node."""
 
-    autostart: bool = declared(True, "configure and activate automatically; false = wait for a "
-                               "lifecycle manager")
+    autostart: bool = declared(
+        True, "configure and activate automatically; false = wait for a lifecycle manager"
+    )

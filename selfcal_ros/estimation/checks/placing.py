@@ -72,8 +72,9 @@ class Misplaced:
     gain: float = float("inf")
 
     @classmethod
-    def of(cls, view: str, planned: StagePose, found: StagePose,
-           gain: float = float("inf")) -> "Misplaced":
+    def of(
+        cls, view: str, planned: StagePose, found: StagePose, gain: float = float("inf")
+    ) -> "Misplaced":
         """Return the difference of two poses."""
         return cls(view, planned.turn_deg, found.turn_deg, planned.shift, found.shift, gain)
 
@@ -90,9 +91,11 @@ class Mirrored:
 
 
 MIRRORS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "x reversed": lambda z: -z.conj(), "y reversed": np.conj,
+    "x reversed": lambda z: -z.conj(),
+    "y reversed": np.conj,
     "x and y exchanged": lambda z: 1j * z.conj(),
-    "x and y exchanged and reversed": lambda z: -1j * z.conj()}
+    "x and y exchanged and reversed": lambda z: -1j * z.conj(),
+}
 """Reflection of a frame -> places and deviations in the right one."""
 
 
@@ -124,24 +127,37 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     one of them.
     """
     artifact, repeated = measurements.artifact, [v for v in measurements.views if v.dof_xy]
-    every = [(view.view, seen) for view in measurements.views
-             if sum(map(abs, view.view.cell or (0, 0))) < 2  # the others would cost seconds
-             and (seen := _seen(artifact, view)) is not None]
+    every = [
+        (view.view, seen)
+        for view in measurements.views
+        if sum(map(abs, view.view.cell or (0, 0))) < 2  # the others would cost seconds
+        and (seen := _seen(artifact, view)) is not None
+    ]
     told = [(view, seen) for view, seen in every if view.cell in (None, (0, 0))]
     if len(told) < 3:
         told = every
     views = [seen for _, seen in told]
     if len(views) < 3:
         return None
-    sigma = np.sqrt(np.average([view.sigma_xy**2 for view in repeated],
-                               weights=[view.dof_xy for view in repeated])) if repeated else 0.0
+    sigma = (
+        np.sqrt(
+            np.average(
+                [view.sigma_xy**2 for view in repeated], weights=[view.dof_xy for view in repeated]
+            )
+        )
+        if repeated
+        else 0.0
+    )
     noise, spread = _sizes(views, float(sigma))
     noise = noise if repeated else UNREPEATED * spread
     if not spread > max(2 * noise, LEAST_NOISE_M):
         return None
     grid = artifact.map_grid
-    sizes = max(noise, spread / 1000), spread, _alike(
-        views, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0)
+    sizes = (
+        max(noise, spread / 1000),
+        spread,
+        _alike(views, grid.pitch_m / artifact.grid_pitch_m if grid else 0.0),
+    )
     planned, square = _likelihood(views, *sizes)
     if square < EXPLAINED:
         return None
@@ -149,14 +165,17 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     names = list(dict.fromkeys(view.plan_view for view, _ in told))
     for view, seen in told:
         if view.cell not in (None, (0, 0)) or (
-                len(names) == 2 and view.plan_view == names[0]):  # their relative pose alone counts
+            len(names) == 2 and view.plan_view == names[0]
+        ):  # their relative pose alone counts
             continue
-        moved = [number for number, (also, _) in enumerate(told)
-                 if also.plan_view == view.plan_view]
+        moved = [
+            number for number, (also, _) in enumerate(told) if also.plan_view == view.plan_view
+        ]
         kept = _Kept(views, moved, *sizes)
         for pose in _poses(seen, artifact):
-            likelihood, left = kept.with_moved([
-                _moved(views[number], seen.pose, pose) for number in moved])
+            likelihood, left = kept.with_moved(
+                [_moved(views[number], seen.pose, pose) for number in moved]
+            )
             tried.append((likelihood - planned, left, view, seen.pose, pose))
     tried.sort(key=lambda item: -item[0])
     best = max(tried[0][0] if tried else 0.0, 0.0)
@@ -172,13 +191,20 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     return Misplaced.of(view.plan_view, before, pose, gain)
 
 
-def _mirrored(views: list[_Seen], planned: float, sizes: tuple[float, float, np.ndarray],
-              least: float, enough: float) -> Mirrored | None:
+def _mirrored(
+    views: list[_Seen],
+    planned: float,
+    sizes: tuple[float, float, np.ndarray],
+    least: float,
+    enough: float,
+) -> Mirrored | None:
     """Return the reflections that gain the most, if that is more than `least`."""
     gains = {}
     for name, of in MIRRORS.items():
-        likelihood, left = _likelihood([replace(
-            seen, place=of(seen.place), deviation=of(seen.deviation)) for seen in views], *sizes)
+        likelihood, left = _likelihood(
+            [replace(seen, place=of(seen.place), deviation=of(seen.deviation)) for seen in views],
+            *sizes,
+        )
         if likelihood - planned > least and left < enough:
             gains[name] = likelihood - planned
     best = max(gains.values(), default=0.0)
@@ -232,13 +258,25 @@ def motions(artifact: Artifact, phase: complex, shift: complex) -> list[tuple[co
     if artifact.marks is not None:
         marks = (artifact.x_m + 1j * artifact.y_m).ravel() / artifact.grid_pitch_m
         found = [*_symmetries(marks), *((1, step) for step in _steps(phase, shift))]
-        return [motion for number, motion in enumerate(found)
-                if not any(abs(motion[0] - turn) + abs(motion[1] - step) < SAME_MARK
-                           for turn, step in found[:number])]
-    steps = {complex(np.round(step)) for step in (0, 1, -1, 1j, -1j, *_steps(phase, shift))
-             if abs(step - np.round(step)) < EDGE}
-    return [(1j**q, step) for step in sorted(steps, key=lambda s: (s.real, s.imag))
-            for q in range(4) if q or step]
+        return [
+            motion
+            for number, motion in enumerate(found)
+            if not any(
+                abs(motion[0] - turn) + abs(motion[1] - step) < SAME_MARK
+                for turn, step in found[:number]
+            )
+        ]
+    steps = {
+        complex(np.round(step))
+        for step in (0, 1, -1, 1j, -1j, *_steps(phase, shift))
+        if abs(step - np.round(step)) < EDGE
+    }
+    return [
+        (1j**q, step)
+        for step in sorted(steps, key=lambda s: (s.real, s.imag))
+        for q in range(4)
+        if q or step
+    ]
 
 
 def _steps(phase: complex, shift: complex) -> list[complex]:
@@ -264,8 +302,12 @@ def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
     inside = np.maximum(np.abs(i), np.abs(j)) <= WINDOW + EDGE
     if inside.sum() < LEAST_READINGS:
         return None
-    return _Seen(cast(AnyPose, pose), (i + 1j * j)[inside],
-                 (view.dx + 1j * view.dy)[inside], view.count[inside])
+    return _Seen(
+        cast(AnyPose, pose),
+        (i + 1j * j)[inside],
+        (view.dx + 1j * view.dy)[inside],
+        view.count[inside],
+    )
 
 
 def _sizes(views: list[_Seen], sigma: float) -> tuple[float, float]:
@@ -308,8 +350,9 @@ def _alike(views: list[_Seen], nodes: float) -> np.ndarray:
     return np.exp(-(x * x + y * y) / (2 * nodes**2))
 
 
-def _likelihood(views: list[_Seen], noise: float, spread: float,
-                stage: np.ndarray) -> tuple[float, float]:
+def _likelihood(
+    views: list[_Seen], noise: float, spread: float, stage: np.ndarray
+) -> tuple[float, float]:
     """Return the log-likelihood of all readings, and their mean standardised square.
 
     Each view's own parameters are removed. `stage`: see `_alike`.
@@ -330,16 +373,18 @@ class _Kept:
         As `_likelihood` takes them.
     """
 
-    def __init__(self, views: list[_Seen], moved: list[int], noise: float, spread: float,
-                 stage: np.ndarray) -> None:
+    def __init__(
+        self, views: list[_Seen], moved: list[int], noise: float, spread: float, stage: np.ndarray
+    ) -> None:
         self.noise, self.spread, self.free = noise, spread, FREE * len(views)
         of_view = np.repeat(np.arange(len(views)), [len(seen.place) for seen in views])
         tried = np.isin(of_view, moved)
         kept = np.flatnonzero(~tried)
         self.beside, self.own = stage[np.ix_(kept, tried)], stage[np.ix_(tried, tried)]
         self.views = [seen for number, seen in enumerate(views) if number not in moved]
-        self.factor = np.linalg.cholesky(self._covariance(
-            self.views, self.views, stage[np.ix_(kept, kept)]))
+        self.factor = np.linalg.cholesky(
+            self._covariance(self.views, self.views, stage[np.ix_(kept, kept)])
+        )
         self.sizes = np.diag(self.factor).real
         self.white = np.linalg.solve(self.factor, self._columns(self.views, 0))
 
@@ -349,15 +394,17 @@ class _Kept:
         if moved:
             beside = self.whiten @ self._covariance(self.views, moved, self.beside)
             factor = np.linalg.cholesky(
-                self._covariance(moved, moved, self.own) - beside.conj().T @ beside)
+                self._covariance(moved, moved, self.own) - beside.conj().T @ beside
+            )
             rest = self._columns(moved, len(self.views)) - beside.conj().T @ white
             white = np.concatenate([white, np.linalg.solve(factor, rest)])
             sizes = np.concatenate([sizes, np.diag(factor).real])
         inner = white[:, :-1].conj().T @ white
-        square = (np.linalg.norm(white[:, -1]) ** 2
-                  - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real)
-        likelihood = (-square / 2 - 2 * np.log(sizes).sum()
-                      - np.linalg.slogdet(inner[:, :-1])[1])
+        square = (
+            np.linalg.norm(white[:, -1]) ** 2
+            - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real
+        )
+        likelihood = -square / 2 - 2 * np.log(sizes).sum() - np.linalg.slogdet(inner[:, :-1])[1]
         return float(likelihood), float(square / 2 / (len(white) - self.free))
 
     @cached_property
@@ -372,7 +419,7 @@ class _Kept:
         one, other = np.equal.outer(mark, other_mark).nonzero()
         covariance[one, other] += self.spread**2 / 2 * turn[one] * other_turn[other].conj()
         if some is others:
-            covariance.flat[::len(mark) + 1] += self.noise**2
+            covariance.flat[:: len(mark) + 1] += self.noise**2
         return covariance
 
     def _columns(self, views: list[_Seen], first: int) -> np.ndarray:
@@ -383,7 +430,7 @@ class _Kept:
         rows = [np.zeros((0, self.free + 1), dtype=complex)]
         for number, seen in enumerate(views, first):
             row = np.zeros((len(seen.place), self.free + 1), dtype=complex)
-            row[:, FREE * number:FREE * (number + 1)] = _motion(seen)
+            row[:, FREE * number : FREE * (number + 1)] = _motion(seen)
             row[:, -1] = seen.deviation
             rows.append(row)
         return np.concatenate(rows)
@@ -392,27 +439,37 @@ class _Kept:
 def _on_plate(views: list[_Seen]) -> tuple[np.ndarray, np.ndarray]:
     """Return turns of the plate and marks of all readings, complex (n,) each."""
     none = np.zeros(0, dtype=complex)
-    return (np.concatenate([none, *(np.full(len(seen.place), seen.pose.phase) for seen in views)]),
-            np.round(np.concatenate([none, *(seen.marks for seen in views)]), 3))
+    return (
+        np.concatenate([none, *(np.full(len(seen.place), seen.pose.phase) for seen in views)]),
+        np.round(np.concatenate([none, *(seen.marks for seen in views)]), 3),
+    )
 
 
 def said(found: Misplaced | Mirrored, where: str = "") -> PlacingError:
     """Return in one line how the plate is placed, and how to continue."""
     if isinstance(found, Mirrored):
-        return PlacingError(f"{where}all views", "the plate turns and shifts as in a mirrored "
-                            f"frame: stage and offsets have {', or '.join(found.axes)}",
-                            "correct the axes of both, so that a plate turned counter-clockwise "
-                            "turns from +x to +y")
+        return PlacingError(
+            f"{where}all views",
+            "the plate turns and shifts as in a mirrored "
+            f"frame: stage and offsets have {', or '.join(found.axes)}",
+            "correct the axes of both, so that a plate turned counter-clockwise "
+            "turns from +x to +y",
+        )
     if found.found_deg != found.planned_deg:
         what = f"the plate lies turned by {found.found_deg:g}°, not by {found.planned_deg:g}°"
         wrong_way = (found.found_deg + found.planned_deg) % 360 == 0
         how = "turn it counter-clockwise" if wrong_way else "turn it as planned"
     else:
-        what = (f"the plate lies shifted by {_pitches(found.found_shift)}, not by "
-                f"{_pitches(found.planned_shift)}")
+        what = (
+            f"the plate lies shifted by {_pitches(found.found_shift)}, not by "
+            f"{_pitches(found.planned_shift)}"
+        )
         how = "shift it as planned"
-    return PlacingError(f"{where}view '{found.view}'", what,
-                        f"{how} and measure this view again, or correct its pose in the plan")
+    return PlacingError(
+        f"{where}view '{found.view}'",
+        what,
+        f"{how} and measure this view again, or correct its pose in the plan",
+    )
 
 
 def _pitches(shift: tuple[float, float]) -> str:

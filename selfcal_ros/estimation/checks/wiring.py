@@ -113,8 +113,11 @@ def wiring_faults(measurements: Measurements) -> list[WiringFault]:
     """
     found = []
     for kind, name in (("grid", "motion"), ("angular", "motion_theta")):
-        told = [(view.view.name, motion) for view in measurements.views
-                if (motion := getattr(view, name)) is not None and motion.dof > 1]
+        told = [
+            (view.view.name, motion)
+            for view in measurements.views
+            if (motion := getattr(view, name)) is not None and motion.dof > 1
+        ]
         tries = (len(AXES[kind]) ** 3 + len(AXES[kind])) * (len(told) + 1)
         for view, motion in _together(told):
             responses = _wrong(motion, AXES[kind], BEYOND_DOUBT / tries)
@@ -147,8 +150,9 @@ def sign_of_lines_is_shown(measurements: Measurements) -> bool:
     motion = _sum(motions)
     place, offset = np.diag(motion.products)
     follows = place > LEAST_NOISE_M**2 * motion.dof
-    return bool(follows) and (offset == 0 or (
-        motion.dof > 1 and _p_for(motion, np.eye(1), -np.eye(1)) < SHOWN))
+    return bool(follows) and (
+        offset == 0 or (motion.dof > 1 and _p_for(motion, np.eye(1), -np.eye(1)) < SHOWN)
+    )
 
 
 def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResponse | None:
@@ -163,8 +167,11 @@ def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResp
     limits = max(1 - BEYOND * u_scale, 0.0), 1 + BEYOND * u_scale
     each = [_p_of_scale(motion, [(i, i)], limits) for i in range(2)]
     axis, p = int(np.argmin(each)), min(*each, _p_of_scale(motion, [(0, 0), (1, 1)], limits))
-    return replace(_response(motion, (axis, axis), AXES["grid"]), p=6 * p) if (
-        6 * p < F_LEVEL) else None
+    return (
+        replace(_response(motion, (axis, axis), AXES["grid"]), p=6 * p)
+        if (6 * p < F_LEVEL)
+        else None
+    )
 
 
 def _of_all_views(measurements: Measurements) -> RepeatMotion | None:
@@ -178,8 +185,9 @@ def _of_all_views(measurements: Measurements) -> RepeatMotion | None:
 
 
 def _sum(motions: Sequence[RepeatMotion]) -> RepeatMotion:
-    return RepeatMotion(np.sum([one.products for one in motions], axis=0),
-                        sum(one.dof for one in motions))
+    return RepeatMotion(
+        np.sum([one.products for one in motions], axis=0), sum(one.dof for one in motions)
+    )
 
 
 def _together(told: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:
@@ -194,12 +202,18 @@ def _together(told: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, Repea
 def _wirings(n: int) -> tuple[np.ndarray, ...]:
     """Return the ways to wire n offsets, the right one first: offset = -D motion."""
     orders = [np.eye(n), np.eye(n)[::-1]][:n]
-    return tuple(np.array(signs)[:, None] * order
-                 for order in orders for signs in product((1.0, -1.0), repeat=n))
+    return tuple(
+        np.array(signs)[:, None] * order
+        for order in orders
+        for signs in product((1.0, -1.0), repeat=n)
+    )
 
 
-def _wrong(motion: RepeatMotion, axes: tuple[str, ...], level: float,
-           ) -> tuple[OffsetResponse, ...]:
+def _wrong(
+    motion: RepeatMotion,
+    axes: tuple[str, ...],
+    level: float,
+) -> tuple[OffsetResponse, ...]:
     """Return the offsets that follow the stage wrongly; none if in doubt."""
     limits = HALVED, DOUBLED
     n, least = len(axes), LEAST_NOISE_M**2 * motion.dof
@@ -234,8 +248,9 @@ def _wiring(motion: RepeatMotion, level: float) -> np.ndarray:
     if not sure:
         return right
     best = max(sure, key=likely)
-    straight = [wiring for wiring in others
-                if wiring[0, 0] and _p_for(motion, best, wiring) > F_LEVEL]
+    straight = [
+        wiring for wiring in others if wiring[0, 0] and _p_for(motion, best, wiring) > F_LEVEL
+    ]
     return max(straight, key=likely, default=best)
 
 
@@ -253,8 +268,9 @@ def _p_for(motion: RepeatMotion, wiring: np.ndarray, other: np.ndarray) -> float
     return _p_of(float(found / np.sqrt(rank * size2)), rank * (motion.dof - 1) + 1)
 
 
-def _p_of_scale(motion: RepeatMotion, pairs: Sequence[tuple[int, int]],
-                limits: tuple[float, float]) -> float:
+def _p_of_scale(
+    motion: RepeatMotion, pairs: Sequence[tuple[int, int]], limits: tuple[float, float]
+) -> float:
     """Return the probability of a scale as far from 1 if it is within the `limits`.
 
     Offset j of each pair (i, j) follows axis i, all with the same scale. With o the offset and p
@@ -268,8 +284,10 @@ def _p_of_scale(motion: RepeatMotion, pairs: Sequence[tuple[int, int]],
         both += np.where(np.eye(2, dtype=bool), one, abs(one))
     place, offset = np.eye(2)
     dof = len(pairs) * (motion.dof - 1) + 1
-    return min(_p_of(_correlation(both, place, offset - most * place), dof),
-               _p_of(_correlation(both, offset, least * place - offset), dof))
+    return min(
+        _p_of(_correlation(both, place, offset - most * place), dof),
+        _p_of(_correlation(both, offset, least * place - offset), dof),
+    )
 
 
 def _correlation(products: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
@@ -298,9 +316,13 @@ def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) 
     cross = float(motion.products[i, n + j])
     r2 = min(cross**2 / (place * offset), 1.0)
     return OffsetResponse(
-        axes[j], axes[i], cross / place, float(np.sqrt((1 - r2) * offset / place
-                                                       / (motion.dof - 1))),
-        offset / abs(cross), _p_of(float(np.sqrt(r2)), motion.dof))
+        axes[j],
+        axes[i],
+        cross / place,
+        float(np.sqrt((1 - r2) * offset / place / (motion.dof - 1))),
+        offset / abs(cross),
+        _p_of(float(np.sqrt(r2)), motion.dof),
+    )
 
 
 def worded(fault: WiringFault) -> WiringError:
@@ -309,22 +331,37 @@ def worded(fault: WiringFault) -> WiringError:
     names = " and ".join(f"offset_{response.offset}" for response in responses)
     numbers = ", ".join(
         f"offset_{r.offset} against {r.axis}: {r.slope:+.2f} ± {r.u_slope:.2g}, expected "
-        f"{0 if r.crossed else -1}" for r in responses)
+        f"{0 if r.crossed else -1}"
+        for r in responses
+    )
     if any(response.crossed for response in responses):
         what = "exchanged axes: " + " and ".join(
-            f"offset_{r.offset} follows {r.axis}" for r in responses)
-        remedy = ("publish offsets along the stage's axes, mark - optical axis; or, if the joints "
-                  "are exchanged, correct joint_x and joint_y")
+            f"offset_{r.offset} follows {r.axis}" for r in responses
+        )
+        remedy = (
+            "publish offsets along the stage's axes, mark - optical axis; or, if the joints "
+            "are exchanged, correct joint_x and joint_y"
+        )
     elif any(response.slope > 0 for response in responses):
-        what = "offsets of the other sign: " + names + (
-            " rise" if len(responses) > 1 else " rises") + " where the optical axis moves on"
-        remedy = (f"publish mark - optical axis: reverse the sign of {names}; or, if it is right, "
-                  "stamp the detections with the time of the exposure")
+        what = (
+            "offsets of the other sign: "
+            + names
+            + (" rise" if len(responses) > 1 else " rises")
+            + " where the optical axis moves on"
+        )
+        remedy = (
+            f"publish mark - optical axis: reverse the sign of {names}; or, if it is right, "
+            "stamp the detections with the time of the exposure"
+        )
     else:
-        what = f"offsets in wrong units: {names} " + ", ".join(
-            f"{abs(r.slope):.3g}" for r in responses) + " times what the stage moves"
+        what = (
+            f"offsets in wrong units: {names} "
+            + ", ".join(f"{abs(r.slope):.3g}" for r in responses)
+            + " times what the stage moves"
+        )
         remedy = "correct the pixel size, or the unit: offsets are in " + (
-            "rad" if fault.kind == "angular" else "m")
+            "rad" if fault.kind == "angular" else "m"
+        )
     where = "stage/mark_detections" + (f" of view '{fault.view}'" if fault.view else "")
     return WiringError(where, f"{what} (slope among repeats of {numbers})", remedy)
 
@@ -350,15 +387,23 @@ class Turned:
 
 TURN, MIRROR = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([-1.0, 1.0])
 AS_IS = Turned(np.eye(2), 1, "the offsets are as they are published")
-OTHER_LINES = Turned(np.eye(2), -1, "offset_theta has the other sign, or the offsets are turned "
-                     "by 180°")
+OTHER_LINES = Turned(
+    np.eye(2), -1, "offset_theta has the other sign, or the offsets are turned by 180°"
+)
 PAIRS = (
-    (Turned(TURN, 1, "the offsets are turned by 90° counter-clockwise"),
-     Turned(-TURN, 1, "the offsets are turned by 90° clockwise")),
-    (Turned(MIRROR, 1, "offset_x has the other sign"),
-     Turned(-MIRROR, 1, "offset_y has the other sign")),
-    (Turned(-TURN @ MIRROR, 1, "offset_x and offset_y are exchanged"),
-     Turned(TURN @ MIRROR, 1, "offset_x and offset_y are exchanged, both with the other sign")))
+    (
+        Turned(TURN, 1, "the offsets are turned by 90° counter-clockwise"),
+        Turned(-TURN, 1, "the offsets are turned by 90° clockwise"),
+    ),
+    (
+        Turned(MIRROR, 1, "offset_x has the other sign"),
+        Turned(-MIRROR, 1, "offset_y has the other sign"),
+    ),
+    (
+        Turned(-TURN @ MIRROR, 1, "offset_x and offset_y are exchanged"),
+        Turned(TURN @ MIRROR, 1, "offset_x and offset_y are exchanged, both with the other sign"),
+    ),
+)
 """Wirings that grid marks do not distinguish: the lines do."""
 
 
@@ -370,32 +415,39 @@ def turned_readings(measurements: Measurements, wiring: Turned) -> Measurements:
 def shows_offsets(measurements: Measurements) -> bool:
     """Return whether the offsets of all grid marks are known, one mark an image."""
     return not measurements.has_images and all(
-        view.visits is not None or not len(view.m) for view in measurements.views)
+        view.visits is not None or not len(view.m) for view in measurements.views
+    )
 
 
 def turned_error(measurements: Measurements, found: Sequence[Turned]) -> WiringError:
     """Return the error for the wirings with which alone the readings agree."""
     what = ", or ".join(wiring.what for wiring in found)
     return WiringError(
-        f"plan '{measurements.plan_id}', stage/mark_detections", f"{what}: only so do the "
-        "readings of all views agree", "publish mark - optical axis along the stage's axes (a "
+        f"plan '{measurements.plan_id}', stage/mark_detections",
+        f"{what}: only so do the readings of all views agree",
+        "publish mark - optical axis along the stage's axes (a "
         "camera: --turn and --mirror, `selfcal camera init` finds them); check_stops in the plan "
-        "show it in the first view")
+        "show it in the first view",
+    )
 
 
 def _undone(view: ViewReadings, wiring: Turned) -> ViewReadings:
     """Return the readings of a view with true offsets, if the published ones had this wiring."""
     back = wiring.of_offsets.T
-    view = replace(view, dtheta=wiring.of_lines * view.dtheta, motion_theta=_turned_motion(
-        view.motion_theta, np.array([[wiring.of_lines]])))
+    view = replace(
+        view,
+        dtheta=wiring.of_lines * view.dtheta,
+        motion_theta=_turned_motion(view.motion_theta, np.array([[wiring.of_lines]])),
+    )
     if view.visits is None:
         return view
     x, y = (back - np.eye(2)) @ np.stack([view.visits.offset_x, view.visits.offset_y])
     return with_offsets(view, view.visits, x + 1j * y, back)
 
 
-def with_offsets(view: ViewReadings, visits: GridVisits, change: np.ndarray,
-                 back: np.ndarray) -> ViewReadings:
+def with_offsets(
+    view: ViewReadings, visits: GridVisits, change: np.ndarray, back: np.ndarray
+) -> ViewReadings:
     """Return the readings of a view with other offsets.
 
     Parameters
@@ -413,13 +465,22 @@ def with_offsets(view: ViewReadings, visits: GridVisits, change: np.ndarray,
         np.minimum.at(least, visits.mark, visits.u)
         weight = (least[visits.mark] / visits.u) ** 2  # one of each mark is 1, however small
     weight = weight / np.bincount(visits.mark, weight)[visits.mark]
-    dx, dy = (np.bincount(visits.mark, weight * part, len(view.m))
-              for part in (change.real, change.imag))
+    dx, dy = (
+        np.bincount(visits.mark, weight * part, len(view.m)) for part in (change.real, change.imag)
+    )
     return replace(
-        view, dx=view.dx + dx, dy=view.dy + dy, motion=_turned_motion(view.motion, back),
-        visits=replace(visits, dx=visits.dx + change.real, dy=visits.dy + change.imag,
-                       offset_x=visits.offset_x + change.real,
-                       offset_y=visits.offset_y + change.imag))
+        view,
+        dx=view.dx + dx,
+        dy=view.dy + dy,
+        motion=_turned_motion(view.motion, back),
+        visits=replace(
+            visits,
+            dx=visits.dx + change.real,
+            dy=visits.dy + change.imag,
+            offset_x=visits.offset_x + change.real,
+            offset_y=visits.offset_y + change.imag,
+        ),
+    )
 
 
 def _turned_motion(motion: RepeatMotion | None, back: np.ndarray) -> RepeatMotion | None:

@@ -81,8 +81,9 @@ class Part:
     result: CalibrationResult | None = None
 
 
-def require_own_readings(parts: Sequence[Part], common: Mapping[str, np.ndarray], *,
-                         scale: bool) -> None:
+def require_own_readings(
+    parts: Sequence[Part], common: Mapping[str, np.ndarray], *, scale: bool
+) -> None:
     """Refuse a map that equals another but for its datum, or has another unit or sign.
 
     Parameters
@@ -96,26 +97,38 @@ def require_own_readings(parts: Sequence[Part], common: Mapping[str, np.ndarray]
     """
     first = next(index for index, part in enumerate(parts) if part.result is not None)
     for kind, known in common.items():
-        q = np.linalg.qr(datum_columns(parts[first].error_map.artifact, kind, known,
-                                       scale=scale))[0]
-        maps, u = (np.array([part.error_map.of(kind)[of][:, known].ravel() for part in parts])
-                   for of in (0, 1))
+        q = np.linalg.qr(datum_columns(parts[first].error_map.artifact, kind, known, scale=scale))[
+            0
+        ]
+        maps, u = (
+            np.array([part.error_map.of(kind)[of][:, known].ravel() for part in parts])
+            for of in (0, 1)
+        )
         maps -= maps @ q @ q.T
         for index, part in enumerate(parts):
             if part.result is None:
                 ratio = rms(maps[index]) / max(rms(maps[first]), rms(u[first]))
                 if ratio > OTHER_UNIT:
-                    raise InputError(part.name, f"its errors are {ratio:.2g} times those of "
-                                     f"{parts[first].name}: is it in µ{KINDS[kind]}?",
-                                     "give m and rad")
+                    raise InputError(
+                        part.name,
+                        f"its errors are {ratio:.2g} times those of "
+                        f"{parts[first].name}: is it in µ{KINDS[kind]}?",
+                        "give m and rad",
+                    )
                 if _is_opposite(*(maps[n] / np.maximum(u[n], NO_NOISE) for n in (index, first))):
-                    raise InputError(part.name, f"of the opposite sign to {parts[first].name}: its "
-                                     "negative agrees, and it does not",
-                                     "give G = indicated - true")
+                    raise InputError(
+                        part.name,
+                        f"of the opposite sign to {parts[first].name}: its "
+                        "negative agrees, and it does not",
+                        "give G = indicated - true",
+                    )
             for other in range(index if kind == "xy" else 0):
                 if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < NEGLIGIBLE:
-                    raise InputError(part.name, f"of the same readings as {parts[other].name}: "
-                                     "their maps are equal", "leave one of them out")
+                    raise InputError(
+                        part.name,
+                        f"of the same readings as {parts[other].name}: their maps are equal",
+                        "leave one of them out",
+                    )
 
 
 def _is_opposite(one: np.ndarray, other: np.ndarray) -> bool:
@@ -131,8 +144,9 @@ def _is_opposite(one: np.ndarray, other: np.ndarray) -> bool:
     return BEYOND * rms(one + other) < rms(one - other)
 
 
-def shared_reference(results: Sequence[CalibrationResult | None],
-                     weights: np.ndarray) -> ReferenceLength | None:
+def shared_reference(
+    results: Sequence[CalibrationResult | None], weights: np.ndarray
+) -> ReferenceLength | None:
     """Return what sets the scale of a mean that keeps it: the reference lengths of its runs.
 
     Parameters
@@ -161,15 +175,21 @@ def shared_reference(results: Sequence[CalibrationResult | None],
     errors = np.array([each.relative_error for each in found])
     names = dict.fromkeys(each.certificate or "none" for each in found)
     return replace(
-        found[0], certified=None, relative_error=float(share @ errors / share.sum()),
-        u_relative=max(each.u_relative for each in found), certificate="; ".join(names),
-        runs=tuple(found))
+        found[0],
+        certified=None,
+        relative_error=float(share @ errors / share.sum()),
+        u_relative=max(each.u_relative for each in found),
+        certificate="; ".join(names),
+        runs=tuple(found),
+    )
 
 
 def exposures(results: Sequence[CalibrationResult | None]) -> dict[str, str]:
     """Return the first and the last exposure of all runs, where they are known."""
-    times = [[str(result.provenance.extra.get(f"{end}_exposure", "")) for result in results
-              if result] for end in ("first", "last")]
+    times = [
+        [str(result.provenance.extra.get(f"{end}_exposure", "")) for result in results if result]
+        for end in ("first", "last")
+    ]
     if not all(map(all, times)):
         return {}
     return {"first_exposure": min(times[0]), "last_exposure": max(times[1])}
@@ -297,6 +317,7 @@ def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
     within : float array (runs,)
         Variance of these values within each run.
     """
+
     def excess(variance: float) -> float:
         return _scatter(squares, within + variance) - (len(within) - 1)
 
@@ -344,21 +365,27 @@ class _Family:
         return min(_independent_number(covariance), self.most)
 
 
-def _families(values: np.ndarray, covariances: list[np.ndarray], q: np.ndarray,
-              shapes: np.ndarray) -> list[_Family]:
+def _families(
+    values: np.ndarray, covariances: list[np.ndarray], q: np.ndarray, shapes: np.ndarray
+) -> list[_Family]:
     """Return the families of values: one for each shape, and what is left, if anything is."""
     amplitude = values @ shapes
     within = np.stack([variances_of(c, shapes) for c in covariances])
-    found = [_Family(amplitude[:, [m]], within[:, m], shape**2, 1)
-             for m, shape in enumerate(shapes.T)]
+    found = [
+        _Family(amplitude[:, [m]], within[:, m], shape**2, 1) for m, shape in enumerate(shapes.T)
+    ]
     known = np.concatenate([q, shapes], axis=1)
     n_rest = len(known) - known.shape[1]
     if n_rest:
         total = np.array([variances(c).sum() for c in covariances])
-        found.append(_Family(
-            (values - amplitude @ shapes.T) * np.sqrt(len(known) / n_rest),
-            np.maximum(total - within.sum(axis=1), 0.0) / n_rest,
-            np.maximum(1 - (known**2).sum(axis=1), 0.0), n_rest))
+        found.append(
+            _Family(
+                (values - amplitude @ shapes.T) * np.sqrt(len(known) / n_rest),
+                np.maximum(total - within.sum(axis=1), 0.0) / n_rest,
+                np.maximum(1 - (known**2).sum(axis=1), 0.0),
+                n_rest,
+            )
+        )
     return found
 
 
@@ -383,38 +410,55 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
     weights = 1 / np.maximum([variances(c).sum() + spread.sum() for c in own], TINY)
     weights = weights / weights.sum()
     shared = [without(run.common, q) for run in runs if run.shares]
-    common = _sum([np.zeros(len(q)), *shared],
-                  np.append(0.0, weights[shares > 0] / max(weights @ shares, TINY)))
+    common = _sum(
+        [np.zeros(len(q)), *shared],
+        np.append(0.0, weights[shares > 0] / max(weights @ shares, TINY)),
+    )
     pooled = weights**2
     within = sum(w * variances(c) for w, c in zip(pooled, own, strict=True))
     between = pooled.sum() * spread
     covariance = _sum([*own, common], np.append(pooled, (weights @ shares) ** 2))
     added = spread
     if covariance.ndim == 2:
-        of_shapes = np.array([family.between for family in families[:shapes.shape[1]]])
-        of_rest = sum(family.between for family in families[shapes.shape[1]:])
+        of_shapes = np.array([family.between for family in families[: shapes.shape[1]]])
+        of_rest = sum(family.between for family in families[shapes.shape[1] :])
         added = (shapes * of_shapes) @ shapes.T + of_rest * (
-            np.eye(len(q)) - q @ q.T - shapes @ shapes.T)
+            np.eye(len(q)) - q @ q.T - shapes @ shapes.T
+        )
     covariance = covariance + pooled.sum() * added
     shared_part = (weights @ shares) ** 2 * variances(common)
     p = _p_between(families, runs, own)
-    of_one = max(families[:shapes.shape[1]], key=lambda family: family.between, default=None)
+    of_one = max(families[: shapes.shape[1]], key=lambda family: family.between, default=None)
     if p < USUAL_LEVEL and of_one and of_one.between > SINGLE * spread.sum():
         dof = _dof_of_single(of_one, weights, shared_part)
     else:
         dof = _dof(runs, own, families, weights, whole=within + shared_part + between)
     return Mean(
-        weights @ values, covariance, within, shared_part, between,
-        float(np.sqrt(spread.mean())), p, weights, dof,
-        tuple(_deviation(i, runs, values, own, common, weights, q, added)
-              for i in range(len(runs))))
+        weights @ values,
+        covariance,
+        within,
+        shared_part,
+        between,
+        float(np.sqrt(spread.mean())),
+        p,
+        weights,
+        dof,
+        tuple(
+            _deviation(i, runs, values, own, common, weights, q, added) for i in range(len(runs))
+        ),
+    )
 
 
 def _sum(covariances: list[np.ndarray], factors: np.ndarray) -> np.ndarray:
     """Return the weighted sum of covariances: a matrix if one of them is."""
     full = any(c.ndim == 2 for c in covariances)
-    return np.sum([f * (np.diag(c) if full and c.ndim == 1 else c)
-                   for f, c in zip(factors, covariances, strict=True)], axis=0)
+    return np.sum(
+        [
+            f * (np.diag(c) if full and c.ndim == 1 else c)
+            for f, c in zip(factors, covariances, strict=True)
+        ],
+        axis=0,
+    )
 
 
 def _p_between(families: list[_Family], runs: list[RunValues], own: list[np.ndarray]) -> float:
@@ -434,8 +478,14 @@ def _noise_dof(runs: list[RunValues], own: list[np.ndarray], factors: np.ndarray
     return min(joint_dof(*zip(power, [run.dof for run in runs], strict=True)), MANY_DOF)
 
 
-def _dof(runs: list[RunValues], own: list[np.ndarray], families: list[_Family],
-         weights: np.ndarray, *, whole: np.ndarray) -> float:
+def _dof(
+    runs: list[RunValues],
+    own: list[np.ndarray],
+    families: list[_Family],
+    weights: np.ndarray,
+    *,
+    whole: np.ndarray,
+) -> float:
     """Return the degrees of freedom of the mean's u, the median of all values.
 
     A variance between runs is a difference: its uncertainty is that of the scatter between runs,
@@ -470,9 +520,16 @@ def _dof_of_single(family: _Family, weights: np.ndarray, shared: np.ndarray) -> 
     return min((len(weights) - 1) * (1 + ratio) ** 2, MANY_DOF)
 
 
-def _deviation(i: int, runs: list[RunValues], values: np.ndarray, own: list[np.ndarray],
-               common: np.ndarray, weights: np.ndarray, q: np.ndarray,
-               between: np.ndarray) -> Deviation:
+def _deviation(
+    i: int,
+    runs: list[RunValues],
+    values: np.ndarray,
+    own: list[np.ndarray],
+    common: np.ndarray,
+    weights: np.ndarray,
+    q: np.ndarray,
+    between: np.ndarray,
+) -> Deviation:
     """Return the deviation of run i from the weighted mean of the others."""
     others = np.where(np.arange(len(runs)) == i, 0.0, weights)
     others = others / others.sum()
@@ -488,8 +545,9 @@ def _deviation(i: int, runs: list[RunValues], values: np.ndarray, own: list[np.n
     return Deviation(e_n, test, _p_scatter(i, values, own, others, between))
 
 
-def _p_scatter(i: int, values: np.ndarray, own: list[np.ndarray], others: np.ndarray,
-               between: np.ndarray) -> float:
+def _p_scatter(
+    i: int, values: np.ndarray, own: list[np.ndarray], others: np.ndarray, between: np.ndarray
+) -> float:
     """Return the probability that run i is so much farther from the mean than the others are.
 
     Ratio of its squared distance from the mean of the others to the scatter of these, each over
@@ -504,8 +562,11 @@ def _p_scatter(i: int, values: np.ndarray, own: list[np.ndarray], others: np.nda
     left = np.flatnonzero(np.arange(runs) != i)
     scatter = ((values[left] - mean) ** 2).sum()
     expected = ((1 - 2 * others[left]) * power[left] + of_mean).sum()
-    ratio = ((values[i] - mean) ** 2).sum() / max(power[i] + of_mean, TINY) / max(
-        scatter / max(expected, TINY), TINY)
+    ratio = (
+        ((values[i] - mean) ** 2).sum()
+        / max(power[i] + of_mean, TINY)
+        / max(scatter / max(expected, TINY), TINY)
+    )
     total = _sum([*own, between], np.append(np.full(runs, 1 / runs), 1.0))
     number = max(_independent_number(total), 1.0)
     return float(fdtrc(number, number * (runs - 2), ratio))
@@ -555,20 +616,31 @@ def combine(parts: Sequence[Part], *, keep_scale: bool = False) -> Combination:
         If the maps cannot be combined.
     """
     first = _checked(parts, keep_scale=keep_scale)
-    common = {kind: np.logical_and.reduce([np.isfinite(part.error_map.of(kind)).all(axis=(0, 1))
-                                           for part in parts]) for kind in KINDS}
+    common = {
+        kind: np.logical_and.reduce(
+            [np.isfinite(part.error_map.of(kind)).all(axis=(0, 1)) for part in parts]
+        )
+        for kind in KINDS
+    }
     known, lines = common["xy"], common["theta"]
     if known.sum() < 3:
-        raise InputError(parts[-1].name, f"{int(known.sum())} sites are known with their "
-                         "uncertainty in all maps", "combine maps that overlap")
+        raise InputError(
+            parts[-1].name,
+            f"{int(known.sum())} sites are known with their uncertainty in all maps",
+            "combine maps that overlap",
+        )
     require_own_readings(parts, common, scale=not keep_scale)
     shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known)}
     if lines.sum() > 1:
         shapes["theta"] = _waves(lines)
-    means = {kind: mean_of(
-        [_run(part, kind, common[kind], keep_scale=keep_scale) for part in parts],
-        datum_columns(first.artifact, kind, common[kind], scale=not keep_scale), of_kind)
-        for kind, of_kind in shapes.items()}
+    means = {
+        kind: mean_of(
+            [_run(part, kind, common[kind], keep_scale=keep_scale) for part in parts],
+            datum_columns(first.artifact, kind, common[kind], scale=not keep_scale),
+            of_kind,
+        )
+        for kind, of_kind in shapes.items()
+    }
     result = _result(parts, first, means, common)
     if not keep_scale:
         result = replace(result, reference=None)
@@ -579,17 +651,24 @@ def _checked(parts: Sequence[Part], *, keep_scale: bool) -> CalibrationResult:
     """Return the first calibration; InputError if the maps cannot be combined."""
     own = [part for part in parts if part.result is not None]
     if len(parts) < 2 or not own:
-        raise InputError(parts[0].name if parts else "RESULT.json", "a single map, or no "
-                         "RESULT.json among them", "give two or more, one of them a RESULT.json")
+        raise InputError(
+            parts[0].name if parts else "RESULT.json",
+            "a single map, or no RESULT.json among them",
+            "give two or more, one of them a RESULT.json",
+        )
     for part in own:
-        require_same_lattice(own[0].error_map.artifact, part.error_map.artifact,
-                             (own[0].name, part.name))
+        require_same_lattice(
+            own[0].error_map.artifact, part.error_map.artifact, (own[0].name, part.name)
+        )
         result = part.result
         if result is None or not result.verdict.qualified:
             raise InputError(part.name, "its calibration is not qualified", "leave it out")
         if keep_scale and result.reference is None:
-            raise InputError("--keep-scale", f"{part.name} has no reference length, so its "
-                             "magnification is unknown", "omit it, or solve with --reference")
+            raise InputError(
+                "--keep-scale",
+                f"{part.name} has no reference length, so its magnification is unknown",
+                "omit it, or solve with --reference",
+            )
     for index, part in enumerate(parts):
         _require_single_run(part, parts[:index])
     found = own[0].result
@@ -608,12 +687,16 @@ def _require_single_run(part: Part, others: Sequence[Part]) -> None:
         if other.result is None:
             continue
         if _same_recording(result, other.result):
-            raise InputError(part.name, f"of the same recording as {other.name}",
-                             "leave one of them out")
+            raise InputError(
+                part.name, f"of the same recording as {other.name}", "leave one of them out"
+            )
         plate = _readings_of_plate(result)
         if plate and plate == _readings_of_plate(other.result):
-            raise InputError(part.name, f"of the same plate errors as {other.name}: both rest on "
-                             "one calibration", "leave one of them out")
+            raise InputError(
+                part.name,
+                f"of the same plate errors as {other.name}: both rest on one calibration",
+                "leave one of them out",
+            )
 
 
 def _readings_of_plate(result: CalibrationResult) -> str:
@@ -628,11 +711,27 @@ def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
     digest = one.input.get("sha256")
     if digest and digest == other.input.get("sha256"):
         return True
-    run, also = ((result.run_id, result.provenance.extra.get("first_exposure"),
-                  result.provenance.extra.get("last_exposure")) for result in (one, other))
-    return all(run) and run == also and bool(np.isclose(
-        one.noise.sigma_xy_repeats, other.noise.sigma_xy_repeats, rtol=NEGLIGIBLE, atol=0.0,
-        equal_nan=True))
+    run, also = (
+        (
+            result.run_id,
+            result.provenance.extra.get("first_exposure"),
+            result.provenance.extra.get("last_exposure"),
+        )
+        for result in (one, other)
+    )
+    return (
+        all(run)
+        and run == also
+        and bool(
+            np.isclose(
+                one.noise.sigma_xy_repeats,
+                other.noise.sigma_xy_repeats,
+                rtol=NEGLIGIBLE,
+                atol=0.0,
+                equal_nan=True,
+            )
+        )
+    )
 
 
 def _run(part: Part, kind: str, known: np.ndarray, *, keep_scale: bool) -> RunValues:
@@ -653,8 +752,12 @@ def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -
     Terms of the microscope that are known from elsewhere, and the reference length.
     """
     terms = {term.name: term for term in result.model.terms}
-    names = [name for name, block in blocks().items() if block.shared
-             if name in terms and remaining_part(terms[name]) >= TOLD]
+    names = [
+        name
+        for name, block in blocks().items()
+        if block.shared
+        if name in terms and remaining_part(terms[name]) >= TOLD
+    ]
     kept = factors_of(result)
     factors = kept.of_map[np.isin(kept.terms, names)][:, :, known]
     factors = factors.reshape(len(factors), 2 * int(known.sum()))
@@ -684,12 +787,15 @@ def _polynomials(x: np.ndarray, y: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 def _waves(lines: np.ndarray) -> np.ndarray:
     angle = 2 * np.pi * np.flatnonzero(lines) / len(lines)
-    return np.array([wave(k * angle) for k in range(1, DEGREE + 1)
-                     for wave in (np.cos, np.sin)]).T
+    return np.array([wave(k * angle) for k in range(1, DEGREE + 1) for wave in (np.cos, np.sin)]).T
 
 
-def _result(parts: Sequence[Part], first: CalibrationResult, means: Mapping[str, Mean],
-            common: Mapping[str, np.ndarray]) -> CalibrationResult:
+def _result(
+    parts: Sequence[Part],
+    first: CalibrationResult,
+    means: Mapping[str, Mean],
+    common: Mapping[str, np.ndarray],
+) -> CalibrationResult:
     """Return the means as a result: of ``xy``, and ``theta`` if it is known, by their places."""
     plate, known = first.plate, common["xy"]
     shapes = {"xy": (2, *known.shape), "theta": (1, len(common["theta"]))}
@@ -703,25 +809,50 @@ def _result(parts: Sequence[Part], first: CalibrationResult, means: Mapping[str,
 
     (gx, gy), (u_gx, u_gy) = maps["xy"], u["xy"]
     o, r = first_order(first.artifact, maps["xy"])
-    emap = ErrorMap(first.artifact, gx, gy, u_gx, u_gy, maps["theta"][0], u["theta"][0], o, r,
-                    ThetaDatum.ZERO_MEAN)
+    emap = ErrorMap(
+        first.artifact,
+        gx,
+        gy,
+        u_gx,
+        u_gy,
+        maps["theta"][0],
+        u["theta"][0],
+        o,
+        r,
+        ThetaDatum.ZERO_MEAN,
+    )
     unknown, unknowns = np.full(plate.shape, np.nan), 2 * int(known.sum())
     runs = [part.result for part in parts]
     found = CalibrationResult(
-        "+".join(dict.fromkeys(run.plan_id for run in runs if run)), emap,
-        ArtifactMap(unknown, unknown, np.full(plate.angular_count, np.nan)), (),
+        "+".join(dict.fromkeys(run.plan_id for run in runs if run)),
+        emap,
+        ArtifactMap(unknown, unknown, np.full(plate.angular_count, np.nan)),
+        (),
         Observability(unknowns, unknowns, 0, True),
-        Noise(np.nan, np.nan, dof_xy=dof["xy"], dof_theta=dof["theta"], k_xy=k["xy"],
-              k_theta=k["theta"], dof_map_xy=dof["xy"], dof_map_theta=dof["theta"]),
-        input={"file": ", ".join(part.name for part in parts)}, method=COMBINED,
-        sense=first.sense, extra={COMBINED: _runs(parts, means)},
-        kept=kept_covariances(_covariances(parts, means)), verdict=_verdict(parts, means),
+        Noise(
+            np.nan,
+            np.nan,
+            dof_xy=dof["xy"],
+            dof_theta=dof["theta"],
+            k_xy=k["xy"],
+            k_theta=k["theta"],
+            dof_map_xy=dof["xy"],
+            dof_map_theta=dof["theta"],
+        ),
+        input={"file": ", ".join(part.name for part in parts)},
+        method=COMBINED,
+        sense=first.sense,
+        extra={COMBINED: _runs(parts, means)},
+        kept=kept_covariances(_covariances(parts, means)),
+        verdict=_verdict(parts, means),
         model=ModelResult(first.model.misalignment),
         reference=shared_reference(runs, means["xy"].weights),
         provenance=Provenance(version=__version__, extra=exposures(runs)),
         findings=(Finding("not_in_all", details={"sites": int((~known).sum())}),)
-        if not known.all() else (),
-        placed_plate=first.placed_plate)
+        if not known.all()
+        else (),
+        placed_plate=first.placed_plate,
+    )
     return replace(found, budget=_budget(found, means))
 
 
@@ -729,13 +860,18 @@ def _runs(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
     """Return the runs with their deviations."""
     facts: dict[str, Any] = {}
     for kind, mean in means.items():
-        facts |= {f"u_between_{KINDS[kind]}": mean.u_between,
-                  f"p_between{SUFFIX[kind]}": mean.p_between}
+        facts |= {
+            f"u_between_{KINDS[kind]}": mean.u_between,
+            f"p_between{SUFFIX[kind]}": mean.p_between,
+        }
     facts["runs"] = []
     for index, part in enumerate(parts):
-        run = {"file": part.name, "run_id": part.result.run_id if part.result else "",
-               "sha256": part.result.input.get("sha256", "") if part.result else "",
-               "weight": float(means["xy"].weights[index])}
+        run = {
+            "file": part.name,
+            "run_id": part.result.run_id if part.result else "",
+            "sha256": part.result.input.get("sha256", "") if part.result else "",
+            "weight": float(means["xy"].weights[index]),
+        }
         for kind, mean in means.items():
             run |= _of_run(mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(parts))
         facts["runs"].append(run)
@@ -745,19 +881,27 @@ def _runs(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
 def _covariances(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, np.ndarray]:
     """Return the covariances of the means whose runs all have theirs."""
     own = all(part.result is not None for part in parts)
-    return {kind: mean.covariance for kind, mean in means.items()
-            if (own or kind == "theta") and mean.covariance.ndim == 2 and all(
-                deviation.test is None or deviation.test.correlated
-                for deviation in mean.deviations)}
+    return {
+        kind: mean.covariance
+        for kind, mean in means.items()
+        if (own or kind == "theta")
+        and mean.covariance.ndim == 2
+        and all(
+            deviation.test is None or deviation.test.correlated for deviation in mean.deviations
+        )
+    }
 
 
 def _of_run(found: Deviation, kind: str, limit: float) -> dict[str, Any]:
     test = found.test
-    return {f"e_n_rms{kind}": rms(found.e_n), f"e_n_largest{kind}": float(abs(found.e_n).max()),
-            f"beyond{kind}": float((abs(found.e_n) > 1).mean()),
-            f"p{kind}": np.nan if test is None else min(1.0, 2 * min(test.p, test.p_z)),
-            f"agrees{kind}": None if test is None else not test.significant,
-            f"stands_out{kind}": bool(found.p_scatter < limit)}
+    return {
+        f"e_n_rms{kind}": rms(found.e_n),
+        f"e_n_largest{kind}": float(abs(found.e_n).max()),
+        f"beyond{kind}": float((abs(found.e_n) > 1).mean()),
+        f"p{kind}": np.nan if test is None else min(1.0, 2 * min(test.p, test.p_z)),
+        f"agrees{kind}": None if test is None else not test.significant,
+        f"stands_out{kind}": bool(found.p_scatter < limit),
+    }
 
 
 def _verdict(parts: Sequence[Part], means: Mapping[str, Mean]) -> Verdict:
@@ -768,19 +912,30 @@ def _verdict(parts: Sequence[Part], means: Mapping[str, Mean]) -> Verdict:
         if mean.p_between < USUAL_LEVEL:
             u, name, unit = np.sqrt(mean.between), BETWEEN + SUFFIX[kind], KINDS[kind]
             enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)
-            failed.append(Finding("between_runs", mean.u_between, unit=unit, p=mean.p_between,
-                                  details={"runs": len(parts), "quantity": kind}))
+            failed.append(
+                Finding(
+                    "between_runs",
+                    mean.u_between,
+                    unit=unit,
+                    p=mean.p_between,
+                    details={"runs": len(parts), "quantity": kind},
+                )
+            )
     for part in parts:
         for item in part.result.verdict.enlarged_by if part.result else ():
             before = enlarged.get(item.name)
             if before is None or before.u_rms < item.u_rms:
                 enlarged[item.name] = item
-    of_runs = [part.name for part in parts
-               if part.result and part.result.verdict.grade is Grade.ENLARGED]
+    of_runs = [
+        part.name for part in parts if part.result and part.result.verdict.grade is Grade.ENLARGED
+    ]
     if of_runs:
         failed.append(Finding("enlarged_runs", details={"runs": of_runs}))
-    return Verdict(Grade.ENLARGED if failed else Grade.GOOD, tuple(failed),
-                   enlarged_by=tuple(enlarged.values()))
+    return Verdict(
+        Grade.ENLARGED if failed else Grade.GOOD,
+        tuple(failed),
+        enlarged_by=tuple(enlarged.values()),
+    )
 
 
 def _budget(result: CalibrationResult, means: Mapping[str, Mean]) -> tuple[BudgetLine, ...]:
@@ -788,12 +943,25 @@ def _budget(result: CalibrationResult, means: Mapping[str, Mean]) -> tuple[Budge
     between = [line for line in budget_lines(result) if line.component == INTERPOLATION]
     for kind, mean in means.items():
         for component, variance, size, letter, dof in (
-                ("uncertainty of the runs", mean.within, rms(np.sqrt(mean.within)), "A", mean.dof),
-                ("shared by all runs", mean.common, rms(np.sqrt(mean.common)), "B", np.inf),
-                ("between runs", mean.between, mean.u_between, "A", mean.dof)):
+            ("uncertainty of the runs", mean.within, rms(np.sqrt(mean.within)), "A", mean.dof),
+            ("shared by all runs", mean.common, rms(np.sqrt(mean.common)), "B", np.inf),
+            ("between runs", mean.between, mean.u_between, "A", mean.dof),
+        ):
             u = np.sqrt(variance)
-            lines.append(BudgetLine(kind, component, letter, 0.0, size, KINDS[kind], rms(u),
-                                    float(u.max()), dof, "readings",
-                                    {"runs": len(mean.weights)}))
+            lines.append(
+                BudgetLine(
+                    kind,
+                    component,
+                    letter,
+                    0.0,
+                    size,
+                    KINDS[kind],
+                    rms(u),
+                    float(u.max()),
+                    dof,
+                    "readings",
+                    {"runs": len(mean.weights)},
+                )
+            )
         lines += [line for line in between if line.quantity == kind]
     return tuple(lines)

@@ -39,8 +39,9 @@ from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import View, shared_rotations
 
 
-def covariance_of(result: CalibrationResult, kind: str, known: np.ndarray, *,
-                  plate: bool = False) -> np.ndarray:
+def covariance_of(
+    result: CalibrationResult, kind: str, known: np.ndarray, *, plate: bool = False
+) -> np.ndarray:
     """Return the covariance of the known values of a map, m^2 or rad^2.
 
     Parameters
@@ -91,8 +92,13 @@ def kept_covariances(covers: Mapping[str, np.ndarray]) -> Kept:
     covers : dict
         ``xy``, Gx, then Gy, m^2, and ``theta``, rad^2 -> covariance (n, n).
     """
-    return Kept(covariances={kind: Covariance.of(cover) for kind, cover in covers.items()
-                             if 0 < len(cover) <= MAX_FULL})
+    return Kept(
+        covariances={
+            kind: Covariance.of(cover)
+            for kind, cover in covers.items()
+            if 0 < len(cover) <= MAX_FULL
+        }
+    )
 
 
 def _stored(result: CalibrationResult, kind: str, known: np.ndarray) -> np.ndarray:
@@ -102,8 +108,11 @@ def _stored(result: CalibrationResult, kind: str, known: np.ndarray) -> np.ndarr
     try:
         full = result.kept.covariances[kind].matrix(len(values) * int(there.sum()))
     except ValueError as error:
-        raise InputError("map_covariance", "no covariance of this map",
-                         "write the map again with `selfcal combine`") from error
+        raise InputError(
+            "map_covariance",
+            "no covariance of this map",
+            "write the map again with `selfcal combine`",
+        ) from error
     chosen = np.tile(known[there], len(values))
     return full[np.ix_(chosen, chosen)]
 
@@ -135,11 +144,19 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         if found is None or found.lacks_terms:
             return unknown
         shear = found.system.gauge.shear
-        moved = np.real(np.tensordot(_complex(factors_of(result).of_map), turned_over(
-            result.sense, shear).conj(), axes=((1, 2), (1, 2))))
+        moved = np.real(
+            np.tensordot(
+                _complex(factors_of(result).of_map),
+                turned_over(result.sense, shear).conj(),
+                axes=((1, 2), (1, 2)),
+            )
+        )
         added = result.kept.added
-        variance = np.diag(found.maps.of(shear)) + (moved**2).sum(axis=0) + (
-            0.0 if added is None else added)
+        variance = (
+            np.diag(found.maps.of(shear))
+            + (moved**2).sum(axis=0)
+            + (0.0 if added is None else added)
+        )
         variance = variance * (result.noise.sigma_xy / found.half_width_m) ** 2
     o, r = np.sqrt(variance)
     return float(o), float(r)
@@ -152,16 +169,25 @@ def _complex(factors: np.ndarray) -> np.ndarray:
 
 def system_behind(result: CalibrationResult) -> NormalEquations | None:
     """Return the system of the weights in a result; None if unknown or not identified."""
-    if np.isnan(result.error_map.u_gx).all() or not result.observability.identifiable \
-            or result.recheck is not None or not result.views \
-            or any(v.read_grid is None or v.read_angular is None for v in result.views):
+    if (
+        np.isnan(result.error_map.u_gx).all()
+        or not result.observability.identifiable
+        or result.recheck is not None
+        or not result.views
+        or any(v.read_grid is None or v.read_angular is None for v in result.views)
+    ):
         return None
     artifact = result.plate
     grid, lines = [], []
     for index, v in enumerate(result.views):
         in_grid, of_grid = _is_read(v.read_grid), f"view '{v.name}', read.grid"
-        view = View(v.name, v.rotation, (v.translation_x, v.translation_y), in_grid,
-                    _is_read(v.read_angular))
+        view = View(
+            v.name,
+            v.rotation,
+            (v.translation_x, v.translation_y),
+            in_grid,
+            _is_read(v.read_angular),
+        )
         pose = pose_of(view, artifact)
         field = np.ones(artifact.angular_count)
         weight = _weights(v.read_angular, field, f"view '{v.name}', read.angular")
@@ -171,14 +197,22 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
             lines.append((index, (pose.turn_lines or 0) + turned, weight))
         if in_grid:
             grid.append((index, pose, _weights(v.read_grid, in_field(view, artifact), of_grid)))
-    angular = np.array([weight for *_, weight in lines]).reshape(len(lines),
-                                                                artifact.angular_count)
+    angular = np.array([weight for *_, weight in lines]).reshape(len(lines), artifact.angular_count)
     return system_of(
-        Marks(tuple(at for _, at, _ in grid), np.array([weight for *_, weight in grid]),
-              tuple(index for index, *_ in grid), rotations=kept_rotations(result, len(grid)),
-              plate=artifact.placed),
-        Marks(tuple(turn for _, turn, _ in lines), angular, tuple(index for index, *_ in lines),
-              artifact.harmonics))
+        Marks(
+            tuple(at for _, at, _ in grid),
+            np.array([weight for *_, weight in grid]),
+            tuple(index for index, *_ in grid),
+            rotations=kept_rotations(result, len(grid)),
+            plate=artifact.placed,
+        ),
+        Marks(
+            tuple(turn for _, turn, _ in lines),
+            angular,
+            tuple(index for index, *_ in lines),
+            artifact.harmonics,
+        ),
+    )
 
 
 def share_of(result: CalibrationResult) -> float:
@@ -202,8 +236,9 @@ def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
 def _kept_cells(images: ImagesKept, n_views: int) -> list[tuple[int, tuple[int, int]]]:
     """Return the placing of the plate in each grid view of a result, and the step of its cell."""
     if not len(images.placing) == len(images.step) == n_views:
-        raise InputError("images", "no images of these views",
-                         "write the result again with `selfcal solve`")
+        raise InputError(
+            "images", "no images of these views", "write the result again with `selfcal solve`"
+        )
     return list(zip(images.placing, images.step, strict=True))
 
 
@@ -229,8 +264,9 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
     except (TypeError, ValueError):
         weight = np.array(np.nan)
     if not (np.isfinite(weight) & (weight >= 0)).all():
-        raise InputError(where, "no weights of this field",
-                         "write the result again with `selfcal solve`")
+        raise InputError(
+            where, "no weights of this field", "write the result again with `selfcal solve`"
+        )
     return weight
 
 
@@ -282,10 +318,18 @@ class Together:
         """Covariance of both maps for unit noise, without terms of the model."""
         result, system = self.result, self.system
         noise, length = result.noise, self.half_width_m
-        ratio = bounded_ratio(system, noise.sigma_xy, noise.sigma_theta,
-                              length) if system.angular.n_views else 1.0
-        return MapsCovariance(system, system.inverse(ratio), result.reference, half_width_m=length,
-                              sigma_m=noise.sigma_xy)
+        ratio = (
+            bounded_ratio(system, noise.sigma_xy, noise.sigma_theta, length)
+            if system.angular.n_views
+            else 1.0
+        )
+        return MapsCovariance(
+            system,
+            system.inverse(ratio),
+            result.reference,
+            half_width_m=length,
+            sigma_m=noise.sigma_xy,
+        )
 
     @cached_property
     def _images(self) -> ImageNoise | None:
@@ -294,8 +338,13 @@ class Together:
             return None
         grid = self.system.grid
         seen = _kept_cells(cast(ImagesKept, self.result.kept.images), grid.n_views)
-        return ImageNoise(stops_of(seen, grid.read), grid.read, grid.weight[grid.read],
-                          np.zeros((0, 2, 3)), np.zeros((0, 2, 3 * grid.n_views)))
+        return ImageNoise(
+            stops_of(seen, grid.read),
+            grid.read,
+            grid.weight[grid.read],
+            np.zeros((0, 2, 3)),
+            np.zeros((0, 2, 3 * grid.n_views)),
+        )
 
     def stage_rows(self, known: np.ndarray) -> np.ndarray:
         """Return the functionals Gx, then Gy, at sites, in the frame of the equations."""
@@ -307,7 +356,8 @@ class Together:
         if self._images is None:
             return cover
         return cover + share_of(self.result) * self._images.added_covariance(
-            self.maps.sensitivities(sites, marks))
+            self.maps.sensitivities(sites, marks)
+        )
 
     def of_sites(self, known: np.ndarray) -> np.ndarray | None:
         """Return the covariance of Gx, then Gy, at sites for unit noise, None if it is not kept."""
@@ -321,8 +371,9 @@ class Together:
         result, system = self.result, self.system
         if len(known) > MAX_FULL or not system.angular.n_views:
             return None
-        conditions = conditions_for(system, ThetaDatum(result.error_map.datum_theta),
-                                    Sense(result.sense), self.half_width_m)
+        conditions = conditions_for(
+            system, ThetaDatum(result.error_map.datum_theta), Sense(result.sense), self.half_width_m
+        )
         to_datum = np.eye(len(known)) - conditions.gain @ conditions.rows
         rows = lines_turned_over(result.sense, to_datum)[known]
         return lines_alone(system).of(rows.T, np.zeros(rows.T.shape))
@@ -343,7 +394,7 @@ class Together:
     @property
     def _effects(self) -> np.ndarray:
         """Effects that are not terms of the model, for unit noise, (e, 2, nx, ny)."""
-        return self._kept.of_map[self._kept.with_map:]
+        return self._kept.of_map[self._kept.with_map :]
 
     @property
     def _effects_on_plate(self) -> np.ndarray:
@@ -387,7 +438,8 @@ class Together:
         exact = np.zeros((s + m + 4, s + m + 4))
         exact[:-4, :-4] = self.of_noise(
             np.concatenate([rows_g, np.zeros((m, *rows_g.shape[1:]))]),
-            np.concatenate([np.zeros((s, *rows_a.shape[1:])), rows_a]))
+            np.concatenate([np.zeros((s, *rows_a.shape[1:])), rows_a]),
+        )
         factors = self._factors(sites, marks)
         terms = len(factors) - len(self._effects)
         cover = exact + factors[:terms].T @ factors[:terms]
@@ -432,8 +484,9 @@ class Together:
         """
         result, angular = self.result, self.system.angular
         count, emap, plate = angular.n_lines, result.error_map, result.artifact_map
-        known = np.isfinite(np.stack([emap.g_theta + emap.u_g_theta,
-                                      plate.a_theta + plate.u_a_theta]))
+        known = np.isfinite(
+            np.stack([emap.g_theta + emap.u_g_theta, plate.a_theta + plate.u_a_theta])
+        )
         if not angular.n_views or count > MAX_FULL or not known.any(axis=1).all():
             return np.zeros((2, count), dtype=bool), np.zeros((2 * count, 2 * count))
         centre = np.zeros((2 * count, 2 * count))
@@ -442,9 +495,11 @@ class Together:
             centre[np.ix_(at, at)] = np.eye(len(at)) - 1 / len(at)
         stage, noise = lines_turned_over(result.sense, centre[:, :count].T), result.noise
         cover = LinesCovariance(self.maps, (noise.sigma_xy, noise.sigma_theta)).of(
-            stage, centre[:, count:].T)
-        terms = self._beside("lines", (2 * count,)) @ centre.T * (
-            noise.sigma_xy / self.half_width_m)
+            stage, centre[:, count:].T
+        )
+        terms = (
+            self._beside("lines", (2 * count,)) @ centre.T * (noise.sigma_xy / self.half_width_m)
+        )
         cover = cover + terms.T @ terms
         white = np.diag(cover)[:count][known[0]].sum()
         found = (emap.u_g_theta[known[0]] ** 2).sum()
@@ -472,7 +527,12 @@ def plate_as_map(result: CalibrationResult) -> CalibrationResult:
     artifact = replace(result.plate, map_grid=None, harmonics=0)
     nothing, none = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
     o, r = first_order(artifact, np.stack([found.ax, found.ay]))
-    u_x, u_y, u_theta = (u if u.size else empty for u, empty in (
-        (found.u_ax, nothing), (found.u_ay, nothing), (found.u_a_theta, none)))
-    return replace(result, placed_plate=None, error_map=ErrorMap(
-        artifact, found.ax, found.ay, u_x, u_y, found.a_theta, u_theta, o, r))
+    u_x, u_y, u_theta = (
+        u if u.size else empty
+        for u, empty in ((found.u_ax, nothing), (found.u_ay, nothing), (found.u_a_theta, none))
+    )
+    return replace(
+        result,
+        placed_plate=None,
+        error_map=ErrorMap(artifact, found.ax, found.ay, u_x, u_y, found.a_theta, u_theta, o, r),
+    )

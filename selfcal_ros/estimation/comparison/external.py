@@ -53,34 +53,53 @@ def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
         for name, values in (grid if is_site else circle).items():
             values[at] = row.cells[name]
             if name.startswith("u_") and (values[at] <= 0 or values[at] > 1):
-                raise InputError(row.place, f"{name} {values[at]:g} is not a standard uncertainty",
-                                 "give it in m (rad), k = 1")
+                raise InputError(
+                    row.place,
+                    f"{name} {values[at]:g} is not a standard uncertainty",
+                    "give it in m (rad), k = 1",
+                )
     known = np.isfinite(list(grid.values())).all(axis=0)
     if not known.any():
-        raise InputError(where, "no site has an error and its uncertainty",
-                         "fill the columns gx, gy, u_gx, u_gy")
+        raise InputError(
+            where, "no site has an error and its uncertainty", "fill the columns gx, gy, u_gx, u_gy"
+        )
     gx, gy, u_gx, u_gy = (np.where(known, values, np.nan) for values in grid.values())
     return ErrorMap(artifact, gx, gy, u_gx, u_gy, circle["g_theta"], circle["u_g_theta"])
 
 
 def _rows(text: str, where: str) -> list[_Row]:
     """Return the rows of a table: known columns by name, NaN where empty or missing."""
-    lines = [(f"{where}:{number}", line) for number, line in enumerate(text.splitlines(), 1)
-             if line.strip(", ")]
-    head = [cell.lower().removesuffix("_m").removesuffix("_rad")
-            for cell in csv_cells(lines[0][1], lines[0][0])] if lines else []
+    lines = [
+        (f"{where}:{number}", line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip(", ")
+    ]
+    head = (
+        [
+            cell.lower().removesuffix("_m").removesuffix("_rad")
+            for cell in csv_cells(lines[0][1], lines[0][0])
+        ]
+        if lines
+        else []
+    )
     missing = [name for name in XY if name not in head]
     if missing:
-        raise InputError(f"{where}:1", f"no column {', '.join(missing)}",
-                         "give x, y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes")
+        raise InputError(
+            f"{where}:1",
+            f"no column {', '.join(missing)}",
+            "give x, y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes",
+        )
     found = []
     for place, line in lines[1:]:
         cells = csv_cells(line, place)
         if len(cells) != len(head):
             raise InputError(place, f"{len(cells)} cells, not {len(head)}", "correct the line")
         try:
-            values = {name: number_of(cell) if cell else np.nan
-                      for name, cell in zip(head, cells, strict=True) if name in (*XY, *THETA)}
+            values = {
+                name: number_of(cell) if cell else np.nan
+                for name, cell in zip(head, cells, strict=True)
+                if name in (*XY, *THETA)
+            }
         except ValueError:
             raise InputError(place, "a cell is not a number", "correct the line") from None
         if any(abs(value) > 1e3 for value in values.values()):
@@ -93,14 +112,20 @@ def _site(row: _Row, artifact: Artifact) -> tuple[int, ...]:
     steps = np.array([row.cells["x"], row.cells["y"]]) / artifact.grid_pitch_m + artifact.half
     at = np.rint(steps)
     if np.abs(steps - at).max() > OFF_SITE or (at < 0).any() or (at >= artifact.shape).any():
-        raise InputError(row.place, f"({row.cells['x']:g}, {row.cells['y']:g}) m is not a site of "
-                         "the other maps", "give the errors at their sites")
+        raise InputError(
+            row.place,
+            f"({row.cells['x']:g}, {row.cells['y']:g}) m is not a site of the other maps",
+            "give the errors at their sites",
+        )
     return tuple(at.astype(int).tolist())
 
 
 def _line(row: _Row, artifact: Artifact) -> tuple[int, ...]:
     step = row.cells["angle"] / (2 * np.pi) * artifact.angular_count
     if not abs(step - np.rint(step)) <= OFF_SITE or not 0 <= np.rint(step) < artifact.angular_count:
-        raise InputError(row.place, "neither a site nor an angular line of the other maps",
-                         "give x and y, or the angle, of one")
+        raise InputError(
+            row.place,
+            "neither a site nor an angular line of the other maps",
+            "give x and y, or the angle, of one",
+        )
     return (int(np.rint(step)),)

@@ -126,8 +126,11 @@ def variances(covariance: np.ndarray) -> np.ndarray:
 
 def variances_of(covariance: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the variances of the inner products of values (n,) with columns (n, k), (k,)."""
-    square = covariance @ columns**2 if covariance.ndim == 1 else np.einsum(
-        "nk,nk->k", covariance @ columns, columns)
+    square = (
+        covariance @ columns**2
+        if covariance.ndim == 1
+        else np.einsum("nk,nk->k", covariance @ columns, columns)
+    )
     return np.maximum(square, 0.0)
 
 
@@ -149,10 +152,19 @@ def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | Non
     drawn = abs(spread.drawn[varies]).max(axis=0) if spread.correlated else None
     p_z, limit = _of_largest(largest, int(varies.sum()), drawn, dof)
     of_largest = spread.variance[np.abs(values).argmax()]
-    return Significance(square / rank, float(rank), p, spread.correlated, largest, limit, p_z, dof,
-                        min(p, p_z) < USUAL_LEVEL / 2,
-                        u_rms=float(np.sqrt(spread.variance.mean())),
-                        u_largest=float(np.sqrt(of_largest)))
+    return Significance(
+        square / rank,
+        float(rank),
+        p,
+        spread.correlated,
+        largest,
+        limit,
+        p_z,
+        dof,
+        min(p, p_z) < USUAL_LEVEL / 2,
+        u_rms=float(np.sqrt(spread.variance.mean())),
+        u_largest=float(np.sqrt(of_largest)),
+    )
 
 
 def of_square(square: float, rank: float, dof: float) -> float:
@@ -171,8 +183,9 @@ def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
     return covariance - (covariance @ q) @ q.T
 
 
-def _of_largest(largest: float, n: int, drawn: np.ndarray | None,
-                noise_dof: float) -> tuple[float, float]:
+def _of_largest(
+    largest: float, n: int, drawn: np.ndarray | None, noise_dof: float
+) -> tuple[float, float]:
     """Return the probability of such a |z| among n values, and the limit of USUAL_LEVEL / 2.
 
     The number of values bounds it (Bonferroni); the largest |z| of draws, if there are any, give it
@@ -247,8 +260,14 @@ class MapDifference:
 
 
 @one_thread()
-def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = False,
-            plates: bool = False, names: tuple[str, str] = ("A", "B")) -> MapDifference:
+def compare(
+    a: CalibrationResult,
+    b: CalibrationResult,
+    *,
+    keep_scale: bool = False,
+    plates: bool = False,
+    names: tuple[str, str] = ("A", "B"),
+) -> MapDifference:
     """Compare two calibrations of the same lattice.
 
     Parameters
@@ -272,18 +291,31 @@ def compare(a: CalibrationResult, b: CalibrationResult, *, keep_scale: bool = Fa
     require_same_lattice(pair[0].artifact, pair[1].artifact, names)
     known = int((pair[0].valid & pair[1].valid).sum())
     if known < 3:
-        raise InputError(names[1], f"{known} sites are known in both maps",
-                         "compare maps that overlap")
+        raise InputError(
+            names[1], f"{known} sites are known in both maps", "compare maps that overlap"
+        )
 
-    xy, theta = (_difference((a, b), pair, kind, covariance, scale=not keep_scale)
-                 for kind in KINDS)
-    o, r = (getattr(pair[1], name) - getattr(pair[0], name)
-            for name in ("nonorthogonality", "scale_difference"))
+    xy, theta = (
+        _difference((a, b), pair, kind, covariance, scale=not keep_scale) for kind in KINDS
+    )
+    o, r = (
+        getattr(pair[1], name) - getattr(pair[0], name)
+        for name in ("nonorthogonality", "scale_difference")
+    )
     dx, dy = xy.values
     return MapDifference(
-        dx, dy, theta.values[0], (float(xy.datum[0]), float(xy.datum[1])), float(xy.datum[2]),
-        0.0 if keep_scale else float(xy.datum[3]), float(theta.datum[0]), o, r, xy.test,
-        theta.test)
+        dx,
+        dy,
+        theta.values[0],
+        (float(xy.datum[0]), float(xy.datum[1])),
+        float(xy.datum[2]),
+        0.0 if keep_scale else float(xy.datum[3]),
+        float(theta.datum[0]),
+        o,
+        r,
+        xy.test,
+        theta.test,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,8 +327,14 @@ class _Difference:
     test: Significance | None
 
 
-def _difference(results: Sequence[CalibrationResult], maps: Sequence[ErrorMap], kind: str,
-                covariance: Callable[..., np.ndarray], *, scale: bool) -> _Difference:
+def _difference(
+    results: Sequence[CalibrationResult],
+    maps: Sequence[ErrorMap],
+    kind: str,
+    covariance: Callable[..., np.ndarray],
+    *,
+    scale: bool,
+) -> _Difference:
     """Return the second map minus the first."""
     (old, _), (new, _) = (emap.of(kind) for emap in maps)
     known = np.isfinite(new - old).all(axis=0)
@@ -314,25 +352,37 @@ def _difference(results: Sequence[CalibrationResult], maps: Sequence[ErrorMap], 
 
     total = np.sum(of_one_kind([covariance(result, kind, known) for result in results]), axis=0)
     power = [float(np.nan_to_num(rms(emap.of(kind)[1]))) ** 2 for emap in maps]
-    dof = joint_dof(*zip(power, [getattr(result.noise, f"dof_{kind}") for result in results],
-                         strict=True))
+    dof = joint_dof(
+        *zip(power, [getattr(result.noise, f"dof_{kind}") for result in results], strict=True)
+    )
     return _Difference(out, datum, significance(values, ReducedNoise(total, columns, dof)))
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:
     """Raise InputError unless both maps have the same lattice."""
-    for what, one, other in (("sites", a.shape, b.shape),
-                             ("angular lines", a.angular_count, b.angular_count)):
+    for what, one, other in (
+        ("sites", a.shape, b.shape),
+        ("angular lines", a.angular_count, b.angular_count),
+    ):
         if one != other:
-            raise InputError(f"{names[0]} and {names[1]}", f"the lattices differ: {one} and "
-                             f"{other} {what}", "compare maps of the same plate")
+            raise InputError(
+                f"{names[0]} and {names[1]}",
+                f"the lattices differ: {one} and {other} {what}",
+                "compare maps of the same plate",
+            )
     if a.marks != b.marks:
-        raise InputError(f"{names[0]} and {names[1]}", "the lists of marks differ",
-                         "compare maps of the same plate")
+        raise InputError(
+            f"{names[0]} and {names[1]}",
+            "the lists of marks differ",
+            "compare maps of the same plate",
+        )
     if abs(a.grid_pitch_m - b.grid_pitch_m) > GAP * a.grid_pitch_m:
-        raise InputError(f"{names[0]} and {names[1]}", "the lattices differ: pitches of "
-                         f"{a.grid_pitch_m * MM_PER_M:.9g} and {b.grid_pitch_m * MM_PER_M:.9g} mm",
-                         "compare maps of the same plate")
+        raise InputError(
+            f"{names[0]} and {names[1]}",
+            "the lattices differ: pitches of "
+            f"{a.grid_pitch_m * MM_PER_M:.9g} and {b.grid_pitch_m * MM_PER_M:.9g} mm",
+            "compare maps of the same plate",
+        )
 
 
 def joint_dof(*parts: tuple[float, float]) -> float:
@@ -366,8 +416,7 @@ class LaserDifference:
 
 
 @one_thread()
-def compare_with_laser(result: CalibrationResult, laser: dict,
-                       where: str) -> list[LaserDifference]:
+def compare_with_laser(result: CalibrationResult, laser: dict, where: str) -> list[LaserDifference]:
     """Compare O and R of a map with a step-diagonal measurement.
 
     Parameters
@@ -386,10 +435,15 @@ def compare_with_laser(result: CalibrationResult, laser: dict,
     """
     parts = laser.get("error_map_equivalent")
     if not isinstance(parts, dict) or parts.get("nonorthogonality") is None:
-        raise InputError(where, "no error_map_equivalent with a nonorthogonality",
-                         "give an OUT.json of a 2D measurement that `selfcal step-diagonal` wrote")
-    of_map = {"nonorthogonality": result.error_map.nonorthogonality,
-              "scale_difference": result.error_map.scale_difference}
+        raise InputError(
+            where,
+            "no error_map_equivalent with a nonorthogonality",
+            "give an OUT.json of a 2D measurement that `selfcal step-diagonal` wrote",
+        )
+    of_map = {
+        "nonorthogonality": result.error_map.nonorthogonality,
+        "scale_difference": result.error_map.scale_difference,
+    }
     u_map = first_order_u(result)
     out = []
     for (name, value), u_of_map in zip(of_map.items(), u_map, strict=True):

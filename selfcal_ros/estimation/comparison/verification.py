@@ -207,8 +207,10 @@ class _Maps:
     def gain(self) -> tuple[float, float]:
         """By how much the sum of squares falls, noise taken off, and its u."""
         gain, variance = 0.0, 0.0
-        for sign, values, cover in ((1, self.before, self.cover_before),
-                                    (-1, self.after, self.cover_after)):
+        for sign, values, cover in (
+            (1, self.before, self.cover_before),
+            (-1, self.after, self.cover_after),
+        ):
             gain += sign * (_square(values) - float(variances(cover).sum()))
             variance += 4 * float(variances_of(cover, values[:, None])[0]) + 2 * _square(cover)
         return gain, variance**0.5
@@ -257,8 +259,9 @@ class _Maps:
 def require_correctable(result: CalibrationResult, where: str) -> None:
     """Raise InputError unless the map of a result may be corrected."""
     if not result.observability.identifiable or not result.verdict.qualified:
-        raise InputError(where, "is not qualified, so it is not a map to correct with",
-                         "calibrate again")
+        raise InputError(
+            where, "is not qualified, so it is not a map to correct with", "calibrate again"
+        )
 
 
 def is_believed(after: CalibrationResult, found: "Verification") -> bool:
@@ -274,13 +277,18 @@ def is_believed(after: CalibrationResult, found: "Verification") -> bool:
 def corrected(result: CalibrationResult) -> CalibrationResult:
     """Return a calibration of a plate whose stage is expected without error, as if corrected."""
     emap = result.error_map
-    return replace(result, error_map=replace(
-        emap, gx=0 * emap.gx, gy=0 * emap.gy, g_theta=0 * emap.g_theta))
+    return replace(
+        result, error_map=replace(emap, gx=0 * emap.gx, gy=0 * emap.gy, g_theta=0 * emap.g_theta)
+    )
 
 
 @one_thread()
-def verify(before: CalibrationResult, after: CalibrationResult, *,
-           names: tuple[str, str] = ("before", "after")) -> Verification:
+def verify(
+    before: CalibrationResult,
+    after: CalibrationResult,
+    *,
+    names: tuple[str, str] = ("before", "after"),
+) -> Verification:
     """Compare the map that is corrected with the map of the stage while it is corrected.
 
     Parameters
@@ -299,13 +307,18 @@ def verify(before: CalibrationResult, after: CalibrationResult, *,
     first, second = before.error_map, after.error_map
     known = np.isfinite(first.gx + first.gy + second.gx + second.gy)
     if known.sum() < 3:
-        raise InputError(names[1], f"{int(known.sum())} nodes are known in both maps",
-                         "measure where the map is known")
+        raise InputError(
+            names[1],
+            f"{int(known.sum())} nodes are known in both maps",
+            "measure where the map is known",
+        )
     maps = _maps(before, after, "xy", known)
     if not np.isfinite(maps.cover).all():
-        raise InputError(names[0] if np.isfinite(second.u_gx[known]).all() else names[1],
-                         "has no uncertainty, so nothing can be verified",
-                         "solve it again with --uncertainty always")
+        raise InputError(
+            names[0] if np.isfinite(second.u_gx[known]).all() else names[1],
+            "has no uncertainty, so nothing can be verified",
+            "solve it again with --uncertainty always",
+        )
     fault = _fault(maps, first)
     if maps.better and not maps.remains:
         fault = TableFault.NONE
@@ -325,38 +338,53 @@ def verify(before: CalibrationResult, after: CalibrationResult, *,
         axes |= _axes(circle, (before, after))
     gx, gy = np.full((2, *known.shape), np.nan)
     gx[known], gy[known] = maps.by_axis(maps.after)
-    return Verification(better, fault, theta_fault, maps.remains, axes, maps.alike,
-                        maps.remaining, gx, gy, g_theta)
+    return Verification(
+        better, fault, theta_fault, maps.remains, axes, maps.alike, maps.remaining, gx, gy, g_theta
+    )
 
 
-def _maps(before: CalibrationResult, after: CalibrationResult, kind: str,
-          known: np.ndarray) -> _Maps:
+def _maps(
+    before: CalibrationResult, after: CalibrationResult, kind: str, known: np.ndarray
+) -> _Maps:
     """Return both maps over known places; scale is datum unless both have one."""
     pair = (before, after)
     keep_scale = all(result.reference is not None for result in pair)
     columns = datum_columns(before.artifact, kind, known, scale=not keep_scale)
     datum = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
     values = [result.error_map.of(kind)[0][:, known].ravel() for result in pair]
-    covers = [without(cover, datum) for cover in of_one_kind(
-        [covariance_of(result, kind, known) for result in pair])]
-    dof = joint_dof(*((float(variances(cover).sum()), getattr(result.noise, f"dof_{kind}"))
-                      for cover, result in zip(covers, pair, strict=True)))
+    covers = [
+        without(cover, datum)
+        for cover in of_one_kind([covariance_of(result, kind, known) for result in pair])
+    ]
+    dof = joint_dof(
+        *(
+            (float(variances(cover).sum()), getattr(result.noise, f"dof_{kind}"))
+            for cover, result in zip(covers, pair, strict=True)
+        )
+    )
     free = [each - datum @ (datum.T @ each) for each in values]
     return _Maps(kind, known, free[0], free[1], covers[0], covers[1], datum, dof)
 
 
-def _axes(maps: _Maps,
-          pair: tuple[CalibrationResult, CalibrationResult]) -> dict[str, AxisError]:
+def _axes(maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult]) -> dict[str, AxisError]:
     """Return the errors of each axis before and after, with U and the factor."""
     u_before, u_after = (
         getattr(result.noise, f"k_{maps.kind}") * result.error_map.of(maps.kind)[1]
-        for result in pair)
+        for result in pair
+    )
     before, after = maps.by_axis(maps.before), maps.by_axis(maps.after)
-    return {name: AxisError(
-        rms(before[axis]), rms(after[axis]), float(np.abs(before[axis]).max()),
-        float(np.abs(after[axis]).max()), rms(u_before[axis, maps.known]),
-        rms(u_after[axis, maps.known]), *maps.factors[axis])
-        for axis, name in enumerate(AXES[maps.kind])}
+    return {
+        name: AxisError(
+            rms(before[axis]),
+            rms(after[axis]),
+            float(np.abs(before[axis]).max()),
+            float(np.abs(after[axis]).max()),
+            rms(u_before[axis, maps.known]),
+            rms(u_after[axis, maps.known]),
+            *maps.factors[axis],
+        )
+        for axis, name in enumerate(AXES[maps.kind])
+    }
 
 
 def _square(values: np.ndarray) -> float:
@@ -388,9 +416,12 @@ def _fault(maps: _Maps, emap: ErrorMap) -> TableFault:
 
 def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[TableFault, tuple[np.ndarray, np.ndarray]]:
     """Return a map (nx, ny) as it acts with each fault of arrangement."""
-    found = {TableFault.COMPONENTS: (gy, gx), TableFault.MIRRORED_X: (gx[::-1], gy[::-1]),
-             TableFault.MIRRORED_Y: (gx[:, ::-1], gy[:, ::-1]),
-             TableFault.MIRRORED: (gx[::-1, ::-1], gy[::-1, ::-1])}
+    found = {
+        TableFault.COMPONENTS: (gy, gx),
+        TableFault.MIRRORED_X: (gx[::-1], gy[::-1]),
+        TableFault.MIRRORED_Y: (gx[:, ::-1], gy[:, ::-1]),
+        TableFault.MIRRORED: (gx[::-1, ::-1], gy[::-1, ::-1]),
+    }
     if gx.shape[0] == gx.shape[1]:
         found |= {TableFault.PLACES: (gx.T, gy.T), TableFault.TRANSPOSED: (gy.T, gx.T)}
     return found

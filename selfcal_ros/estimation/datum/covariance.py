@@ -42,16 +42,23 @@ NO_NOISE = float(np.sqrt(np.finfo(float).tiny))
 """Noise that stands for none: its square is still a number."""
 
 
-def scale_of(system: NormalEquations, reference: ReferenceLength, *, field: np.ndarray,
-             plate: np.ndarray, half_width_m: float) -> float:
+def scale_of(
+    system: NormalEquations,
+    reference: ReferenceLength,
+    *,
+    field: np.ndarray,
+    plate: np.ndarray,
+    half_width_m: float,
+) -> float:
     """Return c for a map and a plate in their datum, m at the unit of position."""
     sites, marks = scale_rows(system, reference)
     value = reference.relative_error * half_width_m * (-1 if reference.kind.of_plate else 1)
     return value + float(np.real(np.vdot(sites, field) + np.vdot(marks, plate)))
 
 
-def scale_rows(system: NormalEquations, reference: ReferenceLength
-               ) -> tuple[np.ndarray, np.ndarray]:
+def scale_rows(
+    system: NormalEquations, reference: ReferenceLength
+) -> tuple[np.ndarray, np.ndarray]:
     """Return c as functionals of both maps in their datum, complex (sites, 1) and (marks, 1)."""
     sites = np.zeros((system.grid.n_sites, 1), dtype=complex)
     marks = np.zeros((system.grid.n_marks, 1), dtype=complex)
@@ -78,8 +85,11 @@ def scale_of_plate(system: NormalEquations, reference: ReferenceLength) -> np.nd
     first, second = (system.grid.views.index_of(*mark) for mark in reference.marks)
     for mark, at in zip(reference.marks, (first, second), strict=True):
         if not known[at]:
-            raise InputError("reference length", f"the mark {mark} was not measured",
-                             "measure it, or take another reference")
+            raise InputError(
+                "reference length",
+                f"the mark {mark} was not measured",
+                "measure it, or take another reference",
+            )
     apart, row = z[second] - z[first], np.zeros(z.shape, dtype=complex)
     row[second], row[first] = (sign * apart / abs(apart) ** 2 for sign in (1, -1))
     return row
@@ -127,10 +137,15 @@ class TermSpread:
     def none(cls, system: NormalEquations) -> "TermSpread":
         """Return that of no term."""
         grid, angular = system.grid, system.angular
-        return cls(np.zeros((0, *grid.weight.shape), dtype=complex),
-                   np.zeros((0, *angular.weight.shape)), np.zeros((grid.n_sites, 0), dtype=complex),
-                   np.zeros((grid.n_marks, 0), dtype=complex), np.zeros((system.size, 0)),
-                   np.zeros((angular.n_lines, 0)), np.zeros((0, 0)))
+        return cls(
+            np.zeros((0, *grid.weight.shape), dtype=complex),
+            np.zeros((0, *angular.weight.shape)),
+            np.zeros((grid.n_sites, 0), dtype=complex),
+            np.zeros((grid.n_marks, 0), dtype=complex),
+            np.zeros((system.size, 0)),
+            np.zeros((angular.n_lines, 0)),
+            np.zeros((0, 0)),
+        )
 
 
 class MapsCovariance:
@@ -152,16 +167,26 @@ class MapsCovariance:
         Terms of the model that were estimated with the maps.
     """
 
-    def __init__(self, system: NormalEquations, inverse: np.ndarray,
-                 reference: ReferenceLength | None = None, *, half_width_m: float = 1.0,
-                 sigma_m: float = 1.0, terms: TermSpread | None = None) -> None:
+    def __init__(
+        self,
+        system: NormalEquations,
+        inverse: np.ndarray,
+        reference: ReferenceLength | None = None,
+        *,
+        half_width_m: float = 1.0,
+        sigma_m: float = 1.0,
+        terms: TermSpread | None = None,
+    ) -> None:
         self.system, self.inverse, self.length = system, inverse, half_width_m
         self.terms = terms or TermSpread.none(system)
         n = 3 * system.grid.n_views
         self._p, self._moved = inverse[:n, :n], self.terms.parameters[:n]
         self._scale = None if reference is None else scale_rows(system, reference)
-        self._u = 0.0 if reference is None else (
-            reference.u_relative * half_width_m / max(sigma_m, NO_NOISE))
+        self._u = (
+            0.0
+            if reference is None
+            else (reference.u_relative * half_width_m / max(sigma_m, NO_NOISE))
+        )
 
     def of(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance (k, k) of functionals Re(conj(sites) G + conj(marks) A).
@@ -229,8 +254,10 @@ class MapsCovariance:
     def maps_of_terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps for a unit of each coefficient in the datum, (sites, p), (marks, p)."""
         out = []
-        for own, plate, known in ((self.terms.fields, False, self.system.known_sites),
-                                  (self.terms.plates, True, self.system.known_marks)):
+        for own, plate, known in (
+            (self.terms.fields, False, self.system.known_sites),
+            (self.terms.plates, True, self.system.known_marks),
+        ):
             fields, g, a = self._datum(plate=plate)
             moved = own + fields @ self._of_terms(g, a).T
             out.append(np.where(known.reshape(-1, 1), moved, 0.0))
@@ -248,8 +275,9 @@ class MapsCovariance:
         """Return the variances that the reference itself adds at places, (2, places)."""
         return (np.stack([z.real, z.imag]).reshape(2, -1) * self._u) ** 2
 
-    def _functionals(self, sites: np.ndarray, marks: np.ndarray | None
-                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _functionals(
+        self, sites: np.ndarray, marks: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return functionals (k, nx, ny) of the maps as those of free maps, (sites, k), (marks, k).
 
         And the share of the reference's length in each, (k,).
@@ -280,15 +308,18 @@ class MapsCovariance:
         if plate:
             z, basis = views.z.reshape(-1), system.plate_gauge.orthonormal
             fields = np.column_stack([-basis, system.plate_gauge.without(z)])
-            g = np.column_stack([np.zeros((views.z_sites.size, basis.shape[1])),
-                                 system.gauge.dual(3).reshape(-1)])
+            g = np.column_stack(
+                [np.zeros((views.z_sites.size, basis.shape[1])), system.gauge.dual(3).reshape(-1)]
+            )
             a = np.column_stack([basis, np.zeros(len(z))])
         else:
             z, g = -views.z_sites.reshape(-1), system.gauge.orthonormal
             fields, a = -g, np.zeros((views.z.size, g.shape[1]))
         if self._scale is not None:
-            fields, g, a = (np.column_stack(pair) for pair in zip(
-                (fields, g, a), (-z, *self._free(*self._scale)), strict=True))
+            fields, g, a = (
+                np.column_stack(pair)
+                for pair in zip((fields, g, a), (-z, *self._free(*self._scale)), strict=True)
+            )
         return fields, g, a
 
     def _solved(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -311,8 +342,13 @@ class MapsCovariance:
             field = self._plates(field, parameters) + noise[:, None] * a
             own, of_terms = noise + grid.variance_of_means, self.terms.plates
             answer = self._plates(-answer, np.eye(len(self._p)))
-        return in_datum(own, ((answer, self._p), (of_terms, self.terms.covariance)),
-                        field - of_terms @ taken, fields, self.of_free(g, a))
+        return in_datum(
+            own,
+            ((answer, self._p), (of_terms, self.terms.covariance)),
+            field - of_terms @ taken,
+            fields,
+            self.of_free(g, a),
+        )
 
     def _plates(self, fields: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return what maps (sites, k) and misalignments (3 views, k) make of the plate."""
@@ -354,8 +390,9 @@ class Conditions:
     phi_gain: np.ndarray
 
 
-def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
-                   half_width_m: float) -> Conditions:
+def conditions_for(
+    system: NormalEquations, datum: ThetaDatum, sense: Sense, half_width_m: float
+) -> Conditions:
     """Return the conditions of a datum for the measured plan.
 
     Parameters
@@ -377,34 +414,57 @@ def conditions_for(system: NormalEquations, datum: ThetaDatum, sense: Sense,
     known, n_lines = system.known_lines, system.angular.n_lines
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         if n_lines % 4:
-            raise InputError("theta datum xy_axes", f"of {n_lines} lines, none lies on the y axis",
-                             "use zero_mean")
+            raise InputError(
+                "theta datum xy_axes",
+                f"of {n_lines} lines, none lies on the y axis",
+                "use zero_mean",
+            )
         sites = turned_over(sense, system.known_sites, sign=1)
         slopes = turned_over(sense, slope_rows(system.grid.views.z_sites * half_width_m, sites))
-        rows = lines_turned_over(sense, np.eye(n_lines)[:, ::n_lines // 4]).T
+        rows = lines_turned_over(sense, np.eye(n_lines)[:, :: n_lines // 4]).T
         _require_axes(sites, [bool(known[row != 0].all()) for row in rows])
         return _solve_conditions(system, rows, slopes)
     rows = np.atleast_2d(known / max(known.sum(), 1))
-    return Conditions(ThetaDatum.ZERO_MEAN, rows,
-                      np.zeros((1, *system.grid.views.shape), dtype=complex),
-                      np.ones((n_lines, 1)), np.zeros((system.angular.n_views, 1)))
+    return Conditions(
+        ThetaDatum.ZERO_MEAN,
+        rows,
+        np.zeros((1, *system.grid.views.shape), dtype=complex),
+        np.ones((n_lines, 1)),
+        np.zeros((system.angular.n_views, 1)),
+    )
 
 
 def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
     """Raise InputError unless all four half axes and their lines are determined."""
     if not all(size % 2 for size in known.shape):
-        raise InputError("theta datum xy_axes", f"no sites of {known.shape[0]} x {known.shape[1]} "
-                         "lie on the axes", "use zero_mean, or odd numbers of sites")
+        raise InputError(
+            "theta datum xy_axes",
+            f"no sites of {known.shape[0]} x {known.shape[1]} lie on the axes",
+            "use zero_mean, or odd numbers of sites",
+        )
     hx, hy = (size // 2 for size in known.shape)
-    halves = (("+x", known[hx + 1:, hy]), ("+y", known[hx, hy + 1:]), ("-x", known[:hx, hy]),
-              ("-y", known[hx, :hy]))
+    halves = (
+        ("+x", known[hx + 1 :, hy]),
+        ("+y", known[hx, hy + 1 :]),
+        ("-x", known[:hx, hy]),
+        ("-y", known[hx, :hy]),
+    )
     for (name, half), line in zip(halves, lines, strict=True):
-        what = ("has one site, which gives no slope" if len(half) < 2 else
-                f"is known at {int(half.sum())} of {len(half)} sites" if not half.all() else
-                "has no known angular line" if not line else "")
+        what = (
+            "has one site, which gives no slope"
+            if len(half) < 2
+            else f"is known at {int(half.sum())} of {len(half)} sites"
+            if not half.all()
+            else "has no known angular line"
+            if not line
+            else ""
+        )
         if what:
-            raise InputError("theta datum xy_axes", f"the half axis along {name} {what}",
-                             "measure what is missing there, or use zero_mean")
+            raise InputError(
+                "theta datum xy_axes",
+                f"the half axis along {name} {what}",
+                "measure what is missing there, or use zero_mean",
+            )
 
 
 def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndarray) -> Conditions:
@@ -482,12 +542,22 @@ class LinesCovariance:
         rows = conditions.rows.T
         misclosure = -rows, np.zeros(rows.shape), self.cover.functionals(conditions.slopes)
         closure, y, n = self.of(*misclosure), self.angular.response, self.angular.n_lines
-        inverse = np.concatenate([self.angular.solve(np.eye(n, len(here), -here[0]))[
-            here, here - here[0]] for here in self._blocks()])
+        inverse = np.concatenate(
+            [
+                self.angular.solve(np.eye(n, len(here), -here[0]))[here, here - here[0]]
+                for here in self._blocks()
+            ]
+        )
         phi = self.cover.inverse[np.ix_(self.system.phi_at, self.system.phi_at)] * (
-            self._xy2 / self.cover.length**2)
-        variance = in_datum(self._theta2 * inverse, ((y, phi), (self.terms[0], self._of_terms)),
-                            self._spread(*misclosure)[0], conditions.gain, closure)[0]
+            self._xy2 / self.cover.length**2
+        )
+        variance = in_datum(
+            self._theta2 * inverse,
+            ((y, phi), (self.terms[0], self._of_terms)),
+            self._spread(*misclosure)[0],
+            conditions.gain,
+            closure,
+        )[0]
         return np.where(self.system.known_lines, variance, np.nan), closure
 
     def of_plate(self) -> np.ndarray:
@@ -496,10 +566,15 @@ class LinesCovariance:
         The rotations of the views are those for which neither stage nor plate is turned.
         """
         system, angular, count = self.system, self.angular, self.angular.n_lines
-        of_sites, of_marks = (-gauge.dual(2).reshape(-1, 1) / self.cover.length
-                              for gauge in (system.gauge, system.plate_gauge))
-        datum = ((system.known_lines / system.known_lines.sum())[:, None], np.zeros((count, 1)),
-                 (of_sites, of_marks))
+        of_sites, of_marks = (
+            -gauge.dual(2).reshape(-1, 1) / self.cover.length
+            for gauge in (system.gauge, system.plate_gauge)
+        )
+        datum = (
+            (system.known_lines / system.known_lines.sum())[:, None],
+            np.zeros((count, 1)),
+            (of_sites, of_marks),
+        )
         own = np.zeros(count)
         for here in self._blocks():
             one = np.eye(count, len(here), -here[0])
@@ -507,12 +582,17 @@ class LinesCovariance:
             own[here] = self._theta2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
             own[here] += self._xy2 * np.einsum("vl,vw,wl->l", factors, self.cover.inverse, factors)
             own[here] += np.einsum("pl,pq,ql->l", of_terms, self._of_terms, of_terms)
-        variance = in_datum(own + self._of_means, (), self._spread(*datum)[1],
-                            np.ones((count, 1)), self.of(*datum))[0]
+        variance = in_datum(
+            own + self._of_means, (), self._spread(*datum)[1], np.ones((count, 1)), self.of(*datum)
+        )[0]
         return np.where(system.known_plate_lines, variance, np.nan)
 
-    def of(self, stage: np.ndarray, plate: np.ndarray,
-           maps: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
+    def of(
+        self,
+        stage: np.ndarray,
+        plate: np.ndarray,
+        maps: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> np.ndarray:
         """Return the covariance of functionals of the free maps, (k, k).
 
         Parameters
@@ -529,8 +609,12 @@ class LinesCovariance:
         cov += of_terms.T @ self._of_terms @ of_terms
         return (cov + cov.T) / 2
 
-    def _free(self, stage: np.ndarray, plate: np.ndarray,
-              maps: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[np.ndarray, ...]:
+    def _free(
+        self,
+        stage: np.ndarray,
+        plate: np.ndarray,
+        maps: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> tuple[np.ndarray, ...]:
         """Return functionals as those of stage lines, misalignments, 1/m, and terms.
 
         And the covariance of the part that is of sites and marks alone, (k, k), rad^2.
@@ -542,11 +626,12 @@ class LinesCovariance:
         if maps is None:
             return rows, factors, of_terms, np.zeros((rows.shape[1],) * 2)
         noise, of_maps, terms_of_maps = self.cover.independent(*maps)
-        factors[:len(of_maps)] += of_maps
+        factors[: len(of_maps)] += of_maps
         return rows, factors, of_terms + terms_of_maps, self._xy2 * noise
 
-    def _spread(self, stage: np.ndarray, plate: np.ndarray,
-                maps: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _spread(
+        self, stage: np.ndarray, plate: np.ndarray, maps: tuple[np.ndarray, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the covariance of functionals with both free maps, (K, k) each."""
         rows, factors, of_terms, _ = self._free(stage, plate, maps)
         moved = self._of_terms @ of_terms

@@ -107,19 +107,34 @@ class FittedCamera(Distortion):
         """What a result keeps of it."""
         scale, shear = self.coefficients[1:3]
         u_scale, u_turn = self.u_coefficients[1]
-        known = {cell: CameraCell(z.real, z.imag, e.real, e.imag, *u) for cell, z, e, u in zip(
-            self.cells, self.place, self.error, self.u, strict=True)}
+        known = {
+            cell: CameraCell(z.real, z.imag, e.real, e.imag, *u)
+            for cell, z, e, u in zip(self.cells, self.place, self.error, self.u, strict=True)
+        }
         return CameraErrors(
-            scale=scale.real, rotation=scale.imag, stretch=shear.real, shear=shear.imag,
-            u_scale=u_scale, u_rotation=u_turn, u_stretch=self.u_coefficients[2, 0],
-            u_shear=self.u_coefficients[2, 1], degree=max(a + b for a, b in self.powers),
-            coefficients=tuple(CameraPower(tuple(power), value.real, value.imag, *u)
-                               for power, value, u in zip(self.powers, self.coefficients[1:],
-                                                          self.u_coefficients[1:], strict=True)),
-            cells=tuple(known.get(cell) or CameraCell(
-                *(part * self.image.pitch_m for part in cell), *[math.nan] * 4)
-                for cell in self.image.cells),
-            noise_image=self.noise_image, noise_mark=self.noise_mark)
+            scale=scale.real,
+            rotation=scale.imag,
+            stretch=shear.real,
+            shear=shear.imag,
+            u_scale=u_scale,
+            u_rotation=u_turn,
+            u_stretch=self.u_coefficients[2, 0],
+            u_shear=self.u_coefficients[2, 1],
+            degree=max(a + b for a, b in self.powers),
+            coefficients=tuple(
+                CameraPower(tuple(power), value.real, value.imag, *u)
+                for power, value, u in zip(
+                    self.powers, self.coefficients[1:], self.u_coefficients[1:], strict=True
+                )
+            ),
+            cells=tuple(
+                known.get(cell)
+                or CameraCell(*(part * self.image.pitch_m for part in cell), *[math.nan] * 4)
+                for cell in self.image.cells
+            ),
+            noise_image=self.noise_image,
+            noise_mark=self.noise_mark,
+        )
 
 
 def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
@@ -146,8 +161,10 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
 
     def offsets(parameters: np.ndarray) -> np.ndarray:
         """Return the offsets of the sub-views for misalignments (..., size)."""
-        return problem.to_stage * (parameters[..., 1:3 * grid.n_views:3]
-                       + 1j * parameters[..., 2:3 * grid.n_views:3])
+        return problem.to_stage * (
+            parameters[..., 1 : 3 * grid.n_views : 3]
+            + 1j * parameters[..., 2 : 3 * grid.n_views : 3]
+        )
 
     noises = images.noises(model.found.residuals)
     drawn = offsets(images.parameters)
@@ -157,8 +174,9 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
     cells, rows, errors = layout
     found, drawn = errors(offsets(model.found.parameters)), errors(drawn)
     samples = noises.mark * drawn[:, 0] + noises.image * drawn[:, 1]
-    published = np.array([_place([readings[row] for row in column[column >= 0]])
-                          for column in rows.T])
+    published = np.array(
+        [_place([readings[row] for row in column[column >= 0]]) for column in rows.T]
+    )
     if not _determined(published, POWERS[1]):
         return None
     error = found
@@ -169,8 +187,18 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
         if np.array_equal(error, before):
             break
     moved = samples @ fit.T
-    return FittedCamera(powers, fit @ error, image, cells, published - error, error, _spread(
-        samples - moved[:, :1]), _spread(moved), noises.image, noises.mark)
+    return FittedCamera(
+        powers,
+        fit @ error,
+        image,
+        cells,
+        published - error,
+        error,
+        _spread(samples - moved[:, :1]),
+        _spread(moved),
+        noises.image,
+        noises.mark,
+    )
 
 
 Layout = tuple[list[tuple[int, int]], np.ndarray, Callable[[np.ndarray], np.ndarray]]
@@ -188,8 +216,13 @@ def _layout(views: Sequence[View], image: ImageCells, seen: np.ndarray) -> Layou
     names = list(dict.fromkeys(name for name, _ in at))
     cells = [cell for cell in image.cells if any((name, cell) in at for name in names)]
     rows = np.array([[at.get((name, cell), -1) for cell in cells] for name in names])
-    effects = np.concatenate([np.repeat(np.eye(len(names)), len(cells), axis=0),
-                              np.tile(np.eye(len(cells)), (len(names), 1))], axis=1)
+    effects = np.concatenate(
+        [
+            np.repeat(np.eye(len(names)), len(cells), axis=0),
+            np.tile(np.eye(len(cells)), (len(names), 1)),
+        ],
+        axis=1,
+    )
     known = rows >= 0
     if np.linalg.matrix_rank(effects[known.ravel()]) < len(names) + len(cells) - 1:
         return None
@@ -209,8 +242,9 @@ def _spread(samples: np.ndarray) -> np.ndarray:
     return np.stack([samples.real.std(axis=0, ddof=1), samples.imag.std(axis=0, ddof=1)], axis=1)
 
 
-def _polynomial(place: np.ndarray, error: np.ndarray,
-                samples: np.ndarray) -> tuple[Powers, np.ndarray]:
+def _polynomial(
+    place: np.ndarray, error: np.ndarray, samples: np.ndarray
+) -> tuple[Powers, np.ndarray]:
     """Return the powers of a polynomial, and the matrix from errors to its coefficients.
 
     A degree is taken if its coefficients differ from 0 by more than those of draws (Hotelling).
@@ -222,8 +256,8 @@ def _polynomial(place: np.ndarray, error: np.ndarray,
         if not _determined(place, more):
             continue
         wider = _fitted(place, more)
-        added = (wider @ error)[len(powers) + 1:]
-        drawn = (samples @ wider.T)[:, len(powers) + 1:]
+        added = (wider @ error)[len(powers) + 1 :]
+        drawn = (samples @ wider.T)[:, len(powers) + 1 :]
         both = np.concatenate([drawn.real, drawn.imag], axis=1)
         value, (k, n) = np.concatenate([added.real, added.imag]), both.shape
         squares = value @ np.linalg.solve(both.T @ both / k, value)
@@ -235,7 +269,7 @@ def _polynomial(place: np.ndarray, error: np.ndarray,
 def _fitted(place: np.ndarray, powers: Powers) -> np.ndarray:
     """Return the least-squares matrix from errors at the cells to coefficients, complex."""
     scale = float(np.abs(place).max())
-    unit = np.array([1.0, *(scale**(a + b) for a, b in powers)])
+    unit = np.array([1.0, *(scale ** (a + b) for a, b in powers)])
     return np.linalg.pinv(_unit_terms(place, powers)) / unit[:, None]
 
 
@@ -253,8 +287,15 @@ def _determined(place: np.ndarray, powers: Powers) -> bool:
 def _place(views: Sequence[ViewReadings]) -> complex:
     """Return the mean published offset in a cell, stage axes, m."""
     visited = [view for view in views if view.visits is not None]
-    return complex(np.mean([view.view.cell_m + (view.visits.offset_x + 1j * view.visits.offset_y)
-                            .mean() for view in visited if view.visits is not None]))
+    return complex(
+        np.mean(
+            [
+                view.view.cell_m + (view.visits.offset_x + 1j * view.visits.offset_y).mean()
+                for view in visited
+                if view.visits is not None
+            ]
+        )
+    )
 
 
 def straightened(measurements: Measurements, camera: Distortion) -> Measurements:
@@ -263,22 +304,30 @@ def straightened(measurements: Measurements, camera: Distortion) -> Measurements
     Or that of its nominal place, if the camera was found from other readings, or without the cell.
     """
     places = camera.places
-    return replace(measurements, views=tuple(
-        view if view.view.cell is None or view.visits is None
-        else _straight(view, view.visits, camera, places.get(view.view.cell, view.view.cell_m))
-        for view in measurements.views))
+    return replace(
+        measurements,
+        views=tuple(
+            view
+            if view.view.cell is None or view.visits is None
+            else _straight(view, view.visits, camera, places.get(view.view.cell, view.view.cell_m))
+            for view in measurements.views
+        ),
+    )
 
 
 def known_camera(result: CalibrationResult) -> Distortion | None:
     """Return the camera that a calibration found; None if it found none."""
     if result.camera is None:
         return None
-    return Distortion([(a, b) for a, b in (one.power for one in result.camera.coefficients)],
-                      np.array([0, *(complex(one.x, one.y) for one in result.camera.coefficients)]))
+    return Distortion(
+        [(a, b) for a, b in (one.power for one in result.camera.coefficients)],
+        np.array([0, *(complex(one.x, one.y) for one in result.camera.coefficients)]),
+    )
 
 
-def _straight(view: ViewReadings, visits: GridVisits, camera: Distortion,
-              place: complex) -> ViewReadings:
+def _straight(
+    view: ViewReadings, visits: GridVisits, camera: Distortion, place: complex
+) -> ViewReadings:
     offset = view.view.cell_m + visits.offset_x + 1j * visits.offset_y
     excess = camera.at(offset) - camera.at(np.array([place]))
     return with_offsets(view, visits, -excess, straight_slope(camera, place))
@@ -301,31 +350,56 @@ def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[F
     for cell in dict.fromkeys(cell for _, cell in counts):
         of_views = {name: count for (name, at), count in counts.items() if at == cell}
         total = np.sum(list(of_views.values()), axis=0)
-        few += [(name, cell, count) for name, count in (
-            [("", total)] if total[0] < DETERMINED * total[1] else of_views.items())
-            if count[0] < DETERMINED * count[1]]
+        few += [
+            (name, cell, count)
+            for name, count in (
+                [("", total)] if total[0] < DETERMINED * total[1] else of_views.items()
+            )
+            if count[0] < DETERMINED * count[1]
+        ]
     if not few:
         return ()
-    unknown = None if camera is None else [
-        list(cell) for cell in camera.image.cells if cell not in camera.cells]
-    return (Finding("few_read", details={"unknown": unknown, "cells": [
-        {"view": name, "cell": list(cell), "read": int(read), "shown": int(shown)}
-        for name, cell, (read, shown) in few]}),)
+    unknown = (
+        None
+        if camera is None
+        else [list(cell) for cell in camera.image.cells if cell not in camera.cells]
+    )
+    return (
+        Finding(
+            "few_read",
+            details={
+                "unknown": unknown,
+                "cells": [
+                    {"view": name, "cell": list(cell), "read": int(read), "shown": int(shown)}
+                    for name, cell, (read, shown) in few
+                ],
+            },
+        ),
+    )
 
 
-def _read_and_shown(measurements: Measurements
-                    ) -> dict[tuple[str, tuple[int, int]], tuple[int, int]]:
+def _read_and_shown(
+    measurements: Measurements,
+) -> dict[tuple[str, tuple[int, int]], tuple[int, int]]:
     """Return for views and cells how many marks were read, and how many the images showed."""
     stops: dict[str, set[tuple[int, int]]] = {}
-    parts = [(one.view.plan_view, one.view.cell, one.view.step_on_plate(measurements.artifact), one)
-             for one in measurements.views if one.view.cell is not None]
+    parts = [
+        (one.view.plan_view, one.view.cell, one.view.step_on_plate(measurements.artifact), one)
+        for one in measurements.views
+        if one.view.cell is not None
+    ]
     for name, _, (m, n), one in parts:
-        stops.setdefault(name, set()).update(zip((one.m - m).tolist(), (one.n - n).tolist(),
-                                             strict=True))
+        stops.setdefault(name, set()).update(
+            zip((one.m - m).tolist(), (one.n - n).tolist(), strict=True)
+        )
     (first_m, last_m), (first_n, last_n) = measurements.artifact.limits
-    return {(name, cell): (len(one.m), sum(
-        first_m <= i + m <= last_m and first_n <= j + n <= last_n for i, j in stops[name]))
-            for name, cell, (m, n), one in parts}
+    return {
+        (name, cell): (
+            len(one.m),
+            sum(first_m <= i + m <= last_m and first_n <= j + n <= last_n for i, j in stops[name]),
+        )
+        for name, cell, (m, n), one in parts
+    }
 
 
 def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
@@ -337,18 +411,17 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     name = next((term.name for term in model.problem.terms if term.block.of_images), None)
     if images is None or name is None or model.equations is None:
         return None
-    free = replace(model.equations,
-                   columns=model.equations.columns.scaled(name, math.inf))
+    free = replace(model.equations, columns=model.equations.columns.scaled(name, math.inf))
     rows = free.rows([name]) & (free.norm > free.norm.max() * TRACE)
     seen = rows[free.rows([name])]
     if np.linalg.matrix_rank(free.untold(free.free)[rows], tol=TRACE) > 1:
         return None
     noise, taken = model.found.xy, model.coefficients
-    now = score(free, model.found.both_residuals, squares(model.problem, model.found),
-                coefficients=taken)
+    now = score(
+        free, model.found.both_residuals, squares(model.problem, model.found), coefficients=taken
+    )
     inverse = free.inverse(noise.sigma)
-    values = taken + inverse @ (
-        free.unbiased_sums(now.total) - free.prior(noise.sigma) * taken)
+    values = taken + inverse @ (free.unbiased_sums(now.total) - free.prior(noise.sigma) * taken)
     centred = np.eye(int(rows.sum())) - 1 / rows.sum()
     to_map = centred @ inverse[rows]
     share = images.noises(model.found.residuals).share
@@ -356,12 +429,20 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     sensitivities = grid.plate(
         np.tensordot(to_map, free.columns.grid, axes=1),
         (to_map @ fit.fields.T).reshape(-1, *grid.views.shape),
-        to_map @ fit.parameters[:3 * grid.n_views].T)[1]
+        to_map @ fit.parameters[: 3 * grid.n_views].T,
+    )[1]
     covariance = to_map[:, rows] @ centred + share * images.added_covariance(sensitivities)
     covariance *= noise.sigma**2
     turned, n = centred @ values[rows], len(centred) - 1
     statistic = turned @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ turned
-    x, y = (sense.sign * axis.ravel()[seen]  # (1.6) and its rotations
-            for axis in np.meshgrid(*ground.node_axes_m, indexing="ij"))
-    return StageYawMap(x, y, sense.sign * turned, np.sqrt(np.diag(covariance)),
-                       float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)))
+    x, y = (
+        sense.sign * axis.ravel()[seen]  # (1.6) and its rotations
+        for axis in np.meshgrid(*ground.node_axes_m, indexing="ij")
+    )
+    return StageYawMap(
+        x,
+        y,
+        sense.sign * turned,
+        np.sqrt(np.diag(covariance)),
+        float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)),
+    )

@@ -73,13 +73,14 @@ class FittedTerms:
     inverse: np.ndarray
     rank: int
 
-    def freed(self, residual: np.ndarray,
-              parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def freed(self, residual: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals and misalignments of a fit without the terms after one with them."""
         right = np.einsum("pvij,vij->p", self.residuals.conj(), self.weight * residual).real
         values = self.inverse @ right
-        return (residual - np.tensordot(values, self.residuals, 1),
-                parameters - values @ self.parameters)
+        return (
+            residual - np.tensordot(values, self.residuals, 1),
+            parameters - values @ self.parameters,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +144,12 @@ class ImageNoise:
             found = both @ sums
         mark, image = np.sqrt(found)
         drawn = self.drawn @ [mark**2, image**2, mark * image]
-        return TwoNoises(float(image), float(mark), _dof_of(drawn @ ([1, self.gain] @ both)),
-                         _dof_of(drawn @ both[0]))
+        return TwoNoises(
+            float(image),
+            float(mark),
+            _dof_of(drawn @ ([1, self.gain] @ both)),
+            _dof_of(drawn @ both[0]),
+        )
 
     def own(self, rest: np.ndarray) -> np.ndarray:
         """Return the variances, (k,), for unit noise of each mark by itself."""
@@ -186,8 +191,14 @@ def _dof_of(draws: np.ndarray) -> float:
     return float(2 * draws.mean() ** 2 / spread) if spread else math.inf
 
 
-def image_noise(artifact: Artifact, views: Sequence[View], system: NormalEquations, *,
-                ground: TermInputs, terms: Sequence[ModelTerm] = ()) -> ImageNoise | None:
+def image_noise(
+    artifact: Artifact,
+    views: Sequence[View],
+    system: NormalEquations,
+    *,
+    ground: TermInputs,
+    terms: Sequence[ModelTerm] = (),
+) -> ImageNoise | None:
     """Return the images behind grid readings; None without images.
 
     Parameters
@@ -207,8 +218,11 @@ def image_noise(artifact: Artifact, views: Sequence[View], system: NormalEquatio
     if key is None:
         return None
     nominal = replace(ground, visits=(None,) * len(ground.names))
-    return _known.get(system, (key, tuple(term.name for term in terms)),
-                      lambda: _drawn(system, key, term_columns(nominal, terms).grid))
+    return _known.get(
+        system,
+        (key, tuple(term.name for term in terms)),
+        lambda: _drawn(system, key, term_columns(nominal, terms).grid),
+    )
 
 
 _known: Memo[tuple, ImageNoise] = Memo()
@@ -240,13 +254,15 @@ def _drawn(system: NormalEquations, views: CellsSeen, columns: np.ndarray) -> Im
     weight = grid.weight[grid.read]
     drawn = np.zeros((N_DRAWS, 2, 3))
     fitted = _fitted_terms(system, columns)
-    plain = ImageNoise(stops, grid.read, weight, drawn,
-                       np.zeros((N_DRAWS, 2, 3 * len(views))), fitted)
+    plain = ImageNoise(
+        stops, grid.read, weight, drawn, np.zeros((N_DRAWS, 2, 3 * len(views))), fitted
+    )
     power = np.zeros(2)
     rng = np.random.default_rng(0)
     for row, parameters in zip(drawn, plain.parameters, strict=True):
-        mark, image = (rng.normal(size=(size, 2)) @ [1, 1j] for size in (
-            len(stops), stops.max() + 1))
+        mark, image = (
+            rng.normal(size=(size, 2)) @ [1, 1j] for size in (len(stops), stops.max() + 1)
+        )
         solved = [_solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
         power += [one[2] for one in solved]
         left, parameters[:] = zip(*(fitted.freed(*one[:2]) for one in solved), strict=True)
@@ -263,13 +279,17 @@ def stops_of(views: CellsSeen, read: np.ndarray) -> np.ndarray:
     names = list(dict.fromkeys(name for name, _ in views))
     view, m, n = np.nonzero(read)
     steps = np.array([step for _, step in views])
-    keys = np.stack([np.array([names.index(name) for name, _ in views])[view],
-                     m - steps[view, 0], n - steps[view, 1]])
+    keys = np.stack(
+        [
+            np.array([names.index(name) for name, _ in views])[view],
+            m - steps[view, 0],
+            n - steps[view, 1],
+        ]
+    )
     return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _solved(system: NormalEquations,
-            values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def _solved(system: NormalEquations, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Return residuals (views, nx, ny), misalignments and square of the map of readings (n,).
 
     Of the grid alone, in the datum.
@@ -279,4 +299,4 @@ def _solved(system: NormalEquations,
     y[grid.read] = values
     field, parameters, _, residual = system.in_datum(y, *system.alone(y))
     known = np.where(system.known_sites, field, 0)
-    return residual, parameters, float((abs(known)**2).sum())
+    return residual, parameters, float((abs(known) ** 2).sum())

@@ -102,13 +102,13 @@ class ModelFit:
 
         Complex (V,), plate frame, m, without the terms.
         """
-        known = [] if self.equations is None else self.equations.columns.at_visits(
-            self.coefficients)
+        known = (
+            [] if self.equations is None else self.equations.columns.at_visits(self.coefficients)
+        )
         for row, visits in enumerate(self.problem.ground.visits):
             if visits is not None:
                 y = visits.y - (known[row] if known else 0.0)
-                yield row, visits, visits.about_means(
-                    y[None], self.problem.system.grid.n_marks)[0]
+                yield row, visits, visits.about_means(y[None], self.problem.system.grid.n_marks)[0]
 
     @property
     def spread(self) -> TermSpread | None:
@@ -125,11 +125,24 @@ def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
     on_lines = np.zeros((equations.n, *system.angular.weight.shape))
     if len(columns.lines.at):
         on_lines[columns.lines.at] = columns.lines.values
-    plates = [system.grid.plate(*one)[0].ravel() for one in zip(
-        columns.grid, fit.fields.T.reshape(-1, *system.grid.views.shape),
-        fit.parameters[:3 * system.grid.n_views].T, strict=True)]
-    return TermSpread(columns.grid, on_lines, fit.fields, np.array(plates).T, fit.parameters,
-                      fit.turned, covariance)
+    plates = [
+        system.grid.plate(*one)[0].ravel()
+        for one in zip(
+            columns.grid,
+            fit.fields.T.reshape(-1, *system.grid.views.shape),
+            fit.parameters[: 3 * system.grid.n_views].T,
+            strict=True,
+        )
+    ]
+    return TermSpread(
+        columns.grid,
+        on_lines,
+        fit.fields,
+        np.array(plates).T,
+        fit.parameters,
+        fit.turned,
+        covariance,
+    )
 
 
 def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFit:
@@ -157,19 +170,29 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         before = change
     if problem.terms:
         free = " or ".join(str(term.name) for term in problem.terms if math.isinf(term.size))
-        raise NotSettledError(f"model {', '.join(str(term.name) for term in problem.terms)}",
-                              "the fit does not converge",
-                              "leave a term out" + (f", or give {free} a size" if free else ""))
-    raise NotSettledError("misalignment model 'rigid'", "the rotations do not converge",
-                          "check the readings for misalignments of more than a few degrees")
+        raise NotSettledError(
+            f"model {', '.join(str(term.name) for term in problem.terms)}",
+            "the fit does not converge",
+            "leave a term out" + (f", or give {free} a size" if free else ""),
+        )
+    raise NotSettledError(
+        "misalignment model 'rigid'",
+        "the rotations do not converge",
+        "check the readings for misalignments of more than a few degrees",
+    )
 
 
 def equations_of(problem: Problem, found: JointFit, columns: TermColumns) -> TermEquations:
     """Return the equations of columns about the estimate `found`."""
     noises = filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals))
     return equations_of_columns(
-        problem.system, columns, found.inverse, ratio=found.ratio,
-        half_width_m=problem.half_width_m, noise_m=min(noises, default=0.0))
+        problem.system,
+        columns,
+        found.inverse,
+        ratio=found.ratio,
+        half_width_m=problem.half_width_m,
+        noise_m=min(noises, default=0.0),
+    )
 
 
 class _State:
@@ -206,12 +229,16 @@ class _State:
 
     def _anew(self, before: TermColumns) -> TermColumns:
         """Return the columns for the present visits and noise-free offsets."""
-        ground = without_noise(self.moving.ground(self.found), self.found.residuals,
-                               before.at_visits(self.coefficients))
+        ground = without_noise(
+            self.moving.ground(self.found),
+            self.found.residuals,
+            before.at_visits(self.coefficients),
+        )
         columns = term_columns(ground, self.problem.terms)
         rows = columns.having(lambda block: block.of_microscope)
         effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
-            self.coefficients, rows)
+            self.coefficients, rows
+        )
         largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
         if self.of_offsets and np.abs(effect).max() <= ROUNDED * largest:
             self.offset_steps = self.steps
@@ -221,7 +248,8 @@ class _State:
         """Return whether the weights of angular readings differ from those in the equations."""
         now, then = self.found.inverse, self.weights
         if len(equations.columns.lines.at) and (
-                abs(self.found.ratio - self.ratio) > NEGLIGIBLE * self.ratio):
+            abs(self.found.ratio - self.ratio) > NEGLIGIBLE * self.ratio
+        ):
             return True
         return bool(np.abs(now - then).max() > NEGLIGIBLE * np.abs(then).max())
 
@@ -241,13 +269,17 @@ class _State:
         elif self.problem.moves:
             self.problem = replace(self.problem, repeats_xy=self.moving.repeats(self.found))
         taken = self.moving.taken(self.found.field)
-        self.y = np.where(self.problem.system.grid.read, self.problem.grid.y - self._excess()
-                          - self._of_terms() - taken, 0.0)
+        self.y = np.where(
+            self.problem.system.grid.read,
+            self.problem.grid.y - self._excess() - self._of_terms() - taken,
+            0.0,
+        )
         self.found = fit(self.problem, self.y, self.theta)
         self.moved_m = np.abs(self.found.parameters - parameters)
         self.changed, self.stepped = self.y - y, self.coefficients - coefficients
-        return max(min(float(self.moved_m.max()), float(np.abs(self.changed).max())),
-                   self.moving.change)
+        return max(
+            min(float(self.moved_m.max()), float(np.abs(self.changed).max())), self.moving.change
+        )
 
     def within_noise(self, part: float) -> bool:
         """Return whether the last step was below a part of what the noise makes of it.
@@ -264,7 +296,8 @@ class _State:
         told = spread > ROUNDED * spread.max(initial=0.0)
         noise = np.where(told, sigma * np.sqrt(np.where(told, spread, 0.0)), of_view)
         still = bool((self.moved_m <= part * noise).all()) or (
-            self._changed_besides_m <= part * of_view and self._terms_are_still(part * sigma))
+            self._changed_besides_m <= part * of_view and self._terms_are_still(part * sigma)
+        )
         return still and self.moving.change <= part * of_view
 
     @property
@@ -286,30 +319,38 @@ class _State:
         return ModelFit(problem, self.found, self.equations, self.coefficients, self.y)
 
     def _solve_terms(self, equations: TermEquations) -> None:
-        now = score(equations, self.found.both_residuals, squares(self.problem, self.found),
-                    coefficients=self.coefficients)
+        now = score(
+            equations,
+            self.found.both_residuals,
+            squares(self.problem, self.found),
+            coefficients=self.coefficients,
+        )
         sums = residual_sums(equations, now)
-        total, dof = _of_lines(self.problem, self.found, equations,
-                               equations.free_inverse @ now.total)
+        total, dof = _of_lines(
+            self.problem, self.found, equations, equations.free_inverse @ now.total
+        )
         if sums.dof_between - dof < DECLARED_DOF or total > sums.between:
             total, dof = 0.0, 0.0
         residuals = sigma_of(sums.between - total, sums.dof_between - dof)
         rounded = residuals[0] == 0  # the weight of nearly exact lines leaves nothing else
         self.problem = replace(
             self.problem,
-            residuals_xy=self.problem.residuals_xy if rounded or self._goes_round(
-                residuals[0]) else residuals,
-            repeats_xy=sigma_of(sums.within, sums.dof_within) if sums.dof_within >= 1
-            else self.problem.repeats_xy)
+            residuals_xy=self.problem.residuals_xy
+            if rounded or self._goes_round(residuals[0])
+            else residuals,
+            repeats_xy=sigma_of(sums.within, sums.dof_within)
+            if sums.dof_within >= 1
+            else self.problem.repeats_xy,
+        )
         sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
         inverse = equations.inverse(sigma)
-        self.coefficients = next_coefficients(equations, now, self.coefficients, sigma_m=sigma,
-                                              inverse=inverse)
+        self.coefficients = next_coefficients(
+            equations, now, self.coefficients, sigma_m=sigma, inverse=inverse
+        )
         lines = equations.columns.lines
         if len(lines.at):
             taken = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
-            own = equations.columns.having(
-                lambda block: block.of_lines and not block.turns_lines)
+            own = equations.columns.having(lambda block: block.of_lines and not block.turns_lines)
             within = inverse[np.ix_(own, own)]
             dof = float(np.sum(within * equations.information[np.ix_(own, own)]))
             angular = replace(self.problem.angular, y=self.lines_read - taken)
@@ -324,8 +365,9 @@ class _State:
             self.fell |= sigma_m < before[0]
         return self.rounds
 
-    def _of_terms(self, trait: Callable[[Block], bool] = lambda block: True,
-                  by: np.ndarray | None = None) -> np.ndarray | float:
+    def _of_terms(
+        self, trait: Callable[[Block], bool] = lambda block: True, by: np.ndarray | None = None
+    ) -> np.ndarray | float:
         """Return the effect of the terms with a trait on the readings, (views, nx, ny), m.
 
         Of their coefficients, or of other ones.
@@ -333,15 +375,18 @@ class _State:
         if self.equations is None:
             return 0.0
         columns = self.equations.columns
-        return columns.shapes.combined(self.coefficients if by is None else by,
-                                       columns.having(trait))
+        return columns.shapes.combined(
+            self.coefficients if by is None else by, columns.having(trait)
+        )
 
     def _excess(self) -> np.ndarray | float:
         """Return `Problem.excess` of the present solution."""
         return self.problem.excess(
-            self.found.parameters, self.found.plate + self._of_terms(lambda block: block.of_plate),
+            self.found.parameters,
+            self.found.plate + self._of_terms(lambda block: block.of_plate),
             self.problem.system.grid.views.gather(self.found.field)
-            + self._of_terms(lambda block: block.of_map))
+            + self._of_terms(lambda block: block.of_map),
+        )
 
 
 def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
@@ -355,15 +400,19 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
     dof = grid_dof(problem)
     if found.ratio > 0:
         length = problem.half_width_m
-        total += found.ratio * length**2 * float(
-            (system.angular.weight * found.residuals_theta**2).sum())
+        total += (
+            found.ratio
+            * length**2
+            * float((system.angular.weight * found.residuals_theta**2).sum())
+        )
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += system.angular.n_readings - system.rank_angular + max(shared - 1, 0)
     return total, dof
 
 
-def _of_lines(problem: Problem, found: JointFit, equations: TermEquations,
-              more: np.ndarray) -> tuple[float, float]:
+def _of_lines(
+    problem: Problem, found: JointFit, equations: TermEquations, more: np.ndarray
+) -> tuple[float, float]:
     """Return the part of lines in `squares` and their degrees of freedom, all columns free.
 
     The weight of lines is that of the grid's noise over theirs. If that noise contained their
@@ -384,8 +433,10 @@ def _of_lines(problem: Problem, found: JointFit, equations: TermEquations,
     rotations = found.ratio * found.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
     followed = np.einsum("vk,pvk,qvk->pq", weight, columns, columns) * equations.free_inverse
     rest = found.residuals_theta - np.tensordot(more, columns, axes=1)
-    return (float((weight * rest**2).sum()),
-            angular.n_readings - angular.rank - float(rotations.sum() + followed.sum()))
+    return (
+        float((weight * rest**2).sum()),
+        angular.n_readings - angular.rank - float(rotations.sum() + followed.sum()),
+    )
 
 
 class FinerEquations(PlacedEquations):
@@ -421,8 +472,7 @@ def is_too_large(system: PlacedEquations) -> bool:
 
 def equations_left(grid: PlacedSystem) -> int:
     """Return the readings of a map beyond plate and misalignments: two numbers each."""
-    return 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (
-        grid.n_misalignments - 7)
+    return 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (grid.n_misalignments - 7)
 
 
 def is_untested(problem: Problem) -> bool:
@@ -434,8 +484,13 @@ def is_untested(problem: Problem) -> bool:
     if views.spline.axes[0].degree == 1 or left > 2 * math.prod(views.spline.refined.shape):
         return False
     fine = PlacedSystem(views.artifact, views.poses, system.grid.weight, views.spline.refined)
-    return left - told_coefficients(PlacedEquations(
-        fine, system.angular, system.grid_index, system.angular_index)) < 1
+    return (
+        left
+        - told_coefficients(
+            PlacedEquations(fine, system.angular, system.grid_index, system.angular_index)
+        )
+        < 1
+    )
 
 
 def finer(model: ModelFit) -> ModelFit | None:
@@ -452,8 +507,11 @@ def finer(model: ModelFit) -> ModelFit | None:
     if views.spline.axes[0].degree == 1:
         smooth = MapSpline.of(views.artifact.field, Interpolation.BICUBIC)
         splines += [smooth, smooth.refined]
-    fits = [fine for spline in splines if (fine := with_map(model, spline)) is not None
-            and np.isfinite(fine.found.xy.residuals)]
+    fits = [
+        fine
+        for spline in splines
+        if (fine := with_map(model, spline)) is not None and np.isfinite(fine.found.xy.residuals)
+    ]
     return min(fits, key=lambda fine: fine.found.xy.residuals, default=None)
 
 
@@ -466,12 +524,20 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     if system is None:
         return None
     grid = system.grid
-    other = FinerEquations(PlacedSystem(grid.views.artifact, grid.views.poses, grid.weight, spline,
-                                        grid.rotations),
-                           system.angular, system.grid_index, system.angular_index)
+    other = FinerEquations(
+        PlacedSystem(grid.views.artifact, grid.views.poses, grid.weight, spline, grid.rotations),
+        system.angular,
+        system.grid_index,
+        system.angular_index,
+    )
     flat = np.zeros((len(problem.conditions.rows), *other.grid.views.shape), dtype=complex)
-    problem = replace(problem, system=other, places=None, residuals_xy=None,
-                      conditions=replace(problem.conditions, slopes=flat))
+    problem = replace(
+        problem,
+        system=other,
+        places=None,
+        residuals_xy=None,
+        conditions=replace(problem.conditions, slopes=flat),
+    )
     refitted = replace(model, problem=problem, found=fit(problem, model.y))
     if model.equations is None:
         return refitted
@@ -483,19 +549,34 @@ def _with_terms(model: ModelFit, columns: TermColumns) -> ModelFit:
     """Return a fit with the coefficients of the terms fitted once more."""
     problem, found = model.problem, model.found
     equations = equations_of(problem, found, columns)
-    now = score(equations, found.both_residuals, squares(problem, found),
-                coefficients=model.coefficients)
-    values = next_coefficients(equations, now, model.coefficients, sigma_m=found.xy.sigma,
-                               inverse=equations.inverse(found.xy.sigma))
-    y = np.where(problem.system.grid.read, model.y - columns.shapes.combined(
-        values - model.coefficients), 0.0)
+    now = score(
+        equations, found.both_residuals, squares(problem, found), coefficients=model.coefficients
+    )
+    values = next_coefficients(
+        equations,
+        now,
+        model.coefficients,
+        sigma_m=found.xy.sigma,
+        inverse=equations.inverse(found.xy.sigma),
+    )
+    y = np.where(
+        problem.system.grid.read,
+        model.y - columns.shapes.combined(values - model.coefficients),
+        0.0,
+    )
     found = fit(problem, y)
-    return replace(model, found=found, y=y, coefficients=values,
-                   equations=equations_of(problem, found, columns))
+    return replace(
+        model,
+        found=found,
+        y=y,
+        coefficients=values,
+        equations=equations_of(problem, found, columns),
+    )
 
 
-def fit_model(problem: Problem,
-              check: Callable[[TermEquations], None] = lambda equations: None) -> ModelFit:
+def fit_model(
+    problem: Problem, check: Callable[[TermEquations], None] = lambda equations: None
+) -> ModelFit:
     """Return the joint least-squares solution of the whole model.
 
     A term's size that is too small would bend the map with nothing to show it: if the readings make
@@ -539,12 +620,20 @@ def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
     one is doubtful, that of the other is, too.
     """
     larger = {test.name: test.allowed / test.given for test in sizes if test.raised}
-    offsets = max((factor for name, factor in larger.items() if block_of(name).of_offsets),
-                  default=1.0)
-    return replace(problem, terms=tuple(
-        term if term.free else term.scaled(max(
-            larger.get(term.name, 1.0), offsets if term.block.of_offsets else 1.0))
-        for term in problem.terms))
+    offsets = max(
+        (factor for name, factor in larger.items() if block_of(name).of_offsets), default=1.0
+    )
+    return replace(
+        problem,
+        terms=tuple(
+            term
+            if term.free
+            else term.scaled(
+                max(larger.get(term.name, 1.0), offsets if term.block.of_offsets else 1.0)
+            )
+            for term in problem.terms
+        ),
+    )
 
 
 def _size_tests(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ...]:
@@ -561,8 +650,12 @@ def _tests_of(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ..
     equations = model.equations
     if equations is None or equations.free.all():
         return ()
-    scored = score(equations, model.found.both_residuals, squares(model.problem, model.found),
-                   coefficients=model.coefficients)
+    scored = score(
+        equations,
+        model.found.both_residuals,
+        squares(model.problem, model.found),
+        coefficients=model.coefficients,
+    )
     right = scored.total + equations.information @ model.coefficients
     noise, excess = model.found.xy, noise_excess(model.problem, model.found.residuals)
     return size_tests(equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof))

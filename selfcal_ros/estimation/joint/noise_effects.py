@@ -40,14 +40,19 @@ def axis_contrast(model: ModelFit) -> float:
         dof = model.found.xy.dof_residuals / 2
     dof /= noise_excess(problem, model.found.residuals)
     small, large = sorted(squares)
-    if not (dof >= 1 and small > 0 and large > SAME**2 * small
-            and 2 * float(fdtrc(dof, dof, large / small)) < F_LEVEL):
+    if not (
+        dof >= 1
+        and small > 0
+        and large > SAME**2 * small
+        and 2 * float(fdtrc(dof, dof, large / small)) < F_LEVEL
+    ):
         return 0.0
     return float((squares[0] - squares[1]) / squares.sum())
 
 
-def structured(model: ModelFit, cover: MapsCovariance,
-               rows: np.ndarray | None = None) -> np.ndarray | float:
+def structured(
+    model: ModelFit, cover: MapsCovariance, rows: np.ndarray | None = None
+) -> np.ndarray | float:
     """Return what noise that is neither equal along x and y nor white adds to the variances.
 
     Those of the nodes, or of functionals `rows` of the map, as `added_variances`.
@@ -66,8 +71,9 @@ def structured(model: ModelFit, cover: MapsCovariance,
     return added + image_variances(model, cover, rows)
 
 
-def image_variances(model: ModelFit, cover: MapsCovariance, rows: np.ndarray | None = None, *,
-                    plate: bool = False) -> np.ndarray | float:
+def image_variances(
+    model: ModelFit, cover: MapsCovariance, rows: np.ndarray | None = None, *, plate: bool = False
+) -> np.ndarray | float:
     """Return what the noise that marks of an image share adds to the variances for unit noise.
 
     Those of the stage's map, of functionals `rows` of it, or of the plate's map.
@@ -79,16 +85,22 @@ def image_variances(model: ModelFit, cover: MapsCovariance, rows: np.ndarray | N
     if images is None or not (share := images.noises(model.found.residuals).share):
         return 0.0
     added = added_variances(cover, images.added, rows, plate=plate)
-    whole = (cover.of_plate if plate else cover.of_stage) if rows is None else np.diag(
-        cover.of(rows))
+    whole = (
+        (cover.of_plate if plate else cover.of_stage) if rows is None else np.diag(cover.of(rows))
+    )
     if (added < -whole).any():
         own = added_variances(cover, images.own, rows, plate=plate)
         added = added * np.minimum(1.0, whole / np.where(own > 0, own, 1.0))
     return share * added
 
 
-def added_variances(cover: MapsCovariance, of: Callable[[np.ndarray], np.ndarray],
-                    rows: np.ndarray | None = None, *, plate: bool = False) -> np.ndarray:
+def added_variances(
+    cover: MapsCovariance,
+    of: Callable[[np.ndarray], np.ndarray],
+    rows: np.ndarray | None = None,
+    *,
+    plate: bool = False,
+) -> np.ndarray:
     """Return `of` the sensitivities of each coordinate of a map, (2, nx, ny), or of functionals.
 
     Parameters
@@ -111,8 +123,16 @@ def added_variances(cover: MapsCovariance, of: Callable[[np.ndarray], np.ndarray
     for start in range(0, n, BLOCK):
         unit = np.eye(min(BLOCK, n - start), n, start).reshape(-1, *shape)
         nothing = np.zeros((len(unit), *other))
-        out.append([of(cover.sensitivities(*((nothing, unit * part) if plate else
-                                             (unit * part, nothing)))) for part in (1, 1j)])
+        out.append(
+            [
+                of(
+                    cover.sensitivities(
+                        *((nothing, unit * part) if plate else (unit * part, nothing))
+                    )
+                )
+                for part in (1, 1j)
+            ]
+        )
     return np.concatenate(out, axis=1).reshape(2, *shape)
 
 
@@ -136,7 +156,7 @@ def time_correlation(model: ModelFit) -> np.ndarray:
     products, number = np.zeros(lags + 1), 0
     for _, _, order, rest in views:
         one = rest[order]
-        products += [float(np.vdot(one[:len(one) - k], one[k:]).real) for k in range(lags + 1)]
+        products += [float(np.vdot(one[: len(one) - k], one[k:]).real) for k in range(lags + 1)]
         number += len(one)
     found = products[1:] / products[0]
     p = float(chdtrc(TESTED, 2 * number * float((found[:TESTED] ** 2).sum())))
@@ -144,18 +164,20 @@ def time_correlation(model: ModelFit) -> np.ndarray:
     return found if p < F_LEVEL and 1 + 2 * found.sum() > SAME**2 else np.zeros(0)
 
 
-def correlated_variances(model: ModelFit, cover: MapsCovariance, correlation: np.ndarray,
-                         rows: np.ndarray | None = None) -> np.ndarray:
+def correlated_variances(
+    model: ModelFit, cover: MapsCovariance, correlation: np.ndarray, rows: np.ndarray | None = None
+) -> np.ndarray:
     """Return what correlated noise adds to the variances, as `added_variances`."""
     views = _by_time(model)
 
     def of(rest: np.ndarray) -> np.ndarray:
         total = np.zeros(len(rest))
         for row, visits, order, _ in views:
-            one = (np.sqrt(visits.weight) * rest[:, row].reshape(len(rest), -1)[:, visits.mark]
-                   )[:, order]
+            one = (np.sqrt(visits.weight) * rest[:, row].reshape(len(rest), -1)[:, visits.mark])[
+                :, order
+            ]
             power = abs(np.fft.fft(one, 2 * one.shape[1])) ** 2
-            products = np.fft.ifft(power).real[:, 1:len(correlation) + 1]
+            products = np.fft.ifft(power).real[:, 1 : len(correlation) + 1]
             total += 2 * products @ correlation
         return total
 
@@ -164,6 +186,13 @@ def correlated_variances(model: ModelFit, cover: MapsCovariance, correlation: np
 
 def _by_time(model: ModelFit) -> list[tuple[int, ViewVisits, np.ndarray, np.ndarray]]:
     """Return row, visits, their order and weighted residuals of views with repeated visits."""
-    return [(row, visits, np.argsort(visits.time, kind="stable"),
-             np.sqrt(visits.weight) * (rest + model.found.residuals[row].reshape(-1)[visits.mark]))
-            for row, visits, rest in model.visits_about_means() if visits.repeated]
+    return [
+        (
+            row,
+            visits,
+            np.argsort(visits.time, kind="stable"),
+            np.sqrt(visits.weight) * (rest + model.found.residuals[row].reshape(-1)[visits.mark]),
+        )
+        for row, visits, rest in model.visits_about_means()
+        if visits.repeated
+    ]

@@ -98,8 +98,9 @@ class NoiseEstimate:
         """Two-sided probability that the residuals have the noise that is `known`."""
         if not self.exceeded:
             return self.p
-        return _same_noise((self.repeats, self.dof_repeats),
-                           (self.residuals, self.dof_residuals), FLOOR)
+        return _same_noise(
+            (self.repeats, self.dof_repeats), (self.residuals, self.dof_residuals), FLOOR
+        )
 
     @property
     def contradicted(self) -> bool:
@@ -129,8 +130,13 @@ def pooled(parts: Iterable[tuple[float, float]]) -> tuple[float, float]:
     return float(np.sqrt(sum(dof * sigma**2 for sigma, dof in good) / total)), total
 
 
-def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float], declared: float, *,
-          floor: float = 0.0) -> NoiseEstimate:
+def noise_estimate(
+    repeats: tuple[float, float],
+    residuals: tuple[float, float],
+    declared: float,
+    *,
+    floor: float = 0.0,
+) -> NoiseEstimate:
     """Return the noise to use: declared, else repeats, else residuals.
 
     If a test contradicts this choice, the larger one is used. Repeats that are identical to the
@@ -148,16 +154,26 @@ def noise_estimate(repeats: tuple[float, float], residuals: tuple[float, float],
     if residuals[1] < 1:  # terms with sizes leave fractions of rounding
         residuals = (float("nan"), 0.0)
     identical = repeats[1] > 0 and repeats[0] == 0 and residuals[1] > 0 and residuals[0] > floor
-    base = (declared, float("inf")) if np.isfinite(declared) else (
-        (float("nan"), 0.0) if identical else repeats)
+    base = (
+        (declared, float("inf"))
+        if np.isfinite(declared)
+        else ((float("nan"), 0.0) if identical else repeats)
+    )
     p = _same_noise(base, residuals, floor)
     if np.isfinite(declared) or base[1] >= MIN_REPEAT_DOF or not residuals[1]:
         chosen = base
     else:
         chosen = residuals
     found = NoiseEstimate(
-        sigma=chosen[0], dof=chosen[1], repeats=repeats[0], residuals=residuals[0],
-        dof_repeats=repeats[1], dof_residuals=residuals[1], declared=declared, p=p)
+        sigma=chosen[0],
+        dof=chosen[1],
+        repeats=repeats[0],
+        residuals=residuals[0],
+        dof_repeats=repeats[1],
+        dof_residuals=residuals[1],
+        declared=declared,
+        p=p,
+    )
     if found.contradicted:
         sigma, dof = max(base, residuals)
         return replace(found, sigma=sigma, dof=dof)
@@ -258,8 +274,9 @@ class Problem:
         """Factor from the turned plate frame of each view's readings to the stage frame."""
         return self.system.grid.views.phases * np.exp(1j * self.turn_rad)
 
-    def excess(self, parameters: np.ndarray, plate: np.ndarray,
-               stage: np.ndarray) -> np.ndarray | float:
+    def excess(
+        self, parameters: np.ndarray, plate: np.ndarray, stage: np.ndarray
+    ) -> np.ndarray | float:
         """Return what finite rotations add to the linear model, frame of the plate as it lies, m.
 
         What is left of the rotation there turns the plate; the rotation of the frame turns what the
@@ -275,7 +292,7 @@ class Problem:
         if not self.rigid:
             return 0.0
         grid, length = self.system.grid, self.half_width_m
-        phi = parameters[:3 * grid.n_views:3, None, None] / length
+        phi = parameters[: 3 * grid.n_views : 3, None, None] / length
         frame = np.expm1(-1j * self.turn_rad)[:, None, None]
         return rotation_excess(phi, grid.views.z * length, plate) + frame * stage
 
@@ -289,13 +306,14 @@ class AngularPart:
     noise: NoiseEstimate
 
 
-def repeats_of(measurements: Measurements
-               ) -> tuple[tuple[float, float], tuple[float, float]]:
+def repeats_of(measurements: Measurements) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
     views = measurements.views
-    return (between_visits(measurements, MIN_REPEAT_DOF) or pooled(
-                (v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
-            pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)))
+    return (
+        between_visits(measurements, MIN_REPEAT_DOF)
+        or pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
+        pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
+    )
 
 
 def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
@@ -349,8 +367,9 @@ def least_noise_rad(problem: Problem, sigma_xy: float) -> float:
     return max(LEAST_NOISE_RAD, NEGLIGIBLE * sigma_xy / problem.half_width_m)
 
 
-def bounded_ratio(system: NormalEquations, sigma_xy: float, sigma_theta: float,
-                  half_width_m: float) -> float:
+def bounded_ratio(
+    system: NormalEquations, sigma_xy: float, sigma_theta: float, half_width_m: float
+) -> float:
     """Return the weight of an angular reading against a grid reading, within what rounding bears.
 
     Parameters
@@ -395,9 +414,16 @@ def own_rotations(grid: GridSystem, y: np.ndarray) -> np.ndarray:
     return turned / np.where(moment > 0, moment, 1.0)
 
 
-def problem_of(measurements: Measurements, options: Options, system: NormalEquations,
-               ground: TermInputs, *, readings: tuple[GridData, AngularData],
-               terms: tuple[ModelTerm, ...], images: ImageNoise | None = None) -> Problem:
+def problem_of(
+    measurements: Measurements,
+    options: Options,
+    system: NormalEquations,
+    ground: TermInputs,
+    *,
+    readings: tuple[GridData, AngularData],
+    terms: tuple[ModelTerm, ...],
+    images: ImageNoise | None = None,
+) -> Problem:
     """Return the problem that readings pose, in the frame of the plate as it lies.
 
     Parameters
@@ -410,13 +436,24 @@ def problem_of(measurements: Measurements, options: Options, system: NormalEquat
         As in `Problem`.
     """
     rigid = options.finite_rotations
-    conditions = conditions_for(system, options.datum_theta, measurements.sense,
-                                ground.half_width_m)
+    conditions = conditions_for(
+        system, options.datum_theta, measurements.sense, ground.half_width_m
+    )
     problem = Problem(
-        system, *readings, *repeats_of(measurements), ground.half_width_m, conditions, ground,
-        options.reference, rigid, terms, turn_rad=np.zeros(len(readings[0].index)),
+        system,
+        *readings,
+        *repeats_of(measurements),
+        ground.half_width_m,
+        conditions,
+        ground,
+        options.reference,
+        rigid,
+        terms,
+        turn_rad=np.zeros(len(readings[0].index)),
         places=places_of(measurements, readings[0], ground, system.known_sites),
-        at_places=options.at_places, images=images)
+        at_places=options.at_places,
+        images=images,
+    )
     return turned(problem) if rigid else problem
 
 
@@ -432,18 +469,29 @@ def turned(problem: Problem) -> Problem:
     frame, bent = np.exp(-1j * phi), np.expm1(-1j * phi)
     marks = grid.views.z * length
     y = np.where(grid.read, frame[:, None, None] * problem.grid.y + bent[:, None, None] * marks, 0)
-    visits = tuple(None if v is None else replace(
-        v, y=f * v.y + e * marks.reshape(-1)[v.mark], phase=v.phase * complex(f),
-        frame=v.frame * complex(f))
-        for v, f, e in zip(problem.ground.visits, frame, bent, strict=True))
+    visits = tuple(
+        None
+        if v is None
+        else replace(
+            v,
+            y=f * v.y + e * marks.reshape(-1)[v.mark],
+            phase=v.phase * complex(f),
+            frame=v.frame * complex(f),
+        )
+        for v, f, e in zip(problem.ground.visits, frame, bent, strict=True)
+    )
     lines = problem.angular.y.copy()
     for row, index in enumerate(problem.angular.index):
         if index in problem.grid.index:
             read = problem.angular.weight[row] > 0
             lines[row] -= np.where(read, phi[problem.grid.index.index(index)], 0.0)
-    return replace(problem, grid=replace(problem.grid, y=y), turn_rad=phi,
-                   angular=replace(problem.angular, y=lines),
-                   ground=replace(problem.ground, visits=visits))
+    return replace(
+        problem,
+        grid=replace(problem.grid, y=y),
+        turn_rad=phi,
+        angular=replace(problem.angular, y=lines),
+        ground=replace(problem.ground, visits=visits),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -525,8 +573,7 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
 
     field, parameters, plate, residuals = system.in_datum(y, field, parameters)
     if problem.reference is not None:
-        grown = scale_of(system, problem.reference, field=field, plate=plate,
-                         half_width_m=length)
+        grown = scale_of(system, problem.reference, field=field, plate=plate, half_width_m=length)
         if problem.reference.marks is not None:  # across, a distance changes by the square
             across = np.vdot(scale_of_plate(system, problem.reference), plate).imag
             true = length * (1 + problem.reference.relative_error)
@@ -546,8 +593,20 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     phi = phi + conditions.phi_gain @ misclosure
     parameters[system.phi_at] = phi * length
     a_theta = angular.plate(problem.angular.y, g_theta, phi)[0]
-    return JointFit(field, plate, residuals, parameters, g_theta, a_theta, residuals_theta,
-                    misclosure, xy, theta.noise, inverse, ratio)
+    return JointFit(
+        field,
+        plate,
+        residuals,
+        parameters,
+        g_theta,
+        a_theta,
+        residuals_theta,
+        misclosure,
+        xy,
+        theta.noise,
+        inverse,
+        ratio,
+    )
 
 
 def angular_part(problem: Problem) -> AngularPart:
@@ -559,8 +618,9 @@ def angular_part(problem: Problem) -> AngularPart:
     residual = angular_residuals(problem.system, y)
     dof = angular.n_readings - problem.system.rank_angular - problem.dof_lines
     total = float((angular.weight * residual**2).sum())
-    found = noise_estimate(problem.repeats_theta, sigma_of(total, dof),
-                           problem.angular.sigma_declared, floor=FLOOR)
+    found = noise_estimate(
+        problem.repeats_theta, sigma_of(total, dof), problem.angular.sigma_declared, floor=FLOOR
+    )
     return AngularPart(*angular.reduced(y), found)
 
 
@@ -601,17 +661,23 @@ class Moving:
         ground = self.problem.ground
         if self.places is None or self.moved is None:
             return ground
-        about = self.places.about(found.field, self.places.errors(found.field, self.moved),
-                                  self.problem.turn_rad)
-        return replace(ground, visits=tuple(
-            None if view is None else replace(view, y=view.y - more)
-            for view, more in zip(ground.visits, about, strict=True)))
+        about = self.places.about(
+            found.field, self.places.errors(found.field, self.moved), self.problem.turn_rad
+        )
+        return replace(
+            ground,
+            visits=tuple(
+                None if view is None else replace(view, y=view.y - more)
+                for view, more in zip(ground.visits, about, strict=True)
+            ),
+        )
 
     def repeats(self, found: JointFit) -> tuple[float, float]:
         """Return (sigma, dof) of the repeats, corrected for differences of the stage error."""
         sigma, dof = self.problem.repeats_xy
-        less = (squares_within(self.problem.ground.visits)
-                - squares_within(self.ground(found).visits))
+        less = squares_within(self.problem.ground.visits) - squares_within(
+            self.ground(found).visits
+        )
         return sigma_of(max(sigma**2 * dof - less, 0.0), dof)
 
 
@@ -652,4 +718,4 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
     """Return the sums of fields (k, nx, ny) over each node and those around it."""
     padded = np.pad(values, ((0, 0), (1, 1), (1, 1)))
     nx, ny = values.shape[1:]
-    return np.sum([padded[:, i:i + nx, j:j + ny] for i in range(3) for j in range(3)], axis=0)
+    return np.sum([padded[:, i : i + nx, j : j + ny] for i in range(3) for j in range(3)], axis=0)

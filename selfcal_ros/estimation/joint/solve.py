@@ -126,9 +126,25 @@ class Solved:
 def noise_of(xy: NoiseEstimate, theta: NoiseEstimate) -> Noise:
     """Return the noises of a result."""
     return Noise(
-        xy.sigma, theta.sigma, xy.repeats, theta.repeats, xy.residuals, theta.residuals,
-        xy.dof_repeats, theta.dof_repeats, xy.dof_residuals, theta.dof_residuals, xy.declared,
-        theta.declared, xy.dof, theta.dof, xy.k, theta.k, xy.p, theta.p)
+        xy.sigma,
+        theta.sigma,
+        xy.repeats,
+        theta.repeats,
+        xy.residuals,
+        theta.residuals,
+        xy.dof_repeats,
+        theta.dof_repeats,
+        xy.dof_residuals,
+        theta.dof_residuals,
+        xy.declared,
+        theta.declared,
+        xy.dof,
+        theta.dof,
+        xy.k,
+        theta.k,
+        xy.p,
+        theta.p,
+    )
 
 
 RESIDUALS = "residuals"
@@ -162,11 +178,18 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
     problem, found = model.problem, model.found
     if problem.system.grid.n_readings > MAX_READINGS:
         return {}
-    starts = [int(v.visits.stamp_ns.min()) for v in measurements.views
-              if v.visits is not None and len(v.visits.stamp_ns)]
-    views, at_visits = [], {
-        row: (rest + found.residuals[row].reshape(-1)[visits.mark]) * problem.to_stage[row]
-        for row, visits, rest in model.visits_about_means()}
+    starts = [
+        int(v.visits.stamp_ns.min())
+        for v in measurements.views
+        if v.visits is not None and len(v.visits.stamp_ns)
+    ]
+    views, at_visits = (
+        [],
+        {
+            row: (rest + found.residuals[row].reshape(-1)[visits.mark]) * problem.to_stage[row]
+            for row, visits, rest in model.visits_about_means()
+        },
+    )
     for index, view in enumerate(measurements.views):
         entry: dict[str, Any] = {"view": view.view.name}
         if index in problem.grid.index:
@@ -195,19 +218,28 @@ def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np
     counts = visits.count[order]
     count = np.add.reduceat(counts, starts)
     since_s = (visits.stamp_ns - start_ns) / NS_PER_S
-    columns = {name: np.add.reduceat(values[order] * counts, starts) / count
-               for name, values in (("time_s", since_s), ("dx", rest.real), ("dy", rest.imag))}
-    return {"time_s": np.round(columns["time_s"], DECIMALS_S),
-            "dx": np.round(columns["dx"], DECIMALS_M), "dy": np.round(columns["dy"], DECIMALS_M),
-            "count": count}
+    columns = {
+        name: np.add.reduceat(values[order] * counts, starts) / count
+        for name, values in (("time_s", since_s), ("dx", rest.real), ("dy", rest.imag))
+    }
+    return {
+        "time_s": np.round(columns["time_s"], DECIMALS_S),
+        "dx": np.round(columns["dx"], DECIMALS_M),
+        "dy": np.round(columns["dy"], DECIMALS_M),
+        "count": count,
+    }
 
 
 MICROSCOPE_PARTS = ("scale", "turn", "stretch", "shear")
 """Coefficients of a microscope in their order."""
 
 
-def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
-                beside: dict[str, np.ndarray] | None = None) -> Factors | None:
+def saved_terms(
+    cover: MapsCovariance,
+    columns: TermColumns,
+    sense: Sense,
+    beside: dict[str, np.ndarray] | None = None,
+) -> Factors | None:
     """Return the factors of the terms; None for large fields.
 
     Parameters
@@ -226,10 +258,15 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
         return None
     maps = cover.maps_of_terms()[0]
     maps = turned_over(sense, maps.reshape(*shape, maps.shape[1]), axes=(0, 1))
-    both = np.concatenate([maps.real.reshape(-1, maps.shape[2]),
-                           maps.imag.reshape(-1, maps.shape[2])])
-    others = np.concatenate([np.zeros((0, maps.shape[2])), *(
-        values.reshape(len(values), -1).T for values in beside.values())])
+    both = np.concatenate(
+        [maps.real.reshape(-1, maps.shape[2]), maps.imag.reshape(-1, maps.shape[2])]
+    )
+    others = np.concatenate(
+        [
+            np.zeros((0, maps.shape[2])),
+            *(values.reshape(len(values), -1).T for values in beside.values()),
+        ]
+    )
     factors, names, moved, alone = [], [], [], []
     for name, root in roots_by_term(cover.terms.covariance, columns):
         left, size, right = np.linalg.svd(both @ root, full_matrices=False)
@@ -245,10 +282,16 @@ def saved_terms(cover: MapsCovariance, columns: TermColumns, sense: Sense,
         return found
     all_of = np.array([*moved, *alone]).reshape(-1, len(others))
     ends = np.cumsum([values[0].size for values in beside.values()])[:-1]
-    return replace(found, with_map=len(names), beside={
-        name: rounded(part.reshape(len(part), *values.shape[1:]))
-        for (name, values), part in zip(beside.items(), np.split(all_of, ends, axis=1),
-                                        strict=True)})
+    return replace(
+        found,
+        with_map=len(names),
+        beside={
+            name: rounded(part.reshape(len(part), *values.shape[1:]))
+            for (name, values), part in zip(
+                beside.items(), np.split(all_of, ends, axis=1), strict=True
+            )
+        },
+    )
 
 
 def factors_of(result: CalibrationResult) -> Factors:
@@ -256,8 +299,9 @@ def factors_of(result: CalibrationResult) -> Factors:
     return result.kept.factors or Factors.none(result.artifact.shape)
 
 
-def angular_terms(cover: MapsCovariance, columns: TermColumns, sigma_m: float,
-                  known: np.ndarray) -> dict[str, np.ndarray]:
+def angular_terms(
+    cover: MapsCovariance, columns: TermColumns, sigma_m: float, known: np.ndarray
+) -> dict[str, np.ndarray]:
     """Return the contribution of each term of the lines to u of the angular map, rad, (K,).
 
     Parameters
@@ -283,12 +327,16 @@ def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
     """Return the variance of the map from each term with a size, (2, nx, ny), m^2."""
     factors = factors_of(result)
     names = np.array(factors.terms, dtype=str)
-    return {str(name): (factors.of_map[names == name] ** 2).sum(axis=0) * result.noise.sigma_xy**2
-            for name in dict.fromkeys(names.tolist()) if name != FREE}
+    return {
+        str(name): (factors.of_map[names == name] ** 2).sum(axis=0) * result.noise.sigma_xy**2
+        for name in dict.fromkeys(names.tolist())
+        if name != FREE
+    }
 
 
-def solve_joint(measurements: Measurements, options: Options, *,
-                whole_only: bool = False) -> Solved:
+def solve_joint(
+    measurements: Measurements, options: Options, *, whole_only: bool = False
+) -> Solved:
     """Calibrate by joint least squares; see `selfcal_ros.estimation.api.calibrate`.
 
     Readings so far from what is assumed of them that the estimate does not converge are solved
@@ -303,8 +351,10 @@ def solve_joint(measurements: Measurements, options: Options, *,
     """
     with one_thread():
         model, seen, whole = _fitted(measurements, options, whole_only=whole_only)
-        return replace(_solved(measurements, options, model=model, seen=seen),
-                       converged=whole or model.found.xy.sigma < LEAST_NOISE_M)
+        return replace(
+            _solved(measurements, options, model=model, seen=seen),
+            converged=whole or model.found.xy.sigma < LEAST_NOISE_M,
+        )
 
 
 def fit_joint(measurements: Measurements, options: Options) -> ModelFit:
@@ -313,8 +363,9 @@ def fit_joint(measurements: Measurements, options: Options) -> ModelFit:
         return _fitted(measurements, options)[0]
 
 
-def _fitted(measurements: Measurements, options: Options, *,
-            whole_only: bool = False) -> tuple[ModelFit, Observability, bool]:
+def _fitted(
+    measurements: Measurements, options: Options, *, whole_only: bool = False
+) -> tuple[ModelFit, Observability, bool]:
     """Return the fit, what the readings determine, and if it has all that is assumed.
 
     Where that does not converge with the places of the stage readings count for their sites, and
@@ -324,10 +375,11 @@ def _fitted(measurements: Measurements, options: Options, *,
     failed: NotSettledError | None = None
     for assumed in dict.fromkeys((options.assumed, of_visits, ())):
         problem, seen = prepare(measurements, replace(options, assumed=assumed))
-        for at_places in ((True, False) if problem.moves else (False,)):
+        for at_places in (True, False) if problem.moves else (False,):
             try:
-                model = fit_model(replace(problem, at_places=at_places),
-                                  partial(require_terms_told, seen=seen))
+                model = fit_model(
+                    replace(problem, at_places=at_places), partial(require_terms_told, seen=seen)
+                )
             except NotSettledError as error:
                 if whole_only:
                     raise
@@ -348,37 +400,55 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     check_visits(measurements)
     grid, angular = grid_data(measurements), angular_data(measurements)
     if not grid.index:
-        raise NoDataError(f"plan '{measurements.plan_id}'", "no grid mark was read",
-                          "record detections of the plate's marks in at least three views")
+        raise NoDataError(
+            f"plan '{measurements.plan_id}'",
+            "no grid mark was read",
+            "record detections of the plate's marks in at least three views",
+        )
     system = system_of(grid, angular)
-    seen = measured_observability(system, measurements.artifact,
-                                  tuple(v.view for v in measurements.views))
+    seen = measured_observability(
+        system, measurements.artifact, tuple(v.view for v in measurements.views)
+    )
     if not seen.identifiable:
-        plan = Plan(measurements.plan_id, measurements.artifact,
-                    tuple(v.view for v in measurements.views))
+        plan = Plan(
+            measurements.plan_id, measurements.artifact, tuple(v.view for v in measurements.views)
+        )
         if not identifies(plan.artifact, plan.views):
             seen = with_unseen_modes(seen, system, plan).observability
-        raise NotIdentifiableError("the marks that were read do not identify the stage "
-                                   f"({seen.deficiency} mode{'s' * (seen.deficiency != 1)} "
-                                   "undetermined)", seen)
+        raise NotIdentifiableError(
+            "the marks that were read do not identify the stage "
+            f"({seen.deficiency} mode{'s' * (seen.deficiency != 1)} "
+            "undetermined)",
+            seen,
+        )
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     ground = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
     # as a column, offsets would explain the noise that they hold
-    ground = replace(ground, line_offsets=ground.line_offsets - angular_residuals(
-        system, angular.y))
+    ground = replace(
+        ground, line_offsets=ground.line_offsets - angular_residuals(system, angular.y)
+    )
     terms = tuple(
-        term for term in options.model_terms(
-            visits=all(v is not None for v in ground.visits), assumed=options.finite_rotations)
-        if ground.has(term.name))
+        term
+        for term in options.model_terms(
+            visits=all(v is not None for v in ground.visits), assumed=options.finite_rotations
+        )
+        if ground.has(term.name)
+    )
     images = image_noise(
-        measurements.artifact, [v.view for v in measurements.views], system, ground=ground,
-        terms=[term for term in terms if term.block.of_images])
-    return problem_of(measurements, options, system, ground, readings=(grid, angular),
-                      terms=terms, images=images), seen
+        measurements.artifact,
+        [v.view for v in measurements.views],
+        system,
+        ground=ground,
+        terms=[term for term in terms if term.block.of_images],
+    )
+    return problem_of(
+        measurements, options, system, ground, readings=(grid, angular), terms=terms, images=images
+    ), seen
 
 
-def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
-            seen: Observability) -> Solved:
+def _solved(
+    measurements: Measurements, options: Options, *, model: ModelFit, seen: Observability
+) -> Solved:
     problem, found = model.problem, model.found
     asked = options.uncertainty
     wanted = problem.system.grid.n_sites <= UNASKED_SITES if asked is None else asked
@@ -390,30 +460,46 @@ def _solved(measurements: Measurements, options: Options, *, model: ModelFit,
     cover = None
     # the datum of the axes is tested in any case
     if wanted or problem.conditions.datum is ThetaDatum.XY_AXES:
-        cover = MapsCovariance(problem.system, found.inverse, options.reference, terms=model.spread,
-                               half_width_m=problem.half_width_m, sigma_m=least)
+        cover = MapsCovariance(
+            problem.system,
+            found.inverse,
+            options.reference,
+            terms=model.spread,
+            half_width_m=problem.half_width_m,
+            sigma_m=least,
+        )
     error_map, closure, kept = _error_map(measurements, model, cover, sigma, wanted=wanted)
     artifact_map = _artifact_map(model, cover if wanted else None, rms(sigma))
-    findings = (*_unchecked(problem.system, measurements.sense),
-                *_magnification(artifact_map, options))
+    findings = (
+        *_unchecked(problem.system, measurements.sense),
+        *_magnification(artifact_map, options),
+    )
     if not wanted and asked is None:
         findings = (Finding("no_uncertainty"), *findings)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
         axes = misclosure_test(found.misclosure, closure)
     result = CalibrationResult(
-        measurements.plan_id, error_map, artifact_map,
-        views_of(measurements, problem, np.where(
-            problem.system.known_views, found.parameters, np.nan)), seen,
+        measurements.plan_id,
+        error_map,
+        artifact_map,
+        views_of(
+            measurements, problem, np.where(problem.system.known_views, found.parameters, np.nan)
+        ),
+        seen,
         noise_of(found.xy, found.theta),
-        measurements.all_rejected(), findings=findings,
+        measurements.all_rejected(),
+        findings=findings,
         sense=str(measurements.sense),
         extra=kept_residuals(measurements, model),
         kept=replace(kept, images=_kept_images(measurements, model)),
         run_id=measurements.run_id,
-        model=ModelResult("rigid" if problem.rigid else "linear", term_results(
-            model, {term.name for term in options.terms})),
-        placed_plate=measurements.artifact.placed)
+        model=ModelResult(
+            "rigid" if problem.rigid else "linear",
+            term_results(model, {term.name for term in options.terms}),
+        ),
+        placed_plate=measurements.artifact.placed,
+    )
     return Solved(result, found.xy, found.theta, model, axes)
 
 
@@ -425,14 +511,19 @@ def _kept_images(measurements: Measurements, model: ModelFit) -> ImagesKept | No
         return None
     noises = model.problem.images.noises(model.found.residuals)
     names = list(dict.fromkeys(name for name, _ in seen))
-    return ImagesKept(noises.share, noises.dof_mark, tuple(names.index(name) for name, _ in seen),
-                      tuple(step for _, step in seen))
+    return ImagesKept(
+        noises.share,
+        noises.dof_mark,
+        tuple(names.index(name) for name, _ in seen),
+        tuple(step for _, step in seen),
+    )
 
 
 def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
     """Return whether plate and encoders differ in scale by more than is plausible."""
     if options.reference is not None or not (
-            abs(found.magnification) > options.magnification_limit):
+        abs(found.magnification) > options.magnification_limit
+    ):
         return ()
     return (Finding("magnification", found.magnification, found.u_magnification, "m/m"),)
 
@@ -464,8 +555,11 @@ def _compact(weight: np.ndarray, expected: np.ndarray) -> Any:
     """Return one number where all expected readings have it, else a number a reading."""
     if len(expected) and (expected == expected.flat[0]).all():
         return _short(float(expected.flat[0]))
-    return [[_short(w) for w in row] for row in weight.tolist()] if weight.ndim == 2 else [
-        _short(w) for w in weight.tolist()]
+    return (
+        [[_short(w) for w in row] for row in weight.tolist()]
+        if weight.ndim == 2
+        else [_short(w) for w in weight.tolist()]
+    )
 
 
 def _short(weight: float) -> float | int:
@@ -483,22 +577,40 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
     out = []
     for term in model.problem.terms:
         estimates = tuple(
-            TermEstimate(model.problem.ground.name_of(c.term, c.view), c.component,
-                         float(model.coefficients[i]) if told[i] else float("nan"),
-                         float(np.sqrt(max(covariance[i, i], 0.0)) * model.found.xy.sigma)
-                         if told[i] else float("nan"), c.unit)
-            for i, c in enumerate(columns) if c.term == term.name)
+            TermEstimate(
+                model.problem.ground.name_of(c.term, c.view),
+                c.component,
+                float(model.coefficients[i]) if told[i] else float("nan"),
+                float(np.sqrt(max(covariance[i, i], 0.0)) * model.found.xy.sigma)
+                if told[i]
+                else float("nan"),
+                c.unit,
+            )
+            for i, c in enumerate(columns)
+            if c.term == term.name
+        )
         size = None if term.free else term.size
         before = None if term.free else given.get(term.name, term.size)
-        out.append(TermResult(str(term.name), before, estimates,
-                              size if size != before else None,
-                              "declared" if term.name in declared else "default"))
+        out.append(
+            TermResult(
+                str(term.name),
+                before,
+                estimates,
+                size if size != before else None,
+                "declared" if term.name in declared else "default",
+            )
+        )
     return tuple(out)
 
 
-def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovariance | None,
-               sigma: np.ndarray, *, wanted: bool
-               ) -> tuple[ErrorMap, np.ndarray | None, Kept]:
+def _error_map(
+    measurements: Measurements,
+    model: ModelFit,
+    cover: MapsCovariance | None,
+    sigma: np.ndarray,
+    *,
+    wanted: bool,
+) -> tuple[ErrorMap, np.ndarray | None, Kept]:
     """Return the map in the stage frame, the covariance of the angular misclosure, factors.
 
     `sigma` is the noise of a reading as it counts at each site, m; what is kept has
@@ -522,9 +634,15 @@ def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovarianc
         if wanted and model.equations is not None:
             columns = model.equations.columns
             kept = replace(
-                kept, factors=saved_terms(cover, columns, measurements.sense,
-                                          _beside_map(model, lines, measurements.sense)),
-                angular=angular_terms(cover, columns, found.xy.sigma, system.known_lines))
+                kept,
+                factors=saved_terms(
+                    cover,
+                    columns,
+                    measurements.sense,
+                    _beside_map(model, lines, measurements.sense),
+                ),
+                angular=angular_terms(cover, columns, found.xy.sigma, system.known_lines),
+            )
         if system.angular.n_views:
             variance, closure = lines.of_stage(problem.conditions)
             u_theta = np.sqrt(variance) if wanted else u_theta
@@ -536,9 +654,22 @@ def _error_map(measurements: Measurements, model: ModelFit, cover: MapsCovarianc
     field = turned_over(sense, field)
     u_x, u_y = (turned_over(sense, u, sign=1) for u in (u_x, u_y))
     g_theta, u_theta = lines_turned_over(sense, g_theta), lines_turned_over(sense, u_theta, sign=1)
-    return ErrorMap(measurements.artifact.field, field.real.copy(), field.imag.copy(), u_x, u_y,
-                    g_theta, u_theta, o / length, r / length,
-                    problem.conditions.datum), closure, kept
+    return (
+        ErrorMap(
+            measurements.artifact.field,
+            field.real.copy(),
+            field.imag.copy(),
+            u_x,
+            u_y,
+            g_theta,
+            u_theta,
+            o / length,
+            r / length,
+            problem.conditions.datum,
+        ),
+        closure,
+        kept,
+    )
 
 
 def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[str, np.ndarray]:
@@ -555,12 +686,23 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
         stage = lines_turned_over(sense, stage)
         lines = np.stack([stage, of_plate]).transpose(2, 0, 1) * length
     of_offsets = block_of_offsets()
-    measured = -length * np.array([[
-        column.term == of_offsets.name and column.component == part
-        for part in MICROSCOPE_PARTS] for column in columns.columns], dtype=float)
-    return {"plate": np.stack([plates.real, plates.imag], axis=1).reshape(
-                len(plates), 2, *system.grid.views.plate_shape),
-            "lines": lines, of_offsets.name: measured}
+    measured = -length * np.array(
+        [
+            [
+                column.term == of_offsets.name and column.component == part
+                for part in MICROSCOPE_PARTS
+            ]
+            for column in columns.columns
+        ],
+        dtype=float,
+    )
+    return {
+        "plate": np.stack([plates.real, plates.imag], axis=1).reshape(
+            len(plates), 2, *system.grid.views.plate_shape
+        ),
+        "lines": lines,
+        of_offsets.name: measured,
+    }
 
 
 def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float) -> ArtifactMap:
@@ -583,24 +725,40 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
         u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:
             u_theta = np.sqrt(LinesCovariance(cover, (sigma, found.theta.sigma)).of_plate())
-    return ArtifactMap(plate.real.copy(), plate.imag.copy(),
-                       np.where(system.known_plate_lines, found.a_theta, np.nan),
-                       scale / length, u, u_x, u_y, u_theta)
+    return ArtifactMap(
+        plate.real.copy(),
+        plate.imag.copy(),
+        np.where(system.known_plate_lines, found.a_theta, np.nan),
+        scale / length,
+        u,
+        u_x,
+        u_y,
+        u_theta,
+    )
 
 
-def views_of(measurements: Measurements, problem: Problem,
-             parameters: np.ndarray) -> tuple[ViewResult, ...]:
+def views_of(
+    measurements: Measurements, problem: Problem, parameters: np.ndarray
+) -> tuple[ViewResult, ...]:
     """Return the results of the views for all misalignments, m, (size,); NaN where unknown."""
     system = problem.system
     phi = dict(zip(system.angular_index, parameters[system.phi_at], strict=True))
     offset: dict[int, complex] = {}
     for row, i in enumerate(system.grid_index):
         phi[i] = parameters[3 * row] + problem.turn_rad[row] * problem.half_width_m
-        offset[i] = problem.to_stage[row] * complex(*parameters[3 * row + 1:3 * row + 3])
+        offset[i] = problem.to_stage[row] * complex(*parameters[3 * row + 1 : 3 * row + 3])
     nan = complex(np.nan, np.nan)
     return tuple(
-        ViewResult(v.view.name, v.view.rotation_rad, *v.view.translation_m,
-                   phi=float(phi.get(i, np.nan) / problem.half_width_m),
-                   tx=offset.get(i, nan).real, ty=offset.get(i, nan).imag, used=v.used,
-                   rejected=sum(v.rejected.values()), **weights_read(problem, i))
-        for i, v in enumerate(measurements.views))
+        ViewResult(
+            v.view.name,
+            v.view.rotation_rad,
+            *v.view.translation_m,
+            phi=float(phi.get(i, np.nan) / problem.half_width_m),
+            tx=offset.get(i, nan).real,
+            ty=offset.get(i, nan).imag,
+            used=v.used,
+            rejected=sum(v.rejected.values()),
+            **weights_read(problem, i),
+        )
+        for i, v in enumerate(measurements.views)
+    )

@@ -51,8 +51,9 @@ class Components:
         return int(np.bincount(known, minlength=len(self.balanced)).argmax())
 
 
-def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: int,
-               n_marks: int) -> Components:
+def components(
+    site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: int, n_marks: int
+) -> Components:
     """Return the components of readings.
 
     Parameters
@@ -71,13 +72,15 @@ def components(site: np.ndarray, mark: np.ndarray, q: np.ndarray, *, n_sites: in
     other = np.flatnonzero(first[mark] != np.arange(len(mark)))
     start = first[mark[other]]
     turn = (q[other] - q[start]) % 4
-    label = _cover(site[start], site[other], turn, n_sites) if turn.any() else _connect(
-        site[start], site[other], n_sites)[None]
+    label = (
+        _cover(site[start], site[other], turn, n_sites)
+        if turn.any()
+        else _connect(site[start], site[other], n_sites)[None]
+    )
     touched = np.zeros(n_sites, dtype=bool)
     touched[site] = True
     # the copies of a site are in all components of the cover over its own component
-    _, one, number = np.unique(label.min(axis=0)[touched], return_index=True,
-                               return_inverse=True)
+    _, one, number = np.unique(label.min(axis=0)[touched], return_index=True, return_inverse=True)
     copies = label[:, np.flatnonzero(touched)[one]]
     balanced = (copies[1:] != copies[0]).all(axis=0)
     of_site[touched] = number
@@ -102,8 +105,9 @@ def _cover(a: np.ndarray, b: np.ndarray, turn: np.ndarray, n: int) -> np.ndarray
     return _connect(from_a.ravel(), to_b.ravel(), 4 * n).reshape(4, n)
 
 
-def free_turns(site: np.ndarray, mark: np.ndarray, q: np.ndarray,
-               parts: Components) -> tuple[np.ndarray, np.ndarray]:
+def free_turns(
+    site: np.ndarray, mark: np.ndarray, q: np.ndarray, parts: Components
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the quarter turns of a component's free vector, int (sites,), (marks,).
 
     Relative to the first site of the component: with v the vector there, G = i^turn v and
@@ -125,8 +129,11 @@ def free_turns(site: np.ndarray, mark: np.ndarray, q: np.ndarray,
     # a vector v of a mark appears as i^q v on its site
     label = _cover(end, start, q[free], len(ends))
     at_site = ends < len(of_site)
-    part = np.where(at_site, parts.of_site[np.where(at_site, ends, 0)],
-                    parts.of_mark[np.where(at_site, 0, ends - len(of_site))])
+    part = np.where(
+        at_site,
+        parts.of_site[np.where(at_site, ends, 0)],
+        parts.of_mark[np.where(at_site, 0, ends - len(of_site))],
+    )
     home = label[0][np.searchsorted(ends, parts.first_sites[part])]
     turn = np.argmax(label == home, axis=0)
     of_site[ends[at_site]], of_mark[ends[~at_site] - len(of_site)] = turn[at_site], turn[~at_site]
@@ -180,7 +187,7 @@ class Gauge:
 
     def __init__(self, z: np.ndarray, known: np.ndarray, *, scale: bool) -> None:
         self.z, self.known, self.scale = z, known, scale
-        self._rows = _modes(z, known)[:4 if scale else 3]
+        self._rows = _modes(z, known)[: 4 if scale else 3]
         self._gram_inverse = _inverse((self._rows.conj() @ self._rows.T).real)
 
     def parts(self, field: np.ndarray) -> np.ndarray:
@@ -212,7 +219,7 @@ class Gauge:
     @property
     def everywhere(self) -> np.ndarray:
         """The modes of `orthonormal` at all sites, complex (sites, modes)."""
-        modes = _modes(self.z, np.ones(self.known.shape, dtype=bool))[:len(self._rows)].T
+        modes = _modes(self.z, np.ones(self.known.shape, dtype=bool))[: len(self._rows)].T
         return modes @ (self._gram_inverse @ np.real(self._rows.conj() @ self.orthonormal))
 
     @cached_property

@@ -62,11 +62,16 @@ class LatticeViews:
     def reach(self) -> int:
         """Largest folded distance, in pitches, of two sites visited by one mark, rounded up."""
         out = 0.0
-        for (p, r), (turn, other) in zip(product(self.shifts, repeat=2),
-                                         product(self.phases, repeat=2), strict=True):
+        for (p, r), (turn, other) in zip(
+            product(self.shifts, repeat=2), product(self.phases, repeat=2), strict=True
+        ):
             (a, b), (c, d) = (p.real, p.imag), (r.real, r.imag)
-            out = max(out, max(abs(a - c), abs(b - d)) if turn == other else
-                      max(abs(a), abs(b)) + max(abs(c), abs(d)))
+            out = max(
+                out,
+                max(abs(a - c), abs(b - d))
+                if turn == other
+                else max(abs(a), abs(b)) + max(abs(c), abs(d)),
+            )
         return ceil(out)
 
     def mark_at(self, i: int, j: int) -> tuple[int, int]:
@@ -119,8 +124,10 @@ class LatticeViews:
     @cached_property
     def site_index(self) -> np.ndarray:
         """Flat index of the node nearest to every mark, int (views, nx, ny); -1 off the field."""
-        i, j = (np.clip(np.rint(part).astype(int), 0, size - 1)
-                for part, size in zip(self.from_corner, self.shape, strict=True))
+        i, j = (
+            np.clip(np.rint(part).astype(int), 0, size - 1)
+            for part, size in zip(self.from_corner, self.shape, strict=True)
+        )
         return np.where(self.in_field, i * self.shape[1] + j, -1)
 
     def near(self, nodes: np.ndarray) -> np.ndarray:
@@ -184,8 +191,9 @@ def rigid_parameters(views: LatticeViews) -> np.ndarray:
     return out
 
 
-def rotation_excess(phi_rad: float | np.ndarray, marks: np.ndarray,
-                    plate: np.ndarray) -> np.ndarray:
+def rotation_excess(
+    phi_rad: float | np.ndarray, marks: np.ndarray, plate: np.ndarray
+) -> np.ndarray:
     """Return the contribution of the rotation beyond the linear model, complex (P,), m."""
     turn = np.expm1(1j * phi_rad)
     return (turn - 1j * phi_rad) * marks + turn * plate  # method eq. 2.6
@@ -227,8 +235,9 @@ class Axis:
         """The spline with a further knot in the middle of each interval: it contains this one."""
         each = np.unique(self.knots)
         knots = np.sort(np.concatenate([self.knots, (each[:-1] + each[1:]) / 2]))
-        nodes = np.array([knots[i + 1:i + self.degree + 1].mean()
-                          for i in range(len(knots) - self.degree - 1)])
+        nodes = np.array(
+            [knots[i + 1 : i + self.degree + 1].mean() for i in range(len(knots) - self.degree - 1)]
+        )
         return Axis(knots, self.degree, nodes, by_nodes=False)
 
     def rows(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -292,8 +301,10 @@ class MapSpline:
 
     def within(self, finer: "MapSpline") -> np.ndarray:
         """Return the matrix to the coefficients of a refined spline, which contains this one."""
-        axes = [np.linalg.solve(fine.matrix(fine.nodes), axis.matrix(fine.nodes) @ axis.from_nodes)
-                for axis, fine in zip(self.axes, finer.axes, strict=True)]
+        axes = [
+            np.linalg.solve(fine.matrix(fine.nodes), axis.matrix(fine.nodes) @ axis.from_nodes)
+            for axis, fine in zip(self.axes, finer.axes, strict=True)
+        ]
         return np.kron(*axes)
 
     @property
@@ -315,8 +326,9 @@ class MapSpline:
         index = ix[:, :, None] * self.shape[1] + iy[:, None, :]
         each = values[0].size if len(values) else 1
         ends = np.arange(0, len(at) * each + 1, each)
-        return csr_matrix((values.ravel(), index.ravel(), ends),
-                          shape=(len(at), self.shape[0] * self.shape[1]))
+        return csr_matrix(
+            (values.ravel(), index.ravel(), ends), shape=(len(at), self.shape[0] * self.shape[1])
+        )
 
     def coefficients(self, field: np.ndarray) -> np.ndarray:
         """Return the coefficients of fields (..., nx, ny), in the same shape."""
@@ -348,12 +360,14 @@ class PlacedViews(LatticeViews):
 
     poses: tuple[PlacedPose, ...]  # type: ignore[assignment]
 
-    def __init__(self, artifact: Artifact, poses: tuple[PlacedPose, ...],
-                 spline: MapSpline | None = None) -> None:
+    def __init__(
+        self, artifact: Artifact, poses: tuple[PlacedPose, ...], spline: MapSpline | None = None
+    ) -> None:
         grid = artifact.map_grid
         self.poses, self.artifact = poses, artifact
         self.spline = spline or MapSpline.of(
-            artifact.field, grid.interpolation if grid else Interpolation.BICUBIC)
+            artifact.field, grid.interpolation if grid else Interpolation.BICUBIC
+        )
         self.bilinear = self.spline.axes[0].degree == 1
         self.node_pitch = artifact.field.grid_pitch_m / artifact.grid_pitch_m
         self.shape, self.half = self.spline.shape, artifact.field.half
@@ -379,22 +393,32 @@ class PlacedViews(LatticeViews):
     @cached_property
     def in_field(self) -> np.ndarray:
         """Marks inside the field, bool (views, nx, ny)."""
-        return np.array([~pose.beyond_field(np.stack(sites), self.artifact) for pose, sites in zip(
-            self.poses, self.sites, strict=True)])
+        return np.array(
+            [
+                ~pose.beyond_field(np.stack(sites), self.artifact)
+                for pose, sites in zip(self.poses, self.sites, strict=True)
+            ]
+        )
 
     @cached_property
     def rows(self) -> tuple[csr_matrix, ...]:
         """Rows of each view's marks on the spline's coefficients, real (marks, nodes); 0 off it."""
         pitch_m = self.artifact.grid_pitch_m
-        return tuple(self.spline.rows((x + 1j * y).ravel() * pitch_m).multiply(
-            inside.reshape(-1, 1)).tocsr() for inside, (x, y) in zip(
-                self.in_field, self.sites, strict=True))
+        return tuple(
+            self.spline.rows((x + 1j * y).ravel() * pitch_m).multiply(inside.reshape(-1, 1)).tocsr()
+            for inside, (x, y) in zip(self.in_field, self.sites, strict=True)
+        )
 
     def gather(self, field: np.ndarray) -> np.ndarray:
         """Return e^(-i alpha) G(X_v(m)), complex (..., views, nx, ny); 0 off the field."""
         flat = self.spline.coefficients(field).reshape(-1, self.z_sites.size).T
-        out = np.stack([(phase.conjugate() * (rows @ flat)).T for phase, rows in zip(
-            self.phases, self.rows, strict=True)], axis=1)
+        out = np.stack(
+            [
+                (phase.conjugate() * (rows @ flat)).T
+                for phase, rows in zip(self.phases, self.rows, strict=True)
+            ],
+            axis=1,
+        )
         return out.reshape(*field.shape[:-2], len(self.poses), *self.plate_shape)
 
     def add_scattered(self, out: np.ndarray, index: int, marks: np.ndarray) -> None:
@@ -415,10 +439,13 @@ class PlacedViews(LatticeViews):
 
     def near(self, nodes: np.ndarray) -> np.ndarray:
         """Return the marks whose cell of the map has only `nodes` as corners, (views, nx, ny)."""
-        i, j = (np.clip(np.floor(part + EDGE).astype(int), 0, size - 2)
-                for part, size in zip(self.from_corner, self.shape, strict=True))
-        return self.in_field & (nodes[i, j] & nodes[i + 1, j] & nodes[i, j + 1]
-                                & nodes[i + 1, j + 1])
+        i, j = (
+            np.clip(np.floor(part + EDGE).astype(int), 0, size - 2)
+            for part, size in zip(self.from_corner, self.shape, strict=True)
+        )
+        return self.in_field & (
+            nodes[i, j] & nodes[i + 1, j] & nodes[i, j + 1] & nodes[i + 1, j + 1]
+        )
 
 
 def maps_of(grid: GridData) -> LatticeViews:

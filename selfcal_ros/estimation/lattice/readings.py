@@ -66,8 +66,16 @@ class Marks[Pose]:
 
     @cached_property
     def _key(self) -> tuple:
-        return (self.plate, self.poses, self.index, self.harmonics, self.rotations,
-                self.known_plate, self.weight.shape, self.weight.tobytes())
+        return (
+            self.plate,
+            self.poses,
+            self.index,
+            self.harmonics,
+            self.rotations,
+            self.known_plate,
+            self.weight.shape,
+            self.weight.tobytes(),
+        )
 
     def __hash__(self) -> int:
         """Return that of all that the equations depend on."""
@@ -103,8 +111,9 @@ def planned_readings(artifact: Artifact, views: Sequence[View]) -> Measurements:
 
     The cells of images are views of their own.
     """
-    return Measurements("", artifact, tuple(
-        _planned(view, artifact) for view in with_sub_views(views)))
+    return Measurements(
+        "", artifact, tuple(_planned(view, artifact) for view in with_sub_views(views))
+    )
 
 
 def _planned(view: View, artifact: Artifact) -> ViewReadings:
@@ -112,12 +121,19 @@ def _planned(view: View, artifact: Artifact) -> ViewReadings:
     if view.grid:
         read = in_field(view, artifact)
         nothing = np.zeros(int(read.sum()))
-        out = replace(out, m=artifact.m[read], n=artifact.n[read], dx=nothing, dy=nothing,
-                      count=np.full(len(nothing), view.repeats))
+        out = replace(
+            out,
+            m=artifact.m[read],
+            n=artifact.n[read],
+            dx=nothing,
+            dy=nothing,
+            count=np.full(len(nothing), view.repeats),
+        )
     if view.angular and artifact.angular_count:
         lines = np.arange(artifact.angular_count)
-        out = replace(out, k=lines, dtheta=np.zeros(len(lines)),
-                      count_theta=np.full(len(lines), view.repeats))
+        out = replace(
+            out, k=lines, dtheta=np.zeros(len(lines)), count_theta=np.full(len(lines), view.repeats)
+        )
     return out
 
 
@@ -140,19 +156,33 @@ def grid_data(measurements: Measurements) -> GridData:
         where = f"view '{readings.view.name}' grid readings"
         flat = _flat_marks(readings, artifact, where=where)
         if not len(readings.dx) == len(readings.dy) == len(flat):
-            raise InputError(where, "marks and deviations differ in length",
-                             "give one value a mark")
+            raise InputError(
+                where, "marks and deviations differ in length", "give one value a mark"
+            )
         if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
             # before it is turned: infinity by a complex number warns
             raise InputError(where, "a deviation is not a finite number", "remove the mark")
         values = (readings.dx + 1j * readings.dy) * pose.phase.conjugate()
-        _place(y[row].reshape(-1), weight[row].reshape(-1), flat, values=values,
-               count=readings.count, where=where)
+        _place(
+            y[row].reshape(-1),
+            weight[row].reshape(-1),
+            flat,
+            values=values,
+            count=readings.count,
+            where=where,
+        )
         ones.append((flat, readings.count, readings.u))
         poses.append(pose)
     sigma = _declare(weight, ones)
-    return GridData(tuple(poses), weight, index, plate=artifact.placed, y=y, sigma_declared=sigma,
-                    rotations=rotations_of([measurements.views[i].view for i in index]))
+    return GridData(
+        tuple(poses),
+        weight,
+        index,
+        plate=artifact.placed,
+        y=y,
+        sigma_declared=sigma,
+        rotations=rotations_of([measurements.views[i].view for i in index]),
+    )
 
 
 def angular_data(measurements: Measurements) -> AngularData:
@@ -168,10 +198,19 @@ def angular_data(measurements: Measurements) -> AngularData:
         turn = pose_of(readings.view, artifact).turn_lines
         k = np.asarray(readings.k)
         if turn is None or k.min() < 0 or k.max() >= artifact.angular_count:
-            raise InputError(where, "a line that the plate does not have",
-                             f"lines are 0 to {artifact.angular_count - 1}")
-        _place(y[row], weight[row], k, values=np.asarray(readings.dtheta),
-               count=readings.count_theta, where=where)
+            raise InputError(
+                where,
+                "a line that the plate does not have",
+                f"lines are 0 to {artifact.angular_count - 1}",
+            )
+        _place(
+            y[row],
+            weight[row],
+            k,
+            values=np.asarray(readings.dtheta),
+            count=readings.count_theta,
+            where=where,
+        )
         ones.append((k, readings.count_theta, readings.u_theta))
         about = readings.axis_theta * artifact.angular_count / (2 * np.pi)
         turns.append(turn + about if artifact.harmonics and about else turn)
@@ -181,8 +220,11 @@ def angular_data(measurements: Measurements) -> AngularData:
 
 def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
     if not readings.view.on_stage(artifact).has_sites:
-        raise InputError(f"view '{readings.view.name}'", "grid marks were read at a turn that is "
-                         "not a multiple of 90 deg", "turn by a multiple of 90 deg")
+        raise InputError(
+            f"view '{readings.view.name}'",
+            "grid marks were read at a turn that is not a multiple of 90 deg",
+            "turn by a multiple of 90 deg",
+        )
     return pose_of(readings.view, artifact)
 
 
@@ -197,16 +239,27 @@ def _flat_marks(readings: ViewReadings, artifact: Artifact, *, where: str) -> np
     for name, bad in (("off the plate", off_plate), ("off the stage's field", off_field)):
         if bad.any():
             k = int(np.argmax(bad))
-            raise InputError(where, f"mark ({m[k]}, {n[k]}) lies {name}",
-                             "check the view's pose and the plate's size")
+            raise InputError(
+                where,
+                f"mark ({m[k]}, {n[k]}) lies {name}",
+                "check the view's pose and the plate's size",
+            )
     return flat
 
 
-def _place(y: np.ndarray, weight: np.ndarray, flat: np.ndarray, *, values: np.ndarray,
-           count: np.ndarray, where: str) -> None:
+def _place(
+    y: np.ndarray,
+    weight: np.ndarray,
+    flat: np.ndarray,
+    *,
+    values: np.ndarray,
+    count: np.ndarray,
+    where: str,
+) -> None:
     if values.shape != flat.shape or np.shape(count) != flat.shape:
-        raise InputError(where, "marks, deviations and counts differ in length",
-                         "give one value a mark")
+        raise InputError(
+            where, "marks, deviations and counts differ in length", "give one value a mark"
+        )
     if not np.isfinite(values).all():
         raise InputError(where, "a deviation is not a finite number", "remove the mark")
     if np.min(count) < 1:

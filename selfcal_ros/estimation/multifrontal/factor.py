@@ -79,8 +79,9 @@ class RealSymmetricForm:
     shares: np.ndarray
 
 
-def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
-         pins: np.ndarray) -> RealSymmetricForm:
+def fold(
+    views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray, pins: np.ndarray
+) -> RealSymmetricForm:
     """Return the folded matrix of weighted readings.
 
     Parameters
@@ -110,17 +111,28 @@ def fold(views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray,
     variable[on_cut] = len(free) + copies
     mean = weight.sum() / max(np.count_nonzero(read), 1)
     size = len(free) + len(keys)
-    diagonal = np.bincount(variable.ravel(), (weight * (1 - relative_weight)).ravel(),
-                           minlength=size)
+    diagonal = np.bincount(
+        variable.ravel(), (weight * (1 - relative_weight)).ravel(), minlength=size
+    )
     pinned = place[pins[~is_cut[pins]]]
     diagonal[pinned] += mean
-    entries = _entries(variable, diagonal, weight.reshape(read.shape),
-                       relative_weight.reshape(read.shape))
+    entries = _entries(
+        variable, diagonal, weight.reshape(read.shape), relative_weight.reshape(read.shape)
+    )
     cut_pins = np.zeros(len(cut))
     cut_pins[place[pins[is_cut[pins]]]] = mean
-    return RealSymmetricForm(*entries, size, free, cut, keys // 4, PHASES[keys % 4],
-                             PHASES[quadrant], cut_pins, variable,
-                             relative_weight.reshape(read.shape))
+    return RealSymmetricForm(
+        *entries,
+        size,
+        free,
+        cut,
+        keys // 4,
+        PHASES[keys % 4],
+        PHASES[quadrant],
+        cut_pins,
+        variable,
+        relative_weight.reshape(read.shape),
+    )
 
 
 def _quadrants(shape: tuple[int, int]) -> np.ndarray:
@@ -133,8 +145,9 @@ def _quadrants(shape: tuple[int, int]) -> np.ndarray:
     return out
 
 
-def _entries(variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray,
-             relative_weight: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _entries(
+    variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray, relative_weight: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and values of one triangle of R."""
     rows, values = [np.arange(len(diagonal))], [diagonal]
     columns = rows.copy()
@@ -185,14 +198,19 @@ class Front:
     def blocks(self, storage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return views of the blocks (own, own) and (b, own), by columns."""
         own, middle = self.stop - self.start, self.offset + (self.stop - self.start) ** 2
-        return (storage[self.offset:middle].reshape(own, own).T,
-                storage[middle:self.offset + self.size].reshape(own, -1).T)
+        return (
+            storage[self.offset : middle].reshape(own, own).T,
+            storage[middle : self.offset + self.size].reshape(own, -1).T,
+        )
 
     def places(self, variables: np.ndarray) -> np.ndarray:
         """Return the positions of variables in this front: its own first, then its boundary."""
         own = self.stop - self.start
-        return np.where(variables < self.stop, variables - self.start,
-                        own + np.searchsorted(self.boundary, variables))
+        return np.where(
+            variables < self.stop,
+            variables - self.start,
+            own + np.searchsorted(self.boundary, variables),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,8 +251,10 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
         Largest folded distance of two sites joined by the matrix.
     """
     # |x| and |y|, rounded down to whole pitches
-    i, j = (abs(2 * at - size + 1) // 2 for at, size in zip(
-        np.divmod(folded.free, shape[1]), shape, strict=True))
+    i, j = (
+        abs(2 * at - size + 1) // 2
+        for at, size in zip(np.divmod(folded.free, shape[1]), shape, strict=True)
+    )
     far, near = np.maximum(i, j), np.minimum(i, j)
     pieces: list[tuple[np.ndarray, tuple[int, ...]]] = []
     # consecutive: the variables of a front are contiguous in memory
@@ -255,8 +275,7 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
     at = total + (column - n) * (size - n) + row - n
     at[inner] = _addresses(fronts, row[inner], column[inner], front=front, size=size)
     both = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
-    return Dissection(order, fronts, top, both[:total],
-                      both[total:].reshape(size - n, size - n).T)
+    return Dissection(order, fronts, top, both[:total], both[total:].reshape(size - n, size - n).T)
 
 
 def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
@@ -278,20 +297,26 @@ def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> t
     return tuple(fronts)
 
 
-def _addresses(fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *,
-               front: np.ndarray, size: int) -> np.ndarray:
+def _addresses(
+    fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *, front: np.ndarray, size: int
+) -> np.ndarray:
     """Return the storage positions of entries (row, column) of the lower triangle."""
     start = np.array([one.start for one in fronts])[front]
     own = np.array([one.stop for one in fronts])[front] - start
     widths = np.array([len(one.boundary) for one in fronts])
-    keys = np.concatenate([np.zeros(0, dtype=int), *(
-        number * size + one.boundary for number, one in enumerate(fronts))])
+    keys = np.concatenate(
+        [
+            np.zeros(0, dtype=int),
+            *(number * size + one.boundary for number, one in enumerate(fronts)),
+        ]
+    )
     before = np.cumsum(widths) - widths
     place = np.searchsorted(keys, front * size + row) - before[front]
     offset = np.array([one.offset for one in fronts])[front]
     column = column - start
-    return offset + np.where(row < start + own, column * own + row - start,
-                             own * own + column * widths[front] + place)
+    return offset + np.where(
+        row < start + own, column * own + row - start, own * own + column * widths[front] + place
+    )
 
 
 def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tuple[int, ...]:
@@ -305,8 +330,10 @@ def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tup
         if spans[axis] > 2 * reach:
             low = _best_cut(at[axis], reach)
             left, right = at[axis] < low, at[axis] >= low + reach
-            below = (*_cut(sites[left], folded, reach, pieces),
-                     *_cut(sites[right], folded, reach, pieces))
+            below = (
+                *_cut(sites[left], folded, reach, pieces),
+                *_cut(sites[right], folded, reach, pieces),
+            )
             between = sites[~left & ~right]
             if not len(between):
                 return below
@@ -400,7 +427,7 @@ class Factor:
         With M = P^H L L^H P these are the products of L^-1 P: no back substitution.
         """
         work, closed = self._eliminated(right)
-        free = work[:self._n_free]
+        free = work[: self._n_free]
         return free.conj().T @ free + closed.conj().T @ (self._cut_inverse @ closed)
 
     def _eliminated(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -417,19 +444,20 @@ class Factor:
     def _forward(self, work: np.ndarray) -> None:
         real = work.view(float)
         for front, (inverse, below) in zip(self.dissection.fronts, self._blocks, strict=True):
-            own = inverse @ real[front.start:front.stop]
-            real[front.start:front.stop] = own
+            own = inverse @ real[front.start : front.stop]
+            real[front.start : front.stop] = own
             if len(below):
                 real[front.boundary] -= below @ own
 
     def _backward(self, work: np.ndarray) -> None:
         real = work.view(float)
-        for front, (inverse, below) in zip(reversed(self.dissection.fronts),
-                                           reversed(self._blocks), strict=True):
-            own = real[front.start:front.stop]
+        for front, (inverse, below) in zip(
+            reversed(self.dissection.fronts), reversed(self._blocks), strict=True
+        ):
+            own = real[front.start : front.stop]
             if len(below):
                 own = own - below.T @ real[front.boundary]
-            real[front.start:front.stop] = inverse.T @ own
+            real[front.start : front.stop] = inverse.T @ own
 
     @cached_property
     def variances(self) -> tuple[np.ndarray, np.ndarray]:
@@ -464,7 +492,7 @@ class Factor:
         for number in range(len(fronts) - 1, -1, -1):
             front = fronts[number]
             z = self._selected(number, needed.pop(number))
-            own[sites[front.start:front.stop]] = z.diagonal()[:front.stop - front.start]
+            own[sites[front.start : front.stop]] = z.diagonal()[: front.stop - front.start]
             mine = marks[slice(*np.searchsorted(after, (front.start, front.stop)))]
             means[mine] = of_means(z, mine, front.places(place[:, mine]))
             for child in front.children:
@@ -507,14 +535,16 @@ def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarr
     inner = int(np.searchsorted(places, own))
     first, last = slice(inner), slice(inner, len(places))
     to = {first: places[first], last: places[last] - own}
-    for block, (rows, columns) in zip(blocks, ((first, first), (last, first), (last, last)),
-                                      strict=False):
+    for block, (rows, columns) in zip(
+        blocks, ((first, first), (last, first), (last, last)), strict=False
+    ):
         at = to[columns][:, None] * len(block) + to[rows]
         np.add.at(block.T.reshape(-1), at.ravel(), update[rows, columns].T.ravel())
 
 
-def _eliminate(f11: np.ndarray, f21: np.ndarray, f22: np.ndarray
-               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _eliminate(
+    f11: np.ndarray, f21: np.ndarray, f22: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return L^-1, F21 L^-T and the Schur complement of the boundary; inputs are overwritten.
 
     Only the lower triangles of symmetric blocks are read and written.

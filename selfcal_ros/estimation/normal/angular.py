@@ -50,8 +50,9 @@ class AngularSystem(PlateEliminated):
 
     coordinates, of_view = 1, 1
 
-    def __init__(self, turns: tuple[float, ...], weight: np.ndarray, *,
-                 known_plate: bool = False) -> None:
+    def __init__(
+        self, turns: tuple[float, ...], weight: np.ndarray, *, known_plate: bool = False
+    ) -> None:
         super().__init__(weight, known_plate=known_plate)
         self.turns = turns
         lines = np.arange(self.n_lines)
@@ -110,8 +111,12 @@ class AngularSystem(PlateEliminated):
         pins = np.zeros(self.n_lines)
         pins[self.pins] = self.weight.sum() / max(self.n_readings, 1)
         matrix = over_nodes(self.rows, self.weight, self.relative_weight)[0] + diags(pins)
-        return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                    options={"SymmetricMode": True})
+        return splu(
+            matrix.tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution of the pinned system for (K,) or (K, k)."""
@@ -148,8 +153,14 @@ class HarmonicSystem(AngularSystem):
 
     smooth = True
 
-    def __init__(self, turns: tuple[float, ...], weight: np.ndarray, harmonics: int, *,
-                 known_plate: bool = False) -> None:
+    def __init__(
+        self,
+        turns: tuple[float, ...],
+        weight: np.ndarray,
+        harmonics: int,
+        *,
+        known_plate: bool = False,
+    ) -> None:
         super().__init__(turns, weight, known_plate=known_plate)
         self.harmonics = harmonics
         line = 2 * np.pi / self.n_lines

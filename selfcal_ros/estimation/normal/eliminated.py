@@ -86,8 +86,9 @@ class PlateEliminated(ABC):
         """Components of the graph of sites and marks."""
         site, mark, q = self.edges
         if self.known_plate:
-            return Components.of_one(np.isin(np.arange(self.n_sites), site),
-                                     np.zeros(self.n_marks, dtype=bool))
+            return Components.of_one(
+                np.isin(np.arange(self.n_sites), site), np.zeros(self.n_marks, dtype=bool)
+            )
         return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks)
 
     @property
@@ -205,8 +206,9 @@ class PlateEliminated(ABC):
         parameters = inverse @ d
         return free - self.response @ parameters, parameters
 
-    def plate(self, y: np.ndarray, field: np.ndarray,
-              parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def plate(
+        self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the plate (..., *marks) and the residuals for a map and misalignments.
 
         The residuals, (..., views, *marks), are 0 where not read.
@@ -238,8 +240,9 @@ class PlateEliminated(ABC):
         return sites, -taken - np.real(self.response.conj().T @ sites)
 
 
-def over_nodes(rows: Sequence[csr_matrix | np.ndarray], weight: np.ndarray,
-               relative_weight: np.ndarray) -> tuple[csr_matrix, csr_matrix]:
+def over_nodes(
+    rows: Sequence[csr_matrix | np.ndarray], weight: np.ndarray, relative_weight: np.ndarray
+) -> tuple[csr_matrix, csr_matrix]:
     """Return the matrix over the nodes with the marks eliminated, and the rows of their means.
 
     Parameters
@@ -250,8 +253,12 @@ def over_nodes(rows: Sequence[csr_matrix | np.ndarray], weight: np.ndarray,
         Weights, and shares in the mean of a mark.
     """
     count = len(rows)
-    own = sum(row.conj().T @ (diags(one) @ row)
-              for row, one in zip(rows, weight.reshape(count, -1), strict=True))
-    mean = sum(diags(part) @ row
-               for row, part in zip(rows, relative_weight.reshape(count, -1), strict=True))
+    own = sum(
+        row.conj().T @ (diags(one) @ row)
+        for row, one in zip(rows, weight.reshape(count, -1), strict=True)
+    )
+    mean = sum(
+        diags(part) @ row
+        for row, part in zip(rows, relative_weight.reshape(count, -1), strict=True)
+    )
     return own - mean.conj().T @ (diags(weight.sum(axis=0).ravel()) @ mean), mean

@@ -61,8 +61,13 @@ class NormalEquations:
         Position of their views in the measurement.
     """
 
-    def __init__(self, grid: GridSystem, angular: AngularSystem, grid_index: tuple[int, ...],
-                 angular_index: tuple[int, ...]) -> None:
+    def __init__(
+        self,
+        grid: GridSystem,
+        angular: AngularSystem,
+        grid_index: tuple[int, ...],
+        angular_index: tuple[int, ...],
+    ) -> None:
         self.grid, self.angular = grid, angular
         self.grid_index, self.angular_index = grid_index, angular_index
         extra = [i for i in angular_index if i not in grid_index]
@@ -77,8 +82,8 @@ class NormalEquations:
     def rigid(self) -> np.ndarray:
         """Datum modes in terms of all misalignments, (7, size)."""
         out = np.zeros((7, self.size))
-        out[:, :3 * self.grid.n_views] = self.grid.rigid
-        out[[2, 6], 3 * self.grid.n_views:] = -1
+        out[:, : 3 * self.grid.n_views] = self.grid.rigid
+        out[[2, 6], 3 * self.grid.n_views :] = -1
         return out
 
     def normal(self, ratio: float) -> np.ndarray:
@@ -125,8 +130,9 @@ class NormalEquations:
         field, parameters = self.grid.fitted(y, self.grid_inverse)
         return field.reshape(self.grid.views.shape), parameters
 
-    def in_datum(self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def in_datum(
+        self, y: np.ndarray, field: np.ndarray, parameters: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return a solution in its datum: map, misalignments, plate and residuals.
 
         Parameters
@@ -138,12 +144,16 @@ class NormalEquations:
         """
         parts = self.gauge.parts(field)
         field = self.gauge.remove(field, parts)
-        rigid = self.rigid[:, :len(parameters)]
-        parameters = parameters - parts @ rigid[:len(parts)]
-        plate, residuals = self.grid.plate(y, field, parameters[:3 * self.grid.n_views])
+        rigid = self.rigid[:, : len(parameters)]
+        parameters = parameters - parts @ rigid[: len(parts)]
+        plate, residuals = self.grid.plate(y, field, parameters[: 3 * self.grid.n_views])
         parts = self.plate_gauge.parts(plate)
-        return (field, parameters - parts @ rigid[4:], self.plate_gauge.remove(plate, parts),
-                residuals)
+        return (
+            field,
+            parameters - parts @ rigid[4:],
+            self.plate_gauge.remove(plate, parts),
+            residuals,
+        )
 
     @cached_property
     def angular_inverse(self) -> np.ndarray:
@@ -192,7 +202,7 @@ class NormalEquations:
         """Undetermined misalignments other than the datum, (size, modes)."""
         # without turns the rigid modes are dependent: an orthonormal basis of their span
         none = np.zeros((self.grid.differences.shape[1], self.size))
-        none[:, :3 * self.grid.n_views] = self.grid.differences.T
+        none[:, : 3 * self.grid.n_views] = self.grid.differences.T
         datum = np.vstack([self.rigid, *[self._turn_of_lines] * self.apart, none])
         rigid, size, _ = np.linalg.svd(datum.T, full_matrices=False)
         rigid = rigid[:, size > GAP * size[0]]
@@ -220,13 +230,13 @@ class NormalEquations:
     def _turn_of_lines(self) -> np.ndarray:
         """The common rotation of views of lines alone, (size,)."""
         out = np.zeros(self.size)
-        out[3 * self.grid.n_views:] = 1.0
+        out[3 * self.grid.n_views :] = 1.0
         return out
 
     @cached_property
     def known_sites(self) -> np.ndarray:
         """Sites whose error is determined up to the datum, bool (nx, ny)."""
-        hidden = self.unseen[:3 * self.grid.n_views]
+        hidden = self.unseen[: 3 * self.grid.n_views]
         parts = self.grid.components
         known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
         if np.any(np.abs(hidden) > TRACE) and known.any():
@@ -313,8 +323,13 @@ def pseudo_inverse(values: np.ndarray, vectors: np.ndarray, scale: float) -> np.
     return (vectors[:, good] / values[good]) @ vectors[:, good].T
 
 
-def in_datum(own: np.ndarray, answers: Sequence[tuple[np.ndarray, np.ndarray]],
-             spread: np.ndarray, fields: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def in_datum(
+    own: np.ndarray,
+    answers: Sequence[tuple[np.ndarray, np.ndarray]],
+    spread: np.ndarray,
+    fields: np.ndarray,
+    inner: np.ndarray,
+) -> np.ndarray:
     """Return the variances of a map in its datum, (2, places); of a real map twice the same.
 
     The map is a free one plus each field times a functional of free maps.
@@ -438,9 +453,16 @@ class PlacedSystem(GridSystem):
     views: PlacedViews
     smooth = True
 
-    def __init__(self, plate: Artifact, poses: tuple[PlacedPose, ...], weight: np.ndarray,
-                 spline: MapSpline | None = None, rotations: tuple[int, ...] = (), *,
-                 known_plate: bool = False) -> None:
+    def __init__(
+        self,
+        plate: Artifact,
+        poses: tuple[PlacedPose, ...],
+        weight: np.ndarray,
+        spline: MapSpline | None = None,
+        rotations: tuple[int, ...] = (),
+        *,
+        known_plate: bool = False,
+    ) -> None:
         super().__init__((), weight, rotations=rotations, known_plate=known_plate)
         self.views = PlacedViews(plate, poses, spline)
 
@@ -452,11 +474,15 @@ class PlacedSystem(GridSystem):
     @cached_property
     def components(self) -> Components:
         """One component of all nodes with readings near them, without a free vector."""
-        read = [rows[weight.ravel() > 0] for rows, weight in zip(
-            self.views.rows, self.weight, strict=True)]
+        read = [
+            rows[weight.ravel() > 0]
+            for rows, weight in zip(self.views.rows, self.weight, strict=True)
+        ]
         touched = np.concatenate([rows.indices[rows.data != 0] for rows in read])
-        return Components.of_one(np.isin(np.arange(self.n_sites), touched),
-                                 self.mark_read.ravel() & (not self.known_plate))
+        return Components.of_one(
+            np.isin(np.arange(self.n_sites), touched),
+            self.mark_read.ravel() & (not self.known_plate),
+        )
 
     @cached_property
     def matrix(self) -> np.ndarray:
@@ -466,8 +492,9 @@ class PlacedSystem(GridSystem):
         """
         n = self.n_sites
         if n > MAX_NODES:
-            raise InputError("map grid_size", f"{n} nodes are more than {MAX_NODES}",
-                             "give the map fewer nodes")
+            raise InputError(
+                "map grid_size", f"{n} nodes are more than {MAX_NODES}", "give the map fewer nodes"
+            )
         out = self.views.spline.on_nodes(self._over_coefficients[0].toarray())
         out[np.diag_indices(n)] += self.vague
         return out
@@ -475,8 +502,10 @@ class PlacedSystem(GridSystem):
     @cached_property
     def _over_coefficients(self) -> tuple[csr_matrix, csr_matrix]:
         """The matrix over the spline's coefficients, and the rows of the means of the marks."""
-        rows = [phase.conjugate() * one
-                for phase, one in zip(self.views.phases, self.views.rows, strict=True)]
+        rows = [
+            phase.conjugate() * one
+            for phase, one in zip(self.views.phases, self.views.rows, strict=True)
+        ]
         return over_nodes(rows, self.weight, self.relative_weight)
 
     @property
@@ -501,12 +530,14 @@ class PlacedSystem(GridSystem):
         inverse = self.factor.inverse.reshape(self.n_sites, *views.shape)
         half = views.spline.coefficients(inverse).reshape(self.n_sites, -1)
         cover = views.spline.coefficients(half.conj().T.reshape(-1, *views.shape)).reshape(
-            self.n_sites, -1)
+            self.n_sites, -1
+        )
         out = np.zeros(self.n_marks)
         for start in range(0, self.n_marks, BLOCK):
-            here = rows[start:start + BLOCK]
-            out[start:start + BLOCK] = np.real(
-                here.conj().multiply(here @ cover).sum(axis=1)).ravel()
+            here = rows[start : start + BLOCK]
+            out[start : start + BLOCK] = np.real(
+                here.conj().multiply(here @ cover).sum(axis=1)
+            ).ravel()
         return out
 
 
@@ -523,9 +554,11 @@ class PlacedEquations(NormalEquations):
         """
         views = self.grid.views
         gauge = Gauge(views.z_sites, np.ones(views.shape, dtype=bool), scale=True)
-        fields = (self.grid.response @ self.unseen[:3 * self.grid.n_views]).T
-        return any(np.abs(gauge.remove(field, gauge.parts(field))).max() > TRACE
-                   for field in fields.reshape(-1, *views.shape))
+        fields = (self.grid.response @ self.unseen[: 3 * self.grid.n_views]).T
+        return any(
+            np.abs(gauge.remove(field, gauge.parts(field))).max() > TRACE
+            for field in fields.reshape(-1, *views.shape)
+        )
 
     @cached_property
     def known_sites(self) -> np.ndarray:
@@ -558,10 +591,14 @@ class PlacedEquations(NormalEquations):
         """
         n, rigid = 3 * self.grid.n_views, datum.orthonormal
         factor, response, own = self.grid.factor, self.grid.response, inverse[:n, :n]
-        spread = factor.inverse @ rigid + response @ (
-            own @ np.real(response.conj().T @ rigid))
-        return in_datum(self.grid.variance_of_sites, ((response, own),), spread, -datum.everywhere,
-                        np.real(rigid.conj().T @ spread))
+        spread = factor.inverse @ rigid + response @ (own @ np.real(response.conj().T @ rigid))
+        return in_datum(
+            self.grid.variance_of_sites,
+            ((response, own),),
+            spread,
+            -datum.everywhere,
+            np.real(rigid.conj().T @ spread),
+        )
 
     @cached_property
     def loose_modes(self) -> np.ndarray:
@@ -601,20 +638,32 @@ def _equations(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
     lines = lines_of(angular)
     if grid.plate is not None:
         return PlacedEquations(
-            PlacedSystem(grid.plate, cast(tuple[PlacedPose, ...], grid.poses), grid.weight,
-                         rotations=grid.rotations, known_plate=grid.known_plate),
-            lines, grid.index, angular.index)
+            PlacedSystem(
+                grid.plate,
+                cast(tuple[PlacedPose, ...], grid.poses),
+                grid.weight,
+                rotations=grid.rotations,
+                known_plate=grid.known_plate,
+            ),
+            lines,
+            grid.index,
+            angular.index,
+        )
     poses = cast(tuple[LatticePose, ...], grid.poses)
     return NormalEquations(
         GridSystem(poses, grid.weight, rotations=grid.rotations, known_plate=grid.known_plate),
-        lines, grid.index, angular.index)
+        lines,
+        grid.index,
+        angular.index,
+    )
 
 
 def lines_of(angular: Marks[float]) -> AngularSystem:
     """Return the equations of the angular readings."""
     if angular.harmonics and angular.poses:
-        return HarmonicSystem(angular.poses, angular.weight, angular.harmonics,
-                              known_plate=angular.known_plate)
+        return HarmonicSystem(
+            angular.poses, angular.weight, angular.harmonics, known_plate=angular.known_plate
+        )
     return AngularSystem(angular.poses, angular.weight, known_plate=angular.known_plate)
 
 

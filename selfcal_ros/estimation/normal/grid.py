@@ -35,8 +35,14 @@ class GridSystem(PlateEliminated):
 
     coordinates, of_view = 2, 3
 
-    def __init__(self, poses: tuple[LatticePose, ...], weight: np.ndarray,
-                 rotations: tuple[int, ...] = (), *, known_plate: bool = False) -> None:
+    def __init__(
+        self,
+        poses: tuple[LatticePose, ...],
+        weight: np.ndarray,
+        rotations: tuple[int, ...] = (),
+        *,
+        known_plate: bool = False,
+    ) -> None:
         super().__init__(weight, known_plate=known_plate)
         self.rotations = rotations
         self.views = LatticeViews(weight.shape[1:], poses)
@@ -124,8 +130,10 @@ class GridSystem(PlateEliminated):
         The latter as phi, Re tau, Im tau of each view, (3 views, k).
         """
         sums = np.tensordot(self.shapes.conj(), readings, axes=([1, 2], [2, 3]))
-        return (self.views.scatter(readings).reshape(len(readings), -1).T,
-                of_misalignments(sums.transpose(2, 0, 1).reshape(2 * self.n_views, -1)))
+        return (
+            self.views.scatter(readings).reshape(len(readings), -1).T,
+            of_misalignments(sums.transpose(2, 0, 1).reshape(2 * self.n_views, -1)),
+        )
 
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
         """Return phi i z + tau at every mark, complex (..., views, nx, ny), from (..., 3 views)."""
@@ -133,8 +141,9 @@ class GridSystem(PlateEliminated):
         phi, tau = each[..., 0], each[..., 1] + 1j * each[..., 2]
         return phi[..., None, None] * self.shapes[0] + tau[..., None, None]
 
-    def free_parts_small(self, field: np.ndarray, plate: np.ndarray
-                         ) -> tuple[np.ndarray, np.ndarray]:
+    def free_parts_small(
+        self, field: np.ndarray, plate: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return G and A with zero mean plate error in each free component.
 
         The linear model does not determine the vector of such a component; a finite rotation

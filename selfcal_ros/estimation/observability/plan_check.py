@@ -70,8 +70,9 @@ class Prediction:
         return rms(self.u_theta)
 
 
-def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
-            repeats: int = 1) -> Prediction:
+def predict(
+    system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *, repeats: int = 1
+) -> Prediction:
     """Return the predicted uncertainties for readings that identify the stage.
 
     Parameters
@@ -91,8 +92,12 @@ def predict(system: NormalEquations, artifact: Artifact, datum: ThetaDatum, *,
     ux, uy = np.sqrt(MapsCovariance(system, inverse).of_stage * repeats)
     if not system.angular.n_views:
         return Prediction(ux, uy, np.zeros(0))
-    conditions = conditions_for(system, ThetaDatum(datum), Sense.MICROSCOPE_MOVES,
-                                artifact.grid_pitch_m * max(artifact.reach))
+    conditions = conditions_for(
+        system,
+        ThetaDatum(datum),
+        Sense.MICROSCOPE_MOVES,
+        artifact.grid_pitch_m * max(artifact.reach),
+    )
     known = replace(conditions, slopes=np.zeros_like(conditions.slopes))
     return Prediction(ux, uy, np.sqrt(repeats * lines_alone(system).of_stage(known)[0]))
 
@@ -139,8 +144,10 @@ def check_plan(plan: Plan) -> PlanCheck:
     seen = with_unchecked(full_observability(system, plan.artifact, plan.views), system)
     if not seen.identifiable:
         return with_unseen_modes(seen, system, plan)
-    return PlanCheck(seen, unknown_sites=0 if plan.artifact.map_grid is None else int(
-        (~system.known_sites).sum()))
+    return PlanCheck(
+        seen,
+        unknown_sites=0 if plan.artifact.map_grid is None else int((~system.known_sites).sum()),
+    )
 
 
 def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) -> PlanCheck:
@@ -157,8 +164,10 @@ def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) 
     """
     modes = tuple(unseen_modes(system))
     cures = tuple(find_cures(plan))
-    advice = tuple(add_views(plan.artifact, *cure, name="or_add_views" if number else "add_views")
-                   for number, cure in enumerate(cures[:3]))
+    advice = tuple(
+        add_views(plan.artifact, *cure, name="or_add_views" if number else "add_views")
+        for number, cure in enumerate(cures[:3])
+    )
     return PlanCheck(replace(seen, modes=modes, advice=advice or seen.advice), cures)
 
 
@@ -170,8 +179,12 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
     the gain grows slowly, as log N, so the prediction is then too small.
     """
     judged = predicted_on(plan)
-    return predict(planned_system(judged.artifact, judged.views), judged.artifact, datum,
-                   repeats=unit_repeats(plan))
+    return predict(
+        planned_system(judged.artifact, judged.views),
+        judged.artifact,
+        datum,
+        repeats=unit_repeats(plan),
+    )
 
 
 def predicted_on(plan: Plan) -> Plan:
@@ -199,16 +212,28 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
     pitch = artifact.grid_pitch_m
     beside = artifact.quarter_shift * pitch
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
-    views = [View(f"{90 * q}deg{name}", q * math.pi / 2,
-                  (a * pitch + q % 2 * beside, b * pitch + q % 2 * beside), True, angular and (
-                      bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0))
-             for (a, b), name in names.items() for q in range(4)
-             if q % 2 == 0 or artifact.marks or artifact.shape[0] == artifact.shape[1]
-             or (a, b) == (0, 0)]
+    views = [
+        View(
+            f"{90 * q}deg{name}",
+            q * math.pi / 2,
+            (a * pitch + q % 2 * beside, b * pitch + q % 2 * beside),
+            True,
+            angular and (bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0),
+        )
+        for (a, b), name in names.items()
+        for q in range(4)
+        if q % 2 == 0
+        or artifact.marks
+        or artifact.shape[0] == artifact.shape[1]
+        or (a, b) == (0, 0)
+    ]
     if angular:
         line = 2 * math.pi / artifact.angular_count
-        views.append(View("one_line", line, (0.0, 0.0), False, True) if not artifact.harmonics else
-                     View(f"{OTHER_TURN_DEG}deg", math.radians(OTHER_TURN_DEG), grid=False))
+        views.append(
+            View("one_line", line, (0.0, 0.0), False, True)
+            if not artifact.harmonics
+            else View(f"{OTHER_TURN_DEG}deg", math.radians(OTHER_TURN_DEG), grid=False)
+        )
     return views
 
 
@@ -221,8 +246,10 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
     """
     angular = any(view.angular for view in plan.views)
     image = next((view.image for view in plan.views if view.grid), None)
-    candidates = [replace(view, image=image if view.grid else None)
-                  for view in candidate_views(plan.artifact, angular=angular)]
+    candidates = [
+        replace(view, image=image if view.grid else None)
+        for view in candidate_views(plan.artifact, angular=angular)
+    ]
     grid_only = [view for view in candidates if view.grid]
     small = smaller(plan, SEARCH_SIZE)
     found: list[tuple[View, ...]] = [()]
@@ -233,15 +260,22 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
             if found:
                 break
     for views in found:
-        cure = next((more for more in (views, (*views, candidates[-1]))
-                     if more and identifies(plan.artifact, (*plan.views, *more))), None)
+        cure = next(
+            (
+                more
+                for more in (views, (*views, candidates[-1]))
+                if more and identifies(plan.artifact, (*plan.views, *more))
+            ),
+            None,
+        )
         if cure:
             yield cure
 
 
 def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
-    return identifies(plan.artifact, [replace(view, angular=False)
-                                      for view in (*plan.views, *views) if view.grid])
+    return identifies(
+        plan.artifact, [replace(view, angular=False) for view in (*plan.views, *views) if view.grid]
+    )
 
 
 @dataclass(frozen=True)
@@ -272,8 +306,10 @@ def more_views(plan: Plan) -> list[Step]:
     out = []
     like = next((view for view in plan.views if view.grid), View(""))
     for view in candidate_views(plan.artifact, angular=angular):
-        named = measured_like(replace(view, name=unused_name(view.name, plan.views)),
-                              replace(like, repeats=unit_repeats(plan)))
+        named = measured_like(
+            replace(view, name=unused_name(view.name, plan.views)),
+            replace(like, repeats=unit_repeats(plan)),
+        )
         out.append(Step(named, (*plan.views, named)))
     return out
 
@@ -281,9 +317,17 @@ def more_views(plan: Plan) -> list[Step]:
 def measured_like(view: View, like: View) -> View:
     """Return a view with the repeats, and in its marks the visiting order, of another one."""
     view = replace(view, repeats=like.repeats)
-    return view if not view.grid else replace(
-        view, visit_order=like.visit_order, check_marks=like.check_marks,
-        check_offset_m=like.check_offset_m, image=like.image)
+    return (
+        view
+        if not view.grid
+        else replace(
+            view,
+            visit_order=like.visit_order,
+            check_marks=like.check_marks,
+            check_offset_m=like.check_offset_m,
+            image=like.image,
+        )
+    )
 
 
 def more_repeats(plan: Plan) -> list[Step]:
@@ -292,14 +336,16 @@ def more_repeats(plan: Plan) -> list[Step]:
     out = []
     for index, view in enumerate(plan.views):
         more = replace(view, repeats=view.repeats + unit)
-        out.append(Step(more, (*plan.views[:index], more, *plan.views[index + 1:]), index))
+        out.append(Step(more, (*plan.views[:index], more, *plan.views[index + 1 :]), index))
     return out
 
 
 def other_orders(plan: Plan) -> list[Step]:
     """Return the visiting orders, with enough repeats to complete them."""
-    steps = [Step(None, tuple(_in_order(view, order) for view in plan.views), order=order)
-             for order in ORDERS]
+    steps = [
+        Step(None, tuple(_in_order(view, order) for view in plan.views), order=order)
+        for order in ORDERS
+    ]
     return [step for step in steps if step.views != plan.views]
 
 
@@ -307,9 +353,17 @@ def check_stops(plan: Plan) -> list[Step]:
     """Return the step to check stops, if the plan has none."""
     if any(view.check_marks for view in plan.views):
         return []
-    return [Step(None, tuple(
-        replace(view, check_marks=CHECK_MARKS, check_offset_m=CHECK_OFFSET_M) if view.grid
-        else view for view in plan.views))]
+    return [
+        Step(
+            None,
+            tuple(
+                replace(view, check_marks=CHECK_MARKS, check_offset_m=CHECK_OFFSET_M)
+                if view.grid
+                else view
+                for view in plan.views
+            ),
+        )
+    ]
 
 
 def _in_order(view: View, order: str) -> View:

@@ -82,17 +82,32 @@ def smaller(plan: Plan, size: int) -> Plan:
     """
     if plan.artifact.marks or max(plan.artifact.shape) <= size:
         return plan
-    reach = [max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
-             for view in with_sub_views(plan.views)]
+    reach = [
+        max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
+        for view in with_sub_views(plan.views)
+    ]
     room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
     part = min(1.0, max(size, room) / max(plan.artifact.shape))
-    nx, ny = (max(2 * round((n * part - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
-              for n in plan.artifact.shape)
-    plate = Artifact(nx, plan.artifact.grid_pitch_m, plan.artifact.angular_count,
-                     0 if nx == ny else ny, harmonics=plan.artifact.harmonics)
+    nx, ny = (
+        max(2 * round((n * part - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
+        for n in plan.artifact.shape
+    )
+    plate = Artifact(
+        nx,
+        plan.artifact.grid_pitch_m,
+        plan.artifact.angular_count,
+        0 if nx == ny else ny,
+        harmonics=plan.artifact.harmonics,
+    )
     grid = plan.artifact.map_grid
-    return replace(plan, artifact=plate if grid is None else replace(plate, map_grid=replace(
-        default_map_grid(plate), interpolation=grid.interpolation)))
+    return replace(
+        plan,
+        artifact=plate
+        if grid is None
+        else replace(
+            plate, map_grid=replace(default_map_grid(plate), interpolation=grid.interpolation)
+        ),
+    )
 
 
 def deficiency(system: NormalEquations) -> int:
@@ -106,8 +121,9 @@ def unknowns_of(system: NormalEquations) -> int:
     return 2 * (grid.n_sites + grid.n_marks) + grid.n_misalignments
 
 
-def full_observability(system: NormalEquations, artifact: Artifact,
-                       views: Iterable[View]) -> Observability:
+def full_observability(
+    system: NormalEquations, artifact: Artifact, views: Iterable[View]
+) -> Observability:
     """Return rank and deficiency over all sites, marks and lines of the artifact.
 
     Parameters
@@ -122,8 +138,13 @@ def full_observability(system: NormalEquations, artifact: Artifact,
     if artifact.map_grid is not None:
         return _placed_observability(system, artifact, tuple(views))
     unseen = deficiency(system)
-    return Observability(system.rank_grid + DATUM_ROWS, unknowns_of(system), unseen, unseen == 0,
-                         advice=advice_for(artifact, views) if unseen else ())
+    return Observability(
+        system.rank_grid + DATUM_ROWS,
+        unknowns_of(system),
+        unseen,
+        unseen == 0,
+        advice=advice_for(artifact, views) if unseen else (),
+    )
 
 
 def angular_deficiency(system: NormalEquations) -> int:
@@ -141,8 +162,9 @@ def angular_deficiency(system: NormalEquations) -> int:
     return angular.n_unknowns - angular.rank - 1 + turns
 
 
-def measured_observability(system: NormalEquations, artifact: Artifact,
-                           views: tuple[View, ...]) -> Observability:
+def measured_observability(
+    system: NormalEquations, artifact: Artifact, views: tuple[View, ...]
+) -> Observability:
     """Return the observability of the marks that were read.
 
     If the views would identify the stage and only marks are missing, the determined sites
@@ -162,13 +184,20 @@ def measured_observability(system: NormalEquations, artifact: Artifact,
 
 def with_unchecked(seen: Observability, system: NormalEquations) -> Observability:
     """Return the observability with the counts of unchecked sites and lines."""
-    return seen if not seen.identifiable else replace(
-        seen, unchecked_sites=int(system.unchecked_sites.sum()),
-        unchecked_lines=int(system.unchecked_lines.sum()))
+    return (
+        seen
+        if not seen.identifiable
+        else replace(
+            seen,
+            unchecked_sites=int(system.unchecked_sites.sum()),
+            unchecked_lines=int(system.unchecked_lines.sum()),
+        )
+    )
 
 
-def _measured_observability(system: NormalEquations, artifact: Artifact,
-                            views: tuple[View, ...]) -> Observability:
+def _measured_observability(
+    system: NormalEquations, artifact: Artifact, views: tuple[View, ...]
+) -> Observability:
     read = _as_read(system, views)
     full = full_observability(system, artifact, read)
     if full.identifiable:
@@ -177,12 +206,18 @@ def _measured_observability(system: NormalEquations, artifact: Artifact,
         return full
     sites, lines = system.known_sites, system.known_lines
     if sites.mean() < DETERMINED or (len(lines) and lines.mean() < DETERMINED):
-        missing = Finding("marks_missing", details={
-            "sites": int(sites.sum()), "of_sites": sites.size, "lines": int(lines.sum()),
-            "of_lines": len(lines)})
+        missing = Finding(
+            "marks_missing",
+            details={
+                "sites": int(sites.sum()),
+                "of_sites": sites.size,
+                "lines": int(lines.sum()),
+                "of_lines": len(lines),
+            },
+        )
         return Observability(full.rank, full.unknowns, full.deficiency, False, advice=(missing,))
     kept = 2 * int(sites.sum() + system.known_marks.sum())
-    kept += int(system.known_views[:3 * system.grid.n_views].sum())
+    kept += int(system.known_views[: 3 * system.grid.n_views].sum())
     kept -= system.grid.differences.shape[1]
     return Observability(kept, kept, 0, True)
 
@@ -193,12 +228,16 @@ def _nodes_known(system: NormalEquations) -> bool:
     Nothing separates the modes that they determine badly from those that they do not determine, so
     that each node counts by its uncertainty (method, views at any pose).
     """
-    return bool(not system.hides_fields and system.known_sites.mean() >= DETERMINED
-                and angular_deficiency(system) == 0)
+    return bool(
+        not system.hides_fields
+        and system.known_sites.mean() >= DETERMINED
+        and angular_deficiency(system) == 0
+    )
 
 
-def _placed_observability(system: NormalEquations, artifact: Artifact,
-                          views: tuple[View, ...]) -> Observability:
+def _placed_observability(
+    system: NormalEquations, artifact: Artifact, views: tuple[View, ...]
+) -> Observability:
     known, grid = int(system.known_sites.sum()), system.grid
     if _nodes_known(system):
         kept = 2 * (known + int(system.known_marks.sum())) + grid.n_misalignments
@@ -206,16 +245,24 @@ def _placed_observability(system: NormalEquations, artifact: Artifact,
     missing = len(system.loose_modes) or 2 * (grid.n_sites - known)
     missing += angular_deficiency(system)
     advice = advice_for(artifact, views) if known < DETERMINED * grid.n_sites else ()
-    return Observability(unknowns_of(system) - missing, unknowns_of(system), max(missing, 1), False,
-                         advice=advice)
+    return Observability(
+        unknowns_of(system) - missing, unknowns_of(system), max(missing, 1), False, advice=advice
+    )
 
 
 def _as_read(system: NormalEquations, views: tuple[View, ...]) -> tuple[View, ...]:
     """Return the views with only the kinds of marks that were read."""
-    return tuple(View(view.name, view.rotation_rad, view.translation_m,
-                      i in system.grid_index, i in system.angular_index)
-                 for i, view in enumerate(views)
-                 if i in system.grid_index or i in system.angular_index)
+    return tuple(
+        View(
+            view.name,
+            view.rotation_rad,
+            view.translation_m,
+            i in system.grid_index,
+            i in system.angular_index,
+        )
+        for i, view in enumerate(views)
+        if i in system.grid_index or i in system.angular_index
+    )
 
 
 def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[Finding, ...]:
@@ -226,12 +273,20 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[Finding, ...]
     missing = []
     if len({round((pose.turn_rad / math.pi) % 1, 6) % 1 for pose in poses}) < 2:
         missing.append(turned)
-    if len({(round(x / artifact.grid_pitch_m, 3), round(y / artifact.grid_pitch_m, 3))
-            for x, y in (pose.shift_m for pose in poses)}) < 2:
+    if (
+        len(
+            {
+                (round(x / artifact.grid_pitch_m, 3), round(y / artifact.grid_pitch_m, 3))
+                for x, y in (pose.shift_m for pose in poses)
+            }
+        )
+        < 2
+    ):
         missing.append(shifted)
     if any(view.angular for view in views) and artifact.angular_count:
-        missing += _missing_lines(artifact, [v.on_stage(artifact).turn_lines or 0
-                                             for v in views if v.angular])
+        missing += _missing_lines(
+            artifact, [v.on_stage(artifact).turn_lines or 0 for v in views if v.angular]
+        )
     return tuple(add_views(artifact, view) for view in missing) or (_tried(artifact, views),)
 
 
@@ -245,8 +300,11 @@ def _usual_views(artifact: Artifact) -> tuple[View, View, View]:
     pitch, beside = artifact.grid_pitch_m, artifact.quarter_shift * artifact.grid_pitch_m
     lines = artifact.angular_count > 0
     turned = lines and artifact.angular_count % 4 == 0
-    return (View("", math.pi / 2, (beside, beside), True, turned),
-            View("", 0.0, (pitch, 0.0), True, lines), View("", 0.0, (0.0, pitch), True, lines))
+    return (
+        View("", math.pi / 2, (beside, beside), True, turned),
+        View("", 0.0, (pitch, 0.0), True, lines),
+        View("", 0.0, (0.0, pitch), True, lines),
+    )
 
 
 def _tried(artifact: Artifact, views: tuple[View, ...]) -> Finding:
@@ -277,7 +335,8 @@ def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
     of_turns, number = np.exp(1j * np.outer(turns_rad, np.arange(1, harmonics + 1))), len(turns_rad)
     turns_deg = np.arange(1, 180)
     more = of_turns.sum(axis=0) + np.exp(
-        1j * np.outer(np.radians(turns_deg), np.arange(1, harmonics + 1)))
+        1j * np.outer(np.radians(turns_deg), np.arange(1, harmonics + 1))
+    )
     information = number + 1 - np.abs(more) ** 2 / (number + 1)  # information on each, in 2 / K
     return int(turns_deg[(1 / np.maximum(information, 1e-12)).sum(axis=1).argmin()])
 
@@ -298,9 +357,9 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
     total = float((grid.weight * abs(residual) ** 2).sum())
     scale = float((grid.weight * abs(y) ** 2).sum())
     right = np.zeros(system.size)
-    right[:3 * grid.n_views] = grid.right_side(y)[1]
+    right[: 3 * grid.n_views] = grid.right_side(y)[1]
     block = np.zeros((system.size, system.size))
-    block[:len(grid.block), :len(grid.block)] = grid.block
+    block[: len(grid.block), : len(grid.block)] = grid.block
     if system.angular.n_views:
         # the angular lines relate the rotations as far as they were read
         weight = system.grid_scale / system.angular_scale
@@ -320,8 +379,10 @@ def unseen_modes(system: NormalEquations) -> Iterator[Finding]:
     yield from _component_family(grid)
     missing = (grid.components.of_site < 0).reshape(grid.views.shape)
     if missing.any():
-        yield Finding("sites_never_visited", details={
-            "count": int(missing.sum()), "first": _sites(missing, grid)[0]})
+        yield Finding(
+            "sites_never_visited",
+            details={"count": int(missing.sum()), "first": _sites(missing, grid)[0]},
+        )
     if n := int((grid.components.of_mark < 0).sum()):
         yield Finding("marks_never_read", details={"count": n})
     if system.angular.n_views:
@@ -337,8 +398,12 @@ def _known_families(system: NormalEquations) -> Iterator[Finding]:
     """Yield the unseen fields among the named ones."""
     z = system.grid.views.z_sites
     x, y = z.real, z.imag
-    for name, field in (("nonorthogonality", y + 1j * x), ("scale_difference", x - 1j * y),
-                        ("bending_x", x * y - 0.5j * x**2), ("bending_y", 0.5 * y**2 - 1j * x * y)):
+    for name, field in (
+        ("nonorthogonality", y + 1j * x),
+        ("scale_difference", x - 1j * y),
+        ("bending_x", x * y - 0.5j * x**2),
+        ("bending_y", 0.5 * y**2 - 1j * x * y),
+    ):
         if is_unseen(system, field):
             yield Finding(name)
 
@@ -365,13 +430,17 @@ def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> Finding:
             return Finding("line_offsets", details={"lines": lines, "opposite": len(turns) > 1})
     beside_datum = 2 * n - 2  # rotation and scale, or the translations
     if len(shifts) == 1:
-        return Finding("rotation_symmetric", details={
-            "half": not any(t % 2 for t in turns), "numbers": beside_datum})
+        return Finding(
+            "rotation_symmetric",
+            details={"half": not any(t % 2 for t in turns), "numbers": beside_datum},
+        )
     if period := _period(label):
         return Finding("periodic_fields", details={"period": period, "numbers": beside_datum})
     numbers, sizes = np.unique(label[label >= 0], return_counts=True)
-    return Finding("groups_of_sites", details={
-        "count": n, "smallest": _sites(label == numbers[np.argmin(sizes)], grid)})
+    return Finding(
+        "groups_of_sites",
+        details={"count": n, "smallest": _sites(label == numbers[np.argmin(sizes)], grid)},
+    )
 
 
 def _period(label: np.ndarray) -> tuple[int, int] | None:
@@ -379,9 +448,14 @@ def _period(label: np.ndarray) -> tuple[int, int] | None:
     out = []
     for axis in (0, 1):
         size = label.shape[axis]
-        moved = [p for p in range(1, size // 2 + 1)
-                 if np.array_equal(np.take(label, range(p, size), axis=axis),
-                                   np.take(label, range(size - p), axis=axis))]
+        moved = [
+            p
+            for p in range(1, size // 2 + 1)
+            if np.array_equal(
+                np.take(label, range(p, size), axis=axis),
+                np.take(label, range(size - p), axis=axis),
+            )
+        ]
         if not moved:
             return None
         out.append(moved[0])
@@ -392,8 +466,10 @@ def _angular_families(angular: AngularSystem) -> Iterator[Finding]:
     """Yield the unseen modes of the angular map."""
     if isinstance(angular, HarmonicSystem):
         if angular.missed:
-            yield Finding("harmonics_unseen", details={
-                "harmonics": [*map(int, angular.missed)], "turned": angular.n_views > 1})
+            yield Finding(
+                "harmonics_unseen",
+                details={"harmonics": [*map(int, angular.missed)], "turned": angular.n_views > 1},
+            )
         return
     parts = angular.components
     n, lines = len(parts.balanced), np.arange(len(parts.of_site))
@@ -429,8 +505,13 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
 
 
 @lru_cache(maxsize=1024)
-def _forms(turn: float, shift: complex, *, square: bool, listed: bool,
-           ) -> tuple[tuple[float, float, float], ...]:
+def _forms(
+    turn: float,
+    shift: complex,
+    *,
+    square: bool,
+    listed: bool,
+) -> tuple[tuple[float, float, float], ...]:
     """Return a view's turn and shift in each of the symmetries: thousands of plans share it."""
     if listed:
         return ((turn, shift.real + 0.0, shift.imag + 0.0),)

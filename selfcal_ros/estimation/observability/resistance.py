@@ -120,16 +120,20 @@ class PlannedTerms:
     """
 
     @one_thread()
-    def __init__(self, plan: Plan, model: Sequence[ModelTerm], assumed: Assumed,
-                 against: Iterable[str] = ()) -> None:
+    def __init__(
+        self, plan: Plan, model: Sequence[ModelTerm], assumed: Assumed, against: Iterable[str] = ()
+    ) -> None:
         plan = predicted_on(plan)
         self.model, self.assumed = tuple(model), assumed
         self.repeats = unit_repeats(plan)
         system = planned_system(plan.artifact, plan.views)
         names = {*nominal_sizes(), *against, *(term.name for term in self.model)}
         # with any size all columns exist; their own is in `with_terms`
-        sized = [ModelTerm(name, block.nominal or 1.0) for name, block in blocks().items()
-                 if name in names]
+        sized = [
+            ModelTerm(name, block.nominal or 1.0)
+            for name, block in blocks().items()
+            if name in names
+        ]
         self.every = planned_equations(plan, system, sized, assumed)
         self.of_model = with_terms(self.every, self.model)
 
@@ -168,8 +172,15 @@ class PlannedTerms:
         """
         rms, largest = self._effect(name, size)
         kinds = {term.name: "free" if term.free else "sized" for term in self.model}
-        return TermCheck(name, kinds.get(name, ""), self._unseen_modes(name), size, rms, largest,
-                         self._power(name, size, level))
+        return TermCheck(
+            name,
+            kinds.get(name, ""),
+            self._unseen_modes(name),
+            size,
+            rms,
+            largest,
+            self._power(name, size, level),
+        )
 
     @one_thread()
     def predicted(self, alone: Prediction) -> Prediction:
@@ -181,8 +192,9 @@ class PlannedTerms:
 
     def _unseen_modes(self, name: str) -> int:
         others = [term for term in self._others(name) if term.free]
-        return (_n_unseen(with_terms(self.every, [*others, ModelTerm(name)]))
-                - _n_unseen(with_terms(self.every, others)))
+        return _n_unseen(with_terms(self.every, [*others, ModelTerm(name)])) - _n_unseen(
+            with_terms(self.every, others)
+        )
 
     def _effect(self, name: str, size: float) -> tuple[float, float]:
         """Return rms and largest effect of the term on the map."""
@@ -190,8 +202,9 @@ class PlannedTerms:
         model, taken, _ = self._remainder(name, self._others(name), self.assumed.sigma_m)
         fields = every.maps[:, term] - every.maps[:, model] @ taken
         known = every.system.known_sites.ravel()
-        spread = size * np.sqrt(np.stack([(fields.real**2).sum(axis=1),
-                                          (fields.imag**2).sum(axis=1)])[:, known])
+        spread = size * np.sqrt(
+            np.stack([(fields.real**2).sum(axis=1), (fields.imag**2).sum(axis=1)])[:, known]
+        )
         return rms(spread), float(spread.max())
 
     def _power(self, name: str, size: float, level: float) -> float:
@@ -200,8 +213,13 @@ class PlannedTerms:
         beside = with_terms(every, others)
         values, rank = self._information(name, others)
         grid = every.system.grid
-        dof = (2 * grid.n_readings - every.system.rank_grid + every.columns.within.dof
-               - beside.rank() - rank)
+        dof = (
+            2 * grid.n_readings
+            - every.system.rank_grid
+            + every.columns.within.dof
+            - beside.rank()
+            - rank
+        )
         if rank == 0 or dof <= 0:
             return 0.0
         rng, ratio = np.random.default_rng(1), (size / self.assumed.sigma_m) ** 2
@@ -209,8 +227,9 @@ class PlannedTerms:
         noise = rng.chisquare(dof, DRAWS) / dof
         return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
 
-    def _remainder(self, name: str, others: Sequence[ModelTerm],
-                   sigma_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _remainder(
+        self, name: str, others: Sequence[ModelTerm], sigma_m: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the columns of other terms, bool (p,), and what they take of those of a term.
 
         The latter (o, t), and the information that is left on the term, (t, t).
@@ -228,7 +247,7 @@ class PlannedTerms:
         norm = every.norm[term]
         scaled = np.linalg.eigvalsh(rest / np.outer(norm, norm))
         rank = int((scaled > every.limit(term)).sum())
-        return np.linalg.eigvalsh(rest)[len(rest) - rank:], rank
+        return np.linalg.eigvalsh(rest)[len(rest) - rank :], rank
 
 
 def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) -> Prediction:
@@ -245,14 +264,22 @@ def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) ->
     """
     (x, y), lines = terms.variances(terms.inverse(terms.noise_m) * repeats)
     shape = alone.ux.shape
-    u_theta = np.sqrt(alone.u_theta**2 + terms.line_weight * lines) if (
-        len(alone.u_theta)) else alone.u_theta
-    return replace(alone, ux=np.sqrt(alone.ux**2 + x.reshape(shape)),
-                   uy=np.sqrt(alone.uy**2 + y.reshape(shape)), u_theta=u_theta)
+    u_theta = (
+        np.sqrt(alone.u_theta**2 + terms.line_weight * lines)
+        if (len(alone.u_theta))
+        else alone.u_theta
+    )
+    return replace(
+        alone,
+        ux=np.sqrt(alone.ux**2 + x.reshape(shape)),
+        uy=np.sqrt(alone.uy**2 + y.reshape(shape)),
+        u_theta=u_theta,
+    )
 
 
-def check_terms(planned: PlannedTerms, sizes: Mapping[str, float],
-                level: float) -> tuple[TermCheck, ...]:
+def check_terms(
+    planned: PlannedTerms, sizes: Mapping[str, float], level: float
+) -> tuple[TermCheck, ...]:
     """Return the checks against all terms; `sizes` override the nominal ones."""
     own = {term.name: term.size for term in planned.model if not term.free}
     wanted = nominal_sizes() | own | dict(sizes)
@@ -309,8 +336,11 @@ class PlanBudget:
 
     def u_rms(self, quantity: str, *, noise_only: bool = False, if_larger: bool = False) -> float:
         """Return the standard uncertainty, rms over the map; NaN without such a map."""
-        parts = [line.effect_rms for line in (self.if_larger if if_larger else self.lines)
-                 if line.quantity == quantity and (line.component == NOISE or not noise_only)]
+        parts = [
+            line.effect_rms
+            for line in (self.if_larger if if_larger else self.lines)
+            if line.quantity == quantity and (line.component == NOISE or not noise_only)
+        ]
         return float(np.sqrt(np.sum(np.square(parts)))) if parts else float("nan")
 
     def share(self, line: BudgetLine) -> float:
@@ -319,8 +349,14 @@ class PlanBudget:
 
 
 @one_thread()
-def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
-                alone: Prediction, *, asked: Iterable[str] = ()) -> PlanBudget:
+def plan_budget(
+    plan: Plan,
+    terms: Sequence[ModelTerm],
+    assumed: Assumed,
+    alone: Prediction,
+    *,
+    asked: Iterable[str] = (),
+) -> PlanBudget:
     """Return the predicted budget of a plan that identifies the stage and its free terms.
 
     Parameters
@@ -342,20 +378,32 @@ def plan_budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed,
         terms = [*terms, *more]
         budget = _budget(plan, terms, assumed, alone, asked=asked)
     larger = [term if term.name in asked else term.scaled(TIMES) for term in terms]
-    return replace(budget, removals=_removals(budget, plan, terms, assumed), if_larger=_budget(
-        plan, larger, assumed, alone, asked=asked).lines)
+    return replace(
+        budget,
+        removals=_removals(budget, plan, terms, assumed),
+        if_larger=_budget(plan, larger, assumed, alone, asked=asked).lines,
+    )
 
 
-def _budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed, alone: Prediction, *,
-            asked: Collection[str]) -> PlanBudget:
+def _budget(
+    plan: Plan,
+    terms: Sequence[ModelTerm],
+    assumed: Assumed,
+    alone: Prediction,
+    *,
+    asked: Collection[str],
+) -> PlanBudget:
     """Return the lines of the budget."""
     n = unit_repeats(plan)
     effects = effects_of_terms(plan, terms, assumed) if terms else {}
     free = effects.pop(FREE, None)
     lines = []
-    for at, (quantity, sigma, unit, gains) in enumerate((
+    for at, (quantity, sigma, unit, gains) in enumerate(
+        (
             ("xy", assumed.sigma_m, "m", np.stack([alone.ux, alone.uy]).reshape(2, -1)),
-            ("theta", assumed.sigma_rad, "rad", alone.u_theta))):
+            ("theta", assumed.sigma_rad, "rad", alone.u_theta),
+        )
+    ):
         if not gains.size:
             continue
         known = np.isfinite(gains)
@@ -365,30 +413,56 @@ def _budget(plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed, alone: Pre
             effect = effects[term.name][at][known] if term.name in effects else np.zeros(1)
             if effect.mean() > TRACE * noise.mean():
                 source = "declared" if term.name in asked else "default"
-                lines.append(_line(quantity, str(term.name), effect, u=term.size,
-                                   unit=term.block.unit, source=source))
+                lines.append(
+                    _line(
+                        quantity,
+                        str(term.name),
+                        effect,
+                        u=term.size,
+                        unit=term.block.unit,
+                        source=source,
+                    )
+                )
     return PlanBudget(tuple(lines), {})
 
 
-def _untold(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed, *,
-            asked: Iterable[str]) -> list[ModelTerm]:
+def _untold(
+    budget: PlanBudget,
+    plan: Plan,
+    terms: Sequence[ModelTerm],
+    assumed: Assumed,
+    *,
+    asked: Iterable[str],
+) -> list[ModelTerm]:
     """Return the terms that readings of the plan will not determine: they will be assumed."""
     more = nominal_terms({*asked, *(term.name for term in terms)}, visits=True)
     effects = effects_of_terms(plan, [*terms, *more], assumed) if terms and more else {}
     least = (UNTOLD * budget.u_rms("xy")) ** 2
-    return [term for term in more
-            if term.name in effects and effects[term.name][0].mean() > least]
+    return [term for term in more if term.name in effects and effects[term.name][0].mean() > least]
 
 
-def _line(quantity: str, component: str, variance: np.ndarray, *, u: float, unit: str,
-          source: str) -> BudgetLine:
+def _line(
+    quantity: str, component: str, variance: np.ndarray, *, u: float, unit: str, source: str
+) -> BudgetLine:
     return BudgetLine(
-        quantity, component, "A" if component == NOISE else "B", float("nan"), u, unit,
-        float(np.sqrt(variance.mean())), float(np.sqrt(variance.max())), np.inf, source)
+        quantity,
+        component,
+        "A" if component == NOISE else "B",
+        float("nan"),
+        u,
+        unit,
+        float(np.sqrt(variance.mean())),
+        float(np.sqrt(variance.max())),
+        np.inf,
+        source,
+    )
 
 
-def effects_of_terms(plan: Plan, terms: Iterable[ModelTerm], assumed: Assumed,
-                     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def effects_of_terms(
+    plan: Plan,
+    terms: Iterable[ModelTerm],
+    assumed: Assumed,
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return the variances of the XY map (2, sites), m^2, and of the lines (K,), rad^2, by term."""
     system = planned_system(plan.artifact, plan.views)
     equations = planned_equations(plan, system, terms, assumed)
@@ -396,16 +470,16 @@ def effects_of_terms(plan: Plan, terms: Iterable[ModelTerm], assumed: Assumed,
     return {name: equations.variances(assumed.sigma_m**2 * root @ root.T) for name, root in roots}
 
 
-def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],
-              assumed: Assumed) -> dict[tuple[str, str], Removal]:
+def _removals(
+    budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm], assumed: Assumed
+) -> dict[tuple[str, str], Removal]:
     """Return what removes each line that matters; tried on a field of at most SEARCH_SIZE sites."""
     judged = smaller(plan, SEARCH_SIZE)
     tried: dict[tuple, dict[str, tuple[np.ndarray, np.ndarray]]] = {}
 
     def effect(step: Step, line: BudgetLine) -> float:
         if step.views not in tried:
-            tried[step.views] = effects_of_terms(
-                replace(judged, views=step.views), terms, assumed)
+            tried[step.views] = effects_of_terms(replace(judged, views=step.views), terms, assumed)
         at = tried[step.views].get(line.component)
         return 0.0 if at is None else float(np.sqrt(at[QUANTITIES.index(line.quantity)].mean()))
 
@@ -415,11 +489,16 @@ def _removals(budget: PlanBudget, plan: Plan, terms: Sequence[ModelTerm],
             continue
         kind, steps = _changes(plan, line.component)
         now = effect(Step(None, plan.views), line)
-        best = min(((effect(step, line), step) for step in steps), default=None,
-                   key=lambda item: float(f"{item[0]:.9g}"))  # the first of equal ones
+        best = min(
+            ((effect(step, line), step) for step in steps),
+            default=None,
+            key=lambda item: float(f"{item[0]:.9g}"),
+        )  # the first of equal ones
         out[line.quantity, line.component] = (
-            Removal(CERTIFICATE) if best is None or best[0] > REMOVED * now else
-            Removal(kind, best[1], line.effect_rms * best[0] / now))
+            Removal(CERTIFICATE)
+            if best is None or best[0] > REMOVED * now
+            else Removal(kind, best[1], line.effect_rms * best[0] / now)
+        )
     return out
 
 

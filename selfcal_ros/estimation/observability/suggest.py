@@ -60,8 +60,12 @@ def posed(view: View, pose: Pose, pitch_m: float) -> View:
     """Return the view at a pose, named after it."""
     turn, *shift = pose
     moved = "".join(f"{step:+g}{axis}" for step, axis in zip(shift, "xy", strict=True) if step)
-    return replace(view, name=f"{turn}deg{moved}", rotation_rad=math.radians(turn),
-                   translation_m=(shift[0] * pitch_m, shift[1] * pitch_m))
+    return replace(
+        view,
+        name=f"{turn}deg{moved}",
+        rotation_rad=math.radians(turn),
+        translation_m=(shift[0] * pitch_m, shift[1] * pitch_m),
+    )
 
 
 def pose_of_view(view: View, pitch_m: float) -> Pose:
@@ -72,8 +76,11 @@ def pose_of_view(view: View, pitch_m: float) -> Pose:
 
 def start_poses(reach: float) -> list[Pose]:
     """Return the poses from which a search starts, with shifts up to `reach` pitches."""
-    return [(turn, *shift) for turn, shift in product(TURNS_DEG, SHIFTS)
-            if max(map(abs, shift)) <= reach]
+    return [
+        (turn, *shift)
+        for turn, shift in product(TURNS_DEG, SHIFTS)
+        if max(map(abs, shift)) <= reach
+    ]
 
 
 def reach_of(artifact: Artifact) -> float:
@@ -81,8 +88,9 @@ def reach_of(artifact: Artifact) -> float:
     return max(1.0, round(REACH * (2 * min(artifact.reach)), 1))
 
 
-def best_pose(starts: Sequence[Pose], reach: float,
-              value: Callable[[Pose], tuple[float, ...]]) -> Pose:
+def best_pose(
+    starts: Sequence[Pose], reach: float, value: Callable[[Pose], tuple[float, ...]]
+) -> Pose:
     """Return the pose of the smallest value near one of the best starts.
 
     Parameters
@@ -116,10 +124,8 @@ def _neighbours(pose: Pose, turn: int, shift: float, reach: float) -> Iterator[P
     angle, x, y = pose
     for sign in (1, -1):
         yield (angle + sign * turn) % 360, x, y
-        yield from ((angle, to + 0.0, y) for to in [round(x + sign * shift, 1)]
-                    if abs(to) <= reach)
-        yield from ((angle, x, to + 0.0) for to in [round(y + sign * shift, 1)]
-                    if abs(to) <= reach)
+        yield from ((angle, to + 0.0, y) for to in [round(x + sign * shift, 1)] if abs(to) <= reach)
+        yield from ((angle, x, to + 0.0) for to in [round(y + sign * shift, 1)] if abs(to) <= reach)
 
 
 EXHAUSTIVE = 2000
@@ -156,11 +162,18 @@ class PlanScore:
 
         For a plan deficient even without terms, their effect is not counted: it comes last.
         """
-        first, second = ((self.rms_xy, self.max_xy) if criterion == "rms"
-                         else (self.max_xy, self.rms_xy))
+        first, second = (
+            (self.rms_xy, self.max_xy) if criterion == "rms" else (self.max_xy, self.rms_xy)
+        )
         # rounding must not decide between plans equal by symmetry
-        return (bool(self.deficiency and not self.of_terms), self.deficiency, self.unknown_sites,
-                round(first, 9), round(second, 9), round(self.rms_theta, 9))
+        return (
+            bool(self.deficiency and not self.of_terms),
+            self.deficiency,
+            self.unknown_sites,
+            round(first, 9),
+            round(second, 9),
+            round(self.rms_theta, 9),
+        )
 
 
 @dataclass(frozen=True)
@@ -221,8 +234,13 @@ def no_progress(done: int, total: int | None = None) -> None:
 
 
 @one_thread()
-def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
-               repeats: int | None = None, against: Against | None = None) -> PlanScore:
+def score_plan(
+    plan: Plan,
+    datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
+    *,
+    repeats: int | None = None,
+    against: Against | None = None,
+) -> PlanScore:
     """Return the score of a plan with every mark read.
 
     The unit of noise is an averaged reading of `repeats` repeats, by default the plan's fewest.
@@ -251,9 +269,14 @@ def score_plan(plan: Plan, datum: ThetaDatum = ThetaDatum.ZERO_MEAN, *,
 
 
 @one_thread()
-def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
-              against: Against | None = None, progress: Progress = no_progress
-              ) -> tuple[PlanScore, list[Suggestion]]:
+def rank_next(
+    plan: Plan,
+    *,
+    criterion: str = "rms",
+    datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
+    against: Against | None = None,
+    progress: Progress = no_progress,
+) -> tuple[PlanScore, list[Suggestion]]:
     """Return the plan's score and every candidate for the next step, the best first.
 
     Candidates are the views of `candidate_views`, another set of repeats of a view of the plan,
@@ -297,10 +320,17 @@ def rank_next(plan: Plan, *, criterion: str = "rms", datum: ThetaDatum = ThetaDa
 
 
 @one_thread()
-def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str = "rms",
-              like: View | None = None, datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
-              against: Against | None = None,
-              progress: Progress = no_progress) -> tuple[Plan, PlanScore, Search]:
+def best_plan(
+    artifact: Artifact,
+    n_views: int,
+    *,
+    angular: bool,
+    criterion: str = "rms",
+    like: View | None = None,
+    datum: ThetaDatum = ThetaDatum.ZERO_MEAN,
+    against: Against | None = None,
+    progress: Progress = no_progress,
+) -> tuple[Plan, PlanScore, Search]:
     """Return the best plan of `n_views` views among the candidates, its score, and the search.
 
     The first view is the one without a turn: turning all views together only renames the marks.
@@ -316,15 +346,17 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
     """
     fixed = int(angular)
     if n_views < 3 + fixed:
-        raise InputError("--views", f"{n_views} views cannot identify the stage",
-                         f"give {3 + fixed} or more")
+        raise InputError(
+            "--views", f"{n_views} views cannot identify the stage", f"give {3 + fixed} or more"
+        )
     like = like or View("")
     candidates = [measured_like(view, like) for view in candidate_views(artifact, angular=angular)]
     pool = [view for view in candidates if view.grid]
     whole = Plan("best", artifact, ())
     small = smaller(whole, SEARCH_SIZE)
-    tried, how = _search(small, pool, n_views - 1 - fixed, criterion=criterion, against=against,
-                         progress=progress)
+    tried, how = _search(
+        small, pool, n_views - 1 - fixed, criterion=criterion, against=against, progress=progress
+    )
     if small is not whole:
         how = replace(how, size=SEARCH_SIZE)
     judged = whole if max(artifact.shape) <= FULL_SIZE else small
@@ -335,21 +367,26 @@ def best_plan(artifact: Artifact, n_views: int, *, angular: bool, criterion: str
 
     finalists = sorted(tried, key=lambda chosen: (tried[chosen], chosen))
     ties = sum(tried[chosen] == tried[finalists[0]] for chosen in finalists)
-    finalists = finalists[:max(FINALISTS, min(ties, MAX_TIES) if angular else 0)]
+    finalists = finalists[: max(FINALISTS, min(ties, MAX_TIES) if angular else 0)]
     scores = [score_plan(with_lines(chosen), datum, against=against) for chosen in finalists]
     best = min(range(len(scores)), key=lambda at: scores[at].key(criterion))
     plan, least = with_lines(finalists[best]), scores[best]
     if artifact.map_grid:
         views = _moved_off_the_lattice(
-            plan.views, artifact, lambda views: score_plan(
-                replace(judged, views=views), datum, against=against).key(criterion))
+            plan.views,
+            artifact,
+            lambda views: score_plan(replace(judged, views=views), datum, against=against).key(
+                criterion
+            ),
+        )
         plan = replace(judged, views=views)
         least = score_plan(plan, datum, against=against)
     return replace(plan, artifact=artifact), least, how
 
 
-def _anywhere(plan: Plan, steps: list[Step],
-              key: Callable[[tuple[View, ...]], tuple[float, ...]]) -> list[Step]:
+def _anywhere(
+    plan: Plan, steps: list[Step], key: Callable[[tuple[View, ...]], tuple[float, ...]]
+) -> list[Step]:
     """Return the best further view at any pose, unless it is one of `steps` on the lattice."""
     pitch_m, added = plan.artifact.grid_pitch_m, steps[0].views[-1]
 
@@ -363,9 +400,11 @@ def _anywhere(plan: Plan, steps: list[Step],
     return [] if best in starts else [Step(views(best)[-1], views(best))]
 
 
-def _moved_off_the_lattice(views: tuple[View, ...], artifact: Artifact,
-                           key: Callable[[tuple[View, ...]], tuple[float, ...]],
-                           ) -> tuple[View, ...]:
+def _moved_off_the_lattice(
+    views: tuple[View, ...],
+    artifact: Artifact,
+    key: Callable[[tuple[View, ...]], tuple[float, ...]],
+) -> tuple[View, ...]:
     """Return the views at the best poses near theirs, changed one by one until none is better.
 
     The first view remains: it is the frame of the others.
@@ -373,7 +412,7 @@ def _moved_off_the_lattice(views: tuple[View, ...], artifact: Artifact,
     now, before, pitch_m = views, None, artifact.grid_pitch_m
 
     def instead(views: tuple[View, ...], at: int, pose: Pose) -> tuple[View, ...]:
-        return *views[:at], posed(views[at], pose, pitch_m), *views[at + 1:]
+        return *views[:at], posed(views[at], pose, pitch_m), *views[at + 1 :]
 
     def value(views: tuple[View, ...], at: int) -> Callable[[Pose], tuple[float, ...]]:
         return lambda pose: key(instead(views, at, pose))
@@ -381,14 +420,24 @@ def _moved_off_the_lattice(views: tuple[View, ...], artifact: Artifact,
     while now != before:
         before = now
         for at in (at for at in range(1, len(views)) if views[at].grid):
-            better = instead(now, at, best_pose([pose_of_view(now[at], pitch_m)],
-                                                reach_of(artifact), value(now, at)))
+            better = instead(
+                now,
+                at,
+                best_pose([pose_of_view(now[at], pitch_m)], reach_of(artifact), value(now, at)),
+            )
             now = better if key(better) < key(now) else now
     return _named(now)
 
 
-def _search(field: Plan, pool: list[View], free: int, *, criterion: str, against: Against | None,
-            progress: Progress) -> tuple[dict[tuple[int, ...], tuple], Search]:
+def _search(
+    field: Plan,
+    pool: list[View],
+    free: int,
+    *,
+    criterion: str,
+    against: Against | None,
+    progress: Progress,
+) -> tuple[dict[tuple[int, ...], tuple], Search]:
     """Return plans of the pool's first view and `free` others with their keys, and how found.
 
     By their grid marks alone; one of mirror-image plans, unless terms of the visits differ in them.
@@ -397,8 +446,10 @@ def _search(field: Plan, pool: list[View], free: int, *, criterion: str, against
     known: dict[tuple, tuple[float, ...]] = {}
     one_by_one = against is not None and any(term.block.needs_visits for term in against.terms)
     if against is not None:  # no choice of views determines the default terms of the visits
-        against = replace(against, by_default=tuple(
-            term for term in against.by_default if not term.block.needs_visits))
+        against = replace(
+            against,
+            by_default=tuple(term for term in against.by_default if not term.block.needs_visits),
+        )
 
     def key(chosen: tuple[int, ...]) -> tuple[float, ...]:
         views = (pool[0], *(pool[i] for i in chosen))
@@ -416,8 +467,11 @@ def _search(field: Plan, pool: list[View], free: int, *, criterion: str, against
     return _exchange(key, len(pool), free), Search(None)
 
 
-def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, free: int,
-              ) -> dict[tuple[int, ...], tuple[float, ...]]:
+def _exchange(
+    key: Callable[[tuple[int, ...]], tuple[float, ...]],
+    n_pool: int,
+    free: int,
+) -> dict[tuple[int, ...], tuple[float, ...]]:
     """Search by greedy choice and exchange; return every plan tried with its key."""
     tried: dict[tuple[int, ...], tuple[float, ...]] = {}
 
@@ -434,7 +488,7 @@ def _exchange(key: Callable[[tuple[int, ...]], tuple[float, ...]], n_pool: int, 
     while improved:
         improved = False
         for place in range(free):
-            rest = now[:place] + now[place + 1:]
+            rest = now[:place] + now[place + 1 :]
             best = min(((*rest, i) for i in range(n_pool)), key=value)
             if value(best) < value(now):
                 now, improved = best, True

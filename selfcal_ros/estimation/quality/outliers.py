@@ -91,10 +91,12 @@ class Residuals:
 def residuals_of(measurements: Measurements, options: Options) -> Residuals:
     """Fit marks and lines, each by themselves, and return their residuals."""
     problem, _ = prepare(measurements, options)
-    exact = measurements.artifact.map_grid is None and (
-        problem.system.grid.n_sites <= MAX_FULL)
-    return Residuals(problem, marks_alone(problem.system, problem.grid.y, exact=exact),
-                     lines_alone(problem.system, problem.angular.y))
+    exact = measurements.artifact.map_grid is None and (problem.system.grid.n_sites <= MAX_FULL)
+    return Residuals(
+        problem,
+        marks_alone(problem.system, problem.grid.y, exact=exact),
+        lines_alone(problem.system, problem.angular.y),
+    )
 
 
 def view_noise(residuals: Residuals) -> np.ndarray:
@@ -146,8 +148,7 @@ MAX_RATIO = 20.0
 """Largest ratio of noises that residuals can show: a noisy view hides the noise of the others."""
 
 
-def noisy_views(residuals: Residuals, measurements: Measurements
-                ) -> tuple[tuple[str, float], ...]:
+def noisy_views(residuals: Residuals, measurements: Measurements) -> tuple[tuple[str, float], ...]:
     """Return the noisy views, each with the ratio of its noise to that of the others.
 
     By their own repeats, and by residuals.
@@ -221,9 +222,18 @@ class Slip(SlipPlace):
     def finding(self, *, spoils: bool) -> Finding:
         """Return the slip as a finding; `spoils` if the view had to be kept unsplit."""
         return Finding(
-            "slip_found", float(np.hypot(self.tx_m, self.ty_m)), unit="m", view=self.view, details={
-                "places": [place.place for place in (self, *self.alternatives)], "x": self.tx_m,
-                "y": self.ty_m, "phi": self.phi_rad, "spoils": spoils})
+            "slip_found",
+            float(np.hypot(self.tx_m, self.ty_m)),
+            unit="m",
+            view=self.view,
+            details={
+                "places": [place.place for place in (self, *self.alternatives)],
+                "x": self.tx_m,
+                "y": self.ty_m,
+                "phi": self.phi_rad,
+                "spoils": spoils,
+            },
+        )
 
 
 def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) -> Slip | None:
@@ -244,8 +254,10 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) 
     problem, marks = residuals.problem, residuals.marks
     limit = CLIP * sigma_m / np.sqrt(np.where(marks.weight > 0, marks.weight, 1.0))
     clipped = marks.residual * np.minimum(1.0, limit / np.maximum(abs(marks.residual), 1e-300))
-    gains = [(_second_misalignment(problem, place, clipped)[1], place)
-             for place in _places(problem, measurements)]
+    gains = [
+        (_second_misalignment(problem, place, clipped)[1], place)
+        for place in _places(problem, measurements)
+    ]
     sizes, left, places = [], [], []
     for gain, place in sorted(gains, key=lambda tried: -tried[0])[:PLACES]:
         if gain >= sigma_m**2 * chdtri(3, BEYOND_DOUBT / len(gains)):
@@ -264,9 +276,13 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) 
     best, (phi, x, y) = places[order[0]], sizes[order[0]]
     moved = complex(x, y) * problem.grid.poses[problem.grid.index.index(best.index)].phase
     near = losses < losses.min() + AMBIGUOUS * variance[order[0]]
-    return Slip(**asdict(best), tx_m=moved.real, ty_m=moved.imag,
-                phi_rad=float(phi) / problem.half_width_m,
-                alternatives=tuple(places[at] for at in order[1:] if near[at]))
+    return Slip(
+        **asdict(best),
+        tx_m=moved.real,
+        ty_m=moved.imag,
+        phi_rad=float(phi) / problem.half_width_m,
+        alternatives=tuple(places[at] for at in order[1:] if near[at]),
+    )
 
 
 def _places(problem: Problem, measurements: Measurements) -> Iterator[SlipPlace]:
@@ -276,8 +292,9 @@ def _places(problem: Problem, measurements: Measurements) -> Iterator[SlipPlace]
         for axis in (0, 1) if measurements.artifact.marks is None else ():
             lines = np.flatnonzero(read.any(axis=1 - axis))[1:] - read.shape[axis] // 2
             for at in np.linspace(0, len(lines) - 1, min(len(lines), MAX_PLACES)).round():
-                place = SlipPlace(measurements.views[index].view.name, index, "mn"[axis],
-                                  int(lines[int(at)]))
+                place = SlipPlace(
+                    measurements.views[index].view.name, index, "mn"[axis], int(lines[int(at)])
+                )
                 if 3 <= after_slip(problem, place).sum() <= read.sum() - 3:
                     yield place
 
@@ -295,12 +312,14 @@ def _slipped(problem: Problem, place: SlipPlace, size: np.ndarray) -> np.ndarray
     out = np.zeros(problem.grid.weight.shape, dtype=complex)
     z = problem.system.grid.views.z
     out[problem.grid.index.index(place.index)] = after_slip(problem, place) * (
-        1j * phi * z + complex(x, y))
+        1j * phi * z + complex(x, y)
+    )
     return out
 
 
-def _second_misalignment(problem: Problem, place: SlipPlace,
-                         residual: np.ndarray) -> tuple[np.ndarray, float]:
+def _second_misalignment(
+    problem: Problem, place: SlipPlace, residual: np.ndarray
+) -> tuple[np.ndarray, float]:
     """Return the misalignment after a slip less that before, (3,), and the squares it explains.
 
     By the projection of its three columns on the residuals (views, nx, ny); 0 where the readings
@@ -326,7 +345,7 @@ def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     parts = [_part(view, ~after, ""), _part(view, after, AFTER_SLIP)]
     if len(view.k):
         parts.append(_part(view, np.zeros(len(view.m), dtype=bool), " lines"))
-    views = (*measurements.views[:slip.index], *parts, *measurements.views[slip.index + 1:])
+    views = (*measurements.views[: slip.index], *parts, *measurements.views[slip.index + 1 :])
     return replace(measurements, views=views)
 
 
@@ -335,10 +354,15 @@ def _part(view: ViewReadings, marks: np.ndarray, suffix: str) -> ViewReadings:
     lines = not marks.any()
     named = replace(view.view, name=view.view.name + suffix, grid=not lines, angular=lines)
     return replace(
-        subset(view, marks, np.full(len(view.k), lines)), view=named,
-        dof_xy=int(view.dof_xy * marks.mean()), dof_theta=view.dof_theta * lines,
-        used=int(view.count[marks].sum()), rejected={} if suffix else view.rejected,
-        motion=None, motion_theta=None)
+        subset(view, marks, np.full(len(view.k), lines)),
+        view=named,
+        dof_xy=int(view.dof_xy * marks.mean()),
+        dof_theta=view.dof_theta * lines,
+        used=int(view.count[marks].sum()),
+        rejected={} if suffix else view.rejected,
+        motion=None,
+        motion_theta=None,
+    )
 
 
 def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> Cause | None:
@@ -351,8 +375,12 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     """
     model = fit_joint(measurements, options)
     row = model.problem.grid.index.index(slip.index)
-    found = find_explanations(model, slips=True, readings=False, placed=PlacedSlip(
-        row, after_slip(model.problem, slip), 2 * MAX_PLACES))
+    found = find_explanations(
+        model,
+        slips=True,
+        readings=False,
+        placed=PlacedSlip(row, after_slip(model.problem, slip), 2 * MAX_PLACES),
+    )
     if not found or found[0].name == SLIP:
         return None
     return cause_of(found[0], model.problem.ground)
@@ -414,16 +442,28 @@ class OutlierScreening:
 def clean(measurements: Measurements, options: Options) -> OutlierScreening:
     """Return the measurement split at slips and without outliers, and the findings."""
     # a pure datum: the redundant axis conditions of xy_axes would show in the angular residuals
-    linear = replace(options, misalignment_model="linear", reference=None, terms=(), assumed=(),
-                     datum_theta=ThetaDatum.ZERO_MEAN)
+    linear = replace(
+        options,
+        misalignment_model="linear",
+        reference=None,
+        terms=(),
+        assumed=(),
+        datum_theta=ThetaDatum.ZERO_MEAN,
+    )
     screened = _without_slips(measurements, options, linear)
     gone, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
     removed = tuple(sorted(gone.values(), key=lambda item: (item.kind, item.view, item.mark)))
     noisy = noisy_views(residuals, screened.measurements)
     findings = [*screened.notes, *_findings(removed, noisy, stopped)]
     unchecked = int((np.isnan(residuals.marks.squares) & (residuals.marks.weight > 0)).sum())
-    return OutlierScreening(without(screened.measurements, gone, mark=True), removed,
-                            screened.slips, noisy, unchecked, tuple(findings))
+    return OutlierScreening(
+        without(screened.measurements, gone, mark=True),
+        removed,
+        screened.slips,
+        noisy,
+        unchecked,
+        tuple(findings),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,22 +493,42 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             if not done:
                 return at
             continue
-        at = replace(at, notes=(*at.notes, Finding(
-            "taken_for_slip", cause.size, cause.u, cause.unit, cause.p, cause.view, cause.axis,
-            cause.mark, {**cause.details, "cause": cause.name, "told": cause.told,
-                         "slip_in": slip.view})))
+        at = replace(
+            at,
+            notes=(
+                *at.notes,
+                Finding(
+                    "taken_for_slip",
+                    cause.size,
+                    cause.u,
+                    cause.unit,
+                    cause.p,
+                    cause.view,
+                    cause.axis,
+                    cause.mark,
+                    {
+                        **cause.details,
+                        "cause": cause.name,
+                        "told": cause.told,
+                        "slip_in": slip.view,
+                    },
+                ),
+            ),
+        )
         options = replace(options, terms=(*options.terms, ModelTerm(cause.name)))
         try:
             flattened = _flattened(at.measurements, options)
         except (NotIdentifiableError, InputError):
             return at
         at = replace(at, flattened=flattened, residuals=residuals_of(flattened, linear))
-    return replace(at, notes=(*at.notes, Finding(
-        "slips_given_up", details={"slips": len(at.slips)})))
+    return replace(
+        at, notes=(*at.notes, Finding("slips_given_up", details={"slips": len(at.slips)}))
+    )
 
 
 def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]:
     """Return the readings split at a slip, or without its view, and whether that was possible."""
+
     def split(readings: Measurements) -> Measurements:
         return left_out(readings, slip.index) if slip.alternatives else split_view(readings, slip)
 
@@ -476,10 +536,16 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
     try:
         residuals = residuals_of(flattened, linear)
     except NotIdentifiableError:
-        return replace(at, slips=(*at.slips, slip),
-                       notes=(*at.notes, slip.finding(spoils=True))), False
-    return _Screened(split(at.measurements), flattened, residuals, (*at.slips, slip),
-                     (*at.notes, slip.finding(spoils=False))), True
+        return replace(
+            at, slips=(*at.slips, slip), notes=(*at.notes, slip.finding(spoils=True))
+        ), False
+    return _Screened(
+        split(at.measurements),
+        flattened,
+        residuals,
+        (*at.slips, slip),
+        (*at.notes, slip.finding(spoils=False)),
+    ), True
 
 
 def robust_sigma(readings: Alone) -> float:
@@ -490,8 +556,9 @@ def robust_sigma(readings: Alone) -> float:
     return max(float(np.sqrt(np.median(squares) / chdtri(readings.coordinates, 0.5))), FLOOR)
 
 
-def _reject(measurements: Measurements, options: Options, residuals: Residuals
-            ) -> tuple[dict[Key, Removed], Residuals, Finding | None]:
+def _reject(
+    measurements: Measurements, options: Options, residuals: Residuals
+) -> tuple[dict[Key, Removed], Residuals, Finding | None]:
     """Remove outliers round by round; return them, the last residuals, and why it stopped early."""
     gone: dict[Key, Removed] = {}
     n_readings = sum(len(view.m) + len(view.k) for view in measurements.views)
@@ -500,16 +567,21 @@ def _reject(measurements: Measurements, options: Options, residuals: Residuals
         if not found:
             break
         if len(gone) + len(found) > MAX_REMOVED * n_readings:
-            return {}, residuals_of(measurements, options), Finding(
-                "too_many_outliers", details={"limit": MAX_REMOVED})
+            return (
+                {},
+                residuals_of(measurements, options),
+                Finding("too_many_outliers", details={"limit": MAX_REMOVED}),
+            )
         try:
             residuals = residuals_of(without(measurements, gone | found), options)
         except NotIdentifiableError:
             return gone, residuals, Finding("outliers_kept")
         gone |= found
     else:
-        return (*_restored(measurements, options, gone, residuals),
-                Finding("outliers_given_up", details={"rounds": MAX_STEPS}))
+        return (
+            *_restored(measurements, options, gone, residuals),
+            Finding("outliers_given_up", details={"rounds": MAX_STEPS}),
+        )
     return (*_restored(measurements, options, gone, residuals), None)
 
 
@@ -522,10 +594,12 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
         ratio = np.nan_to_num(readings.squares, nan=0.0) / robust_sigma(readings) ** 2
         # by rounded ratios, so that equal ones keep the order of the readings
         order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
-        floor = max(chdtri(readings.coordinates, residuals.level),
-                    NEAR_LARGEST * float(ratio.max(initial=0.0)))
+        floor = max(
+            chdtri(readings.coordinates, residuals.level),
+            NEAR_LARGEST * float(ratio.max(initial=0.0)),
+        )
         taken: dict[object, float] = {}
-        for number in order[:int((ratio > floor).sum())]:
+        for number in order[: int((ratio > floor).sum())]:
             at = tuple(int(i) for i in np.unravel_index(number, ratio.shape))
             grid = readings.kind == "grid"
             nodes = (("mark", at[1:]), ("site", int(sites[at]))) if grid else ("lines",)
@@ -536,14 +610,19 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
             index = of_views.index[at[0]]
             mark = problem.system.grid.views.mark_at(*at[1:]) if grid else at[1:]
             found[index, readings.kind, mark] = Removed(
-                measurements.views[index].view.name, readings.kind, mark,
-                float(np.sqrt(ratio[at])), float(1 - readings.redundancy[at]),
-                float(abs(readings.residual[at])))
+                measurements.views[index].view.name,
+                readings.kind,
+                mark,
+                float(np.sqrt(ratio[at])),
+                float(1 - readings.redundancy[at]),
+                float(abs(readings.residual[at])),
+            )
     return found
 
 
-def _restored(measurements: Measurements, options: Options, gone: dict[Key, Removed],
-                residuals: Residuals) -> tuple[dict[Key, Removed], Residuals]:
+def _restored(
+    measurements: Measurements, options: Options, gone: dict[Key, Removed], residuals: Residuals
+) -> tuple[dict[Key, Removed], Residuals]:
     """Restore readings, one by one, that agree with the good ones.
 
     Readings that were removed together, each the only check of the other, are restored together.
@@ -551,8 +630,12 @@ def _restored(measurements: Measurements, options: Options, gone: dict[Key, Remo
     for key in sorted(gone, key=lambda k: gone[k].standardised):
         if key not in gone:
             continue
-        mates = {k for k in gone if k[1] == key[1] and abs(
-            gone[k].standardised - gone[key].standardised) <= TRACE * gone[key].standardised}
+        mates = {
+            k
+            for k in gone
+            if k[1] == key[1]
+            and abs(gone[k].standardised - gone[key].standardised) <= TRACE * gone[key].standardised
+        }
         for back in dict.fromkeys((frozenset([key]), frozenset(mates))):
             rest = {k: v for k, v in gone.items() if k not in back}
             again = residuals_of(without(measurements, rest), options)
@@ -570,15 +653,33 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
     if kind == "grid":
         at = (problem.grid.index.index(index), *problem.system.grid.views.index_of(*mark))
         return residuals.marks.p_outlier(at) >= residuals.level
-    return residuals.lines.p_outlier(
-        (problem.angular.index.index(index), *mark)) >= residuals.level
+    return residuals.lines.p_outlier((problem.angular.index.index(index), *mark)) >= residuals.level
 
 
-def _findings(removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...],
-              stopped: Finding | None) -> list[Finding]:
-    out = [Finding("outliers_removed", details={"number": len(removed), "first": [
-        {"view": item.view, "kind": item.kind, "mark": list(item.mark),
-         "standardised": item.standardised} for item in removed[:NAMED]]})] if removed else []
+def _findings(
+    removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...], stopped: Finding | None
+) -> list[Finding]:
+    out = (
+        [
+            Finding(
+                "outliers_removed",
+                details={
+                    "number": len(removed),
+                    "first": [
+                        {
+                            "view": item.view,
+                            "kind": item.kind,
+                            "mark": list(item.mark),
+                            "standardised": item.standardised,
+                        }
+                        for item in removed[:NAMED]
+                    ],
+                },
+            )
+        ]
+        if removed
+        else []
+    )
     out += [Finding("noisy_view", ratio, unit="m/m", view=name) for name, ratio in noisy]
     return out + ([stopped] if stopped else [])
 
@@ -603,14 +704,26 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
 
 def listed(cleaned: OutlierScreening) -> dict[str, Any]:
     """Return the tables of outliers, slips and noisy views for RESULT.json, SI units."""
-    removed = [{
-        "view": item.view, "kind": item.kind, "mark": list(item.mark),
-        "standardised": item.standardised, "leverage": item.leverage,
-        "residual_m": item.residual if item.kind == "grid" else None,
-        "residual_rad": item.residual if item.kind == "angular" else None,
-    } for item in cleaned.removed]
-    outliers = {"rule": f"removed if its squared standardised residual fails an F-test at level "
-                        f"{OUTLIER_LEVEL}/n, for marks and lines together",
-                "unchecked": cleaned.unchecked, "removed": removed}
-    return {"outliers": outliers, "slips": [asdict(item) for item in cleaned.slips],
-            "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy]}
+    removed = [
+        {
+            "view": item.view,
+            "kind": item.kind,
+            "mark": list(item.mark),
+            "standardised": item.standardised,
+            "leverage": item.leverage,
+            "residual_m": item.residual if item.kind == "grid" else None,
+            "residual_rad": item.residual if item.kind == "angular" else None,
+        }
+        for item in cleaned.removed
+    ]
+    outliers = {
+        "rule": f"removed if its squared standardised residual fails an F-test at level "
+        f"{OUTLIER_LEVEL}/n, for marks and lines together",
+        "unchecked": cleaned.unchecked,
+        "removed": removed,
+    }
+    return {
+        "outliers": outliers,
+        "slips": [asdict(item) for item in cleaned.slips],
+        "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy],
+    }

@@ -82,8 +82,7 @@ class HeldReadings:
 def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> HeldReadings:
     """Return the grid readings `held` with the columns of the terms that `kept` was fitted with."""
     problem, grid = model.problem, grid_data(held)
-    rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1
-                 for i in grid.index)
+    rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1 for i in grid.index)
     ground = ground_of(held, grid, problem.half_width_m)
     places = places_of(held, grid, ground, problem.system.known_sites)
     moved: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
@@ -112,12 +111,16 @@ def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> He
 def _fitted_row(fitted: TermInputs, held: TermInputs, rows: tuple[int, ...], first: int) -> int:
     """Return the first view of a placing in the fit; -1 if no view of it was fitted."""
     known = [rows[view] for view in held.members[first] if rows[view] >= 0]
-    return next(first for first, members in fitted.members.items()
-                if known[0] in members) if known else -1
+    return (
+        next(first for first, members in fitted.members.items() if known[0] in members)
+        if known
+        else -1
+    )
 
 
-def _in_time_of(ground: TermInputs, grid: GridData, kept: Measurements,
-                held: Measurements) -> TermInputs:
+def _in_time_of(
+    ground: TermInputs, grid: GridData, kept: Measurements, held: Measurements
+) -> TermInputs:
     """Return the inputs with times of visits relative to those of the fitted views, -1 to 1."""
     visits: list[ViewVisits | None] = []
     placings = ground.placings or range(len(ground.names))
@@ -157,8 +160,9 @@ def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
     return error
 
 
-def _fitted_placing(errors: np.ndarray, marks: np.ndarray, plate: np.ndarray, *,
-                    rigid: bool) -> tuple[float, complex]:
+def _fitted_placing(
+    errors: np.ndarray, marks: np.ndarray, plate: np.ndarray, *, rigid: bool
+) -> tuple[float, complex]:
     """Return rotation, rad, and offset, plate frame, m, that fit errors; NaN of too few, (P,)."""
     if len(errors) < 3:
         return np.nan, complex(np.nan)
@@ -209,8 +213,9 @@ class PredictionLimit:
         return float(np.sqrt(self.mean * fdtri(self.dof, dof, 1 - F_LEVEL)))
 
 
-def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
-                     weight: np.ndarray) -> PredictionLimit:
+def prediction_limit(
+    model: ModelFit, held: HeldReadings, known: np.ndarray, weight: np.ndarray
+) -> PredictionLimit:
     """Return the distribution of the prediction error of held-out grid readings.
 
     Parameters
@@ -254,8 +259,9 @@ def prediction_limit(model: ModelFit, held: HeldReadings, known: np.ndarray,
     return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
 
 
-def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
-            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fitted(
+    model: ModelFit, noise: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit k draws of unit noise: maps (sites, k), misalignments (3 views, k), terms (p, k)."""
     problem = model.problem
     grid, n = problem.system.grid, 3 * problem.system.grid.n_views
@@ -266,9 +272,13 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
         return fields, parameters, np.zeros((0, len(noise)))
     now = equations_of(problem, found, model.equations.columns)
     shapes = now.columns.shapes
-    right = np.stack([
-        shapes.against(shapes.sums(grid.weight * grid.plate(one, *fitted)[1]))
-        for one, fitted in zip(noise, drawn, strict=True)], axis=1)
+    right = np.stack(
+        [
+            shapes.against(shapes.sums(grid.weight * grid.plate(one, *fitted)[1]))
+            for one, fitted in zip(noise, drawn, strict=True)
+        ],
+        axis=1,
+    )
     values, vectors = np.linalg.eigh(now.columns.within.gram)
     within = vectors * np.sqrt(np.maximum(values, 0.0))
     right += within @ rng.standard_normal((now.n, len(noise)))
@@ -278,8 +288,11 @@ def _fitted(model: ModelFit, noise: np.ndarray, rng: np.random.Generator
     prior = np.where(now.free, 0.0, found.xy.sigma / now.columns.size)
     right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))
     coefficients = now.inverse(found.xy.sigma) @ right
-    return (fields - now.projected.fields @ coefficients,
-            parameters - now.projected.parameters[:n] @ coefficients, coefficients)
+    return (
+        fields - now.projected.fields @ coefficients,
+        parameters - now.projected.parameters[:n] @ coefficients,
+        coefficients,
+    )
 
 
 def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> tuple[float, complex]:
@@ -355,8 +368,7 @@ def validate(measurements: Measurements, options: Options, *, folds: int = 3) ->
         As `calibrate`, for all readings.
     """
     # a pure datum: half axes that lose a mark would not do for xy_axes
-    options = replace(options, uncertainty=False, causes=False,
-                      datum_theta=ThetaDatum.ZERO_MEAN)
+    options = replace(options, uncertainty=False, causes=False, datum_theta=ThetaDatum.ZERO_MEAN)
     fit_joint(measurements, options)  # refuses what cannot be solved as a whole
     rng = np.random.default_rng(0)
     group = []
@@ -369,19 +381,28 @@ def validate(measurements: Measurements, options: Options, *, folds: int = 3) ->
         chosen = [(grid == fold, lines == fold) for grid, lines in group]
         out.append(replace(_held_out(measurements, options, chosen), tenth=fold + 1))
     for index, view in enumerate(measurements.views):
-        chosen = [(np.full(len(v.m), i == index), np.full(len(v.k), i == index))
-                  for i, v in enumerate(measurements.views)]
+        chosen = [
+            (np.full(len(v.m), i == index), np.full(len(v.k), i == index))
+            for i, v in enumerate(measurements.views)
+        ]
         out.append(replace(_held_out(measurements, options, chosen), view=view.view.name))
     return out
 
 
-def _held_out(measurements: Measurements, options: Options,
-              chosen: list[tuple[np.ndarray, np.ndarray]]) -> HeldOut:
+def _held_out(
+    measurements: Measurements, options: Options, chosen: list[tuple[np.ndarray, np.ndarray]]
+) -> HeldOut:
     """Calibrate without the chosen readings, and predict them."""
-    kept, held = (replace(measurements, views=tuple(
-        subset(view, grid ^ flip, lines ^ flip)
-        for view, (grid, lines) in zip(measurements.views, chosen, strict=True)))
-        for flip in (True, False))
+    kept, held = (
+        replace(
+            measurements,
+            views=tuple(
+                subset(view, grid ^ flip, lines ^ flip)
+                for view, (grid, lines) in zip(measurements.views, chosen, strict=True)
+            ),
+        )
+        for flip in (True, False)
+    )
     try:
         solved = solve_joint(kept, options)
     except (NotIdentifiableError, NoDataError):
@@ -396,13 +417,23 @@ def _held_out(measurements: Measurements, options: Options,
     if not both.size and not lines_off.size:
         return HeldOut(why=Finding("nothing_to_predict"))
     ratio, limit, why = _judged(solved, of, known=known, error=error)
-    return HeldOut("", 0, both.shape[1], len(lines_off), rms(both) if both.size else NOTHING,
-                   float(abs(both).max()) if both.size else NOTHING,
-                   rms(lines_off) if lines_off.size else NOTHING, ratio, why, limit)
+    return HeldOut(
+        "",
+        0,
+        both.shape[1],
+        len(lines_off),
+        rms(both) if both.size else NOTHING,
+        float(abs(both).max()) if both.size else NOTHING,
+        rms(lines_off) if lines_off.size else NOTHING,
+        ratio,
+        why,
+        limit,
+    )
 
 
-def _judged(solved: Solved, held: HeldReadings, *, known: np.ndarray,
-            error: np.ndarray) -> tuple[float, float, Finding | None]:
+def _judged(
+    solved: Solved, held: HeldReadings, *, known: np.ndarray, error: np.ndarray
+) -> tuple[float, float, Finding | None]:
     """Return error over noise, its limit, and why there is no limit."""
     noise, model = solved.result.noise, solved.joint
     if not known.any():
@@ -413,8 +444,7 @@ def _judged(solved: Solved, held: HeldReadings, *, known: np.ndarray,
         weight = weight * (noise.sigma_xy_declared / held.grid.sigma_declared) ** 2
     square = float((weight * abs(error) ** 2)[known].sum()) / (2 * int(known.sum()))
     ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
-    own = [str(term.name) for term in model.problem.terms
-           if term.free and term.block.by_placing]
+    own = [str(term.name) for term in model.problem.terms if term.free and term.block.by_placing]
     if own and -1 in held.rows:
         return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own})
     if not (noise.sigma_xy > FLOOR and noise.dof_xy > 0):
@@ -424,29 +454,51 @@ def _judged(solved: Solved, held: HeldReadings, *, known: np.ndarray,
 
 def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
     """Return the finding that the rest does not identify the stage, with a view to be added."""
-    views = tuple(replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
-                  for v in kept.views if len(v.m) or len(v.k))
+    views = tuple(
+        replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
+        for v in kept.views
+        if len(v.m) or len(v.k)
+    )
     gone = {pose_of(v.view, held.artifact) for v in held.views if len(v.m) or len(v.k)}
     plan = Plan("", kept.artifact, views)
     if max(kept.artifact.shape) > FULL_SIZE and views:
         plan = smaller(plan, SEARCH_SIZE)
     for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
         if pose_of(more, plan.artifact) not in gone and identifies(
-                plan.artifact, (*plan.views, more)):
-            return Finding("rest_not_identified", details={"add": {
-                "rotation": more.rotation_rad, "translation_x": more.translation_m[0],
-                "translation_y": more.translation_m[1], "grid": more.grid,
-                "angular": more.angular}})
+            plan.artifact, (*plan.views, more)
+        ):
+            return Finding(
+                "rest_not_identified",
+                details={
+                    "add": {
+                        "rotation": more.rotation_rad,
+                        "translation_x": more.translation_m[0],
+                        "translation_y": more.translation_m[1],
+                        "grid": more.grid,
+                        "angular": more.angular,
+                    }
+                },
+            )
     return Finding("rest_not_identified")
 
 
 def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
     """Return the result, disqualified if a prediction error exceeds its limit."""
-    failed = tuple(Finding("prediction_failed", item.ratio, unit="m/m", view=item.view,
-                           details={"tenth": item.tenth, "limit": item.limit})
-                   for item in found if item.exceeds)
+    failed = tuple(
+        Finding(
+            "prediction_failed",
+            item.ratio,
+            unit="m/m",
+            view=item.view,
+            details={"tenth": item.tenth, "limit": item.limit},
+        )
+        for item in found
+        if item.exceeds
+    )
     if not failed:
         return result
     verdict = result.verdict
-    return replace(result, verdict=replace(verdict, grade=Grade.NOT_QUALIFIED,
-                                           failed=(*verdict.failed, *failed)))
+    return replace(
+        result,
+        verdict=replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *failed)),
+    )

@@ -65,10 +65,12 @@ class ChangeTests(ReducedNoise):
     def _smooth(self) -> np.ndarray:
         """Orthonormal polynomials of both coordinates that are free from `removed`, (2n, k)."""
         z = self.places / np.abs(self.places).max()
-        columns = np.stack([z.real**i * z.imag**j for i in range(ORDER + 1)
-                            for j in range(ORDER + 1 - i)], axis=1)
-        basis, size, _ = np.linalg.svd(self.without(np.kron(np.eye(2), columns)),
-                                       full_matrices=False)
+        columns = np.stack(
+            [z.real**i * z.imag**j for i in range(ORDER + 1) for j in range(ORDER + 1 - i)], axis=1
+        )
+        basis, size, _ = np.linalg.svd(
+            self.without(np.kron(np.eye(2), columns)), full_matrices=False
+        )
         return basis[:, size > np.sqrt(GAP) * size[0]]
 
     @cached_property
@@ -104,17 +106,20 @@ class ChangeTests(ReducedNoise):
         A change beyond all draws has the bound, which is close there, if that is smaller.
         """
         found, (drawn, least) = statistics(self.seen(values[:, None]))[:, 0], self._ranked
-        rank = min(DRAWS - int(np.searchsorted(row, one)) + 1
-                   for row, one in zip(drawn, found, strict=True))
+        rank = min(
+            DRAWS - int(np.searchsorted(row, one)) + 1
+            for row, one in zip(drawn, found, strict=True)
+        )
         p = (1 + int(np.searchsorted(least, rank, side="right"))) / (1 + DRAWS)
         return p if rank > 1 else min(p, self._bound(values, found))
 
     def _bound(self, values: np.ndarray, found: np.ndarray) -> float:
         """Return a bound of the probability (Bonferroni)."""
-        each = [float(2 * len(self.u) * stdtr(min(self.dof, MANY_DOF),
-                                              -np.abs(values / self.u).max())),
-                of_square(found[0], self.rank, self.dof),
-                of_square(found[2], self._smooth.shape[1], self.dof)]
+        each = [
+            float(2 * len(self.u) * stdtr(min(self.dof, MANY_DOF), -np.abs(values / self.u).max())),
+            of_square(found[0], self.rank, self.dof),
+            of_square(found[2], self._smooth.shape[1], self.dof),
+        ]
         return min(len(each) * min(each), 1.0)
 
     def detectable(self, level: float) -> Detectable:
@@ -132,8 +137,9 @@ class ChangeTests(ReducedNoise):
         one[at, number], one[at + n, number] = np.cos(turn), np.sin(turn)
         smooth = self._smooth @ rng.standard_normal((self._smooth.shape[1], len(number)))
         smooth /= np.sqrt((smooth**2).mean(axis=0))
-        return Detectable(*(self._size(self.without(shape), noise, limits)
-                            for shape in (one, smooth)))
+        return Detectable(
+            *(self._size(self.without(shape), noise, limits) for shape in (one, smooth))
+        )
 
     def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
         """Return the size of a change of given shape of which POWER are found, by bisection."""
@@ -210,13 +216,21 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     out = np.full((2, len(common)), np.nan)
     out[:, common] = in_datum, np.sqrt(np.maximum(tests.variance, 0.0))
     changes, u = out.reshape(2, 2, *artifact.shape)
-    return Change(changes, u, test, 1.0 if test is None else tests.p(in_datum), scale, u_scale,
-                  2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
-                  None if test is None else tests)
+    return Change(
+        changes,
+        u,
+        test,
+        1.0 if test is None else tests.p(in_datum),
+        scale,
+        u_scale,
+        2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
+        None if test is None else tests,
+    )
 
 
-def _compared(new: NewMap, artifact: Artifact,
-              plate: KnownPlate) -> tuple[np.ndarray, np.ndarray, ChangeTests]:
+def _compared(
+    new: NewMap, artifact: Artifact, plate: KnownPlate
+) -> tuple[np.ndarray, np.ndarray, ChangeTests]:
     """Return where both XY maps are known, new minus old there, and the tests of that.
 
     Raises
@@ -228,15 +242,23 @@ def _compared(new: NewMap, artifact: Artifact,
     rows, known_before = _on_nodes(artifact, plate)
     common = new.known & np.tile(known_before, 2)
     if common.sum() < 6:
-        raise InputError(plate.where, f"only {common.sum() // 2} nodes are known in both maps",
-                         "measure where its map is known")
+        raise InputError(
+            plate.where,
+            f"only {common.sum() // 2} nodes are known in both maps",
+            "measure where its map is known",
+        )
     values, covariance, dof = _difference(
-        new, common, np.kron(np.eye(2), rows), np.concatenate([old.gx[sites], old.gy[sites]]),
-        plate=plate, dof=plate.result.noise.dof_xy)
+        new,
+        common,
+        np.kron(np.eye(2), rows),
+        np.concatenate([old.gx[sites], old.gy[sites]]),
+        plate=plate,
+        dof=plate.result.noise.dof_xy,
+    )
     modes = datum_modes(artifact, scale=True).reshape(4, -1).T[common]
     basis = modes if plate.reference is None else modes[:, :3]
     basis = basis / np.linalg.norm(basis, axis=0)
-    z = (artifact.x_m + 1j * artifact.y_m).ravel()[common[:artifact.m.size]]
+    z = (artifact.x_m + 1j * artifact.y_m).ravel()[common[: artifact.m.size]]
     return common, values, ChangeTests(covariance, basis, dof, z)
 
 
@@ -260,8 +282,9 @@ class OtherCause:
     p_left: float
 
 
-def change_by_effects(new: NewMap, artifact: Artifact, plate: KnownPlate,
-                      rows: Sequence[int]) -> OtherCause:
+def change_by_effects(
+    new: NewMap, artifact: Artifact, plate: KnownPlate, rows: Sequence[int]
+) -> OtherCause:
     """Return the effects, of those in `rows`, that explain a change of the XY map best."""
     common, values, tests = _compared(new, artifact, plate)
     made = tests.without(new.moved[common[new.known]][:, rows])
@@ -270,13 +293,23 @@ def change_by_effects(new: NewMap, artifact: Artifact, plate: KnownPlate,
     information = white_made.T @ white_made
     covariance = np.linalg.pinv(information, hermitian=True)
     found = covariance @ (white_made.T @ white)
-    return OtherCause(found, np.sqrt(covariance.diagonal()),
-                      of_square(float(found @ information @ found), len(rows), tests.dof),
-                      tests.p(change - made @ found))
+    return OtherCause(
+        found,
+        np.sqrt(covariance.diagonal()),
+        of_square(float(found @ information @ found), len(rows), tests.dof),
+        tests.p(change - made @ found),
+    )
 
 
-def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray, old: np.ndarray, *,
-                plate: KnownPlate, dof: float) -> tuple[np.ndarray, np.ndarray, float]:
+def _difference(
+    new: NewMap,
+    common: np.ndarray,
+    rows: np.ndarray,
+    old: np.ndarray,
+    *,
+    plate: KnownPlate,
+    dof: float,
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return new minus old map where both are known, its covariance and degrees of freedom.
 
     By the noise of the new readings, and by the calibration: what it got wrong is in the old map
@@ -303,8 +336,11 @@ def _difference(new: NewMap, common: np.ndarray, rows: np.ndarray, old: np.ndarr
     of_noise = (of_new[NOISE] + of_new[TERMS])[np.ix_(here, here)]
     of_old = by_calibration @ new.effects.before @ by_calibration.T
     of_old += plate.variance_of_expansion * np.outer(longer, longer)
-    return (new.values[here] - rows @ old, of_noise + of_old,
-            joint_dof((np.trace(of_noise), new.dof), (np.trace(of_old), dof)))
+    return (
+        new.values[here] - rows @ old,
+        of_noise + of_old,
+        joint_dof((np.trace(of_noise), new.dof), (np.trace(of_old), dof)),
+    )
 
 
 def line_change(new: NewMap, plate: KnownPlate) -> Change:
@@ -314,8 +350,14 @@ def line_change(new: NewMap, plate: KnownPlate) -> Change:
     out = np.full((2, count), np.nan)
     if common.sum() < 2:
         return Change(out[0], out[1], None)
-    values, covariance, dof = _difference(new, common, np.eye(count), np.nan_to_num(old),
-                                          plate=plate, dof=plate.result.noise.dof_theta)
+    values, covariance, dof = _difference(
+        new,
+        common,
+        np.eye(count),
+        np.nan_to_num(old),
+        plate=plate,
+        dof=plate.result.noise.dof_theta,
+    )
     spread = ReducedNoise(covariance, np.ones((len(values), 1)), dof)
     values = values - values.mean()
     out[:, common] = values, np.sqrt(np.maximum(spread.variance, 0.0))
@@ -335,44 +377,67 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
     Rows (n, s), and nodes of the other map, bool (n,).
     """
     known, old = plate.together.sites.ravel(), plate.result.artifact
-    if artifact.shape == old.shape and abs(
-            artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP:
+    if artifact.shape == old.shape and abs(artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP:
         return np.eye(len(known))[:, known], known
     return rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
 
 
-def recheck_found(change: Change, lines: Change, artifact: Artifact, plate: KnownPlate, *,
-                  passes: int) -> Recheck:
+def recheck_found(
+    change: Change, lines: Change, artifact: Artifact, plate: KnownPlate, *, passes: int
+) -> Recheck:
     """Return what a result says of the changes of both maps.
 
     `passes` are those of the view with the fewest.
     """
     axis, *node = change.worst
     at = tuple(node)
-    largest = LargestChange(float(artifact.x_m[at]), float(artifact.y_m[at]), "xy"[axis],
-                            float(change.values[change.worst]), float(change.u[change.worst]))
+    largest = LargestChange(
+        float(artifact.x_m[at]),
+        float(artifact.y_m[at]),
+        "xy"[axis],
+        float(change.values[change.worst]),
+        float(change.u[change.worst]),
+    )
     tested = [part.p for part in (change, lines) if part.test is not None]
     p = min(len(tested) * min(tested), 1.0) if tested else float("nan")
-    scale = ScaleChange(change.p_scale < USUAL_LEVEL, change.scale, change.u_scale,
-                        change.p_scale)
+    scale = ScaleChange(change.p_scale < USUAL_LEVEL, change.scale, change.u_scale, change.p_scale)
     (dx, dy), (u_dx, u_dy) = change.values, change.u
     found = Recheck(
-        plate.where, _calibration(plate.result), p < USUAL_LEVEL, p, largest,
-        rms(change.values), rms(change.u), p_xy=change.p, significance_xy=change.test, scale=scale,
-        dx=dx, dy=dy, u_dx=u_dx, u_dy=u_dy, passes=passes)
+        plate.where,
+        _calibration(plate.result),
+        p < USUAL_LEVEL,
+        p,
+        largest,
+        rms(change.values),
+        rms(change.u),
+        p_xy=change.p,
+        significance_xy=change.test,
+        scale=scale,
+        dx=dx,
+        dy=dy,
+        u_dx=u_dx,
+        u_dy=u_dy,
+        passes=passes,
+    )
     if change.tests is not None:
         found = replace(found, detectable=change.tests.detectable(USUAL_LEVEL / len(tested)))
     if lines.test is None:
         return found
-    line, = lines.worst
+    (line,) = lines.worst
     return replace(
-        found, p_theta=lines.p, significance_theta=lines.test, d_theta=lines.values,
-        u_d_theta=lines.u, largest_theta=LargestTurn(line, float(lines.values[line]),
-                                                     float(lines.u[line])))
+        found,
+        p_theta=lines.p,
+        significance_theta=lines.test,
+        d_theta=lines.values,
+        u_d_theta=lines.u,
+        largest_theta=LargestTurn(line, float(lines.values[line]), float(lines.u[line])),
+    )
 
 
 def _calibration(result: CalibrationResult) -> PlateCalibration:
-    first, last = (result.provenance.extra.get(name) or None
-                   for name in ("first_exposure", "last_exposure"))
-    return PlateCalibration(result.plan_id, result.run_id, result.provenance.created,
-                            dict(result.input), first, last)
+    first, last = (
+        result.provenance.extra.get(name) or None for name in ("first_exposure", "last_exposure")
+    )
+    return PlateCalibration(
+        result.plan_id, result.run_id, result.provenance.created, dict(result.input), first, last
+    )

@@ -74,8 +74,11 @@ class KnownPlate:
             now, then = self._lengths
             longer = now.relative_error - then.relative_error
         nominal = lattice.x_m + 1j * lattice.y_m
-        return np.where(self.together.marks, plate.ax + 1j * plate.ay + longer * nominal,
-                        complex(np.nan, np.nan))
+        return np.where(
+            self.together.marks,
+            plate.ax + 1j * plate.ay + longer * nominal,
+            complex(np.nan, np.nan),
+        )
 
     @property
     def _lengths(self) -> tuple[ReferenceLength, ReferenceLength] | None:
@@ -101,7 +104,7 @@ class KnownPlate:
             return 0.0
         u_kelvin = np.hypot(now.u_temperature_k, then.u_temperature_k)
         warmer = now.temperature_c - then.temperature_c
-        return float((now.expansion_per_k * u_kelvin)**2 + (warmer * now.u_expansion_per_k)**2)
+        return float((now.expansion_per_k * u_kelvin) ** 2 + (warmer * now.u_expansion_per_k) ** 2)
 
     def length_at(self, marks: np.ndarray) -> np.ndarray:
         """Return what a relative expansion of 1 adds to Ax, Ay of marks, and to the microscope.
@@ -114,8 +117,12 @@ class KnownPlate:
     @property
     def of_offsets(self) -> np.ndarray:
         """Coefficients of the microscope that it found, (4,); NaN if it did not estimate them."""
-        found = {each.component: each.value for term in self.result.model.terms
-                 if block_of(term.name).of_microscope for each in term.estimates}
+        found = {
+            each.component: each.value
+            for term in self.result.model.terms
+            if block_of(term.name).of_microscope
+            for each in term.estimates
+        }
         return np.array([found.get(part, 0.0 if found else np.nan) for part in MICROSCOPE_PARTS])
 
 
@@ -142,17 +149,24 @@ def reference_now(result: CalibrationResult, where: str, at: str) -> ReferenceLe
         return None
     before = result.reference
     if before is None or before.certified is None or not before.kind.of_plate:
-        raise InputError("--reference-at", f"{where} has no reference length of its plate with the "
-                         "temperature of the calibration", "leave it out: the map then has no "
-                         "scale; or calibrate with --reference and --reference-at")
+        raise InputError(
+            "--reference-at",
+            f"{where} has no reference length of its plate with the temperature of the calibration",
+            "leave it out: the map then has no "
+            "scale; or calibrate with --reference and --reference-at",
+        )
     certified = before.certified
-    now = replace(before, relative_error=certified.relative_error,
-                  u_relative=certified.u_relative).at_temperature(at)
+    now = replace(
+        before, relative_error=certified.relative_error, u_relative=certified.u_relative
+    ).at_temperature(at)
     for name in ("expansion_per_k", "u_expansion_per_k", "certified_at_c"):
         changed, known = getattr(now.certified, name), getattr(certified, name)
         if not np.isclose(changed, known, rtol=1e-9, atol=0.0):
-            raise InputError("--reference-at", f"{name} is {changed:g}, and {known:g} in {where}",
-                             "change the temperature alone")
+            raise InputError(
+                "--reference-at",
+                f"{name} is {changed:g}, and {known:g} in {where}",
+                "change the temperature alone",
+            )
     return now
 
 
@@ -175,16 +189,21 @@ def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPla
         `reference_now`.
     """
     if result.recheck is not None:
-        raise InputError(where, "is itself a recheck, which does not calibrate a plate",
-                         f"name the calibration that it used, {result.recheck.of}")
+        raise InputError(
+            where,
+            "is itself a recheck, which does not calibrate a plate",
+            f"name the calibration that it used, {result.recheck.of}",
+        )
     if not result.observability.identifiable or not result.verdict.qualified:
-        raise InputError(where, "is not qualified, so its plate is not known",
-                         "calibrate again")
+        raise InputError(where, "is not qualified, so its plate is not known", "calibrate again")
     covariances = together(result)
     if covariances is None:
-        raise InputError(where, "does not contain the covariance of its plate",
-                         "calibrate with the method joint and with uncertainty; a plate may have "
-                         "31 x 31 marks at most")
+        raise InputError(
+            where,
+            "does not contain the covariance of its plate",
+            "calibrate with the method joint and with uncertainty; a plate may have "
+            "31 x 31 marks at most",
+        )
     return KnownPlate(result, covariances, where, reference_now(result, where, at))
 
 
@@ -198,10 +217,15 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     """
     mine, other = measurements.artifact, plate.result.plate
     if (mine.shape, mine.angular_count, mine.marks) != (
-            other.shape, other.angular_count, other.marks) or abs(
-            mine.grid_pitch_m / other.grid_pitch_m - 1) > GAP:
-        raise InputError(plate.where, f"its plate has {_described(other)}, not {_described(mine)}",
-                         "name the calibration of that plate")
+        other.shape,
+        other.angular_count,
+        other.marks,
+    ) or abs(mine.grid_pitch_m / other.grid_pitch_m - 1) > GAP:
+        raise InputError(
+            plate.where,
+            f"its plate has {_described(other)}, not {_described(mine)}",
+            "name the calibration of that plate",
+        )
     if mine.map_grid is None and other.map_grid is not None:
         mine = replace(mine, map_grid=other.map_grid)
     if not mine.harmonics:
@@ -213,8 +237,10 @@ def _described(artifact: Artifact) -> str:
     nx, ny = artifact.shape
     if artifact.marks:
         return f"a list of {nx} marks and {artifact.angular_count or 'no'} lines"
-    return (f"{nx} x {ny} marks {artifact.grid_pitch_m * MM_PER_M:g} mm apart and "
-            f"{artifact.angular_count or 'no'} lines")
+    return (
+        f"{nx} x {ny} marks {artifact.grid_pitch_m * MM_PER_M:g} mm apart and "
+        f"{artifact.angular_count or 'no'} lines"
+    )
 
 
 def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarray]:
@@ -256,8 +282,12 @@ class _Read:
     shift: complex
     u: float
 
-    def left(self, plate: np.ndarray, artifact: Artifact, pose: tuple[complex, complex],
-             ) -> tuple[np.ndarray, np.ndarray] | None:
+    def left(
+        self,
+        plate: np.ndarray,
+        artifact: Artifact,
+        pose: tuple[complex, complex],
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return what the known plate leaves, and of which readings; None if they are not on it.
 
         `pose`: factor of a further turn, and shift of the plate's centre, in its pitches.
@@ -273,8 +303,10 @@ class _Read:
         free = np.stack([np.ones(len(z)), z, z.conj()], axis=1)
         left, weight = rest[here], np.ones((len(z), 1))
         for _ in range(STEPS):  # least sum of lengths: single marks may be far off
-            left = rest[here] - free @ np.linalg.lstsq(
-                weight * free, weight[:, 0] * rest[here], rcond=None)[0]
+            left = (
+                rest[here]
+                - free @ np.linalg.lstsq(weight * free, weight[:, 0] * rest[here], rcond=None)[0]
+            )
             weight = np.maximum(abs(left), self.u)[:, None] ** -0.5
         return left, here
 
@@ -310,13 +342,20 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
         if other is not None:
             raise said(_misplaced(view, seen, other), f"plan '{measurements.plan_id}', ")
         if _of_marks(seen.marks[here], rest, seen.u):
-            return Finding("other_plate", _size(rest), seen.u, "m",
-                           view=view.view.name, details={"times": many, "of": plate.where})
+            return Finding(
+                "other_plate",
+                _size(rest),
+                seen.u,
+                "m",
+                view=view.view.name,
+                details={"times": many, "of": plate.where},
+            )
     return None
 
 
-def _read(view: ViewReadings, measurements: Measurements, plate: KnownPlate,
-          sigma: float) -> _Read | None:
+def _read(
+    view: ViewReadings, measurements: Measurements, plate: KnownPlate, sigma: float
+) -> _Read | None:
     """Return the readings of a view less the stage as it was, where it was known."""
     artifact, pitch = measurements.artifact, measurements.artifact.grid_pitch_m
     if not len(view.m):
@@ -326,16 +365,26 @@ def _read(view: ViewReadings, measurements: Measurements, plate: KnownPlate,
     rows, there = rows_at(sign * at, plate)
     stage = sign * (rows @ (old.gx + 1j * old.gy)[plate.together.sites])
     marks = plate.result.artifact_map
-    u = [sigma / np.sqrt(view.count.mean()), rms(np.stack([old.u_gx, old.u_gy])),
-         rms(np.stack([marks.u_ax, marks.u_ay])), LEAST * rms(np.stack([marks.ax, marks.ay]))]
+    u = [
+        sigma / np.sqrt(view.count.mean()),
+        rms(np.stack([old.u_gx, old.u_gy])),
+        rms(np.stack([marks.u_ax, marks.u_ay])),
+        LEAST * rms(np.stack([marks.ax, marks.ay])),
+    ]
     offsets = np.where(there, view.dx + 1j * view.dy - stage, complex(np.nan, np.nan))
     x, y = artifact.places(view.m, view.n)
-    return _Read(x + 1j * y, offsets, complex(np.exp(1j * view.view.rotation_rad)),
-                 complex(*view.view.translation_m) / pitch, float(np.linalg.norm(u)))
+    return _Read(
+        x + 1j * y,
+        offsets,
+        complex(np.exp(1j * view.view.rotation_rad)),
+        complex(*view.view.translation_m) / pitch,
+        float(np.linalg.norm(u)),
+    )
 
 
-def _other_pose(seen: _Read, plate: np.ndarray,
-                artifact: Artifact) -> tuple[complex, complex] | None:
+def _other_pose(
+    seen: _Read, plate: np.ndarray, artifact: Artifact
+) -> tuple[complex, complex] | None:
     """Return the pose that explains the readings much better than the planned one; else None.
 
     By the gain of the log-likelihood of differences of unknown size. Poses that do not explain most
@@ -364,11 +413,17 @@ def _size(rest: np.ndarray) -> float:
 def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[complex, complex]) -> Misplaced:
     """Return how the plate lies, turns in degrees, shifts in pitches along the stage's axes."""
     deg, moved = np.degrees(view.view.rotation_rad), seen.shift + seen.turn * pose[1]
-    planned, found = (tuple(float(np.round(part, 6)) for part in (at.real, at.imag))
-                      for at in (seen.shift, moved))
+    planned, found = (
+        tuple(float(np.round(part, 6)) for part in (at.real, at.imag)) for at in (seen.shift, moved)
+    )
     turned = deg + np.degrees(np.angle(pose[0]))
-    return Misplaced(view.view.name, round(float(deg) % 360, 6), round(float(turned) % 360, 6),
-                     (planned[0], planned[1]), (found[0], found[1]))
+    return Misplaced(
+        view.view.name,
+        round(float(deg) % 360, 6),
+        round(float(turned) % 360, 6),
+        (planned[0], planned[1]),
+        (found[0], found[1]),
+    )
 
 
 def _of_marks(marks: np.ndarray, rest: np.ndarray, u: float) -> bool:

@@ -139,8 +139,9 @@ class Rechecked:
         """Return the map with its uncertainty."""
         artifact, xy = self.artifact, self.in_datum
         variance = np.sum(list(self.variances.values()), axis=0)
-        (gx, gy), (u_x, u_y) = (xy.whole(part).reshape(2, *artifact.shape)
-                                for part in (xy.values, np.sqrt(variance)))
+        (gx, gy), (u_x, u_y) = (
+            xy.whole(part).reshape(2, *artifact.shape) for part in (xy.values, np.sqrt(variance))
+        )
         u_theta = np.sqrt(np.diag(self.of_lines))
         theta, u_theta = (self.lines.whole(part) for part in (self.lines.values, u_theta))
         o, r = first_order(artifact, np.stack([gx, gy]))
@@ -150,22 +151,34 @@ class Rechecked:
 def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) -> Rechecked:
     """Return the parts from which `recheck` assembles its result."""
     if options.reference is not None:
-        raise InputError("options", "a recheck always uses the reference length of the plate's "
-                         "calibration", "leave it out")
+        raise InputError(
+            "options",
+            "a recheck always uses the reference length of the plate's calibration",
+            "leave it out",
+        )
     measurements = on_plate(measurements, plate)
     problem = _problem(measurements, options, plate)
     seen = None if measurements.has_images else _seen_by_visits(problem)
     if seen is not None:
         sigma, dof = problem.repeats_xy
         measurements = replace(measurements, views=tuple(map(seen.corrected, measurements.views)))
-        problem = replace(_problem(measurements, options, plate),
-                          repeats_xy=(min(sigma, seen.sigma), dof))
+        problem = replace(
+            _problem(measurements, options, plate), repeats_xy=(min(sigma, seen.sigma), dof)
+        )
     xy, theta = _noise(measurements, problem, plate)
     readings = _readings(measurements, problem, options, plate=plate, sigma=xy.sigma, seen=seen)
     solution = solve_marks(readings)
-    return Rechecked(measurements, plate, readings, solution,
-                     map_of_marks(readings, solution, xy.dof),
-                     _new_lines(readings, plate, theta), xy, theta, seen)
+    return Rechecked(
+        measurements,
+        plate,
+        readings,
+        solution,
+        map_of_marks(readings, solution, xy.dof),
+        _new_lines(readings, plate, theta),
+        xy,
+        theta,
+        seen,
+    )
 
 
 @one_thread()
@@ -191,35 +204,60 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     readings, solution, problem = solved.readings, solved.solution, solved.readings.problem
     covers = {"xy": np.sum(list(solved.covariances.values()), axis=0), "theta": solved.of_lines}
     change = map_change(solved.new, solved.artifact, plate)
-    found = recheck_found(change, line_change(solved.lines, plate), solved.artifact, plate,
-                          passes=min(view.view.repeats for view in measurements.views))
+    found = recheck_found(
+        change,
+        line_change(solved.lines, plate),
+        solved.artifact,
+        plate,
+        passes=min(view.view.repeats for view in measurements.views),
+    )
     noise = _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate)
     declared = {term.name for term in options.terms}
     changes = _findings(found) + _off(solved)
     other = check_plate(solved.measurements, plate, solved.xy.sigma)
-    failed = (other,) if other is not None else _misfit(
-        solution.square, readings.dof,
-        dof_of_marks(plate.result) if measurements.has_images else solved.xy.dof)
+    failed = (
+        (other,)
+        if other is not None
+        else _misfit(
+            solution.square,
+            readings.dof,
+            dof_of_marks(plate.result) if measurements.has_images else solved.xy.dof,
+        )
+    )
     if not failed and found.changed and found.passes == 1 and "drift" not in declared:
         failed = (replace(changes[0], name="changed_or_drifted"),)
     if found.changed:
         failed += _by_microscope(solved, found, changes[0])
     unknowns = 2 * int(readings.known.sum()) + problem.system.grid.n_misalignments
-    terms = tuple(TermResult(
-        str(term.name), term.size, (), None, "declared" if term.name in declared else "default")
-        for term in problem.terms)
+    terms = tuple(
+        TermResult(
+            str(term.name), term.size, (), None, "declared" if term.name in declared else "default"
+        )
+        for term in problem.terms
+    )
     result = CalibrationResult(
-        measurements.plan_id, solved.error_map(), plate.result.artifact_map,
+        measurements.plan_id,
+        solved.error_map(),
+        plate.result.artifact_map,
         views_of(measurements, problem, solution.parameters),
-        Observability(unknowns, unknowns, 0, True), noise, measurements.all_rejected(),
+        Observability(unknowns, unknowns, 0, True),
+        noise,
+        measurements.all_rejected(),
         findings=(*(() if failed else changes), *views_findings(measurements)),
-        sense=str(measurements.sense), kept=kept_covariances(covers),
+        sense=str(measurements.sense),
+        kept=kept_covariances(covers),
         run_id=measurements.run_id,
-        verdict=Verdict(Grade.NOT_QUALIFIED if failed else Grade.GOOD, failed,
-                        enlarged_by=plate.result.verdict.enlarged_by),
+        verdict=Verdict(
+            Grade.NOT_QUALIFIED if failed else Grade.GOOD,
+            failed,
+            enlarged_by=plate.result.verdict.enlarged_by,
+        ),
         model=ModelResult("rigid" if options.finite_rotations else "linear", terms),
-        reference=plate.reference, provenance=provenance_of(measurements, options),
-        placed_plate=solved.measurements.artifact.placed, recheck=found)
+        reference=plate.reference,
+        provenance=provenance_of(measurements, options),
+        placed_plate=solved.measurements.artifact.placed,
+        recheck=found,
+    )
     return replace(result, budget=tuple(_budget(result, solved.variances, plate)))
 
 
@@ -229,8 +267,11 @@ def _findings(found: Recheck) -> tuple[Finding, ...]:
     where = {"x": largest.x, "y": largest.y, **of}
     out: tuple[Finding, ...] = ()
     if found.changed:
-        out = (Finding("changed", largest.change, largest.u, "m", found.p, axis=largest.axis,
-                       details=where),)
+        out = (
+            Finding(
+                "changed", largest.change, largest.u, "m", found.p, axis=largest.axis, details=where
+            ),
+        )
     if scale.changed:
         out += (Finding("scale_changed", scale.change, scale.u, "m/m", scale.p, details=of),)
     return out
@@ -246,8 +287,15 @@ def _off(solved: Rechecked) -> tuple[Finding, ...]:
     sizes = [term.size_of(part) for part in SIMILAR]
     if (np.abs(values[:2]) <= BEYOND * np.array(sizes)).all():
         return ()
-    return (Finding("microscope_off", float(values[0]), float(u[0]), "m/m", details={
-        "turn": float(values[1]), "u_turn": float(u[1])}),)
+    return (
+        Finding(
+            "microscope_off",
+            float(values[0]),
+            float(u[0]),
+            "m/m",
+            details={"turn": float(values[1]), "u_turn": float(u[1])},
+        ),
+    )
 
 
 BEYOND = 3
@@ -267,8 +315,11 @@ def _by_microscope(solved: Rechecked, found: Recheck, changed: Finding) -> tuple
     """
     readings, block = solved.readings, block_of_offsets()
     columns = readings.columns.columns
-    rows = [row for row, column in enumerate(columns)
-            if column.term == block.name and column.component in SIMILAR]
+    rows = [
+        row
+        for row, column in enumerate(columns)
+        if column.term == block.name and column.component in SIMILAR
+    ]
     of_lines = found.p_theta is not None and 2 * found.p_theta < USUAL_LEVEL
     if not rows or of_lines or readings.shows_microscope:
         return ()
@@ -276,9 +327,19 @@ def _by_microscope(solved: Rechecked, found: Recheck, changed: Finding) -> tuple
     if min(other.p_left, 1.0) < USUAL_LEVEL or other.p_none >= USUAL_LEVEL:
         return ()
     (scale, turn), (u_scale, u_turn) = readings.effects.mean[rows] + other.values, other.u
-    return (replace(changed, name="changed_or_microscope", details={
-        **changed.details, "scale": float(scale), "u_scale": float(u_scale),
-        "turn": float(turn), "u_turn": float(u_turn)}),)
+    return (
+        replace(
+            changed,
+            name="changed_or_microscope",
+            details={
+                **changed.details,
+                "scale": float(scale),
+                "u_scale": float(u_scale),
+                "turn": float(turn),
+                "u_turn": float(u_turn),
+            },
+        ),
+    )
 
 
 def _problem(measurements: Measurements, options: Options, plate: KnownPlate) -> Problem:
@@ -286,18 +347,27 @@ def _problem(measurements: Measurements, options: Options, plate: KnownPlate) ->
     grid, angular = grid_data(measurements), angular_data(measurements)
     grid = replace(grid, weight=np.where(plate.together.marks, grid.weight, 0.0))
     if not grid.weight.any():
-        raise NoDataError(f"plan '{measurements.plan_id}'", "no known mark was read",
-                          "record detections of the marks of the plate")
+        raise NoDataError(
+            f"plan '{measurements.plan_id}'",
+            "no known mark was read",
+            "record detections of the marks of the plate",
+        )
     system = system_of(replace(grid, known_plate=True), Marks((), angular.weight[:0], ()))
     length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     ground = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in ground.visits))
-    return problem_of(measurements, options, system, ground, readings=(grid, angular),
-                      terms=terms)
+    return problem_of(measurements, options, system, ground, readings=(grid, angular), terms=terms)
 
 
-def _readings(measurements: Measurements, problem: Problem, options: Options, *,
-              plate: KnownPlate, sigma: float, seen: "SeenMicroscope | None") -> PlateReadings:
+def _readings(
+    measurements: Measurements,
+    problem: Problem,
+    options: Options,
+    *,
+    plate: KnownPlate,
+    sigma: float,
+    seen: "SeenMicroscope | None",
+) -> PlateReadings:
     """Return the readings with what has an effect on them, for the noise of one reading, m.
 
     The noise of a mark in images is the calibration's, and not none: the readings have to be
@@ -312,24 +382,34 @@ def _readings(measurements: Measurements, problem: Problem, options: Options, *,
     marks = read.any(axis=0)
     of_mark = np.eye(marks.size)[marks.ravel()].reshape(-1, 1, *marks.shape) * read
     of_stop = (stop == np.arange(stop.max() + 1)[:, None, None, None]) * np.sqrt(
-        (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0))
+        (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0)
+    )
     columns = _columns(problem, of_mark, of_stop)
     offsets, declared = plate.of_offsets, any(term.block.of_microscope for term in options.terms)
     of_microscope = columns.having(lambda block: block.of_microscope)
     known = of_microscope & (np.isfinite(offsets).all() and not declared and seen is None)
-    parts = np.array([MICROSCOPE_PARTS.index(columns.columns[at].component)
-                      for at in np.flatnonzero(known)], dtype=int)
-    source = np.where(columns.rows([PLATE]) | known, PLATE,
-                      np.where(columns.rows([NOISE]), NOISE, TERMS))
+    parts = np.array(
+        [MICROSCOPE_PARTS.index(columns.columns[at].component) for at in np.flatnonzero(known)],
+        dtype=int,
+    )
+    source = np.where(
+        columns.rows([PLATE]) | known, PLATE, np.where(columns.rows([NOISE]), NOISE, TERMS)
+    )
     start, end = 2 * int(sites.sum()), 2 * int(sites.sum() + marks.sum())
     kept = np.append(np.arange(end), end + parts)
     before, now = plate.together.cover(sites, marks)[np.ix_(kept, kept)], plate.field[marks]
-    effects = Effects.of(source, columns.size, np.concatenate([now.real, now.imag, offsets[parts]]),
-                         before=before, length=plate.length_at(marks)[kept[start:] - start])
+    effects = Effects.of(
+        source,
+        columns.size,
+        np.concatenate([now.real, now.imag, offsets[parts]]),
+        before=before,
+        length=plate.length_at(marks)[kept[start:] - start],
+    )
     if seen is not None:
         effects = effects.known_as(of_microscope, seen.covariance)
-    return PlateReadings(problem, measurements.sense, columns, effects, variance,
-                         shows_microscope=seen is not None)
+    return PlateReadings(
+        problem, measurements.sense, columns, effects, variance, shows_microscope=seen is not None
+    )
 
 
 WELL = 1 / 3
@@ -363,10 +443,16 @@ class SeenMicroscope:
         offset = visits.offset_x + 1j * visits.offset_y
         missing = complex(scale, turn) * offset + complex(stretch, shear) * offset.conj()
         number = np.bincount(visits.mark, visits.count, len(view.m))
-        dx, dy = (np.bincount(visits.mark, visits.count * part, len(view.m)) / np.maximum(number, 1)
-                  for part in (missing.real, missing.imag))
-        return replace(view, dx=view.dx + dx, dy=view.dy + dy, visits=replace(
-            visits, dx=visits.dx + missing.real, dy=visits.dy + missing.imag))
+        dx, dy = (
+            np.bincount(visits.mark, visits.count * part, len(view.m)) / np.maximum(number, 1)
+            for part in (missing.real, missing.imag)
+        )
+        return replace(
+            view,
+            dx=view.dx + dx,
+            dy=view.dy + dy,
+            visits=replace(visits, dx=visits.dx + missing.real, dy=visits.dy + missing.imag),
+        )
 
 
 def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
@@ -410,8 +496,11 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
 def _require_noise(sigma: float) -> None:
     """Raise InputError if the noise of a reading, m or rad, is none."""
     if not sigma > FLOOR:
-        raise InputError("readings", "they or those of the calibration have no noise against which "
-                         "to judge a change", "use measured readings")
+        raise InputError(
+            "readings",
+            "they or those of the calibration have no noise against which to judge a change",
+            "use measured readings",
+        )
 
 
 def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> TermColumns:
@@ -433,8 +522,9 @@ def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:
     """Return the stop of the stage at which each mark was read, (views, nx, ny); -1 = none."""
     read = problem.system.grid.read
     out = np.full(read.shape, -1)
-    cells = cells_seen(measurements.artifact,
-                       [measurements.views[index].view for index in problem.grid.index])
+    cells = cells_seen(
+        measurements.artifact, [measurements.views[index].view for index in problem.grid.index]
+    )
     if cells is not None:
         out[read] = stops_of(cells, read)
     return out
@@ -442,17 +532,24 @@ def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:
 
 def _terms(options: Options, *, visits: bool) -> tuple[ModelTerm, ...]:
     """Return the terms; views of a known plate do not determine those without a size."""
-    terms = tuple(term for term in options.model_terms(
-        visits=visits, assumed=options.finite_rotations) if not term.block.between)
+    terms = tuple(
+        term
+        for term in options.model_terms(visits=visits, assumed=options.finite_rotations)
+        if not term.block.between
+    )
     for term in terms:
         if term.free:
-            raise InputError("model_terms", f"views of a known plate cannot determine the term "
-                             f"'{term.name}'", f"give it a size, {term.name}:SIZE")
+            raise InputError(
+                "model_terms",
+                f"views of a known plate cannot determine the term '{term.name}'",
+                f"give it a size, {term.name}:SIZE",
+            )
     return terms
 
 
-def _noise(measurements: Measurements, problem: Problem,
-           plate: KnownPlate) -> tuple[NoiseEstimate, NoiseEstimate]:
+def _noise(
+    measurements: Measurements, problem: Problem, plate: KnownPlate
+) -> tuple[NoiseEstimate, NoiseEstimate]:
     """Return the noise of the readings: declared, of many repeats, or that of the calibration.
 
     What detections of images declare is the noise of a mark, without that of its image.
@@ -464,12 +561,14 @@ def _noise(measurements: Measurements, problem: Problem,
         fewer = 1 + (marks_of_image(stop[stop >= 0]) - 1) * share_of(plate.result)
         of_marks, of_mark = (of_marks[0], of_marks[1] / fewer), nan
     for kind, repeats, declared in (
-            ("xy", of_marks, of_mark),
-            ("theta", problem.repeats_theta, problem.angular.sigma_declared)):
+        ("xy", of_marks, of_mark),
+        ("theta", problem.repeats_theta, problem.angular.sigma_declared),
+    ):
         noise = noise_estimate(repeats, (nan, 0), declared)
         if not (noise.sigma > 0 and noise.dof >= MIN_REPEAT_DOF):
-            noise = replace(noise, sigma=getattr(before, f"sigma_{kind}"),
-                            dof=getattr(before, f"dof_{kind}"))
+            noise = replace(
+                noise, sigma=getattr(before, f"sigma_{kind}"), dof=getattr(before, f"dof_{kind}")
+            )
         out.append(noise)
     return out[0], out[1]
 
@@ -479,18 +578,30 @@ def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate)
     angular, of_terms = readings.problem.angular, readings.columns.lines
     (_, known), before = plate.together.lines()
     count = len(known)
-    lines = lines_of(replace(angular, weight=np.where(known, angular.weight, 0.0),
-                             known_plate=True))
+    lines = lines_of(
+        replace(angular, weight=np.where(known, angular.weight, 0.0), known_plate=True)
+    )
     if lines.n_readings:
         _require_noise(theta.sigma)
     of_plate = np.broadcast_to(np.eye(count)[:, None], (count, *angular.weight.shape))
     values = np.concatenate([of_plate, *of_terms.values[:, None]])
     size = np.append(np.ones(count), readings.columns.size[of_terms.at])
     source = np.where(np.arange(len(size)) < count, PLATE, TERMS)
-    effects = Effects.of(source, size, np.nan_to_num(plate.result.artifact_map.a_theta),
-                         before=before, length=np.zeros(count))
-    return map_of_lines(lines, angular.y, LineColumns(np.arange(len(size)), values), effects,
-                        sense=readings.sense, noise=theta)
+    effects = Effects.of(
+        source,
+        size,
+        np.nan_to_num(plate.result.artifact_map.a_theta),
+        before=before,
+        length=np.zeros(count),
+    )
+    return map_of_lines(
+        lines,
+        angular.y,
+        LineColumns(np.arange(len(size)), values),
+        effects,
+        sense=readings.sense,
+        noise=theta,
+    )
 
 
 def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
@@ -510,25 +621,46 @@ def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
 def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate) -> Noise:
     """Return the noise with degrees of freedom and k of the map's uncertainty."""
     before = plate.result.noise
-    dof = joint_dof((parts[NOISE].mean(), noise.dof_xy), (parts[PLATE].mean(), before.dof_of("xy")),
-                    (parts[TEMPERATURE].mean() + parts[TERMS].mean(), np.inf))
+    dof = joint_dof(
+        (parts[NOISE].mean(), noise.dof_xy),
+        (parts[PLATE].mean(), before.dof_of("xy")),
+        (parts[TEMPERATURE].mean() + parts[TERMS].mean(), np.inf),
+    )
     dof_theta = min(noise.dof_theta, before.dof_of("theta"))
-    return replace(noise, dof_map_xy=dof, k_xy=coverage_factor(dof), dof_map_theta=dof_theta,
-                   k_theta=coverage_factor(dof_theta) if dof_theta > 0 else noise.k_theta)
+    return replace(
+        noise,
+        dof_map_xy=dof,
+        k_xy=coverage_factor(dof),
+        dof_map_theta=dof_theta,
+        k_theta=coverage_factor(dof_theta) if dof_theta > 0 else noise.k_theta,
+    )
 
 
-def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
-            plate: KnownPlate) -> Iterator[BudgetLine]:
+def _budget(
+    result: CalibrationResult, parts: dict[str, np.ndarray], plate: KnownPlate
+) -> Iterator[BudgetLine]:
     """Yield the lines of the budget: noise, known plate, its temperature, terms; interpolation."""
     noise, of_plate, inf = result.noise, plate.result.artifact_map, float("inf")
-    by = next((way for way in ("declared", "repeats")
-               if getattr(noise, f"sigma_xy_{way}") == noise.sigma_xy), "residuals")
+    by = next(
+        (
+            way
+            for way in ("declared", "repeats")
+            if getattr(noise, f"sigma_xy_{way}") == noise.sigma_xy
+        ),
+        "residuals",
+    )
     rows: dict[str, tuple[str, float, str, float, str]] = {
         NOISE: ("A", noise.sigma_xy, "m", noise.dof_xy, "readings"),
-        PLATE: ("A", rms(np.stack([of_plate.u_ax, of_plate.u_ay])), "m",
-                plate.result.noise.dof_of("xy"), "declared"),
+        PLATE: (
+            "A",
+            rms(np.stack([of_plate.u_ax, of_plate.u_ay])),
+            "m",
+            plate.result.noise.dof_of("xy"),
+            "declared",
+        ),
         TEMPERATURE: ("B", float(np.sqrt(plate.variance_of_length)), "m/m", inf, "declared"),
-        TERMS: ("B", float("nan"), "m", inf, "default")}
+        TERMS: ("B", float("nan"), "m", inf, "default"),
+    }
     for name, variance in parts.items():
         if name == TEMPERATURE and plate.reference is None:
             continue
@@ -536,10 +668,14 @@ def _budget(result: CalibrationResult, parts: dict[str, np.ndarray],
         details: dict[str, object] = {"plate": plate.where}
         if name == NOISE:
             details = {"by": by, "contradicted": False}
-        yield BudgetLine("xy", name, kind, 0.0, u, unit, rms(u_map), float(u_map.max()), dof,
-                         source, details)
-    yield from (line for line in budget_lines(result)
-                if (line.quantity, line.component) == ("xy", INTERPOLATION))
+        yield BudgetLine(
+            "xy", name, kind, 0.0, u, unit, rms(u_map), float(u_map.max()), dof, source, details
+        )
+    yield from (
+        line
+        for line in budget_lines(result)
+        if (line.quantity, line.component) == ("xy", INTERPOLATION)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -574,5 +710,7 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
     unit = noise.sigma_xy / root
     emap = found.error_map()
     u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
-    return PlannedRecheck(Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
-                          rms(map_change(found.new, found.artifact, plate).u) / unit)
+    return PlannedRecheck(
+        Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
+        rms(map_change(found.new, found.artifact, plate).u) / unit,
+    )

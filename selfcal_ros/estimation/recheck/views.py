@@ -54,8 +54,15 @@ class Effects:
     length: np.ndarray
 
     @classmethod
-    def of(cls, source: np.ndarray, size: np.ndarray, plate: np.ndarray, *, before: np.ndarray,
-           length: np.ndarray) -> "Effects":
+    def of(
+        cls,
+        source: np.ndarray,
+        size: np.ndarray,
+        plate: np.ndarray,
+        *,
+        before: np.ndarray,
+        length: np.ndarray,
+    ) -> "Effects":
         """Return effects with sizes (p,), of which the calibration knows values `plate` (k,)."""
         known, here = source == PLATE, len(before) - len(plate)
         mean, covariance = np.zeros(len(size)), np.diag(size**2)
@@ -70,8 +77,13 @@ class Effects:
         all_known[np.ix_(here, here)] = covariance
         return replace(self, mean=mean, covariance=all_known)
 
-    def projected(self, columns: tuple[np.ndarray, ...], response: np.ndarray,
-                  inverse: np.ndarray, variance: float) -> tuple[np.ndarray, ...]:
+    def projected(
+        self,
+        columns: tuple[np.ndarray, ...],
+        response: np.ndarray,
+        inverse: np.ndarray,
+        variance: float,
+    ) -> tuple[np.ndarray, ...]:
         """Return what an estimate makes of a unit of each if it is not known, and what is left.
 
         The map (nodes, p), the misalignments (size, p), and what an estimate of the effects leaves
@@ -89,8 +101,11 @@ class Effects:
         free, right, gram = columns
         moved = inverse @ right
         information = (gram - right.T @ moved) / variance
-        return free - response @ moved, moved, np.linalg.inv(
-            np.eye(len(gram)) + self.covariance @ information)
+        return (
+            free - response @ moved,
+            moved,
+            np.linalg.inv(np.eye(len(gram)) + self.covariance @ information),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,10 +148,10 @@ class NewMap:
     def without(self, modes: np.ndarray) -> "NewMap":
         """Return the map without its least-squares parts in modes, (n, d)."""
         basis = np.linalg.qr(modes[self.known])[0]
-        values, white, moved = (part - basis @ (basis.T @ part)
-                                for part in (self.values, self.white, self.moved))
-        return replace(self, values=values, moved=moved,
-                       white=white - (white @ basis) @ basis.T)
+        values, white, moved = (
+            part - basis @ (basis.T @ part) for part in (self.values, self.white, self.moved)
+        )
+        return replace(self, values=values, moved=moved, white=white - (white @ basis) @ basis.T)
 
     def covariances(self, variance_of_length: float) -> dict[str, np.ndarray]:
         """Return the covariances of the map by their sources, which add up, (q, q) each.
@@ -204,15 +219,19 @@ class PlateReadings:
         fewer = ", or give the map fewer nodes" * (placed(self.problem) is not None)
         raise NotIdentifiableError(
             f"a view of the known plate that leaves {unknown} of {n} nodes of the map "
-            f"unknown: measure more of its marks{fewer}", Observability(
-                2 * int(known.sum()), 2 * n, 2 * unknown, False))
+            f"unknown: measure more of its marks{fewer}",
+            Observability(2 * int(known.sum()), 2 * n, 2 * unknown, False),
+        )
 
     @property
     def dof(self) -> int:
         """Degrees of freedom of the residuals, the effects known."""
         system, on_map = self.problem.system, placed(self.problem)
-        rank = system.rank_grid if on_map is None else (
-            round(told_coefficients(on_map)) + on_map.rank_schur)
+        rank = (
+            system.rank_grid
+            if on_map is None
+            else (round(told_coefficients(on_map)) + on_map.rank_schur)
+        )
         return 2 * system.grid.n_readings - rank
 
 
@@ -257,8 +276,12 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
     problem, shapes, effects = readings.problem, readings.columns.shapes, readings.effects
     system, grid, gauge = problem.system, problem.system.grid, problem.system.gauge
     reduced = reduce_columns(grid, shapes)
-    fields, moved, left = effects.projected((reduced.free, reduced.right, reduced.gram),
-                                            grid.response, system.grid_inverse, readings.variance)
+    fields, moved, left = effects.projected(
+        (reduced.free, reduced.right, reduced.gram),
+        grid.response,
+        system.grid_inverse,
+        readings.variance,
+    )
     gain = left @ effects.covariance / readings.variance
     linear = problem.grid.y - shapes.combined(effects.mean)
     plate = shapes.combined(effects.mean, readings.columns.rows([PLATE]))
@@ -273,18 +296,33 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
         parts = gauge.parts(field)
         field = gauge.remove(field, parts)
         parameters = parameters - moved @ shown - parts @ system.rigid[:3]
-        lacking = grid.read * (moving.taken(np.where(readings.known, field, 0.0))
-                               + problem.excess(parameters, plate, grid.views.gather(field)))
+        lacking = grid.read * (
+            moving.taken(np.where(readings.known, field, 0.0))
+            + problem.excess(parameters, plate, grid.views.gather(field))
+        )
         if np.abs(lacking - before).max() <= FLOOR:
             square = float((grid.weight * np.abs(residuals) ** 2).sum() - shown @ right)
-            return PlateSolution(field.ravel(), parameters, square / readings.variance, fields,
-                                 left)
-    raise NotSettledError("recheck", "the rotations of the plate do not converge",
-                          "check the readings for misalignments of more than a few degrees")
+            return PlateSolution(
+                field.ravel(), parameters, square / readings.variance, fields, left
+            )
+    raise NotSettledError(
+        "recheck",
+        "the rotations of the plate do not converge",
+        "check the readings for misalignments of more than a few degrees",
+    )
 
 
-def _map_of(rows: np.ndarray, field: np.ndarray, fields: np.ndarray, left: np.ndarray, *,
-            effects: Effects, alone: np.ndarray, known: np.ndarray, dof: float) -> NewMap:
+def _map_of(
+    rows: np.ndarray,
+    field: np.ndarray,
+    fields: np.ndarray,
+    left: np.ndarray,
+    *,
+    effects: Effects,
+    alone: np.ndarray,
+    known: np.ndarray,
+    dof: float,
+) -> NewMap:
     """Return the map whose values are functionals, rows (n, q), of a field (n,).
 
     `fields` and `left` are those of `PlateSolution`, `alone` (q, q) is the covariance of the values
@@ -292,8 +330,14 @@ def _map_of(rows: np.ndarray, field: np.ndarray, fields: np.ndarray, left: np.nd
     """
     fields = np.real(rows.conj().T @ fields)
     moved = fields @ left
-    return NewMap(known, np.real(rows.conj().T @ field),
-                  alone + moved @ effects.covariance @ (fields - moved).T, moved, effects, dof)
+    return NewMap(
+        known,
+        np.real(rows.conj().T @ field),
+        alone + moved @ effects.covariance @ (fields - moved).T,
+        moved,
+        effects,
+        dof,
+    )
 
 
 def map_of_marks(readings: PlateReadings, found: PlateSolution, dof: float) -> NewMap:
@@ -303,13 +347,29 @@ def map_of_marks(readings: PlateReadings, found: PlateSolution, dof: float) -> N
     rows = turned_over(readings.sense, unit_rows(known)).reshape(-1, known.size).T
     rows = system.gauge.without(rows)
     alone = readings.variance * MapsCovariance(system, system.grid_inverse).of_free(
-        rows, np.zeros((system.grid.n_marks, rows.shape[1])))
-    return _map_of(rows, found.field, found.fields, found.left, effects=readings.effects,
-                   alone=alone, known=np.tile(known.ravel(), 2), dof=dof)
+        rows, np.zeros((system.grid.n_marks, rows.shape[1]))
+    )
+    return _map_of(
+        rows,
+        found.field,
+        found.fields,
+        found.left,
+        effects=readings.effects,
+        alone=alone,
+        known=np.tile(known.ravel(), 2),
+        dof=dof,
+    )
 
 
-def map_of_lines(lines: AngularSystem, y: np.ndarray, columns: LineColumns, effects: Effects, *,
-                 sense: Sense, noise: NoiseEstimate) -> NewMap:
+def map_of_lines(
+    lines: AngularSystem,
+    y: np.ndarray,
+    columns: LineColumns,
+    effects: Effects,
+    *,
+    sense: Sense,
+    noise: NoiseEstimate,
+) -> NewMap:
     """Return the angular map, its mean 0; nothing is known where the lines do not determine it.
 
     Parameters
@@ -332,14 +392,27 @@ def map_of_lines(lines: AngularSystem, y: np.ndarray, columns: LineColumns, effe
         nothing = np.zeros((0, len(effects.mean)))
         return NewMap(known, np.zeros(0), np.zeros((0, 0)), nothing, effects, noise.dof)
     inverse = pseudo_inverse(spectrum[0], spectrum[1], scale)
-    fields, _, left = effects.projected(lines_eliminated(lines, columns), lines.response, inverse,
-                                        variance)
+    fields, _, left = effects.projected(
+        lines_eliminated(lines, columns), lines.response, inverse, variance
+    )
     y = y - np.tensordot(effects.mean, columns.values, axes=1)
     field, phi = lines.fitted(y, inverse)
-    shown = left @ effects.covariance @ columns.sums(
-        lines.weight * lines.plate(y, field, phi)[1]) / variance
+    shown = (
+        left
+        @ effects.covariance
+        @ columns.sums(lines.weight * lines.plate(y, field, phi)[1])
+        / variance
+    )
     centre = np.eye(lines.n_lines)[:, known]
     rows = lines_turned_over(sense, centre - centre.mean(axis=1, keepdims=True))
     alone = lines.solve(rows) + lines.response @ (inverse @ (lines.response.T @ rows))
-    return _map_of(rows, field - fields @ shown, fields, left, effects=effects,
-                   alone=variance * rows.T @ alone, known=known, dof=noise.dof)
+    return _map_of(
+        rows,
+        field - fields @ shown,
+        fields,
+        left,
+        effects=effects,
+        alone=variance * rows.T @ alone,
+        known=known,
+        dof=noise.dof,
+    )

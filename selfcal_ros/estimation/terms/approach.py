@@ -17,8 +17,12 @@ from selfcal_ros.model.terms import ModelTerm
 def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     """Yield the signs along x and along y."""
     # in the nominal frame, as the map: an approach that every visit has is the map's
-    found = inputs.at_visits(lambda visits: inputs.sense.sign * np.stack(
-        [visits.approach_x, visits.approach_y]).astype(complex), nominal=True)
+    found = inputs.at_visits(
+        lambda visits: (
+            inputs.sense.sign * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
+        ),
+        nominal=True,
+    )
     for coefficient, (marks, visits) in zip(AXES, found, strict=False):
         yield Pattern((coefficient,), marks, visits)
 
@@ -30,6 +34,15 @@ def located(found: Any, names: tuple[str, ...]) -> Located:
 
 
 BLOCK = Block(
-    "approach", "m", patterns, undetected=1e-12, nominal=10e-9, needs_visits=True, of_map=True,
-    shared=True, located=located, change="order",
-    cure="visit the marks from both sides, e.g. visit_order: x_back_y_back")
+    "approach",
+    "m",
+    patterns,
+    undetected=1e-12,
+    nominal=10e-9,
+    needs_visits=True,
+    of_map=True,
+    shared=True,
+    located=located,
+    change="order",
+    cure="visit the marks from both sides, e.g. visit_order: x_back_y_back",
+)

@@ -61,7 +61,8 @@ class Shapes:
             at[rows] = np.arange(len(rows))
             here = np.flatnonzero(at[self.of_column] >= 0)
             out[here, view] = (self.unit[here, None] * values[at[self.of_column[here]]]).reshape(
-                -1, *self.lattice)
+                -1, *self.lattice
+            )
         return out
 
     def of_columns(self, each: np.ndarray) -> np.ndarray:
@@ -124,8 +125,12 @@ class LineColumns:
 NO_LINES = LineColumns(np.zeros(0, dtype=int), np.zeros((0, 0, 0)))
 
 
-def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int],
-              unit: Sequence[complex], weight: np.ndarray) -> Shapes:
+def shapes_of(
+    means: Sequence[Mapping[int, np.ndarray]],
+    of_column: Sequence[int],
+    unit: Sequence[complex],
+    weight: np.ndarray,
+) -> Shapes:
     """Return shapes given by their values in their views.
 
     Parameters
@@ -141,10 +146,19 @@ def shapes_of(means: Sequence[Mapping[int, np.ndarray]], of_column: Sequence[int
     for view in range(len(weight)):
         here = [at for at, mean in enumerate(means) if view in mean]
         rows.append(np.array(here, dtype=int))
-        values.append(np.array([means[at][view] for at in here], dtype=complex).reshape(
-            len(here), weight[0].size))
-    return Shapes(len(means), weight.shape[1:], tuple(rows), tuple(values),
-                  np.array(of_column, dtype=int), np.array(unit, dtype=complex))
+        values.append(
+            np.array([means[at][view] for at in here], dtype=complex).reshape(
+                len(here), weight[0].size
+            )
+        )
+    return Shapes(
+        len(means),
+        weight.shape[1:],
+        tuple(rows),
+        tuple(values),
+        np.array(of_column, dtype=int),
+        np.array(unit, dtype=complex),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,9 +271,17 @@ class TermColumns:
         """
         of_shape = np.zeros(len(self.at), dtype=complex)
         np.add.at(of_shape, self.shapes.of_column, coefficients * self.shapes.unit)
-        return [sum((value * shape[view] for value, shape in zip(
-            of_shape, self.at, strict=True) if view in shape), start=0.0)
-            for view in range(len(self.shapes.rows))]
+        return [
+            sum(
+                (
+                    value * shape[view]
+                    for value, shape in zip(of_shape, self.at, strict=True)
+                    if view in shape
+                ),
+                start=0.0,
+            )
+            for view in range(len(self.shapes.rows))
+        ]
 
     def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which columns belong to the terms `names`, bool (p,)."""
@@ -273,9 +295,13 @@ class TermColumns:
 
     def scaled(self, name: str, factor: float) -> "TermColumns":
         """Return the same columns with the sizes of the term `name` multiplied by `factor`."""
-        return replace(self, columns=tuple(
-            replace(column, size=column.size * factor) if column.term == name else column
-            for column in self.columns))
+        return replace(
+            self,
+            columns=tuple(
+                replace(column, size=column.size * factor) if column.term == name else column
+                for column in self.columns
+            ),
+        )
 
 
 @dataclass
@@ -325,8 +351,13 @@ class ColumnBuilder:
         shapes = shapes_of(self.means, self.of_column, self.unit, self.ground.weight)
         at, values = zip(*self.lines, strict=True) if self.lines else ((), ())
         within = within_marks(self.ground.visits, self.at, shapes)
-        return TermColumns(tuple(self.columns), shapes, within, self.at,
-                           LineColumns(np.array(at), np.stack(values)) if at else NO_LINES)
+        return TermColumns(
+            tuple(self.columns),
+            shapes,
+            within,
+            self.at,
+            LineColumns(np.array(at), np.stack(values)) if at else NO_LINES,
+        )
 
 
 def term_columns(ground: TermInputs, terms: Iterable[ModelTerm]) -> TermColumns:
@@ -352,6 +383,10 @@ def term_columns(ground: TermInputs, terms: Iterable[ModelTerm]) -> TermColumns:
 def _require_visits(ground: TermInputs, name: str) -> None:
     for view, visits in zip(ground.names, ground.visits, strict=True):
         if visits is None:
-            raise InputError(f"view '{view}'", f"the term '{name}' needs the time, the offset and "
-                             "the direction of approach of each reading, and the readings do not "
-                             "contain them", "solve from the bag, or leave the term out")
+            raise InputError(
+                f"view '{view}'",
+                f"the term '{name}' needs the time, the offset and "
+                "the direction of approach of each reading, and the readings do not "
+                "contain them",
+                "solve from the bag, or leave the term out",
+            )

@@ -28,26 +28,43 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     orders = range(1, inputs.drift_degree + 1)
     for first, members in inputs.members.items():
         found = inputs.at_visits(
-            lambda visits: np.stack([polynomial(order, visits.time) for order in orders]), members)
+            lambda visits: np.stack([polynomial(order, visits.time) for order in orders]), members
+        )
         for order, (marks, visits) in zip(orders, found, strict=False):
-            yield Pattern(tuple((f"{axis} P{order}", unit) for axis, unit in AXES), marks, visits,
-                          view=first)
+            yield Pattern(
+                tuple((f"{axis} P{order}", unit) for axis, unit in AXES), marks, visits, view=first
+            )
 
 
 def located(found: Any, names: tuple[str, ...]) -> Located:
     """Yield the range of the path of each view along each axis."""
     for view in sorted({column.view for column in found.columns}):
         for axis in "xy":
-            shape = np.array([
-                polynomial(int(c.component[3:]), TIMES)
-                if c.view == view and c.component[0] == axis else 0 * TIMES
-                for c in found.columns])
+            shape = np.array(
+                [
+                    polynomial(int(c.component[3:]), TIMES)
+                    if c.view == view and c.component[0] == axis
+                    else 0 * TIMES
+                    for c in found.columns
+                ]
+            )
             path = found.values @ shape
-            yield {"view": names[view], "axis": axis}, (
-                shape[:, int(path.argmax())] - shape[:, int(path.argmin())])
+            yield (
+                {"view": names[view], "axis": axis},
+                (shape[:, int(path.argmax())] - shape[:, int(path.argmin())]),
+            )
 
 
 BLOCK = Block(
-    "drift", "m", patterns, undetected=1e-12, nominal=10e-9, needs_visits=True, of_time=True,
-    alone=lambda component: component.endswith("P1"), located=located, change="order",
-    cure="visit the marks in more than one order, e.g. visit_order: x_back_y_back")
+    "drift",
+    "m",
+    patterns,
+    undetected=1e-12,
+    nominal=10e-9,
+    needs_visits=True,
+    of_time=True,
+    alone=lambda component: component.endswith("P1"),
+    located=located,
+    change="order",
+    cure="visit the marks in more than one order, e.g. visit_order: x_back_y_back",
+)

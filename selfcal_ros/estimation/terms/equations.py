@@ -81,12 +81,14 @@ def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
     """Return columns with the sites eliminated; the last ones are kept."""
     sites, inner, asked = _marks_eliminated(grid, shapes)
     inner -= grid.factor.products(sites)
-    return ReducedColumns(grid, shapes, sites, (inner + inner.conj().T) / 2,
-                          asked - _coupled(grid, sites))
+    return ReducedColumns(
+        grid, shapes, sites, (inner + inner.conj().T) / 2, asked - _coupled(grid, sites)
+    )
 
 
-def _marks_eliminated(grid: GridSystem, shapes: Shapes
-                      ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _marks_eliminated(
+    grid: GridSystem, shapes: Shapes
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return s (sites, q), inner products (q, q) and the coupling to the views (2 views, q)."""
     n, marks = grid.n_views, grid.n_marks
     weight, part = (array.reshape(n, marks) for array in (grid.weight, grid.relative_weight))
@@ -108,8 +110,11 @@ def _marks_eliminated(grid: GridSystem, shapes: Shapes
     asked -= (to_views * weight[:, None]) @ means.T
     for v in range(n):
         grid.views.add_scattered(sites, v, (means * -weight[v]).reshape(-1, *shapes.lattice))
-    return (np.ascontiguousarray(sites.reshape(shapes.n, grid.n_sites).T), inner,
-            asked.reshape(2 * n, shapes.n))
+    return (
+        np.ascontiguousarray(sites.reshape(shapes.n, grid.n_sites).T),
+        inner,
+        asked.reshape(2 * n, shapes.n),
+    )
 
 
 def _coupled(grid: GridSystem, sites: np.ndarray) -> np.ndarray:
@@ -144,8 +149,9 @@ class ProjectedColumns:
         """Map F, complex (sites, p)."""
         return self.make_fields()
 
-    def of_lines(self, system: NormalEquations, lines: LineColumns,
-                 half_width_m: float) -> np.ndarray:
+    def of_lines(
+        self, system: NormalEquations, lines: LineColumns, half_width_m: float
+    ) -> np.ndarray:
         """Return the angular residuals of the columns, (p, views, K), rad."""
         y = np.zeros((len(self.gram), *system.angular.weight.shape))
         if len(lines.at):
@@ -154,8 +160,15 @@ class ProjectedColumns:
         return system.angular.plate(y, -self.turned.T, phi.T)[1]
 
 
-def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarray,
-            lines: LineColumns, *, ratio: float, half_width_m: float) -> ProjectedColumns:
+def project(
+    system: NormalEquations,
+    reduced: ReducedColumns,
+    inverse: np.ndarray,
+    lines: LineColumns,
+    *,
+    ratio: float,
+    half_width_m: float,
+) -> ProjectedColumns:
     """Return the effect of the columns on the joint estimate.
 
     Parameters
@@ -181,12 +194,17 @@ def project(system: NormalEquations, reduced: ReducedColumns, inverse: np.ndarra
     gram[np.ix_(lines.at, lines.at)] += ratio * half_width_m**2 * gram_of_lines
     turned = angular.response @ parameters[system.phi_at] / half_width_m
     turned[:, lines.at] -= free
-    return ProjectedColumns(lambda: reduced.free - system.grid.response @ parameters[:n],
-                            parameters, (gram + gram.T) / 2, turned)
+    return ProjectedColumns(
+        lambda: reduced.free - system.grid.response @ parameters[:n],
+        parameters,
+        (gram + gram.T) / 2,
+        turned,
+    )
 
 
-def lines_eliminated(angular: AngularSystem,
-                      lines: LineColumns) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def lines_eliminated(
+    angular: AngularSystem, lines: LineColumns
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return what q columns make of the stage's lines, (K, q), and right-hand side and products.
 
     Of the misalignments, (views, q), and of the residuals, (q, q).
@@ -253,16 +271,16 @@ class TermEquations:
         grid = self.columns.shapes.squares(self.system.grid.weight)
         lines = self.columns.lines
         grid[lines.at] += self.line_weight * lines.sums(self.system.angular.weight, 2)
-        return np.sqrt(np.maximum(grid + np.diag(self.columns.within.gram),
-                                  np.finfo(float).tiny))
+        return np.sqrt(np.maximum(grid + np.diag(self.columns.within.gram), np.finfo(float).tiny))
 
     @property
     def free(self) -> np.ndarray:
         """Coefficients to be determined by the readings alone, bool (p,)."""
         return np.isinf(self.columns.size)
 
-    def untold(self, rows: np.ndarray, limit: float | None = None, *,
-               unknown: np.ndarray | None = None) -> np.ndarray:
+    def untold(
+        self, rows: np.ndarray, limit: float | None = None, *, unknown: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return undetermined combinations of the coefficients `rows`, (p, k).
 
         Orthonormal in scaled coefficients (times `norm`); others are taken as known, but for those
@@ -279,14 +297,19 @@ class TermEquations:
         """Eigenvalues and eigenvectors of the scaled equations of all coefficients."""
         return self._spectrum_of(np.ones(self.n, dtype=bool))
 
-    def _spectrum_of(self, rows: np.ndarray, unknown: np.ndarray | None = None
-                     ) -> tuple[np.ndarray, np.ndarray]:
+    def _spectrum_of(
+        self, rows: np.ndarray, unknown: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         scaled = self.information / np.outer(self.norm, self.norm)
         told = scaled[np.ix_(rows, rows)]
         if unknown is not None:
             couple = scaled[np.ix_(rows, unknown)]
-            told = told - couple @ np.linalg.pinv(
-                scaled[np.ix_(unknown, unknown)], hermitian=True) @ couple.T
+            told = (
+                told
+                - couple
+                @ np.linalg.pinv(scaled[np.ix_(unknown, unknown)], hermitian=True)
+                @ couple.T
+            )
         values, vectors = np.linalg.eigh(told)
         return values, vectors
 
@@ -301,8 +324,7 @@ class TermEquations:
         Offsets of lines are told apart from their noise only where they stand alone: among others
         theirs is a combination of its own.
         """
-        of_marks, of_lines = (float(part[rows].max(initial=0.0))
-                              for part in self._noise_of_offsets)
+        of_marks, of_lines = (float(part[rows].max(initial=0.0)) for part in self._noise_of_offsets)
         alone = self._noise_of_offsets[1][rows].all()
         return max(GAP, OVER_NOISE * (of_lines if alone else of_marks))
 
@@ -316,8 +338,10 @@ class TermEquations:
         power = (self.noise_m / self.norm) ** 2
         marks = self.columns.having(lambda block: block.of_microscope)
         lines = self.columns.having(lambda block: block.of_offsets and block.of_lines)
-        return (self.system.grid.n_readings * power * marks,
-                self.system.angular.n_views * power * lines)
+        return (
+            self.system.grid.n_readings * power * marks,
+            self.system.angular.n_views * power * lines,
+        )
 
     @cached_property
     def maps(self) -> np.ndarray:
@@ -338,8 +362,10 @@ class TermEquations:
 
         (2, sites) of the XY map, and (K,) of the angular one.
         """
-        x, y, lines = ((part @ covariance * part).sum(axis=1)
-                       for part in (self.maps.real, self.maps.imag, self.turned))
+        x, y, lines = (
+            (part @ covariance * part).sum(axis=1)
+            for part in (self.maps.real, self.maps.imag, self.turned)
+        )
         return np.stack([x, y]), lines
 
     def unseen(self, rows: np.ndarray) -> np.ndarray:
@@ -351,8 +377,9 @@ class TermEquations:
         unit = untold / self.norm[:, None]
         moved = self.maps @ unit * np.sqrt(grid.weight.sum() / grid.n_sites)
         lines = (self.turned @ unit)[self.system.known_lines]
-        lines = lines * np.sqrt(self.line_weight * self.system.angular.weight.sum()
-                                / max(len(lines), 1))
+        lines = lines * np.sqrt(
+            self.line_weight * self.system.angular.weight.sum() / max(len(lines), 1)
+        )
         both = np.concatenate([moved.real, moved.imag, lines])
         _, size, right = np.linalg.svd(both, full_matrices=False)
         return untold @ right[size > TRACE].T  # the smallest true ones are 1e-2
@@ -371,7 +398,8 @@ class TermEquations:
         count = 2 * self.system.grid.n_readings + self.columns.within.dof
         # those that multiply an offset along its own axis: 1, not i, in the direction of the noise
         feigned = self.columns.having(lambda block: block.of_microscope) & (
-            self.columns.shapes.unit == 1)
+            self.columns.shapes.unit == 1
+        )
         return (self.noise_m * count) ** 2 * feigned
 
     @cached_property
@@ -425,8 +453,10 @@ class TermEquations:
         diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
         own = np.sqrt(np.where(self.free & (diagonal <= GAP), 1.0, diagonal))
         null = np.linalg.qr(own[:, None] * hold)[0]
-        found = np.linalg.pinv(matrix / np.outer(own, own) + null @ null.T, hermitian=True,
-                               rcond=1e-14) - null @ null.T
+        found = (
+            np.linalg.pinv(matrix / np.outer(own, own) + null @ null.T, hermitian=True, rcond=1e-14)
+            - null @ null.T
+        )
         found /= np.outer(own, own)
         told = np.eye(self.n) - hold @ hold.T
         return told @ found @ told * np.outer(scale, scale)
@@ -439,7 +469,8 @@ class TermEquations:
         free it would explain noise alone.
         """
         return self.inverse_without(
-            self.columns.having(lambda block: block.of_offsets and block.of_lines))
+            self.columns.having(lambda block: block.of_offsets and block.of_lines)
+        )
 
     def inverse_without(self, known: np.ndarray) -> np.ndarray:
         """Return the covariance of free coefficients (p, p) if those in `known` are known."""
@@ -447,8 +478,9 @@ class TermEquations:
         untold, norm = self.untold(free)[free], self.norm[free]
         scaled = self.information[np.ix_(free, free)] / np.outer(norm, norm)
         out = np.zeros((self.n, self.n))
-        out[np.ix_(free, free)] = (np.linalg.inv(scaled + untold @ untold.T)
-                                   - untold @ untold.T) / np.outer(norm, norm)
+        out[np.ix_(free, free)] = (
+            np.linalg.inv(scaled + untold @ untold.T) - untold @ untold.T
+        ) / np.outer(norm, norm)
         return out
 
     def rank(self) -> int:
@@ -456,8 +488,15 @@ class TermEquations:
         return self.n - self.untold(np.ones(self.n, dtype=bool)).shape[1]
 
 
-def equations_of_columns(system: NormalEquations, columns: TermColumns, inverse: np.ndarray, *,
-                         ratio: float, half_width_m: float, noise_m: float) -> TermEquations:
+def equations_of_columns(
+    system: NormalEquations,
+    columns: TermColumns,
+    inverse: np.ndarray,
+    *,
+    ratio: float,
+    half_width_m: float,
+    noise_m: float,
+) -> TermEquations:
     """Return the equations of columns of readings that are planned, or about an estimate.
 
     Parameters
@@ -472,8 +511,9 @@ def equations_of_columns(system: NormalEquations, columns: TermColumns, inverse:
         Noise of one grid reading, m; 0 if unknown.
     """
     reduced = reduce_columns(system.grid, columns.shapes)
-    projected = project(system, reduced, inverse, columns.lines, ratio=ratio,
-                        half_width_m=half_width_m)
+    projected = project(
+        system, reduced, inverse, columns.lines, ratio=ratio, half_width_m=half_width_m
+    )
     return TermEquations(system, columns, projected, noise_m, ratio * half_width_m**2)
 
 
@@ -522,8 +562,13 @@ class Score:
         return self.between + self.within
 
 
-def score(equations: TermEquations, residuals: tuple[np.ndarray, np.ndarray],
-          squares: tuple[float, float], *, coefficients: np.ndarray | None = None) -> Score:
+def score(
+    equations: TermEquations,
+    residuals: tuple[np.ndarray, np.ndarray],
+    squares: tuple[float, float],
+    *,
+    coefficients: np.ndarray | None = None,
+) -> Score:
     """Return the right-hand side of the remaining coefficients.
 
     Parameters
@@ -545,7 +590,8 @@ def score(equations: TermEquations, residuals: tuple[np.ndarray, np.ndarray],
     taken = np.zeros(equations.n) if coefficients is None else coefficients
     between = shapes.against(shapes.sums(weight * residuals[0]))
     between[columns.lines.at] += equations.line_weight * columns.lines.sums(
-        equations.system.angular.weight * residuals[1])
+        equations.system.angular.weight * residuals[1]
+    )
     inner = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
     sums = Sums(*squares, float(inner), within.dof)
     return Score(between, within.right - within.gram @ taken, sums)
@@ -561,12 +607,22 @@ def residual_sums(equations: TermEquations, found: Score) -> Sums:
     gram, within = equations.projected.gram, equations.columns.within.gram
     between = found.sums.between - 2 * more @ found.between + more @ gram @ more
     inner = found.sums.within - 2 * more @ found.within + more @ within @ more
-    return Sums(max(float(between), 0.0), found.sums.dof_between - float(np.sum(inverse * gram)),
-                max(float(inner), 0.0), found.sums.dof_within - float(np.sum(inverse * within)))
+    return Sums(
+        max(float(between), 0.0),
+        found.sums.dof_between - float(np.sum(inverse * gram)),
+        max(float(inner), 0.0),
+        found.sums.dof_within - float(np.sum(inverse * within)),
+    )
 
 
-def next_coefficients(equations: TermEquations, found: Score, coefficients: np.ndarray, *,
-                      sigma_m: float, inverse: np.ndarray) -> np.ndarray:
+def next_coefficients(
+    equations: TermEquations,
+    found: Score,
+    coefficients: np.ndarray,
+    *,
+    sigma_m: float,
+    inverse: np.ndarray,
+) -> np.ndarray:
     """Return the coefficients from the score, (p,), with sizes as prior knowledge.
 
     Parameters
@@ -678,8 +734,9 @@ class SizeTest:
         return self.p < DOUBT_LEVEL
 
 
-def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
-              noise: tuple[float, float]) -> SizeTest:
+def size_test(
+    equations: TermEquations, right: np.ndarray, term: ModelTerm, noise: tuple[float, float]
+) -> SizeTest:
     """Return the test of one size, the other terms with their sizes or free.
 
     The test of all its coefficients, or of those of one family (`Block.families`): whichever
@@ -698,17 +755,31 @@ def size_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
     """
     columns = equations.columns.columns
     every = equations.rows([term.name])
-    families = [every & np.array([column.component in family for column in columns])
-                for family in term.block.families]
-    whole, *parts = [_coefficients_test(equations, right, term, noise, rows=rows,
-                                        among=1 + len(families))
-                     for rows in (every, *families)]
-    return replace(min((whole, *parts), key=lambda test: test.p), rank=whole.rank,
-                   statistic=whole.statistic, p_together=whole.p_together)
+    families = [
+        every & np.array([column.component in family for column in columns])
+        for family in term.block.families
+    ]
+    whole, *parts = [
+        _coefficients_test(equations, right, term, noise, rows=rows, among=1 + len(families))
+        for rows in (every, *families)
+    ]
+    return replace(
+        min((whole, *parts), key=lambda test: test.p),
+        rank=whole.rank,
+        statistic=whole.statistic,
+        p_together=whole.p_together,
+    )
 
 
-def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelTerm,
-                       noise: tuple[float, float], *, rows: np.ndarray, among: int) -> SizeTest:
+def _coefficients_test(
+    equations: TermEquations,
+    right: np.ndarray,
+    term: ModelTerm,
+    noise: tuple[float, float],
+    *,
+    rows: np.ndarray,
+    among: int,
+) -> SizeTest:
     """Return the test of a size by the coefficients `rows`, bool (p,), one of `among` tests."""
     sigma, dof = noise
     values, information, of_size = _told(equations, right, rows, sigma)
@@ -743,12 +814,14 @@ def _coefficients_test(equations: TermEquations, right: np.ndarray, term: ModelT
     # the limit of few coefficients is far above what they show
     allowed = min(allowed, max(term.size, term.block.plausible, shown))
     wider = float(np.log(variances(shown) / variances(term.size)).sum())
-    return replace(test, shown=shown, allowed=allowed,
-                   evidence=float(found - statistic(shown) - wider) / 2)
+    return replace(
+        test, shown=shown, allowed=allowed, evidence=float(found - statistic(shown) - wider) / 2
+    )
 
 
-def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m: float
-          ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _told(
+    equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the estimates of coefficients taken as free.
 
     The determined combinations, scaled by the columns' norms, (r,), the information on them for
@@ -759,8 +832,10 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
     norm = np.hypot(equations.norm, prior)
     scaled = equations.unbiased / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
     hidden = equations.untold(equations.free & rest)[rest]
-    held = np.linalg.pinv(scaled[np.ix_(rest, rest)] + hidden @ hidden.T, hermitian=True,
-                          rcond=1e-14) - hidden @ hidden.T
+    held = (
+        np.linalg.pinv(scaled[np.ix_(rest, rest)] + hidden @ hidden.T, hermitian=True, rcond=1e-14)
+        - hidden @ hidden.T
+    )
     couple, scores = scaled[np.ix_(rows, rest)] @ held, equations.unbiased_sums(right) / norm
     told_by = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(rest, rows)]
     size, vectors = np.linalg.eigh((told_by + told_by.T) / 2)
@@ -772,8 +847,12 @@ def _told(equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m
     return values, size, turned.T @ turned
 
 
-def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[ModelTerm],
-               noise: tuple[float, float]) -> tuple[SizeTest, ...]:
+def size_tests(
+    equations: TermEquations,
+    right: np.ndarray,
+    terms: Sequence[ModelTerm],
+    noise: tuple[float, float],
+) -> tuple[SizeTest, ...]:
     """Return the tests of all sizes, raised ones first, in the order of their evidence.
 
     Each is tested with the preceding terms at the sizes that the readings allow, so that one term
@@ -798,8 +877,9 @@ def size_tests(equations: TermEquations, right: np.ndarray, terms: Sequence[Mode
         worst = max(failed, key=lambda test: test.evidence)
         found.append(worst)
         sized = [term for term in sized if term.name != worst.name]
-        equations = replace(equations, columns=equations.columns.scaled(
-            worst.name, worst.allowed / worst.given))
+        equations = replace(
+            equations, columns=equations.columns.scaled(worst.name, worst.allowed / worst.given)
+        )
     return tuple(found)
 
 
@@ -835,13 +915,23 @@ def require_terms_told(equations: TermEquations, seen: Observability) -> None:
     if not modes:
         return
     by_term = unseen_by_term(equations)
-    alike = tuple(Finding("looks_like_stage", details={"term": name, "count": count})
-                  for name, count in by_term.items())
+    alike = tuple(
+        Finding("looks_like_stage", details={"term": name, "count": count})
+        for name, count in by_term.items()
+    )
     advice = tuple(Finding("separate_term", details={"term": name}) for name in by_term)
     free = int(equations.free.sum())
-    found = replace(seen, unknowns=seen.unknowns + free, rank=seen.rank + free - modes,
-                    deficiency=seen.deficiency + modes, identifiable=False, modes=alike,
-                    advice=advice)
+    found = replace(
+        seen,
+        unknowns=seen.unknowns + free,
+        rank=seen.rank + free - modes,
+        deficiency=seen.deficiency + modes,
+        identifiable=False,
+        modes=alike,
+        advice=advice,
+    )
     raise NotIdentifiableError(
         f"the readings do not separate {' and '.join(by_term)} from the stage "
-        f"({modes} mode{'s' * (modes != 1)} undetermined)", found)
+        f"({modes} mode{'s' * (modes != 1)} undetermined)",
+        found,
+    )

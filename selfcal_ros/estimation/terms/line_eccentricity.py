@@ -18,7 +18,7 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
     """Yield both waves of each view of lines; free ones are relative to the first."""
     angle = 2 * np.pi / max(inputs.n_lines, 1) * np.arange(inputs.n_lines)
     count = len(inputs.line_names)
-    for view in range(count)[int(term.free):]:
+    for view in range(count)[int(term.free) :]:
         for component, wave in (("cos", np.cos(angle)), ("sin", np.sin(angle))):
             values = np.zeros((count, inputs.n_lines))
             values[view] = wave
@@ -34,6 +34,12 @@ def located(found: Any, names: tuple[str, ...]) -> Located:
 
 
 BLOCK = Block(
-    "line_eccentricity", "rad", patterns, undetected=1e-9,
+    "line_eccentricity",
+    "rad",
+    patterns,
+    undetected=1e-9,
     sizes=(2e-6,),  # centred to 0.1 um at a radius of 50 mm
-    of_lines=True, located=located, cure="centre the circle of lines better")
+    of_lines=True,
+    located=located,
+    cure="centre the circle of lines better",
+)

@@ -18,7 +18,14 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
 
 
 BLOCK = Block(
-    "line_scale", "m/m", patterns, undetected=1e-6,
+    "line_scale",
+    "m/m",
+    patterns,
+    undetected=1e-6,
     sizes=(0.01,),  # as of the microscope for the marks
-    plausible=0.1, of_lines=True, of_offsets=True, shared=True,
-    cure="turn the plate differently in views in which marks and lines are read")
+    plausible=0.1,
+    of_lines=True,
+    of_offsets=True,
+    shared=True,
+    cure="turn the plate differently in views in which marks and lines are read",
+)

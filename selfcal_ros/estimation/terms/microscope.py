@@ -30,10 +30,19 @@ def located(found: object, names: tuple[str, ...]) -> Located:
 
 
 BLOCK = Block(
-    "microscope", "m/m", patterns, undetected=1e-6, nominal=1e-3,
+    "microscope",
+    "m/m",
+    patterns,
+    undetected=1e-6,
+    nominal=1e-3,
     # the pixel size is known to 1 %, the rotation of the camera to 10 mrad
     sizes=(0.01, 0.01, 0.002),
     parts=(("scale", ("scale",)), ("turn", ("turn",)), ("shear", ("stretch", "shear"))),
-    plausible=0.1, needs_visits=True, of_offsets=True, shared=True, located=located,
+    plausible=0.1,
+    needs_visits=True,
+    of_offsets=True,
+    shared=True,
+    located=located,
     change="check_stops",
-    cure="ask for check_stops in the plan, or align the microscope and leave the term out")
+    cure="ask for check_stops in the plan, or align the microscope and leave the term out",
+)

@@ -15,8 +15,12 @@ from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
 
-def of_each_placing(inputs: TermInputs, term: ModelTerm, forms: Sequence[np.ndarray],
-                    coefficients: Sequence[tuple[str, int, complex]]) -> Iterator[Pattern]:
+def of_each_placing(
+    inputs: TermInputs,
+    term: ModelTerm,
+    forms: Sequence[np.ndarray],
+    coefficients: Sequence[tuple[str, int, complex]],
+) -> Iterator[Pattern]:
     """Yield patterns that are the same at all visits of a mark.
 
     Parameters
@@ -28,7 +32,7 @@ def of_each_placing(inputs: TermInputs, term: ModelTerm, forms: Sequence[np.ndar
     coefficients : sequence of (str, int, complex)
         Component, number of its form, factor.
     """
-    for first, members in list(inputs.members.items())[1 if term.free else 0:]:
+    for first, members in list(inputs.members.items())[1 if term.free else 0 :]:
         here = {view: inputs.weight[view].reshape(-1) > 0 for view in members}
         of_form = [{view: form * read for view, read in here.items()} for form in forms]
         for component, number, factor in coefficients:
@@ -43,5 +47,10 @@ def against_first(found: Any, names: tuple[str, ...]) -> Located:
     for column, row in zip(found.columns, np.eye(len(found.columns)), strict=True):
         row -= [c.view == 0 and c.component == column.component for c in found.columns]
         if row.any():
-            yield {"view": names[column.view],
-                   "details": {"against": names[0], "part": column.component}}, row
+            yield (
+                {
+                    "view": names[column.view],
+                    "details": {"against": names[0], "part": column.component},
+                },
+                row,
+            )

@@ -70,8 +70,9 @@ class StagePlaces:
         s, t = self.views.from_corner
         return s[self.at], t[self.at]
 
-    def moved(self, field: np.ndarray, near: np.ndarray | None = None, *,
-              local: bool = False) -> np.ndarray:
+    def moved(
+        self, field: np.ndarray, near: np.ndarray | None = None, *, local: bool = False
+    ) -> np.ndarray:
         """Return the stage error where the stage stood less that at the site, (P,), m.
 
         Parameters
@@ -87,7 +88,8 @@ class StagePlaces:
         filled = _filled(field, self.known)
         at_site = self._at_nominal(filled)
         x, y = self._cells(filled, local=local).beyond(
-            *self._place(at_site if near is None else near))
+            *self._place(at_site if near is None else near)
+        )
         return x + 1j * y - at_site
 
     def _at_nominal(self, field: np.ndarray) -> np.ndarray:
@@ -113,8 +115,9 @@ class StagePlaces:
         out[self.at] = moved * self._phase(turn_rad)[self.at[0]]
         return out
 
-    def about(self, field: np.ndarray, near: np.ndarray,
-              turn_rad: np.ndarray) -> list[np.ndarray | float]:
+    def about(
+        self, field: np.ndarray, near: np.ndarray, turn_rad: np.ndarray
+    ) -> list[np.ndarray | float]:
         """Return the excess of the visits of each view over the mean of their mark, (V,), m.
 
         By the slopes of the stage error where the stage stood; arguments as in `moved`, `changes`.
@@ -174,8 +177,9 @@ def _along_both(field: np.ndarray, known: np.ndarray) -> np.ndarray:
     return field
 
 
-def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
-              known: np.ndarray) -> StagePlaces | None:
+def places_of(
+    measurements: Measurements, grid: GridData, ground: TermInputs, known: np.ndarray
+) -> StagePlaces | None:
     """Return where the stage stood; None where it stood at the sites, or no visit tells.
 
     Parameters
@@ -207,5 +211,6 @@ def places_of(measurements: Measurements, grid: GridData, ground: TermInputs,
     pitch_m = ground.half_width_m / views.unit * views.node_pitch
     if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
         return None
-    return StagePlaces(views, pitch_m, known, np.nonzero(located), away[located], tuple(marks),
-                       tuple(about))
+    return StagePlaces(
+        views, pitch_m, known, np.nonzero(located), away[located], tuple(marks), tuple(about)
+    )

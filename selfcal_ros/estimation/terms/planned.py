@@ -100,7 +100,8 @@ def planned_ground(artifact: Artifact, views: Sequence[View], assumed: Assumed) 
     rng = np.random.default_rng(1)
     x, y = assumed.error_m * np.random.default_rng([1, 1]).normal(size=(2, 2, *artifact.shape))
     stage, plate = assumed.error_rad * np.random.default_rng([1, 2]).normal(
-        size=(2, artifact.angular_count))
+        size=(2, artifact.angular_count)
+    )
     planned = planned_readings(artifact, views)
     lines = angular_data(planned)
     of_lines = dict(zip(lines.index, lines_of(lines).gather(stage) + plate, strict=True))
@@ -115,8 +116,12 @@ def planned_ground(artifact: Artifact, views: Sequence[View], assumed: Assumed) 
             view = replace(view, dtheta=of_lines[index] + lies[0])
         expected.append(view)
     readings = replace(planned, views=tuple(expected))
-    return ground_of(readings, grid_data(readings), artifact.grid_pitch_m * max(artifact.reach),
-                     drift_degree=assumed.drift_degree)
+    return ground_of(
+        readings,
+        grid_data(readings),
+        artifact.grid_pitch_m * max(artifact.reach),
+        drift_degree=assumed.drift_degree,
+    )
 
 
 def _placings(planned: Measurements) -> list[int]:
@@ -132,8 +137,15 @@ def _placings(planned: Measurements) -> list[int]:
     return [number[placing] for placing in placings]
 
 
-def _visits(artifact: Artifact, readings: ViewReadings, assumed: Assumed, rng: np.random.Generator,
-            *, lies: tuple[float, complex], errors: np.ndarray) -> GridVisits:
+def _visits(
+    artifact: Artifact,
+    readings: ViewReadings,
+    assumed: Assumed,
+    rng: np.random.Generator,
+    *,
+    lies: tuple[float, complex],
+    errors: np.ndarray,
+) -> GridVisits:
     """Return the visits of a view.
 
     Given rotation, rad, and position, m, of the plate, and the errors of stage and plate,
@@ -141,28 +153,46 @@ def _visits(artifact: Artifact, readings: ViewReadings, assumed: Assumed, rng: n
     """
     view, (turn, away) = readings.view, lies
     order = assumed.order or view.visit_order or DEFAULT_ORDER
-    found = visit_sequence(artifact, view, order=order, rng=rng) if parse_order(
-        order).name == "random" else _sequence(artifact, replace(view, name=""), order)
+    found = (
+        visit_sequence(artifact, view, order=order, rng=rng)
+        if parse_order(order).name == "random"
+        else _sequence(artifact, replace(view, name=""), order)
+    )
     n = len(found)
     sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
     aside = found.aside_m[0] + 1j * found.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
     phase = complex(view.pose.phase)
     mark = artifact.flat(found.m, found.n)
-    near = mark if artifact.marks else artifact.flat(*(
-        np.clip(at, *ends).astype(int)  # the nearest, off the lattice
-        for at, ends in zip(artifact.nearest(found.i, found.j), artifact.limits, strict=True)))
+    near = (
+        mark
+        if artifact.marks
+        else artifact.flat(
+            *(
+                np.clip(at, *ends).astype(int)  # the nearest, off the lattice
+                for at, ends in zip(
+                    artifact.nearest(found.i, found.j), artifact.limits, strict=True
+                )
+            )
+        )
+    )
     stage, plate = errors[0].ravel()[near], errors[1].ravel()[mark] * phase
     u, v = artifact.places(found.m, found.n)
     arm = (u + 1j * v) * artifact.grid_pitch_m * phase
-    offset = np.exp(-1j * turn) * (
-        np.expm1(1j * turn) * arm + away + plate - stage - stops - aside)
+    offset = np.exp(-1j * turn) * (np.expm1(1j * turn) * arm + away + plate - stage - stops - aside)
     # the sense of measurement does not matter: the stage's motion and its part of a reading
     # both change sign
     return GridVisits(
-        np.searchsorted(artifact.flat(readings.m, readings.n), mark), np.zeros(n), np.zeros(n),
-        found.count, np.rint(2 * found.time).astype(int), offset.real, offset.imag,
-        approach_signs((sites + aside).real), approach_signs((sites + aside).imag))
+        np.searchsorted(artifact.flat(readings.m, readings.n), mark),
+        np.zeros(n),
+        np.zeros(n),
+        found.count,
+        np.rint(2 * found.time).astype(int),
+        offset.real,
+        offset.imag,
+        approach_signs((sites + aside).real),
+        approach_signs((sites + aside).imag),
+    )
 
 
 @lru_cache(maxsize=256)
@@ -171,8 +201,9 @@ def _sequence(artifact: Artifact, view: View, order: str) -> VisitSequence:
     return visit_sequence(artifact, view, order=order)
 
 
-def planned_equations(plan: Plan, system: NormalEquations, terms: Iterable[ModelTerm],
-                      assumed: Assumed) -> TermEquations:
+def planned_equations(
+    plan: Plan, system: NormalEquations, terms: Iterable[ModelTerm], assumed: Assumed
+) -> TermEquations:
     """Return the equations of terms with the readings of a plan.
 
     Without terms of the lines rotations are those from the grid, as in `predict`: lines add little
@@ -186,8 +217,9 @@ def planned_equations(plan: Plan, system: NormalEquations, terms: Iterable[Model
     if len(columns.lines.at):
         ratio = (assumed.sigma_m / (assumed.sigma_rad * length)) ** 2  # method eq. 4.2
         inverse = system.inverse(ratio)
-    return equations_of_columns(system, columns, inverse, ratio=ratio, half_width_m=length,
-                                noise_m=assumed.sigma_m)
+    return equations_of_columns(
+        system, columns, inverse, ratio=ratio, half_width_m=length, noise_m=assumed.sigma_m
+    )
 
 
 def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:
@@ -203,25 +235,39 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
     sizes: dict[str, float] = {term.name: term.size for term in terms}
     known = every.columns
     rows = rows_of(known, terms)
-    columns = tuple(replace(column, size=sizes[column.term])
-                    for column, here in zip(known.columns, rows, strict=True) if here)
+    columns = tuple(
+        replace(column, size=sizes[column.term])
+        for column, here in zip(known.columns, rows, strict=True)
+        if here
+    )
     inner = known.within
     within = WithinMarks(inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof)
     part, of_lines = every.projected, rows[known.lines.at]
-    lines = LineColumns(np.cumsum(rows)[known.lines.at[of_lines]] - 1,
-                        known.lines.values[of_lines])
+    lines = LineColumns(np.cumsum(rows)[known.lines.at[of_lines]] - 1, known.lines.values[of_lines])
     return TermEquations(
-        every.system, TermColumns(columns, known.shapes.part(rows), within, known.at, lines),
-        ProjectedColumns(lambda: part.fields[:, rows], part.parameters[:, rows],
-                         part.gram[np.ix_(rows, rows)], part.turned[:, rows]),
-        every.noise_m, every.line_weight)
+        every.system,
+        TermColumns(columns, known.shapes.part(rows), within, known.at, lines),
+        ProjectedColumns(
+            lambda: part.fields[:, rows],
+            part.parameters[:, rows],
+            part.gram[np.ix_(rows, rows)],
+            part.turned[:, rows],
+        ),
+        every.noise_m,
+        every.line_weight,
+    )
 
 
 def rows_of(columns: TermColumns, terms: Iterable[ModelTerm]) -> np.ndarray:
     """Return the columns of the terms, bool (p,)."""
     free: dict[str, bool] = {term.name: term.free for term in terms}
-    return np.array([column.term in free and not (free[column.term] and _first(column))
-                     for column in columns.columns], dtype=bool)
+    return np.array(
+        [
+            column.term in free and not (free[column.term] and _first(column))
+            for column in columns.columns
+        ],
+        dtype=bool,
+    )
 
 
 def _first(column: Column) -> bool:

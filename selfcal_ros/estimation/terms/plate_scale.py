@@ -15,6 +15,14 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
     return of_each_placing(inputs, term, [form], [("scale", 0, 1)])
 
 
-BLOCK = Block("plate_scale", "m/m", patterns, undetected=1e-10, nominal=1e-6, of_plate=True,
-              part_of="plate_strain", located=against_first,
-              cure="add views that are turned and shifted")
+BLOCK = Block(
+    "plate_scale",
+    "m/m",
+    patterns,
+    undetected=1e-10,
+    nominal=1e-6,
+    of_plate=True,
+    part_of="plate_strain",
+    located=against_first,
+    cure="add views that are turned and shifted",
+)

@@ -14,8 +14,9 @@ from selfcal_ros.model.terms import ModelTerm
 
 FORMS = ("z^2", "|z|^2", "z*^2")
 
-COEFFICIENTS = [(f"{form} {axis}", number, unit) for number, form in enumerate(FORMS)
-                for axis, unit in AXES]
+COEFFICIENTS = [
+    (f"{form} {axis}", number, unit) for number, form in enumerate(FORMS) for axis, unit in AXES
+]
 
 
 def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
@@ -26,9 +27,14 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
 
 
 BLOCK = Block(
-    "plate_shape", "m", patterns, undetected=1e-12, nominal=10e-9,
+    "plate_shape",
+    "m",
+    patterns,
+    undetected=1e-12,
+    nominal=10e-9,
     sizes=(5e-9,),  # what handling does to fused silica 6 mm thick
     families=tuple((f"{form} x", f"{form} y") for form in FORMS),
     of_plate=True,
     located=against_first,
-    cure="add views shifted both ways along both axes, and one along a diagonal")
+    cure="add views shifted both ways along both axes, and one along a diagonal",
+)

@@ -16,12 +16,22 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
     """Yield the strain of each placing."""
     z = inputs.z.reshape(-1)
     return of_each_placing(
-        inputs, term, [z * inputs.half_width_m, z.conj() * inputs.half_width_m],
-        [("scale", 0, 1), ("stretch", 1, 1), ("shear", 1, 1j)])
+        inputs,
+        term,
+        [z * inputs.half_width_m, z.conj() * inputs.half_width_m],
+        [("scale", 0, 1), ("stretch", 1, 1), ("shear", 1, 1j)],
+    )
 
 
 BLOCK = Block(
-    "plate_strain", "m/m", patterns, undetected=1e-10, nominal=1e-6,
+    "plate_strain",
+    "m/m",
+    patterns,
+    undetected=1e-10,
+    nominal=1e-6,
     # a plate of fused silica: 5e-8 by clamping, and as much again by 0.1 K
-    sizes=(7e-8,), of_plate=True, located=against_first,
-    cure="add views shifted both ways along both axes")
+    sizes=(7e-8,),
+    of_plate=True,
+    located=against_first,
+    cure="add views shifted both ways along both axes",
+)

@@ -13,7 +13,7 @@ from selfcal_ros.model.terms import ModelTerm
 
 def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
     """Yield the turn of each view of marks and lines; free ones are relative to the first."""
-    for view in inputs.with_lines[int(term.free):]:
+    for view in inputs.with_lines[int(term.free) :]:
         values = np.zeros((len(inputs.line_names), inputs.n_lines))
         values[view] = 1.0
         yield Pattern((("turn", 1),), view=view, lines=values)
@@ -25,8 +25,12 @@ def located(found: Any, names: tuple[str, ...]) -> Located:
     apart = []
     for at in range(n):
         others = [unit[at] - unit[other] for other in range(n) if other != at]
-        apart.append(min((abs(found.values @ weights) / _u(found, weights) for weights in others),
-                         default=0.0))
+        apart.append(
+            min(
+                (abs(found.values @ weights) / _u(found, weights) for weights in others),
+                default=0.0,
+            )
+        )
     at = int(np.argmax(apart))
     weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
     # u is that of the difference from the nearest
@@ -40,6 +44,13 @@ def _u(found: Any, weights: np.ndarray) -> float:
 
 
 BLOCK = Block(
-    "rotation", "rad", patterns, undetected=1e-10,
+    "rotation",
+    "rad",
+    patterns,
+    undetected=1e-10,
     sizes=(1e-7,),  # 5 nm at a radius of 50 mm
-    of_lines=True, between=True, located=located, cure="read lines in more views with marks")
+    of_lines=True,
+    between=True,
+    located=located,
+    cure="read lines in more views with marks",
+)

@@ -102,8 +102,9 @@ def squares_within(visits: Iterable[ViewVisits | None]) -> float:
     return total
 
 
-def time_ranges(views: Iterable[ViewReadings],
-                placings: Iterable[int]) -> dict[int, tuple[int, int]]:
+def time_ranges(
+    views: Iterable[ViewReadings], placings: Iterable[int]
+) -> dict[int, tuple[int, int]]:
     """Return the first and the last instant of each placing, ns, that has visits."""
     out: dict[int, tuple[int, int]] = {}
     for view, placing in zip(views, placings, strict=True):
@@ -114,8 +115,9 @@ def time_ranges(views: Iterable[ViewReadings],
     return out
 
 
-def _visits_of(view: ViewReadings, grid: GridData, row: int, ends: tuple[int, int] | None,
-               flat: np.ndarray) -> ViewVisits | None:
+def _visits_of(
+    view: ViewReadings, grid: GridData, row: int, ends: tuple[int, int] | None, flat: np.ndarray
+) -> ViewVisits | None:
     """Return the visits of a view whose marks have the indices `flat` (P,); None if unknown.
 
     `ends` are those of the time of the placing to which it belongs, see `TermInputs`.
@@ -128,9 +130,16 @@ def _visits_of(view: ViewReadings, grid: GridData, row: int, ends: tuple[int, in
     total = np.bincount(mark, own, grid.y[row].size)
     weight = own / total[mark] * grid.weight[row].reshape(-1)[mark]
     phase = grid.poses[row].phase.conjugate()
-    return ViewVisits(mark, weight, (visits.dx + 1j * visits.dy) * phase,
-                      view_time(visits.stamp_ns, *ends), visits.offset_x + 1j * visits.offset_y,
-                      visits.approach_x.astype(float), visits.approach_y.astype(float), phase)
+    return ViewVisits(
+        mark,
+        weight,
+        (visits.dx + 1j * visits.dy) * phase,
+        view_time(visits.stamp_ns, *ends),
+        visits.offset_x + 1j * visits.offset_y,
+        visits.approach_x.astype(float),
+        visits.approach_y.astype(float),
+        phase,
+    )
 
 
 def check_visits(measurements: Measurements) -> None:
@@ -140,20 +149,37 @@ def check_visits(measurements: Measurements) -> None:
         if visits is None or not len(visits.mark):
             continue
         where = f"view '{view.view.name}' visits of grid marks"
-        columns = (visits.dx, visits.dy, visits.count, visits.stamp_ns, visits.offset_x,
-                   visits.offset_y, visits.approach_x, visits.approach_y)
+        columns = (
+            visits.dx,
+            visits.dy,
+            visits.count,
+            visits.stamp_ns,
+            visits.offset_x,
+            visits.offset_y,
+            visits.approach_x,
+            visits.approach_y,
+        )
         if any(len(column) != len(visits.mark) for column in columns):
-            raise InputError(where, "marks, deviations, counts, stamps, offsets and approaches "
-                             "differ in length", "give one value per visit")
+            raise InputError(
+                where,
+                "marks, deviations, counts, stamps, offsets and approaches differ in length",
+                "give one value per visit",
+            )
         if visits.mark.min() < 0 or visits.mark.max() >= len(view.m):
-            raise InputError(where, "a visit belongs to none of the marks that were read",
-                             "number the marks as `m` and `n` have them")
+            raise InputError(
+                where,
+                "a visit belongs to none of the marks that were read",
+                "number the marks as `m` and `n` have them",
+            )
         if visits.count.min() < 1:
             raise InputError(where, "a count below 1", "leave out visits without a reading")
         for values in (visits.dx, visits.dy, visits.offset_x, visits.offset_y):
             if not (np.abs(values) < FARTHEST_M).all():
-                raise InputError(where, "a deviation or offset is not a finite number, or no "
-                                 "length of a stage", "remove the visit")
+                raise InputError(
+                    where,
+                    "a deviation or offset is not a finite number, or no length of a stage",
+                    "remove the visit",
+                )
 
 
 def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
@@ -271,17 +297,23 @@ class TermInputs:
         if self.stage is None:
             return []
         most = max(2, int(np.sqrt(MOST_VALUES / (len(self.names) * self.z.size))))
-        return [np.linspace(-half, half, min(sites, most, MOST_NODES)) for half, sites in zip(
-            self.stage.field_half_m, self.stage.shape, strict=True)]
+        return [
+            np.linspace(-half, half, min(sites, most, MOST_NODES))
+            for half, sites in zip(self.stage.field_half_m, self.stage.shape, strict=True)
+        ]
 
     def on_stage(self, view: int) -> np.ndarray:
         """Return the nominal places of all marks in a view, stage axes, complex (marks,), m."""
         pose = self.poses[view]
         return complex(*pose.shift_m) + pose.phase * self.z.reshape(-1) * self.half_width_m
 
-    def at_visits(self, values_of: Callable[[ViewVisits], np.ndarray],
-                  views: Iterable[int] | None = None, *, nominal: bool = False
-                  ) -> list[tuple[dict[int, np.ndarray], dict[int, np.ndarray]]]:
+    def at_visits(
+        self,
+        values_of: Callable[[ViewVisits], np.ndarray],
+        views: Iterable[int] | None = None,
+        *,
+        nominal: bool = False,
+    ) -> list[tuple[dict[int, np.ndarray], dict[int, np.ndarray]]]:
         """Return patterns that differ between the visits of a mark.
 
         Parameters
@@ -305,8 +337,13 @@ class TermInputs:
                 frame = visits.frame if nominal else 1.0
                 means[view] = visits.means(at[view] / frame, self.z.size)
         number = len(next(iter(at.values()), ()))
-        return [({view: mean[row] for view, mean in means.items()},
-                 {view: value[row] for view, value in at.items()}) for row in range(number)]
+        return [
+            (
+                {view: mean[row] for view, mean in means.items()},
+                {view: value[row] for view, value in at.items()},
+            )
+            for row in range(number)
+        ]
 
     @property
     def members(self) -> dict[int, list[int]]:
@@ -335,8 +372,13 @@ class TermInputs:
         return (*self.names_of(term), "")[view]
 
 
-def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *,
-              drift_degree: int = DRIFT_DEGREE) -> TermInputs:
+def ground_of(
+    measurements: Measurements,
+    grid: GridData,
+    half_width_m: float,
+    *,
+    drift_degree: int = DRIFT_DEGREE,
+) -> TermInputs:
     """Return the ground of a measurement whose grid readings are `grid`."""
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
@@ -345,17 +387,30 @@ def ground_of(measurements: Measurements, grid: GridData, half_width_m: float, *
     views = [view.view for view in readings]
     placings = placings_of(views)
     ranges = time_ranges(readings, placings)
-    visits = tuple(_visits_of(view, grid, row, ranges.get(placings[row]),
-                              measurements.artifact.flat(view.m, view.n))
-                   for row, view in enumerate(readings))
-    return TermInputs(z, half_width_m, grid.weight, visits, tuple(view.name for view in views),
-                      measurements.sense,
-                      tuple(view.view.name for view in lines), measurements.artifact.angular_count,
-                      _line_offsets_of(lines, measurements.artifact.angular_count),
-                      shared if len(shared) > 1 else (), placings,
-                      tuple(view.plan_view for view in views),
-                      np.array([view.cell_m for view in views]), measurements.artifact.field,
-                      drift_degree, tuple(view.pose for view in views))
+    visits = tuple(
+        _visits_of(
+            view, grid, row, ranges.get(placings[row]), measurements.artifact.flat(view.m, view.n)
+        )
+        for row, view in enumerate(readings)
+    )
+    return TermInputs(
+        z,
+        half_width_m,
+        grid.weight,
+        visits,
+        tuple(view.name for view in views),
+        measurements.sense,
+        tuple(view.view.name for view in lines),
+        measurements.artifact.angular_count,
+        _line_offsets_of(lines, measurements.artifact.angular_count),
+        shared if len(shared) > 1 else (),
+        placings,
+        tuple(view.plan_view for view in views),
+        np.array([view.cell_m for view in views]),
+        measurements.artifact.field,
+        drift_degree,
+        tuple(view.pose for view in views),
+    )
 
 
 def _line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
@@ -370,8 +425,9 @@ def _line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
     return out
 
 
-def without_noise(ground: TermInputs, residuals: np.ndarray,
-                  of_terms: Sequence[np.ndarray | float] = ()) -> TermInputs:
+def without_noise(
+    ground: TermInputs, residuals: np.ndarray, of_terms: Sequence[np.ndarray | float] = ()
+) -> TermInputs:
     """Return the ground with offsets from which the noise of the readings is taken off.
 
     The offset that a microscope saw holds the noise of its reading. As a column it would explain

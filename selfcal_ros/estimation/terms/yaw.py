@@ -22,10 +22,16 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
         return
     views = range(len(inputs.names))
     places = np.array([inputs.on_stage(view) for view in views])
-    along = [_hats(part, axis) for part, axis in zip(
-        (places.real, places.imag), inputs.node_axes_m, strict=True)]
-    phases = np.array([inputs.poses[view].phase.conjugate() if visits is None else visits.phase
-                       for view, visits in enumerate(inputs.visits)])
+    along = [
+        _hats(part, axis)
+        for part, axis in zip((places.real, places.imag), inputs.node_axes_m, strict=True)
+    ]
+    phases = np.array(
+        [
+            inputs.poses[view].phase.conjugate() if visits is None else visits.phase
+            for view, visits in enumerate(inputs.visits)
+        ]
+    )
     unit = -1j * phases[:, None] * (inputs.weight.reshape(places.shape) > 0)
     beside = unit * _beside_cells(inputs)
     turned = unit * inputs.cells_m[:, None] + beside
@@ -53,23 +59,28 @@ def _beside_cells(inputs: TermInputs) -> np.ndarray:
     for row, visits in enumerate(inputs.visits):
         if visits is not None:
             mean[row] = visits.offset.mean()
-            out[row, visits.mark] = visits.means(visits.offset[None], inputs.z.size)[
-                0, visits.mark]
+            out[row, visits.mark] = visits.means(visits.offset[None], inputs.z.size)[0, visits.mark]
     for members in inputs.members.values():
         axis = [row for row in members if not inputs.cells_m[row]]
-        out[members] += np.where(out[members], (mean[axis[0]] if axis else 0) - mean[
-            members, None], 0)
+        out[members] += np.where(
+            out[members], (mean[axis[0]] if axis else 0) - mean[members, None], 0
+        )
     return out
 
 
 def located(found: Any, names: tuple[str, ...]) -> Located:
     """Yield the size of every node's."""
-    return (({}, weights * np.sign(found.values))
-            for _, weights in by_coefficient(found, names))
+    return (({}, weights * np.sign(found.values)) for _, weights in by_coefficient(found, names))
 
 
 BLOCK = Block(
-    "yaw", "rad", patterns, undetected=1e-9,
+    "yaw",
+    "rad",
+    patterns,
+    undetected=1e-9,
     sizes=(1e-4,),  # 20", more than the yaw of almost any stage, so that images determine it
-    of_images=True, shared=True, located=located,
-    cure="let images show more marks, along x and along y")
+    of_images=True,
+    shared=True,
+    located=located,
+    cure="let images show more marks, along x and along y",
+)

@@ -61,8 +61,9 @@ class PlacedSlip:
     places: int
 
 
-def reading_columns(made: ColumnBuilder, residuals: np.ndarray,
-                    phases: np.ndarray) -> Iterator[tuple[range, int, tuple[int, int]]]:
+def reading_columns(
+    made: ColumnBuilder, residuals: np.ndarray, phases: np.ndarray
+) -> Iterator[tuple[range, int, tuple[int, int]]]:
     """Add the columns of the readings with the largest residuals.
 
     Two for each reading: its errors along x and y, stage axes, m. Yield their indices, the view,
@@ -112,8 +113,12 @@ def slip_columns(made: ColumnBuilder) -> Iterator[tuple[range, int, float]]:
                 yield add_slip(made, view, (after * visits.phase, after * at), visits), view, part
 
 
-def add_slip(made: ColumnBuilder, view: int, values: tuple[np.ndarray, np.ndarray],
-             visits: ViewVisits | None = None) -> range:
+def add_slip(
+    made: ColumnBuilder,
+    view: int,
+    values: tuple[np.ndarray, np.ndarray],
+    visits: ViewVisits | None = None,
+) -> range:
     """Add the columns of a slip, and return their indices.
 
     Offset along x and y, stage axes, m, and rotation, m at the half width.
@@ -131,8 +136,11 @@ def add_slip(made: ColumnBuilder, view: int, values: tuple[np.ndarray, np.ndarra
         The visits.
     """
     for one, parts in zip(values, (AXES, (("phi", 1j),)), strict=True):
-        shape = made.add({view: one}) if visits is None else made.add(
-            {view: visits.means(one[None], made.ground.z.size)[0]}, {view: one})
+        shape = (
+            made.add({view: one})
+            if visits is None
+            else made.add({view: visits.means(one[None], made.ground.z.size)[0]}, {view: one})
+        )
         for text, unit in parts:
             made.column(Column(SLIP, view, text, np.inf), shape, unit)
     return range(len(made.columns) - 3, len(made.columns))
@@ -215,15 +223,27 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     if p >= CAUSE_LEVEL:
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
-    cause = Cause(OFF_SITES, float(effect[worst]), float(noise[worst]), "m", p,
-                  details={"away": places.distance * places.pitch_m}, effect_rms=rms(effect),
-                  effect_max=float(effect[worst]))
-    return OffSites(cause, moved, bool(other.xy.residuals < SHOWN * before),
-                 rms(ratio[:, known]) < model.found.xy.k)
+    cause = Cause(
+        OFF_SITES,
+        float(effect[worst]),
+        float(noise[worst]),
+        "m",
+        p,
+        details={"away": places.distance * places.pitch_m},
+        effect_rms=rms(effect),
+        effect_max=float(effect[worst]),
+    )
+    return OffSites(
+        cause,
+        moved,
+        bool(other.xy.residuals < SHOWN * before),
+        rms(ratio[:, known]) < model.found.xy.k,
+    )
 
 
-def _missed(problem: Problem, places: StagePlaces, field: np.ndarray,
-            there: np.ndarray) -> np.ndarray:
+def _missed(
+    problem: Problem, places: StagePlaces, field: np.ndarray, there: np.ndarray
+) -> np.ndarray:
     """Return the part of a field at the positions of the stage that a solution omits, (P,), m.
 
     Parameters
@@ -241,8 +261,7 @@ def _missed(problem: Problem, places: StagePlaces, field: np.ndarray,
     return ROUGH * (places.moved(field, there, local=True) - smooth) if problem.moves else smooth
 
 
-def _noise(problem: Problem, places: StagePlaces, there: np.ndarray,
-           u: np.ndarray) -> np.ndarray:
+def _noise(problem: Problem, places: StagePlaces, there: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return the standard deviation of `_missed` at each site for noise u of the nodes, m.
 
     Both (2, nx, ny).
@@ -253,8 +272,9 @@ def _noise(problem: Problem, places: StagePlaces, there: np.ndarray,
         drawn = rng.normal(0, u)
         missed = _missed(problem, places, drawn[0] + 1j * drawn[1], there)
         total += [np.bincount(at, part**2, n_sites) for part in _parts(missed)]
-    return np.sqrt(total / (FEW_DRAWS * np.maximum(np.bincount(at, minlength=n_sites), 1))
-                   ).reshape(u.shape)
+    return np.sqrt(total / (FEW_DRAWS * np.maximum(np.bincount(at, minlength=n_sites), 1))).reshape(
+        u.shape
+    )
 
 
 def _parts(field: np.ndarray) -> np.ndarray:
@@ -336,8 +356,15 @@ class Candidates:
         right, gram = self._total[at], self.equations.projected.gram[square]
         values = inverse @ right
         between = sums.between + values @ (gram @ values - 2 * self.right.between[at])
-        return Explained(at, inverse, int(told.sum()), values, float(right @ values),
-                         float(between), sums.dof_between - float((inverse * gram).sum()))
+        return Explained(
+            at,
+            inverse,
+            int(told.sum()),
+            values,
+            float(right @ values),
+            float(between),
+            sums.dof_between - float((inverse * gram).sum()),
+        )
 
     @cached_property
     def _scaled(self) -> np.ndarray:
@@ -357,8 +384,7 @@ class Candidates:
     def everything(self) -> tuple[float, float]:
         """Sum of squares of all residuals, m^2, and its degrees of freedom, without any column."""
         sums = self.right.sums
-        return (sums.total, sums.dof) if sums.dof_within >= 1 else (sums.between,
-                                                                   sums.dof_between)
+        return (sums.total, sums.dof) if sums.dof_within >= 1 else (sums.between, sums.dof_between)
 
     def noise(self, fitted: Explained) -> tuple[float, float]:
         """Return the remaining variance of one reading, m^2, and its degrees of freedom.
@@ -426,9 +452,13 @@ class Explanation:
         moved = equations.maps @ coefficients
         turned = np.where(system.known_lines, -(equations.turned @ coefficients), 0.0)
         known, lines = (max(int(at.sum()), 1) for at in (system.known_sites, system.known_lines))
-        return replace(self, moved=moved, turned=turned,
-                       effect_m=float(np.sqrt((abs(moved) ** 2).sum() / (2 * known))),
-                       effect_rad=float(np.sqrt((turned**2).sum() / lines)))
+        return replace(
+            self,
+            moved=moved,
+            turned=turned,
+            effect_m=float(np.sqrt((abs(moved) ** 2).sum() / (2 * known))),
+            effect_rad=float(np.sqrt((turned**2).sum() / lines)),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,8 +473,9 @@ class Group:
     mark: tuple[int, int] | None = None
 
 
-def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
-                      placed: PlacedSlip | None = None) -> list[Explanation]:
+def find_explanations(
+    model: ModelFit, *, slips: bool, readings: bool = True, placed: PlacedSlip | None = None
+) -> list[Explanation]:
     """Return the significant explanations of the residuals of a fit, the most likely first.
 
     Parameters
@@ -457,43 +488,52 @@ def find_explanations(model: ModelFit, *, slips: bool, readings: bool = True,
         A slip that competes with the others.
     """
     problem = model.problem
-    known = () if model.equations is None else model.equations.columns.at_visits(
-        model.coefficients)
+    known = () if model.equations is None else model.equations.columns.at_visits(model.coefficients)
     ground = without_noise(problem.ground, model.found.residuals, known)
     own = [term.name for term in problem.terms]
     told = all(visits is not None for visits in ground.visits)
-    more = [ModelTerm(block.name) for block in blocks().values()
-            if block.name not in own and (told or not block.needs_visits)]
+    more = [
+        ModelTerm(block.name)
+        for block in blocks().values()
+        if block.name not in own and (told or not block.needs_visits)
+    ]
     made, views = ColumnBuilder(ground), problem.system.grid.views
     made.add_terms((*problem.terms, *more))
     groups = list(_groups(made.columns, [term.name for term in more]))
     phases, every = views.phases.conj(), int(np.count_nonzero(ground.weight))
     if slips:
         steps = list(slip_columns(made))
-        groups += [Group(SLIP, np.array(rows), view, part, len(steps))
-                   for rows, view, part in steps]
+        groups += [
+            Group(SLIP, np.array(rows), view, part, len(steps)) for rows, view, part in steps
+        ]
     if readings:
-        groups += [Group(READING, np.array(rows), view, places=every, mark=views.mark_at(*place))
-                   for rows, view, place in reading_columns(made, model.found.residuals, phases)]
+        groups += [
+            Group(READING, np.array(rows), view, places=every, mark=views.mark_at(*place))
+            for rows, view, place in reading_columns(made, model.found.residuals, phases)
+        ]
     if placed is not None:
         moved, turned = placed.after * phases[placed.view], placed.after * ground.z
         rows = add_slip(made, placed.view, (moved.reshape(-1), turned.reshape(-1)))
         groups.append(Group(SLIP, np.array(rows), placed.view, places=placed.places))
     columns = made.done()
-    groups = [replace(group, rows=np.isin(np.arange(len(columns.columns)), group.rows))
-              for group in groups]
+    groups = [
+        replace(group, rows=np.isin(np.arange(len(columns.columns)), group.rows))
+        for group in groups
+    ]
     equations = equations_of(problem, model.found, columns)
     taken = np.zeros(equations.n)
-    taken[:len(model.coefficients)] = model.coefficients
-    right = score(equations, model.found.both_residuals, squares(problem, model.found),
-                  coefficients=taken)
+    taken[: len(model.coefficients)] = model.coefficients
+    right = score(
+        equations, model.found.both_residuals, squares(problem, model.found), coefficients=taken
+    )
     # images determine the yaw: no other cause may gain from a size that is too small for it
     sized = columns.rows([name for name in own if not block_of(name).of_images])
     prior = np.where(sized, equations.prior(model.found.xy.sigma), 0.0)
     excess = noise_excess(problem, model.found.residuals)
     common = excess * model.found.xy.residuals**2 if problem.images else 0.0
-    return select_explanations(Candidates(equations, right, prior, taken, excess, common), groups,
-                               columns.rows(own))
+    return select_explanations(
+        Candidates(equations, right, prior, taken, excess, common), groups, columns.rows(own)
+    )
 
 
 def _groups(columns: Sequence[Column], names: Iterable[str]) -> Iterator[Group]:
@@ -502,8 +542,9 @@ def _groups(columns: Sequence[Column], names: Iterable[str]) -> Iterator[Group]:
     By their indices.
     """
     of_view = np.array([c.view for c in columns], dtype=int)
-    alone = np.array([c.term in blocks() and blocks()[c.term].alone(c.component)
-                      for c in columns], dtype=bool)
+    alone = np.array(
+        [c.term in blocks() and blocks()[c.term].alone(c.component) for c in columns], dtype=bool
+    )
     for name in names:
         whole = np.array([c.term == name for c in columns], dtype=bool)
         parts = [whole]
@@ -512,26 +553,36 @@ def _groups(columns: Sequence[Column], names: Iterable[str]) -> Iterator[Group]:
             parts.append(here)
             if (here & alone).any():
                 parts.append(here & alone)
-        yield from (Group(str(name), np.flatnonzero(rows), places=len(parts))
-                    for rows in parts if rows.any())
+        yield from (
+            Group(str(name), np.flatnonzero(rows), places=len(parts))
+            for rows in parts
+            if rows.any()
+        )
 
 
-def select_explanations(pool: Candidates, groups: list[Group],
-                        taken: np.ndarray) -> list[Explanation]:
+def select_explanations(
+    pool: Candidates, groups: list[Group], taken: np.ndarray
+) -> list[Explanation]:
     """Return the explanations, each tested together with `taken` and those before it."""
     found: list[Explanation] = []
     rank = 0
     while groups and len(found) < MAX_CAUSES:
         before = pool.explain(taken)
-        tests = [(_test(pool, before, pool.explain(taken | group.rows), group), group)
-                 for group in groups]
-        good = [(test, group) for test, group in tests
-                if test is not None and test[0] < CAUSE_LEVEL]
+        tests = [
+            (_test(pool, before, pool.explain(taken | group.rows), group), group)
+            for group in groups
+        ]
+        good = [
+            (test, group) for test, group in tests if test is not None and test[0] < CAUSE_LEVEL
+        ]
         if not good:
             break
         best = max(good, key=lambda item: item[0][1])[1]
-        as_good = [(test, group) for test, group in good
-                   if group is best or _replaces(pool, taken, group, best)]
+        as_good = [
+            (test, group)
+            for test, group in good
+            if group is best or _replaces(pool, taken, group, best)
+        ]
         # the best part of each term; what all views share is simpler than what each view has
         as_good.sort(key=lambda item: (not _is_shared(item[1].name), -item[0][1]))
         names: list[str] = []
@@ -541,9 +592,13 @@ def select_explanations(pool: Candidates, groups: list[Group],
                 found.append(replace(_explanation(pool, taken, group, p), rank=rank))
         rank += 1
         taken = taken | best.rows
-        groups = [g for g in groups if (g.rows & ~taken).any() and (
-            g.name == best.name or g.name not in names) and not (
-            best.name == SLIP == g.name and g.view == best.view)]
+        groups = [
+            g
+            for g in groups
+            if (g.rows & ~taken).any()
+            and (g.name == best.name or g.name not in names)
+            and not (best.name == SLIP == g.name and g.view == best.view)
+        ]
     return found
 
 
@@ -560,8 +615,9 @@ def _replaces(pool: Candidates, taken: np.ndarray, group: Group, best: Group) ->
     return more is None or more[0] >= CAUSE_LEVEL
 
 
-def _test(pool: Candidates, before: Explained, after: Explained,
-          group: Group) -> tuple[float, float] | None:
+def _test(
+    pool: Candidates, before: Explained, after: Explained, group: Group
+) -> tuple[float, float] | None:
     """Return probability and evidence of a group; None if the readings do not determine it.
 
     `before` is the fit without the group, `after` the one with it.
@@ -585,10 +641,17 @@ def _explanation(pool: Candidates, taken: np.ndarray, group: Group, p: float) ->
     own = np.zeros(len(group.rows))
     own[group.rows] = fitted.values[here]
     columns = tuple(compress(pool.equations.columns.columns, group.rows))
-    return Explanation(group.name, columns, fitted.values[here],
-                       variance * fitted.inverse[np.ix_(here, here)], p,
-                       pool.explain(group.rows).rank == int(group.rows.sum()), 0.0, group.part,
-                       group.mark).with_effect(pool.equations, own)
+    return Explanation(
+        group.name,
+        columns,
+        fitted.values[here],
+        variance * fitted.inverse[np.ix_(here, here)],
+        p,
+        pool.explain(group.rows).rank == int(group.rows.sum()),
+        0.0,
+        group.part,
+        group.mark,
+    ).with_effect(pool.equations, own)
 
 
 NOISY = 1.5
@@ -607,15 +670,30 @@ def cause_of(found: Explanation, ground: TermInputs) -> Cause:
         Of the fit: names of the views, unit of a slip's rotation.
     """
     names = ground.names_of(found.name)
-    options = list(_OTHERS[found.name](found, names, ground.half_width_m)
-                   if found.name in _OTHERS else block_of(found.name).located(found, names))
-    fields, value, u = max(((fields, *_linear(found, weights)) for fields, weights in options),
-                           key=lambda sized: abs(sized[1]) / max(sized[2], 1e-300))
+    options = list(
+        _OTHERS[found.name](found, names, ground.half_width_m)
+        if found.name in _OTHERS
+        else block_of(found.name).located(found, names)
+    )
+    fields, value, u = max(
+        ((fields, *_linear(found, weights)) for fields, weights in options),
+        key=lambda sized: abs(sized[1]) / max(sized[2], 1e-300),
+    )
     unit = blocks()[found.name].unit if found.name in blocks() else "m"
     largest = 0.0 if found.moved is None else float(np.abs(found.moved).max(initial=0.0))
-    return Cause(**{"name": found.name, "size": value, "u": u, "unit": unit, "p": found.p,
-                    "effect_rms": found.effect_m, "effect_max": largest, "told": found.whole,
-                    **fields})
+    return Cause(
+        **{
+            "name": found.name,
+            "size": value,
+            "u": u,
+            "unit": unit,
+            "p": found.p,
+            "effect_rms": found.effect_m,
+            "effect_max": largest,
+            "told": found.whole,
+            **fields,
+        }
+    )
 
 
 def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = True) -> Explanation:
@@ -630,15 +708,22 @@ def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = Tru
     return found.with_effect(equations, np.where(rows, model.coefficients, 0.0))
 
 
-def scatter_of_views(measurements: Measurements,
-                     model: ModelFit | None = None) -> list[tuple[str, float, float]]:
+def scatter_of_views(
+    measurements: Measurements, model: ModelFit | None = None
+) -> list[tuple[str, float, float]]:
     """Return (name, noise of one reading, degrees of freedom) from the repeats of each grid view.
 
     If marks were visited again, from the visits after subtraction of the fitted terms.
     """
-    again = {} if model is None or model.equations is None else {
-        model.problem.grid.index[row]: (visits, rest)
-        for row, visits, rest in model.visits_about_means() if visits.repeated}
+    again = (
+        {}
+        if model is None or model.equations is None
+        else {
+            model.problem.grid.index[row]: (visits, rest)
+            for row, visits, rest in model.visits_about_means()
+            if visits.repeated
+        }
+    )
     out = []
     for index, view in enumerate(measurements.views):
         sigma, dof = view.sigma_xy, float(view.dof_xy)
@@ -681,8 +766,10 @@ def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:
 def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Located:
     if found.mark is None:
         raise ValueError("a reading without its mark")
-    yield {"view": names[found.columns[0].view], "mark": found.mark}, (
-        found.values / np.hypot(*found.values))
+    yield (
+        {"view": names[found.columns[0].view], "mark": found.mark},
+        (found.values / np.hypot(*found.values)),
+    )
 
 
 def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Located:
@@ -691,23 +778,28 @@ def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Lo
     size = math.hypot(x, y)
     toward = np.zeros(3)
     toward[order["x"]], toward[order["y"]] = (x / size, y / size) if size else (1.0, 0.0)
-    yield {"view": names[found.columns[0].view],
-           "details": {"after": found.part, "x": x, "y": y, "phi": phi / half_width_m}}, toward
+    yield (
+        {
+            "view": names[found.columns[0].view],
+            "details": {"after": found.part, "x": x, "y": y, "phi": phi / half_width_m},
+        },
+        toward,
+    )
 
 
 _OTHERS: dict[str, Callable[..., Located]] = {SLIP: _slip, READING: _reading}
 """What is not a term: see `selfcal_ros.blocks.Block.located`."""
 
 
-def turned_too_far(model: ModelFit, result: CalibrationResult,
-                   measurements: Measurements) -> Cause | None:
+def turned_too_far(
+    model: ModelFit, result: CalibrationResult, measurements: Measurements
+) -> Cause | None:
     """Return a cause if lines rotate relative to marks by as much as the plate is rotated.
 
     A plate that moved does not explain that: the offsets of lines have the wrong sign, or those of
     marks the wrong unit. None otherwise, or if the model has no such rotation.
     """
-    between = next((term.name for term in model.problem.terms
-                    if block_of(term.name).between), None)
+    between = next((term.name for term in model.problem.terms if block_of(term.name).between), None)
     if between is None:
         return None
     held = fitted_term(model, between)
@@ -716,8 +808,11 @@ def turned_too_far(model: ModelFit, result: CalibrationResult,
     apart, variance = abs(values[:, None] - values), np.diag(covariance)
     spread = variance[:, None] + variance - 2 * covariance
     of_u = apart / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
-    phi = [view.phi for view, readings in zip(result.views, measurements.views, strict=True)
-           if len(readings.m) and len(readings.k)]
+    phi = [
+        view.phi
+        for view, readings in zip(result.views, measurements.views, strict=True)
+        if len(readings.m) and len(readings.k)
+    ]
     if not apart[of_u > BEYOND].max(initial=0.0) > np.ptp(phi) / 2:
         return None
     p = math.erfc(float(of_u.max()) / math.sqrt(2))
@@ -752,5 +847,8 @@ def line_cause(model: ModelFit, measurements: Measurements) -> Cause | None:
     checked = lines.redundancy[v, k]
     u = lines.noise_without((v, k), least) / math.sqrt(lines.weight[v, k] * checked)
     view = measurements.views[problem.angular.index[v]].view.name
-    return Cause(READING, float(lines.residual[v, k] / checked), u, "rad", p, view,
-                 mark=(k,)) if p < CAUSE_LEVEL else None
+    return (
+        Cause(READING, float(lines.residual[v, k] / checked), u, "rad", p, view, mark=(k,))
+        if p < CAUSE_LEVEL
+        else None
+    )

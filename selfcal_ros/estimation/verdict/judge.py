@@ -70,8 +70,9 @@ FEW_OUTLIERS = 5
 
 
 @one_thread()
-def judged(solved: Solved, measurements: Measurements, options: Options, *,
-           advise: bool = True) -> Solved:
+def judged(
+    solved: Solved, measurements: Measurements, options: Options, *, advise: bool = True
+) -> Solved:
     """Return the solution that allows for causes, its result with its verdict as data.
 
     Parameters
@@ -87,9 +88,14 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     checked = checked_by(solved, measurements, options, failed=bool(noises))
     own, failed = checked is solved, []
     if not own and checked.model is not None and checked.model.problem.rigid:
-        failed.append(Finding(
-            "finite_rotation", max(abs(view.phi) for view in checked.result.views), unit="rad",
-            details={"residuals": checked.xy.residuals}))
+        failed.append(
+            Finding(
+                "finite_rotation",
+                max(abs(view.phi) for view in checked.result.views),
+                unit="rad",
+                details={"residuals": checked.xy.residuals},
+            )
+        )
     p, size_rad = checked.axes
     if not p >= USUAL_LEVEL:
         failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
@@ -99,8 +105,12 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     failed += _lines_sign_findings(checked, measurements, options)
     searched = search_causes(checked, measurements, options, failed=bool(noises), advise=advise)
     zero = {str(term.name) for term in options.terms if term.size == 0}
-    causes = tuple(replace(cause, details={**cause.details, "declared": 0.0})
-                   if str(cause.name) in zero else cause for cause in searched.causes)
+    causes = tuple(
+        replace(cause, details={**cause.details, "declared": 0.0})
+        if str(cause.name) in zero
+        else cause
+        for cause in searched.causes
+    )
     if own:
         solved = searched.solved
         noises = _noise_findings(solved)
@@ -109,21 +119,44 @@ def judged(solved: Solved, measurements: Measurements, options: Options, *,
     effects = [*searched.effects, *_beyond_repeats(solved)]
     result = with_coverage(enlarged(result, [*effects, *untold_effects(solved, options)]))
     bounded = searched.bounded and (own or not causes) and not _unexplained_noise(solved)
-    grade = (Grade.GOOD if not (failed or noises or causes) else
-             Grade.ENLARGED if bounded and not failed and result.has_uncertainty else
-             Grade.NOT_QUALIFIED)
-    shown = [*((cause.name, cause.unit) for cause in causes),
-             *((LACK_OF_FIT, noise.unit) for noise in noises)]  # else a line of the budget alone
-    verdict = Verdict(grade, (*failed, *noises), causes, enlargements(result, searched.terms, [
-        effect for effect in effects if effect.name not in (ROUGHNESS, LACK_OF_FIT)
-        or (effect.name, effect.unit) in shown]))
+    grade = (
+        Grade.GOOD
+        if not (failed or noises or causes)
+        else Grade.ENLARGED
+        if bounded and not failed and result.has_uncertainty
+        else Grade.NOT_QUALIFIED
+    )
+    shown = [
+        *((cause.name, cause.unit) for cause in causes),
+        *((LACK_OF_FIT, noise.unit) for noise in noises),
+    ]  # else a line of the budget alone
+    verdict = Verdict(
+        grade,
+        (*failed, *noises),
+        causes,
+        enlargements(
+            result,
+            searched.terms,
+            [
+                effect
+                for effect in effects
+                if effect.name not in (ROUGHNESS, LACK_OF_FIT)
+                or (effect.name, effect.unit) in shown
+            ],
+        ),
+    )
     untested = solved.model is not None and is_untested(solved.model.problem)
     result = replace(
-        result, verdict=verdict,
-        findings=(*result.findings,
-                  *_visits_findings(checked), *views_findings(measurements),
-                  *[Finding("roughness_untested")] * untested),
-        provenance=provenance_of(measurements, options))
+        result,
+        verdict=verdict,
+        findings=(
+            *result.findings,
+            *_visits_findings(checked),
+            *views_findings(measurements),
+            *[Finding("roughness_untested")] * untested,
+        ),
+        provenance=provenance_of(measurements, options),
+    )
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result))))
 
 
@@ -144,8 +177,9 @@ def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
         yield Effect(LACK_OF_FIT, np.stack([each, each]), np.zeros(len(emap.g_theta)))
     size_rad = _lack_of_fit(solved.theta, system.angular.weight, found.residuals_theta)
     if size_rad:
-        yield Effect(LACK_OF_FIT, np.zeros((2, *shape)),
-                     np.where(np.isfinite(emap.g_theta), size_rad, 0.0))
+        yield Effect(
+            LACK_OF_FIT, np.zeros((2, *shape)), np.where(np.isfinite(emap.g_theta), size_rad, 0.0)
+        )
 
 
 def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray) -> float:
@@ -166,8 +200,13 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
     squares = (each * residuals.reshape(each.shape) ** 2).sum(axis=1)
     share = (each > 0).sum(axis=1) / (each > 0).sum()
     dof = noise.dof_residuals * share
-    largest = noise.residuals**2 * squares / squares.sum() * noise.dof_residuals / chdtri(
-        dof, 1 - DOUBT_LEVEL)
+    largest = (
+        noise.residuals**2
+        * squares
+        / squares.sum()
+        * noise.dof_residuals
+        / chdtri(dof, 1 - DOUBT_LEVEL)
+    )
     return float(np.sqrt(max(largest.max() - noise.known**2, 0.0) / each[each > 0].mean()))
 
 
@@ -175,11 +214,13 @@ def _unexplained_noise(solved: Solved) -> bool:
     """Return whether the noise is not known, or residuals are larger than U covers."""
     return not np.isfinite(solved.xy.sigma) or any(
         noise.contradicted and noise.residuals > NOISY * noise.known
-        for noise in (solved.xy, solved.theta))
+        for noise in (solved.xy, solved.theta)
+    )
 
 
-def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
-               failed: bool) -> Solved:
+def checked_by(
+    solved: Solved, measurements: Measurements, options: Options, *, failed: bool
+) -> Solved:
     """Return the solution in which causes are searched for: joint, and rigid if that fits better.
 
     A solution by other steps has no residuals of all readings, and a linear model mistakes
@@ -191,16 +232,18 @@ def checked_by(solved: Solved, measurements: Measurements, options: Options, *,
     if options.causes is False or not wanted or options.misalignment_model != "linear":
         return solved
     try:
-        linear = solved if solved.model is not None else solve_joint(
-            measurements, replace(options, at_places=False))
+        linear = (
+            solved
+            if solved.model is not None
+            else solve_joint(measurements, replace(options, at_places=False))
+        )
         rigid = solve_joint(measurements, replace(options, misalignment_model="rigid"))
     except InputError:
         return solved
     return rigid if SAME * rigid.xy.residuals < linear.xy.residuals else linear
 
 
-def _sign_findings(solved: Solved, measurements: Measurements,
-                   options: Options) -> list[Finding]:
+def _sign_findings(solved: Solved, measurements: Measurements, options: Options) -> list[Finding]:
     """Return a finding if nothing shows the sign of the offsets, or lines alone do.
 
     Repeats show it, or the joint fit does (through where the stage stood beside its targets,
@@ -215,8 +258,9 @@ def _sign_findings(solved: Solved, measurements: Measurements,
         return []
     equations = model.equations
     rows = equations.columns.having(lambda block: block.of_microscope)
-    scale = [at for at in np.flatnonzero(rows)
-             if equations.columns.columns[at].component == "scale"]
+    scale = [
+        at for at in np.flatnonzero(rows) if equations.columns.columns[at].component == "scale"
+    ]
     if not scale or not np.isfinite(model.found.xy.sigma):
         return []
     lines = equations.columns.having(lambda block: block.of_offsets and block.of_lines)
@@ -248,8 +292,9 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
     """
     problem = replace(model.problem, terms=())  # with its noise: lines weigh the same for each k
     stood = np.zeros_like(model.y)
-    for row, (index, placed) in enumerate(zip(problem.grid.index, problem.ground.visits,
-                                              strict=True)):
+    for row, (index, placed) in enumerate(
+        zip(problem.grid.index, problem.ground.visits, strict=True)
+    ):
         visits = measurements.views[index].visits
         if visits is None or placed is None:
             continue
@@ -257,7 +302,8 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
         means = placed.means((beside * placed.phase)[None], stood[row].size)[0]
         stood[row] = means.reshape(stood[row].shape)
     with_it, halfway, without = (
-        squares(problem, fit(problem, model.y - k * stood))[0] for k in range(3))
+        squares(problem, fit(problem, model.y - k * stood))[0] for k in range(3)
+    )
     noise = max(model.found.xy.sigma, LEAST_NOISE_M)
     information = (with_it + without) / 2 - halfway
     if not information > noise**2:
@@ -269,11 +315,13 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
 def _is_declared(options: Options) -> bool:
     """Return whether the microscope is declared, and with it the signs of the offsets."""
     return not options.assumed or any(
-        term.block.of_microscope and not term.free for term in options.terms)
+        term.block.of_microscope and not term.free for term in options.terms
+    )
 
 
-def _lines_sign_findings(solved: Solved, measurements: Measurements,
-                         options: Options) -> list[Finding]:
+def _lines_sign_findings(
+    solved: Solved, measurements: Measurements, options: Options
+) -> list[Finding]:
     """Return a finding if nothing shows the sign of the lines' offsets.
 
     Their repeats show it, or the turns of the plate that marks and lines share: with the other
@@ -281,9 +329,13 @@ def _lines_sign_findings(solved: Solved, measurements: Measurements,
     microscope was declared.
     """
     model = solved.model
-    if (model is None or _is_declared(options) or options.datum_theta != ThetaDatum.ZERO_MEAN
-            or not np.isfinite(solved.xy.sigma)
-            or sign_of_lines_is_shown(measurements)):
+    if (
+        model is None
+        or _is_declared(options)
+        or options.datum_theta != ThetaDatum.ZERO_MEAN
+        or not np.isfinite(solved.xy.sigma)
+        or sign_of_lines_is_shown(measurements)
+    ):
         return []
     problem = replace(model.problem, terms=(), residuals_xy=None)
     angular, squared = problem.angular, []
@@ -299,26 +351,47 @@ def _lines_sign_findings(solved: Solved, measurements: Measurements,
     return [] if worse > -2 * np.log(SHOWN) else [Finding("lines_sign_not_shown")]
 
 
-def _scale_findings(solved: Solved, measurements: Measurements, options: Options,
-                    causes: Iterable[Cause]) -> list[Finding]:
+def _scale_findings(
+    solved: Solved, measurements: Measurements, options: Options, causes: Iterable[Cause]
+) -> list[Finding]:
     """Return a finding if repeats contradict a scale of the microscope that is not fitted.
 
     A fit uses offsets that are far larger than their noise. Of smaller ones, the noise of encoders
     reduces the scale and that of detections increases it: they give limits.
     """
-    term = next((term for term in options.model_terms(visits=True)
-                 if term.block.of_microscope), None)
+    term = next(
+        (term for term in options.model_terms(visits=True) if term.block.of_microscope), None
+    )
     u = 0.0 if term is None else term.size_of("scale")
-    fitted = [estimate for each in solved.result.model.terms
-              if term is not None and each.name == term.name for estimate in each.estimates
-              if estimate.component == "scale" and estimate.u < TOLD * u]
-    if np.isinf(u) or fitted or any(
-            cause.name in blocks() and blocks()[cause.name].of_microscope for cause in causes):
+    fitted = [
+        estimate
+        for each in solved.result.model.terms
+        if term is not None and each.name == term.name
+        for estimate in each.estimates
+        if estimate.component == "scale" and estimate.u < TOLD * u
+    ]
+    if (
+        np.isinf(u)
+        or fitted
+        or any(cause.name in blocks() and blocks()[cause.name].of_microscope for cause in causes)
+    ):
         return []
     found = contradicted_scale(measurements, u)
-    return [] if found is None else [Finding(
-        "scale_of_offsets", -found.slope, found.u_slope, unit="m/m", p=found.p, axis=found.axis,
-        details={"most": found.most, "u_scale": u})]
+    return (
+        []
+        if found is None
+        else [
+            Finding(
+                "scale_of_offsets",
+                -found.slope,
+                found.u_slope,
+                unit="m/m",
+                p=found.p,
+                axis=found.axis,
+                details={"most": found.most, "u_scale": u},
+            )
+        ]
+    )
 
 
 def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
@@ -330,9 +403,17 @@ def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
 
 
 def _noise_findings(solved: Solved) -> list[Finding]:
-    out = [Finding("noise_contradicted", noise.residuals, unit=unit, p=noise.p, details={
-        "stated": noise.stated, "declared": bool(np.isfinite(noise.declared))})
-        for noise, unit in ((solved.xy, "m"), (solved.theta, "rad")) if noise.contradicted]
+    out = [
+        Finding(
+            "noise_contradicted",
+            noise.residuals,
+            unit=unit,
+            p=noise.p,
+            details={"stated": noise.stated, "declared": bool(np.isfinite(noise.declared))},
+        )
+        for noise, unit in ((solved.xy, "m"), (solved.theta, "rad"))
+        if noise.contradicted
+    ]
     return out if np.isfinite(solved.xy.sigma) else [*out, Finding("noise_unknown")]
 
 
@@ -372,21 +453,36 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
     for part in measurements.views:
         whole = replace(part.view, name=part.view.name.split(AFTER_SLIP)[0])
         parts.setdefault(whole.plan_view, []).append(part)
-    known = (any(len(part.m) for part in measurements.views),
-             any(len(part.k) for part in measurements.views))
+    known = (
+        any(len(part.m) for part in measurements.views),
+        any(len(part.k) for part in measurements.views),
+    )
     for name, of in parts.items():
         views = {part.view.cell: part.view for part in of}.values()
-        asked = (sum(int(view.on_stage(artifact).mark_rows(artifact)[1].sum())
-                     for view in views if view.grid),
-                 artifact.angular_count * any(view.angular for view in views))
+        asked = (
+            sum(
+                int(view.on_stage(artifact).mark_rows(artifact)[1].sum())
+                for view in views
+                if view.grid
+            ),
+            artifact.angular_count * any(view.angular for view in views),
+        )
         read = (sum(len(part.m) for part in of), sum(len(part.k) for part in of))
-        few = any(seen and got < DETERMINED * wanted
-                  for seen, got, wanted in zip(known, read, asked, strict=True))
+        few = any(
+            seen and got < DETERMINED * wanted
+            for seen, got, wanted in zip(known, read, asked, strict=True)
+        )
         if few or not any(read):
             rejected = sum((Counter(part.rejected) for part in of), Counter[str]())
-            yield Finding("view_left_out", view=name, details={
-                "read": list(read), "asked": list(asked),
-                "rejected": {str(reason): count for reason, count in rejected.most_common(3)}})
+            yield Finding(
+                "view_left_out",
+                view=name,
+                details={
+                    "read": list(read),
+                    "asked": list(asked),
+                    "rejected": {str(reason): count for reason, count in rejected.most_common(3)},
+                },
+            )
 
 
 FIRST_DATE_NS = 365 * 86_400 * NS_PER_S
@@ -401,9 +497,13 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     of a simulated clock, or of images whose times are not known.
     """
     first, last = time_ranges(measurements.views, [0] * len(measurements.views)).get(0, (0, 0))
-    extra: dict[str, Any] = {"visit_order": {
-        view.view.name: view.view.visit_order for view in measurements.views
-        if view.view.visit_order}}
+    extra: dict[str, Any] = {
+        "visit_order": {
+            view.view.name: view.view.visit_order
+            for view in measurements.views
+            if view.view.visit_order
+        }
+    }
     if options.terms_from:
         extra["model_terms_from"] = options.terms_from
     duration = float("nan")

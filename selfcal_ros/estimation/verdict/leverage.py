@@ -71,8 +71,9 @@ class Alone:
         skew = abs(self.skew)
         good = self.redundancy - skew > CHECKED
         both = np.where(good, self.redundancy**2 - skew**2, 1.0)
-        form = (self.redundancy * abs(self.residual) ** 2
-                + np.real(np.conj(self.skew) * self.residual**2))
+        form = self.redundancy * abs(self.residual) ** 2 + np.real(
+            np.conj(self.skew) * self.residual**2
+        )
         return np.where(good, form / both * self.weight, np.nan)
 
     def noise_without(self, at: tuple[int, ...], least: float = FLOOR) -> float:
@@ -96,21 +97,36 @@ class Alone:
 
 def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> Alone:
     """Return the grid readings y, complex (views, nx, ny), m, fitted by themselves."""
-    redundancy, skew = exact_leverage(system.grid, system.grid_inverse) if exact else (
-        drawn_redundancy(system), np.zeros(y.shape))
-    return Alone("grid", grid_residuals(system, y), system.grid.weight, redundancy,
-                 2 * system.grid.n_readings - system.rank_grid, skew)
+    redundancy, skew = (
+        exact_leverage(system.grid, system.grid_inverse)
+        if exact
+        else (drawn_redundancy(system), np.zeros(y.shape))
+    )
+    return Alone(
+        "grid",
+        grid_residuals(system, y),
+        system.grid.weight,
+        redundancy,
+        2 * system.grid.n_readings - system.rank_grid,
+        skew,
+    )
 
 
 def lines_alone(system: NormalEquations, y: np.ndarray) -> Alone:
     """Return the readings of lines y, (views, K), rad, fitted by themselves."""
-    return Alone("angular", angular_residuals(system, y), system.angular.weight,
-                 angular_redundancy(system), system.angular.n_readings - system.rank_angular,
-                 np.zeros(y.shape))
+    return Alone(
+        "angular",
+        angular_residuals(system, y),
+        system.angular.weight,
+        angular_redundancy(system),
+        system.angular.n_readings - system.rank_angular,
+        np.zeros(y.shape),
+    )
 
 
-def exact_leverage(part: GridSystem | AngularSystem,
-                   misaligned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def exact_leverage(
+    part: GridSystem | AngularSystem, misaligned: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return 1 - h and the skew of every reading of one kind, (views, *marks).
 
     `misaligned` is the covariance of the misalignments for unit noise of these readings alone.
@@ -129,8 +145,10 @@ def exact_leverage(part: GridSystem | AngularSystem,
     answer = np.tensordot(misaligned, basis, axes=1)
     spread = (np.conj(basis) * answer).real.sum(axis=0) / part.coordinates
     h = weight * (1 / np.where(total > 0, total, 1.0) + (variance + spread))
-    return (np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0),
-            weight * (basis * answer).sum(axis=0) / part.coordinates)
+    return (
+        np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0),
+        weight * (basis * answer).sum(axis=0) / part.coordinates,
+    )
 
 
 def drawn_redundancy(system: NormalEquations) -> np.ndarray:

@@ -78,8 +78,11 @@ class Adequacy:
         """
         emap = result.error_map
         if self.of_lines:
-            return Effect(NAME, np.zeros((2, *emap.gx.shape)), np.where(
-                np.isfinite(emap.g_theta), self.lack, 0.0))
+            return Effect(
+                NAME,
+                np.zeros((2, *emap.gx.shape)),
+                np.where(np.isfinite(emap.g_theta), self.lack, 0.0),
+            )
         sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
         local = turned_over(result.sense, self.local, sign=1)
         each = np.where(emap.valid, sign * np.maximum(self.lack, local), 0.0)
@@ -90,10 +93,19 @@ class Adequacy:
         """The cause `roughness`, if the map does not suffice."""
         if not self.p < F_LEVEL:
             return None
-        size: dict[str, Any] = {"harmonics": self.nodes[0]} if self.of_lines else {
-            "nodes": list(self.nodes)}
-        return Cause(NAME, self.lack, 0.0, "rad" if self.of_lines else "m", self.p,
-                     effect_rms=self.lack, effect_max=self.lack, details=size)
+        size: dict[str, Any] = (
+            {"harmonics": self.nodes[0]} if self.of_lines else {"nodes": list(self.nodes)}
+        )
+        return Cause(
+            NAME,
+            self.lack,
+            0.0,
+            "rad" if self.of_lines else "m",
+            self.p,
+            effect_rms=self.lack,
+            effect_max=self.lack,
+            details=size,
+        )
 
 
 def adequacy_of(model: ModelFit) -> Adequacy | None:
@@ -126,8 +138,7 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
         p = _improved(before, rest, more, dof)
         if p < 1.0:
             y = other.y if p < F_LEVEL else model.y  # the terms of a map that suffices
-            power = _Further.of(fine, coarse, y).power(
-                max(float(np.sqrt(rest / dof)), FLOOR))
+            power = _Further.of(fine, coarse, y).power(max(float(np.sqrt(rest / dof)), FLOOR))
         power = power + _of_terms(model, other) ** 2 * (p < F_LEVEL)
     if bilinear and before > readings * FLOOR**2:
         smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
@@ -191,9 +202,14 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
         return None
     (before, coarse_map), (rest, fine_map) = (_fitted_lines(one, y) for one in (coarse, fine))
     square = float(((fine_map - coarse_map) ** 2).mean()) - rest / dof * (
-        fine.mean_variance - coarse.mean_variance)
-    return Adequacy(_improved(before, rest, more, dof), float(np.sqrt(max(square, 0.0))), more,
-                    (coarse.harmonics,))
+        fine.mean_variance - coarse.mean_variance
+    )
+    return Adequacy(
+        _improved(before, rest, more, dof),
+        float(np.sqrt(max(square, 0.0))),
+        more,
+        (coarse.harmonics,),
+    )
 
 
 def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarray]:
@@ -284,11 +300,14 @@ class _Further:
         told, vectors = np.linalg.eigh(left @ beside)
         moved = (inside @ (answer @ beside) - beside) @ vectors
         scalar = np.asarray(spline.rows(at) @ np.hstack(np.split(moved, 2)))
-        field = scalar[:, :moved.shape[1]] + 1j * scalar[:, moved.shape[1]:]
+        field = scalar[:, : moved.shape[1]] + 1j * scalar[:, moved.shape[1] :]
         field = _datum_of(at).without(field)
         alone = right - normal @ inside @ (inverse @ (inside.T @ right))
-        return cls(np.maximum(told, 0.0), vectors.T @ (beside.T @ alone),
-                   np.concatenate([field.real, field.imag]))
+        return cls(
+            np.maximum(told, 0.0),
+            vectors.T @ (beside.T @ alone),
+            np.concatenate([field.real, field.imag]),
+        )
 
     def size(self, sigma_m: float) -> float:
         """Return the likeliest standard deviation of the coefficients, m (method eq. 12.6)."""
@@ -305,4 +324,4 @@ class _Further:
         if not size:
             return np.zeros(len(self.error))
         share = size**2 / (sigma_m**2 + size**2 * self.told)
-        return (self.error @ (share * self.right))**2 + self.error**2 @ (share * sigma_m**2)
+        return (self.error @ (share * self.right)) ** 2 + self.error**2 @ (share * sigma_m**2)

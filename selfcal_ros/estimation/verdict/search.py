@@ -77,8 +77,14 @@ class SearchResult:
     bounded: bool = True
 
 
-def search_causes(solved: Solved, measurements: Measurements, options: Options, *,
-              failed: bool, advise: bool = True) -> SearchResult:
+def search_causes(
+    solved: Solved,
+    measurements: Measurements,
+    options: Options,
+    *,
+    failed: bool,
+    advise: bool = True,
+) -> SearchResult:
     """Search the residuals for effects that are not in the model.
 
     Parameters
@@ -96,17 +102,26 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
     if options.causes is False or solved.model is None:
         return found
     sizes = [test for test in solved.model.sizes if test.contradicted]
-    place = None if measurements.artifact.map_grid else off_sites_cause(
-        solved.model, solved.result.error_map)
+    place = (
+        None
+        if measurements.artifact.map_grid
+        else off_sites_cause(solved.model, solved.result.error_map)
+    )
     failed = failed or bool(sizes or place)
     sites = solved.model.problem.system.grid.n_sites
     if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
         _search(found, measurements, options, failed=failed)
     solved, tests = found.solved, found.solved.joint.sizes
-    raised = {str(test.name): _raised_cause(solved, test) for test in tests
-              if (test.contradicted or not _is_plausible(test)) and test.name not in found.terms}
-    scales = _either_scale(solved, measurements, options) if any(
-        block_of(name).of_offsets for name, cause in raised.items() if cause) else {}
+    raised = {
+        str(test.name): _raised_cause(solved, test)
+        for test in tests
+        if (test.contradicted or not _is_plausible(test)) and test.name not in found.terms
+    }
+    scales = (
+        _either_scale(solved, measurements, options)
+        if any(block_of(name).of_offsets for name, cause in raised.items() if cause)
+        else {}
+    )
     raised = scales | {name: cause for name, cause in raised.items() if name not in scales}
     names = [name for name, cause in raised.items() if cause is not None]
     found.bounded &= not any(_beyond_u(solved, test) for test in tests)
@@ -126,25 +141,39 @@ def search_causes(solved: Solved, measurements: Measurements, options: Options, 
             found.causes.append(replace(cause, remedies=(Remedy("map", nodes),) if nodes else ()))
     if place is not None:
         found.causes.insert(0 if place.shown else len(found.causes), place.cause)
-        found.effects.append(effect_of_field(
-            place.cause.name, place.moved, measurements.sense,
-            np.zeros(measurements.artifact.angular_count)))
+        found.effects.append(
+            effect_of_field(
+                place.cause.name,
+                place.moved,
+                measurements.sense,
+                np.zeros(measurements.artifact.angular_count),
+            )
+        )
         found.bounded &= place.bounded
     found.solved, found.terms = _from_readings(solved, found.terms), [*names, *found.terms]
     found.bounded &= plausible
     if advise and found.causes:
         tried = found.terms and plausible and not alike
         model = _best_model(found, measurements, options) if tried else None
-        faulty = (*(name for name, block in blocks().items() if block.of_time), READING,
-                  *([turned.name] if turned else []))
+        faulty = (
+            *(name for name, block in blocks().items() if block.of_time),
+            READING,
+            *([turned.name] if turned else []),
+        )
         found.causes = [_advised(cause, model, found.terms, faulty) for cause in found.causes]
     return found
 
 
 def _better_map(measurements: Measurements, options: Options) -> str:
     """Return the first map (--map) with which nothing contradicts these readings; else empty."""
-    return next((text for text, readings in maps_to_try(measurements)
-                 if _uncontradicted(readings, options)), "")
+    return next(
+        (
+            text
+            for text, readings in maps_to_try(measurements)
+            if _uncontradicted(readings, options)
+        ),
+        "",
+    )
 
 
 def _uncontradicted(measurements: Measurements, options: Options) -> Solved | None:
@@ -156,8 +185,9 @@ def _uncontradicted(measurements: Measurements, options: Options) -> Solved | No
     return None if again.causes else solved
 
 
-def _advised(cause: Cause, model: str | None, terms: Collection[str],
-             faulty: Collection[str]) -> Cause:
+def _advised(
+    cause: Cause, model: str | None, terms: Collection[str], faulty: Collection[str]
+) -> Cause:
     """Return a cause with its remedies: a model that was tried, a view to measure again.
 
     Measuring again does not remove the causes `faulty`.
@@ -170,8 +200,7 @@ def _advised(cause: Cause, model: str | None, terms: Collection[str],
     return replace(cause, remedies=tuple(remedies))
 
 
-def _best_model(searched: SearchResult, measurements: Measurements,
-                options: Options) -> str | None:
+def _best_model(searched: SearchResult, measurements: Measurements, options: Options) -> str | None:
     """Return the model with which these readings give a good map; None if there is none.
 
     Its terms are free, or have the sizes that the readings allow: of the two models, if nothing
@@ -180,8 +209,7 @@ def _best_model(searched: SearchResult, measurements: Measurements,
     used = {term.name: term for term in searched.solved.joint.problem.terms}
     best, least = None, np.inf
     for free in (True, False):
-        terms = [ModelTerm(name) if free else used[name].rounded_up
-                 for name in searched.terms]
+        terms = [ModelTerm(name) if free else used[name].rounded_up for name in searched.terms]
         tried = replace(options, terms=merged(options.terms, terms))
         if (solved := _uncontradicted(measurements, tried)) is not None:
             emap = solved.result.error_map
@@ -222,8 +250,9 @@ def is_searched(sites: int, options: Options, *, failed: bool) -> bool:
     return failed or sites <= ALWAYS_SITES or bool(options.causes)
 
 
-def _search(found: SearchResult, measurements: Measurements, options: Options, *,
-            failed: bool) -> None:
+def _search(
+    found: SearchResult, measurements: Measurements, options: Options, *, failed: bool
+) -> None:
     """Add terms while the readings show any; then bound the effects of all other causes."""
     left: list[Explanation] = []
     for _ in range(MAX_CAUSES + 1):
@@ -237,9 +266,13 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
     if (line := line_cause(found.solved.joint, measurements)) is not None:
         found.causes.append(line)
         lines = measurements.artifact.angular_count  # the error of a reading at most
-        found.effects.append(Effect(
-            line.name, np.zeros((2, *measurements.artifact.field.shape)),
-            np.full(lines, abs(line.size) / np.sqrt(max(lines, 1)))))
+        found.effects.append(
+            Effect(
+                line.name,
+                np.zeros((2, *measurements.artifact.field.shape)),
+                np.full(lines, abs(line.size) / np.sqrt(max(lines, 1))),
+            )
+        )
     if not found.causes:
         _noisy_views(found, measurements)
 
@@ -247,11 +280,13 @@ def _search(found: SearchResult, measurements: Measurements, options: Options, *
 def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
     """Return explanations of the residuals of a solution, the most likely first."""
     model = solved.joint
-    found = [item for item in find_explanations(model, slips=False)
-             if failed or _counts(item, solved)]
+    found = [
+        item for item in find_explanations(model, slips=False) if failed or _counts(item, solved)
+    ]
     if found or failed:
-        found = [item for item in find_explanations(model, slips=True)
-                 if failed or _counts(item, solved)]
+        found = [
+            item for item in find_explanations(model, slips=True) if failed or _counts(item, solved)
+        ]
     if not found or (fine := finer(model)) is None:
         return found
     still = {item.name for item in find_explanations(fine, slips=True)}
@@ -266,12 +301,12 @@ def _counts(found: Explanation, solved: Solved) -> bool:
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
     if not np.isfinite(u).any():
         return True
-    return (found.effect_m > MATTERS * rms(u)
-            or found.effect_rad > MATTERS * rms(emap.u_g_theta))
+    return found.effect_m > MATTERS * rms(u) or found.effect_rad > MATTERS * rms(emap.u_g_theta)
 
 
-def solved_with(measurements: Measurements, options: Options,
-                terms: Collection[ModelTerm]) -> Solved | None:
+def solved_with(
+    measurements: Measurements, options: Options, terms: Collection[ModelTerm]
+) -> Solved | None:
     """Return the solution with further terms; None if there is none."""
     try:
         return solve_joint(measurements, replace(options, terms=merged(options.terms, terms)))
@@ -284,8 +319,9 @@ def _hardly(name: str) -> ModelTerm:
     return ModelTerm(name, block_of(name).undetected)
 
 
-def _join(found: SearchResult, first: list[Explanation], measurements: Measurements,
-          options: Options) -> bool:
+def _join(
+    found: SearchResult, first: list[Explanation], measurements: Measurements, options: Options
+) -> bool:
     """Add the first of equally good explanations to the model; the others enlarge u.
 
     Return whether it joined.
@@ -293,18 +329,19 @@ def _join(found: SearchResult, first: list[Explanation], measurements: Measureme
     ground = found.solved.joint.problem.ground
     names = [*found.terms, first[0].name]
     solved = solved_with(measurements, options, [_hardly(n) for n in names])
-    if solved is None or not any(test.name == first[0].name and test.contradicted
-                                 for test in solved.joint.sizes):
+    if solved is None or not any(
+        test.name == first[0].name and test.contradicted for test in solved.joint.sizes
+    ):
         return False
     for other in first[1:]:
-        twin = solved_with(measurements, options, [
-            _hardly(n) for n in (*found.terms, other.name)])
+        twin = solved_with(measurements, options, [_hardly(n) for n in (*found.terms, other.name)])
         if twin is not None:
             found.effects.append(difference(other.name, twin.result, solved.result))
     found.causes += [cause_of(item, ground) for item in first]
     found.solved, found.terms = solved, names
-    found.causes[-len(first)] = cause_of(fitted_term(
-        solved.joint, first[0].name, first[0].p, whole=first[0].whole), ground)
+    found.causes[-len(first)] = cause_of(
+        fitted_term(solved.joint, first[0].name, first[0].p, whole=first[0].whole), ground
+    )
     return True
 
 
@@ -327,17 +364,26 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     of = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
     # the part that no reading determines is in the uncertainty, as far as that is known
     little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
-    held = fitted_term(solved.joint, term.name, test.p,
-                   whole=little or test.rank == len(term.estimates))
+    held = fitted_term(
+        solved.joint, term.name, test.p, whole=little or test.rank == len(term.estimates)
+    )
     if not _counts(held, solved) and _is_plausible(test):
         return None
     block = block_of(test.name)
     if (block.between or block.shared) and abs(
-            (cause := cause_of(held, solved.joint.problem.ground)).size) > BEYOND * cause.u:
+        (cause := cause_of(held, solved.joint.problem.ground)).size
+    ) > BEYOND * cause.u:
         return cause  # otherwise the readings do not determine which view or part it is
     largest = max(term.estimates, key=lambda e: abs(e.value))
-    return Cause(str(test.name), abs(largest.value), largest.u, largest.unit, test.p,
-                 largest.view, details={"given": test.given})
+    return Cause(
+        str(test.name),
+        abs(largest.value),
+        largest.u,
+        largest.unit,
+        test.p,
+        largest.view,
+        details={"given": test.given},
+    )
 
 
 def _beyond_u(solved: Solved, test: SizeTest) -> bool:
@@ -347,8 +393,10 @@ def _beyond_u(solved: Solved, test: SizeTest) -> bool:
         return False
     emap = solved.result.error_map
     whole = {"m": rms(emap.u_xy), "rad": rms(emap.u_g_theta)}
-    return any(2 * part.u_rms**2 > whole[part.unit]**2
-               for part in enlargements(solved.result, [term.name], []))
+    return any(
+        2 * part.u_rms**2 > whole[part.unit] ** 2
+        for part in enlargements(solved.result, [term.name], [])
+    )
 
 
 def _as_a_microscope(found: SearchResult, measurements: Measurements, options: Options) -> bool:
@@ -356,15 +404,22 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
 
     If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
     """
-    known = next((term for term in options.model_terms(visits=True)
-                  if term.block.of_microscope and not term.free), None)
+    known = next(
+        (
+            term
+            for term in options.model_terms(visits=True)
+            if term.block.of_microscope and not term.free
+        ),
+        None,
+    )
     twin = _with_wide(known, measurements, options) if known else None
     if known is None or twin is None:
         return False
     held = fitted_term(twin.joint, known.name)
     effect = difference(str(known.name), twin.result, found.solved.result)
-    if not _counts(replace(held, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
-                   found.solved):
+    if not _counts(
+        replace(held, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)), found.solved
+    ):
         return False
     cause = cause_of(held, twin.joint.problem.ground)
     found.causes.append(cause)
@@ -411,8 +466,9 @@ def _with_wide(known: ModelTerm, measurements: Measurements, options: Options) -
     return None if contradicted else twin
 
 
-def _either_scale(solved: Solved, measurements: Measurements,
-                  options: Options) -> dict[str, Cause | None]:
+def _either_scale(
+    solved: Solved, measurements: Measurements, options: Options
+) -> dict[str, Cause | None]:
     """Return the scales of the offsets of marks and of lines as causes, each as the only one.
 
     Nothing if not each by itself explains what the readings show.

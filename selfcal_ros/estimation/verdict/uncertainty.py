@@ -91,46 +91,66 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
         return result
     emap, plate, kept = result.error_map, result.artifact_map, result.kept
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
-    of_plate = sum((np.mean(effect.xy**2) if effect.plate is None else effect.plate**2
-                    for effect in effects), np.zeros((2, *plate.ax.shape)))
+    of_plate = sum(
+        (np.mean(effect.xy**2) if effect.plate is None else effect.plate**2 for effect in effects),
+        np.zeros((2, *plate.ax.shape)),
+    )
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
     if emap.gx.size <= MAX_FULL and result.noise.sigma_xy > 0:
         before, sigma = factors_of(result), result.noise.sigma_xy
-        kept = replace(kept, factors=replace(
-            before, terms=(*before.terms, *(effect.name for effect in effects)),
-            of_map=np.concatenate([before.of_map, [
-                rounded(effect.xy / sigma) for effect in effects]]),
-            on_plate=rounded(of_plate / sigma**2)))
+        kept = replace(
+            kept,
+            factors=replace(
+                before,
+                terms=(*before.terms, *(effect.name for effect in effects)),
+                of_map=np.concatenate(
+                    [before.of_map, [rounded(effect.xy / sigma) for effect in effects]]
+                ),
+                on_plate=rounded(of_plate / sigma**2),
+            ),
+        )
     turned = dict(kept.angular)
     for effect in effects:
         if effect.theta.any():
             turned[effect.name] = np.hypot(turned.get(effect.name, 0.0), effect.theta)
     kept = replace(kept, angular=turned)
-    emap = replace(emap, u_gx=np.sqrt(emap.u_gx**2 + power[0]),
-                   u_gy=np.sqrt(emap.u_gy**2 + power[1]), u_g_theta=u_theta)
+    emap = replace(
+        emap,
+        u_gx=np.sqrt(emap.u_gx**2 + power[0]),
+        u_gy=np.sqrt(emap.u_gy**2 + power[1]),
+        u_g_theta=u_theta,
+    )
     if plate.u_ax.size:
-        plate = replace(plate, u_ax=np.sqrt(plate.u_ax**2 + of_plate[0]),
-                        u_ay=np.sqrt(plate.u_ay**2 + of_plate[1]))
+        plate = replace(
+            plate,
+            u_ax=np.sqrt(plate.u_ax**2 + of_plate[0]),
+            u_ay=np.sqrt(plate.u_ay**2 + of_plate[1]),
+        )
     return replace(result, error_map=emap, artifact_map=plate, kept=kept)
 
 
-def enlargements(result: CalibrationResult, names: Iterable[str],
-                 effects: Iterable[Effect]) -> tuple[Enlargement, ...]:
+def enlargements(
+    result: CalibrationResult, names: Iterable[str], effects: Iterable[Effect]
+) -> tuple[Enlargement, ...]:
     """Return the contributions of terms, by name, and effects to u, the largest first.
 
     To u of the XY map, or of the angular map (rad) if only that changes.
     """
     variance = variance_of_terms(result)
-    found = [Enlargement(name, float(np.sqrt(power.mean())), float(np.sqrt(power.max())))
-             for name in dict.fromkeys(names) if (power := variance.get(name)) is not None]
+    found = [
+        Enlargement(name, float(np.sqrt(power.mean())), float(np.sqrt(power.max())))
+        for name in dict.fromkeys(names)
+        if (power := variance.get(name)) is not None
+    ]
     for name in dict.fromkeys(names):
         if name in result.kept.angular:
             u = result.kept.angular[name]
             found.append(Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad"))
     for effect in effects:
         values = effect.xy if effect.unit == "m" else effect.theta
-        found.append(Enlargement(effect.name, rms(values), float(np.abs(values).max(initial=0)),
-                                 effect.unit))
+        found.append(
+            Enlargement(effect.name, rms(values), float(np.abs(values).max(initial=0)), effect.unit)
+        )
     return tuple(sorted(found, key=lambda item: -item.u_rms))
 
 
@@ -167,12 +187,15 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
     """
     noise, emap = result.noise, result.error_map
     terms = {term.name: term for term in result.model.terms}
-    of_lines = sum((u**2 for name, u in result.kept.angular.items() if _not_told(terms.get(name))),
-                   np.zeros(emap.u_g_theta.shape))
+    of_lines = sum(
+        (u**2 for name, u in result.kept.angular.items() if _not_told(terms.get(name))),
+        np.zeros(emap.u_g_theta.shape),
+    )
     changed: dict[str, float] = {}
     for kind, power, known in (
-            ("xy", emap.u_xy ** 2, known_beforehand(result)),
-            ("theta", emap.u_g_theta ** 2, of_lines)):
+        ("xy", emap.u_xy**2, known_beforehand(result)),
+        ("theta", emap.u_g_theta**2, of_lines),
+    ):
         dof, at = getattr(noise, f"dof_{kind}"), np.isfinite(power)
         if dof > 0 and known[at].any():
             whole = float(power[at].mean())
@@ -225,8 +248,12 @@ class Budget:
     @property
     def u_max(self) -> float:
         """Combined standard uncertainty at the worst node; anywhere, at most."""
-        return float(np.hypot(self.worst, sum(
-            line.effect_max for line in self.lines if line.component == INTERPOLATION)))
+        return float(
+            np.hypot(
+                self.worst,
+                sum(line.effect_max for line in self.lines if line.component == INTERPOLATION),
+            )
+        )
 
     @property
     def U_rms(self) -> float:
@@ -241,8 +268,12 @@ class Budget:
     @property
     def assumptions(self) -> tuple[BudgetLine, ...]:
         """Lines that matter of default terms that the readings do not determine."""
-        return tuple(line for line in self.lines if line.source == "default" and (
-            line.component.startswith(TERM) and line.effect_rms**2 > OWED * self.u_rms**2))
+        return tuple(
+            line
+            for line in self.lines
+            if line.source == "default"
+            and (line.component.startswith(TERM) and line.effect_rms**2 > OWED * self.u_rms**2)
+        )
 
     @property
     def U_max_if_larger(self) -> float:
@@ -264,11 +295,17 @@ def budgets(result: CalibrationResult) -> list[Budget]:
         anywhere = tuple(line for line in lines if line.quantity == quantity)
         nodes = tuple(line for line in anywhere if line.component != INTERPOLATION)
         at_nodes = sum(line.effect_rms**2 for line in nodes)
-        between = sum(line.effect_rms**2 for line in anywhere[len(nodes):])
+        between = sum(line.effect_rms**2 for line in anywhere[len(nodes) :])
         more = (1 + between / at_nodes) ** 2 if at_nodes > 0 else 1.0
         worst = float(np.max(u, initial=0.0, where=np.isfinite(u)))
-        found += [Budget(quantity, False, nodes, dof, worst),
-                  Budget(quantity, True, anywhere, dof * more, worst)] if nodes else []
+        found += (
+            [
+                Budget(quantity, False, nodes, dof, worst),
+                Budget(quantity, True, anywhere, dof * more, worst),
+            ]
+            if nodes
+            else []
+        )
     return found
 
 
@@ -280,7 +317,7 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
     emap, noise = result.error_map, result.noise
     if not result.has_uncertainty:
         return
-    power = emap.u_xy ** 2
+    power = emap.u_xy**2
     of_terms, of_reference = variance_of_terms(result), variance_of_reference(result)
     # the uncertainty of the map includes those of reference and terms, which have their own lines
     power = power - sum(of_terms.values()) - of_reference
@@ -308,18 +345,41 @@ def _or_infinite(dof: float) -> float:
 
 def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
     """Return the contribution of the noise of readings to a map."""
-    sigma, repeats, residuals, p = (getattr(noise, name) for name in (
-        f"sigma_{kind}", f"sigma_{kind}_repeats", f"sigma_{kind}_residuals", f"p_{kind}"))
+    sigma, repeats, residuals, p = (
+        getattr(noise, name)
+        for name in (
+            f"sigma_{kind}",
+            f"sigma_{kind}_repeats",
+            f"sigma_{kind}_residuals",
+            f"p_{kind}",
+        )
+    )
     unit = "m" if kind == "xy" else "rad"
     if not (np.isfinite(sigma) and sigma > 0):
         return BudgetLine(kind, "reading noise", "A", 0.0, 0.0, unit, 0.0, 0.0, np.inf, "readings")
     dof = _dof(noise, kind)
-    by = ("residuals" if sigma == residuals else "repeats" if sigma == repeats else
-          "declared" if sigma == getattr(noise, f"sigma_{kind}_declared") else "together")
+    by = (
+        "residuals"
+        if sigma == residuals
+        else "repeats"
+        if sigma == repeats
+        else "declared"
+        if sigma == getattr(noise, f"sigma_{kind}_declared")
+        else "together"
+    )
     return BudgetLine(
-        kind, "reading noise", "B" if by == "declared" else "A", 0.0, sigma, unit, rms(u),
-        float(np.nanmax(u)), dof, "declared" if by == "declared" else "readings",
-        {"by": by, "contradicted": bool(p < F_LEVEL)})
+        kind,
+        "reading noise",
+        "B" if by == "declared" else "A",
+        0.0,
+        sigma,
+        unit,
+        rms(u),
+        float(np.nanmax(u)),
+        dof,
+        "declared" if by == "declared" else "readings",
+        {"by": by, "contradicted": bool(p < F_LEVEL)},
+    )
 
 
 def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResult) -> BudgetLine:
@@ -333,29 +393,68 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
         cause = next((cause for cause in result.verdict.causes if cause.name == name), None)
         if cause is None and name in blocks():  # not determined by the readings
             block = block_of(name)
-            return BudgetLine(quantity, TERM + name, "B", np.nan, block.nominal, block.unit,
-                              *effect, np.inf, "default", {"given": block.nominal})
-        value, u_value, unit = (np.nan, np.nan, "m") if cause is None else (
-            cause.size, cause.u, cause.unit)
-        return BudgetLine(quantity, f"effect {name}", "B", value, u_value, unit, *effect, np.inf,
-                          "readings", {"cause": name})
+            return BudgetLine(
+                quantity,
+                TERM + name,
+                "B",
+                np.nan,
+                block.nominal,
+                block.unit,
+                *effect,
+                np.inf,
+                "default",
+                {"given": block.nominal},
+            )
+        value, u_value, unit = (
+            (np.nan, np.nan, "m") if cause is None else (cause.size, cause.u, cause.unit)
+        )
+        return BudgetLine(
+            quantity,
+            f"effect {name}",
+            "B",
+            value,
+            u_value,
+            unit,
+            *effect,
+            np.inf,
+            "readings",
+            {"cause": name},
+        )
     part = remaining_part(term)
     told = part < TOLD
     largest = max(term.estimates, key=lambda each: abs(np.nan_to_num(each.value)))
     return BudgetLine(
-        quantity, TERM + name, "A" if told else "B", largest.value, largest.u, largest.unit,
-        *effect, _dof(result.noise, quantity) if told else np.inf,
+        quantity,
+        TERM + name,
+        "A" if told else "B",
+        largest.value,
+        largest.u,
+        largest.unit,
+        *effect,
+        _dof(result.noise, quantity) if told else np.inf,
         "readings" if told or term.size_used else term.source,
-        {"given": term.size or term.solved_with, "allowed": term.size_used, "remaining": part})
+        {"given": term.size or term.solved_with, "allowed": term.size_used, "remaining": part},
+    )
 
 
 def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetLine:
     if reference is None:
-        return BudgetLine("xy", "reference length", "B", 0.0, 0.0, "m/m", 0.0, 0.0, np.inf,
-                          "default")
-    return BudgetLine("xy", "reference length", "B", reference.relative_error,
-                      reference.u_relative, "m/m", rms(u), float(u.max()), np.inf, "declared",
-                      {"kind": str(reference.kind)})
+        return BudgetLine(
+            "xy", "reference length", "B", 0.0, 0.0, "m/m", 0.0, 0.0, np.inf, "default"
+        )
+    return BudgetLine(
+        "xy",
+        "reference length",
+        "B",
+        reference.relative_error,
+        reference.u_relative,
+        "m/m",
+        rms(u),
+        float(u.max()),
+        np.inf,
+        "declared",
+        {"kind": str(reference.kind)},
+    )
 
 
 def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
@@ -366,10 +465,15 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     emap = result.error_map
     if result.plate.map_grid is not None:
         return _interpolation("xy", 0.0, 0.0)
-    found = [[error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0))
-              for axis in (0, 1)] for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))]
-    return _interpolation("xy", np.sqrt(np.mean([x[0]**2 + y[0]**2 for x, y in found])),
-                          max(np.hypot(x[1], y[1]) for x, y in found))
+    found = [
+        [error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0)) for axis in (0, 1)]
+        for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))
+    ]
+    return _interpolation(
+        "xy",
+        np.sqrt(np.mean([x[0] ** 2 + y[0] ** 2 for x, y in found])),
+        max(np.hypot(x[1], y[1]) for x, y in found),
+    )
 
 
 def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
@@ -381,5 +485,15 @@ def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
 
 def _interpolation(quantity: str, halfway: float, largest: float) -> BudgetLine:
     u = float(np.sqrt(CELL_MEAN) * halfway)
-    return BudgetLine(quantity, INTERPOLATION, "B", 0.0, u, "m" if quantity == "xy" else "rad",
-                      u, largest, np.inf, "readings")
+    return BudgetLine(
+        quantity,
+        INTERPOLATION,
+        "B",
+        0.0,
+        u,
+        "m" if quantity == "xy" else "rad",
+        u,
+        largest,
+        np.inf,
+        "readings",
+    )

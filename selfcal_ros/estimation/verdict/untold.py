@@ -50,13 +50,17 @@ def untold_effects(solved: Solved, options: Options) -> Iterator[Effect]:
         equations = equations_of(problem, found, columns)
         covariance = equations.inverse(found.xy.sigma)
         maps = MapsCovariance(
-            problem.system, found.inverse, options.reference, half_width_m=problem.half_width_m,
-            terms=spread_of(equations, covariance)).maps_of_terms()
+            problem.system,
+            found.inverse,
+            options.reference,
+            half_width_m=problem.half_width_m,
+            terms=spread_of(equations, covariance),
+        ).maps_of_terms()
         both = np.concatenate([part for values in maps for part in (values.real, values.imag)])
         root = found.xy.sigma * root_of(covariance, equations.rows([term.name]))
         moved, size, _ = np.linalg.svd(both @ root, full_matrices=False)
         added = (moved * size).T[size > NEGLIGIBLE * size.max(initial=0.0)]
-        if np.sqrt((added[:, :2 * emap.gx.size]**2).sum(axis=0).mean()) > least:
+        if np.sqrt((added[:, : 2 * emap.gx.size] ** 2).sum(axis=0).mean()) > least:
             for each in added:
                 yield _effect(str(term.name), each, solved)
 

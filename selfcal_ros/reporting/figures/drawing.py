@@ -16,26 +16,41 @@ SERIES = 6
 """Colours of series, ``c0`` to ``c5`` (Okabe and Ito); then they repeat."""
 
 _PLAIN = {
-    "ink": ("#16202a", "#e7ecf1"), "soft": ("#55606a", "#a3afba"), "paper": ("#ffffff", "#14191e"),
-    "line": ("#d5dbe1", "#36414b"), "card": ("#f5f7f9", "#1d242b"), "good": ("#00664b", "#4cc9a0"),
-    "bad": ("#a83a00", "#ff9a5c"), "warn": ("#b58900", "#e3b341"),
-    "none": ("#e3e3e3", "#2b3137"), "band": ("#56b4e9", "#2f7fb0"), "truth": ("#d55e00", "#ff8f3f"),
-    "c0": ("#0072b2", "#5ab4e8"), "c1": ("#d55e00", "#ff8f3f"), "c2": ("#008060", "#3fcf9f"),
-    "c3": ("#a0509a", "#e39ad0"), "c4": ("#7a6a00", "#e0cc55"), "c5": ("#404a54", "#b9c3cc")}
+    "ink": ("#16202a", "#e7ecf1"),
+    "soft": ("#55606a", "#a3afba"),
+    "paper": ("#ffffff", "#14191e"),
+    "line": ("#d5dbe1", "#36414b"),
+    "card": ("#f5f7f9", "#1d242b"),
+    "good": ("#00664b", "#4cc9a0"),
+    "bad": ("#a83a00", "#ff9a5c"),
+    "warn": ("#b58900", "#e3b341"),
+    "none": ("#e3e3e3", "#2b3137"),
+    "band": ("#56b4e9", "#2f7fb0"),
+    "truth": ("#d55e00", "#ff8f3f"),
+    "c0": ("#0072b2", "#5ab4e8"),
+    "c1": ("#d55e00", "#ff8f3f"),
+    "c2": ("#008060", "#3fcf9f"),
+    "c3": ("#a0509a", "#e39ad0"),
+    "c4": ("#7a6a00", "#e0cc55"),
+    "c5": ("#404a54", "#b9c3cc"),
+}
 _RAMPS = {
     "e": (("#ffffff", "#b5d3ea", "#4f93cc"), ("#171d23", "#22476a", "#2f74b0")),
     "v": (("#ffffff", "#c3b8de", "#7761ab"), ("#171d23", "#41346a", "#7058b0")),
-    "d": (("#2b6cb0", "#ffffff", "#c8601a"), ("#3f86d0", "#171d23", "#d06a20"))}
+    "d": (("#2b6cb0", "#ffffff", "#c8601a"), ("#3f86d0", "#171d23", "#d06a20")),
+}
 
 
 def _mixed(stops: tuple[str, ...], part: float) -> str:
     """Return the colour at `part` (0 to 1) of a gradient with evenly spaced stops."""
     place = part * (len(stops) - 1)
     index = min(int(place), len(stops) - 2)
-    low, high = (tuple(int(stops[i][at:at + 2], 16) for at in (1, 3, 5))
-                 for i in (index, index + 1))
-    return "#" + "".join(f"{round(a + (b - a) * (place - index)):02x}"
-                         for a, b in zip(low, high, strict=True))
+    low, high = (
+        tuple(int(stops[i][at : at + 2], 16) for at in (1, 3, 5)) for i in (index, index + 1)
+    )
+    return "#" + "".join(
+        f"{round(a + (b - a) * (place - index)):02x}" for a, b in zip(low, high, strict=True)
+    )
 
 
 def _all_colours() -> dict[str, tuple[str, str]]:
@@ -58,14 +73,18 @@ def _variables(column: int) -> str:
 
 def variables_css(root: str = ":root") -> str:
     """Return the rules that define all colours as CSS variables; print uses the light ones."""
-    return (f"{root} {{ color-scheme: light dark; {_variables(0)} }}\n"
-            f"@media screen and (prefers-color-scheme: dark) {{ {root} {{ {_variables(1)} }} }}\n")
+    return (
+        f"{root} {{ color-scheme: light dark; {_variables(0)} }}\n"
+        f"@media screen and (prefers-color-scheme: dark) {{ {root} {{ {_variables(1)} }} }}\n"
+    )
 
 
 def classes_css() -> str:
     """Return the classes of figures: ``f-NAME`` fills, ``s-NAME`` strokes."""
-    return "".join(f"svg.figure .f-{name}{{fill:var(--{name})}}"
-                   f"svg.figure .s-{name}{{stroke:var(--{name})}}\n" for name in COLOURS)
+    return "".join(
+        f"svg.figure .f-{name}{{fill:var(--{name})}}svg.figure .s-{name}{{stroke:var(--{name})}}\n"
+        for name in COLOURS
+    )
 
 
 Point = tuple[float, float]
@@ -147,42 +166,96 @@ class Drawing:
     height: float
     items: list[Item] = field(default_factory=list)
 
-    def line(self, points: Iterable[Point], *, stroke: str = "ink", width: float = 1.0,
-             dash: Sequence[float] = ()) -> None:
+    def line(
+        self,
+        points: Iterable[Point],
+        *,
+        stroke: str = "ink",
+        width: float = 1.0,
+        dash: Sequence[float] = (),
+    ) -> None:
         """Draw one line through points."""
         self.items.append(Path((tuple(points),), stroke=stroke, width=width, dash=tuple(dash)))
 
-    def lines(self, lines: Iterable[Iterable[Point]], *, stroke: str = "ink",
-              width: float = 1.0) -> None:
+    def lines(
+        self, lines: Iterable[Iterable[Point]], *, stroke: str = "ink", width: float = 1.0
+    ) -> None:
         """Draw many lines in one style."""
         together = tuple(tuple(line) for line in lines)
         if together:
             self.items.append(Path(together, stroke=stroke, width=width))
 
-    def shapes(self, outlines: Iterable[Iterable[Point]], *, fill: str, stroke: str = "",
-               opacity: float = 1.0) -> None:
+    def shapes(
+        self,
+        outlines: Iterable[Iterable[Point]],
+        *,
+        fill: str,
+        stroke: str = "",
+        opacity: float = 1.0,
+    ) -> None:
         """Fill outlines in one style."""
         together = tuple(tuple(outline) for outline in outlines)
         if together:
             self.items.append(Path(together, fill=fill, stroke=stroke, opacity=opacity))
 
-    def box(self, left: float, top: float, width: float, height: float, *, fill: str = "",
-            stroke: str = "") -> None:
+    def box(
+        self,
+        left: float,
+        top: float,
+        width: float,
+        height: float,
+        *,
+        fill: str = "",
+        stroke: str = "",
+    ) -> None:
         """Draw a rectangle."""
-        self.items.append(Path((((left, top), (left + width, top), (left + width, top + height),
-                                 (left, top + height), (left, top)),), fill=fill, stroke=stroke))
+        self.items.append(
+            Path(
+                (
+                    (
+                        (left, top),
+                        (left + width, top),
+                        (left + width, top + height),
+                        (left, top + height),
+                        (left, top),
+                    ),
+                ),
+                fill=fill,
+                stroke=stroke,
+            )
+        )
 
-    def discs(self, centres: Sequence[Point], radii: Sequence[Point] | float, *, fill: str = "",
-              stroke: str = "", opacity: float = 1.0) -> None:
+    def discs(
+        self,
+        centres: Sequence[Point],
+        radii: Sequence[Point] | float,
+        *,
+        fill: str = "",
+        stroke: str = "",
+        opacity: float = 1.0,
+    ) -> None:
         """Draw ellipses in one style; a single number is the radius of all."""
         if not len(centres):
             return
-        sizes = ((float(radii), float(radii)),) * len(centres) if isinstance(
-            radii, int | float) else tuple(radii)
+        sizes = (
+            ((float(radii), float(radii)),) * len(centres)
+            if isinstance(radii, int | float)
+            else tuple(radii)
+        )
         self.items.append(Discs(tuple(centres), sizes, fill, stroke, opacity))
 
-    def label(self, x: float, y: float, text: str, *, size: float = 12.0, anchor: str = "start",
-              colour: str = "ink", bold: bool = False, turned: bool = False) -> None:
+    def label(
+        self,
+        x: float,
+        y: float,
+        text: str,
+        *,
+        size: float = 12.0,
+        anchor: str = "start",
+        colour: str = "ink",
+        bold: bool = False,
+        turned: bool = False,
+    ) -> None:
         """Write text with its baseline at (x, y)."""
         self.items.append(Label((x, y), text, size, anchor, colour, bold, turned))
 
@@ -192,6 +265,7 @@ class Drawing:
 
     def add(self, other: "Drawing", x: float, y: float) -> None:
         """Put the items of another drawing with its upper left corner at (x, y)."""
+
         def moved(points: Iterable[Point]) -> tuple[Point, ...]:
             return tuple((across + x, down + y) for across, down in points)
 
@@ -237,8 +311,10 @@ class Frame:
         left, top, width, height = self.box
         along = (x - self.x[0]) / (self.x[1] - self.x[0])
         up = (y - self.y[0]) / (self.y[1] - self.y[0])
-        return (left + width * min(max(along, -10.0), 10.0),
-                top + height * (1 - min(max(up, -10.0), 10.0)))
+        return (
+            left + width * min(max(along, -10.0), 10.0),
+            top + height * (1 - min(max(up, -10.0), 10.0)),
+        )
 
     @property
     def per_x(self) -> float:
@@ -254,28 +330,44 @@ class Frame:
         """Draw the outline."""
         self.drawing.box(*self.box, stroke="soft")
 
-    def axes(self, *, x_label: str = "", y_label: str = "",
-             ticks: tuple[int, int] = (5, 5)) -> None:
+    def axes(
+        self, *, x_label: str = "", y_label: str = "", ticks: tuple[int, int] = (5, 5)
+    ) -> None:
         """Draw outline, numbered ticks, and labels of the axes."""
         left, top, width, height = self.box
         bottom = top + height
         for value, text in self._ticks(self.x, ticks[0]):
             x = self.at(value, self.y[0])[0]
             self.drawing.line([(x, bottom), (x, bottom + 4)], stroke="soft")
-            self.drawing.label(x, bottom + 6 + TICK, text, size=TICK, anchor="middle",
-                               colour="soft")
+            self.drawing.label(
+                x, bottom + 6 + TICK, text, size=TICK, anchor="middle", colour="soft"
+            )
         for value, text in self._ticks(self.y, ticks[1]):
             y = self.at(self.x[0], value)[1]
             self.drawing.line([(left - 4, y), (left, y)], stroke="soft")
-            self.drawing.label(left - 7, y + 0.35 * TICK, text, size=TICK, anchor="end",
-                               colour="soft")
+            self.drawing.label(
+                left - 7, y + 0.35 * TICK, text, size=TICK, anchor="end", colour="soft"
+            )
         self.border()
         if x_label:
-            self.drawing.label(left + width / 2, bottom + 2.4 * TICK + 8, x_label, size=TICK + 1,
-                               anchor="middle", colour="soft")
+            self.drawing.label(
+                left + width / 2,
+                bottom + 2.4 * TICK + 8,
+                x_label,
+                size=TICK + 1,
+                anchor="middle",
+                colour="soft",
+            )
         if y_label:
-            self.drawing.label(left - 40, top + height / 2, y_label, size=TICK + 1,
-                               anchor="middle", colour="soft", turned=True)
+            self.drawing.label(
+                left - 40,
+                top + height / 2,
+                y_label,
+                size=TICK + 1,
+                anchor="middle",
+                colour="soft",
+                turned=True,
+            )
 
     def _ticks(self, span: tuple[float, float], count: int) -> list[tuple[float, str]]:
         if not self.log:
@@ -294,8 +386,9 @@ def round_step(span: float, count: int) -> float:
         return 1.0
     rough = span / max(count, 1)
     power = 10.0 ** math.floor(math.log10(rough))
-    return next((step * power for step in (1, 2, 5) if step * power >= rough * (1 - 1e-9)),
-                10 * power)
+    return next(
+        (step * power for step in (1, 2, 5) if step * power >= rough * (1 - 1e-9)), 10 * power
+    )
 
 
 def round_down(value: float) -> float:

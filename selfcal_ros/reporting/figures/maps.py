@@ -44,8 +44,9 @@ SCALE_AT = math.radians(22.5)
 """Where the radial scale is labelled."""
 
 
-def map_picture(result: CalibrationResult,
-                truth: Mapping[str, np.ndarray] | None = None) -> draw.Drawing:
+def map_picture(
+    result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None
+) -> draw.Drawing:
     """Return the map as one picture: verdict, vectors, angular error and origin.
 
     Raises
@@ -60,8 +61,9 @@ def map_picture(result: CalibrationResult,
     return _side_by_side(pictures, state_sentence(result), _origin(result))
 
 
-def difference_picture(a: CalibrationResult, b: CalibrationResult,
-                       difference: Mapping[str, Any], verdict: str) -> draw.Drawing:
+def difference_picture(
+    a: CalibrationResult, b: CalibrationResult, difference: Mapping[str, Any], verdict: str
+) -> draw.Drawing:
     """Return two maps and their difference side by side, each at its own scale.
 
     Parameters
@@ -75,24 +77,40 @@ def difference_picture(a: CalibrationResult, b: CalibrationResult,
         Heading.
     """
     first, other = a.error_map, b.error_map
-    noise = replace(a.noise, k_xy=max(a.noise.k_xy, b.noise.k_xy),
-                    k_theta=max(a.noise.k_theta, b.noise.k_theta))
+    noise = replace(
+        a.noise, k_xy=max(a.noise.k_xy, b.noise.k_xy), k_theta=max(a.noise.k_theta, b.noise.k_theta)
+    )
     names = ("gx", "gy", "g_theta")
-    of_b = replace(b, error_map=replace(other, **{
-        name: getattr(first, name) + difference[name] for name in names}))
-    of_both = replace(a, noise=noise, error_map=replace(first, **difference, **{
-        f"u_{name}": np.hypot(*(getattr(emap, f"u_{name}") for emap in (first, other)))
-        for name in names}))
+    of_b = replace(
+        b,
+        error_map=replace(
+            other, **{name: getattr(first, name) + difference[name] for name in names}
+        ),
+    )
+    of_both = replace(
+        a,
+        noise=noise,
+        error_map=replace(
+            first,
+            **difference,
+            **{
+                f"u_{name}": np.hypot(*(getattr(emap, f"u_{name}") for emap in (first, other)))
+                for name in names
+            },
+        ),
+    )
     shown = [("A", a), ("B, in the datum of A", of_b), ("B − A", of_both)]
     pictures = [error_map(result, title=title) for title, result in shown]
     if np.isfinite(difference["g_theta"]).any():
-        pictures.append(angular_map(of_both, title="B − A in θ in arcsec, outwards = "
-                                    "counter-clockwise"))
+        pictures.append(
+            angular_map(of_both, title="B − A in θ in arcsec, outwards = counter-clockwise")
+        )
     return _side_by_side(pictures, verdict, f"A: {_origin(a)}", f"B: {_origin(b)}")
 
 
-def verification_picture(before: CalibrationResult, after: CalibrationResult,
-                         found: Verification, sentence: str) -> draw.Drawing:
+def verification_picture(
+    before: CalibrationResult, after: CalibrationResult, found: Verification, sentence: str
+) -> draw.Drawing:
     """Return the maps without and with the correction side by side, at one scale.
 
     Parameters
@@ -105,12 +123,17 @@ def verification_picture(before: CalibrationResult, after: CalibrationResult,
         Heading.
     """
     with_it = replace(after, error_map=replace(after.error_map, gx=found.gx, gy=found.gy))
-    largest = max(float(np.nanmax(np.hypot(each.error_map.gx, each.error_map.gy)))
-                  for each in (before, with_it))
-    pictures = [error_map(each, title=title, largest_m=largest) for title, each in (
-        ("Without the correction", before), ("With the correction", with_it))]
-    return _side_by_side(pictures, sentence, f"without: {_origin(before)}",
-                         f"with: {_origin(after)}")
+    largest = max(
+        float(np.nanmax(np.hypot(each.error_map.gx, each.error_map.gy)))
+        for each in (before, with_it)
+    )
+    pictures = [
+        error_map(each, title=title, largest_m=largest)
+        for title, each in (("Without the correction", before), ("With the correction", with_it))
+    ]
+    return _side_by_side(
+        pictures, sentence, f"without: {_origin(before)}", f"with: {_origin(after)}"
+    )
 
 
 def _side_by_side(pictures: list[draw.Drawing], heading: str, *foot: str) -> draw.Drawing:
@@ -132,15 +155,24 @@ def _side_by_side(pictures: list[draw.Drawing], heading: str, *foot: str) -> dra
 
 def _origin(result: CalibrationResult) -> str:
     source = os.path.basename(str(result.input.get("file", "")))
-    words = [f"plan {parts.shortened(result.plan_id, 60)}",
-             f"method {parts.shortened(result.method, 20)}",
-             f"θ datum {result.error_map.datum_theta}" if result.artifact.angular_count else "",
-             f"input {parts.shortened(source, 60)}" if source else "", f"selfcal {__version__}"]
+    words = [
+        f"plan {parts.shortened(result.plan_id, 60)}",
+        f"method {parts.shortened(result.method, 20)}",
+        f"θ datum {result.error_map.datum_theta}" if result.artifact.angular_count else "",
+        f"input {parts.shortened(source, 60)}" if source else "",
+        f"selfcal {__version__}",
+    ]
     return "  ·  ".join(word for word in words if word)
 
 
-def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
-              title: str = "", of: str = "stage", largest_m: float = 0.0) -> draw.Drawing:
+def error_map(
+    result: CalibrationResult,
+    truth: Mapping[str, np.ndarray] | None = None,
+    *,
+    title: str = "",
+    of: str = "stage",
+    largest_m: float = 0.0,
+) -> draw.Drawing:
     """Return the vectors of a map over their lengths in colour, with U around their heads.
 
     A known truth is drawn beneath. `of` is a key of `ERRORS`; the scales have room for an error
@@ -151,19 +183,24 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
     step = sites[0].step or 1
     length = np.hypot(emap.gx, emap.gy)
     U = emap.u_xy * k
-    factor = parts.enlargement(np.fmax(np.fmax(length, largest_m), U.max(axis=0)),
-                               step * artifact.grid_pitch_m)
+    factor = parts.enlargement(
+        np.fmax(np.fmax(length, largest_m), U.max(axis=0)), step * artifact.grid_pitch_m
+    )
 
     def shown(along: Iterable[np.ndarray], scale: float = 1.0) -> np.ndarray:
         return np.stack([part[sites].ravel() for part in along]) * scale
 
     at = shown((artifact.x_m, artifact.y_m), MM_PER_M)
     around = shown(U, factor * MM_PER_M)
-    fields = [shown(np.where(emap.valid, g[key], np.nan) for key in ("gx", "gy"))
-              for g in (vars(emap), truth) if g is not None]
+    fields = [
+        shown(np.where(emap.valid, g[key], np.nan) for key in ("gx", "gy"))
+        for g in (vars(emap), truth)
+        if g is not None
+    ]
     tips = [at + field * factor * MM_PER_M for field in fields]
-    drawing = parts.titled(f"{'error' if of == 'stage' else of}-map",
-                           title or f"Error of the {of}, {ERRORS[of]}")
+    drawing = parts.titled(
+        f"{'error' if of == 'stage' else of}-map", title or f"Error of the {of}, {ERRORS[of]}"
+    )
     frame = _frame(drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips])
     scale = parts.Scale("e", 0.0, parts.round_end(np.fmax(length, largest_m) * UM_PER_M))
     parts.cells(frame, artifact, length * UM_PER_M, scale)
@@ -180,8 +217,11 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
     _spots(frame, result, ERRORS[of][0])
     parts.arrow_key(frame, factor, (LEFT, top + height + 58))
     thin = "" if step == 1 else f", every {parts.ordinal(step)} site"
-    drawing.label(LEFT + 130, top + height + 62, f"vectors enlarged {factor:,.0f} ×{thin}"
-                  if emap.valid.any() else "no site is known")
+    drawing.label(
+        LEFT + 130,
+        top + height + 62,
+        f"vectors enlarged {factor:,.0f} ×{thin}" if emap.valid.any() else "no site is known",
+    )
     parts.legend(drawing, entries, (LEFT, top + height + 82))
     drawing.height = top + height + 92
     return drawing
@@ -190,9 +230,13 @@ def error_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None 
 def _frame(drawing: draw.Drawing, artifact: Artifact, ends_mm: list[np.ndarray]) -> draw.Frame:
     """Return a frame of the field and of points (2, P) up to four pitches outside of it."""
     pitch = artifact.grid_pitch_m * MM_PER_M
-    x, y = (min(max((half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch),
-                (half + 4) * pitch)
-            for half, ends in zip(artifact.reach, np.concatenate(ends_mm, axis=1), strict=True))
+    x, y = (
+        min(
+            max((half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch),
+            (half + 4) * pitch,
+        )
+        for half, ends in zip(artifact.reach, np.concatenate(ends_mm, axis=1), strict=True)
+    )
     return draw.Frame(drawing, (LEFT, TOP, SIDE, SIDE * y / x), (-x, x), (-y, y))
 
 
@@ -202,8 +246,12 @@ def _ellipses(frame: draw.Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
     radii = (u_mm * np.array([[frame.per_x], [frame.per_y]]))[:, known]
     if radii.max(initial=0.0) < 0.7:
         return False
-    frame.drawing.discs([frame.at(x, y) for x, y in tips_mm[:, known].T], list(map(tuple, radii.T)),
-                        fill="band", opacity=0.6)
+    frame.drawing.discs(
+        [frame.at(x, y) for x, y in tips_mm[:, known].T],
+        list(map(tuple, radii.T)),
+        fill="band",
+        opacity=0.6,
+    )
     return True
 
 
@@ -215,11 +263,20 @@ def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
     radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
     for index in np.ndindex(artifact.shape):
         x, y = (float(part[index]) * MM_PER_M for part in (artifact.x_m, artifact.y_m))
-        gx, gy, ux, uy = (significant(float(part[index]) * scale) for part, scale in (
-            (emap.gx, UM_PER_M), (emap.gy, UM_PER_M), (emap.u_gx, k * UM_PER_M),
-            (emap.u_gy, k * UM_PER_M)))
-        words = UNKNOWN if gx == UNKNOWN else (
-            f"{name}x {gx} ± {ux} µm, {name}y {gy} ± {uy} µm (k = {k:.3g})")
+        gx, gy, ux, uy = (
+            significant(float(part[index]) * scale)
+            for part, scale in (
+                (emap.gx, UM_PER_M),
+                (emap.gy, UM_PER_M),
+                (emap.u_gx, k * UM_PER_M),
+                (emap.u_gy, k * UM_PER_M),
+            )
+        )
+        words = (
+            UNKNOWN
+            if gx == UNKNOWN
+            else (f"{name}x {gx} ± {ux} µm, {name}y {gy} ± {uy} µm (k = {k:.3g})")
+        )
         frame.drawing.spot(*frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}")
 
 
@@ -236,8 +293,12 @@ def uncertainty_map(result: CalibrationResult) -> draw.Drawing | None:
     frame.axes(x_label="stage x in mm", y_label="stage y in mm")
     left, top, width, height = frame.box
     if scale.low == scale.high:
-        drawing.label(left + width / 2, top + height / 2 + 4,
-                      f"{significant(scale.high)} µm everywhere", anchor="middle")
+        drawing.label(
+            left + width / 2,
+            top + height / 2 + 4,
+            f"{significant(scale.high)} µm everywhere",
+            anchor="middle",
+        )
     else:
         parts.scale_bar(drawing, scale, (left + width + 16, top, 14.0, height))
     drawing.height = top + height + 92
@@ -255,10 +316,13 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
     end, side, gap, left, top = parts.round_end(errors), 158.0, 44.0, 44.0, 50.0
     drawing = parts.titled(
         "components" if of == "stage" else f"{of}-components",
-        f"Components of the error, and their U with k = {k:.3g}")
+        f"Components of the error, and their U with k = {k:.3g}",
+    )
     both = [ERRORS[of][0] + axis for axis in "xy"]
-    for names, pair, scale in ((both, errors, parts.Scale("d", -end, end)),
-                               ([f"U({name})" for name in both], u, parts.range_scale("v", u))):
+    for names, pair, scale in (
+        (both, errors, parts.Scale("d", -end, end)),
+        ([f"U({name})" for name in both], u, parts.range_scale("v", u)),
+    ):
         for column, (name, values) in enumerate(zip(names, pair, strict=True)):
             box = (left + column * (side + gap), top, side)
             frame = parts.map_frame(drawing, result.artifact, box)
@@ -267,9 +331,14 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
             uniform = scale.low == scale.high
             drawing.label(frame.box[0], top - 7, name, bold=True)
             if uniform:
-                drawing.label(frame.box[0] + side / 2, top + frame.box[3] / 2 + 4,
-                              f"{significant(scale.high)} µm everywhere"
-                              if np.isfinite(values).any() else "not known", anchor="middle")
+                drawing.label(
+                    frame.box[0] + side / 2,
+                    top + frame.box[3] / 2 + 4,
+                    f"{significant(scale.high)} µm everywhere"
+                    if np.isfinite(values).any()
+                    else "not known",
+                    anchor="middle",
+                )
         if not uniform:
             parts.scale_bar(drawing, scale, (left + 2 * side + gap + 14, top, 12.0, frame.box[3]))
         top += frame.box[3] + 56
@@ -277,16 +346,24 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
     return drawing
 
 
-def angular_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None, *,
-                title: str = "Error in θ in arcsec, outwards = counter-clockwise",
-                of: str = "stage") -> draw.Drawing:
+def angular_map(
+    result: CalibrationResult,
+    truth: Mapping[str, np.ndarray] | None = None,
+    *,
+    title: str = "Error in θ in arcsec, outwards = counter-clockwise",
+    of: str = "stage",
+) -> draw.Drawing:
     """Return the angular error around the circle, with its expanded uncertainty as a band."""
     emap, k = result.error_map, result.noise.k_theta
     error, u = emap.g_theta * ARCSEC_PER_RAD, emap.u_g_theta * k * ARCSEC_PER_RAD
-    true = None if truth is None or truth.get("g_theta") is None else np.asarray(
-        truth["g_theta"]) * ARCSEC_PER_RAD
-    drawing = parts.titled("angular-map" if of == "stage" else f"{of}-angular", title,
-                           CENTRE[1] + 230)
+    true = (
+        None
+        if truth is None or truth.get("g_theta") is None
+        else np.asarray(truth["g_theta"]) * ARCSEC_PER_RAD
+    )
+    drawing = parts.titled(
+        "angular-map" if of == "stage" else f"{of}-angular", title, CENTRE[1] + 230
+    )
     curves = [np.abs(error) + np.nan_to_num(u)] + ([] if true is None else [np.abs(true)])
     known = np.concatenate(curves)
     known = known[np.isfinite(known)]
@@ -311,9 +388,12 @@ def angular_map(result: CalibrationResult, truth: Mapping[str, np.ndarray] | Non
         good = np.flatnonzero(np.isfinite(error))
         drawing.discs([_at(angles[i], error[i], span) for i in good], 1.8, fill="ink")
         for i in good:
-            drawing.spot(*_at(angles[i], error[i], span), 7,
-                         f"line {i}, {math.degrees(angles[i]):.6g}°: {significant(error[i])} ± "
-                         f"{significant(u[i])} arcsec (k = {k:.3g})")
+            drawing.spot(
+                *_at(angles[i], error[i], span),
+                7,
+                f"line {i}, {math.degrees(angles[i]):.6g}°: {significant(error[i])} ± "
+                f"{significant(u[i])} arcsec (k = {k:.3g})",
+            )
     _scale(drawing, span)
     parts.legend(drawing, entries, (90, CENTRE[1] + 220))
     return drawing
@@ -336,9 +416,14 @@ def _rings(drawing: draw.Drawing, span: float) -> None:
         angle = math.radians(degrees)
         drawing.line([_at(angle, -span, span), _at(angle, span, span)], stroke="line")
         outside = ZERO + ROOM + 16
-        drawing.label(CENTRE[0] + outside * math.cos(angle),
-                      CENTRE[1] - outside * math.sin(angle) + 4, f"{degrees}°", size=draw.TICK,
-                      anchor="middle", colour="soft")
+        drawing.label(
+            CENTRE[0] + outside * math.cos(angle),
+            CENTRE[1] - outside * math.sin(angle) + 4,
+            f"{degrees}°",
+            size=draw.TICK,
+            anchor="middle",
+            colour="soft",
+        )
 
 
 def _scale(drawing: draw.Drawing, span: float) -> None:
@@ -355,14 +440,33 @@ def _between(known: np.ndarray) -> list[tuple[int, int]]:
     return [(i, (i + 1) % count) for i in range(count) if known[i] and known[(i + 1) % count]]
 
 
-def _curve(drawing: draw.Drawing, angles: np.ndarray, values: np.ndarray, span: float, *,
-           colour: str, width: float) -> None:
-    drawing.lines([[_at(angles[k], values[k], span) for k in pair]
-                   for pair in _between(np.isfinite(values))], stroke=colour, width=width)
+def _curve(
+    drawing: draw.Drawing,
+    angles: np.ndarray,
+    values: np.ndarray,
+    span: float,
+    *,
+    colour: str,
+    width: float,
+) -> None:
+    drawing.lines(
+        [[_at(angles[k], values[k], span) for k in pair] for pair in _between(np.isfinite(values))],
+        stroke=colour,
+        width=width,
+    )
 
 
-def _band(drawing: draw.Drawing, angles: np.ndarray, error: np.ndarray, u: np.ndarray,
-          span: float) -> None:
-    drawing.shapes([[_at(angles[k], error[k] + side * u[k], span)
-                     for k, side in ((i, 1), (j, 1), (j, -1), (i, -1))]
-                    for i, j in _between(np.isfinite(error + u))], fill="band", opacity=0.6)
+def _band(
+    drawing: draw.Drawing, angles: np.ndarray, error: np.ndarray, u: np.ndarray, span: float
+) -> None:
+    drawing.shapes(
+        [
+            [
+                _at(angles[k], error[k] + side * u[k], span)
+                for k, side in ((i, 1), (j, 1), (j, -1), (i, -1))
+            ]
+            for i, j in _between(np.isfinite(error + u))
+        ],
+        fill="band",
+        opacity=0.6,
+    )

@@ -29,12 +29,17 @@ POINTS_PER_INCH = 72
 KINDS: dict[str, dict[str, str | None]] = {
     ".png": {"Software": f"selfcal {__version__}"},
     ".svg": {"Creator": f"selfcal {__version__}", "Date": None},
-    ".pdf": {"Creator": f"selfcal {__version__}", "CreationDate": None}}
+    ".pdf": {"Creator": f"selfcal {__version__}", "CreationDate": None},
+}
 """Endings of pictures, and what is written into them: no date, so that they are repeatable."""
 
-RC: dict[Any, Any] = {"font.family": "DejaVu Sans", "text.parse_math": False,
-                      "svg.hashsalt": "selfcal", "svg.fonttype": "path",
-                      "text.color": COLOURS["ink"][0]}
+RC: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "text.parse_math": False,
+    "svg.hashsalt": "selfcal",
+    "svg.fonttype": "path",
+    "text.color": COLOURS["ink"][0],
+}
 """Settings of every picture; the fixed salt makes SVG files repeatable."""
 
 
@@ -48,8 +53,11 @@ def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
     """
     kind = FilePath(path).suffix.lower()
     if kind not in KINDS:
-        raise InputError(str(path), "not a picture format by its suffix",
-                         "name a file that ends in .png, .svg or .pdf")
+        raise InputError(
+            str(path),
+            "not a picture format by its suffix",
+            "name a file that ends in .png, .svg or .pdf",
+        )
     page, data = figure(drawing), io.BytesIO()
     with rc_context(RC):
         page.savefig(data, format=kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
@@ -103,34 +111,60 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
             codes.append(Outline.CLOSEPOLY)
     dash = (0, tuple(part * points for part in item.dash)) if item.dash else "solid"
     fill, stroke = to_rgba(_light(item.fill), item.opacity), to_rgba(_light(item.stroke))
-    axes.add_artist(PathPatch(Outline(vertices, codes), facecolor=fill, edgecolor=stroke,
-                              linewidth=item.width * points if item.stroke else 0,
-                              linestyle=dash, zorder=order, clip_on=False))
+    axes.add_artist(
+        PathPatch(
+            Outline(vertices, codes),
+            facecolor=fill,
+            edgecolor=stroke,
+            linewidth=item.width * points if item.stroke else 0,
+            linestyle=dash,
+            zorder=order,
+            clip_on=False,
+        )
+    )
 
 
 def _discs(item: Discs, axes: Axes, points: float, order: int) -> None:
     wide, high = zip(*item.radii, strict=True)
     fill, stroke = to_rgba(_light(item.fill), item.opacity), to_rgba(_light(item.stroke))
-    axes.add_collection(EllipseCollection(
-        [2 * r for r in wide], [2 * r for r in high], [0.0] * len(wide), units="xy",
-        offsets=item.centres, offset_transform=axes.transData, facecolor=fill, edgecolor=stroke,
-        linewidth=item.width * points if item.stroke else 0, zorder=order, clip_on=False),
-        autolim=False)
+    axes.add_collection(
+        EllipseCollection(
+            [2 * r for r in wide],
+            [2 * r for r in high],
+            [0.0] * len(wide),
+            units="xy",
+            offsets=item.centres,
+            offset_transform=axes.transData,
+            facecolor=fill,
+            edgecolor=stroke,
+            linewidth=item.width * points if item.stroke else 0,
+            zorder=order,
+            clip_on=False,
+        ),
+        autolim=False,
+    )
 
 
 def _label(item: Label, axes: Axes, points: float, order: int) -> None:
-    axes.text(*item.at, drawable(item.text), fontsize=item.size * points,
-              color=_light(item.colour), weight="bold" if item.bold else "normal",
-              ha={"start": "left", "middle": "center", "end": "right"}[item.anchor],
-              va="baseline", rotation=90 if item.turned else 0, rotation_mode="anchor",
-              zorder=order)
+    axes.text(
+        *item.at,
+        drawable(item.text),
+        fontsize=item.size * points,
+        color=_light(item.colour),
+        weight="bold" if item.bold else "normal",
+        ha={"start": "left", "middle": "center", "end": "right"}[item.anchor],
+        va="baseline",
+        rotation=90 if item.turned else 0,
+        rotation_mode="anchor",
+        zorder=order,
+    )
 
 
 def drawable(text: object, limit: int = 300) -> str:
     """Return `text` as one line of characters in the font, truncated at `limit`."""
     known = _characters()
-    line = "".join(c if c.isprintable() and c in known else "?" for c in str(text)[:limit + 1])
-    return line if len(line) <= limit else line[:limit - 1] + "…"
+    line = "".join(c if c.isprintable() and c in known else "?" for c in str(text)[: limit + 1])
+    return line if len(line) <= limit else line[: limit - 1] + "…"
 
 
 @cache

@@ -39,8 +39,9 @@ def titled(name: str, title: str, height: float = 0.0) -> draw.Drawing:
     return drawing
 
 
-def map_frame(drawing: draw.Drawing, artifact: Artifact,
-              box: tuple[float, float, float]) -> draw.Frame:
+def map_frame(
+    drawing: draw.Drawing, artifact: Artifact, box: tuple[float, float, float]
+) -> draw.Frame:
     """Return a frame of the field in mm with half a cell of margin.
 
     `box` is left, top and width in pixels; the height follows from the shape of the plate.
@@ -74,11 +75,14 @@ def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scal
         for _, run in groupby(range(level.shape[1]), level[i].__getitem__):
             alike = list(run)
             first, last = alike[0], alike[-1]
-            low, high = frame.at(x[i, first] - half, y[i, first] - half), frame.at(
-                x[i, last] + half, y[i, last] + half)
+            low, high = (
+                frame.at(x[i, first] - half, y[i, first] - half),
+                frame.at(x[i, last] + half, y[i, last] + half),
+            )
             low, high = _clipped(frame, low), _clipped(frame, high)
             outlines.setdefault(int(level[i, first]), []).append(
-                (low, (high[0], low[1]), high, (low[0], high[1])))
+                (low, (high[0], low[1]), high, (low[0], high[1]))
+            )
     for found in sorted(outlines):
         frame.drawing.shapes(outlines[found], fill="none" if found < 0 else f"{scale.ramp}{found}")
 
@@ -101,24 +105,30 @@ def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
     return np.where(np.isfinite(part), np.minimum(step, top), -1).astype(int)
 
 
-def scale_bar(drawing: draw.Drawing, scale: Scale, box: tuple[float, float, float, float],
-              unit: str = "µm") -> None:
+def scale_bar(
+    drawing: draw.Drawing, scale: Scale, box: tuple[float, float, float, float], unit: str = "µm"
+) -> None:
     """Draw a colour bar from bottom to top, with round numbers on its right."""
     left, top, width, height = box
     count = 2 * draw.SIDES + 1 if scale.ramp == "d" else draw.LEVELS
     each = height / count
     for step in range(count):
-        drawing.box(left, top + height - (step + 1) * each, width, each,
-                    fill=f"{scale.ramp}{step}")
+        drawing.box(left, top + height - (step + 1) * each, width, each, fill=f"{scale.ramp}{step}")
     drawing.box(*box, stroke="soft")
     inset = each / 2 if scale.ramp == "d" else 0.0  # its outer steps are centred on the ends
-    frame = draw.Frame(drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0),
-                       (scale.low, scale.high))
+    frame = draw.Frame(
+        drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0), (scale.low, scale.high)
+    )
     for value in draw.round_ticks(scale.low, scale.high, 5):
         y = frame.at(0, value)[1]
         drawing.line([(left + width, y), (left + width + 3, y)], stroke="soft")
-        drawing.label(left + width + 6, y + 0.35 * draw.TICK, draw.tick_text(value), size=draw.TICK,
-                      colour="soft")
+        drawing.label(
+            left + width + 6,
+            y + 0.35 * draw.TICK,
+            draw.tick_text(value),
+            size=draw.TICK,
+            colour="soft",
+        )
     drawing.label(left + width / 2, top - 7, unit, size=draw.TICK, anchor="middle", colour="soft")
 
 
@@ -157,8 +167,16 @@ def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
     return draw.round_down(factor)
 
 
-def arrows(frame: draw.Frame, xy_mm: np.ndarray, vectors_m: np.ndarray, factor: float, *,
-           colour: str = "ink", width: float = 1.2, heads: bool = True) -> None:
+def arrows(
+    frame: draw.Frame,
+    xy_mm: np.ndarray,
+    vectors_m: np.ndarray,
+    factor: float,
+    *,
+    colour: str = "ink",
+    width: float = 1.2,
+    heads: bool = True,
+) -> None:
     """Draw vectors (2, P) at points (2, P), enlarged by `factor`, without unknown ones."""
     shafts, tips = [], []
     for x, y, gx, gy in zip(*xy_mm, *vectors_m, strict=True):
@@ -176,15 +194,19 @@ def arrows(frame: draw.Frame, xy_mm: np.ndarray, vectors_m: np.ndarray, factor: 
     frame.drawing.shapes(tips, fill=colour)
 
 
-def _head(start: draw.Point, end: draw.Point, length: float,
-          width: float) -> tuple[draw.Point, ...]:
+def _head(
+    start: draw.Point, end: draw.Point, length: float, width: float
+) -> tuple[draw.Point, ...]:
     """Return the outline of an arrow's head."""
     size = min(3.2 + 1.8 * width, 0.6 * length)
     ux, uy = (end[0] - start[0]) / length, (end[1] - start[1]) / length
     back = end[0] - ux * size, end[1] - uy * size
     side = 0.38 * size
-    return (end, (back[0] - uy * side, back[1] + ux * side),
-            (back[0] + uy * side, back[1] - ux * side))
+    return (
+        end,
+        (back[0] - uy * side, back[1] + ux * side),
+        (back[0] + uy * side, back[1] - ux * side),
+    )
 
 
 def curved_arrow(drawing: draw.Drawing, way: Sequence[draw.Point], *, colour: str) -> None:
@@ -224,8 +246,9 @@ def ordinal(number: int) -> str:
     return f"{number}{'th' if teen else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')}"
 
 
-def panels(drawing: draw.Drawing, titles: Sequence[str], reach_mm: Sequence[float],
-           below: float = 50.0) -> list[draw.Frame]:
+def panels(
+    drawing: draw.Drawing, titles: Sequence[str], reach_mm: Sequence[float], below: float = 50.0
+) -> list[draw.Frame]:
     """Return titled frames of the field, two per row; the drawing grows as needed."""
     side, gap, left, top = 186.0, 42.0, 46.0, 48.0
     height = side * reach_mm[1] / reach_mm[0]
@@ -241,7 +264,7 @@ def panels(drawing: draw.Drawing, titles: Sequence[str], reach_mm: Sequence[floa
 
 def shortened(words: str, most: int) -> str:
     """Return text truncated at `most` characters."""
-    return words if len(words) <= most else words[:most - 1] + "…"
+    return words if len(words) <= most else words[: most - 1] + "…"
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,21 +281,37 @@ class Curve:
     band: bool = False
 
 
-def chart(drawing: draw.Drawing, box: tuple[float, float, float, float], curves: Sequence[Curve], *,
-          title: str = "", labels: tuple[str, str] = ("", ""), log: bool = False,
-          x: tuple[float, float] | None = None, y: tuple[float, float] | None = None) -> None:
+def chart(
+    drawing: draw.Drawing,
+    box: tuple[float, float, float, float],
+    curves: Sequence[Curve],
+    *,
+    title: str = "",
+    labels: tuple[str, str] = ("", ""),
+    log: bool = False,
+    x: tuple[float, float] | None = None,
+    y: tuple[float, float] | None = None,
+) -> None:
     """Draw curves; x and y are ranges that include all of them unless given.
 
     With `log` both axes are logarithmic.
     """
     scaled = [replace(c, x=np.log10(c.x), y=np.log10(c.y)) for c in curves] if log else curves
     reach = [c.y + side * (0.0 if c.U is None else c.U) for c in scaled for side in (-1, 1)]
-    frame = draw.Frame(drawing, box, x or _span([c.x for c in scaled], 0.04),
-                       y or _span(reach, 0.06), log)
+    frame = draw.Frame(
+        drawing, box, x or _span([c.x for c in scaled], 0.04), y or _span(reach, 0.06), log
+    )
     drawing.label(box[0], box[1] - 7, title, bold=True)
     for curve in scaled:
-        low, high = ([frame.at(*point) for point in zip(curve.x, curve.y + side * (
-            0.0 if curve.U is None else curve.U), strict=True)] for side in (-1, 1))
+        low, high = (
+            [
+                frame.at(*point)
+                for point in zip(
+                    curve.x, curve.y + side * (0.0 if curve.U is None else curve.U), strict=True
+                )
+            ]
+            for side in (-1, 1)
+        )
         if curve.band:
             drawing.shapes([[*high, *reversed(low)]], fill=curve.colour, opacity=0.25)
         elif curve.U is not None:

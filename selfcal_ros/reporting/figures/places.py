@@ -34,16 +34,22 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
     if artifact.map_grid is not None:  # the corners may reach far beyond the field
         corners = np.abs([_places_mm(view, *_corners(artifact)) for view in views])
         reach = np.maximum(reach, corners.max(axis=(0, 2)) + margin / 2 * MM_PER_M).tolist()
-    titles = [f"{view.name}: {pose_text(view.rotation_rad, view.translation_m, artifact)}"
-              for view in views]
+    titles = [
+        f"{view.name}: {pose_text(view.rotation_rad, view.translation_m, artifact)}"
+        for view in views
+    ]
     for frame, view in zip(parts.panels(drawing, titles, reach), views, strict=True):
         _plate(frame, view, artifact)
         frame.border()
-    legend = ["shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
-            "small dots: only lines are read; hollow: off the field, not read"]
+    legend = [
+        "shaded: field; dot: corner (h, h) of the plate; arrow: its turn",
+        "small dots: only lines are read; hollow: off the field, not read",
+    ]
     if aside := {view.check_offset_m for view in views if view.check_marks}:
-        legend.append("crosses: check stops, measured again with the stage "
-                    f"{' or '.join(f'{each * UM_PER_M:.6g}' for each in sorted(aside))} µm off")
+        legend.append(
+            "crosses: check stops, measured again with the stage "
+            f"{' or '.join(f'{each * UM_PER_M:.6g}' for each in sorted(aside))} µm off"
+        )
     for line in legend:
         drawing.height += 18
         drawing.label(46, drawing.height - 12, line, size=11.5, colour="soft")
@@ -56,11 +62,19 @@ def views_in(result: CalibrationResult) -> list[View]:
     On the lattice grids are read after quarter turns; else the offset of such a view is known.
     """
     placed = result.plate.map_grid is not None
-    return [View(without_cell(view.name), view.rotation, (view.translation_x, view.translation_y),
-                 math.isfinite(view.tx) if placed else
-                 abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6, angular=False)
-            for view in result.views if view.name.endswith(cell_label((0, 0)))
-            or view.name == without_cell(view.name)]
+    return [
+        View(
+            without_cell(view.name),
+            view.rotation,
+            (view.translation_x, view.translation_y),
+            math.isfinite(view.tx)
+            if placed
+            else abs(math.remainder(view.rotation, math.pi / 2)) < 1e-6,
+            angular=False,
+        )
+        for view in result.views
+        if view.name.endswith(cell_label((0, 0))) or view.name == without_cell(view.name)
+    ]
 
 
 def _corners(artifact: Artifact) -> np.ndarray:
@@ -89,13 +103,18 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     if view.check_marks:
         there = pose.marks_in_field(artifact)[1]
         for x, y in _at(frame, there[:, check_marks(there, view.check_marks)] * pitch * MM_PER_M):
-            drawing.lines([[(x - 6, y), (x + 6, y)], [(x, y - 6), (x, y + 6)]], stroke="c0",
-                          width=1.6)
+            drawing.lines(
+                [[(x - 6, y), (x + 6, y)], [(x, y - 6), (x, y + 6)]], stroke="c0", width=1.6
+            )
     drawing.discs(_at(frame, _places_mm(view, *(half * pitch))), 3.6, fill="truth")
     if view.rotation_rad:
         inside = 0.72 * half * pitch
-        arc = np.hstack([_places_mm(replace(view, rotation_rad=float(angle)), *inside)
-                         for angle in np.linspace(0.0, view.rotation_rad, 61)])
+        arc = np.hstack(
+            [
+                _places_mm(replace(view, rotation_rad=float(angle)), *inside)
+                for angle in np.linspace(0.0, view.rotation_rad, 61)
+            ]
+        )
         parts.curved_arrow(drawing, _at(frame, arc), colour="truth")
 
 
@@ -121,8 +140,11 @@ def rejected_in(result: CalibrationResult) -> list[Place]:
         columns = [row.get(key) for key in ("reason", "x", "y")]
         if not all(isinstance(column, list | tuple | np.ndarray) for column in columns):
             continue
-        found += [(str(row.get("view")), str(reason), x * MM_PER_M, y * MM_PER_M)
-                  for reason, x, y in zip(*columns, strict=False) if _number(x) and _number(y)]
+        found += [
+            (str(row.get("view")), str(reason), x * MM_PER_M, y * MM_PER_M)
+            for reason, x, y in zip(*columns, strict=False)
+            if _number(x) and _number(y)
+        ]
     views = {view.name: view for view in result.views}
     outliers = result.extra.get("outliers")
     removed = outliers.get("removed") if isinstance(outliers, dict) else None
@@ -161,20 +183,28 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     artifact = result.plate
     field = [(half + 0.5 * artifact.grid_pitch_m) * MM_PER_M for half in artifact.field_half_m]
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
-    colours = {reason: f"c{i % SERIES}" for i, (reason, _) in enumerate(
-        Counter(row[1] for row in found).most_common())}
+    colours = {
+        reason: f"c{i % SERIES}"
+        for i, (reason, _) in enumerate(Counter(row[1] for row in found).most_common())
+    }
     drawing = parts.titled("rejected", "Positions of rejected grid readings")
     for title, frame in zip(names, parts.panels(drawing, names, reach), strict=True):
         low, high = frame.at(-field[0], -field[1]), frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
         for reason, colour in colours.items():
             at = [(x, y) for view, why, x, y in found if (view, why) == (title, reason)]
-            inside = [(min(max(x, -reach[0]), reach[0]), min(max(y, -reach[1]), reach[1]))
-                      for x, y in at]
+            inside = [
+                (min(max(x, -reach[0]), reach[0]), min(max(y, -reach[1]), reach[1])) for x, y in at
+            ]
             drawing.discs([frame.at(x, y) for x, y in inside], 3.0, fill=colour, opacity=0.8)
         frame.axes(ticks=(4, 4))
-    _legend(drawing, {reason: (colour, sum(row[1] == reason for row in found))
-                      for reason, colour in colours.items()})
+    _legend(
+        drawing,
+        {
+            reason: (colour, sum(row[1] == reason for row in found))
+            for reason, colour in colours.items()
+        },
+    )
     return drawing
 
 
@@ -211,8 +241,10 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
     parts.arrows(frame, place, error, factor)
     frame.axes(x_label="offset x in mm", y_label="offset y in mm")
     for x, y, dx, dy, ux, uy in np.concatenate([place, error * UM_PER_M, u * UM_PER_M]).T:
-        words = (f"{significant(dx)} ± {significant(ux)} µm, {significant(dy)} ± "
-                 f"{significant(uy)} µm (k = {result.noise.k_xy:.3g})")
+        words = (
+            f"{significant(dx)} ± {significant(ux)} µm, {significant(dy)} ± "
+            f"{significant(uy)} µm (k = {result.noise.k_xy:.3g})"
+        )
         drawing.spot(*frame.at(x, y), 12.0, f"x {x:.4g} mm, y {y:.4g} mm: {words}")
     parts.arrow_key(frame, factor, (LEFT, TOP + SIDE + 58))
     drawing.label(LEFT + 130, TOP + SIDE + 62, f"vectors enlarged {factor:,.0f} ×")
@@ -236,15 +268,25 @@ def stage_yaw(result: CalibrationResult) -> draw.Drawing | None:
     scale = parts.Scale("d", -(end := parts.round_end(yaw)), end)
     levels = parts.levels(yaw, scale)
     for level in np.unique(levels).tolist():
-        drawing.shapes([tuple(frame.at(a + i * dx, b + j * dy) for i, j in (
-            (-1, -1), (1, -1), (1, 1), (-1, 1))) for a, b in place[:, levels == level].T],
-            fill=f"d{level}")
+        drawing.shapes(
+            [
+                tuple(
+                    frame.at(a + i * dx, b + j * dy)
+                    for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+                )
+                for a, b in place[:, levels == level].T
+            ],
+            fill=f"d{level}",
+        )
     frame.axes(x_label="stage x in mm", y_label="stage y in mm")
     parts.scale_bar(drawing, scale, (LEFT + width + 16, TOP, 14.0, height), "µrad")
     k = result.noise.k_xy
     for (a, b), value, spread in zip(place.T, yaw, u * k, strict=True):
-        drawing.spot(*frame.at(a, b), 0.9 * min(dx * frame.per_x, dy * frame.per_y),
-                     f"x {a:.4g} mm, y {b:.4g} mm: {significant(value)} ± {significant(spread)} "
-                     f"µrad (k = {k:.3g})")
+        drawing.spot(
+            *frame.at(a, b),
+            0.9 * min(dx * frame.per_x, dy * frame.per_y),
+            f"x {a:.4g} mm, y {b:.4g} mm: {significant(value)} ± {significant(spread)} "
+            f"µrad (k = {k:.3g})",
+        )
     drawing.height = TOP + height + 46
     return drawing

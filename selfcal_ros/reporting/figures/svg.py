@@ -9,11 +9,13 @@ from selfcal_ros.errors import printable
 from selfcal_ros.reporting.figures import drawing as draw
 
 FONT = 'system-ui, "Segoe UI", "DejaVu Sans", sans-serif'
-FIGURE_CSS = (f"svg.figure {{ display: block; width: 100%; height: auto; font-family: {FONT}; }}\n"
-              "svg.figure path, svg.figure ellipse { fill: none; }\n"
-              "svg.figure .b { font-weight: 600; }\n"
-              "svg.figure .spot { fill: transparent; }\n"
-              "svg.figure .spot:hover { fill: var(--truth); fill-opacity: .35; }\n")
+FIGURE_CSS = (
+    f"svg.figure {{ display: block; width: 100%; height: auto; font-family: {FONT}; }}\n"
+    "svg.figure path, svg.figure ellipse { fill: none; }\n"
+    "svg.figure .b { font-weight: 600; }\n"
+    "svg.figure .spot { fill: transparent; }\n"
+    "svg.figure .spot:hover { fill: var(--truth); fill-opacity: .35; }\n"
+)
 
 Paint = Callable[[str, str], str]
 """Names of the colours of a fill and of a stroke -> attributes of the element."""
@@ -51,31 +53,46 @@ def svg_file(drawing: draw.Drawing) -> str:
     """Return a drawing as a file that adapts to light and dark mode."""
     style = "".join((draw.variables_css("svg"), FIGURE_CSS, draw.classes_css()))
     size = f'width="{_n(drawing.width)}" height="{_n(drawing.height)}"'
-    return _svg(drawing, before=f'<style>{style}</style><rect class="f-paper" {size}/>\n',
-                attributes=f' xmlns="http://www.w3.org/2000/svg" {size}') + "\n"
+    return (
+        _svg(
+            drawing,
+            before=f'<style>{style}</style><rect class="f-paper" {size}/>\n',
+            attributes=f' xmlns="http://www.w3.org/2000/svg" {size}',
+        )
+        + "\n"
+    )
 
 
-def _svg(drawing: draw.Drawing, *, paint: Paint = by_class, before: str = "",
-         attributes: str = "") -> str:
-    items = [_item(item, paint) for item in drawing.items
-             if paint is by_class or not isinstance(item, draw.Spot)]
+def _svg(
+    drawing: draw.Drawing, *, paint: Paint = by_class, before: str = "", attributes: str = ""
+) -> str:
+    items = [
+        _item(item, paint)
+        for item in drawing.items
+        if paint is by_class or not isinstance(item, draw.Spot)
+    ]
     body = "\n".join(items)
-    return (f'<svg{attributes} class="figure" role="img" '
-            f'aria-label="{escape(printable(drawing.says))}" '
-            f'viewBox="0 0 {_n(drawing.width)} {_n(drawing.height)}">\n{before}{body}\n</svg>')
+    return (
+        f'<svg{attributes} class="figure" role="img" '
+        f'aria-label="{escape(printable(drawing.says))}" '
+        f'viewBox="0 0 {_n(drawing.width)} {_n(drawing.height)}">\n{before}{body}\n</svg>'
+    )
 
 
 def _item(item: draw.Item, paint: Paint) -> str:
     if isinstance(item, draw.Label):
         return _label(item, paint)
     if isinstance(item, draw.Spot):
-        return (f'<circle class="spot" cx="{_n(item.at[0])}" cy="{_n(item.at[1])}" '
-                f'r="{_n(item.radius)}"><title>{escape(printable(item.title))}</title></circle>')
+        return (
+            f'<circle class="spot" cx="{_n(item.at[0])}" cy="{_n(item.at[1])}" '
+            f'r="{_n(item.radius)}"><title>{escape(printable(item.title))}</title></circle>'
+        )
     colours, more = paint(item.fill, item.stroke), _look(item)
     if isinstance(item, draw.Discs):
-        return "".join(f'<ellipse{colours} cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" '
-                       f'ry="{_n(ry)}"{more}/>'
-                       for (x, y), (rx, ry) in zip(item.centres, item.radii, strict=True))
+        return "".join(
+            f'<ellipse{colours} cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" ry="{_n(ry)}"{more}/>'
+            for (x, y), (rx, ry) in zip(item.centres, item.radii, strict=True)
+        )
     return f'<path{colours} d="{_d(item.lines, closed=bool(item.fill))}"{more}/>'
 
 
@@ -88,8 +105,9 @@ def _look(item: draw.Path | draw.Discs) -> str:
 
 def _d(lines: Iterable[tuple[draw.Point, ...]], *, closed: bool) -> str:
     """Return path data."""
-    return "".join("M" + "L".join(f"{_n(x)} {_n(y)}" for x, y in line) + "Z" * closed
-                   for line in lines)
+    return "".join(
+        "M" + "L".join(f"{_n(x)} {_n(y)}" for x, y in line) + "Z" * closed for line in lines
+    )
 
 
 def _label(label: draw.Label, paint: Paint) -> str:
@@ -100,8 +118,10 @@ def _label(label: draw.Label, paint: Paint) -> str:
         look = paint(label.colour, "") + (' font-weight="600"' if label.bold else "")
     anchor = "" if label.anchor == "start" else f' text-anchor="{label.anchor}"'
     turned = f' transform="rotate(-90 {_n(x)} {_n(y)})"' if label.turned else ""
-    return (f'<text{look} x="{_n(x)}" y="{_n(y)}" font-size="{_n(label.size)}"{anchor}'
-            f"{turned}>{escape(printable(label.text))}</text>")
+    return (
+        f'<text{look} x="{_n(x)}" y="{_n(y)}" font-size="{_n(label.size)}"{anchor}'
+        f"{turned}>{escape(printable(label.text))}</text>"
+    )
 
 
 def _n(value: float) -> str:

@@ -89,8 +89,9 @@ def counted(number: int, noun: str) -> str:
 
 def numeric_columns(table: Sequence[Sequence[str]]) -> list[bool]:
     """Return which columns of a table contain only numbers below the header."""
-    return [all(_NUMBER.fullmatch(cell) for cell in column)
-            for column in zip(*table[1:], strict=True)]
+    return [
+        all(_NUMBER.fullmatch(cell) for cell in column) for column in zip(*table[1:], strict=True)
+    ]
 
 
 def aligned(rows: Sequence[Sequence[str]], *, left: int = 1, indent: str = "  ") -> list[str]:
@@ -100,8 +101,10 @@ def aligned(rows: Sequence[Sequence[str]], *, left: int = 1, indent: str = "  ")
     widths = [max(_columns(row[i]) for row in rows) for i in range(len(rows[0]))]
     lines = []
     for row in rows:
-        cells = [cell + _fill(cell, width) if i < left else _fill(cell, width) + cell
-                 for i, (cell, width) in enumerate(zip(row, widths, strict=True))]
+        cells = [
+            cell + _fill(cell, width) if i < left else _fill(cell, width) + cell
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
         lines.append((indent + "  ".join(cells)).rstrip())
     return lines
 
@@ -192,19 +195,23 @@ def summary_numbers(result: CalibrationResult | None) -> dict[str, float]:
     if result is None:
         return dict.fromkeys(_SUMMARY_FIELDS, math.nan)
     u_rms, u_max, _ = anywhere_m(result)
-    return {**summary_figures(result.error_map),
-            "rms_uncertainty_anywhere_um": u_rms * UM_PER_M,
-            "max_uncertainty_anywhere_um": u_max * UM_PER_M}
+    return {
+        **summary_figures(result.error_map),
+        "rms_uncertainty_anywhere_um": u_rms * UM_PER_M,
+        "max_uncertainty_anywhere_um": u_max * UM_PER_M,
+    }
 
 
 def summary_figures(emap: ErrorMap) -> dict[str, float]:
     """Return the numbers of a CalibrationSummary that follow from its map alone."""
     figures = map_figures(emap)
-    return {"max_error_um": figures.max_error_m * UM_PER_M,
-            "rms_error_um": figures.rms_error_m * UM_PER_M,
-            "rms_uncertainty_um": figures.rms_u_m * UM_PER_M,
-            "max_theta_error_arcsec": figures.max_theta_rad * ARCSEC_PER_RAD,
-            "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD}
+    return {
+        "max_error_um": figures.max_error_m * UM_PER_M,
+        "rms_error_um": figures.rms_error_m * UM_PER_M,
+        "rms_uncertainty_um": figures.rms_u_m * UM_PER_M,
+        "max_theta_error_arcsec": figures.max_theta_rad * ARCSEC_PER_RAD,
+        "rms_theta_uncertainty_arcsec": figures.rms_u_theta_rad * ARCSEC_PER_RAD,
+    }
 
 
 def anywhere_m(result: CalibrationResult) -> tuple[float, float, float]:
@@ -225,8 +232,14 @@ def anywhere_m(result: CalibrationResult) -> tuple[float, float, float]:
 
 
 _SUMMARY_FIELDS = (
-    "max_error_um", "rms_error_um", "rms_uncertainty_um", "max_theta_error_arcsec",
-    "rms_theta_uncertainty_arcsec", "rms_uncertainty_anywhere_um", "max_uncertainty_anywhere_um")
+    "max_error_um",
+    "rms_error_um",
+    "rms_uncertainty_um",
+    "max_theta_error_arcsec",
+    "rms_theta_uncertainty_arcsec",
+    "rms_uncertainty_anywhere_um",
+    "max_uncertainty_anywhere_um",
+)
 
 
 def map_figures(emap: ErrorMap) -> MapFigures:
@@ -238,7 +251,9 @@ def map_figures(emap: ErrorMap) -> MapFigures:
     max_theta, line = largest(emap.g_theta)
     u_theta = emap.u_g_theta[np.isfinite(emap.g_theta)]
     return MapFigures(
-        known.size, int(known.sum()), max_error,
+        known.size,
+        int(known.sum()),
+        max_error,
         max_site=_site(emap, index),
         rms_error_m=rms(g),
         rms_u_m=rms(u),
@@ -249,7 +264,8 @@ def map_figures(emap: ErrorMap) -> MapFigures:
         max_line=line[0] if line else None,
         rms_theta_rad=rms(emap.g_theta),
         rms_u_theta_rad=rms(u_theta),
-        max_u_theta_rad=largest(u_theta)[0])
+        max_u_theta_rad=largest(u_theta)[0],
+    )
 
 
 def _site(emap: ErrorMap, index: tuple[int, ...] | None) -> tuple[int, int] | None:
@@ -284,15 +300,15 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
         difference = remove_modes(difference, datum_modes(artifact, scale=True))
     difference[:, ~np.isfinite(difference).all(axis=0)] = np.nan
     longest, index = largest(np.hypot(*difference))
-    xy = (longest, _site(emap, index), rms(difference),
-          *_in_units(difference, emap.u_xy))
+    xy = (longest, _site(emap, index), rms(difference), *_in_units(difference, emap.u_xy))
     if "g_theta" not in true:
         return TruthFigures(*xy)
     theta = emap.g_theta - true["g_theta"]
     theta = theta - _common(theta, emap.u_g_theta)
     largest_theta, line = largest(theta)
-    return TruthFigures(*xy, largest_theta, line[0] if line else None, rms(theta),
-                        *_in_units(theta, emap.u_g_theta))
+    return TruthFigures(
+        *xy, largest_theta, line[0] if line else None, rms(theta), *_in_units(theta, emap.u_g_theta)
+    )
 
 
 def _common(theta_rad: np.ndarray, u_rad: np.ndarray) -> float:
@@ -313,8 +329,10 @@ def _in_units(difference: np.ndarray, u: np.ndarray) -> tuple[float, float, floa
     return rms(ratio), largest(ratio)[0], share
 
 
-def truth_arrays(emap: ErrorMap, truth: Mapping[str, np.ndarray] | None,
-                 ) -> dict[str, np.ndarray] | None:
+def truth_arrays(
+    emap: ErrorMap,
+    truth: Mapping[str, np.ndarray] | None,
+) -> dict[str, np.ndarray] | None:
     """Return the truth as float arrays on the lattice of `emap`; None stays None.
 
     `g_theta` is left out where the plate has no angular lines or the truth does not hold it.
@@ -339,11 +357,15 @@ def _truth_array(truth: Mapping[str, np.ndarray], key: str, shape: tuple[int, ..
     try:
         array = np.array(truth[key], dtype=float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"truth {key}", "not an array of numbers", "give lists of numbers "
-                         "and null") from error
+        raise InputError(
+            f"truth {key}", "not an array of numbers", "give lists of numbers and null"
+        ) from error
     if array.shape != shape:
-        raise InputError(f"truth {key}", f"has the shape {array.shape}, the map has {shape}",
-                         "give the truth on the lattice of the map")
+        raise InputError(
+            f"truth {key}",
+            f"has the shape {array.shape}, the map has {shape}",
+            "give the truth on the lattice of the map",
+        )
     return array
 
 
@@ -365,18 +387,36 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     worst = int(np.argmax(np.hypot(*cells[2:4])))
     x, y = cells[:2, worst] * MM_PER_M
     size, u = math.hypot(*cells[2:4, worst]), math.hypot(*cells[4:6, worst]) / math.sqrt(2)
-    parts = [name for name, power in (("quadratic", (2, 0)), ("radial (cubic)", (2, 1)))
-             if power in [one.power for one in camera.coefficients]]
-    return (("scale", told(camera.scale, camera.u_scale, PERCENT, "%")
-             + ", positive: published offsets too long"),
-            ("rotation", told(camera.rotation, camera.u_rotation, MRAD_PER_RAD, "mrad")),
-            ("stretch, shear", f"{told(camera.stretch, camera.u_stretch, PERCENT, '%')}, "
-                               f"{told(camera.shear, camera.u_shear, PERCENT, '%')}"),
-            ("distortion", " and ".join(parts) or "none shown"),
-            ("largest error", f"{significant(size * UM_PER_M)} ± {significant(u * UM_PER_M)} µm at "
-                              f"x {x:.4g} mm, y {y:.4g} mm of the image"),
-            ("noise", f"{significant(camera.noise_image * UM_PER_M)} µm of an image, "
-                      f"{significant(camera.noise_mark * UM_PER_M)} µm of a mark in it"), *yaw)
+    parts = [
+        name
+        for name, power in (("quadratic", (2, 0)), ("radial (cubic)", (2, 1)))
+        if power in [one.power for one in camera.coefficients]
+    ]
+    return (
+        (
+            "scale",
+            told(camera.scale, camera.u_scale, PERCENT, "%")
+            + ", positive: published offsets too long",
+        ),
+        ("rotation", told(camera.rotation, camera.u_rotation, MRAD_PER_RAD, "mrad")),
+        (
+            "stretch, shear",
+            f"{told(camera.stretch, camera.u_stretch, PERCENT, '%')}, "
+            f"{told(camera.shear, camera.u_shear, PERCENT, '%')}",
+        ),
+        ("distortion", " and ".join(parts) or "none shown"),
+        (
+            "largest error",
+            f"{significant(size * UM_PER_M)} ± {significant(u * UM_PER_M)} µm at "
+            f"x {x:.4g} mm, y {y:.4g} mm of the image",
+        ),
+        (
+            "noise",
+            f"{significant(camera.noise_image * UM_PER_M)} µm of an image, "
+            f"{significant(camera.noise_mark * UM_PER_M)} µm of a mark in it",
+        ),
+        *yaw,
+    )
 
 
 def yaw_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
@@ -384,8 +424,11 @@ def yaw_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     found = result.stage_yaw
     if found is None:
         return ()
-    low, high, mean_u = (significant(value * URAD_PER_RAD) for value in (
-        found.yaw.min(), found.yaw.max(), math.sqrt(np.mean(found.u_yaw**2))))
-    shown = (f"p = {found.p:.1g}" if found.p < TURNS
-             else f"not more than its noise, p = {found.p:.2g}")
+    low, high, mean_u = (
+        significant(value * URAD_PER_RAD)
+        for value in (found.yaw.min(), found.yaw.max(), math.sqrt(np.mean(found.u_yaw**2)))
+    )
+    shown = (
+        f"p = {found.p:.1g}" if found.p < TURNS else f"not more than its noise, p = {found.p:.2g}"
+    )
     return (("yaw of the stage", f"{low} to {high} ± {mean_u} µrad (k=1) about its mean; {shown}"),)

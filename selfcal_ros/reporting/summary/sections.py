@@ -50,12 +50,19 @@ class Section:
     notes: tuple[str, ...] = ()
 
 
-def all_sections(result: CalibrationResult,
-                 truth: Mapping[str, np.ndarray] | None = None) -> list[Section]:
+def all_sections(
+    result: CalibrationResult, truth: Mapping[str, np.ndarray] | None = None
+) -> list[Section]:
     """Return the sections of a summary in reading order."""
-    sections = [verdict_section(result), measurement_section(result), views_section(result),
-                error_section(result), terms_section(result), noise_section(result.noise),
-                Section("Camera", camera_facts(result))]
+    sections = [
+        verdict_section(result),
+        measurement_section(result),
+        views_section(result),
+        error_section(result),
+        terms_section(result),
+        noise_section(result.noise),
+        Section("Camera", camera_facts(result)),
+    ]
     if truth is not None:
         sections.append(truth_section(result.error_map, truth))
     sections += [rejected_section(result), attention_section(result)]
@@ -66,27 +73,35 @@ def verdict_section(result: CalibrationResult) -> Section:
     """Return the verdict with failed tests and their likely causes; empty if none failed."""
     verdict = result.verdict
     notes = [printable(reason) for reason in verdict.reasons]
-    notes += [f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})"
-              for cause in verdict.causes]
+    notes += [
+        f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})" for cause in verdict.causes
+    ]
     return Section(_TITLES[verdict.grade], notes=(*notes, *enlargement_texts(verdict)))
 
 
 def enlargement_texts(verdict: Verdict) -> list[str]:
     """Return a line for each cause of an enlarged uncertainty."""
-    return [f"U enlarged by {printable(item.name)}: u {unit(item.u_rms)} rms, "
-            f"{unit(item.u_max)} largest" for item, unit in (
-                (item, arcsec if item.unit == "rad" else um) for item in verdict.enlarged_by)]
+    return [
+        f"U enlarged by {printable(item.name)}: u {unit(item.u_rms)} rms, "
+        f"{unit(item.u_max)} largest"
+        for item, unit in (
+            (item, arcsec if item.unit == "rad" else um) for item in verdict.enlarged_by
+        )
+    ]
 
 
 THETA_DATUM = {
     ThetaDatum.XY_AXES: "xy_axes: the angular errors at 0°, 90°, 180° and 270° are tied to the "
-                        "slopes of the XY error along the four half axes (Hu eqs. 9, 27)",
+    "slopes of the XY error along the four half axes (Hu eqs. 9, 27)",
     ThetaDatum.ZERO_MEAN: "zero_mean: the angular errors add up to zero",
 }
 """Which constant of the angular errors is convention, in words."""
 
-_TITLES = {Grade.GOOD: "Verdict", Grade.ENLARGED: "Verdict: GOOD WITHIN AN ENLARGED U",
-           Grade.NOT_QUALIFIED: "Verdict: NOT QUALIFIED"}
+_TITLES = {
+    Grade.GOOD: "Verdict",
+    Grade.ENLARGED: "Verdict: GOOD WITHIN AN ENLARGED U",
+    Grade.NOT_QUALIFIED: "Verdict: NOT QUALIFIED",
+}
 
 
 def terms_section(result: CalibrationResult) -> Section:
@@ -104,8 +119,16 @@ def terms_section(result: CalibrationResult) -> Section:
             scale, unit = unit_of(term.name, item.unit)
             value, u = item.value * scale, item.u * scale
             decimals = decimals_for([u], 2)  # two figures of u, and the value to the same place
-            rows.append((f"{term.name} ({how})", item.view or "all", item.component,
-                         fixed(value, decimals), fixed(u, decimals), unit))
+            rows.append(
+                (
+                    f"{term.name} ({how})",
+                    item.view or "all",
+                    item.component,
+                    fixed(value, decimals),
+                    fixed(u, decimals),
+                    unit,
+                )
+            )
     if not rows:
         return Section("Terms of the model")
     header = ("term", "view", "component", "value", "u (k=1)", "unit")
@@ -113,41 +136,67 @@ def terms_section(result: CalibrationResult) -> Section:
 
 
 def _nodes(grid: MapGrid, shape: tuple[int, int]) -> str:
-    return (f"{shape[0]} × {shape[1]} nodes, pitch {grid.pitch_m * MM_PER_M:.6g} mm, "
-            f"{grid.interpolation}")
+    return (
+        f"{shape[0]} × {shape[1]} nodes, pitch {grid.pitch_m * MM_PER_M:.6g} mm, "
+        f"{grid.interpolation}"
+    )
 
 
 def measurement_section(result: CalibrationResult) -> Section:
     """Return plan, plate, method and input."""
     artifact = result.plate
     (nx, ny), pitch = artifact.shape, artifact.grid_pitch_m * MM_PER_M
-    marks = (f"list of {nx} marks, neighbours {pitch:.6g} mm apart (median)" if artifact.marks else
-             f"{nx} × {ny} marks, pitch {pitch:.6g} mm")
+    marks = (
+        f"list of {nx} marks, neighbours {pitch:.6g} mm apart (median)"
+        if artifact.marks
+        else f"{nx} × {ny} marks, pitch {pitch:.6g} mm"
+    )
     x, y = (2 * half * pitch for half in artifact.reach)
     seen = result.observability
     done = {without_cell(view.name) for view in filter(_in_the_map(result), result.views)}
     views = f"{counted_views(result.views)}, {len(done)} measured"
-    facts = [("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
-             ("plate", f"{marks}, field {x:.6g} × {y:.6g} mm, "
-              f"{artifact.angular_count or 'no'} angular lines"),
-             *([("map", _nodes(artifact.map_grid, artifact.field.shape))]
-               if artifact.map_grid else []),
-             *([("angular map", f"Fourier series, {counted(artifact.harmonics, 'harmonic')}")]
-               if artifact.harmonics else []),
-             ("method", f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}, "
-              f"{result.model.misalignment} misalignments"),
-             ("identifiable", f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
-              f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'undetermined mode')})")]
+    facts = [
+        ("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
+        (
+            "plate",
+            f"{marks}, field {x:.6g} × {y:.6g} mm, {artifact.angular_count or 'no'} angular lines",
+        ),
+        *([("map", _nodes(artifact.map_grid, artifact.field.shape))] if artifact.map_grid else []),
+        *(
+            [("angular map", f"Fourier series, {counted(artifact.harmonics, 'harmonic')}")]
+            if artifact.harmonics
+            else []
+        ),
+        (
+            "method",
+            f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}, "
+            f"{result.model.misalignment} misalignments",
+        ),
+        (
+            "identifiable",
+            f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
+            f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'undetermined mode')})",
+        ),
+    ]
     plate_map = result.artifact_map
     if math.isfinite(plate_map.magnification):
         value, u = (x * UM_PER_M for x in (plate_map.magnification, plate_map.u_magnification))
         spread = f" ± {significant(u)} (k=1)" if math.isfinite(u) else ""
-        facts.append(("magnification", f"plate {'larger' if value >= 0 else 'smaller'} than the "
-                      f"encoders indicate by {significant(abs(value))}{spread} µm/m"))
+        facts.append(
+            (
+                "magnification",
+                f"plate {'larger' if value >= 0 else 'smaller'} than the "
+                f"encoders indicate by {significant(abs(value))}{spread} µm/m",
+            )
+        )
     if result.input.get("file"):
         digest = printable(result.input.get("sha256") or "")
-        facts.append(("input", printable(result.input["file"])
-                      + (f" (sha256 {digest[:16]})" if digest else "")))
+        facts.append(
+            (
+                "input",
+                printable(result.input["file"]) + (f" (sha256 {digest[:16]})" if digest else ""),
+            )
+        )
     return Section("Measurement", tuple(facts))
 
 
@@ -165,16 +214,20 @@ def _in_the_map(result: CalibrationResult) -> Callable[[ViewResult], bool]:
 def views_section(result: CalibrationResult) -> Section:
     """Return the table of views: nominal pose, misalignment, detections."""
     artifact, views = result.plate, result.views
-    columns = [[printable(v.name) for v in views],
-               [pose_text(v.rotation, (v.translation_x, v.translation_y), artifact) for v in views],
-               fixed_column([v.phi / RAD_PER_MRAD for v in views]),
-               fixed_column([v.tx * UM_PER_M for v in views]),
-               fixed_column([v.ty * UM_PER_M for v in views]),
-               [str(v.used) for v in views], [str(v.rejected) for v in views]]
+    columns = [
+        [printable(v.name) for v in views],
+        [pose_text(v.rotation, (v.translation_x, v.translation_y), artifact) for v in views],
+        fixed_column([v.phi / RAD_PER_MRAD for v in views]),
+        fixed_column([v.tx * UM_PER_M for v in views]),
+        fixed_column([v.ty * UM_PER_M for v in views]),
+        [str(v.used) for v in views],
+        [str(v.rejected) for v in views],
+    ]
     pose = f"pose ({'mm' if artifact.marks else 'pitches'})"
     header = ("view", pose, "φ mrad", "tx µm", "ty µm", "used", "rejected")
-    return Section("Views and their misalignment",
-                   table=(header, *zip(*columns, strict=True)) if views else ())
+    return Section(
+        "Views and their misalignment", table=(header, *zip(*columns, strict=True)) if views else ()
+    )
 
 
 def pose_text(rotation_rad: float, translation_m: tuple[float, float], artifact: Artifact) -> str:
@@ -202,18 +255,30 @@ def error_section(result: CalibrationResult) -> Section:
     """Return errors and uncertainties of the XY map and of the angular map."""
     emap = result.error_map
     figures = map_figures(emap)
-    facts = [("largest error", f"{um(figures.max_error_m)} {place_text(emap, figures.max_site)}"),
-             ("rms error", f"{um(figures.rms_error_m)} per axis")]
+    facts = [
+        ("largest error", f"{um(figures.max_error_m)} {place_text(emap, figures.max_site)}"),
+        ("rms error", f"{um(figures.rms_error_m)} per axis"),
+    ]
     if figures.n_known < figures.n_sites:
         facts.append(("sites known", f"{figures.n_known} of {figures.n_sites}"))
     u_o, u_r = _first_order_u(result)
-    facts += [*_spread_facts("uncertainty", um, (figures.rms_u_m, figures.max_u_m),
-                             (result.noise.k_xy, result.noise.dof_of("xy"))),
-              *_between_nodes(result),
-              ("non-orthogonality", _slope_text(emap, (emap.nonorthogonality, u_o), "O", "µrad",
-                                                "out of square by 2|O|")),
-              ("scale difference", _slope_text(emap, (emap.scale_difference, u_r), "R", "µm/m",
-                                               "X and Y differ by 2|R|"))]
+    facts += [
+        *_spread_facts(
+            "uncertainty",
+            um,
+            (figures.rms_u_m, figures.max_u_m),
+            (result.noise.k_xy, result.noise.dof_of("xy")),
+        ),
+        *_between_nodes(result),
+        (
+            "non-orthogonality",
+            _slope_text(emap, (emap.nonorthogonality, u_o), "O", "µrad", "out of square by 2|O|"),
+        ),
+        (
+            "scale difference",
+            _slope_text(emap, (emap.scale_difference, u_r), "R", "µm/m", "X and Y differ by 2|R|"),
+        ),
+    ]
     if emap.artifact.angular_count:
         facts += _theta_facts(result)
     return Section("Stage error (indicated − true)", tuple(facts))
@@ -225,9 +290,15 @@ def _between_nodes(result: CalibrationResult) -> list[tuple[str, str]]:
         known = budgets(result)
     except InputError:  # damaged factors: the map can be shown all the same
         return []
-    return [("anywhere", f"U {um(budget.U_rms)} rms, at most {um(budget.U_max)} "
-             f"(k={budget.k:.3g}), the map interpolated between its nodes")
-            for budget in known if budget.quantity == "xy" and budget.anywhere]
+    return [
+        (
+            "anywhere",
+            f"U {um(budget.U_rms)} rms, at most {um(budget.U_max)} "
+            f"(k={budget.k:.3g}), the map interpolated between its nodes",
+        )
+        for budget in known
+        if budget.quantity == "xy" and budget.anywhere
+    ]
 
 
 def _first_order_u(result: CalibrationResult) -> tuple[float, float]:
@@ -238,15 +309,18 @@ def _first_order_u(result: CalibrationResult) -> tuple[float, float]:
         return math.nan, math.nan
 
 
-def _slope_text(emap: ErrorMap, found: tuple[float, float], symbol: str, unit: str,
-                meaning: str) -> str:
+def _slope_text(
+    emap: ErrorMap, found: tuple[float, float], symbol: str, unit: str, meaning: str
+) -> str:
     """Return a slope, with its standard uncertainty, and what it means."""
     length = (max(emap.artifact.shape) - 1) * emap.artifact.grid_pitch_m
     value, u = found
     spread = f" ± {u * UM_PER_M:.3g} (k=1)" if math.isfinite(u) else ""
-    return (f"{symbol} {significant(value * UM_PER_M)}{spread} {unit} = {um(value * length)} over "
-            f"{length * MM_PER_M:.6g} mm; {meaning} = {significant(2 * abs(value) * UM_PER_M)} "
-            f"{unit}")
+    return (
+        f"{symbol} {significant(value * UM_PER_M)}{spread} {unit} = {um(value * length)} over "
+        f"{length * MM_PER_M:.6g} mm; {meaning} = {significant(2 * abs(value) * UM_PER_M)} "
+        f"{unit}"
+    )
 
 
 def _theta_facts(result: CalibrationResult) -> list[tuple[str, str]]:
@@ -256,48 +330,82 @@ def _theta_facts(result: CalibrationResult) -> list[tuple[str, str]]:
     if figures.max_line is not None:
         degrees = figures.max_line * 360 / emap.artifact.angular_count
         at = f" at line {figures.max_line}, {degrees:.6g}°"
-    facts = [("largest θ error", arcsec(figures.max_theta_rad) + at),
-             ("rms θ error", arcsec(figures.rms_theta_rad))]
+    facts = [
+        ("largest θ error", arcsec(figures.max_theta_rad) + at),
+        ("rms θ error", arcsec(figures.rms_theta_rad)),
+    ]
     if figures.n_lines_known < figures.n_lines:
         facts.append(("lines known", f"{figures.n_lines_known} of {figures.n_lines}"))
-    return [*facts, *_spread_facts("θ uncertainty", arcsec, (figures.rms_u_theta_rad,
-                                                             figures.max_u_theta_rad),
-                                   (result.noise.k_theta, result.noise.dof_of("theta"))),
-            ("θ datum", THETA_DATUM[emap.datum_theta])]
+    return [
+        *facts,
+        *_spread_facts(
+            "θ uncertainty",
+            arcsec,
+            (figures.rms_u_theta_rad, figures.max_u_theta_rad),
+            (result.noise.k_theta, result.noise.dof_of("theta")),
+        ),
+        ("θ datum", THETA_DATUM[emap.datum_theta]),
+    ]
 
 
-def _spread_facts(label: str, unit: Callable[[float], str], u: tuple[float, float],
-                  student: tuple[float, float]) -> list[tuple[str, str]]:
+def _spread_facts(
+    label: str, unit: Callable[[float], str], u: tuple[float, float], student: tuple[float, float]
+) -> list[tuple[str, str]]:
     """Return u and U (rms, largest), with coverage factor and degrees of freedom."""
     (rms_u, max_u), (k, dof) = u, student
     if not math.isfinite(rms_u):
         return [(label, "not known")]
     facts = [(label, f"u {unit(rms_u)} rms, {unit(max_u)} largest (k=1)")]
     if math.isfinite(k):
-        facts.append(("", f"U {unit(k * rms_u)} rms, {unit(k * max_u)} largest (k={k:.3g}, "
-                      f"95.45 %, {dof_text(dof)} degrees of freedom)"))
+        facts.append(
+            (
+                "",
+                f"U {unit(k * rms_u)} rms, {unit(k * max_u)} largest (k={k:.3g}, "
+                f"95.45 %, {dof_text(dof)} degrees of freedom)",
+            )
+        )
     return facts
 
 
 def noise_section(noise: Noise) -> Section:
     """Return the noise of one reading: used, from repeats, from residuals, and their ratio."""
     rows = []
-    for label, name, scale, unit in (("x, y", "xy", UM_PER_M, "µm"),
-                                     ("θ", "theta", ARCSEC_PER_RAD, "arcsec")):
-        used, repeats, residuals = (getattr(noise, f"sigma_{name}{suffix}")
-                                    for suffix in ("", "_repeats", "_residuals"))
+    for label, name, scale, unit in (
+        ("x, y", "xy", UM_PER_M, "µm"),
+        ("θ", "theta", ARCSEC_PER_RAD, "arcsec"),
+    ):
+        used, repeats, residuals = (
+            getattr(noise, f"sigma_{name}{suffix}") for suffix in ("", "_repeats", "_residuals")
+        )
         if not any(map(math.isfinite, (used, repeats, residuals))):
             continue
         dofs = [getattr(noise, f"dof_{name}_{kind}") for kind in ("repeats", "residuals")]
         ratio = residuals / repeats if repeats > 0 else float("nan")
         shown = aligned_numbers([value * scale for value in (used, repeats, residuals)])
-        rows.append((f"{label} ({unit})", *shown[:2], _dof(dofs[0]), shown[2], _dof(dofs[1]),
-                     significant(ratio)))
-    header = ("one reading", "σ used", "repeats", "degrees of freedom", "residuals",
-              "degrees of freedom", "residuals/repeats")
+        rows.append(
+            (
+                f"{label} ({unit})",
+                *shown[:2],
+                _dof(dofs[0]),
+                shown[2],
+                _dof(dofs[1]),
+                significant(ratio),
+            )
+        )
+    header = (
+        "one reading",
+        "σ used",
+        "repeats",
+        "degrees of freedom",
+        "residuals",
+        "degrees of freedom",
+        "residuals/repeats",
+    )
     if not rows:
-        return Section("Noise", notes=("not known: no mark was read twice and no detection "
-                                       "declared its uncertainty",))
+        return Section(
+            "Noise",
+            notes=("not known: no mark was read twice and no detection declared its uncertainty",),
+        )
     return Section("Noise", table=(header, *rows))
 
 
@@ -309,29 +417,41 @@ def _dof(dof: float) -> str:
 def truth_section(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> Section:
     """Return the comparison with a known truth, after removing the datum difference."""
     f = truth_figures(emap, truth)
-    facts = [("largest |G − truth|", f"{um(f.largest_m)} {place_text(emap, f.site)}"),
-             ("rms", f"{um(f.rms_m)} per axis"), *_in_u(f.rms_in_u, f.largest_in_u, f.within_2u)]
+    facts = [
+        ("largest |G − truth|", f"{um(f.largest_m)} {place_text(emap, f.site)}"),
+        ("rms", f"{um(f.rms_m)} per axis"),
+        *_in_u(f.rms_in_u, f.largest_in_u, f.within_2u),
+    ]
     if emap.artifact.angular_count and truth.get("g_theta") is not None:
         at = "" if f.line is None else f" at line {f.line}"
-        facts += [("largest θ difference", arcsec(f.largest_theta_rad) + at),
-                  ("rms θ difference", arcsec(f.rms_theta_rad)),
-                  *_in_u(f.rms_theta_in_u, f.largest_theta_in_u, f.theta_within_2u)]
+        facts += [
+            ("largest θ difference", arcsec(f.largest_theta_rad) + at),
+            ("rms θ difference", arcsec(f.rms_theta_rad)),
+            *_in_u(f.rms_theta_in_u, f.largest_theta_in_u, f.theta_within_2u),
+        ]
     return Section("Against the known truth (datum difference removed)", tuple(facts))
 
 
 def _in_u(in_u: float, largest_in_u: float, within: float) -> list[tuple[str, str]]:
     if not math.isfinite(in_u):
         return []
-    return [("", f"{significant(in_u)} u rms, {significant(largest_in_u)} u largest, "
-             f"{100 * within:.1f} % within 2 u")]
+    return [
+        (
+            "",
+            f"{significant(in_u)} u rms, {significant(largest_in_u)} u largest, "
+            f"{100 * within:.1f} % within 2 u",
+        )
+    ]
 
 
 def rejected_section(result: CalibrationResult) -> Section:
     """Return rejected detections by reason, most frequent first."""
     counts = sorted(result.rejected.items(), key=lambda item: (-item[1], item[0]))
     total, used = sum(result.rejected.values()), sum(v.used for v in result.views)
-    facts = [("detections", f"{used} used, {total} rejected"),
-             *((printable(reason).replace("_", " "), str(count)) for reason, count in counts)]
+    facts = [
+        ("detections", f"{used} used, {total} rejected"),
+        *((printable(reason).replace("_", " "), str(count)) for reason, count in counts),
+    ]
     return Section("Rejected detections", tuple(facts))
 
 
@@ -349,8 +469,10 @@ def state_sentence(result: CalibrationResult) -> str:
     seen, figures = result.observability, map_figures(result.error_map)
     if not seen.identifiable:
         advice = f"; {printable(seen.advice[0].text)}" if seen.advice else ""
-        return (f"Not a calibration: {counted(seen.deficiency, 'mode')} of the stage error cannot "
-                f"be determined from the marks that were read{advice}.")
+        return (
+            f"Not a calibration: {counted(seen.deficiency, 'mode')} of the stage error cannot "
+            f"be determined from the marks that were read{advice}."
+        )
     if not figures.n_known and not figures.n_lines_known:
         return "No calibration: no site of the error map is known."
     k = result.noise.k_theta
@@ -395,8 +517,11 @@ def state_line(result: CalibrationResult) -> str:
 
 
 def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
-    share = (f" at {figures.n_known} of {figures.n_sites} sites"
-             if figures.n_known < figures.n_sites else "")
+    share = (
+        f" at {figures.n_known} of {figures.n_sites} sites"
+        if figures.n_known < figures.n_sites
+        else ""
+    )
     views = counted_views(result.views, _in_the_map(result)) + of_few_read(result.findings)
     text = f"Calibrated{share} from {views}"
     if not figures.n_known:
@@ -423,8 +548,12 @@ def _warnings(result: CalibrationResult) -> str:
     return f"; {counted(len(result.warnings), 'warning')}" if result.warnings else ""
 
 
-def summary_text(result: CalibrationResult, *, truth: Mapping[str, np.ndarray] | None = None,
-                 ascii_only: bool = False) -> str:
+def summary_text(
+    result: CalibrationResult,
+    *,
+    truth: Mapping[str, np.ndarray] | None = None,
+    ascii_only: bool = False,
+) -> str:
     """Return the summary of a calibration as aligned plain text, without a final newline.
 
     Parameters
@@ -442,6 +571,7 @@ def summary_text(result: CalibrationResult, *, truth: Mapping[str, np.ndarray] |
     InputError
         If `truth` lacks an array or has another shape.
     """
+
     def spell(text: str) -> str:
         return to_ascii(text) if ascii_only else text
 
@@ -457,5 +587,8 @@ def _section_lines(section: Section, spell: Callable[[str], str]) -> list[str]:
     table = [[spell(cell) for cell in row] for row in section.table]
     numeric = numeric_columns(section.table) if section.table else []
     left = next((i for i, number in enumerate(numeric) if number), len(numeric))
-    return (aligned(facts, left=2) + aligned(table, left=max(left, 1))
-            + [f"  {spell(note)}" for note in section.notes])
+    return (
+        aligned(facts, left=2)
+        + aligned(table, left=max(left, 1))
+        + [f"  {spell(note)}" for note in section.notes]
+    )

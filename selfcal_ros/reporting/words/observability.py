@@ -20,8 +20,9 @@ NAMED = 4
 
 def worded_observability(seen: Observability) -> Observability:
     """Return an observability with its modes and advice in words; existing texts are kept."""
-    return replace(seen, modes=tuple(map(worded, seen.modes)),
-                   advice=tuple(map(worded, seen.advice)))
+    return replace(
+        seen, modes=tuple(map(worded, seen.modes)), advice=tuple(map(worded, seen.advice))
+    )
 
 
 def told(error: NotIdentifiableError) -> NotIdentifiableError:
@@ -45,16 +46,19 @@ def describe_view(view: View, artifact: Artifact) -> str:
     if not view.grid:
         lines = view.on_stage(artifact).turn_lines or 0
         of_lines = "" if artifact.harmonics else f"{lines} line{'s' * (lines != 1)} ("
-        what = (f"an angular view turned by {of_lines}{360 * lines / artifact.angular_count:g} deg"
-                + ")" * bool(of_lines))
+        what = (
+            f"an angular view turned by {of_lines}{360 * lines / artifact.angular_count:g} deg"
+            + ")" * bool(of_lines)
+        )
     elif 1e-6 < turn < 360 - 1e-6:
         what = f"a view turned by {turn:.6g} deg"
     else:
         what = "an unturned view"
     unit, name = (1 / MM_PER_M, "mm") if artifact.marks else (artifact.grid_pitch_m, "pitch")
     steps = [round(shift / unit, 3) + 0.0 for shift in view.translation_m]
-    shifted = [f"{step:+g} {name} along {axis}" for step, axis in zip(steps, "XY", strict=True)
-               if step]
+    shifted = [
+        f"{step:+g} {name} along {axis}" for step, axis in zip(steps, "XY", strict=True) if step
+    ]
     also = " shifted by " if what.startswith("an unturned") else " and shifted by "
     return what + (also + " and ".join(shifted) if shifted else "")
 
@@ -69,23 +73,31 @@ def _line_offsets(of: Mapping[str, Any]) -> str:
 
 
 def _periodic(of: Mapping[str, Any]) -> str:
-    along = " and ".join(f"every {period} pitches along {axis}"
-                         for period, axis in zip(of["period"], "xy", strict=True) if period > 1)
+    along = " and ".join(
+        f"every {period} pitches along {axis}"
+        for period, axis in zip(of["period"], "xy", strict=True)
+        if period > 1
+    )
     return f"patterns that repeat {along} ({of['numbers']} numbers beside the datum)"
 
 
 def _groups(of: Mapping[str, Any]) -> str:
     smallest = [f"({m}, {n})" for m, n in of["smallest"]]
     more = ["..."] * (len(smallest) > NAMED)
-    return (f"{of['count']} groups of sites that no reading connects: each may move "
-            f"independently; the smallest is {', '.join([*smallest[:NAMED], *more])}")
+    return (
+        f"{of['count']} groups of sites that no reading connects: each may move "
+        f"independently; the smallest is {', '.join([*smallest[:NAMED], *more])}"
+    )
 
 
 def _harmonics(of: Mapping[str, Any]) -> str:
     *most, last = map(str, of["harmonics"])
     numbers = f"s {', '.join(most)} and {last}" if most else f" {last}"
-    why = ("every turn between views is a whole number of their periods, or nearly so"
-           if of["turned"] else "no view turns the lines")
+    why = (
+        "every turn between views is a whole number of their periods, or nearly so"
+        if of["turned"]
+        else "no view turns the lines"
+    )
     return f"angular map: harmonic{numbers}, as {why}"
 
 
@@ -101,32 +113,39 @@ SENTENCES: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "bending_x": lambda of: "steady turn from column to column: Gx = x y, Gy = -x^2/2",
     "bending_y": lambda of: "steady turn from row to row: Gx = y^2/2, Gy = -x y",
     "undetermined_fields": lambda of: (
-        f"{of['count']} fields whose standard uncertainty exceeds ten times the noise of a "
-        "reading"),
+        f"{of['count']} fields whose standard uncertainty exceeds ten times the noise of a reading"
+    ),
     "sites_never_visited": lambda of: (
         f"{of['count']} sites that no mark reaches, the first is "
-        f"({of['first'][0]}, {of['first'][1]})"),
+        f"({of['first'][0]}, {of['first'][1]})"
+    ),
     "marks_never_read": lambda of: f"{of['count']} marks of the plate that no view reads",
     "every_field": lambda of: "everything: one view cannot separate the stage from the plate",
     "line_offsets": _line_offsets,
     "rotation_symmetric": lambda of: (
         f"rotation-symmetric fields: every field that a {'half' if of['half'] else 'quarter'} "
-        f"turn maps to itself ({of['numbers']} numbers beside the datum)"),
+        f"turn maps to itself ({of['numbers']} numbers beside the datum)"
+    ),
     "periodic_fields": _periodic,
     "groups_of_sites": _groups,
     "harmonics_unseen": _harmonics,
     "periodic_lines": _periodic_lines,
     "groups_of_lines": lambda of: (
-        f"angular map: {of['count']} groups of lines that no view connects"),
+        f"angular map: {of['count']} groups of lines that no view connects"
+    ),
     "lines_never_visited": lambda of: f"{of['count']} angles of the stage that no line reaches",
     "looks_like_stage": lambda of: (
-        f"{of['term']}: {of['count']} mode{'s' * (of['count'] != 1)} of the stage look like it"),
+        f"{of['term']}: {of['count']} mode{'s' * (of['count'] != 1)} of the stage look like it"
+    ),
     "separate_term": lambda of: (
-        f"{of['term']}: {block_of(of['term']).cure}, or give it a size, as in {of['term']}:SIZE"),
+        f"{of['term']}: {block_of(of['term']).cure}, or give it a size, as in {of['term']}:SIZE"
+    ),
     "marks_missing": lambda of: (
         f"read the missing marks: only {of['sites']} of {of['of_sites']} sites and "
-        f"{of['lines']} of {of['of_lines']} lines are determined"),
+        f"{of['lines']} of {of['of_lines']} lines are determined"
+    ),
     "add_views": _add,
     "or_add_views": lambda of: f"or {_add(of)}",
-    "add_views_or_fewer_nodes": lambda of: f"{_add(of)}, or give the map fewer nodes"}
+    "add_views_or_fewer_nodes": lambda of: f"{_add(of)}, or give the map fewer nodes",
+}
 """The sentence of each mode and advice."""

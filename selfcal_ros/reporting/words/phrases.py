@@ -14,14 +14,19 @@ from selfcal_ros.model.result import ViewResult
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
-_NOISES = {"residuals": "residuals of the fit", "repeats": "scatter of repeats",
-           "declared": "declared by the detections",
-           "together": "declared by the detections, and residuals of the fit"}
+_NOISES = {
+    "residuals": "residuals of the fit",
+    "repeats": "scatter of repeats",
+    "declared": "declared by the detections",
+    "together": "declared by the detections, and residuals of the fit",
+}
 
-OF_RECHECK = {"known plate": "covariance of the plate's map in {}",
-              "plate temperature": "temperature of the plate now, and its expansion coefficient, "
-                                   "beyond what its calibration in {} contains",
-              "terms": "sizes of the terms of the model, which these views do not determine"}
+OF_RECHECK = {
+    "known plate": "covariance of the plate's map in {}",
+    "plate temperature": "temperature of the plate now, and its expansion coefficient, "
+    "beyond what its calibration in {} contains",
+    "terms": "sizes of the terms of the model, which these views do not determine",
+}
 """How a line of the budget was found, given the file of the plate."""
 
 
@@ -53,12 +58,17 @@ def few_read_text(found: Finding, of: dict[str, Any]) -> str:
     """Return the sentence on cells of images with few readings."""
     where = " and ".join(
         f"in cell {cell_label(one['cell'])} of the images"
-        f"{f' of view {one['view']!r}' * bool(one['view'])} ({one['read']} of {one['shown']})"
-        for one in of["cells"])
-    unknown = "the camera's error could not be determined" if of["unknown"] is None else (
-        f"the camera's error is not known in {_named(of['unknown'])}")
-    return (f"few marks were read {where}: look for dirt or a shadow in that part of the image"
-            + (f"; {unknown}" if of["unknown"] != [] else ""))
+        f"{f' of view {one["view"]!r}' * bool(one['view'])} ({one['read']} of {one['shown']})"
+        for one in of["cells"]
+    )
+    unknown = (
+        "the camera's error could not be determined"
+        if of["unknown"] is None
+        else (f"the camera's error is not known in {_named(of['unknown'])}")
+    )
+    return f"few marks were read {where}: look for dirt or a shadow in that part of the image" + (
+        f"; {unknown}" if of["unknown"] != [] else ""
+    )
 
 
 def view_left_out_text(found: Finding, of: dict[str, Any]) -> str:
@@ -67,20 +77,25 @@ def view_left_out_text(found: Finding, of: dict[str, Any]) -> str:
     read = of.get("read", [0, 0])  # older results name only views without readings
     if any(read):
         parts = " and ".join(
-            f"{got} of {wanted} {kind}" for got, wanted, kind in zip(
-                read, of["asked"], ("marks", "lines"), strict=True) if wanted)
+            f"{got} of {wanted} {kind}"
+            for got, wanted, kind in zip(read, of["asked"], ("marks", "lines"), strict=True)
+            if wanted
+        )
         text = f"view '{found.view}' is only partly in the map: {parts} became readings"
     else:
         text = f"view '{found.view}' is not part of the map: " + (
-            "none of its detections became a reading" if rejected else "nothing was detected in it")
+            "none of its detections became a reading" if rejected else "nothing was detected in it"
+        )
     return f"{text} ({rejected})" if rejected else text
 
 
 def repeats_contradict_text(found: Finding, of: dict[str, Any]) -> str:
     """Return the sentence on a view in which many readings are outliers among repeats."""
-    return (f"{of['rejected']} of {of['of']} readings of view '{found.view}' contradict the other "
-            "repeats of their marks and were left out: the plate slipped within the view, or a "
-            "second publisher sent readings (ros2 topic info -v); measure it again")
+    return (
+        f"{of['rejected']} of {of['of']} readings of view '{found.view}' contradict the other "
+        "repeats of their marks and were left out: the plate slipped within the view, or a "
+        "second publisher sent readings (ros2 topic info -v); measure it again"
+    )
 
 
 def _named(cells: Sequence[Any]) -> str:
@@ -89,8 +104,14 @@ def _named(cells: Sequence[Any]) -> str:
 
 def of_few_read(findings: Sequence[Finding]) -> str:
     """Return what the first sentence on a result says of cells with few readings."""
-    cells = list(dict.fromkeys(tuple(one["cell"]) for found in findings if found.name == "few_read"
-                               for one in found.details.get("cells", [])))
+    cells = list(
+        dict.fromkeys(
+            tuple(one["cell"])
+            for found in findings
+            if found.name == "few_read"
+            for one in found.details.get("cells", [])
+        )
+    )
     return f", few of them read in {_named(cells)}" if cells else ""
 
 
@@ -98,23 +119,29 @@ def line_text(line: BudgetLine) -> str:
     """Return how a line of the budget was found."""
     of = line.details
     if "by" in of:
-        return _NOISES[of["by"]] + (", the larger of two that contradict each other (see the "
-                                    "verdict)" if of["contradicted"] else "")
+        return _NOISES[of["by"]] + (
+            ", the larger of two that contradict each other (see the verdict)"
+            if of["contradicted"]
+            else ""
+        )
     if "given" in of and "remaining" not in of:
         return f"size {of['given']:.3g}, what the readings do not determine of it"
     if "given" in of:
         given = f"size {of['given']:.3g}, " + (
-            "of which the readings" if of["allowed"] is None else
-            f"too small for the readings; of {of['allowed']:.3g}, which they allow, they")
+            "of which the readings"
+            if of["allowed"] is None
+            else f"too small for the readings; of {of['allowed']:.3g}, which they allow, they"
+        )
         return f"{given} leave {of['remaining']:.0%}"
     if of.get("cause") == LACK_OF_FIT:
         return "residuals beyond the scatter of repeats, met in full at every place"
     if "cause" in of:
         return f"effect of the cause '{of['cause']}' that the readings show (see the verdict)"
     if "runs" in of:
-        return {"between runs": f"scatter of {of['runs']} runs beyond their uncertainties",
-                "shared by all runs": "declared or assumed, the same in all runs"}.get(
-                    line.component, f"uncertainties of {of['runs']} runs, by their weights")
+        return {
+            "between runs": f"scatter of {of['runs']} runs beyond their uncertainties",
+            "shared by all runs": "declared or assumed, the same in all runs",
+        }.get(line.component, f"uncertainties of {of['runs']} runs, by their weights")
     if "kind" in of:
         return f"relative {line.u:.3g} of the distance from the centre, by {of['kind']}"
     if "plate" in of:
@@ -122,14 +149,19 @@ def line_text(line: BudgetLine) -> str:
     if line.component == INTERPOLATION:
         nodes = "sites" if line.quantity == "xy" else "lines"
         return f"curvature of the map; assumes that it is smooth between {nodes}"
-    return ("no noise was found" if line.unit != "m/m" else
-            "none: the scale is a convention, and not part of the map")
+    return (
+        "no noise was found"
+        if line.unit != "m/m"
+        else "none: the scale is a convention, and not part of the map"
+    )
 
 
 STILL_GOOD = "Still good"
 CHANGED = "Changed"
-ONE_PASS = ("a single pass cannot tell a change from drift: measure two passes (repeats: 2, "
-            "visit_order: there_and_back), or declare the drift (--model drift:SIZE)")
+ONE_PASS = (
+    "a single pass cannot tell a change from drift: measure two passes (repeats: 2, "
+    "visit_order: there_and_back), or declare the drift (--model drift:SIZE)"
+)
 
 
 def recheck_sentence(found: Recheck) -> str:
@@ -138,10 +170,14 @@ def recheck_sentence(found: Recheck) -> str:
     if found.changed:
         return _changed(since, clearest, found.p)
     if scale.changed:
-        return (f"{_scale_changed(since, scale.change, scale.u, scale.p)}; otherwise no "
-                f"change beyond its uncertainty (p = {found.p:.2g}); {clearest}")
-    return (f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {found.p:.2g}); "
-            f"{clearest}")
+        return (
+            f"{_scale_changed(since, scale.change, scale.u, scale.p)}; otherwise no "
+            f"change beyond its uncertainty (p = {found.p:.2g}); {clearest}"
+        )
+    return (
+        f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {found.p:.2g}); "
+        f"{clearest}"
+    )
 
 
 def _since(where: str) -> str:
@@ -150,15 +186,19 @@ def _since(where: str) -> str:
 
 
 def _changed(since: str, clearest: str, p: float) -> str:
-    return (f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
-            "clean and placed as planned, and the camera was not touched (if it was, declare it: "
-            f"--microscope 0.01); {clearest} (p = {p:.2g})")
+    return (
+        f"{CHANGED} since {since}: calibrate again, provided this is the same plate, "
+        "clean and placed as planned, and the camera was not touched (if it was, declare it: "
+        f"--microscope 0.01); {clearest} (p = {p:.2g})"
+    )
 
 
 def _scale_changed(since: str, change: float, u: float, p: float) -> str:
-    return (f"Scale changed since {since} by {change * UM_PER_M:+.3g} ± {u * UM_PER_M:.2g} µm/m "
-            f"(k=1, p = {p:.2g}): the temperature of the plate or of the encoders has changed, one "
-            "plate cannot tell which")
+    return (
+        f"Scale changed since {since} by {change * UM_PER_M:+.3g} ± {u * UM_PER_M:.2g} µm/m "
+        f"(k=1, p = {p:.2g}): the temperature of the plate or of the encoders has changed, one "
+        "plate cannot tell which"
+    )
 
 
 def scale_changed_text(found: Finding, of: Mapping[str, Any]) -> str:
@@ -169,34 +209,47 @@ def scale_changed_text(found: Finding, of: Mapping[str, Any]) -> str:
 def other_plate_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why what was read is not the plate that is known."""
     since = _since(str(of["of"]))
-    return (f"another plate, or the plate has changed, in view '{printable(found.view)}': its "
-            f"marks differ from {since} by {found.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
-            "u, and neighbouring marks are not correlated, unlike the errors of a stage: check "
-            "which plate it is, that it is clean and lies as planned; if it has changed, calibrate "
-            "again")
+    return (
+        f"another plate, or the plate has changed, in view '{printable(found.view)}': its "
+        f"marks differ from {since} by {found.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
+        "u, and neighbouring marks are not correlated, unlike the errors of a stage: check "
+        "which plate it is, that it is clean and lies as planned; if it has changed, calibrate "
+        "again"
+    )
 
 
 def _clearest(of: LargestChange) -> str:
-    return (f"clearest at x = {of.x * MM_PER_M:.6g}, y = {of.y * MM_PER_M:.6g} mm: "
-            f"{of.change * UM_PER_M:+.3f} ± {of.u * UM_PER_M:.3f} µm along {of.axis} (k=1)")
+    return (
+        f"clearest at x = {of.x * MM_PER_M:.6g}, y = {of.y * MM_PER_M:.6g} mm: "
+        f"{of.change * UM_PER_M:+.3f} ± {of.u * UM_PER_M:.3f} µm along {of.axis} (k=1)"
+    )
 
 
 def recheck_lines(found: Recheck) -> list[str]:
     """Return what a recheck found in a few lines: both maps, and the scale."""
-    out = [f"XY     rms {found.rms * UM_PER_M:.5f} µm per axis, "
-           f"u {found.u_rms * UM_PER_M:.5f} µm, p = {found.p_xy:.2g}"]
+    out = [
+        f"XY     rms {found.rms * UM_PER_M:.5f} µm per axis, "
+        f"u {found.u_rms * UM_PER_M:.5f} µm, p = {found.p_xy:.2g}"
+    ]
     if (sizes := found.detectable) is not None:
-        out.append(f"detectable in 9 of 10 cases: {sizes.one_node * UM_PER_M:.2g} µm at one node, "
-                   f"or a smooth change of {sizes.smooth * UM_PER_M:.2g} µm rms per axis")
+        out.append(
+            f"detectable in 9 of 10 cases: {sizes.one_node * UM_PER_M:.2g} µm at one node, "
+            f"or a smooth change of {sizes.smooth * UM_PER_M:.2g} µm rms per axis"
+        )
     if (turn := found.largest_theta) is not None:
-        out.append(f"theta  clearest at line {turn.line}: "
-                   f"{turn.change * ARCSEC_PER_RAD:+.4f} ± {turn.u * ARCSEC_PER_RAD:.4f} "
-                   f"arcsec (k=1), p = {found.p_theta:.2g}")
+        out.append(
+            f"theta  clearest at line {turn.line}: "
+            f"{turn.change * ARCSEC_PER_RAD:+.4f} ± {turn.u * ARCSEC_PER_RAD:.4f} "
+            f"arcsec (k=1), p = {found.p_theta:.2g}"
+        )
     if found.passes == 1:
         out.append(ONE_PASS)
     scale = found.scale
-    return [*out, f"scale  {scale.change * UM_PER_M:+.4f} ± {scale.u * UM_PER_M:.4f} µm/m "
-            f"against the plate (k=1), p = {scale.p:.2g}"]
+    return [
+        *out,
+        f"scale  {scale.change * UM_PER_M:+.4f} ± {scale.u * UM_PER_M:.4f} µm/m "
+        f"against the plate (k=1), p = {scale.p:.2g}",
+    ]
 
 
 def changed_text(found: Finding, of: Mapping[str, Any]) -> str:
@@ -206,26 +259,32 @@ def changed_text(found: Finding, of: Mapping[str, Any]) -> str:
 
 def changed_or_drifted_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why a change that one pass shows is not qualified."""
-    return (f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
-            f"(p = {found.p:.2g}); {ONE_PASS}")
+    return (
+        f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
+        f"(p = {found.p:.2g}); {ONE_PASS}"
+    )
 
 
 def changed_or_microscope_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why a change that a microscope explains too is not qualified."""
-    return (f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
-            f"(p = {found.p:.2g}); a changed stage, or a microscope with a scale wrong by "
-            f"{of['scale']:+.1%} ± {of['u_scale']:.1%} and turned by "
-            f"{of['turn'] * MRAD_PER_RAD:+.2g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad (k=1) "
-            "explains it alike: measure check stops (check_stops in the plan), or correct the "
-            "pixel size")
+    return (
+        f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
+        f"(p = {found.p:.2g}); a changed stage, or a microscope with a scale wrong by "
+        f"{of['scale']:+.1%} ± {of['u_scale']:.1%} and turned by "
+        f"{of['turn'] * MRAD_PER_RAD:+.2g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad (k=1) "
+        "explains it alike: measure check stops (check_stops in the plan), or correct the "
+        "pixel size"
+    )
 
 
 def microscope_off_text(found: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of a microscope that is not as assumed, which the readings correct."""
-    return (f"the scale of the microscope is wrong by {found.size:+.2%} ± {found.u:.2%} and it is "
-            f"turned by {of['turn'] * MRAD_PER_RAD:+.3g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad "
-            "(k=1), as visits of one mark at several places show: the readings were corrected by "
-            "that; correct the pixel size before the next calibration")
+    return (
+        f"the scale of the microscope is wrong by {found.size:+.2%} ± {found.u:.2%} and it is "
+        f"turned by {of['turn'] * MRAD_PER_RAD:+.3g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad "
+        "(k=1), as visits of one mark at several places show: the readings were corrected by "
+        "that; correct the pixel size before the next calibration"
+    )
 
 
 def _clearest_of(found: Finding, of: Mapping[str, Any]) -> str:
@@ -234,6 +293,8 @@ def _clearest_of(found: Finding, of: Mapping[str, Any]) -> str:
 
 def misfit_text(found: Finding, _: Mapping[str, Any]) -> str:
     """Return the reason why readings do not fit a known plate."""
-    return (f"residuals are {found.size:.2f} times what the noise and the known plate allow "
-            f"(p = {found.p:.2g}): is it that plate, does it lie as planned, and has the map "
-            "enough nodes?")
+    return (
+        f"residuals are {found.size:.2f} times what the noise and the known plate allow "
+        f"(p = {found.p:.2g}): is it that plate, does it lie as planned, and has the map "
+        "enough nodes?"
+    )

@@ -26,19 +26,35 @@ def why_text(why: Finding | None, artifact: Artifact) -> str:
         return "" if why is None else sentence_of(why)
     more = "no single further view would change that"
     if add := why.details.get("add"):
-        view = View("", add["rotation"], (add["translation_x"], add["translation_y"]),
-                    add["grid"], add["angular"])
+        view = View(
+            "",
+            add["rotation"],
+            (add["translation_x"], add["translation_y"]),
+            add["grid"],
+            add["angular"],
+        )
         more = f"with {describe_view(view, artifact)} measured as well it could be"
     return f"cannot be held out: the rest does not identify the stage; {more}"
 
 
 def validation_json(found: list[HeldOut], artifact: Artifact) -> list[dict[str, Any]]:
     """Return the validation for ``extra["validation"]`` of a result: SI units."""
-    return [{"name": held_out_text(item.view, item.tenth), "view": item.view,
-             "n_grid": item.n_grid, "n_angular": item.n_angular, "rms_m": item.rms_m,
-             "max_m": item.max_m, "rms_rad": item.rms_rad, "ratio": item.ratio,
-             "note": why_text(item.why, artifact), "limit": item.limit,
-             "exceeds": item.exceeds} for item in found]
+    return [
+        {
+            "name": held_out_text(item.view, item.tenth),
+            "view": item.view,
+            "n_grid": item.n_grid,
+            "n_angular": item.n_angular,
+            "rms_m": item.rms_m,
+            "max_m": item.max_m,
+            "rms_rad": item.rms_rad,
+            "ratio": item.ratio,
+            "note": why_text(item.why, artifact),
+            "limit": item.limit,
+            "exceeds": item.exceeds,
+        }
+        for item in found
+    ]
 
 
 def validation_text(found: list[HeldOut], artifact: Artifact) -> list[str]:
@@ -51,12 +67,15 @@ def validation_text(found: list[HeldOut], artifact: Artifact) -> list[str]:
             continue
         parts = []
         if item.n_grid:
-            parts.append(f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} µm "
-                         f"rms, {item.max_m * UM_PER_M:.4g} µm at most "
-                         f"({item.ratio:.2f} times the noise{_limit_text(item, why)})")
+            parts.append(
+                f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} µm "
+                f"rms, {item.max_m * UM_PER_M:.4g} µm at most "
+                f"({item.ratio:.2f} times the noise{_limit_text(item, why)})"
+            )
         if item.n_angular:
-            parts.append(f"{item.n_angular} lines within "
-                         f"{item.rms_rad * ARCSEC_PER_RAD:.4g} arcsec rms")
+            parts.append(
+                f"{item.n_angular} lines within {item.rms_rad * ARCSEC_PER_RAD:.4g} arcsec rms"
+            )
         lines.append(f"{name}: " + ", ".join(parts))
     return lines
 
@@ -73,7 +92,8 @@ _QUANTITIES = {
     ("xy", False): "XY, one coordinate at the nodes of the map",
     ("xy", True): "XY, one coordinate anywhere in the field, map interpolated between its nodes",
     ("theta", False): "theta at the lines of the map",
-    ("theta", True): "theta at any angle, map interpolated between its lines"}
+    ("theta", True): "theta at any angle, map interpolated between its lines",
+}
 
 
 def quantity_text(budget: Budget) -> str:
@@ -86,16 +106,22 @@ def budget_text(found: list[Budget]) -> list[str]:
     lines = []
     for budget in found:
         factor, unit = (UM_PER_M, "µm") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
-        lines += [f"uncertainty of {quantity_text(budget)}, {unit}",
-                  f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from"]
+        lines += [
+            f"uncertainty of {quantity_text(budget)}, {unit}",
+            f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from",
+        ]
         for line in budget.lines:
-            lines.append(f"  {line.component:18}{line.kind:>5}{line.effect_rms * factor:12.4g}"
-                         f"{line.effect_max * factor:12.4g}{dof_text(line.dof):>10}  "
-                         f"{line.text or line_text(line)}")
-        lines += [f"  {'combined':18}{'':5}{budget.u_rms * factor:12.4g}"
-                  f"{budget.u_max * factor:12.4g}{dof_text(budget.dof):>10}",
-                  f"  {f'expanded, k = {budget.k:.2f}':23}{budget.U_rms * factor:12.4g}"
-                  f"{budget.U_max * factor:12.4g}          95.45 % coverage"]
+            lines.append(
+                f"  {line.component:18}{line.kind:>5}{line.effect_rms * factor:12.4g}"
+                f"{line.effect_max * factor:12.4g}{dof_text(line.dof):>10}  "
+                f"{line.text or line_text(line)}"
+            )
+        lines += [
+            f"  {'combined':18}{'':5}{budget.u_rms * factor:12.4g}"
+            f"{budget.u_max * factor:12.4g}{dof_text(budget.dof):>10}",
+            f"  {f'expanded, k = {budget.k:.2f}':23}{budget.U_rms * factor:12.4g}"
+            f"{budget.U_max * factor:12.4g}          95.45 % coverage",
+        ]
     return lines
 
 
@@ -104,28 +130,36 @@ _CERTIFICATES: dict[str, str] = {
     "plate_strain": "declare a smaller plate_strain:SIZE, from support and temperature",
     "line_eccentricity": "declare a smaller line_eccentricity:SIZE, from a certificate",
     "line_scale": "declare a smaller line_scale:SIZE, from a certificate",
-    "yaw": "declare a smaller yaw:SIZE, from a measurement of the stage's angles"}
+    "yaw": "declare a smaller yaw:SIZE, from a measurement of the stage's angles",
+}
 """What removes a line of a plan's budget that no change of the plan removes."""
 
 
 def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
     """Return the predicted budget of a plan as a table, with what removes each line."""
     out = ["predicted uncertainty budget (standard uncertainty, rms):"]
-    for quantity, name, factor, unit in (("xy", "XY, one coordinate", NM_PER_M, "nm"),
-                                         ("theta", "theta", URAD_PER_RAD, "µrad")):
+    for quantity, name, factor, unit in (
+        ("xy", "XY, one coordinate", NM_PER_M, "nm"),
+        ("theta", "theta", URAD_PER_RAD, "µrad"),
+    ):
         lines = [line for line in budget.lines if line.quantity == quantity]
         for line in lines:
             found = budget.removals.get((quantity, line.component))
-            out.append(f"  {name if line is lines[0] else '':20}{line.component:18}"
-                       f"{line.effect_rms * factor:9.3g} {unit}{100 * budget.share(line):5.0f} %"
-                       + ("" if found is None else f"  {removal_text(found, line, plan)}"))
+            out.append(
+                f"  {name if line is lines[0] else '':20}{line.component:18}"
+                f"{line.effect_rms * factor:9.3g} {unit}{100 * budget.share(line):5.0f} %"
+                + ("" if found is None else f"  {removal_text(found, line, plan)}")
+            )
         if lines:
-            whole, noise = (2 * factor * budget.u_rms(quantity, noise_only=only)
-                            for only in (False, True))
+            whole, noise = (
+                2 * factor * budget.u_rms(quantity, noise_only=only) for only in (False, True)
+            )
             larger = 2 * factor * budget.u_rms(quantity, if_larger=True)
-            out.append(f"  {'':20}U (k = 2) {whole:17.3g} {unit}; from noise alone {noise:.3g} "
-                       f"{unit}; {larger:.3g} {unit} if all that is assumed were {TIMES} times "
-                       "as large")
+            out.append(
+                f"  {'':20}U (k = 2) {whole:17.3g} {unit}; from noise alone {noise:.3g} "
+                f"{unit}; {larger:.3g} {unit} if all that is assumed were {TIMES} times "
+                "as large"
+            )
     return out
 
 
@@ -148,13 +182,17 @@ def step_text(step: plan_check.Step, plan: Plan) -> str:
         The plan before it.
     """
     if step.view is None and not step.order:
-        return (f"add check_stops: {{marks: {plan_check.CHECK_MARKS}, "
-                f"offset: {plan_check.CHECK_OFFSET_M * UM_PER_M:g}e-6}}")
+        return (
+            f"add check_stops: {{marks: {plan_check.CHECK_MARKS}, "
+            f"offset: {plan_check.CHECK_OFFSET_M * UM_PER_M:g}e-6}}"
+        )
     if step.view is None:
-        pairs = {(old.repeats, new.repeats)
-                 for old, new in zip(plan.views, step.views, strict=True)}
+        pairs = {
+            (old.repeats, new.repeats) for old, new in zip(plan.views, step.views, strict=True)
+        }
         return f"visit the marks in the order {step.order}" + "".join(
-            f", {new} repeats for {old}" for old, new in sorted(pairs) if new != old)
+            f", {new} repeats for {old}" for old, new in sorted(pairs) if new != old
+        )
     if step.repeat_of is None:
         return "add " + describe_view(step.view, plan.artifact)
     before = plan.views[step.repeat_of]
@@ -163,7 +201,10 @@ def step_text(step: plan_check.Step, plan: Plan) -> str:
 
 def search_text(search: Search) -> str:
     """Return how the best plan was searched."""
-    how = ("greedy choice, then exchange of single views" if search.n_plans is None
-           else f"all {search.n_plans} plans tried")
+    how = (
+        "greedy choice, then exchange of single views"
+        if search.n_plans is None
+        else f"all {search.n_plans} plans tried"
+    )
     size = search.size
     return how if size is None else f"{how} on a field of {size} x {size} sites"

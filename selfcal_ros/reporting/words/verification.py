@@ -18,22 +18,23 @@ from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
 _FAULTS = {
     TableFault.OFF: "the correction does not act: the table is not switched on or not loaded, or "
-                    "its unit is much too small",
+    "its unit is much too small",
     TableFault.SIGN: "the correction acts with the wrong sign: negate the table",
     TableFault.COMPONENTS: "the corrections of x and y are exchanged: the correction of x acts on "
-                           "y, and that of y on x",
+    "y, and that of y on x",
     TableFault.PLACES: "the places of the table are exchanged: its rows are read as columns",
     TableFault.TRANSPOSED: "x and y are exchanged in the whole table: its places and its "
-                           "corrections",
+    "corrections",
     TableFault.MIRRORED_X: "the table acts mirrored along x: its order, or the direction of x",
     TableFault.MIRRORED_Y: "the table acts mirrored along y: its order, or the direction of y",
     TableFault.MIRRORED: "the table acts mirrored along x and y: its order, or both directions",
     TableFault.OTHER: "a correction acts that is not this map: another table is loaded, or its "
-                      "places are wrong",
+    "places are wrong",
     TableFault.OLDER: "a correction acts that is like this map but not this map: an older table is "
-                      "loaded, or the stage has changed since",
+    "loaded, or the stage has changed since",
     TableFault.TOO_SMALL: "the map is not larger than its own uncertainty: there is nothing to "
-                          "verify"}
+    "verify",
+}
 
 _ACTS = {TableFault.OFF: "does not act", TableFault.SIGN: "has the wrong sign"}
 
@@ -41,16 +42,24 @@ UNIT = {"x": ("µm", UM_PER_M), "y": ("µm", UM_PER_M), "theta": ("arcsec", ARCS
 """Unit of an axis in a text, and how many of it are an SI unit."""
 
 
-def with_verification(before: CalibrationResult, after: CalibrationResult, *,
-                      names: tuple[str, str]) -> tuple[CalibrationResult, Verification]:
+def with_verification(
+    before: CalibrationResult, after: CalibrationResult, *, names: tuple[str, str]
+) -> tuple[CalibrationResult, Verification]:
     """Return the result with the correction on, with its ``verification``, and what that found."""
     found = verify(before, after, names=names)
     passed = found.passed and is_believed(after, found)
-    kept = {"of": names[0], "sentence": verification_sentence(found), "better": found.better,
-            "passed": passed, "fault": str(found.fault), "theta_fault": str(found.theta_fault),
-            "remains": found.remains, "correlation": found.alike,
-            "axes": {name: asdict(axis) for name, axis in found.axes.items()},
-            "remaining": None if found.remaining is None else asdict(found.remaining)}
+    kept = {
+        "of": names[0],
+        "sentence": verification_sentence(found),
+        "better": found.better,
+        "passed": passed,
+        "fault": str(found.fault),
+        "theta_fault": str(found.theta_fault),
+        "remains": found.remains,
+        "correlation": found.alike,
+        "axes": {name: asdict(axis) for name, axis in found.axes.items()},
+        "remaining": None if found.remaining is None else asdict(found.remaining),
+    }
     return replace(after, extra={**after.extra, VERIFICATION: plain(kept)}), found
 
 
@@ -58,11 +67,14 @@ def verification_sentence(found: Verification) -> str:
     """Return the verdict in one sentence."""
     both = [found.axes[name] for name in "xy"]
     was, now, U_was, U_now = (
-        significant(UM_PER_M * math.sqrt(sum(getattr(axis, name)**2 for axis in both) / 2))
-        for name in ("rms_before", "rms_after", "U_before", "U_after"))
+        significant(UM_PER_M * math.sqrt(sum(getattr(axis, name) ** 2 for axis in both) / 2))
+        for name in ("rms_before", "rms_after", "U_before", "U_after")
+    )
     head = "Better" if found.better else "Not better"
-    text = (f"{head}: the error is {was} µm rms per axis without the correction, {now} µm with it "
-            f"(U of a node {U_was} and {U_now} µm)")
+    text = (
+        f"{head}: the error is {was} µm rms per axis without the correction, {now} µm with it "
+        f"(U of a node {U_was} and {U_now} µm)"
+    )
     return "; ".join([text, *_why(found)])
 
 
@@ -71,20 +83,32 @@ def _why(found: Verification) -> list[str]:
     parts = []
     if found.fault is TableFault.FACTOR:
         mean = sum(found.axes[name].factor for name in "xy") / 2
-        parts.append(f"{significant(mean)} times the correction acts: look for a wrong unit or "
-                     "scale of the table")
+        parts.append(
+            f"{significant(mean)} times the correction acts: look for a wrong unit or "
+            "scale of the table"
+        )
     elif found.fault is TableFault.AXES_DIFFER:
-        parts.append("the axes differ: " + ", ".join(
-            f"{significant(found.axes[name].factor)} times the correction acts in {name}"
-            for name in "xy") + ": compare their tables")
+        parts.append(
+            "the axes differ: "
+            + ", ".join(
+                f"{significant(found.axes[name].factor)} times the correction acts in {name}"
+                for name in "xy"
+            )
+            + ": compare their tables"
+        )
     elif found.fault is not TableFault.NONE:
         parts.append(_FAULTS[found.fault])
     elif found.remains:
-        parts.append("more remains than the uncertainties explain: the stage has changed a little "
-                     "since, or an older table is loaded")
+        parts.append(
+            "more remains than the uncertainties explain: the stage has changed a little "
+            "since, or an older table is loaded"
+        )
     else:
-        parts.append("the correction acts as the map says" if found.better else
-                     "the difference is within the uncertainties")
+        parts.append(
+            "the correction acts as the map says"
+            if found.better
+            else "the difference is within the uncertainties"
+        )
     theta = found.axes.get("theta")
     if theta is not None and found.theta_fault is not TableFault.NONE:
         parts.append(_of_theta(found.theta_fault, theta))
@@ -100,16 +124,45 @@ def _of_theta(fault: TableFault, theta: AxisError) -> str:
 
 def verification_text(found: Verification) -> str:
     """Return the sentence, and the error of each axis before and after."""
-    rows = [["", "rms without", "rms with", "largest without", "largest with", "U without",
-             "U with", "acts"]]
+    rows = [
+        [
+            "",
+            "rms without",
+            "rms with",
+            "largest without",
+            "largest with",
+            "U without",
+            "U with",
+            "acts",
+        ]
+    ]
     for name, axis in found.axes.items():
         unit, scale = UNIT[name]
-        values = (axis.rms_before, axis.rms_after, axis.largest_before, axis.largest_after,
-                  axis.U_before, axis.U_after)
-        acts = "not shown" if math.isnan(axis.factor) else (
-            f"{axis.factor:.3f} ± {axis.u_factor:.3f}")
-        rows.append([f"{'θ' if name == 'theta' else name}, {unit}",
-                     *(significant(value * scale) for value in values), acts])
-    return "\n".join([verification_sentence(found), "", *aligned(rows), "",
-                      "  U: expanded uncertainty of a node, rms; acts: part of the correction that "
-                      "acts (1 is right), ± u"])
+        values = (
+            axis.rms_before,
+            axis.rms_after,
+            axis.largest_before,
+            axis.largest_after,
+            axis.U_before,
+            axis.U_after,
+        )
+        acts = (
+            "not shown" if math.isnan(axis.factor) else (f"{axis.factor:.3f} ± {axis.u_factor:.3f}")
+        )
+        rows.append(
+            [
+                f"{'θ' if name == 'theta' else name}, {unit}",
+                *(significant(value * scale) for value in values),
+                acts,
+            ]
+        )
+    return "\n".join(
+        [
+            verification_sentence(found),
+            "",
+            *aligned(rows),
+            "",
+            "  U: expanded uncertainty of a node, rms; acts: part of the correction that "
+            "acts (1 is right), ± u",
+        ]
+    )

@@ -23,17 +23,26 @@ from test.support.truth import random_truth, simulate_measurements
 
 UNSEARCHED = Options(causes=False)
 WRONG = {  # what the plan says, where the plate lies, in which view, and what is said
-    "clockwise": ("0, 90, tx", "0, 270, tx", 1, "turned by 270°, not by 90°; turn it counter-"
-                                                "clockwise"),
+    "clockwise": (
+        "0, 90, tx",
+        "0, 270, tx",
+        1,
+        "turned by 270°, not by 90°; turn it counter-clockwise",
+    ),
     "half a turn": ("0, 90, tx", "0, 180, tx", 1, "turned by 180°, not by 90°; turn it as planned"),
     "not turned": ("0, 90, tx, ty", "0, 0, tx, ty", 1, "turned by 0°, not by 90°; turn it as "),
     "other side": ("0, 90, tx", "0, 90, -tx", 2, "shifted by (-1, +0) pitches, not by (+1, +0) "),
     "other axis": ("0, 90, tx", "0, 90, ty", 2, "shifted by (+0, +1) pitches, not by (+1, +0) "),
-    "not shifted": ("0, 90, 180, tx", "0, 90, 180, 0", 3, "shifted by (+0, +0) pitches, not by ")}
+    "not shifted": ("0, 90, 180, tx", "0, 90, 180, 0", 3, "shifted by (+0, +0) pitches, not by "),
+}
 
 
-EITHER_WAY = [(name, sense) for name in WRONG for sense in Sense
-              if sense is Sense.MICROSCOPE_MOVES or name in ("clockwise", "other side")]
+EITHER_WAY = [
+    (name, sense)
+    for name in WRONG
+    for sense in Sense
+    if sense is Sense.MICROSCOPE_MOVES or name in ("clockwise", "other side")
+]
 """A turn and a shift in both senses: what moves changes the sign of either alike."""
 
 
@@ -51,7 +60,8 @@ def test_without_ids_the_other_views_tell_how_a_plate_lies(name, sense):
     with pytest.raises(PlacingError) as error:
         calibrate(readings)
     assert str(error.value).startswith(
-        f"plan '{lies}', view '{names[index]}': the plate lies {said}")
+        f"plan '{lies}', view '{names[index]}': the plate lies {said}"
+    )
     assert str(error.value).endswith("and measure this view again, or correct its pose in the plan")
 
 
@@ -66,16 +76,19 @@ def test_readings_without_repeats_tell_how_a_plate_lies(name):
 
 def test_a_contradiction_that_hides_in_scattered_repeats_tells_how_a_plate_lies():
     readings, names = read("0, 90, tx, ty", "0, 270, tx, ty")
-    drifting = replace(readings, views=tuple(
-        replace(view, sigma_xy=8 * view.sigma_xy) for view in readings.views))
+    drifting = replace(
+        readings, views=tuple(replace(view, sigma_xy=8 * view.sigma_xy) for view in readings.views)
+    )
     found = misplaced(drifting)
     assert found is not None and (found.view, found.found_deg) == (names[1], 270)
 
 
 def unrepeated(readings):
     """Return readings of which nothing tells the noise of repeats."""
-    return replace(readings, views=tuple(
-        replace(view, sigma_xy=float("nan"), dof_xy=0) for view in readings.views))
+    return replace(
+        readings,
+        views=tuple(replace(view, sigma_xy=float("nan"), dof_xy=0) for view in readings.views),
+    )
 
 
 @pytest.mark.parametrize("others", [(180,), ()])
@@ -84,14 +97,24 @@ def unrepeated(readings):
 def test_images_tell_in_which_view_a_plate_lies_otherwise(sense, repeats, others):
     """Of two views the second relative to the first."""
     truth = random_truth(Artifact(7, 1e-3, 0), 3, np.random.default_rng(3))
-    planned, lies = (simulate_measurements(
-        truth, image_plan(7, turns=(0, turn, *others), repeats=repeats), np.random.default_rng(4),
-        sigma_m=2e-8, sense=sense) for turn in (90, 270))
+    planned, lies = (
+        simulate_measurements(
+            truth,
+            image_plan(7, turns=(0, turn, *others), repeats=repeats),
+            np.random.default_rng(4),
+            sigma_m=2e-8,
+            sense=sense,
+        )
+        for turn in (90, 270)
+    )
     assert len(lies.views) == 9 * (2 + len(others))
     assert misplaced(planned) is None and misplaced(lies) is None
-    views = tuple(replace(there, view=here.view, m=-there.m, n=-there.n)
-                  if there.view.plan_view == "270" else there
-                  for here, there in zip(planned.views, lies.views, strict=True))
+    views = tuple(
+        replace(there, view=here.view, m=-there.m, n=-there.n)
+        if there.view.plan_view == "270"
+        else there
+        for here, there in zip(planned.views, lies.views, strict=True)
+    )
     found = misplaced(replace(lies, views=views))
     assert found is not None and (found.view, found.found_deg) == ("90", 270)
 
@@ -99,11 +122,13 @@ def test_images_tell_in_which_view_a_plate_lies_otherwise(sense, repeats, others
 def test_the_cells_of_one_view_alone_name_no_pose():
     """The first view of a run, which is checked as soon as it has been measured."""
     truth = random_truth(Artifact(7, 1e-3, 0), 1, np.random.default_rng(3))
-    readings = simulate_measurements(truth, image_plan(7, turns=(0,)), np.random.default_rng(4),
-                                     sigma_m=2e-8)
+    readings = simulate_measurements(
+        truth, image_plan(7, turns=(0,)), np.random.default_rng(4), sigma_m=2e-8
+    )
     rng = np.random.default_rng(5)
-    dirty = tuple(replace(cell, dx=cell.dx + rng.normal(0, 1e-6, len(cell.dx)))
-                  for cell in readings.views)
+    dirty = tuple(
+        replace(cell, dx=cell.dx + rng.normal(0, 1e-6, len(cell.dx))) for cell in readings.views
+    )
     assert len({cell.view.plan_view for cell in dirty}) == 1 < len(dirty)
     assert misplaced(unrepeated(replace(readings, views=dirty))) is None
 
@@ -125,9 +150,13 @@ def test_two_views_do_not_tell_which_of_them_lies_otherwise():
 def test_a_plate_without_errors_of_its_own_tells_nothing():
     readings, _ = read("0, 90, tx", "0, 270, tx")
     noise = np.random.default_rng(1)
-    blank = replace(readings, views=tuple(
-        replace(v, dx=noise.normal(0, 1.4e-8, len(v.m)), dy=noise.normal(0, 1.4e-8, len(v.m)))
-        for v in readings.views))
+    blank = replace(
+        readings,
+        views=tuple(
+            replace(v, dx=noise.normal(0, 1.4e-8, len(v.m)), dy=noise.normal(0, 1.4e-8, len(v.m)))
+            for v in readings.views
+        ),
+    )
     assert misplaced(blank) is None
 
 
@@ -155,22 +184,37 @@ def test_other_poses_are_turns_and_shifts_each_once():
     pose = plan_of("tx", 5, count=0).views[0].lattice_pose(plan_of("tx", 5, count=0).artifact)
     poses = [(other.q, other.shift) for other in other_poses(pose)]
     assert len(poses) == len(set(poses)) and (0, (1, 0)) not in poses
-    assert {(1, (1, 0)), (2, (1, 0)), (3, (1, 0)), (0, (0, 0)), (0, (-1, 0)), (0, (0, 1)),
-            (0, (0, -1)), (0, (2, 0)), (0, (1, 1)), (0, (1, -1))} == set(poses)
+    assert {
+        (1, (1, 0)),
+        (2, (1, 0)),
+        (3, (1, 0)),
+        (0, (0, 0)),
+        (0, (-1, 0)),
+        (0, (0, 1)),
+        (0, (0, -1)),
+        (0, (2, 0)),
+        (0, (1, 1)),
+        (0, (1, -1)),
+    } == set(poses)
 
 
 PLATES = {"lattice": plate(9, 5), "list": lattice(7), "rings": rings(), "scatter": scatter()}
 
 
-@pytest.mark.parametrize(("name", "index", "pose", "said"), [
-    ("lattice", 1, (270, (0, 0)), "turned by 270°, not by 90°"),
-    ("lattice", 2, (127, (0.6, -0.7)), "turned by 127°, not by 37°"),
-    ("lattice", 4, (0, (0, 0)), "shifted by (+0, +0) pitches, not by (+1, +0)"),
-    ("list", 1, (0, (0, 0)), "turned by 0°, not by 90°"),
-    ("list", 4, (0, (-1, 0)), "shifted by (-1, +0) pitches, not by (+1, +0)"),
-    ("rings", 2, (217, (0.6, -0.7)), "turned by 217°, not by 37°")])
+@pytest.mark.parametrize(
+    ("name", "index", "pose", "said"),
+    [
+        ("lattice", 1, (270, (0, 0)), "turned by 270°, not by 90°"),
+        ("lattice", 2, (127, (0.6, -0.7)), "turned by 127°, not by 37°"),
+        ("lattice", 4, (0, (0, 0)), "shifted by (+0, +0) pitches, not by (+1, +0)"),
+        ("list", 1, (0, (0, 0)), "turned by 0°, not by 90°"),
+        ("list", 4, (0, (-1, 0)), "shifted by (-1, +0) pitches, not by (+1, +0)"),
+        ("rings", 2, (217, (0.6, -0.7)), "turned by 217°, not by 37°"),
+    ],
+)
 def test_plates_off_the_lattice_and_lists_of_marks_are_found_to_lie_otherwise(
-        name, index, pose, said):
+    name, index, pose, said
+):
     with pytest.raises(PlacingError, match=re.escape(f"'view {index}': the plate lies {said}")):
         calibrate(laid_at(PLATES[name], index, pose, 0), UNSEARCHED)
 
@@ -196,12 +240,19 @@ def reflected(events, of):
     return out
 
 
-@pytest.mark.parametrize(("of", "said", "sense"), [
-    (lambda x, y: (-x, y), "have x reversed; correct", Sense.MICROSCOPE_MOVES),
-    (lambda x, y: (x, -y), "have y reversed; correct", Sense.PLATE_MOVES),
-    (lambda x, y: (y, x), "have x and y exchanged; correct", Sense.PLATE_MOVES),
-    (lambda x, y: (-y, -x), "have x and y exchanged and reversed; correct",
-     Sense.MICROSCOPE_MOVES)])
+@pytest.mark.parametrize(
+    ("of", "said", "sense"),
+    [
+        (lambda x, y: (-x, y), "have x reversed; correct", Sense.MICROSCOPE_MOVES),
+        (lambda x, y: (x, -y), "have y reversed; correct", Sense.PLATE_MOVES),
+        (lambda x, y: (y, x), "have x and y exchanged; correct", Sense.PLATE_MOVES),
+        (
+            lambda x, y: (-y, -x),
+            "have x and y exchanged and reversed; correct",
+            Sense.MICROSCOPE_MOVES,
+        ),
+    ],
+)
 def test_a_mirrored_frame_without_ids_is_named(sense, of, said):
     cell = scene("0, 90, 180, tx, ty", with_ids=False, sense=sense, **NOISE)
     readings = collect(reflected(cell.events, of), measurement_sense=str(sense))[0]

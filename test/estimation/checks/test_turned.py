@@ -34,11 +34,19 @@ def measured(camera=lambda x, y: (x, y), line=1.0, seed=5, plan=PLAN):
     return gathered(events).collect()[0]
 
 
-@pytest.mark.parametrize(("camera", "line", "said"), [
-    (lambda x, y: (-y, x), 1, "the offsets are turned by 90° counter-clockwise"),
-    (lambda x, y: (-x, y), 1, "offset_x has the other sign"),
-    (lambda x, y: (y, x), 1, "offset_x and offset_y are exchanged"),
-    (lambda x, y: (x, y), -1, "offset_theta has the other sign, or the offsets are turned by 180")])
+@pytest.mark.parametrize(
+    ("camera", "line", "said"),
+    [
+        (lambda x, y: (-y, x), 1, "the offsets are turned by 90° counter-clockwise"),
+        (lambda x, y: (-x, y), 1, "offset_x has the other sign"),
+        (lambda x, y: (y, x), 1, "offset_x and offset_y are exchanged"),
+        (
+            lambda x, y: (x, y),
+            -1,
+            "offset_theta has the other sign, or the offsets are turned by 180",
+        ),
+    ],
+)
 def test_the_wiring_is_named_before_any_other_cause(camera, line, said):
     """One of each pair that the lines tell apart: the other one of it is not named."""
     with pytest.raises(WiringError) as caught:
@@ -49,10 +57,16 @@ def test_the_wiring_is_named_before_any_other_cause(camera, line, said):
 
 
 def test_without_lines_both_signs_are_possible_and_named():
-    plan = replace(PLAN, artifact=replace(PLAN.artifact, angular_count=0), views=tuple(
-        replace(view, angular=False) for view in PLAN.views if view.grid))
-    with pytest.raises(WiringError, match="turned by 90° counter-clockwise, or the offsets are "
-                       "turned by 90° clockwise: only so"):
+    plan = replace(
+        PLAN,
+        artifact=replace(PLAN.artifact, angular_count=0),
+        views=tuple(replace(view, angular=False) for view in PLAN.views if view.grid),
+    )
+    with pytest.raises(
+        WiringError,
+        match="turned by 90° counter-clockwise, or the offsets are "
+        "turned by 90° clockwise: only so",
+    ):
         calibrate(measured(lambda x, y: (-y, x), plan=plan))
 
 
@@ -67,8 +81,10 @@ def test_right_offsets_are_not_refused(seed):
 def test_another_contradiction_is_not_taken_for_wrong_offsets():
     """A plate that slips within a view fits no other wiring either."""
     readings = measured()
-    slipped = replace(readings.views[1], dx=readings.views[1].dx + 5e-6 * (
-        np.arange(len(readings.views[1].m)) > 12))
+    slipped = replace(
+        readings.views[1],
+        dx=readings.views[1].dx + 5e-6 * (np.arange(len(readings.views[1].m)) > 12),
+    )
     spoilt = replace(readings, views=(readings.views[0], slipped, *readings.views[2:]))
     assert not calibrate(spoilt).verdict.qualified
 

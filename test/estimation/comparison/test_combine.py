@@ -50,8 +50,9 @@ def run_of(values, variance, *, common=0.0, shares=True, dof=np.inf):
 def calibrated(seed, *, options=None, artifact=ARTIFACT, truth=None, sigma=2e-8):
     rng = np.random.default_rng(seed)
     truth = truth or random_truth(artifact, 4, np.random.default_rng(99))
-    readings = simulate_measurements(truth, hu_plan(artifact, 2), rng, sigma_m=sigma,
-                                     sigma_theta_rad=2e-5)
+    readings = simulate_measurements(
+        truth, hu_plan(artifact, 2), rng, sigma_m=sigma, sigma_theta_rad=2e-5
+    )
     return calibrate(readings, options or bare(causes=False))
 
 
@@ -62,21 +63,32 @@ def part(name, result):
 def run_at(run_id, **changed):
     """Return run A with another map, and what tells when it was recorded."""
     times = dict.fromkeys(("first_exposure", "last_exposure"), "2026-01-01T00:00:00+00:00")
-    return replace(A, run_id=run_id, error_map=replace(A.error_map, **changed),
-                   provenance=replace(A.provenance, extra=times))
+    return replace(
+        A,
+        run_id=run_id,
+        error_map=replace(A.error_map, **changed),
+        provenance=replace(A.provenance, extra=times),
+    )
 
 
 def thrice(result):
     """Return a run three times, apart by a tenth of u: equal maps are of one recording."""
     off = 0.1 * result.error_map.u_gx
-    return [part(name, replace(result, error_map=replace(
-        result.error_map, gx=result.error_map.gx + sign * off)))
-        for name, sign in zip("abc", (1, -1, 0), strict=True)]
+    return [
+        part(
+            name,
+            replace(
+                result, error_map=replace(result.error_map, gx=result.error_map.gx + sign * off)
+            ),
+        )
+        for name, sign in zip("abc", (1, -1, 0), strict=True)
+    ]
 
 
 def scaled(emap, by):
-    return replace(emap, **{name: by * getattr(emap, name) for name in ("gx", "gy", "u_gx",
-                                                                        "u_gy")})
+    return replace(
+        emap, **{name: by * getattr(emap, name) for name in ("gx", "gy", "u_gx", "u_gy")}
+    )
 
 
 A, B, C = (calibrated(seed) for seed in (1, 2, 3))
@@ -138,10 +150,18 @@ def test_the_probability_of_the_scatter_is_that_of_chi_squared_and_of_two_shapes
 
 def test_what_is_shared_is_known_and_adds_degrees_of_freedom():
     shape = np.array([[3.0], [1.0], [-1.0], [-3.0]])
-    alone, shared = (mean_of([run_of(amplitude * shape[:, 0], 0.01, common=common)
-                              for amplitude in (-1.0, 0.0, 1.0)], np.zeros((4, 0)), shape)
-                     for common in (0.0, 7.0))
-    ratio = np.min(shared.u**4 / (alone.within + alone.between)**2 * alone.dof)
+    alone, shared = (
+        mean_of(
+            [
+                run_of(amplitude * shape[:, 0], 0.01, common=common)
+                for amplitude in (-1.0, 0.0, 1.0)
+            ],
+            np.zeros((4, 0)),
+            shape,
+        )
+        for common in (0.0, 7.0)
+    )
+    ratio = np.min(shared.u**4 / (alone.within + alone.between) ** 2 * alone.dof)
     assert shared.dof == pytest.approx(ratio, rel=0.02) and shared.dof > 10 * alone.dof
 
 
@@ -154,9 +174,15 @@ def test_a_single_number_that_differs_between_two_runs_has_one_degree_of_freedom
 
 def test_the_datum_of_a_run_changes_nothing():
     emap, at = B.error_map, ARTIFACT
-    moved = replace(B, error_map=replace(
-        emap, gx=emap.gx + 1e-5 - 2e-5 * at.y_m + 3e-5 * at.x_m,
-        gy=emap.gy - 2e-5 + 2e-5 * at.x_m + 3e-5 * at.y_m, g_theta=emap.g_theta + 1e-4))
+    moved = replace(
+        B,
+        error_map=replace(
+            emap,
+            gx=emap.gx + 1e-5 - 2e-5 * at.y_m + 3e-5 * at.x_m,
+            gy=emap.gy - 2e-5 + 2e-5 * at.x_m + 3e-5 * at.y_m,
+            g_theta=emap.g_theta + 1e-4,
+        ),
+    )
     plain_one, other = (combine([part("a", A), part("b", b)]) for b in (B, moved))
     np.testing.assert_allclose(other.xy.values, plain_one.xy.values, atol=1e-17)
     np.testing.assert_allclose(other.theta.values, plain_one.theta.values, atol=1e-17)
@@ -166,8 +192,9 @@ def test_the_datum_of_a_run_changes_nothing():
 def test_three_equal_runs_give_their_map_with_a_third_of_the_variance():
     found = combine(thrice(A)).result
     np.testing.assert_allclose(found.error_map.gx, A.error_map.gx, atol=1e-18)
-    np.testing.assert_allclose(found.error_map.g_theta, A.error_map.g_theta
-                               - A.error_map.g_theta.mean(), atol=1e-18)
+    np.testing.assert_allclose(
+        found.error_map.g_theta, A.error_map.g_theta - A.error_map.g_theta.mean(), atol=1e-18
+    )
     np.testing.assert_allclose(found.error_map.u_gy * np.sqrt(3), A.error_map.u_gy, rtol=1e-9)
     assert found.error_map.nonorthogonality == pytest.approx(A.error_map.nonorthogonality)
     assert found.error_map.scale_difference == pytest.approx(A.error_map.scale_difference)
@@ -195,9 +222,12 @@ def test_the_mean_keeps_its_covariance_in_its_file():
 def test_an_assumed_microscope_is_shared_by_all_runs():
     """The variance of its factors in one run is that in the mean of three of its equals."""
     truth = random_truth(Artifact(5, 0.01), 4, np.random.default_rng(4))
-    result = calibrate(simulate_measurements(
-        truth, hu_plan(truth.artifact, 2), np.random.default_rng(5), sigma_m=2e-8, visits=True),
-        Options(causes=False, terms=parse_terms(["microscope:2e-5"], "")))
+    result = calibrate(
+        simulate_measurements(
+            truth, hu_plan(truth.artifact, 2), np.random.default_rng(5), sigma_m=2e-8, visits=True
+        ),
+        Options(causes=False, terms=parse_terms(["microscope:2e-5"], "")),
+    )
     found = combine(thrice(result))
     factors = result.kept.factors.of_map
     of = np.array(result.kept.factors.terms) == "microscope"
@@ -209,8 +239,9 @@ def test_an_assumed_microscope_is_shared_by_all_runs():
 
 
 def test_a_reference_length_is_kept_once():
-    reference = Options(assumed=(), causes=False,
-                        reference=ReferenceLength("artifact", 1e-5, 2e-6, "PTB 1"))
+    reference = Options(
+        assumed=(), causes=False, reference=ReferenceLength("artifact", 1e-5, 2e-6, "PTB 1")
+    )
     runs = [part(name, calibrated(seed, options=reference)) for name, seed in (("a", 1), ("b", 2))]
     kept, removed = (combine(runs, keep_scale=keep) for keep in (True, False))
     place = np.concatenate([ARTIFACT.x_m.ravel(), ARTIFACT.y_m.ravel()]) * 2e-6
@@ -233,10 +264,21 @@ def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
     runs = []
     for amplitude in (-1.0, 0.0, 1.0):
         emap = A.error_map
-        runs.append(part(str(amplitude), replace(A, input={}, error_map=replace(
-            emap, gx=emap.gx + 1e-6 * amplitude * field[0],
-            gy=emap.gy + 1e-6 * amplitude * field[1],
-            g_theta=emap.g_theta + 1e-3 * amplitude * wave))))
+        runs.append(
+            part(
+                str(amplitude),
+                replace(
+                    A,
+                    input={},
+                    error_map=replace(
+                        emap,
+                        gx=emap.gx + 1e-6 * amplitude * field[0],
+                        gy=emap.gy + 1e-6 * amplitude * field[1],
+                        g_theta=emap.g_theta + 1e-3 * amplitude * wave,
+                    ),
+                ),
+            )
+        )
     found = combine(runs)
     assert np.corrcoef(found.theta.between, wave**2)[0, 1] > 0.999
     assert found.theta.between.max() == pytest.approx(1e-6 / 3, rel=0.01)
@@ -248,8 +290,9 @@ def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
 def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     """Twice the u of the calibration: a fifth of the weight of both."""
     emap = A.error_map
-    other = replace(thrice(A)[0].error_map, u_gx=2 * emap.u_gx, u_gy=2 * emap.u_gy,
-                    u_g_theta=2 * emap.u_g_theta)
+    other = replace(
+        thrice(A)[0].error_map, u_gx=2 * emap.u_gx, u_gy=2 * emap.u_gy, u_g_theta=2 * emap.u_g_theta
+    )
     found = combine([part("a", A), Part("b", other)])
     np.testing.assert_allclose(found.xy.weights, [0.8, 0.2], atol=0.02)
     np.testing.assert_allclose(found.theta.weights, [0.8, 0.2], atol=0.03)
@@ -257,8 +300,7 @@ def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     assert covariance_of(found.result, "xy", found.known).ndim == 1
 
 
-@pytest.mark.parametrize(("kind", "size"), [
-    ("none", 0.0), ("white", 20e-9), ("smooth", 20e-9)])
+@pytest.mark.parametrize(("kind", "size"), [("none", 0.0), ("white", 20e-9), ("smooth", 20e-9)])
 def test_coverage_and_false_alarms(kind, size):
     """95.45 % within U; E_n beyond 1 in 4.55 % of the nodes, and 5 % of runs, without a part.
 
@@ -299,20 +341,23 @@ def test_the_run_that_differs_is_named():
 
 
 def test_runs_agree_where_p_is_above_the_level():
-    rows = combine([part(name, one) for name, one in zip("abc", (A, B, C), strict=True)]
-                   ).result.extra["combined"]["runs"]
+    rows = combine(
+        [part(name, one) for name, one in zip("abc", (A, B, C), strict=True)]
+    ).result.extra["combined"]["runs"]
     assert all(row["agrees"] and 0.05 < row["p"] <= 1 for row in rows)
 
 
 def test_sites_that_a_run_does_not_know_are_unknown():
     hole = B.error_map.gx.copy()
     hole[1, 2] = np.nan
-    found = combine([part("a", A), part("b", replace(B, error_map=replace(
-        B.error_map, gx=hole)))]).result
+    found = combine(
+        [part("a", A), part("b", replace(B, error_map=replace(B.error_map, gx=hole)))]
+    ).result
     assert np.isnan(found.error_map.gx[1, 2]) and np.isnan(found.error_map.u_gx[1, 2])
     assert np.isnan(found.error_map.gx).sum() == 1
     assert worded(found).warnings == (
-        "sites that are not known in all runs are unknown in the mean: 1",)
+        "sites that are not known in all runs are unknown in the mean: 1",
+    )
 
 
 def test_large_fields_are_combined_by_their_variances():
@@ -320,15 +365,20 @@ def test_large_fields_are_combined_by_their_variances():
     artifact, rng = Artifact(41, 0.01), np.random.default_rng(3)
     base = random_map(artifact, 1)
     u = np.full(artifact.shape, 3e-9)
-    maps = [replace(base, gx=base.gx + rng.normal(0, u), gy=base.gy + rng.normal(0, u), u_gx=u,
-                    u_gy=u) for _ in range(3)]
-    found = combine([Part(name, emap, replace(result_of(emap), input={}))
-                     for name, emap in zip("abc", maps, strict=True)])
+    maps = [
+        replace(base, gx=base.gx + rng.normal(0, u), gy=base.gy + rng.normal(0, u), u_gx=u, u_gy=u)
+        for _ in range(3)
+    ]
+    found = combine(
+        [
+            Part(name, emap, replace(result_of(emap), input={}))
+            for name, emap in zip("abc", maps, strict=True)
+        ]
+    )
     assert found.xy.covariance.ndim == 1 and not found.result.kept.covariances
     emap = found.result.error_map
     np.testing.assert_allclose(emap.u_gx, 3e-9 / np.sqrt(3), rtol=0.05)
-    assert all(not run.test.correlated and not run.test.significant
-               for run in found.xy.deviations)
+    assert all(not run.test.correlated and not run.test.significant for run in found.xy.deviations)
     beyond = np.mean([abs(run.e_n) > 1 for run in found.xy.deviations])
     assert beyond == pytest.approx(0.0455, abs=0.01)
 
@@ -340,25 +390,53 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
     assert e_n == pytest.approx(9.0 / (coverage_factor(GTC_DOF) * np.sqrt(5.0)), rel=1e-6)
 
 
-@pytest.mark.parametrize(("parts", "message"), [
-    ([part("a", A)], "a single map"),
-    ([Part("a", A.error_map), Part("b", B.error_map)], "no RESULT.json among them"),
-    ([part("a", A), part("b", replace(B, verdict=Verdict(Grade.NOT_QUALIFIED)))],
-     "b: its calibration is not qualified"),
-    ([part("a", replace(A, input={"sha256": "1"})), part("b", replace(A, input={"sha256": "1"}))],
-     "b: of the same recording as a"),
-    ([part("a", A), part("b", replace(A, run_id="other"))],
-     "b: of the same readings as a: their maps are equal"),
-    ([part("a", run_at("1")), part("b", run_at("1", gx=B.error_map.gx))],
-     "b: of the same recording as a"),
-    ([part("a", A), Part("b", scaled(B.error_map, 1e6))], r"b: .* of a: is it in µm\?"),
-    ([part("a", A), Part("b", replace(B.error_map, g_theta=1e6 * B.error_map.g_theta))],
-     r"b: .* of a: is it in µrad\?"),
-    ([part("a", A), part("b", calibrated(1, artifact=Artifact(5, 0.01, 12)))],
-     "the lattices differ"),
-    ([part("a", A), part("b", replace(B, error_map=replace(
-        B.error_map, u_gx=np.full(ARTIFACT.shape, np.nan))))], "0 sites are known"),
-])
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ([part("a", A)], "a single map"),
+        ([Part("a", A.error_map), Part("b", B.error_map)], "no RESULT.json among them"),
+        (
+            [part("a", A), part("b", replace(B, verdict=Verdict(Grade.NOT_QUALIFIED)))],
+            "b: its calibration is not qualified",
+        ),
+        (
+            [
+                part("a", replace(A, input={"sha256": "1"})),
+                part("b", replace(A, input={"sha256": "1"})),
+            ],
+            "b: of the same recording as a",
+        ),
+        (
+            [part("a", A), part("b", replace(A, run_id="other"))],
+            "b: of the same readings as a: their maps are equal",
+        ),
+        (
+            [part("a", run_at("1")), part("b", run_at("1", gx=B.error_map.gx))],
+            "b: of the same recording as a",
+        ),
+        ([part("a", A), Part("b", scaled(B.error_map, 1e6))], r"b: .* of a: is it in µm\?"),
+        (
+            [part("a", A), Part("b", replace(B.error_map, g_theta=1e6 * B.error_map.g_theta))],
+            r"b: .* of a: is it in µrad\?",
+        ),
+        (
+            [part("a", A), part("b", calibrated(1, artifact=Artifact(5, 0.01, 12)))],
+            "the lattices differ",
+        ),
+        (
+            [
+                part("a", A),
+                part(
+                    "b",
+                    replace(
+                        B, error_map=replace(B.error_map, u_gx=np.full(ARTIFACT.shape, np.nan))
+                    ),
+                ),
+            ],
+            "0 sites are known",
+        ),
+    ],
+)
 def test_what_cannot_be_combined_is_refused(parts, message):
     with pytest.raises(InputError, match=message):
         combine(parts)
@@ -373,8 +451,13 @@ def test_runs_at_the_same_simulated_time_are_told_apart_by_their_noise():
 def test_a_table_as_coarse_as_its_errors_is_no_other_unit():
     """A map of a tenth of the accuracy is combined; its errors are larger, as its u says."""
     rng, u = np.random.default_rng(1), 20 * A.error_map.u_gx
-    coarse = replace(A.error_map, gx=A.error_map.gx + rng.normal(0, u),
-                     gy=A.error_map.gy + rng.normal(0, u), u_gx=u, u_gy=u)
+    coarse = replace(
+        A.error_map,
+        gx=A.error_map.gx + rng.normal(0, u),
+        gy=A.error_map.gy + rng.normal(0, u),
+        u_gx=u,
+        u_gy=u,
+    )
     assert combine([part("a", A), Part("b", coarse)]).xy.weights[0] > 0.99
 
 
@@ -399,28 +482,47 @@ def test_what_shapes_leave_of_a_run_has_the_variance_of_the_other_directions():
     np.testing.assert_allclose(rest.share, (others**2).sum(axis=1))
 
 
-@pytest.mark.parametrize(("p", "p_z", "both"), [(0.01, 0.3, 0.02), (0.3, 0.01, 0.02),
-                                                (0.7, 0.6, 1.0)])
+@pytest.mark.parametrize(
+    ("p", "p_z", "both"), [(0.01, 0.3, 0.02), (0.3, 0.01, 0.02), (0.7, 0.6, 1.0)]
+)
 def test_the_probability_of_a_run_is_twice_that_of_its_worse_test(p, p_z, both):
-    found = _of_run(SimpleNamespace(
-        e_n=np.array([0.5, -2.0, 0.5, -0.5]), p_scatter=0.04,
-        test=SimpleNamespace(p=p, p_z=p_z, significant=both < 0.05)), "_theta", 0.05)
-    assert found == {"e_n_rms_theta": pytest.approx(np.sqrt(4.75 / 4)), "e_n_largest_theta": 2.0,
-                     "beyond_theta": 0.25, "p_theta": both, "agrees_theta": both == 1.0,
-                     "stands_out_theta": True}
+    found = _of_run(
+        SimpleNamespace(
+            e_n=np.array([0.5, -2.0, 0.5, -0.5]),
+            p_scatter=0.04,
+            test=SimpleNamespace(p=p, p_z=p_z, significant=both < 0.05),
+        ),
+        "_theta",
+        0.05,
+    )
+    assert found == {
+        "e_n_rms_theta": pytest.approx(np.sqrt(4.75 / 4)),
+        "e_n_largest_theta": 2.0,
+        "beyond_theta": 0.25,
+        "p_theta": both,
+        "agrees_theta": both == 1.0,
+        "stands_out_theta": True,
+    }
 
 
 def test_a_recheck_is_not_combined_with_what_its_plate_is_known_from():
-    one, other = (part(f"{name}.json", replace(result, input={"sha256": name}))
-                  for result, name in ((A, "a"), (B, "b")))
+    one, other = (
+        part(f"{name}.json", replace(result, input={"sha256": name}))
+        for result, name in ((A, "a"), (B, "b"))
+    )
     assert combine([one, other])
 
     def rechecked(run, of):
         calibration = SimpleNamespace(readings={"sha256": of})
-        return replace(run, result=replace(run.result, recheck=SimpleNamespace(
-            calibration=calibration)))
+        return replace(
+            run, result=replace(run.result, recheck=SimpleNamespace(calibration=calibration))
+        )
+
     assert combine([one, rechecked(other, "c")])
-    for pair in ([one, rechecked(other, "a")], [rechecked(other, "a"), one],
-                 [rechecked(one, "c"), rechecked(other, "c")]):
+    for pair in (
+        [one, rechecked(other, "a")],
+        [rechecked(other, "a"), one],
+        [rechecked(one, "c"), rechecked(other, "c")],
+    ):
         with pytest.raises(InputError, match=r"of the same plate errors as .*one calibration"):
             combine(pair)

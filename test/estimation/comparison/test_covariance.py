@@ -33,23 +33,42 @@ PLAN = plan_of("0,90,tx,2ty", Artifact(5, 0.01, 12), lines=1)
 TURNED = plan_of("0,90+tx,2ty,270-2tx+ty,tx", Artifact(5, 0.01, 12), lines=1)
 HU, SMALL = hu_plan(Artifact(7, 0.01, 12)), hu_plan(Artifact(5, 0.01, 8))
 _BARE = plan_of("0,90,tx,ty", Artifact(5, 0.01, 24))
-APART = replace(_BARE, views=(*(replace(view, angular=False) for view in _BARE.views), *(
-    View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (0, 1, 6))))
+APART = replace(
+    _BARE,
+    views=(
+        *(replace(view, angular=False) for view in _BARE.views),
+        *(View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (0, 1, 6)),
+    ),
+)
 
 
-def measured(plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES, missing=0.0,
-             linear=False, spread=None):
-    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(truth_seed),
-                         spread)
-    return simulate_measurements(truth, plan, np.random.default_rng(seed), sense=sense,
-                                 missing=missing, sigma_m=2e-8, sigma_theta_rad=2e-5,
-                                 linear=linear)
+def measured(
+    plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES, missing=0.0, linear=False, spread=None
+):
+    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(truth_seed), spread)
+    return simulate_measurements(
+        truth,
+        plan,
+        np.random.default_rng(seed),
+        sense=sense,
+        missing=missing,
+        sigma_m=2e-8,
+        sigma_theta_rad=2e-5,
+        linear=linear,
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
-@pytest.mark.parametrize("reference", [
-    None, ReferenceLength("stage_x", 1e-6, 0.0), ReferenceLength("stage_y", 1e-6, 2e-6),
-    ReferenceLength("artifact", 1e-6, 2e-6), reference_length("marks", 1e-6, 2e-6)])
+@pytest.mark.parametrize(
+    "reference",
+    [
+        None,
+        ReferenceLength("stage_x", 1e-6, 0.0),
+        ReferenceLength("stage_y", 1e-6, 2e-6),
+        ReferenceLength("artifact", 1e-6, 2e-6),
+        reference_length("marks", 1e-6, 2e-6),
+    ],
+)
 def test_covariance_of_a_saved_map(sense, reference):
     readings = measured(PLAN, 1, sense=sense)
     options = bare(reference=reference)
@@ -62,12 +81,15 @@ def test_covariance_of_a_saved_map(sense, reference):
 
 
 @pytest.mark.parametrize("sense", Sense)
-@pytest.mark.parametrize("reference", [
-    None, ReferenceLength("stage_x", 1e-6, 2e-6), reference_length("marks", 1e-6, 2e-6)])
+@pytest.mark.parametrize(
+    "reference",
+    [None, ReferenceLength("stage_x", 1e-6, 2e-6), reference_length("marks", 1e-6, 2e-6)],
+)
 def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference):
     readings = measured(TURNED, 1, sense=sense, missing=0.1)
-    options = bare(reference=reference, terms=(
-        ModelTerm("plate_scale"), ModelTerm("plate_shape", 3e-8)))
+    options = bare(
+        reference=reference, terms=(ModelTerm("plate_scale"), ModelTerm("plate_shape", 3e-8))
+    )
     result = calibrate(readings, options)
     saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
     known = result.error_map.valid
@@ -83,9 +105,15 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     assert np.isnan(first_order_u(alone)).all()  # noise alone would be too little
 
 
-@pytest.mark.parametrize(("read", "message"), [
-    ("x", "no weights of this field"), ([[1, 2], [3, 4]], "no weights of this field"),
-    ([[1, 2], [3]], "no weights of this field"), (-1, "no weights of this field")])
+@pytest.mark.parametrize(
+    ("read", "message"),
+    [
+        ("x", "no weights of this field"),
+        ([[1, 2], [3, 4]], "no weights of this field"),
+        ([[1, 2], [3]], "no weights of this field"),
+        (-1, "no weights of this field"),
+    ],
+)
 def test_weights_that_are_none_are_refused(read, message):
     result = calibrate(measured(PLAN, 1), BARE)
     views = (replace(result.views[0], read_grid=read), *result.views[1:])
@@ -96,17 +124,22 @@ def test_weights_that_are_none_are_refused(read, message):
 def test_a_reference_adds_nothing_to_the_uncertainty_of_squareness():
     readings = measured(PLAN, 1)
     plain = first_order_u(calibrate(readings, BARE))
-    scaled = first_order_u(calibrate(readings, bare(
-        reference=ReferenceLength("artifact", 1e-6, 2e-6))))
+    scaled = first_order_u(
+        calibrate(readings, bare(reference=ReferenceLength("artifact", 1e-6, 2e-6)))
+    )
     assert scaled == pytest.approx(plain, rel=0.05)
 
 
 def test_without_weights_only_the_variances_are_known():
     result = calibrate(measured(PLAN, 1), BARE)
-    emap, bare_views = result.error_map, replace(result, views=tuple(
-        replace(v, read_grid=None, read_angular=None) for v in result.views))
+    emap, bare_views = (
+        result.error_map,
+        replace(
+            result, views=tuple(replace(v, read_grid=None, read_angular=None) for v in result.views)
+        ),
+    )
     found = covariance_of(bare_views, "xy", emap.valid)
-    assert found.tolist() == [*(emap.u_gx[emap.valid]**2), *(emap.u_gy[emap.valid]**2)]
+    assert found.tolist() == [*(emap.u_gx[emap.valid] ** 2), *(emap.u_gy[emap.valid] ** 2)]
     assert covariance_of(bare_views, "theta", np.isfinite(emap.g_theta)).ndim == 1
     assert np.isnan(first_order_u(bare_views)).all()
 
@@ -121,8 +154,9 @@ def test_maps_with_references_agree_as_often_as_they_should(keep_scale):
         for one in range(2):
             error = 3e-6 * np.random.default_rng((seed, one)).normal()
             reference = ReferenceLength("stage_x", error, 3e-6)
-            pair.append(calibrate(measured(HU, 1000 * seed + one),
-                                  replace(options, reference=reference)))
+            pair.append(
+                calibrate(measured(HU, 1000 * seed + one), replace(options, reference=reference))
+            )
         test = compare(*pair, keep_scale=keep_scale).xy
         assert test.correlated
         found.append(test.chi2_ratio)
@@ -135,10 +169,17 @@ def require_covariances(result, answers, *, theta=1e-6):
     sites = result.artifact.shape[0] * result.artifact.shape[1]
     of_readings = answers.T @ answers
     for covariance, wanted, tolerance in (
-            (covariance_of(result, "xy", result.error_map.valid),
-             of_readings[:2 * sites, :2 * sites], 1e-6),
-            (covariance_of(result, "theta", np.isfinite(result.error_map.g_theta)),
-             of_readings[2 * sites:, 2 * sites:], theta)):
+        (
+            covariance_of(result, "xy", result.error_map.valid),
+            of_readings[: 2 * sites, : 2 * sites],
+            1e-6,
+        ),
+        (
+            covariance_of(result, "theta", np.isfinite(result.error_map.g_theta)),
+            of_readings[2 * sites :, 2 * sites :],
+            theta,
+        ),
+    ):
         assert abs(covariance - wanted).max() < tolerance * wanted.max()
 
 
@@ -148,18 +189,27 @@ def map_of(result):
 
 
 def stated(readings):
-    return replace(readings, views=tuple(
-        replace(view, sigma_xy=2e-8, dof_xy=1000, sigma_theta=2e-5, dof_theta=1000)
-        for view in readings.views))
+    return replace(
+        readings,
+        views=tuple(
+            replace(view, sigma_xy=2e-8, dof_xy=1000, sigma_theta=2e-5, dof_theta=1000)
+            for view in readings.views
+        ),
+    )
 
 
-@pytest.mark.parametrize(("datum", "sense", "theta"), [
-    ("xy_axes", Sense.MICROSCOPE_MOVES, 0.02), ("zero_mean", Sense.PLATE_MOVES, 1e-6)])
+@pytest.mark.parametrize(
+    ("datum", "sense", "theta"),
+    [("xy_axes", Sense.MICROSCOPE_MOVES, 0.02), ("zero_mean", Sense.PLATE_MOVES, 1e-6)],
+)
 def test_lines_in_views_of_their_own_have_the_covariance_of_their_readings(datum, sense, theta):
     """Angular noise alone tells how lines correlate: the slopes that the axes add are small."""
     readings = stated(measured(APART, 1, sense=sense, linear=True))
     options = bare(misalignment_model="linear", datum_theta=datum, causes=False)
     quick = replace(options, uncertainty=False)
-    answers = responses(lambda moved: map_of(solve_joint(moved, quick).result), readings,
-                        sizes_of(readings, 2e-8, 2e-5))
+    answers = responses(
+        lambda moved: map_of(solve_joint(moved, quick).result),
+        readings,
+        sizes_of(readings, 2e-8, 2e-5),
+    )
     require_covariances(calibrate(readings, options), answers, theta=theta)

@@ -23,14 +23,16 @@ DRAWS = 40
 
 
 def calibrated(truth, rng):
-    return solve_joint(simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
-                       BARE).result
+    return solve_joint(
+        simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, sigma_theta_rad=2e-6), BARE
+    ).result
 
 
 def test_plates_measured_twice_agree_five_times_in_hundred():
     """On two machines, with lines: two tests of 5 %, each a little below."""
-    machines = [random_truth(PLAN.artifact, len(PLAN.views), np.random.default_rng(k))
-                for k in (1, 2)]
+    machines = [
+        random_truth(PLAN.artifact, len(PLAN.views), np.random.default_rng(k)) for k in (1, 2)
+    ]
     machines[1] = replace(machines[1], a=machines[0].a, a_theta=machines[0].a_theta)
     xy = theta = 0
     for seed in range(DRAWS):
@@ -42,8 +44,10 @@ def test_plates_measured_twice_agree_five_times_in_hundred():
 
 
 def test_what_differs_is_found_without_motion_and_scale():
-    rng, truth = np.random.default_rng(1), random_truth(
-        PLAN.artifact, len(PLAN.views), np.random.default_rng(3))
+    rng, truth = (
+        np.random.default_rng(1),
+        random_truth(PLAN.artifact, len(PLAN.views), np.random.default_rng(3)),
+    )
     moved = np.zeros((2, 5, 5))
     moved[0, 1, 3] = 4e-7
     modes = datum_modes(PLAN.artifact, scale=True)
@@ -65,10 +69,12 @@ def test_u_off_the_lattice_is_what_each_reading_does_to_the_plate():
         for name in ("dx", "dy"):
             for at in range(len(view.m)):
                 views = list(whole.views)
-                views[index] = replace(view, **{
-                    name: getattr(view, name) + 1e-7 * (np.arange(len(view.m)) == at)})
-                plate = solve_joint(replace(whole, views=tuple(views)),
-                                    replace(options, uncertainty=False)).result.artifact_map
+                views[index] = replace(
+                    view, **{name: getattr(view, name) + 1e-7 * (np.arange(len(view.m)) == at)}
+                )
+                plate = solve_joint(
+                    replace(whole, views=tuple(views)), replace(options, uncertainty=False)
+                ).result.artifact_map
                 maps.append(np.concatenate([plate.ax.ravel(), plate.ay.ravel()]))
     plate = result.artifact_map
     centre = np.concatenate([plate.ax.ravel(), plate.ay.ravel()])

@@ -97,8 +97,13 @@ PLAN = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
 def pair_of(seed, *, missing=0.0):
     rng = np.random.default_rng(seed)
     truth = random_truth(PLAN.artifact, len(PLAN.views), rng)
-    return [solve_joint(simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, missing=missing,
-                                              linear=True), PLAIN).result for _ in range(2)]
+    return [
+        solve_joint(
+            simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, missing=missing, linear=True),
+            PLAIN,
+        ).result
+        for _ in range(2)
+    ]
 
 
 def test_missing_marks_do_not_make_maps_differ():
@@ -130,8 +135,9 @@ def test_one_node_that_moved_is_found():
 
 def test_the_comparison_is_the_same_after_the_file():
     a, b = pair_of(5, missing=0.2)
-    again = [result_from_dict(json.loads(json.dumps(result_to_dict(worded(r)))), "r")
-             for r in (a, b)]
+    again = [
+        result_from_dict(json.loads(json.dumps(result_to_dict(worded(r)))), "r") for r in (a, b)
+    ]
     one, two = compare(a, b), compare(*again)
     assert two.xy.chi2_ratio == pytest.approx(one.xy.chi2_ratio, rel=1e-9)
     assert (two.xy.dof, two.xy.noise_dof) == (one.xy.dof, one.xy.noise_dof)

@@ -30,8 +30,12 @@ def _equal_white_noise(monkeypatch):
 @cache
 def solved(plan, model, sense=Sense.MICROSCOPE_MOVES):
     """Return the result and the dense least squares of readings; of lines some are missing."""
-    return both(measured(plan, model, sense, missing=0.1 * (plan == "lines")), model,
-                misalignment_model="linear", at_places=False)
+    return both(
+        measured(plan, model, sense, missing=0.1 * (plan == "lines")),
+        model,
+        misalignment_model="linear",
+        at_places=False,
+    )
 
 
 def saved(result):
@@ -46,26 +50,40 @@ def require_same(found, wanted, rel):
 
 
 @pytest.mark.parametrize("model", ["none", "assumed", "sized", "free"])
-@pytest.mark.parametrize(("plan", "sense"), [
-    ("lines", Sense.MICROSCOPE_MOVES), ("oblong", Sense.PLATE_MOVES)])
+@pytest.mark.parametrize(
+    ("plan", "sense"), [("lines", Sense.MICROSCOPE_MOVES), ("oblong", Sense.PLATE_MOVES)]
+)
 def test_covariance_of_both_maps_and_the_microscope(plan, model, sense):
     result, dense = solved(plan, model, sense)
     known = together(saved(result))
     dense.grid(known.sites)
     dense.plate(known.marks, known.sites)
-    of = {part: at for (term, _, part), at in zip(
-        dense.keys, range(len(dense.p))[dense.b], strict=True) if term == "microscope"}
+    of = {
+        part: at
+        for (term, _, part), at in zip(dense.keys, range(len(dense.p))[dense.b], strict=True)
+        if term == "microscope"
+    }
     rows = np.zeros((4, len(dense.p)))
     for row, part in zip(rows, ("scale", "turn", "stretch", "shear"), strict=True):
         row[of.get(part, 0)] = part in of
-    rows = np.concatenate([dense.to_map[np.tile(known.sites.ravel(), 2)],
-                           dense.to_plate[np.tile(known.marks.ravel(), 2)], rows])
+    rows = np.concatenate(
+        [
+            dense.to_map[np.tile(known.sites.ravel(), 2)],
+            dense.to_plate[np.tile(known.marks.ravel(), 2)],
+            rows,
+        ]
+    )
     require_same(known.cover(known.sites, known.marks), rows @ dense.covariance @ rows.T, 2e-3)
 
 
-@pytest.mark.parametrize(("model", "sense"), [
-    ("none", Sense.MICROSCOPE_MOVES), ("assumed", Sense.PLATE_MOVES),
-    ("sized", Sense.MICROSCOPE_MOVES)])
+@pytest.mark.parametrize(
+    ("model", "sense"),
+    [
+        ("none", Sense.MICROSCOPE_MOVES),
+        ("assumed", Sense.PLATE_MOVES),
+        ("sized", Sense.MICROSCOPE_MOVES),
+    ],
+)
 def test_covariance_of_both_angular_maps(model, sense):
     result, dense = solved("lines", model, sense)
     known, cover = together(saved(result)).lines()
@@ -85,16 +103,30 @@ def test_what_is_not_kept_is_not_known():
     assert together(saved(result)) is not None
     kept = replace(result.kept, factors=replace(result.kept.factors, beside={}))
     assert together(replace(result, kept=kept)) is None
-    assert together(replace(result, views=tuple(
-        replace(view, read_grid=None) for view in result.views))) is None
+    assert (
+        together(
+            replace(result, views=tuple(replace(view, read_grid=None) for view in result.views))
+        )
+        is None
+    )
 
 
-@pytest.mark.parametrize(("changed", "message"), [
-    (lambda kept: {"beside": {k: v for k, v in kept.beside.items() if k != "plate"}},
-     "no plate of this plate"),
-    (lambda kept: {"terms": (*kept.terms, "slip"),
-                   "of_map": np.concatenate([kept.of_map, kept.of_map[:1]])},
-     "no effects on the plate")])
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            lambda kept: {"beside": {k: v for k, v in kept.beside.items() if k != "plate"}},
+            "no plate of this plate",
+        ),
+        (
+            lambda kept: {
+                "terms": (*kept.terms, "slip"),
+                "of_map": np.concatenate([kept.of_map, kept.of_map[:1]]),
+            },
+            "no effects on the plate",
+        ),
+    ],
+)
 def test_factors_without_what_belongs_to_them_are_refused(changed, message):
     result, _ = solved("oblong", "sized")
     factors = replace(result.kept.factors, **changed(result.kept.factors))

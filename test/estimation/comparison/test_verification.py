@@ -8,9 +8,14 @@ from selfcal_ros.reporting.words.verification import verification_sentence
 from test.support.wired import WRONG, machine
 
 EXPECTED = {
-    "right": "the correction acts as the map says", "sign": "the wrong sign",
-    "exchanged": "exchanged", "unit": "look for a wrong unit", "another": "that is not this map",
-    "off": "does not act", "old": "an older table"}
+    "right": "the correction acts as the map says",
+    "sign": "the wrong sign",
+    "exchanged": "exchanged",
+    "unit": "look for a wrong unit",
+    "another": "that is not this map",
+    "off": "does not act",
+    "old": "an older table",
+}
 
 
 @pytest.mark.parametrize("wiring", EXPECTED)
@@ -27,13 +32,17 @@ def test_the_sentence_names_what_acts(wiring):
                 assert abs(axis.factor - factor) < 5 * axis.u_factor
 
 
-@pytest.mark.parametrize(("fault", "loaded"), [
-    (TableFault.COMPONENTS, lambda table: table[::-1]),
-    (TableFault.PLACES, lambda table: table.transpose(0, 2, 1)),
-    (TableFault.TRANSPOSED, lambda table: table.transpose(0, 2, 1)[::-1]),
-    (TableFault.MIRRORED_X, lambda table: table[:, ::-1]),
-    (TableFault.MIRRORED_Y, lambda table: table[:, :, ::-1]),
-    (TableFault.MIRRORED, lambda table: table[:, ::-1, ::-1])])
+@pytest.mark.parametrize(
+    ("fault", "loaded"),
+    [
+        (TableFault.COMPONENTS, lambda table: table[::-1]),
+        (TableFault.PLACES, lambda table: table.transpose(0, 2, 1)),
+        (TableFault.TRANSPOSED, lambda table: table.transpose(0, 2, 1)[::-1]),
+        (TableFault.MIRRORED_X, lambda table: table[:, ::-1]),
+        (TableFault.MIRRORED_Y, lambda table: table[:, :, ::-1]),
+        (TableFault.MIRRORED, lambda table: table[:, ::-1, ::-1]),
+    ],
+)
 def test_each_arrangement_of_a_table_is_named(fault, loaded):
     before, after, _ = machine(101, loaded)
     found = verify(before, after)

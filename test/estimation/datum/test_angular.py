@@ -32,12 +32,25 @@ def test_the_conditions_are_met_and_the_free_rotations_follow(sense):
     rotation, those of the grid views held, under the four slopes as constraints.
     """
     rng = np.random.default_rng(3)
-    readings = simulate_measurements(random_truth(ARTIFACT, 4, rng, Spread()), PLAN, rng,
-                                     sigma_m=1e-7, sigma_theta_rad=1e-5, sense=sense, linear=True)
-    readings = replace(readings, views=(*readings.views[:3], subset(
-        readings.views[3], np.zeros(0, dtype=bool), np.arange(12) % 5 != 0)))
-    problem, _ = prepare(readings, Options(misalignment_model="linear",
-                                           datum_theta=ThetaDatum.XY_AXES))
+    readings = simulate_measurements(
+        random_truth(ARTIFACT, 4, rng, Spread()),
+        PLAN,
+        rng,
+        sigma_m=1e-7,
+        sigma_theta_rad=1e-5,
+        sense=sense,
+        linear=True,
+    )
+    readings = replace(
+        readings,
+        views=(
+            *readings.views[:3],
+            subset(readings.views[3], np.zeros(0, dtype=bool), np.arange(12) % 5 != 0),
+        ),
+    )
+    problem, _ = prepare(
+        readings, Options(misalignment_model="linear", datum_theta=ThetaDatum.XY_AXES)
+    )
     found = fit(problem, problem.grid.y)
     conditions, system = problem.conditions, problem.system
     assert len(conditions.rows) == 4 and np.ptp(found.misclosure) > 1e-6
@@ -58,16 +71,16 @@ def test_the_conditions_are_met_and_the_free_rotations_follow(sense):
     constraint = np.hstack([conditions.rows, np.zeros((4, k + 1))])
     normal = np.array(rows).T @ rows
     kkt = np.block([[normal, constraint.T], [constraint, np.zeros((4, 4))]])
-    dense = np.linalg.lstsq(kkt, np.concatenate([np.array(rows).T @ right, slopes]),
-                            rcond=None)[0]
+    dense = np.linalg.lstsq(kkt, np.concatenate([np.array(rows).T @ right, slopes]), rcond=None)[0]
     assert found.g_theta == pytest.approx(dense[:k], abs=1e-12)
     assert phi[3] == pytest.approx(dense[2 * k], abs=1e-12)
 
 
 def test_variances_do_not_depend_on_how_many_lines_are_computed_at_once(monkeypatch):
     rng = np.random.default_rng(3)
-    readings = simulate_measurements(random_truth(ARTIFACT, 4, rng, Spread()), PLAN, rng,
-                                     sigma_m=1e-7, sigma_theta_rad=1e-5)
+    readings = simulate_measurements(
+        random_truth(ARTIFACT, 4, rng, Spread()), PLAN, rng, sigma_m=1e-7, sigma_theta_rad=1e-5
+    )
     whole = calibrate(readings).error_map.u_g_theta
     monkeypatch.setattr(covers, "BLOCK", 5)  # of 12
     assert calibrate(readings).error_map.u_g_theta == pytest.approx(whole, rel=1e-12)

@@ -35,7 +35,9 @@ def known(truth, pair=PAIR, u_m=0.0, error_m=0.0):
     """Return the reference with the true distance, and an error."""
     return ReferenceLength.between(
         f"{pair[0][0]},{pair[0][1]}:{pair[1][0]},{pair[1][1]}:{distance(truth, pair) + error_m!r}"
-        f":{u_m!r}", ARTIFACT)
+        f":{u_m!r}",
+        ARTIFACT,
+    )
 
 
 def drawn(seed, *, sense=Sense.MICROSCOPE_MOVES, sigma_m=0.0, spread=None):
@@ -67,8 +69,9 @@ def test_errors_of_the_scale_are_as_large_as_their_uncertainty():
     for seed in range(200):
         truth, readings = drawn(seed, sigma_m=1e-8)
         error_m = np.random.default_rng((seed, 1)).normal(0, 2e-8)
-        emap = solve_joint(readings, bare(reference=known(
-            truth, u_m=2e-8, error_m=error_m))).result.error_map
+        emap = solve_joint(
+            readings, bare(reference=known(truth, u_m=2e-8, error_m=error_m))
+        ).result.error_map
         off = np.stack([emap.gx, emap.gy]) - truth.g
         normalised.append(off / np.stack([emap.u_gx, emap.u_gy]))
         scales.append((off * PLACE).sum() / (PLACE**2).sum())
@@ -88,13 +91,20 @@ def test_a_certified_distance_belongs_to_its_temperature():
     assert warm.marks == ((-2, 0), (2, 0)) and warm.certificate == "PTB 1"
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("-2,0:2,0:0.04", "is not M,N:M,N:LENGTH:U"), ("-2,0:x,0:0.04:0", "is not M,N:M,N:LENGTH:U"),
-    ("-2,0:2,0,1:0.04:0", "is not M,N:M,N:LENGTH:U"), ("", "is not M,N:M,N:LENGTH:U"),
-    ("-2,0:3,0:0.05:0", r"no mark \(3, 0\); its marks go from \(-2, -2\) to \(2, 2\)"),
-    ("1,0:1,0:0.01:0", "names one mark twice; name two marks"),
-    ("-2,0:2,0:40:0", "is not a relative error"), ("-2,0:2,0:nan:0", "is not a relative error"),
-    ("-2,0:2,0:0.04:-1", "is not a standard uncertainty")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("-2,0:2,0:0.04", "is not M,N:M,N:LENGTH:U"),
+        ("-2,0:x,0:0.04:0", "is not M,N:M,N:LENGTH:U"),
+        ("-2,0:2,0,1:0.04:0", "is not M,N:M,N:LENGTH:U"),
+        ("", "is not M,N:M,N:LENGTH:U"),
+        ("-2,0:3,0:0.05:0", r"no mark \(3, 0\); its marks go from \(-2, -2\) to \(2, 2\)"),
+        ("1,0:1,0:0.01:0", "names one mark twice; name two marks"),
+        ("-2,0:2,0:40:0", "is not a relative error"),
+        ("-2,0:2,0:nan:0", "is not a relative error"),
+        ("-2,0:2,0:0.04:-1", "is not a standard uncertainty"),
+    ],
+)
 def test_what_is_no_distance_of_two_marks_is_refused(text, message):
     with pytest.raises(InputError, match=message):
         ReferenceLength.between(text, ARTIFACT)
@@ -102,24 +112,40 @@ def test_what_is_no_distance_of_two_marks_is_refused(text, message):
 
 def test_a_mark_that_was_not_measured_is_refused():
     truth, readings = drawn(3)
-    views = tuple(replace(view, **{name: getattr(view, name)[(view.m != 2) | (view.n != 0)]
-                                   for name in ("dx", "dy", "count", "m", "n")})
-                  for view in readings.views)
+    views = tuple(
+        replace(
+            view,
+            **{
+                name: getattr(view, name)[(view.m != 2) | (view.n != 0)]
+                for name in ("dx", "dy", "count", "m", "n")
+            },
+        )
+        for view in readings.views
+    )
     with pytest.raises(InputError, match=r"the mark \(2, 0\) was not measured; measure it, or"):
         calibrate(replace(readings, views=views), bare(reference=known(truth)))
 
 
-@pytest.mark.parametrize("given", [
-    {"reference_kind": "marks"}, {"reference_marks": "-2,0:2,0:0.04:0"},
-    {"reference_kind": "artifact", "reference_marks": "-2,0:2,0:0.04:0"}])
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"reference_kind": "marks"},
+        {"reference_marks": "-2,0:2,0:0.04:0"},
+        {"reference_kind": "artifact", "reference_marks": "-2,0:2,0:0.04:0"},
+    ],
+)
 def test_kind_and_marks_belong_together(given):
     with pytest.raises(InputError, match=r"reference_marks: .* does not fit reference_kind"):
         solver_options(SolverSettings.checked(given, "here"))
 
 
 def test_the_solver_takes_the_marks_of_the_plate_that_was_measured():
-    settings = SolverSettings(reference_kind="marks", reference_marks="-2,0:2,0:0.04000004:4e-9",
-                              reference_certificate="PTB 1", reference_at="21:0:5e-7:0")
+    settings = SolverSettings(
+        reference_kind="marks",
+        reference_marks="-2,0:2,0:0.04000004:4e-9",
+        reference_certificate="PTB 1",
+        reference_at="21:0:5e-7:0",
+    )
     reference = solver_options(settings, drawn(3)[1]).reference
     assert reference.relative_error == pytest.approx(1.5e-6)
     assert (reference.marks, reference.certificate) == (((-2, 0), (2, 0)), "PTB 1")

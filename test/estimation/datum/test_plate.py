@@ -26,11 +26,13 @@ def linear(**how):
 def readings(sense=Sense.MICROSCOPE_MOVES, size=3, lines=0):
     plan = plan_of("0,90,tx,ty", Artifact(size, 0.01, lines), lines=1 if lines else None)
     rng = np.random.default_rng(1)
-    plan = replace(plan, views=tuple(
-        replace(view, repeats=2 + i) for i, view in enumerate(plan.views)))
+    plan = replace(
+        plan, views=tuple(replace(view, repeats=2 + i) for i, view in enumerate(plan.views))
+    )
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(rotation="linear"))
-    return simulate_measurements(truth, plan, rng, linear=True, sense=sense, sigma_m=1e-8,
-                                 sigma_theta_rad=1e-6)
+    return simulate_measurements(
+        truth, plan, rng, linear=True, sense=sense, sigma_m=1e-8, sigma_theta_rad=1e-6
+    )
 
 
 def plate_of(measurements, options):
@@ -61,17 +63,24 @@ def test_each_reading_adds_what_it_does_to_the_plate(kind, sense):
 def test_each_reading_adds_what_it_does_to_the_lines_of_the_plate(sense):
     """With declared noise, more than residuals show: then no weight changes."""
     whole, options, power = readings(sense, lines=8), linear(), 0.0
-    whole = replace(whole, views=tuple(replace(
-        view, u=1.5e-8 / np.sqrt(view.count), u_theta=1.5e-6 / np.sqrt(view.count_theta))
-        for view in whole.views))
+    whole = replace(
+        whole,
+        views=tuple(
+            replace(
+                view, u=1.5e-8 / np.sqrt(view.count), u_theta=1.5e-6 / np.sqrt(view.count_theta)
+            )
+            for view in whole.views
+        ),
+    )
     least = replace(options, uncertainty=False)
     centre = calibrate(whole, least).artifact_map.a_theta
     for index, view in enumerate(whole.views):
         for name, each in (("dx", view.u), ("dy", view.u), ("dtheta", view.u_theta)):
             for at, u in enumerate(each):
                 views = list(whole.views)
-                views[index] = replace(view, **{
-                    name: getattr(view, name) + u / 10 * (np.arange(len(each)) == at)})
+                views[index] = replace(
+                    view, **{name: getattr(view, name) + u / 10 * (np.arange(len(each)) == at)}
+                )
                 moved = calibrate(replace(whole, views=tuple(views)), least).artifact_map.a_theta
                 power = power + (10 * (moved - centre)) ** 2
     result = calibrate(whole, options)

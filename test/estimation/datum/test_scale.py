@@ -49,11 +49,14 @@ def test_a_longer_plate_and_an_axis_that_indicates_too_much_turn_the_scale_the_r
     z, none = system.grid.views.z, np.zeros(system.grid.views.shape, dtype=complex)
     for kind in (ReferenceKind.ARTIFACT, ReferenceKind.MARKS):
         plate = reference_length(kind, 2e-6)
-        assert scale_of(system, plate, field=none, plate=2e-6 * HALF_M * z,
-                        half_width_m=HALF_M) == pytest.approx(0.0, abs=1e-18)
+        assert scale_of(
+            system, plate, field=none, plate=2e-6 * HALF_M * z, half_width_m=HALF_M
+        ) == pytest.approx(0.0, abs=1e-18)
     axis = reference_length(ReferenceKind.STAGE_Y, 2e-6)
     only_y = 1j * 2e-6 * HALF_M * z.imag
-    assert scale_of(system, axis, field=only_y, plate=none,
-                    half_width_m=HALF_M) == pytest.approx(0.0, abs=1e-18)
-    assert scale_of(system, axis, field=2e-6 * HALF_M * z.real, plate=none,
-                    half_width_m=HALF_M) == pytest.approx(2e-6 * HALF_M)
+    assert scale_of(system, axis, field=only_y, plate=none, half_width_m=HALF_M) == pytest.approx(
+        0.0, abs=1e-18
+    )
+    assert scale_of(
+        system, axis, field=2e-6 * HALF_M * z.real, plate=none, half_width_m=HALF_M
+    ) == pytest.approx(2e-6 * HALF_M)

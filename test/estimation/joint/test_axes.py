@@ -27,8 +27,9 @@ def measured(ratio, *, size=5, lines=8, repeats=4, sense=Sense.MICROSCOPE_MOVES,
     plan, rng = hu_plan(Artifact(size, 0.01, lines), repeats), np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(phi_rad=5e-4))
     settings = CellSettings(sense, 40e-9, 2e-6, noise_ratio=ratio)
-    return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True,
-                                        missing=0.1)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings, visits=True, missing=0.1
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -62,8 +63,12 @@ def test_either_coordinate_lies_within_its_own_uncertainty(repeats):
         turn = (error[1, known] @ x - error[0, known] @ y) / (x @ x + y @ y)
         grown = (error[0, known] @ x + error[1, known] @ y) / (x @ x + y @ y)
         error[:, known] -= turn * np.stack([-y, x]) + grown * np.stack([x, y])
-        inside.append([(abs(e) <= k * u)[known].mean() for e, u in zip(
-            error, (emap.u_gx, emap.u_gy), strict=True)])
+        inside.append(
+            [
+                (abs(e) <= k * u)[known].mean()
+                for e, u in zip(error, (emap.u_gx, emap.u_gy), strict=True)
+            ]
+        )
     assert np.mean(inside, axis=0) == pytest.approx([0.96, 0.96], abs=0.025)
 
 

@@ -26,8 +26,9 @@ SIZED = "plate_scale:1e-7,plate_shape:5e-9"
 def measured(size, seed=0, *, sense=Sense.MICROSCOPE_MOVES, slow_m=0.0):
     plan, rng = hu_plan(Artifact(size, 0.01, 8), 5), np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(phi_rad=5e-4))
-    settings = CellSettings(sense, 5e-9 if slow_m else 20e-9, 2e-6, flicker_xy_m=slow_m,
-                            servo_sigma_m=0.0)
+    settings = CellSettings(
+        sense, 5e-9 if slow_m else 20e-9, 2e-6, flicker_xy_m=slow_m, servo_sigma_m=0.0
+    )
     return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 
@@ -46,16 +47,15 @@ def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlat
     monkeypatch.setattr(noise_effects, "time_correlation", lambda model: np.array(correlation))
     _, readings = measured(5, sense=sense)
     terms = parse_terms([text], "") if text else ()
-    result = solve_joint(readings, Options(terms=terms, assumed=(), causes=False,
-                                           misalignment_model="linear")).result
+    result = solve_joint(
+        readings, Options(terms=terms, assumed=(), causes=False, misalignment_model="linear")
+    ).result
     emap, noise = result.error_map, result.noise
-    dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta),
-                     correlation=correlation)
+    dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta), correlation=correlation)
     _, (u_x, u_y) = dense.grid(np.isfinite(emap.gx))
     assert np.allclose(emap.u_gx, u_x, rtol=1e-6, atol=0)
     assert np.allclose(emap.u_gy, u_y, rtol=1e-6, atol=0)
-    white = first_order_u(replace(result, kept=replace(
-        result.kept, added=None)))
+    white = first_order_u(replace(result, kept=replace(result.kept, added=None)))
     found = first_order_u(result)
     assert found == pytest.approx(u_of_first_order(dense, readings.artifact), rel=1e-5)
     assert found != pytest.approx(white, rel=0.02)

@@ -27,19 +27,28 @@ from test.support.options import STILL
 CORNER = (1, 1)
 
 
-def with_dirt(measurements: Measurements, dirty: dict[tuple[str, tuple[int, int]], int]
-              ) -> Measurements:
+def with_dirt(
+    measurements: Measurements, dirty: dict[tuple[str, tuple[int, int]], int]
+) -> Measurements:
     """Return readings of which so many are left in some cells of some views."""
     out = []
     for one in measurements.views:
         left = dirty.get((one.view.plan_view, one.view.cell))
         if left is not None:
             of_visits = one.visits.mark < left
-            visits = replace(one.visits, **{
-                item.name: value[of_visits] for item in fields(one.visits)
-                if len(value := np.atleast_1d(getattr(one.visits, item.name))) == len(of_visits)})
-            one = replace(one, visits=visits, **{
-                name: getattr(one, name)[:left] for name in ("m", "n", "dx", "dy", "count")})
+            visits = replace(
+                one.visits,
+                **{
+                    item.name: value[of_visits]
+                    for item in fields(one.visits)
+                    if len(value := np.atleast_1d(getattr(one.visits, item.name))) == len(of_visits)
+                },
+            )
+            one = replace(
+                one,
+                visits=visits,
+                **{name: getattr(one, name)[:left] for name in ("m", "n", "dx", "dy", "count")},
+            )
         out.append(one)
     return replace(measurements, views=tuple(out))
 
@@ -56,15 +65,21 @@ def population(dirty, runs):
         found = calibrate(with_dirt(measurements, dirty), Options(causes=False, terms=STILL))
         emap, cells = found.error_map, found.camera.known_cells
         maps.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
-        cameras.append((cells[2:4] - (physics.seen_offset(truth, cells[:2]) - cells[:2]))
-                       / cells[4:])
+        cameras.append(
+            (cells[2:4] - (physics.seen_offset(truth, cells[:2]) - cells[:2])) / cells[4:]
+        )
         results.append(found)
     return np.array(maps), np.array(cameras), results
 
 
-@pytest.mark.parametrize(("dirty", "cells"), [
-    ({("0", (0, 0)): 0, ("90", CORNER): 1}, 9),
-    (everywhere((0, 0)), 8), (everywhere(CORNER, (-1, 0)), 7)])
+@pytest.mark.parametrize(
+    ("dirty", "cells"),
+    [
+        ({("0", (0, 0)): 0, ("90", CORNER): 1}, 9),
+        (everywhere((0, 0)), 8),
+        (everywhere(CORNER, (-1, 0)), 7),
+    ],
+)
 def test_map_and_camera_are_found_without_some_cells(dirty, cells):
     maps, cameras, results = population(dirty, 3)
     within(maps, 20)
@@ -85,13 +100,20 @@ def test_a_cell_that_no_view_shows_is_said_to_be_unknown():
     found = result_from_dict(result_to_dict(found), "test")
     assert found.verdict.qualified
     assert plain(found.camera.cells[-1]) == {
-        "x": pytest.approx(1e-3), "y": pytest.approx(1e-3), "dx": None, "dy": None, "u_dx": None,
-        "u_dy": None}
+        "x": pytest.approx(1e-3),
+        "y": pytest.approx(1e-3),
+        "dx": None,
+        "dy": None,
+        "u_dx": None,
+        "u_dy": None,
+    }
     assert found.warnings == (
         "few marks were read in cell [+1,+1] of the images (0 of 72): look for dirt or a shadow in "
-        "that part of the image; the camera's error is not known in cell [+1,+1]",)
+        "that part of the image; the camera's error is not known in cell [+1,+1]",
+    )
     assert state_sentence(found).startswith(
-        "Calibrated from 2 views with images of 9 marks, few of them read in cell [+1,+1]: largest")
+        "Calibrated from 2 views with images of 9 marks, few of them read in cell [+1,+1]: largest"
+    )
     assert dict(camera_facts(found))["distortion"] == "radial (cubic)"
     spots = [item for item in camera_errors(found).items if type(item).__name__ == "Spot"]
     assert len(spots) == 8
@@ -99,10 +121,13 @@ def test_a_cell_that_no_view_shows_is_said_to_be_unknown():
 
 def test_a_cell_that_one_view_lacks_is_named_with_the_view():
     _, measurements = measured(MARK, 3, size=7, **DISTORTED)
-    (said,) = worded(calibrate(with_dirt(measurements, {
-        ("90", CORNER): 17, ("0", (0, -1)): 21}))).warnings
-    assert said == ("few marks were read in cell [+1,+1] of the images of view '90' (17 of 36): "
-                    "look for dirt or a shadow in that part of the image")
+    (said,) = worded(
+        calibrate(with_dirt(measurements, {("90", CORNER): 17, ("0", (0, -1)): 21}))
+    ).warnings
+    assert said == (
+        "few marks were read in cell [+1,+1] of the images of view '90' (17 of 36): "
+        "look for dirt or a shadow in that part of the image"
+    )
 
 
 def test_two_rows_of_cells_show_the_linear_part():
@@ -115,13 +140,15 @@ def test_two_rows_of_cells_show_the_linear_part():
 
 def test_one_row_of_cells_shows_no_camera():
     _, measurements = measured(MARK, 3, size=7)
-    measurements = with_dirt(measurements, everywhere(*(
-        (x, y) for x in (-1, 0, 1) for y in (-1, 1))))
+    measurements = with_dirt(
+        measurements, everywhere(*((x, y) for x in (-1, 0, 1) for y in (-1, 1)))
+    )
     found, straight = api._camera(measurements, Options())
     assert found is None and straight is measurements
     (finding,) = camera.few_read(measurements, found)
     assert few_read_text(finding, finding.details).endswith(
-        "; the camera's error could not be determined")
+        "; the camera's error could not be determined"
+    )
 
 
 def test_full_images_have_no_cell_with_few_readings():

@@ -20,8 +20,9 @@ LOST = {(1, 1), (-2, 2), (0, -2), (-1, 2), (-2, -1), (1, -2)}
 def without_lost_marks():
     """Return readings of plates turned by a degree, whose sites `APART` hang on no others."""
     plan, rng = plan_of("0, 90, tx, ty", 5), np.random.default_rng(3)
-    truth = random_truth(plan.artifact, len(plan.views), rng,
-                         Spread(phi_rad=np.deg2rad(1), rotation="finite"))
+    truth = random_truth(
+        plan.artifact, len(plan.views), rng, Spread(phi_rad=np.deg2rad(1), rotation="finite")
+    )
     readings = simulate_measurements(truth, plan, rng)
     views = []
     for view in readings.views:
@@ -29,12 +30,21 @@ def without_lost_marks():
         if view.view.name == "tx":
             keep = np.array([mark not in LOST for mark in at])
         elif view.view.name == "ty":
-            keep = np.array([mark not in APART and (mark[0], mark[1] + 1) not in APART
-                             for mark in at])
+            keep = np.array(
+                [mark not in APART and (mark[0], mark[1] + 1) not in APART for mark in at]
+            )
         else:
             keep = np.ones(len(at), dtype=bool)
-        views.append(replace(view, m=view.m[keep], n=view.n[keep], dx=view.dx[keep],
-                             dy=view.dy[keep], count=view.count[keep]))
+        views.append(
+            replace(
+                view,
+                m=view.m[keep],
+                n=view.n[keep],
+                dx=view.dx[keep],
+                dy=view.dy[keep],
+                count=view.count[keep],
+            )
+        )
     return replace(readings, views=tuple(views)), truth
 
 

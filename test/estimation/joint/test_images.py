@@ -35,14 +35,23 @@ MARK = 2e-8
 ALONE = Options(assumed=())
 
 
-def measured(image_m: float, seed: int, *, size: int = 7, repeats: int = 1, missing: float = 0.0,
-             sense: Sense = Sense.MICROSCOPE_MOVES, servo_m: float = 0.0, **spread):
+def measured(
+    image_m: float,
+    seed: int,
+    *,
+    size: int = 7,
+    repeats: int = 1,
+    missing: float = 0.0,
+    sense: Sense = Sense.MICROSCOPE_MOVES,
+    servo_m: float = 0.0,
+    **spread,
+):
     """Return truth and readings of two turns with images of 3 x 3 marks."""
     plan, rng = image_plan(size, repeats=repeats), np.random.default_rng(seed)
-    truth = random_truth(plan.artifact, 2, rng, Spread(
-        **{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread))
-    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=servo_m,
-                            sense=sense)
+    truth = random_truth(
+        plan.artifact, 2, rng, Spread(**{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread)
+    )
+    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=servo_m, sense=sense)
     return truth, simulate_measurements(truth, plan, rng, settings=settings, missing=missing)
 
 
@@ -69,9 +78,11 @@ def dense(measurements):
             stops.append((view.view.rotation_rad, site))
             at, own = 2 * place, 4 * nx * ny + 2 * number
             rows[at, 2 * site] = rows[at + 1, 2 * site + 1] = 1
-            rows[at:at + 2, 2 * (nx * ny + mark):2 * (nx * ny + mark) + 2] = [
-                [cosine, -sine], [sine, cosine]]
-            rows[at:at + 2, offsets + placed.index(view.view.plan_view)] = -y, x
+            rows[at : at + 2, 2 * (nx * ny + mark) : 2 * (nx * ny + mark) + 2] = [
+                [cosine, -sine],
+                [sine, cosine],
+            ]
+            rows[at : at + 2, offsets + placed.index(view.view.plan_view)] = -y, x
             rows[at, own] = rows[at + 1, own + 1] = 1
             place += 1
     return rows, np.unique(stops, axis=0, return_inverse=True)[1].reshape(-1)
@@ -81,8 +92,9 @@ def datum(artifact) -> np.ndarray:
     """Return the projector of a map, x and y of each site, on that without the four modes."""
     x, y = artifact.m.ravel().astype(float), artifact.n.ravel().astype(float)
     zero, one = np.zeros_like(x), np.ones_like(x)
-    modes = np.stack([np.stack(pair, axis=1).ravel() for pair in (
-        (one, zero), (zero, one), (-y, x), (x, y))])
+    modes = np.stack(
+        [np.stack(pair, axis=1).ravel() for pair in ((one, zero), (zero, one), (-y, x), (x, y))]
+    )
     basis = np.linalg.qr(modes.T)[0]
     return np.eye(2 * x.size) - basis @ basis.T
 
@@ -102,7 +114,7 @@ def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
     mark, image = camera.noise_mark, camera.noise_image
     assert image > 2 * mark > 0
     sites = np.prod(measurements.artifact.shape)
-    gain = datum(measurements.artifact) @ inverse[:2 * sites]
+    gain = datum(measurements.artifact) @ inverse[: 2 * sites]
     together = np.kron(stops[:, None] == stops, np.eye(2))
     covariance = mark**2 * np.eye(len(matrix)) + image**2 * together
     u = np.sqrt(np.diag(gain @ covariance @ gain.T))
@@ -115,7 +127,7 @@ def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
     # the plate has the scale of stage and plate together: noise of images moves it little
     artifact = measurements.artifact
     z = np.stack([artifact.m.ravel(), artifact.n.ravel()], axis=1).ravel().astype(float)
-    both = inverse[2 * sites:4 * sites] + np.outer(z, z @ inverse[:2 * sites]) / (z @ z)
+    both = inverse[2 * sites : 4 * sites] + np.outer(z, z @ inverse[: 2 * sites]) / (z @ z)
     kept = np.eye(2 * sites) - datum(artifact) - np.outer(z, z) / (z @ z)
     gain = both - kept @ both
     u = np.sqrt(np.diag(gain @ covariance @ gain.T))
@@ -131,9 +143,11 @@ def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(
     result = calibrate(measurements, ALONE)
     camera = result.camera
     covariance = camera.noise_mark**2 * np.eye(len(matrix)) + camera.noise_image**2 * np.kron(
-        stops[:, None] == stops, np.eye(2))
+        stops[:, None] == stops, np.eye(2)
+    )
     gain = (datum(measurements.artifact) @ np.linalg.pinv(matrix, rcond=1e-10)[:50]).reshape(
-        5, 5, 2, -1)
+        5, 5, 2, -1
+    )
     if sense is Sense.PLATE_MOVES:
         gain = -gain[::-1, ::-1]
     known = result.error_map.valid.copy()
@@ -150,13 +164,18 @@ def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
     measurements, matrix, stops, inverse = whole(missing)
     system = system_of(grid_data(measurements), angular_data(measurements))
     grid = grid_data(measurements)
-    images = image_noise(measurements.artifact, [v.view for v in measurements.views], system,
-                         ground=ground_of(measurements, grid, 1.0))
+    images = image_noise(
+        measurements.artifact,
+        [v.view for v in measurements.views],
+        system,
+        ground=ground_of(measurements, grid, 1.0),
+    )
     left = np.eye(len(matrix)) - matrix @ inverse
     together = np.kron(stops[:, None] == stops, np.eye(2))
-    expected = [[np.trace(left), np.trace(left @ together @ left)],
-                [np.trace(left @ together @ left),
-                 np.trace(together @ left @ together @ left)]]
+    expected = [
+        [np.trace(left), np.trace(left @ together @ left)],
+        [np.trace(left @ together @ left), np.trace(together @ left @ together @ left)],
+    ]
     expected = np.append(expected, np.zeros((2, 1)), axis=1)  # the two noises are independent
     spread = images.drawn.std(axis=0) / np.sqrt(len(images.drawn))
     away = images.drawn.mean(axis=0) - expected
@@ -190,19 +209,30 @@ def within(away: np.ndarray, independent: int, *, least: float = 1.0) -> None:
 
 def away_of(truth, camera) -> np.ndarray:
     """Return (error of the camera - truth) / u at every cell, (2, cells)."""
-    place, error, u = (np.array([[getattr(cell, f"{name}{axis}") for cell in camera.cells]
-                                 for axis in "xy"]) for name in ("", "d", "u_d"))
+    place, error, u = (
+        np.array([[getattr(cell, f"{name}{axis}") for cell in camera.cells] for axis in "xy"])
+        for name in ("", "d", "u_d")
+    )
     return (error - (physics.seen_offset(truth, place) - place)) / u
 
 
-DISTORTED = {"microscope_distortion": 0.02, "microscope_field_m": 1.414e-3,
-             "microscope_scale": 0.005, "microscope_rotation_rad": -0.003}
+DISTORTED = {
+    "microscope_distortion": 0.02,
+    "microscope_field_m": 1.414e-3,
+    "microscope_scale": 0.005,
+    "microscope_rotation_rad": -0.003,
+}
 """2 % in the corner of the image, and an error of scale and turn."""
 
 
-@pytest.mark.parametrize(("part", "size", "sense", "runs"), [
-    (0.3, 7, Sense.MICROSCOPE_MOVES, 4), (1.0, 7, Sense.PLATE_MOVES, 3),
-    (3.0, 7, Sense.MICROSCOPE_MOVES, 6)])  # the more images share, the fewer numbers a run has
+@pytest.mark.parametrize(
+    ("part", "size", "sense", "runs"),
+    [
+        (0.3, 7, Sense.MICROSCOPE_MOVES, 4),
+        (1.0, 7, Sense.PLATE_MOVES, 3),
+        (3.0, 7, Sense.MICROSCOPE_MOVES, 6),
+    ],
+)  # the more images share, the fewer numbers a run has
 def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size, sense, runs):
     away, results = population(part * MARK, size, runs, sense=sense, **DISTORTED)
     assert all(found.verdict.qualified for _, found in results)
@@ -210,8 +240,10 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
     cameras = [found.camera for _, found in results]
     within(np.array([away_of(truth, found.camera) for truth, found in results]), 9)
     assert all(camera.degree == 3 for camera in cameras)
-    mark, image = (np.mean([getattr(camera, name) ** 2 for camera in cameras])
-                   for name in ("noise_mark", "noise_image"))
+    mark, image = (
+        np.mean([getattr(camera, name) ** 2 for camera in cameras])
+        for name in ("noise_mark", "noise_image")
+    )
     dof = sum(found.kept.images.dof_mark for _, found in results)
     assert mark == pytest.approx(MARK**2, rel=3 * np.sqrt(2 / dof))
     assert image == pytest.approx((part * MARK) ** 2, rel=0.15)
@@ -225,13 +257,19 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
 @pytest.mark.parametrize("sense", list(Sense))
 def test_repeats_are_compared_with_the_scale_that_the_camera_shows(sense):
     """Every stop is 1 um off, so that the repeats show the pixel size to 0.1 %."""
-    off = {"microscope_scale": 0.005, "microscope_rotation_rad": -0.02,
-           "microscope_distortion": 0.02, "microscope_field_m": 1.414e-3}
+    off = {
+        "microscope_scale": 0.005,
+        "microscope_rotation_rad": -0.02,
+        "microscope_distortion": 0.02,
+        "microscope_field_m": 1.414e-3,
+    }
     _, readings = measured(MARK, 0, repeats=4, sense=sense, servo_m=1e-6, **off)
     assert calibrate(readings, Options(causes=False)).verdict.qualified
     longer = np.diag([1.0, 1.0, 1.01, 1.01])
-    views = tuple(replace(view, motion=replace(
-        view.motion, products=longer @ view.motion.products @ longer)) for view in readings.views)
+    views = tuple(
+        replace(view, motion=replace(view.motion, products=longer @ view.motion.products @ longer))
+        for view in readings.views
+    )
     failed = calibrate(replace(readings, views=views), Options(causes=False)).verdict.failed
     assert [one.name for one in failed] == ["scale_of_offsets"]
 
@@ -239,8 +277,9 @@ def test_repeats_are_compared_with_the_scale_that_the_camera_shows(sense):
 def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
     """True offsets are minus the motion; published ones have the camera's error, (x, y) mixed."""
     rng, place = np.random.default_rng(4), 3e-4 - 2e-4j
-    camera = Distortion(((1, 0), (0, 1), (2, 1)),
-                        np.array([0, 0.004 + 0.03j, 0.002 - 0.005j, 2e4 + 1e4j]))
+    camera = Distortion(
+        ((1, 0), (0, 1), (2, 1)), np.array([0, 0.004 + 0.03j, 0.002 - 0.005j, 2e4 + 1e4j])
+    )
     true = place + rng.normal(0, 1e-7, 500) + 2e-7j * rng.normal(0, 1, 500)
     published = true.copy()
     for _ in range(30):
@@ -270,8 +309,9 @@ def test_an_approach_alike_at_every_visit_of_a_site_is_no_cause():
     """Rotations of the views let readings tell it from the stage by rounding and worse."""
     _, measurements = measured(0.3 * MARK, 1155, size=7, **DISTORTED)
     assert calibrate(measurements).verdict.causes == ()
-    equations = solve_joint(measurements, Options(
-        terms=(ModelTerm("approach", 1e-8),))).model.equations
+    equations = solve_joint(
+        measurements, Options(terms=(ModelTerm("approach", 1e-8),))
+    ).model.equations
     rows = equations.rows(["approach"])
     share = np.diag(equations.information)[rows] / equations.norm[rows] ** 2
     assert np.abs(share).max() < 1e-14
@@ -299,8 +339,9 @@ def test_images_in_one_line_show_no_distortion_of_the_camera():
 
 def test_hus_law_refuses_images():
     _, measurements = measured(MARK, 1, size=5)
-    with pytest.raises(InputError, match="Hu's law cannot use images of several marks; "
-                                         "solve with --method"):
+    with pytest.raises(
+        InputError, match="Hu's law cannot use images of several marks; solve with --method"
+    ):
         calibrate_by_law(measurements, Options())
 
 
@@ -311,8 +352,12 @@ def test_noise_of_offsets_taken_for_a_microscope_makes_no_variance_negative():
     settings = CellSettings(sigma_xy_m=MARK, image_xy_m=MARK, servo_sigma_m=0.0)
     found = calibrate(simulate_measurements(truth, plan, rng, settings=settings))
     assert [cause.name for cause in found.verdict.causes] == ["microscope"]
-    for u in (found.error_map.u_gx, found.error_map.u_gy, found.artifact_map.u_ax,
-              found.artifact_map.u_ay):
+    for u in (
+        found.error_map.u_gx,
+        found.error_map.u_gy,
+        found.artifact_map.u_ax,
+        found.artifact_map.u_ay,
+    ):
         assert (u > 0.2 * MARK).all()
 
 

@@ -20,8 +20,17 @@ def measured(sense=Sense.MICROSCOPE_MOVES, *, visits=False, missing=0.0):
     artifact = Artifact(7, 0.01, 8)
     plan = hu_plan(artifact, 2)
     truth = random_truth(artifact, len(plan.views), rng)
-    return simulate_measurements(truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=1e-5,
-                                 sense=sense, missing=missing, visits=visits, linear=True)
+    return simulate_measurements(
+        truth,
+        plan,
+        rng,
+        sigma_m=2e-8,
+        sigma_theta_rad=1e-5,
+        sense=sense,
+        missing=missing,
+        visits=visits,
+        linear=True,
+    )
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -32,8 +41,9 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
     emap, amap, artifact = result.error_map, result.artifact_map, result.artifact
     h, pitch, lines = artifact.half[0], artifact.grid_pitch_m, artifact.angular_count
     seen = 0
-    for view, found, kept in zip(measurements.views, result.views,
-                                 result.extra["residuals"]["views"], strict=True):
+    for view, found, kept in zip(
+        measurements.views, result.views, result.extra["residuals"]["views"], strict=True
+    ):
         assert kept["view"] == view.view.name
         pose = view.view.lattice_pose(artifact)
         turns = pose.turn_lines
@@ -46,7 +56,7 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
             assert "dx" not in kept
             continue
         for m, n, dx, dy in zip(view.m, view.n, view.dx, view.dy, strict=True):
-            turn = 1j ** pose.quarter_turns
+            turn = 1j**pose.quarter_turns
             arm = turn * complex(m, n) * pitch
             i, j = pose.site_of(m, n)
             sites = (-i + h, -j + h) if sense is Sense.PLATE_MOVES else (i + h, j + h)
@@ -55,7 +65,8 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
                 stage = -stage
             plate = turn * complex(amap.ax[m + h, n + h], amap.ay[m + h, n + h])
             expected = complex(dx, dy) - (
-                stage + plate + 1j * found.phi * arm + complex(found.tx, found.ty))
+                stage + plate + 1j * found.phi * arm + complex(found.tx, found.ty)
+            )
             assert kept["dx"][m + h, n + h] == pytest.approx(expected.real, abs=2e-13)
             assert kept["dy"][m + h, n + h] == pytest.approx(expected.imag, abs=2e-13)
             seen += 1
@@ -71,10 +82,12 @@ def test_a_course_follows_the_readings_of_each_visit():
     late = visits.stamp_ns > np.median(visits.stamp_ns)
     jumped = replace(visits, dx=visits.dx + np.where(late, 5e-7, 0))
     means = np.bincount(visits.mark, visits.count * jumped.dx) / np.bincount(
-        visits.mark, visits.count)
+        visits.mark, visits.count
+    )
     views[0] = replace(views[0], dx=means, visits=jumped)
-    kept = calibrate(replace(measurements, views=tuple(views)),
-                     bare(causes=False)).extra["residuals"]["views"]
+    kept = calibrate(replace(measurements, views=tuple(views)), bare(causes=False)).extra[
+        "residuals"
+    ]["views"]
     course = kept[0]["course"]
     early = course["time_s"] < np.median(course["time_s"])
     assert course["dx"][~early].mean() - course["dx"][early].mean() == pytest.approx(5e-7, rel=0.1)
@@ -92,10 +105,12 @@ def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
         course, count = entry["course"], view.visits.count
         first = min(v.visits.stamp_ns.min() for v in measurements.views if len(v.m))
         assert np.average(course["dx"], weights=course["count"]) == pytest.approx(
-            np.average(entry["dx"][np.isfinite(entry["dx"])]), abs=1e-12)
+            np.average(entry["dx"][np.isfinite(entry["dx"])]), abs=1e-12
+        )
         mean_s = np.average((view.visits.stamp_ns - first) / 1e9, weights=count)
         assert np.average(course["time_s"], weights=course["count"]) == pytest.approx(
-            mean_s, abs=1e-3)
+            mean_s, abs=1e-3
+        )
         assert (np.diff(course["time_s"]) > 0).all()
 
 
@@ -106,22 +121,31 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkey
     rng, measurements = np.random.default_rng(2), measured(visits=True)
     views, about = [], []
     for view in measurements.views[:2]:
-        visits = replace(view.visits, count=rng.integers(1, 6, len(view.visits.mark)),
-                         stamp_ns=rng.permutation(view.visits.stamp_ns))
+        visits = replace(
+            view.visits,
+            count=rng.integers(1, 6, len(view.visits.mark)),
+            stamp_ns=rng.permutation(view.visits.stamp_ns),
+        )
         count = np.bincount(visits.mark, visits.count)
-        dx, dy = (np.bincount(visits.mark, visits.count * values) / count
-                  for values in (visits.dx, visits.dy))
+        dx, dy = (
+            np.bincount(visits.mark, visits.count * values) / count
+            for values in (visits.dx, visits.dy)
+        )
         views.append(replace(view, count=count.astype(int), dx=dx, dy=dy, visits=visits))
         about.append((visits.dx - dx[visits.mark], visits.dy - dy[visits.mark]))
     views += measurements.views[2:]
-    kept = calibrate(replace(measurements, views=tuple(views)),
-                     bare(causes=False)).extra["residuals"]["views"]
+    kept = calibrate(replace(measurements, views=tuple(views)), bare(causes=False)).extra[
+        "residuals"
+    ]["views"]
     first = min(view.visits.stamp_ns.min() for view in views if len(view.m))
     for view, (dx, dy), entry in zip(views[:2], about, kept[:2], strict=True):
         visits, course = view.visits, entry["course"]
         at = view.m[visits.mark] + 3, view.n[visits.mark] + 3
-        found = {"time_s": (visits.stamp_ns - first) / 1e9, "dx": entry["dx"][at] + dx,
-                 "dy": entry["dy"][at] + dy}
+        found = {
+            "time_s": (visits.stamp_ns - first) / 1e9,
+            "dx": entry["dx"][at] + dx,
+            "dy": entry["dy"][at] + dy,
+        }
         chosen = [part for part in np.array_split(np.argsort(visits.stamp_ns), parts) if len(part)]
         assert len(chosen) == len(course["count"])
         for number, part in enumerate(chosen):
@@ -129,7 +153,8 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkey
             for name, values in found.items():
                 mean = (values[part] * visits.count[part]).sum() / visits.count[part].sum()
                 assert course[name][number] == pytest.approx(
-                    mean, abs=1e-3 if name == "time_s" else 2e-13)
+                    mean, abs=1e-3 if name == "time_s" else 2e-13
+                )
 
 
 def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monkeypatch):
@@ -139,8 +164,9 @@ def test_residuals_survive_the_json_form_and_are_left_out_of_large_results(monke
     again = result_from_dict(data, "r.json").extra["residuals"]["views"]
     own = result.extra["residuals"]["views"]
     assert [e["view"] for e in again] == [e["view"] for e in own]
-    assert again[3]["dx"] == [[None if np.isnan(v) else v for v in row]
-                              for row in own[3]["dx"].tolist()]
+    assert again[3]["dx"] == [
+        [None if np.isnan(v) else v for v in row] for row in own[3]["dx"].tolist()
+    ]
     monkeypatch.setattr(solve, "MAX_READINGS", 49 + 49 + 42 - 1)
     assert "residuals" not in calibrate(measurements, BARE).extra
     monkeypatch.setattr(solve, "MAX_READINGS", 49 + 49 + 42)

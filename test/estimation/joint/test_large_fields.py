@@ -27,9 +27,16 @@ from test.support.truth import random_truth, simulate_measurements
 ROOT = Path(__file__).parents[3]
 
 
-@pytest.mark.parametrize(("names", "identified"), [
-    ("0,tx,ty", False), ("0,180,tx", False), ("0,90", False), ("0,90,180,270", False),
-    ("0,90,tx", True)])
+@pytest.mark.parametrize(
+    ("names", "identified"),
+    [
+        ("0,tx,ty", False),
+        ("0,180,tx", False),
+        ("0,90", False),
+        ("0,90,180,270", False),
+        ("0,90,tx", True),
+    ],
+)
 def test_the_middle_of_a_large_plan_tells_what_the_whole_does(monkeypatch, names, identified):
     plan, sizes = plan_of(names, Artifact(21, 0.005)), []
     assert identifies(plan.artifact, plan.views) == identified
@@ -60,8 +67,11 @@ def test_the_uncertainty_of_a_large_field_is_given_on_request(monkeypatch):
 
 def test_more_than_401_rows_of_marks_are_refused():
     assert Artifact(401, 0.001).shape == (401, 401)
-    with pytest.raises(InputError, match=r"^artifact grid_size: 402 rows of marks are more than "
-                       r"401; use every other mark: half the rows, twice the pitch$"):
+    with pytest.raises(
+        InputError,
+        match=r"^artifact grid_size: 402 rows of marks are more than "
+        r"401; use every other mark: half the rows, twice the pitch$",
+    ):
         Artifact(402, 0.001)
 
 
@@ -86,7 +96,12 @@ def test_the_number_of_threads_changes_no_bit(capsys):
     with threadpool_limits(1):
         exec(SCRIPT, {})
     alone = capsys.readouterr().out
-    several = subprocess.run([sys.executable, "-c", SCRIPT], text=True, capture_output=True,
-                             check=True, cwd=ROOT,
-                             env={**os.environ, "OPENBLAS_NUM_THREADS": "5"}).stdout
+    several = subprocess.run(
+        [sys.executable, "-c", SCRIPT],
+        text=True,
+        capture_output=True,
+        check=True,
+        cwd=ROOT,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "5"},
+    ).stdout
     assert several == alone

@@ -27,10 +27,21 @@ ARTIFACT = Artifact(5, PITCH, LINES)
 def plan_with(shared: int, alone: int) -> Plan:
     """Return grid views of which `shared` have lines too, and views of nothing but lines."""
     poses = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (3, 0, -2)]
-    grids = [View(str(i), q * pi / 2, (a * PITCH, b * PITCH), True, i < shared)
-             for i, (q, a, b) in enumerate(poses)]
-    return Plan("p", ARTIFACT, (*grids, *(View(f"line{s}", s * 2 * pi / LINES, (0.0, 0.0), False,
-                                               True) for s in range(1, alone + 1))))
+    grids = [
+        View(str(i), q * pi / 2, (a * PITCH, b * PITCH), True, i < shared)
+        for i, (q, a, b) in enumerate(poses)
+    ]
+    return Plan(
+        "p",
+        ARTIFACT,
+        (
+            *grids,
+            *(
+                View(f"line{s}", s * 2 * pi / LINES, (0.0, 0.0), False, True)
+                for s in range(1, alone + 1)
+            ),
+        ),
+    )
 
 
 def dense_dof(plan: Plan) -> int:
@@ -47,10 +58,10 @@ def dense_dof(plan: Plan) -> int:
             if np.abs(site).max() > 2:
                 continue
             row = np.zeros((2, lines + 2 * LINES))
-            row[:, 2 * (5 * (site[0] + 2) + site[1] + 2):][:, :2] = np.eye(2)
-            row[:, 2 * sites + 2 * (5 * (m + 2) + n + 2):][:, :2] = turn
+            row[:, 2 * (5 * (site[0] + 2) + site[1] + 2) :][:, :2] = np.eye(2)
+            row[:, 2 * sites + 2 * (5 * (m + 2) + n + 2) :][:, :2] = turn
             x, y = turn @ [m, n]
-            row[:, views + 3 * v:][:, :3] = [[-y, 1, 0], [x, 0, 1]]
+            row[:, views + 3 * v :][:, :3] = [[-y, 1, 0], [x, 0, 1]]
             rows += list(row)
         for k in range(LINES if view.angular else 0):
             row = np.zeros(lines + 2 * LINES)
@@ -63,24 +74,38 @@ def dense_dof(plan: Plan) -> int:
 @pytest.mark.parametrize(("shared", "alone"), [(0, 0), (0, 2), (1, 1), (1, 2), (2, 1), (4, 2)])
 def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shared, alone):
     plan, rng = plan_with(shared, alone), np.random.default_rng(6)
-    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
-                                     sigma_m=2e-8, sigma_theta_rad=2e-6)
+    readings = simulate_measurements(
+        random_truth(ARTIFACT, len(plan.views), rng), plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-6
+    )
     model = fit_model(prepare(readings, BARE)[0])
     assert squares(model.problem, model.found)[1] == dense_dof(plan)
 
 
-@pytest.mark.parametrize(("terms", "message"), [
-    ("", "misalignment model 'rigid': the rotations do not converge; check the readings for "
-     "misalignments of more than a few degrees"),
-    ("plate_scale,drift:1e-8", "model drift, plate_scale: the fit does not converge; leave a "
-     "term out, or give plate_scale a size"),
-    ("plate_scale:1e-7,drift:1e-8", "model drift, plate_scale: the fit does not converge; leave "
-     "a term out")])
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        (
+            "",
+            "misalignment model 'rigid': the rotations do not converge; check the readings for "
+            "misalignments of more than a few degrees",
+        ),
+        (
+            "plate_scale,drift:1e-8",
+            "model drift, plate_scale: the fit does not converge; leave a "
+            "term out, or give plate_scale a size",
+        ),
+        (
+            "plate_scale:1e-7,drift:1e-8",
+            "model drift, plate_scale: the fit does not converge; leave a term out",
+        ),
+    ],
+)
 def test_what_does_not_settle_is_named(monkeypatch, terms, message):
     monkeypatch.setattr(model_fit, "MAX_STEPS", 1)
     plan, rng = plan_with(0, 0), np.random.default_rng(6)
-    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
-                                     sigma_m=2e-8, visits=True)
+    readings = simulate_measurements(
+        random_truth(ARTIFACT, len(plan.views), rng), plan, rng, sigma_m=2e-8, visits=True
+    )
     with pytest.raises(InputError) as caught:
         fit_model(prepare(readings, bare(terms=parse_terms([terms], "")))[0])
     assert str(caught.value) == message
@@ -102,6 +127,7 @@ def test_an_iteration_in_circles_is_given_up_and_a_slow_one_is_not(monkeypatch):
             state.moved_m = np.full(state.problem.system.size, change)
             state.changed = np.full_like(state.y, change)
             return change
+
         monkeypatch.setattr(model_fit._State, "step", told)
         return fit_model(problem)
 
@@ -115,8 +141,9 @@ def test_an_iteration_in_circles_is_given_up_and_a_slow_one_is_not(monkeypatch):
 def test_in_a_linear_model_only_the_terms_change_what_is_taken_off_the_readings():
     """What finite rotations take off is another change, which coefficients do not explain."""
     plan, rng = plan_with(0, 0), np.random.default_rng(6)
-    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng,
-                                     sigma_m=2e-8, visits=True)
+    readings = simulate_measurements(
+        random_truth(ARTIFACT, len(plan.views), rng), plan, rng, sigma_m=2e-8, visits=True
+    )
     terms = parse_terms(["plate_scale:1e-6"], "")
     for model, besides in (("linear", False), ("rigid", True)):
         options = bare(misalignment_model=model, terms=terms)
@@ -143,8 +170,9 @@ def test_rotations_settle_in_four_steps_from_what_the_views_show(monkeypatch):
     """From nothing, or with rotations of the other sense, five are needed."""
     artifact = Artifact(11, 0.01)
     rng = np.random.default_rng(3)
-    readings = simulate_measurements(random_truth(artifact, 3, rng), plan_of("0,90,tx", artifact),
-                                     rng, sigma_m=2e-8)
+    readings = simulate_measurements(
+        random_truth(artifact, 3, rng), plan_of("0,90,tx", artifact), rng, sigma_m=2e-8
+    )
     fits, plain = [], model_fit.fit
     monkeypatch.setattr(model_fit, "fit", lambda *args: fits.append(1) or plain(*args))
     fit_model(prepare(readings, BARE)[0])

@@ -28,14 +28,29 @@ SIGMA_M = 20e-9
 FOLLOWS = {"follow_mark": True}
 
 
-def measured(plan, seed=1, *, t_m=1e-3, sense=Sense.MICROSCOPE_MOVES, length=4.0, missing=0.0,
-             sigma_m=SIGMA_M, g_m=0.2e-6, **cell):
+def measured(
+    plan,
+    seed=1,
+    *,
+    t_m=1e-3,
+    sense=Sense.MICROSCOPE_MOVES,
+    length=4.0,
+    missing=0.0,
+    sigma_m=SIGMA_M,
+    g_m=0.2e-6,
+    **cell,
+):
     """Return a smooth stage, and its readings; plates lie `t_m` (sigma) beside their places."""
     rng = np.random.default_rng(seed)
-    truth = random_truth(plan.artifact, len(plan.views), rng, Spread(
-        g_m=g_m, t_m=t_m, phi_rad=5e-4, correlation_pitches=length))
-    settings = CellSettings(sense, sigma_m, 2e-5, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0,
-                            **cell)
+    truth = random_truth(
+        plan.artifact,
+        len(plan.views),
+        rng,
+        Spread(g_m=g_m, t_m=t_m, phi_rad=5e-4, correlation_pitches=length),
+    )
+    settings = CellSettings(
+        sense, sigma_m, 2e-5, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0, **cell
+    )
     return truth, simulate_measurements(truth, plan, rng, settings=settings, missing=missing)
 
 
@@ -44,7 +59,8 @@ def off(truth, result):
     emap = result.error_map
     error = np.stack([emap.gx, emap.gy]) - truth.g
     return remove_modes(error, datum_modes(truth.artifact, scale=True)) / np.stack(
-        [emap.u_gx, emap.u_gy])
+        [emap.u_gx, emap.u_gy]
+    )
 
 
 def maps_of(machines, *, size=11, **how):
@@ -81,19 +97,23 @@ def test_a_stage_too_rough_for_it_is_rather_not_qualified_than_wrong():
 def test_taking_the_sites_for_the_places_makes_errors_larger_than_u(sense):
     errors = []
     for seed in range(6):
-        truth, readings = measured(hu_plan(Artifact(9, 0.01, 24), 5), seed, sense=sense,
-                                   **FOLLOWS)
+        truth, readings = measured(hu_plan(Artifact(9, 0.01, 24), 5), seed, sense=sense, **FOLLOWS)
         errors.append(off(truth, solve_joint(readings, bare(at_places=False)).result))
     assert np.sqrt(np.mean(np.square(errors))) > 1.05
 
 
 def test_at_two_tenths_u_holds_the_noise_that_readings_between_nodes_have_more(monkeypatch):
     def ratio():
-        return np.sqrt(np.mean([off(truth, solve_joint(readings, bare()).result) ** 2
-                                for truth, readings in made]))
+        return np.sqrt(
+            np.mean(
+                [off(truth, solve_joint(readings, bare()).result) ** 2 for truth, readings in made]
+            )
+        )
 
-    made = [measured(plan_of("0,90,tx", Artifact(7, 0.01)), seed, t_m=2e-3, **FOLLOWS)
-            for seed in range(6)]
+    made = [
+        measured(plan_of("0,90,tx", Artifact(7, 0.01)), seed, t_m=2e-3, **FOLLOWS)
+        for seed in range(6)
+    ]
     held = ratio()
     monkeypatch.setattr(fitting, "FAR", np.inf)
     assert held == pytest.approx(1, abs=0.1)
@@ -119,8 +139,9 @@ def test_micrometres_off_the_sites_are_nothing():
 
 def test_a_stage_at_the_sites_has_the_same_result_to_the_bit():
     _, readings = measured(hu_plan(Artifact(11, 0.01, 24), 5), t_m=30e-6)
-    one, two = (result_to_dict(worded(calibrate(readings, Options(at_places=at))))
-                for at in (True, False))
+    one, two = (
+        result_to_dict(worded(calibrate(readings, Options(at_places=at)))) for at in (True, False)
+    )
     for made in (one, two):
         made["provenance"].pop("created", None)
     assert one == two
@@ -129,11 +150,14 @@ def test_a_stage_at_the_sites_has_the_same_result_to_the_bit():
 @pytest.mark.parametrize("terms", ["", "approach"])
 def test_repeats_scatter_by_their_noise_alone(terms):
     """Stops 0.5 mm (sigma) beside differ by what the stage error does over 0.5 mm."""
-    _, readings = measured(hu_plan(Artifact(11, 0.01), 5), t_m=0.0, stop_sigma_m=0.5e-3,
-                           sigma_m=5e-9)
+    _, readings = measured(
+        hu_plan(Artifact(11, 0.01), 5), t_m=0.0, stop_sigma_m=0.5e-3, sigma_m=5e-9
+    )
     options = bare(terms=parse_terms([terms], ""), causes=False)
-    there, at_sites = (calibrate(readings, replace(options, at_places=at)).noise.sigma_xy_repeats
-                       for at in (True, False))
+    there, at_sites = (
+        calibrate(readings, replace(options, at_places=at)).noise.sigma_xy_repeats
+        for at in (True, False)
+    )
     assert there == pytest.approx(5e-9, rel=0.05)
     assert at_sites > 5.5e-9
 

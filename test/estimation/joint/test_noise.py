@@ -16,7 +16,8 @@ def test_one_noise_is_contradicted_once_in_a_thousand():
     draws, dofs = 4000, (40, 12)
     alarms = sum(
         noise_estimate((a * 1e-8, dofs[0]), (b * 1e-8, dofs[1]), NAN).contradicted
-        for a, b in zip(*(np.sqrt(rng.chisquare(d, draws) / d) for d in dofs), strict=True))
+        for a, b in zip(*(np.sqrt(rng.chisquare(d, draws) / d) for d in dofs), strict=True)
+    )
     assert binom.ppf(1e-4, draws, F_LEVEL) <= alarms <= binom.ppf(1 - 1e-4, draws, F_LEVEL)
 
 
@@ -30,8 +31,9 @@ def test_the_larger_of_two_noises_that_contradict_each_other_counts(ratio, large
     assert found.dof == {"residuals": 50, "repeats": 100}[larger]
 
 
-@pytest.mark.parametrize(("dof", "counts"), [
-    (1e-13, False), (0.99, False), (1.01, True), (2, True)])
+@pytest.mark.parametrize(
+    ("dof", "counts"), [(1e-13, False), (0.99, False), (1.01, True), (2, True)]
+)
 def test_residuals_without_degrees_of_freedom_contradict_nothing(dof, counts):
     """Terms with sizes leave a fraction of one, in which there is rounding alone."""
     found = noise_estimate((8e-7, 48), (2e-12, dof), NAN)
@@ -47,8 +49,9 @@ def test_repeats_count_from_thirty_degrees_of_freedom(dof, used):
     assert not found.contradicted
 
 
-@pytest.mark.parametrize(("ratio", "contradicted"), [(1.09, False), (1.11, True),
-                                                     (1 / 1.09, False), (1 / 1.11, True)])
+@pytest.mark.parametrize(
+    ("ratio", "contradicted"), [(1.09, False), (1.11, True), (1 / 1.09, False), (1 / 1.11, True)]
+)
 def test_noises_within_a_tenth_are_the_same_for_every_purpose(ratio, contradicted):
     found = noise_estimate((1e-8, 1_000_000), (ratio * 1e-8, 1_000_000), NAN)
     assert found.p < F_LEVEL and found.contradicted is contradicted
@@ -75,8 +78,12 @@ def test_many_repeats_excuse_residuals_beyond_the_declared_noise_few_do_not(dof,
 
 
 def test_nothing_to_compare_is_no_contradiction():
-    for repeats, residuals in (((NAN, 0), (1e-8, 9)), ((1e-8, 40), (NAN, 0)),
-                               ((0.0, 40), (1e-8, 9)), ((0.0, 40), (0.0, 9))):
+    for repeats, residuals in (
+        ((NAN, 0), (1e-8, 9)),
+        ((1e-8, 40), (NAN, 0)),
+        ((0.0, 40), (1e-8, 9)),
+        ((0.0, 40), (0.0, 9)),
+    ):
         found = noise_estimate(repeats, residuals, NAN, floor=1e-13)
         assert np.isnan(found.p) and not found.contradicted
     assert noise_estimate((0.0, 40), (1e-8, 9), NAN, floor=1e-13).sigma == 1e-8

@@ -20,8 +20,12 @@ PLATE = Artifact(6, 0.01, 24, 4)
 
 def calibrated(seed, artifact=PLATE, repeats=2):
     plan, rng = hu_plan(artifact, repeats), np.random.default_rng(seed)
-    truth = random_truth(plan.artifact, 4, rng, Spread(
-        rotation="finite", phi_rad=1e-3, t_m=2e-5, microscope_rotation_rad=0.01))
+    truth = random_truth(
+        plan.artifact,
+        4,
+        rng,
+        Spread(rotation="finite", phi_rad=1e-3, t_m=2e-5, microscope_rotation_rad=0.01),
+    )
     settings = CellSettings(sigma_xy_m=NOISE, sigma_theta_rad=2e-6, servo_sigma_m=3e-7)
     return calibrate(simulate_measurements(truth, plan, rng, settings=settings, visits=True))
 
@@ -48,8 +52,12 @@ def test_the_noise_of_very_few_marks_is_that_of_lines_as_well():
 @pytest.mark.parametrize("phi_rad", [1e-6, 1e-5, 1e-4])
 def test_lines_without_noise_neither_stop_the_fit_nor_contradict_anything(phi_rad):
     """Plates that lie almost straight hardly show the microscope's scale."""
-    plate, exact = Artifact(11, 0.01, 24), CellSettings(
-        sigma_xy_m=20e-9, sigma_theta_rad=0.0, servo_sigma_m=20e-9, servo_sigma_theta_rad=1e-7)
+    plate, exact = (
+        Artifact(11, 0.01, 24),
+        CellSettings(
+            sigma_xy_m=20e-9, sigma_theta_rad=0.0, servo_sigma_m=20e-9, servo_sigma_theta_rad=1e-7
+        ),
+    )
     for seed in range(4):
         plan, rng = hu_plan(plate, 3), np.random.default_rng(seed)
         truth = random_truth(plate, 4, rng, Spread(rotation="finite", phi_rad=phi_rad))

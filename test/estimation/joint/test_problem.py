@@ -21,8 +21,9 @@ from test.support.truth import hu_plan, random_truth, simulate_measurements
 @pytest.fixture(scope="module")
 def problem():
     plan, rng = hu_plan(Artifact(7, 0.01, 12), repeats=3), np.random.default_rng(0)
-    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng,
-                                     sigma_m=1e-8, sigma_theta_rad=1e-6)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=1e-8, sigma_theta_rad=1e-6
+    )
     return prepare(readings, Options())[0], readings
 
 
@@ -45,7 +46,8 @@ def test_the_ratio_ends_where_the_lighter_kind_would_be_lost(problem):
     equal = system.grid_scale / system.angular_scale
     y = np.zeros_like(problem[0].grid.y)
     assert bounded_ratio(system, 1.0, 1e-15, problem[0].half_width_m) == pytest.approx(
-        equal * MAX_WEIGHT)
+        equal * MAX_WEIGHT
+    )
     # lines have at least a thousandth of the noise of marks
     assert weight_ratio(problem[0], 1.0, 1e-15, y) == pytest.approx(1e6)
     assert weight_ratio(problem[0], 1e-15, 1.0, y) == pytest.approx(equal / MAX_WEIGHT)

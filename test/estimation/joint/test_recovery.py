@@ -71,8 +71,17 @@ def test_squareness_and_scale_difference_are_those_of_a_straight_fit_to_the_map(
     assert (emap.nonorthogonality, emap.scale_difference) == pytest.approx(tuple(wanted), rel=1e-6)
 
 
-@pytest.mark.parametrize("names", ["0,90,tx", "0,90,180,tx", "90,180,tx", "0,270-2tx+ty,tx,ty",
-                                   "0,90,180,270,tx,ty", "90+tx,-tx,ty"])
+@pytest.mark.parametrize(
+    "names",
+    [
+        "0,90,tx",
+        "0,90,180,tx",
+        "90,180,tx",
+        "0,270-2tx+ty,tx,ty",
+        "0,90,180,270,tx,ty",
+        "90+tx,-tx,ty",
+    ],
+)
 @pytest.mark.parametrize("shape", [(7, 7), (9, 5), (5, 9)])
 def test_any_plan_and_shape(names, shape):
     artifact = Artifact(shape[0], 0.01, 0, shape[1])
@@ -103,8 +112,12 @@ def test_a_long_field_needs_and_takes_shifts_both_ways():
 def test_missing_marks(missing, sense):
     artifact = Artifact(11, 0.01, 24)
     truth, readings = measured_in_datum(
-        hu_plan(artifact), 5, lambda some: calibrate(some, BARE).error_map.valid, missing=missing,
-        sense=sense)
+        hu_plan(artifact),
+        5,
+        lambda some: calibrate(some, BARE).error_map.valid,
+        missing=missing,
+        sense=sense,
+    )
     found = calibrate(readings, BARE)
     known = found.error_map.valid
     assert known.mean() > 0.95
@@ -119,8 +132,10 @@ def test_missing_marks(missing, sense):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_order_of_readings_changes_no_bit(seed):
-    random, (_, readings) = np.random.default_rng(seed), measured(
-        hu_plan(Artifact(5, 0.01, 8)), sigma_m=1e-8, sigma_theta_rad=1e-7, missing=0.05)
+    random, (_, readings) = (
+        np.random.default_rng(seed),
+        measured(hu_plan(Artifact(5, 0.01, 8)), sigma_m=1e-8, sigma_theta_rad=1e-7, missing=0.05),
+    )
     shuffled = []
     for view in readings.views:
         marks, lines = (random.permutation(len(of)) for of in (view.m, view.k))
@@ -150,15 +165,23 @@ def test_datum_shifts_change_nothing(shift, names):
     truth = measured(plan_of(names, artifact))[0]
     cx, cy, turn, grow, ax, ay, plate = shift
     x, y = artifact.x_m, artifact.y_m
-    moved = replace(truth, g=truth.g + np.stack([cx - turn * y + grow * x,
-                                                 cy + turn * x + grow * y]),
-                    a=truth.a + np.stack([ax - plate * y, ay + plate * x]))
+    moved = replace(
+        truth,
+        g=truth.g + np.stack([cx - turn * y + grow * x, cy + turn * x + grow * y]),
+        a=truth.a + np.stack([ax - plate * y, ay + plate * x]),
+    )
     plan = plan_of(names, artifact)
     largest = max(np.nanmax(abs(grid_deviation(truth, i, v))) for i, v in enumerate(plan.views))
     for model, limit in (("linear", EXACT), ("rigid", EXACT + 4e-4 * largest)):
-        one, two = (calibrate(simulate_measurements(
-            known, plan, np.random.default_rng(0), linear=model == "linear"),
-            bare(misalignment_model=model, causes=False)).error_map for known in (truth, moved))
+        one, two = (
+            calibrate(
+                simulate_measurements(
+                    known, plan, np.random.default_rng(0), linear=model == "linear"
+                ),
+                bare(misalignment_model=model, causes=False),
+            ).error_map
+            for known in (truth, moved)
+        )
         assert np.abs(one.gx - two.gx).max() < limit
         assert np.abs(one.gy - two.gy).max() < limit
 
@@ -170,8 +193,9 @@ def test_a_plan_turned_as_a_whole_gives_the_map_turned(names):
     truth, readings = measured(plan_of(names, artifact))
     turned = replace(truth, g=np.stack([-truth.g[1][:, ::-1].T, truth.g[0][:, ::-1].T]))
     found = calibrate(readings, BARE).error_map
-    other = calibrate(simulate_measurements(turned, plan_of(names, artifact),
-                                            np.random.default_rng(0)), BARE).error_map
+    other = calibrate(
+        simulate_measurements(turned, plan_of(names, artifact), np.random.default_rng(0)), BARE
+    ).error_map
     assert np.abs(other.gx + found.gy[:, ::-1].T).max() < EXACT
     assert np.abs(other.gy - found.gx[:, ::-1].T).max() < EXACT
 
@@ -182,8 +206,10 @@ def test_weights_of_repeats_are_those_of_repeated_readings():
     _, readings = measured(plan, sigma_m=1e-7)
     heavy = replace(readings.views[0], count=readings.views[0].count * 2)
     weighted = calibrate(replace(readings, views=(heavy, *readings.views[1:])), BARE).error_map
-    declared = [replace(view, u=np.full(len(view.m), 1e-7 / np.sqrt(2 if i == 0 else 1)))
-                for i, view in enumerate(readings.views)]
+    declared = [
+        replace(view, u=np.full(len(view.m), 1e-7 / np.sqrt(2 if i == 0 else 1)))
+        for i, view in enumerate(readings.views)
+    ]
     by_sigma = calibrate(replace(readings, views=tuple(declared)), BARE).error_map
     assert np.abs(weighted.gx - by_sigma.gx).max() < 1e-18
     assert np.abs(weighted.gx - calibrate(readings, BARE).error_map.gx).max() > 1e-10
@@ -193,8 +219,14 @@ def test_a_view_broken_off_after_one_mark_harms_nothing():
     plan = hu_plan(Artifact(7, 0.01, 24))
     truth, readings = measured(plan)
     first = readings.views[0]
-    broken = ViewReadings(View("broken", 0.0, (0.0, 0.01)), first.m[:1], first.n[:1] + 2,
-                          first.dx[:1], first.dy[:1], first.count[:1])
+    broken = ViewReadings(
+        View("broken", 0.0, (0.0, 0.01)),
+        first.m[:1],
+        first.n[:1] + 2,
+        first.dx[:1],
+        first.dy[:1],
+        first.count[:1],
+    )
     found = calibrate(replace(readings, views=(*readings.views, broken)), BARE)
     assert np.abs(found.error_map.gx - truth.g[0]).max() < EXACT
     assert [view.phi for view in found.views[:4]] == pytest.approx(list(truth.phi_rad), abs=EXACT)
@@ -204,9 +236,13 @@ def test_a_view_broken_off_after_one_mark_harms_nothing():
 
 def test_angular_marks_planned_but_never_read_leave_the_xy_map():
     truth, readings = measured(hu_plan(Artifact(7, 0.01, 24)))
-    bare = replace(readings, views=tuple(
-        replace(view, k=view.k[:0], dtheta=view.dtheta[:0], count_theta=view.count_theta[:0])
-        for view in readings.views))
+    bare = replace(
+        readings,
+        views=tuple(
+            replace(view, k=view.k[:0], dtheta=view.dtheta[:0], count_theta=view.count_theta[:0])
+            for view in readings.views
+        ),
+    )
     found = calibrate(bare, BARE)
     assert np.abs(found.error_map.gx - truth.g[0]).max() < EXACT
     assert np.isnan(found.error_map.g_theta).all() and np.isnan(found.views[2].phi)
@@ -221,16 +257,25 @@ class TestHostile:
         return replace(readings, views=(first, *readings.views[1:]))
 
     def test_nothing_read(self):
-        empty = Measurements("p", self.plan.artifact,
-                             tuple(ViewReadings(view) for view in self.plan.views))
+        empty = Measurements(
+            "p", self.plan.artifact, tuple(ViewReadings(view) for view in self.plan.views)
+        )
         with pytest.raises(NoDataError, match="plan 'p': no grid mark was read; record"):
             calibrate(empty, BARE)
 
     def test_mark_off_the_plate(self):
-        with pytest.raises(InputError, match=r"view 'identity' grid readings: mark \(3, 0\) lies "
-                                             "off the plate"):
-            calibrate(self.readings(m=np.r_[3, self.readings().views[0].m[1:]],
-                                    n=np.r_[0, self.readings().views[0].n[1:]]), BARE)
+        with pytest.raises(
+            InputError,
+            match=r"view 'identity' grid readings: mark \(3, 0\) lies "
+            "off the plate",
+        ):
+            calibrate(
+                self.readings(
+                    m=np.r_[3, self.readings().views[0].m[1:]],
+                    n=np.r_[0, self.readings().views[0].n[1:]],
+                ),
+                BARE,
+            )
 
     def test_mark_off_the_field(self):
         with pytest.raises(InputError, match="off the stage's field"):

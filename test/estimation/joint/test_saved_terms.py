@@ -20,7 +20,8 @@ def cover_of(field, known):
     return SimpleNamespace(
         system=SimpleNamespace(grid=grid),
         maps_of_terms=lambda: (np.where(known, field, 0.0).reshape(-1, 1), None),
-        terms=SimpleNamespace(covariance=np.array([[SIGMA**2]])))
+        terms=SimpleNamespace(covariance=np.array([[SIGMA**2]])),
+    )
 
 
 def kept(shape, sense=Sense.MICROSCOPE_MOVES, size=float("inf")):
@@ -28,14 +29,27 @@ def kept(shape, sense=Sense.MICROSCOPE_MOVES, size=float("inf")):
     rng = np.random.default_rng(1)
     field = rng.normal(size=(*shape, 2)) @ [1, 1j]
     known = rng.random(shape) < 0.9
-    columns = TermColumns((Column("plate_scale", 1, "b", size),), np.zeros((1, 2, *shape)),
-                          WithinMarks(np.zeros((1, 1)), np.zeros(1), 0.0, 0), [])
+    columns = TermColumns(
+        (Column("plate_scale", 1, "b", size),),
+        np.zeros((1, 2, *shape)),
+        WithinMarks(np.zeros((1, 1)), np.zeros(1), 0.0, 0),
+        [],
+    )
     return field, known, saved_terms(cover_of(field, known), columns, sense)
 
 
-@pytest.mark.parametrize(("shape", "is_kept"), [
-    ((3, 5), True), ((31, 31), True), ((1, 961), True), ((1, 962), False), ((31, 33), False),
-    ((33, 31), False), ((33, 33), False)])
+@pytest.mark.parametrize(
+    ("shape", "is_kept"),
+    [
+        ((3, 5), True),
+        ((31, 31), True),
+        ((1, 961), True),
+        ((1, 962), False),
+        ((31, 33), False),
+        ((33, 31), False),
+        ((33, 33), False),
+    ],
+)
 def test_factors_are_kept_up_to_31_by_31_sites(shape, is_kept):
     _, _, found = kept(shape)
     assert (found is not None) == is_kept
@@ -43,15 +57,16 @@ def test_factors_are_kept_up_to_31_by_31_sites(shape, is_kept):
 
 @pytest.mark.parametrize(("size", "names"), [(float("inf"), [""]), (1e-6, ["plate_scale"])])
 @pytest.mark.parametrize("sense", Sense)
-def test_a_factor_is_what_a_standard_deviation_of_the_coefficient_does_to_the_map(sense, size,
-                                                                                  names):
+def test_a_factor_is_what_a_standard_deviation_of_the_coefficient_does_to_the_map(
+    sense, size, names
+):
     """With the plate moving the map is seen from the other end: H(x) = -G(-x)."""
     field, known, found = kept((5, 3), sense, size)
     moved = SIGMA * np.where(known, field, 0.0)
     if sense is Sense.PLATE_MOVES:
         moved = -moved[::-1, ::-1]
     assert list(found.terms) == names
-    factor, = found.of_map
+    (factor,) = found.of_map
     turned = factor[0] + 1j * factor[1]
     sign = np.sign((turned * moved.conj()).sum().real)  # L L' is the same for -L
     assert turned == pytest.approx(sign * moved, rel=1e-6)

@@ -65,11 +65,19 @@ def test_map_and_rotations_of_marks_and_lines_are_those_of_one_least_squares(mis
     found, at = solution(measurements, solved.model.found.ratio * length**2)
     sites = np.prod(measurements.artifact.shape)
     emap = solved.result.error_map
-    np.testing.assert_allclose(np.stack([emap.gx, emap.gy], axis=-1).ravel(),
-                               datum(measurements.artifact) @ found[:2 * sites], atol=1e-14)
-    phi = {name: {round(view.phi, 15) for of, view in zip(
-        measurements.views, solved.result.views, strict=True) if of.view.plan_view == name}
-        for name in ("0", "90")}
+    np.testing.assert_allclose(
+        np.stack([emap.gx, emap.gy], axis=-1).ravel(),
+        datum(measurements.artifact) @ found[: 2 * sites],
+        atol=1e-14,
+    )
+    phi = {
+        name: {
+            round(view.phi, 15)
+            for of, view in zip(measurements.views, solved.result.views, strict=True)
+            if of.view.plan_view == name
+        }
+        for name in ("0", "90")
+    }
     (first,), (second,) = phi["0"], phi["90"]
     assert second - first == pytest.approx(np.diff(found[at])[0] / PITCH, abs=1e-13)
     assert abs(second - first) > 1e-5
@@ -93,8 +101,11 @@ def test_modes_that_a_plan_leaves_unseen_are_those_of_the_matrix(turns, unseen):
     assert deficiency(system) == unseen
     if 180 not in turns:  # the matrix knows quarter turns up to one
         rng = np.random.default_rng(1)
-        matrix = dense(simulate_measurements(random_truth(
-            plan.artifact, len(turns), rng), plan, rng, sigma_m=MARK))[0]
+        matrix = dense(
+            simulate_measurements(
+                random_truth(plan.artifact, len(turns), rng), plan, rng, sigma_m=MARK
+            )
+        )[0]
         assert matrix.shape[1] - np.linalg.matrix_rank(matrix, tol=1e-9) == 7 + unseen
 
 
@@ -116,9 +127,11 @@ def test_a_cell_turned_by_itself_is_not_followed():
     at = [view.view.cell for view in measurements.views].index((1, 1))
     view = measurements.views[at]
     turned = replace(view, dx=view.dx - 1e-3 * PITCH * view.n, dy=view.dy + 1e-3 * PITCH * view.m)
-    views = (*measurements.views[:at], turned, *measurements.views[at + 1:])
-    before, after = (solve_joint(one, LINEAR).xy.residuals for one in (
-        measurements, replace(measurements, views=views)))
+    views = (*measurements.views[:at], turned, *measurements.views[at + 1 :])
+    before, after = (
+        solve_joint(one, LINEAR).xy.residuals
+        for one in (measurements, replace(measurements, views=views))
+    )
     assert before < 1.3 * MARK
     assert after > 5 * before
 
@@ -146,17 +159,22 @@ def test_one_rotation_tells_a_linear_yaw_from_a_bent_plate():
     matrix, sites, views = dense(measurements)[0], 49, measurements.views
     turn = np.repeat([(1, 1j)[v.view.plan_view == "90"] for v in views], [len(v.m) for v in views])
     z = np.concatenate([view.m + 1j * view.n for view in views]) / 3
-    forms = [turn * (turn == 1j) * unit * form for form in (z * z, abs(z) ** 2, z.conj() ** 2)
-             for unit in (1, 1j)]
+    forms = [
+        turn * (turn == 1j) * unit * form
+        for form in (z * z, abs(z) ** 2, z.conj() ** 2)
+        for unit in (1, 1j)
+    ]
     cell = np.repeat(np.arange(len(views)), [len(view.m) for view in views])
     apart = [1j * turn * z * (cell == number) for number in range(len(views))]
-    bent, apart = (np.array([np.stack([one.real, one.imag], axis=1).ravel() for one in many]).T
-                   for many in (forms, apart))
+    bent, apart = (
+        np.array([np.stack([one.real, one.imag], axis=1).ravel() for one in many]).T
+        for many in (forms, apart)
+    )
     slope, u = np.repeat(np.arange(7.0) - 3, 7) / 28 / 7, []
     for columns in (matrix, np.hstack([matrix, apart])):
         whole = np.hstack([columns, bent, of_yaw(measurements) / PITCH])
         values, vectors = np.linalg.eigh(whole.T @ whole)
         values = np.maximum(values, 1e-9 * values[-1])
-        u.append(np.sqrt(((vectors[-sites:].T @ slope)**2 / values).sum()))
+        u.append(np.sqrt(((vectors[-sites:].T @ slope) ** 2 / values).sum()))
     assert 0.03 < u[0] < 0.05  # rad of the reading's noise over a pitch, per pitch
     assert u[1] > 100 * u[0]

@@ -37,10 +37,14 @@ def of_yaw(measurements):
     axis = {v.view.plan_view: v.visits for v in measurements.views if v.view.cell == (0, 0)}
     for view in measurements.views:
         seen, on_axis = view.visits, axis[view.view.plan_view]
-        ox, oy = (getattr(seen, of) - getattr(seen, of).mean() + getattr(on_axis, of).mean()
-                  for of in ("offset_x", "offset_y"))
-        beside = {(int(view.m[at]), int(view.n[at])): (ox[visit], oy[visit])
-                  for visit, at in enumerate(seen.mark)}
+        ox, oy = (
+            getattr(seen, of) - getattr(seen, of).mean() + getattr(on_axis, of).mean()
+            for of in ("offset_x", "offset_y")
+        )
+        beside = {
+            (int(view.m[at]), int(view.n[at])): (ox[visit], oy[visit])
+            for visit, at in enumerate(seen.mark)
+        }
         turned = round(view.view.rotation_rad / (np.pi / 2))
         # the plate, with all its marks, lies shifted by minus the place of the cell
         dx, dy = (-round(t / PITCH) * PITCH for t in view.view.translation_m)
@@ -58,11 +62,22 @@ def of_yaw(measurements):
 
 @pytest.mark.parametrize("missing", [0.0, 0.06])
 def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
-    _, measurements = measured(3 * MARK, 5, missing=missing, size=5, rotation="linear",
-                               phi_rad=1e-5, t_m=1e-6, stage_yaw_rad=2e-5)
-    solved = solve_joint(measurements, Options(
-        assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear",
-        at_places=False))
+    _, measurements = measured(
+        3 * MARK,
+        5,
+        missing=missing,
+        size=5,
+        rotation="linear",
+        phi_rad=1e-5,
+        t_m=1e-6,
+        stage_yaw_rad=2e-5,
+    )
+    solved = solve_joint(
+        measurements,
+        Options(
+            assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear", at_places=False
+        ),
+    )
     matrix, stops = dense(measurements)
     matrix = np.hstack([matrix, of_yaw(measurements) / PITCH])
     inverse = np.linalg.pinv(matrix, rcond=1e-10)
@@ -70,14 +85,16 @@ def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
     noises = solved.model.problem.images.noises(solved.model.found.residuals)
     assert noises.image > 2 * noises.mark > 0
     covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
-        stops[:, None] == stops, np.eye(2))
+        stops[:, None] == stops, np.eye(2)
+    )
     sites = np.prod(measurements.artifact.shape)
     to_yaw = (np.eye(sites) - 1 / sites) @ inverse[-sites:] / PITCH
     yaw = yaw_of(solved.model, measurements.sense)
     np.testing.assert_allclose(yaw.yaw, to_yaw @ y, atol=TURNED * yaw.yaw.std())
-    np.testing.assert_allclose(yaw.u_yaw, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)),
-                               rtol=TURNED)
-    to_map = datum(measurements.artifact) @ inverse[:2 * sites]
+    np.testing.assert_allclose(
+        yaw.u_yaw, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)), rtol=TURNED
+    )
+    to_map = datum(measurements.artifact) @ inverse[: 2 * sites]
     emap = solved.result.error_map
     g = np.stack([emap.gx, emap.gy], axis=-1).ravel()
     np.testing.assert_allclose(g, to_map @ y, atol=TURNED * g.std())
@@ -94,23 +111,30 @@ def at_places(matrix, measurements, field):
     along, across = (CubicSpline(np.arange(n), np.eye(n)) for n in (nx, ny))
     for view in measurements.views:
         seen = view.visits
-        stood = dict(zip(seen.mark.tolist(), (
-            seen.dx - seen.offset_x + 1j * (seen.dy - seen.offset_y)).tolist(), strict=True))
+        stood = dict(
+            zip(
+                seen.mark.tolist(),
+                (seen.dx - seen.offset_x + 1j * (seen.dy - seen.offset_y)).tolist(),
+                strict=True,
+            )
+        )
         for reading in range(len(view.m)):
-            site = int(out[place, :2 * nx * ny:2].argmax())
-            error = complex(*field[2 * site:2 * site + 2])
+            site = int(out[place, : 2 * nx * ny : 2].argmax())
+            error = complex(*field[2 * site : 2 * site + 2])
             for _ in range(6):
                 away = (stood[reading] - error) / PITCH
                 weight = np.outer(along(site // ny + away.real), across(site % ny + away.imag))
                 error = complex(*(weight.ravel() @ field.reshape(-1, 2)))
             for axis in range(2):
-                out[place + axis, axis:2 * nx * ny:2] = weight.ravel()
+                out[place + axis, axis : 2 * nx * ny : 2] = weight.ravel()
             place += 2
     return out
 
 
-@pytest.mark.parametrize(("stop_m", "image_m", "near"), [
-    (0.0, 3 * MARK, 1e-3), (3e-5, 3 * MARK, 0.015), (3e-5, 0.3 * MARK, 0.015)])
+@pytest.mark.parametrize(
+    ("stop_m", "image_m", "near"),
+    [(0.0, 3 * MARK, 1e-3), (3e-5, 3 * MARK, 0.015), (3e-5, 0.3 * MARK, 0.015)],
+)
 def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image_m, near):
     """Plates 30 um beside, stops off the sites; the equations are those of the sites.
 
@@ -118,34 +142,49 @@ def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image
     still.
     """
     plan, rng = image_plan(5, repeats=1), np.random.default_rng(5)
-    truth = random_truth(plan.artifact, 2, rng, Spread(
-        phi_rad=1e-5, t_m=3e-5, stage_yaw_rad=2e-5, rotation="linear", correlation_pitches=4.0))
-    measurements = simulate_measurements(truth, plan, rng, settings=CellSettings(
-        sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=stop_m))
-    solved = solve_joint(measurements, Options(
-        assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear"))
+    truth = random_truth(
+        plan.artifact,
+        2,
+        rng,
+        Spread(
+            phi_rad=1e-5, t_m=3e-5, stage_yaw_rad=2e-5, rotation="linear", correlation_pitches=4.0
+        ),
+    )
+    measurements = simulate_measurements(
+        truth,
+        plan,
+        rng,
+        settings=CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=stop_m),
+    )
+    solved = solve_joint(
+        measurements, Options(assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear")
+    )
     matrix, stops = dense(measurements)
     whole = np.hstack([matrix, of_yaw(measurements) / PITCH])
     inverse, sites = np.linalg.pinv(whole, rcond=1e-10), np.prod(plan.artifact.shape)
     project = datum(plan.artifact)
     y = np.concatenate([np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views])
-    field = project @ inverse[:2 * sites] @ y
+    field = project @ inverse[: 2 * sites] @ y
     for _ in range(4):
         moved = np.zeros_like(whole)
-        moved[:, :2 * sites] = (at_places(matrix, measurements, field) - matrix)[
-            :, :2 * sites] @ project
+        moved[:, : 2 * sites] = (at_places(matrix, measurements, field) - matrix)[
+            :, : 2 * sites
+        ] @ project
         estimate = np.linalg.solve(np.eye(len(inverse)) + inverse @ moved, inverse)
-        field = project @ estimate[:2 * sites] @ y
+        field = project @ estimate[: 2 * sites] @ y
     emap, yaw = solved.result.error_map, yaw_of(solved.model, measurements.sense)
-    np.testing.assert_allclose(np.stack([emap.gx, emap.gy], axis=-1).ravel(), field,
-                               atol=1e-3 * emap.u_gx.mean())
+    np.testing.assert_allclose(
+        np.stack([emap.gx, emap.gy], axis=-1).ravel(), field, atol=1e-3 * emap.u_gx.mean()
+    )
     noises = solved.model.problem.images.noises(solved.model.found.residuals)
     covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
-        stops[:, None] == stops, np.eye(2))
+        stops[:, None] == stops, np.eye(2)
+    )
     to_yaw = (np.eye(sites) - 1 / sites) @ estimate[-sites:] / PITCH
     np.testing.assert_allclose(yaw.yaw, to_yaw @ y, atol=1e-3 * yaw.u_yaw.mean())
-    np.testing.assert_allclose(yaw.u_yaw, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)),
-                               rtol=near)
+    np.testing.assert_allclose(
+        yaw.u_yaw, np.sqrt(np.diag(to_yaw @ covariance @ to_yaw.T)), rtol=near
+    )
 
 
 def test_only_a_constant_yaw_is_the_cameras():
@@ -154,7 +193,7 @@ def test_only_a_constant_yaw_is_the_cameras():
     alone = dense(measurements)[0]
     both = np.hstack([alone, of_yaw(measurements) / PITCH])
     values, vectors = np.linalg.eigh(both.T @ both)
-    free = vectors[-both.shape[1] + alone.shape[1]:, values < 1e-9 * values[-1]]
+    free = vectors[-both.shape[1] + alone.shape[1] :, values < 1e-9 * values[-1]]
     free = free[:, np.abs(free).max(axis=0) > 1e-9]
     assert np.linalg.matrix_rank(free, tol=1e-6) == 1
     assert np.ptp(free, axis=0).max() < 1e-9
@@ -166,8 +205,10 @@ def turns(truth, found) -> np.ndarray:
     return (found.yaw - (true - true.mean())) / found.u_yaw
 
 
-@pytest.mark.parametrize(("size", "sense", "rad", "runs"), [
-    (7, Sense.MICROSCOPE_MOVES, 1e-5, 3), (7, Sense.PLATE_MOVES, 3e-5, 3)])
+@pytest.mark.parametrize(
+    ("size", "sense", "rad", "runs"),
+    [(7, Sense.MICROSCOPE_MOVES, 1e-5, 3), (7, Sense.PLATE_MOVES, 3e-5, 3)],
+)
 def test_yaw_and_map_of_a_stage_that_turns_are_within_their_uncertainties(size, sense, rad, runs):
     away, results = population(MARK, size, runs, sense=sense, stage_yaw_rad=rad)
     assert all(found.verdict.qualified and not found.verdict.causes for _, found in results)
@@ -189,8 +230,11 @@ def test_a_stage_that_yaws_smoothly_by_more_than_assumed_bends_no_plate(size, mo
     slope = np.linspace(-size, size, 7)[:, None] + np.zeros(7)
     truth = replace(truth, yaw=slope)
     measurements = simulate_measurements(
-        truth, image_plan(7, repeats=1), np.random.default_rng(3),
-        settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0))
+        truth,
+        image_plan(7, repeats=1),
+        np.random.default_rng(3),
+        settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0),
+    )
     found = calibrate(measurements, Options(terms=(*STILL, *parse_terms(more, "test"))))
     causes = {cause.name: cause for cause in found.verdict.causes}
     assert list(causes) == ["yaw"] * (size == 1e-3 and not more)
@@ -212,13 +256,23 @@ def test_a_plate_bent_in_one_view_is_told_from_a_stage_that_yaws_linearly():
         shape[1] = [[0, bend_m, 0], [-bend_m, 0, 0]]
         slope = np.linspace(-yaw_rad, yaw_rad, 7)[:, None] + np.zeros(7)
         truth = replace(truth, yaw=slope, plate_shape_m=shape)
-        found = calibrate(simulate_measurements(
-            truth, image_plan(7, repeats=1), np.random.default_rng(seed),
-            settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0)), Options(terms=STILL))
+        found = calibrate(
+            simulate_measurements(
+                truth,
+                image_plan(7, repeats=1),
+                np.random.default_rng(seed),
+                settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0),
+            ),
+            Options(terms=STILL),
+        )
         assert [cause.name for cause in found.verdict.causes] == ["plate_shape"]
         assert found.verdict.qualified
-        of = {(one.component, one.view): one.value for term in found.model.terms
-              if term.name == "plate_shape" for one in term.estimates}
+        of = {
+            (one.component, one.view): one.value
+            for term in found.model.terms
+            if term.name == "plate_shape"
+            for one in term.estimates
+        }
         for name in ("z^2 y", "|z|^2 y"):  # (xy, -x^2) = -i/2 (z^2 + |z|^2)
             assert of[name, "90"] - of[name, "0"] == pytest.approx(-bend_m / 2, abs=MARK)
         emap = found.error_map
@@ -248,10 +302,14 @@ def test_one_line_of_marks_shows_it_too():
     image = replace(plan.views[0].image, ny=1)
     more = replace(plan.views[0], name="shifted", translation_m=(PITCH, 0.0))
     plan = replace(plan, views=tuple(replace(v, image=image) for v in (*plan.views, more)))
-    truth = random_truth(plan.artifact, 3, rng, Spread(
-        phi_rad=1e-4, stage_yaw_rad=5e-5, correlation_pitches=4.0))
-    found = calibrate(simulate_measurements(truth, plan, rng, settings=CellSettings(
-        sigma_xy_m=MARK, servo_sigma_m=0.0)))
+    truth = random_truth(
+        plan.artifact, 3, rng, Spread(phi_rad=1e-4, stage_yaw_rad=5e-5, correlation_pitches=4.0)
+    )
+    found = calibrate(
+        simulate_measurements(
+            truth, plan, rng, settings=CellSettings(sigma_xy_m=MARK, servo_sigma_m=0.0)
+        )
+    )
     assert found.camera is None
     away = turns(truth, found.stage_yaw)
     assert 0.6 < np.sqrt((away**2).mean()) < 1.5

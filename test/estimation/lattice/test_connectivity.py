@@ -46,10 +46,14 @@ def test_components_are_those_that_a_walk_finds(readings, seed):
         assert found.balanced[number] == agree
         assert found.first_sites[number] == min(sites)
         assert set(np.flatnonzero(found.of_mark == number).tolist()) == {
-            m for s, m in zip(site.tolist(), mark.tolist(), strict=True) if s in sites}
+            m for s, m in zip(site.tolist(), mark.tolist(), strict=True) if s in sites
+        }
     assert set(np.flatnonzero(found.of_site < 0)) == set(range(14)) - set(site.tolist())
-    assert found.largest in [found.of_site[min(sites)] for sites, _ in expected
-                             if len(sites) == max(len(one) for one, _ in expected)]
+    assert found.largest in [
+        found.of_site[min(sites)]
+        for sites, _ in expected
+        if len(sites) == max(len(one) for one, _ in expected)
+    ]
 
 
 @pytest.mark.parametrize("seed", range(8))

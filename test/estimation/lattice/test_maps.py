@@ -7,14 +7,20 @@ import pytest
 from selfcal_ros.estimation.lattice.maps import LatticeViews
 from selfcal_ros.model.pose import LatticePose
 
-TURNS = [np.array(rows) for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]],
-                                     [[0, 1], [-1, 0]])]
+TURNS = [
+    np.array(rows)
+    for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]])
+]
 
 
-@pytest.mark.parametrize("shift", [(0, 0), (1, 0), (0, -2), (-2, 1), (4, 0), (5, 0), (0, 3),
-                                   (0, -3), (-7, 1), (9, 9), (-9, -9)])
-@pytest.mark.parametrize(("shape", "q"), [((5, 5), 0), ((5, 5), 1), ((5, 5), 2), ((5, 5), 3),
-                                          ((5, 3), 0), ((5, 3), 2), ((1, 7), 0)])
+@pytest.mark.parametrize(
+    "shift",
+    [(0, 0), (1, 0), (0, -2), (-2, 1), (4, 0), (5, 0), (0, 3), (0, -3), (-7, 1), (9, 9), (-9, -9)],
+)
+@pytest.mark.parametrize(
+    ("shape", "q"),
+    [((5, 5), 0), ((5, 5), 1), ((5, 5), 2), ((5, 5), 3), ((5, 3), 0), ((5, 3), 2), ((1, 7), 0)],
+)
 def test_sites_of_marks(shape, q, shift):
     hx, hy = (shape[0] - 1) // 2, (shape[1] - 1) // 2
     expected = np.full(shape, -1)
@@ -28,8 +34,12 @@ def test_sites_of_marks(shape, q, shift):
     assert views.in_field[0].tolist() == (expected >= 0).tolist()
 
 
-POSES = (LatticePose(1, (1, 0), None), LatticePose(0, (0, 0), None), LatticePose(3, (-2, 1), None),
-         LatticePose(2, (0, -1), None))
+POSES = (
+    LatticePose(1, (1, 0), None),
+    LatticePose(0, (0, 0), None),
+    LatticePose(3, (-2, 1), None),
+    LatticePose(2, (0, -1), None),
+)
 HALF, SIDE = 2, 5
 
 
@@ -40,7 +50,7 @@ def dense(pose):
         for n in range(-HALF, HALF + 1):
             i, j = TURNS[pose.q] @ [m, n] + pose.shift
             if max(abs(i), abs(j)) <= HALF:
-                out[(m + HALF) * SIDE + n + HALF, (i + HALF) * SIDE + j + HALF] = (-1j)**pose.q
+                out[(m + HALF) * SIDE + n + HALF, (i + HALF) * SIDE + j + HALF] = (-1j) ** pose.q
     return out
 
 
@@ -50,8 +60,10 @@ def test_fields_go_to_the_marks_and_back_as_dense_matrices_take_them():
     field = rng.normal(size=(SIDE, SIDE, 2)) @ [1, 1j]
     marks = rng.normal(size=(4, SIDE, SIDE, 2)) @ [1, 1j]
     gathered = [(matrix @ field.ravel()).reshape(SIDE, SIDE) for matrix in matrices]
-    back = [(matrix.conj().T @ one.ravel()).reshape(SIDE, SIDE)
-            for matrix, one in zip(matrices, marks, strict=True)]
+    back = [
+        (matrix.conj().T @ one.ravel()).reshape(SIDE, SIDE)
+        for matrix, one in zip(matrices, marks, strict=True)
+    ]
     assert views.gather(field) == pytest.approx(np.array(gathered))
     assert views.scatter(marks) == pytest.approx(np.sum(back, axis=0))
     for index in range(4):

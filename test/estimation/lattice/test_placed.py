@@ -15,8 +15,16 @@ CELLS = {"bilinear": bilinear_cells, "bicubic": bicubic_cells}
 
 
 def views_of(artifact: Artifact, poses) -> PlacedViews:
-    return PlacedViews(artifact, tuple(pose_of(View("", np.radians(turn), tuple(
-        step * artifact.grid_pitch_m for step in shift)), artifact) for turn, shift in poses))
+    return PlacedViews(
+        artifact,
+        tuple(
+            pose_of(
+                View("", np.radians(turn), tuple(step * artifact.grid_pitch_m for step in shift)),
+                artifact,
+            )
+            for turn, shift in poses
+        ),
+    )
 
 
 @pytest.mark.parametrize("how", CELLS)
@@ -51,8 +59,13 @@ def test_on_the_lattice_the_maps_are_those_of_the_lattice():
     artifact = Artifact(7, 10e-3, map_grid=MapGrid(7, 10e-3))
     placed = views_of(artifact, poses)
     bare = Artifact(7, 10e-3)
-    lattice = LatticeViews((7, 7), tuple(View("", np.radians(turn), tuple(
-        10e-3 * step for step in shift)).lattice_pose(bare) for turn, shift in poses))
+    lattice = LatticeViews(
+        (7, 7),
+        tuple(
+            View("", np.radians(turn), tuple(10e-3 * step for step in shift)).lattice_pose(bare)
+            for turn, shift in poses
+        ),
+    )
     field = np.random.default_rng(4).normal(size=(7, 7)) * (1 + 2j)
     assert placed.gather(field) == pytest.approx(lattice.gather(field), abs=1e-14)
     assert (placed.in_field == lattice.in_field).all()

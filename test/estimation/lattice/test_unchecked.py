@@ -26,8 +26,14 @@ def one_by_one(site, mark):
     left = list(zip(site.tolist(), mark.tolist(), strict=True))
     alone = True
     while alone:
-        alone = next((r for r in left if [s for s, _ in left].count(r[0]) == 1
-                      or [m for _, m in left].count(r[1]) == 1), None)
+        alone = next(
+            (
+                r
+                for r in left
+                if [s for s, _ in left].count(r[0]) == 1 or [m for _, m in left].count(r[1]) == 1
+            ),
+            None,
+        )
         if alone:
             left.remove(alone)
     return set(site.tolist()) - {s for s, _ in left}
@@ -50,25 +56,53 @@ def measured(names, gone, *, sense=Sense.MICROSCOPE_MOVES, lines=(), size=5, siz
     """Return readings of Hu's noise without the marks `gone` and `lines`: {view: marks}, stated."""
     plan = plan_of(names, size, count=8, size_y=size_y, line=True, repeats=4)
     rng = np.random.default_rng(5)
-    readings = simulate_measurements(random_truth(plan.artifact, len(plan.views), rng), plan, rng,
-                                     sigma_m=SIGMA_M, sigma_theta_rad=2e-5, sense=sense)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, len(plan.views), rng),
+        plan,
+        rng,
+        sigma_m=SIGMA_M,
+        sigma_theta_rad=2e-5,
+        sense=sense,
+    )
     views = []
     for view in readings.views:
-        keep = np.array([mark not in gone.get(view.view.name, ())
-                         for mark in zip(view.m.tolist(), view.n.tolist(), strict=True)], bool)
-        rows = np.array([k not in dict(lines).get(view.view.name, ()) for k in view.k.tolist()],
-                        bool)
-        views.append(replace(view, m=view.m[keep], n=view.n[keep], dx=view.dx[keep],
-                             dy=view.dy[keep], count=view.count[keep], k=view.k[rows],
-                             dtheta=view.dtheta[rows], count_theta=view.count_theta[rows]))
+        keep = np.array(
+            [
+                mark not in gone.get(view.view.name, ())
+                for mark in zip(view.m.tolist(), view.n.tolist(), strict=True)
+            ],
+            bool,
+        )
+        rows = np.array(
+            [k not in dict(lines).get(view.view.name, ()) for k in view.k.tolist()], bool
+        )
+        views.append(
+            replace(
+                view,
+                m=view.m[keep],
+                n=view.n[keep],
+                dx=view.dx[keep],
+                dy=view.dy[keep],
+                count=view.count[keep],
+                k=view.k[rows],
+                dtheta=view.dtheta[rows],
+                count_theta=view.count_theta[rows],
+            )
+        )
     return replace(readings, views=tuple(views))
 
 
 def off(readings, name, mark, by_m):
     """Return the readings with one mark of one view off along x."""
-    return replace(readings, views=tuple(
-        view if view.view.name != name else replace(view, dx=view.dx + by_m * (
-            (view.m == mark[0]) & (view.n == mark[1]))) for view in readings.views))
+    return replace(
+        readings,
+        views=tuple(
+            view
+            if view.view.name != name
+            else replace(view, dx=view.dx + by_m * ((view.m == mark[0]) & (view.n == mark[1])))
+            for view in readings.views
+        ),
+    )
 
 
 # site (2, 1) is reached by mark (2, 1) in '0', by (1, -2) in '90' and by (1, 1) in 'tx'
@@ -92,8 +126,9 @@ def test_an_error_of_a_reading_that_no_other_checks_is_in_the_map_and_said(sense
 
 @pytest.mark.parametrize("sense", list(Sense))
 def test_an_error_of_a_line_that_no_other_checks_is_in_the_map_and_said(sense):
-    readings = measured("0, 90, tx", {}, sense=sense,
-                        lines={"90": {1}, "tx": {3}, "line": {2}}.items())
+    readings = measured(
+        "0, 90, tx", {}, sense=sense, lines={"90": {1}, "tx": {3}, "line": {2}}.items()
+    )
     first = readings.views[0]
     bad = replace(first, dtheta=first.dtheta + 1e-3 * (first.k == 3))
     good, bad = calibrate(readings), calibrate(replace(readings, views=(bad, *readings.views[1:])))
@@ -102,15 +137,18 @@ def test_an_error_of_a_line_that_no_other_checks_is_in_the_map_and_said(sense):
     assert bad.findings == good.findings == (unchecked([], [moved]),)
 
 
-@pytest.mark.parametrize(("names", "gone", "lines", "expected"), [
-    ("0, 90, tx", {}, (), ()),
-    # two readings are left of site (2, 1), but one of them is all that tells of mark (1, -2)
-    ("0, 90, tx", {"tx": {(1, 1), (1, -2)}, "0": {(1, -2)}}, (), (unchecked([[2, 1]], []),)),
-    # a mark that is read once tells nothing of its site, which others reach
-    ("0, 90, tx, ty", {"tx": {(1, 1)}, "90": {(1, 1)}, "ty": {(1, 1)}}, (), ()),
-    ("0, 90, tx, ty", ONE_LEFT, (), ()),
-    ("0, 90, tx", {}, {"90": {1}, "tx": {3}, "line": {2}}.items(),
-     (unchecked([], [3]),))])
+@pytest.mark.parametrize(
+    ("names", "gone", "lines", "expected"),
+    [
+        ("0, 90, tx", {}, (), ()),
+        # two readings are left of site (2, 1), but one of them is all that tells of mark (1, -2)
+        ("0, 90, tx", {"tx": {(1, 1), (1, -2)}, "0": {(1, -2)}}, (), (unchecked([[2, 1]], []),)),
+        # a mark that is read once tells nothing of its site, which others reach
+        ("0, 90, tx, ty", {"tx": {(1, 1)}, "90": {(1, 1)}, "ty": {(1, 1)}}, (), ()),
+        ("0, 90, tx, ty", ONE_LEFT, (), ()),
+        ("0, 90, tx", {}, {"90": {1}, "tx": {3}, "line": {2}}.items(), (unchecked([], [3]),)),
+    ],
+)
 def test_what_is_counted(names, gone, lines, expected):
     result = calibrate(measured(names, gone, lines=tuple(lines)))
     assert result.findings == expected

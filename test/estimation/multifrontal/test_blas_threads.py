@@ -13,8 +13,11 @@ from selfcal_ros.estimation.multifrontal.factor import one_thread
 
 def threads() -> set[int]:
     """Threads of the BLAS of numpy and of scipy; others (OpenCV's) came in with other tests."""
-    return {row["num_threads"] for row in threadpool_info()
-            if row["user_api"] == "blas" and re.search("numpy|scipy", row["filepath"])}
+    return {
+        row["num_threads"]
+        for row in threadpool_info()
+        if row["user_api"] == "blas" and re.search("numpy|scipy", row["filepath"])
+    }
 
 
 @pytest.fixture(autouse=True)

@@ -8,8 +8,12 @@ from selfcal_ros.estimation.multifrontal import factor
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.pose import LatticePose
 
-SETS = [((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 0), (2, 0, 0), (3, 1, -1)),
-        ((0, 0, 0), (0, 1, 0), (0, 0, 2)), ((1, 0, 0), (2, 1, 0), (3, 0, 0), (0, 0, 0))]
+SETS = [
+    ((0, 0, 0), (1, 0, 0), (0, 1, 0)),
+    ((0, 0, 0), (2, 0, 0), (3, 1, -1)),
+    ((0, 0, 0), (0, 1, 0), (0, 0, 2)),
+    ((1, 0, 0), (2, 1, 0), (3, 0, 0), (0, 0, 0)),
+]
 
 
 def grid_of(poses, shape, seed):
@@ -48,8 +52,12 @@ def dense(grid):
 def mean_at_sites(grid):
     """Return the mean of i^-q G(X) over the readings of each mark, as rows over the sites."""
     out = np.zeros((grid.n_marks, grid.n_sites), dtype=complex)
-    for pose, index, part in zip(grid.views.poses, grid.views.site_index, grid.weight
-                                 / np.maximum(grid.weight.sum(axis=0), 1), strict=True):
+    for pose, index, part in zip(
+        grid.views.poses,
+        grid.views.site_index,
+        grid.weight / np.maximum(grid.weight.sum(axis=0), 1),
+        strict=True,
+    ):
         read = np.flatnonzero(part)
         np.add.at(out, (read, index.ravel()[read]), (-1j) ** pose.q * part.ravel()[read])
     return out
@@ -59,7 +67,8 @@ def mean_at_sites(grid):
 @pytest.mark.parametrize("poses", SETS)
 @pytest.mark.parametrize("leaf", [4, 12, factor.LEAF])
 def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
-        poses, shape, leaf, monkeypatch):
+    poses, shape, leaf, monkeypatch
+):
     """With small leaves there are fronts on many levels, as on large fields."""
     monkeypatch.setattr(factor, "LEAF", leaf)
     grid = grid_of(poses, shape, 3)
@@ -70,10 +79,12 @@ def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
     sites, means = grid.factor.variances
     np.testing.assert_allclose(sites, np.real(np.diag(inverse)), atol=1e-10 * size)
     rows = mean_at_sites(grid)
-    np.testing.assert_allclose(means, np.real(np.diag(rows @ inverse @ rows.conj().T)),
-                               atol=1e-10 * size)
+    np.testing.assert_allclose(
+        means, np.real(np.diag(rows @ inverse @ rows.conj().T)), atol=1e-10 * size
+    )
     rng = np.random.default_rng(1)
     right = rng.normal(size=(grid.n_sites, 3)) + 1j * rng.normal(size=(grid.n_sites, 3))
     np.testing.assert_allclose(grid.factor.solve(right), inverse @ right, atol=1e-9 * size)
-    np.testing.assert_allclose(grid.factor.solve(right[:, 0]), (inverse @ right)[:, 0],
-                               atol=1e-9 * size)
+    np.testing.assert_allclose(
+        grid.factor.solve(right[:, 0]), (inverse @ right)[:, 0], atol=1e-9 * size
+    )

@@ -21,18 +21,26 @@ from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.view import Plan, View
 
 PLATE = Artifact(11, 0.01, 0, map_grid=MapGrid(7, 0.1 / 6))
-PLAN = Plan("aslant", PLATE, (View("first", angular=False, repeats=2),
-                              View("turned", math.radians(90), angular=False, repeats=2),
-                              View("moved", math.radians(37), (0.013, -0.007), angular=False,
-                                   repeats=2)))
+PLAN = Plan(
+    "aslant",
+    PLATE,
+    (
+        View("first", angular=False, repeats=2),
+        View("turned", math.radians(90), angular=False, repeats=2),
+        View("moved", math.radians(37), (0.013, -0.007), angular=False, repeats=2),
+    ),
+)
 
 
 @pytest.mark.parametrize("target", [(217, 1.4, -0.8), (359, -0.3, 1.7), (45, 0.0, 0.0)])
 def test_the_search_finds_the_minimum_to_a_degree_and_a_tenth(target):
     def value(pose):
         turn = math.radians(pose[0] - target[0])
-        return (1 - math.cos(turn) + sum((a - b) ** 2 for a, b in zip(
-            pose[1:], target[1:], strict=True)),)
+        return (
+            1
+            - math.cos(turn)
+            + sum((a - b) ** 2 for a, b in zip(pose[1:], target[1:], strict=True)),
+        )
 
     assert best_pose(start_poses(2.0), 2.0, value) == target
 

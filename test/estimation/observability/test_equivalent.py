@@ -16,8 +16,10 @@ SQUARE, LONG = Artifact(5, 0.01), Artifact(5, 0.01, 0, 7)
 
 
 def views_of(poses):
-    return tuple(View(f"v{n}", q * pi / 2, (a * 0.01, b * 0.01), True, False)
-                 for n, (q, a, b) in enumerate(poses))
+    return tuple(
+        View(f"v{n}", q * pi / 2, (a * 0.01, b * 0.01), True, False)
+        for n, (q, a, b) in enumerate(poses)
+    )
 
 
 BASE = [(0, 0, 0), (1, 1, 0), (0, 0, 2), (2, -1, 0)]
@@ -54,8 +56,13 @@ def test_what_changes_the_plan_has_another_key_and_score(name):
 def test_shifts_are_compared_in_pitches_whatever_the_pitch():
     """With marks 10 um apart a shift of a pitch is far below the rounding in metres."""
     small = Artifact(5, 1e-5)
-    plans = [[replace(view, translation_m=tuple(1e-3 * part for part in view.translation_m))
-              for view in views_of(poses)] for poses in (BASE, OTHER["one shift back"])]
+    plans = [
+        [
+            replace(view, translation_m=tuple(1e-3 * part for part in view.translation_m))
+            for view in views_of(poses)
+        ]
+        for poses in (BASE, OTHER["one shift back"])
+    ]
     assert equivalent_key(small, plans[0]) == equivalent_key(SQUARE, views_of(BASE))
     assert equivalent_key(small, plans[1]) != equivalent_key(small, plans[0])
 

@@ -59,24 +59,35 @@ def test_a_free_term_adds_to_the_noise():
     free = SIGMA * dense.gain((terms[0],))
     assert effects(found)[NOISE] == pytest.approx(free, rel=1e-6)
     assert effects(found)["plate_strain"] == pytest.approx(
-        np.sqrt((SIGMA * dense.gain(terms)) ** 2 - free**2), rel=1e-4)
+        np.sqrt((SIGMA * dense.gain(terms)) ** 2 - free**2), rel=1e-4
+    )
     assert [line.source for line in found.lines] == ["readings", "declared"]
     assert found.u_rms("xy") == pytest.approx(SIGMA * dense.gain(terms), rel=1e-6)
     assert found.u_rms("xy", noise_only=True) == effects(found)[NOISE]
     assert sum(map(found.share, found.lines)) == pytest.approx(1)
 
 
-LINES = Plan("lines", Artifact(5, 0.01, 8), (
-    View("0", 0.0, (0.0, 0.0), True, True, 2), View("90", pi / 2, (0.0, 0.0), True, True, 1),
-    View("line", pi / 4, (0.0, 0.0), False, True, 3),
-    View("tx", 0.0, (0.01, 0.0), True, True, 2)))
+LINES = Plan(
+    "lines",
+    Artifact(5, 0.01, 8),
+    (
+        View("0", 0.0, (0.0, 0.0), True, True, 2),
+        View("90", pi / 2, (0.0, 0.0), True, True, 1),
+        View("line", pi / 4, (0.0, 0.0), False, True, 3),
+        View("tx", 0.0, (0.01, 0.0), True, True, 2),
+    ),
+)
 
 
 def dense_lines(sizes, sigma):
     """Root mean square u of the angular map, rotations of views with marks known."""
     rows, weight = [], []
-    keys = [(view, part) for view in range(4) for part in ("cos", "sin", "turn")
-            if part != "turn" or LINES.views[view].grid]
+    keys = [
+        (view, part)
+        for view in range(4)
+        for part in ("cos", "sin", "turn")
+        if part != "turn" or LINES.views[view].grid
+    ]
     for number, view in enumerate(LINES.views):
         turn = round(view.rotation_rad / (pi / 4))
         for k in range(8):
@@ -101,15 +112,17 @@ def dense_lines(sizes, sigma):
 
 def test_the_lines_have_a_budget_of_their_own():
     sizes, sigma = (3e-6, 2e-6), 4e-6
-    terms = (ModelTerm("line_eccentricity", sizes[0]),
-             ModelTerm("rotation", sizes[1]))
+    terms = (ModelTerm("line_eccentricity", sizes[0]), ModelTerm("rotation", sizes[1]))
     # marks so good that they tell the rotations
     found = budget_of(LINES, terms, Assumed(1e-12, sigma_rad=sigma))
     assert found.u_rms("theta") == pytest.approx(dense_lines(sizes, sigma), rel=1e-3)
-    assert effects(found, "theta")[NOISE] == pytest.approx(dense_lines((1e-12, 1e-12), sigma),
-                                                           rel=1e-3)
-    assert effects(found, "theta")["line_eccentricity"] == pytest.approx(np.sqrt(
-        dense_lines(sizes, sigma) ** 2 - dense_lines((1e-12, sizes[1]), sigma) ** 2), rel=1e-3)
+    assert effects(found, "theta")[NOISE] == pytest.approx(
+        dense_lines((1e-12, 1e-12), sigma), rel=1e-3
+    )
+    assert effects(found, "theta")["line_eccentricity"] == pytest.approx(
+        np.sqrt(dense_lines(sizes, sigma) ** 2 - dense_lines((1e-12, sizes[1]), sigma) ** 2),
+        rel=1e-3,
+    )
     assert np.isnan(budget_of(plan_of("0, 90, tx", 5), (), Assumed()).u_rms("theta"))
 
 
@@ -149,11 +162,15 @@ def test_a_larger_assumption_changes_what_the_readings_leave_of_it_and_nothing_d
 
 def test_removals_of_a_large_field_are_tried_on_a_small_one(monkeypatch):
     sizes = []
-    monkeypatch.setattr(module, "effects_of_terms", lambda plan, *more: (
-        sizes.append(plan.artifact.shape), effects_of_terms(plan, *more))[1])
+    monkeypatch.setattr(
+        module,
+        "effects_of_terms",
+        lambda plan, *more: (sizes.append(plan.artifact.shape), effects_of_terms(plan, *more))[1],
+    )
     found = budget_of(plan_of("0, 90, tx", 15), default_terms(), Assumed(1e-9))
     # with the drift, and with larger sizes
     assert sizes.count((15, 15)) == 4 and set(sizes) == {(15, 15), (11, 11)}
-    before = effects_of_terms(plan_of("0, 90, tx", 15), [
-        *default_terms(), ModelTerm("drift", 10e-9)], Assumed(1e-9))
+    before = effects_of_terms(
+        plan_of("0, 90, tx", 15), [*default_terms(), ModelTerm("drift", 10e-9)], Assumed(1e-9)
+    )
     assert effects(found)["microscope"] == pytest.approx(np.sqrt(before["microscope"][0].mean()))

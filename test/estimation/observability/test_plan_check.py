@@ -63,7 +63,7 @@ def dense_rank(plan):
             row = np.zeros(4 * sites + 3 * len(plan.views))
             for axis, part in enumerate(parts):
                 if part is not None:
-                    row[base + axis * sites:base + (axis + 1) * sites] = part
+                    row[base + axis * sites : base + (axis + 1) * sites] = part
             rows.append(row)
     return np.linalg.matrix_rank(np.array(rows))
 
@@ -78,8 +78,10 @@ def test_all_rank_tables_of_qiao(views, rank, extra, size):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.lists(st.sampled_from(sorted(POSES)), min_size=1, max_size=4),
-       st.sampled_from([(3, 0), (5, 0), (5, 3)]))
+@given(
+    st.lists(st.sampled_from(sorted(POSES)), min_size=1, max_size=4),
+    st.sampled_from([(3, 0), (5, 0), (5, 3)]),
+)
 def test_rank_is_that_of_the_dense_matrix(names, shape):
     if shape[1]:
         names = [name for name in names if POSES[name][0] % 2 == 0] or ["0"]
@@ -95,8 +97,10 @@ def test_few_sites_of_a_small_plate_leave_nothing_to_eliminate(views):
     assert plan_observability(plan).rank == dense_rank(plan)
 
 
-@pytest.mark.parametrize(("views", "asks"), [
-    ("0", False), ("-tx, -ty, 90tx", False), ("90tx, tx, ty", False), ("0, 90, tx", True)])
+@pytest.mark.parametrize(
+    ("views", "asks"),
+    [("0", False), ("-tx, -ty, 90tx", False), ("90tx, tx, ty", False), ("0, 90, tx", True)],
+)
 def test_no_matrix_is_made_where_a_count_says_no(monkeypatch, views, asks):
     """One view joins each mark to one site; then one mark is never read, then no corner visited."""
     asked: list = []
@@ -110,8 +114,9 @@ def test_an_arbitrary_field_is_seen_by_hus_plan_and_not_by_one_view():
     field = np.random.default_rng(1).normal(size=(2, 5, 5))
     for views, unseen in (("0, 90, tx", False), ("0, 90", False), ("0", True)):
         plan = plan_of(views)
-        assert is_unseen(planned_system(plan.artifact, plan.views),
-                         field[0] + 1j * field[1]) is unseen
+        assert (
+            is_unseen(planned_system(plan.artifact, plan.views), field[0] + 1j * field[1]) is unseen
+        )
 
 
 def test_no_error_is_unseen_and_the_least_one_is_not():
@@ -130,8 +135,10 @@ def names(views, **kwargs):
 def test_groups_that_no_reading_joins_are_counted_and_the_smallest_is_named():
     """Every second site of a row of 5 hangs together: three with the ends, two between them."""
     plan = plan_of("0, tx2", 5, size_y=3)
-    assert ("6 groups of sites that no reading connects: each may move independently; the smallest "
-            "is (-1, -1), (1, -1)") in in_words(check_plan(plan).observability.modes)
+    assert (
+        "6 groups of sites that no reading connects: each may move independently; the smallest "
+        "is (-1, -1), (1, -1)"
+    ) in in_words(check_plan(plan).observability.modes)
 
 
 def test_shifts_along_both_axes_leave_exactly_nonorthogonality_and_scale_difference():
@@ -149,18 +156,21 @@ def test_four_turns_leave_half_of_n_squared_less_5_fields(size):
     assert seen.modes[0].details["numbers"] == seen.deficiency
 
 
-@pytest.mark.parametrize(("views", "expected"), [
-    ("0", ["every_field"]),
-    ("tx", ["every_field", "sites_never_visited", "marks_never_read"]),
-    ("0, 90", ["rotation_symmetric"]),
-    ("0, 90, 180, 270", ["rotation_symmetric"]),
-    ("0, 180", ["nonorthogonality", "scale_difference", "rotation_symmetric"]),
-    ("0, tx", ["nonorthogonality", "scale_difference", "bending_x", "line_offsets"]),
-    ("0, ty", ["nonorthogonality", "scale_difference", "bending_y", "line_offsets"]),
-    ("0, 180, tx", ["nonorthogonality", "scale_difference", "line_offsets"]),
-    ("0, tx2, ty2", ["nonorthogonality", "scale_difference", "periodic_fields"]),
-    ("0, 90, tx", []),
-])
+@pytest.mark.parametrize(
+    ("views", "expected"),
+    [
+        ("0", ["every_field"]),
+        ("tx", ["every_field", "sites_never_visited", "marks_never_read"]),
+        ("0, 90", ["rotation_symmetric"]),
+        ("0, 90, 180, 270", ["rotation_symmetric"]),
+        ("0, 180", ["nonorthogonality", "scale_difference", "rotation_symmetric"]),
+        ("0, tx", ["nonorthogonality", "scale_difference", "bending_x", "line_offsets"]),
+        ("0, ty", ["nonorthogonality", "scale_difference", "bending_y", "line_offsets"]),
+        ("0, 180, tx", ["nonorthogonality", "scale_difference", "line_offsets"]),
+        ("0, tx2, ty2", ["nonorthogonality", "scale_difference", "periodic_fields"]),
+        ("0, 90, tx", []),
+    ],
+)
 def test_unseen_modes_by_name(views, expected):
     assert names(views, size=7) == expected
 
@@ -174,25 +184,34 @@ def test_unseen_modes_in_words():
     def modes(views, size, **kwargs):
         return in_words(check_plan(plan_of(views, size, **kwargs)).observability.modes)
 
-    assert modes("0, 180, tx, ty", 5) == ["non-orthogonality of the axes: Gx = O y, Gy = O x",
-                                          "scale difference of the axes: Gx = R x, Gy = -R y"]
+    assert modes("0, 180, tx, ty", 5) == [
+        "non-orthogonality of the axes: Gx = O y, Gy = O x",
+        "scale difference of the axes: Gx = R x, Gy = -R y",
+    ]
     assert modes("0, 90", 5, count=8) == [
         "rotation-symmetric fields: every field that a quarter turn maps to itself "
-        "(10 numbers beside the datum)", "angular map: patterns that repeat every 2 lines"]
+        "(10 numbers beside the datum)",
+        "angular map: patterns that repeat every 2 lines",
+    ]
     half = modes("0, 180", 5)[-1]
     assert "half turn" in half
     rows = modes("0, 180, tx", 5)[-1]
     assert rows.endswith("opposite in opposite rows")
     double = modes("0, tx2, ty2", 7)[-1]
-    assert double == ("patterns that repeat every 2 pitches along x and every 2 pitches along y "
-                      "(6 numbers beside the datum)")
+    assert double == (
+        "patterns that repeat every 2 pitches along x and every 2 pitches along y "
+        "(6 numbers beside the datum)"
+    )
 
 
-@pytest.mark.parametrize(("views", "first"), [
-    ("0, 90", "add an unturned view shifted by +1 pitch along X"),
-    ("0, tx, ty", "add a view turned by 90 deg"),
-    ("0", "add a view turned by 90 deg and an unturned view shifted by +1 pitch along X"),
-])
+@pytest.mark.parametrize(
+    ("views", "first"),
+    [
+        ("0, 90", "add an unturned view shifted by +1 pitch along X"),
+        ("0, tx, ty", "add a view turned by 90 deg"),
+        ("0", "add a view turned by 90 deg and an unturned view shifted by +1 pitch along X"),
+    ],
+)
 def test_advice_names_the_missing_view(views, first):
     assert in_words(check_plan(plan_of(views)).observability.advice)[0] == first
 
@@ -206,17 +225,19 @@ def test_every_cure_cures_and_nothing_smaller_does(views, size):
         assert plan_observability(replace(plan, views=(*plan.views, *cure))).identifiable
         if len(cure) > 1:
             for left_out in range(len(cure)):
-                part = cure[:left_out] + cure[left_out + 1:]
+                part = cure[:left_out] + cure[left_out + 1 :]
                 assert not plan_observability(
-                    replace(plan, views=(*plan.views, *part))).identifiable
+                    replace(plan, views=(*plan.views, *part))
+                ).identifiable
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.integers(0, 23), min_size=1, max_size=4))
 def test_turns_identify_the_circle_if_they_generate_it(turns):
     plan = plan_of("0, 90, tx", 3, count=24)
-    lines = tuple(View(f"l{i}", turn * np.pi / 12, (0.0, 0.0), False, True)
-                  for i, turn in enumerate(turns))
+    lines = tuple(
+        View(f"l{i}", turn * np.pi / 12, (0.0, 0.0), False, True) for i, turn in enumerate(turns)
+    )
     grid = tuple(replace(view, angular=view.name == "0") for view in plan.views)
     step = gcd(24, *turns)
     seen = plan_observability(replace(plan, views=(*grid, *lines)))
@@ -237,8 +258,9 @@ def test_missing_marks_change_the_verdict():
     readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
     assert calibrate(readings, BARE).observability.identifiable
     shifted = readings.views[2]
-    gone = replace(shifted, **{name: getattr(shifted, name)[:1]
-                               for name in ("m", "n", "dx", "dy", "count")})
+    gone = replace(
+        shifted, **{name: getattr(shifted, name)[:1] for name in ("m", "n", "dx", "dy", "count")}
+    )
     with pytest.raises(NotIdentifiableError, match="do not identify the stage"):
         calibrate(replace(readings, views=(*readings.views[:2], gone)), BARE)
 
@@ -289,10 +311,14 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
     with pytest.raises(NotIdentifiableError) as refusal:
         calibrate(readings, BARE)
     error = told(refusal.value)
-    assert str(error).startswith("the marks that were read do not identify the stage (2 modes "
-                                 "undetermined): add a view turned by 90 deg; or add a view ")
+    assert str(error).startswith(
+        "the marks that were read do not identify the stage (2 modes "
+        "undetermined): add a view turned by 90 deg; or add a view "
+    )
     assert [mode.name for mode in error.observability.modes] == [
-        "nonorthogonality", "scale_difference"]
+        "nonorthogonality",
+        "scale_difference",
+    ]
     assert error.observability.advice[1].text == "or add a view turned by 270 deg"
     assert told(error) is error
 
@@ -306,8 +332,9 @@ def test_lines_may_be_measured_in_views_of_their_own(datum):
     assert plan_observability(plan).identifiable
     assert plan_observability(replace(plan, views=(*grid, lines[0]))).deficiency == 11
     rng = np.random.default_rng(2)
-    truth = random_truth(plan.artifact, 5, rng, Spread(
-        encoder="xy_axes" if datum == "xy_axes" else "independent"))
+    truth = random_truth(
+        plan.artifact, 5, rng, Spread(encoder="xy_axes" if datum == "xy_axes" else "independent")
+    )
     result = calibrate(simulate_measurements(truth, plan, rng), bare(datum_theta=datum))
     shift = truth.g_theta.mean() if datum == "zero_mean" else 0.0
     assert np.abs(result.error_map.g_theta - truth.g_theta + shift).max() < 1e-15
@@ -316,8 +343,14 @@ def test_lines_may_be_measured_in_views_of_their_own(datum):
     assert np.isnan([v.phi for v in result.views[3:]]).all()
 
 
-@pytest.mark.parametrize(("views", "rank"), [
-    ("0, 90, tx", 4 * 101**2 + 9), ("0, 180, tx", 4 * 101**2 - 101 + 10),
-    ("0, tx, ty", 4 * 101**2 + 7), ("0, 90", (7 * 101**2 + 17) // 2)])
+@pytest.mark.parametrize(
+    ("views", "rank"),
+    [
+        ("0, 90, tx", 4 * 101**2 + 9),
+        ("0, 180, tx", 4 * 101**2 - 101 + 10),
+        ("0, tx, ty", 4 * 101**2 + 7),
+        ("0, 90", (7 * 101**2 + 17) // 2),
+    ],
+)
 def test_large_fields_have_the_rank_of_the_formula(views, rank):
     assert plan_observability(plan_of(views, 101)).rank == rank

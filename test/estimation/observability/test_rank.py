@@ -24,9 +24,14 @@ from test.support.placed import SIX, plate
 from test.support.refusals import in_words, refused
 from test.support.truth import random_truth, simulate_measurements
 
-PLANS = [((0, 0, 0), (1, 0, 0), (0, 1, 0)), ((0, 0, 0), (2, 0, 0), (0, 1, 0)),
-         ((0, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, 0, 0), (3, 1, 0), (0, 2, -1)),
-         ((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1)), ((0, 0, 0), (1, 0, 0))]
+PLANS = [
+    ((0, 0, 0), (1, 0, 0), (0, 1, 0)),
+    ((0, 0, 0), (2, 0, 0), (0, 1, 0)),
+    ((0, 0, 0), (0, 1, 0), (0, 0, 1)),
+    ((0, 0, 0), (3, 1, 0), (0, 2, -1)),
+    ((0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0), (0, 0, 1)),
+    ((0, 0, 0), (1, 0, 0)),
+]
 
 
 def dense(grid: GridSystem) -> np.ndarray:
@@ -38,9 +43,9 @@ def dense(grid: GridSystem) -> np.ndarray:
         back = PHASES[-pose.q % 4]
         for m in np.flatnonzero(grid.read[v].ravel()):
             row = np.zeros(4 * n + 3 * views, dtype=complex)
-            row[2 * index[v, m]:2 * index[v, m] + 2] = back, 1j * back
-            row[2 * n + 2 * m:2 * n + 2 * m + 2] = 1, 1j
-            row[4 * n + 3 * v:4 * n + 3 * v + 3] = 1j * z[m], 1, 1j
+            row[2 * index[v, m] : 2 * index[v, m] + 2] = back, 1j * back
+            row[2 * n + 2 * m : 2 * n + 2 * m + 2] = 1, 1j
+            row[4 * n + 3 * v : 4 * n + 3 * v + 3] = 1j * z[m], 1, 1j
             rows += [row.real, row.imag]
     return np.array(rows)
 
@@ -58,10 +63,17 @@ def test_rank_is_that_of_the_full_matrix(poses, shape, missing):
     assert joint.rank_grid == np.linalg.matrix_rank(dense(grid), tol=1e-8)
 
 
-@pytest.mark.parametrize(("names", "needs"), [
-    ("0", "turned by 90 deg"), ("0,90", "1 pitch along X"), ("0,tx", "turned by 90 deg"),
-    ("0,180,tx,ty", "turned by 90 deg"), ("0,tx,ty", "turned by 90 deg"),
-    ("0,90,180,270", "1 pitch along X")])
+@pytest.mark.parametrize(
+    ("names", "needs"),
+    [
+        ("0", "turned by 90 deg"),
+        ("0,90", "1 pitch along X"),
+        ("0,tx", "turned by 90 deg"),
+        ("0,180,tx,ty", "turned by 90 deg"),
+        ("0,tx,ty", "turned by 90 deg"),
+        ("0,90,180,270", "1 pitch along X"),
+    ],
+)
 @pytest.mark.parametrize("lines", [0, 24])
 def test_deficient_plans_are_refused_by_name(names, needs, lines):
     artifact = Artifact(7, 0.01, lines)
@@ -79,7 +91,9 @@ def test_deficient_plans_are_refused_by_name(names, needs, lines):
 
 def test_a_half_turn_spares_neither_the_quarter_turn_nor_the_shift():
     assert in_words(plan_observability(plan_of("0,180", Artifact(5, 0.01))).advice) == [
-        "add a view turned by 90 deg", "add an unturned view shifted by +1 pitch along X"]
+        "add a view turned by 90 deg",
+        "add an unturned view shifted by +1 pitch along X",
+    ]
 
 
 def test_angular_views_without_a_line_turn_are_refused():
@@ -106,18 +120,28 @@ def test_without_a_mark_the_rank_is_that_of_what_is_read():
     plan = plan_of("0,90,tx", artifact)
     rng = np.random.default_rng(0)
     readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng)
-    readings = replace(readings, views=tuple(
-        subset(view, (view.m != 2) | (view.n != 2), np.ones(0, dtype=bool))
-        for view in readings.views))
+    readings = replace(
+        readings,
+        views=tuple(
+            subset(view, (view.m != 2) | (view.n != 2), np.ones(0, dtype=bool))
+            for view in readings.views
+        ),
+    )
     system = prepare(readings, Options())[0].system
     seen = measured_observability(system, artifact, plan.views)
     assert seen.identifiable
     assert seen.rank == seen.unknowns == np.linalg.matrix_rank(dense(system.grid), tol=1e-8) + 7
 
 
-@pytest.mark.parametrize(("lines", "more"), [
-    (1, []), (-1, []), (2, ["add an angular view turned by 1 line (45 deg)"]),
-    (4, ["add an angular view turned by 1 line (45 deg)"])])
+@pytest.mark.parametrize(
+    ("lines", "more"),
+    [
+        (1, []),
+        (-1, []),
+        (2, ["add an angular view turned by 1 line (45 deg)"]),
+        (4, ["add an angular view turned by 1 line (45 deg)"]),
+    ],
+)
 def test_a_turn_by_one_line_is_advised_where_none_tells_the_lines_apart(lines, more):
     seen = plan_observability(plan_of("0,90", Artifact(5, 0.01, 8), lines=lines))
     assert in_words(seen.advice) == ["add an unturned view shifted by +1 pitch along X", *more]
@@ -140,8 +164,10 @@ def test_a_view_of_a_single_mark_hides_its_own_rotation_alone():
 
 def test_unknowns_of_a_map_of_its_own_nodes():
     """Both parts of 49 nodes and 121 marks, three misalignments a view; nothing is lacking."""
-    views = tuple(View(f"{number}", np.radians(turn), (x * 0.01, y * 0.01), True, False)
-                  for number, (turn, (x, y)) in enumerate(SIX))
+    views = tuple(
+        View(f"{number}", np.radians(turn), (x * 0.01, y * 0.01), True, False)
+        for number, (turn, (x, y)) in enumerate(SIX)
+    )
     seen = plan_observability(Plan("six", plate(11, 7), views))
     assert seen.identifiable and seen.deficiency == 0
     assert seen.rank == seen.unknowns == 2 * (49 + 121) + 3 * 6

@@ -49,15 +49,26 @@ def test_each_term_as_the_dense_matrix_has_it(name, order, sense):
     assert found.unseen_modes == dense.n_unseen([ModelTerm(name)])
     assert found.told is (found.unseen_modes == 0)
     assert (found.effect_rms_m, found.effect_max_m) == pytest.approx(
-        dense.effect([], name, size), rel=1e-6)
+        dense.effect([], name, size), rel=1e-6
+    )
     assert found.power == pytest.approx(dense.power([], name, size, LEVEL), abs=0.08)
 
 
-MODELS = ["drift", "drift,approach", "plate_scale:1e-7", "plate_shape:30e-9,drift",
-          "microscope,plate_scale:2e-6,approach:5e-9", "plate_shape:1e-9,drift:3e-9"]
-UNLIKE = replace(plan_of("0, 90, tx, -ty", 5, size_y=3), views=tuple(
-    replace(view, repeats=repeats) for view, repeats in zip(
-        plan_of("0, 90, tx, -ty", 5).views, (2, 4, 3, 2), strict=True)))
+MODELS = [
+    "drift",
+    "drift,approach",
+    "plate_scale:1e-7",
+    "plate_shape:30e-9,drift",
+    "microscope,plate_scale:2e-6,approach:5e-9",
+    "plate_shape:1e-9,drift:3e-9",
+]
+UNLIKE = replace(
+    plan_of("0, 90, tx, -ty", 5, size_y=3),
+    views=tuple(
+        replace(view, repeats=repeats)
+        for view, repeats in zip(plan_of("0, 90, tx, -ty", 5).views, (2, 4, 3, 2), strict=True)
+    ),
+)
 """A plate of 5 x 3 marks, and views of unlike repeats."""
 
 
@@ -75,8 +86,9 @@ def test_columns_are_as_long_as_those_of_all_visits(name, size):
 
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("text", MODELS)
-@pytest.mark.parametrize(("plan", "order"), [(SMALL, "x_back_y_back"),
-                                             (UNLIKE, "serpentine@plate")])
+@pytest.mark.parametrize(
+    ("plan", "order"), [(SMALL, "x_back_y_back"), (UNLIKE, "serpentine@plate")]
+)
 def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
     model = parse_terms([text], "test")
     assumed = Assumed(SIGMA, 10e-6, 2, order)
@@ -93,13 +105,16 @@ def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
     for found in check_terms(planned, sizes, LEVEL):
         others = [term for term in model if term.name != found.name]
         held = [term for term in others if term.free]
-        assert found.unseen_modes == (dense.n_unseen([*held, ModelTerm(found.name)])
-                                      - dense.n_unseen(held))
+        assert found.unseen_modes == (
+            dense.n_unseen([*held, ModelTerm(found.name)]) - dense.n_unseen(held)
+        )
         if dense.n_unseen(held) == 0:
             assert (found.effect_rms_m, found.effect_max_m) == pytest.approx(
-                dense.effect(others, found.name, sizes[found.name]), rel=1e-5)
+                dense.effect(others, found.name, sizes[found.name]), rel=1e-5
+            )
             assert found.power == pytest.approx(
-                dense.power(others, found.name, sizes[found.name], LEVEL), abs=0.08)
+                dense.power(others, found.name, sizes[found.name], LEVEL), abs=0.08
+            )
 
 
 ORDER_TABLE = {  # order, repeats that are one turn of it: degree 1, 2, 3, 5
@@ -119,8 +134,7 @@ def test_what_a_drift_hides_depends_on_the_visiting_order(order, repeats):
     assert alone.rms_xy == pytest.approx(0.843, abs=5e-4)
     row = []
     for degree in (1, 2, 3, 5):
-        planned = PlannedTerms(plan, [ModelTerm("drift")],
-                               Assumed(SIGMA, 10e-6, degree, order))
+        planned = PlannedTerms(plan, [ModelTerm("drift")], Assumed(SIGMA, 10e-6, degree, order))
         hidden = planned.check("drift", 1e-8, LEVEL).unseen_modes
         row.append(hidden or round(planned.predicted(alone).rms_xy, 3))
     assert tuple(row) == pytest.approx(ORDER_TABLE[order, repeats], abs=1e-9)
@@ -142,31 +156,47 @@ def test_free_terms_that_are_not_told_are_named_with_their_cure():
 
 def test_shifts_of_both_signs_damp_bent_plates():
     """Plates bent by 10 nm in each view: both shifts take most of it off the map."""
+
     def effect(text):
-        return PlannedTerms(plan_of(text, 11), (), Assumed()).check(
-            "plate_shape", 10e-9, LEVEL).effect_rms_m
+        return (
+            PlannedTerms(plan_of(text, 11), (), Assumed())
+            .check("plate_shape", 10e-9, LEVEL)
+            .effect_rms_m
+        )
 
     one_sided, both_sides = effect("0, 90, tx"), effect("0, 90, tx, -tx, ty, -ty")
     assert both_sides < 0.5 * one_sided
 
 
-@pytest.mark.parametrize(("views", "worst"), [("0, 90, tx", 34.8),
-                                              ("0, 90, tx, -tx, ty, -ty", 8.5)])
+@pytest.mark.parametrize(
+    ("views", "worst"), [("0, 90, tx", 34.8), ("0, 90, tx, -tx, ty, -ty", 8.5)]
+)
 def test_a_plate_bent_in_one_view_only(views, worst):
     """10 nm of (x^2 - y^2, -2xy), which no turn and no single shift tells from the stage."""
     plan = plan_of(views, 11)
     every = PlannedTerms(plan, (), Assumed()).every
     found = []
     for view in range(len(plan.views)):
-        b = [10 * ((c.term, c.view, c.component) == ("plate_shape", view, "z*^2 x"))
-             for c in every.columns.columns]
+        b = [
+            10 * ((c.term, c.view, c.component) == ("plate_shape", view, "z*^2 x"))
+            for c in every.columns.columns
+        ]
         moved = every.maps @ b
         found.append(max(abs(moved.real).max(), abs(moved.imag).max()))
     assert max(found) == pytest.approx(worst, abs=0.05)
 
 
-@pytest.mark.parametrize("text", ["line_scale", "line_eccentricity", "rotation", "drift",
-                                  "line_scale:0.1", "plate_shape,line_eccentricity:1e-5"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "line_scale",
+        "line_eccentricity",
+        "rotation",
+        "drift",
+        "line_scale:0.1",
+        "plate_shape,line_eccentricity:1e-5",
+    ],
+)
 def test_terms_of_the_model_are_judged_as_the_readings_would_be(text):
     """Also those for which plans are not judged otherwise, and those of the lines."""
     plan = plan_of("0, 90, tx", 5, count=8, line=True)
@@ -174,8 +204,9 @@ def test_terms_of_the_model_are_judged_as_the_readings_would_be(text):
     planned = PlannedTerms(plan, terms, assumed, ["line_scale"])
     alone = planned_equations(plan, planned_system(plan.artifact, plan.views), terms, assumed)
     assert planned.of_model.n == alone.n > 0
-    assert planned.of_model.unseen(planned.of_model.free).shape[1] == alone.unseen(
-        alone.free).shape[1]
+    assert (
+        planned.of_model.unseen(planned.of_model.free).shape[1] == alone.unseen(alone.free).shape[1]
+    )
     assert planned.of_model.columns.columns == alone.columns.columns
     named = [found.name for found in check_terms(planned, {"line_scale": 0.1}, LEVEL)]
     assert set(nominal_sizes()) < set(named)
@@ -184,8 +215,9 @@ def test_terms_of_the_model_are_judged_as_the_readings_would_be(text):
 
 def test_the_assumed_offsets_are_misalignments_and_stop_errors():
     plan = plan_of("0, 90, tx", 31)
-    exact = planned_ground(plan.artifact, plan.views, Assumed(
-        stop_error_m=1e-15, error_m=1e-15)).visits
+    exact = planned_ground(
+        plan.artifact, plan.views, Assumed(stop_error_m=1e-15, error_m=1e-15)
+    ).visits
     for view, visits in zip(plan.views, exact, strict=True):
         found = visit_sequence(plan.artifact, view)
         place = 0.01 * (found.i + 1j * found.j) - complex(*view.translation_m)
@@ -197,8 +229,10 @@ def test_the_assumed_offsets_are_misalignments_and_stop_errors():
         assert 1e-5 < abs(turn) < 3 * np.radians(0.3)
         assert 1e-6 < abs(shift) < 3 * 30e-6 * 2**0.5
         # the same draws with stop errors, or errors of stage and plate: those have their size
-        for more, size in (({"stop_error_m": 5e-6, "error_m": 1e-15}, 5e-6),
-                           ({"stop_error_m": 1e-15, "error_m": 2e-6}, 2e-6 * 2**0.5)):
+        for more, size in (
+            ({"stop_error_m": 5e-6, "error_m": 1e-15}, 5e-6),
+            ({"stop_error_m": 1e-15, "error_m": 2e-6}, 2e-6 * 2**0.5),
+        ):
             rough = planned_ground(plan.artifact, plan.views, Assumed(**more))
             added = rough.visits[plan.views.index(view)].offset - visits.offset
             n = len(added)
@@ -223,9 +257,16 @@ def test_large_fields_are_judged_on_a_smaller_one(monkeypatch):
 def test_a_shift_along_a_diagonal_tells_bent_plates_from_the_stage():
     plan = plan_of("0, 90, tx, -tx, ty, -ty", 5)
     corner = View("corner", 0.0, (0.01, 0.01), True, False)
-    found = [PlannedTerms(replace(plan, views=views), (), Assumed()).check(
-        "plate_shape", 1e-8, LEVEL).unseen_modes
-        for views in (plan.views, (*plan.views, corner))]
+    found = [
+        PlannedTerms(replace(plan, views=views), (), Assumed())
+        .check("plate_shape", 1e-8, LEVEL)
+        .unseen_modes
+        for views in (plan.views, (*plan.views, corner))
+    ]
     assert found == [1, 0]
-    assert Dense(replace(plan, views=(*plan.views, corner)), Assumed()).n_unseen(
-        [ModelTerm("plate_shape")]) == 0
+    assert (
+        Dense(replace(plan, views=(*plan.views, corner)), Assumed()).n_unseen(
+            [ModelTerm("plate_shape")]
+        )
+        == 0
+    )

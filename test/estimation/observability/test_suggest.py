@@ -52,9 +52,15 @@ def test_gains_of_the_table(views):
     assert np.round(found, 3) == pytest.approx(BOUNDS[views], abs=1e-9)
 
 
-@pytest.mark.parametrize(("count", "datum", "gain"), [
-    (24, "xy_axes", 0.752), (24, "zero_mean", 0.677), (72, "xy_axes", 1.129),
-    (72, "zero_mean", 0.891)])
+@pytest.mark.parametrize(
+    ("count", "datum", "gain"),
+    [
+        (24, "xy_axes", 0.752),
+        (24, "zero_mean", 0.677),
+        (72, "xy_axes", 1.129),
+        (72, "zero_mean", 0.891),
+    ],
+)
 def test_angular_gains(count, datum, gain):
     found = predict_plan(hu_plan(Artifact(11, 0.01, count)), ThetaDatum(datum))
     assert found.rms_theta == pytest.approx(gain, abs=5e-4)
@@ -64,19 +70,22 @@ def test_angular_gains(count, datum, gain):
 def test_prediction_is_the_uncertainty_that_the_solver_reports():
     plan = plan_of("0, 90, tx, ty", 7, count=12, line=True)
     rng = np.random.default_rng(2)
-    readings = simulate_measurements(random_truth(plan.artifact, 5, rng), plan, rng,
-                                     sigma_m=1e-8, sigma_theta_rad=1e-3)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 5, rng), plan, rng, sigma_m=1e-8, sigma_theta_rad=1e-3
+    )
     result = calibrate(readings, BARE)
     found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
     assert np.allclose(result.error_map.u_gx / result.noise.sigma_xy, found.ux, rtol=1e-4)
     assert np.allclose(result.error_map.u_gy / result.noise.sigma_xy, found.uy, rtol=1e-4)
-    assert np.allclose(result.error_map.u_g_theta / result.noise.sigma_theta, found.u_theta,
-                       rtol=1e-4, atol=1e-3)
+    assert np.allclose(
+        result.error_map.u_g_theta / result.noise.sigma_theta, found.u_theta, rtol=1e-4, atol=1e-3
+    )
 
 
 def test_equal_repeats_change_nothing_for_an_averaged_reading():
-    once, five = (predict_plan(plan_of("0, 90, tx", 5, repeats=r), ThetaDatum.XY_AXES)
-                  for r in (1, 5))
+    once, five = (
+        predict_plan(plan_of("0, 90, tx", 5, repeats=r), ThetaDatum.XY_AXES) for r in (1, 5)
+    )
     assert np.allclose(once.ux, five.ux, rtol=1e-12)
 
 
@@ -127,8 +136,11 @@ def test_suggested_views_keep_the_repeats_and_have_names_of_their_own():
 
 @pytest.fixture
 def few_candidates(monkeypatch):
-    few = [view for view in candidate_views(Artifact(3, 0.01), angular=False)
-           if view.name in ("0deg", "90deg", "180deg", "270deg", "0deg+x", "0deg+y", "0deg-x")]
+    few = [
+        view
+        for view in candidate_views(Artifact(3, 0.01), angular=False)
+        if view.name in ("0deg", "90deg", "180deg", "270deg", "0deg+x", "0deg+y", "0deg-x")
+    ]
     for module in (suggest, plan_check):
         monkeypatch.setattr(module, "candidate_views", lambda *_, **__: few)
     return few
@@ -138,8 +150,10 @@ def few_candidates(monkeypatch):
 def test_best_plan_of_three_views_is_the_best_of_all(criterion, few_candidates):
     plan, score, how = best_plan(Artifact(3, 0.01), 3, angular=False, criterion=criterion)
     assert search_text(how) == "all 28 plans tried"
-    every = [score_plan(replace(plan, views=(few_candidates[0], *views))).key(criterion)
-             for views in combinations_with_replacement(few_candidates, 2)]
+    every = [
+        score_plan(replace(plan, views=(few_candidates[0], *views))).key(criterion)
+        for views in combinations_with_replacement(few_candidates, 2)
+    ]
     assert score.key(criterion) == min(every)
 
 
@@ -189,9 +203,17 @@ def test_gain_is_that_of_every_reading_moved_in_turn():
     assert np.sqrt((answers**2).sum(axis=0).mean()) == pytest.approx(found.rms_xy, rel=1e-6)
 
 
-@pytest.mark.parametrize(("taken", "name"), [
-    ([], "90"), (["0"], "90"), (["90"], "90_2"), (["90", "90_3"], "90_2"),
-    (["90_2", "90"], "90_3"), (["90", "90_2", "90_3", "90_4"], "90_5")])
+@pytest.mark.parametrize(
+    ("taken", "name"),
+    [
+        ([], "90"),
+        (["0"], "90"),
+        (["90"], "90_2"),
+        (["90", "90_3"], "90_2"),
+        (["90_2", "90"], "90_3"),
+        (["90", "90_2", "90_3", "90_4"], "90_5"),
+    ],
+)
 def test_a_name_that_is_taken_gets_the_next_free_number(taken, name):
     assert unused_name("90", [View(one) for one in taken]) == name
 
@@ -221,8 +243,7 @@ def test_bent_plates_ask_for_a_shift_the_other_way():
     # by noise alone a shift along y is as good
     assert set(shifts(alone[:3])) == {(-1, 0), (0, 1), (0, -1)}
     by_text = {step_text(item, plan): item.score.rms_xy for item in ranked}
-    back, on = (by_text[f"add an unturned view shifted by {a} pitch along X"]
-                for a in ("-1", "+1"))
+    back, on = (by_text[f"add an unturned view shifted by {a} pitch along X"] for a in ("-1", "+1"))
     assert back < 0.7 * on
     # a plate's shape does not ask in which order it is visited
     assert not any(item.order for item in ranked)
@@ -241,8 +262,9 @@ def test_a_drift_asks_for_another_order():
     assert {view.repeats for view in best.views} == {4} and best.view is None
     assert best.score.rms_xy < orders["x_then_y"].score.rms_xy < now.rms_xy
     assert best.score.rms_xy == pytest.approx(0.845 / 2, abs=1e-3)
-    added = next(item for item in ranked
-                 if step_text(item, plan).startswith("add a view turned by 180"))
+    added = next(
+        item for item in ranked if step_text(item, plan).startswith("add a view turned by 180")
+    )
     assert added.views == (*plan.views, added.view) and added.view.visit_order == "raster"
 
 
@@ -256,8 +278,9 @@ def test_free_terms_that_are_not_told_are_a_deficiency():
 def test_what_terms_hide_is_better_than_a_plan_that_is_deficient_without_them():
     """Of such a plan nobody counts what the terms would hide besides."""
     free = Against(parse_terms(["drift"], ""), Assumed(order="raster"))
-    hidden, none = (score_plan(plan_of(text, 5), against=free)
-                    for text in ("0, 90, tx", "0, tx, ty"))
+    hidden, none = (
+        score_plan(plan_of(text, 5), against=free) for text in ("0, 90, tx", "0, tx, ty")
+    )
     assert hidden.of_terms and not none.of_terms and 0 < none.deficiency < hidden.deficiency
     assert hidden.key("rms") < none.key("rms")
     assert score_plan(plan_of("0, 90, tx", 5)).key("max") < hidden.key("max")
@@ -265,8 +288,10 @@ def test_what_terms_hide_is_better_than_a_plan_that_is_deficient_without_them():
 
 def test_the_best_plan_against_bent_plates_shifts_both_ways(few_candidates):
     plan, found, _ = best_plan(Artifact(5, 0.01), 4, angular=False, against=Against(BENT))
-    every = [score_plan(replace(plan, views=(few_candidates[0], *views)), against=Against(BENT))
-             for views in combinations_with_replacement(few_candidates, 3)]
+    every = [
+        score_plan(replace(plan, views=(few_candidates[0], *views)), against=Against(BENT))
+        for views in combinations_with_replacement(few_candidates, 3)
+    ]
     assert found.key("rms") == min(score.key("rms") for score in every)
 
 

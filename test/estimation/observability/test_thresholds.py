@@ -23,8 +23,9 @@ FIELD = Artifact(11, 0.01, 0)
 def with_marks(keep):
     plan, rng = plan_of("0,90,tx", FIELD), np.random.default_rng(0)
     data = simulate_measurements(random_truth(FIELD, 3, rng), plan, rng)
-    views = tuple(subset(view, keep(view.m, view.n), np.zeros(0, dtype=bool))
-                  for view in data.views)
+    views = tuple(
+        subset(view, keep(view.m, view.n), np.zeros(0, dtype=bool)) for view in data.views
+    )
     return replace(data, views=views)
 
 
@@ -63,7 +64,7 @@ def test_the_prediction_for_lines_counts_the_repeats_of_each_view(repeats):
     plan = hu_plan(Artifact(5, 0.01, 12))
     views = tuple(replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True))
     system = planned_system(plan.artifact, views)
-    found = predict(system, plan.artifact, ThetaDatum.ZERO_MEAN).u_theta**2
+    found = predict(system, plan.artifact, ThetaDatum.ZERO_MEAN).u_theta ** 2
     wanted = dense_theta([0, 3, 1, 0], repeats, [2], 12)
     assert found == pytest.approx(wanted, rel=1e-9)
     as_unit = predict(system, plan.artifact, ThetaDatum.ZERO_MEAN, repeats=min(repeats))

@@ -35,17 +35,33 @@ ZERO_MEAN = bare(datum_theta="zero_mean")
 LINEAR = bare(datum_theta="zero_mean", misalignment_model="linear")
 
 
-def measured(seed=0, *, repeats=1, sense=Sense.MICROSCOPE_MOVES, missing=0.0, sigma=SIGMA_M,
-             more=False, linear=False):
+def measured(
+    seed=0,
+    *,
+    repeats=1,
+    sense=Sense.MICROSCOPE_MOVES,
+    missing=0.0,
+    sigma=SIGMA_M,
+    more=False,
+    linear=False,
+):
     rng = np.random.default_rng(seed)
     plan = hu_plan(ARTIFACT, repeats)
     if more:
-        plan = replace(plan, views=(*plan.views, View("rot180", np.pi), View(
-            "shift_y", 0.0, (0.0, 0.01))))
+        plan = replace(
+            plan, views=(*plan.views, View("rot180", np.pi), View("shift_y", 0.0, (0.0, 0.01)))
+        )
     truth = random_truth(ARTIFACT, len(plan.views), rng)
-    return truth, simulate_measurements(truth, plan, rng, sigma_m=sigma,
-                                        sigma_theta_rad=SIGMA_RAD, sense=sense, missing=missing,
-                                        linear=linear)
+    return truth, simulate_measurements(
+        truth,
+        plan,
+        rng,
+        sigma_m=sigma,
+        sigma_theta_rad=SIGMA_RAD,
+        sense=sense,
+        missing=missing,
+        linear=linear,
+    )
 
 
 def with_errors(readings, index, *, dx=None, dtheta=None):
@@ -80,8 +96,10 @@ def refused(result, reason):
 
 
 def removed(result):
-    return {(row["view"], row["kind"], ", ".join(map(str, row["mark"])))
-            for row in result.extra["outliers"]["removed"]}
+    return {
+        (row["view"], row["kind"], ", ".join(map(str, row["mark"])))
+        for row in result.extra["outliers"]["removed"]
+    }
 
 
 def test_redundancies_add_up_to_the_degrees_of_freedom():
@@ -89,9 +107,11 @@ def test_redundancies_add_up_to_the_degrees_of_freedom():
     left = residuals_of(readings, ZERO_MEAN)
     system = left.problem.system
     assert 2 * left.marks.redundancy.sum() == pytest.approx(
-        2 * system.grid.n_readings - system.rank_grid, rel=1e-9)
+        2 * system.grid.n_readings - system.rank_grid, rel=1e-9
+    )
     assert angular_redundancy(system).sum() == pytest.approx(
-        system.angular.n_readings - system.rank_angular, rel=1e-9)
+        system.angular.n_readings - system.rank_angular, rel=1e-9
+    )
 
 
 def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkeypatch):
@@ -99,7 +119,8 @@ def test_mean_redundancies_of_many_lines_add_up_to_the_degrees_of_freedom(monkey
     system = residuals_of(readings, ZERO_MEAN).problem.system
     monkeypatch.setattr(leverage, "MAX_FULL", 0)
     assert angular_redundancy(system).sum() == pytest.approx(
-        system.angular.n_readings - system.rank_angular, rel=1e-9)
+        system.angular.n_readings - system.rank_angular, rel=1e-9
+    )
 
 
 def test_drawn_and_exact_redundancies_agree(monkeypatch):
@@ -111,9 +132,17 @@ def test_drawn_and_exact_redundancies_agree(monkeypatch):
 
 
 def test_standardised_residuals_are_chi_square():
-    squares = np.concatenate([
-        residuals_of(measured(seed, repeats=2, linear=True)[1], LINEAR).marks.squares.ravel()
-        for seed in range(10)]) / SIGMA_M**2
+    squares = (
+        np.concatenate(
+            [
+                residuals_of(
+                    measured(seed, repeats=2, linear=True)[1], LINEAR
+                ).marks.squares.ravel()
+                for seed in range(10)
+            ]
+        )
+        / SIGMA_M**2
+    )
     squares = squares[np.isfinite(squares)]
     assert squares.mean() == pytest.approx(2, rel=0.08)
     for level in (0.5, 0.1, 0.01):
@@ -132,8 +161,12 @@ def test_good_readings_stay(monkeypatch):
     for seed in range(30):
         rng = np.random.default_rng(seed)
         truth = random_truth(plan.artifact, 4, rng)
-        found = clean(simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=True,
-                                            sigma_theta_rad=SIGMA_RAD), LINEAR)
+        found = clean(
+            simulate_measurements(
+                truth, plan, rng, sigma_m=SIGMA_M, linear=True, sigma_theta_rad=SIGMA_RAD
+            ),
+            LINEAR,
+        )
         lost += bool(found.removed)
         assert not found.slips and not found.noisy
     assert lost <= binom.ppf(0.999, 30, 0.3)
@@ -150,8 +183,9 @@ def test_what_a_reading_adds_to_the_sum_of_squares_is_exact():
     plan = hu_plan(Artifact(5, 0.01, 8))
     rng = np.random.default_rng(4)
     truth = random_truth(plan.artifact, 4, rng)
-    readings = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=True,
-                                     sigma_theta_rad=SIGMA_RAD)
+    readings = simulate_measurements(
+        truth, plan, rng, sigma_m=SIGMA_M, linear=True, sigma_theta_rad=SIGMA_RAD
+    )
     whole = residuals_of(readings, LINEAR)
     total = (abs(whole.marks.residual) ** 2).sum()
     for mark in ((-2, 1), (0, 0), (2, 2)):
@@ -160,7 +194,8 @@ def test_what_a_reading_adds_to_the_sum_of_squares_is_exact():
         at, dof = (1, mark[0] + 2, mark[1] + 2), dof_of(rest)
         assert whole.marks.squares[at] == pytest.approx(total - left, rel=1e-6)
         assert whole.marks.p_outlier(at) == pytest.approx(
-            f_distribution.sf((total - left) / 2 / (left / dof), 2, dof), rel=1e-5)
+            f_distribution.sf((total - left) / 2 / (left / dof), 2, dof), rel=1e-5
+        )
     total = (whole.lines.residual**2).sum()
     rest = residuals_of(without(readings, [(0, "angular", (3,))]), LINEAR)
     left = (rest.lines.residual**2).sum()
@@ -168,7 +203,8 @@ def test_what_a_reading_adds_to_the_sum_of_squares_is_exact():
     angular = rest.problem.system
     dof = angular.angular.n_readings - angular.rank_angular
     assert whole.lines.p_outlier((0, 3)) == pytest.approx(
-        f_distribution.sf((total - left) / (left / dof), 1, dof), rel=1e-5)
+        f_distribution.sf((total - left) / (left / dof), 1, dof), rel=1e-5
+    )
 
 
 def seen_by_a_turned_microscope(readings, seed=2, *, turn=5e-3):
@@ -181,8 +217,21 @@ def seen_by_a_turned_microscope(readings, seed=2, *, turn=5e-3):
         moved = -1j * turn * offset
         dx, dy = view.dx + moved.real, view.dy + moved.imag
         one = np.ones(n, dtype=np.int8)
-        visits = GridVisits(np.arange(n), dx, dy, np.ones(n, dtype=int), np.arange(n) * 10**9,
-                            offset.real, offset.imag, one, one) if n else None
+        visits = (
+            GridVisits(
+                np.arange(n),
+                dx,
+                dy,
+                np.ones(n, dtype=int),
+                np.arange(n) * 10**9,
+                offset.real,
+                offset.imag,
+                one,
+                one,
+            )
+            if n
+            else None
+        )
         views.append(replace(view, dx=dx, dy=dy, visits=visits))
     return replace(readings, views=tuple(views))
 
@@ -191,14 +240,25 @@ def test_a_turned_microscope_is_no_slip():
     """Stops off to one side in half of a view look like a slip; the microscope explains more."""
     rng = np.random.default_rng(4)
     plan = plan_of("0,90,180,tx,ty", Artifact(9, 0.01))
-    readings = simulate_measurements(random_truth(plan.artifact, 5, rng), plan, rng,
-                                     sigma_m=SIGMA_M, linear=True)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 5, rng), plan, rng, sigma_m=SIGMA_M, linear=True
+    )
     seen = seen_by_a_turned_microscope(readings)
     view = seen.views[3]
     step = 8e-5 * (view.m > 0)
     dy = view.dy - 5e-3 * step
-    turned = replace(seen, views=(*seen.views[:3], replace(view, dy=dy, visits=replace(
-        view.visits, offset_x=view.visits.offset_x + step, dy=dy)), *seen.views[4:]))
+    turned = replace(
+        seen,
+        views=(
+            *seen.views[:3],
+            replace(
+                view,
+                dy=dy,
+                visits=replace(view.visits, offset_x=view.visits.offset_x + step, dy=dy),
+            ),
+            *seen.views[4:],
+        ),
+    )
     result = robust_calibrate(turned, LINEAR)
     assert result.extra["slips"] == []
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
@@ -207,9 +267,13 @@ def test_a_turned_microscope_is_no_slip():
     assert "no view was split" in " ".join(worded(result).warnings)
     with_term = replace(LINEAR, terms=(ModelTerm("microscope"),))
     bad = with_errors(turned, 1, dx={(-4, 2): 1e-6})
-    bad = replace(bad, views=tuple(
-        view if view.visits is None else replace(view, visits=replace(view.visits, dx=view.dx))
-        for view in bad.views))
+    bad = replace(
+        bad,
+        views=tuple(
+            view if view.visits is None else replace(view, visits=replace(view.visits, dx=view.dx))
+            for view in bad.views
+        ),
+    )
     mended = robust_calibrate(bad, with_term)
     assert removed(mended) == {("90", "grid", "-4, 2")}
     assert mended.extra["slips"] == [] and mended.verdict.qualified
@@ -220,8 +284,14 @@ def test_the_visits_of_a_split_view_stay_with_their_marks():
     seen = seen_by_a_turned_microscope(readings, turn=0.0)
     moved = slipped(seen, 3, "m", 2, (2e-7, -1e-7, 0.0))
     view = moved.views[3]
-    moved = replace(moved, views=(*moved.views[:3], replace(view, visits=replace(
-        view.visits, dx=view.dx, dy=view.dy)), *moved.views[4:]))
+    moved = replace(
+        moved,
+        views=(
+            *moved.views[:3],
+            replace(view, visits=replace(view.visits, dx=view.dx, dy=view.dy)),
+            *moved.views[4:],
+        ),
+    )
     found = clean(moved, ZERO_MEAN)
     assert [(slip.axis, slip.first) for slip in found.slips] == [("m", 2)]
     parts = {v.view.name: v for v in found.measurements.views}
@@ -237,23 +307,29 @@ def test_giving_up_is_said(monkeypatch):
     bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 3e-6, (3, -3): 5e-7})
     result = robust_calibrate(bad, ZERO_MEAN)
     assert "gave up on outliers after 1 rounds: the readings seem to contain more" in " ".join(
-        worded(result).warnings)
+        worded(result).warnings
+    )
     refused(result, "gave up on outliers after 1 rounds")
     monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_CAUSES", 0)
     _, readings = measured(4, more=True)
     moved = slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0))
     result = robust_calibrate(moved, ZERO_MEAN)
     assert "gave up on slips after 0: the readings seem to contain more" in " ".join(
-        worded(result).warnings)
+        worded(result).warnings
+    )
     assert result.extra["slips"] == []
     refused(result, "gave up on slips after 0")
 
 
 def test_a_view_is_compared_by_its_own_repeats():
     _, readings = measured(6, repeats=5)
-    shaken = replace(readings, views=tuple(
-        replace(v, sigma_xy=2 * v.sigma_xy) if i == 1 else v
-        for i, v in enumerate(readings.views)))
+    shaken = replace(
+        readings,
+        views=tuple(
+            replace(v, sigma_xy=2 * v.sigma_xy) if i == 1 else v
+            for i, v in enumerate(readings.views)
+        ),
+    )
     assert noisy_views(residuals_of(readings, ZERO_MEAN), readings) == ()
     (named,) = robust_calibrate(shaken, ZERO_MEAN).extra["noisy_views"]
     assert named["view"] == "rot90" and named["ratio"] == pytest.approx(2.0)
@@ -266,8 +342,9 @@ def test_a_reading_goes_where_it_adds_more_than_one_in_a_hundred_sets_of_good_on
 
     def squares(planted_m, *, without_it=False):
         given = with_errors(readings, 1, dx={(2, -3): planted_m})
-        found = residuals_of(without(given, {(1, "grid", (2, -3))}) if without_it else given,
-                             LINEAR)
+        found = residuals_of(
+            without(given, {(1, "grid", (2, -3))}) if without_it else given, LINEAR
+        )
         checked = sum(np.isfinite(kind.squares).sum() for kind in (found.marks, found.lines))
         return float((abs(found.marks.residual) ** 2).sum()), found.marks.dof, checked
 
@@ -288,8 +365,12 @@ def test_planted_outliers_are_removed_and_nothing_else(sense):
     bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 1e-6, (3, -3): -3e-7})
     bad = with_errors(bad, 0, dtheta={5: 6e-4})
     result = robust_calibrate(bad, ZERO_MEAN)
-    assert removed(result) == {("rot90", "grid", "-4, 2"), ("rot90", "grid", "0, 0"),
-                               ("rot90", "grid", "3, -3"), ("identity", "angular", "5")}
+    assert removed(result) == {
+        ("rot90", "grid", "-4, 2"),
+        ("rot90", "grid", "0, 0"),
+        ("rot90", "grid", "3, -3"),
+        ("identity", "angular", "5"),
+    }
     assert error_rms(result, truth) < 1.2 * error_rms(solved(readings), truth)
     assert error_rms(solved(bad), truth) > 1.5 * error_rms(result, truth)
     assert result.rejected[OUTLIER] == 4
@@ -316,8 +397,10 @@ def test_removed_readings_survive_the_file(tmp_path):
     assert again.extra["outliers"] == plain(result.extra["outliers"])
 
 
-@pytest.mark.parametrize(("index", "axis", "first", "change"), [
-    (3, "m", 2, (2e-7, -1e-7, 0.0)), (0, "n", -1, (2e-6, 0.0, 1e-5)), (1, "m", 0, (0, 3e-7, 0))])
+@pytest.mark.parametrize(
+    ("index", "axis", "first", "change"),
+    [(3, "m", 2, (2e-7, -1e-7, 0.0)), (0, "n", -1, (2e-6, 0.0, 1e-5)), (1, "m", 0, (0, 3e-7, 0))],
+)
 def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
     truth, readings = measured(4, more=True)
     slipped_readings = slipped(readings, index, axis, first, change)
@@ -335,7 +418,10 @@ def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
     said = worded(result).warnings[-1]
     assert f"view '{name}': the plate slipped before {axis} = {first}" in said
     assert [v.name for v in result.views if v.name.startswith(name)] == [
-        name, f"{name} after slip", f"{name} lines"]
+        name,
+        f"{name} after slip",
+        f"{name} lines",
+    ]
 
 
 def test_a_slip_whose_place_three_views_do_not_tell_is_reported_not_mended():
@@ -346,7 +432,8 @@ def test_a_slip_whose_place_three_views_do_not_tell_is_reported_not_mended():
     places = [(place["axis"], place["first"]) for place in (slip, *slip["alternatives"])]
     assert ("m", 2) in places and len(set(places)) >= 2
     assert "do not determine which; this spoils the map: measure the view again" in " ".join(
-        worded(result).warnings)
+        worded(result).warnings
+    )
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
 
 
@@ -356,9 +443,12 @@ def slipped(readings, index, axis, first, change):
     after = getattr(view, axis) >= first
     q = view.view.lattice_pose(ARTIFACT).quarter_turns
     x, y = ((view.m, view.n), (-view.n, view.m))[q]
-    moved = replace(view, dx=view.dx + after * (change[0] - change[2] * y * 0.01),
-                    dy=view.dy + after * (change[1] + change[2] * x * 0.01))
-    return replace(readings, views=(*readings.views[:index], moved, *readings.views[index + 1:]))
+    moved = replace(
+        view,
+        dx=view.dx + after * (change[0] - change[2] * y * 0.01),
+        dy=view.dy + after * (change[1] + change[2] * x * 0.01),
+    )
+    return replace(readings, views=(*readings.views[:index], moved, *readings.views[index + 1 :]))
 
 
 def test_one_gross_outlier_is_no_slip():
@@ -373,9 +463,12 @@ def test_a_noisy_view_is_named(index):
     _, readings = measured(6)
     rng = np.random.default_rng(1)
     view = readings.views[index]
-    noisy = replace(view, dx=view.dx + rng.normal(0, 2e-7, view.dx.shape),
-                    dy=view.dy + rng.normal(0, 2e-7, view.dy.shape))
-    views = (*readings.views[:index], noisy, *readings.views[index + 1:])
+    noisy = replace(
+        view,
+        dx=view.dx + rng.normal(0, 2e-7, view.dx.shape),
+        dy=view.dy + rng.normal(0, 2e-7, view.dy.shape),
+    )
+    views = (*readings.views[:index], noisy, *readings.views[index + 1 :])
     result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
     (named,) = result.extra["noisy_views"]
     assert named["view"] == view.view.name and 3 < named["ratio"] <= 20
@@ -387,8 +480,10 @@ def test_too_many_contradictions_remove_nothing():
     _, readings = measured(7)
     rng = np.random.default_rng(2)
     view = readings.views[1]
-    bad = {(int(m), int(n)): float(rng.choice([-1, 1]) * 5e-6)
-           for m, n in zip(view.m[::2], view.n[::2], strict=True)}
+    bad = {
+        (int(m), int(n)): float(rng.choice([-1, 1]) * 5e-6)
+        for m, n in zip(view.m[::2], view.n[::2], strict=True)
+    }
     result = robust_calibrate(with_errors(readings, 1, dx=bad), ZERO_MEAN)
     assert not removed(result)
     text = " ".join(worded(result).warnings)
@@ -409,9 +504,13 @@ def test_order_of_readings_does_not_matter():
     shuffled = []
     for view in bad.views:
         at, to = rng.permutation(len(view.m)), rng.permutation(len(view.k))
-        shuffled.append(replace(
-            view, **{name: getattr(view, name)[at] for name in ("m", "n", "dx", "dy", "count")},
-            **{name: getattr(view, name)[to] for name in ("k", "dtheta", "count_theta")}))
+        shuffled.append(
+            replace(
+                view,
+                **{name: getattr(view, name)[at] for name in ("m", "n", "dx", "dy", "count")},
+                **{name: getattr(view, name)[to] for name in ("k", "dtheta", "count_theta")},
+            )
+        )
     a, b = (robust_calibrate(r, ZERO_MEAN) for r in (bad, replace(bad, views=tuple(shuffled))))
     assert np.array_equal(a.error_map.gx, b.error_map.gx)
     assert a.extra["outliers"] == b.extra["outliers"]
@@ -449,13 +548,26 @@ def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monk
 
 def test_a_part_of_a_view_keeps_the_visits_of_its_marks():
     """By hand: of four marks the second and the last stay, with the visits that were theirs."""
-    visits = GridVisits(np.array([0, 1, 1, 3, 3]), *(np.arange(5.0) + k for k in (0, 10)),
-                        np.array([1, 2, 3, 4, 5]), np.arange(5) * 10**9,
-                        *(np.arange(5.0) + k for k in (20, 30)),
-                        *(np.array([1, -1, 0, 1, -1], dtype=np.int8) * k for k in (1, -1)),
-                        u=np.arange(5.0) + 40, sigma_m=1e-8, dof=9)
-    view = ViewReadings(View("a"), np.arange(4), np.zeros(4, int), np.zeros(4), np.zeros(4),
-                        np.array([1, 5, 0, 9]), visits=visits)
+    visits = GridVisits(
+        np.array([0, 1, 1, 3, 3]),
+        *(np.arange(5.0) + k for k in (0, 10)),
+        np.array([1, 2, 3, 4, 5]),
+        np.arange(5) * 10**9,
+        *(np.arange(5.0) + k for k in (20, 30)),
+        *(np.array([1, -1, 0, 1, -1], dtype=np.int8) * k for k in (1, -1)),
+        u=np.arange(5.0) + 40,
+        sigma_m=1e-8,
+        dof=9,
+    )
+    view = ViewReadings(
+        View("a"),
+        np.arange(4),
+        np.zeros(4, int),
+        np.zeros(4),
+        np.zeros(4),
+        np.array([1, 5, 0, 9]),
+        visits=visits,
+    )
     found = subset(view, np.array([False, True, False, True]), np.zeros(0, dtype=bool))
     assert found.m.tolist() == [1, 3]
     kept = found.visits
@@ -467,5 +579,7 @@ def test_a_part_of_a_view_keeps_the_visits_of_its_marks():
     assert kept.approach_x.tolist() == [-1, 0, 1, -1]
     assert kept.approach_y.tolist() == [1, 0, -1, 1]
     assert kept.u.tolist() == [41, 42, 43, 44] and (kept.sigma_m, kept.dof) == (1e-8, 9)
-    assert subset(replace(view, visits=None), np.ones(4, dtype=bool),
-                  np.zeros(0, dtype=bool)).visits is None
+    assert (
+        subset(replace(view, visits=None), np.ones(4, dtype=bool), np.zeros(0, dtype=bool)).visits
+        is None
+    )

@@ -38,8 +38,12 @@ def with_visits(readings: Measurements, rng: np.random.Generator) -> Measurement
     for view in readings.views:
         n = len(view.visits.mark)
         offset = rng.normal(0, 3e-5, n) + 1j * rng.normal(0, 3e-5, n)
-        visits = replace(view.visits, offset_x=offset.real, offset_y=offset.imag,
-                         stamp_ns=rng.permutation(n) * 10**9)
+        visits = replace(
+            view.visits,
+            offset_x=offset.real,
+            offset_y=offset.imag,
+            stamp_ns=rng.permutation(n) * 10**9,
+        )
         views.append(replace(view, visits=visits))
     return replace(readings, views=tuple(views))
 
@@ -50,8 +54,9 @@ def with_values(readings: Measurements, values: np.ndarray, grid: GridData) -> M
     for row, view in enumerate(readings.views):
         half = readings.artifact.half
         value = values[row][view.m + half[0], view.n + half[1]] * 1j ** grid.poses[row].q
-        visits = replace(view.visits, dx=value.real[view.visits.mark],
-                         dy=value.imag[view.visits.mark])
+        visits = replace(
+            view.visits, dx=value.real[view.visits.mark], dy=value.imag[view.visits.mark]
+        )
         views.append(replace(view, dx=value.real, dy=value.imag, visits=visits))
     return replace(readings, views=tuple(views))
 
@@ -66,19 +71,28 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
     monkeypatch.setattr(validation, "N_DRAWS", 4)
     plan = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
     rng = np.random.default_rng(8)
-    readings = with_visits(simulate_measurements(random_truth(
-        plan.artifact, len(plan.views), rng), plan, rng, linear=True, sigma_m=UNIT_M, visits=True),
-        rng)
+    readings = with_visits(
+        simulate_measurements(
+            random_truth(plan.artifact, len(plan.views), rng),
+            plan,
+            rng,
+            linear=True,
+            sigma_m=UNIT_M,
+            visits=True,
+        ),
+        rng,
+    )
     terms = [ModelTerm("microscope"), *[ModelTerm("drift")] * of_view]
-    options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1,
-                   at_places=False)
+    options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1, at_places=False)
     seen, limit_of = [], validation.prediction_limit
 
-    def judged(model: ModelFit, held: HeldReadings, known: np.ndarray,
-               weight: np.ndarray) -> PredictionLimit:
+    def judged(
+        model: ModelFit, held: HeldReadings, known: np.ndarray, weight: np.ndarray
+    ) -> PredictionLimit:
         limit = limit_of(model, held, known, weight)
         seen.append((model, held, known, weight, limit))
         return limit
+
     monkeypatch.setattr(validation, "prediction_limit", judged)
     first = validation.validate(readings, options, folds=1)
     number = 0 if of_view else 1  # a random tenth of all views, or a whole view
@@ -100,4 +114,4 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
         found = validation.validate(again, options, folds=1)
         squares.append((found[number].rms_m / UNIT_M) ** 2)
     assert limit.mean == pytest.approx(np.mean(squares), rel=1e-4)
-    assert limit.dof == pytest.approx(2 * np.mean(squares)**2 / np.var(squares, ddof=1), rel=1e-4)
+    assert limit.dof == pytest.approx(2 * np.mean(squares) ** 2 / np.var(squares, ddof=1), rel=1e-4)

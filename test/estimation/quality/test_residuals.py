@@ -20,11 +20,20 @@ TURNS = {0.0: ((1, 0), (0, 1)), np.pi / 2: ((0, -1), (1, 0)), np.pi: ((-1, 0), (
 def measured():
     """Views of a rectangular plate; one with more repeats, one three times as noisy."""
     artifact, rng = Artifact(5, 0.01, grid_size_y=3), np.random.default_rng(3)
-    plan = Plan("p", artifact, (
-        View("start"), View("rot90", np.pi / 2), View("rot180", np.pi, repeats=4),
-        View("shift_x", 0.0, (0.01, 0.0)), View("shift_y", 0.0, (0.0, 0.01))))
-    readings = simulate_measurements(random_truth(artifact, 5, rng), plan, rng, sigma_m=2e-8,
-                                     sigma_theta_rad=0.0, linear=True)
+    plan = Plan(
+        "p",
+        artifact,
+        (
+            View("start"),
+            View("rot90", np.pi / 2),
+            View("rot180", np.pi, repeats=4),
+            View("shift_x", 0.0, (0.01, 0.0)),
+            View("shift_y", 0.0, (0.0, 0.01)),
+        ),
+    )
+    readings = simulate_measurements(
+        random_truth(artifact, 5, rng), plan, rng, sigma_m=2e-8, sigma_theta_rad=0.0, linear=True
+    )
     noisy = readings.views[3]
     more = rng.normal(size=(2, len(noisy.m))) * 2e-8 * np.sqrt(8)
     noisy = replace(noisy, dx=noisy.dx + more[0], dy=noisy.dy + more[1])
@@ -44,9 +53,9 @@ def dense(readings):
                 row = np.zeros(4 * sites + 3 * len(readings.views))
                 row[2 * ((at[0] + hx) * ny + at[1] + hy) + axis] = 1
                 mark = 2 * (sites + (m + hx) * ny + n + hy)
-                row[mark:mark + 2] = turn[axis]
+                row[mark : mark + 2] = turn[axis]
                 place = turn @ (m, n)
-                row[4 * sites + 3 * v:][:3] = ((-place[1], 1, 0), (place[0], 0, 1))[axis]
+                row[4 * sites + 3 * v :][:3] = ((-place[1], 1, 0), (place[0], 0, 1))[axis]
                 rows.append(np.sqrt(count) * row)
                 right.append(np.sqrt(count) * offset[axis])
                 of_view.append(v)
@@ -78,8 +87,9 @@ def test_the_noise_of_a_view_and_its_degrees_of_freedom(monkeypatch):
         assert found[v, 2] == pytest.approx(2 / scatter, rel=0.06)
         assert found[v, 2] < 16  # one more or less is not within 6 %
         variances = y @ forms @ y
-        np.testing.assert_allclose(found[v, :2], np.sqrt(np.maximum(variances, 0)), rtol=0.05,
-                                   atol=1e-9)
+        np.testing.assert_allclose(
+            found[v, :2], np.sqrt(np.maximum(variances, 0)), rtol=0.05, atol=1e-9
+        )
     assert found[3, 0] > 2 * found[3, 1]
 
 

@@ -33,12 +33,14 @@ SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
 def measured(*, more=True, sense=Sense.MICROSCOPE_MOVES, sigma=SIGMA_M, repeats=1):
     plan = hu_plan(ARTIFACT, repeats)
     if more:
-        plan = replace(plan, views=(*plan.views, View("both", pi / 2, (0.0, 0.01), True, True,
-                                                      repeats)))
+        plan = replace(
+            plan, views=(*plan.views, View("both", pi / 2, (0.0, 0.01), True, True, repeats))
+        )
     rng = np.random.default_rng(3)
     truth = random_truth(ARTIFACT, len(plan.views), rng)
-    return simulate_measurements(truth, plan, rng, sense=sense, sigma_m=sigma,
-                                 sigma_theta_rad=SIGMA_RAD * bool(sigma))
+    return simulate_measurements(
+        truth, plan, rng, sense=sense, sigma_m=sigma, sigma_theta_rad=SIGMA_RAD * bool(sigma)
+    )
 
 
 def called(item):
@@ -53,11 +55,17 @@ def few_draws(monkeypatch):
 
 @pytest.mark.parametrize("sense", list(Sense))
 def test_exact_readings_are_predicted_exactly(sense, few_draws):
-    found = {called(item): item
-             for item in validate(measured(sense=sense, sigma=0.0), BARE, folds=1)}
+    found = {
+        called(item): item for item in validate(measured(sense=sense, sigma=0.0), BARE, folds=1)
+    }
     assert len(found) == 6
-    for name in ("a random tenth (1)", "view 'identity'", "view 'rot90'", "view 'shift_x'",
-                 "view 'both'"):
+    for name in (
+        "a random tenth (1)",
+        "view 'identity'",
+        "view 'rot90'",
+        "view 'shift_x'",
+        "view 'both'",
+    ):
         assert found[name].n_grid > 20
         assert found[name].max_m < 1e-16 and found[name].rms_rad < 1e-13
 
@@ -78,8 +86,10 @@ def test_a_spoiled_view_is_predicted_badly(few_draws):
     right = {called(item): item for item in validate(readings, BARE, folds=1)}
     view = readings.views[4]
     swapped = replace(view, dx=view.dy, dy=view.dx)
-    wrong = {called(item): item for item in validate(
-        replace(readings, views=(*readings.views[:4], swapped)), BARE, folds=1)}
+    wrong = {
+        called(item): item
+        for item in validate(replace(readings, views=(*readings.views[:4], swapped)), BARE, folds=1)
+    }
     for name in ("a random tenth (1)", "view 'both'"):
         assert wrong[name].rms_m > 3 * right[name].rms_m
     with pytest.raises(NotIdentifiableError):
@@ -88,14 +98,16 @@ def test_a_spoiled_view_is_predicted_badly(few_draws):
 
 def test_views_that_are_needed_cannot_be_held_out(few_draws):
     readings = measured(more=False)
-    notes = {called(item): why_text(item.why, ARTIFACT)
-             for item in validate(readings, BARE, folds=1)}
+    notes = {
+        called(item): why_text(item.why, ARTIFACT) for item in validate(readings, BARE, folds=1)
+    }
     assert notes["a random tenth (1)"] == ""
     for name in ("identity", "rot90", "line", "shift_x"):
         assert "does not identify the stage" in notes[f"view '{name}'"]
     assert notes["view 'shift_x'"] == (
         "cannot be held out: the rest does not identify the stage; with a view turned by "
-        "90 deg and shifted by +1 pitch along X measured as well it could be")
+        "90 deg and shifted by +1 pitch along X measured as well it could be"
+    )
     rng = np.random.default_rng(3)
     plan = hu_plan(ARTIFACT)
     plan = replace(plan, views=(*plan.views, View("more", pi / 2, (0.01, 0.0), True, True)))
@@ -113,13 +125,18 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
         if not len(kept.views[0].m):
             raise NotSettledError("model drift", "the fit does not converge", "leave it out")
         return solve(kept, options)
+
     monkeypatch.setattr(validation, "solve_joint", without_first)
     found = validate(readings, BARE, folds=1)
     line = "cannot be held out: the rest does not converge"
     assert validation_text(found, ARTIFACT)[1] == f"view 'identity': {line}"
     assert validation_json(found, ARTIFACT)[1]["note"] == line and not found[1].exceeds
     assert [called(item) for item in found if item.n_grid] == [
-        "a random tenth (1)", "view 'rot90'", "view 'shift_x'", "view 'both'"]
+        "a random tenth (1)",
+        "view 'rot90'",
+        "view 'shift_x'",
+        "view 'both'",
+    ]
 
 
 def drawn(seed, plan, spread=None, **how):
@@ -135,10 +152,19 @@ LINEAR = bare(datum_theta="zero_mean", misalignment_model="linear")
 def test_the_limit_is_that_of_good_readings(monkeypatch):
     """At a level of 5 % as many good sets exceed it as should; at 0.1 % hardly any."""
     monkeypatch.setattr("selfcal_ros.estimation.quality.validation.F_LEVEL", 0.05)
-    plan = replace(SMALL, views=tuple(replace(v, repeats=repeats) for v, repeats in zip(
-        SMALL.views, (1, 3, 1, 3, 2), strict=True)))
-    found = [item for seed in range(8) for item in validate(
-        drawn(seed, plan, missing=0.1), LINEAR, folds=3) if np.isfinite(item.limit)]
+    plan = replace(
+        SMALL,
+        views=tuple(
+            replace(v, repeats=repeats)
+            for v, repeats in zip(SMALL.views, (1, 3, 1, 3, 2), strict=True)
+        ),
+    )
+    found = [
+        item
+        for seed in range(8)
+        for item in validate(drawn(seed, plan, missing=0.1), LINEAR, folds=3)
+        if np.isfinite(item.limit)
+    ]
     tenths = [item for item in found if item.tenth]
     views = [item for item in found if item.view]
     for items in (tenths, views):
@@ -165,7 +191,8 @@ def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
     assert not judged.verdict.qualified
     assert judged.verdict.reasons == (
         f"view 'ty' is predicted with {bad.ratio:.2f} times the noise, beyond the limit of "
-        f"{bad.limit:.2f}",)
+        f"{bad.limit:.2f}",
+    )
     assert judged.verdict.sentence == f"Not qualified: {judged.verdict.reasons[0]}"
     assert validation_json([bad], ARTIFACT)[0]["exceeds"] is True
 
@@ -180,10 +207,22 @@ def test_terms_are_predicted_with_the_readings(few_draws):
         order = rng.permutation(n)
         # (1 + E) o should be read, E = 5 mrad of turn; 200 nm of drift along y
         moved = -5e-3j * offset + 1j * 2e-7 * (2 * order / (n - 1) - 1)
-        visits = replace(visits, dx=visits.dx + moved.real, dy=visits.dy + moved.imag,
-                         offset_x=offset.real, offset_y=offset.imag, stamp_ns=order * 10**9)
-        views.append(replace(view, dx=visits.dx[np.argsort(visits.mark)],
-                             dy=visits.dy[np.argsort(visits.mark)], visits=visits))
+        visits = replace(
+            visits,
+            dx=visits.dx + moved.real,
+            dy=visits.dy + moved.imag,
+            offset_x=offset.real,
+            offset_y=offset.imag,
+            stamp_ns=order * 10**9,
+        )
+        views.append(
+            replace(
+                view,
+                dx=visits.dx[np.argsort(visits.mark)],
+                dy=visits.dy[np.argsort(visits.mark)],
+                visits=visits,
+            )
+        )
     readings = replace(readings, views=tuple(views))
     terms = (ModelTerm("microscope"), ModelTerm("drift"))
     found = validate(readings, replace(LINEAR, terms=terms, drift_degree=1), folds=2)
@@ -204,9 +243,12 @@ def test_a_view_held_out_has_own_terms_within_their_sizes(few_draws, monkeypatch
     monkeypatch.setattr(validation, "F_LEVEL", 0.05)
     strained = bare(terms=(ModelTerm("plate_strain", 5e-6),))
     spread = Spread(plate_strain=5e-6)
-    found = [item for seed in range(8) for item in validate(
-        drawn(seed, SMALL, spread=spread), strained, folds=1)
-        if item.view and item.n_grid]
+    found = [
+        item
+        for seed in range(8)
+        for item in validate(drawn(seed, SMALL, spread=spread), strained, folds=1)
+        if item.view and item.n_grid
+    ]
     assert len(found) >= 30 and all(item.why is None for item in found)
     assert sum(item.exceeds for item in found) <= binom.ppf(0.9995, len(found), 0.05)
     assert min(item.ratio for item in found) > 1 and np.mean([item.ratio for item in found]) > 3
@@ -218,8 +260,9 @@ def test_lines_are_predicted_with_the_eccentricity_of_their_view(sense, few_draw
     rng = np.random.default_rng(2)
     plan = hu_plan(Artifact(7, 0.01, 24), 1)
     truth = random_truth(plan.artifact, 4, rng, Spread(line_eccentricity_rad=15e-6))
-    readings = simulate_measurements(truth, plan, rng, sense=sense, sigma_m=SIGMA_M,
-                                     sigma_theta_rad=2e-8)
+    readings = simulate_measurements(
+        truth, plan, rng, sense=sense, sigma_m=SIGMA_M, sigma_theta_rad=2e-8
+    )
     model = bare(terms=(ModelTerm("line_eccentricity", 15e-6),))
     for item in validate(readings, model, folds=2)[:2]:
         assert 1e-8 < item.rms_rad < 1e-7

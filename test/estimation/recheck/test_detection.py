@@ -64,8 +64,10 @@ def test_nine_of_ten_changes_of_the_stated_size_are_found(kind, level):
 def test_smooth_changes_and_those_of_few_nodes_are_found_better_than_by_one_sum_of_squares():
     """Independent nodes, one by 5.5 u, or a bend of 0.5 u rms: the sum finds two of three."""
     modes = datum_modes(PLATE, scale=True).reshape(4, -1).T
-    tests, rng = ChangeTests(np.eye(98), modes, np.inf, change_tests(12.0).places), (
-        np.random.default_rng(7))
+    tests, rng = (
+        ChangeTests(np.eye(98), modes, np.inf, change_tests(12.0).places),
+        (np.random.default_rng(7)),
+    )
     bend = tests.without(np.concatenate([tests.places.real**2, 0 * tests.places.real]))
     limit = chi2.ppf(0.95, 94)
     for shape in (0.5 * bend / np.sqrt((bend**2).mean()), tests.without(5.5 * np.eye(98)[24])):

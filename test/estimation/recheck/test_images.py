@@ -27,32 +27,51 @@ LINEAR = bare(causes=False, at_places=False, misalignment_model="linear")
 RUNS = 4
 
 
-def sessions(image_m, seed, *, size=7, turn=0, repeats=1, change=0.0, missing=0.0,
-             sense=Sense.MICROSCOPE_MOVES, **spread):
+def sessions(
+    image_m,
+    seed,
+    *,
+    size=7,
+    turn=0,
+    repeats=1,
+    change=0.0,
+    missing=0.0,
+    sense=Sense.MICROSCOPE_MOVES,
+    **spread,
+):
     """Return truth after a change, the readings of a calibration and of a later view."""
     plan, rng = image_plan(size), np.random.default_rng(seed)
     again = image_plan(size, turns=(turn,), repeats=repeats)
-    truth = random_truth(plan.artifact, 3, rng, Spread(
-        **{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread))
+    truth = random_truth(
+        plan.artifact, 3, rng, Spread(**{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread)
+    )
     settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=0.0, sense=sense)
-    later = replace(truth, t_m=truth.t_m[2:], phi_rad=truth.phi_rad[2:],
-                    plate_shape_m=truth.plate_shape_m[2:],
-                    g=truth.g + change * rng.normal(size=truth.g.shape))
-    return later, *(simulate_measurements(one, its, rng, settings=settings, missing=missing)
-                    for one, its in ((truth, plan), (later, again)))
+    later = replace(
+        truth,
+        t_m=truth.t_m[2:],
+        phi_rad=truth.phi_rad[2:],
+        plate_shape_m=truth.plate_shape_m[2:],
+        g=truth.g + change * rng.normal(size=truth.g.shape),
+    )
+    return later, *(
+        simulate_measurements(one, its, rng, settings=settings, missing=missing)
+        for one, its in ((truth, plan), (later, again))
+    )
 
 
 def values(measurements) -> np.ndarray:
     """Return the readings of all views in the order of `dense`, x and y by turns."""
-    return np.concatenate([np.stack([view.dx, view.dy], axis=1).ravel()
-                           for view in measurements.views])
+    return np.concatenate(
+        [np.stack([view.dx, view.dy], axis=1).ravel() for view in measurements.views]
+    )
 
 
 @pytest.mark.parametrize(("image", "missing", "repeats"), [(3.0, 0.0, 1), (1.0, 0.06, 2)])
 def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
     """The plate of the calibration with its noise, then generalised least squares, both dense."""
-    _, before, after = sessions(image * MARK, 5, size=5, missing=missing, repeats=repeats,
-                                change=3e-8, phi_rad=0.0)
+    _, before, after = sessions(
+        image * MARK, 5, size=5, missing=missing, repeats=repeats, change=3e-8, phi_rad=0.0
+    )
     first = solve_joint(before, LINEAR).result
     found = recheck(after, LINEAR, known_plate(first, "r.json"))
     share, power, sites = first.kept.images.share, first.noise.sigma_xy**2, 25
@@ -63,37 +82,42 @@ def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
     one = np.eye(len(early)) * (1 - share) + share * np.kron(stops[:, None] == stops, np.eye(2))
     weight = np.repeat(np.concatenate([view.count for view in after.views]), 2)
     mark = (1 - share) * power
-    two = mark * np.eye(len(late)) + (later - mark) * np.kron(
-        again[:, None] == again, np.eye(2))
+    two = mark * np.eye(len(late)) + (later - mark) * np.kron(again[:, None] == again, np.eye(2))
     two /= np.sqrt(np.outer(weight, weight))
     noise = block_diag(power * one, two)
     # G and A of the calibration: the scale is the plate's
     inverse, project = np.linalg.pinv(early, rcond=1e-10), datum(before.artifact)
     z = np.stack([before.artifact.m.ravel(), before.artifact.n.ravel()], axis=1).ravel() * 1.0
     grown = np.outer(z, z) / (z @ z)
-    old = project @ inverse[:2 * sites]
-    plate = inverse[2 * sites:4 * sites] + grown @ inverse[:2 * sites]
+    old = project @ inverse[: 2 * sites]
+    plate = inverse[2 * sites : 4 * sites] + grown @ inverse[: 2 * sites]
     plate = plate - (np.eye(2 * sites) - project - grown) @ plate
     # the later map from what the plate leaves, with the covariance of both
-    of_plate, free = late[:, 2 * sites:4 * sites], np.delete(
-        late, np.s_[2 * sites:4 * sites], axis=1)
+    of_plate, free = (
+        late[:, 2 * sites : 4 * sites],
+        np.delete(late, np.s_[2 * sites : 4 * sites], axis=1),
+    )
     left = np.hstack([-of_plate @ plate, np.eye(len(late))])
     root = np.linalg.inv(np.linalg.cholesky(left @ noise @ left.T))
     gain = np.linalg.pinv(root @ free, rcond=1e-9) @ root @ left
-    new = project @ gain[:2 * sites]
+    new = project @ gain[: 2 * sites]
     change = new - project @ np.hstack([old, np.zeros((len(old), len(late)))])
     y = np.concatenate([values(before), values(after)])
     recheck_of, shape = found.recheck, (5, 5)
     for rows, of, u in (
-            (new, (found.error_map.gx, found.error_map.gy),
-             (found.error_map.u_gx, found.error_map.u_gy)),
-            (change, (recheck_of.dx, recheck_of.dy),
-             (recheck_of.u_dx, recheck_of.u_dy))):
+        (
+            new,
+            (found.error_map.gx, found.error_map.gy),
+            (found.error_map.u_gx, found.error_map.u_gy),
+        ),
+        (change, (recheck_of.dx, recheck_of.dy), (recheck_of.u_dx, recheck_of.u_dy)),
+    ):
         spread = np.sqrt(np.diag(rows @ noise @ rows.T))
         for axis in range(2):
             np.testing.assert_allclose(u[axis], spread[axis::2].reshape(shape), rtol=1e-5)
-            np.testing.assert_allclose(of[axis], (rows @ y)[axis::2].reshape(shape), rtol=0,
-                                       atol=1e-4 * spread.min())
+            np.testing.assert_allclose(
+                of[axis], (rows @ y)[axis::2].reshape(shape), rtol=0, atol=1e-4 * spread.min()
+            )
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.06])
@@ -107,10 +131,10 @@ def test_both_maps_of_a_calibration_with_noise_of_images_as_dense_linear_algebra
     grown = np.outer(z, z) / (z @ z)
     plate = inverse[50:100] + grown @ inverse[:50]
     plate = plate - (np.eye(50) - project - grown) @ plate
-    both = np.vstack([rows[axis::2] for rows in (project @ inverse[:50], plate)
-                      for axis in range(2)])
-    noise = np.eye(len(matrix)) * (1 - share) + share * np.kron(
-        stops[:, None] == stops, np.eye(2))
+    both = np.vstack(
+        [rows[axis::2] for rows in (project @ inverse[:50], plate) for axis in range(2)]
+    )
+    noise = np.eye(len(matrix)) * (1 - share) + share * np.kron(stops[:, None] == stops, np.eye(2))
     wanted = first.noise.sigma_xy**2 * both @ noise @ both.T
     cover = kept.cover(kept.sites, kept.marks)[:-4, :-4]
     np.testing.assert_allclose(cover, wanted, rtol=0, atol=1e-6 * wanted.max())
@@ -125,11 +149,12 @@ def population(image_m, runs, **settings):
         result = calibrate(after, Options(plate=first, plate_from="r.json"))
         emap, told = result.error_map, result.recheck
         modes = datum_modes(emap.artifact, scale=True)
-        away.append(remove_modes(np.stack([emap.gx, emap.gy]) - later.g, modes)
-                    / np.stack([emap.u_gx, emap.u_gy]))
+        away.append(
+            remove_modes(np.stack([emap.gx, emap.gy]) - later.g, modes)
+            / np.stack([emap.u_gx, emap.u_gy])
+        )
         if not settings.get("change"):
-            changes.append(np.stack([told.dx, told.dy])
-                           / np.stack([told.u_dx, told.u_dy]))
+            changes.append(np.stack([told.dx, told.dy]) / np.stack([told.u_dx, told.u_dy]))
         results.append(result)
     return np.array(away), np.array(changes), results
 
@@ -140,9 +165,10 @@ def require_within(away: np.ndarray) -> None:
     assert (np.abs(away) < 2).mean() >= binom.ppf(1e-3, 20 * len(away), 0.9545) / 20 / len(away)
 
 
-@pytest.mark.parametrize(("part", "settings"), [
-    (0.3, {"sense": Sense.PLATE_MOVES, "turn": 180}),
-    (1.0, {"repeats": 2, **DISTORTED})])
+@pytest.mark.parametrize(
+    ("part", "settings"),
+    [(0.3, {"sense": Sense.PLATE_MOVES, "turn": 180}), (1.0, {"repeats": 2, **DISTORTED})],
+)
 def test_an_unchanged_stage_is_found_within_its_uncertainty(part, settings):
     away, changes, results = population(part * MARK, RUNS, **settings)
     assert all(result.verdict.qualified or result.recheck.changed for result in results)

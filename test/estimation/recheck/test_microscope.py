@@ -23,10 +23,19 @@ from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.truth import simulate_measurements
 
 PLATE = Artifact(9, 0.01)
-FIRST = Plan("first", PLATE, tuple(
-    View(name, turn, shift, True, False, repeats=2) for name, turn, shift in (
-        ("a", 0.0, (0.0, 0.0)), ("b", np.pi / 2, (0.0, 0.0)), ("c", 0.0, (0.01, 0.0)),
-        ("d", 0.0, (0.0, -0.01)))))
+FIRST = Plan(
+    "first",
+    PLATE,
+    tuple(
+        View(name, turn, shift, True, False, repeats=2)
+        for name, turn, shift in (
+            ("a", 0.0, (0.0, 0.0)),
+            ("b", np.pi / 2, (0.0, 0.0)),
+            ("c", 0.0, (0.01, 0.0)),
+            ("d", 0.0, (0.0, -0.01)),
+        )
+    ),
+)
 STOPS = {"check_marks": 5, "check_offset_m": 20e-6}
 
 
@@ -38,8 +47,9 @@ def settings(sense=Sense.MICROSCOPE_MOVES, stop_m=0.0, noise_m=20e-9):
 def calibrated(sense=Sense.MICROSCOPE_MOVES):
     """Return the truth of a cell and its known plate."""
     rng = np.random.default_rng(8)
-    truth = random_truth(PLATE, len(FIRST.views), rng, Spread(
-        phi_rad=1e-3, t_m=3e-5, correlation_pitches=3.0))
+    truth = random_truth(
+        PLATE, len(FIRST.views), rng, Spread(phi_rad=1e-3, t_m=3e-5, correlation_pitches=3.0)
+    )
     readings = simulate_measurements(truth, FIRST, rng, visits=True, settings=settings(sense))
     return truth, known_plate(worded(calibrate(readings, Options(causes=False))), "first.json")
 
@@ -47,8 +57,9 @@ def calibrated(sense=Sense.MICROSCOPE_MOVES):
 def later(truth, view, sense=Sense.MICROSCOPE_MOVES, **cell):
     """Return the readings of one view of the plate."""
     plan = Plan("again", PLATE, (replace(FIRST.views[0], name="again", **view),))
-    return simulate_measurements(truth, plan, np.random.default_rng(9), visits=True,
-                                 settings=settings(sense, **cell))
+    return simulate_measurements(
+        truth, plan, np.random.default_rng(9), visits=True, settings=settings(sense, **cell)
+    )
 
 
 def rechecked(change, view=None, sense=Sense.MICROSCOPE_MOVES, **cell):
@@ -63,8 +74,9 @@ def touched(scale=0.0, turn=0.0):
 
 def another_stage(truth):
     x, y = PLATE.x_m, PLATE.y_m
-    return replace(truth, g=truth.g + 1e-7 * np.stack([np.sin(60 * x + 40 * y),
-                                                       np.cos(70 * x - 20 * y)]))
+    return replace(
+        truth, g=truth.g + 1e-7 * np.stack([np.sin(60 * x + 40 * y), np.cos(70 * x - 20 * y)])
+    )
 
 
 def larger_errors(truth):
@@ -127,13 +139,22 @@ def test_an_unchanged_cell_has_nothing_to_say():
 def test_a_program_sees_the_exit_code(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     plate = {"grid_size": 7, "grid_pitch": 0.01, "angular_count": 0}
-    views = [{"name": "a", "repeats": 2}, {"name": "b", "rotation_deg": 90, "repeats": 2},
-             {"name": "c", "translation_pitch": [1, 0], "repeats": 2}]
-    for name, views_of, physics in (("first", views, {}),
-                                    ("again", views[:1], {"microscope_scale": -0.1})):
-        spec = {"seed": 3, "noise": {"sigma_xy": 2e-8}, "physics": physics,
-                "cell": {"visit_order": "there_and_back", "stop_sigma": 0.0},
-                "plan": {"plan_id": name, "artifact": plate, "views": views_of}}
+    views = [
+        {"name": "a", "repeats": 2},
+        {"name": "b", "rotation_deg": 90, "repeats": 2},
+        {"name": "c", "translation_pitch": [1, 0], "repeats": 2},
+    ]
+    for name, views_of, physics in (
+        ("first", views, {}),
+        ("again", views[:1], {"microscope_scale": -0.1}),
+    ):
+        spec = {
+            "seed": 3,
+            "noise": {"sigma_xy": 2e-8},
+            "physics": physics,
+            "cell": {"visit_order": "there_and_back", "stop_sigma": 0.0},
+            "plan": {"plan_id": name, "artifact": plate, "views": views_of},
+        }
         (tmp_path / f"{name}.yaml").write_text(json.dumps(spec))
         assert main(["simulate", f"{name}.yaml", "-o", name]) == 0
     assert main(["solve", "first", "-o", "r.json", "--quiet"]) == 0

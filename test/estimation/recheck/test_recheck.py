@@ -60,8 +60,15 @@ def _equal_white_noise(monkeypatch):
 
 
 def linear(model="none"):
-    return replace(bare(causes=False, at_places=False, terms=STILL, misalignment_model=(
-        "linear" if model == "none" else "rigid")), assumed=parse_terms([MODELS[model]], ""))
+    return replace(
+        bare(
+            causes=False,
+            at_places=False,
+            terms=STILL,
+            misalignment_model=("linear" if model == "none" else "rigid"),
+        ),
+        assumed=parse_terms([MODELS[model]], ""),
+    )
 
 
 def saved(result):
@@ -70,21 +77,39 @@ def saved(result):
 
 def one_view(artifact, q=0, a=0, b=0, degrees=0.0):
     turn = q * np.pi / 2 + np.radians(degrees)
-    return Plan("again", artifact, (View("again", turn, (a * PITCH, b * PITCH), True,
-                                         artifact.angular_count > 0 and not degrees),))
+    return Plan(
+        "again",
+        artifact,
+        (
+            View(
+                "again",
+                turn,
+                (a * PITCH, b * PITCH),
+                True,
+                artifact.angular_count > 0 and not degrees,
+            ),
+        ),
+    )
 
 
 @cache
 def sessions(sense=Sense.MICROSCOPE_MOVES, pose=(0, 0, 0), microscope=False):
     """Readings of a calibration on the lattice, and of a view of a stage that has changed."""
     plan, rng = plan_of("0,90,tx", Artifact(5, PITCH, 8), lines=1), np.random.default_rng(5)
-    truth = random_truth(plan.artifact, len(plan.views), rng, Spread(
-        phi_rad=1e-5, microscope_scale=4e-3 * microscope,
-        microscope_shear=5e-4 * microscope))
+    truth = random_truth(
+        plan.artifact,
+        len(plan.views),
+        rng,
+        Spread(
+            phi_rad=1e-5, microscope_scale=4e-3 * microscope, microscope_shear=5e-4 * microscope
+        ),
+    )
     changed = replace(truth, g=truth.g + rng.normal(0, 3e-8, truth.g.shape))
     settings = CellSettings(sense, 20e-9, 2e-6, **QUIET)
-    return tuple(simulate_measurements(one, its, rng, visits=True, settings=settings)
-                 for one, its in ((truth, plan), (changed, one_view(plan.artifact, *pose))))
+    return tuple(
+        simulate_measurements(one, its, rng, visits=True, settings=settings)
+        for one, its in ((truth, plan), (changed, one_view(plan.artifact, *pose)))
+    )
 
 
 def require_first_order(emap):
@@ -104,8 +129,9 @@ def require_same(result, wanted, *, rel=1e-5):
     """Require map, change and their covariances as one least squares has them."""
     emap, found = result.error_map, result.recheck
     for rows, values, u in (
-            (wanted.after, (emap.gx, emap.gy), (emap.u_gx, emap.u_gy)),
-            (wanted.change, (found.dx, found.dy), (found.u_dx, found.u_dy))):
+        (wanted.after, (emap.gx, emap.gy), (emap.u_gx, emap.u_gy)),
+        (wanted.change, (found.dx, found.dy), (found.u_dx, found.u_dy)),
+    ):
         of, spread = wanted.of(rows)
         assert np.ravel(u)[wanted.known] == pytest.approx(spread, rel=rel)
         assert np.abs(np.ravel(values)[wanted.known] - of).max() < rel * spread.min()
@@ -115,8 +141,10 @@ def require_same(result, wanted, *, rel=1e-5):
     assert test.dof == dof
     assert test.chi2_ratio == pytest.approx(chi2 / dof, rel=100 * rel)
     if wanted.K:
-        for rows, value, u in ((wanted.after_theta, emap.g_theta, emap.u_g_theta),
-                               (wanted.change_theta, found.d_theta, found.u_d_theta)):
+        for rows, value, u in (
+            (wanted.after_theta, emap.g_theta, emap.u_g_theta),
+            (wanted.change_theta, found.d_theta, found.u_d_theta),
+        ):
             of, spread = wanted.of(rows)
             assert u == pytest.approx(spread, rel=rel)
             assert np.abs(value - of).max() < rel * spread.min()
@@ -126,8 +154,9 @@ def require_same(result, wanted, *, rel=1e-5):
     assert cover == pytest.approx(wanted.after @ wanted.after.T, abs=rel * cover.max())
     if wanted.K:
         cover = covariance_of(result, "theta", np.isfinite(emap.g_theta))
-        assert cover == pytest.approx(wanted.after_theta @ wanted.after_theta.T,
-                                      abs=rel * cover.max())
+        assert cover == pytest.approx(
+            wanted.after_theta @ wanted.after_theta.T, abs=rel * cover.max()
+        )
     u = np.linalg.norm(wanted.scale)
     assert found.scale.change == pytest.approx(wanted.scale @ wanted.y, abs=rel * u)
     assert found.scale.u == pytest.approx(u, rel=rel)
@@ -141,10 +170,18 @@ def test_a_view_on_the_lattice_as_one_least_squares_of_both_sessions(model, pose
     first = saved(calibrate(before, linear(model)))
     result = recheck(after, linear(model), known_plate(first, "r.json"))
     grid = placed.plate(5, 5, "bilinear", angular_count=8)
-    require_same(result, TwoSessions(before, after, grid, first.noise.sigma_xy,
-                                     MICROSCOPE if model == "microscope" else (),
-                                     sigma_theta=first.noise.sigma_theta),
-                 rel=1e-5 if model == "none" else 1e-2)
+    require_same(
+        result,
+        TwoSessions(
+            before,
+            after,
+            grid,
+            first.noise.sigma_xy,
+            MICROSCOPE if model == "microscope" else (),
+            sigma_theta=first.noise.sigma_theta,
+        ),
+        rel=1e-5 if model == "none" else 1e-2,
+    )
 
 
 def general(pose, sigma=20e-9, seed=3, change=0.0, how="bicubic", nodes=5):
@@ -156,26 +193,40 @@ def general(pose, sigma=20e-9, seed=3, change=0.0, how="bicubic", nodes=5):
     def stage(at):
         return placed.rows(artifact, np.ravel(at)) @ field.ravel()
 
-    after, other = placed.readings(artifact, [pose], rng, linear=True, sigma=sigma,
-                                   stage=lambda at: stage(at).reshape(np.shape(at)))
+    after, other = placed.readings(
+        artifact,
+        [pose],
+        rng,
+        linear=True,
+        sigma=sigma,
+        stage=lambda at: stage(at).reshape(np.shape(at)),
+    )
     # of the same plate
-    view, = after.views
+    (view,) = after.views
     inside = view.view.pose.in_field(artifact)
     moved = np.exp(1j * view.view.rotation_rad) * (truth.plate - other.plate)[inside]
-    return before, replace(after, views=(replace(
-        view, dx=view.dx + moved.real, dy=view.dy + moved.imag),))
+    return before, replace(
+        after, views=(replace(view, dx=view.dx + moved.real, dy=view.dy + moved.imag),)
+    )
 
 
-@pytest.mark.parametrize(("pose", "nodes"), [
-    ((0, (0, 0)), 5), ((4, (0.1, -0.1)), 5), ((90, (0.5, 0.5)), 5), ((4, (0.1, -0.1)), 3)])
+@pytest.mark.parametrize(
+    ("pose", "nodes"),
+    [((0, (0, 0)), 5), ((4, (0.1, -0.1)), 5), ((90, (0.5, 0.5)), 5), ((4, (0.1, -0.1)), 3)],
+)
 def test_a_view_off_the_lattice_as_one_least_squares_of_both_sessions(pose, nodes):
     before, after = general(pose, change=3e-8, nodes=nodes)
     first = saved(calibrate(before, linear()))
     result = recheck(after, linear(), known_plate(first, "r.json"))
     assert result.error_map.valid.sum() > nodes**2 / 2
     assert {found.name for found in result.verdict.failed} <= {"changed_or_drifted"}
-    require_same(result, TwoSessions(before, after, before.artifact, first.noise.sigma_xy,
-                                     known=result.error_map.valid), rel=1e-4)
+    require_same(
+        result,
+        TwoSessions(
+            before, after, before.artifact, first.noise.sigma_xy, known=result.error_map.valid
+        ),
+        rel=1e-4,
+    )
 
 
 @cache
@@ -188,8 +239,9 @@ def test_terms_with_sizes_are_part_of_the_noise():
     _, after = sessions()
     plate, size = known_plate(calibrated(), "r.json"), 2e-6
     plain = recheck(after, linear(), plate)
-    strained = recheck(after, replace(linear(), terms=parse_terms([f"plate_strain:{size}"], "")),
-                       plate)
+    strained = recheck(
+        after, replace(linear(), terms=parse_terms([f"plate_strain:{size}"], "")), plate
+    )
     x, y = plain.artifact.x_m, plain.artifact.y_m
     both = np.hypot(x, y) * size  # stretch and shear; a scale is not part of the map
     for name in ("u_gx", "u_gy"):
@@ -199,7 +251,11 @@ def test_terms_with_sizes_are_part_of_the_noise():
     assert more == pytest.approx(np.hypot(plain.recheck.scale.u, size), rel=1e-6)
     np.testing.assert_allclose(strained.error_map.gx, plain.error_map.gx, atol=1e-15)
     assert [line.component for line in strained.budget] == [
-        "reading noise", "known plate", "terms", "interpolation"]
+        "reading noise",
+        "known plate",
+        "terms",
+        "interpolation",
+    ]
 
 
 def test_what_has_changed_is_read_as_it_was_written():
@@ -231,8 +287,9 @@ def test_marks_and_lines_that_are_missing_are_unknown():
     kept, lines = view.m > -2, view.k > 1
     fewer = replace(after, views=(subset(view, kept, lines),))
     result = recheck(fewer, linear(), known_plate(calibrated(), "r.json"))
-    np.testing.assert_array_equal(result.error_map.valid, np.tile(
-        np.arange(-2, 3)[:, None] > -2, 5))
+    np.testing.assert_array_equal(
+        result.error_map.valid, np.tile(np.arange(-2, 3)[:, None] > -2, 5)
+    )
     np.testing.assert_array_equal(np.isfinite(result.error_map.g_theta), np.arange(8) > 1)
     assert abs(np.nansum(result.error_map.gx)) < 1e-15
     assert np.nansum(result.error_map.g_theta) == pytest.approx(0, abs=1e-15)
@@ -252,34 +309,54 @@ def test_a_view_that_is_only_partly_read_is_said():
 def test_a_mark_that_is_not_known_but_visited_twice_is_left_out():
     """The calibration has not read it: map and u are those of a view without it."""
     before, again = sessions()[0], replace(one_view(Artifact(5, PITCH, 8)).views[0], repeats=2)
-    kept = [replace(subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool)),
-                    visits=None) for view in before.views]
+    kept = [
+        replace(
+            subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool)), visits=None
+        )
+        for view in before.views
+    ]
     plate = known_plate(saved(calibrate(replace(before, views=tuple(kept)), linear())), "r.json")
     assert plate.together.marks.sum() == 24
     plan, rng = Plan("again", before.artifact, (again,)), np.random.default_rng(6)
     truth = random_truth(plan.artifact, 1, rng, Spread(phi_rad=1e-5))
-    after = simulate_measurements(truth, plan, rng, visits=True, settings=CellSettings(
-        Sense.MICROSCOPE_MOVES, 20e-9, 2e-6, **QUIET))
+    after = simulate_measurements(
+        truth,
+        plan,
+        rng,
+        visits=True,
+        settings=CellSettings(Sense.MICROSCOPE_MOVES, 20e-9, 2e-6, **QUIET),
+    )
     view = after.views[0]
     fewer = subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool))
-    whole, part = (recheck(replace(after, views=(replace(one, visits=seen),)), linear(), plate)
-                   for one, seen in ((view, view.visits), (fewer, None)))
+    whole, part = (
+        recheck(replace(after, views=(replace(one, visits=seen),)), linear(), plate)
+        for one, seen in ((view, view.visits), (fewer, None))
+    )
     assert whole.error_map.gx == pytest.approx(part.error_map.gx, abs=1e-15, nan_ok=True)
     assert whole.error_map.u_gx == pytest.approx(part.error_map.u_gx, rel=1e-9, nan_ok=True)
 
 
 def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
     _, after = general((0, (0, 0)))
-    with pytest.raises(InputError, match="its plate has 5 x 5 marks 10 mm apart and 8 lines, not "
-                       "7 x 7 marks 10 mm apart and no lines"):
+    with pytest.raises(
+        InputError,
+        match="its plate has 5 x 5 marks 10 mm apart and 8 lines, not "
+        "7 x 7 marks 10 mm apart and no lines",
+    ):
         recheck(after, linear(), known_plate(calibrated(), "r.json"))
 
 
-@pytest.mark.parametrize(("change", "message"), [
-    ({"verdict": Verdict(Grade.NOT_QUALIFIED)}, "is not qualified, so its plate is not known"),
-    ({"views": ()}, "does not contain the covariance of its plate"),
-    ({"recheck": SimpleNamespace(of="first.json")}, "which does not calibrate a plate; name "
-                                                    "the calibration that it used, first.json")])
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"verdict": Verdict(Grade.NOT_QUALIFIED)}, "is not qualified, so its plate is not known"),
+        ({"views": ()}, "does not contain the covariance of its plate"),
+        (
+            {"recheck": SimpleNamespace(of="first.json")},
+            "which does not calibrate a plate; name the calibration that it used, first.json",
+        ),
+    ],
+)
 def test_results_without_a_known_plate(change, message):
     with pytest.raises(InputError, match=f"r.json: .*{message}"):
         known_plate(replace(calibrated(), **change), "r.json")
@@ -291,9 +368,20 @@ def test_what_one_view_cannot_tell_is_refused():
         recheck(after, replace(linear(), terms=parse_terms(["drift"], "")), plate)
     with pytest.raises(InputError, match="a recheck always uses the reference length of"):
         recheck(after, replace(linear(), reference=ReferenceLength("artifact", 0.0, 0.0)), plate)
-    nothing = replace(after, views=(replace(after.views[0], m=np.zeros(0, int), n=np.zeros(0, int),
-                                            dx=np.zeros(0), dy=np.zeros(0),
-                                            count=np.zeros(0, int), visits=None),))
+    nothing = replace(
+        after,
+        views=(
+            replace(
+                after.views[0],
+                m=np.zeros(0, int),
+                n=np.zeros(0, int),
+                dx=np.zeros(0),
+                dy=np.zeros(0),
+                count=np.zeros(0, int),
+                visits=None,
+            ),
+        ),
+    )
     with pytest.raises(NoDataError, match="no known mark was read"):
         recheck(nothing, linear(), plate)
     before, few = general((0, (3.2, 3.1)))
@@ -301,9 +389,13 @@ def test_what_one_view_cannot_tell_is_refused():
         recheck(few, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
 
 
-@pytest.mark.parametrize(("how", "gone", "free"), [
-    ("bicubic", lambda m, n: m > 5, 0),
-    ("bilinear", lambda m, n: np.maximum(abs(m), abs(n)) < 2, 1)])
+@pytest.mark.parametrize(
+    ("how", "gone", "free"),
+    [
+        ("bicubic", lambda m, n: m > 5, 0),
+        ("bilinear", lambda m, n: np.maximum(abs(m), abs(n)) < 2, 1),
+    ],
+)
 def test_nodes_that_the_readings_do_not_determine_are_unknown(how, gone, free):
     """By the null space of the view's dense matrix, over the nodes without motion."""
     before, after = general((4, (0.1, -0.1)), how=how)
@@ -314,8 +406,9 @@ def test_nodes_that_the_readings_do_not_determine_are_unknown(how, gone, free):
     m, n, valid = view.m[kept], view.n[kept], result.error_map.valid.ravel()
     w = placed.rows(artifact, view.view.pose.places(artifact, m, n)) + 0j
     turn = np.exp(1j * view.view.rotation_rad)
-    design = np.hstack([w, 1j * w, np.column_stack([turn * 1j * (m + 1j * n), 0 * m + 1, 0 * m + 1j
-                                                    ])])
+    design = np.hstack(
+        [w, 1j * w, np.column_stack([turn * 1j * (m + 1j * n), 0 * m + 1, 0 * m + 1j])]
+    )
     null = null_space(np.vstack([design.real, design.imag]), rcond=1e-9)[:50]
     modes = datum_modes(artifact.field, scale=False).reshape(3, -1).T
     here = np.tile(valid, 2)
@@ -328,14 +421,16 @@ def test_nodes_that_the_readings_do_not_determine_are_unknown(how, gone, free):
 def test_the_budget_is_of_the_known_nodes_alone():
     """Nodes that the readings do not determine have variances, without a meaning."""
     before, after = general((4, (0.1, -0.1)), how="bicubic")
-    after = replace(after, views=(subset(after.views[0], after.views[0].m <= 5,
-                                         np.zeros(0, bool)),))
+    after = replace(
+        after, views=(subset(after.views[0], after.views[0].m <= 5, np.zeros(0, bool)),)
+    )
     found = recheck(after, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
     emap, lines = found.error_map, [line for line in found.budget if line.effect_max]
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
     assert np.count_nonzero(~emap.valid) > 0 and len(lines) >= 2
     assert np.sqrt(sum(line.effect_rms**2 for line in lines)) == pytest.approx(
-        np.sqrt(np.mean(u**2)))
+        np.sqrt(np.mean(u**2))
+    )
     assert all(line.effect_rms <= line.effect_max <= u.max() for line in lines)
 
 
@@ -347,8 +442,11 @@ def test_a_map_with_as_many_nodes_as_marks_needs_more_than_one_view():
     after, _ = placed.readings(artifact, [(0, (0.3, 0))], rng, linear=True)
     planned = Plan("again", artifact, (after.views[0].view,))
     for what in (lambda: recheck(after, linear(), plate), lambda: predict_recheck(planned, plate)):
-        with pytest.raises(NotIdentifiableError, match=r"leaves 81 of 81 nodes of the map unknown: "
-                                                       "measure more .*, or give the map fewer"):
+        with pytest.raises(
+            NotIdentifiableError,
+            match=r"leaves 81 of 81 nodes of the map unknown: "
+            "measure more .*, or give the map fewer",
+        ):
             what()
 
 
@@ -366,11 +464,13 @@ def test_a_stage_read_beside_its_sites_where_the_calibration_was_as_well():
     """With visits and a smooth stage; the plate lies 0.5 mm beside, the stage follows the marks."""
     artifact = Artifact(7, PITCH)
     plan, rng = plan_of("0,90,tx", artifact), np.random.default_rng(2)
-    truth = random_truth(artifact, 3, rng, Spread(correlation_pitches=5.0, t_m=0, phi_rad=1e-3,
-                                                  g_m=2e-6))
+    truth = random_truth(
+        artifact, 3, rng, Spread(correlation_pitches=5.0, t_m=0, phi_rad=1e-3, g_m=2e-6)
+    )
     settings = CellSettings(sigma_xy_m=5e-9, follow_mark=True, **(QUIET | {"stop_sigma_m": 0}))
-    first = saved(calibrate(simulate_measurements(truth, plan, rng, visits=True,
-                                                  settings=settings), BARE))
+    first = saved(
+        calibrate(simulate_measurements(truth, plan, rng, visits=True, settings=settings), BARE)
+    )
     beside = replace(truth, t_m=np.array([[5e-4, -4e-4]]), phi_rad=truth.phi_rad[:1])
     after = simulate_measurements(beside, one_view(artifact), rng, visits=True, settings=settings)
     plate = known_plate(first, "r.json")
@@ -386,16 +486,25 @@ def test_lines_of_two_views_as_one_generalised_least_squares(sense):
     rng, count, sigma, turns = np.random.default_rng(8), 7, 2e-6, (0, 3)
     weight = rng.integers(1, 4, (2, count)).astype(float) * (rng.random((2, count)) < 0.8)
     root, y = 3e-6 * rng.normal(size=(2 * count, count)), 1e-5 * rng.normal(size=(2, count))
-    before, of_term, plate = root @ root.T, rng.normal(size=(2, count)), 1e-5 * rng.normal(
-        size=count)
+    before, of_term, plate = (
+        root @ root.T,
+        rng.normal(size=(2, count)),
+        1e-5 * rng.normal(size=count),
+    )
     columns = np.concatenate([np.tile(np.eye(count)[:, None], (1, 2, 1)), of_term[None]])
     source = np.array(["known plate"] * count + ["terms"])
-    effects = Effects.of(source, np.append(np.ones(count), 4e-6), plate, before=before,
-                         length=np.zeros(count))
+    effects = Effects.of(
+        source, np.append(np.ones(count), 4e-6), plate, before=before, length=np.zeros(count)
+    )
     noise = noise_estimate((sigma, 99), (np.nan, 0), np.nan)
-    found = map_of_lines(AngularSystem(turns, weight, known_plate=True), y,
-                         LineColumns(np.arange(count + 1), columns), effects, sense=sense,
-                         noise=noise)
+    found = map_of_lines(
+        AngularSystem(turns, weight, known_plate=True),
+        y,
+        LineColumns(np.arange(count + 1), columns),
+        effects,
+        sense=sense,
+        noise=noise,
+    )
 
     view, line = np.nonzero(weight)
     at = (line + np.array(turns)[view]) % count
@@ -420,7 +529,8 @@ def test_lines_of_two_views_as_one_generalised_least_squares(sense):
 def test_lines_without_noise_are_refused():
     """There is nothing to judge their change by, however noisy the marks are."""
     _, after = sessions()
-    plate = known_plate(replace(calibrated(), noise=replace(calibrated().noise, sigma_theta=1e-14)),
-                        "r.json")
+    plate = known_plate(
+        replace(calibrated(), noise=replace(calibrated().noise, sigma_theta=1e-14)), "r.json"
+    )
     with pytest.raises(InputError, match="no noise against which to judge a change"):
         recheck(after, linear(), plate)

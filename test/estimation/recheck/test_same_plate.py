@@ -44,11 +44,21 @@ def calibrated(sense):
 def once_more(sense, degrees=0.0, shift=(0, 0), *, repeats=2, **changes):
     """Return readings of one more view, of a truth with some parts changed."""
     truth, _ = calibrated(sense)
-    view = View("again", np.radians(degrees), tuple(0.01 * part for part in shift), True, False,
-                repeats=repeats)
+    view = View(
+        "again",
+        np.radians(degrees),
+        tuple(0.01 * part for part in shift),
+        True,
+        False,
+        repeats=repeats,
+    )
     changed = replace(truth, t_m=truth.t_m[:1], phi_rad=truth.phi_rad[:1], **changes)
-    return simulate_measurements(changed, Plan("again", ARTIFACT, (view,)),
-                                 np.random.default_rng(7), settings=CellSettings(sense, 20e-9))
+    return simulate_measurements(
+        changed,
+        Plan("again", ARTIFACT, (view,)),
+        np.random.default_rng(7),
+        settings=CellSettings(sense, 20e-9),
+    )
 
 
 def said_to_lie(after, degrees, shift=(0, 0)):
@@ -60,8 +70,10 @@ def said_to_lie(after, degrees, shift=(0, 0)):
     on = np.maximum(abs(m), abs(n)) <= ARTIFACT.half[0]
     order = np.lexsort((n[on], m[on]))
     part = {name: getattr(seen, name)[on][order] for name in ("dx", "dy", "count")}
-    return replace(after, views=(replace(seen, view=view, m=m[on][order], n=n[on][order], **part,
-                                         visits=None),))
+    return replace(
+        after,
+        views=(replace(seen, view=view, m=m[on][order], n=n[on][order], **part, visits=None),),
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -70,8 +82,11 @@ def test_a_plate_that_lies_at_another_pose_is_named(pose, sense):
     _, plate = calibrated(sense)
     real = once_more(sense, *pose)
     assert recheck(real, BARE, plate).verdict.grade is Grade.GOOD
-    turned = (f"turned by {pose[0]}°, not by 0°" if pose[0] else
-              "shifted by (+1, +0) pitches, not by (+0, +0) pitches")
+    turned = (
+        f"turned by {pose[0]}°, not by 0°"
+        if pose[0]
+        else "shifted by (+1, +0) pitches, not by (+0, +0) pitches"
+    )
     with pytest.raises(PlacingError) as error:
         recheck(said_to_lie(real, 0), BARE, plate)
     assert turned in str(error.value) and "view 'again'" in str(error.value)
@@ -128,8 +143,11 @@ def test_a_bent_stage_and_a_few_marks_are_not_another_plate(size):
     x, y = ARTIFACT.x_m / 0.03, ARTIFACT.y_m / 0.03
     few = np.zeros_like(truth.g)
     few[0, 2, 3], few[1, 5, 1] = size, -size
-    for bent in (size * np.stack([x * y, x**2]), size * np.stack([np.sin(4 * y), np.sin(4 * x)]),
-                 few):
+    for bent in (
+        size * np.stack([x * y, x**2]),
+        size * np.stack([np.sin(4 * y), np.sin(4 * x)]),
+        few,
+    ):
         result = worded(recheck(once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent), BARE, plate))
         assert result.recheck.changed
         assert result.verdict.sentence.startswith("Changed since r.json: calibrate again, provided")
@@ -139,8 +157,9 @@ def test_a_scale_that_has_changed_is_the_headline():
     truth, plate = calibrated(Sense.MICROSCOPE_MOVES)
     grown = 5e-6 * np.stack([ARTIFACT.x_m, ARTIFACT.y_m])
     for sign in (1, -1):
-        result = worded(recheck(once_more(Sense.MICROSCOPE_MOVES, a=truth.a + sign * grown), BARE,
-                                plate))
+        result = worded(
+            recheck(once_more(Sense.MICROSCOPE_MOVES, a=truth.a + sign * grown), BARE, plate)
+        )
         found = result.recheck
         assert found.scale.changed and not found.changed
         assert abs(abs(found.scale.change) - 5e-6) < 3 * found.scale.u
@@ -154,8 +173,9 @@ def test_a_scale_that_has_changed_is_the_headline():
 def test_a_change_that_one_pass_shows_is_not_qualified_unless_drift_is_declared():
     truth, plate = calibrated(Sense.MICROSCOPE_MOVES)
     bent = 3e-7 * np.stack([ARTIFACT.y_m**2, ARTIFACT.x_m**2]) / 9e-4
-    one, two = (once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent, repeats=repeats)
-                for repeats in (1, 2))
+    one, two = (
+        once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent, repeats=repeats) for repeats in (1, 2)
+    )
     drift = replace(BARE, terms=(*BARE.terms, ModelTerm("drift", 1e-8)))
     for readings, options, told in ((one, BARE, False), (two, BARE, True), (one, drift, True)):
         result = worded(recheck(readings, options, plate))
@@ -168,8 +188,13 @@ def test_a_view_off_the_lattice_that_lies_a_quarter_turn_on():
     rng, artifact = np.random.default_rng(4), placed.plate(9, 5)
     poses = [*placed.SIX, (37, (0.0, 0.0)), (127, (0.0, 0.0))]
     readings, _ = placed.readings(artifact, poses, rng)
-    plate = known_plate(result_from_dict(result_to_dict(worded(calibrate(
-        replace(readings, views=readings.views[:6]), BARE))), "r"), "r.json")
+    plate = known_plate(
+        result_from_dict(
+            result_to_dict(worded(calibrate(replace(readings, views=readings.views[:6]), BARE))),
+            "r",
+        ),
+        "r.json",
+    )
     seen, turned = readings.views[6:]
     assert recheck(replace(readings, views=(turned,)), BARE, plate).verdict.grade is Grade.GOOD
     lies = replace(turned, view=seen.view, m=-turned.n, n=turned.m)

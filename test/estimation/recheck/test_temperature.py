@@ -48,7 +48,8 @@ def session(seed, warmer, *, told=True, sense=Sense.MICROSCOPE_MOVES):
         return f"{read}:{U_KELVIN}:{EXPANSION}:{U_EXPANSION}"
 
     reference = ReferenceLength(ReferenceKind.ARTIFACT, LENGTH, U_LENGTH, "C 1").at_temperature(
-        shown(20.4))
+        shown(20.4)
+    )
     cold, warm = (of_length(truth, length + expansion * (kelvin + 0.4)) for kelvin in (0, warmer))
     of_plate = simulate_measurements(cold, PLAN, rng, sigma_m=2e-8, sense=sense)
     before = worded(calibrate(of_plate, Options(reference=reference, causes=False)))
@@ -58,9 +59,14 @@ def session(seed, warmer, *, told=True, sense=Sense.MICROSCOPE_MOVES):
     return recheck(again, Options(terms=parse_terms(["plate_shape:0"], "")), plate), truth
 
 
-@pytest.mark.parametrize(("warmer", "told", "sense"), [
-    (1.0, True, Sense.MICROSCOPE_MOVES), (-1.0, True, Sense.PLATE_MOVES),
-    (1.0, False, Sense.MICROSCOPE_MOVES)])
+@pytest.mark.parametrize(
+    ("warmer", "told", "sense"),
+    [
+        (1.0, True, Sense.MICROSCOPE_MOVES),
+        (-1.0, True, Sense.PLATE_MOVES),
+        (1.0, False, Sense.MICROSCOPE_MOVES),
+    ],
+)
 def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
     """The scale is part of the map only if the temperature is known."""
     ratios, scales = [], []
@@ -68,7 +74,7 @@ def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
         result, truth = session(seed, warmer, told=told, sense=sense)
         emap = result.error_map
         modes = datum_modes(PLAN.artifact, scale=True)
-        error = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g, modes[:3 if told else 4])
+        error = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g, modes[: 3 if told else 4])
         ratios.append(error / np.stack([emap.u_gx, emap.u_gy]))
         scales.append(result.recheck.scale.p)
         assert (result.reference is not None) is told is is_traceable(result)
@@ -88,8 +94,12 @@ def test_what_was_converted_is_stated():
 
 
 def test_a_temperature_that_has_nothing_to_convert_is_refused():
-    readings = simulate_measurements(random_truth(PLAN.artifact, 3, np.random.default_rng(1)),
-                                     PLAN, np.random.default_rng(2), sigma_m=2e-8)
+    readings = simulate_measurements(
+        random_truth(PLAN.artifact, 3, np.random.default_rng(1)),
+        PLAN,
+        np.random.default_rng(2),
+        sigma_m=2e-8,
+    )
     certified = ReferenceLength(ReferenceKind.ARTIFACT, LENGTH, U_LENGTH, "C 1")
     axis = ReferenceLength(ReferenceKind.STAGE_X, LENGTH, U_LENGTH, "C 1")
     text = "20.4:0.05:8e-6:4e-7"
@@ -97,7 +107,8 @@ def test_a_temperature_that_has_nothing_to_convert_is_refused():
         result = worded(calibrate(readings, Options(reference=reference, causes=False)))
         with pytest.raises(InputError, match="r has no reference length of its plate with the"):
             known_plate(result, "r", text)
-    result = worded(calibrate(readings, Options(
-        reference=certified.at_temperature(text), causes=False)))
+    result = worded(
+        calibrate(readings, Options(reference=certified.at_temperature(text), causes=False))
+    )
     with pytest.raises(InputError, match="expansion_per_k is 5e-07, and 8e-06 in r; change the"):
         known_plate(result, "r", "20.4:0.05:5e-7:4e-7")

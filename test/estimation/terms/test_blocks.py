@@ -60,9 +60,14 @@ def sagging(tmp_path, monkeypatch):
         return SAG * loads[index][:, None] * (x**3 - x)
 
     monkeypatch.setattr(physics, "stage_bending", bending)
-    write_yaml(tmp_path / "sim.yaml", {
-        "plan": str(tmp_path / "plan.yaml"), "seed": 3,
-        "noise": {"sigma_xy": 5e-9, "sigma_theta": 1e-6}})
+    write_yaml(
+        tmp_path / "sim.yaml",
+        {
+            "plan": str(tmp_path / "plan.yaml"),
+            "seed": 3,
+            "noise": {"sigma_xy": 5e-9, "sigma_theta": 1e-6},
+        },
+    )
     assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "bag")]) == 0
     return str(tmp_path / "bag")
 
@@ -81,8 +86,11 @@ def test_it_is_found_sized_and_said(sagging, capsys):
     assert cause["name"] == "stage_sag" and cause["unit"] == "m/m"
     assert abs(cause["size"] - SAG) < 4 * cause["u"] < 0.2 * SAG  # bending of 5 nm
     text = " ".join(shown.split())
-    assert re.search(r"a stage that sags under a plate off its centre, by [78]\.\d\d ± \d\.\d\d "
-                     "µm a metre", text)
+    assert re.search(
+        r"a stage that sags under a plate off its centre, by [78]\.\d\d ± \d\.\d\d "
+        "µm a metre",
+        text,
+    )
     assert "stiffen the guides, or keep the plate at the centre" in text
 
 
@@ -102,14 +110,26 @@ def test_a_plan_that_does_not_tell_it_is_refused_with_its_cure(capsys):
     assert main(["plan", "check", str(ROOT / "config/plans/hu.yaml"), "--model", "stage_sag"]) == 0
     assert "stage_sag" in capsys.readouterr().out
     assert [term.name for term in parse_terms(["stage_sag:1e-6,drift"], "x")] == [
-        "drift", "stage_sag"]
+        "drift",
+        "stage_sag",
+    ]
 
 
-@pytest.mark.parametrize(("entry", "message"), [
-    ("stage_sag = nowhere:BLOCK", r"^block 'stage_sag' \(nowhere:BLOCK\): it cannot be loaded: "
-     "No module named 'nowhere'; repair or remove the package that registers it$"),
-    ("sag = stage_sag:BLOCK", "^block 'sag' .*: it is not a selfcal_ros.blocks.Block of this name"),
-    ("drift = stage_sag:BLOCK", "^block 'drift' .*, or another block has the name; correct")])
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        (
+            "stage_sag = nowhere:BLOCK",
+            r"^block 'stage_sag' \(nowhere:BLOCK\): it cannot be loaded: "
+            "No module named 'nowhere'; repair or remove the package that registers it$",
+        ),
+        (
+            "sag = stage_sag:BLOCK",
+            "^block 'sag' .*: it is not a selfcal_ros.blocks.Block of this name",
+        ),
+        ("drift = stage_sag:BLOCK", "^block 'drift' .*, or another block has the name; correct"),
+    ],
+)
 def test_a_block_that_cannot_be_used_is_named(tmp_path, monkeypatch, entry, message):
     register(tmp_path, monkeypatch, entry)
     with pytest.raises(InputError, match=message):

@@ -21,16 +21,32 @@ from test.support.refusals import refused
 from test.support.results import covered
 
 NOISE, OFFSET, MARKS, REPEATS = 20e-9, 20e-6, 5, 5
-MACHINE = Spread(phi_rad=5e-5, t_m=5e-6, microscope_scale=0.01, microscope_rotation_rad=5e-3,
-                 microscope_shear=2e-3)
+MACHINE = Spread(
+    phi_rad=5e-5,
+    t_m=5e-6,
+    microscope_scale=0.01,
+    microscope_rotation_rad=5e-3,
+    microscope_shear=2e-3,
+)
 FREE = bare(terms=(ModelTerm("microscope"),))
 
 
 def measured(sense, *, marks=MARKS, seed=1, **settings):
     """Return the truth and the readings of Hu's views of a plate that lies straight."""
-    views = tuple(View(name, turn, (shift, 0.0), True, False, REPEATS, "x_back_y_back@plate",
-                       marks, OFFSET if marks else 0.0)
-                  for name, turn, shift in (("0", 0, 0), ("90", np.pi / 2, 0), ("x", 0, 0.01)))
+    views = tuple(
+        View(
+            name,
+            turn,
+            (shift, 0.0),
+            True,
+            False,
+            REPEATS,
+            "x_back_y_back@plate",
+            marks,
+            OFFSET if marks else 0.0,
+        )
+        for name, turn, shift in (("0", 0, 0), ("90", np.pi / 2, 0), ("x", 0, 0.01))
+    )
     plan, rng = Plan("p", Artifact(7, 0.01, 0), views), np.random.default_rng(seed)
     truth = random_truth(plan.artifact, 3, rng, MACHINE)
     how = CellSettings(sense, NOISE, **settings)
@@ -81,12 +97,28 @@ def test_a_check_stop_that_was_lost_does_not_bias_the_map_with_the_term(consecut
     mark = visits.mark[last]
     keep = np.arange(len(visits.mark)) != last
     count = view.count - (np.arange(len(view.m)) == mark)
-    columns = {name: getattr(visits, name)[keep] for name in (
-        "mark", "dx", "dy", "count", "stamp_ns", "offset_x", "offset_y", "approach_x",
-        "approach_y")}
-    mean = {name: (getattr(view, name) * view.count
-                   - (np.arange(len(view.m)) == mark) * getattr(visits, name)[last]) / count
-            for name in ("dx", "dy")}
+    columns = {
+        name: getattr(visits, name)[keep]
+        for name in (
+            "mark",
+            "dx",
+            "dy",
+            "count",
+            "stamp_ns",
+            "offset_x",
+            "offset_y",
+            "approach_x",
+            "approach_y",
+        )
+    }
+    mean = {
+        name: (
+            getattr(view, name) * view.count
+            - (np.arange(len(view.m)) == mark) * getattr(visits, name)[last]
+        )
+        / count
+        for name in ("dx", "dy")
+    }
     lost = replace(view, count=count, visits=replace(visits, **columns), **mean)
     short = replace(measurements, views=(lost, *measurements.views[1:]))
     whole, with_loss = (calibrate(m, FREE).error_map for m in (measurements, short))

@@ -19,8 +19,9 @@ def measured(servo_m, seed=0, *, offsets_m=0.0, **spread):
     """Return truth and readings; by default the encoders have all the noise."""
     plan, rng = hu_plan(Artifact(7, 0.01, 8), repeats=5), np.random.default_rng(seed)
     truth = random_truth(plan.artifact, 4, rng, Spread(**spread))
-    settings = CellSettings(sigma_xy_m=offsets_m, sigma_theta_rad=2e-6, encoder_sigma_m=NOISE,
-                            servo_sigma_m=servo_m)
+    settings = CellSettings(
+        sigma_xy_m=offsets_m, sigma_theta_rad=2e-6, encoder_sigma_m=NOISE, servo_sigma_m=servo_m
+    )
     return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 

@@ -32,9 +32,13 @@ def measured(factor, sense=Sense.MICROSCOPE_MOVES, *, spread=SPREAD, plan=None, 
 
 def with_stops():
     plan = hu_plan(ARTIFACT, 4)
-    return replace(plan, views=tuple(
-        replace(view, check_marks=5, check_offset_m=20e-6) if view.grid else view
-        for view in plan.views))
+    return replace(
+        plan,
+        views=tuple(
+            replace(view, check_marks=5, check_offset_m=20e-6) if view.grid else view
+            for view in plan.views
+        ),
+    )
 
 
 def scale_of(result):
@@ -81,8 +85,9 @@ def test_check_stops_tell_the_lines_from_the_microscope(factor):
 
 @pytest.mark.parametrize("spread", [replace(SPREAD, microscope_scale=0.06), SPREAD])
 def test_without_them_either_may_be_at_fault(spread):
-    truth, readings = measured(1.0 if spread.microscope_scale else 1 / 0.94, spread=spread,
-                               servo_sigma_m=5e-9)
+    truth, readings = measured(
+        1.0 if spread.microscope_scale else 1 / 0.94, spread=spread, servo_sigma_m=5e-9
+    )
     result = worded(calibrate(readings, Options()))
     microscope, lines = result.verdict.causes
     assert (microscope.name, lines.name) == ("microscope", "line_scale")
@@ -104,7 +109,8 @@ def test_where_all_plates_lie_alike_it_is_a_part_of_the_uncertainty():
     wanted = truth.g_theta - truth.g_theta.mean()
     assert added == pytest.approx(0.01 * np.abs(wanted), abs=0.1 * 0.01 * np.abs(wanted).max())
     assert result.error_map.u_g_theta**2 - exact.error_map.u_g_theta**2 == pytest.approx(
-        added**2, rel=0.05, abs=0.02 * (added**2).max())
+        added**2, rel=0.05, abs=0.02 * (added**2).max()
+    )
 
 
 @pytest.mark.parametrize("sense", BOTH)
@@ -113,8 +119,9 @@ def test_a_stage_that_turns_to_the_lines_has_no_offsets_to_scale(sense):
     truth, readings = measured(0.9, sense, follow_mark=True)
     result = calibrate(readings, Options(terms=parse_terms(["microscope:0"], "")))
     assert result.verdict.grade is Grade.GOOD and off(result, truth) < 1.5
-    assert all(abs(view.axis_theta - np.mean(view.dtheta)) < 1e-6
-               for view in readings.views if len(view.k))
+    assert all(
+        abs(view.axis_theta - np.mean(view.dtheta)) < 1e-6 for view in readings.views if len(view.k)
+    )
 
 
 def test_noise_of_the_lines_shows_no_scale():

@@ -30,11 +30,26 @@ def readings(stands_m, sense=Sense.MICROSCOPE_MOVES):
         away = np.tile(stands_m, N * N)
         deviation = offset + (-away if sense is Sense.PLATE_MOVES else away)
         mark, one = np.repeat(np.arange(N * N), 2), np.ones(2 * N * N, dtype=int)
-        visits = GridVisits(mark, *deviation, one, np.arange(2 * N * N) * 10**9, *offset,
-                            0 * one.astype("i1"), 0 * one.astype("i1"))
+        visits = GridVisits(
+            mark,
+            *deviation,
+            one,
+            np.arange(2 * N * N) * 10**9,
+            *offset,
+            0 * one.astype("i1"),
+            0 * one.astype("i1"),
+        )
         mean = deviation.reshape(2, -1, 2).mean(axis=2)
-        views.append(ViewReadings(View(f"{quarter}", quarter * np.pi / 2), m, n, *mean,
-                                  np.full(N * N, 2), visits=visits))
+        views.append(
+            ViewReadings(
+                View(f"{quarter}", quarter * np.pi / 2),
+                m,
+                n,
+                *mean,
+                np.full(N * N, 2),
+                visits=visits,
+            )
+        )
     return Measurements("places", Artifact(N, PITCH_M, 0), tuple(views), sense)
 
 
@@ -50,8 +65,10 @@ def stands(x, y):
 
 
 def error_at(x_m, y_m, field=FIELD):
-    return sum(unit * RectBivariateSpline(SITES, SITES, part).ev(x_m, y_m)
-               for unit, part in zip((1, 1j), field, strict=True))
+    return sum(
+        unit * RectBivariateSpline(SITES, SITES, part).ev(x_m, y_m)
+        for unit, part in zip((1, 1j), field, strict=True)
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -86,7 +103,7 @@ def test_visits_differ_by_the_slopes_between_their_places():
     at = 3 * N + 4
     x, y = 1.2e-3 - near[at].real, PITCH_M - 0.7e-3 - near[at].imag
     wanted = (error_at(x + 2e-5, y) - error_at(x - 2e-5, y)) / 2 * np.exp(-1j * TURN_RAD[0])
-    np.testing.assert_allclose(first[2 * at:2 * at + 2], [-wanted, wanted], rtol=1e-4)
+    np.testing.assert_allclose(first[2 * at : 2 * at + 2], [-wanted, wanted], rtol=1e-4)
     turned = N * 2 + 3  # mark (-1, 0), which lies on site (0, -1) after a quarter turn
     y = -PITCH_M - 0.7e-3 - near[N * N + turned].imag
     x = 1.2e-3 - near[N * N + turned].real
@@ -101,8 +118,9 @@ def test_beyond_the_outermost_sites_the_spline_goes_on():
     x, y = ((part - 3) * PITCH_M / 0.03 for part in true)
     assert x.max() > 1 and y.max() > 1
     moved = places.moved(cubic, np.zeros(2 * N * N))
-    np.testing.assert_allclose(moved + cubic.reshape(-1)[places.site], x**3 + 0.5j * y**2,
-                               atol=1e-14)
+    np.testing.assert_allclose(
+        moved + cubic.reshape(-1)[places.site], x**3 + 0.5j * y**2, atol=1e-14
+    )
 
 
 def test_a_stage_that_stands_at_its_sites_has_no_places():
@@ -131,7 +149,7 @@ def test_unknown_sites_are_on_lines_through_known_ones():
 
 def test_an_unknown_site_lies_between_its_neighbours():
     """Of m^2 + n^2 the mean of the neighbours on either line is larger by 1."""
-    field = (STEPS[:, None]**2 + STEPS**2).astype(complex)
+    field = (STEPS[:, None] ** 2 + STEPS**2).astype(complex)
     known = np.ones((N, N), dtype=bool)
     known[1, 1] = known[N - 2, 2] = False
     expected = field + ~known

@@ -30,8 +30,12 @@ def machine(seed=1, plan=PLAN, strain=0.0):
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(phi_rad=1e-3))
     scale, stretch, shear = rng.normal(0, strain, (3, len(plan.views)))
-    return replace(truth, plate_strain=np.stack(
-        [scale + stretch, shear, shear, scale - stretch], axis=1).reshape(-1, 2, 2)), rng
+    return replace(
+        truth,
+        plate_strain=np.stack([scale + stretch, shear, shear, scale - stretch], axis=1).reshape(
+            -1, 2, 2
+        ),
+    ), rng
 
 
 @cache
@@ -52,9 +56,15 @@ def test_cells_belong_to_the_placing_of_their_view():
     assert placings_of(plan_of("0, 90, tx", 5).views) == (0, 1, 2)
 
 
-@pytest.mark.parametrize(("name", "size", "count"), [
-    ("plate_strain", 1e-6, 6), ("plate_strain", np.inf, 3),
-    ("plate_shape", 1e-8, 12), ("drift", 1e-8, 8)])
+@pytest.mark.parametrize(
+    ("name", "size", "count"),
+    [
+        ("plate_strain", 1e-6, 6),
+        ("plate_strain", np.inf, 3),
+        ("plate_shape", 1e-8, 12),
+        ("drift", 1e-8, 8),
+    ],
+)
 def test_a_placing_has_its_columns_in_all_cells(name, size, count):
     ground, columns = columns_of(measured(), name, size)
     assert len(columns.columns) == count
@@ -86,8 +96,9 @@ def test_u_holds_a_strain_that_all_cells_share():
         truth, rng = machine(seed, strain=1e-5)
         measurements = simulate_measurements(truth, PLAN, rng, settings=SETTINGS)
         emap = solve_joint(measurements, bare(terms=(term,))).result.error_map
-        error = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g,
-                             datum_modes(truth.artifact, scale=True))
+        error = remove_modes(
+            np.stack([emap.gx, emap.gy]) - truth.g, datum_modes(truth.artifact, scale=True)
+        )
         z.append(error / np.stack([emap.u_gx, emap.u_gy]))
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3
 
@@ -101,8 +112,10 @@ def test_a_held_out_cell_is_predicted_with_the_terms_of_its_placing(monkeypatch)
 
 
 def test_views_without_images_are_placings_of_their_own():
-    plan = replace(plan_of("0, 90, tx", 5, count=0), views=tuple(
-        replace(view, repeats=2) for view in plan_of("0, 90, tx", 5, count=0).views))
+    plan = replace(
+        plan_of("0, 90, tx", 5, count=0),
+        views=tuple(replace(view, repeats=2) for view in plan_of("0, 90, tx", 5, count=0).views),
+    )
     measurements = measured(plan)
     ground, columns = columns_of(measurements, "plate_strain", 1e-6)
     assert [column.view for column in columns.columns] == [0] * 3 + [1] * 3 + [2] * 3

@@ -16,8 +16,9 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
     plan = plan_of("0, 90, 270, tx", 5)
     placed = replace(plan.artifact, map_grid=MapGrid(5, plan.artifact.grid_pitch_m))
     assumed = Assumed(order="serpentine@plate")
-    grounds = [planned_ground(artifact, plan.views, assumed)
-               for artifact in (plan.artifact, placed)]
+    grounds = [
+        planned_ground(artifact, plan.views, assumed) for artifact in (plan.artifact, placed)
+    ]
     for one, other in zip(*(ground.visits for ground in grounds), strict=True):
         for name in ("mark", "weight", "offset", "phase", "approach_x", "approach_y"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-18)

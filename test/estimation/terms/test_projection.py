@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the estimate leaves of columns, and makes of them: as one dense least squares has it."""
 
-
 import numpy as np
 import pytest
 
@@ -27,8 +26,9 @@ def system():
     poses = tuple(LatticePose(q, shift, None) for q, *shift in POSES)
     field = GridSystem(poses, np.zeros((len(POSES), *SHAPE))).views.in_field
     weight = rng.integers(1, 5, field.shape) * (rng.random(field.shape) > 0.1) * field * 1.0
-    return NormalEquations(GridSystem(poses, weight), AngularSystem((), np.zeros((0, 0))),
-                           tuple(range(len(POSES))), ())
+    return NormalEquations(
+        GridSystem(poses, weight), AngularSystem((), np.zeros((0, 0))), tuple(range(len(POSES))), ()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,15 @@ def shapes(system):
     rng = np.random.default_rng(4)
     values = rng.normal(size=(4, len(POSES), SHAPE[0] * SHAPE[1], 2)) @ [1, 1j]
     read = system.grid.read.reshape(len(POSES), -1)
-    return shapes_of([{view: values[at, view] * read[view] for view in views}
-                      for at, views in enumerate(([1], [0, 1, 2, 3], [3], [0, 2]))],
-                     OF_COLUMN, UNIT, system.grid.weight)
+    return shapes_of(
+        [
+            {view: values[at, view] * read[view] for view in views}
+            for at, views in enumerate(([1], [0, 1, 2, 3], [3], [0, 2]))
+        ],
+        OF_COLUMN,
+        UNIT,
+        system.grid.weight,
+    )
 
 
 def design(grid):
@@ -60,7 +66,7 @@ def design(grid):
             row[2 * site], row[2 * site + 1] = (-1j) ** pose.q, 1j * (-1j) ** pose.q
             mark = 2 * n + 2 * (i * ny + j)
             row[mark], row[mark + 1] = 1, 1j
-            row[4 * n + 3 * v:4 * n + 3 * v + 3] = 1j * z, 1, 1j
+            row[4 * n + 3 * v : 4 * n + 3 * v + 3] = 1j * z, 1, 1j
             rows.append(np.sqrt(grid.weight[v, i, j]) * row)
             places.append((v, i, j))
     return np.array(rows), tuple(np.array(places).T)
@@ -74,16 +80,13 @@ def test_what_is_left_of_columns_and_their_maps_are_those_of_a_dense_solution(sy
     grid = system.grid
     rows, places = design(grid)
     dense = np.concatenate([rows.real, rows.imag])
-    columns = np.array([parts(np.sqrt(grid.weight[places]) * one[places])
-                        for one in shapes.grid]).T
+    columns = np.array([parts(np.sqrt(grid.weight[places]) * one[places]) for one in shapes.grid]).T
     found = np.linalg.pinv(dense, rcond=1e-12) @ columns
     left = columns - dense @ found
     reduced = reduce_columns(grid, shapes)
-    projected = project(system, reduced, system.grid_inverse, NO_LINES, ratio=0.0,
-                        half_width_m=1.0)
+    projected = project(system, reduced, system.grid_inverse, NO_LINES, ratio=0.0, half_width_m=1.0)
     assert projected.gram == pytest.approx(left.T @ left, abs=1e-9)
-    for mine, wanted in zip(projected.fields.T, found[:2 * grid.n_sites].T, strict=True):
+    for mine, wanted in zip(projected.fields.T, found[: 2 * grid.n_sites].T, strict=True):
         moved = mine - (wanted[::2] + 1j * wanted[1::2])
-        rest = system.gauge.remove(moved.reshape(SHAPE), system.gauge.parts(
-            moved.reshape(SHAPE)))
+        rest = system.gauge.remove(moved.reshape(SHAPE), system.gauge.parts(moved.reshape(SHAPE)))
         assert np.abs(rest[system.known_sites]).max() < 1e-9

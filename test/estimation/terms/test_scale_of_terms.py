@@ -27,8 +27,10 @@ PLATE = ReferenceLength("artifact", 0.0)
 
 def measured(seed, grown, *, sense=Sense.MICROSCOPE_MOVES, sigma=1e-10, marks=None):
     """Return truth and readings of a plate that is larger by `grown` in each view."""
-    views = tuple(View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, False, 2)
-                  for name, q, (a, b) in VIEWS)
+    views = tuple(
+        View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, False, 2)
+        for name, q, (a, b) in VIEWS
+    )
     plan, rng = Plan("p", ARTIFACT, views), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(views), rng, Spread(rotation="finite"))
     radial = scale_in(truth.a)

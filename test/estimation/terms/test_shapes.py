@@ -43,7 +43,8 @@ def test_inner_products_are_those_of_the_columns(made):
     assert shapes.products(every.conj() @ every.T) == pytest.approx((rows.conj() @ rows.T).real)
     other = drawn(2, VIEWS, *LATTICE)
     assert shapes.against(shapes.sums(other)) == pytest.approx(
-        (rows.conj() @ other.reshape(-1)).real)
+        (rows.conj() @ other.reshape(-1)).real
+    )
     weight = np.abs(drawn(3, VIEWS, *LATTICE))
     assert shapes.squares(weight) == pytest.approx((weight * abs(full) ** 2).sum(axis=(1, 2, 3)))
     linear = drawn(4, 6, VIEWS * MARKS)

@@ -27,8 +27,13 @@ from test.support.results import trusted
 from test.support.truth import simulate_measurements
 
 CLEAN = Spread(encoder="independent", rotation="finite", phi_rad=1e-4)
-SIZES = {"microscope": 1e-3, "drift": 50e-9, "plate_scale": 1e-6, "plate_shape": 30e-9,
-         "approach": 20e-9}
+SIZES = {
+    "microscope": 1e-3,
+    "drift": 50e-9,
+    "plate_scale": 1e-6,
+    "plate_shape": 30e-9,
+    "approach": 20e-9,
+}
 
 
 def of_sizes(truth, rng, sizes):
@@ -39,10 +44,13 @@ def of_sizes(truth, rng, sizes):
     # Legendre polynomials of 2 tau - 1, less what is constant
     drift = np.stack([2 * p1 - 6 * p2 + 12 * p3, 6 * p2 - 30 * p3, 20 * p3], axis=2)
     return replace(
-        truth, drift_m=drift, plate_scale=rng.normal(0, of["plate_scale"], views),
+        truth,
+        drift_m=drift,
+        plate_scale=rng.normal(0, of["plate_scale"], views),
         plate_shape_m=bending(rng.normal(0, of["plate_shape"], (views, 2, 3))),
         backlash_m=rng.normal(0, of["approach"], 2),
-        microscope=matrix_of(*rng.normal(0, of["microscope"], 4)))
+        microscope=matrix_of(*rng.normal(0, of["microscope"], 4)),
+    )
 
 
 def bending(parts):
@@ -105,14 +113,21 @@ def test_a_size_that_is_too_small_is_told_and_the_one_shown_is_right(name, facto
 
 def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
     _, readings = measured(5, SIZES, phi_rad=1e-6)
-    wanted = options("plate_scale:4e-7", "plate_shape:3e-8", "approach:2e-8", "drift",
-                     misalignment_model="linear", at_places=False)
+    wanted = options(
+        "plate_scale:4e-7",
+        "plate_shape:3e-8",
+        "approach:2e-8",
+        "drift",
+        misalignment_model="linear",
+        at_places=False,
+    )
     model = fitted(readings, wanted)
     assert not any(test.contradicted for test in model.sizes)
 
     def squares(without=None):
-        terms = tuple(ModelTerm(term.name) if term.name == without else term
-                      for term in wanted.terms)
+        terms = tuple(
+            ModelTerm(term.name) if term.name == without else term for term in wanted.terms
+        )
         return DenseFit(readings, terms, (model.found.xy.sigma, 1.0), places=False).squares
 
     tests = {test.name: test for test in model.sizes}
@@ -120,11 +135,15 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
         assert tests[name].statistic == pytest.approx(squares() - squares(name), rel=1e-5), name
 
 
-@pytest.mark.parametrize(("term", "said"), [
-    ("plate_scale:1e-8", "a term 'plate_scale' as large as "),
-    ("drift:1e-9", "a term 'drift' as large as "),
-    ("microscope:1e-6", "a microscope that shows lengths along x longer than along y by "),
-    ("approach:1e-10", "an indicated x that changes by ±(0.0")])
+@pytest.mark.parametrize(
+    ("term", "said"),
+    [
+        ("plate_scale:1e-8", "a term 'plate_scale' as large as "),
+        ("drift:1e-9", "a term 'drift' as large as "),
+        ("microscope:1e-6", "a microscope that shows lengths along x longer than along y by "),
+        ("approach:1e-10", "an indicated x that changes by ±(0.0"),
+    ],
+)
 def test_a_calibration_with_a_contradicted_size_says_so_and_its_u_is_honest(term, said):
     name, _, given = term.partition(":")
     truth, readings = measured(4, {name: 5 * SIZES[name]})
@@ -175,8 +194,9 @@ def test_doubtful_sizes_are_raised_to_the_limit_of_their_chi_square():
 def test_doubt_raises_no_size_beyond_what_is_plausible_or_shown(monkeypatch, plausible, grade):
     """What the readings show beyond what is plausible is a fault, though it be only doubtful."""
     size, seen = SIZES["plate_scale"], 0
-    monkeypatch.setitem(blocks(), "plate_scale", replace(
-        blocks()["plate_scale"], plausible=plausible * size))
+    monkeypatch.setitem(
+        blocks(), "plate_scale", replace(blocks()["plate_scale"], plausible=plausible * size)
+    )
     for seed in range(8):
         _, readings = measured(seed, {"plate_scale": 3 * size})
         (test,) = fitted(readings, options(f"plate_scale:{size}")).sizes
@@ -210,7 +230,10 @@ def test_one_wrong_size_does_not_make_another_appear_wrong():
     wanted = options("plate_scale:1e-8", "plate_shape:1e-8", "approach:2e-8")
     sizes = fitted(readings, wanted).sizes
     assert [(t.name, t.contradicted) for t in sizes] == [
-        ("plate_scale", True), ("plate_shape", False), ("approach", False)]
+        ("plate_scale", True),
+        ("plate_shape", False),
+        ("approach", False),
+    ]
 
 
 def test_readings_without_noise_contradict_a_size_as_well():
@@ -241,7 +264,9 @@ def test_a_coefficient_that_is_known_exactly_leaves_no_part_to_free_ones():
     sizes = ModelTerm("line_eccentricity", 1.0), ModelTerm("rotation", 1.0)
     columns = SimpleNamespace(
         columns=tuple(SimpleNamespace(term=term.name, size=term.size) for term in sizes),
-        size=np.ones(2), rows=lambda names: np.array([term.name in names for term in sizes]))
+        size=np.ones(2),
+        rows=lambda names: np.array([term.name in names for term in sizes]),
+    )
     covariance = np.array([[1e24, 1e7], [1e7, 0.0]])
     parts = dict(roots_by_term(covariance, columns))
     assert parts.pop(FREE).shape == (2, 0)

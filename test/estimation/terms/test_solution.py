@@ -16,14 +16,17 @@ def test_what_columns_leave_is_what_a_dense_least_squares_leaves(p):
     e, f = rng.normal(size=7), rng.normal(size=11)
     gram, own = means.T @ means, within.T @ within
     equations = SimpleNamespace(
-        free_inverse=np.linalg.inv(gram + own), projected=SimpleNamespace(gram=gram),
-        columns=SimpleNamespace(within=SimpleNamespace(gram=own)))
+        free_inverse=np.linalg.inv(gram + own),
+        projected=SimpleNamespace(gram=gram),
+        columns=SimpleNamespace(within=SimpleNamespace(gram=own)),
+    )
     score = Score(means.T @ e, within.T @ f, Sums(float(e @ e), 7, float(f @ f), 11))
     found = residual_sums(equations, score)
     both = np.vstack([means, within])
     values = np.linalg.lstsq(both, np.concatenate([e, f]), rcond=None)[0]
     hat = np.diag(both @ np.linalg.pinv(both))
-    assert found.between == pytest.approx(((e - means @ values)**2).sum())
-    assert found.within == pytest.approx(((f - within @ values)**2).sum())
+    assert found.between == pytest.approx(((e - means @ values) ** 2).sum())
+    assert found.within == pytest.approx(((f - within @ values) ** 2).sum())
     assert (found.dof_between, found.dof_within) == pytest.approx(
-        (7 - hat[:7].sum(), 11 - hat[7:].sum()))
+        (7 - hat[:7].sum(), 11 - hat[7:].sum())
+    )

@@ -32,8 +32,11 @@ FINE_RAD, COARSE_RAD = 2e-7, 2e-5
 def truth_and_readings(seed, sigma_rad, *, repeats=2, spread=None, **how):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng, spread or Spread(rotation="finite"))
-    settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=sigma_rad,
-                            **{"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0} | how)
+    settings = CellSettings(
+        sigma_xy_m=2e-8,
+        sigma_theta_rad=sigma_rad,
+        **{"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0} | how,
+    )
     return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
 
 
@@ -84,16 +87,21 @@ SCALES = ["microscope", "line_scale"]
 """Of marks and lines that turn unequally nobody knows which are seen at a wrong scale."""
 
 
-@pytest.mark.parametrize(("spread", "by_rad", "names", "sense"), [
-    (ASKEW, 4e-6, ["rotation"], Sense.MICROSCOPE_MOVES),
-    (ASKEW, -4e-6, ["rotation"], Sense.PLATE_MOVES),
-    (replace(ASKEW, microscope_scale=0.06), 0.0, SCALES, Sense.PLATE_MOVES),
-    (replace(ASKEW, line_factor=0.94), 0.0, SCALES, Sense.MICROSCOPE_MOVES),
-    (replace(ASKEW, plate_strain=2e-6), 0.0, ["plate_strain"], Sense.PLATE_MOVES)])
+@pytest.mark.parametrize(
+    ("spread", "by_rad", "names", "sense"),
+    [
+        (ASKEW, 4e-6, ["rotation"], Sense.MICROSCOPE_MOVES),
+        (ASKEW, -4e-6, ["rotation"], Sense.PLATE_MOVES),
+        (replace(ASKEW, microscope_scale=0.06), 0.0, SCALES, Sense.PLATE_MOVES),
+        (replace(ASKEW, line_factor=0.94), 0.0, SCALES, Sense.MICROSCOPE_MOVES),
+        (replace(ASKEW, plate_strain=2e-6), 0.0, ["plate_strain"], Sense.PLATE_MOVES),
+    ],
+)
 def test_what_turns_lines_against_marks_is_told_from_what_is_assumed(spread, by_rad, names, sense):
     """No size grows for a turn of lines, and no turn of lines is named where a size is wrong."""
-    truth, readings = truth_and_readings(5, FINE_RAD, spread=spread, sense=sense,
-                                         servo_sigma_m=2e-8)
+    truth, readings = truth_and_readings(
+        5, FINE_RAD, spread=spread, sense=sense, servo_sigma_m=2e-8
+    )
     result = calibrate(turned(readings, 3, by_rad), Options())
     told = names != ["plate_strain"]  # Hu's views do not determine two of its modes
     assert result.verdict.grade is (Grade.ENLARGED if told else Grade.NOT_QUALIFIED)
@@ -118,8 +126,9 @@ def test_without_an_uncertainty_it_cannot_be_said_to_be_harmless():
     assert verdict.grade is Grade.NOT_QUALIFIED
 
 
-@pytest.mark.parametrize("options", [BARE, Options(), apart(np.inf)],
-                         ids=["bare", "assumed", "free"])
+@pytest.mark.parametrize(
+    "options", [BARE, Options(), apart(np.inf)], ids=["bare", "assumed", "free"]
+)
 def test_offsets_of_lines_with_the_other_sign_are_no_bent_plate(options):
     readings = measured(3, COARSE_RAD, servo_sigma_m=2e-8)
     wrong = replace(readings, views=tuple(replace(v, dtheta=-v.dtheta) for v in readings.views))
@@ -170,10 +179,14 @@ def test_the_probability_is_one():
 
 
 def test_one_common_view_tells_nothing():
-    grids = [View(name, q * np.pi / 2, (a * 0.01, 0.0), True, name == "0", 2)
-             for name, q, a in (("0", 0, 0), ("90", 1, 0), ("+x", 0, 1))]
-    views = (*grids, *(View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True, 2)
-                       for k in (1, 6)))
+    grids = [
+        View(name, q * np.pi / 2, (a * 0.01, 0.0), True, name == "0", 2)
+        for name, q, a in (("0", 0, 0), ("90", 1, 0), ("+x", 0, 1))
+    ]
+    views = (
+        *grids,
+        *(View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True, 2) for k in (1, 6)),
+    )
     plan, rng = Plan("p", ARTIFACT, views), np.random.default_rng(0)
     readings = simulate_measurements(random_truth(ARTIFACT, 5, rng), plan, rng)
     assert prepare(readings, apart())[0].terms == ()

@@ -27,8 +27,13 @@ from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.options import bare
 from test.support.truth import hu_plan, simulate_measurements
 
-SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                        servo_sigma_theta_rad=0.0, stop_sigma_m=20e-6)
+SETTINGS = CellSettings(
+    sigma_xy_m=20e-9,
+    sigma_theta_rad=2e-5,
+    servo_sigma_m=0.0,
+    servo_sigma_theta_rad=0.0,
+    stop_sigma_m=20e-6,
+)
 REFERENCE = ReferenceLength("artifact", 0.0, 3e-6)
 
 
@@ -43,8 +48,9 @@ def calibrated(size=3, **how):
     return result_from_dict(json.loads(json.dumps(result_to_dict(result))), "r.json")
 
 
-@pytest.mark.parametrize("how", [
-    {"reference": REFERENCE}, {"terms": parse_terms(["plate_shape:100e-9"], "")}, {}])
+@pytest.mark.parametrize(
+    "how", [{"reference": REFERENCE}, {"terms": parse_terms(["plate_shape:100e-9"], "")}, {}]
+)
 def test_one_k_is_read_everywhere(how):
     result = calibrated(**how)
     k, dof = (result_to_dict(result)[name]["xy"] for name in ("coverage_factor", "dof"))
@@ -59,10 +65,16 @@ def test_one_k_is_read_everywhere(how):
     shown = "> 100000" if how.get("terms") else f"{dof:.0f}"
     assert f"(k={k:.3g}, 95.45 %, {shown} degrees of freedom)" in facts
     assert f"(k={k:.3g})" in state_sentence(result)
-    assert any(line.endswith(f"; U: k = {k:.3g} for 95.45 %")
-               for line in provenance(result, MachineFrame()))
-    (table,) = (section.table for chapter in chapters(result, None)
-                for section in chapter.sections if section.title.startswith("Two kinds of U"))
+    assert any(
+        line.endswith(f"; U: k = {k:.3g} for 95.45 %")
+        for line in provenance(result, MachineFrame())
+    )
+    (table,) = (
+        section.table
+        for chapter in chapters(result, None)
+        for section in chapter.sections
+        if section.title.startswith("Two kinds of U")
+    )
     row = next(row for row in table if row[0] == "x or y, at the nodes")
     assert row[6] == f"{k:.2f}"
     said = float(re.search(r"U ([\d.]+) µm rms", facts)[1])
@@ -93,8 +105,10 @@ def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles():
     settings = replace(SETTINGS, sigma_theta_rad=2e-6)
     result = calibrate(measured(settings=settings), Options(terms=parse_terms(["microscope"], "")))
     u2 = np.mean(result.error_map.u_g_theta**2)
-    assumed = sum(np.mean(np.square(result.kept.angular[name]))
-                  for name in ("line_eccentricity", "line_scale"))
+    assumed = sum(
+        np.mean(np.square(result.kept.angular[name]))
+        for name in ("line_eccentricity", "line_scale")
+    )
     dof = result.noise.dof_theta * (u2 / (u2 - assumed)) ** 2
     assert 0.01 < assumed / u2 < 1
     assert result.noise.dof_map_theta == pytest.approx(dof, rel=1e-9)
@@ -104,8 +118,13 @@ def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles():
 
 def test_declared_noise_has_a_budget_with_k_after_it_is_read():
     found = calibrated()
-    declared = replace(found, noise=replace(found.noise, **dict.fromkeys(
-        ("dof_xy", "dof_map_xy", "dof_theta", "dof_map_theta"), math.inf)))
+    declared = replace(
+        found,
+        noise=replace(
+            found.noise,
+            **dict.fromkeys(("dof_xy", "dof_map_xy", "dof_theta", "dof_map_theta"), math.inf),
+        ),
+    )
     again = result_from_dict(json.loads(json.dumps(plain(result_to_dict(declared)))), "r.json")
     for budget in budgets(again):
         assert budget.k == pytest.approx(2.0, abs=1e-4)

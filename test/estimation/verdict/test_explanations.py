@@ -26,26 +26,36 @@ PITCH = 0.01
 OPTIONS = bare(datum_theta="zero_mean", misalignment_model="rigid")
 """Nothing is assumed: what is wrong has to be found."""
 CLEAN = Spread(encoder="independent", rotation="finite")
-SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                        servo_sigma_theta_rad=0.0)
+SETTINGS = CellSettings(
+    sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0
+)
 
 
 def plan_of(order="x_back_y_back", repeats=4):
-    poses = (("0", 0, (0, 0)), ("90", 1, (0, 0)), ("+x", 0, (1, 0)), ("-x", 0, (-1, 0)),
-             ("+y", 0, (0, 1)))
-    grids = tuple(View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, True, repeats, order)
-                  for name, q, (a, b) in poses)
+    poses = (
+        ("0", 0, (0, 0)),
+        ("90", 1, (0, 0)),
+        ("+x", 0, (1, 0)),
+        ("-x", 0, (-1, 0)),
+        ("+y", 0, (0, 1)),
+    )
+    grids = tuple(
+        View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, True, repeats, order)
+        for name, q, (a, b) in poses
+    )
     line = View("line", np.pi / 12, (0.0, 0.0), False, True, repeats)
     return Plan("p", Artifact(7, PITCH, 24), (*grids, line))
 
 
-def calibrated(spread=CLEAN, *, change=lambda truth: truth, plan=None, seed=1, spoil=lambda m: m,
-               **how):
+def calibrated(
+    spread=CLEAN, *, change=lambda truth: truth, plan=None, seed=1, spoil=lambda m: m, **how
+):
     """Return the truth and the result."""
     plan, rng = plan or plan_of(), np.random.default_rng(seed)
     truth = change(random_truth(plan.artifact, len(plan.views), rng, spread))
-    readings = simulate_measurements(truth, plan, rng, settings=replace(SETTINGS, **how),
-                                     visits=True)
+    readings = simulate_measurements(
+        truth, plan, rng, settings=replace(SETTINGS, **how), visits=True
+    )
     return truth, worded(calibrate(spoil(readings), OPTIONS))
 
 
@@ -55,10 +65,12 @@ def judged(*args, **how):
 
 def with_views(name, index, value, shape):
     """Return a change of a truth: one view has something of its own."""
+
     def change(truth):
         values = np.zeros((len(truth.phi_rad), *shape))
         values[index] = value
         return replace(truth, **{name: values})
+
     return change
 
 
@@ -70,28 +82,48 @@ def steadily(along_x_m):
 
 def slipping(after, by_m):
     """Return a change of a truth: view 2 steps aside in the middle, as the walk of its plate."""
+
     def change(truth):
         steps = 400
         walk = np.zeros((len(truth.phi_rad), 2, steps + 1))
-        walk[2, :, round(after * steps):] = np.array(by_m)[:, None]
+        walk[2, :, round(after * steps) :] = np.array(by_m)[:, None]
         return replace(truth, walk_m=walk)
+
     return change
 
 
 CASES = {
-    "turned": ("microscope", 2e-3, "a microscope turned counter-clockwise by ",
-               {"spread": replace(CLEAN, microscope_rotation_rad=2e-3), "stop_sigma_m": 20e-6}),
-    "turned back": ("microscope", -2e-3, "a microscope turned clockwise by ",
-                    {"spread": replace(CLEAN, microscope_rotation_rad=-2e-3),
-                     "stop_sigma_m": 20e-6}),
-    "scaled": ("microscope", 5e-3, "a microscope that shows lengths too short by ",
-               {"spread": replace(CLEAN, microscope_scale=5e-3), "stop_sigma_m": 20e-6}),
-    "drift": ("drift", 500e-9, "along x during view '90'",
-              {"change": steadily(500e-9)}),
-    "grown": ("plate_scale", 2e-6, "in view '+x' than in view '0'",
-              {"change": with_views("plate_scale", 2, 2e-6, ())}),
-    "backlash": ("approach", 50e-9, "an indicated x that changes by ±(",
-                 {"spread": replace(CLEAN, backlash_x_m=50e-9)}),
+    "turned": (
+        "microscope",
+        2e-3,
+        "a microscope turned counter-clockwise by ",
+        {"spread": replace(CLEAN, microscope_rotation_rad=2e-3), "stop_sigma_m": 20e-6},
+    ),
+    "turned back": (
+        "microscope",
+        -2e-3,
+        "a microscope turned clockwise by ",
+        {"spread": replace(CLEAN, microscope_rotation_rad=-2e-3), "stop_sigma_m": 20e-6},
+    ),
+    "scaled": (
+        "microscope",
+        5e-3,
+        "a microscope that shows lengths too short by ",
+        {"spread": replace(CLEAN, microscope_scale=5e-3), "stop_sigma_m": 20e-6},
+    ),
+    "drift": ("drift", 500e-9, "along x during view '90'", {"change": steadily(500e-9)}),
+    "grown": (
+        "plate_scale",
+        2e-6,
+        "in view '+x' than in view '0'",
+        {"change": with_views("plate_scale", 2, 2e-6, ())},
+    ),
+    "backlash": (
+        "approach",
+        50e-9,
+        "an indicated x that changes by ±(",
+        {"spread": replace(CLEAN, backlash_x_m=50e-9)},
+    ),
     "slip": ("slip", 250e-9, "of view '+x'", {"change": slipping(0.45, (200e-9, -150e-9))}),
 }
 
@@ -131,6 +163,7 @@ def test_a_noisy_view_is_named():
         views = list(readings.views)
         views[3] = replace(views[3], sigma_xy=3 * views[3].sigma_xy, visits=None)
         return replace(readings, views=tuple(views))
+
     truth, result = calibrated(spoil=louder)
     verdict = result.verdict
     names = [cause.name for cause in verdict.causes]
@@ -161,13 +194,17 @@ def test_causes_can_be_left_out():
 
 def test_the_effect_of_a_cause_is_what_holding_it_does_to_the_map():
     plan, rng = plan_of(), np.random.default_rng(1)
-    truth = random_truth(plan.artifact, len(plan.views), rng,
-                         replace(CLEAN, microscope_rotation_rad=2e-3))
-    readings = simulate_measurements(truth, plan, rng, visits=True,
-                                     settings=replace(SETTINGS, stop_sigma_m=20e-6))
+    truth = random_truth(
+        plan.artifact, len(plan.views), rng, replace(CLEAN, microscope_rotation_rad=2e-3)
+    )
+    readings = simulate_measurements(
+        truth, plan, rng, visits=True, settings=replace(SETTINGS, stop_sigma_m=20e-6)
+    )
     found = find_explanations(fit_model(prepare(readings, OPTIONS)[0]), slips=False)[0]
-    without, held = (calibrate(readings, replace(OPTIONS, causes=False, terms=terms)).error_map
-                     for terms in ((), parse_terms(["microscope"], "")))
+    without, held = (
+        calibrate(readings, replace(OPTIONS, causes=False, terms=terms)).error_map
+        for terms in ((), parse_terms(["microscope"], ""))
+    )
     moved = np.stack([held.gx - without.gx, held.gy - without.gy])
     assert found.name == "microscope"
     assert found.effect_m == pytest.approx(np.sqrt((moved**2).mean()), rel=0.02)
@@ -176,14 +213,22 @@ def test_the_effect_of_a_cause_is_what_holding_it_does_to_the_map():
     assert cause.effect_max == pytest.approx(np.hypot(*moved).max(), rel=0.02)
 
 
-@pytest.mark.parametrize(("consecutive", "repeats", "terms", "said"), [
-    (True, 4, (), True), (False, 4, (), False), (True, 1, (), False),
-    (True, 4, ("drift:1e-8",), False), (True, 4, ("plate_scale:1e-8",), True)])
+@pytest.mark.parametrize(
+    ("consecutive", "repeats", "terms", "said"),
+    [
+        (True, 4, (), True),
+        (False, 4, (), False),
+        (True, 1, (), False),
+        (True, 4, ("drift:1e-8",), False),
+        (True, 4, ("plate_scale:1e-8",), True),
+    ],
+)
 def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms, said):
     plan, rng = plan_of("serpentine", repeats), np.random.default_rng(1)
     truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
-    readings = simulate_measurements(truth, plan, rng, visits=True,
-                                     settings=replace(SETTINGS, consecutive=consecutive))
+    readings = simulate_measurements(
+        truth, plan, rng, visits=True, settings=replace(SETTINGS, consecutive=consecutive)
+    )
     result = calibrate(readings, replace(OPTIONS, terms=parse_terms(terms, "")))
     assert result.verdict.qualified
     assert result.findings == ((Finding("visited_once"),) if said else ())
@@ -204,14 +249,22 @@ def test_a_view_whose_repeats_contradict_each_other_is_named(lost, said):
         assert found.text == (
             f"60 of 260 readings of view '{first.view.name}' contradict the other repeats of their "
             "marks and were left out: the plate slipped within the view, or a second publisher "
-            "sent readings (ros2 topic info -v); measure it again")
+            "sent readings (ros2 topic info -v); measure it again"
+        )
 
 
 def test_a_drift_is_tried_as_a_whole_in_each_view_and_in_each_view_steadily():
     found = [(view, part) for view in range(3) for part in ("x P1", "y P1", "x P2")]
     columns = [Column("drift", view, part, np.inf) for view, part in found]
-    tried = [[found[at] for at in group.rows]
-             for group in _groups(columns, ["approach", "drift"])]
-    assert tried == [found, *(rows for view in range(3) for rows in (
-        [one for one in found if one[0] == view],
-        [one for one in found if one[0] == view and one[1] != "x P2"]))]
+    tried = [[found[at] for at in group.rows] for group in _groups(columns, ["approach", "drift"])]
+    assert tried == [
+        found,
+        *(
+            rows
+            for view in range(3)
+            for rows in (
+                [one for one in found if one[0] == view],
+                [one for one in found if one[0] == view and one[1] != "x P2"],
+            )
+        ),
+    ]

@@ -18,8 +18,9 @@ from test.support.truth import random_truth, simulate_measurements
 def ground():
     """Return the ground of two views of 7 x 7 marks, the second turned by 90 deg."""
     plan, rng = plan_of("0,90,tx", Artifact(7, 0.01)), np.random.default_rng(4)
-    readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng,
-                                     settings=CellSettings(), visits=True)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 3, rng), plan, rng, settings=CellSettings(), visits=True
+    )
     return ground_of(readings, grid_data(readings), 0.03)
 
 

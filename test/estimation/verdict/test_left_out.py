@@ -28,26 +28,43 @@ def thinned(readings, marks, lines, rejected):
     view = readings.views[LATE]
     part = subset(view, np.arange(len(view.m)) < marks, np.arange(len(view.k)) < lines)
     part = replace(part, used=int(part.count.sum() + part.count_theta.sum()), rejected=rejected)
-    return replace(readings, views=tuple(
-        part if one is view else one for one in readings.views))
+    return replace(readings, views=tuple(part if one is view else one for one in readings.views))
 
 
 def left_out(result):
     return [one for one in result.findings if one.name == "view_left_out"]
 
 
-@pytest.mark.parametrize(("marks", "lines", "rejected", "said"), [
-    (0, 0, {"too_far_from_nominal": 50, "low_score": 2},
-     "is not part of the map: none of its detections became a "
-     "reading (too_far_from_nominal 50, "
-     "low_score 2)"),
-    (0, 0, {}, "is not part of the map: nothing was detected in it"),
-    (1, 0, {"stage_not_at_mark": 144}, "is only partly in the map: 1 of {marks} marks and 0 of "
-     "{lines} lines became readings (stage_not_at_mark 144)"),
-    (1, 0, {}, "is only partly in the map: 1 of {marks} marks and 0 of {lines} lines became "
-     "readings")])
-def test_a_view_that_was_left_out_is_a_warning_of_the_result(readings, marks, lines, rejected,
-                                                             said):
+@pytest.mark.parametrize(
+    ("marks", "lines", "rejected", "said"),
+    [
+        (
+            0,
+            0,
+            {"too_far_from_nominal": 50, "low_score": 2},
+            "is not part of the map: none of its detections became a "
+            "reading (too_far_from_nominal 50, "
+            "low_score 2)",
+        ),
+        (0, 0, {}, "is not part of the map: nothing was detected in it"),
+        (
+            1,
+            0,
+            {"stage_not_at_mark": 144},
+            "is only partly in the map: 1 of {marks} marks and 0 of "
+            "{lines} lines became readings (stage_not_at_mark 144)",
+        ),
+        (
+            1,
+            0,
+            {},
+            "is only partly in the map: 1 of {marks} marks and 0 of {lines} lines became readings",
+        ),
+    ],
+)
+def test_a_view_that_was_left_out_is_a_warning_of_the_result(
+    readings, marks, lines, rejected, said
+):
     view = readings.views[LATE]
     result = worded(calibrate(thinned(readings, marks, lines, rejected)))
     line = f"view '{view.view.name}' " + said.format(marks=len(view.m), lines=len(view.k))
@@ -72,8 +89,10 @@ def test_a_view_without_most_of_its_marks_or_lines_is_told_and_no_other(readings
 
 
 def test_lines_that_no_view_has_are_not_missed(readings):
-    views = tuple(subset(view, np.full(len(view.m), True), np.full(len(view.k), False))
-                  for view in readings.views)
+    views = tuple(
+        subset(view, np.full(len(view.m), True), np.full(len(view.k), False))
+        for view in readings.views
+    )
     assert [one.view for one in left_out(calibrate(replace(readings, views=views)))] == ["line"]
 
 
@@ -82,5 +101,8 @@ def test_the_parts_of_a_view_that_slipped_are_one_view(readings):
     place = SlipPlace(name, LATE, "m", int(readings.views[LATE].m.min()) + 1)
     result = calibrate(split_view(readings, place))
     assert [view.name for view in result.views if view.name.startswith(name)] == [
-        name, f"{name} after slip", f"{name} lines"]
+        name,
+        f"{name} after slip",
+        f"{name} lines",
+    ]
     assert not left_out(result)

@@ -18,8 +18,9 @@ from test.support.options import bare
 from test.support.results import covered
 from test.support.truth import hu_plan, simulate_measurements
 
-SETTINGS = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0,
-                        servo_sigma_theta_rad=0.0)
+SETTINGS = CellSettings(
+    sigma_xy_m=20e-9, sigma_theta_rad=2e-5, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0
+)
 FLAT = Spread(encoder="independent", rotation="finite", phi_rad=1e-7)
 LINEAR = bare(misalignment_model="linear")
 METHODS = pytest.mark.parametrize("method", ["law", "joint"])
@@ -28,8 +29,9 @@ METHODS = pytest.mark.parametrize("method", ["law", "joint"])
 def judged(method, options=LINEAR, spread=FLAT, *, repeats=5, **how):
     plan, rng = hu_plan(Artifact(7, 0.01, 24), repeats), np.random.default_rng(3)
     truth = random_truth(plan.artifact, 4, rng, spread)
-    readings = simulate_measurements(truth, plan, rng, settings=replace(SETTINGS, **how),
-                                     visits=True)
+    readings = simulate_measurements(
+        truth, plan, rng, settings=replace(SETTINGS, **how), visits=True
+    )
     return truth, worded(calibrate_by(method, readings, options))
 
 
@@ -53,12 +55,23 @@ def test_a_plate_that_really_turns_is_told_with_its_largest_turn(method):
     assert found.verdict.sentence == f"Not qualified: {found.verdict.reasons[0]}"
 
 
-@pytest.mark.parametrize(("method", "options", "repeats"), [
-    ("joint", LINEAR, 1), ("law", LINEAR, 1),
-    ("joint", Options(misalignment_model="linear",
-                      terms=(ModelTerm("microscope"), ModelTerm("drift"))), 2)])
-def test_rotations_are_named_where_nothing_tells_the_noise_or_terms_take_them_up(method, options,
-                                                                                 repeats):
+@pytest.mark.parametrize(
+    ("method", "options", "repeats"),
+    [
+        ("joint", LINEAR, 1),
+        ("law", LINEAR, 1),
+        (
+            "joint",
+            Options(
+                misalignment_model="linear", terms=(ModelTerm("microscope"), ModelTerm("drift"))
+            ),
+            2,
+        ),
+    ],
+)
+def test_rotations_are_named_where_nothing_tells_the_noise_or_terms_take_them_up(
+    method, options, repeats
+):
     """A turned microscope, strain, and lines of the other sign were named instead."""
     turned = {"spread": replace(FLAT, phi_rad=1e-2), "repeats": repeats, "servo_sigma_m": 1e-7}
     verdict = judged(method, options, **turned)[1].verdict
@@ -70,8 +83,9 @@ def test_rotations_are_named_where_nothing_tells_the_noise_or_terms_take_them_up
 
 @METHODS
 def test_a_turned_microscope_is_named(method):
-    truth, found = judged(method, spread=replace(FLAT, microscope_rotation_rad=2e-3),
-                          stop_sigma_m=20e-6)
+    truth, found = judged(
+        method, spread=replace(FLAT, microscope_rotation_rad=2e-3), stop_sigma_m=20e-6
+    )
     assert [cause.name for cause in found.verdict.causes] == ["microscope"]
     assert found.verdict.causes[0].size == pytest.approx(2e-3, abs=4 * found.verdict.causes[0].u)
     assert not any("linear" in reason for reason in found.verdict.reasons)
@@ -90,7 +104,8 @@ def test_a_linear_model_assumes_nothing(method):
     _, alone = judged(method, LINEAR, turned)
     assert found.model.terms == () and found.verdict.grade is alone.verdict.grade
     assert [r.partition(": ")[0] for r in found.verdict.reasons] == [
-        r.partition(": ")[0] for r in alone.verdict.reasons]
+        r.partition(": ")[0] for r in alone.verdict.reasons
+    ]
     np.testing.assert_array_equal(found.error_map.u_gx, alone.error_map.u_gx)
 
 

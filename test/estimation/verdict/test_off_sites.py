@@ -32,12 +32,21 @@ STEPS = np.arange(N) - (N - 1) // 2
 def stage_error(x, y, bend_m=5e-7, rough_m=0.0):
     """Indicated minus true position where the stage is, m: bent, and waves of 2.7 pitches."""
     (u, v), (p, q) = np.array([x, y]) / HALF_M, np.array([x, y]) / PITCH_M * 2 * np.pi / 2.7
-    return (bend_m * np.array([u**2 + 0.5 * u * v, v**2 - u * v])
-            + rough_m * np.array([np.cos(p) * np.cos(q + 0.3), np.sin(p + q)]))
+    return bend_m * np.array([u**2 + 0.5 * u * v, v**2 - u * v]) + rough_m * np.array(
+        [np.cos(p) * np.cos(q + 0.3), np.sin(p + q)]
+    )
 
 
-def readings(*, follow, sense=Sense.MICROSCOPE_MOVES, beside=BESIDE_M, seed=1, visits=True,
-             sigma_m=SIGMA_M, **stage):
+def readings(
+    *,
+    follow,
+    sense=Sense.MICROSCOPE_MOVES,
+    beside=BESIDE_M,
+    seed=1,
+    visits=True,
+    sigma_m=SIGMA_M,
+    **stage,
+):
     """Return what a stage reads that goes to the marks as they lie, or to their sites."""
     rng, views = np.random.default_rng(seed), []
     sign = -1 if sense is Sense.PLATE_MOVES else 1
@@ -52,11 +61,20 @@ def readings(*, follow, sense=Sense.MICROSCOPE_MOVES, beside=BESIDE_M, seed=1, v
         seen = mark - sign * true + rng.normal(0, sigma_m, mark.shape)
         dx, dy = sign * indicated + seen - site
         count = np.ones(here.sum(), dtype=int)
-        at = GridVisits(np.arange(here.sum()), dx, dy, count, np.arange(here.sum()) * 10**9, *seen,
-                        0 * count.astype("i1"), 0 * count.astype("i1"))
+        at = GridVisits(
+            np.arange(here.sum()),
+            dx,
+            dy,
+            count,
+            np.arange(here.sum()) * 10**9,
+            *seen,
+            0 * count.astype("i1"),
+            0 * count.astype("i1"),
+        )
         view = View(f"{quarter} {a} {b}", quarter * np.pi / 2, (a * PITCH_M, b * PITCH_M))
-        views.append(ViewReadings(view, m[here], n[here], dx, dy, count,
-                                  visits=at if visits else None))
+        views.append(
+            ViewReadings(view, m[here], n[here], dx, dy, count, visits=at if visits else None)
+        )
     return Measurements("beside", Artifact(N, PITCH_M, 0), tuple(views), sense)
 
 
@@ -83,7 +101,8 @@ def covered(result, **stage):
 @pytest.mark.parametrize("misalignment", ["rigid", "linear"])
 @pytest.mark.parametrize("sense", Sense)
 def test_a_stage_that_follows_plates_beside_their_places_has_the_error_of_its_places(
-        sense, misalignment):
+    sense, misalignment
+):
     whole = readings(follow=True, sense=sense)
     result = calibrate(whole, bare(misalignment_model=misalignment))
     at_sites = calibrate(whole, bare(misalignment_model=misalignment, at_places=False))
@@ -150,8 +169,9 @@ def test_with_a_microscope_that_nobody_knows_the_sign_of_its_offsets_is_not_show
 @pytest.mark.parametrize("at_places", [True, False])
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_of_the_map_is_no_roughness_of_the_stage(seed, at_places):
-    verdict = calibrate(readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0),
-                        bare(at_places=at_places)).verdict
+    verdict = calibrate(
+        readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0), bare(at_places=at_places)
+    ).verdict
     assert verdict.grade is Grade.GOOD
 
 
@@ -168,15 +188,22 @@ def test_what_spoils_the_map_comes_before_places_that_residuals_do_not_show():
 
 
 def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
-    for verdict in (calibrate(readings(follow=True, visits=False), BARE).verdict,
-                    calibrate(readings(follow=True, rough_m=1e-7), bare(causes=False)).verdict):
+    for verdict in (
+        calibrate(readings(follow=True, visits=False), BARE).verdict,
+        calibrate(readings(follow=True, rough_m=1e-7), bare(causes=False)).verdict,
+    ):
         assert verdict.grade is Grade.GOOD and not verdict.causes
 
 
-@pytest.mark.parametrize("options", [
-    bare(uncertainty=False), bare(misalignment_model="linear"),
-    bare(terms=parse_terms(["plate_scale:1e-7"], "")),
-    bare(reference=reference_length("marks", 0.0, 1e-7))])
+@pytest.mark.parametrize(
+    "options",
+    [
+        bare(uncertainty=False),
+        bare(misalignment_model="linear"),
+        bare(terms=parse_terms(["plate_scale:1e-7"], "")),
+        bare(reference=reference_length("marks", 0.0, 1e-7)),
+    ],
+)
 def test_it_is_found_whatever_else_is_asked_for(options):
     found = trusted(readings(follow=True, rough_m=1e-7), options).verdict
     assert found.causes[0].name == "off_sites"
@@ -201,17 +228,29 @@ def test_the_same_readings_tell_the_same_in_either_sense():
     one, two = (trusted(replace(whole, views=views, sense=sense), BARE) for sense in Sense)
     assert not np.allclose(one.error_map.u_gx, one.error_map.u_gx[::-1], rtol=0.1, atol=0)
     (first, *_), (second, *_) = one.verdict.causes, two.verdict.causes
-    assert (first.name, first.size, first.u) == (second.name, pytest.approx(second.size),
-                                                 pytest.approx(second.u))
+    assert (first.name, first.size, first.u) == (
+        second.name,
+        pytest.approx(second.size),
+        pytest.approx(second.u),
+    )
 
 
 def test_the_law_which_takes_the_sites_for_the_places_is_told_so():
     plan = hu_plan(Artifact(N, PITCH_M, 24), 4)
     rng = np.random.default_rng(2)
-    truth = random_truth(plan.artifact, 4, rng, Spread(
-        t_m=1e-3, phi_rad=1e-5, correlation_pitches=4, rotation="linear"))
-    cell = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=1e-6, servo_sigma_m=0.0,
-                        servo_sigma_theta_rad=0.0, follow_mark=True)
+    truth = random_truth(
+        plan.artifact,
+        4,
+        rng,
+        Spread(t_m=1e-3, phi_rad=1e-5, correlation_pitches=4, rotation="linear"),
+    )
+    cell = CellSettings(
+        sigma_xy_m=SIGMA_M,
+        sigma_theta_rad=1e-6,
+        servo_sigma_m=0.0,
+        servo_sigma_theta_rad=0.0,
+        follow_mark=True,
+    )
     made = simulate_measurements(truth, plan, rng, settings=cell)
     law, joint = (calibrate_by(method, made, bare()) for method in ("law", "joint"))
     assert joint.verdict.qualified and not law.verdict.qualified

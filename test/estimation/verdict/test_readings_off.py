@@ -26,11 +26,17 @@ SIGMA_M, SIGMA_RAD = 2e-8, 2e-5
 def truth_and_readings(seed, *, repeats=1, visits=True):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, len(plan.views), rng)
-    stands = CellSettings(sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=1e-7,
-                          servo_sigma_theta_rad=0.0)
-    return truth, simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M,
-                                        sigma_theta_rad=SIGMA_RAD,
-                                        settings=stands if visits else None)
+    stands = CellSettings(
+        sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=1e-7, servo_sigma_theta_rad=0.0
+    )
+    return truth, simulate_measurements(
+        truth,
+        plan,
+        rng,
+        sigma_m=SIGMA_M,
+        sigma_theta_rad=SIGMA_RAD,
+        settings=stands if visits else None,
+    )
 
 
 def measured(seed, **how):
@@ -43,13 +49,16 @@ def misread(readings, index, *, mark=None, by_m=(0.0, 0.0), line=None, by_rad=0.
     at = (view.m == mark[0]) & (view.n == mark[1]) if mark else np.zeros(len(view.m), dtype=bool)
     turned = view.dtheta + by_rad * (view.k == line)
     views = list(readings.views)
-    views[index] = replace(view, dx=view.dx + at * by_m[0], dy=view.dy + at * by_m[1],
-                           dtheta=turned)
+    views[index] = replace(
+        view, dx=view.dx + at * by_m[0], dy=view.dy + at * by_m[1], dtheta=turned
+    )
     return replace(readings, views=tuple(views))
 
 
-@pytest.mark.parametrize(("index", "mark", "repeats", "visits"), [
-    (1, (2, -1), 1, True), (1, (2, -1), 4, True), (0, (0, 3), 1, False), (3, (-3, 1), 4, False)])
+@pytest.mark.parametrize(
+    ("index", "mark", "repeats", "visits"),
+    [(1, (2, -1), 1, True), (1, (2, -1), 4, True), (0, (0, 3), 1, False), (3, (-3, 1), 4, False)],
+)
 def test_a_mark_that_is_off_in_one_view_is_named(index, mark, repeats, visits):
     truth, readings = truth_and_readings(3, repeats=repeats, visits=visits)
     size, noise = 1e-6, SIGMA_M / np.sqrt(repeats)
@@ -82,8 +91,10 @@ def test_a_line_that_is_off_in_one_view_is_named():
     assert (cause.name, cause.unit) == ("reading", "rad")
     assert cause.size == pytest.approx(-1e-3, abs=4.5 * cause.u)
     assert SIGMA_RAD < cause.u < 4 * SIGMA_RAD
-    assert cause.text.startswith(f"a reading of line 5 in view 'rot90' that is off by "
-                                 f"{-cause.size * 180 * 3600 / np.pi:.1f} ± ")
+    assert cause.text.startswith(
+        f"a reading of line 5 in view 'rot90' that is off by "
+        f"{-cause.size * 180 * 3600 / np.pi:.1f} ± "
+    )
     assert (cause.view, cause.mark) == ("rot90", (5,))
     lines = {line.component: line for line in bad.budget if line.quantity == "theta"}
     assert (lines["effect reading"].value, lines["effect reading"].u) == (cause.size, cause.u)
@@ -101,8 +112,9 @@ def test_the_remedy_that_is_named_mends_it():
 
 def test_nothing_is_said_of_exact_readings():
     plan, rng = hu_plan(ARTIFACT), np.random.default_rng(1)
-    exact = simulate_measurements(random_truth(ARTIFACT, 4, rng), plan, rng, sigma_m=0.0,
-                                  sigma_theta_rad=0.0)
+    exact = simulate_measurements(
+        random_truth(ARTIFACT, 4, rng), plan, rng, sigma_m=0.0, sigma_theta_rad=0.0
+    )
     assert calibrate(exact).verdict.grade is Grade.GOOD
 
 

@@ -33,16 +33,19 @@ FIELD = np.arange(15.0).reshape(5, 3) + 1j * np.arange(15.0, 30.0).reshape(5, 3)
 def result():
     plan, rng = hu_plan(Artifact(5, 0.01, 8), repeats=2), np.random.default_rng(2)
     truth = random_truth(plan.artifact, 4, rng)
-    return calibrate(simulate_measurements(truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
-                     bare(terms=(ModelTerm("plate_strain", 2e-7),
-                                 ModelTerm("line_eccentricity", 1e-6))))
+    return calibrate(
+        simulate_measurements(truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
+        bare(terms=(ModelTerm("plate_strain", 2e-7), ModelTerm("line_eccentricity", 1e-6))),
+    )
 
 
 def effects_of(result):
     rng, shape = np.random.default_rng(5), (2, *result.artifact.shape)
-    return (Effect("slip", rng.normal(0, 3e-8, shape), np.zeros(8)),
-            Effect("rotation", rng.normal(0, 1e-8, shape), rng.normal(0, 2e-6, 8)),
-            Effect("nothing", np.zeros(shape), np.zeros(8)))
+    return (
+        Effect("slip", rng.normal(0, 3e-8, shape), np.zeros(8)),
+        Effect("rotation", rng.normal(0, 1e-8, shape), rng.normal(0, 2e-6, 8)),
+        Effect("nothing", np.zeros(shape), np.zeros(8)),
+    )
 
 
 def test_a_field_of_a_moved_plate_is_that_of_the_opposite_place_with_the_other_sign():
@@ -61,10 +64,11 @@ def test_effects_add_up_in_quadrature_and_leave_the_map_alone(result):
     found = enlarged(result, (slip, turned, nothing)).error_map
     before = result.error_map
     for name, at in (("u_gx", 0), ("u_gy", 1)):
-        wanted = np.sqrt(getattr(before, name)**2 + slip.xy[at]**2 + turned.xy[at]**2)
+        wanted = np.sqrt(getattr(before, name) ** 2 + slip.xy[at] ** 2 + turned.xy[at] ** 2)
         np.testing.assert_allclose(getattr(found, name), wanted, rtol=1e-12)
-    np.testing.assert_allclose(found.u_g_theta, np.hypot(before.u_g_theta, turned.theta),
-                               rtol=1e-12)
+    np.testing.assert_allclose(
+        found.u_g_theta, np.hypot(before.u_g_theta, turned.theta), rtol=1e-12
+    )
     for name in ("gx", "gy", "g_theta"):
         np.testing.assert_array_equal(getattr(found, name), getattr(before, name))
     assert enlarged(result, (nothing,)) is result
@@ -106,15 +110,17 @@ def test_the_difference_of_two_maps_is_theirs_without_a_common_angle(result):
     wanted = np.full(emap.gy.shape, -2e-9)
     wanted[1, 2] = 0.0
     np.testing.assert_allclose(found.xy[1], wanted, rtol=1e-6)
-    np.testing.assert_allclose(found.theta, np.array([-3, -2, -1, 0, 1, 2, 3, 0]) * 1e-6,
-                               rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(
+        found.theta, np.array([-3, -2, -1, 0, 1, 2, 3, 0]) * 1e-6, rtol=1e-6, atol=1e-15
+    )
 
 
 def test_what_enlarged_an_uncertainty_is_listed_the_most_first(result):
     slip, turned, _ = effects_of(result)
     only_lines = replace(turned, name="reading", xy=np.zeros_like(turned.xy))
-    found = enlargements(result, ["plate_strain", "line_eccentricity", "plate_strain", "drift"],
-                         (slip, only_lines))
+    found = enlargements(
+        result, ["plate_strain", "line_eccentricity", "plate_strain", "drift"], (slip, only_lines)
+    )
     by_name = {item.name: item for item in found}
     assert sorted(by_name) == ["line_eccentricity", "plate_strain", "reading", "slip"]
     sizes = [item.u_rms for item in found]
@@ -132,10 +138,18 @@ def test_what_enlarged_an_uncertainty_is_listed_the_most_first(result):
 def test_the_interpolation_of_angles_does_not_depend_on_where_the_lines_begin(result):
     def line(steps):
         emap = result.error_map
-        turned = replace(result, error_map=replace(
-            emap, g_theta=np.roll(emap.g_theta, steps), u_g_theta=np.roll(emap.u_g_theta, steps)))
-        return next(line for line in budget_lines(turned)
-                    if line.component == INTERPOLATION and line.quantity == "theta")
+        turned = replace(
+            result,
+            error_map=replace(
+                emap, g_theta=np.roll(emap.g_theta, steps), u_g_theta=np.roll(emap.u_g_theta, steps)
+            ),
+        )
+        return next(
+            line
+            for line in budget_lines(turned)
+            if line.component == INTERPOLATION and line.quantity == "theta"
+        )
+
     lines = [line(steps) for steps in range(8)]
     assert all(one.effect_rms == pytest.approx(lines[0].effect_rms, rel=1e-12) for one in lines)
     assert lines[0].effect_rms > 0

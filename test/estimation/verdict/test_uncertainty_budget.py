@@ -31,10 +31,17 @@ def calibrated(repeats=5, *, extra_m=0.0, angular=True, g_m=0.0):
     artifact = ARTIFACT if angular else Artifact(9, 0.01)
     rng = np.random.default_rng(1)
     truth = random_truth(artifact, 4, rng, Spread(g_m=g_m, g_theta_rad=0.0))
-    readings = simulate_measurements(truth, hu_plan(artifact, repeats), rng, sigma_m=2e-8,
-                                     sigma_theta_rad=2e-5)
-    views = tuple(replace(v, dx=v.dx + rng.normal(0, extra_m, v.dx.shape),
-                          dy=v.dy + rng.normal(0, extra_m, v.dy.shape)) for v in readings.views)
+    readings = simulate_measurements(
+        truth, hu_plan(artifact, repeats), rng, sigma_m=2e-8, sigma_theta_rad=2e-5
+    )
+    views = tuple(
+        replace(
+            v,
+            dx=v.dx + rng.normal(0, extra_m, v.dx.shape),
+            dy=v.dy + rng.normal(0, extra_m, v.dy.shape),
+        )
+        for v in readings.views
+    )
     return calibrate(Measurements(readings.plan_id, artifact, views), BARE)
 
 
@@ -60,7 +67,8 @@ def test_reading_noise_is_that_of_the_map():
     assert part.effect_max == pytest.approx(u.max())
     assert part.dof == result.noise.dof_xy_repeats and part.details == by("repeats")
     assert parts_of(theta)["reading noise"].effect_rms == pytest.approx(
-        np.sqrt((result.error_map.u_g_theta**2).mean()))
+        np.sqrt((result.error_map.u_g_theta**2).mean())
+    )
 
 
 def test_noise_beyond_the_repeats_is_in_the_noise_once():
@@ -75,8 +83,9 @@ def test_noise_beyond_the_repeats_is_in_the_noise_once():
     assert line_text(lack) == "residuals beyond the scatter of repeats, met in full at every place"
     assert part.dof == result.noise.dof_xy_residuals
     assert part.details == by("residuals", contradicted=True)
-    assert line_text(part) == ("residuals of the fit, the larger of two that contradict each "
-                                  "other (see the verdict)")
+    assert line_text(part) == (
+        "residuals of the fit, the larger of two that contradict each other (see the verdict)"
+    )
     # an error of 30 nm a mean beside 20 nm / sqrt(5)
     quiet = parts_of(budgets(calibrated())[0])["reading noise"]
     more = np.hypot(3e-8 * np.sqrt(5), 2e-8) / 2e-8
@@ -88,16 +97,19 @@ def test_noise_that_repeats_show_beyond_the_declared_is_not_lack_of_fit():
     """A detector knows the noise of its image, not the vibration of the stage."""
     rng = np.random.default_rng(1)
     truth = random_truth(ARTIFACT, 4, rng)
-    readings = simulate_measurements(truth, hu_plan(ARTIFACT, 5), rng, sigma_m=2e-8,
-                                     sigma_theta_rad=2e-5)
-    views = tuple(replace(view, u=np.full(view.dx.shape, 1e-8 / np.sqrt(5)))
-                  for view in readings.views)
+    readings = simulate_measurements(
+        truth, hu_plan(ARTIFACT, 5), rng, sigma_m=2e-8, sigma_theta_rad=2e-5
+    )
+    views = tuple(
+        replace(view, u=np.full(view.dx.shape, 1e-8 / np.sqrt(5))) for view in readings.views
+    )
     result = calibrate(replace(readings, views=views), BARE)
     assert result.verdict.grade == Grade.ENLARGED  # the declaration is contradicted
     parts = parts_of(budgets(result)[0])
     assert "effect lack_of_fit" not in parts
     assert parts["reading noise"].effect_rms == pytest.approx(
-        parts_of(budgets(calibrated())[0])["reading noise"].effect_rms, rel=0.1)
+        parts_of(budgets(calibrated())[0])["reading noise"].effect_rms, rel=0.1
+    )
 
 
 def test_without_repeats_the_residuals_speak():
@@ -108,14 +120,16 @@ def test_without_repeats_the_residuals_speak():
 def test_nodes_and_field_are_told_apart():
     at_nodes, in_field, of_lines, at_any_angle = budgets(calibrated(g_m=1e-6))
     assert quantity_text(at_nodes) == "XY, one coordinate at the nodes of the map"
-    assert quantity_text(in_field) == ("XY, one coordinate anywhere in the field, map interpolated "
-                                 "between its nodes")
+    assert quantity_text(in_field) == (
+        "XY, one coordinate anywhere in the field, map interpolated between its nodes"
+    )
     assert quantity_text(of_lines) == "theta at the lines of the map"
     assert quantity_text(at_any_angle) == "theta at any angle, map interpolated between its lines"
     assert "interpolation" not in parts_of(at_nodes) | parts_of(of_lines)
     assert parts_of(in_field)["interpolation"].effect_rms > 5 * at_nodes.u_rms
-    assert in_field.u_rms == pytest.approx(np.hypot(
-        at_nodes.u_rms, parts_of(in_field)["interpolation"].effect_rms))
+    assert in_field.u_rms == pytest.approx(
+        np.hypot(at_nodes.u_rms, parts_of(in_field)["interpolation"].effect_rms)
+    )
 
 
 def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
@@ -138,8 +152,9 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     assert parts["reading noise"].effect_rms == pytest.approx(noise, rel=1e-3)
     assert line.effect_rms > 0.2 * noise
     assert line_text(line).startswith("size 1e-07, of which the readings leave ")
-    loose = parts_of(budgets(calibrate(readings, replace(plain, terms=(
-        ModelTerm("plate_shape", 1e-9),))))[0])["term plate_shape"]
+    loose = parts_of(
+        budgets(calibrate(readings, replace(plain, terms=(ModelTerm("plate_shape", 1e-9),))))[0]
+    )["term plate_shape"]
     assert (loose.kind, loose.dof) == ("B", np.inf) and loose.effect_rms < line.effect_rms
 
 
@@ -197,25 +212,43 @@ def test_sum_degrees_of_freedom_and_coverage_factor():
 
 def test_the_table_names_all_lines_and_their_sum():
     text = "\n".join(budget_text(budgets(calibrated())))
-    for label in ("reading noise", "reference length", "interpolation",
-                  "combined", "expanded, k = 2.", "scatter of repeats",
-                  "curvature of the map; assumes that it is smooth between lines"):
+    for label in (
+        "reading noise",
+        "reference length",
+        "interpolation",
+        "combined",
+        "expanded, k = 2.",
+        "scatter of repeats",
+        "curvature of the map; assumes that it is smooth between lines",
+    ):
         assert label in text
 
 
 def test_a_result_has_its_budget_also_in_a_file():
     result = worded(calibrated())
     assert [(line.quantity, line.component, line.kind, line.source) for line in result.budget] == [
-        ("xy", "reading noise", "A", "readings"), ("xy", "reference length", "B", "default"),
-        ("xy", "interpolation", "B", "readings"), ("theta", "reading noise", "A", "readings"),
-        ("theta", "interpolation", "B", "readings")]
+        ("xy", "reading noise", "A", "readings"),
+        ("xy", "reference length", "B", "default"),
+        ("xy", "interpolation", "B", "readings"),
+        ("theta", "reading noise", "A", "readings"),
+        ("theta", "interpolation", "B", "readings"),
+    ]
     rows = json.loads(json.dumps(result_to_dict(result)))["budget"]
     noise = result.noise
     assert rows[0] == {
-        "quantity": "xy", "component": "reading noise", "type": "A", "value": 0.0,
-        "u": noise.sigma_xy, "unit": "m", "effect_rms": result.budget[0].effect_rms,
-        "effect_max": result.budget[0].effect_max, "dof": noise.dof_xy, "source": "readings",
-        "details": {"by": "repeats", "contradicted": False}, "text": "scatter of repeats"}
+        "quantity": "xy",
+        "component": "reading noise",
+        "type": "A",
+        "value": 0.0,
+        "u": noise.sigma_xy,
+        "unit": "m",
+        "effect_rms": result.budget[0].effect_rms,
+        "effect_max": result.budget[0].effect_max,
+        "dof": noise.dof_xy,
+        "source": "readings",
+        "details": {"by": "repeats", "contradicted": False},
+        "text": "scatter of repeats",
+    }
     assert rows[1]["dof"] is None and rows[3]["u"] == noise.sigma_theta
     again = result_from_dict(result_to_dict(result), "r.json")
     assert again.budget == result.budget and budgets(again) == budgets(result)
@@ -225,13 +258,15 @@ def test_a_result_has_its_budget_also_in_a_file():
     assert list(budget_lines(bare)) == [] and drawn_up(bare) == []
 
 
-@pytest.mark.parametrize(("given", "source"), [
-    (None, "default"), ("plate_strain:1e-9", "declared")])
+@pytest.mark.parametrize(
+    ("given", "source"), [(None, "default"), ("plate_strain:1e-9", "declared")]
+)
 def test_a_line_says_what_its_size_rests_on(given, source):
     rng = np.random.default_rng(1)
     plan = hu_plan(ARTIFACT, 2)
-    readings = simulate_measurements(random_truth(ARTIFACT, 4, rng),
-                                     plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-5)
+    readings = simulate_measurements(
+        random_truth(ARTIFACT, 4, rng), plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-5
+    )
     result = calibrate(readings, Options(terms=parse_terms([given], "") if given else ()))
     line = parts_of(budgets(result)[0])["term plate_strain"]
     (term,) = (term for term in result.model.terms if term.name == "plate_strain")
@@ -252,8 +287,9 @@ def test_noise_that_the_detections_declare_is_told_as_such():
     rng = np.random.default_rng(1)
     truth = random_truth(ARTIFACT, 4, rng)
     for repeats in (1, 3):
-        readings = simulate_measurements(truth, hu_plan(ARTIFACT, repeats), rng, sigma_m=2e-8,
-                                         sigma_theta_rad=2e-5)
+        readings = simulate_measurements(
+            truth, hu_plan(ARTIFACT, repeats), rng, sigma_m=2e-8, sigma_theta_rad=2e-5
+        )
         views = tuple(replace(v, u=np.full(len(v.m), 5e-8)) for v in readings.views)
         result = calibrate(replace(readings, views=views), BARE)
         parts = parts_of(budgets(result)[0])

@@ -55,15 +55,25 @@ def drawn(result, truth=None):
 
 def long_names(result):
     """Return a result whose views have long names, and one that has a model with a drift."""
-    views = tuple(replace(v, name=f"{v.name} of the third repetition on Monday morning")
-                  for v in result.views)
-    rows = [{**row, "view": view.name} for row, view in
-            zip(result.extra["residuals"]["views"], views, strict=True)]
-    estimates = tuple(TermEstimate(v.name, f"{axis} P{n}", 1e-7 / n, 1e-9, "m")
-                      for v in views for axis in "xy" for n in (1, 2))
-    return replace(result, views=views, model=ModelResult("rigid", (
-        TermResult("drift", None, estimates),)),
-        extra={**result.extra, "residuals": {"views": rows}})
+    views = tuple(
+        replace(v, name=f"{v.name} of the third repetition on Monday morning") for v in result.views
+    )
+    rows = [
+        {**row, "view": view.name}
+        for row, view in zip(result.extra["residuals"]["views"], views, strict=True)
+    ]
+    estimates = tuple(
+        TermEstimate(v.name, f"{axis} P{n}", 1e-7 / n, 1e-9, "m")
+        for v in views
+        for axis in "xy"
+        for n in (1, 2)
+    )
+    return replace(
+        result,
+        views=views,
+        model=ModelResult("rigid", (TermResult("drift", None, estimates),)),
+        extra={**result.extra, "residuals": {"views": rows}},
+    )
 
 
 RESULTS = {
@@ -72,8 +82,10 @@ RESULTS = {
     "wide": lambda: with_residuals(9, 8, size_y=5),
     "large": lambda: known_result(51, 360)[0],
     "long names": lambda: long_names(with_residuals()),
-    "huge errors": lambda: replace(known_result(5, 8)[0], error_map=replace(
-        known_result(5, 8)[0].error_map, gx=np.full((5, 5), 123.456))),
+    "huge errors": lambda: replace(
+        known_result(5, 8)[0],
+        error_map=replace(known_result(5, 8)[0].error_map, gx=np.full((5, 5), 123.456)),
+    ),
 }
 
 
@@ -93,16 +105,25 @@ def test_words_do_not_lie_on_each_other(name):
 
 def shafts(drawing, colour="ink", width=1.2):
     """Return the vectors (start, end) drawn in a colour and width, map frame left out."""
-    return [line for item in drawing.items if isinstance(item, Path)
-            and (item.stroke, item.width) == (colour, width) for line in item.lines]
+    return [
+        line
+        for item in drawing.items
+        if isinstance(item, Path) and (item.stroke, item.width) == (colour, width)
+        for line in item.lines
+    ]
 
 
 def test_vectors_begin_at_their_sites_and_point_along_the_error():
     result, _ = known_result(5, 0, size_y=3)
     emap = result.error_map
     drawing = error_map(result)
-    factor = float(next(re.search(r"enlarged ([\d,]+) ×", i.text)[1].replace(",", "")
-                        for i in drawing.items if isinstance(i, Label) and "enlarged" in i.text))
+    factor = float(
+        next(
+            re.search(r"enlarged ([\d,]+) ×", i.text)[1].replace(",", "")
+            for i in drawing.items
+            if isinstance(i, Label) and "enlarged" in i.text
+        )
+    )
     vectors = np.array(shafts(drawing))
     assert vectors.shape == (15, 2, 2)
     starts, ends = vectors[:, 0], vectors[:, 1]
@@ -124,39 +145,55 @@ def test_residuals_of_a_turned_view_stand_where_its_marks_lie():
     turned = replace(result, extra={"residuals": {"views": rows}})
     assert math.degrees(turned.views[1].rotation) == pytest.approx(90)
     drawing = residual_maps(turned, residuals_in(turned))
-    box = next(i for i in drawing.items if isinstance(i, Path) and i.stroke == "soft"
-               and len(i.lines[0]) == 5).lines[0]
+    box = next(
+        i
+        for i in drawing.items
+        if isinstance(i, Path) and i.stroke == "soft" and len(i.lines[0]) == 5
+    ).lines[0]
     centre = np.mean(box[:4], axis=0)
-    (start, end), = shafts(drawing, width=0.9)
+    ((start, end),) = shafts(drawing, width=0.9)
     assert start[0] == pytest.approx(centre[0])
     assert start[1] < centre[1] - 20
     assert end[0] > start[0] + 5 and end[1] == pytest.approx(start[1])
 
 
-@pytest.mark.parametrize(("value", "step"), [(0.0, 0), (0.0999, 0), (0.1001, 1), (0.95, 9),
-                                             (1.0, 9), (7.0, 9), (np.nan, -1)])
+@pytest.mark.parametrize(
+    ("value", "step"),
+    [(0.0, 0), (0.0999, 0), (0.1001, 1), (0.95, 9), (1.0, 9), (7.0, 9), (np.nan, -1)],
+)
 def test_steps_of_a_scale_from_zero(value, step):
     assert levels(np.array([value]), Scale("e", 0.0, 1.0)) == [step]
     assert levels(np.array([value + 5]), Scale("e", 5.0, 6.0)) == [step]
 
 
-@pytest.mark.parametrize(("value", "step"), [(-2.0, 0), (-1.0, 0), (-0.11, 4), (-0.09, 5),
-                                             (0.09, 5), (0.11, 6), (1.0, 10), (np.nan, -1)])
+@pytest.mark.parametrize(
+    ("value", "step"),
+    [(-2.0, 0), (-1.0, 0), (-0.11, 4), (-0.09, 5), (0.09, 5), (0.11, 6), (1.0, 10), (np.nan, -1)],
+)
 def test_steps_of_a_scale_to_both_sides(value, step):
     assert levels(np.array([value]), Scale("d", -1.0, 1.0)) == [step]
 
 
-@pytest.mark.parametrize(("values", "ends"), [
-    ([0.0231, 0.0362, np.nan], (0.0225, 0.0375)), ([3.0, 3.02], (3.02, 3.02)), ([np.nan], (0, 0)),
-    ([0.0, 1.0], (0.0, 1.0))])
+@pytest.mark.parametrize(
+    ("values", "ends"),
+    [
+        ([0.0231, 0.0362, np.nan], (0.0225, 0.0375)),
+        ([3.0, 3.02], (3.02, 3.02)),
+        ([np.nan], (0, 0)),
+        ([0.0, 1.0], (0.0, 1.0)),
+    ],
+)
 def test_a_scale_over_a_range_shows_the_variation_unless_there_is_none(values, ends):
     scale = range_scale("v", np.array(values))
     assert (scale.low, scale.high) == pytest.approx(ends)
 
 
 def fills(drawing, ramp):
-    return [item.fill for item in drawing.items if isinstance(item, Path)
-            and re.fullmatch(rf"{ramp}\d+", item.fill)]
+    return [
+        item.fill
+        for item in drawing.items
+        if isinstance(item, Path) and re.fullmatch(rf"{ramp}\d+", item.fill)
+    ]
 
 
 def test_components_share_one_scale_and_their_u_another_that_shows_where_it_is_large():
@@ -172,8 +209,9 @@ def test_components_share_one_scale_and_their_u_another_that_shows_where_it_is_l
     assert fills(drawing, "v")[:4] == ["v0", "v9"] * 2
     words = [item.text for item in drawing.items if isinstance(item, Label)]
     assert words[0].endswith("U with k = 2.28") and {"U(Gx)", "U(Gy)", "0.05"} <= set(words)
-    even = replace(result, error_map=replace(emap, u_gx=np.full((3, 3), 1e-7),
-                                             u_gy=np.full((3, 3), 1.001e-7)))
+    even = replace(
+        result, error_map=replace(emap, u_gx=np.full((3, 3), 1e-7), u_gy=np.full((3, 3), 1.001e-7))
+    )
     drawing = component_maps(even)
     words = [item.text for item in drawing.items if isinstance(item, Label)]
     assert words.count("0.228 µm everywhere") == 2
@@ -183,11 +221,17 @@ def test_components_share_one_scale_and_their_u_another_that_shows_where_it_is_l
 def test_ellipses_are_as_wide_as_u_along_x_and_as_high_as_u_along_y_with_the_k_of_the_result():
     result, _ = known_result(7, 0, size_y=5)
     wide, high = np.full((7, 5), 3e-7), np.full((7, 5), 1e-7)
-    result = replace(result, noise=replace(result.noise, k_xy=2.5), error_map=replace(
-        result.error_map, u_gx=wide, u_gy=high))
+    result = replace(
+        result,
+        noise=replace(result.noise, k_xy=2.5),
+        error_map=replace(result.error_map, u_gx=wide, u_gy=high),
+    )
     drawing = error_map(result)
-    found, = (item for item in drawing.items if isinstance(item, Discs) and item.fill == "band"
-              and len(item.radii) > 1)
+    (found,) = (
+        item
+        for item in drawing.items
+        if isinstance(item, Discs) and item.fill == "band" and len(item.radii) > 1
+    )
     vectors = np.array(shafts(drawing))
     gain = (vectors[:, 1, 0] - vectors[:, 0, 0]) / result.error_map.gx.ravel()  # pixels a metre
     np.testing.assert_allclose(found.radii, np.outer(gain, (2.5 * 3e-7, 2.5 * 1e-7)))
@@ -206,23 +250,38 @@ def test_a_map_without_one_known_site_says_so():
     assert shafts(drawing, width=1.2) == []
 
 
-@pytest.mark.parametrize(("number", "words"), [(1, "1st"), (2, "2nd"), (3, "3rd"), (4, "4th"),
-                                               (11, "11th"), (12, "12th"), (21, "21st"),
-                                               (22, "22nd"), (23, "23rd"), (113, "113th")])
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [
+        (1, "1st"),
+        (2, "2nd"),
+        (3, "3rd"),
+        (4, "4th"),
+        (11, "11th"),
+        (12, "12th"),
+        (21, "21st"),
+        (22, "22nd"),
+        (23, "23rd"),
+        (113, "113th"),
+    ],
+)
 def test_ordinals(number, words):
     assert ordinal(number) == words
 
 
-@pytest.mark.parametrize(("value", "rounded"), [(1, 1), (1.99, 1), (2, 2), (4.9, 2), (5, 5),
-                                                (9.99, 5), (19564, 10000), (0.0021, 0.002)])
+@pytest.mark.parametrize(
+    ("value", "rounded"),
+    [(1, 1), (1.99, 1), (2, 2), (4.9, 2), (5, 5), (9.99, 5), (19564, 10000), (0.0021, 0.002)],
+)
 def test_round_numbers(value, rounded):
     assert round_down(value) == pytest.approx(rounded)
 
 
 def test_lines_lie_outside_the_circle_where_the_error_is_positive():
     result, _ = known_result(3, 4)
-    emap = replace(result.error_map, g_theta=np.array([1e-5, -1e-5, 0.0, np.nan]),
-                   u_g_theta=np.zeros(4))
+    emap = replace(
+        result.error_map, g_theta=np.array([1e-5, -1e-5, 0.0, np.nan]), u_g_theta=np.zeros(4)
+    )
     drawing = angular_map(replace(result, error_map=emap))
     dots = next(i for i in drawing.items if isinstance(i, Discs) and i.radii[0][0] == 1.8).centres
     away = [math.dist(CENTRE, dot) for dot in dots]
@@ -236,8 +295,11 @@ def test_histograms_hold_every_residual():
     found = residuals_in(result)
     for kind, values in (("xy", [v.xy_m for v in found]), ("theta", [v.theta_rad for v in found])):
         drawing = distributions(found, kind)
-        said = [int(i.text.split()[0]) for i in drawing.items
-                if isinstance(i, Label) and "residuals, rms" in i.text]
+        said = [
+            int(i.text.split()[0])
+            for i in drawing.items
+            if isinstance(i, Label) and "residuals, rms" in i.text
+        ]
         assert said == [np.isfinite(v).sum() for v in values]
         bars = [i for i in drawing.items if isinstance(i, Path) and i.fill == "band"]
         for item, count in zip(bars, said, strict=True):
@@ -249,14 +311,24 @@ def test_histograms_hold_every_residual():
 
 def test_a_drift_is_drawn_from_its_legendre_coefficients():
     result = with_residuals()
-    estimates = (TermEstimate("identity", "x P1", 3e-7, 1e-9, "m"),
-                 TermEstimate("identity", "y P2", 2e-7, 1e-9, "m"))
-    drawing = drift_found(replace(result, model=ModelResult("rigid", (
-        TermResult("drift", None, estimates),))))
-    x, y = (next(i.lines[0] for i in drawing.items if isinstance(i, Path) and i.stroke == "c0"
-                 and i.dash == dash) for dash in ((), (5, 3)))
-    zero = next(i.lines[0][0][1] for i in drawing.items if isinstance(i, Path)
-                and i.stroke == "line")
+    estimates = (
+        TermEstimate("identity", "x P1", 3e-7, 1e-9, "m"),
+        TermEstimate("identity", "y P2", 2e-7, 1e-9, "m"),
+    )
+    drawing = drift_found(
+        replace(result, model=ModelResult("rigid", (TermResult("drift", None, estimates),)))
+    )
+    x, y = (
+        next(
+            i.lines[0]
+            for i in drawing.items
+            if isinstance(i, Path) and i.stroke == "c0" and i.dash == dash
+        )
+        for dash in ((), (5, 3))
+    )
+    zero = next(
+        i.lines[0][0][1] for i in drawing.items if isinstance(i, Path) and i.stroke == "line"
+    )
     up = np.array([zero - point[1] for point in x])
     assert up[0] == pytest.approx(-up[-1]) and up[-1] > 0  # P1 goes from -1 to 1
     bent = np.array([zero - point[1] for point in y])
@@ -268,8 +340,12 @@ def test_a_drift_is_drawn_from_its_legendre_coefficients():
 def test_courses_need_times_and_show_a_rise_upwards():
     result = with_residuals()
     rows = [dict(row) for row in result.extra["residuals"]["views"]]
-    rows[0]["course"] = {"time_s": np.arange(5.0), "dx": np.arange(5) * 1e-8, "dy": np.zeros(5),
-                         "count": np.ones(5)}
+    rows[0]["course"] = {
+        "time_s": np.arange(5.0),
+        "dx": np.arange(5) * 1e-8,
+        "dy": np.zeros(5),
+        "count": np.ones(5),
+    }
     for row in rows[1:]:
         del row["course"]
     found = residuals_in(replace(result, extra={"residuals": {"views": rows}}))
@@ -283,31 +359,45 @@ def turned(rotation_deg, shift=(0.0, 0.0), grid=None, **more):
     """Return the figure of one view of a plate of 5 x 9 marks, and the middle of its panel."""
     view = View("v", math.radians(rotation_deg), shift, **more)
     drawing = plan_figure(Artifact(5, 0.01, 24, 9, grid), [view])
-    frame = next(item.lines[0] for item in drawing.items if isinstance(item, Path)
-                 and item.stroke == "soft" and len(item.lines[0]) == 5)
+    frame = next(
+        item.lines[0]
+        for item in drawing.items
+        if isinstance(item, Path) and item.stroke == "soft" and len(item.lines[0]) == 5
+    )
     return drawing, np.mean(frame[:4], axis=0)
 
 
 def heads(drawing):
-    return [np.array(item.lines[0]) for item in drawing.items
-            if isinstance(item, Path) and item.fill == "truth"]
+    return [
+        np.array(item.lines[0])
+        for item in drawing.items
+        if isinstance(item, Path) and item.fill == "truth"
+    ]
 
 
-@pytest.mark.parametrize(("rotation", "corner", "sense"), [
-    (90, (-1, -1), "left"), (-90, (1, 1), "right"), (180, (-1, 1), "left")])
+@pytest.mark.parametrize(
+    ("rotation", "corner", "sense"),
+    [(90, (-1, -1), "left"), (-90, (1, 1), "right"), (180, (-1, 1), "left")],
+)
 def test_the_arrow_leads_the_corner_of_a_turned_plate_the_way_it_is_turned(rotation, corner, sense):
     """Pixels grow downwards: (-1, -1) is top left, where a quarter turn to the left leads it."""
     drawing, middle = turned(rotation)
-    dot, = (item.centres[0] for item in drawing.items if isinstance(item, Discs)
-            and item.fill == "truth")
+    (dot,) = (
+        item.centres[0]
+        for item in drawing.items
+        if isinstance(item, Discs) and item.fill == "truth"
+    )
     assert tuple(np.sign(dot - middle)) == corner
-    way, = (np.array(item.lines[0]) - middle for item in drawing.items if isinstance(item, Path)
-            and item.stroke == "truth" and len(item.lines[0]) == 61)
+    (way,) = (
+        np.array(item.lines[0]) - middle
+        for item in drawing.items
+        if isinstance(item, Path) and item.stroke == "truth" and len(item.lines[0]) == 61
+    )
     assert way[0][0] > 0 > way[0][1]  # begins at the top right, where the corner is without a turn
     assert np.sign(way[-1]).tolist() == list(corner)
     across = way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0]  # < 0: counter-clockwise
     assert (across < 0).all() if sense == "left" else (across > 0).all()
-    head, = heads(drawing)
+    (head,) = heads(drawing)
     np.testing.assert_allclose(head[0] - middle, way[-1])
 
 
@@ -315,36 +405,52 @@ def test_a_plate_off_the_lattice_is_drawn_within_its_panel():
     """Turned by 37 deg over a map of 30 x 60 mm: what lies beyond the nodes is hollow."""
     grid = MapGrid(3, 0.015, size_y=5)
     view = View("v", math.radians(37), (0.013, -0.007), angular=False)
-    drawing, middle = turned(37, view.translation_m, grid, angular=False, check_marks=1,
-                             check_offset_m=2e-5)
-    hollow, = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
-    read, = (item for item in drawing.items if isinstance(item, Discs) and item.fill == "ink")
+    drawing, middle = turned(
+        37, view.translation_m, grid, angular=False, check_marks=1, check_offset_m=2e-5
+    )
+    (hollow,) = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
+    (read,) = (item for item in drawing.items if isinstance(item, Discs) and item.fill == "ink")
     inside = view.pose.in_field(Artifact(5, 0.01, 24, 9, grid))
     assert (len(read.centres), len(hollow.centres)) == (inside.sum(), (~inside).sum())
-    frame = next(np.array(item.lines[0]) for item in drawing.items if isinstance(item, Path)
-                 and item.stroke == "soft" and len(item.lines[0]) == 5)
-    plate = next(np.array(item.lines[0]) for item in drawing.items if isinstance(item, Path)
-                 and item.stroke == "truth" and len(item.lines[0]) == 5)
+    frame = next(
+        np.array(item.lines[0])
+        for item in drawing.items
+        if isinstance(item, Path) and item.stroke == "soft" and len(item.lines[0]) == 5
+    )
+    plate = next(
+        np.array(item.lines[0])
+        for item in drawing.items
+        if isinstance(item, Path) and item.stroke == "truth" and len(item.lines[0]) == 5
+    )
     assert (frame.min(axis=0) < plate.min(axis=0)).all()
     assert (plate.max(axis=0) < frame.max(axis=0)).all()
     places = view.pose.places(Artifact(5, 0.01), 0, 0)
     assert np.sign(np.mean(plate[:4], axis=0) - middle).tolist() == [
-        np.sign(places.real), -np.sign(places.imag)]  # pixels grow downwards
+        np.sign(places.real),
+        -np.sign(places.imag),
+    ]  # pixels grow downwards
 
 
 def test_a_plate_that_is_not_turned_has_no_arrow_and_marks_off_the_field_are_hollow():
     drawing, middle = turned(0, (0.01, 0.0))
     assert heads(drawing) == []
-    hollow, = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
+    (hollow,) = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
     assert len(hollow.centres) == 9 and all(x > middle[0] for x, _ in hollow.centres)
 
 
 def test_check_stops_are_crosses_at_the_marks_that_are_visited_again():
     drawing, middle = turned(0, check_marks=5, check_offset_m=2e-5)
-    crosses = [np.mean(np.concatenate(item.lines), axis=0) - middle for item in drawing.items
-               if isinstance(item, Path) and item.stroke == "c0"]
-    pitch = next(abs(a[0] - b[0]) for item in drawing.items if isinstance(item, Discs)
-                 and item.fill == "ink" for a, b in [(item.centres[0], item.centres[9])])
+    crosses = [
+        np.mean(np.concatenate(item.lines), axis=0) - middle
+        for item in drawing.items
+        if isinstance(item, Path) and item.stroke == "c0"
+    ]
+    pitch = next(
+        abs(a[0] - b[0])
+        for item in drawing.items
+        if isinstance(item, Discs) and item.fill == "ink"
+        for a, b in [(item.centres[0], item.centres[9])]
+    )
     sites = {tuple(np.rint(cross / pitch).astype(int).tolist()) for cross in crosses}
     assert sites == {(0, 0), (1, -2), (-1, -2), (-1, 2), (1, 2)}
     words = [item.text for item in drawing.items if isinstance(item, Label)]
@@ -355,8 +461,10 @@ def test_check_stops_are_crosses_at_the_marks_that_are_visited_again():
 def test_rejected_readings_stand_where_they_happened():
     result = with_residuals(5, 0)
     found = rejected_in(result)
-    assert found[:2] == [("identity", "low_score", 10.0, 20.0),
-                         ("identity", "too_far_from_nominal", -20.0, 0.0)]
+    assert found[:2] == [
+        ("identity", "low_score", 10.0, 20.0),
+        ("identity", "too_far_from_nominal", -20.0, 0.0),
+    ]
     view, reason, x, y = found[2]  # mark (1, 0) in the view that is turned by 90 degrees
     assert (view, reason) == (result.views[1].name, "outlier_among_views")
     assert (x, y) == pytest.approx((0.0, 10.0), abs=1e-9)
@@ -366,22 +474,37 @@ def test_rejected_readings_stand_where_they_happened():
 
 def test_readings_rejected_far_away_stand_at_the_edge_of_their_panel():
     result = with_residuals(9, 8, size_y=5)
-    far = [{"view": result.views[0].name, "reason": ["low_score"] * 2,
-            "x": [1.0, -1.0], "y": [1.0, -1.0]}]
+    far = [
+        {
+            "view": result.views[0].name,
+            "reason": ["low_score"] * 2,
+            "x": [1.0, -1.0],
+            "y": [1.0, -1.0],
+        }
+    ]
     drawing = rejected_map(replace(result, extra={"rejected_at": far}))
     (left, top), _, (right, bottom), *_ = next(
-        item.lines[0] for item in drawing.items if isinstance(item, Path) and item.stroke == "soft"
-        and len(item.lines[0]) == 5)
+        item.lines[0]
+        for item in drawing.items
+        if isinstance(item, Path) and item.stroke == "soft" and len(item.lines[0]) == 5
+    )
     dots = next(item for item in drawing.items if isinstance(item, Discs))
     assert np.ravel(dots.centres) == pytest.approx([right, top, left, bottom])
 
 
-@pytest.mark.parametrize("extra", [
-    {}, {"residuals": 5}, {"residuals": {"views": []}}, {"residuals": {"views": "abc"}},
-    {"residuals": {"views": [1, 2, 3, 4]}, "rejected_at": [7]},
-    {"residuals": {"views": [{"dx": [[1]], "course": {"dx": "x"}}] * 4}, "rejected_at": [{}]},
-    {"rejected_at": [{"view": "identity", "reason": "abc", "x": [1], "y": ["b"]}]},
-    {"outliers": {"removed": [{"view": "identity", "kind": "grid", "mark": "1; 2"}]}}])
+@pytest.mark.parametrize(
+    "extra",
+    [
+        {},
+        {"residuals": 5},
+        {"residuals": {"views": []}},
+        {"residuals": {"views": "abc"}},
+        {"residuals": {"views": [1, 2, 3, 4]}, "rejected_at": [7]},
+        {"residuals": {"views": [{"dx": [[1]], "course": {"dx": "x"}}] * 4}, "rejected_at": [{}]},
+        {"rejected_at": [{"view": "identity", "reason": "abc", "x": [1], "y": ["b"]}]},
+        {"outliers": {"removed": [{"view": "identity", "kind": "grid", "mark": "1; 2"}]}},
+    ],
+)
 def test_extras_of_another_form_are_left_out(extra):
     result = replace(known_result(3, 0)[0], extra=extra)
     found = residuals_in(result)
@@ -414,8 +537,10 @@ def test_numbers_that_are_none_are_no_part_of_a_drawing():
         inline_svg(drawing)
 
 
-@pytest.mark.parametrize(("span", "count", "step"), [(10, 5, 2), (1, 5, 0.2), (0.7, 5, 0.2),
-                                                     (26, 5, 10), (0, 5, 1), (math.inf, 5, 1)])
+@pytest.mark.parametrize(
+    ("span", "count", "step"),
+    [(10, 5, 2), (1, 5, 0.2), (0.7, 5, 0.2), (26, 5, 10), (0, 5, 1), (math.inf, 5, 1)],
+)
 def test_round_steps(span, count, step):
     assert round_step(span, count) == pytest.approx(step)
 

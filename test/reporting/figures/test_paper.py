@@ -27,8 +27,9 @@ def test_png_of_any_size(tmp_path, size, lines):
     drawing = map_picture(result, truth)
     save_picture(drawing, tmp_path / "map.png")
     height, width = imread(tmp_path / "map.png").shape[:2]
-    assert (width, height) == pytest.approx((drawing.width * 150 / 72, drawing.height * 150 / 72),
-                                            abs=1)
+    assert (width, height) == pytest.approx(
+        (drawing.width * 150 / 72, drawing.height * 150 / 72), abs=1
+    )
     assert (width > 2000) == (lines > 0)
     assert list(tmp_path.iterdir()) == [tmp_path / "map.png"]
 
@@ -46,18 +47,27 @@ def test_the_picture_holds_the_figures_of_the_report_beside_each_other():
     np.testing.assert_allclose(moves[:count], np.broadcast_to(moves[0], (count, 2)))
     np.testing.assert_allclose(moves[count:], np.broadcast_to(moves[-1], (len(moves) - count, 2)))
     assert moves[-1][0] - moves[0][0] >= figures[0].width and moves[0][1] == pytest.approx(
-        moves[-1][1])
+        moves[-1][1]
+    )
     for kind in (Discs, Label):
-        assert min(at[0] for item in found.items if isinstance(item, kind)
-                   for at in (item.centres if kind is Discs else [item.at])) >= moves[0][0]
+        assert (
+            min(
+                at[0]
+                for item in found.items
+                if isinstance(item, kind)
+                for at in (item.centres if kind is Discs else [item.at])
+            )
+            >= moves[0][0]
+        )
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, 1e-30, 1e300])
 def test_maps_without_size_and_of_absurd_size_are_drawn(tmp_path, coarse, value):
     result, _ = known_result(3, 8)
     field, lines = np.full((3, 3), value), np.full(8, value)
-    emap = replace(result.error_map, gx=field, gy=field, u_gx=field, u_gy=field, g_theta=lines,
-                   u_g_theta=lines)
+    emap = replace(
+        result.error_map, gx=field, gy=field, u_gx=field, u_gy=field, g_theta=lines, u_g_theta=lines
+    )
     if value == 1e300:
         emap = replace(emap, gx=field * 1e-302, gy=field * 1e-302, g_theta=lines * 1e-302)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -67,8 +77,10 @@ def test_maps_without_size_and_of_absurd_size_are_drawn(tmp_path, coarse, value)
 
 def test_text_of_the_user_is_drawn_as_it_is(tmp_path, coarse):
     result, _ = known_result(3, 0)
-    save_picture(map_picture(replace(result, plan_id=r"$\frac{ $ 長 \x", input={"file": "$a_$"})),
-                 tmp_path / "map.png")
+    save_picture(
+        map_picture(replace(result, plan_id=r"$\frac{ $ 長 \x", input={"file": "$a_$"})),
+        tmp_path / "map.png",
+    )
     assert drawable("a\nb 長 θ$") == "a?b ? θ$"
     assert drawable("x" * 400, 10) == "x" * 9 + "…"
 

@@ -24,11 +24,21 @@ from test.support.truth import Spread, random_truth, simulate_measurements
 @cache
 def result():
     plan, rng = image_plan(5), np.random.default_rng(4)
-    truth = random_truth(plan.artifact, 2, rng, Spread(
-        phi_rad=0.003, correlation_pitches=4.0, microscope_distortion=0.01,
-        microscope_field_m=1e-3, microscope_scale=0.004))
-    measured = simulate_measurements(truth, plan, rng, settings=CellSettings(
-        sigma_xy_m=2e-8, image_xy_m=4e-8, servo_sigma_m=0.0))
+    truth = random_truth(
+        plan.artifact,
+        2,
+        rng,
+        Spread(
+            phi_rad=0.003,
+            correlation_pitches=4.0,
+            microscope_distortion=0.01,
+            microscope_field_m=1e-3,
+            microscope_scale=0.004,
+        ),
+    )
+    measured = simulate_measurements(
+        truth, plan, rng, settings=CellSettings(sigma_xy_m=2e-8, image_xy_m=4e-8, servo_sigma_m=0.0)
+    )
     made = worded(calibrate(measured))
     return result_from_dict(result_to_dict(made), "test")
 
@@ -39,12 +49,17 @@ def test_the_summary_states_the_camera():
     assert facts["distortion"] == "radial (cubic)"
     worst = max(result().camera.cells, key=lambda c: np.hypot(c.dx, c.dy))
     assert facts["largest error"].startswith(
-        f"{significant(1e6 * np.hypot(worst.dx, worst.dy))} ± ")
+        f"{significant(1e6 * np.hypot(worst.dx, worst.dy))} ± "
+    )
     assert facts["largest error"].endswith(
-        f" at x {worst.x * 1e3:.4g} mm, y {worst.y * 1e3:.4g} mm of the image")
+        f" at x {worst.x * 1e3:.4g} mm, y {worst.y * 1e3:.4g} mm of the image"
+    )
     assert "Camera" in summary_text(result())
-    words = {line.split("  ")[1]: line for line in summary_text(result()).splitlines()
-             if line.startswith("  ")}
+    words = {
+        line.split("  ")[1]: line
+        for line in summary_text(result()).splitlines()
+        if line.startswith("  ")
+    }
     assert "-0.39" in words["scale"]
 
 
@@ -61,7 +76,8 @@ def test_the_summary_states_the_yaw_of_the_stage():
     (fact,) = yaw_facts(result())
     assert fact in camera_facts(result())
     assert fact[1].startswith(
-        f"{significant(min(yaw.yaw) * 1e6)} to {significant(max(yaw.yaw) * 1e6)} ± ")
+        f"{significant(min(yaw.yaw) * 1e6)} to {significant(max(yaw.yaw) * 1e6)} ± "
+    )
     assert "not more than its noise" in fact[1]
     turning = replace(result(), camera=None, stage_yaw=replace(yaw, p=1e-5))
     assert yaw_facts(turning)[0][1].endswith("mean; p = 1e-05")
@@ -85,14 +101,19 @@ def test_the_report_draws_the_yaw():
     assert len(spots) == 25
     assert spots[7].title.startswith(f"x {yaw.x[7] * 1e3:.4g} mm, y {yaw.y[7] * 1e3:.4g} mm")
     assert f": {significant(yaw.yaw[7] * 1e6)} ±" in spots[7].title
-    fields = [item for item in drawing.items if getattr(item, "fill", "").startswith("d")
-              and len(item.lines[0]) == 4]  # those of the scale are closed
+    fields = [
+        item
+        for item in drawing.items
+        if getattr(item, "fill", "").startswith("d") and len(item.lines[0]) == 4
+    ]  # those of the scale are closed
     assert len({item.fill for item in fields}) > 5
     corners = np.concatenate([item.lines for item in fields])
     low, high = corners.min(axis=1), corners.max(axis=1)
     (left, top), _, (right, bottom), *_ = next(
-        item.lines[0] for item in drawing.items if getattr(item, "stroke", "") == "soft"
-        and len(item.lines[0]) == 5)
+        item.lines[0]
+        for item in drawing.items
+        if getattr(item, "stroke", "") == "soft" and len(item.lines[0]) == 5
+    )
     assert len(corners) == 25  # 5 x 5 fields that fill the frame
     assert high - low == pytest.approx(np.tile([right - left, bottom - top], (25, 1)) / 5)
     assert low.min(axis=0) == pytest.approx([left, top])

@@ -14,8 +14,9 @@ def test_the_constant_of_an_angular_difference_is_weighted():
     """Differences 3, -1, 0, 0 with u = 1, 2, 1, 4: weights 1, 1/4, 1, 1/16."""
     result, truth = known_result(3, 4)
     difference, u = np.array([3.0, -1.0, 0.0, 0.0]), np.array([1.0, 2.0, 1.0, 4.0])
-    emap = replace(result.error_map, g_theta=truth["g_theta"] + difference * 1e-6,
-                   u_g_theta=u * 1e-6)
+    emap = replace(
+        result.error_map, g_theta=truth["g_theta"] + difference * 1e-6, u_g_theta=u * 1e-6
+    )
     mean = (3 - 1 / 4) / (1 + 1 / 4 + 1 + 1 / 16)
     rest = difference - mean
     found = truth_figures(emap, truth)

@@ -46,8 +46,16 @@ TESTED = Noise(1e-8, 1e-6, p_theta=0.4)
 def explanation(name, components, values, u, **more):
     """Return an explanation with equal, independent uncertainties; (view, component) each."""
     columns = tuple(Column(name, view, component, np.inf) for view, component in components)
-    return Explanation(name, columns, np.array(values, dtype=float),
-                       u**2 * np.eye(len(values)), 1e-6, more.pop("whole", True), 0.0, **more)
+    return Explanation(
+        name,
+        columns,
+        np.array(values, dtype=float),
+        u**2 * np.eye(len(values)),
+        1e-6,
+        more.pop("whole", True),
+        0.0,
+        **more,
+    )
 
 
 def microscope(*values):
@@ -59,65 +67,170 @@ def strained(part, size):
     return explanation("plate_strain", [(1, "scale"), (1, "stretch"), (1, "shear")], values, 1e-7)
 
 
-@pytest.mark.parametrize(("found", "text", "size", "u", "unit"), [
-    # E o = (scale + i turn) o + (stretch + i shear) conj(o)
-    *((microscope(0, sign * 2e-3, 0, 0), f"a microscope turned {way} by 2.000 ± 0.010 mrad: "
-       f"{ALIGN}", sign * 2e-3, 1e-5, "rad") for sign, way in (
-        (1, "counter-clockwise"), (-1, "clockwise"))),
-    # (1 + E) of what is seen is true
-    *((microscope(sign * 5e-3, 0, 0, 0), f"a microscope that shows lengths too {what} by 0.5000 ± "
-       f"0.0010 %: {ALIGN}", sign * 5e-3, 1e-5, "m/m") for sign, what in (
-        (1, "short"), (-1, "long"))),
-    *((microscope(0, 0, sign * 1e-3, 0), f"a microscope that shows lengths along x {what} than "
-       f"along y by 0.2000 ± 0.0020 %: {ALIGN}", sign * 1e-3, 1e-5, "m/m") for sign, what in (
-        (1, "shorter"), (-1, "longer"))),
-    (microscope(0, 0, 0, 1e-3), "microscope axes out of square by 2.000 ± 0.020 mrad: "
-     f"{ALIGN}", 1e-3, 1e-5, "rad"),
-    # P1 runs from -1 to 1: the range is twice the coefficient
-    (explanation("drift", [(1, "x P1"), (1, "y P1"), (2, "x P1"), (2, "y P1")],
-                 [1e-9, 0, 0, 25.6e-9], 1e-9), "a drift of 0.0512 ± 0.0020 µm along y during view "
-     "'+x': visit the marks there and back", 51.2e-9, 2e-9, "m"),
-    (explanation("plate_scale", [(1, ""), (2, "")], [1e-7, -2e-6], 1e-7),
-     "a plate smaller by 2.00 ± 0.10 µm/m in view '+x' than in "
-     "view '0': let the plate reach "
-     "thermal equilibrium", -2e-6, 1e-7, "m/m"),
-    (explanation("plate_scale", [(1, ""), (2, "")], [1e-7, 2e-6], 1e-7),
-     "a plate larger by 2.00 ± 0.10 µm/m in view '+x' than in view '0': let the plate reach "
-     "thermal equilibrium", 2e-6, 1e-7, "m/m"),
-    *((strained(part, size), f"a plate {how} by 3.00 ± 0.10 µm/m in view '90' relative to view "
-       f"'0': {CLAMP}", size, 1e-7, "m/m") for part, size, how in (
-        ("scale", 3e-6, "enlarged"), ("scale", -3e-6, "shrunk"),
-        # V = b z + (a + ih) z*
-        ("stretch", 3e-6, "stretched along x and compressed along y"),
-        ("stretch", -3e-6, "stretched along y and compressed along x"),
-        ("shear", 3e-6, "stretched along its diagonal at 45° and compressed along the other"),
-        ("shear", -3e-6, "stretched along its diagonal at 135° and compressed along the other"))),
-    (explanation("plate_shape", [(1, "x x2"), (1, "y x2")], [3e-8, 0], 1.5e-9),
-     "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
-     "in view '90' relative to view "
-     f"'0': {CLAMP}", 3e-8, 1.5e-9, "m"),
-    (explanation("plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, whole=False),
-     "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
-     "in view '90' relative to view "
-     f"'0', part of which cannot be separated from the stage: {CLAMP}", -3e-8, 1.5e-9, "m"),
-    (explanation("approach", [(-1, "x"), (-1, "y")], [0, 2e-8], 1e-9),
-     "an indicated y that changes by ±(0.0200 ± 0.0010 µm) with the direction of approach: "
-     "approach each mark from the same side", 2e-8, 1e-9, "m"),
-    # 3 and 4 make 5
-    (explanation("line_eccentricity", [(0, "cos"), (0, "sin"), (1, "cos"), (1, "sin")],
-                 [1e-7, 0, 3e-6, -4e-6], 1e-7),
-     "a circle of lines off the axis of rotation by 5.00 ± 0.10 "
-     "µrad of its radius in view '90': "
-     "centre the circle of lines on the axis of rotation in each view", 5e-6, 1e-7, "rad"),
-    # a rotation is in units of what it does at the half width, 0.05 m
-    (explanation("slip", [(1, "x"), (1, "y"), (1, "phi")], [3e-7, -4e-7, 5e-8], 1e-8, part=0.4),
-     "a plate that slipped by (0.3, -0.4) µm and 1 µrad after "
-     "about 40% of view '90': measure the "
-     "view again, or solve with --robust", 5e-7, 1e-8, "m"),
-    (explanation("reading", [(2, "x"), (2, "y")], [-3e-7, 4e-7], 1e-8, mark=(-2, 5)),
-     "a reading of mark (-2, 5) in view '+x' that is off by 0.500 "
-     "± 0.010 µm: solve with --robust, "
-     "or measure it again", 5e-7, 1e-8, "m")])
+@pytest.mark.parametrize(
+    ("found", "text", "size", "u", "unit"),
+    [
+        # E o = (scale + i turn) o + (stretch + i shear) conj(o)
+        *(
+            (
+                microscope(0, sign * 2e-3, 0, 0),
+                f"a microscope turned {way} by 2.000 ± 0.010 mrad: {ALIGN}",
+                sign * 2e-3,
+                1e-5,
+                "rad",
+            )
+            for sign, way in ((1, "counter-clockwise"), (-1, "clockwise"))
+        ),
+        # (1 + E) of what is seen is true
+        *(
+            (
+                microscope(sign * 5e-3, 0, 0, 0),
+                f"a microscope that shows lengths too {what} by 0.5000 ± 0.0010 %: {ALIGN}",
+                sign * 5e-3,
+                1e-5,
+                "m/m",
+            )
+            for sign, what in ((1, "short"), (-1, "long"))
+        ),
+        *(
+            (
+                microscope(0, 0, sign * 1e-3, 0),
+                f"a microscope that shows lengths along x {what} than "
+                f"along y by 0.2000 ± 0.0020 %: {ALIGN}",
+                sign * 1e-3,
+                1e-5,
+                "m/m",
+            )
+            for sign, what in ((1, "shorter"), (-1, "longer"))
+        ),
+        (
+            microscope(0, 0, 0, 1e-3),
+            f"microscope axes out of square by 2.000 ± 0.020 mrad: {ALIGN}",
+            1e-3,
+            1e-5,
+            "rad",
+        ),
+        # P1 runs from -1 to 1: the range is twice the coefficient
+        (
+            explanation(
+                "drift",
+                [(1, "x P1"), (1, "y P1"), (2, "x P1"), (2, "y P1")],
+                [1e-9, 0, 0, 25.6e-9],
+                1e-9,
+            ),
+            "a drift of 0.0512 ± 0.0020 µm along y during view "
+            "'+x': visit the marks there and back",
+            51.2e-9,
+            2e-9,
+            "m",
+        ),
+        (
+            explanation("plate_scale", [(1, ""), (2, "")], [1e-7, -2e-6], 1e-7),
+            "a plate smaller by 2.00 ± 0.10 µm/m in view '+x' than in "
+            "view '0': let the plate reach "
+            "thermal equilibrium",
+            -2e-6,
+            1e-7,
+            "m/m",
+        ),
+        (
+            explanation("plate_scale", [(1, ""), (2, "")], [1e-7, 2e-6], 1e-7),
+            "a plate larger by 2.00 ± 0.10 µm/m in view '+x' than in view '0': let the plate reach "
+            "thermal equilibrium",
+            2e-6,
+            1e-7,
+            "m/m",
+        ),
+        *(
+            (
+                strained(part, size),
+                f"a plate {how} by 3.00 ± 0.10 µm/m in view '90' relative to view '0': {CLAMP}",
+                size,
+                1e-7,
+                "m/m",
+            )
+            for part, size, how in (
+                ("scale", 3e-6, "enlarged"),
+                ("scale", -3e-6, "shrunk"),
+                # V = b z + (a + ih) z*
+                ("stretch", 3e-6, "stretched along x and compressed along y"),
+                ("stretch", -3e-6, "stretched along y and compressed along x"),
+                (
+                    "shear",
+                    3e-6,
+                    "stretched along its diagonal at 45° and compressed along the other",
+                ),
+                (
+                    "shear",
+                    -3e-6,
+                    "stretched along its diagonal at 135° and compressed along the other",
+                ),
+            )
+        ),
+        (
+            explanation("plate_shape", [(1, "x x2"), (1, "y x2")], [3e-8, 0], 1.5e-9),
+            "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
+            "in view '90' relative to view "
+            f"'0': {CLAMP}",
+            3e-8,
+            1.5e-9,
+            "m",
+        ),
+        (
+            explanation("plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, whole=False),
+            "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
+            "in view '90' relative to view "
+            f"'0', part of which cannot be separated from the stage: {CLAMP}",
+            -3e-8,
+            1.5e-9,
+            "m",
+        ),
+        (
+            explanation("approach", [(-1, "x"), (-1, "y")], [0, 2e-8], 1e-9),
+            "an indicated y that changes by ±(0.0200 ± 0.0010 µm) with the direction of approach: "
+            "approach each mark from the same side",
+            2e-8,
+            1e-9,
+            "m",
+        ),
+        # 3 and 4 make 5
+        (
+            explanation(
+                "line_eccentricity",
+                [(0, "cos"), (0, "sin"), (1, "cos"), (1, "sin")],
+                [1e-7, 0, 3e-6, -4e-6],
+                1e-7,
+            ),
+            "a circle of lines off the axis of rotation by 5.00 ± 0.10 "
+            "µrad of its radius in view '90': "
+            "centre the circle of lines on the axis of rotation in each view",
+            5e-6,
+            1e-7,
+            "rad",
+        ),
+        # a rotation is in units of what it does at the half width, 0.05 m
+        (
+            explanation(
+                "slip", [(1, "x"), (1, "y"), (1, "phi")], [3e-7, -4e-7, 5e-8], 1e-8, part=0.4
+            ),
+            "a plate that slipped by (0.3, -0.4) µm and 1 µrad after "
+            "about 40% of view '90': measure the "
+            "view again, or solve with --robust",
+            5e-7,
+            1e-8,
+            "m",
+        ),
+        (
+            explanation("reading", [(2, "x"), (2, "y")], [-3e-7, 4e-7], 1e-8, mark=(-2, 5)),
+            "a reading of mark (-2, 5) in view '+x' that is off by 0.500 "
+            "± 0.010 µm: solve with --robust, "
+            "or measure it again",
+            5e-7,
+            1e-8,
+            "m",
+        ),
+    ],
+)
 def test_a_cause_in_words(found, text, size, u, unit):
     cause = cause_of(found, GROUND)
     assert (cause.name, sentence_of(cause), cause.unit, cause.p) == (found.name, text, unit, 1e-6)
@@ -128,55 +241,104 @@ TURN = Cause("microscope", 2e-3, 1e-5, "rad", 1e-6, details={"part": "turn"})
 SCALE = Cause("microscope", 0.06, 1e-3, "m/m", 1e-6, details={"part": "scale", "either": True})
 COMPARE = "compare the offset of a line at two angles of the rotary axis"
 CAUSES = [
-    *((Cause("line_scale", size, 1e-3, "m/m", 1e-6, details={"part": "scale"}),
-       f"offsets of the lines too {how} by 5.00 ± 0.10 %: {COMPARE}")
-      for size, how in ((0.05, "small"), (-0.05, "large"))),
-    *((replace(SCALE, name="line_scale", size=size),
-       f"offsets of the lines too {how} by 6.00 ± 0.10 %, or a "
-       "microscope that shows lengths too "
-       f"{other} by as much: {COMPARE}")
-      for size, how, other in ((0.06, "small", "long"), (-0.06, "large", "short"))),
-    *((replace(SCALE, size=size),
-       f"a microscope that shows lengths too {how} by 6.00 ± 0.10 %, "
-       "or offsets of the lines too "
-       f"{other} by as much: {ALIGN}")
-      for size, how, other in ((0.06, "short", "large"), (-0.06, "long", "small"))),
-    (Cause("reading", -2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90", mark=(7,)),
-     "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 "
-     "arcsec: solve with --robust, or "
-     "measure it again"),
-    *((Cause("rotation", sign * 2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90"),
-       f"lines turned {way} by 2.00 ± 0.10 arcsec relative to the marks in view '90': check "
-       "whether the plate moved between marks and lines, and the sign of the lines' offsets")
-      for sign, way in ((1, "counter-clockwise"), (-1, "clockwise"))),
-    (Cause("noise", 3.1415, 0.2, "m/m", 1e-4, "90"),
-     "3.14 times as much noise in view '90' as in the others: measure the view again, and look "
-     "for a source of vibration"),
-    (Cause("off_sites", 2e-8, 1e-9, "m", 1e-6, details={"away": 4.1e-4}),
-     "a stage that stood 0.41 mm off the sites, where its error differs by 0.0200 ± 0.0010 µm: "
-     "place the plate closer to its nominal pose, or send the stage to the sites"),
-    *((replace(TURN, details={"given": given}),
-       f"a term 'microscope' as large as 2 mrad, {times} times the size assumed: {ALIGN}")
-      for given, times in ((1e-6, "2000"), (8e-4, "2.5"))),
-    (Cause("plate_strain", 2e-6, 1e-7, "m/m", 1e-6, "90", details={"given": 1e-6}),
-     f"a term 'plate_strain' as large as 2 µm/m in view '90', 2 times the size assumed: {CLAMP}")]
+    *(
+        (
+            Cause("line_scale", size, 1e-3, "m/m", 1e-6, details={"part": "scale"}),
+            f"offsets of the lines too {how} by 5.00 ± 0.10 %: {COMPARE}",
+        )
+        for size, how in ((0.05, "small"), (-0.05, "large"))
+    ),
+    *(
+        (
+            replace(SCALE, name="line_scale", size=size),
+            f"offsets of the lines too {how} by 6.00 ± 0.10 %, or a "
+            "microscope that shows lengths too "
+            f"{other} by as much: {COMPARE}",
+        )
+        for size, how, other in ((0.06, "small", "long"), (-0.06, "large", "short"))
+    ),
+    *(
+        (
+            replace(SCALE, size=size),
+            f"a microscope that shows lengths too {how} by 6.00 ± 0.10 %, "
+            "or offsets of the lines too "
+            f"{other} by as much: {ALIGN}",
+        )
+        for size, how, other in ((0.06, "short", "large"), (-0.06, "long", "small"))
+    ),
+    (
+        Cause("reading", -2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90", mark=(7,)),
+        "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 "
+        "arcsec: solve with --robust, or "
+        "measure it again",
+    ),
+    *(
+        (
+            Cause("rotation", sign * 2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90"),
+            f"lines turned {way} by 2.00 ± 0.10 arcsec relative to the marks in view '90': check "
+            "whether the plate moved between marks and lines, and the sign of the lines' offsets",
+        )
+        for sign, way in ((1, "counter-clockwise"), (-1, "clockwise"))
+    ),
+    (
+        Cause("noise", 3.1415, 0.2, "m/m", 1e-4, "90"),
+        "3.14 times as much noise in view '90' as in the others: measure the view again, and look "
+        "for a source of vibration",
+    ),
+    (
+        Cause("off_sites", 2e-8, 1e-9, "m", 1e-6, details={"away": 4.1e-4}),
+        "a stage that stood 0.41 mm off the sites, where its error differs by 0.0200 ± 0.0010 µm: "
+        "place the plate closer to its nominal pose, or send the stage to the sites",
+    ),
+    *(
+        (
+            replace(TURN, details={"given": given}),
+            f"a term 'microscope' as large as 2 mrad, {times} times the size assumed: {ALIGN}",
+        )
+        for given, times in ((1e-6, "2000"), (8e-4, "2.5"))
+    ),
+    (
+        Cause("plate_strain", 2e-6, 1e-7, "m/m", 1e-6, "90", details={"given": 1e-6}),
+        f"a term 'plate_strain' as large as 2 µm/m in view '90', 2 times the size assumed: {CLAMP}",
+    ),
+]
 
 
 def noise(size, stated, unit, *, declared):
-    return Finding("noise_contradicted", size, unit=unit,
-                   details={"stated": stated, "declared": declared})
+    return Finding(
+        "noise_contradicted", size, unit=unit, details={"stated": stated, "declared": declared}
+    )
 
 
 def slip(places, *, spoils, y=-4e-7, phi=5e-6):
-    return Finding("slip_found", 5e-7, unit="m", view="90", details={
-        "places": [{"view": view, "axis": axis, "first": first} for view, axis, first in places],
-        "x": 3e-7, "y": y, "phi": phi, "spoils": spoils})
+    return Finding(
+        "slip_found",
+        5e-7,
+        unit="m",
+        view="90",
+        details={
+            "places": [
+                {"view": view, "axis": axis, "first": first} for view, axis, first in places
+            ],
+            "x": 3e-7,
+            "y": y,
+            "phi": phi,
+            "spoils": spoils,
+        },
+    )
 
 
 def outliers(number, first):
-    return Finding("outliers_removed", details={"number": number, "first": [
-        {"view": view, "kind": kind, "mark": mark, "standardised": ratio}
-        for view, kind, mark, ratio in first]})
+    return Finding(
+        "outliers_removed",
+        details={
+            "number": number,
+            "first": [
+                {"view": view, "kind": kind, "mark": mark, "standardised": ratio}
+                for view, kind, mark, ratio in first
+            ],
+        },
+    )
 
 
 def unchecked(sites, lines=()):
@@ -185,92 +347,152 @@ def unchecked(sites, lines=()):
 
 FINDINGS = [
     (Finding("not_identified"), "the readings do not identify the stage"),
-    (noise(4e-8, 2e-8, "m", declared=False),
-     "grid readings: residuals show a noise of 0.04 µm, repeats 0.02 µm; the readings contain "
-     "something other than random noise"),
-    (noise(ARCSEC_RAD, 2 * ARCSEC_RAD, "rad", declared=True),
-     "angular readings: residuals show a noise of 1 arcsec, the detections' own sigma 2 arcsec; "
-     "repeats share what single readings do not (drift between passes), or the stated noise is "
-     "too large"),
-    (Finding("noise_unknown"),
-     "grid readings: neither repeats nor residuals determine the "
-     "noise, so the uncertainty is not "
-     "known; read every mark twice"),
-    (Finding("finite_rotation", 5.126e-3, unit="rad", details={"residuals": 2.04e-8}),
-     "the model is linear, but the plate was turned by up to 5.13 mrad: leave out "
-     "--misalignment linear (or --method law); solved jointly "
-     "with finite rotations, the default, "
-     "the readings leave 0.0204 µm"),
-    (Finding("axes_not_met", 3 * ARCSEC_RAD, unit="rad", p=0.0012),
-     "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure 3 "
-     "arcsec, p = 0.0012); use zero_mean"),
-    (Finding("prediction_failed", 3.456, view="ty", details={"tenth": 0, "limit": 1.2}),
-     "view 'ty' is predicted with 3.46 times the noise, beyond the limit of 1.20"),
-    (Finding("prediction_failed", 3.456, details={"tenth": 2, "limit": 1.2}),
-     "a random tenth (2) is predicted with 3.46 times the noise, beyond the limit of 1.20"),
-    (Finding("no_uncertainty"),
-     "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)"),
-    (unchecked([[5, -3]]),
-     "1 site (5, -3) of the map rests on a single reading that no other checks; an error in it "
-     "goes into the map, and no residual shows it: measure the missing marks, or add a view"),
-    (unchecked([[m, 5] for m in range(7)], [4, 11]),
-     "7 sites ((0, 5), (1, 5), (2, 5), (3, 5), (4, 5) and 2 more) "
-     "and 2 lines (4, 11) of the map "
-     "rest on single readings that no other checks; an error in them goes into the map, and no "
-     "residual shows it: measure the missing marks, or add a view"),
-    (unchecked([], [4]),
-     "1 line 4 of the map rests on a single reading that no other checks; an error in it goes "
-     "into the map, and no residual shows it: measure the missing marks, or add a view"),
-    *((Finding("magnification", sign * 2e-3, 1e-5, "m/m"),
-       f"the plate is {word} than the encoders indicate by 2000 ± 10 "
-       "µm/m, more than plate and "
-       "encoders should differ: check the pitch in the plan "
-       "(grid_pitch), and the scale of the "
-       "encoders") for sign, word in ((1, "larger"), (-1, "smaller"))),
-    (Finding("drawn_uncertainty", details={"draws": 200}),
-     "uncertainties of Hu's law from 200 draws of unit noise: 5.0 % standard error"),
-    (outliers(2, [("90", "grid", [0, -2], 5.04), ("a", "angular", [7], 9.0)]),
-     "removed 2 outliers: '90' grid (0, -2) (5.0 sigma), 'a' angular 7 (9.0 sigma)"),
-    (outliers(3, [("90", "grid", [0, -2], 5.04), ("90", "grid", [1, -2], 6.04)]),
-     "removed 3 outliers: '90' grid (0, -2) (5.0 sigma), '90' "
-     "grid (1, -2) (6.0 sigma) and 1 more"),
-    (outliers(1, [("90", "grid", [0, -2], 5.04)]),
-     "removed 1 outlier: '90' grid (0, -2) (5.0 sigma)"),
-    (Finding("noisy_view", 2.26, view="90"),
-     "view '90' is 2.3 times as noisy as the others: measure it again"),
-    (Finding("too_many_outliers", details={"limit": 0.1}),
-     "more than 10% of the readings contradict the others: none was removed; look for a wrong "
-     "plan or a faulty view"),
+    (
+        noise(4e-8, 2e-8, "m", declared=False),
+        "grid readings: residuals show a noise of 0.04 µm, repeats 0.02 µm; the readings contain "
+        "something other than random noise",
+    ),
+    (
+        noise(ARCSEC_RAD, 2 * ARCSEC_RAD, "rad", declared=True),
+        "angular readings: residuals show a noise of 1 arcsec, the detections' own sigma 2 arcsec; "
+        "repeats share what single readings do not (drift between passes), or the stated noise is "
+        "too large",
+    ),
+    (
+        Finding("noise_unknown"),
+        "grid readings: neither repeats nor residuals determine the "
+        "noise, so the uncertainty is not "
+        "known; read every mark twice",
+    ),
+    (
+        Finding("finite_rotation", 5.126e-3, unit="rad", details={"residuals": 2.04e-8}),
+        "the model is linear, but the plate was turned by up to 5.13 mrad: leave out "
+        "--misalignment linear (or --method law); solved jointly "
+        "with finite rotations, the default, "
+        "the readings leave 0.0204 µm",
+    ),
+    (
+        Finding("axes_not_met", 3 * ARCSEC_RAD, unit="rad", p=0.0012),
+        "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure 3 "
+        "arcsec, p = 0.0012); use zero_mean",
+    ),
+    (
+        Finding("prediction_failed", 3.456, view="ty", details={"tenth": 0, "limit": 1.2}),
+        "view 'ty' is predicted with 3.46 times the noise, beyond the limit of 1.20",
+    ),
+    (
+        Finding("prediction_failed", 3.456, details={"tenth": 2, "limit": 1.2}),
+        "a random tenth (2) is predicted with 3.46 times the noise, beyond the limit of 1.20",
+    ),
+    (
+        Finding("no_uncertainty"),
+        "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)",
+    ),
+    (
+        unchecked([[5, -3]]),
+        "1 site (5, -3) of the map rests on a single reading that no other checks; an error in it "
+        "goes into the map, and no residual shows it: measure the missing marks, or add a view",
+    ),
+    (
+        unchecked([[m, 5] for m in range(7)], [4, 11]),
+        "7 sites ((0, 5), (1, 5), (2, 5), (3, 5), (4, 5) and 2 more) "
+        "and 2 lines (4, 11) of the map "
+        "rest on single readings that no other checks; an error in them goes into the map, and no "
+        "residual shows it: measure the missing marks, or add a view",
+    ),
+    (
+        unchecked([], [4]),
+        "1 line 4 of the map rests on a single reading that no other checks; an error in it goes "
+        "into the map, and no residual shows it: measure the missing marks, or add a view",
+    ),
+    *(
+        (
+            Finding("magnification", sign * 2e-3, 1e-5, "m/m"),
+            f"the plate is {word} than the encoders indicate by 2000 ± 10 "
+            "µm/m, more than plate and "
+            "encoders should differ: check the pitch in the plan "
+            "(grid_pitch), and the scale of the "
+            "encoders",
+        )
+        for sign, word in ((1, "larger"), (-1, "smaller"))
+    ),
+    (
+        Finding("drawn_uncertainty", details={"draws": 200}),
+        "uncertainties of Hu's law from 200 draws of unit noise: 5.0 % standard error",
+    ),
+    (
+        outliers(2, [("90", "grid", [0, -2], 5.04), ("a", "angular", [7], 9.0)]),
+        "removed 2 outliers: '90' grid (0, -2) (5.0 sigma), 'a' angular 7 (9.0 sigma)",
+    ),
+    (
+        outliers(3, [("90", "grid", [0, -2], 5.04), ("90", "grid", [1, -2], 6.04)]),
+        "removed 3 outliers: '90' grid (0, -2) (5.0 sigma), '90' "
+        "grid (1, -2) (6.0 sigma) and 1 more",
+    ),
+    (
+        outliers(1, [("90", "grid", [0, -2], 5.04)]),
+        "removed 1 outlier: '90' grid (0, -2) (5.0 sigma)",
+    ),
+    (
+        Finding("noisy_view", 2.26, view="90"),
+        "view '90' is 2.3 times as noisy as the others: measure it again",
+    ),
+    (
+        Finding("too_many_outliers", details={"limit": 0.1}),
+        "more than 10% of the readings contradict the others: none was removed; look for a wrong "
+        "plan or a faulty view",
+    ),
     (Finding("outliers_kept"), "removing more outliers would leave the stage undetermined"),
-    (Finding("outliers_given_up", details={"rounds": 60}),
-     "gave up on outliers after 60 rounds: the readings seem to contain more; look for a wrong "
-     "plan or a faulty view"),
-    (slip([("90", "m", 2)], spoils=False),
-     "view '90': the plate slipped before m = 2 by (0.3, -0.4) µm and 5 µrad; treated as two "
-     "placements"),
-    (slip([("90", "m", 2)], spoils=True),
-     "view '90': the plate slipped before m = 2 by (0.3, -0.4) µm and 5 µrad; treated as two "
-     "placements; this spoils the map: measure the view again"),
-    (slip([("90", "m", 2), ("+x", "n", 0)], spoils=False, y=0.0, phi=0.0),
-     "view '90': the plate slipped by about (0.3, 0) µm and 0 "
-     "µrad, before m = 2 or before n = 0 "
-     "in view '+x'; the readings do not determine which; the view is left out"),
-    (slip([("90", "m", 2), ("90", "n", 0)], spoils=True),
-     "view '90': the plate slipped by about (0.3, -0.4) µm and 5 "
-     "µrad, before m = 2 or before n = "
-     "0; the readings do not determine which; this spoils the map: measure the view again"),
-    (replace(TURN, name="taken_for_slip", details={
-        "part": "turn", "cause": "microscope", "slip_in": "+x"}),
-     "view '+x' looks as if the plate slipped, but the readings show a microscope turned "
-     "counter-clockwise by 2.000 ± 0.010 mrad, which explains them better: no view was split"),
-    (Finding("slips_given_up", details={"slips": 3}),
-     "gave up on slips after 3: the readings seem to contain more; measure again"),
-    (Finding("own_terms_unknown", details={"terms": ["drift", "plate_scale"]}),
-     "its own drift and plate_scale cannot be known: not judged")]
+    (
+        Finding("outliers_given_up", details={"rounds": 60}),
+        "gave up on outliers after 60 rounds: the readings seem to contain more; look for a wrong "
+        "plan or a faulty view",
+    ),
+    (
+        slip([("90", "m", 2)], spoils=False),
+        "view '90': the plate slipped before m = 2 by (0.3, -0.4) µm and 5 µrad; treated as two "
+        "placements",
+    ),
+    (
+        slip([("90", "m", 2)], spoils=True),
+        "view '90': the plate slipped before m = 2 by (0.3, -0.4) µm and 5 µrad; treated as two "
+        "placements; this spoils the map: measure the view again",
+    ),
+    (
+        slip([("90", "m", 2), ("+x", "n", 0)], spoils=False, y=0.0, phi=0.0),
+        "view '90': the plate slipped by about (0.3, 0) µm and 0 "
+        "µrad, before m = 2 or before n = 0 "
+        "in view '+x'; the readings do not determine which; the view is left out",
+    ),
+    (
+        slip([("90", "m", 2), ("90", "n", 0)], spoils=True),
+        "view '90': the plate slipped by about (0.3, -0.4) µm and 5 "
+        "µrad, before m = 2 or before n = "
+        "0; the readings do not determine which; this spoils the map: measure the view again",
+    ),
+    (
+        replace(
+            TURN,
+            name="taken_for_slip",
+            details={"part": "turn", "cause": "microscope", "slip_in": "+x"},
+        ),
+        "view '+x' looks as if the plate slipped, but the readings show a microscope turned "
+        "counter-clockwise by 2.000 ± 0.010 mrad, which explains them better: no view was split",
+    ),
+    (
+        Finding("slips_given_up", details={"slips": 3}),
+        "gave up on slips after 3: the readings seem to contain more; measure again",
+    ),
+    (
+        Finding("own_terms_unknown", details={"terms": ["drift", "plate_scale"]}),
+        "its own drift and plate_scale cannot be known: not judged",
+    ),
+]
 
 
-@pytest.mark.parametrize(("found", "text"), [*CAUSES, *FINDINGS],
-                         ids=[found.name for found, _ in [*CAUSES, *FINDINGS]])
+@pytest.mark.parametrize(
+    ("found", "text"), [*CAUSES, *FINDINGS], ids=[found.name for found, _ in [*CAUSES, *FINDINGS]]
+)
 def test_a_finding_in_words(found, text):
     assert sentence_of(found) == text
 
@@ -285,13 +507,25 @@ def test_every_finding_of_the_package_has_its_words_and_no_words_are_left_over()
     made = set()
     for path in (*(PACKAGE / "estimation").rglob("*.py"), PACKAGE / "papers/law.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if (isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding"
-                    and isinstance(node.args[0], ast.Constant)):
+            if (
+                isinstance(node, ast.Call)
+                and getattr(node.func, "id", "") == "Finding"
+                and isinstance(node.args[0], ast.Constant)
+            ):
                 made.add(node.args[0].value)
-    elsewhere = {"not_identified", "taken_for_slip", "changed_or_drifted",
-                 "changed_or_microscope",
-                 "nonorthogonality", "scale_difference", "bending_x", "bending_y",
-                 "add_views", "or_add_views", "add_views_or_fewer_nodes"}
+    elsewhere = {
+        "not_identified",
+        "taken_for_slip",
+        "changed_or_drifted",
+        "changed_or_microscope",
+        "nonorthogonality",
+        "scale_difference",
+        "bending_x",
+        "bending_y",
+        "add_views",
+        "or_add_views",
+        "add_views_or_fewer_nodes",
+    }
     sentences = {*SENTENCES, *OF_OBSERVABILITY, "rest_not_identified"}
     unsaid, unused = (made | elsewhere) - sentences, sentences - made - elsewhere
     assert not unsaid, f"add to SENTENCES in reporting/words/findings.py: {sorted(unsaid)}"
@@ -308,7 +542,8 @@ def test_a_remedy_that_was_tried_comes_first_and_a_view_is_for_programs():
     cause = replace(cause_of(found, GROUND), remedies=tried)
     assert sentence_of(cause) == (
         "a drift of 0.0200 ± 0.0020 µm along x during view '90': solve with --model drift:2e-08, "
-        "or visit the marks there and back")
+        "or visit the marks there and back"
+    )
     assert remedies(cause) == (*tried, Remedy("action", "visit the marks there and back"))
 
 
@@ -322,18 +557,25 @@ def saved_and_read(result):
 def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
     """Whatever a view is called: what a cause is, and what to do, come from the data."""
     found = explanation("plate_scale", [(1, ""), (2, "")], [1e-7, 2e-6], 1e-7)
-    cause = replace(cause_of(found, SimpleNamespace(
-        names_of=lambda term: ("0: first", "90", ODD), half_width_m=0.05)), remedies=(
-        Remedy("model", "plate_scale:3e-06"), Remedy("view", ODD)))
-    what = (f"a plate larger by 2.00 ± 0.10 µm/m in view '{ODD}' than in view '0: first'")
+    cause = replace(
+        cause_of(
+            found, SimpleNamespace(names_of=lambda term: ("0: first", "90", ODD), half_width_m=0.05)
+        ),
+        remedies=(Remedy("model", "plate_scale:3e-06"), Remedy("view", ODD)),
+    )
+    what = f"a plate larger by 2.00 ± 0.10 µm/m in view '{ODD}' than in view '0: first'"
     noisy = Finding("noisy_view", 2.26, unit="m/m", view=ODD)
-    bare = replace(result_of(random_map(Artifact(3, 0.01, 8), 1)), findings=(noisy,),
-                   verdict=Verdict(Grade.NOT_QUALIFIED, (noisy,), (cause,)))
+    bare = replace(
+        result_of(random_map(Artifact(3, 0.01, 8), 1)),
+        findings=(noisy,),
+        verdict=Verdict(Grade.NOT_QUALIFIED, (noisy,), (cause,)),
+    )
     again = saved_and_read(worded(bare))
     verdict = again.verdict
     assert verdict.reasons == (
         f"view '{ODD}' is 2.3 times as noisy as the others: measure it again",
-        f"the readings show {what}")
+        f"the readings show {what}",
+    )
     remedy = "solve with --model plate_scale:3e-06, or let the plate reach thermal equilibrium"
     assert verdict.sentence == f"Not qualified: most likely {what}: {remedy}"
     assert (what_it_is(verdict.causes[0]), advice(verdict.causes[0])) == (what, remedy)
@@ -353,10 +595,14 @@ def test_a_verdict_names_the_likeliest_cause_or_else_the_first_reason():
     drift = Cause("drift", 5e-7, 1e-8, "m", 1e-6, "90", "x")
     unknown = Finding("noise_unknown")
     found = worded_verdict(Verdict(Grade.NOT_QUALIFIED, (unknown,), (TURN, drift)), TESTED)
-    assert found.sentence == ("Not qualified: most likely a microscope turned counter-clockwise by "
-                              f"2.000 ± 0.010 mrad: {ALIGN}")
-    assert found.reasons == (sentence_of(unknown), *(
-        f"the readings show {what_it_is(cause)}" for cause in (TURN, drift)))
+    assert found.sentence == (
+        "Not qualified: most likely a microscope turned counter-clockwise by "
+        f"2.000 ± 0.010 mrad: {ALIGN}"
+    )
+    assert found.reasons == (
+        sentence_of(unknown),
+        *(f"the readings show {what_it_is(cause)}" for cause in (TURN, drift)),
+    )
     assert [cause.text for cause in found.causes] == [sentence_of(TURN), sentence_of(drift)]
     assert not found.qualified and worded_verdict(found, TESTED) is found
     alone = worded_verdict(Verdict(Grade.NOT_QUALIFIED, (unknown,)), TESTED)
@@ -365,9 +611,11 @@ def test_a_verdict_names_the_likeliest_cause_or_else_the_first_reason():
 
 def test_a_qualified_verdict_says_what_was_compared():
     assert worded_verdict(Verdict(Grade.GOOD), TESTED).sentence == (
-        "Good: residuals and the noise of readings agree")
+        "Good: residuals and the noise of readings agree"
+    )
     assert worded_verdict(Verdict(Grade.GOOD), UNTESTED).sentence == (
-        "Good: residuals show the noise; there are no repeats to compare it with")
+        "Good: residuals show the noise; there are no repeats to compare it with"
+    )
 
 
 def test_a_verdict_within_an_enlarged_uncertainty_names_what_enlarged_it():
@@ -377,10 +625,12 @@ def test_a_verdict_within_an_enlarged_uncertainty_names_what_enlarged_it():
 
 
 def test_a_result_is_worded_once_and_only_then_written():
-    bare = replace(result_of(random_map(Artifact(3, 0.01, 8), 1)), warnings=("as read",),
-                   verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("noise_unknown"),), (TURN,)),
-                   findings=(Finding("outliers_kept"), Finding("slips_given_up", details={
-                       "slips": 3})))
+    bare = replace(
+        result_of(random_map(Artifact(3, 0.01, 8), 1)),
+        warnings=("as read",),
+        verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("noise_unknown"),), (TURN,)),
+        findings=(Finding("outliers_kept"), Finding("slips_given_up", details={"slips": 3})),
+    )
     for part in (bare, replace(bare, findings=())):
         with pytest.raises(ValueError, match=re.escape("is not worded")):
             result_to_dict(part)
@@ -388,21 +638,53 @@ def test_a_result_is_worded_once_and_only_then_written():
     assert found.warnings == ("as read", *map(sentence_of, bare.findings))
     written = result_to_dict(found)
     assert result_to_dict(worded(found)) == written
-    assert written["verdict"]["causes"] == [{
-        "name": "microscope", "text": sentence_of(TURN), "view": "", "axis": "", "mark": [],
-        "size": 2e-3, "u": 1e-5, "unit": "rad", "p": 1e-6, "details": {"part": "turn"},
-        "effect_rms": None, "effect_max": None, "told": True, "remedies": [{"action": ALIGN}]}]
-    assert written["verdict"]["failed"] == [{
-        "name": "noise_unknown", "text": sentence_of(Finding("noise_unknown")), "view": "",
-        "axis": "", "mark": [], "size": None, "u": None, "unit": "", "p": None, "details": {}}]
+    assert written["verdict"]["causes"] == [
+        {
+            "name": "microscope",
+            "text": sentence_of(TURN),
+            "view": "",
+            "axis": "",
+            "mark": [],
+            "size": 2e-3,
+            "u": 1e-5,
+            "unit": "rad",
+            "p": 1e-6,
+            "details": {"part": "turn"},
+            "effect_rms": None,
+            "effect_max": None,
+            "told": True,
+            "remedies": [{"action": ALIGN}],
+        }
+    ]
+    assert written["verdict"]["failed"] == [
+        {
+            "name": "noise_unknown",
+            "text": sentence_of(Finding("noise_unknown")),
+            "view": "",
+            "axis": "",
+            "mark": [],
+            "size": None,
+            "u": None,
+            "unit": "",
+            "p": None,
+            "details": {},
+        }
+    ]
     assert written["findings"][1]["details"] == {"slips": 3}
     assert [item["text"] for item in written["findings"]] == list(found.warnings[1:])
     assert np.array_equal(found.error_map.gx, bare.error_map.gx)
 
 
-@pytest.mark.parametrize(("name", "si", "unit"), [
-    ("drift", "m", "µm"), ("microscope", "m/m", "µm/m"), ("microscope", "rad", "mrad"),
-    ("line_eccentricity", "rad", "µrad"), ("line_scale", "m/m", "µm/m"),
-    ("plate_strain", "m/m", "µm/m")])
+@pytest.mark.parametrize(
+    ("name", "si", "unit"),
+    [
+        ("drift", "m", "µm"),
+        ("microscope", "m/m", "µm/m"),
+        ("microscope", "rad", "mrad"),
+        ("line_eccentricity", "rad", "µrad"),
+        ("line_scale", "m/m", "µm/m"),
+        ("plate_strain", "m/m", "µm/m"),
+    ],
+)
 def test_estimates_and_causes_have_one_unit_each(name, si, unit):
     assert unit_of(name, si).name == unit
