@@ -16,6 +16,7 @@ setup:  ## the environment .venv, without ROS installed
 demo: setup  ## replay a recorded bag through the live nodes, and show the map
 	@$(BIN)/python tools/demo.py
 lint: setup  ## style, types
+	@$(BIN)/ruff format --quiet --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy --num-workers $(shell nproc)
 build/linters/.complete: tools/linter-requirements.txt | setup
