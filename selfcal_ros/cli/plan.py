@@ -202,6 +202,14 @@ def _judge(
     `without`: observability and prediction without terms.
     """
     terms = PlannedTerms(plan, model, assumed, sizes)
+    for term in model:
+        if not terms.every.rows([term.name]).any():
+            raise InputError(
+                f"model: {term.name}",
+                "no reading of this plan depends on it",
+                "leave it out of --model and of model_terms, or add what it acts on (angular "
+                "lines, images of several marks)",
+            )
     seen = terms.told(without[0])
     joint = terms.predicted(without[1]) if seen.identifiable else None
     return seen, joint, check_terms(terms, sizes, CAUSE_LEVEL)

@@ -352,6 +352,8 @@ def test_a_plan_of_a_known_plate_leaves_open_whether_it_is_identified(capsys):
         (["--drift-degree", "0"], "--drift-degree: 0 is not a degree of a drift; give 1 to 9"),
         (["--order", "spiral"], "--order: 'spiral' is not a visiting order"),
         (["--model", "creep"], "--model: the term 'creep' is unknown"),
+        (["--model", "yaw"], "model: yaw: no reading of this plan depends on it; leave it out"),
+        (["--model", "line_scale"], "model: line_scale: no reading of this plan depends on it"),
         (["--against", "drift"], "--against: drift: a size is missing; write drift:SIZE"),
         (["--repeats", "0"], "--repeats: 0 is not positive; give 1 or more"),
     ],

@@ -154,10 +154,21 @@ def judged(
             *_visits_findings(checked),
             *views_findings(measurements),
             *[Finding("roughness_untested")] * untested,
+            *_without_readings(solved, options),
         ),
         provenance=provenance_of(measurements, options),
     )
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result))))
+
+
+def _without_readings(solved: Solved, options: Options) -> Iterator[Finding]:
+    """Yield a finding of each named term on which no reading depends: the model is without it."""
+    if solved.model is None:
+        return
+    estimated = {term.name for term in solved.model.problem.terms}
+    for term in options.terms:
+        if term.size > 0 and term.name not in estimated:
+            yield Finding("term_without_readings", details={"term": str(term.name)})
 
 
 def _beyond_repeats(solved: Solved) -> Iterator[Effect]:

@@ -272,6 +272,9 @@ SENTENCES: dict[str, Words] = {
         "contribution for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the "
         "readings too few, for a finer map; solve with fewer nodes once, or add a view"
     ),
+    "term_without_readings": lambda f, of: (
+        f"no reading depends on {of['term']}: it is not in the model; leave it out"
+    ),
     "visited_once": lambda f, of: (
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "the same in all views becomes part of the map, and repeats do not show it; visit the "
