@@ -141,7 +141,7 @@ def image_fields(
     return IMAGE_TOPIC, from_model.image(values, camera.encoding, exposure.stamp_ns, "camera")
 
 
-def write_truth(path: Path, truth: Truth, **more: object) -> None:
+def write_truth(path: Path, truth: Truth, **provenance: object) -> None:
     """Write the known truth, that of the stage at the nodes of its map.
 
     gx, gy, ax, ay (m), g_theta, a_theta (rad); of each view phi (rad), t, drift, drift_walk,
@@ -184,7 +184,7 @@ def write_truth(path: Path, truth: Truth, **more: object) -> None:
                     else {"rotation": view.rotation_rad, "translation": view.translation_m}
                     for view in truth.placed
                 ],
-                **more,
+                **provenance,
             }
         ),
     )

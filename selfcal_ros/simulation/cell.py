@@ -205,13 +205,13 @@ def grid_exposures(
     )
     visit = np.repeat(np.arange(len(visits)), visits.count)
     size = len(visit)
-    m, n, there = physics.marks_below(truth, index, view, (visits.m, visits.n))
+    m, n, is_mark = physics.marks_below(truth, index, view, (visits.m, visits.n))
     place, _ = physics.mark_places(truth, index, truth.placed_as(index, view), (m, n))
     tau = np.arange(size) / max(size - 1, 1)
-    moved = physics.drift(truth, index, tau)
+    drifted_m = physics.drift(truth, index, tau)
     stop = stage_targets(truth.artifact, view, visits, settings.sense)
     if settings.follow_mark:  # the stage continues until the mark is under the microscope
-        centre = place + moved[:, np.cumsum(visits.count) - visits.count]
+        centre = place + drifted_m[:, np.cumsum(visits.count) - visits.count]
         centre = -centre if settings.sense is Sense.PLATE_MOVES else centre
         stop = centre + physics.stage_error(truth, centre, index)
     stop = stop + normal(rng, settings.stop_sigma_m, stop.shape) + visits.aside_m
@@ -228,40 +228,41 @@ def grid_exposures(
         sign=physics.motion_sign(np.diff(came, axis=1))[:, visit],
         rested_s=rested * settings.exposure_period_s,
     )
-    at = (truth, settings.sense, position, stage)
+    machine = (truth, settings.sense, position, stage)
     white = white_noise(rng, settings, size)
     shared = (
         normal(rng, settings.visit_xy_m, (2, len(visits)))[:, visit]
         + _flicker(rng, settings.flicker_xy_m, (2, size))
         + normal(rng, settings.image_xy_m, (2, size))
     )
-    told = physics.offset_seen(*at, place[:, visit] + moved) + white + shared
+    offset = physics.offset_seen(*machine, place[:, visit] + drifted_m) + white + shared
     indicated = position + normal(rng, settings.encoder_sigma_m, (2, size))
-    others = []
+    other_cells = []
     for sub in view.sub_views:
         if sub.cell is not None and sub.cell != (0, 0):
             marks = physics.marks_beside(truth, index, view, (m, n), sub)
             away = physics.mark_places(truth, index, truth.placed_as(index, view), marks[:2])[0]
-            beside = physics.offset_seen(*at, away[:, visit] + moved)
-            others.append(
+            cell_offset = physics.offset_seen(*machine, away[:, visit] + drifted_m)
+            other_cells.append(
                 Seen(
                     sub.cell,
                     quantised(
-                        beside + white_noise(rng, settings, size) + shared, settings.resolution_xy_m
+                        cell_offset + white_noise(rng, settings, size) + shared,
+                        settings.resolution_xy_m,
                     ),
                     np.stack(marks[:2]),
-                    there & marks[2],
+                    is_mark & marks[2],
                 )
             )
     return GridExposures(
         visits,
         visit,
         indicated,
-        offset=quantised(told, settings.resolution_xy_m),
+        offset=quantised(offset, settings.resolution_xy_m),
         mark=np.stack([m, n]),
-        there=there,
+        there=is_mark,
         approach=approach,
-        others=tuple(others),
+        others=tuple(other_cells),
     )
 
 
@@ -281,7 +282,7 @@ def angular_exposures(
     truth: Truth, index: int, view: View, *, settings: CellSettings, rng: np.random.Generator
 ) -> AngularExposures:
     """Return the exposures of the angular lines of view `index`, line by line."""
-    direction, _, there = physics.line_directions(truth, index, view)
+    direction, _, is_line = physics.line_directions(truth, index, view)
     k, target = line_targets(truth.artifact, view, settings.sense, consecutive=settings.consecutive)
     n_stops = len(direction) if settings.consecutive else len(k)
     stop = normal(rng, settings.stop_sigma_theta_rad, n_stops)
@@ -291,18 +292,20 @@ def angular_exposures(
         target = (centre + physics.encoder_error(truth, centre))[k]
     position = target + stop + normal(rng, settings.servo_sigma_theta_rad, len(k))
     offset = physics.line_offset(truth, settings.sense, direction[k], position)
-    told = (
+    offset_read = (
         truth.line_factor * offset
         + normal(rng, settings.sigma_theta_rad, len(k))
         + _flicker(rng, settings.flicker_theta_rad, (len(k),))
     )
     indicated = position + normal(rng, settings.encoder_sigma_theta_rad, len(k))
-    return AngularExposures(k, there[k], indicated, quantised(told, settings.resolution_theta_rad))
+    return AngularExposures(
+        k, is_line[k], indicated, quantised(offset_read, settings.resolution_theta_rad)
+    )
 
 
-def quantised(told: np.ndarray, step: float) -> np.ndarray:
+def quantised(values: np.ndarray, step: float) -> np.ndarray:
     """Return the nearest multiples of `step`; unchanged if it is 0."""
-    return np.rint(told / step) * step if step else told
+    return np.rint(values / step) * step if step else values
 
 
 def flicker_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
@@ -344,17 +347,17 @@ def view_events(
     Every mark is visited `repeats` times, grid first. The first stamp is `start_ns`; the stage
     rests for a period, and approaches the first grid mark in + direction.
     """
-    stops, seen = _exposures(truth, index, plan.views[index], settings, rng)
+    stops, detected = _exposures(truth, index, plan.views[index], settings, rng)
     period_ns, step_ns = settings.period_ns, round(NS_PER_S / settings.encoder_rate_hz)
     end_ns = start_ns + period_ns * len(stops)
     exposed = 0
     for stamp in range(start_ns, end_ns + 1, step_ns):
-        while exposed < len(seen):
-            at = start_ns + (exposed + 1) * period_ns + settings.exposure_ns
-            if at > stamp:
+        while exposed < len(detected):
+            exposed_ns = start_ns + (exposed + 1) * period_ns + settings.exposure_ns
+            if exposed_ns > stamp:
                 break
-            for offset, mark in seen[exposed]:
-                yield _detection(at, offset, mark, settings)
+            for offset, mark in detected[exposed]:
+                yield _detection(exposed_ns, offset, mark, settings)
             exposed += 1
         yield EncoderSample(stamp, JOINTS, _position(stops, stamp - start_ns, settings))
 
@@ -399,40 +402,40 @@ def _exposures(
     Offset (3,) and mark (kind, m, n, k) of each; none if the plate has none there.
     """
     stops: list[np.ndarray] = [np.zeros((0, 3))]
-    shown: list[list[tuple[np.ndarray, tuple]]] = []
+    marks_shown: list[list[tuple[np.ndarray, tuple]]] = []
     if view.grid:
         grid = grid_exposures(truth, index, view, settings=settings, rng=rng)
         zero = np.zeros(grid.position.shape[1])
         stops.append(np.stack([*grid.position, zero], axis=1))
-        shown = [[] for _ in zero]
+        marks_shown = [[] for _ in zero]
         for cell in (Seen((0, 0), grid.offset, grid.mark, grid.there), *grid.others):
             offsets = np.stack([*cell.offset, zero], axis=1)
-            m, n, there = (row[grid.visit].tolist() for row in (*cell.mark, cell.there))
-            for number in np.flatnonzero(there).tolist():
-                shown[number].append((offsets[number], (Kind.GRID, m[number], n[number], 0)))
+            m, n, is_mark = (row[grid.visit].tolist() for row in (*cell.mark, cell.there))
+            for number in np.flatnonzero(is_mark).tolist():
+                marks_shown[number].append((offsets[number], (Kind.GRID, m[number], n[number], 0)))
     if view.angular:
         lines = angular_exposures(truth, index, view, settings=settings, rng=rng)
         zero = np.zeros(len(lines.k))
         stops.append(np.stack([zero, zero, lines.position], axis=1))
         offsets = np.stack([zero, zero, lines.offset], axis=1)
-        shown += [
+        marks_shown += [
             [(offset, (Kind.ANGULAR, 0, 0, k))]
             for offset, k in zip(offsets, lines.line.tolist(), strict=True)
         ]
-    every = np.concatenate(stops)
-    before = every[:1].copy()
+    stops_of_exposures = np.concatenate(stops)
+    before = stops_of_exposures[:1].copy()
     if view.grid:
         before[:, :2] = lead_in(truth, before[:, :2])
-    return np.concatenate([before, every]), shown
+    return np.concatenate([before, stops_of_exposures]), marks_shown
 
 
 def _position(stops: np.ndarray, elapsed_ns: int, settings: CellSettings) -> tuple[float, ...]:
     number, within = divmod(elapsed_ns, settings.period_ns)
-    here = stops[min(number, len(stops) - 1)]
+    position = stops[min(number, len(stops) - 1)]
     if within > settings.dwell_ns and number + 1 < len(stops):
         part = (within - settings.dwell_ns) / (settings.period_ns - settings.dwell_ns)
-        here = here + (stops[number + 1] - here) * part
-    return tuple(here.tolist())
+        position = position + (stops[number + 1] - position) * part
+    return tuple(position.tolist())
 
 
 def _detection(stamp_ns: int, offset: np.ndarray, mark: tuple, settings: CellSettings) -> Detection:

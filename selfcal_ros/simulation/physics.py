@@ -34,15 +34,15 @@ def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -
     """
     (hx, hy), pitch = truth.artifact.reach, truth.artifact.grid_pitch_m
     x, y = truth.artifact.places(m, n)
-    moved = truth.a[:, *truth.artifact.index(m, n)]
+    displacement = truth.a[:, *truth.artifact.index(m, n)]
     if len(truth.plate_scale):
-        moved = moved + truth.plate_scale[index] * np.stack([x, y]) * pitch
+        displacement = displacement + truth.plate_scale[index] * np.stack([x, y]) * pitch
     if len(truth.plate_shape_m):
         u, v = x / hx, y / hy
-        moved = moved + truth.plate_shape_m[index] @ np.stack([u * u, u * v, v * v])
+        displacement = displacement + truth.plate_shape_m[index] @ np.stack([u * u, u * v, v * v])
     if len(truth.plate_strain):
-        moved = moved + truth.plate_strain[index] @ np.stack([x, y]) * pitch
-    return moved
+        displacement = displacement + truth.plate_strain[index] @ np.stack([x, y]) * pitch
+    return displacement
 
 
 def marks_below(
@@ -74,8 +74,8 @@ def marks_below(
             away < artifact.grid_pitch_m / 2,
         )
     m, n = np.stack(artifact.nearest(*place)).astype(int)
-    there = artifact.has(m, n)
-    return m * there, n * there, there
+    on_plate = artifact.has(m, n)
+    return m * on_plate, n * on_plate, on_plate
 
 
 def marks_beside(
@@ -88,11 +88,11 @@ def marks_beside(
     lies = truth.placed_as(index, view)
     step = np.conj(lies.pose.phase) * sub_view.cell_m / truth.artifact.grid_pitch_m
     m, n = (
-        at + np.rint(part).astype(int)
-        for at, part in zip(marks, (step.real, step.imag), strict=True)
+        centre + np.rint(part).astype(int)
+        for centre, part in zip(marks, (step.real, step.imag), strict=True)
     )
-    there = truth.artifact.has(m, n)
-    return m * there, n * there, there
+    on_plate = truth.artifact.has(m, n)
+    return m * on_plate, n * on_plate, on_plate
 
 
 def mark_places(
@@ -150,20 +150,22 @@ def _tilted(
         return np.zeros_like(arm), np.zeros_like(height)
     kx, ky = tilt / angle
     along = kx * arm[1] - ky * arm[0]  # axis x arm, upwards
-    sine, less = np.sin(angle), 2 * np.sin(angle / 2) ** 2
+    sine, one_less_cosine = np.sin(angle), 2 * np.sin(angle / 2) ** 2
     aside = np.array([[ky], [-kx]])
-    return aside * (sine * height + less * along), sine * along - less * height
+    return aside * (
+        sine * height + one_less_cosine * along
+    ), sine * along - one_less_cosine * height
 
 
 def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
     """Return the displacement of the plate at times `tau` (E,), 0..1 of a view, (2, E), m."""
-    moved = np.zeros((2, len(tau)))
+    displacement = np.zeros((2, len(tau)))
     if len(truth.drift_m):
-        moved += truth.drift_m[index] @ np.stack([tau**power for power in DRIFT_POWERS])
+        displacement += truth.drift_m[index] @ np.stack([tau**power for power in DRIFT_POWERS])
     if truth.walk_m.any():
         steps = np.linspace(0, 1, truth.walk_m.shape[2])
-        moved += np.stack([np.interp(tau, steps, row) for row in truth.walk_m[index]])
-    return moved
+        displacement += np.stack([np.interp(tau, steps, row) for row in truth.walk_m[index]])
+    return displacement
 
 
 def motion_sign(step: np.ndarray) -> np.ndarray:

@@ -187,9 +187,9 @@ class Camera:
         angle: float,
     ) -> None:
         column, row = round(u), round(v)
-        top, left = row - half, column - half
-        rows = slice(max(top, 0), min(top + 2 * half + 1, self.height))
-        columns = slice(max(left, 0), min(left + 2 * half + 1, self.width))
+        first_row, first_column = row - half, column - half
+        rows = slice(max(first_row, 0), min(first_row + 2 * half + 1, self.height))
+        columns = slice(max(first_column, 0), min(first_column + 2 * half + 1, self.width))
         if rows.start >= rows.stop or columns.start >= columns.stop:
             return
         step = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
@@ -204,7 +204,10 @@ class Camera:
         pixels = along @ cover @ along.T
         grey[rows, columns] += (
             contrast
-            * pixels[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+            * pixels[
+                rows.start - first_row : rows.stop - first_row,
+                columns.start - first_column : columns.stop - first_column,
+            ]
         )
 
 
@@ -287,27 +290,27 @@ def exposures(
     (m, n), (i, j) = physics.all_marks(artifact), artifact.middle
     place, index, angle = np.zeros((2, 0)), -1, 0.0
     for _, group in groupby(events, key=lambda event: (event.stamp_ns, _is_grid(event))):
-        found = list(group)
-        for event in found:
+        simultaneous = list(group)
+        for event in simultaneous:
             if isinstance(event, Command) and event.view is not None and event.view_index != index:
                 index = event.view_index
                 view = truth.placed_as(index, event.view)
                 place, _ = physics.mark_places(truth, index, view, (m, n))
                 angle = float(view.rotation_rad + truth.phi_rad[index])
-        seen = {
+        offset_of_mark = {
             (event.m + i) * artifact.shape[1] + event.n + j: (event.offset_x, event.offset_y)
-            for event in found
+            for event in simultaneous
             if isinstance(event, Detection) and _is_grid(event)
         }
-        if not seen:
-            yield from found
+        if not offset_of_mark:
+            yield from simultaneous
             continue
-        first = next(iter(seen))
+        first = next(iter(offset_of_mark))
         away, stage = place - place[:, [first]], place[:, [first]]
         away = physics.with_yaw(truth, sense, -stage if sense is Sense.PLATE_MOVES else stage, away)
-        offsets = np.array([seen[first]]).T + physics.seen_offset(truth, away)
-        offsets[:, list(seen)] = np.array(list(seen.values())).T
-        yield Exposure(found[0].stamp_ns, offsets[:, np.hypot(*away) < reach], angle)
+        offsets = np.array([offset_of_mark[first]]).T + physics.seen_offset(truth, away)
+        offsets[:, list(offset_of_mark)] = np.array(list(offset_of_mark.values())).T
+        yield Exposure(simultaneous[0].stamp_ns, offsets[:, np.hypot(*away) < reach], angle)
 
 
 def _is_grid(event: Event) -> bool:

@@ -302,11 +302,13 @@ class Simulation:
         """Return the truth, the messages with their times of arrival, and the counts of faults."""
         truth, rng = self.draw(len(self.plan.views))
         settings = replace(self.settings, with_ids=True) if self.camera else self.settings
-        made = plan_events(truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns)
+        cell_events = plan_events(
+            truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns
+        )
         events = list(
-            exposures(truth, self.plan, self.camera, made, sense=settings.sense)
+            exposures(truth, self.plan, self.camera, cell_events, sense=settings.sense)
             if self.camera
-            else made
+            else cell_events
         )
         arrivals, ledger = apply_faults(events, self.faults, rng)
         return truth, arrivals, ledger
@@ -398,10 +400,10 @@ def camera_of(path: str | Path) -> tuple[Camera, Spread]:
     InputError
         If it has no camera, or cannot be read.
     """
-    found = read_simulation(path)
-    if found.camera is None:
+    simulation = read_simulation(path)
+    if simulation.camera is None:
         raise InputError(str(path), "the cell has no camera", "add the key 'camera'")
-    return found.camera, found.spread
+    return simulation.camera, simulation.spread
 
 
 def _check_of_images(faults: Mapping[str, Any], where: str) -> None:
@@ -427,8 +429,8 @@ def spread_of(values: Mapping[str, Any], default: Spread | None = None) -> Sprea
 
 
 def _fields_of(values: Mapping[str, Any], keys: Section, defaults: Any) -> dict[str, Any]:
-    found = {key: field_of(key, type(defaults)) for key in keys if key in values}
-    return {name: type(getattr(defaults, name))(values[key]) for key, name in found.items()}
+    fields_by_key = {key: field_of(key, type(defaults)) for key in keys if key in values}
+    return {name: type(getattr(defaults, name))(values[key]) for key, name in fields_by_key.items()}
 
 
 def _plan(plan: Any, path: Path) -> Plan:
@@ -489,12 +491,12 @@ def corrected(truth: Truth, table: ErrorMap, times: float) -> Truth:
     )
 
 
-def _mapping(data: Any, where: str, known: tuple[str, ...]) -> dict:
+def _mapping(data: Any, where: str, known_keys: tuple[str, ...]) -> dict:
     if not isinstance(data, dict):
         raise InputError(where, "not a mapping", "see docs/guides/simulate.md")
     for key in data:
-        if key not in known:
-            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known))
+        if key not in known_keys:
+            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known_keys))
     return data
 
 
