@@ -158,8 +158,8 @@ class HuLaw:
         right = np.concatenate(
             [quarter, *(_columns(np.diff(part, axis=axis)) for part in step for axis in (0, 1))]
         )
-        rest = self.solve_xy(right, np.zeros((6, 1)))[1][:, 0]
-        return rest / np.linalg.norm(rest)
+        residual = self.solve_xy(right, np.zeros((6, 1)))[1][:, 0]
+        return residual / np.linalg.norm(residual)
 
     def _theta(self, u: np.ndarray, g: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Gtheta from the axis slopes (eq. 27) and the circle's differences (eq. 28)."""
@@ -187,10 +187,10 @@ def _identity(size: int) -> sparse.csr_array:
 
 def _rows_xy(size: int) -> sparse.csr_array:
     """Return the left-hand sides of eqs. 23 and 25 for F as (2, N, N) flattened."""
-    one = _identity(size)
+    identity = _identity(size)
     first = _diagonals((-1.0, 1.0), (size - 1, size))
     second = first[:-1, :-1] @ first
-    curve = sparse.kron(second, one)  # F(m+2,n) - 2 F(m+1,n) + F(m,n)
+    curve = sparse.kron(second, identity)  # F(m+2,n) - 2 F(m+1,n) + F(m,n)
     twist = sparse.kron(first, first)  # the mixed difference
     full = _identity(size * size)
     i, j = (index.ravel() for index in np.indices((size, size)))
@@ -211,9 +211,9 @@ def _rows_xy(size: int) -> sparse.csr_array:
 
 def _first_order_rows(artifact: Artifact) -> np.ndarray:
     """Return the six sums of eq. 7 over F, in lattice units."""
-    one = np.ones(artifact.shape)
+    ones = np.ones(artifact.shape)
     rows = np.zeros((6, 2, *artifact.shape))
-    for index, weight in enumerate((one, *artifact.places(artifact.m, artifact.n))):
+    for index, weight in enumerate((ones, *artifact.places(artifact.m, artifact.n))):
         rows[index, 0] = rows[index + 3, 1] = weight / np.linalg.norm(weight)
     return rows.reshape(6, -1)
 
@@ -223,14 +223,16 @@ def _rows_theta(
     datum: ThetaDatum,
     axis_lines: np.ndarray,
 ) -> tuple[sparse.csr_array, np.ndarray]:
-    one = _identity(count)
+    identity = _identity(count)
     k = np.arange(count)
     rows = sparse.csr_array(
-        sparse.vstack([one[(k + count // 4) % count] - one, one[(k + 1) % count] - one])
+        sparse.vstack(
+            [identity[(k + count // 4) % count] - identity, identity[(k + 1) % count] - identity]
+        )
     )
     if datum is ThetaDatum.ZERO_MEAN:
         return rows, np.full((1, count), 1 / np.sqrt(count))
-    return rows, one[axis_lines].toarray()
+    return rows, identity[axis_lines].toarray()
 
 
 def _bordered(
@@ -259,10 +261,10 @@ def _bordered(
     )
 
     def solve(right: np.ndarray, tied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = factor.solve(np.concatenate([rows.T @ right, tied]))[:unknowns]
-        rest, slack = right - rows @ found, tied - ties @ found
-        more = factor.solve(np.concatenate([rows.T @ rest, slack]))[:unknowns]
-        return found + more, rest - rows @ more  # one refinement: to rounding
+        solution = factor.solve(np.concatenate([rows.T @ right, tied]))[:unknowns]
+        residual, slack = right - rows @ solution, tied - ties @ solution
+        refinement = factor.solve(np.concatenate([rows.T @ residual, slack]))[:unknowns]
+        return solution + refinement, residual - rows @ refinement  # one refinement: to rounding
 
     return solve
 
@@ -309,14 +311,14 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     views = hu_views(measurements)
     order = [next(i for i, v in enumerate(measurements.views) if v is view) for view in views]
     law = law_for(measurements.artifact, ThetaDatum(options.datum_theta), measurements.sense)
-    found = law.solve(hu_readings(measurements.artifact, views))
+    solution = law.solve(hu_readings(measurements.artifact, views))
     spread = _propagate(law, views)
-    xy, theta = _noise(found, spread, measurements.views)
+    xy, theta = _noise(solution, spread, measurements.views)
     noise, sense = noise_of(xy, theta), measurements.sense
     u_g, u_theta = spread.uncertainty(noise)
     if options.uncertainty is False:
         u_g, u_theta = np.full_like(u_g, np.nan), np.full_like(u_theta, np.nan)
-    (gx, gy), g_theta = _to_stage(sense, found.g[..., 0], found.g_theta[:, 0])
+    (gx, gy), g_theta = _to_stage(sense, solution.g[..., 0], solution.g_theta[:, 0])
     (u_gx, u_gy), u_theta = _to_stage(sense, u_g, u_theta, sign=1)
     artifact = measurements.artifact
     sites = artifact.shape[0] * artifact.shape[1]
@@ -330,19 +332,19 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
             u_gy=u_gy,
             g_theta=g_theta,
             u_g_theta=u_theta,
-            nonorthogonality=float(found.o[0]),
-            scale_difference=float(found.r[0]),
+            nonorthogonality=float(solution.o[0]),
+            scale_difference=float(solution.r[0]),
             datum_theta=law.datum,
         ),
-        ArtifactMap(found.a[0, ..., 0], found.a[1, ..., 0], found.a_theta[:, 0]),
+        ArtifactMap(solution.a[0, ..., 0], solution.a[1, ..., 0], solution.a_theta[:, 0]),
         tuple(
             ViewResult(
                 view.view.name,
                 view.view.rotation_rad,
                 *view.view.translation_m,
-                phi=float(found.phi[order.index(i), 0]),
-                tx=float(found.t[order.index(i), 0, 0]),
-                ty=float(found.t[order.index(i), 1, 0]),
+                phi=float(solution.phi[order.index(i), 0]),
+                tx=float(solution.t[order.index(i), 0, 0]),
+                ty=float(solution.t[order.index(i), 1, 0]),
                 used=view.used,
                 rejected=sum(view.rejected.values()),
             )
@@ -415,25 +417,25 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
         (1, (0, 0), artifact.angular_count // 4): 1,
         (0, (1, 0), 0): 3,
     }
-    found: dict[int, ViewReadings] = {}
+    view_of_index: dict[int, ViewReadings] = {}
     for view in measurements.views:
         pose = view.view.lattice_pose(artifact)
         grid, lines = len(view.m) > 0, len(view.k) > 0
         index = wanted.get((pose.quarter_turns, pose.shift, pose.turn_lines)) if grid else None
         if not grid and lines and (pose.shift, pose.turn_lines) == ((0, 0), 1):
             index = 2
-        if index is None or index in found:
+        if index is None or index in view_of_index:
             raise InputError(
                 f"method law: view '{view.view.name}'",
                 "is not one of Hu's four views, each once",
                 _REMEDY,
             )
-        found[index] = view
+        view_of_index[index] = view
     for index, name in enumerate(_NAMES):
-        if index not in found:
+        if index not in view_of_index:
             raise InputError("method law", f"Hu's view {index} ({name}) is missing", _REMEDY)
-        _require_complete(found[index], index, artifact)
-    return [found[index] for index in range(4)]
+        _require_complete(view_of_index[index], index, artifact)
+    return [view_of_index[index] for index in range(4)]
 
 
 def _require_complete(view: ViewReadings, index: int, artifact: Artifact) -> None:
@@ -462,8 +464,8 @@ def hu_readings(artifact: Artifact, views: list[ViewReadings]) -> HuReadings:
 
 def _grid(view: ViewReadings, artifact: Artifact) -> np.ndarray:
     values = np.full((2, *artifact.shape), np.nan)
-    at = artifact.index(view.m, view.n)
-    values[0][at], values[1][at] = view.dx, view.dy
+    index = artifact.index(view.m, view.n)
+    values[0][index], values[1][index] = view.dx, view.dy
     return values
 
 
@@ -496,24 +498,24 @@ def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
     grid, lines = (
         law.solve(_unit_noise(law.artifact, views, kind=kind, exact=exact)) for kind in range(2)
     )
-    rest, dof = np.transpose(
-        [_quadratic_form(each, exact=exact) for each in (grid.rest_xy, lines.rest_theta)]
+    expected_squares, dof = np.transpose(
+        [_quadratic_form(of_kind, exact=exact) for of_kind in (grid.rest_xy, lines.rest_theta)]
     )
     columns = 1 if exact else N_DRAWS
     var_g, var_theta = (
-        np.stack([(values**2).sum(axis=-1) / columns for values in each])
-        for each in ((grid.g, lines.g), (grid.g_theta, lines.g_theta))
+        np.stack([(values**2).sum(axis=-1) / columns for values in of_kind])
+        for of_kind in ((grid.g, lines.g), (grid.g_theta, lines.g_theta))
     )
-    return _Spread(var_g, var_theta, rest, dof)
+    return _Spread(var_g, var_theta, expected_squares, dof)
 
 
-def _quadratic_form(rest: np.ndarray, *, exact: bool) -> tuple[float, float]:
+def _quadratic_form(residuals: np.ndarray, *, exact: bool) -> tuple[float, float]:
     """Return mean and effective degrees of freedom (Satterthwaite) of the sum of squares."""
     if exact:
-        gram = rest.T @ rest
+        gram = residuals.T @ residuals
         mean, twice_squares = float(np.trace(gram)), 2 * float((gram**2).sum())
     else:
-        sums = (rest**2).sum(axis=0)
+        sums = (residuals**2).sum(axis=0)
         mean, twice_squares = float(sums.mean()), float(sums.var(ddof=1))
     return mean, 2 * mean**2 / twice_squares
 
@@ -555,23 +557,26 @@ def _per_mean(view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]) ->
 
 
 def _noise(
-    found: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]
+    solution: HuSolution, spread: _Spread, views: tuple[ViewReadings, ...]
 ) -> tuple[NoiseEstimate, NoiseEstimate]:
     """Estimate the noise of one reading from repeats, and from the residuals."""
-    rest = np.sqrt(
-        [(found.rest_xy**2).sum() / spread.rest[0], (found.rest_theta**2).sum() / spread.rest[1]]
+    from_residuals = np.sqrt(
+        [
+            (solution.rest_xy**2).sum() / spread.rest[0],
+            (solution.rest_theta**2).sum() / spread.rest[1],
+        ]
     )
     dof = np.maximum(np.round(spread.rest_dof), 1).astype(int)
     declared = float("nan")
     xy = noise_estimate(
         pooled((v.sigma_xy, v.dof_xy) for v in views if len(v.m)),
-        (float(rest[0]), int(dof[0])),
+        (float(from_residuals[0]), int(dof[0])),
         declared,
         floor=FLOOR,
     )
     theta = noise_estimate(
         pooled((v.sigma_theta, v.dof_theta) for v in views if len(v.k)),
-        (float(rest[1]), int(dof[1])),
+        (float(from_residuals[1]), int(dof[1])),
         declared,
         floor=FLOOR,
     )

@@ -129,8 +129,8 @@ def scatters(measurements: Measurements, axis: int) -> dict[tuple[int, int], Sca
     for view in measurements.views:
         for site, group in _groups(view, measurements, axis, sign):
             groups.setdefault(site, []).append(group)
-    found = {site: _scatter(parts) for site, parts in groups.items()}
-    return {site: item for site, item in found.items() if item is not None}
+    scatter_at = {site: _scatter(parts) for site, parts in groups.items()}
+    return {site: item for site, item in scatter_at.items() if item is not None}
 
 
 def _groups(
@@ -155,26 +155,26 @@ def _groups(
 
 def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:
     """Return the pooled repeats of a site; None if a direction has none, or no second one."""
-    weight = moved = 0.0
+    weight = weighted_reversal = 0.0
     square, dof = np.zeros(2), np.zeros(2, dtype=int)
     signs = np.concatenate([approach for _, approach in parts])
     for values, approach in parts:
         means, counts = np.zeros(2), np.zeros(2, dtype=int)
         for side, wanted in enumerate((1, -1)):
-            of = values[approach == wanted]
-            counts[side] = len(of)
-            if len(of):
-                means[side] = of.mean()
-                square[side] += ((of - of.mean()) ** 2).sum()
-                dof[side] += len(of) - 1
+            repeats = values[approach == wanted]
+            counts[side] = len(repeats)
+            if len(repeats):
+                means[side] = repeats.mean()
+                square[side] += ((repeats - repeats.mean()) ** 2).sum()
+                dof[side] += len(repeats) - 1
         if counts.all():
             w = 1 / (1 / counts).sum()
-            weight, moved = weight + w, moved + w * (means[0] - means[1])
+            weight, weighted_reversal = weight + w, weighted_reversal + w * (means[0] - means[1])
     if not weight or not dof.all():
         return None
     s = np.sqrt(square / dof)
     return Scatter(
-        float(moved / weight),
+        float(weighted_reversal / weight),
         float(1 / np.sqrt(weight)),
         float(s[0]),
         float(s[1]),
@@ -199,7 +199,9 @@ def bidirectional(
         return high.max(axis=-1) - low.min(axis=-1)
 
     reversal = up - down
-    both = np.maximum(2 * s_up + 2 * s_down + np.abs(reversal), np.maximum(4 * s_up, 4 * s_down))
+    repeatability = np.maximum(
+        2 * s_up + 2 * s_down + np.abs(reversal), np.maximum(4 * s_up, 4 * s_down)
+    )
     high = np.maximum(up + 2 * s_up, down + 2 * s_down)
     low = np.minimum(up - 2 * s_up, down - 2 * s_down)
     return {
@@ -209,7 +211,7 @@ def bidirectional(
         "E": spread(np.maximum(up, down), np.minimum(up, down)),
         "E+": spread(up, up),
         "E-": spread(down, down),
-        "R": both.max(axis=-1),
+        "R": repeatability.max(axis=-1),
         "R+": 4 * s_up.max(axis=-1),
         "R-": 4 * s_down.max(axis=-1),
         "A": spread(high, low),
@@ -245,18 +247,18 @@ def axis_figures(
     InputError
         If the line has fewer than three positions.
     """
-    known = _positions(stage, axis, line, repeats)
-    at, emap = stage.error_map.artifact, stage.error_map
-    place = at.index(*np.array(known).T)
-    error = (emap.gx, emap.gy)[axis][place]
-    drawn = error + _map_draws(stage, place, axis)
-    along = (at.x_m[:, 0], at.y_m[0])[axis]
-    position, left_out = along[place[axis]], np.delete(along, place[axis])
-    line_m = (line + at.off_centre[1 - axis]) * at.grid_pitch_m
-    nothing = np.full(len(known), np.nan)
+    sites = _positions(stage, axis, line, repeats)
+    plate, emap = stage.error_map.artifact, stage.error_map
+    index = plate.index(*np.array(sites).T)
+    error = (emap.gx, emap.gy)[axis][index]
+    drawn = error + _map_draws(stage, index, axis)
+    along = (plate.x_m[:, 0], plate.y_m[0])[axis]
+    position, left_out = along[index[axis]], np.delete(along, index[axis])
+    line_m = (line + plate.off_centre[1 - axis]) * plate.grid_pitch_m
+    nothing = np.full(len(sites), np.nan)
     if repeats is None:
         value = -error
-        whole = float(np.ptp(value))
+        range_m = float(np.ptp(value))
         return AxisFigures(
             "xy"[axis],
             line_m,
@@ -267,9 +269,9 @@ def axis_figures(
             s_down_m=nothing,
             approaches=(0, 0),
             left_out_m=left_out,
-            figures={"M": Figure(whole, _rms_about(np.ptp(drawn, axis=-1), whole))},
+            figures={"M": Figure(range_m, _rms_about(np.ptp(drawn, axis=-1), range_m))},
         )
-    items = [repeats[site] for site in known]
+    items = [repeats[site] for site in sites]
     s_up, s_down, reversal, u_reversal, dof_up, dof_down, sign = (
         np.array([getattr(item, name) for item in items])
         for name in (
@@ -282,10 +284,10 @@ def axis_figures(
             "mean_sign",
         )
     )
-    shift = np.zeros(len(known)) if approach_in_model else sign * reversal / 2
+    shift = np.zeros(len(sites)) if approach_in_model else sign * reversal / 2
     up, down = -(error - shift + reversal / 2), -(error - shift - reversal / 2)
     rng = np.random.default_rng(0)
-    size = (DRAWS, len(known))
+    size = (DRAWS, len(sites))
     u = u_reversal * np.sqrt(np.mean(s_up**2 + s_down**2) / 2)
     turned = _true_values(reversal, u, rng)
     draws = bidirectional(
@@ -294,7 +296,7 @@ def axis_figures(
         s_up * np.sqrt(rng.chisquare(dof_up, size) / dof_up),
         s_down * np.sqrt(rng.chisquare(dof_down, size) / dof_down),
     )
-    found = bidirectional(up, down, s_up, s_down)
+    values_of = bidirectional(up, down, s_up, s_down)
     return AxisFigures(
         "xy"[axis],
         line_m,
@@ -307,7 +309,7 @@ def axis_figures(
         left_out_m=left_out,
         figures={
             name: Figure(float(value), _rms_about(draws[name], float(value)))
-            for name, value in found.items()
+            for name, value in values_of.items()
         },
     )
 
@@ -336,29 +338,29 @@ def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) ->
     fit -= 0.5 * np.log(weight.sum(axis=1))
     chosen = rng.choice(SHARES, DRAWS, p=np.exp(fit - fit.max()) / np.exp(fit - fit.max()).sum())
     about = mean[chosen] + rng.standard_normal(DRAWS) / np.sqrt(weight[chosen].sum(axis=1))
-    kept = 1 - u**2 * weight[chosen]
-    drawn = rng.standard_normal((DRAWS, n)) * u * np.sqrt(kept)
-    return about[:, None] + kept * (values - about[:, None]) + drawn
+    true_share = 1 - u**2 * weight[chosen]
+    drawn = rng.standard_normal((DRAWS, n)) * u * np.sqrt(true_share)
+    return about[:, None] + true_share * (values - about[:, None]) + drawn
 
 
 def _positions(
     stage: StageMap, axis: int, line: int, repeats: dict[tuple[int, int], Scatter] | None
 ) -> list[tuple[int, int]]:
     """Return the known sites along a line, with repeats if there are some."""
-    at, valid = stage.error_map.artifact, stage.error_map.valid
-    (first, last), (low, high) = at.limits[axis], at.limits[1 - axis]
+    plate, valid = stage.error_map.artifact, stage.error_map.valid
+    (first, last), (low, high) = plate.limits[axis], plate.limits[1 - axis]
     sites = [(i, line) if axis == 0 else (line, i) for i in range(first, last + 1)]
-    known = [
+    known_sites = [
         site
         for site in sites
         if low <= line <= high
-        and valid[site[0] + at.middle[0], site[1] + at.middle[1]]
+        and valid[site[0] + plate.middle[0], site[1] + plate.middle[1]]
         and (repeats is None or site in repeats)
     ]
-    if len(known) < FEWEST:
+    if len(known_sites) < FEWEST:
         raise InputError(
             f"line {line} along {'xy'[axis]}",
-            f"{len(known)} positions "
+            f"{len(known_sites)} positions "
             + (
                 "are known"
                 if repeats is None
@@ -369,7 +371,7 @@ def _positions(
             else "measure with visit_order "
             "there_and_back, or x_back_y_back for both axes, and repeats 4 or more",
         )
-    return known
+    return known_sites
 
 
 def _rms_about(values: np.ndarray, centre: float) -> float:
@@ -384,10 +386,10 @@ def _map_draws(stage: StageMap, place: tuple[np.ndarray, np.ndarray], axis: int)
     cover = covariance_of(stage.result, "xy", chosen)
     n = int(chosen.sum())
     part = slice(axis * n, (axis + 1) * n)
-    own = cover[part, part] if cover.ndim == 2 else np.diag(cover[part])
+    along_axis = cover[part, part] if cover.ndim == 2 else np.diag(cover[part])
     order = np.argsort(np.ravel_multi_index(place, emap.artifact.shape))
     out = np.empty((DRAWS, n))
-    out[:, order] = _draws(own)
+    out[:, order] = _draws(along_axis)
     return out
 
 
@@ -422,8 +424,8 @@ def circle_figures(
     InputError
         If the circle is not in the field, or crosses unknown sites (UnknownSitesError).
     """
-    at = stage.error_map.artifact
-    reach = np.array(at.half) * at.grid_pitch_m - np.abs(centre_m)
+    plate = stage.error_map.artifact
+    reach = np.array(plate.half) * plate.grid_pitch_m - np.abs(centre_m)
     if not 0 < radius_m <= reach.min() * (1 + 1e-9):
         raise InputError(
             "circle",
@@ -457,67 +459,67 @@ def diagonal_figures(stage: StageMap) -> list[PathFigures]:
     ``M`` is the range of the deviation along the diagonal, ``length`` that of its length: actual
     minus commanded. The difference of the lengths, first minus second, shows the squareness.
     """
-    at = stage.error_map.artifact
-    hx, hy = np.array(at.half) * at.grid_pitch_m
-    count = min(at.shape)
+    plate = stage.error_map.artifact
+    hx, hy = np.array(plate.half) * plate.grid_pitch_m
+    count = min(plate.shape)
     along = np.linspace(-1, 1, count)
     ends = np.hypot(hx, hy)
-    found = []
+    diagonals = []
     x = np.concatenate([hx * along, hx * along])
     y = np.concatenate([hy * along, -hy * along])
     e = np.stack([np.full(2 * count, hx), np.repeat([hy, -hy], count)]) / ends
 
     def figures(path: np.ndarray) -> dict[str, np.ndarray]:
         d = (path * e).sum(axis=-2)
-        one, two = d[..., :count], d[..., count:]
-        lengths = [part[..., -1] - part[..., 0] for part in (one, two)]
+        first, second = d[..., :count], d[..., count:]
+        lengths = [part[..., -1] - part[..., 0] for part in (first, second)]
         return {
-            "1 M": np.ptp(one, axis=-1),
+            "1 M": np.ptp(first, axis=-1),
             "1 length": lengths[0],
-            "2 M": np.ptp(two, axis=-1),
+            "2 M": np.ptp(second, axis=-1),
             "2 length": lengths[1],
             "3 length": lengths[0] - lengths[1],
         }
 
-    both = _path(stage, (x, y), figures, ("diagonals", "measure them"))
+    figures_of_both = _path(stage, (x, y), figures, ("diagonals", "measure them"))
     for key, name in (
         ("1", "diagonal +x +y"),
         ("2", "diagonal +x -y"),
         ("3", "difference of the diagonals"),
     ):
-        found.append(
+        diagonals.append(
             PathFigures(
                 name,
                 {
                     symbol.partition(" ")[2]: figure
-                    for symbol, figure in both.items()
+                    for symbol, figure in figures_of_both.items()
                     if symbol.startswith(key)
                 },
             )
         )
-    return found
+    return diagonals
 
 
 def _path(
     stage: StageMap,
-    at: tuple[np.ndarray, np.ndarray],
+    points: tuple[np.ndarray, np.ndarray],
     figures: Callable[[np.ndarray], dict[str, np.ndarray]],
-    said: tuple[str, str],
+    messages: tuple[str, str],
 ) -> dict[str, Figure]:
     """Return the figures of the deviations, actual minus commanded, at points of a path.
 
-    `said` are the name of the path, and what helps if it crosses unknown sites.
+    `messages` are the name of the path, and what helps if it crosses unknown sites.
     """
-    gx, gy = stage.error(*at)
+    gx, gy = stage.error(*points)
     if not np.isfinite(gx + gy).all():
-        raise UnknownSitesError(said[0], "unknown sites on the path", said[1])
+        raise UnknownSitesError(messages[0], "unknown sites on the path", messages[1])
     deviation = -np.stack([gx, gy])
-    found = figures(deviation)
+    measured = figures(deviation)
     try:
-        drawn = figures(deviation - _draws(stage.covariance(*at)).reshape(DRAWS, 2, -1))
+        drawn = figures(deviation - _draws(stage.covariance(*points)).reshape(DRAWS, 2, -1))
     except InputError:  # without the correlations of the sites
-        drawn = {name: np.full(1, np.nan) for name in found}
+        drawn = {name: np.full(1, np.nan) for name in measured}
     return {
         name: Figure(float(value), _rms_about(drawn[name], float(value)))
-        for name, value in found.items()
+        for name, value in measured.items()
     }
