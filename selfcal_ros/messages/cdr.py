@@ -86,8 +86,8 @@ class Layout:
     def _words(self) -> list[tuple[str, int, np.uint64, np.uint64]]:
         """Return name, offset, mask and value of each word that determines the layout."""
         words = []
-        for at in range(0, self.length, WORD):
-            place = min(at, self.length - WORD)
+        for end in range(0, self.length, WORD):
+            place = min(end, self.length - WORD)
             mask = int.from_bytes(self.fixed[place : place + WORD], "little")
             value = int.from_bytes(self.example[place : place + WORD], "little") & mask
             if mask:
@@ -98,10 +98,10 @@ class Layout:
     def dtype(self) -> np.dtype:
         """The messages as a numpy structure: the values, and the determining words."""
         fields = [
-            (name, code if count is None else (code, (count,)), at)
-            for name, (code, at, count) in self.values.items()
+            (name, code if count is None else (code, (count,)), offset)
+            for name, (code, offset, count) in self.values.items()
         ]
-        fields += [(name, "<u8", at) for name, at, _, _ in self._words]
+        fields += [(name, "<u8", offset) for name, offset, _, _ in self._words]
         names, formats, offsets = zip(*fields, strict=True)
         return np.dtype(
             {"names": names, "formats": formats, "offsets": offsets, "itemsize": self.length}
@@ -299,13 +299,13 @@ class ColumnDecoder:
         one.
         """
         groups: list[Columns] = []
-        rest: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
+        undecoded_parts: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
         tries = FREE_TRIES + len(messages) // WORTH
         # frequent lengths first, so that odd messages do not slow them down
         for index in sorted(_by_length(messages.length), key=len, reverse=True):
             tries, undecoded = self._decode_length(messages, index, groups, tries)
-            rest.append(undecoded)
-        return groups, np.sort(np.concatenate(rest))
+            undecoded_parts.append(undecoded)
+        return groups, np.sort(np.concatenate(undecoded_parts))
 
     def _decode_length(
         self, messages: Payloads, index: np.ndarray, groups: list[Columns], tries: int
@@ -335,11 +335,12 @@ class ColumnDecoder:
         return tries, np.concatenate([np.array(failed, dtype=np.int64), index])
 
     def _remember(self, layout: Layout) -> None:
-        known = [*self._known.pop(layout.length, []), layout]
-        self._known[layout.length] = known[-MAX_KNOWN:]
+        layouts = [*self._known.pop(layout.length, []), layout]
+        self._known[layout.length] = layouts[-MAX_KNOWN:]
         while (
             len(self._known) > MAX_LENGTHS
-            or sum(length * len(found) for length, found in self._known.items()) > MAX_KNOWN_BYTES
+            or sum(length * len(of_length) for length, of_length in self._known.items())
+            > MAX_KNOWN_BYTES
         ):
             self._known.pop(next(iter(self._known)))
 

@@ -152,8 +152,8 @@ def plate_from(message: Any) -> str:
 def plan_keys_of(message: Any) -> dict[str, str]:
     """Return the `PLAN_KEYS` of a ViewCommand or ViewMeasurement, "" for those not there."""
     texts = reversed([str(text).partition(": ") for text in getattr(message, "plan_keys", ())])
-    found = {key: value for key, _, value in texts}  # the first of a key counts
-    return {key: found.get(key, "") for key in PLAN_KEYS}
+    text_of_key = {key: value for key, _, value in texts}  # the first of a key counts
+    return {key: text_of_key.get(key, "") for key in PLAN_KEYS}
 
 
 def notes_of(message: Any) -> tuple[str, ...]:
@@ -391,13 +391,13 @@ def error_map(message: Any) -> ErrorMap:
         name: np.array(getattr(message, name), dtype=float).reshape(artifact.shape)
         for name in ("gx", "gy", "u_gx", "u_gy")
     }
-    known = np.array(message.valid, dtype=bool).reshape(artifact.shape)
+    valid = np.array(message.valid, dtype=bool).reshape(artifact.shape)
     g_theta, u_g_theta = (
         np.array(getattr(message, name), dtype=float) for name in ("g_theta", "u_g_theta")
     )
-    _refuse_not_finite(grids, known, g_theta)
+    _refuse_not_finite(grids, valid, g_theta)
     for values in grids.values():
-        values[~known] = np.nan
+        values[~valid] = np.nan
     return ErrorMap(
         artifact,
         **grids,
@@ -410,15 +410,15 @@ def error_map(message: Any) -> ErrorMap:
 
 
 def _refuse_not_finite(
-    grids: dict[str, np.ndarray], known: np.ndarray, g_theta: np.ndarray
+    grids: dict[str, np.ndarray], valid: np.ndarray, g_theta: np.ndarray
 ) -> None:
     """Refuse a map that is not finite where it is said to be known, or known nowhere."""
     for name in ("gx", "gy"):
-        bad = int((~np.isfinite(grids[name][known])).sum())
+        bad = int((~np.isfinite(grids[name][valid])).sum())
         if bad:
             raise InputError(
                 ERROR_MAP_TOPIC,
-                f"{name} is not finite at {bad} of the {int(known.sum())} valid sites",
+                f"{name} is not finite at {bad} of the {int(valid.sum())} valid sites",
                 "correct the publisher",
             )
     for name in ("u_gx", "u_gy"):
@@ -426,7 +426,7 @@ def _refuse_not_finite(
             raise InputError(ERROR_MAP_TOPIC, f"{name} is negative", "correct the publisher")
     if np.isinf(g_theta).any():
         raise InputError(ERROR_MAP_TOPIC, "g_theta is infinite", "correct the publisher")
-    if not known.any() or (len(g_theta) and np.isnan(g_theta).all()):
+    if not valid.any() or (len(g_theta) and np.isnan(g_theta).all()):
         raise InputError(
             ERROR_MAP_TOPIC,
             "the error of no site or of no line is known",
@@ -473,8 +473,8 @@ class PositionEditor:
         """Return names and positions; None if the message is damaged or too long."""
         if not self._find(data):
             return None
-        found = self._known[0]
-        return found.names, found.form.unpack_from(data, found.at)
+        layout = self._known[0]
+        return layout.names, layout.form.unpack_from(data, layout.at)
 
     @property
     def frame_id(self) -> str:
@@ -483,9 +483,9 @@ class PositionEditor:
 
     def replaced(self, data: bytes, positions: Sequence[float]) -> bytes:
         """Return the last message read with other positions."""
-        found = self._known[0]
-        end = found.at + found.form.size
-        return data[: found.at] + found.form.pack(*positions) + data[end:]
+        layout = self._known[0]
+        end = layout.at + layout.form.size
+        return data[: layout.at] + layout.form.pack(*positions) + data[end:]
 
     def _find(self, data: bytes) -> bool:
         """Move the layout of a message to the front; return whether it has one."""
@@ -537,12 +537,12 @@ def first_stamps_ns(messages: cdr.Payloads) -> tuple[np.ndarray, np.ndarray]:
     -------
     stamps_ns : int64 array (k,)
         Stamps, ns.
-    there : bool array (n,)
+    has_header : bool array (n,)
         Which of the messages have one.
     """
-    there = messages.length >= STAMP_END
+    has_header = messages.length >= STAMP_END
     octets = np.frombuffer(messages.data, np.uint8)[
-        messages.start[there][:, None] + np.arange(STAMP_END)
+        messages.start[has_header][:, None] + np.arange(STAMP_END)
     ]
     words = octets[:, 4:].copy()
     little, big = (
@@ -551,7 +551,7 @@ def first_stamps_ns(messages: cdr.Payloads) -> tuple[np.ndarray, np.ndarray]:
     )
     is_little = octets[:, 1] & 1 == 1
     second = np.where(is_little, little["sec"], big["sec"]).astype(np.int64)
-    return second * NS_PER_S + np.where(is_little, little["nanosec"], big["nanosec"]), there
+    return second * NS_PER_S + np.where(is_little, little["nanosec"], big["nanosec"]), has_header
 
 
 def encoder_block(group: cdr.Columns) -> EncoderBlock:

@@ -17,9 +17,9 @@ Field = tuple[np.ndarray, str, float]
 """Vectors (2, nx, ny) in m, their colour, and the width of their shafts."""
 
 
-def hu_figures(found: HuReproduction) -> list[Drawing]:
+def hu_figures(reproduction: HuReproduction) -> list[Drawing]:
     """Return Figures 4 to 9 of Hu."""
-    truth = found.truth
+    truth = reproduction.truth
     low, high = truth.g.min() * UM_PER_M, truth.g.max() * UM_PER_M
     field = parts.titled(
         "hu_figure_4", f"Hu, Figure 4: nominal stage error, {low:.3f} to {high:.3f} µm"
@@ -43,19 +43,21 @@ def hu_figures(found: HuReproduction) -> list[Drawing]:
         lines,
         *(
             _draws(run, name, columns)
-            for run in found.runs
+            for run in reproduction.runs
             for name, columns in zip(run.published.figures, ((0, 1), (2,)), strict=True)
         ),
     ]
 
 
-def qiao_figures(found: QiaoReproduction) -> list[Drawing]:
+def qiao_figures(reproduction: QiaoReproduction) -> list[Drawing]:
     """Return Figures 3 and 4 of Qiao."""
-    artifact = Artifact(found.error_um.shape[1], QIAO_PITCH_M, 0)
+    artifact = Artifact(reproduction.error_um.shape[1], QIAO_PITCH_M, 0)
     programs = parts.titled("qiao_figure_3", "Qiao, Figure 3: truth and least-squares answer")
     for frame, program in zip(
-        parts.panels(programs, [", ".join(p.views) for p in found.programs], _reach(artifact)),
-        found.programs,
+        parts.panels(
+            programs, [", ".join(p.views) for p in reproduction.programs], _reach(artifact)
+        ),
+        reproduction.programs,
         strict=True,
     ):
         _vectors(
@@ -69,9 +71,9 @@ def qiao_figures(found: QiaoReproduction) -> list[Drawing]:
     programs.height += 54
     noise = parts.titled("qiao_figure_4", "Qiao, Figure 4: noise of 0.1 µm")
     frame = parts.panels(noise, ["error of one draw"], _reach(artifact))[0]
-    _vectors(frame, artifact, [(found.error_um * M_PER_UM, "ink", 1.0)])
+    _vectors(frame, artifact, [(reproduction.error_um * M_PER_UM, "ink", 1.0)])
     _, top, _, height = frame.box
-    n = len(found.rms_um)
+    n = len(reproduction.rms_um)
     parts.chart(
         noise,
         (290, top, 182, height),
@@ -80,14 +82,17 @@ def qiao_figures(found: QiaoReproduction) -> list[Drawing]:
                 parts.Curve(
                     np.arange(1, n + 1), np.sqrt((values**2).mean(axis=1)), colour, 0.0, dots=1.8
                 )
-                for values, colour in ((found.rms_um, "c0"), (found.rms_uniform_um, "c1"))
+                for values, colour in (
+                    (reproduction.rms_um, "c0"),
+                    (reproduction.rms_uniform_um, "c1"),
+                )
             ),
             _level(n, 0.05, "ink", (5, 3)),
-            _level(n, found.bound_um, "c2", (2, 2)),
+            _level(n, reproduction.bound_um, "c2", (2, 2)),
         ],
         title="rms error, µm",
         labels=("draw", ""),
-        y=(0.0, 1.1 * float(found.rms_um.max())),
+        y=(0.0, 1.1 * float(reproduction.rms_um.max())),
     )
     for number, entries in enumerate(
         (
@@ -106,12 +111,12 @@ def _reach(artifact: Artifact) -> list[float]:
 
 def _vectors(frame: Frame, artifact: Artifact, fields: Sequence[Field]) -> None:
     """Draw fields over each other at the same enlargement, with a key below."""
-    at = np.stack([artifact.x_m.ravel(), artifact.y_m.ravel()]) * MM_PER_M
+    places_mm = np.stack([artifact.x_m.ravel(), artifact.y_m.ravel()]) * MM_PER_M
     factor = parts.enlargement(
         np.concatenate([np.hypot(*field).ravel() for field, _, _ in fields]), artifact.grid_pitch_m
     )
     for field, colour, width in fields:
-        parts.arrows(frame, at, field.reshape(2, -1), factor, colour=colour, width=width)
+        parts.arrows(frame, places_mm, field.reshape(2, -1), factor, colour=colour, width=width)
     frame.axes(ticks=(4, 4))
     left, top, _, height = frame.box
     parts.arrow_key(frame, factor, (left, top + height + 32))

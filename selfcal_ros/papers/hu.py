@@ -159,17 +159,17 @@ def _run(
 
 def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
     law = law_for(ARTIFACT, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)
-    each = [hu_readings(ARTIFACT, hu_views(readings)) for readings in draws]
-    found = law.solve(
+    readings_of_draws = [hu_readings(ARTIFACT, hu_views(readings)) for readings in draws]
+    solution = law.solve(
         HuReadings(
             *(
-                np.concatenate([getattr(one, name) for one in each], axis=-1)
+                np.concatenate([getattr(of_draw, name) for of_draw in readings_of_draws], axis=-1)
                 for name in ("v0", "v1", "v3", "vt")
             )
         )
     )
-    xy = np.moveaxis(found.g, -1, 0) - truth.g
-    return Errors(xy * UM_PER_M, np.rad2deg(found.g_theta.T - truth.g_theta))
+    xy = np.moveaxis(solution.g, -1, 0) - truth.g
+    return Errors(xy * UM_PER_M, np.rad2deg(solution.g_theta.T - truth.g_theta))
 
 
 def _joint_errors(truth: Truth, draws: list[Measurements], spread: Callable) -> Errors:
@@ -186,19 +186,19 @@ def _joint_maps(draws: list[Measurements]) -> list[ErrorMap]:
     return [calibrate(readings, options).error_map for readings in draws]
 
 
-def hu_text(found: HuReproduction) -> str:
+def hu_text(reproduction: HuReproduction) -> str:
     """Return Tables 1 and 2 and the series of Figures 6 to 9, next to the paper's."""
-    n = len(found.runs[0].law.xy)
+    n = len(reproduction.runs[0].law.xy)
     lines = [
         "Hu, Zhu, Liu: self-calibration of XY-theta stages, section 4",
         "N = 11, 10 mm, K = 24; law = the published steps, joint = least squares of all "
         "readings at once",
-        f"without noise the law errs by {found.noise_free_um:.1e} um, "
-        f"{found.noise_free_deg:.1e} deg",
+        f"without noise the law errs by {reproduction.noise_free_um:.1e} um, "
+        f"{reproduction.noise_free_deg:.1e} deg",
         "bound = smallest rms error of any unbiased method; std leaves out the mean of a "
         "map's error, so that it may lie below",
     ]
-    for run in found.runs:
+    for run in reproduction.runs:
         lines += ["", *_table_text(run, n), "", *_series_text(run)]
     return "\n".join(lines)
 

@@ -57,12 +57,12 @@ def reproduce_ibaraki(
     """Recompute Table 1, and measure the machine of the case study `n_draws` times."""
     rng = np.random.default_rng(seed)
     table = {}
-    for case, given in GIVEN_MM.items():
-        errors_m = np.reshape(given, (2, 1, 2)) * M_PER_MM
-        found = identify_wang(
+    for case, given_mm in GIVEN_MM.items():
+        errors_m = np.reshape(given_mm, (2, 1, 2)) * M_PER_MM
+        identified = identify_wang(
             simulate_step_diagonal(StepMachine(STEPS_M, errors_m), Measurement(), rng)
         )
-        table[case] = found.errors_m.ravel() * MM_PER_M
+        table[case] = identified.errors_m.ravel() * MM_PER_M
     new, conventional = [], []
     for draw in range(n_draws):
         data = _case_study(rng)
@@ -77,22 +77,22 @@ def _case_study(rng: np.random.Generator) -> StepDiagonal:
     return simulate_step_diagonal(case_study_machine(), Measurement(setups, NOISE), rng)
 
 
-def _sizes_um(found: StepDiagonalResult) -> np.ndarray:
+def _sizes_um(result: StepDiagonalResult) -> np.ndarray:
     """Return the figures of the case study, in the order of `CASE_STUDY_UM`."""
     return UM_PER_M * np.array(
         [
-            straightness(found, 0, 1).value,
-            straightness(found, 1, 0).value,
-            squareness(found).value,
-            profile_m(found, 0, 0)[-1],
-            profile_m(found, 1, 1)[-1],
+            straightness(result, 0, 1).value,
+            straightness(result, 1, 0).value,
+            squareness(result).value,
+            profile_m(result, 0, 0)[-1],
+            profile_m(result, 1, 1)[-1],
         ]
     )
 
 
-def ibaraki_text(found: IbarakiReproduction) -> str:
+def ibaraki_text(reproduction: IbarakiReproduction) -> str:
     """Return Table 1 and the case study, the published figures beside ours."""
-    n = len(found.new_um)
+    n = len(reproduction.new_um)
     lines = [
         "Ibaraki, Goto, Matsubara: issues in laser step diagonal measurement",
         "Table 1: conventional formulation, lasers along the machine's own diagonals, mm",
@@ -104,7 +104,7 @@ def ibaraki_text(found: IbarakiReproduction) -> str:
             f"{name:8}"
             + "".join(
                 f"{GIVEN_MM[case][row]:14g}{ESTIMATED_MM[case][row]:11g}"
-                f"{round(found.table_1_mm[case][row], 4) + 0.0:9.4f}"
+                f"{round(reproduction.table_1_mm[case][row], 4) + 0.0:9.4f}"
                 for case in GIVEN_MM
             )
         )
@@ -118,8 +118,8 @@ def ibaraki_text(found: IbarakiReproduction) -> str:
     for row, (name, (measured, new, conventional)) in enumerate(CASE_STUDY_UM.items()):
         lines.append(
             f"{name:16}{measured:10.2f}{'':8}{'-' if new is None else f'{new:.2f}':>10}"
-            f"{found.new_um[:, row].mean():8.2f}{'':16}{conventional:10.2f}"
-            f"{found.conventional_um[:, row].mean():8.2f}"
+            f"{reproduction.new_um[:, row].mean():8.2f}{'':16}{conventional:10.2f}"
+            f"{reproduction.conventional_um[:, row].mean():8.2f}"
         )
     return "\n".join(
         [

@@ -55,7 +55,7 @@ def calibrate_by_law(measurements: Measurements, options: Options) -> Calibratio
 
 def require_plain(measurements: Measurements, options: Options) -> None:
     """Raise InputError if readings or options have what the law cannot use."""
-    for name, given, why in (
+    for name, is_given, why in (
         ("robust", options.robust, "Hu's law needs every reading and cannot leave any out"),
         ("method law", options.plate, "Hu's law cannot use a known plate"),
         (
@@ -66,5 +66,5 @@ def require_plain(measurements: Measurements, options: Options) -> None:
         ("method law", options.reference, "Hu's law has no reference length"),
         ("method law", options.terms, "Hu's law has no terms besides stage and plate"),
     ):
-        if given:
+        if is_given:
             raise InputError(name, why, JOINTLY)

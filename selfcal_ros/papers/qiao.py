@@ -147,7 +147,7 @@ def reproduce_qiao(
 
     The noise runs are solved by `workers` processes, with the same results for any number.
     """
-    seen = [
+    observability = [
         [plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES] for row in ROWS
     ]
     rng = np.random.default_rng(seed)
@@ -163,8 +163,8 @@ def reproduce_qiao(
     normal, uniform = errors[:n_draws], errors[n_draws:]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES).rms_xy
     return QiaoReproduction(
-        np.array([[s.rank for s in row] for row in seen]),
-        np.array([[s.unknowns for s in row] for row in seen]),
+        np.array([[s.rank for s in row] for row in observability]),
+        np.array([[s.unknowns for s in row] for row in observability]),
         (first, second),
         _rms(normal),
         _rms(uniform),
@@ -183,8 +183,8 @@ def _all_errors_um(truth: Truth, draws: list[Measurements]) -> list[np.ndarray]:
 
 def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
     options = Options(misalignment_model="linear", uncertainty=False, causes=False)
-    found = calibrate(readings, options).error_map
-    return (np.stack([found.gx, found.gy]) - truth.g) * UM_PER_M
+    error_map = calibrate(readings, options).error_map
+    return (np.stack([error_map.gx, error_map.gy]) - truth.g) * UM_PER_M
 
 
 def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Measurements:
@@ -205,13 +205,13 @@ def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Mea
 def _program(truth: Truth, views: tuple[str, ...]) -> Program:
     """Solve without noise: by the estimator, or by the generalised inverse if it refuses."""
     plan = plan_of(views)
-    seen = plan_observability(plan)
-    if seen.identifiable:
+    observability = plan_observability(plan)
+    if observability.identifiable:
         readings = simulate_measurements(truth, plan, np.random.default_rng(0))
-        found = truth.g * UM_PER_M + _errors_um(truth, readings)
+        map_um = truth.g * UM_PER_M + _errors_um(truth, readings)
     else:
-        found = _minimum_norm(truth, plan) * UM_PER_M
-    return Program(views, truth.g * UM_PER_M, found, seen.deficiency)
+        map_um = _minimum_norm(truth, plan) * UM_PER_M
+    return Program(views, truth.g * UM_PER_M, map_um, observability.deficiency)
 
 
 def _minimum_norm(truth: Truth, plan: Plan) -> np.ndarray:
@@ -233,8 +233,8 @@ def _minimum_norm(truth: Truth, plan: Plan) -> np.ndarray:
     datum[4:, 2 * sites : 4 * sites] = plate.reshape(3, -1)
     matrix = np.vstack([np.array(columns).T, datum])
     right = np.concatenate([_observe(truth, plan), np.zeros(7)])
-    found = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
-    return found[: 2 * sites].reshape(2, *artifact.shape)
+    solution = np.linalg.lstsq(matrix, right, rcond=1e-10)[0]
+    return solution[: 2 * sites].reshape(2, *artifact.shape)
 
 
 def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> Truth:
@@ -259,7 +259,7 @@ def _observe(truth: Truth, plan: Plan) -> np.ndarray:
     return values[np.isfinite(values)]
 
 
-def qiao_text(found: QiaoReproduction) -> str:
+def qiao_text(reproduction: QiaoReproduction) -> str:
     """Return the rank tables, both programs and the noise run, next to the paper's."""
     lines = [
         "Qiao et al.: position self-calibration by least squares, tables 1-4",
@@ -267,7 +267,7 @@ def qiao_text(found: QiaoReproduction) -> str:
         + "".join(f"{f'n = {n}':>10}" for n in SIZES)
         + "   unknowns",
     ]
-    for row, ranks in zip(ROWS, found.ranks, strict=True):
+    for row, ranks in zip(ROWS, reproduction.ranks, strict=True):
         marks = [
             f"{rank:>9}" + ("=" if rank == row.rank(n) else "!")
             for rank, n in zip(ranks, SIZES, strict=True)
@@ -277,17 +277,17 @@ def qiao_text(found: QiaoReproduction) -> str:
         )
     equal = sum(
         int(rank == row.rank(n))
-        for row, ranks in zip(ROWS, found.ranks, strict=True)
+        for row, ranks in zip(ROWS, reproduction.ranks, strict=True)
         for rank, n in zip(ranks, SIZES, strict=True)
     )
     lines += [
-        f"{equal} of {found.ranks.size} ranks as printed (marked =)",
+        f"{equal} of {reproduction.ranks.size} ranks as printed (marked =)",
         "",
         "Figure 3: without noise, n = 11, stage and plate errors of 1 um",
     ]
     for number, (program, published) in enumerate(
         zip(
-            found.programs,
+            reproduction.programs,
             ("the answer covers the truth", "the answer differs from the truth"),
             strict=True,
         ),
@@ -305,18 +305,18 @@ def qiao_text(found: QiaoReproduction) -> str:
             f"  program {number}, {' + '.join(program.views)}: rms error "
             f"{program.rms_um:.3g} um{how}; published: {published}"
         )
-    return "\n".join([*lines, "", *_noise_text(found)])
+    return "\n".join([*lines, "", *_noise_text(reproduction)])
 
 
-def _noise_text(found: QiaoReproduction) -> list[str]:
-    n, (x, y) = len(found.rms_um), found.rms_um[0]
-    both, uniform = (rms(r) for r in (found.rms_um, found.rms_uniform_um))
+def _noise_text(reproduction: QiaoReproduction) -> list[str]:
+    n, (x, y) = len(reproduction.rms_um), reproduction.rms_um[0]
+    weighted, uniform = (rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um))
     return [
         f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",
         f"  rms error of one draw: x {x:.4f} um, y {y:.4f} um; published "
         f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} um",
-        f"  rms over all draws: {both:.4f} um; published {PUBLISHED_MEAN_UM} um",
-        f"  bound of any unbiased estimator: {found.bound_um:.4f} um",
+        f"  rms over all draws: {weighted:.4f} um; published {PUBLISHED_MEAN_UM} um",
+        f"  bound of any unbiased estimator: {reproduction.bound_um:.4f} um",
         "  The published figure lies below that bound, so that it is not reproducible as printed.",
         f"  Noise uniform within +-0.1 um gives {uniform:.4f} um: probably this was used.",
     ]

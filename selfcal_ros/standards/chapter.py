@@ -86,9 +86,9 @@ def _addressed(party: dict[str, Any]) -> str:
     return ", ".join(party[key] for key in ("name", "city", "country") if key in party)
 
 
-def _facts(title: str, found: dict[str, Any]) -> Section:
+def _facts(title: str, facts: dict[str, Any]) -> Section:
     return Section(
-        title, tuple((key.replace("_", " "), printable(str(value))) for key, value in found.items())
+        title, tuple((key.replace("_", " "), printable(str(value))) for key, value in facts.items())
     )
 
 

@@ -89,13 +89,13 @@ def certificate(
 
 def _node(namespace: str, name: str, *content: ET.Element | str | None) -> ET.Element:
     """Return an element with children, or with a text; None among the children is left out."""
-    found = ET.Element(f"{{{namespace}}}{name}")
+    element = ET.Element(f"{{{namespace}}}{name}")
     for part in content:
         if isinstance(part, str):
-            found.text = visible(part)
+            element.text = visible(part)
         elif part is not None:
-            found.append(part)
-    return found
+            element.append(part)
+    return element
 
 
 def _dcc(name: str, *content: ET.Element | str | None) -> ET.Element:
@@ -177,13 +177,13 @@ def _identification(issuer: str, value: str, name: str) -> ET.Element:
 def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
     """Yield the parts of an item or an equipment."""
     yield _content("name", item["name"])
-    known = [
+    descriptions = [
         f"{word}: {item[key]}"
         for word, key in (("certificate", "certificate"), ("valid until", "valid_until"))
         if key in item
     ]
-    if known:
-        yield _content("description", ", ".join(known))
+    if descriptions:
+        yield _content("description", ", ".join(descriptions))
     if "manufacturer" in item:
         yield _dcc("manufacturer", _content("name", item["manufacturer"]))
     yield _given("model", item.get("model"))
@@ -193,17 +193,17 @@ def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
         )
 
 
-def _contact(of: dict[str, str]) -> Iterator[ET.Element | None]:
-    yield _content("name", of["name"])
-    yield _given("eMail", of.get("email"))
-    yield _given("phone", of.get("phone"))
+def _contact(details: dict[str, str]) -> Iterator[ET.Element | None]:
+    yield _content("name", details["name"])
+    yield _given("eMail", details.get("email"))
+    yield _given("phone", details.get("phone"))
     yield _dcc(
         "location",
-        _dcc("city", of["city"]),
-        _dcc("countryCode", of["country"]),
-        _given("postCode", of.get("post_code")),
-        _given("street", of.get("street")),
-        _given("streetNo", of.get("number")),
+        _dcc("city", details["city"]),
+        _dcc("countryCode", details["country"]),
+        _given("postCode", details.get("post_code")),
+        _given("street", details.get("street")),
+        _given("streetNo", details.get("number")),
     )
 
 
@@ -295,7 +295,7 @@ def _model_texts(result: CalibrationResult) -> list[str]:
 
 def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str, str]]:
     """Yield what else is known of the measurement, by name."""
-    noise, made = result.noise, result.provenance
+    noise, provenance = result.noise, result.provenance
     yield "plan", result.plan_id
     for name in ("file", "sha256"):
         if result.input.get(name):
@@ -304,14 +304,14 @@ def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str
         yield f"result, {name}", value
     for name, value in (
         ("run", result.run_id),
-        ("evaluated", made.created),
-        *made.extra.items(),
+        ("evaluated", provenance.created),
+        *provenance.extra.items(),
         ("clock of the readings", core.get("clock")),
     ):
         if value:
             yield name.replace("_", " "), said(value)
-    if np.isfinite(made.duration_s):
-        yield "duration", f"{made.duration_s:.0f} s"
+    if np.isfinite(provenance.duration_s):
+        yield "duration", f"{provenance.duration_s:.0f} s"
     for run in result.extra.get(COMBINED, {}).get("runs", ()):
         yield (
             f"readings of {run['file']}",
@@ -412,17 +412,17 @@ def _list(
 
 def _maps(stage: StageMap) -> Iterator[ET.Element]:
     """Yield the maps: positions, errors and U of all known nodes and lines."""
-    result, emap, at = stage.result, stage.error_map, stage.error_map.artifact
-    known = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
+    result, emap, plate = stage.result, stage.error_map, stage.error_map.artifact
+    has_u = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
     k = result.noise.k_xy
     yield _result(
         "Error G = indicated - true in x and y at the nodes",
         _dcc(
             "list",
-            _list("x", at.x_m[known], METRE),
-            _list("y", at.y_m[known], METRE),
-            _list("Gx", emap.gx[known], METRE, (emap.u_gx[known], k)),
-            _list("Gy", emap.gy[known], METRE, (emap.u_gy[known], k)),
+            _list("x", plate.x_m[has_u], METRE),
+            _list("y", plate.y_m[has_u], METRE),
+            _list("Gx", emap.gx[has_u], METRE, (emap.u_gx[has_u], k)),
+            _list("Gy", emap.gy[has_u], METRE, (emap.u_gy[has_u], k)),
         ),
     )
     u_o, u_r = (u if np.isfinite(u) else None for u in first_order_u(result))
@@ -443,7 +443,7 @@ def _maps(stage: StageMap) -> Iterator[ET.Element]:
         )
     lines = np.isfinite(emap.g_theta + emap.u_g_theta)
     if lines.any():
-        angle = 2 * np.pi * np.flatnonzero(lines) / at.angular_count
+        angle = 2 * np.pi * np.flatnonzero(lines) / plate.angular_count
         yield _result(
             "Error of the angle at the lines, indicated - true",
             _dcc(
@@ -510,8 +510,8 @@ def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
 
 def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
     """Yield U of distances, a + b L, and the covariance of all nodes if requested."""
-    emap, at = stage.error_map, stage.error_map.artifact
-    known = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
+    emap, plate = stage.error_map, stage.error_map.artifact
+    has_u = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
     try:
         a, b = stage.length_uncertainty()
     except InputError as error:
@@ -529,14 +529,14 @@ def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
     )
     if not covariance:
         return
-    if known.sum() > MAX_COVARIANCE:
+    if has_u.sum() > MAX_COVARIANCE:
         raise InputError(
             "--covariance",
-            f"{int(known.sum())} nodes",
+            f"{int(has_u.sum())} nodes",
             "omit it: U of distances is "
             f"given; the covariance is written for up to {MAX_COVARIANCE} nodes",
         )
-    full = stage.covariance(at.x_m[known], at.y_m[known])
+    full = stage.covariance(plate.x_m[has_u], plate.y_m[has_u])
     columns = (
         _si(
             "columnXMLList",
@@ -555,7 +555,7 @@ def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
             _content("name", "Gx, then Gy"),
             _si(
                 "realListXMLList",
-                _si("valueXMLList", _numbers(np.concatenate([emap.gx[known], emap.gy[known]]))),
+                _si("valueXMLList", _numbers(np.concatenate([emap.gx[has_u], emap.gy[has_u]]))),
                 _si("unitXMLList", METRE),
                 _si(
                     "measurementUncertaintyMultivariateXMLList",

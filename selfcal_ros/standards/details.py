@@ -142,23 +142,23 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
     for name in data:
         if name not in SECTIONS:
             raise InputError(f"{where}: {name}", "is unknown", known_are(str(name), SECTIONS))
-    found: dict[str, Any] = {}
+    details: dict[str, Any] = {}
     for name in SECTIONS:
         if not data.get(name):
             if name in NEEDED:
                 raise InputError(
                     f"{where}: {name}", "is missing", "give " + ", ".join(SECTIONS[name][1])
                 )
-            found[name] = []
+            details[name] = []
         elif name in LISTS:
             items = data[name] if isinstance(data[name], list) else [data[name]]
-            found[name] = [
+            details[name] = [
                 _section(item, name, f"{where}: {name}[{index}]")
                 for index, item in enumerate(items)
             ]
         else:
-            found[name] = _section(data[name], name, f"{where}: {name}")
-    for index, item in enumerate(found["conditions"]):
+            details[name] = _section(data[name], name, f"{where}: {name}")
+    for index, item in enumerate(details["conditions"]):
         if (
             ("value" in item) is not ("unit" in item)
             or not ("value" in item or "text" in item)
@@ -171,13 +171,13 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
             )
         if item.get("unit") == "degC":
             check_celsius(item["value"], f"{where}: conditions[{index}]")
-    _check_dates(found, where)
-    return found
+    _check_dates(details, where)
+    return details
 
 
-def _check_dates(found: dict[str, Any], where: str) -> None:
+def _check_dates(details: dict[str, Any], where: str) -> None:
     """Refuse dates that are not in their order; the day of issue is today unless it is given."""
-    core = found["certificate"]
+    core = details["certificate"]
     if core["begin"] > core["end"]:
         raise InputError(
             f"{where}: certificate.end",
@@ -191,7 +191,7 @@ def _check_dates(found: dict[str, Any], where: str) -> None:
             f"{issued} is before the end of the measurement, {core['end']}",
             "correct the dates",
         )
-    for index, item in enumerate(found["equipment"]):
+    for index, item in enumerate(details["equipment"]):
         if item.get("valid_until", issued) < core["end"]:
             raise InputError(
                 f"{where}: equipment[{index}].valid_until",
@@ -207,13 +207,13 @@ def _section(data: Any, name: str, where: str) -> dict[str, Any]:
     for key in data:
         if key not in keys:
             raise InputError(f"{where}.{key}", "is unknown", known_are(str(key), keys))
-    found = {}
+    section = {}
     for key, (reader, expected) in keys.items():
         if data.get(key) is None:
             if key in needed:
                 raise InputError(f"{where}.{key}", "is missing", f"give {expected}")
             continue
-        found[key] = reader(data[key])
-        if found[key] is None:
+        section[key] = reader(data[key])
+        if section[key] is None:
             raise InputError(f"{where}.{key}", f"{data[key]!r} is not {expected}", "correct it")
-    return found
+    return section

@@ -81,8 +81,8 @@ def _require_temperature(result: CalibrationResult, conditions: list[dict[str, A
 def is_traceable(result: CalibrationResult) -> bool:
     """Return whether certified lengths, at the temperature of the measurement, set the scale."""
     return result.reference is not None and all(
-        found.certificate and found.certified and found.u_relative
-        for found in result.reference.each
+        length.certificate and length.certified and length.u_relative
+        for length in result.reference.each
     )
 
 
@@ -114,21 +114,25 @@ def known_plate_texts(result: CalibrationResult) -> list[str]:
     """Return which calibration made the plate of a recheck known; nothing of other results."""
     if result.recheck is None:
         return []
-    known = result.recheck.calibration
+    calibration = result.recheck.calibration
     readings, dates = (
-        known.readings,
-        [instant[:10] for instant in (known.first_exposure, known.last_exposure) if instant],
+        calibration.readings,
+        [
+            instant[:10]
+            for instant in (calibration.first_exposure, calibration.last_exposure)
+            if instant
+        ],
     )
     facts = [
-        f"plan {known.plan_id}",
-        *([f"run {known.run_id}"] if known.run_id else []),
+        f"plan {calibration.plan_id}",
+        *([f"run {calibration.run_id}"] if calibration.run_id else []),
         *([f"readings of {' to '.join(dict.fromkeys(dates))}"] if dates else []),
         *(
             [f"{readings['file']}, sha256 {readings['sha256']}"]
             if {"file", "sha256"} <= readings.keys()
             else []
         ),
-        *([f"evaluated {known.created}"] if known.created else []),
+        *([f"evaluated {calibration.created}"] if calibration.created else []),
     ]
     return [
         f"the errors of the marks are those of a self-calibration ({'; '.join(facts)}); their "
@@ -154,19 +158,19 @@ def scale_texts(result: CalibrationResult) -> list[str]:
             "The scale is that of the known plate, set at its calibration and converted "
             "to the temperature of this measurement as follows."
         )
-    for found in result.reference.each:
+    for length in result.reference.each:
         texts.append(
-            f"The scale is set by a reference length ({found.name}): relative "
-            f"error {found.relative_error:.4g}, standard uncertainty "
-            f"{found.u_relative:.3g}; certificate: {found.certificate or 'none'}."
+            f"The scale is set by a reference length ({length.name}): relative "
+            f"error {length.relative_error:.4g}, standard uncertainty "
+            f"{length.u_relative:.3g}; certificate: {length.certificate or 'none'}."
         )
-        if known := found.certified:
+        if certified := length.certified:
             texts.append(
-                f"Certified at {known.certified_at_c:g} °C: {known.relative_error:.4g}, "
-                f"standard uncertainty {known.u_relative:.3g}; used at "
-                f"{known.temperature_c:g} °C (u {known.u_temperature_k:g} K) with the "
-                f"expansion coefficient {known.expansion_per_k:.4g} 1/K "
-                f"(u {known.u_expansion_per_k:.2g} 1/K)."
+                f"Certified at {certified.certified_at_c:g} °C: {certified.relative_error:.4g}, "
+                f"standard uncertainty {certified.u_relative:.3g}; used at "
+                f"{certified.temperature_c:g} °C (u {certified.u_temperature_k:g} K) with the "
+                f"expansion coefficient {certified.expansion_per_k:.4g} 1/K "
+                f"(u {certified.u_expansion_per_k:.2g} 1/K)."
             )
     if not is_traceable(result):
         texts.append(
