@@ -86,8 +86,8 @@ class Layout:
     def _words(self) -> list[tuple[str, int, np.uint64, np.uint64]]:
         """Return name, offset, mask and value of each word that determines the layout."""
         words = []
-        for end in range(0, self.length, WORD):
-            place = min(end, self.length - WORD)
+        for start in range(0, self.length, WORD):
+            place = min(start, self.length - WORD)
             mask = int.from_bytes(self.fixed[place : place + WORD], "little")
             value = int.from_bytes(self.example[place : place + WORD], "little") & mask
             if mask:
@@ -318,8 +318,8 @@ class ColumnDecoder:
             (len(messages.data) - length + 1,), f"V{length}", messages.data, strides=(1,)
         )
         rows = bytes_at[messages.start[index]]
-        for known in tuple(self._known.get(length, ())):
-            index, rows = _take(known, index, rows, groups)
+        for known_layout in tuple(self._known.get(length, ())):
+            index, rows = _take(known_layout, index, rows, groups)
         failed = []
         while len(index) and tries > 0:
             tries -= 1 + length // TRY_BYTES

@@ -489,14 +489,17 @@ class PositionEditor:
 
     def _find(self, data: bytes) -> bool:
         """Move the layout of a message to the front; return whether it has one."""
-        for number, known in enumerate(self._known):
-            if len(data) == known.length and int.from_bytes(data) & known.mask == known.value:
+        for number, known_layout in enumerate(self._known):
+            if (
+                len(data) == known_layout.length
+                and int.from_bytes(data) & known_layout.mask == known_layout.value
+            ):
                 self._known.rotate(-number)
                 return True
         layout = cdr.layout_of(JOINT_STATE, data) if len(data) <= cdr.MAX_LENGTH else None
         if layout is None:
             return False
-        code, at, count = layout.values["position"]
+        code, offset, count = layout.values["position"]
         mask = int.from_bytes(layout.fixed)
         self._known.appendleft(
             _Positions(
@@ -506,7 +509,7 @@ class PositionEditor:
                 layout.texts["name"],
                 layout.texts["header.frame_id"][0],
                 Struct(f"{code[0]}{count}d"),
-                at,
+                offset,
             )
         )
         return True

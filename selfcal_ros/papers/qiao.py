@@ -310,12 +310,12 @@ def qiao_text(reproduction: QiaoReproduction) -> str:
 
 def _noise_text(reproduction: QiaoReproduction) -> list[str]:
     n, (x, y) = len(reproduction.rms_um), reproduction.rms_um[0]
-    weighted, uniform = (rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um))
+    over_draws, uniform = (rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um))
     return [
         f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",
         f"  rms error of one draw: x {x:.4f} um, y {y:.4f} um; published "
         f"{PUBLISHED_RMS_UM[0]} and {PUBLISHED_RMS_UM[1]} um",
-        f"  rms over all draws: {weighted:.4f} um; published {PUBLISHED_MEAN_UM} um",
+        f"  rms over all draws: {over_draws:.4f} um; published {PUBLISHED_MEAN_UM} um",
         f"  bound of any unbiased estimator: {reproduction.bound_um:.4f} um",
         "  The published figure lies below that bound, so that it is not reproducible as printed.",
         f"  Noise uniform within +-0.1 um gives {uniform:.4f} um: probably this was used.",
