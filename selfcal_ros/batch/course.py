@@ -147,21 +147,21 @@ def courses(
     seed, orders : int
         Seed and number of the random orders.
     """
-    rng, found = np.random.default_rng(seed), {}
+    rng, course_of_quantity = np.random.default_rng(seed), {}
     for name, values in table.items():
-        known = np.isfinite(values)
-        if known.sum() >= FEWEST:
-            course = course_of(days[known], values[known], rng, orders=orders)
+        has_value = np.isfinite(values)
+        if has_value.sum() >= FEWEST:
+            course = course_of(days[has_value], values[has_value], rng, orders=orders)
             if course.change:
-                last, first = np.flatnonzero(known)[course.change - 1 : course.change + 1]
+                last, first = np.flatnonzero(has_value)[course.change - 1 : course.change + 1]
                 course = replace(course, last_before=int(last), change=int(first))
-            found[name] = course
+            course_of_quantity[name] = course
     adjusted = _adjusted(
-        [p for course in found.values() for p in (course.p_trend, course.p_change)]
+        [p for course in course_of_quantity.values() for p in (course.p_trend, course.p_change)]
     ).reshape(-1, 2)
     return {
         name: _judged(course, pair, days, table[name])
-        for (name, course), pair in zip(found.items(), adjusted, strict=True)
+        for (name, course), pair in zip(course_of_quantity.items(), adjusted, strict=True)
     }
 
 
@@ -188,10 +188,10 @@ def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray, values: np.n
 
 def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> CourseKind:
     """Return the better of a line and a step (BIC of Laplace errors, 2 and 3 unknowns)."""
-    known = np.isfinite(values)
-    t, x, n = days[known], values[known], int(known.sum())
+    has_value = np.isfinite(values)
+    t, x, n = days[has_value], values[has_value], int(has_value.sum())
     line = x - course.slope_per_day[0] * t
-    after = np.flatnonzero(known) >= course.change
+    after = np.flatnonzero(has_value) >= course.change
     step = x - np.where(after, course.after, course.before)
     sizes = [np.abs(line - np.median(line)).sum(), np.abs(step).sum()]
     tiny = np.finfo(float).tiny
@@ -230,7 +230,7 @@ def compared(
         for number, record in enumerate(records)
         if record.get("quantities") and "result" in record
     }
-    found = {
+    differences = {
         number: difference
         for number, difference in tried.items()
         if isinstance(difference, MapDifference)
@@ -241,16 +241,16 @@ def compared(
     ]
     p = {
         number: value
-        for number, difference in found.items()
+        for number, difference in differences.items()
         if np.isfinite(value := probability(difference))
     }
     adjusted = dict(zip(p, _adjusted(list(p.values())), strict=True))
     return [
         record
-        if number not in found
+        if number not in differences
         else record
         | {
-            "quantities": record["quantities"] | _quantities(found[number]),
+            "quantities": record["quantities"] | _quantities(differences[number]),
             "baseline": None
             if number not in p
             else {
@@ -284,12 +284,12 @@ def _difference(
 
 
 def _quantities(difference: MapDifference) -> dict[str, float | None]:
-    found = {
+    values = {
         "difference_from_baseline_rms_um": difference.rms_m * UM_PER_M,
         "difference_from_baseline_largest_um": difference.max_m * UM_PER_M,
         "theta_difference_from_baseline_rms_arcsec": difference.rms_theta_rad * ARCSEC_PER_RAD,
     }
-    return {name: value for name, value in found.items() if np.isfinite(value)}
+    return {name: value for name, value in values.items() if np.isfinite(value)}
 
 
 def sentence(records: Sequence[Record], where: str) -> str:
@@ -299,9 +299,9 @@ def sentence(records: Sequence[Record], where: str) -> str:
     named = ", ".join(
         f"{record['bag']} (p = {record['baseline']['adjusted_p']:.2g})" for record in changed
     )
-    others = Counter(record["not_compared"] for record in records if "not_compared" in record)
+    reasons = Counter(record["not_compared"] for record in records if "not_compared" in record)
     return (
         f"{len(changed)} of {len(tested)} maps differ from {where}"
         + (f": {named}" if changed else "")
-        + "".join(f"; not compared: {count} ({reason})" for reason, count in others.items())
+        + "".join(f"; not compared: {count} ({reason})" for reason, count in reasons.items())
     )

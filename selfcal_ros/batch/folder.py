@@ -45,20 +45,20 @@ def find_bags(paths: Iterable[str]) -> list[Path]:
     NoDataError
         If there is no bag.
     """
-    found: dict[str, Path] = {}
+    bag_of_path: dict[str, Path] = {}
     for name in paths:
         path = Path(name)
         if not path.exists():
             raise InputError(name, "no such file or folder", "check the path")
         for bag in sorted(_below(path)) if path.is_dir() else [path]:
-            found.setdefault(os.path.realpath(bag), bag)
-    if not found:
+            bag_of_path.setdefault(os.path.realpath(bag), bag)
+    if not bag_of_path:
         raise NoDataError(
             ", ".join(paths),
             "no bag in it",
             "give MCAP files, rosbag2 folders or folders that contain them",
         )
-    return list(found.values())
+    return list(bag_of_path.values())
 
 
 def _below(top: Path) -> list[Path]:
@@ -85,14 +85,14 @@ def _refuse(error: OSError) -> NoReturn:
 
 def stat_of(bag: Path) -> list[list]:
     """Return name, size and time of change (ns) of the files of a bag, equal if unchanged."""
-    found = []
+    stats = []
     for file in sorted(_entries(bag)) if bag.is_dir() else [bag]:
         try:
             if file.is_file():
-                found.append([file.name, file.stat().st_size, file.stat().st_mtime_ns])
+                stats.append([file.name, file.stat().st_size, file.stat().st_mtime_ns])
         except OSError:  # it has just disappeared: reading it will fail
             continue
-    return found
+    return stats
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -198,10 +198,10 @@ def opened(folder: Path) -> Iterator[None]:
 def kept_records(folder: Path, settings: BatchSettings) -> list[Record]:
     """Return the records of these settings in the folder."""
     digest = settings.digest()
-    found = (read_record(path) for path in sorted((folder / RECORDS).glob("*.json")))
+    records = (read_record(path) for path in sorted((folder / RECORDS).glob("*.json")))
     return [
         record
-        for record in found
+        for record in records
         if record is not None and record["settings"] == digest and is_whole(folder, record)
     ]
 
@@ -215,13 +215,13 @@ def done_and_to_do(
     A bag is finished if it has a record and its files are unchanged. The largest of the others come
     first, so that all cores finish at about the same time.
     """
-    known = {record["bag"]: record for record in kept}
-    done, sizes = {}, {}
+    record_of_bag = {record["bag"]: record for record in kept}
+    finished, sizes = {}, {}
     for index, bag in enumerate(bags):
         files = stat_of(bag)
-        record = known.get(os.path.realpath(bag))
+        record = record_of_bag.get(os.path.realpath(bag))
         if record is not None and record["files"] == files:
-            done[index] = record
+            finished[index] = record
         else:
             sizes[index] = sum(size for _, size, _ in files)
-    return done, sorted(sizes, key=lambda index: -sizes[index])
+    return finished, sorted(sizes, key=lambda index: -sizes[index])

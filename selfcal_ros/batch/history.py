@@ -100,22 +100,22 @@ def history(folder: Path) -> list[Entry]:
     """
     if not folder.is_dir():
         raise InputError(str(folder), "is not a folder", "name the folder of the calibrations")
-    found = []
+    entries = []
     for path in sorted(folder.rglob("*.json")):
         if _is_result(path):
             result = read_result(path)
             if result.observability.identifiable and VERIFICATION not in result.extra:
-                found.append(Entry(path, result, _measured(result, str(path))))
-    if not found:
+                entries.append(Entry(path, result, _measured(result, str(path))))
+    if not entries:
         raise NoDataError(
             str(folder),
             "no RESULT.json with a map is in it",
             "write the results of `selfcal solve` there",
         )
-    found.sort(key=lambda entry: (entry.measured, entry.result.provenance.created))
+    entries.sort(key=lambda entry: (entry.measured, entry.result.provenance.created))
     return [
-        Entry(entry.path, entry.result, entry.measured, _change(found[max(at - 1, 0)], entry))
-        for at, entry in enumerate(found)
+        Entry(entry.path, entry.result, entry.measured, _change(entries[max(number - 1, 0)], entry))
+        for number, entry in enumerate(entries)
     ]
 
 
@@ -159,12 +159,12 @@ def drift_from(active: Entry, entries: Sequence[Entry]) -> Drift | None:
     days, changes, u = [], [], []
     for entry in entries:
         apart = abs((entry.measured - active.measured).total_seconds()) / S_PER_DAY
-        found = _change(active, entry)
-        if isinstance(found, str) or not apart or found.xy is None:
+        change = _change(active, entry)
+        if isinstance(change, str) or not apart or change.xy is None:
             continue
         days.append(apart)
-        u.append(found.xy.u_rms)
-        changes.append(math.sqrt(max(found.rms_m**2 - found.xy.u_rms**2, 0.0)))
+        u.append(change.xy.u_rms)
+        changes.append(math.sqrt(max(change.rms_m**2 - change.xy.u_rms**2, 0.0)))
     if not days:
         return None
     t = np.array(days)

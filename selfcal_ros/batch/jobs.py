@@ -49,11 +49,11 @@ def run_job(job: folder.BatchJob) -> folder.Record:
         return record | _without_result(error)
     key = hashlib.sha256(f"{source['sha256']} {record['settings']}".encode()).hexdigest()[:24]
     path = job.folder / folder.RECORDS / f"{key}.json"
-    kept = None if job.redo else folder.read_record(path)
-    if kept is not None and folder.is_whole(job.folder, kept):
-        if not Path(kept["bag"]).exists():  # it was moved
-            write_json(path, kept | record)
-        return kept | record
+    existing = None if job.redo else folder.read_record(path)
+    if existing is not None and folder.is_whole(job.folder, existing):
+        if not Path(existing["bag"]).exists():  # it was moved
+            write_json(path, existing | record)
+        return existing | record
     record |= {"key": key, "sha256": source["sha256"]}
     result: results.CalibrationResult | None = None
     try:
@@ -79,8 +79,8 @@ def solved(
     options = solver_options(settings.solver, session.measurements)
     problem = None
     try:
-        found = calibrate_by(settings.solver.method, session.measurements, options)
-        result = worded(with_places(found, session.measurements.views))
+        calibrated = calibrate_by(settings.solver.method, session.measurements, options)
+        result = worded(with_places(calibrated, session.measurements.views))
     except NotIdentifiableError as error:
         if not isinstance(error.observability, results.Observability):
             raise
@@ -118,7 +118,7 @@ def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
     u_o, u_r = first_order_u(result) if result.has_uncertainty else (math.nan, math.nan)
     used = sum(view.used for view in result.views)
     rejected = sum(result.rejected.values())
-    found = {
+    values = {
         "nonorthogonality_arcsec": emap.nonorthogonality * ARCSEC_PER_RAD,
         "u_nonorthogonality_arcsec": u_o * ARCSEC_PER_RAD,
         "scale_difference_ppm": emap.scale_difference * PPM_PER_ONE,
@@ -132,5 +132,7 @@ def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
         for estimate in term.estimates:
             if not estimate.view:
                 unit = estimate.unit.replace("/", folder.PER)
-                found[f"{term.name}_{estimate.component}_{unit}".replace(" ", "_")] = estimate.value
-    return {name: value if math.isfinite(value) else None for name, value in found.items()}
+                values[f"{term.name}_{estimate.component}_{unit}".replace(" ", "_")] = (
+                    estimate.value
+                )
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}

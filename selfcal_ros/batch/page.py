@@ -48,7 +48,9 @@ LIMIT = 3.0
 Span = tuple[float, float]
 
 
-def page_html(records: Sequence[Record], found: Sequence[PlanHistory], lines: Sequence[str]) -> str:
+def page_html(
+    records: Sequence[Record], histories: Sequence[PlanHistory], lines: Sequence[str]
+) -> str:
     """Return the page; `lines` are those of `summary_lines`; all text is escaped."""
     head, *findings = lines
     codes = {record["exit_code"] for record in records}
@@ -57,7 +59,7 @@ def page_html(records: Sequence[Record], found: Sequence[PlanHistory], lines: Se
         f'<p class="verdict {grade}">{_text(head)}</p>',
         f"<p>{'<br>'.join(map(_text, findings))}</p>" if findings else "",
     ]
-    parts += [_history(series) for series in found if series.courses]
+    parts += [_history(series) for series in histories if series.courses]
     parts.append(
         f"<section><h2>Bags</h2>{_table(records)}"
         "<p>table.csv has all quantities of each bag.</p></section>"
@@ -77,23 +79,23 @@ def _history(series: PlanHistory) -> str:
         for name, course in series.courses.items()
         if course.finding is not CourseKind.NONE and name not in first
     ]
-    others = [name for name in series.courses if name not in first]
+    further = [name for name in series.courses if name not in first]
     spans = _common_spans(series)
 
     def plots(names: Iterable[str]) -> str:
         pictures = "\n".join(_figure(series, name, spans[name]) for name in names)
         return f'<div class="figures">{pictures}</div>'
 
-    more = (
-        f"<details><summary>{len(others)} further quantities</summary>{plots(others)}</details>"
-        if others
+    details = (
+        f"<details><summary>{len(further)} further quantities</summary>{plots(further)}</details>"
+        if further
         else ""
     )
     return (
         f"<section><h2>{_text('Plan ' + series.plan_id)}: over time</h2>"
         "<p>Dots are bags, red ones not qualified; bars are ± 2 u. The band is the median "
         f"± {LIMIT:.0f} standard deviations of the bags themselves: a stable stage stays in "
-        f"it.</p>{plots(first)}{more}</section>"
+        f"it.</p>{plots(first)}{details}</section>"
     )
 
 
@@ -108,9 +110,9 @@ def _values(series: PlanHistory, name: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _limits(values: np.ndarray) -> Span:
     """Return the median less and plus `LIMIT` robust standard deviations."""
-    known = values[np.isfinite(values)]
-    middle = float(np.median(known))
-    spread = LIMIT * S_PER_MAD * float(np.median(np.abs(known - middle)))
+    finite = values[np.isfinite(values)]
+    middle = float(np.median(finite))
+    spread = LIMIT * S_PER_MAD * float(np.median(np.abs(finite - middle)))
     return middle - spread, middle + spread
 
 
@@ -125,8 +127,8 @@ def _common_spans(series: PlanHistory) -> dict[str, Span]:
         ends: list[float] = []
         for name in names:
             values, u = _values(series, name)
-            known = np.isfinite(values)
-            ends += [*_limits(values), *(values - 2 * u)[known], *(values + 2 * u)[known]]
+            has_value = np.isfinite(values)
+            ends += [*_limits(values), *(values - 2 * u)[has_value], *(values + 2 * u)[has_value]]
         low, high = min(ends), max(ends)
         margin = (high - low) * 0.08 or abs(high) * 0.01 or 1.0
         spans |= dict.fromkeys(names, (low - margin, high + margin))
@@ -162,8 +164,8 @@ def _figure(series: PlanHistory, name: str, span: Span) -> str:
                 [frame.at(day, value + end) for end in (-2 * spread, 2 * spread)], stroke="soft"
             )
         drawing.discs([frame.at(day, value)], 3.0, fill="bad" if record["exit_code"] else "good")
-        said = f"{record['bag']}: {value:.6g} {unit}" + f" ± {2 * spread:.2g}" * bool(spread > 0)
-        drawing.spot(*frame.at(day, value), 6, said)
+        label = f"{record['bag']}: {value:.6g} {unit}" + f" ± {2 * spread:.2g}" * bool(spread > 0)
+        drawing.spot(*frame.at(day, value), 6, label)
     _finding(frame, series, values, series.courses[name])
     caption = f"{text}{', ' * bool(unit)}{unit}" + ("" if u.any() else " (u is not known)")
     return f"<figure>{inline_svg(drawing)}<figcaption>{_text(caption)}</figcaption></figure>"

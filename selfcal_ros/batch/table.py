@@ -92,7 +92,9 @@ def series_of(records: Sequence[Record]) -> list[PlanHistory]:
         if record.get("quantities") and _time_s(record) is not None:
             group = (record["plan_id"], tuple(record["plate"]))
             groups.setdefault(group, {}).setdefault(record["sha256"], record)
-    return [_series(group[0], list(found.values())) for group, found in groups.items()]
+    return [
+        _series(group[0], list(records_of_bag.values())) for group, records_of_bag in groups.items()
+    ]
 
 
 def _series(plan_id: str, records: list[Record]) -> PlanHistory:
@@ -130,7 +132,7 @@ def csv_text(records: Sequence[Record]) -> str:
     )
     writer.writerow([*BASE, "cause", "cause_view", *compared, *names])
     for record in ordered:
-        found, causes = record.get("quantities", {}), record.get("causes", [])
+        quantities, causes = record.get("quantities", {}), record.get("causes", [])
         likeliest = causes[0] if causes else {"name": "", "view": ""}
         writer.writerow(
             [_field(record.get(name)) for name in BASE]
@@ -140,7 +142,7 @@ def csv_text(records: Sequence[Record]) -> str:
                 for name in ("adjusted_p", "changed", "not_compared")
                 if compared
             ]
-            + [_field(found.get(name)) for name in names]
+            + [_field(quantities.get(name)) for name in names]
         )
     return out.getvalue()
 
@@ -149,7 +151,9 @@ def _field(value: Any) -> Any:
     return "" if value is None else str(value).lower() if isinstance(value, bool) else value
 
 
-def batch_json(records: Sequence[Record], found: Sequence[PlanHistory], done_before: int) -> dict:
+def batch_json(
+    records: Sequence[Record], histories: Sequence[PlanHistory], done_before: int
+) -> dict:
     """Return the whole batch as one JSON object, docs/guides/batch.md."""
     counts = {
         name: sum(code == r["exit_code"] for r in records)
@@ -174,7 +178,7 @@ def batch_json(records: Sequence[Record], found: Sequence[PlanHistory], done_bef
                     name: _course_json(series, course) for name, course in series.courses.items()
                 },
             }
-            for series in found
+            for series in histories
         ],
     }
 
@@ -199,7 +203,7 @@ def _course_json(series: PlanHistory, course: Course) -> dict:
 
 
 def summary_lines(
-    records: Sequence[Record], found: Sequence[PlanHistory], done_before: int
+    records: Sequence[Record], histories: Sequence[PlanHistory], done_before: int
 ) -> list[str]:
     """Return a summary of a batch, in lines."""
     good = sum(record["exit_code"] == 0 for record in records)
@@ -208,7 +212,7 @@ def summary_lines(
         f"{len(records)} bags: {maps} calibrated, {good} of them qualified, "
         f"{len(records) - maps} without a result; {done_before} were done before"
     ]
-    for series in found:
+    for series in histories:
         sentences = series.sentences()
         lines.append(
             f"plan {series.plan_id}, {len(series.records)} bags from {series.date(0)} to "
