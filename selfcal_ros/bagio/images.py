@@ -223,7 +223,7 @@ def write_pictures(
     run_id = str(now)
 
     def command(phase: Phase, index: int) -> None:
-        known = plan.views[index] if index < len(plan.views) else None
+        planned = plan.views[index] if index < len(plan.views) else None
         writer.write(
             f"/{COMMAND_TOPIC}",
             from_model.command(
@@ -232,8 +232,8 @@ def write_pictures(
                     phase,
                     plan.plan_id,
                     index,
-                    known,
-                    plan.artifact if known else None,
+                    planned,
+                    plan.artifact if planned else None,
                     len(plan.views),
                     run_id=run_id,
                     model_terms=plan.model_terms,
@@ -261,11 +261,11 @@ def write_pictures(
                     f"/{ENCODER_TOPIC}", from_model.joint_state(sample, frame_id), now + step
                 )
             try:
-                found = detect(read_bytes(folder / row.file), row.file, now)
+                detections = detect(read_bytes(folder / row.file), row.file, now)
             except InputError as error:
                 problems[str(error)] += 1
-                found = ()
-            for detection in found:
+                detections = ()
+            for detection in detections:
                 writer.write(f"/{DETECTION_TOPIC}", from_model.detection(detection, frame_id), now)
         now += STEP_NS
         command(Phase.DONE, len(plan.views))
@@ -323,17 +323,17 @@ class ImageBag:
         reader = BagReader(self.path)
         self._files = reader.files
         self.lost.update(reader.lost)
-        found: dict[str, str] = {}
+        transport_of_topic: dict[str, str] = {}
         for stream in streams(self._files, [], lambda topic: False):
             for _ in stream.blocks():
                 pass  # blocks of a file without an index
-            found |= {
+            transport_of_topic |= {
                 channel.topic: transport
                 for channel in stream.channels.values()
                 if (transport := self._transport(channel.topic))
             }
-        raw = [topic for topic, transport in found.items() if transport == "raw"]
-        names = raw or list(found)
+        raw = [topic for topic, transport in transport_of_topic.items() if transport == "raw"]
+        names = raw or list(transport_of_topic)
         if not names:
             raise NoDataError(
                 str(self.path),
@@ -346,15 +346,19 @@ class ImageBag:
                 f"images of several cells: {', '.join(names)}",
                 "choose one with --namespace",
             )
-        self.topic, self._kind = names[0], IMAGE_TYPES[found[names[0]]]
+        self.topic, self._kind = names[0], IMAGE_TYPES[transport_of_topic[names[0]]]
 
     def _transport(self, topic: str) -> str:
         """Return the transport of a topic of images, else ""."""
         for transport, role in IMAGE_TOPICS.items():
             space = topic.removesuffix(role)
             if (topic.endswith(role) and space in ("", "/")) or topic.endswith(f"/{role}"):
-                known = self.namespace
-                return transport if known is None or space.strip("/") == known.strip("/") else ""
+                namespace = self.namespace
+                return (
+                    transport
+                    if namespace is None or space.strip("/") == namespace.strip("/")
+                    else ""
+                )
         return ""
 
     @property
@@ -461,11 +465,11 @@ class ImageBag:
                     writer.copy(_number(writer, item, numbers), item.channel.topic, item.message)
                     continue
                 try:
-                    found = detect(item.image) if item.image is not None else ()
+                    detections = detect(item.image) if item.image is not None else ()
                 except InputError as error:
                     problems[str(error)] += 1
                     continue
-                for detection in found:
+                for detection in detections:
                     writer.write(
                         topic, from_model.detection(detection, frame_id), item.message.log_time
                     )

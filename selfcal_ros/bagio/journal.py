@@ -58,8 +58,8 @@ def resume(folder: str | os.PathLike) -> "Journal | None":
     InputError
         If another process writes this journal, or it cannot be read or written.
     """
-    found = claim(folder)
-    return found.resume() if found else None
+    journal = claim(folder)
+    return journal.resume() if journal else None
 
 
 class Claim:
@@ -96,8 +96,8 @@ def claim(folder: str | os.PathLike) -> Claim | None:
     InputError
         If another process writes this journal, or the folder cannot be read.
     """
-    found = newest(folder)
-    return Claim(found[0]) if found else None
+    journals = newest(folder)
+    return Claim(journals[0]) if journals else None
 
 
 def unfinished(folder: str | os.PathLike, journal: Path | None = None) -> list[Path]:
@@ -119,10 +119,10 @@ def unfinished(folder: str | os.PathLike, journal: Path | None = None) -> list[P
     """
     bag = Path(folder)
     try:
-        found = journal or _newest(bag)[1]
-        if found is None:
+        newest_journal = journal or _newest(bag)[1]
+        if newest_journal is None:
             return []
-        bag, files = found, _files(found)
+        bag, files = newest_journal, _files(newest_journal)
         commands = [
             command
             for file in files
@@ -243,8 +243,8 @@ class Journal(Closing):
         self._failed: OSError | None = None
         self._file = JournalFile(path / f"{path.name}_{len(metadata.files)}.mcap")
         metadata.files.append(self._file.content.entry)
-        for topic, known in metadata.topics.items():
-            self._declare(topic, known)
+        for topic, bag_topic in metadata.topics.items():
+            self._declare(topic, bag_topic)
         metadata.write(path)
         self._stop = threading.Event()
         self._unsynced_s: float | None = None  # time since which there is something to synchronise
@@ -268,20 +268,22 @@ class Journal(Closing):
         if topic in self._channels:
             return
         definition_of(topic, typename)  # refuses an unknown type
-        known = self._metadata.topics.setdefault(
+        bag_topic = self._metadata.topics.setdefault(
             topic, BagTopic(typename, list(qos), heard_on=heard_on)
         )
-        self._declare(topic, known)
+        self._declare(topic, bag_topic)
 
-    def _declare(self, topic: str, known: BagTopic) -> None:
-        number, definition = len(self._channels) + 1, definition_of(topic, known.type)
-        schema = Schema(id=number, name=known.type, encoding="ros2msg", data=definition.encode())
+    def _declare(self, topic: str, bag_topic: BagTopic) -> None:
+        number, definition = len(self._channels) + 1, definition_of(topic, bag_topic.type)
+        schema = Schema(
+            id=number, name=bag_topic.type, encoding="ros2msg", data=definition.encode()
+        )
         channel = Channel(
             id=number,
             topic=topic,
             message_encoding="cdr",
             schema_id=number,
-            metadata=known.channel_metadata(),
+            metadata=bag_topic.channel_metadata(),
         )
         self.flush()
         with _as_input_error(self.path):
@@ -421,12 +423,12 @@ def _locked(path: Path) -> int:
 
 def _newest(folder: Path) -> tuple[int, Path | None]:
     """Return the last time of writing, ns, of a journal in `folder`, and that journal."""
-    found: list[tuple[int, Path]] = []
+    written: list[tuple[int, Path]] = []
     with suppress(FileNotFoundError, NotADirectoryError):
         for bag in folder.iterdir():
             if JOURNAL.fullmatch(bag.name):
-                found += [(file.stat().st_mtime_ns, bag) for file in _files(bag)]
-    return max(found, default=(0, None))
+                written += [(file.stat().st_mtime_ns, bag) for file in _files(bag)]
+    return max(written, default=(0, None))
 
 
 def _files(bag: Path) -> list[Path]:
@@ -441,7 +443,7 @@ def _number(file: Path) -> tuple[int, str]:
 
 def _commands(content: Content, where: str) -> list[tuple[int, Phase]]:
     """Return stamps and phases of the commands; damaged ones are omitted."""
-    found: list[tuple[int, Phase]] = []
+    phases: list[tuple[int, Phase]] = []
     bad: Counter = Counter()
     for number, data in content.kept:
         schema = content.schemas.get(content.channels[number].schema_id)
@@ -451,5 +453,5 @@ def _commands(content: Content, where: str) -> list[tuple[int, Phase]]:
             store = store_of_schema(schema.name, schema.encoding, schema.data.decode(), where)
             message = ChannelDecoder(COMMAND_TOPIC, schema.name, (store,), bad, told=True).one(data)
             if message is not None:
-                found.append((stamp_ns(message), Phase(int(message.phase))))
-    return found
+                phases.append((stamp_ns(message), Phase(int(message.phase))))
+    return phases

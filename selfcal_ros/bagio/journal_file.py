@@ -155,10 +155,10 @@ class JournalFile:
         If a failed write cannot be undone, nothing is appended until it can.
         """
         self._take_back()
-        rest = memoryview(data)
+        remaining = memoryview(data)
         try:
-            while rest:
-                rest = rest[os.write(self._fd, rest) :]
+            while remaining:
+                remaining = remaining[os.write(self._fd, remaining) :]
         except OSError:
             self._torn = True
             with suppress(OSError):
@@ -246,8 +246,8 @@ def _scan(file: BinaryIO, name: str, keep: str) -> Content:
         content.end = end
 
 
-def _next_head(file: BinaryIO, at: int) -> tuple[int, int] | None:
-    file.seek(at)
+def _next_head(file: BinaryIO, offset: int) -> tuple[int, int] | None:
+    file.seek(offset)
     head = file.read(HEAD.size)
     return HEAD.unpack(head) if len(head) == HEAD.size else None
 

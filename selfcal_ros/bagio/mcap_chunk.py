@@ -132,10 +132,10 @@ def block_of(messages: list[Message]) -> MessageBlock:
     return MessageBlock(fronts, Payloads.joined([message.data for message in messages]))
 
 
-def message_block(data: bytes, at: int) -> tuple[MessageBlock, int]:
-    """Return the consecutive messages from `at` on, and their end."""
+def message_block(data: bytes, first: int) -> tuple[MessageBlock, int]:
+    """Return the consecutive messages from `first` on, and their end."""
     places = _Places(data)
-    end = places.find(at)
+    end = places.find(first)
     start = np.concatenate([*places.parts, np.array(places.single, dtype=np.int64)])
     if not len(start):
         return MessageBlock(np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)), end
@@ -146,19 +146,19 @@ def message_block(data: bytes, at: int) -> tuple[MessageBlock, int]:
     return MessageBlock(fronts, Payloads(data, start + FRONT, length)), end
 
 
-def stretch(file: BinaryIO, at: int, size: int) -> tuple[MessageBlock | None, int]:
-    """Return the messages outside chunks from `at` on and their end, or None.
+def stretch(file: BinaryIO, start: int, size: int) -> tuple[MessageBlock | None, int]:
+    """Return the messages outside chunks from `start` on and their end, or None.
 
     Nothing is read from byte `size` on, nor from where a file that was joined to it begins.
     """
-    file.seek(at)
+    file.seek(start)
     if file.read(1) != bytes([Opcode.MESSAGE]):
-        return None, at
-    file.seek(at)
-    data = file.read(min(STRETCH, size - at))
+        return None, start
+    file.seek(start)
+    data = file.read(min(STRETCH, size - start))
     joint = data.find(JOINT)
     block, end = message_block(data if joint < 0 else data[:joint], 0)
-    return (block if len(block) else None), at + end
+    return (block if len(block) else None), start + end
 
 
 class _Places:
@@ -169,51 +169,53 @@ class _Places:
         self.parts: list[np.ndarray] = [np.zeros(0, dtype=np.int64)]
         self.single: list[int] = []
 
-    def find(self, at: int) -> int:
-        """Skip the messages from `at` on; return the beginning of the next other record."""
+    def find(self, offset: int) -> int:
+        """Skip the messages from `offset` on; return the beginning of the next other record."""
         data, size, single = self.data, len(self.data), self.single
         waited, patience = 0, PATIENCE
-        while at + FRONT <= size:
-            opcode, length = mcap_salvage.HEAD.unpack_from(data, at)
-            end = at + mcap_salvage.HEAD.size + length
+        while offset + FRONT <= size:
+            opcode, length = mcap_salvage.HEAD.unpack_from(data, offset)
+            end = offset + mcap_salvage.HEAD.size + length
             if opcode != Opcode.MESSAGE or length < mcap_salvage.MESSAGE_FRONT or end > size:
                 break
-            single.append(at)
-            at = end
+            single.append(offset)
+            offset = end
             waited += 1
             if waited >= patience:
-                sizes = _period(np.diff([*single[-waited:], at]))
-                found = self._run(at, sizes) if len(sizes) else 0
-                patience = PATIENCE if found >= FIRST_LOOK else min(2 * patience, MAX_PATIENCE)
-                at, waited = at + found // max(len(sizes), 1) * int(sizes.sum()), 0
-        return at
+                sizes = _period(np.diff([*single[-waited:], offset]))
+                taken_messages = self._run(offset, sizes) if len(sizes) else 0
+                patience = (
+                    PATIENCE if taken_messages >= FIRST_LOOK else min(2 * patience, MAX_PATIENCE)
+                )
+                offset, waited = offset + taken_messages // max(len(sizes), 1) * int(sizes.sum()), 0
+        return offset
 
-    def _run(self, at: int, sizes: np.ndarray) -> int:
-        """Take messages with repeating sizes from `at` on; return their number."""
+    def _run(self, start: int, sizes: np.ndarray) -> int:
+        """Take messages with repeating sizes from `start` on; return their number."""
         stride, offsets = int(sizes.sum()), np.cumsum(sizes) - sizes
-        possible = (len(self.data) - at) // stride
-        found, look = 0, max(FIRST_LOOK // len(sizes), 1)
-        while found < possible:
-            count = min(look, possible - found)
+        possible = (len(self.data) - start) // stride
+        taken_runs, look = 0, max(FIRST_LOOK // len(sizes), 1)
+        while taken_runs < possible:
+            count = min(look, possible - taken_runs)
             good = np.ones(count, dtype=bool)
             for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
                 heads = np.ndarray(
-                    (count,), HEAD_TYPE, self.data, at + found * stride + offset, (stride,)
+                    (count,), HEAD_TYPE, self.data, start + taken_runs * stride + offset, (stride,)
                 )
                 good &= (heads["opcode"] == Opcode.MESSAGE) & (
                     heads["length"] == size - mcap_salvage.HEAD.size
                 )
             step = count if good.all() else int(good.argmin())
-            found += step
+            taken_runs += step
             if step < count:
                 break
             look *= 4
-        if found:
+        if taken_runs:
             self.parts.append(np.array(self.single, dtype=np.int64))
-            starts = at + stride * np.arange(found, dtype=np.int64)
+            starts = start + stride * np.arange(taken_runs, dtype=np.int64)
             self.parts.append((starts[:, None] + offsets).ravel())
             self.single.clear()
-        return found * len(sizes)
+        return taken_runs * len(sizes)
 
 
 def _period(sizes: np.ndarray) -> np.ndarray:
@@ -254,19 +256,19 @@ def chunk_items(chunk: Chunk) -> list[MessageBlock | Schema | Channel]:
 
 def _items(data: bytes) -> list[MessageBlock | Schema | Channel]:
     items: list[MessageBlock | Schema | Channel] = []
-    at = 0
-    while at < len(data):
-        block, at = message_block(data, at)
+    offset = 0
+    while offset < len(data):
+        block, offset = message_block(data, offset)
         if len(block):
             items.append(block)
-        if at == len(data):
+        if offset == len(data):
             break
-        opcode, length = mcap_salvage.HEAD.unpack_from(data, at)
-        start, at = at + mcap_salvage.HEAD.size, at + mcap_salvage.HEAD.size + length
-        if at > len(data) or opcode == Opcode.MESSAGE:
+        opcode, length = mcap_salvage.HEAD.unpack_from(data, offset)
+        start, offset = offset + mcap_salvage.HEAD.size, offset + mcap_salvage.HEAD.size + length
+        if offset > len(data) or opcode == Opcode.MESSAGE:
             raise ValueError("a record does not fit into its chunk")
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record, used = mcap_salvage.parsed(opcode, data[start:at])
+            record, used = mcap_salvage.parsed(opcode, data[start:offset])
             if used != length:
                 raise ValueError("the length of a record is wrong")
             if isinstance(record, Schema | Channel):
@@ -351,11 +353,11 @@ def _content(file: BinaryIO) -> bytes:
 
 
 def _parsed(content: bytes) -> Summary:
-    summary, at = Summary(), 0
-    while at < len(content):
-        opcode, length = mcap_salvage.HEAD.unpack_from(content, at)
-        at += mcap_salvage.HEAD.size
-        body = ReadDataStream(io.BytesIO(content[at : at + length]))
+    summary, offset = Summary(), 0
+    while offset < len(content):
+        opcode, length = mcap_salvage.HEAD.unpack_from(content, offset)
+        offset += mcap_salvage.HEAD.size
+        body = ReadDataStream(io.BytesIO(content[offset : offset + length]))
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(body)
             summary.schemas[schema.id] = schema
@@ -364,5 +366,5 @@ def _parsed(content: bytes) -> Summary:
             summary.channels[channel.id] = channel
         elif opcode == Opcode.CHUNK_INDEX:
             summary.chunks.append(ChunkIndex.read(body))
-        at += length
+        offset += length
     return summary

@@ -219,40 +219,40 @@ def parsed(opcode: int, body: bytes) -> tuple[McapRecord | None, int]:
         return Message.read(stream, len(body)), len(body)
     if opcode == Opcode.CHUNK and chunk_length(body, 0) > len(body):
         raise ValueError("the length of a chunk is wrong")
-    for known, parse in PARSERS.items():
-        if opcode == known:
+    for parsed_opcode, parse in PARSERS.items():
+        if opcode == parsed_opcode:
             return parse(stream), stream.count
     return None, len(body)
 
 
-def chunk_length(data: bytes | mmap, at: int) -> int:
-    """Return the length of the chunk whose content begins at `at`, from the lengths inside it.
+def chunk_length(data: bytes | mmap, start: int) -> int:
+    """Return the length of the chunk whose content begins at `start`, from the lengths inside it.
 
     More than available if `data` ends before them.
     """
-    name_length = int.from_bytes(data[at + 28 : at + 32], "little")
-    inside = int.from_bytes(data[at + 32 + name_length : at + 40 + name_length], "little")
+    name_length = int.from_bytes(data[start + 28 : start + 32], "little")
+    inside = int.from_bytes(data[start + 32 + name_length : start + 40 + name_length], "little")
     return CHUNK_FRONT - HEAD.size + name_length + inside
 
 
 def declarations(data: mmap) -> Iterator[Schema | Channel]:
     """Yield the schemas and channels repeated in the summary; nothing without a summary."""
-    at = (
+    offset = (
         struct.unpack_from("<Q", data, len(data) - FOOTER_CONTENT)[0]
         if len(data) >= FOOTER_CONTENT
         else 0
     )
-    while 0 < at <= len(data) - HEAD.size:
-        opcode, length = HEAD.unpack_from(data, at)
-        at += HEAD.size
+    while 0 < offset <= len(data) - HEAD.size:
+        opcode, length = HEAD.unpack_from(data, offset)
+        offset += HEAD.size
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             try:
-                record, _ = parsed(opcode, data[at : at + length])
+                record, _ = parsed(opcode, data[offset : offset + length])
             except Exception:  # no summary, or a damaged one
                 return
             if isinstance(record, Schema | Channel):
                 yield record
-        at += length
+        offset += length
 
 
 def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int:
@@ -269,21 +269,21 @@ def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int
     """
     pattern = CHUNKS if channels is None else MESSAGES
     for match in pattern.finditer(data, start + 1):
-        at = match.start()
-        opcode, length = HEAD.unpack_from(data, at)
-        end = at + HEAD.size + length
+        offset = match.start()
+        opcode, length = HEAD.unpack_from(data, offset)
+        end = offset + HEAD.size + length
         if opcode == Opcode.DATA_END:
-            return at
+            return offset
         if end > len(data) or length < MESSAGE_FRONT:
             continue
         if opcode == Opcode.CHUNK:
-            fits = length == chunk_length(data, at + HEAD.size)
+            fits = length == chunk_length(data, offset + HEAD.size)
         else:
-            fits = struct.unpack_from("<H", data, at + HEAD.size)[0] in (channels or ()) and (
+            fits = struct.unpack_from("<H", data, offset + HEAD.size)[0] in (channels or ()) and (
                 end == len(data) or data[end] in (Opcode.MESSAGE, Opcode.DATA_END)
             )
         if fits:
-            return at
+            return offset
     return len(data)
 
 
@@ -301,19 +301,19 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
     body = _decompressed_front(name, data[begin : begin + inside], size)
     if crc and len(body) >= size and zlib.crc32(body[:size]) != crc:
         return
-    at = 0
-    while at + HEAD.size <= len(body):
-        opcode, length = HEAD.unpack_from(body, at)
-        at += HEAD.size
-        if at + length > len(body):
+    offset = 0
+    while offset + HEAD.size <= len(body):
+        opcode, length = HEAD.unpack_from(body, offset)
+        offset += HEAD.size
+        if offset + length > len(body):
             return
         try:
-            record, _ = parsed(opcode, body[at : at + length])
+            record, _ = parsed(opcode, body[offset : offset + length])
         except Exception:  # a damaged chunk, not only truncated: the rest cannot be trusted
             return
         if record is not None:
             yield record
-        at += length
+        offset += length
 
 
 def _decompressed_front(compression: str, data: bytes, declared: int) -> bytes:
@@ -332,8 +332,8 @@ def _decompressed_front(compression: str, data: bytes, declared: int) -> bytes:
             decoder = lz4.frame.LZ4FrameDecompressor()
         else:
             return data
-        for at in range(0, len(data), SLICE):
-            out += decoder.decompress(data[at : at + SLICE])
+        for start in range(0, len(data), SLICE):
+            out += decoder.decompress(data[start : start + SLICE])
             if len(out) > limit:
                 return b""
     except (zstandard.ZstdError, RuntimeError, EOFError):

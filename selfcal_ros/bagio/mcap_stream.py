@@ -179,46 +179,48 @@ class McapStream:
     def _records(self, file: BinaryIO) -> Iterator[mcap_chunk.MessageBlock]:
         """Go from record to record; records that begin before `sure` have been read."""
         size = self._size
-        at = sure = clean = self.begin + len(mcap_chunk.MAGIC)
-        last = at  # the record before
+        offset = sure = clean = self.begin + len(mcap_chunk.MAGIC)
+        last = offset  # the record before
         data_ended = passed = False
-        while at <= self._size:
-            block, end = mcap_chunk.stretch(file, at, size)
+        while offset <= self._size:
+            block, end = mcap_chunk.stretch(file, offset, size)
             if block is not None:
-                last = sure = at + int(block.payloads.start[-1]) - mcap_chunk.FRONT
+                last = sure = offset + int(block.payloads.start[-1]) - mcap_chunk.FRONT
                 clean = end
-                at = end
+                offset = end
                 yield from self._take(block)
                 continue
-            if _is_chunk(file, at, self._needless.get(at)):
+            if _is_chunk(file, offset, self._needless.get(offset)):
                 self._chunked = passed = True
-                at = sure = clean = self._needless[at]
+                offset = sure = clean = self._needless[offset]
                 continue
             try:
-                opcode, record, end = _record(file, at, size)
+                opcode, record, end = _record(file, offset, size)
             except Exception as error:  # a damaged record may fail anywhere in its parser
                 size = self._end_at_joint(file, last, size)
-                at, sure = (at, sure) if at <= size else (last, last)  # the one before is cut off
-                if data_ended or at == size == clean:
+                offset, sure = (
+                    (offset, sure) if offset <= size else (last, last)
+                )  # the one before is cut off
+                if data_ended or offset == size == clean:
                     self._say_end(file, data_ended)
                     return
-                file.seek(at)
-                start = at if file.read(1) == bytes([Opcode.CHUNK]) else sure
+                file.seek(offset)
+                start = offset if file.read(1) == bytes([Opcode.CHUNK]) else sure
                 yield from self._salvage(file, start, error)
-                at = sure = self._found(file, start)
-                if at == size:
+                offset = sure = self._found(file, start)
+                if offset == size:
                     return
                 continue
             if opcode == Opcode.FOOTER:
                 self._note_rest(file, end)
                 return
             data_ended = data_ended or opcode == Opcode.DATA_END
-            last = at
+            last = offset
             if opcode in CHECKED:  # only the record after a message confirms its length
-                sure, clean = at if opcode == Opcode.MESSAGE else end, end
+                sure, clean = offset if opcode == Opcode.MESSAGE else end, end
             if passed and opcode == Opcode.MESSAGE_INDEX:
-                self._n_read += (end - at - mcap_salvage.HEAD.size - INDEX.size) // INDEX_ENTRY
-            at = end
+                self._n_read += (end - offset - mcap_salvage.HEAD.size - INDEX.size) // INDEX_ENTRY
+            offset = end
             if isinstance(record, Chunk):
                 self._chunked, passed = True, False
                 yield from self._chunk(file, record, (last, end))
@@ -383,36 +385,36 @@ class McapStream:
         )
 
 
-def _is_chunk(file: BinaryIO, at: int, end: int | None) -> bool:
-    """Return whether there is a chunk of the indexed length at `at`."""
+def _is_chunk(file: BinaryIO, offset: int, end: int | None) -> bool:
+    """Return whether there is a chunk of the indexed length at `offset`."""
     if end is None:
         return False
     head = mcap_salvage.HEAD
-    file.seek(at)
-    return file.read(head.size) == head.pack(Opcode.CHUNK, end - at - head.size)
+    file.seek(offset)
+    return file.read(head.size) == head.pack(Opcode.CHUNK, end - offset - head.size)
 
 
-def _record(file: BinaryIO, at: int, size: int) -> tuple[int, McapRecord | None, int]:
-    """Return opcode, content (None if not needed) and end of the record at `at`."""
-    file.seek(at)
+def _record(file: BinaryIO, offset: int, size: int) -> tuple[int, McapRecord | None, int]:
+    """Return opcode, content (None if not needed) and end of the record at `offset`."""
+    file.seek(offset)
     head = file.read(mcap_salvage.HEAD.size)
     if len(head) < mcap_salvage.HEAD.size:
         raise _Cut
     opcode, length = mcap_salvage.HEAD.unpack(head)
     if not (0 < opcode <= max(Opcode) or opcode >= 0x80):  # the range of private records
         raise ValueError(f"no record has the opcode {opcode}")
-    if at + mcap_salvage.HEAD.size + length > size:
+    if offset + mcap_salvage.HEAD.size + length > size:
         raise _Cut
     if opcode >= 0x80 or opcode == Opcode.ATTACHMENT:
-        return opcode, None, at + mcap_salvage.HEAD.size + length
+        return opcode, None, offset + mcap_salvage.HEAD.size + length
     body = file.read(length)
     if opcode != Opcode.CHUNK and mcap_chunk.JOINT in body + file.read(len(mcap_chunk.JOINT) - 1):
         raise _Cut
     if opcode == Opcode.MESSAGE_INDEX:
         if INDEX.unpack_from(body)[1] != length - INDEX.size:
             raise ValueError("the length of a message index is wrong")
-        return opcode, None, at + mcap_salvage.HEAD.size + length
+        return opcode, None, offset + mcap_salvage.HEAD.size + length
     record, used = mcap_salvage.parsed(opcode, body)
     # a chunk ends where its records do, even if the length before it says more
     size = used if opcode == Opcode.CHUNK else length
-    return opcode, record, at + mcap_salvage.HEAD.size + size
+    return opcode, record, offset + mcap_salvage.HEAD.size + size

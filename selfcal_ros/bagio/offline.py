@@ -211,15 +211,15 @@ def topics_like(topic: str, topics: dict[str, str]) -> str:
 
     The text can be followed by another remedy; it is empty if there is no such topic.
     """
-    others = {
+    type_of_topic = {
         name: kind
         for name, kind in topics.items()
         if not any(f"/{name}".endswith(f"/{role}") for role in INPUT_TOPICS)
     }
-    same = sorted(name for name, kind in others.items() if kind == INPUT_TOPICS[topic])
+    same = sorted(name for name, kind in type_of_topic.items() if kind == INPUT_TOPICS[topic])
     if same:
         return f"is it {' or '.join(same[:MAX_SAID])}? then remap it to {topic}, or "
-    hint = did_you_mean(f"/{topic}", others)
+    hint = did_you_mean(f"/{topic}", type_of_topic)
     return f"{hint} then remap it, or " if hint else ""
 
 
@@ -357,9 +357,9 @@ class Playlist:
         if self._order is None:
             yield from messages
             return
-        kept = [(topic, data) for topic, _, data in messages]
+        of_topics = [(topic, data) for topic, _, data in messages]
         for number, stamp in zip(self._order.tolist(), self._times.tolist(), strict=True):
-            topic, data = kept[number]
+            topic, data = of_topics[number]
             yield topic, stamp, data
 
 

@@ -103,27 +103,29 @@ class BagReader:
                 "neither a file nor a folder",
                 "give an MCAP file or a rosbag2 folder",
             )
-        there = {p.name for p in self.path.iterdir() if p.name.endswith(SUFFIXES) and p.is_file()}
-        found = sorted(
-            (name for name in there if name.removesuffix(".zstd") not in there - {name}),
+        present = {p.name for p in self.path.iterdir() if p.name.endswith(SUFFIXES) and p.is_file()}
+        recordings = sorted(
+            (name for name in present if name.removesuffix(".zstd") not in present - {name}),
             key=_natural,
         )
         listed = self._listed()
-        names = listed if there.intersection(listed) else found  # the files may have been renamed
+        names = (
+            listed if present.intersection(listed) else recordings
+        )  # the files may have been renamed
         instead = ", ".join(name for name in names if name not in listed)
         for name in listed:
-            if name not in there:
+            if name not in present:
                 self.lost.append(
                     f"the file {name}, which metadata.yaml lists, is missing"
                     + (f"; {instead} was read" if instead else "")
                 )
         plain = {name.removesuffix(".zstd") for name in names}
-        for name in found:
+        for name in recordings:
             if name.removesuffix(".zstd") not in plain:
                 self.lost.append(
                     f"the file {name}, which metadata.yaml does not list, was not used"
                 )
-        files = [self.path / name for name in names if name in there]
+        files = [self.path / name for name in names if name in present]
         if not files and any(p.suffix == ".db3" for p in self.path.iterdir()):
             raise InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
         if not files:
@@ -180,13 +182,13 @@ class BagReader:
         """
         bad: Counter = Counter()
         for block, parts in self._blocks(bad):
-            found = [
+            numbered = [
                 (number, decoder.role, data)
                 for decoder, index in parts
                 for number, data in decoder.own_bytes(block.payloads[index], index)
             ]
             stamps = block.fronts["log_time"].tolist()
-            for number, role, data in sorted(found, key=lambda item: item[0]):
+            for number, role, data in sorted(numbered, key=lambda item: item[0]):
                 yield role, stamps[number], data
         self._say(bad)
 
@@ -284,9 +286,9 @@ class BagReader:
         return index[~ahead] if self.leave_ahead else index
 
     def _note_steps(self, watch: StepWatch, role: str, block: MessageBlock) -> None:
-        stamps, there = first_stamps_ns(block.payloads)
-        found = watch.add(stamps, block.fronts["log_time"][there].astype(np.int64))
-        self.steps.setdefault(role, []).extend(found)
+        stamps, has_header = first_stamps_ns(block.payloads)
+        steps = watch.add(stamps, block.fronts["log_time"][has_header].astype(np.int64))
+        self.steps.setdefault(role, []).extend(steps)
 
     def _say(self, bad: Counter) -> None:
         self.lost += [
@@ -320,11 +322,11 @@ class BagReader:
             return ChannelDecoder(
                 role, name, (store, *shorter_stores(name, LAST_FIELDS[role])), bad, told=False
             )
-        other = other_field(store, name, LAST_FIELDS[role])
-        if other:
+        difference = other_field(store, name, LAST_FIELDS[role])
+        if difference:
             raise InputError(
                 where,
-                f"another version of {name}: {other}",
+                f"another version of {name}: {difference}",
                 "record the bag with the messages of this version",
             )
         return ChannelDecoder(role, name, (store,), bad, told=True)
@@ -363,10 +365,10 @@ def _stride(index: np.ndarray) -> int:
 
 def _ahead(block: MessageBlock, index: np.ndarray) -> np.ndarray:
     """Return which messages are stamped ahead of their log time."""
-    stamps, there = first_stamps_ns(block.payloads[index])
+    stamps, has_header = first_stamps_ns(block.payloads[index])
     ahead = np.zeros(len(index), dtype=bool)
-    logged = np.minimum(block.fronts["log_time"][index[there]], NEVER_NS).astype(np.int64)
-    ahead[there] = (stamps - logged > MAX_AHEAD_NS) & (logged > 0)  # 0: unknown
+    logged = np.minimum(block.fronts["log_time"][index[has_header]], NEVER_NS).astype(np.int64)
+    ahead[has_header] = (stamps - logged > MAX_AHEAD_NS) & (logged > 0)  # 0: unknown
     return ahead
 
 

@@ -151,8 +151,8 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
 def _store_of_text(name: str, encoding: str, text: str) -> Typestore:
     """Return the cached typestore of a schema: rosbags generates code for each."""
     types = get_types_from_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, name)
-    for known in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
-        types.setdefault(known, typestore().fielddefs[known])
+    for type_name in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
+        types.setdefault(type_name, typestore().fielddefs[type_name])
     return _store(types)
 
 
@@ -168,7 +168,7 @@ def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
         return ()
     constants, fields = typestore().fielddefs[name]
     names = [field for field, _ in fields]
-    common = {known: typestore().fielddefs[known] for known in COMMON}
+    common = {type_name: typestore().fielddefs[type_name] for type_name in COMMON}
     return tuple(
         _store({**common, name: (constants, fields[:count])})
         for count in range(len(names) - 1, names.index(last), -1)
@@ -226,17 +226,19 @@ def other_field(store: Typestore, name: str, last: str) -> str:
     Every field up to `last` must be present, and common fields must have the same type. Unknown
     fields, and bounds on the length of a string or array, are ignored.
     """
-    found, required = dict(store.fielddefs[name][1]), True
+    type_of_field, required = dict(store.fielddefs[name][1]), True
     for part, wanted in typestore().fielddefs[name][1]:
-        if part not in found and required:
+        if part not in type_of_field and required:
             return f"no field '{part}'"
-        if part in found and _free_of_bounds(found[part]) != _free_of_bounds(wanted):
+        if part in type_of_field and _free_of_bounds(type_of_field[part]) != _free_of_bounds(
+            wanted
+        ):
             return f"the field '{part}' has another type"
         inner = wanted[1]
-        if isinstance(inner, str) and part in found:  # a type of its own
-            other = other_field(store, inner, typestore().fielddefs[inner][1][-1][0])
-            if other:
-                return f"in '{part}', {other}"
+        if isinstance(inner, str) and part in type_of_field:  # a type of its own
+            difference = other_field(store, inner, typestore().fielddefs[inner][1][-1][0])
+            if difference:
+                return f"in '{part}', {difference}"
         required = required and part != last
     return ""
 
@@ -342,11 +344,11 @@ class ChannelDecoder:
 
     def many(self, messages: Payloads) -> Iterator[Input]:
         """Yield the decoded messages; failures are counted."""
-        rest = np.arange(len(messages))
+        undecoded = np.arange(len(messages))
         if self._columns is not None:
-            groups, rest = self._columns.decode(messages)
+            groups, undecoded = self._columns.decode(messages)
             yield from map(BLOCKS[self.role], groups)
-        for data in messages[rest]:
+        for data in messages[undecoded]:
             message = self.one(data)
             if message is not None:
                 yield _block(self.role, message)
@@ -356,11 +358,13 @@ class ChannelDecoder:
 
         Failures are omitted and counted.
         """
-        rest = np.ones(len(messages), dtype=bool)
+        is_doubtful = np.ones(len(messages), dtype=bool)
         if self._columns is not None and self._own:
-            rest[:] = False
-            rest[self._columns.decode(messages)[1]] = True
-        for number, data, doubtful in zip(index.tolist(), messages, rest.tolist(), strict=True):
+            is_doubtful[:] = False
+            is_doubtful[self._columns.decode(messages)[1]] = True
+        for number, data, doubtful in zip(
+            index.tolist(), messages, is_doubtful.tolist(), strict=True
+        ):
             little = data[: len(LITTLE)] == LITTLE
             if little and not doubtful:
                 yield number, data

@@ -56,10 +56,10 @@ def new_bag(path: str | Path) -> Iterator[Path]:
 def _profiles(metadata: dict[str, str]) -> list[dict]:
     """Return the offered QoS profiles in the metadata of a channel; empty if unreadable."""
     try:
-        found = yaml.safe_load(metadata.get("offered_qos_profiles", "")) or []
+        profiles = yaml.safe_load(metadata.get("offered_qos_profiles", "")) or []
     except yaml.YAMLError:
         return []
-    return found if isinstance(found, list) else []
+    return profiles if isinstance(profiles, list) else []
 
 
 @contextmanager
@@ -162,13 +162,13 @@ class Metadata:
 
     def _information(self) -> dict[str, Any]:
         firsts = [file.first_ns for file in self.files if file.first_ns is not None]
-        whole = FileEntry(
+        bag_entry = FileEntry(
             "",
             sum(file.count for file in self.files),
             min(firsts, default=None),
             max((file.last_ns for file in self.files), default=0),
         )
-        about = whole.about()
+        about = bag_entry.about()
         topics = [
             {
                 "topic_metadata": {

@@ -59,25 +59,25 @@ def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
         Places of the marks, px.
     """
     apart = [
-        float(np.hypot(*(found[i] - found[j])))
-        for found in images
-        for i in range(len(found))
+        float(np.hypot(*(places[i] - places[j])))
+        for places in images
+        for i in range(len(places))
         for j in range(i)
     ]
     limit = min(apart) / 2 if apart else np.inf
     numbers: list[np.ndarray] = []
-    count, before, known = 0, np.zeros((0, 2)), np.zeros(0, dtype=int)
-    for found in images:
-        mine = np.full(len(found), -1)
-        for index, place in enumerate(found):
+    count, before, tracks_before = 0, np.zeros((0, 2)), np.zeros(0, dtype=int)
+    for places in images:
+        mine = np.full(len(places), -1)
+        for index, place in enumerate(places):
             away = np.hypot(*(before - place).T)
             if len(away) and away.min() < limit:
-                mine[index] = known[away.argmin()]
+                mine[index] = tracks_before[away.argmin()]
             else:
                 mine[index], count = count, count + 1
         numbers.append(mine)
-        if len(found):
-            before, known = found, mine
+        if len(places):
+            before, tracks_before = places, mine
     return numbers
 
 
@@ -102,7 +102,7 @@ def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sens
         image of the motion.
     """
     number = np.concatenate([np.zeros(0, int), *tracks(images)])
-    stage = np.repeat(positions, [len(found) for found in images], axis=0)
+    stage = np.repeat(positions, [len(places) for places in images], axis=0)
     place = np.concatenate([np.zeros((0, 2)), *images])
     followed = np.bincount(number)[number] > 1 if len(number) else np.zeros(0, bool)
     number, stage, place = number[followed], stage[followed], place[followed]
@@ -156,26 +156,26 @@ def _similar(
         size = np.hypot(a + d, c - b) / 2
         return np.array([size, np.arctan2(c - b, a + d), (a - d) / 2 / size, (b + c) / 2 / size])
 
-    found = parts(by_stage)
+    components = parts(by_stage)
     step = 1e-6 * np.abs(by_stage).max()
     jacobian = np.empty((4, 4))
     for index in range(4):
         change = np.zeros(4)
         change[index] = step
-        both = [parts(by_stage + way * change.reshape(2, 2)) for way in (1, -1)]
-        differ = both[0] - both[1]
+        nearby = [parts(by_stage + way * change.reshape(2, 2)) for way in (1, -1)]
+        differ = nearby[0] - nearby[1]
         differ[1] = np.remainder(differ[1] + np.pi, 2 * np.pi) - np.pi
         jacobian[:, index] = differ / (2 * step)
     u = np.sqrt(np.diagonal(jacobian @ covariance @ jacobian.T))
-    if not u[0] <= TOO_UNCERTAIN * found[0]:
+    if not u[0] <= TOO_UNCERTAIN * components[0]:
         raise InputError(
             "images",
             "the marks do not follow the stage: the size of a pixel has a "
-            f"standard uncertainty of {u[0] / found[0]:.2g} of itself",
+            f"standard uncertainty of {u[0] / components[0]:.2g} of itself",
             "move the stage from image to image by less than half the distance of "
             "two marks, and check the positions",
         )
-    sheared = float(np.hypot(*found[2:]))
+    sheared = float(np.hypot(*components[2:]))
     if sheared > max(NOT_SIMILAR, 5 * float(u[2:].max())):
         raise InputError(
             "images",
@@ -184,9 +184,9 @@ def _similar(
             "and that the encoder axes are those of the camera's stage",
         )
     return CameraPose(
-        float(found[0]),
+        float(components[0]),
         float(u[0]),
-        float(found[1]),
+        float(components[1]),
         u_turn_rad=float(u[1]),
         mirror=mirror,
         sheared=sheared,
@@ -195,14 +195,14 @@ def _similar(
     )
 
 
-def require_size(found: CameraPose, *, mark_size_m: float, mark_pixels: float, where: str) -> None:
+def require_size(pose: CameraPose, *, mark_size_m: float, mark_pixels: float, where: str) -> None:
     """Raise InputError for a camera in which marks would have another size than stated."""
-    told = mark_size_m / mark_pixels
-    if abs(told / found.pixel_size_m - 1) > DetectorSettings().size_tolerance:
+    stated_m = mark_size_m / mark_pixels
+    if abs(stated_m / pose.pixel_size_m - 1) > DetectorSettings().size_tolerance:
         raise InputError(
             where,
             "by the moves of the stage a pixel has "
-            f"{found.pixel_size_m / M_PER_UM:.3g} µm, by the size of the marks over "
-            f"their pixels {told / M_PER_UM:.3g} µm",
+            f"{pose.pixel_size_m / M_PER_UM:.3g} µm, by the size of the marks over "
+            f"their pixels {stated_m / M_PER_UM:.3g} µm",
             "correct the unit of the positions (m), the size of the marks (m) or their pixels",
         )

@@ -35,8 +35,8 @@ class CodedPlate:
     """
 
     def __init__(self, text: str, where: str) -> None:
-        found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
-        if not found:
+        match = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+        if not match:
             raise InputError(
                 f"{where}: aruco",
                 f"'{text}' is not the marks along x and y",
@@ -50,7 +50,7 @@ class CodedPlate:
                 "OpenCV, which reads the markers, is not installed",
                 "pip install 'selfcal_ros[camera]', or leave aruco out",
             ) from error
-        self._shape = np.array([int(found[1]), int(found[2])])
+        self._shape = np.array([int(match[1]), int(match[2])])
         self._centres = edge_markers(*self._shape.tolist())
         parameters = cv2.aruco.DetectorParameters()
         parameters.detectInvertedMarker = True
@@ -80,8 +80,8 @@ class CodedPlate:
             return [None] * len(marks)
         last = values.shape[1] - 1
         pixels = np.array([(last - mark.u if mirror else mark.u) - 1j * mark.v for mark in marks])
-        at, seen = places
-        return [self._id(at(pixel), seen) for pixel in pixels.tolist()]
+        place_of, markers = places
+        return [self._id(place_of(pixel), markers) for pixel in pixels.tolist()]
 
     def _places(self, values: np.ndarray, full_scale: int) -> Any:
         """Return the function from pixel to plate, and the markers seen; None without them.
@@ -93,24 +93,24 @@ class CodedPlate:
         if numbers is None:
             return None
         numbers = np.ravel(numbers)
-        known = numbers < len(self._centres)
-        if not known.any():
+        on_plate = numbers < len(self._centres)
+        if not on_plate.any():
             return None
-        seen = self._centres[numbers[known]]
-        pixels = np.array([np.reshape(each, (4, 2)) for each in corners])[known]
+        markers = self._centres[numbers[on_plate]]
+        pixels = np.reshape(corners, (-1, 4, 2))[on_plate]
         pixel = (pixels[..., 0] - 1j * pixels[..., 1]).ravel()
-        place = (seen[:, None] + CORNERS) @ (1, 1j)
+        place = (markers[:, None] + CORNERS) @ (1, 1j)
         columns = np.stack([pixel, np.ones_like(pixel)], axis=1)
         factor, shift = np.linalg.lstsq(columns, place.ravel(), rcond=None)[0]
         if np.abs(factor * pixel + shift - place.ravel()).max() > AGREE:
             return None
-        return lambda at: factor * at + shift, seen
+        return lambda place_px: factor * place_px + shift, markers
 
-    def _id(self, place: complex, seen: np.ndarray) -> tuple[int, int] | MarkFault | None:
-        at = np.array([place.real, place.imag])
-        if (np.abs(seen - at).max(axis=1) < SIDE / 2 + 0.05).any():
+    def _id(self, place: complex, markers: np.ndarray) -> tuple[int, int] | MarkFault | None:
+        point = np.array([place.real, place.imag])
+        if (np.abs(markers - point).max(axis=1) < SIDE / 2 + 0.05).any():
             return MarkFault.MARKER
-        index = at + (self._shape - 1) / 2
+        index = point + (self._shape - 1) / 2
         nearest = np.round(index)
         if (
             np.abs(index - nearest).max() > NEAR

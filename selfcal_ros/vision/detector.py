@@ -131,7 +131,7 @@ class MarkDetector:
             If there are more possible marks than `max_marks`.
         """
         image, full = picture.values, self.settings.full_scale or picture.full_scale
-        seen = candidates(
+        possible = candidates(
             image,
             mark=self.settings.mark,
             size=self.size,
@@ -139,12 +139,12 @@ class MarkDetector:
             sign=self._sign,
             most=self.settings.max_marks,
         )
-        found = _without_doubles(self._fitted(image, seen, full), SAME * self.size)
+        fitted = _without_doubles(self._fitted(image, possible, full), SAME * self.size)
         return [
             Judged(mark.u, mark.v, mark)
             if isinstance(mark, Mark)
             else Judged(candidate.column, candidate.row, mark)
-            for candidate, mark in zip(seen, found, strict=True)
+            for candidate, mark in zip(possible, fitted, strict=True)
         ]
 
     def marks(self, picture: Picture) -> tuple[list[Mark], Counter[str]]:
@@ -158,52 +158,55 @@ class MarkDetector:
         return told_apart(self.judged(picture))
 
     def _fitted(
-        self, image: np.ndarray, seen: list[Candidate], full: int
+        self, image: np.ndarray, possible: list[Candidate], full: int
     ) -> list[Mark | MarkFault]:
         """Return the mark at each candidate, or why there is none.
 
         Each is fitted again in a window centred on a first fit, so that nothing depends on the
         candidate.
         """
-        if not seen:
+        if not possible:
             return []
-        out: list[Mark | MarkFault] = [MarkFault.NO_FIT] * len(seen)
+        out: list[Mark | MarkFault] = [MarkFault.NO_FIT] * len(possible)
         columns, rows = (
-            np.array([getattr(candidate, name) for candidate in seen], dtype=int)
+            np.array([getattr(candidate, name) for candidate in possible], dtype=int)
             for name in ("column", "row")
         )
         blur = max(1.0, FIRST_BLUR * self.size)
         starts = np.array(
-            [self._model.start(self.size, self._width, candidate.angle, blur) for candidate in seen]
+            [
+                self._model.start(self.size, self._width, candidate.angle, blur)
+                for candidate in possible
+            ]
         )
-        waiting, moved = np.arange(len(seen)), False
+        waiting, is_second = np.arange(len(possible)), False
         while len(waiting):
-            again = []
+            off_centre = []
             for index, fit in self._fits(image, (columns, rows), starts, waiting, full):
                 if isinstance(fit, MarkFault):
                     out[index] = fit
                     continue
                 du, dv = (round(float(away)) for away in fit.centre)
-                if moved or not (du or dv):
+                if is_second or not (du or dv):
                     out[index] = self._mark(fit, int(columns[index]), int(rows[index]))
                     continue
                 columns[index] += du
                 rows[index] += dv
                 starts[index] = list(fit.shape.values())
-                again.append(index)
-            waiting, moved = np.array(again, dtype=int), True
+                off_centre.append(index)
+            waiting, is_second = np.array(off_centre, dtype=int), True
         return out
 
     def _fits(
         self,
         image: np.ndarray,
-        at: tuple[np.ndarray, np.ndarray],
+        centres: tuple[np.ndarray, np.ndarray],
         starts: np.ndarray,
         which: np.ndarray,
         full: int,
     ) -> Iterator[tuple[int, Fit | MarkFault]]:
         """Yield the fit of each candidate in `which`, or why there is none."""
-        columns, rows = at[0][which], at[1][which]
+        columns, rows = centres[0][which], centres[1][which]
         radius = self._model.reach * self.size + 2
         inside = lie_inside(image, columns, rows, radius)
         for index in which[~inside]:
@@ -212,11 +215,11 @@ class MarkDetector:
         saturated = (windows.values >= full).mean(axis=1) > SATURATED
         for index in which[inside][saturated]:
             yield int(index), MarkFault.SATURATED
-        left = which[inside][~saturated]
+        usable = which[inside][~saturated]
         fits = fit_marks(
-            self._model, Windows(windows.disc, windows.values[~saturated]), starts[left]
+            self._model, Windows(windows.disc, windows.values[~saturated]), starts[usable]
         )
-        for index, fit in zip(left, fits, strict=True):
+        for index, fit in zip(usable, fits, strict=True):
             yield int(index), MarkFault.NO_FIT if fit is None else fit
 
     def _mark(self, fit: Fit, column: int, row: int) -> Mark | MarkFault:
@@ -236,19 +239,19 @@ class MarkDetector:
 
     def _fault(self, fit: Fit) -> MarkFault | None:
         """Return why a fitted mark is rejected, or None."""
-        given = self.settings
+        settings = self.settings
         size = fit.shape.get("size", self.size)
         if self._sign * fit.contrast < 0:
             return MarkFault.NO_FIT
-        if abs(fit.shape["blur"]) > given.max_blur * self.size:
+        if abs(fit.shape["blur"]) > settings.max_blur * self.size:
             return MarkFault.DEFOCUSED
         if fit.bright + fit.dark + fit.inner_stains + fit.outer_stains >= STAINED:
             if max(fit.bright, fit.dark) >= STAINED:  # these spoil the levels of the others
                 return MarkFault.REFLECTION if fit.bright > fit.dark else MarkFault.DIRT
             return MarkFault.BROKEN if fit.inner_stains > fit.outer_stains else MarkFault.DIRT
-        if abs(size / self.size - 1) > given.size_tolerance:
+        if abs(size / self.size - 1) > settings.size_tolerance:
             return MarkFault.WRONG_SIZE
-        if not max(fit.sigmas) <= given.max_sigma_px:
+        if not max(fit.sigmas) <= settings.max_sigma_px:
             return MarkFault.WEAK
         return None
 
@@ -262,23 +265,23 @@ class MarkDetector:
         rejected : Counter
             Reason -> possible marks that were rejected in all of them.
         """
-        given = self.settings
+        settings = self.settings
         wanted = (
-            f"no {'' if self._sign == 0 else given.polarity + ' '}{given.mark} of "
+            f"no {'' if self._sign == 0 else settings.polarity + ' '}{settings.mark} of "
             f"{self.size:.3g} px was found"
         )
         reasons = ", ".join(f"{count} {name}" for name, count in rejected.most_common())
-        said = wanted + (f"; rejected: {reasons}" if reasons else "")
+        summary = wanted + (f"; rejected: {reasons}" if reasons else "")
         spots = None if picture is None else spots_in(picture.values)
         if spots is None:
-            return f"{said}; nothing repeats in them", "check exposure and focus"
+            return f"{summary}; nothing repeats in them", "check exposure and focus"
         options = []
-        if abs(spots.side_px / self.size - 1) > given.size_tolerance:
-            options.append(f"--mark-size {spots.side_px * given.pixel_size:.2g}")
-        if self._sign and spots.polarity != given.polarity:
+        if abs(spots.side_px / self.size - 1) > settings.size_tolerance:
+            options.append(f"--mark-size {spots.side_px * settings.pixel_size:.2g}")
+        if self._sign and spots.polarity != settings.polarity:
             options.append(f"--polarity {spots.polarity}")
-        seen = f"{said}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
-        return seen, (
+        what = f"{summary}; what repeats is {spots.side_px:.3g} px, {spots.polarity}"
+        return what, (
             f"try {' '.join(options)}"
             if options
             else "see where they are with --draw FOLDER; another --mark (disc, ring, cross, "
@@ -294,15 +297,15 @@ class MarkDetector:
     ) -> list[Detection]:
         """Return the marks of an image of this shape (h, w) as detections, with ids if known."""
         out = []
-        for mark, known in zip(marks, ids or [None] * len(marks), strict=True):
+        for mark, mark_id in zip(marks, ids or [None] * len(marks), strict=True):
             x, y = offset(mark.u, mark.v, shape, self.settings)
             sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u**2 + mark.u_v**2) / 2))
-            m, n = known or (0, 0)
+            m, n = mark_id or (0, 0)
             out.append(
                 Detection(
                     stamp_ns,
                     int(Kind.GRID),
-                    known is not None,
+                    mark_id is not None,
                     m=m,
                     n=n,
                     k=0,
@@ -320,11 +323,11 @@ def told_apart(judged: Iterable[Judged]) -> tuple[list[Mark], Counter[str]]:
     """Return the marks, and the number of rejected ones by reason."""
     marks: list[Mark] = []
     faults: Counter[str] = Counter()
-    for each in judged:
-        if isinstance(each.found, Mark):
-            marks.append(each.found)
+    for candidate in judged:
+        if isinstance(candidate.found, Mark):
+            marks.append(candidate.found)
         else:
-            faults[str(each.found)] += 1
+            faults[str(candidate.found)] += 1
     return marks, faults
 
 
@@ -333,11 +336,11 @@ def _without_doubles(marks: list[Mark | MarkFault], near: float) -> list[Mark | 
     places = np.array(
         [(mark.u, mark.v) if isinstance(mark, Mark) else (np.nan, np.nan) for mark in marks]
     ).reshape(len(marks), 2)
-    known = np.flatnonzero(np.isfinite(places[:, 0]))
+    fitted = np.flatnonzero(np.isfinite(places[:, 0]))
     out = list(marks)
-    if len(known) < 2:
+    if len(fitted) < 2:
         return out
-    pairs = known[KDTree(places[known]).query_pairs(near, output_type="ndarray")]
+    pairs = fitted[KDTree(places[fitted]).query_pairs(near, output_type="ndarray")]
     for first, second in sorted(map(tuple, np.sort(pairs, axis=1)), key=lambda pair: pair[::-1]):
         if isinstance(out[first], Mark):
             out[second] = MarkFault.DOUBLE

@@ -154,8 +154,8 @@ class ImageDetector:
                     "stamp each exposure by its own instant",
                 )
             picture = decode(lambda shape: self._refuse_other((camera, *shape), name))
-            if not self._source.agrees(seen := (camera, *picture.values.shape)):
-                raise other_source(self._source.image, seen, name)
+            if not self._source.agrees(source := (camera, *picture.values.shape)):
+                raise other_source(self._source.image, source, name)
             judged, ids = self._identified(self._detector.judged(picture), picture)
         except InputError as error:
             self.counts.refused += 1
@@ -164,18 +164,18 @@ class ImageDetector:
         if self.draw is not None:
             self.draw(name if name != "image" else str(stamp), picture, judged)
         marks, rejected = told_apart(judged)
-        found = self._detector.detections(marks, picture.values.shape, stamp, ids)
-        if not self.counts.marks and not found:
+        detections = self._detector.detections(marks, picture.values.shape, stamp, ids)
+        if not self.counts.marks and not detections:
             self._empty = picture
         self._stamps[stamp] = None
         if len(self._stamps) > MOST_STAMPS:
             del self._stamps[next(iter(self._stamps))]
         self.counts.paged += picture.more_pages
         self.counts.images += 1
-        self.counts.empty += not found
-        self.counts.marks += len(found)
+        self.counts.empty += not detections
+        self.counts.marks += len(detections)
         self.counts.rejected.update(rejected)
-        return found
+        return detections
 
     def _identified(
         self,
@@ -185,14 +185,18 @@ class ImageDetector:
         """Return the possible marks without parts of markers, and the ids of the marks."""
         if self._coded is None:
             return judged, []
-        marks = [each.found for each in judged if isinstance(each.found, Mark)]
-        found = self._coded.identified(marks, picture, mirror=self._detector.settings.mirror)
-        each_id = iter(found)
+        marks = [candidate.found for candidate in judged if isinstance(candidate.found, Mark)]
+        id_of_mark = self._coded.identified(marks, picture, mirror=self._detector.settings.mirror)
+        each_id = iter(id_of_mark)
         out = []
-        for each in judged:
-            said = next(each_id) if isinstance(each.found, Mark) else None
-            out.append(replace(each, found=said) if isinstance(said, MarkFault) else each)
-        return out, [known for known in found if not isinstance(known, MarkFault)]
+        for candidate in judged:
+            identified = next(each_id) if isinstance(candidate.found, Mark) else None
+            out.append(
+                replace(candidate, found=identified)
+                if isinstance(identified, MarkFault)
+                else candidate
+            )
+        return out, [mark_id for mark_id in id_of_mark if not isinstance(mark_id, MarkFault)]
 
     def _refuse_other(self, image: tuple, name: str) -> None:
         """Refuse an image of another camera or size than the settled one, before it is decoded.
@@ -204,19 +208,19 @@ class ImageDetector:
             raise other_source(self._source.image, image, name)
 
 
-def other_source(image: tuple, other: tuple, name: str) -> InputError:
+def other_source(image: tuple, source: tuple, name: str) -> InputError:
     """Return the error that an image is of another camera, or of another size.
 
     Its centre would not be the optical axis of the others.
     """
-    if image[0] != other[0]:
+    if image[0] != source[0]:
         return InputError(
             name,
-            f"of the camera '{printable(other[0])}', earlier ones are of "
+            f"of the camera '{printable(source[0])}', earlier ones are of "
             f"'{printable(image[0])}' (frame_id)",
             "remap one of the two: a mark_detector has one camera",
         )
-    old, new = (f"{width} x {height}" for _, height, width in (image, other))
+    old, new = (f"{width} x {height}" for _, height, width in (image, source))
     return InputError(
         name,
         f"{new} pixels, but earlier images have {old}",

@@ -77,7 +77,7 @@ def _templates(
     """
     model, half = MODELS[mark], _half(size)
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
-    found = []
+    templates = []
     angles = np.arange(ANGLES if sign else ANGLES // 2) * model.turns / ANGLES
     for angle in angles if model.turns else [0.0]:
         value = (sign or 1) * model.shape(
@@ -87,12 +87,12 @@ def _templates(
         square = (value / np.sqrt(value @ value)).reshape(u.shape).astype(np.float32)
         padded = np.zeros(shape, dtype=np.float32)
         padded[: 2 * half + 1, : 2 * half + 1] = square
-        found.append(
+        templates.append(
             _Template(
                 float(angle), square, np.conj(fft.rfft2(np.roll(padded, (-half, -half), (0, 1))))
             )
         )
-    return found
+    return templates
 
 
 def _half(size: float) -> int:
@@ -181,8 +181,8 @@ def _correlated(padded: np.ndarray, templates: list[_Template], sign: int) -> np
     transform = fft.rfft2(padded)
     best = np.full(padded.shape, -np.inf, dtype=np.float32)
     for template in templates:
-        found = fft.irfft2(transform * template.transform, padded.shape)
-        np.maximum(best, found if sign else np.abs(found, out=found), out=best)
+        correlation = fft.irfft2(transform * template.transform, padded.shape)
+        np.maximum(best, correlation if sign else np.abs(correlation, out=correlation), out=best)
     return best
 
 
@@ -202,8 +202,8 @@ def _vertex(row: np.ndarray, peak: int) -> float:
     """Return the vertex of the parabola through a peak and its neighbours, relative to it."""
     if not 0 < peak < len(row) - 1:
         return 0.0
-    before, at, after = row[peak - 1 : peak + 2].tolist()
-    return (before - after) / (2 * (before - 2 * at + after)) if before + after < 2 * at else 0.0
+    before, top, after = row[peak - 1 : peak + 2].tolist()
+    return (before - after) / (2 * (before - 2 * top + after)) if before + after < 2 * top else 0.0
 
 
 def _noise(image: np.ndarray) -> float:

@@ -152,17 +152,17 @@ def fit_marks(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fi
     starts : float array (marks, shape)
         First parameters of the shapes.
     """
-    each = max(1, TOGETHER // max(1, windows.values.shape[1]))
-    found: list[Fit | None] = []
-    for first in range(0, len(windows.values), each):
-        some = slice(first, first + each)
+    together = max(1, TOGETHER // max(1, windows.values.shape[1]))
+    fits: list[Fit | None] = []
+    for first in range(0, len(windows.values), together):
+        some = slice(first, first + together)
         part = Windows(windows.disc, windows.values[some])
-        found += _fitted(model, part, starts[some])
-    return found
+        fits += _fitted(model, part, starts[some])
+    return fits
 
 
 def _fitted(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit | None]:
-    found: list[Fit | None] = [None] * len(starts)
+    fits: list[Fit | None] = [None] * len(starts)
     step = max(1, windows.values.shape[1] // FEW)
     parameters, settled = _settled(model, windows, starts, step)
     if step > 1 and not settled.all():
@@ -172,8 +172,8 @@ def _fitted(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit 
     which = np.flatnonzero(settled)
     some = Windows(windows.disc, windows.values[which])
     for index, fit in zip(which, _weighted(model, some, parameters[which]), strict=True):
-        found[index] = fit
-    return found
+        fits[index] = fit
+    return fits
 
 
 def _image(
@@ -188,15 +188,15 @@ def _image(
     illumination, shape.
     """
     columns = p.T[..., None].astype(PRECISION)
-    shape, by = model.shape(u - columns[0], v - columns[1], columns[2 + LIGHTING :])
+    shape, derivatives = model.shape(u - columns[0], v - columns[1], columns[2 + LIGHTING :])
     light = 1 + columns[4] * u + columns[5] * v
     level, bright = columns[2] + columns[3] * shape, columns[3] * light
     jacobian = np.empty((len(p), p.shape[1], len(u)), dtype=PRECISION)
-    for row, derivative in zip((0, 1, *range(2 + LIGHTING, p.shape[1])), by, strict=True):
+    for row, derivative in zip((0, 1, *range(2 + LIGHTING, p.shape[1])), derivatives, strict=True):
         np.multiply(derivative, bright, out=jacobian[:, row])
     jacobian[:, 2] = light
-    for row, (one, other) in enumerate(((light, shape), (level, u), (level, v)), start=3):
-        np.multiply(one, other, out=jacobian[:, row])
+    for row, (factor, values) in enumerate(((light, shape), (level, u), (level, v)), start=3):
+        np.multiply(factor, values, out=jacobian[:, row])
     return level * light, jacobian, shape
 
 
@@ -228,13 +228,13 @@ def _each(solver: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
         return solver(*arrays)
     except np.linalg.LinAlgError:  # a shape without size or width
         pass
-    found = np.full_like(arrays[-1], np.nan)
-    for index in range(len(found)):
+    solutions = np.full_like(arrays[-1], np.nan)
+    for index in range(len(solutions)):
         try:
-            found[index] = solver(*(array[index] for array in arrays))
+            solutions[index] = solver(*(array[index] for array in arrays))
         except np.linalg.LinAlgError:
             continue
-    return found
+    return solutions
 
 
 def _solved(
@@ -289,17 +289,17 @@ def _settled(
         better = possible & (new_cost <= cost[running])
         small = np.hypot(change[:, 0], change[:, 1]) < SETTLED
 
-        taken = running[better]
-        p[taken], residual[taken], jacobian[taken] = (
+        improved = running[better]
+        p[improved], residual[improved], jacobian[improved] = (
             tried[better],
             new_residual[better],
             new_jacobian[better],
         )
-        cost[taken] = new_cost[better]
+        cost[improved] = new_cost[better]
         damping[running] *= np.where(better, 0.1, 10.0)
-        done = small & possible & (~better | (damping[running] < 1e-3))
-        settled[running[done]] = True
-        running = running[~done & ~lost]
+        converged = small & possible & (~better | (damping[running] < 1e-3))
+        settled[running[converged]] = True
+        running = running[~converged & ~lost]
     return p, settled
 
 
@@ -315,14 +315,16 @@ def _variance(
         return _dot(values, part.astype(PRECISION)) / np.maximum(part.sum(axis=1), 1)
 
     mean = np.maximum(mean_of(square, used) * factor, 1e-12)
-    ground, mark = used & (shape < CLEAR), used & (shape > 1 - CLEAR)
-    low, high = (np.maximum(mean_of(square, part) * factor, mean / 10) for part in (ground, mark))
-    at_low, at_high = mean_of(image, ground), mean_of(image, mark)
-    apart = (np.minimum(ground.sum(axis=1), mark.sum(axis=1)) >= ENOUGH) & (at_low != at_high)
+    on_ground, on_mark = used & (shape < CLEAR), used & (shape > 1 - CLEAR)
+    low, high = (
+        np.maximum(mean_of(square, part) * factor, mean / 10) for part in (on_ground, on_mark)
+    )
+    at_low, at_high = mean_of(image, on_ground), mean_of(image, on_mark)
+    apart = (np.minimum(on_ground.sum(axis=1), on_mark.sum(axis=1)) >= ENOUGH) & (at_low != at_high)
     low, high = np.where(apart, low, mean), np.where(apart, high, mean)
     slope = (high - low) / np.where(apart, at_high - at_low, 1.0)
     low, high, slope, at_low = (
-        each[:, None].astype(PRECISION) for each in (low, high, slope, at_low)
+        column[:, None].astype(PRECISION) for column in (low, high, slope, at_low)
     )
     return np.clip(low + slope * (image - at_low), np.minimum(low, high), np.maximum(low, high))
 
@@ -333,9 +335,9 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
     None for a fit that diverges, or of which too much is stained.
     """
     disc = windows.disc
-    found: list[Fit | None] = [None] * len(p)
+    fitted: list[Fit | None] = [None] * len(p)
     running = np.arange(len(p))
-    for done in range(1, WEIGHTED_ROUNDS[1] + 1):
+    for rounds in range(1, WEIGHTED_ROUNDS[1] + 1):
         if not len(running):
             break
         values, before = windows.values[running], p[running]
@@ -352,10 +354,10 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
         )
         after = before + sigmas / scale
         after[:, -1] = np.maximum(after[:, -1], SMALLEST_BLUR)
-        whole = enough & ~_diverged(after, disc.inside.shape[0] / 2)
+        usable = enough & ~_diverged(after, disc.inside.shape[0] / 2)
         settled = np.abs(sigmas).max(axis=1) < SETTLED_SIGMAS
-        last = done == WEIGHTED_ROUNDS[1]
-        ready = whole & (last | ((done >= WEIGHTED_ROUNDS[0]) & settled))
+        last = rounds == WEIGHTED_ROUNDS[1]
+        ready = usable & (last | ((rounds >= WEIGHTED_ROUNDS[0]) & settled))
         p[running] = after
         if ready.any():
             fits = _fits(
@@ -366,9 +368,9 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
                 (normal[ready], scale[ready]),
             )
             for index, fit in zip(running[ready], fits, strict=True):
-                found[index] = fit
-        running = running[whole & ~ready]
-    return found
+                fitted[index] = fit
+        running = running[usable & ~ready]
+    return fitted
 
 
 def _fits(
@@ -419,10 +421,10 @@ def _stains(
     least = STAIN * np.abs(p[:, 3:4])
     stained = (np.abs(mean) > np.maximum(least, STAIN_SIGMAS * noise)) & (np.abs(residual) > least)
 
-    found = np.zeros((len(p), 4), dtype=int)
+    counts = np.zeros((len(p), 4), dtype=int)
     some = stained.any(axis=1)  # the levels of the others are not wanted
     p, values, shape, mean, stained = (
-        each[some] for each in (p, windows.values, shape, mean, stained)
+        array[some] for array in (p, windows.values, shape, mean, stained)
     )
     levels = np.stack(
         [
@@ -434,11 +436,11 @@ def _stains(
     beyond = 0.25 * (high - low)
     bright = stained & (mean > 0) & (values > high + beyond)
     dark = stained & (mean < 0) & (values < low - beyond)
-    other, inner = stained & ~bright & ~dark, shape > 0.5
-    found[some] = np.stack(
-        [part.sum(axis=1) for part in (bright, dark, other & inner, other & ~inner)], axis=1
+    neither, inner = stained & ~bright & ~dark, shape > 0.5
+    counts[some] = np.stack(
+        [part.sum(axis=1) for part in (bright, dark, neither & inner, neither & ~inner)], axis=1
     )
-    return found
+    return counts
 
 
 def _median_of_part(values: np.ndarray, part: np.ndarray, level: np.ndarray) -> np.ndarray:

@@ -33,11 +33,11 @@ def spots_in(image: np.ndarray) -> Spots | None:
     if level is None:
         return None
     kinds = [
-        found
+        spots
         for polarity, mask in (("dark", image <= level), ("bright", image > level))
-        if (found := _alike(mask, polarity)) is not None
+        if (spots := _alike(mask, polarity)) is not None
     ]
-    return max(kinds, key=lambda found: found.number, default=None)
+    return max(kinds, key=lambda spots: spots.number, default=None)
 
 
 def _threshold(image: np.ndarray) -> float | None:
