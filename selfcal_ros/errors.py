@@ -5,6 +5,7 @@ A message is one line: where, what is wrong, and how to correct it.
 The same codes are the ``error_code`` of services and actions.
 """
 
+import copyreg
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -50,6 +51,10 @@ class InputError(SelfcalError):
     def __init__(self, where: str, what: str, remedy: str = "") -> None:
         self.where, self.what, self.remedy = where, what, remedy
         super().__init__(printable(f"{where}: {what}" + (f"; {remedy}" if remedy else "")))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how another process makes it again, without the parameters of its class."""
+        return copyreg.__newobj__, (type(self), *self.args), vars(self)
 
 
 class NotIdentifiableError(SelfcalError):

@@ -215,6 +215,14 @@ def test_two_batches_do_not_work_in_one_folder(shelf, tmp_path, capsys):
     )
 
 
+def test_a_folder_that_cannot_be_written_is_one_line(shelf, tmp_path, capfd):
+    """As on a full disk: it is the folder that fails, not a bag."""
+    (tmp_path / RESULTS).symlink_to("/proc")
+    assert batch(shelf / "a.mcap", shelf / "b.mcap", "-o", tmp_path, "--workers", 2) == 2
+    [line] = capfd.readouterr().err.splitlines()
+    assert f"{tmp_path / RESULTS}" in line and "cannot be written (" in line
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
