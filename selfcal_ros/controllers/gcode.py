@@ -283,6 +283,8 @@ class Rewriter:
             self._refuse("the program has not said M82 or M83", "write it after the last G90")
         if relative and act.does in IN_PLANE:
             self._refuse(f"{act.name} by increments", "write G90 before arcs and cycles")
+        if act.does == "hole" and not line.named("XYZ"):
+            self._refuse(f"{act.name} names no axis", "give the hole's X and Y")
         if act.does == "arc" and self.dialect == "grbl" and not line.named("XY"):
             self._refuse("grbl needs X or Y for an arc", "give its end")
 

@@ -359,6 +359,7 @@ grbl | +G0 X0 Y0 // G2 X10 I10 | 5: the arc has no centre
 grbl | +G0 X0 Y0 // G91 // G2 X10 I5 | 6: G2 by increments; write G90 before arcs
 grbl | +G2 X1 I5 | 4: the position
 grbl | +G0 X0 Y0 // G2 I5 | 5: grbl needs X or Y
+linuxcnc | +G64 // G0 X0 Y0 Z5 // G81 X1 Z-1 R1 // G81 R2 | 7: G81 names no axis
 grbl | +G0 X0 Y0 // G2 X10.0011 Y0 I5 | 5: the arc ends at 1.000220 times its radius
 grbl | +G0 X0 Y0 // G2 X0 Y0.0001 I5 | 5: the arc ends
 grbl | +G0 X0 Y0 // G2 X10 I5 P2 | 5: P is not a word of G2; write each repeat, turn
