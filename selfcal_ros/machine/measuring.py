@@ -425,7 +425,11 @@ class Run:
             ]
         )
         if not len(shift):
-            return False
+            self.desk.say(
+                f"view '{view.name}': none of its marks is seen where it was: the plate was "
+                "moved, or nothing is seen; the view is measured anew"
+            )
+            return True
         sigma = readings.sigma_xy if math.isfinite(readings.sigma_xy) else 0.0
         limit = max(LEAST_SHIFT_M, SHIFT_SIGMAS * sigma * math.sqrt(1 + 1 / len(shift)))
         x, y = np.median(shift, axis=0)

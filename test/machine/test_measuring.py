@@ -191,6 +191,20 @@ def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
     assert calibrate(readings).verdict.qualified
 
 
+def test_a_plate_that_was_taken_away_has_the_view_measured_anew(tmp_path):
+    """Another machine, as after its simulation was killed: its plate lies as for the first view."""
+    cell, machine = write_cell(tmp_path)
+    with pytest.raises(MachineError):
+        run_of(tmp_path, Spoilt(machine, "connection lost in a move", after=100), cell).measure()
+    cell, machine = write_cell(tmp_path)
+    desk = Agreeing()
+    run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12), desk).measure(resume=True)
+    assert [line for line in desk.lines if "none of its marks is seen where it was" in line]
+    assert calibrate(
+        collect_bag(tmp_path / "bag", CollectorSettings()).measurements
+    ).verdict.qualified
+
+
 def test_a_bag_is_not_overwritten_and_not_continued_by_another_plan(tmp_path):
     cell, machine = write_cell(tmp_path)
     with pytest.raises(MachineError):
