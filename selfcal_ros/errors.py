@@ -5,7 +5,6 @@ A message is one line: where, what is wrong, and how to correct it.
 The same codes are the ``error_code`` of services and actions.
 """
 
-import copyreg
 import re
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -54,7 +53,7 @@ class InputError(SelfcalError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how another process makes it again, without the parameters of its class."""
-        return copyreg.__newobj__, (type(self), *self.args), vars(self)
+        return Exception.__new__, (type(self), *self.args), vars(self)
 
 
 class NotIdentifiableError(SelfcalError):
