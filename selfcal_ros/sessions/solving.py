@@ -531,8 +531,10 @@ class SolvingSession:
         run = self.shown.run
         named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")
         line = f"saved to {target}: {named}; readings {self.digest() or 'of a loaded map'}"
-        newer = self._newer(self._planned)
-        return line + (f"; WARNING: {newer}" if newer else ""), str(target)
+        verdict = self.shown.result.verdict
+        doubts = [self._newer(self._planned), "" if verdict.qualified else verdict.sentence]
+        doubts += self.shown.result.warnings
+        return "; WARNING: ".join([line, *filter(None, doubts)]), str(target)
 
     def _newer(self, runs: Iterable[PlanRun]) -> str:
         """Return a note on a run that is newer than the published one; "" if none."""

@@ -633,6 +633,20 @@ def test_a_saved_map_names_its_run_and_a_newer_one_that_is_not_in_it(tmp_path):
     assert "WARNING" not in desk.session.save("map.json")[0]
 
 
+def test_a_saved_map_tells_that_it_is_not_qualified_and_what_it_lacks(tmp_path):
+    desk = Desk(result_folder=str(tmp_path))
+    views = views_of()
+    views[1].dx[3] += 5e-6
+    desk.take(views)
+    shown = desk.session.shown
+    assert not shown.result.verdict.qualified
+    lacking = replace(shown.result, warnings=("one view is partly in the map",))
+    desk.session.shown = replace(shown, result=lacking)
+    assert desk.session.save("map.json")[0].endswith(
+        f"; WARNING: {lacking.verdict.sentence}; WARNING: one view is partly in the map"
+    )
+
+
 def test_readings_of_a_run_of_the_future_are_refused(desk):
     desk.take(views_of(run_id=str(NOW)))
     with pytest.raises(InputError, match="begins in the future of this node's clock; set the"):
