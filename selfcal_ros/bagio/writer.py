@@ -45,7 +45,11 @@ def new_bag(path: str | Path) -> Iterator[Path]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as unfinished:
-            yield Path(unfinished, target.name)
+            try:
+                yield Path(unfinished, target.name)
+            except InputError as error:  # named as it was asked for
+                where = error.where.replace(str(unfinished), str(target.parent))
+                raise InputError(where, error.what, error.remedy) from error
             Path(unfinished, target.name).rename(target)
     except OSError as error:
         raise InputError(

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Reader
 
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import hash_of, typestore
-from selfcal_ros.bagio.writer import BagWriter
+from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.errors import InputError
 from selfcal_ros.messages import from_model
@@ -293,3 +293,10 @@ def test_a_full_disk_is_one_line(tmp_path, act):
             "write": lambda: writer.write("/notes", {"data": "x" * 300_000}, 1),
         }[act]()
     writer._file.close()
+
+
+def test_a_bag_that_fails_is_named_as_it_was_asked_for_and_leaves_nothing(tmp_path):
+    with pytest.raises(InputError) as raised, new_bag(tmp_path / "bag") as unfinished:
+        raise InputError(str(unfinished / "bag_0.mcap"), "cannot be written", "free some space")
+    assert str(raised.value) == f"{tmp_path}/bag/bag_0.mcap: cannot be written; free some space"
+    assert not list(tmp_path.iterdir())
