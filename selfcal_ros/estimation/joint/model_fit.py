@@ -33,6 +33,7 @@ from selfcal_ros.estimation.joint.problem import (
     angular_part,
     fit,
     grid_dof,
+    lines_have_their_weight,
     noise_excess,
     sigma_of,
 )
@@ -393,20 +394,19 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
     """Return the weighted squares of all residuals, m^2, and their degrees of freedom.
 
     Grid and angular readings together, as they share the rotations: angular residuals in units of
-    the grid's, by the ratio with which they were fitted.
+    the grid's, by the ratio with which they were fitted. Lines with less noise than they are
+    weighted with tell nothing of the noise: of them the rotations alone count.
     """
     system = problem.system
     total = float((system.grid.weight * abs(found.residuals) ** 2).sum())
     dof = grid_dof(problem)
     if found.ratio > 0:
-        length = problem.half_width_m
-        total += (
-            found.ratio
-            * length**2
-            * float((system.angular.weight * found.residuals_theta**2).sum())
-        )
         shared = len(set(system.angular_index) & set(system.grid_index))
-        dof += system.angular.n_readings - system.rank_angular + max(shared - 1, 0)
+        dof += max(shared - 1, 0)
+        if lines_have_their_weight(problem, found):
+            squares_rad = float((system.angular.weight * found.residuals_theta**2).sum())
+            total += found.ratio * problem.half_width_m**2 * squares_rad
+            dof += system.angular.n_readings - system.rank_angular
     return total, dof
 
 
@@ -425,7 +425,7 @@ def _of_lines(
     more : float array (p,)
         Free coefficients of the columns less those of the solution.
     """
-    if not found.ratio > 0:
+    if not (found.ratio > 0 and lines_have_their_weight(problem, found)):
         return 0.0, 0.0
     system, angular = problem.system, problem.system.angular
     columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)

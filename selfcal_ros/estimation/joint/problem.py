@@ -139,8 +139,8 @@ def noise_estimate(
 ) -> NoiseEstimate:
     """Return the noise to use: declared, else repeats, else residuals.
 
-    If a test contradicts this choice, the larger one is used. Repeats that are identical to the
-    last bit show the resolution of the sensor, not the noise, and are ignored.
+    If a test contradicts this choice, the larger one is used. Repeats that are identical, but for
+    rounding, show the resolution of the sensor, not the noise, and are ignored.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def noise_estimate(
     """
     if residuals[1] < 1:  # terms with sizes leave fractions of rounding
         residuals = (float("nan"), 0.0)
-    identical = repeats[1] > 0 and repeats[0] == 0 and residuals[1] > 0 and residuals[0] > floor
+    identical = repeats[1] > 0 and repeats[0] <= floor < residuals[0] and residuals[1] > 0
     base = (
         (declared, float("inf"))
         if np.isfinite(declared)
@@ -197,7 +197,11 @@ ROUNDING = 16 * np.finfo(float).eps
 
 LEAST_NOISE_RAD = 1e-9
 """Noise of lines that counts in weights at least, 0.05 nm at 50 mm: exact lines would outweigh all
-that is assumed. And `NEGLIGIBLE`, as a part of the noise of marks at the half width."""
+that is assumed."""
+
+LEAST_OF_MARKS = 0.01
+"""The same as a part of the noise of marks at the half width: a hundred marks show the turn of a
+view to a tenth of that noise, and lines with a hundredth determine it alone."""
 
 MAX_WEIGHT = 1e8
 """Largest weight of one kind of readings against the other, all together: beyond, the lighter one
@@ -364,7 +368,12 @@ def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.nd
 
 def least_noise_rad(problem: Problem, sigma_xy: float) -> float:
     """Return the noise of lines that counts at least beside such a noise of marks, rad."""
-    return max(LEAST_NOISE_RAD, NEGLIGIBLE * sigma_xy / problem.half_width_m)
+    return max(LEAST_NOISE_RAD, LEAST_OF_MARKS * sigma_xy / problem.half_width_m)
+
+
+def lines_have_their_weight(problem: Problem, found: "JointFit") -> bool:
+    """Return whether lines weigh as their noise says; not if that is less than counts."""
+    return not found.theta.sigma < least_noise_rad(problem, found.xy.sigma)
 
 
 def bounded_ratio(

@@ -565,7 +565,7 @@ def _noise(
         ("theta", problem.repeats_theta, problem.angular.sigma_declared),
     ):
         noise = noise_estimate(repeats, (nan, 0), declared)
-        if not (noise.sigma > 0 and noise.dof >= MIN_REPEAT_DOF):
+        if not (noise.sigma > FLOOR and noise.dof >= MIN_REPEAT_DOF):
             noise = replace(
                 noise, sigma=getattr(before, f"sigma_{kind}"), dof=getattr(before, f"dof_{kind}")
             )

@@ -48,18 +48,18 @@ def test_the_ratio_ends_where_the_lighter_kind_would_be_lost(problem):
     assert bounded_ratio(system, 1.0, 1e-15, problem[0].half_width_m) == pytest.approx(
         equal * MAX_WEIGHT
     )
-    # lines have at least a thousandth of the noise of marks
-    assert weight_ratio(problem[0], 1.0, 1e-15, y) == pytest.approx(1e6)
+    # lines have at least a hundredth of the noise of marks
+    assert weight_ratio(problem[0], 1.0, 1e-15, y) == pytest.approx(1e4)
     assert weight_ratio(problem[0], 1e-15, 1.0, y) == pytest.approx(equal / MAX_WEIGHT)
 
 
 def test_readings_without_any_noise_weigh_as_much_as_rounding_bears(problem):
     system, y = problem[0].system, np.zeros_like(problem[0].grid.y)
     equal = system.grid_scale / system.angular_scale
-    least = (1e-8 / (LEAST_NOISE_RAD * problem[0].half_width_m)) ** 2
+    least = (1e-9 / (LEAST_NOISE_RAD * problem[0].half_width_m)) ** 2
     assert least < equal * MAX_WEIGHT
-    assert weight_ratio(problem[0], 1e-8, 0.0, y) == pytest.approx(least)
-    assert weight_ratio(problem[0], 1e-5, 0.0, y) == pytest.approx(1e6)
+    assert weight_ratio(problem[0], 1e-9, 0.0, y) == pytest.approx(least)
+    assert weight_ratio(problem[0], 1e-5, 0.0, y) == pytest.approx(1e4)
     assert weight_ratio(problem[0], 0.0, 1e-6, y) == pytest.approx(equal / MAX_WEIGHT)
 
 
