@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from selfcal_ros.compensation.cells import SNAP, Interpolation, Outside, cubic_pieces
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, NotIdentifiableError
-from selfcal_ros.estimation.comparison.covariance import covariance_of
+from selfcal_ros.estimation.comparison.covariance import covariance_of, lack_of_fit_m
 from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.results import read_result
@@ -193,10 +193,14 @@ class StageMap(Compensator):
                 "the result does not contain the correlations of its sites",
                 "solve again with uncertainties; fields beyond 31 x 31 marks have none",
             )
+        # what has a sign of its own at each place has it between the sites as well
+        alone = lack_of_fit_m(self.result) ** 2
+        sites[np.diag_indices_from(sites)] -= alone
         both = np.kron(np.eye(2), weights[:, used])
         cells = np.stack([self._cell(x, 0), self._cell(y, 1)])
         alike = (cells[:, :, None] == cells[:, None, :]).all(axis=0)
         cover = both @ sites @ both.T
+        cover[np.diag_indices_from(cover)] += alone
         for axis, more in enumerate(self._between(x, y)):
             part = slice(axis * len(x), (axis + 1) * len(x))
             cover[part, part] += alike * np.outer(more, more)

@@ -128,6 +128,34 @@ def test_the_error_of_a_distance_is_that_of_its_ends(file, result):
     assert u == pytest.approx([np.sqrt(row @ full @ row)], rel=1e-9)
 
 
+def test_what_residuals_have_beyond_repeats_is_met_at_both_ends_of_a_distance():
+    """An encoder that errs by 30 nm in each 20 um errs anew at each place."""
+
+    def encoder(z):
+        x, y = 30e-9 * np.sin(2 * np.pi * np.stack([z.real, z.imag]) / 20e-6)
+        return x + 1j * y
+
+    inside, u_over_lack = [], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        measurements, _ = readings(plate(11, 7), SIX, rng, sigma=9e-9, stage=encoder)
+        repeated = [
+            replace(view, count=view.count * 5, sigma_xy=20e-9, dof_xy=8 * len(view.m))
+            for view in measurements.views
+        ]
+        stage = StageMap(calibrate(replace(measurements, views=tuple(repeated)), Options()))
+        lack = max(part.u_max for part in stage.result.verdict.enlarged_by)
+        ends = rng.uniform(-0.03, 0.03, (2, 2, 400))
+        error, u = stage.length_error(*ends)
+        true = encoder(ends[1, 0] + 1j * ends[1, 1]) - encoder(ends[0, 0] + 1j * ends[0, 1])
+        along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+        left = error - along[0] * true.real - along[1] * true.imag
+        inside.append((abs(left) < stage.result.noise.k_xy * u).mean())
+        u_over_lack.append(np.median(u) / lack)
+    assert min(inside) > 0.9
+    assert np.median(u_over_lack) == pytest.approx(np.sqrt(2), rel=0.2)
+
+
 def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result):
     stage, plate = load(file), result.artifact
     a, b = stage.length_uncertainty(anywhere=False)

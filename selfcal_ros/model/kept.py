@@ -20,6 +20,9 @@ FACTORS, ANGULAR, ADDED, IMAGES, COVARIANCE = KEYS = (
 )
 """Keys in RESULT.json."""
 
+LACK_OF_FIT = "lack_of_fit"
+"""Name of the effect of what residuals have beyond the scatter of repeats."""
+
 DIGITS = 7
 """Digits that are kept of a number."""
 
@@ -99,6 +102,11 @@ class Factors:
     def none(cls, shape: tuple[int, ...]) -> "Factors":
         """Return that there is none on a map of this shape."""
         return cls((), np.zeros((0, 2, *shape)))
+
+    @property
+    def of_each_place(self) -> np.ndarray:
+        """Factors of what has a sign of its own at each place: lack of fit, bool (r,)."""
+        return np.isin(self.terms, LACK_OF_FIT)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form."""

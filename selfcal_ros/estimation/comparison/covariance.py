@@ -144,22 +144,35 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         if found is None or found.lacks_terms:
             return unknown
         shear = found.system.gauge.shear
-        moved = np.real(
-            np.tensordot(
-                _complex(factors_of(result).of_map),
-                turned_over(result.sense, shear).conj(),
-                axes=((1, 2), (1, 2)),
-            )
-        )
+        kept, row = factors_of(result), turned_over(result.sense, shear).conj()
+        common = _complex(kept.of_map[~kept.of_each_place])
+        moved = np.real(np.tensordot(common, row, axes=((1, 2), (1, 2))))
         added = result.kept.added
         variance = (
             np.diag(found.maps.of(shear))
             + (moved**2).sum(axis=0)
             + (0.0 if added is None else added)
         )
-        variance = variance * (result.noise.sigma_xy / found.half_width_m) ** 2
+        variance = variance * result.noise.sigma_xy**2
+        variance += lack_of_fit_m(result) ** 2 * (abs(shear) ** 2).sum(axis=(1, 2))
+        variance = variance / found.half_width_m**2
     o, r = np.sqrt(variance)
     return float(o), float(r)
+
+
+def _product(factors: np.ndarray, of_each_place: np.ndarray) -> np.ndarray:
+    """Return the covariance L' L of factors (r, q), or their variances alone where so marked."""
+    common = factors[~of_each_place]
+    cover = common.T @ common
+    cover[np.diag_indices_from(cover)] += (factors[of_each_place] ** 2).sum(axis=0)
+    return cover
+
+
+def lack_of_fit_m(result: CalibrationResult) -> float:
+    """Return the contribution of lack of fit to u, m: at each place, with a sign of its own."""
+    factors = factors_of(result)
+    squares = (factors.of_map[factors.of_each_place] ** 2).sum(axis=0)
+    return float(np.sqrt(squares.max(initial=0.0)) * np.nan_to_num(result.noise.sigma_xy))
 
 
 def _complex(factors: np.ndarray) -> np.ndarray:
@@ -364,7 +377,7 @@ class Together:
         if known.size > MAX_FULL or self.lacks_terms:
             return None
         factors = self._kept.of_map[:, :, known].reshape(-1, 2 * int(known.sum()))
-        return self.of_noise(self.stage_rows(known)) + factors.T @ factors
+        return self.of_noise(self.stage_rows(known)) + _product(factors, self._kept.of_each_place)
 
     def of_lines(self, known: np.ndarray) -> np.ndarray | None:
         """Return the covariance of Gtheta at lines for their unit noise, None if it is not kept."""
@@ -449,7 +462,7 @@ class Together:
             root = np.sqrt(np.repeat([self._ratio, self._ratio_of_plate, 1.0], [s, m, 4]))
             cover *= np.outer(root, root)
         effects = factors[terms:]
-        cover += effects.T @ effects
+        cover += _product(effects, self._kept.of_each_place[self._kept.with_map :])
         if len(effects):
             cover[range(s, s + m), range(s, s + m)] += self._effects_on_plate[:, marks].ravel()
         return cover * self.result.noise.sigma_xy**2

@@ -44,7 +44,6 @@ from selfcal_ros.estimation.verdict.search import (
     search_causes,
 )
 from selfcal_ros.estimation.verdict.uncertainty import (
-    LACK_OF_FIT,
     TOLD,
     Effect,
     budget_lines,
@@ -54,6 +53,7 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.estimation.verdict.untold import untold_effects
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.readings import AFTER_SLIP, REPEAT_OUTLIER, Measurements, ViewReadings
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S

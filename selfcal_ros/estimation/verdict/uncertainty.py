@@ -28,10 +28,6 @@ TOLD = 0.5
 """Share of a term's size left by the readings below which they determine the term (type A)."""
 
 
-LACK_OF_FIT = "lack_of_fit"
-"""Name of the effect of what residuals have beyond the scatter of repeats."""
-
-
 @dataclass(frozen=True, eq=False)
 class Effect:
     """Effect of a cause on the maps, stage frame.

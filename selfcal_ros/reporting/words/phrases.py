@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from selfcal_ros.errors import printable
-from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, LACK_OF_FIT
+from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
+from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck
 from selfcal_ros.model.result import ViewResult

@@ -9,9 +9,11 @@ import pytest
 from scipy.stats import t as student
 
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines, budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
+from selfcal_ros.model.error_map import first_order
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -91,6 +93,17 @@ def test_noise_beyond_the_repeats_is_in_the_noise_once():
     more = np.hypot(3e-8 * np.sqrt(5), 2e-8) / 2e-8
     assert part.effect_rms == pytest.approx(quiet.effect_rms * more, rel=0.15)
     assert quiet.details == by("repeats")
+
+
+def test_lack_of_fit_is_in_the_squareness_as_at_each_node_by_itself():
+    result = calibrated(extra_m=3e-8)
+    cover = covariance_of(result, "xy", result.error_map.valid)
+    units = np.eye(len(cover)).reshape(-1, 2, *ARTIFACT.shape)
+    rows = np.array([first_order(ARTIFACT, unit) for unit in units]).T
+    wanted = np.sqrt(np.diag(rows @ cover @ rows.T))
+    assert first_order_u(result) == pytest.approx(wanted, rel=0.01)
+    quiet = replace(result, kept=replace(result.kept, factors=None))
+    assert first_order_u(quiet)[0] < 0.9 * wanted[0]
 
 
 def test_noise_that_repeats_show_beyond_the_declared_is_not_lack_of_fit():
