@@ -8,6 +8,16 @@ import pytest
 
 from selfcal_ros.cli.main import VERBS, main
 from selfcal_ros.collection.inputs import Reason
+from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.collection.settings.nodes import CompensatorSettings
+from selfcal_ros.compensation.plausible import PLAUSIBLE, PLAUSIBLE_M
+from selfcal_ros.files import MAX_JSON_VALUES, MAX_YAML_BYTES, MAX_YAML_NODES
+from selfcal_ros.messages.cdr import MAX_LENGTH
+from selfcal_ros.model.artifact import MAX_GRID_SIZE
+from selfcal_ros.model.plan_form import MAX_VIEWS
+from selfcal_ros.sessions.compensating import LARGEST_FILE, LEAST_RADIUS_M
+from selfcal_ros.vision.exposures import SETTLED
+from selfcal_ros.vision.images import EXPANSION, FORMATS, LARGEST
 from test.support.pages import PAGES
 
 ROOT = Path(__file__).parents[2]
@@ -73,3 +83,22 @@ def test_the_site_reads_a_page_as_github_does(page):
         begins_list = re.match(r"(-|\d\.) ", line) and not within_fence
         assert not begins_list or re.match(r"$|(-|\d\.) | +", above), f"no line above {line}"
         above = line
+
+
+def test_the_security_page_states_the_bounds_of_the_code():
+    detector, compensator = DetectorSettings(), CompensatorSettings()
+    stated = " ".join((ROOT / "SECURITY.md").read_text().split())
+    for bound in (
+        f"YAML to {MAX_YAML_BYTES >> 20} MB and {MAX_YAML_NODES:,} values",
+        f"plans to {MAX_VIEWS:,} views and plates to {MAX_GRID_SIZE} marks per side",
+        f"inputs longer than {MAX_LENGTH >> 10} kB",
+        f"as {', '.join(FORMATS[:-1])} or {FORMATS[-1]} only",
+        f"up to {LARGEST // 10**6} million pixels and {EXPANSION:,} pixels per byte",
+        f"`max_marks` ({detector.max_marks:,})",
+        f"results up to {LARGEST_FILE >> 20} MB and a million values",
+        f"`max_correction` ({compensator.max_correction * 1e3:g} mm ",
+        f"{LEAST_RADIUS_M * 1e3:g} mm from the axis",
+        f"steeper than {100 * PLAUSIBLE:g} % of the pitch or {PLAUSIBLE_M * 1e6:g} um",
+    ):
+        assert bound in stated
+    assert MAX_JSON_VALUES == 10**6 and SETTLED == 3 and "Once three images" in stated
