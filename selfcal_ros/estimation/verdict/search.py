@@ -129,6 +129,7 @@ def search_causes(
     between = any(block_of(name).between for name in raised)
     alike = bool(scales) or (between and _as_a_microscope(found, measurements, options))
     found.causes[:0] = [cause for cause in raised.values() if cause is not None]
+    _allow_for_plates(found, names, measurements, options)
     turned = turned_too_far(solved.joint, solved.result, measurements)
     if turned is not None:
         found.bounded = False
@@ -397,6 +398,30 @@ def _beyond_u(solved: Solved, test: SizeTest) -> bool:
         2 * part.u_rms**2 > whole[part.unit] ** 2
         for part in enlargements(solved.result, [term.name], [])
     )
+
+
+def _allow_for_plates(
+    found: SearchResult, raised: Collection[str], measurements: Measurements, options: Options
+) -> None:
+    """Add plates that differ as causes beside scales of offsets that explain no more than they do.
+
+    Scales of marks and lines that are wrong alike make a plate seem to shrink by E phi^2: where a
+    plate lies turned by mrad, it may have grown instead.
+    """
+    for name in raised:
+        if not (block_of(name).of_lines and block_of(name).of_offsets):
+            continue
+        twin = solved_with(measurements, options, [ModelTerm(name, 0.0)])
+        if twin is None:
+            continue
+        contradicted = [test for test in twin.joint.sizes if test.contradicted]
+        plausible = [
+            test for test in contradicted if block_of(test.name).of_plate and _is_plausible(test)
+        ]
+        if not contradicted or plausible != contradicted:
+            continue
+        found.causes += filter(None, (_raised_cause(twin, test) for test in contradicted))
+        found.effects.append(difference(name, twin.result, found.solved.result))
 
 
 def _as_a_microscope(found: SearchResult, measurements: Measurements, options: Options) -> bool:

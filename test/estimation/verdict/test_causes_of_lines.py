@@ -110,6 +110,26 @@ def test_what_turns_lines_against_marks_is_told_from_what_is_assumed(spread, by_
     assert covered(result, truth.g) >= 0.85
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_scales_of_offsets_that_explain_a_plate_that_grew_are_not_the_only_cause(seed):
+    """Where plates lie turned by mrad: both scales by 9 % look like 1 um/m, E phi^2."""
+    artifact = Artifact(11, 0.01, 24)
+    plan, rng = hu_plan(artifact, 5), np.random.default_rng(seed)
+    truth = replace(
+        random_truth(artifact, 4, rng, Spread(rotation="finite", encoder="independent")),
+        phi_rad=np.array([7e-3, 0.4e-3, 7.1e-3, -3.8e-3]),
+        plate_scale=np.array([0, 1e-6, 0, 0]),
+    )
+    settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=np.deg2rad(1e-3), servo_sigma_m=2e-8)
+    readings = simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    result = calibrate(readings, Options())
+    assert [cause.name for cause in result.verdict.causes] == ["line_scale", "plate_strain"]
+    assert covered(result, truth.g) > 0.9
+    error = result.error_map.g_theta - truth.g_theta
+    error -= error.mean()
+    assert (abs(error) < 2 * result.error_map.u_g_theta).mean() > 0.8
+
+
 @pytest.mark.parametrize("options", [BARE, Options(), apart()], ids=["bare", "assumed", "held"])
 def test_what_moves_no_map_disqualifies_nothing(options):
     # all lines were read in every view: a turn of all lines of one moves none against another
