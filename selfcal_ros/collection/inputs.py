@@ -353,7 +353,8 @@ REMEDY = {
     "nearest to the optical axis",
     Reason.LOW_SCORE: "their score is below min_score; correct the detection, or lower min_score",
     Reason.OUTLIER: "repeats of a mark contradict each other; check the stage for backlash, that "
-    "each id belongs to one mark, or raise outlier_limit",
+    "one node alone publishes detections (ros2 topic info -v), that each id belongs to one mark, "
+    "or raise outlier_limit",
 }
 """Remedies if most detections are rejected for a reason; reasons not listed are not faults."""
 

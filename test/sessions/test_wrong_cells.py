@@ -246,7 +246,8 @@ REMEDIES = {
     "pixels too large": "divide pixel_size by this factor",
     "no offsets": "measure the offset anew in each image, and publish it in m",
     "offsets 1000 times too small": "measure the offset anew in each image",
-    "backlash": "repeats of a mark contradict each other; check the stage for backlash",
+    "backlash": "repeats of a mark contradict each other; check the stage for backlash, that one "
+    "node alone publishes detections (ros2 topic info -v)",
     "old stamps": "stamp detections at the instant of exposure",
     "reversed theta": "count k counter-clockwise; or reverse the sign of theta",
     "theta in degrees": "publish theta in rad",
