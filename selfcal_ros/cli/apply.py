@@ -198,19 +198,19 @@ def corrected(
     """
     names, what = AXES[: points.shape[1]], "true" if inverse else "command"
     x, y, *theta = points.T
-    found = list(stage.correct(x, y) if inverse else stage.command(x, y))
+    corrected_axes = list(stage.correct(x, y) if inverse else stage.command(x, y))
     u = list((stage.uncertainty_indicated if inverse else stage.uncertainty)(x, y))
     outside = ~stage.inside(x, y)
     if inverse:
-        outside &= ~stage.inside(found[0], found[1])
+        outside &= ~stage.inside(corrected_axes[0], corrected_axes[1])
     if theta:
-        found.append((stage.correct_theta if inverse else stage.command_theta)(theta[0]))
-        u.append(stage.uncertainty_theta(found[2] if inverse else theta[0]))
-    unknown = int((np.isnan(found).any(axis=0) & ~outside).sum())
+        corrected_axes.append((stage.correct_theta if inverse else stage.command_theta)(theta[0]))
+        u.append(stage.uncertainty_theta(corrected_axes[2] if inverse else theta[0]))
+    unknown = int((np.isnan(corrected_axes).any(axis=0) & ~outside).sum())
     if not edge:
-        found[:2] = (np.where(outside, np.nan, axis) for axis in found[:2])
+        corrected_axes[:2] = (np.where(outside, np.nan, axis) for axis in corrected_axes[:2])
     head = [*names, *(f"{name}_{what}" for name in names), *(f"u_{name}" for name in names)]
-    return _csv(head, np.column_stack([points, *found, *u])), unknown, int(outside.sum())
+    return _csv(head, np.column_stack([points, *corrected_axes, *u])), unknown, int(outside.sum())
 
 
 def distances(

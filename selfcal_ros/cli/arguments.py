@@ -141,15 +141,15 @@ def misplaced(args: argparse.Namespace) -> InputError | None:
     files = list(_files(args))
     wrong = [item for item in files if item.misplaced]
     for first in wrong:
-        for other in wrong:
-            if first.kind in other.wanted and other.kind in first.wanted:
+        for swapped in wrong:
+            if first.kind in swapped.wanted and swapped.kind in first.wanted:
                 words = [
-                    {first.path: other.path, other.path: first.path}.get(word, word)
+                    {first.path: swapped.path, swapped.path: first.path}.get(word, word)
                     for word in args.words
                 ]
                 return InputError(
                     first.path,
-                    f"is {first.kind}, and {other.path} is {other.kind}: they are swapped",
+                    f"is {first.kind}, and {swapped.path} is {swapped.kind}: they are swapped",
                     f"write `selfcal {shlex.join(words)}`",
                 )
     for item in wrong:

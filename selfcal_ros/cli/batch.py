@@ -90,24 +90,26 @@ def run(args: argparse.Namespace) -> int:
         if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(bag)):
             raise InputError(str(folder), f"it is in the bag {bag}", "name another folder")
     with opened(folder):
-        kept = [] if args.redo else kept_records(folder, settings)
-        done, places = done_and_to_do(kept, bags)
-        for record in (done[index] for index in sorted(done)):
+        earlier_records = [] if args.redo else kept_records(folder, settings)
+        record_of, places = done_and_to_do(earlier_records, bags)
+        for record in (record_of[index] for index in sorted(record_of)):
             _say(record)
-        done |= _worked(args, bags, settings, places)
+        record_of |= _worked(args, bags, settings, places)
 
-        records = [done[index] for index in sorted(done)]
-        keys = {record.get("key") for record in kept}  # copies and moved bags have one, too
+        records = [record_of[index] for index in sorted(record_of)]
+        keys = {
+            record.get("key") for record in earlier_records
+        }  # copies and moved bags have one, too
         before = sum("key" in record and record["key"] in keys for record in records)
         if baseline is not None:
             records = compared(records, folder, baseline, args.baseline)
-        found = series_of(records)
-        lines = summary_lines(records, found, before)
+        series = series_of(records)
+        lines = summary_lines(records, series, before)
         if baseline is not None:
             lines += [sentence(records, args.baseline)]
-        content = batch_json(records, found, before)
+        content = batch_json(records, series, before)
         write_text(folder / "table.csv", csv_text(records))
-        write_text(folder / "index.html", page_html(records, found, lines))
+        write_text(folder / "index.html", page_html(records, series, lines))
         write_json(folder / "batch.json", content)
     say(
         args,
@@ -123,7 +125,7 @@ def _worked(
     args: argparse.Namespace, bags: Sequence[Path], settings: "BatchSettings", places: Sequence[int]
 ) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
-    found: dict[int, Record] = {}
+    records: dict[int, Record] = {}
     workers = check_workers(args.workers)
     folder = Path(args.output).absolute()
     jobs = [BatchJob(bags[place], folder, settings, args.redo) for place in places]
@@ -132,10 +134,10 @@ def _worked(
             place = places[outcome.index]
             if isinstance(outcome.error, SelfcalError):  # the folder cannot be written
                 raise outcome.error
-            found[place] = outcome.value or _failed(bags[place], outcome.error)
-            _say(found[place])
-            progress(len(found), len(jobs))
-    return found
+            records[place] = outcome.value or _failed(bags[place], outcome.error)
+            _say(records[place])
+            progress(len(records), len(jobs))
+    return records
 
 
 def _failed(bag: Path, error: BaseException | None) -> dict[str, Any]:

@@ -206,8 +206,8 @@ def _evaluate(args: argparse.Namespace) -> int:
     }
     if frame is not None and frame.theta_axis is not None:
         rotary.add(frame.theta_axis)
-    given = cal_lines.in_unit(args.position, unit, rotary=rotary)
-    positions = cal_lines.numbers(given, "--position")
+    positions_in_unit = cal_lines.in_unit(args.position, unit, rotary=rotary)
+    positions = cal_lines.numbers(positions_in_unit, "--position")
     if not positions:
         raise InputError("--position", "no position given", "write --position 1=10.5")
     corrections = CalEvaluator(cal.tables, _setup(args)).corrections(positions)
@@ -226,7 +226,7 @@ def _setup(args: argparse.Namespace) -> "MachineSetup":
                 f"'{word}' is not a home direction",
                 f"write {axis}=CW or {axis}=CCW",
             )
-    found: dict[str, dict[int, Any]] = {
+    values_of: dict[str, dict[int, Any]] = {
         name: cal_lines.numbers(
             getattr(args, name), f"--{name.replace('_', '-')}", positive=name.startswith("counts")
         )
@@ -237,11 +237,11 @@ def _setup(args: argparse.Namespace) -> "MachineSetup":
             "absolute_feedback_offset",
         )
     }
-    found["home_direction"] = directions
-    axes: set[int] = set().union(*found.values())
+    values_of["home_direction"] = directions
+    axes: set[int] = set().union(*values_of.values())
     return MachineSetup(
         {
-            axis: AxisSetup(**{name: values.get(axis) for name, values in found.items()})
+            axis: AxisSetup(**{name: values.get(axis) for name, values in values_of.items()})
             for axis in axes
         },
         args.temperature,
@@ -315,11 +315,15 @@ def _export(args: argparse.Namespace) -> int:
     }
     if frame.theta_axis is not None:
         target = Path(args.output)
-        beside = args.theta_output or str(target.with_name(f"{target.stem}_theta{target.suffix}"))
-        if os.path.realpath(beside) == os.path.realpath(target):
-            raise InputError(beside, "a 1D and a 2D table cannot share a file", "name another file")
+        theta_path = args.theta_output or str(
+            target.with_name(f"{target.stem}_theta{target.suffix}")
+        )
+        if os.path.realpath(theta_path) == os.path.realpath(target):
+            raise InputError(
+                theta_path, "a 1D and a 2D table cannot share a file", "name another file"
+            )
         table = export.table_theta(result.error_map, frame)
-        texts[beside] = cal_text(
+        texts[theta_path] = cal_text(
             [table], comments=comments, decimals=export.theta_decimals(result.error_map)
         )
     lines, files = [], []
@@ -408,9 +412,9 @@ def _verify(args: argparse.Namespace) -> int:
     result, cal = read_result(args.result), load_cals(args.files)
     frame = cal_lines.frame_of(args, frame_of_file(cal))
     with busy("simulating the controller"):
-        found = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
-    one_axis = found.one_axis
-    text, figures = residual_text(found.residuals), figures_of(found.residuals)
+        verification = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
+    one_axis = verification.one_axis
+    text, figures = residual_text(verification.residuals), figures_of(verification.residuals)
     if one_axis is not None:
         text = f"{text}\n{one_axis_text(one_axis)}"
         figures |= {"one_axis": plain(asdict(one_axis))}
@@ -418,16 +422,16 @@ def _verify(args: argparse.Namespace) -> int:
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
-        save_picture(controller_figure(found), args.plot)
+        save_picture(controller_figure(verification), args.plot)
     unfit_parts = [part for part in one_axis.parts if part.unfit] if one_axis is not None else []
-    if found.worse and one_axis is not None and not unfit_parts:
+    if verification.worse and one_axis is not None and not unfit_parts:
         raise InputError(
             cal.where,
             "the tables make the middle line better and the field worse: "
             "most of the error depends on both positions",
             "write a 2D table (selfcal cal export)",
         )
-    if found.worse:
+    if verification.worse:
         raise InputError(
             cal.where,
             "the tables make the machine worse",
@@ -442,13 +446,16 @@ def _verify(args: argparse.Namespace) -> int:
             "unit and number of entries, or write them again",
             file=sys.stderr,
         )
-    unfit = found.unfit(result.error_map)
+    unfit = verification.unfit(result.error_map)
     for residual in unfit:
-        left, most = (size("after") / size("before") for size in (residual.rms, residual.largest))
+        rms_left, peak_left = (
+            size("after") / size("before") for size in (residual.rms, residual.largest)
+        )
         print(
-            f"{args.leaf.prog}: {cal.where}: the tables leave {left:.0%} of the error at the "
-            f"{residual.place}, {most:.0%} of the largest, more than the U of the map: they are "
-            "not those of this map; check offset, unit and number of rows, or export them again",
+            f"{args.leaf.prog}: {cal.where}: the tables leave {rms_left:.0%} of the error at the "
+            f"{residual.place}, {peak_left:.0%} of the largest, more than the U of the map: they "
+            "are not those of this map; check offset, unit and number of rows, or export "
+            "them again",
             file=sys.stderr,
         )
     return int(ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE)

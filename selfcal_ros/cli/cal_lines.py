@@ -41,7 +41,7 @@ _HOMES: dict[Literal["end", "middle", "middle-balanced"], str] = {
 
 def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
     """Return axis -> value of options AXIS=VALUE; InputError for anything else."""
-    found: dict[int, str] = {}
+    values: dict[int, str] = {}
     for text in texts or []:
         axis, equals, value = text.partition("=")
         if not (equals and axis.isascii() and axis.isdigit() and 1 <= int(axis[:9]) <= 32):
@@ -50,15 +50,15 @@ def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
                 f"'{text}' is not AXIS=VALUE with an axis from 1 to 32",
                 f"write {option} 1=10.5",
             )
-        if int(axis) in found:
+        if int(axis) in values:
             raise InputError(option, f"axis {int(axis)} is given twice", "keep one of them")
-        found[int(axis)] = value
-    return found
+        values[int(axis)] = value
+    return values
 
 
 def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> dict[int, float]:
     """Return axis -> number of options AXIS=NUMBER; InputError for anything else."""
-    found = {}
+    numbers_of = {}
     for axis, text in pairs(texts, option).items():
         try:
             value = number(text)
@@ -70,8 +70,8 @@ def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> 
                 f"'{text}' is not a {'positive ' * positive}number",
                 f"write {option} {axis}={1000 if positive else 10.5}",
             )
-        found[axis] = value
-    return found
+        numbers_of[axis] = value
+    return numbers_of
 
 
 def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) -> list[str]:
@@ -82,11 +82,11 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
     InputError
         For a length of an axis in `rotary`.
     """
-    found = []
+    converted = []
     for text in texts or []:
         match = re.fullmatch(r"(\d+)=([-+]?[\d.]+(?:[eE][-+]?\d{1,3})?) ?(m|mm|um|µm|nm)", text)
         if match is None:
-            found.append(text)
+            converted.append(text)
             continue
         if int(match[1]) in rotary:
             raise InputError(
@@ -96,10 +96,10 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
             )
         factor = Fraction(str(M_PER[match[3].replace("µ", "u")])) / Fraction(str(M_PER[unit]))
         try:
-            found.append(f"{match[1]}={float(Fraction(match[2]) * factor)!r}")
+            converted.append(f"{match[1]}={float(Fraction(match[2]) * factor)!r}")
         except (ValueError, OverflowError):
-            found.append(text)
-    return found
+            converted.append(text)
+    return converted
 
 
 def add_frame(
@@ -277,7 +277,7 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
 
 def _orthogonality(args: argparse.Namespace) -> int:
     frame = _frame(args)
-    other: Axis = "y" if args.along == "x" else "x"
+    across: Axis = "y" if args.along == "x" else "x"
     measured = (args.measured, args.over, args.travel)
     if args.source is not None:
         if any(measured) or args.home:
@@ -290,7 +290,7 @@ def _orthogonality(args: argparse.Namespace) -> int:
         if not args.steep:
             require_plausible(result.error_map, args.source)
         line = cal_lines.map_orthogonality(result.error_map, args.along)
-        return _deliver(args, line, frame, (args.along, other), result)
+        return _deliver(args, line, frame, (args.along, across), result)
     if None in measured:
         raise InputError(
             "arguments",
@@ -308,22 +308,22 @@ def _orthogonality(args: argparse.Namespace) -> int:
                 "--home", "the home position is missing", "give end, middle or middle-balanced"
             )
         line = cal_lines.orthogonality(measured_m, over_m, travel_m, args.home)
-        return _deliver(args, line, frame, (args.along, other))
+        return _deliver(args, line, frame, (args.along, across))
     homes = [args.home] if args.home else list(_HOMES)
-    found = {home: cal_lines.orthogonality(measured_m, over_m, travel_m, home) for home in homes}
+    line_of = {home: cal_lines.orthogonality(measured_m, over_m, travel_m, home) for home in homes}
     unit_m = UNITS_M[args.unit]
     tables = {
         home: [
             [round(p / unit_m, 9), round(c / M_PER_UM, 9)]
             for p, c in zip(line.positions_m, line.corrections_m, strict=True)
         ]
-        for home, line in found.items()
+        for home, line in line_of.items()
     }
     if args.json:
         print(json.dumps({"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1))
         return int(ExitCode.DONE)
     tell(
-        f"correction of {other} over the full travel of {args.along}: "
+        f"correction of {across} over the full travel of {args.along}: "
         f"{-measured_m / over_m * travel_m * UM_PER_M:.9g} µm"
     )
     for home, rows in tables.items():
@@ -380,14 +380,14 @@ def _deliver(
     ]
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)
-    found = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
+    written = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
     if args.output:
         backup = replace_files(args, {args.output: text}, [args.source])[args.output]
         say(
             args,
             f"{args.output}: {args.sub_verb} table for {axes[1]}{replaced(backup)}",
-            found | {"file": args.output, "old_file": backup},
+            written | {"file": args.output, "old_file": backup},
         )
     else:
-        say(args, text.removesuffix("\n"), found)
+        say(args, text.removesuffix("\n"), written)
     return int(ExitCode.DONE) if result is None else exit_code(result)

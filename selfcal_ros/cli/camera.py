@@ -97,17 +97,17 @@ def run(args: argparse.Namespace) -> int:
             "and are left out",
             file=sys.stderr,
         )
-    found = camera_pose(positions, images, Sense(args.sense))
+    camera = camera_pose(positions, images, Sense(args.sense))
     require_size(
-        found,
+        camera,
         mark_size_m=args.mark_size,
         mark_pixels=args.mark_pixels,
         where=args.positions or args.bag,
     )
     values = {
-        "pixel_size": found.pixel_size_m,
-        "turn": math.degrees(found.turn_rad),
-        "mirror": found.mirror,
+        "pixel_size": camera.pixel_size_m,
+        "turn": math.degrees(camera.turn_rad),
+        "mirror": camera.mirror,
         "mark": args.mark,
         "mark_size": args.mark_size,
         "polarity": args.polarity,
@@ -115,29 +115,29 @@ def run(args: argparse.Namespace) -> int:
     write_yaml(args.output, {"mark_detector": {"ros__parameters": values}})
     say(
         args,
-        pose_text(found, args.output),
+        pose_text(camera, args.output),
         {
             "file": args.output,
             **values,
-            "u_pixel_size": found.u_pixel_size_m,
-            "u_turn": math.degrees(found.u_turn_rad),
-            "sheared": found.sheared,
-            "u_sheared": found.u_sheared,
-            "noise_px": found.noise_px,
+            "u_pixel_size": camera.u_pixel_size_m,
+            "u_turn": math.degrees(camera.u_turn_rad),
+            "sheared": camera.sheared,
+            "u_sheared": camera.u_sheared,
+            "noise_px": camera.noise_px,
         },
     )
     return 0
 
 
-def pose_text(found: "CameraPose", output: str) -> str:
+def pose_text(camera: "CameraPose", output: str) -> str:
     """Return a camera in one line."""
     return (
-        f"{output}: pixel size {found.pixel_size_m / M_PER_UM:.6g} µm (u "
-        f"{found.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(found.turn_rad):.5g}° "
-        f"(u {math.degrees(found.u_turn_rad):.1g}°), "
-        f"{'mirrored' if found.mirror else 'not mirrored'}; axes unequal or sheared by "
-        f"{found.sheared:.1g} (u {found.u_sheared:.1g}); noise of a mark "
-        f"{found.noise_px:.2g} pixels"
+        f"{output}: pixel size {camera.pixel_size_m / M_PER_UM:.6g} µm (u "
+        f"{camera.u_pixel_size_m / M_PER_UM:.1g} µm), turn {math.degrees(camera.turn_rad):.5g}° "
+        f"(u {math.degrees(camera.u_turn_rad):.1g}°), "
+        f"{'mirrored' if camera.mirror else 'not mirrored'}; axes unequal or sheared by "
+        f"{camera.sheared:.1g} (u {camera.u_sheared:.1g}); noise of a mark "
+        f"{camera.noise_px:.2g} pixels"
     )
 
 
@@ -151,10 +151,10 @@ def _of_bag(
     bag = ImageBag(Path(args.bag))
     for item in bag.items():
         if item.image is not None:
-            found = detector.take(item.image)
-            if found:
-                exposed.append(found[0].stamp_ns)
-                images.append(np.array([(mark.offset_x, mark.offset_y) for mark in found]))
+            marks = detector.take(item.image)
+            if marks:
+                exposed.append(marks[0].stamp_ns)
+                images.append(np.array([(mark.offset_x, mark.offset_y) for mark in marks]))
     for line, count in bag.lost.items():
         print(f"selfcal camera: {args.bag}: {count} x {line}", file=sys.stderr)
     if not exposed or not len(stamps):
@@ -179,8 +179,8 @@ def _of_files(
     """Return stage positions and marks of each image of a folder."""
     positions, images = [], []
     for number, row in enumerate(read_positions(args.positions, None)):
-        found = detector.take_file(read_bytes(Path(args.bag) / row.file), row.file, number)
-        if found:
+        marks = detector.take_file(read_bytes(Path(args.bag) / row.file), row.file, number)
+        if marks:
             positions.append((row.x_m, row.y_m))
-            images.append(np.array([(mark.offset_x, mark.offset_y) for mark in found]))
+            images.append(np.array([(mark.offset_x, mark.offset_y) for mark in marks]))
     return np.array(positions).reshape(-1, 2), images

@@ -113,29 +113,29 @@ def _try(args: argparse.Namespace) -> int:
         if not args.yes and not _agrees(args, trial.step_m):
             say(args, "nothing was moved or written", {"marks": len(marks)})
             return int(ExitCode.DONE)
-        found = trial.move()
-    values, notes = values_of(found)
+        outcome = trial.move()
+    values, notes = values_of(outcome)
     if values:
         with_values(cell.path, "detector", values, notes)
-    if found.settling_s > cell.settle.time:
-        with_values(cell.path, "settle", {"time": float(f"{found.settling_s:.2g}")}, {})
+    if outcome.settling_s > cell.settle.time:
+        with_values(cell.path, "settle", {"time": float(f"{outcome.settling_s:.2g}")}, {})
     with_values(
         cell.path,
         "found",
-        {f"backlash_{axis}": asdict(each) for axis, each in found.reversal.items()}
-        | {"settling_time": found.settling_s, "noise": found.noise_m},
+        {f"backlash_{axis}": asdict(reversal) for axis, reversal in outcome.reversal.items()}
+        | {"settling_time": outcome.settling_s, "noise": outcome.noise_m},
         {},
     )
-    lines = [] if found.camera is None else [pose_text(found.camera, args.cell)]
+    lines = [] if outcome.camera is None else [pose_text(outcome.camera, args.cell)]
     lines += [
-        f"backlash of {axis}: {each.value / M_PER_UM:.3g} µm (u {each.u / M_PER_UM:.1g} µm)"
-        for axis, each in found.reversal.items()
+        f"backlash of {axis}: {reversal.value / M_PER_UM:.3g} µm (u {reversal.u / M_PER_UM:.1g} µm)"
+        for axis, reversal in outcome.reversal.items()
     ]
     lines.append(
-        f"at rest {found.settling_s:.2g} s after a move; noise of a mark "
-        f"{found.noise_m / M_PER_UM:.2g} µm"
+        f"at rest {outcome.settling_s:.2g} s after a move; noise of a mark "
+        f"{outcome.noise_m / M_PER_UM:.2g} µm"
     )
-    lines += [f"note: {note}" for note in found.notes]
+    lines += [f"note: {note}" for note in outcome.notes]
     say(
         args,
         "\n".join(lines),
@@ -144,10 +144,10 @@ def _try(args: argparse.Namespace) -> int:
             "seen": output if pixels is not None else "",
             "marks": len(marks),
             **values,
-            "backlash": {axis: asdict(each) for axis, each in found.reversal.items()},
-            "settling_time": found.settling_s,
-            "noise": found.noise_m,
-            "notes": list(found.notes),
+            "backlash": {axis: asdict(reversal) for axis, reversal in outcome.reversal.items()},
+            "settling_time": outcome.settling_s,
+            "noise": outcome.noise_m,
+            "notes": list(outcome.notes),
         },
     )
     return int(ExitCode.DONE)

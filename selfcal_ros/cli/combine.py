@@ -82,24 +82,24 @@ def read_parts(names: Sequence[str]) -> list[Part]:
     ]
 
 
-def _text(result: CalibrationResult, found: dict[str, Any]) -> str:
+def _text(result: CalibrationResult, figures: dict[str, Any]) -> str:
     emap, noise = result.error_map, result.noise
     u = [rms(emap.u_gx), rms(emap.u_gy)]
     lines = [
-        f"mean of {len(found['runs'])} maps: {result.verdict.sentence}",
+        f"mean of {len(figures['runs'])} maps: {result.verdict.sentence}",
         f"XY     U {noise.k_xy * math.hypot(*u) / math.sqrt(2) * UM_PER_M:.4g} µm rms "
-        f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {found['u_between_m'] * UM_PER_M:.3g} "
-        f"µm rms, p = {found['p_between']:.2g}",
+        f"(k = {noise.k_xy:.3g}, 95.45 %), between runs {figures['u_between_m'] * UM_PER_M:.3g} "
+        f"µm rms, p = {figures['p_between']:.2g}",
     ]
-    if "u_between_rad" in found:
+    if "u_between_rad" in figures:
         lines.append(
             f"theta  U {noise.k_theta * rms(emap.u_g_theta) * ARCSEC_PER_RAD:.4g} arcsec "
             f"rms (k = {noise.k_theta:.3g}), between runs "
-            f"{found['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, "
-            f"p = {found['p_between_theta']:.2g}"
+            f"{figures['u_between_rad'] * ARCSEC_PER_RAD:.3g} arcsec rms, "
+            f"p = {figures['p_between_theta']:.2g}"
         )
     lines.append("each map against the mean of the others:")
-    for run in found["runs"]:
+    for run in figures["runs"]:
         lines.append(
             f"  {run['file']}: weight {run['weight']:.3f}, |E_n| rms "
             f"{run['e_n_rms']:.2f}, largest {run['e_n_largest']:.2f}, beyond 1 at "

@@ -94,11 +94,11 @@ def run(args: argparse.Namespace) -> int:
             f"selfcal detect: {args.bag}: {f'{count} x ' if count > 1 else ''}{line}",
             file=sys.stderr,
         )
-    found = detector.counts.values()
+    counts = detector.counts.values()
     say(
         args,
-        text_of(args.output, found),
-        {"bag": args.output, "counts": found, "problems": dict(problems)},
+        text_of(args.output, counts),
+        {"bag": args.output, "counts": counts, "problems": dict(problems)},
     )
     return 0
 
@@ -132,26 +132,26 @@ def _drawn(
     write_bytes(folder / f"{Path(name).stem}.png", circled(picture.values, marks, size, rejected))
 
 
-def text_of(output: str, found: dict[str, int]) -> str:
+def text_of(output: str, counts: dict[str, int]) -> str:
     """Return the numbers of images and marks as a line."""
     rejected = ", ".join(
         f"{count} {name.removeprefix('rejected_')}"
-        for name, count in found.items()
+        for name, count in counts.items()
         if name.startswith("rejected_")
     )
-    more = [
-        f"{found[name]} {text}"
+    extra_counts = [
+        f"{counts[name]} {text}"
         for name, text in (
             ("images_without_marks", "images without marks"),
             ("images_refused", "images refused"),
             ("images_with_more_pages", "images with further pages, which were not used"),
         )
-        if found.get(name)
+        if counts.get(name)
     ]
     return "; ".join(
         [
-            f"{output}: {found['marks']} marks in {found['images']} images",
+            f"{output}: {counts['marks']} marks in {counts['images']} images",
             *([f"rejected: {rejected}"] if rejected else []),
-            *more,
+            *extra_counts,
         ]
     )

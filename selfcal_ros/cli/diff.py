@@ -87,27 +87,29 @@ def run(args: argparse.Namespace) -> int:
                     "omit it, or solve with --reference",
                 )
     with busy("comparing"):
-        found = compare(
+        difference = compare(
             a, b, keep_scale=args.keep_scale, plates=args.artifact, names=(args.a, args.b)
         )
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
-        one, other = (plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b)
+        map_a, map_b = (plate_as_map(a), plate_as_map(b)) if args.artifact else (a, b)
         save_picture(
             difference_picture(
-                one,
-                other,
-                {"gx": found.dx, "gy": found.dy, "g_theta": found.d_theta},
-                _verdict_text(found),
+                map_a,
+                map_b,
+                {"gx": difference.dx, "gy": difference.dy, "g_theta": difference.d_theta},
+                _verdict_text(difference),
             ),
             args.plot,
         )
     say(
-        args, _text(found, _grades_text([a, b]), args.artifact), {**_json(found), **_grades([a, b])}
+        args,
+        _text(difference, _grades_text([a, b]), args.artifact),
+        {**_json(difference), **_grades([a, b])},
     )
     datums = [result.error_map.datum_theta for result in (a, b)]
-    if datums[0] != datums[1] and not (args.json or args.artifact) and found.theta is not None:
+    if datums[0] != datums[1] and not (args.json or args.artifact) and difference.theta is not None:
         print(
             f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
             "lines to the XY axes"
@@ -141,57 +143,57 @@ def _grades_text(results: Sequence[CalibrationResult]) -> list[str]:
     ]
 
 
-def _json(found: MapDifference) -> dict[str, Any]:
+def _json(difference: MapDifference) -> dict[str, Any]:
     return plain(
         {
-            "significant": found.significant,
-            "rms_um": found.rms_m * UM_PER_M,
-            "max_um": found.max_m * UM_PER_M,
-            "rms_theta_arcsec": found.rms_theta_rad * ARCSEC_PER_RAD,
-            "max_theta_arcsec": found.max_theta_rad * ARCSEC_PER_RAD,
+            "significant": difference.significant,
+            "rms_um": difference.rms_m * UM_PER_M,
+            "max_um": difference.max_m * UM_PER_M,
+            "rms_theta_arcsec": difference.rms_theta_rad * ARCSEC_PER_RAD,
+            "max_theta_arcsec": difference.max_theta_rad * ARCSEC_PER_RAD,
             "datum_difference": {
-                "translation_x": found.translation_m[0],
-                "translation_y": found.translation_m[1],
-                "rotation": found.rotation_rad,
-                "scale": found.scale,
-                "theta": found.theta_rad,
+                "translation_x": difference.translation_m[0],
+                "translation_y": difference.translation_m[1],
+                "rotation": difference.rotation_rad,
+                "scale": difference.scale,
+                "theta": difference.theta_rad,
             },
-            "nonorthogonality": found.nonorthogonality,
-            "scale_difference": found.scale_difference,
-            "significance_xy": None if found.xy is None else asdict(found.xy),
-            "significance_theta": None if found.theta is None else asdict(found.theta),
-            "dx": found.dx,
-            "dy": found.dy,
-            "d_theta": found.d_theta,
+            "nonorthogonality": difference.nonorthogonality,
+            "scale_difference": difference.scale_difference,
+            "significance_xy": None if difference.xy is None else asdict(difference.xy),
+            "significance_theta": None if difference.theta is None else asdict(difference.theta),
+            "dx": difference.dx,
+            "dy": difference.dy,
+            "d_theta": difference.d_theta,
         }
     )
 
 
-def _text(found: MapDifference, grades: Sequence[str], plates: bool) -> str:
-    tx, ty = found.translation_m
+def _text(difference: MapDifference, grades: Sequence[str], plates: bool) -> str:
+    tx, ty = difference.translation_m
     lines = [
         f"B minus A{', plates' if plates else ''}, datum difference removed: translation "
         f"({_signed(tx * UM_PER_M)}, {_signed(ty * UM_PER_M)}) µm, "
-        f"rotation {_signed(found.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
-        f"scale {_signed(found.scale * UM_PER_M)} µm/m"
+        f"rotation {_signed(difference.rotation_rad * ARCSEC_PER_RAD)} arcsec, "
+        f"scale {_signed(difference.scale * UM_PER_M)} µm/m"
         + (
             ""
-            if math.isnan(found.theta_rad)
-            else f", theta {_signed(found.theta_rad * ARCSEC_PER_RAD)} arcsec"
+            if math.isnan(difference.theta_rad)
+            else f", theta {_signed(difference.theta_rad * ARCSEC_PER_RAD)} arcsec"
         ),
-        f"XY     rms {found.rms_m * UM_PER_M:.5f} µm per axis   "
-        f"largest {found.max_m * UM_PER_M:.5f} µm on an axis",
-        *_test_text(found.xy),
-        f"       non-orthogonality {_signed(found.nonorthogonality * URAD_PER_RAD)} µrad, "
-        f"scale difference {_signed(found.scale_difference * UM_PER_M)} µm/m",
+        f"XY     rms {difference.rms_m * UM_PER_M:.5f} µm per axis   "
+        f"largest {difference.max_m * UM_PER_M:.5f} µm on an axis",
+        *_test_text(difference.xy),
+        f"       non-orthogonality {_signed(difference.nonorthogonality * URAD_PER_RAD)} µrad, "
+        f"scale difference {_signed(difference.scale_difference * UM_PER_M)} µm/m",
     ]
-    if not math.isnan(found.rms_theta_rad):
+    if not math.isnan(difference.rms_theta_rad):
         lines += [
-            f"theta  rms {found.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
-            f"largest {found.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",
-            *_test_text(found.theta),
+            f"theta  rms {difference.rms_theta_rad * ARCSEC_PER_RAD:.4f} arcsec   "
+            f"largest {difference.max_theta_rad * ARCSEC_PER_RAD:.4f} arcsec",
+            *_test_text(difference.theta),
         ]
-    return "\n".join([*lines, *grades, _verdict_text(found)])
+    return "\n".join([*lines, *grades, _verdict_text(difference)])
 
 
 def _signed(value: float) -> str:
@@ -211,9 +213,9 @@ def _test_text(test: Significance | None) -> list[str]:
     ]
 
 
-def _verdict_text(found: MapDifference) -> str:
-    tests = {"XY": found.xy, "theta": found.theta}
-    if found.significant is None:
+def _verdict_text(difference: MapDifference) -> str:
+    tests = {"XY": difference.xy, "theta": difference.theta}
+    if difference.significant is None:
         return "verdict: none, no uncertainties to test against"
     differ = [name for name, test in tests.items() if test is not None and test.significant]
     if differ:

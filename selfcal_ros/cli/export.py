@@ -102,10 +102,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _wiring(args: argparse.Namespace) -> "Wiring":
-    given, args.counts_per_unit = args.counts_per_unit, None
+    count_options, args.counts_per_unit = args.counts_per_unit, None
     args.unit = args.unit or FORMATS[args.format].unit
     frame = frame_of(args)
-    counts = numbers(given, "--counts-per-unit", positive=True)
+    counts = numbers(count_options, "--counts-per-unit", positive=True)
     axes = (frame.x_axis, frame.y_axis)
     if counts and set(counts) != set(axes):
         raise InputError(

@@ -97,14 +97,14 @@ def run(args: argparse.Namespace) -> int:
     program = corrected_program(text, args.program, rewriter)
     (x0, *_, x1), (y0, *_, y1) = nodes(result.error_map, frame)
     lowest, highest = rewriter.reach_m
-    said = ["moves leave the field, beyond which the correction at its edge is used, without U"]
+    warnings = ["moves leave the field, beyond which the correction at its edge is used, without U"]
     if np.all(lowest >= (x0 - ROUNDING_M, y0 - ROUNDING_M)) and np.all(
         highest <= (x1 + ROUNDING_M, y1 + ROUNDING_M)
     ):
-        said = []
-    for line in said:
+        warnings = []
+    for line in warnings:
         print(f"selfcal gcode: {args.program}: {line}", file=sys.stderr)
-    comments = [*origin_lines(result, command(args)), *said]
+    comments = [*origin_lines(result, command(args)), *warnings]
     return deliver(
         args,
         result,

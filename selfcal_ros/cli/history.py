@@ -139,7 +139,7 @@ def _largest_m(entry: Entry) -> float:
 
 def _entry_json(entry: Entry) -> dict[str, Any]:
     change = entry.change
-    found: dict[str, Any] = (
+    fields: dict[str, Any] = (
         {"not_compared": change or None}
         if isinstance(change, str)
         else {
@@ -157,5 +157,5 @@ def _entry_json(entry: Entry) -> dict[str, Any]:
         "grade": str(entry.result.verdict.grade),
         "largest_m": _largest_m(entry),
         "U_rms_m": entry.expanded_m,
-        **found,
+        **fields,
     }

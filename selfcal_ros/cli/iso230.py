@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     stage, measurements = _read(args)
     if stage.result.plate.map_grid is not None:
         measurements = None
-    at = stage.error_map.artifact
+    artifact = stage.error_map.artifact
     axes, problems = [], []
     for axis in (0, 1):
         repeats = None if measurements is None else iso230.scatters(measurements, axis)
@@ -69,7 +69,11 @@ def run(args: argparse.Namespace) -> int:
                 raise
             problems.append(str(error))
             axes.append(iso230.axis_figures(stage, axis, args.line))
-    radius = min(at.half) * at.grid_pitch_m if args.radius is None else args.radius * M_PER_MM
+    radius = (
+        min(artifact.half) * artifact.grid_pitch_m
+        if args.radius is None
+        else args.radius * M_PER_MM
+    )
     problems = [f"{line}; only M is given" for line in problems]
     paths = []
     for figures, chosen in (
@@ -112,8 +116,10 @@ def _read(args: argparse.Namespace) -> tuple[StageMap, Measurements | None]:
     return stage, measurements
 
 
-def _figures(found: AxisFigures | PathFigures) -> dict[str, Any]:
-    return {name: {"value": figure.value, "u": figure.u} for name, figure in found.figures.items()}
+def _figures(evaluated: AxisFigures | PathFigures) -> dict[str, Any]:
+    return {
+        name: {"value": figure.value, "u": figure.u} for name, figure in evaluated.figures.items()
+    }
 
 
 def _json(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) -> dict[str, Any]:
@@ -175,9 +181,9 @@ def _text(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) ->
     return "\n".join(lines)
 
 
-def _rows(found: AxisFigures | PathFigures) -> list[str]:
+def _rows(evaluated: AxisFigures | PathFigures) -> list[str]:
     return [
         f"  {name:7}{figure.value * UM_PER_M:10.4f} µm   u "
         + (f"{figure.u * UM_PER_M:.4f} µm" if figure.u == figure.u else "not known")
-        for name, figure in found.figures.items()
+        for name, figure in evaluated.figures.items()
     ]

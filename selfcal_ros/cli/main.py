@@ -106,8 +106,8 @@ def _complete() -> None:
     """Answer a shell's request for completions and end; see README."""
     import argcomplete  # for completion only
 
-    whole = os.environ.get("COMP_LINE", "").split(" ")[1:-1]  # without the word at the cursor
-    argcomplete.autocomplete(build_parser(_verb_in(word for word in whole if word)))
+    words = os.environ.get("COMP_LINE", "").split(" ")[1:-1]  # without the word at the cursor
+    argcomplete.autocomplete(build_parser(_verb_in(word for word in words if word)))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -205,10 +205,10 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
         """Return the arguments; an unknown option ends with a line that names it."""
-        found, unknown = self.parse_known_args(args, namespace)
+        parsed, unknown = self.parse_known_args(args, namespace)
         if unknown:
-            found.leaf.refuse(unknown)
-        return found
+            parsed.leaf.refuse(unknown)
+        return parsed
 
     def refuse(self, unknown: Sequence[str]) -> NoReturn:
         """End with a line on the first argument that is not recognised."""
@@ -251,8 +251,8 @@ class Parser(argparse.ArgumentParser):
                 None, f"'{value}' is a file, and {_name_of(action)} comes first"
             )
         choices: Iterable[str] = map(str, action.choices)
-        known = list(choices)
-        hint = did_you_mean(str(value), known) or f"known are {', '.join(known)}"
+        choice_names = list(choices)
+        hint = did_you_mean(str(value), choice_names) or f"known are {', '.join(choice_names)}"
         raise argparse.ArgumentError(None, f"{_name_of(action)} '{value}' is unknown; {hint}")
 
 
@@ -297,12 +297,12 @@ class AllVerbs(Parser):
 
 def _columns(rows: dict[str, str], width: int) -> list[str]:
     """Return names and texts in two columns."""
-    left = max(map(len, rows)) + 4
+    name_width = max(map(len, rows)) + 4
     lines = []
     for name, text in rows.items():
-        first, *more = textwrap.wrap(text, max(width - left, 20)) or [""]
-        lines.append(f"  {name:{left - 4}}  {first}")
-        lines += [" " * left + line for line in more]
+        first, *continued = textwrap.wrap(text, max(width - name_width, 20)) or [""]
+        lines.append(f"  {name:{name_width - 4}}  {first}")
+        lines += [" " * name_width + line for line in continued]
     return lines
 
 

@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, solve, report."""
     plan, cell = read_plan(args.plan), read_cell(args.cell)
     bag = Path(args.output)
-    kept = f"{bag} is kept, --resume continues"
+    resume_hint = f"{bag} is kept, --resume continues"
     desk = Terminal(args.yes, bag, aside(args))
     if not args.yes and not sys.stdin.isatty():
         raise InputError(
@@ -77,13 +77,13 @@ def run(args: argparse.Namespace) -> int:
     except (MachineError, NoDataError) as error:
         desk.end()
         kind = NoDataError if isinstance(error, NoDataError) else InputError
-        remedies = filter(None, [error.remedy, kept if bag.exists() else ""])
+        remedies = filter(None, [error.remedy, resume_hint if bag.exists() else ""])
         raise kind(error.where, error.what, "; ".join(remedies)) from error
     except (KeyboardInterrupt, SystemExit):
         desk.end()
-        left = kept if bag.exists() else "nothing was measured yet"
+        bag_state = resume_hint if bag.exists() else "nothing was measured yet"
         with contextlib.suppress(OSError):  # of a terminal that is closed
-            print(f"selfcal measure: stopped; {left}", file=sys.stderr)
+            print(f"selfcal measure: stopped; {bag_state}", file=sys.stderr)
         raise
     desk.end()
     if plan.verify:

@@ -101,37 +101,39 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
 @contextlib.contextmanager
 def _lines(log: list[str]) -> Iterator[Callable[[Any], None]]:
     """Print a line for each change that a script may wait for."""
-    said: dict[str, str] = {}
-    there: set[str] = set()
+    printed: dict[str, str] = {}
+    heard_nodes: set[str] = set()
 
     def draw(picture: Any) -> None:
         while log:
             print(printable(log.pop(0)), flush=True)
         if picture is None:
             return
-        for key, line in _state_lines(picture, there, set(said)):
-            if said.get(key) != line:
-                said[key] = line
+        for key, line in _state_lines(picture, heard_nodes, set(printed)):
+            if printed.get(key) != line:
+                printed[key] = line
                 print(printable(f"{key}: {line}"), flush=True)
 
     yield draw
 
 
-def _state_lines(picture: Any, there: set[str], said: set[str]) -> Iterator[tuple[str, str]]:
-    """Yield changes that a script may wait for; `there` collects the nodes heard so far."""
+def _state_lines(
+    picture: Any, heard_nodes: set[str], printed: set[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield changes that a script may wait for; `heard_nodes` collects the nodes heard so far."""
     yield "now", what_now(picture)
     if picture["summary"]:
         yield "map", picture["summary"]["state"]
     if saved_as(picture):
         yield "saved", saved_as(picture)
     for node, health in picture["health"].items():
-        if health is None and node in there:
+        if health is None and node in heard_nodes:
             yield node, "gone: no sign of life"
         elif health is not None:
-            there.add(node)
+            heard_nodes.add(node)
             if health["level"]:
                 yield node, health["message"]
-            elif node in said:
+            elif node in printed:
                 yield node, "well again"
 
 
@@ -162,13 +164,13 @@ def _keys() -> Iterator[Callable[[], list[str]]]:
         tty.setcbreak(sys.stdin)
 
         def pressed() -> list[str]:
-            found = []
+            commands = []
             while select.select([sys.stdin], [], [], 0)[0]:
                 keys = _read_keys(sys.stdin.fileno())
-                found += [KEYS.get(key, "quit") for key in keys if key in KEYS or key == "q"]
+                commands += [KEYS.get(key, "quit") for key in keys if key in KEYS or key == "q"]
                 if not keys:  # the terminal is gone
-                    return [*found, "quit"]
-            return found
+                    return [*commands, "quit"]
+            return commands
 
         yield pressed
     finally:
@@ -195,9 +197,9 @@ def _words() -> Callable[[], list[str]]:
     threading.Thread(target=read, name="stdin", daemon=True).start()
 
     def taken() -> list[str]:
-        found = []
+        words = []
         while not lines.empty():
-            found.append(lines.get())
-        return [word for word in found if word]
+            words.append(lines.get())
+        return [word for word in words if word]
 
     return taken

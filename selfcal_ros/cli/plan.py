@@ -136,38 +136,40 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
     budget: PlanBudget | None = None
     with busy("judging the plan"):
         checked = check_plan(plan)
-        seen = checked.observability
-        if seen.identifiable:
+        observability = checked.observability
+        if observability.identifiable:
             alone = predict_plan(plan, ThetaDatum(args.theta_datum))
-            seen, joint, checks = _judge(plan, model, assumed, sizes, (seen, alone))
-        if alone is not None and seen.identifiable:
+            observability, joint, checks = _judge(
+                plan, model, assumed, sizes, (observability, alone)
+            )
+        if alone is not None and observability.identifiable:
             terms = (*model, *plan_terms.assumed_terms(args.model, declared, plan))
             budget = plan_budget(
                 plan, terms, assumed, alone, asked=[term.name for term in declared]
             )
-    seen = worded_observability(seen)
+    observability = worded_observability(observability)
     if args.json:
-        found = _check_json(plan, (seen, checked.unknown_sites), alone, maps=args.map)
+        summary = _check_json(plan, (observability, checked.unknown_sites), alone, maps=args.map)
         unit = _averaged_m(plan, assumed) * UM_PER_M
         if alone is not None and args.sigma is not None:
-            found["predicted"] |= {
+            summary["predicted"] |= {
                 "rms_u_xy_um": alone.rms_xy * unit,
                 "max_u_xy_um": alone.max_xy * unit,
             }
         if alone is not None:
-            found["predicted"] |= {
+            summary["predicted"] |= {
                 "rms_gain_xy_with_terms": joint and joint.rms_xy,
                 "max_gain_xy_with_terms": joint and joint.max_xy,
             }
             if args.sigma is not None and joint is not None:
-                found["predicted"] |= {
+                summary["predicted"] |= {
                     "rms_u_xy_um_with_terms": joint.rms_xy * unit,
                     "max_u_xy_um_with_terms": joint.max_xy * unit,
                 }
-        found["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
-        print(json.dumps(found | {"terms": plan_terms.terms_json(checks)}, indent=1))
+        summary["budget"] = budget and plan_terms.budget_json(budget, plan, assumed)
+        print(json.dumps(summary | {"terms": plan_terms.terms_json(checks)}, indent=1))
     else:
-        lines = _check_text(plan, (seen, checked.unknown_sites), alone)
+        lines = _check_text(plan, (observability, checked.unknown_sites), alone)
         if alone is not None and args.sigma is not None:
             lines.append(_in_um("XY    ", alone, plan, assumed))
         if model and joint is not None:
@@ -176,9 +178,9 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             lines += [_in_um(what, joint, plan, assumed)] if args.sigma is not None else []
         lines += plan_budget_text(budget, plan) if budget else []
         lines += plan_terms.terms_text(plan, checks, assumed) if checks else []
-        lines += _map_text(alone) if args.map and alone and seen.identifiable else []
+        lines += _map_text(alone) if args.map and alone and observability.identifiable else []
         tell("\n".join(lines))
-    return int(ExitCode.DONE if seen.identifiable else ExitCode.NOT_IDENTIFIABLE)
+    return int(ExitCode.DONE if observability.identifiable else ExitCode.NOT_IDENTIFIABLE)
 
 
 def _repeated(plan: Plan, repeats: int | None) -> Plan:
@@ -210,27 +212,27 @@ def _judge(
                 "leave it out of --model and of model_terms, or add what it acts on (angular "
                 "lines, images of several marks)",
             )
-    seen = terms.told(without[0])
-    joint = terms.predicted(without[1]) if seen.identifiable else None
-    return seen, joint, check_terms(terms, sizes, CAUSE_LEVEL)
+    observability = terms.told(without[0])
+    joint = terms.predicted(without[1]) if observability.identifiable else None
+    return observability, joint, check_terms(terms, sizes, CAUSE_LEVEL)
 
 
 def _check_json(
-    plan: Plan, found: tuple[Observability, int], predicted: Prediction | None, *, maps: bool
+    plan: Plan, checked: tuple[Observability, int], predicted: Prediction | None, *, maps: bool
 ) -> dict[str, Any]:
-    seen, unknown = found
+    observability, unknown = checked
     out = {
         "plan_id": plan.plan_id,
-        "rank": seen.rank,
-        "unknowns": seen.unknowns,
-        "deficiency": seen.deficiency,
-        "identifiable": seen.identifiable,
-        "modes": [mode.text for mode in seen.modes],
-        "advice": [advice.text for advice in seen.advice],
+        "rank": observability.rank,
+        "unknowns": observability.unknowns,
+        "deficiency": observability.deficiency,
+        "identifiable": observability.identifiable,
+        "modes": [mode.text for mode in observability.modes],
+        "advice": [advice.text for advice in observability.advice],
         "predicted": None,
-        "unknown_sites": unknown if seen.identifiable else None,
-        "unchecked_sites": seen.unchecked_sites,
-        "unchecked_lines": seen.unchecked_lines,
+        "unknown_sites": unknown if observability.identifiable else None,
+        "unchecked_sites": observability.unchecked_sites,
+        "unchecked_lines": observability.unchecked_lines,
     }
     if predicted is not None:
         out["predicted"] = plain(
@@ -249,9 +251,9 @@ def _check_json(
 
 
 def _check_text(
-    plan: Plan, found: tuple[Observability, int], predicted: Prediction | None
+    plan: Plan, checked: tuple[Observability, int], predicted: Prediction | None
 ) -> list[str]:
-    artifact, (seen, unknown) = plan.artifact, found
+    artifact, (observability, unknown) = plan.artifact, checked
     marks = (
         f"{artifact.shape[0]} x {artifact.shape[1]}"
         if artifact.marks is None
@@ -262,19 +264,19 @@ def _check_text(
         f"{artifact.angular_count or 'no'} angular lines",
         *_nodes_text(plan),
         *_image_text(plan),
-        _rank_text(seen),
+        _rank_text(observability),
     ]
-    if predicted is None or not seen.identifiable:
+    if predicted is None or not observability.identifiable:
         lines += ["the plan does not identify the stage: it cannot determine"]
-        lines += [f"  - {mode.text}" for mode in seen.modes]
+        lines += [f"  - {mode.text}" for mode in observability.modes]
         return [
             *lines,
             "to determine all of it,",
-            *(f"  - {advice.text}" for advice in seen.advice),
+            *(f"  - {advice.text}" for advice in observability.advice),
         ]
     lines += [
         _known_text(plan, unknown),
-        *_unchecked_text(seen),
+        *_unchecked_text(observability),
         "predicted standard uncertainty, in units of the noise of one averaged reading:",
         f"  XY     rms {predicted.rms_xy:.4f}   largest {predicted.max_xy:.4f}",
     ]
@@ -289,15 +291,15 @@ def _check_text(
     ]
 
 
-def _rank_text(seen: Observability) -> str:
+def _rank_text(observability: Observability) -> str:
     """Return rank and unseen modes; the rank is that of the marks, without the lines."""
-    lines = seen.deficiency - (seen.unknowns - seen.rank)
+    lines = observability.deficiency - (observability.unknowns - observability.rank)
     modes = (
-        counted(seen.deficiency, "undetermined mode")
-        if seen.deficiency
+        counted(observability.deficiency, "undetermined mode")
+        if observability.deficiency
         else "no undetermined modes"
     )
-    return f"rank {seen.rank} of {seen.unknowns} unknowns, {modes}" + (
+    return f"rank {observability.rank} of {observability.unknowns} unknowns, {modes}" + (
         f", {lines} of them in the angular map" if lines else ""
     )
 
@@ -351,15 +353,15 @@ def _check_stops_text(plan: Plan) -> str:
     )
 
 
-def _unchecked_text(seen: Observability) -> list[str]:
-    counts = ((seen.unchecked_sites, "sites"), (seen.unchecked_lines, "lines"))
-    found = " and ".join(f"{count} {what}" for count, what in counts if count)
+def _unchecked_text(observability: Observability) -> list[str]:
+    counts = ((observability.unchecked_sites, "sites"), (observability.unchecked_lines, "lines"))
+    groups = " and ".join(f"{count} {what}" for count, what in counts if count)
     return (
         [
-            f"{found} depend on single readings that no other reading checks: another view would "
+            f"{groups} depend on single readings that no other reading checks: another view would "
             "check them"
         ]
-        if found
+        if groups
         else []
     )
 
@@ -393,10 +395,10 @@ def _in_um(what: str, predicted: Prediction, plan: Plan, assumed: Assumed) -> st
 
 
 def _map_text(predicted: Prediction) -> list[str]:
-    both = (predicted.ux**2 + predicted.uy**2) ** 0.5
+    u_xy = (predicted.ux**2 + predicted.uy**2) ** 0.5
     return [
         "sqrt(u_gx^2 + u_gy^2), one line for each y from the top, x to the right:",
-        *(" ".join(f"{value:5.2f}" for value in row) for row in both.T[::-1]),
+        *(" ".join(f"{value:5.2f}" for value in row) for row in u_xy.T[::-1]),
     ]
 
 
@@ -404,9 +406,9 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
 
     if args.top is not None and args.views is not None:
         raise InputError("--top", "with --views one plan is found, not a list", "omit it")
-    shown = SHOWN if args.top is None else args.top
-    if shown < 1:
-        raise InputError("--top", f"{shown} is not positive", "give 1 or more")
+    n_shown = SHOWN if args.top is None else args.top
+    if n_shown < 1:
+        raise InputError("--top", f"{n_shown} is not positive", "give 1 or more")
     check_outputs([args.plan], [args.output])
     plan = _in_order(plan, args.order)
     against = _against(args, plan)
@@ -440,7 +442,7 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
         _show_best(args, best, (score, unit), search_text(search))
     else:
         best = replace(plan, views=ranked[0].views)
-        _show_ranked(args, plan, (now, unit), ranked[:shown])
+        _show_ranked(args, plan, (now, unit), ranked[:n_shown])
     if args.output:
         write_yaml(args.output, plan_to_dict(best))
     return int(ExitCode.DONE)
@@ -459,9 +461,9 @@ def _in_order(plan: Plan, order: str) -> Plan:
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     """Return the terms included in the uncertainty: the plan's, --against's, default ones."""
-    found = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
-    found |= {name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()}
-    named = in_order(found.values())
+    term_of = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
+    term_of |= {name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()}
+    named = in_order(term_of.values())
     by_default = plan_terms.assumed_terms(args.against, named, plan)
     return Against(named, plan_terms.assumed_of(args), by_default) if named or by_default else None
 

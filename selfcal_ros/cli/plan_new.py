@@ -190,22 +190,26 @@ def run(args: argparse.Namespace) -> int:
     simulation = cell_path.with_name(f"{cell_path.stem}_simulation.yaml")
     if sys.stdin.isatty():  # before anything is asked
         _require_new([path, cell_path], force=args.force)
-    known = _answers(args)
-    artifact = _artifact(known)
-    _require_travel(known, artifact)
-    simulated = known.machine == "simulated"
+    answers = _answers(args)
+    artifact = _artifact(answers)
+    _require_travel(answers, artifact)
+    simulated = answers.machine == "simulated"
     outputs = [path, cell_path, *([simulation] if simulated else [])]
     _require_new(outputs, force=args.force)
     with late_progress("judging plans") as progress:
-        plan = _best(known, artifact, path.stem, lambda: progress(0, None))
-        found = _budget(plan), _next(plan)
+        plan = _best(answers, artifact, path.stem, lambda: progress(0, None))
+        prediction = _budget(plan), _next(plan)
     write_yaml(path, plan_to_dict(plan))
-    write_text(cell_path, _cell_text(known, simulation.name))
+    write_text(cell_path, _cell_text(answers, simulation.name))
     if simulated:
         folder = path.resolve().parent
         named = path.name if folder == simulation.resolve().parent else str(path.resolve())
-        write_yaml(simulation, _simulation(known, named))
-    say(args, "\n".join(_text(known, plan, found, outputs)), _json(known, plan, found, outputs))
+        write_yaml(simulation, _simulation(answers, named))
+    say(
+        args,
+        "\n".join(_text(answers, plan, prediction, outputs)),
+        _json(answers, plan, prediction, outputs),
+    )
     return int(ExitCode.DONE)
 
 
@@ -231,11 +235,11 @@ def _answers(args: argparse.Namespace) -> Known:
         )
     values: dict[str, Any] = {}
     for item in QUESTIONS:
-        given = getattr(args, item.name)
-        if given is None and asks:
+        answer = getattr(args, item.name)
+        if answer is None and asks:
             values[item.name] = _asked(item)
         else:
-            text = item.default if given is None else given
+            text = item.default if answer is None else answer
             values[item.name] = item.read(text, f"--{item.name}")
     return Known(**values)
 
@@ -255,24 +259,24 @@ def _asked(item: Question) -> Any:
             print(f"  {error}", file=sys.stderr)
 
 
-def _artifact(known: Known) -> Artifact:
-    nx, ny = known.marks
-    if known.lines and any(known.field):
+def _artifact(answers: Known) -> Artifact:
+    nx, ny = answers.marks
+    if answers.lines and any(answers.field):
         raise InputError(
             "--lines",
             "lines are not found in images, and a camera is given",
             "plan the lines apart, with --field none",
         )
-    return Artifact(nx, known.pitch, known.lines, 0 if nx == ny else ny)
+    return Artifact(nx, answers.pitch, answers.lines, 0 if nx == ny else ny)
 
 
-def _require_travel(known: Known, artifact: Artifact) -> None:
+def _require_travel(answers: Known, artifact: Artifact) -> None:
     """Refuse a plate that the stage cannot pass over."""
     aside = _check_offset_m(artifact)
-    for axis, travel, count in zip("xy", known.travel, artifact.shape, strict=True):
-        span = (count - 1) * known.pitch + 2 * aside
+    for axis, travel, count in zip("xy", answers.travel, artifact.shape, strict=True):
+        span = (count - 1) * answers.pitch + 2 * aside
         if span > travel:
-            fits = int((travel - 2 * aside) / known.pitch) + 1
+            fits = int((travel - 2 * aside) / answers.pitch) + 1
             mend = (
                 f"take {fits} marks, or marks that are closer"
                 if fits >= 3
@@ -290,44 +294,46 @@ def _check_offset_m(artifact: Artifact) -> float:
     return min(CHECK_OFFSET_M, MOST_CHECK_OFFSET * artifact.grid_pitch_m)
 
 
-def _image(known: Known) -> ImageCells | None:
+def _image(answers: Known) -> ImageCells | None:
     """Return the cells that the camera sees; None for a single mark."""
     counts = []
-    for side, marks in zip(known.field, known.marks, strict=True):
-        shown = min(int(side / known.pitch * (1 + 1e-9)), marks)  # 0.6 mm are 3 pitches of 0.2 mm
-        counts.append(max(1, shown - 1 + shown % 2))
+    for side, marks in zip(answers.field, answers.marks, strict=True):
+        n_seen = min(
+            int(side / answers.pitch * (1 + 1e-9)), marks
+        )  # 0.6 mm are 3 pitches of 0.2 mm
+        counts.append(max(1, n_seen - 1 + n_seen % 2))
     nx, ny = counts
-    return ImageCells(nx, ny, known.pitch) if nx * ny > 1 else None
+    return ImageCells(nx, ny, answers.pitch) if nx * ny > 1 else None
 
 
-def _best(known: Known, artifact: Artifact, name: str, tick: Callable[[], None]) -> Plan:
+def _best(answers: Known, artifact: Artifact, name: str, tick: Callable[[], None]) -> Plan:
     """Return the plan of the smallest uncertainty that the time allows."""
     like = View(
-        "", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact), image=_image(known)
+        "", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact), image=_image(answers)
     )
     fewest = _fewest_exposures(artifact, like)
     plans: list[Plan] = []
     for n_views in range(3, MOST_VIEWS + 1):
-        if plans and _minutes(known, n_views, n_views * fewest) > known.minutes:
+        if plans and _minutes(answers, n_views, n_views * fewest) > answers.minutes:
             break  # without the search that takes longest
         views = best_plan(
             artifact,
-            n_views + bool(known.lines),
-            angular=bool(known.lines),
+            n_views + bool(answers.lines),
+            angular=bool(answers.lines),
             like=like,
             against=_against(),
         )[0].views
         plans += list(_repeated(Plan(name, artifact, views)))
         tick()
-        if minutes_of(known, plans[-len(REPEATS)]) > known.minutes:
+        if minutes_of(answers, plans[-len(REPEATS)]) > answers.minutes:
             break
-    fitting = [plan for plan in plans if minutes_of(known, plan) <= known.minutes]
+    fitting = [plan for plan in plans if minutes_of(answers, plan) <= answers.minutes]
     if not fitting:
         raise InputError(
             "--minutes",
-            f"{known.minutes:g}, and the shortest plan takes "
-            f"{math.ceil(minutes_of(known, plans[0]))}: "
-            f"{_counted_visits(plans[0], known)}",
+            f"{answers.minutes:g}, and the shortest plan takes "
+            f"{math.ceil(minutes_of(answers, plans[0]))}: "
+            f"{_counted_visits(plans[0], answers)}",
             "give more minutes, fewer marks, or fewer seconds for a mark",
         )
     return min(fitting, key=_u_of_reading)
@@ -370,30 +376,30 @@ def _exposures(plan: Plan) -> int:
     )
 
 
-def minutes_of(known: Known, plan: Plan) -> float:
+def minutes_of(answers: Known, plan: Plan) -> float:
     """Return the minutes that a plan takes."""
-    return _minutes(known, len(plan.views), _exposures(plan))
+    return _minutes(answers, len(plan.views), _exposures(plan))
 
 
-def _minutes(known: Known, placings: int, exposures: int) -> float:
-    return placings * PLACING_MIN[known.placing] + exposures * known.seconds / 60
+def _minutes(answers: Known, placings: int, exposures: int) -> float:
+    return placings * PLACING_MIN[answers.placing] + exposures * answers.seconds / 60
 
 
-def _counted_visits(plan: Plan, known: Known) -> str:
+def _counted_visits(plan: Plan, answers: Known) -> str:
     return (
-        f"{len(plan.views)} placings of {PLACING_MIN[known.placing]:g} minutes, "
-        f"{_exposures(plan)} exposures of {known.seconds:g} s"
+        f"{len(plan.views)} placings of {PLACING_MIN[answers.placing]:g} minutes, "
+        f"{_exposures(plan)} exposures of {answers.seconds:g} s"
     )
 
 
 def _budget(plan: Plan) -> PlanBudget:
     """Return the predicted budget, as of `selfcal plan check`."""
-    seen = check_plan(plan).observability
-    if not seen.identifiable:  # only a search that misses its aim
+    observability = check_plan(plan).observability
+    if not observability.identifiable:  # only a search that misses its aim
         raise InputError(
             "--marks",
             "no plan of these marks identifies the stage",
-            "; ".join(each.text for each in worded_observability(seen).advice),
+            "; ".join(advice.text for advice in worded_observability(observability).advice),
         )
     return plan_budget(plan, default_terms(), Assumed(), predict_plan(plan, ThetaDatum.ZERO_MEAN))
 
@@ -405,70 +411,75 @@ def _next(plan: Plan) -> tuple[View, float]:
     return added.views[-1], added.score.rms_xy / now.rms_xy
 
 
-def _cell_text(known: Known, simulation: str) -> str:
+def _cell_text(answers: Known, simulation: str) -> str:
     """Return CELL.yaml, the places to be edited named in comments."""
-    own = (
+    machine_keys = (
         f"{{simulation: {simulation}}}"
-        if known.machine == "simulated"
-        else f"{OWN_KEYS[known.machine]}  # edit these"
+        if answers.machine == "simulated"
+        else f"{OWN_KEYS[answers.machine]}  # edit these"
     )
-    x, y = (f"[{-travel / 2:.6g}, {travel / 2:.6g}]" for travel in known.travel)
-    theta = ", theta: [-7.0, 7.0]" if known.lines else ""
+    x, y = (f"[{-travel / 2:.6g}, {travel / 2:.6g}]" for travel in answers.travel)
+    theta = ", theta: [-7.0, 7.0]" if answers.lines else ""
     lines = [
         "# From `selfcal plan new`.",
-        f"machine: {known.machine}",
-        f"{known.machine}: {own}",
+        f"machine: {answers.machine}",
+        f"{answers.machine}: {machine_keys}",
         f"limits: {{x: {x}, y: {y}{theta}}}  # m, as the stage indicates; never left",
         "origin: {x: 0.0, y: 0.0}  # what it indicates at the centre of the field, m",
         "sense: microscope_moves  # plate_moves where the stage carries the plate",
     ]
-    if any(known.field) or known.machine != "simulated":
-        size = _mark_size_m(known)
-        pixel = f", pixel_size: {size / PIXELS_A_MARK:.6g}" if known.machine == "simulated" else ""
+    if any(answers.field) or answers.machine != "simulated":
+        size = _mark_size_m(answers)
+        pixel = (
+            f", pixel_size: {size / PIXELS_A_MARK:.6g}" if answers.machine == "simulated" else ""
+        )
         lines.append(
             f"detector: {{mark: disc, mark_size: {size:.6g}{pixel}}}  # as the artwork; "
             "`selfcal cell try` finds pixel size, turn and mirror"
         )
-    placing = "robot  # the simulation" if known.machine == "simulated" else known.placing
+    placing = "robot  # the simulation" if answers.machine == "simulated" else answers.placing
     return "\n".join([*lines, "settle: {time: 0.0}  # s", f"placing: {placing}", ""])
 
 
-def _mark_size_m(known: Known) -> float:
-    return known.pitch / 5  # the default of `selfcal plate`
+def _mark_size_m(answers: Known) -> float:
+    return answers.pitch / 5  # the default of `selfcal plate`
 
 
-def _simulation(known: Known, plan: str) -> dict[str, Any]:
+def _simulation(answers: Known, plan: str) -> dict[str, Any]:
     """Return SIM.yaml of the simulated machine."""
     out: dict[str, Any] = {
         "plan": plan,
         "seed": 1,
         "truth": {
-            "t": min(3e-5, known.pitch / 20),  # error of the placing
+            "t": min(3e-5, answers.pitch / 20),  # error of the placing
             "correlation": 4,
         },  # pitches: a smooth stage, as stages are
         "noise": {"sigma_xy": 2e-8, "sigma_theta": 1e-6},
     }
-    if any(known.field):
-        pixel_m = _mark_size_m(known) / PIXELS_A_MARK
-        width, height = (round(side / pixel_m) for side in known.field)
+    if any(answers.field):
+        pixel_m = _mark_size_m(answers) / PIXELS_A_MARK
+        width, height = (round(side / pixel_m) for side in answers.field)
         out["camera"] = {
             "width": width,
             "height": height,
             "pixel_size": pixel_m,
-            "mark_size": _mark_size_m(known),
+            "mark_size": _mark_size_m(answers),
         }
     return out
 
 
 def _text(
-    known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]], outputs: list[Path]
+    answers: Known,
+    plan: Plan,
+    prediction: tuple[PlanBudget, tuple[View, float]],
+    outputs: list[Path],
 ) -> Iterator[str]:
-    (budget, (further, factor)), artifact = found, plan.artifact
+    (budget, (further, factor)), artifact = prediction, plan.artifact
     nx, ny = artifact.shape
-    span = " x ".join(f"{(count - 1) * known.pitch * MM_PER_M:g}" for count in artifact.shape)
-    travel = " x ".join(f"{side * MM_PER_M:g}" for side in known.travel)
+    span = " x ".join(f"{(count - 1) * answers.pitch * MM_PER_M:g}" for count in artifact.shape)
+    travel = " x ".join(f"{side * MM_PER_M:g}" for side in answers.travel)
     yield (
-        f"plan {plan.plan_id}: {nx} x {ny} marks, {known.lines or 'no'} angular lines; the map "
+        f"plan {plan.plan_id}: {nx} x {ny} marks, {answers.lines or 'no'} angular lines; the map "
         f"covers {span} of {travel} mm of travel"
     )
     for view in plan.views:
@@ -480,15 +491,17 @@ def _text(
         f"rms) for {noise.sigma_m * UM_PER_M:g} µm noise of one reading; `selfcal plan check` "
         "shows where U comes from"
     )
-    yield (f"it takes about {minutes_of(known, plan):.0f} minutes: {_counted_visits(plan, known)}")
-    longer = minutes_of(known, replace(plan, views=(further,)))
+    yield (
+        f"it takes about {minutes_of(answers, plan):.0f} minutes: {_counted_visits(plan, answers)}"
+    )
+    longer = minutes_of(answers, replace(plan, views=(further,)))
     yield (
         f"the further view that helps most: {describe_view(further, artifact)}; it makes U "
         f"{1 - factor:.0%} smaller and takes {longer:.0f} minutes more"
     )
     yield f"written: {', '.join(map(str, outputs))}"
-    tried = "" if known.machine == "simulated" else f"selfcal cell try {outputs[1]}; "
-    yes = " --yes" if known.machine == "simulated" else ""
+    tried = "" if answers.machine == "simulated" else f"selfcal cell try {outputs[1]}; "
+    yes = " --yes" if answers.machine == "simulated" else ""
     yield (
         f"next: selfcal plate {outputs[0]} -o plate.svg; {tried}"
         f"selfcal measure {outputs[0]} {outputs[1]} -o BAG{yes}"
@@ -496,17 +509,20 @@ def _text(
 
 
 def _json(
-    known: Known, plan: Plan, found: tuple[PlanBudget, tuple[View, float]], outputs: list[Path]
+    answers: Known,
+    plan: Plan,
+    prediction: tuple[PlanBudget, tuple[View, float]],
+    outputs: list[Path],
 ) -> dict[str, Any]:
-    budget, (further, _) = found
+    budget, (further, _) = prediction
     theta = budget.u_rms("theta")
     return {
         "plan_id": plan.plan_id,
         "written": list(map(str, outputs)),
         "views": [view_to_dict(view, plan.artifact) for view in plan.views],
-        "minutes": minutes_of(known, plan),
+        "minutes": minutes_of(answers, plan),
         "exposures": _exposures(plan),
         "U_xy": 2 * budget.u_rms("xy"),
-        "U_theta": 2 * theta if known.lines else None,
+        "U_theta": 2 * theta if answers.lines else None,
         "next_view": view_to_dict(further, plan.artifact),
     }

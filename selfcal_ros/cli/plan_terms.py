@@ -107,11 +107,11 @@ def length_m(text: str, option: str, most: float = math.inf) -> float:
 
 def _quantity(text: str, option: str, units: Mapping[str, float], what: str, most: float) -> float:
     """Return a positive number with one of the units, the first if none is given."""
-    found = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
+    match = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
     plain = next(iter(units))
-    unit = found[2].replace("µ", "u") or plain if found else ""
+    unit = match[2].replace("µ", "u") or plain if match else ""
     try:
-        value = float(found[1]) * units[unit] if found else math.nan
+        value = float(match[1]) * units[unit] if match else math.nan
     except (ValueError, KeyError):
         value = math.nan
     if not 0 < value < math.inf:
@@ -179,7 +179,7 @@ def declared_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
     """Return the terms of the plan, replaced by those of ``--model``; those of size 0 as well."""
     if _is_none(args.model):
         return ()
-    found = {
+    term_of = {
         term.name: term
         for terms in (
             parse_terms(plan.model_terms, "model_terms"),
@@ -187,16 +187,16 @@ def declared_of(args: argparse.Namespace, plan: Plan) -> tuple[ModelTerm, ...]:
         )
         for term in terms
     }
-    return in_order(found.values())
+    return in_order(term_of.values())
 
 
-def _is_none(given: list[str]) -> bool:
+def _is_none(texts: list[str]) -> bool:
     """Return whether an option says that there is no term, not even a default one."""
-    return NO_TERMS in given
+    return NO_TERMS in texts
 
 
-def _named(given: list[str]) -> list[str]:
-    return [text for text in given if text != NO_TERMS]
+def _named(texts: list[str]) -> list[str]:
+    return [text for text in texts if text != NO_TERMS]
 
 
 def assumed_terms(

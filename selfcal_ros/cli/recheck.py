@@ -63,7 +63,7 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
         return _awaited(args, plan)
     plate = known_plate(read_result(plan.artifact_from), plan.artifact_from)
     with busy("judging the plan"):
-        found = predict_recheck(plan, plate)
+        prediction = predict_recheck(plan, plate)
     if args.json:
         print(
             json.dumps(
@@ -72,12 +72,12 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
                         "plan_id": plan.plan_id,
                         "identifiable": True,
                         "artifact_from": plan.artifact_from,
-                        "unknown_sites": found.map.n_unknown,
+                        "unknown_sites": prediction.map.n_unknown,
                         "predicted": {
-                            "rms_gain_xy": found.map.rms_xy,
-                            "max_gain_xy": found.map.max_xy,
-                            "rms_gain_theta": found.map.rms_theta,
-                            "rms_gain_change": found.change,
+                            "rms_gain_xy": prediction.map.rms_xy,
+                            "max_gain_xy": prediction.map.max_xy,
+                            "rms_gain_theta": prediction.map.rms_theta,
+                            "rms_gain_change": prediction.change,
                         },
                     }
                 ),
@@ -93,16 +93,20 @@ def planned(args: argparse.Namespace, plan: "Plan") -> int:
                 f"{plan.artifact_from}",
                 *(
                     [
-                        f"{found.map.n_unknown} of {found.map.ux.size} nodes of the "
+                        f"{prediction.map.n_unknown} of {prediction.map.ux.size} nodes of the "
                         "map remain unknown"
                     ]
-                    if found.map.n_unknown
+                    if prediction.map.n_unknown
                     else []
                 ),
                 "predicted standard uncertainty, in units of the noise of one averaged reading:",
-                f"  XY     rms {found.map.rms_xy:.4f}   largest {found.map.max_xy:.4f}",
-                *([f"  theta  rms {found.map.rms_theta:.4f}"] if len(found.map.u_theta) else []),
-                f"  change of XY since the calibration: rms {found.change:.4f}",
+                f"  XY     rms {prediction.map.rms_xy:.4f}   largest {prediction.map.max_xy:.4f}",
+                *(
+                    [f"  theta  rms {prediction.map.rms_theta:.4f}"]
+                    if len(prediction.map.u_theta)
+                    else []
+                ),
+                f"  change of XY since the calibration: rms {prediction.change:.4f}",
                 *([ONE_PASS] if min(view.repeats for view in plan.views) == 1 else []),
             ]
         )

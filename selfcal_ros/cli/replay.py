@@ -121,14 +121,14 @@ def run(args: argparse.Namespace) -> int:
         domain(args.domain) as environment,
     ):
         saved = folder / "result.json"
-        code, unplayed = _play(args, saved, environment, detector, said=bag.faults)
+        code, unplayed = _play(args, saved, environment, detector, printed_faults=bag.faults)
         if saved.exists():
             data = with_bag(read_json(saved), bag, unplayed, source)
             if file_of(args):
                 write_json(args.output, data)
             if on_stdout(args):
                 put(data)
-        _refuse_fault(args, code, detector, folder, said=bag.faults)
+        _refuse_fault(args, code, detector, folder, printed_faults=bag.faults)
         if code or not saved.exists():  # perhaps a result without a map
             return code or 1
     result = result_from_dict(data, args.bag)
@@ -152,11 +152,11 @@ def _refuse_fault(
     detector: DetectorSettings | None,
     folder: Path,
     *,
-    said: Sequence[str],
+    printed_faults: Sequence[str],
 ) -> None:
     """Refuse a plan that is not identified because of a fault of the cell, as `solve` does.
 
-    A fault that is `said` is not repeated.
+    A fault that is in `printed_faults` is not repeated.
 
     Raises
     ------
@@ -174,7 +174,9 @@ def _refuse_fault(
             if fault not in session.lost:
                 raise InputError(
                     args.bag,
-                    "not identified, for the reason said first" if fault in said else fault,
+                    "not identified, for the reason said first"
+                    if fault in printed_faults
+                    else fault,
                     "correct this first",
                 )
 
@@ -183,14 +185,14 @@ def _detected(args: argparse.Namespace, settings: DetectorSettings, folder: Path
     """Return the bag of marks that `selfcal detect` finds in the images of a bag."""
     from selfcal_ros.vision.exposures import ImageDetector  # with scipy, for images only
 
-    detector, found = ImageDetector(settings, args.bag), folder / "detected"
+    detector, marks_bag = ImageDetector(settings, args.bag), folder / "detected"
     ImageBag(Path(args.bag), args.namespace).write_detected(
-        found,
+        marks_bag,
         detector.take,
         check=lambda: detector.refuse_nothing(args.bag),
         frame_id=settings.frame_id,
     )
-    return found
+    return marks_bag
 
 
 def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
@@ -249,12 +251,12 @@ def with_bag(
     source : dict
         File and SHA-256 of the bag.
     """
-    beside = [line for line in unplayed if line not in bag.faults]
-    known = [*bag.lost, *beside, *bag.clock]
-    of_nodes = [line for line in data["warnings"] if line not in known]
+    unplayed_only = [line for line in unplayed if line not in bag.faults]
+    bag_warnings = [*bag.lost, *unplayed_only, *bag.clock]
+    of_nodes = [line for line in data["warnings"] if line not in bag_warnings]
     refused = dict(sorted((data["rejected"] | bag.refused).items()))
     return with_digests(
-        data | {"warnings": [*of_nodes, *known], "rejected": refused, "input": source}
+        data | {"warnings": [*of_nodes, *bag_warnings], "rejected": refused, "input": source}
     )
 
 
@@ -264,18 +266,18 @@ def _play(
     environment: dict,
     detector: DetectorSettings | None,
     *,
-    said: Sequence[str],
+    printed_faults: Sequence[str],
 ) -> tuple[int, list[str]]:
     """Return the exit code of the session, and what it could not play, a line each.
 
-    Lines that are `said` are not printed again.
+    Lines that are in `printed_faults` are not printed again.
     """
-    rest = ["--ros-args", "--params-file", args.params] if args.params else []
+    parameter_arguments = ["--ros-args", "--params-file", args.params] if args.params else []
     quiet = ["--ros-args", "--log-level", "warn"]
     rate = 0.0 if args.fast else args.rate
     cell = "" if args.namespace is None else f"/{args.namespace.strip('/')}"
     with contextlib.ExitStack() as stack:
-        own = {"solver": ["--ros-args", "-p", f"result_folder:={saved.parent}"]}
+        node_arguments = {"solver": ["--ros-args", "-p", f"result_folder:={saved.parent}"]}
         if detector is not None:
             file = saved.with_name("mark_detector.yaml")
             write_yaml(file, {detector.NODE: {"ros__parameters": asdict(detector)}})
@@ -289,7 +291,9 @@ def _play(
         for node in NODES:
             stack.enter_context(
                 process(
-                    f"selfcal_ros.nodes.{node}", [*rest, *own.get(node, []), *quiet], environment
+                    f"selfcal_ros.nodes.{node}",
+                    [*parameter_arguments, *node_arguments.get(node, []), *quiet],
+                    environment,
                 )
             )
         session = stack.enter_context(
@@ -317,6 +321,6 @@ def _play(
                 bar(int(done), int(total))
             elif word == "lost":
                 lost.append(tail)
-                if tail not in said:
+                if tail not in printed_faults:
                     print(f"selfcal replay: {args.bag}: {tail}", file=sys.stderr)
         return session.wait(), lost

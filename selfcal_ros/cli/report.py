@@ -71,15 +71,15 @@ def run(args: argparse.Namespace) -> int:
     result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None
     details = read_details(args.details) if args.details else None
-    more = [table_chapter(result, load_cal(args.table))] if args.table else []
+    chapters = [table_chapter(result, load_cal(args.table))] if args.table else []
     if details:
-        more.append(certificate_chapter(result, details))
+        chapters.append(certificate_chapter(result, details))
     with busy("drawing"):
         if args.plot:
             from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
             save_picture(map_picture(result, truth), args.plot)
-        write_report(result, output, truth=truth, more=more, about=_about(args, details))
+        write_report(result, output, truth=truth, more=chapters, about=_about(args, details))
     written = [str(name) for name in (output, args.plot) if name]
     text = (
         [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))]

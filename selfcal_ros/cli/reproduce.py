@@ -73,10 +73,10 @@ def _make(folder: Path) -> None:
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    found = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
+    reproduction = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
 
     def figures() -> list[Drawing]:
-        return hu_figures(found)
+        return hu_figures(reproduction)
 
     tables = [
         {
@@ -89,58 +89,60 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
             "joint_std": run.joint.std.tolist(),
             "bound": run.bound,
         }
-        for run in found.runs
+        for run in reproduction.runs
     ]
     return (
-        hu_text(found),
+        hu_text(reproduction),
         figures,
         {
-            "noise_free_um": found.noise_free_um,
-            "noise_free_deg": found.noise_free_deg,
+            "noise_free_um": reproduction.noise_free_um,
+            "noise_free_deg": reproduction.noise_free_deg,
             "tables": tables,
         },
     )
 
 
 def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    found = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
+    reproduction = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
 
     def figures() -> list[Drawing]:
-        return qiao_figures(found)
+        return qiao_figures(reproduction)
 
     programs = [
         {"views": program.views, "rms_um": program.rms_um, "deficiency": program.deficiency}
-        for program in found.programs
+        for program in reproduction.programs
     ]
     return (
-        qiao_text(found),
+        qiao_text(reproduction),
         figures,
         {
             "sizes": SIZES,
-            "ranks": found.ranks.tolist(),
-            "unknowns": found.unknowns.tolist(),
+            "ranks": reproduction.ranks.tolist(),
+            "unknowns": reproduction.unknowns.tolist(),
             "programs": programs,
-            "rms_um": found.rms_um.tolist(),
-            "rms_uniform_um": found.rms_uniform_um.tolist(),
-            "bound_um": found.bound_um,
+            "rms_um": reproduction.rms_um.tolist(),
+            "rms_uniform_um": reproduction.rms_uniform_um.tolist(),
+            "bound_um": reproduction.bound_um,
         },
     )
 
 
 def _ibaraki(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    found = reproduce_ibaraki(args.draws, args.seed, progress=progress)
+    reproduction = reproduce_ibaraki(args.draws, args.seed, progress=progress)
 
     def figures() -> list[Drawing]:
         return []
 
     return (
-        ibaraki_text(found),
+        ibaraki_text(reproduction),
         figures,
         {
-            "table_1_mm": {case: values.tolist() for case, values in found.table_1_mm.items()},
+            "table_1_mm": {
+                case: values.tolist() for case, values in reproduction.table_1_mm.items()
+            },
             "published_um": CASE_STUDY_UM,
-            "new_um": found.new_um.tolist(),
-            "conventional_um": found.conventional_um.tolist(),
+            "new_um": reproduction.new_um.tolist(),
+            "conventional_um": reproduction.conventional_um.tolist(),
         },
     )
 

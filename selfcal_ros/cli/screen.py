@@ -38,19 +38,19 @@ def fitted(rows: list[Text], most: int) -> list[Text]:
     """Return at most `most` rows; the last one states how many were omitted."""
     if len(rows) <= most:
         return rows
-    left = len(rows) - max(most - 1, 0)
-    more = Text(f"... {left} more row{'s' * (left > 1)}", style="dim")
-    return [*rows[: max(most - 1, 0)], more][:most]
+    n_omitted = len(rows) - max(most - 1, 0)
+    omission = Text(f"... {n_omitted} more row{'s' * (n_omitted > 1)}", style="dim")
+    return [*rows[: max(most - 1, 0)], omission][:most]
 
 
 def last_fitted(texts: Sequence[Text], width: int, most: int) -> list[Text]:
     """Return the last texts that fit into `most` rows; the beginning of one that does not."""
     rows: list[Text] = []
     for text in reversed(texts):
-        more = wrapped([text], width)
-        if len(rows) + len(more) > most:
-            return rows or fitted(more, most)
-        rows = more + rows
+        lines = wrapped([text], width)
+        if len(rows) + len(lines) > most:
+            return rows or fitted(lines, most)
+        rows = lines + rows
     return rows
 
 
@@ -103,17 +103,17 @@ def screen(
         return Group(*fitted(wrapped([*_task(picture), small], width), max(height - 1, 0)), keys)
     now = headed("now", fitted(wrapped(_task(picture), width), height // 4), width)
     nodes = headed("nodes", fitted(wrapped(_health(picture), width), height // 8), width)
-    said = headed(
+    log_rows = headed(
         "log", last_fitted([_said(line) for line in log] or [Text("-")], width, height // 8), width
     )
-    rows = height - len(now) - len(nodes) - len(said) - 1
+    rows = height - len(now) - len(nodes) - len(log_rows) - 1
     left = (width - BETWEEN) // 2
     halves = (_measured(picture, left, rows), _found(picture, width - BETWEEN - left, rows))
-    beside = [
+    side_by_side = [
         _beside(width, *(half[row] if row < len(half) else Text() for half in halves))
         for row in range(rows)
     ]
-    return Group(*now, *beside, *nodes, *said, keys)
+    return Group(*now, *side_by_side, *nodes, *log_rows, keys)
 
 
 def _beside(width: int, left: Text, right: Text) -> Text:
@@ -127,14 +127,14 @@ def _beside(width: int, left: Text, right: Text) -> Text:
 
 def what_now(picture: dict[str, Any]) -> str:
     """Return in one sentence what the operator has to do."""
-    told = picture["health"].get("pose_sequencer")
-    if told is None:
+    health = picture["health"].get("pose_sequencer")
+    if health is None:
         return "pose_sequencer is not running: start it, or wait for it."
     command = picture["command"] or {}
-    state = _state(told["values"], command)
-    if told["message"].startswith("waiting for ") and state in ("IDLE", "DONE", "ABORTED"):
-        return f"Nothing: {printable(told['message'])}."
-    look = f"Look: {printable(told['message'])}." if told["level"] else ""
+    state = _state(health["values"], command)
+    if health["message"].startswith("waiting for ") and state in ("IDLE", "DONE", "ABORTED"):
+        return f"Nothing: {printable(health['message'])}."
+    look = f"Look: {printable(health['message'])}." if health["level"] else ""
     if state == "PLACING":
         x, y = command.get("translation_mm") or (None, None)
         turn = command.get("rotation_deg")
@@ -143,7 +143,7 @@ def what_now(picture: dict[str, Any]) -> str:
             if None in (x, y, turn)
             else (f" turned by {turn:g} deg{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm")
         )
-        name = command.get("view_name") or told["values"].get("view_name", "")
+        name = command.get("view_name") or health["values"].get("view_name", "")
         return f"Place the plate for view '{printable(name)}'{pose}; then press c. {look}".rstrip()
     if state == "MEASURING":
         return look or "Nothing: the view is being measured."
@@ -152,7 +152,7 @@ def what_now(picture: dict[str, Any]) -> str:
         "DONE": "Done. s starts another run.",
         "ABORTED": "Aborted. s starts a new run.",
         "FOLLOWING": "Nothing: another sequencer is in command; a ends that.",
-    }.get(state, printable(told["message"]))
+    }.get(state, printable(health["message"]))
 
 
 def _sense_of(turn_deg: Any) -> str:
@@ -167,8 +167,8 @@ def _sense_of(turn_deg: Any) -> str:
 
 def saved_as(picture: dict[str, Any]) -> str:
     """Return the file that the solver has written the map to, empty if none."""
-    told = picture["health"].get("solver")
-    return str(told["values"].get("saved", "")) if told else ""
+    health = picture["health"].get("solver")
+    return str(health["values"].get("saved", "")) if health else ""
 
 
 def _state(values: dict[str, str], command: dict[str, Any]) -> str:
@@ -183,13 +183,13 @@ def _state(values: dict[str, str], command: dict[str, Any]) -> str:
 
 def _task(picture: dict[str, Any]) -> list[Text]:
     """Return view, run and current task."""
-    command, told = picture["command"], picture["health"].get("pose_sequencer")
-    values = told["values"] if told else {}
+    command, health = picture["command"], picture["health"].get("pose_sequencer")
+    values = health["values"] if health else {}
     views = _whole(values.get("views")) or (command or {}).get("views_planned", 0)
     name, index = (command or {}).get("view_name", ""), (command or {}).get("view_index", 0)
-    of = "no view yet"
+    heading = "no view yet"
     if command and views:
-        of = (
+        heading = (
             f"view {index + 1} of {views}: {printable(name)}"
             if command["phase"] in ("PLACE", "MEASURE")
             else f"{min(index, views)} of {views} views done"
@@ -197,7 +197,7 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     run = printable(values.get("run_id") or (command or {}).get("run_id") or "-")
     plan = printable(values.get("plan_id") or (command or {}).get("plan_id") or "-")
     return [
-        Text.assemble((of, "bold"), (f"   plan {plan}, run {run}", "dim")),
+        Text.assemble((heading, "bold"), (f"   plan {plan}, run {run}", "dim")),
         Text(what_now(picture), style="bold cyan"),
         *(
             [Text(f"The map is saved as {printable(saved_as(picture))}")]
@@ -261,8 +261,8 @@ def _coverage(view: dict[str, Any], width: int) -> list[Text]:
         texts.append(Text(f"repeatability {', '.join(noise)}"))
     if view["missing_lines"]:
         missing = view["missing_lines"]
-        rest = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
-        texts.append(Text(f"missing lines {', '.join(map(str, missing[:10]))}{rest}"))
+        omission = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
+        texts.append(Text(f"missing lines {', '.join(map(str, missing[:10]))}{omission}"))
     return texts
 
 
@@ -284,15 +284,19 @@ def _worst_mark(cells: list[str]) -> str:
 
 def _found(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
     """Return verdict and map."""
-    told = picture["map"]
-    um = told["um"] if told else []
+    solved_map = picture["map"]
+    um = solved_map["um"] if solved_map else []
     room = min(len(um), max(4, rows // 2 - 1))
     verdict = headed(
         "map and verdict", fitted(wrapped(_verdict(picture), width), rows - 2 - room), width
     )
     return [
         *verdict,
-        *(_map(um, width, rows - len(verdict), told) if um else [Text("no map yet", style="dim")]),
+        *(
+            _map(um, width, rows - len(verdict), solved_map)
+            if um
+            else [Text("no map yet", style="dim")]
+        ),
     ]
 
 
@@ -333,10 +337,12 @@ def _verdict(picture: dict[str, Any]) -> list[Text]:
     ]
 
 
-def _map(um: list[list[float | None]], width: int, rows: int, told: dict[str, Any]) -> list[Text]:
+def _map(
+    um: list[list[float | None]], width: int, rows: int, solved_map: dict[str, Any]
+) -> list[Text]:
     """Return the size of the error at each site as a picture."""
     cells, step = coarser(um, width, max(rows - 1, 1), _worst_error)
-    step *= told.get("step", 1)
+    step *= solved_map.get("step", 1)
     most = max((value for row in cells for value in row if value is not None), default=0.0)
     signs = [
         ["?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))] for value in row]
@@ -347,34 +353,34 @@ def _map(um: list[list[float | None]], width: int, rows: int, told: dict[str, An
 
 
 def _worst_error(cells: list[float | None]) -> float | None:
-    known = [value for value in cells if value is not None]
-    return max(known) if len(known) == len(cells) else None
+    errors = [value for value in cells if value is not None]
+    return max(errors) if len(errors) == len(cells) else None
 
 
 def _health(picture: dict[str, Any]) -> list[Text]:
     """Return the nodes with a problem, one per line, and those that are well."""
     well, texts = [], []
-    for node, told in picture["health"].items():
-        if told is not None and not told["level"]:
+    for node, health in picture["health"].items():
+        if health is not None and not health["level"]:
             well.append(node)
             continue
         word, colour = (
-            ("no sign of life", "red") if told is None else LEVELS.get(told["level"], LEVELS[2])
+            ("no sign of life", "red") if health is None else LEVELS.get(health["level"], LEVELS[2])
         )
-        message = "" if told is None else f" {printable(told['message'])}"
+        message = "" if health is None else f" {printable(health['message'])}"
         texts.append(Text.assemble((f"{node}: ", "bold"), (word, colour), message))
     return [*texts, *([Text.assemble(("ok: ", "green"), ", ".join(well))] if well else [])]
 
 
 def _said(line: str) -> Text:
     """Return a line of the log, without the time for lines of nodes."""
-    told = PREFIX.match(line)
-    if told is None:
+    match = PREFIX.match(line)
+    if match is None:
         return Text(printable(line))
-    level = "" if told[1] == "INFO" else f"{told[1]} "
+    level = "" if match[1] == "INFO" else f"{match[1]} "
     return Text(
-        printable(f"{level}{told[2]}: {line[told.end() :]}"),
-        style={"WARN": "yellow", "ERROR": "red", "FATAL": "red"}.get(told[1], ""),
+        printable(f"{level}{match[2]}: {line[match.end() :]}"),
+        style={"WARN": "yellow", "ERROR": "red", "FATAL": "red"}.get(match[1], ""),
     )
 
 

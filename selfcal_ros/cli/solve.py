@@ -200,11 +200,11 @@ def _reference(text: str | None) -> dict[str, Any]:
     """Return the solver parameters in KIND:ERROR:U."""
     if text is None:
         return {}
-    kind, _, rest = text.partition(":")
+    kind, _, sizes = text.partition(":")
     if kind == "marks":
-        return {"reference_kind": kind, "reference_marks": rest}
+        return {"reference_kind": kind, "reference_marks": sizes}
     try:
-        error, u = rest.split(":")
+        error, u = sizes.split(":")
         return {
             "reference_kind": kind,
             "reference_error": number_of(error),
@@ -237,8 +237,12 @@ def run(args: argparse.Namespace) -> int:
             args.bag, collector, namespace=args.namespace, progress=lambda count: bar(count, None)
         )
     used = sum(view.used for view in measurements.views)
-    said = [*findings, *lost, *(() if findings else rejections(measurements.all_rejected(), used))]
-    for line in dict.fromkeys(said):  # a clock step is a finding, and noted in the result
+    warnings = [
+        *findings,
+        *lost,
+        *(() if findings else rejections(measurements.all_rejected(), used)),
+    ]
+    for line in dict.fromkeys(warnings):  # a clock step is a finding, and noted in the result
         print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
     measurements = _with_map(args, measurements)
     options = solver_options(solver, measurements, plate_from=getattr(args, "plate_from", ""))
@@ -322,26 +326,26 @@ def _validated(
     result = with_places(result, measurements.views)
     if args.validate:
         used = clean(measurements, options).measurements if options.robust else measurements
-        found = validate(used, options)
-        result = judged_by(result, found)
+        validation = validate(used, options)
+        result = judged_by(result, validation)
         result = replace(
-            result, extra={**result.extra, "validation": validation_json(found, result.plate)}
+            result, extra={**result.extra, "validation": validation_json(validation, result.plate)}
         )
         lines += [
             "",
             "held-out readings:",
-            *(f"  {line}" for line in validation_text(found, result.plate)),
+            *(f"  {line}" for line in validation_text(validation, result.plate)),
         ]
     return result, lines
 
 
 def _since(result: Any) -> list[str]:
     """Return the text of the change since the calibration of a known plate."""
-    found = result.recheck
+    recheck = result.recheck
     return (
         []
-        if found is None
-        else ["", f"change since {found.of}:", *(f"  {line}" for line in recheck_lines(found))]
+        if recheck is None
+        else ["", f"change since {recheck.of}:", *(f"  {line}" for line in recheck_lines(recheck))]
     )
 
 

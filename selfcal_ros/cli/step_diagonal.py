@@ -127,19 +127,19 @@ def run(args: argparse.Namespace) -> int:
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
     with busy("identifying"):
-        found = identify(data, choice)
+        identified = identify(data, choice)
     if readings_are_equal(data):
         warnings = [*warnings, EQUAL_READINGS]
-    result = outcome(found, data, line=ReferenceLine(args.line), warnings=warnings)
+    result = outcome(identified, data, line=ReferenceLine(args.line), warnings=warnings)
     result["input"] = source
     for warning in result["warnings"]:
         print(f"selfcal step-diagonal: warning: {warning}", file=sys.stderr)
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
-        save_picture(profiles_figure(found, data), args.plot)
+        save_picture(profiles_figure(identified, data), args.plot)
     if args.cal:
-        _write_cal(args, found)
+        _write_cal(args, identified)
     if args.output:
         write_json(args.output, result)
     if args.output and not args.json:
@@ -152,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
 def _check_outputs(args: argparse.Namespace) -> None:
     """Refuse outputs that would not be written."""
     measured = not args.simulate
-    for option, path, there, remedy in (
+    for option, path, installed, remedy in (
         ("--truth", args.truth, args.simulate, "it belongs to --simulate"),
         ("--plot", args.plot, measured, "omit it with --simulate"),
         ("--cal", args.cal, measured, "it belongs to a measurement"),
@@ -163,7 +163,7 @@ def _check_outputs(args: argparse.Namespace) -> None:
             "it belongs to a bag",
         ),
     ):
-        if path and not there:
+        if path and not installed:
             raise InputError(option, "nothing would be written", remedy)
     check_outputs(
         [args.data, args.simulate], [args.output, args.plot, args.cal, args.truth, args.save_csv]
@@ -184,27 +184,27 @@ def _refuse_machine(args: argparse.Namespace) -> None:
     )
 
 
-def _write_cal(args: argparse.Namespace, found: "StepDiagonalResult") -> None:
+def _write_cal(args: argparse.Namespace, identified: "StepDiagonalResult") -> None:
     """Write the corrections as 1D tables."""
     frame = frame_of(args)
     comments = [
         f"written by selfcal {__version__} from the step-diagonal measurement {args.data}",
-        f"{found.method} formulation; correction = -(actual - commanded)",
+        f"{identified.method} formulation; correction = -(actual - commanded)",
         "positions count from the start of the first block; the x axis is the reference",
         frame.comment(),
     ]
-    text = cal_text(correction_tables(found, frame), comments=comments, decimals=DECIMALS)
+    text = cal_text(correction_tables(identified, frame), comments=comments, decimals=DECIMALS)
     backup = write_cal(args.cal, text, force=args.force)
     if backup:
         print(f"selfcal step-diagonal: the old {args.cal} is {backup}", file=sys.stderr)
 
 
-def correction_tables(found: "StepDiagonalResult", frame: "MachineFrame") -> list["Table1D"]:
+def correction_tables(identified: "StepDiagonalResult", frame: "MachineFrame") -> list["Table1D"]:
     """Return the 1D tables of all corrections, in the controller's coordinates.
 
     The machine's home is counted from the start of the first block.
     """
-    lines = axis_corrections(found)
+    lines = axis_corrections(identified)
     return [
         line_table(AxisCorrection(*lines[pair]), frame, along=pair[0], corrected=pair[1])
         for pair in sorted(lines)

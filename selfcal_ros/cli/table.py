@@ -90,11 +90,15 @@ def _cell(value: float) -> str:
 def npz_bytes(result: "CalibrationResult") -> bytes:
     """Return the maps as arrays by the names of RESULT.json, [i, j] = site i - Nx//2, j - Ny//2."""
     emap, plate = result.error_map, result.artifact
-    out, found = io.BytesIO(), result.plate.marks
+    out, plate_marks = io.BytesIO(), result.plate.marks
     marks = (
         {}
-        if found is None
-        else {"mark_id": found.id_array, "mark_x": found.places_m[0], "mark_y": found.places_m[1]}
+        if plate_marks is None
+        else {
+            "mark_id": plate_marks.id_array,
+            "mark_x": plate_marks.places_m[0],
+            "mark_y": plate_marks.places_m[1],
+        }
     )
     np.savez(
         out,

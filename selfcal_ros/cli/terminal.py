@@ -42,9 +42,9 @@ def add_parameters(
     options : mapping
         Name of the option without dashes -> name of the parameter.
     """
-    known = {parameter.name: parameter for parameter in kind.parameters()}
+    parameter_of = {parameter.name: parameter for parameter in kind.parameters()}
     for option, name in options.items():
-        parameter = known[name]
+        parameter = parameter_of[name]
         default = parameter.default
         suffix = f" (default: {default})" if default else ""
         how: dict[str, Any] = (
@@ -129,8 +129,8 @@ def exit_code(result: CalibrationResult) -> int:
 
     The reason is printed in one line on stderr in any case.
     """
-    said = say_unless_qualified(result, "selfcal")
-    return int(ExitCode.NOT_QUALIFIED if said else ExitCode.DONE)
+    unqualified = say_unless_qualified(result, "selfcal")
+    return int(ExitCode.NOT_QUALIFIED if unqualified else ExitCode.DONE)
 
 
 def say_unless_qualified(result: CalibrationResult, who: str) -> bool:

@@ -102,9 +102,9 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
     # separate: an interrupted simulated run must never continue with real readings
     folder = "journals_simulated" if args.simulate else "journals"
     journal = args.journal or str(state_folder(args.results) / folder)
-    of = "_simulated" if args.simulate else ""
+    name_suffix = "_simulated" if args.simulate else ""
     # first, so that a parameter file can override it
-    saved = Path(args.results, f"{Path(args.plan).stem}{of}_{{run_id}}.json")
+    saved = Path(args.results, f"{Path(args.plan).stem}{name_suffix}_{{run_id}}.json")
     nodes = {
         "measurement_collector": with_parameters(journal=str(Path(journal).absolute())),
         "solver": [

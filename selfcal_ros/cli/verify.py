@@ -48,21 +48,24 @@ def run(args: argparse.Namespace) -> int:
     require_correctable(before, args.map)
     after = _after(args, before)
     with busy("comparing"):
-        after, found = with_verification(before, after, names=(args.map, args.bag))
-    told = after.extra[VERIFICATION]
+        after, verification = with_verification(before, after, names=(args.map, args.bag))
+    verdict = after.extra[VERIFICATION]
     if args.plot:
         from selfcal_ros.reporting.figures.maps import verification_picture  # loads matplotlib
         from selfcal_ros.reporting.figures.paper import save_picture  # likewise
 
-        save_picture(verification_picture(before, after, found, told["sentence"]), args.plot)
+        save_picture(
+            verification_picture(before, after, verification, verdict["sentence"]), args.plot
+        )
     say(
         args,
-        verification_text(found),
-        told | plain({"gx": found.gx, "gy": found.gy, "g_theta": found.g_theta}),
+        verification_text(verification),
+        verdict
+        | plain({"gx": verification.gx, "gy": verification.gy, "g_theta": verification.g_theta}),
     )
-    if not is_believed(after, found):
+    if not is_believed(after, verification):
         say_unless_qualified(after, f"selfcal verify: {args.bag}")
-    return int(ExitCode.DONE if told["passed"] else ExitCode.NOT_QUALIFIED)
+    return int(ExitCode.DONE if verdict["passed"] else ExitCode.NOT_QUALIFIED)
 
 
 def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationResult:
