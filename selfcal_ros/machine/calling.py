@@ -21,7 +21,7 @@ def called(
     function: Callable[..., Any],
     *values: Any,
     remedy: str = "check cables, power and the driver",
-    **more: Any,
+    **keywords: Any,
 ) -> Any:
     """Return what a function returns.
 
@@ -41,7 +41,7 @@ def called(
         libraries that led to it; also for the end of the program, unless a signal asks for that.
     """
     try:
-        return function(*values, **more)
+        return function(*values, **keywords)
     except (SelfcalError, ModuleNotFoundError, Ended):
         raise
     except (Exception, SystemExit) as error:

@@ -172,15 +172,25 @@ def read_cell(path: str | Path) -> Cell:
             f"name a machine: {', '.join(known_machines())}, or package.module:Class",
         )
     machine = data["machine"]
-    own = machine.rpartition(":")[2]
+    machine_key = machine.rpartition(":")[2]
     if ":" not in machine and machine not in SHIPPED and machine not in known_machines():
         raise InputError(
             f"{where}: machine",
             f"there is no machine '{machine}'",
             f"{known_are(machine, sorted(known_machines()))}; or package.module:Class",
         )
-    known = ("machine", own, "limits", "origin", "sense", "settle", "detector", "placing", "found")
-    _only(data, known, where)
+    known_keys = (
+        "machine",
+        machine_key,
+        "limits",
+        "origin",
+        "sense",
+        "settle",
+        "detector",
+        "placing",
+        "found",
+    )
+    _only(data, known_keys, where)
     limits = {}
     for axis, pair in _mapping(data.get("limits", {}), f"{where}: limits").items():
         limits[axis] = _pair(pair, f"{where}: limits: {axis}")
@@ -198,11 +208,13 @@ def read_cell(path: str | Path) -> Cell:
                 f"give {axis}: [low, high] in m, as the machine indicates them",
             )
     sense = Parameter("sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense)))
-    found = _mapping(data.get("placing") if isinstance(data.get("placing"), dict) else {}, where)
-    _only(found, ("command",), f"{where}: placing")
+    placing_keys = _mapping(
+        data.get("placing") if isinstance(data.get("placing"), dict) else {}, where
+    )
+    _only(placing_keys, ("command",), f"{where}: placing")
     placing = (
         "robot"
-        if found
+        if placing_keys
         else Parameter("placing", "person", "", choices=PLACERS).check(
             data.get("placing", "person"), where
         )
@@ -210,7 +222,7 @@ def read_cell(path: str | Path) -> Cell:
     return Cell(
         path,
         machine,
-        _mapping(data.get(own, {}), f"{where}: {own}"),
+        _mapping(data.get(machine_key, {}), f"{where}: {machine_key}"),
         limits,
         origin=_numbers(data.get("origin", {}), f"{where}: origin", dict.fromkeys(AXES, 0.0)),
         sense=Sense(sense.check(data.get("sense", sense.default), where)),
@@ -224,7 +236,7 @@ def read_cell(path: str | Path) -> Cell:
         ),
         detector=_detector(data["detector"], where) if "detector" in data else None,
         placing=placing,
-        place_command=str(found.get("command", "")),
+        place_command=str(placing_keys.get("command", "")),
     )
 
 
@@ -274,8 +286,8 @@ def _pair(value: Any, where: str) -> tuple[float, float]:
 
 def known_machines() -> dict[str, str]:
     """Return name -> ``package.module:Class`` of all machines that have a name."""
-    others = importlib.metadata.entry_points(group=ENTRY_POINTS)
-    return {point.name: point.value for point in others} | SHIPPED
+    plugins = importlib.metadata.entry_points(group=ENTRY_POINTS)
+    return {point.name: point.value for point in plugins} | SHIPPED
 
 
 def open_machine(cell: Cell) -> Machine:
@@ -340,7 +352,7 @@ def class_of(cell: Cell) -> Any:
     if folder not in sys.path:
         sys.path.append(folder)
     try:
-        found = importlib.import_module(module)
+        loaded = importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not module.startswith(error.name):
             raise InputError(
@@ -361,14 +373,14 @@ def class_of(cell: Cell) -> Any:
             f"the module '{module}' fails: {type(error).__name__}: {first_line(error)}",
             "correct it",
         ) from error
-    if not hasattr(found, name):
-        path = getattr(found, "__file__", None) or "built into Python"
+    if not hasattr(loaded, name):
+        path = getattr(loaded, "__file__", None) or "built into Python"
         raise InputError(
             where,
             f"the module '{module}' ({path}) has no '{name}'",
-            known_are(name, [key for key in vars(found) if not key.startswith("_")]),
+            known_are(name, [key for key in vars(loaded) if not key.startswith("_")]),
         )
-    return getattr(found, name)
+    return getattr(loaded, name)
 
 
 def check_keys(kind: Any, cell: Cell) -> None:

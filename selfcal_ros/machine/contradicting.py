@@ -35,11 +35,13 @@ def contradiction(visits: GridVisits) -> Contradiction | None:
     if len(mark) < mark.max(initial=0) + 1 + LEAST_VISITS:
         return None
     order = np.argsort(visits.stamp_ns)
-    moved = _about_means(np.stack([visits.dx, visits.dy]), mark)
-    found = max(
-        _reversal(visits, moved, mark), _jump(order, moved, mark), _running(visits, moved, mark)
+    deviations_m = _about_means(np.stack([visits.dx, visits.dy]), mark)
+    likeliest = max(
+        _reversal(visits, deviations_m, mark),
+        _jump(order, deviations_m, mark),
+        _running(visits, deviations_m, mark),
     )
-    return found if found.explained > EXPLAINED else None
+    return likeliest if likeliest.explained > EXPLAINED else None
 
 
 def _about_means(values: np.ndarray, mark: np.ndarray) -> np.ndarray:
@@ -48,18 +50,18 @@ def _about_means(values: np.ndarray, mark: np.ndarray) -> np.ndarray:
     return values - (sums / np.bincount(mark))[:, mark].reshape(values.shape)
 
 
-def _fitted(cause: np.ndarray, moved: np.ndarray) -> tuple[np.ndarray, float]:
+def _fitted(cause: np.ndarray, deviations_m: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the slopes (2,) of x and y on a cause (2, V), and the part that they explain."""
     weight = (cause**2).sum(axis=1)
-    product = (cause * moved).sum(axis=1)
+    product = (cause * deviations_m).sum(axis=1)
     slope = np.divide(product, weight, out=np.zeros(2), where=weight > 0)
-    total = (moved**2).sum()
+    total = (deviations_m**2).sum()
     return slope, float((slope * product).sum() / total) if total else 0.0
 
 
-def _reversal(visits: GridVisits, moved: np.ndarray, mark: np.ndarray) -> Contradiction:
+def _reversal(visits: GridVisits, deviations_m: np.ndarray, mark: np.ndarray) -> Contradiction:
     signs = np.stack([visits.approach_x, visits.approach_y]).astype(float)
-    slope, explained = _fitted(_about_means(signs, mark), moved)
+    slope, explained = _fitted(_about_means(signs, mark), deviations_m)
     x, y = np.abs(2 * slope) * UM_PER_M
     return Contradiction(
         explained,
@@ -69,13 +71,13 @@ def _reversal(visits: GridVisits, moved: np.ndarray, mark: np.ndarray) -> Contra
     )
 
 
-def _jump(order: np.ndarray, moved: np.ndarray, mark: np.ndarray) -> Contradiction:
+def _jump(order: np.ndarray, deviations_m: np.ndarray, mark: np.ndarray) -> Contradiction:
     """Return the best single jump between two visits."""
     best = Contradiction(0.0, "", "")
     later = np.ones(len(order))
     for number, row in enumerate(order[:-1]):
         later[row] = 0.0
-        slope, explained = _fitted(np.tile(_about_means(later, mark), (2, 1)), moved)
+        slope, explained = _fitted(np.tile(_about_means(later, mark), (2, 1)), deviations_m)
         if explained > best.explained:
             x, y = slope * UM_PER_M
             best = Contradiction(
@@ -88,10 +90,10 @@ def _jump(order: np.ndarray, moved: np.ndarray, mark: np.ndarray) -> Contradicti
     return best
 
 
-def _running(visits: GridVisits, moved: np.ndarray, mark: np.ndarray) -> Contradiction:
+def _running(visits: GridVisits, deviations_m: np.ndarray, mark: np.ndarray) -> Contradiction:
     time_ns = visits.stamp_ns - visits.stamp_ns.min()
     time = time_ns / max(int(time_ns.max()), 1)
-    slope, explained = _fitted(np.tile(_about_means(time, mark), (2, 1)), moved)
+    slope, explained = _fitted(np.tile(_about_means(time, mark), (2, 1)), deviations_m)
     x, y = slope * UM_PER_M
     return Contradiction(
         explained,

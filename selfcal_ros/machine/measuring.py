@@ -290,9 +290,9 @@ class Run:
 
     def _why(self, progress: ViewProgress) -> tuple[str, str]:
         """Return why marks of a view are not read, to be appended to a sentence, and a remedy."""
-        found = self._contradiction(progress)
-        if found:
-            return f": {found.what}", found.remedy
+        cause = self._contradiction(progress)
+        if cause:
+            return f": {cause.what}", cause.remedy
         findings = self.collector.findings(*self.collector.collect())
         finding = findings.get(progress.view_index) or findings.get(None)
         if finding:
@@ -335,11 +335,11 @@ class Run:
             return
         if not resumed:
             self._visit(None)
-        left, rounds = math.inf, 0
+        needed_before, rounds = math.inf, 0
         progress = self._progress()
         while not progress.complete:
-            rounds = rounds + 1 if progress.needed >= left else 0
-            left = progress.needed
+            rounds = rounds + 1 if progress.needed >= needed_before else 0
+            needed_before = progress.needed
             if rounds >= REVISITS:
                 why, remedy = self._why(progress)
                 raise NoDataError(
@@ -357,9 +357,9 @@ class Run:
             )
             progress = self._progress()
         self.desk.show(progress)
-        found = self._contradiction(progress)
-        if found:
-            self.desk.say(f"note: view '{view.name}': {found.what}; {found.remedy}")
+        cause = self._contradiction(progress)
+        if cause:
+            self.desk.say(f"note: view '{view.name}': {cause.what}; {cause.remedy}")
         measurements, _ = self.collector.collect()
         check_wiring(measurements)
         if self._is_misplaced(measurements, view.name):
@@ -375,10 +375,10 @@ class Run:
         PlacingError
             If a robot placed it.
         """
-        found = misplaced(measurements)
-        if not isinstance(found, Misplaced) or found.view != view:
+        misplacement = misplaced(measurements)
+        if not isinstance(misplacement, Misplaced) or misplacement.view != view:
             return False
-        error = said(found)
+        error = said(misplacement)
         if self.cell.placing == "robot":
             raise error
         self.desk.say(f"{error}; the view is measured anew")
@@ -408,18 +408,22 @@ class Run:
             mark: (readings.dx[row], readings.dy[row])
             for mark, row in zip(marks, some, strict=True)
         }
-        again = Collector(collector_settings(self.cell))
+        collector = Collector(collector_settings(self.cell))
         command = self.collector.newest_command
         assert command is not None
-        again.add_command(replace(command, view=replace(view, repeats=1)))
+        collector.add_command(replace(command, view=replace(view, repeats=1)))
         for event in self.visitor.view(self.plan.artifact, view, Again(marks)):
-            _feed(again, event)
-        found = again.collect()[1][progress.view_index].readings
+            _feed(collector, event)
+        revisited = collector.collect()[1][progress.view_index].readings
         shift = np.array(
             [
                 [x - before[m, n][0], y - before[m, n][1]]
                 for m, n, x, y in zip(
-                    found.m.tolist(), found.n.tolist(), found.dx, found.dy, strict=True
+                    revisited.m.tolist(),
+                    revisited.n.tolist(),
+                    revisited.dx,
+                    revisited.dy,
+                    strict=True,
                 )
                 if (m, n) in before
             ]
@@ -480,17 +484,17 @@ def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:
         for word in shlex.split(cell.place_command)
     ]
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             words, cwd=cell.path.parent, check=False, capture_output=True, text=True
         )
     except OSError as error:
         raise MachineError(
             f"{words[0]} cannot be run ({error.strerror})", f"{cell.path}: placing"
         ) from error
-    if done.returncode:
-        last = (done.stderr.strip().splitlines() or [""])[-1]
+    if process.returncode:
+        last = (process.stderr.strip().splitlines() or [""])[-1]
         raise MachineError(
-            f"{words[0]} ended with {done.returncode}: {last}",
+            f"{words[0]} ended with {process.returncode}: {last}",
             f"{cell.path}: placing",
             "the plate is not placed; --resume continues",
         )
@@ -502,10 +506,14 @@ def _named(progress: ViewProgress) -> str:
     names = [*marks, *(f"line {k}" for k in missing.k)]
     if not names:
         return "check stops"
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return ", ".join(names[:NAMED]) + more
+    omission = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(names[:NAMED]) + omission
 
 
 def _rejected(progress: ViewProgress) -> str:
-    found = sorted(progress.readings.rejected.items(), key=lambda item: -item[1])[:3]
-    return f" (rejected: {', '.join(f'{name} {count}' for name, count in found)})" if found else ""
+    commonest = sorted(progress.readings.rejected.items(), key=lambda item: -item[1])[:3]
+    return (
+        f" (rejected: {', '.join(f'{name} {count}' for name, count in commonest)})"
+        if commonest
+        else ""
+    )

@@ -102,10 +102,10 @@ class MicroManagerMachine:
     def _expose_for(self, exposure_s: float) -> None:
         """Set the exposure; a core clips it without a word."""
         self._call("exposure", self._core.setExposure, exposure_s * MS_PER_S)
-        told = self._core.getExposure() / MS_PER_S
-        if not math.isclose(told, exposure_s, rel_tol=1e-3):
+        set_s = self._core.getExposure() / MS_PER_S
+        if not math.isclose(set_s, exposure_s, rel_tol=1e-3):
             raise MachineError(
-                f"the exposure is {told:g} s instead of {exposure_s:g} s",
+                f"the exposure is {set_s:g} s instead of {exposure_s:g} s",
                 f"{self._where}: exposure",
                 "give one that the camera has",
             )
@@ -137,8 +137,8 @@ class MicroManagerMachine:
                 "begin anew: the position has another sign",
             )
         x, y = position
-        here = self.position()
-        longest_s = ALLOWANCE * math.hypot(x - here[0], y - here[1]) / self._speed + PATIENCE_S
+        start = self.position()
+        longest_s = ALLOWANCE * math.hypot(x - start[0], y - start[1]) / self._speed + PATIENCE_S
         self._call("the time-out", self._core.setTimeoutMs, round(longest_s * MS_PER_S))
         self._call("the move", self._core.setXYPosition, self._stage, x * UM_PER_M, y * UM_PER_M)
         try:

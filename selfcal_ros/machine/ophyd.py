@@ -102,8 +102,8 @@ class OphydMachine:
             return None
         status = _called("trigger", self._detector.trigger)
         _called("trigger", status.wait, timeout=self._timeout_s)
-        found = reduce(getattr, self._image.split("."), self._detector)
-        pixels = np.asarray(_called("image", found.get) if hasattr(found, "get") else found)
+        signal = reduce(getattr, self._image.split("."), self._detector)
+        pixels = np.asarray(_called("image", signal.get) if hasattr(signal, "get") else signal)
         return Image(grey(pixels))
 
     def offsets(self) -> list[Offset]:
@@ -124,13 +124,13 @@ def _object(name: str, timeout_s: float) -> Any:
     """Return an object named ``module:object``, connected."""
     module, _, path = name.partition(":")
     try:
-        found = reduce(getattr, path.split("."), importlib.import_module(module))
+        device = reduce(getattr, path.split("."), importlib.import_module(module))
     except (ImportError, AttributeError, ValueError) as error:
         raise MachineError(
             f"'{name}' cannot be had ({first_line(error)})",
             "ophyd",
             "name module:object; the module may lie beside CELL.yaml",
         ) from error
-    if hasattr(found, "wait_for_connection"):
-        _called(name, found.wait_for_connection, timeout=timeout_s)
-    return found
+    if hasattr(device, "wait_for_connection"):
+        _called(name, device.wait_for_connection, timeout=timeout_s)
+    return device

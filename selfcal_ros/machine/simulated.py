@@ -98,8 +98,8 @@ class SimulatedMachine:
             self._places, self._sites = physics.mark_places(self.truth, index, pose, (m, n))
         self._lines = physics.line_directions(self.truth, index, view)
         self._cells = [sub.cell_m for sub in view.sub_views]
-        shown = view.on_stage(artifact).n_in_field(artifact) if view.grid else 0
-        self._n_expected = max(1, shown * view.repeats + 4 * view.check_marks)
+        n_in_field = view.on_stage(artifact).n_in_field(artifact) if view.grid else 0
+        self._n_expected = max(1, n_in_field * view.repeats + 4 * view.check_marks)
         self._n_exposed = 0
         self._n_placed += 1
         self._rng = np.random.default_rng(
@@ -118,27 +118,29 @@ class SimulatedMachine:
 
         To the same target again the stage only scatters: another exposure of a visit.
         """
-        given, target = self._settings, np.array(position)
+        settings, target = self._settings, np.array(position)
         if self._clock is not None:
-            self._free_ns = self._clock.now_ns() + given.period_ns
-            self._clock.sleep((1 - DWELL) * given.exposure_period_s)
+            self._free_ns = self._clock.now_ns() + settings.period_ns
+            self._clock.sleep((1 - DWELL) * settings.exposure_period_s)
         stays = np.abs(target - self.position()) <= SAME
         before = stop = self._position - self._servo
         if not (stays | (np.abs(target - self._commanded) <= SAME)).all():
-            error = self._scattered(given.stop_sigma_m, given.stop_sigma_theta_rad)
+            error = self._scattered(settings.stop_sigma_m, settings.stop_sigma_theta_rad)
             stop = np.where(stays, before, self._followed(target) + error)
             self._commanded = np.where(stays, self._commanded, target)
             self._sign = physics.motion_sign((stop - before)[:2])
             self._approach = np.where(self._sign, self._sign, self._approach)
-            self._visit_noise = normal(self._rng, given.visit_xy_m, 2)
+            self._visit_noise = normal(self._rng, settings.visit_xy_m, 2)
             self._rested = 0
         self._servo = np.where(
-            stays, self._servo, self._scattered(given.servo_sigma_m, given.servo_sigma_theta_rad)
+            stays,
+            self._servo,
+            self._scattered(settings.servo_sigma_m, settings.servo_sigma_theta_rad),
         )
         self._encoder = np.where(
             stays,
             self._encoder,
-            self._scattered(given.encoder_sigma_m, given.encoder_sigma_theta_rad),
+            self._scattered(settings.encoder_sigma_m, settings.encoder_sigma_theta_rad),
         )
         self._position = stop + self._servo
 
@@ -179,38 +181,40 @@ class SimulatedMachine:
 
         One mark, or one in each cell of a view of images.
         """
-        given, found = self._settings, []
-        declared = given.declare_sigma
+        settings, seen_offsets = self._settings, []
+        declared = settings.declare_sigma
         offsets = self._seen()
         for cell in self._cells if offsets.size and self._camera is None else []:
             away = np.hypot(offsets[0] - cell.real, offsets[1] - cell.imag)
             nearest = int(np.argmin(away))
-            x, y = quantised(offsets[:, nearest], given.resolution_xy_m).tolist()
-            mark = tuple(self._marks[:, nearest].tolist()) if given.with_ids else None
+            x, y = quantised(offsets[:, nearest], settings.resolution_xy_m).tolist()
+            mark = tuple(self._marks[:, nearest].tolist()) if settings.with_ids else None
             if away[nearest] < self.truth.artifact.grid_pitch_m / 2:
-                found.append(
-                    Offset(x, y, mark=mark, score=0.95, sigma=given.sigma_xy_m if declared else 0.0)
+                seen_offsets.append(
+                    Offset(
+                        x, y, mark=mark, score=0.95, sigma=settings.sigma_xy_m if declared else 0.0
+                    )
                 )
         direction, _, line = self._lines
         if len(direction):
-            away = physics.line_offset(self.truth, given.sense, direction, self._position[2:])
+            away = physics.line_offset(self.truth, settings.sense, direction, self._position[2:])
             away = np.remainder(away + np.pi, 2 * np.pi) - np.pi
             nearest = int(np.argmin(np.abs(away)))
-            told = (
+            indicated_rad = (
                 self.truth.line_factor * away[nearest]
-                + given.sigma_theta_rad * self._rng.normal()
-                + given.flicker_theta_rad * self._flicker[2, self._at()]
+                + settings.sigma_theta_rad * self._rng.normal()
+                + settings.flicker_theta_rad * self._flicker[2, self._at()]
             )
-            theta = float(quantised(told, given.resolution_theta_rad))
-            found.append(
+            theta = float(quantised(indicated_rad, settings.resolution_theta_rad))
+            seen_offsets.append(
                 Offset(
                     theta=theta,
                     score=0.95,
-                    line=int(line[nearest]) if given.with_ids else None,
-                    sigma=given.sigma_theta_rad if declared else 0.0,
+                    line=int(line[nearest]) if settings.with_ids else None,
+                    sigma=settings.sigma_theta_rad if declared else 0.0,
                 )
             )
-        return found
+        return seen_offsets
 
     def _at(self) -> int:
         """Return the number of the exposure within the view."""
@@ -227,7 +231,7 @@ class SimulatedMachine:
         """
         if self._clock is not None:
             self._clock.sleep(max(0, self._free_ns - self._clock.now_ns()) / NS_PER_S)
-        truth, given, tau = self.truth, self._settings, self._tau()
+        truth, settings, tau = self.truth, self._settings, self._tau()
         position = self._position[:2, None]
         stage = physics.true_position(
             truth,
@@ -236,25 +240,25 @@ class SimulatedMachine:
             tau=tau,
             approach=self._approach[:, None],
             sign=self._sign[:, None],
-            rested_s=np.array([self._rested * given.exposure_period_s]),
+            rested_s=np.array([self._rested * settings.exposure_period_s]),
         )
         place = self._places + physics.drift(truth, self._index, tau)
         count = place.shape[1]
         offsets = physics.offset_seen(
             truth,
-            given.sense,
+            settings.sense,
             np.repeat(position, count, axis=1),
             np.repeat(stage, count, axis=1),
             place,
         )
         shared = (
             self._visit_noise
-            + given.flicker_xy_m * self._flicker[:2, self._at()]
-            + normal(self._rng, given.image_xy_m, 2)
+            + settings.flicker_xy_m * self._flicker[:2, self._at()]
+            + normal(self._rng, settings.image_xy_m, 2)
         )
         self._n_exposed += 1
         self._rested += 1
-        return offsets + white_noise(self._rng, given, count) + shared[:, None]
+        return offsets + white_noise(self._rng, settings, count) + shared[:, None]
 
     def stop(self) -> None:
         """Do nothing: a move has ended when `move_to` returns."""

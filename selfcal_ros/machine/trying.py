@@ -199,14 +199,14 @@ class Trial:
 
     def _marks(self) -> np.ndarray:
         """Return offsets of the marks seen now, (k, 2): px with a camera, else m."""
-        found = self._visitor.marks()
-        if not found:
+        detections = self._visitor.marks()
+        if not detections:
             raise NoDataError(
                 "machine",
                 "no mark is seen after a small move",
                 "begin with a mark near the middle of the image",
             )
-        return np.array([(item.offset_x, item.offset_y) for item in found])
+        return np.array([(item.offset_x, item.offset_y) for item in detections])
 
     def _camera(self) -> CameraPose:
         """Return the camera from places around the present one."""
@@ -248,24 +248,24 @@ class Trial:
     def _reversal(self, axis: str) -> FoundValue:
         """Return how much an approach in + direction differs from one in - direction, m."""
         number = ("x", "y").index(axis)
-        told = np.zeros((2, APPROACHES))
+        places_m = np.zeros((2, APPROACHES))
         for repeat in range(APPROACHES):
             for side, sign in enumerate((-1, 1)):  # from below, from above
                 away = [0.0, 0.0]
                 away[number] = sign * self.step_m
                 self._go(*away)
-                told[side, repeat] = self._true(axis, self._go(0.0, 0.0))
+                places_m[side, repeat] = self._true(axis, self._go(0.0, 0.0))
         # a mark seems to lie where the stage indicates too much
-        difference = told[0].mean() - told[1].mean()
+        difference = places_m[0].mean() - places_m[1].mean()
         sign = -1 if self.cell.sense is Sense.PLATE_MOVES else 1
-        u = math.sqrt(told.var(axis=1, ddof=1).sum() / APPROACHES)
+        u = math.sqrt(places_m.var(axis=1, ddof=1).sum() / APPROACHES)
         return FoundValue(float(sign * difference), float(u))
 
     def _settling(self) -> tuple[float, float]:
         """Return the time from which a mark stands still after a move, s, and its noise, m."""
         self._go(-self.step_m, -self.step_m)
-        at = self._go(0.0, 0.0)
-        ended_ns = at.stamp_ns
+        arrival = self._go(0.0, 0.0)
+        ended_ns = arrival.stamp_ns
         places, times = [], []
         for _ in range(SETTLING):
             places.append(self._per_pixel(_nearest(self._marks())))
@@ -324,11 +324,11 @@ def _notes(camera: CameraPose | None, reversal: dict[str, FoundValue]) -> Iterat
             f"the axes of the stage are unequal or not square by {camera.sheared:.2g}, or the "
             "pixels are not square"
         )
-    for axis, found in reversal.items():
-        if abs(found.value) > max(SIGMAS * found.u, LARGE_REVERSAL_M):
+    for axis, backlash in reversal.items():
+        if abs(backlash.value) > max(SIGMAS * backlash.u, LARGE_REVERSAL_M):
             yield (
-                f"{axis} has a backlash of {found.value * UM_PER_M:.3g} um (u "
-                f"{found.u * UM_PER_M:.2g} um): approach marks from one side, or let the model "
+                f"{axis} has a backlash of {backlash.value * UM_PER_M:.3g} um (u "
+                f"{backlash.u * UM_PER_M:.2g} um): approach marks from one side, or let the model "
                 "have the term approach; the map holds for one side only"
             )
 

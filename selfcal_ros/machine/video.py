@@ -52,16 +52,16 @@ class VideoCamera:
                 self._where,
                 "check number, cable and permissions (group video)",
             )
-        for name, value, given in (
+        for name, value, dimension in (
             (cv2.CAP_PROP_FRAME_WIDTH, width, "width"),
             (cv2.CAP_PROP_FRAME_HEIGHT, height, "height"),
         ):
             if value:
                 self._capture.set(name, value)
-                told = round(self._capture.get(name))
-                if told != value:
+                actual = round(self._capture.get(name))
+                if actual != value:
                     raise MachineError(
-                        f"its {given} is {told} instead of {value} pixels",
+                        f"its {dimension} is {actual} instead of {value} pixels",
                         self._where,
                         "give a size that it has",
                     )

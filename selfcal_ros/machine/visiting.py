@@ -124,19 +124,19 @@ def stops(
         if not again.checks:
             view = replace(view, check_marks=0, check_offset_m=0.0)
     visits = visit_sequence(artifact, view, consecutive=consecutive, rng=rng)
-    at = stage_targets(artifact, view, visits, sense) + visits.aside_m
+    targets_m = stage_targets(artifact, view, visits, sense) + visits.aside_m
     aside = visits.aside_m.any(axis=0)
-    found = []
+    stops_in_order = []
     for number, (m, n) in enumerate(zip(visits.m.tolist(), visits.n.tolist(), strict=True)):
         if again is None or aside[number] or (m, n) in again.marks:
-            x, y = at[:, number].tolist()
-            found.append(Stop({"x": x, "y": y}, Kind.GRID, int(visits.count[number])))
+            x, y = targets_m[:, number].tolist()
+            stops_in_order.append(Stop({"x": x, "y": y}, Kind.GRID, int(visits.count[number])))
     if view.angular:
         lines, theta = line_targets(artifact, view, sense, consecutive=consecutive)
         for k, angle in zip(lines.tolist(), theta.tolist(), strict=True):
             if again is None or k in again.lines:
-                found.append(Stop({"theta": angle}, Kind.ANGULAR))
-    return found
+                stops_in_order.append(Stop({"theta": angle}, Kind.ANGULAR))
+    return stops_in_order
 
 
 @dataclass
@@ -214,10 +214,10 @@ class Visitor:
     @property
     def silence(self) -> MachineError | None:
         """What has not been answered for too long; only in the main thread is it given up."""
-        asked = self._asked
-        if asked is None or (self.clock.now_ns() - asked[1]) / NS_PER_S <= self._longest_s:
+        pending = self._asked
+        if pending is None or (self.clock.now_ns() - pending[1]) / NS_PER_S <= self._longest_s:
             return None
-        return self._silent(asked[0])
+        return self._silent(pending[0])
 
     @contextmanager
     def stopping(self) -> Iterator[None]:
@@ -260,7 +260,9 @@ class Visitor:
                 "it returns no image any more", "machine.image", "check the camera and its cable"
             )
         offsets = self._ask("offsets")
-        if not isinstance(offsets, list) or not all(isinstance(each, Offset) for each in offsets):
+        if not isinstance(offsets, list) or not all(
+            isinstance(offset, Offset) for offset in offsets
+        ):
             raise MachineError(
                 f"it returns {offsets!r:.50}",
                 "machine.offsets",
@@ -315,11 +317,11 @@ class Visitor:
         empty = 0
         for number, stop in enumerate(route):
             for _ in range(stop.exposures):
-                found = 0
+                n_detected = 0
                 for event in self._visit(stop, only_nearest=view.image is None):
-                    found += not isinstance(event, EncoderSample)
+                    n_detected += not isinstance(event, EncoderSample)
                     yield event
-                empty = 0 if found else empty + 1
+                empty = 0 if n_detected else empty + 1
             if again is None and empty >= min(EMPTY_STOPS, len(route)):
                 raise self._sees_nothing(view, empty, at_first=empty > number)
 
@@ -362,15 +364,15 @@ class Visitor:
             If it is not a position.
         """
         before = self.clock.now_ns()
-        told = self._ask("position")
+        indicated = self._ask("position")
         stamp = max((before + self.clock.now_ns()) // 2, self._told_ns + 1)
         try:
-            values = tuple(map(float, told))
+            values = tuple(map(float, indicated))
         except (TypeError, ValueError):
             values = ()
         if len(values) != len(self.axes) or not all(map(math.isfinite, values)):
             raise MachineError(
-                f"its position is {told!r:.100}",
+                f"its position is {indicated!r:.100}",
                 "machine.position",
                 f"return {', '.join(self.axes)} in m and rad",
             )
@@ -412,11 +414,11 @@ class Visitor:
         self._ask("move_to", tuple(self.cell.to_machine(axis, goal[axis]) for axis in self.axes))
         if self.cell.settle.time:
             self.clock.sleep(self.cell.settle.time)
-        at = self._rest(start, goal, target)
+        arrival = self._rest(start, goal, target)
         if last is None or left.stamp_ns - last.stamp_ns > self.step_ns:
             self._untold.append(left)  # what was read at rest meanwhile may have been told
-        self._untold += self._track(left, at)
-        return at
+        self._untold += self._track(left, arrival)
+        return arrival
 
     def _left(self) -> EncoderSample:
         """Return where the stage rests; raise if it is not where it was left."""
@@ -425,19 +427,19 @@ class Visitor:
             self._check_left_alone(_difference(self._last, now))
         return now
 
-    def _check_left_alone(self, moved: Position) -> None:
+    def _check_left_alone(self, motion: Position) -> None:
         """Raise if the position at rest has changed by more than the tolerance of arrival."""
-        axis = self._farthest(moved)
-        if abs(moved[axis]) > self.cell.settle.of(axis, "arrival"):
+        axis = self._farthest(motion)
+        if abs(motion[axis]) > self.cell.settle.of(axis, "arrival"):
             raise MachineError(
-                f"{axis} has changed by {_shown(axis, moved[axis])} at rest, without a command",
+                f"{axis} has changed by {_shown(axis, motion[axis])} at rest, without a command",
                 "machine.position",
                 "see whether it was moved by hand, was reset, or has lost its zero; home it",
             )
 
-    def _rests(self, moved: Position) -> bool:
+    def _rests(self, motion: Position) -> bool:
         """Return whether two readings agree."""
-        return all(abs(moved[axis]) <= self.cell.settle.of(axis, "within") for axis in self.axes)
+        return all(abs(motion[axis]) <= self.cell.settle.of(axis, "within") for axis in self.axes)
 
     def _farthest(self, away: Position) -> str:
         """Return the axis that is farthest off, in units of its tolerance of arrival."""
@@ -448,11 +450,11 @@ class Visitor:
     def _within_limits(self, theta: float) -> float:
         """Return an angle or the same some turns off, within the limits if one is."""
         low, high = self.cell.limits.get("theta", (-math.inf, math.inf))
-        at = self.cell.to_machine("theta", theta)
+        angle = self.cell.to_machine("theta", theta)
         turns = (
-            math.ceil((low - at) / math.tau)
-            if at < low
-            else (math.floor((high - at) / math.tau) if at > high else 0)
+            math.ceil((low - angle) / math.tau)
+            if angle < low
+            else (math.floor((high - angle) / math.tau) if angle > high else 0)
         )
         return theta + turns * math.tau
 
@@ -464,13 +466,13 @@ class Visitor:
         while True:
             self.clock.sleep(self.step_ns / 2 / NS_PER_S)
             now = self.sample()
-            moved = _difference(before, now)
+            motion = _difference(before, now)
             away = {
                 axis: value - goal[axis]
                 for axis, value in zip(self.axes, now.positions, strict=True)
             }
             self._check_limits(start, goal, now)
-            rests = self._rests(moved)
+            rests = self._rests(motion)
             arrived = all(abs(away[axis]) <= settle.of(axis, "arrival") for axis in commanded)
             if rests and arrived:
                 self._last = now
@@ -498,23 +500,23 @@ class Visitor:
         """Raise if an axis leaves its limits, beyond where it was and where it is to go."""
         for axis, value in zip(self.axes, now.positions, strict=True):
             low, high = self.cell.limits.get(axis, (-math.inf, math.inf))
-            at, *ends = (
+            indicated, *ends = (
                 self.cell.to_machine(axis, place) for place in (value, start[axis], goal[axis])
             )
             near = self.cell.settle.of(axis, "arrival")
-            if not min(low, *ends) - near <= at <= max(high, *ends) + near:
+            if not min(low, *ends) - near <= indicated <= max(high, *ends) + near:
                 raise self._astray(start, goal, {axis: value - goal[axis]}, "beyond its limits")
 
     def _not_at_rest(self, before: EncoderSample, now: EncoderSample) -> MachineError:
         self._check_axes(before, now)
-        moved = _difference(before, now)
+        motion = _difference(before, now)
         axis = max(
             self.axes,
-            key=lambda name: abs(moved[name]) / max(self.cell.settle.of(name, "within"), TINY),
+            key=lambda name: abs(motion[name]) / max(self.cell.settle.of(name, "within"), TINY),
         )
         return MachineError(
             f"{axis} does not come to rest in {self.cell.settle.patience:g} s: two readings differ "
-            f"by {_shown(axis, moved[axis])}",
+            f"by {_shown(axis, motion[axis])}",
             "machine",
             "tune the axis, or raise settle: within or patience in CELL.yaml",
         )
@@ -536,15 +538,15 @@ class Visitor:
             if goal[axis] != start[axis] and (abs(value) > self.cell.settle.of(axis, "arrival"))
         }
         axis = self._farthest(moving or away)
-        other = {"x": "y", "y": "x"}.get(axis, "")
-        at, step = goal[axis] + away[axis], goal[axis] - start[axis]
+        cross_axis = {"x": "y", "y": "x"}.get(axis, "")
+        indicated, step = goal[axis] + away[axis], goal[axis] - start[axis]
         reason = (
-            _reason(axis, step, at - start[axis], away.get(other, 0.0))
+            _reason(axis, step, indicated - start[axis], away.get(cross_axis, 0.0))
             if (abs(step) > self.cell.settle.of(axis, "within"))
             else ""
         )
         return MachineError(
-            f"{axis} was sent to {goal[axis]:.6g} and indicates {at:.6g} {when}, "
+            f"{axis} was sent to {goal[axis]:.6g} and indicates {indicated:.6g} {when}, "
             f"{_shown(axis, away[axis])} away"
             f"{reason and ': '}{reason}",
             "machine",
@@ -666,11 +668,11 @@ class Visitor:
             at_home = self.cell.to_machine(axis, home[axis])
             inward = length if at_home < (low + high) / 2 else -length
             sees = marks and axis != "theta"
-            seen = self.marks() if sees else []
-            at = self.go({axis: home[axis] + inward})
+            marks_before = self.marks() if sees else []
+            arrival = self.go({axis: home[axis] + inward})
             if sees:
-                moved = dict(zip(self.axes, at.positions, strict=True))[axis] - home[axis]
-                self._check_marks(axis, moved, seen, self.marks(), self.marks())
+                step_done = dict(zip(self.axes, arrival.positions, strict=True))[axis] - home[axis]
+                self._check_marks(axis, step_done, marks_before, self.marks(), self.marks())
             if low <= at_home <= high:
                 self.go({axis: home[axis]})
 
@@ -696,11 +698,11 @@ class Visitor:
         sign = 1 if self.cell.sense is Sense.PLATE_MOVES else -1
         expected = sign * step
         changes = [_change(first, later, axis, expected) for later in (second, third)]
-        (along, across), (again, _) = changes
+        (along, across), (along_again, _) = changes
         follows = math.hypot(along - expected, across) <= FOLLOWS * abs(step)
         if follows:
             return
-        if abs(along) <= FOLLOWS * abs(step) and abs(again - expected) <= FOLLOWS * abs(step):
+        if abs(along) <= FOLLOWS * abs(step) and abs(along_again - expected) <= FOLLOWS * abs(step):
             reason, remedy = (
                 "the image is late by one frame",
                 ("let the camera expose when it is asked (software trigger), or drop a frame"),
@@ -711,10 +713,10 @@ class Visitor:
                 ("check that the camera returns new images, and that the stage really moves"),
             )
         else:
-            other = "y" if axis == "x" else "x"
+            cross_axis = "y" if axis == "x" else "x"
             reason = _reason(axis, expected, along, across) or (
                 f"the marks moved by {_shown(axis, along)} along {axis} and "
-                f"{_shown(other, across)} along {other}"
+                f"{_shown(cross_axis, across)} along {cross_axis}"
             )
             remedy = "correct pixel_size, turn, mirror and sense in CELL.yaml: `selfcal cell try`"
         raise MachineError(
@@ -753,8 +755,8 @@ def _change(
     mark = min(first, key=lambda item: math.hypot(item.offset_x, item.offset_y))
     from_x, from_y = mark.offset_x, mark.offset_y
     to_x, to_y = (from_x + expected, from_y) if axis == "x" else (from_x, from_y + expected)
-    found = min(later, key=lambda item: math.hypot(item.offset_x - to_x, item.offset_y - to_y))
-    x, y = found.offset_x - from_x, found.offset_y - from_y
+    nearest = min(later, key=lambda item: math.hypot(item.offset_x - to_x, item.offset_y - to_y))
+    x, y = nearest.offset_x - from_x, nearest.offset_y - from_y
     return (x, y) if axis == "x" else (y, x)
 
 

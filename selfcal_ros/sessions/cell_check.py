@@ -100,16 +100,16 @@ def grouped(items: list[CheckItem], fault: str) -> list[CheckItem]:
     fault : str
         Name of the one that tells the fault, "" = the first that failed.
     """
-    found = [item for item in items if item.passed]
+    ordered = [item for item in items if item.passed]
     failed = sorted(
         (item for item in items if not item.passed), key=lambda item: item.name != fault
     )
     while failed:
-        first, *others = failed
-        covered = [item for item in others if item.name in COVERED.get(first.name, ())]
-        found += [first, *(replace(item, remedy="", follows=first.name) for item in covered)]
-        failed = [item for item in others if item not in covered]
-    return found
+        first, *later_faults = failed
+        covered = [item for item in later_faults if item.name in COVERED.get(first.name, ())]
+        ordered += [first, *(replace(item, remedy="", follows=first.name) for item in covered)]
+        failed = [item for item in later_faults if item not in covered]
+    return ordered
 
 
 def checked_view(plan: Plan) -> tuple[Artifact, View]:
@@ -196,12 +196,12 @@ class CellCheck:
 
     def take_detection(self, message: Any) -> None:
         """Take a detection."""
-        found = to_model.detection(message)
+        detection = to_model.detection(message)
         self._seen.append(
-            (self._ports.now_s(), self._ports.now_ns() - found.stamp_ns, found.has_id)
+            (self._ports.now_s(), self._ports.now_ns() - detection.stamp_ns, detection.has_id)
         )
-        self._collector.add_detection(found)
-        self._events.append(found)
+        self._collector.add_detection(detection)
+        self._events.append(detection)
 
     def take_health(self, node: str, level: int, line: str) -> None:
         """Take the health of a node of the cell: its level, and what is wrong."""
@@ -240,19 +240,21 @@ class CellCheck:
         """Check the cell, then tell which nodes are in error at the end."""
         yield from self._run()
         if self._foreign or self._has_unread:
-            said = [
+            node_errors = [
                 f"{name}: {line}"
                 for name, line in islice(sorted(self._foreign.items()), MOST_NAMED)
             ]
-            more = len(self._foreign) - len(said)
-            if more > 0:
-                said.append(f"and {more} more")
+            n_unread = len(self._foreign) - len(node_errors)
+            if n_unread > 0:
+                node_errors.append(f"and {n_unread} more")
             if self._has_unread:
-                said.append(f"there were more than {MOST_KEPT} names, and others were not read")
+                node_errors.append(
+                    f"there were more than {MOST_KEPT} names, and others were not read"
+                )
             self._tell(
                 "diagnostics",
                 False,
-                "ERROR on /diagnostics: " + "; ".join(said),
+                "ERROR on /diagnostics: " + "; ".join(node_errors),
                 "correct what these nodes say, or end them if they are not of this machine",
             )
 
@@ -427,7 +429,7 @@ class CellCheck:
 
     def _longest_pause_s(self) -> float:
         """Return the time in which a detection in transit arrives: twice the longest interval."""
-        received = [at for at, _, _ in self._seen]
+        received = [received_s for received_s, _, _ in self._seen]
         return max(WATCH_S, 2 * float(np.diff(received).max())) if len(received) > 1 else WATCH_S
 
     def _collected(self) -> tuple[Measurements, ViewProgress]:
@@ -524,21 +526,23 @@ class CellCheck:
             figure, remedy = f"{fault.what} ({figure})", fault.remedy
         self._tell("ids", not mistaken and fault is None, figure, remedy)
         self._judge_loss(progress, rejected, total)
-        follows, told = self._judge_wiring(measurements, progress.check_done)
+        follows, signs_told = self._judge_wiring(measurements, progress.check_done)
         if follows and self.view.angular and not mistaken and fault is None:
             self._judge_theta(measurements)
-        self.items[first:] = grouped(self.items[first:], "ids" if fault else "signs" * told)
+        self.items[first:] = grouped(self.items[first:], "ids" if fault else "signs" * signs_told)
 
     def _judge_loss(self, progress: ViewProgress, rejected: Mapping[str, int], total: int) -> None:
-        others = {reason: count for reason, count in rejected.items() if reason not in MISTAKEN}
+        not_mistaken = {
+            reason: count for reason, count in rejected.items() if reason not in MISTAKEN
+        }
         grid, angular = expected_marks(self.plate, self.view)
         self._tell(
             "marks",
             progress.grid_done >= grid and progress.angular_done >= angular,
             f"{progress.grid_done} of {grid} marks and {progress.angular_done} of {angular} "
             f"lines {REPEATS} times; {progress.readings.used} of {total} detections used"
-            + "".join(f", {count} {reason}" for reason, count in others.items()),
-            "; ".join(REMEDY.get(Reason(reason), reason) for reason in others)
+            + "".join(f", {count} {reason}" for reason, count in not_mistaken.items()),
+            "; ".join(REMEDY.get(Reason(reason), reason) for reason in not_mistaken)
             or "measure every mark `repeats` times; publish reliable, depth 1000",
         )
         self._tell(
@@ -567,7 +571,7 @@ class CellCheck:
             turned and abs(by_lines - sign * by_marks) < CLEARLY * abs(by_marks) for sign in (1, -1)
         )
         scatters = view.motion_theta is not None and view.motion_theta.products[1, 1] > 0
-        shown = scatters and sign_of_lines_is_shown(measurements)
+        sign_is_shown = scatters and sign_of_lines_is_shown(measurements)
         figure = (
             f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
             f"lines {by_lines * MRAD_PER_RAD:+.3f} mrad"
@@ -577,15 +581,15 @@ class CellCheck:
             remedy = "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise"
         elif not turned:
             remedy = "turn the plate by 1 mrad and check again"
-            figure += "" if shown else ", too little to tell the sign"
+            figure += "" if sign_is_shown else ", too little to tell the sign"
         else:
             enough = (abs(by_marks) + abs(by_lines)) / CLEARLY * MRAD_PER_RAD
             remedy = (
                 "lay the plate straight, set theta to 0 where line 0 is read, turn the plate "
                 f"by 1 mrad and check again; or turn it by {enough:.2g} mrad"
             )
-            figure += "" if same or shown else ": neither the same nor the opposite turn"
-        self._tell("theta", same or (shown and not reversed_), figure, remedy)
+            figure += "" if same or sign_is_shown else ": neither the same nor the opposite turn"
+        self._tell("theta", same or (sign_is_shown and not reversed_), figure, remedy)
 
     def _judge_wiring(self, measurements: Measurements, stops: int) -> tuple[bool, bool]:
         """Tell whether the offsets follow the stage; the angle only with check stops.
@@ -605,7 +609,7 @@ class CellCheck:
         figure = ", ".join(
             f"{axis} {slope:+.3f}" for axis, slope in slopes.items() if slope is not None
         )
-        shown = slopes["x"] is not None and slopes["y"] is not None
+        offsets_follow = slopes["x"] is not None and slopes["y"] is not None
         what = "; ".join(error.what for error in faults)
         remedy = "; ".join(error.remedy for error in faults)
         turned = _turned_deg(view.motion) if stops else None
@@ -614,21 +618,26 @@ class CellCheck:
             and abs(turned) > TURNED_DEG
             and not (faults and abs(turned) > 180 - TURNED_DEG)
         ):
-            shown = False
+            offsets_follow = False
             what = f"the offsets are turned by {turned:+.1f}° against the stage"
             remedy = (
                 "publish offsets along the stage's axes: turn the camera back by this angle, "
                 "or state it (detector: turn)"
             )
         factor = max((abs(slopes[axis] or 1.0) for axis in "xy"), key=lambda size: abs(size - 1))
-        if shown and stops and not faults and abs(factor - 1) > block_of_offsets().plausible:
-            shown = False
+        if (
+            offsets_follow
+            and stops
+            and not faults
+            and abs(factor - 1) > block_of_offsets().plausible
+        ):
+            offsets_follow = False
             what = f"the offsets are {factor:.3g} times as large as the motion of the stage"
             remedy = (
                 "divide pixel_size by this factor, or find it with selfcal camera init: no "
                 "map would be qualified"
             )
-        if stops and not shown and not what:
+        if stops and not offsets_follow and not what:
             moved_um, seen_um = _spreads_um(view.motion)
             what = (
                 f"the offsets do not follow the stage: between the stops at a mark it moves by "
@@ -640,11 +649,11 @@ class CellCheck:
             )
         self._tell(
             "signs",
-            shown and not faults,
+            offsets_follow and not faults,
             what or f"offset against stage {figure or 'not known'} (-1 expected)",
             remedy or "let the stage stop off the marks: check stops",
         )
-        return shown and not faults, bool(what)
+        return offsets_follow and not faults, bool(what)
 
 
 def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
@@ -652,10 +661,11 @@ def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
     if motion is None:
         return None
     n = len(motion.products) // 2
-    place, offset, both = (
-        float(motion.products[at]) for at in ((axis, axis), (n + axis, n + axis), (axis, n + axis))
+    place, offset, cross = (
+        float(motion.products[index])
+        for index in ((axis, axis), (n + axis, n + axis), (axis, n + axis))
     )
-    return both / place if both**2 > FOLLOWS * place * offset else None
+    return cross / place if cross**2 > FOLLOWS * place * offset else None
 
 
 def _spreads_um(motion: RepeatMotion | None) -> tuple[float, float]:
@@ -675,13 +685,13 @@ def _turned_deg(motion: RepeatMotion | None) -> float | None:
     """
     if motion is None or len(motion.products) != 4:
         return None
-    place, both, offset = (
-        motion.products[at]
-        for at in ((slice(2), slice(2)), (slice(2, 4), slice(2)), (slice(2, 4), slice(2, 4)))
+    place, cross, offset = (
+        motion.products[block]
+        for block in ((slice(2), slice(2)), (slice(2, 4), slice(2)), (slice(2, 4), slice(2, 4)))
     )
     if not np.linalg.det(place) > 0:
         return None
-    response = -both @ np.linalg.inv(place)  # the offset is minus D times the motion
+    response = -cross @ np.linalg.inv(place)  # the offset is minus D times the motion
     explained = np.trace(response @ place @ response.T)
     if np.linalg.det(response) <= 0 or explained < FOLLOWS * np.trace(offset):
         return None

@@ -57,7 +57,7 @@ def explaining(
         return standing
     total = sum(isinstance(event, Detection) for event in events)
     used, *_ = _outcome(Fault("", "", command, tuple(events)), settings)
-    found: list[Fault] = []
+    faults: list[Fault] = []
     best: tuple[float, float, float] = ((used + total) / 2, -np.inf, 0)
     for fault in _faults(command, events, settings):
         try:
@@ -65,16 +65,16 @@ def explaining(
         except InputError:  # an even and an odd side do not lie so
             continue
         if outcome > best:
-            found, best = [], outcome
+            faults, best = [], outcome
         if outcome == best:
-            found.append(fault)
+            faults.append(fault)
     return (
         replace(
-            found[0],
-            what=", or ".join(fault.what for fault in found),
-            remedy="; or ".join(fault.remedy for fault in found),
+            faults[0],
+            what=", or ".join(fault.what for fault in faults),
+            remedy="; or ".join(fault.remedy for fault in faults),
         )
-        if found
+        if faults
         else None
     )
 
@@ -152,25 +152,27 @@ def _faults(
     command: Command, events: Sequence[Event], settings: CollectorSettings
 ) -> Iterator[Fault]:
     """Yield the faults that are tried."""
-    seen = [event for event in events if isinstance(event, Detection)]
+    readings = [event for event in events if isinstance(event, Detection)]
     samples = [event for event in events if isinstance(event, EncoderSample)]
 
     def fault(what: str, remedy: str, detections: Sequence[Detection]) -> Fault:
         return Fault(what, remedy, command, (*samples, *detections))
 
-    yield from _counts(command, samples, seen, settings, fault)
+    yield from _counts(command, samples, readings, settings, fault)
     yield fault(
         "m and n are exchanged",
         "m counts the marks along plate x, n along plate y",
-        [replace(one, m=one.n, n=one.m) for one in seen],
+        [replace(reading, m=reading.n, n=reading.m) for reading in readings],
     )
     for scale, unit in ((1e3, "mm"), (1e6, "µm")):
         yield fault(
             f"the offsets are in {unit}",
             "publish offset_x and offset_y in m",
             [
-                replace(one, offset_x=one.offset_x / scale, offset_y=one.offset_y / scale)
-                for one in seen
+                replace(
+                    reading, offset_x=reading.offset_x / scale, offset_y=reading.offset_y / scale
+                )
+                for reading in readings
             ],
         )
     for late in (1, 2):
@@ -179,16 +181,16 @@ def _faults(
             f"each detection shows the mark of {exposures} before its stamp",
             "stamp detections with the time of the exposure, and read each image once",
             [
-                replace(one, stamp_ns=before.stamp_ns)
-                for one, before in zip(seen[late:], seen, strict=False)
+                replace(reading, stamp_ns=before.stamp_ns)
+                for reading, before in zip(readings[late:], readings, strict=False)
             ],
         )
         yield fault(
             f"each detection shows the mark of {exposures} after its stamp",
             "stamp detections with the time of the exposure",
             [
-                replace(one, stamp_ns=after.stamp_ns)
-                for one, after in zip(seen, seen[late:], strict=False)
+                replace(reading, stamp_ns=after.stamp_ns)
+                for reading, after in zip(readings, readings[late:], strict=False)
             ],
         )
     turns = list(product((1.0,), (False, True), ((1, 1), (-1, -1), (-1, 1), (1, -1))))
@@ -205,7 +207,7 @@ def _faults(
                     _moved(sample, settings, scale=scale, swapped=swapped, signs=signs)
                     for sample in samples
                 ),
-                *seen,
+                *readings,
             ),
         )
     for what, remedy, factor in (
@@ -216,7 +218,7 @@ def _faults(
             what,
             remedy,
             command,
-            (*(_turned(sample, settings, factor=factor) for sample in samples), *seen),
+            (*(_turned(sample, settings, factor=factor) for sample in samples), *readings),
         )
     yield from _placings(command, events)
 
@@ -224,7 +226,7 @@ def _faults(
 def _counts(
     command: Command,
     samples: Sequence[EncoderSample],
-    seen: Sequence[Detection],
+    detections: Sequence[Detection],
     settings: CollectorSettings,
     fault: Callable[[str, str, Sequence[Detection]], Fault],
 ) -> Iterator[Fault]:
@@ -242,24 +244,28 @@ def _counts(
             what,
             "m counts the marks along plate x, n along plate y",
             [
-                replace(one, m=signs[0] * one.m - even[0], n=signs[1] * one.n - even[1])
-                for one in seen
+                replace(
+                    detection,
+                    m=signs[0] * detection.m - even[0],
+                    n=signs[1] * detection.n - even[1],
+                )
+                for detection in detections
             ],
         )
-    lines = [one for one in seen if _is_line(one)]
+    lines = [detection for detection in detections if _is_line(detection)]
     if not lines or not plate.angular_count:
         return
     yield fault(
         "the lines are counted clockwise",
         "count k counter-clockwise",
-        [replace(one, k=-one.k % plate.angular_count) for one in seen],
+        [replace(detection, k=-detection.k % plate.angular_count) for detection in detections],
     )
     zero = _other_zero(view.rotation_rad, plate.angular_count, samples, lines, settings)
     yield Fault(
         f"theta is indicated {degrees(zero):+.4g}° from where the lines are",
         "count k from the line along plate x, and set theta to 0 where that line is read",
         command,
-        (*(_turned(sample, settings, zero_rad=zero) for sample in samples), *seen),
+        (*(_turned(sample, settings, zero_rad=zero) for sample in samples), *detections),
     )
 
 
@@ -274,10 +280,10 @@ def _other_zero(
     stamps, turns = _turns(samples, settings)
     if not turns:
         return 0.0
-    at = np.interp([one.stamp_ns for one in lines], stamps, turns)
-    sites = rotation_rad + 2 * pi * np.array([one.k for one in lines]) / count
+    theta_rad = np.interp([line.stamp_ns for line in lines], stamps, turns)
+    sites = rotation_rad + 2 * pi * np.array([line.k for line in lines]) / count
     return float(
-        np.angle(np.exp(1j * (at - Sense(settings.measurement_sense).sign * sites)).mean())
+        np.angle(np.exp(1j * (theta_rad - Sense(settings.measurement_sense).sign * sites)).mean())
     )
 
 
@@ -290,7 +296,7 @@ def _turns(
     samples: Sequence[EncoderSample], settings: CollectorSettings
 ) -> tuple[list[int], list[float]]:
     """Return stamps, ns, and theta, rad, of the samples that have it."""
-    told = [
+    turns = [
         (sample.stamp_ns, theta)
         for sample in samples
         if (
@@ -300,7 +306,7 @@ def _turns(
         )
         is not None
     ]
-    return [stamp for stamp, _ in told], [theta for _, theta in told]
+    return [stamp for stamp, _ in turns], [theta for _, theta in turns]
 
 
 def _turned(
@@ -333,11 +339,14 @@ def _moved(
     if place is None:
         return sample
     x, y = place[::-1] if swapped else place
-    moved = {settings.joint_x: signs[0] * x / scale, settings.joint_y: signs[1] * y / scale}
+    joint_positions = {
+        settings.joint_x: signs[0] * x / scale,
+        settings.joint_y: signs[1] * y / scale,
+    }
     return replace(
         sample,
         positions=tuple(
-            moved.get(name, position)
+            joint_positions.get(name, position)
             for name, position in zip(sample.names, sample.positions, strict=False)
         ),
     )

@@ -56,8 +56,8 @@ class ClockWatch:
         """
         if is_older:
             return
-        known = bool(run_id) and run_id == self._live_run
-        self._live = known or abs(now_ns - stamp_ns) <= LIVE_NS
+        same_run = bool(run_id) and run_id == self._live_run
+        self._live = same_run or abs(now_ns - stamp_ns) <= LIVE_NS
         if self._live and run_id != self._live_run:
             self._live_run, self._watches, self.steps = run_id, {}, {}
 
@@ -210,33 +210,33 @@ class RunWatch:
         self, newest: Command | None, strays: tuple[Command, ...], now_ns: int
     ) -> dict[str, str]:
         """Return a line for each problem, with its remedy, by the kind of problem."""
-        found = {}
+        problems = {}
         if newest is not None and is_future(newest.stamp_ns, now_ns):
-            found["set back"] = (
+            problems["set back"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.0f} s "
                 "ahead of this machine's clock, which was set back: no later run is shown; restart "
                 "measurement_collector, which ignores such a run, and start the plan again"
             )
         elif newest is not None and 0 < now_ns < newest.stamp_ns - NS_PER_S:
-            found["ahead"] = (
+            problems["ahead"] = (
                 f"the newest view command is stamped {(newest.stamp_ns - now_ns) * S_PER_NS:.1f} s "
                 "ahead of this machine's clock: detections until then count before it; synchronise "
                 "the clocks"
             )
         if self._hidden is not None and newest is not None:
             behind = (newest.stamp_ns - self._hidden.stamp_ns) * S_PER_NS
-            found[f"hidden {self._hidden.run_id} {newest.run_id}"] = (
+            problems[f"hidden {self._hidden.run_id} {newest.run_id}"] = (
                 f"run {self._hidden.run_id} is not shown: it began {behind:.3g} s before the last "
                 f"view command of run {newest.run_id}, by its stamps; abort it, synchronise the "
                 "clocks, and start it again"
             )
         if strays:
-            found["strays"] = (
+            problems["strays"] = (
                 f"{len(strays)} view command{'s' * (len(strays) > 1)} of plan "
                 f"'{strays[-1].plan_id}' arrived during a run, belonging to no run that has begun, "
                 "and changed nothing: find their publisher"
             )
-        return found
+        return problems
 
 
 def _run_of(command: Command) -> PlanRun:

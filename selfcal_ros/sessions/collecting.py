@@ -158,12 +158,12 @@ class CollectingSession:
         """Take a selfcal_msgs/ViewCommand; `is_older`: published before this node listened."""
         try:
             command = to_model.command(message)
-            known = self.collector.knows(command)
+            repeated = self.collector.knows(command)
             self.collector.add_command(command)
             self._clock.command(
                 command.stamp_ns, self._ports.now_ns(), is_older=is_older, run_id=command.run_id
             )
-            if not known:
+            if not repeated:
                 self._runs.command(command, self.collector.newest_command, self.now_ns)
                 self._note_missed(command, is_older=is_older)
         except InputError:
@@ -410,7 +410,7 @@ class CollectingSession:
             },
         )
         lines = self._rejections.findings or advice(self._rejected)
-        found = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
+        diagnosis = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
         runs = Diagnosis(
             Level.WARN if self._run_lines else Level.OK, "; ".join(self._run_lines.values())
         )
@@ -420,7 +420,7 @@ class CollectingSession:
             [
                 runs,
                 self._checks.diagnosis(),
-                found,
+                diagnosis,
                 self._clock.diagnosis(),
                 stepped,
                 self._encoder(),

@@ -133,11 +133,12 @@ class CompensatingSession:
 
     def _refuse_other_frame(self, message: Any) -> None:
         """Refuse a map of another frame than the positions'; an empty one is not stated."""
-        frame, own = message.header.frame_id, self._settings.frame_id
-        if frame not in ("", own):
+        frame, stage_frame = message.header.frame_id, self._settings.frame_id
+        if frame not in ("", stage_frame):
             raise InputError(
                 f"the map of {_source(message)}",
-                f"it is in the frame {printable(frame)!r}, the positions to correct are in {own!r}",
+                f"it is in the frame {printable(frame)!r}, the positions to correct are "
+                f"in {stage_frame!r}",
                 "use a map of this stage, or set frame_id of the compensator and of "
                 "the solver alike",
             )
@@ -180,33 +181,33 @@ class CompensatingSession:
         except InputError:
             return ""  # refused with its reason when it is used
         for name, value in figures.items():
-            stated = float(getattr(self._summary, name))
+            summary_value = float(getattr(self._summary, name))
             if (
-                stated
-                and math.isfinite(stated)
-                and not math.isclose(stated, value, rel_tol=SAME_FIGURE)
+                summary_value
+                and math.isfinite(summary_value)
+                and not math.isclose(summary_value, value, rel_tol=SAME_FIGURE)
             ):
                 return (
-                    f"selfcal/summary states {name} {stated:.6g}, and the map of "
+                    f"selfcal/summary states {name} {summary_value:.6g}, and the map of "
                     f"{_source(self._map)} has {value:.6g}: it is not the map that was solved"
                 )
         return ""
 
-    def _use(self, error_map: ErrorMap, source: str, stamp_ns: int, stated: str) -> None:
+    def _use(self, error_map: ErrorMap, source: str, stamp_ns: int, interpolation: str) -> None:
         """Use a map with the interpolation stated with it, or that of the parameter.
 
         With unknown nodes there is no spline: such a map is interpolated bilinearly.
         """
         self._refuse_large(error_map, [error_map.gx, error_map.gy], error_map.g_theta, source)
         method, fitted = self._settings.interpolation, None
-        if stated and stated not in get_args(Interpolation):
+        if interpolation and interpolation not in get_args(Interpolation):
             raise InputError(
                 f"the map of {source}",
-                f"its interpolation {stated!r} is not known",
+                f"its interpolation {interpolation!r} is not known",
                 f"known are {' and '.join(get_args(Interpolation))}",
             )
-        if stated:
-            fitted = cast(Interpolation, stated)
+        if interpolation:
+            fitted = cast(Interpolation, interpolation)
             method = fitted if error_map.valid.all() else "bilinear"
         use = Compensator(error_map, method=method, fitted=fitted, outside=self._settings.outside)
         self._refuse_large(error_map, *use.between(), source)
@@ -259,11 +260,11 @@ class CompensatingSession:
             Takes each corrected sample.
         """
         waiting, self._waiting = self._waiting, []
-        kept = waiting if lost + len(waiting) <= KEEPS_UP else waiting[-1:]
-        skipped = lost + len(waiting) - len(kept)
+        samples = waiting if lost + len(waiting) <= KEEPS_UP else waiting[-1:]
+        skipped = lost + len(waiting) - len(samples)
         self._skipped += skipped
         self.counts["skipped"] += skipped
-        for data, received_ns in kept:
+        for data, received_ns in samples:
             sample = self._editor.read(data)
             if sample is None:
                 self.counts["refused"] += 1
@@ -315,7 +316,7 @@ class CompensatingSession:
         self,
         names: Sequence[str],
         positions: Sequence[float],
-        by: tuple[Callable[[float, float], tuple], Callable[[float], Any]],
+        corrections: tuple[Callable[[float, float], tuple], Callable[[float], Any]],
     ) -> list[float] | None:
         """Return the positions of all joints with the stage's corrected; None if unknown.
 
@@ -347,12 +348,12 @@ class CompensatingSession:
         corrected = list(positions)
         try:
             if x is not None and y is not None:
-                corrected[x], corrected[y] = map(float, by[0](positions[x], positions[y]))
+                corrected[x], corrected[y] = map(float, corrections[0](positions[x], positions[y]))
                 if not self.compensator.is_inside(positions[x], positions[y]):
                     self.counts["outside"] += 1
                     self._outside += 1
             if theta is not None and self.compensator.has_theta:
-                corrected[theta] = float(by[1](positions[theta]))
+                corrected[theta] = float(corrections[1](positions[theta]))
         except InputError:
             return None
         return corrected if all(math.isfinite(corrected[index]) for index in stage) else None
@@ -384,18 +385,20 @@ class CompensatingSession:
             )
         if not all((np.abs(axis) <= FARTHEST).all() for axis in points):
             raise InputError("request", "a position is not a number", "give m and rad")
-        found = [*(use.correct if inverse else use.command)(*points[:2]), points[2]]
+        corrected = [*(use.correct if inverse else use.command)(*points[:2]), points[2]]
         u = [*(use.uncertainty_indicated if inverse else use.uncertainty)(*points[:2]), points[2]]
         if len(theta):
-            found[2] = (use.correct_theta if inverse else use.command_theta)(points[2])
-            u[2] = use.uncertainty_theta(found[2] if inverse else points[2])
-        if not all(np.isfinite(axis).all() for axis in found):
+            corrected[2] = (use.correct_theta if inverse else use.command_theta)(points[2])
+            u[2] = use.uncertainty_theta(corrected[2] if inverse else points[2])
+        if not all(np.isfinite(axis).all() for axis in corrected):
             raise InputError(
                 "request",
                 "a position lies next to an unknown site or line",
                 "leave it out, or measure the site",
             )
-        return dict(zip(("x", "y", "theta", "u_x", "u_y", "u_theta"), [*found, *u], strict=True))
+        return dict(
+            zip(("x", "y", "theta", "u_x", "u_y", "u_theta"), [*corrected, *u], strict=True)
+        )
 
     def remark(self, answer: dict[str, np.ndarray]) -> str:
         """Return the line of an answer: the map that was used, and whether u is missing."""
@@ -431,11 +434,11 @@ class CompensatingSession:
             )
         strange, self._strange = self._strange, ()
         if strange and (refused or not ages_s):  # beside samples of the stage they may be others
-            own = ", ".join(
+            stage_joints = ", ".join(
                 (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
             )
             lines.append(
-                f"joints {printable(', '.join(strange))} are not of the stage ({own}): "
+                f"joints {printable(', '.join(strange))} are not of the stage ({stage_joints}): "
                 "correct joint_x, joint_y and joint_theta, or the publisher"
             )
         frame, self._other_frame = self._other_frame, ""
@@ -491,16 +494,16 @@ def _refuse_other_axes(error_map: ErrorMap, source: str) -> None:
     stated = error_map.nonorthogonality, error_map.scale_difference
     if not all(map(math.isfinite, stated)) or not any(stated):
         return
-    found = first_order(error_map.artifact, np.stack([error_map.gx, error_map.gy]))
+    fits = first_order(error_map.artifact, np.stack([error_map.gx, error_map.gy]))
     half_m = max(error_map.artifact.half) * error_map.artifact.grid_pitch_m
     largest_m = float(np.nanmax(np.hypot(error_map.gx, error_map.gy)))
-    if max(abs(a - b) for a, b in zip(found, stated, strict=True)) * half_m > (
+    if max(abs(a - b) for a, b in zip(fits, stated, strict=True)) * half_m > (
         SAME_FIGURE * largest_m
     ):
         raise InputError(
             f"the map of {source}",
             "its non-orthogonality and scale difference are "
-            f"{found[0]:.4g} and {found[1]:.4g}, it states {stated[0]:.4g} and {stated[1]:.4g}: "
+            f"{fits[0]:.4g} and {fits[1]:.4g}, it states {stated[0]:.4g} and {stated[1]:.4g}: "
             "axes were exchanged or reversed, or numbers changed, after it was solved",
             "publish the map as the solver does",
         )

@@ -39,9 +39,9 @@ class DetectingSession:
     def take(self, message: Any) -> None:
         """Take an image message; raise InputError if it cannot be used."""
         began_s = time.thread_time()
-        found = self._detector.take(message)
-        self._empty = 0 if found else self._empty + 1
-        for detection in found:
+        detections = self._detector.take(message)
+        self._empty = 0 if detections else self._empty + 1
+        for detection in detections:
             self._ports.publish(
                 "detection", from_model.detection(detection, self._settings.frame_id)
             )

@@ -323,8 +323,8 @@ class CellChecks:
             not self._misplaced and self._marks < marks < MORE * self._marks
         ):
             return
-        self._marks, found = marks, misplaced(measurements)
-        line = str(said(found)) if found else ""
+        self._marks, misplacement = marks, misplaced(measurements)
+        line = str(said(misplacement)) if misplacement else ""
         if line and line != self._misplaced:
             self._say(Level.ERROR, line)
         self._misplaced = line
@@ -390,9 +390,9 @@ def missing_marks(status: Any) -> str:
 
 
 def _named(words: list[str], count: int, what: str) -> str:
-    shown = ", ".join(words[:NAMED])
-    rest = count - len(words[:NAMED])
+    first_names = ", ".join(words[:NAMED])
+    n_unnamed = count - len(words[:NAMED])
     text = f"{count} {what}{'s' * (count != 1)}"
-    if not shown:
+    if not first_names:
         return text
-    return f"{text}: {shown}" + (f" and {rest} more" if rest > 0 else "")
+    return f"{text}: {first_names}" + (f" and {n_unnamed} more" if n_unnamed > 0 else "")

@@ -68,8 +68,8 @@ def take_up(files: list[Path], settings: CollectorSettings) -> ResumedRun:
             for topic, item in reader.columns():
                 feed[topic](item)
             lost += reader.lost
-            for topic, found in reader.steps.items():
-                steps.setdefault(topic, []).extend(found)
+            for topic, stamped_steps in reader.steps.items():
+                steps.setdefault(topic, []).extend(stamped_steps)
         except InputError as error:
             refused.append(error)
             lost.append(f"the file {file.name} was not read: {error.what}")
@@ -201,10 +201,10 @@ class JournalKeeper:
             return
         self._claim, left = None, None
         try:
-            known = journals.newest(self._folder)
-            self.away_s = known[1] if known is not None else 0.0
-            if known is not None and known[1] > self._max_age_s:
-                left, self._left_ago_s = known
+            newest = journals.newest(self._folder)
+            self.away_s = newest[1] if newest is not None else 0.0
+            if newest is not None and newest[1] > self._max_age_s:
+                left, self._left_ago_s = newest
             else:
                 self._claim = journals.claim(self._folder)
             if self._claim is None:
@@ -272,8 +272,8 @@ class JournalKeeper:
         with ExitStack() as undo:
             undo.callback(_given_up, journal)
             for topic, typename in INPUT_TOPICS.items():
-                kept = self._topics[topic]
-                journal.add_topic(kept.name, typename, [kept.qos], kept.heard_on)
+                topic_kept = self._topics[topic]
+                journal.add_topic(topic_kept.name, typename, [topic_kept.qos], topic_kept.heard_on)
             undo.pop_all()
         self._journal = journal
 
@@ -289,14 +289,14 @@ class JournalKeeper:
 
     def flush(self) -> None:
         """Write the messages taken; a failure is reported once, and when it is over."""
-        taken, self._n_taken = self._n_taken, 0
+        n_taken, self._n_taken = self._n_taken, 0
         try:
             if self._journal is None:
                 self._try_again()
                 return
             lost = self.lost
             self._journal.flush()
-            if taken and self.lost == lost:
+            if n_taken and self.lost == lost:
                 self._is_written()
         except InputError as error:  # in any case the messages taken are used
             self._fail(error)

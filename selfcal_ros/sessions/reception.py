@@ -160,9 +160,9 @@ class Reception:
         if not waiting:
             return []
         now_ns = self.session.now_ns
-        stamps, there = first_stamps_ns(Payloads.joined([item[1] for item in waiting]))
+        stamps, stamped = first_stamps_ns(Payloads.joined([item[1] for item in waiting]))
         ahead = np.zeros(len(waiting), dtype=np.int64)
-        ahead[there] = stamps - now_ns
+        ahead[stamped] = stamps - now_ns
         refused = (ahead > MAX_AHEAD_NS) & (now_ns > 0)
         if not refused.any():
             return waiting
@@ -190,24 +190,24 @@ class Reception:
         measuring = self.restoring or (newest is not None and newest.phase == Phase.MEASURE)
         for topic, data, received_ns, _ in waiting:
             if topic == ENCODER_TOPIC:
-                kept = self._resting.sample(data, received_ns, measuring=measuring)
+                samples = self._resting.sample(data, received_ns, measuring=measuring)
             else:
-                kept = self._resting.wake(received_ns)
-            for sample in kept:
+                samples = self._resting.wake(received_ns)
+            for sample in samples:
                 self.journal.write(ENCODER_TOPIC, *sample)
             if topic != ENCODER_TOPIC:
                 self.journal.write(topic, data, received_ns)
 
-    def _adopt(self, taken: Future[ResumedRun]) -> None:
+    def _adopt(self, reading: Future[ResumedRun]) -> None:
         """Continue from the content of the journal."""
         self._restoring = None
         try:
-            found = taken.result()
+            run = reading.result()
         except Exception as error:  # an unreadable journal stops nothing
             self._refuse("journal", error)
             return
-        self.session.adopt(found.collector, self._source, found.steps, self.journal.away_s)
-        for line in found.lost:
+        self.session.adopt(run.collector, self._source, run.steps, self.journal.away_s)
+        for line in run.lost:
             self._say(Level.WARN, f"{self._source}: {line}")
 
     def _feed(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
@@ -237,10 +237,10 @@ class Reception:
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of the journal."""
-        found = self.journal.diagnosis()
+        diagnosis = self.journal.diagnosis()
         if self.restoring:
-            return Diagnosis(Level.WARN, f"reading the journal {self._source}", found.values)
-        return found
+            return Diagnosis(Level.WARN, f"reading the journal {self._source}", diagnosis.values)
+        return diagnosis
 
     def close(self) -> None:
         """Take waiting messages, and close the journal."""
@@ -266,20 +266,20 @@ class Resting:
 
     def end(self) -> list[Sample]:
         """Return and release the held samples, oldest first."""
-        held, self._held = self._held, deque()
-        return [*held]
+        samples, self._held = self._held, deque()
+        return [*samples]
 
     def sample(self, data: bytes, received_ns: int, *, measuring: bool) -> list[Sample]:
         """Take a sample; return those to be kept now, oldest first."""
         if measuring or (self._until_ns is not None and received_ns <= self._until_ns):
             return [*self.end(), (data, received_ns)]
         self._held.append((data, received_ns))
-        kept = []
+        samples = []
         while abs(received_ns - self._held[0][1]) > REACH_NS:  # a clock may be set back
             oldest = self._held.popleft()
             if self._is_kept(oldest[1]):
-                kept.append(oldest)
-        return kept
+                samples.append(oldest)
+        return samples
 
     def _is_kept(self, received_ns: int) -> bool:
         """Return whether to keep a sample that is too old to be needed."""

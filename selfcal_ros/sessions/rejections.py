@@ -69,18 +69,21 @@ class RejectionWatch:
         where: dict[int | None, str] = {None: ""}
         where.update((index, f"view '{view.view.name}': ") for index, view in progress.items())
         found: dict[Key, str] = {
-            (index, one.reason): f"{where[index]}{one}" for index, one in findings.items()
+            (index, finding.reason): f"{where[index]}{finding}"
+            for index, finding in findings.items()
         }
         for index, rejected in self._since_used(progress, ended).items():
-            one = of_last(index, rejected)
-            if one and not {(index, one.reason), (None, one.reason)} & found.keys():
-                found[index, one.reason] = f"{where[index]}none of the last ones was used: {one}"
-        known = found.keys() | self._said
+            finding = of_last(index, rejected)
+            if finding and not {(index, finding.reason), (None, finding.reason)} & found.keys():
+                found[index, finding.reason] = (
+                    f"{where[index]}none of the last ones was used: {finding}"
+                )
+        reported = found.keys() | self._said
         advised: dict[Key, str] = {
             (index, reason): where[index] + line
             for index in ended
             for reason, count in progress[index].readings.rejected.items()
-            if not {(index, reason), (None, reason)} & known
+            if not {(index, reason), (None, reason)} & reported
             for line in advice({reason: count})
         }
         now = float("-inf") if final else self._now_s()

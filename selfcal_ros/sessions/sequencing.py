@@ -82,17 +82,17 @@ class SequencingSession:
         if not self._settings.start_checks:
             return []
         collector = self.presence.of("measurement_collector")
-        found = []
+        missing_nodes = []
         if collector is None:
-            found.append("measurement_collector (no sign of life)")
+            missing_nodes.append("measurement_collector (no sign of life)")
         else:
             if collector.values.get("encoder_heard") != "yes":
-                found.append("the encoder (measurement_collector hears no sample)")
+                missing_nodes.append("the encoder (measurement_collector hears no sample)")
             if collector.values.get("detections_matched") != "yes":
-                found.append("a publisher of stage/mark_detections")
+                missing_nodes.append("a publisher of stage/mark_detections")
         if self.presence.of("solver") is None:
-            found.append("solver (no sign of life)")
-        return found
+            missing_nodes.append("solver (no sign of life)")
+        return missing_nodes
 
     def begin(self) -> str:
         """Start the plan, or resume its run; wait for missing nodes and name them."""
@@ -138,8 +138,8 @@ class SequencingSession:
         self.run_id = health["run_id"]
         command = self.machine.resume(index, Phase[phase])
         self._send([command], stamp_ns=stamp_ns)  # unchanged: it is latched again
-        known = self._measured.get((plan.plan_id, self.run_id), {})
-        names = ", ".join(known[number] for number in sorted(known))
+        view_names = self._measured.get((plan.plan_id, self.run_id), {})
+        names = ", ".join(view_names[number] for number in sorted(view_names))
         return f"resumed run {self.run_id} in view '{plan.views[index].name}', {phase}" + (
             f"; already measured: {names}" if names else ""
         )
@@ -169,12 +169,12 @@ class SequencingSession:
         view = to_model.view_of(
             message, repeats=message.repeats, grid=message.grid, angular=message.angular
         )
-        done = [
+        n_read = [
             np.count_nonzero(np.asarray(counts) >= message.repeats)
             for counts in (message.count, message.count_theta)
         ]
         views = self._measured.setdefault((message.plan_id, message.run_id), {})
-        if all(map(ge, done, expected_marks(plan.artifact, view))):
+        if all(map(ge, n_read, expected_marks(plan.artifact, view))):
             views[message.view_index] = message.view_name
         else:
             views.pop(message.view_index, None)
@@ -219,8 +219,8 @@ class SequencingSession:
             return  # of another run
         expected = message.grid_expected + message.angular_expected + message.check_expected
         if message.view_index == self.machine.index and expected:
-            done = message.grid_done + message.angular_done + message.check_done
-            self.coverage = done / expected
+            n_measured = message.grid_done + message.angular_done + message.check_done
+            self.coverage = n_measured / expected
             self._status = message
             self._stall.take(message.detections_used + message.detections_rejected)
         moved_on = self.machine.status(message.plan_id, message.view_index, message.complete)
@@ -294,9 +294,9 @@ class SequencingSession:
 
     def _time_out(self) -> None:
         self._ports.say(Level.WARN, f"view {self._view_name} is not complete in time")
-        again = self._redos < self._settings.max_redos
-        self._redos = self._redos + 1 if again else 0
-        self._send(self.machine.redo() if again else self.machine.skip())
+        redoes = self._redos < self._settings.max_redos
+        self._redos = self._redos + 1 if redoes else 0
+        self._send(self.machine.redo() if redoes else self.machine.skip())
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of the node."""

@@ -74,8 +74,8 @@ def solve(job: Job) -> SolvingOutcome:
     try:
         if job.measurements.verify:
             return SolvingOutcome(job, _verified(job), None)
-        found = calibrate_by(job.method, job.measurements, job.options)
-        return SolvingOutcome(job, _finished(job, found), None)
+        outcome = calibrate_by(job.method, job.measurements, job.options)
+        return SolvingOutcome(job, _finished(job, outcome), None)
     except NotIdentifiableError as error:
         result = results.unidentified_result(job.measurements, error.observability)
         return SolvingOutcome(job, _finished(job, result), told(error))
@@ -221,8 +221,8 @@ class SolvingSession:
         command = to_model.command(message)
         check_command(command)
         run = PlanRun(command.plan_id, command.run_id)
-        known = self._planned.get(run, 0)
-        self._planned[run] = max(known, command.views_planned)
+        n_planned = self._planned.get(run, 0)
+        self._planned[run] = max(n_planned, command.views_planned)
         ends = command.phase == Phase.DONE and run not in self._ended
         if ends:
             self._ended.add(run)
@@ -230,7 +230,7 @@ class SolvingSession:
             self.shown.problem, NoDataError | NotIdentifiableError
         )
         if run in (self._run, PlanRun(self._run.plan_id)) and (
-            command.views_planned > known or (ends and tells)
+            command.views_planned > n_planned or (ends and tells)
         ):
             self._stale = True  # the summary shows the number of planned or remaining views
 
@@ -456,7 +456,7 @@ class SolvingSession:
             advice = (
                 [str(shown.problem)]
                 if result is None
-                else [found.text for found in result.observability.advice]
+                else [advised.text for advised in result.observability.advice]
             )
         self._ports.publish(
             "summary",
@@ -490,11 +490,11 @@ class SolvingSession:
 
     def _state(self) -> str:
         if self._unfinished():
-            done, planned = self.shown.views_done, self._planned_views(self.shown.run)
+            n_done, planned = self.shown.views_done, self._planned_views(self.shown.run)
             views = (
-                f"{done} of {planned} views measured"
+                f"{n_done} of {planned} views measured"
                 if planned
-                else f"{counted(done, 'view')} measured so far"
+                else f"{counted(n_done, 'view')} measured so far"
             )
             return f"{views}, not yet enough to identify the stage."
         if self.shown.problem is not None or self.shown.result is None:
@@ -538,13 +538,13 @@ class SolvingSession:
 
     def _newer(self, runs: Iterable[PlanRun]) -> str:
         """Return a note on a run that is newer than the published one; "" if none."""
-        now_ns, shown = self._ports.now_ns(), begun_ns(self.shown.run.run_id)
+        now_ns, published_ns = self._ports.now_ns(), begun_ns(self.shown.run.run_id)
         later = [
             (begun, run)
             for run in runs
             if (begun := begun_ns(run.run_id))
-            and shown
-            and begun > shown
+            and published_ns
+            and begun > published_ns
             and not begins_in_future(run, now_ns)
         ]
         if not later:
@@ -570,12 +570,12 @@ class SolvingSession:
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of the node."""
         shown = self.shown
-        known = shown.result is not None or shown.problem is not None
+        has_outcome = shown.result is not None or shown.problem is not None
         newer = self._newer(self._ended)  # a running one may still send its readings
         fine = (shown.problem is None or self._unfinished()) and (
             shown.problem is not None or shown.result is None or is_qualified(shown.result)
         )
-        state = self._state() if known else "waiting for views"
+        state = self._state() if has_outcome else "waiting for views"
         wrong = [line for line in (self._unsaved, newer) if line]
         return Diagnosis(
             Level.OK if fine and not wrong else Level.WARN,

@@ -240,10 +240,10 @@ def plate_picture(
     if n_missing > len(named):  # marks after the last named one are unknown
         signs[(signs > 0) & ((m > named[-1][0]) | ((m == named[-1][0]) & (n > named[-1][1])))] = 2
     for mark in named:
-        there = artifact.has(*map(np.array, mark))
-        at = artifact.index(*map(np.array, mark))
-        if there and signs[at]:
-            signs[at] = 3
+        has_mark = artifact.has(*map(np.array, mark))
+        index = artifact.index(*map(np.array, mark))
+        if has_mark and signs[index]:
+            signs[index] = 3
     signs, step = _squares(signs, artifact, most)
     for axis in (0, 1):
         signs = np.maximum.reduceat(signs, np.arange(0, signs.shape[axis], step), axis=axis)
