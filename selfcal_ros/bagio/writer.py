@@ -47,8 +47,10 @@ def new_bag(path: str | Path) -> Iterator[Path]:
         with temporary_folder(target.parent) as unfinished:
             try:
                 yield Path(unfinished, target.name)
-            except InputError as error:  # named as it was asked for
-                where = error.where.replace(str(unfinished), str(target.parent))
+            except InputError as error:
+                if str(unfinished) not in error.where:
+                    raise
+                where = error.where.replace(str(unfinished), str(target.parent))  # as asked for
                 raise InputError(where, error.what, error.remedy) from error
             Path(unfinished, target.name).rename(target)
     except OSError as error:
