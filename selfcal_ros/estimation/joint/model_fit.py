@@ -323,7 +323,7 @@ class _State:
         now = score(
             equations,
             self.found.both_residuals,
-            squares(self.problem, self.found),
+            squares(self.problem, self.found, of_noise=False),  # less those `_of_lines`
             coefficients=self.coefficients,
         )
         sums = residual_sums(equations, now)
@@ -390,12 +390,12 @@ class _State:
         )
 
 
-def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
+def squares(problem: Problem, found: JointFit, *, of_noise: bool = True) -> tuple[float, float]:
     """Return the weighted squares of all residuals, m^2, and their degrees of freedom.
 
     Grid and angular readings together, as they share the rotations: angular residuals in units of
-    the grid's, by the ratio with which they were fitted. Lines with less noise than they are
-    weighted with tell nothing of the noise: of them the rotations alone count.
+    the grid's, by the ratio with which they were fitted. If they are to tell the noise
+    (`of_noise`), lines that have less than they are weighted with do not count.
     """
     system = problem.system
     total = float((system.grid.weight * abs(found.residuals) ** 2).sum())
@@ -403,7 +403,7 @@ def squares(problem: Problem, found: JointFit) -> tuple[float, float]:
     if found.ratio > 0:
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += max(shared - 1, 0)
-        if lines_have_their_weight(problem, found):
+        if not of_noise or lines_have_their_weight(problem, found):
             squares_rad = float((system.angular.weight * found.residuals_theta**2).sum())
             total += found.ratio * problem.half_width_m**2 * squares_rad
             dof += system.angular.n_readings - system.rank_angular
@@ -425,7 +425,7 @@ def _of_lines(
     more : float array (p,)
         Free coefficients of the columns less those of the solution.
     """
-    if not (found.ratio > 0 and lines_have_their_weight(problem, found)):
+    if not found.ratio > 0:
         return 0.0, 0.0
     system, angular = problem.system, problem.system.angular
     columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)
