@@ -85,8 +85,8 @@ class Adequacy:
             )
         sign = 1 - 2 * (np.indices(emap.gx.shape).sum(axis=0) % 2)
         local = turned_over(result.sense, self.local, sign=1)
-        each = np.where(emap.valid, sign * np.maximum(self.lack, local), 0.0)
-        return Effect(NAME, each, np.zeros(len(emap.g_theta)))
+        node_lack_m = np.where(emap.valid, sign * np.maximum(self.lack, local), 0.0)
+        return Effect(NAME, node_lack_m, np.zeros(len(emap.g_theta)))
 
     @property
     def cause(self) -> Cause | None:
@@ -123,35 +123,39 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     if system is None or is_too_large(system):
         return None
     grid, coarse = system.grid, _of_marks(model)
-    other = with_map(model, grid.views.spline.refined)
-    if other is None:
+    refit = with_map(model, grid.views.spline.refined)
+    if refit is None:
         return None
-    fine = _of_marks(other)
-    n = [told_coefficients(one) for one in (fine, coarse)]
-    before, rest = _squares(coarse, model.y), _squares(fine, other.y)
+    fine = _of_marks(refit)
+    n = [told_coefficients(equations) for equations in (fine, coarse)]
+    squares_coarse, squares_refit = _squares(coarse, model.y), _squares(fine, refit.y)
     readings = equations_left(grid)
-    more, dof, p = n[0] - n[1], readings - n[0], 1.0
+    n_further, dof, p = n[0] - n[1], readings - n[0], 1.0
     power, bilinear = np.zeros(2 * len(known_places(coarse))), grid.views.spline.axes[0].degree == 1
     if dof < 1 and not bilinear:
         return None
-    if dof >= 1 and more >= 1:
-        p = _improved(before, rest, more, dof)
+    if dof >= 1 and n_further >= 1:
+        p = _improved(squares_coarse, squares_refit, n_further, dof)
         if p < 1.0:
-            y = other.y if p < F_LEVEL else model.y  # the terms of a map that suffices
-            power = _Further.of(fine, coarse, y).power(max(float(np.sqrt(rest / dof)), FLOOR))
-        power = power + _of_terms(model, other) ** 2 * (p < F_LEVEL)
-    if bilinear and before > readings * FLOOR**2:
+            y = refit.y if p < F_LEVEL else model.y  # the terms of a map that suffices
+            power = _Further.of(fine, coarse, y).power(
+                max(float(np.sqrt(squares_refit / dof)), FLOOR)
+            )
+        power = power + _of_terms(model, refit) ** 2 * (p < F_LEVEL)
+    if bilinear and squares_coarse > readings * FLOOR**2:
         smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
-        if (other := with_map(model, smooth)) is not None:
-            rest = max(_squares(_of_marks(other), other.y), FLOOR * before)
-            likelier = math.exp(min((readings - n[1]) / 2 * math.log(rest / before), 0.0))
-            p, apart = min(p, likelier), _apart(other, model)
+        if (refit := with_map(model, smooth)) is not None:
+            squares_refit = max(_squares(_of_marks(refit), refit.y), FLOOR * squares_coarse)
+            likelier = math.exp(
+                min((readings - n[1]) / 2 * math.log(squares_refit / squares_coarse), 0.0)
+            )
+            p, apart = min(p, likelier), _apart(refit, model)
             power = apart if likelier < F_LEVEL and apart.mean() > power.mean() else power
     local = np.zeros((2, *grid.views.shape))
     i, j = _halves(coarse)
     nodes = (i % 2 == 0) & (j % 2 == 0)
     local[:, i[nodes] // 2, j[nodes] // 2] = np.sqrt(power.reshape(2, -1)[:, nodes])
-    return Adequacy(p, float(np.sqrt(power.mean())), more, grid.views.shape, local)
+    return Adequacy(p, float(np.sqrt(power.mean())), n_further, grid.views.shape, local)
 
 
 def _of_marks(model: ModelFit) -> PlacedEquations:
@@ -164,8 +168,8 @@ def _of_terms(model: ModelFit, other: ModelFit) -> float:
     """Return what the terms change of a map by what another map makes of them, rms, m."""
     if model.equations is None:
         return 0.0
-    moved = model.equations.maps @ (other.coefficients - model.coefficients)
-    return float(np.sqrt((np.abs(moved) ** 2).mean() / 2))
+    map_change_m = model.equations.maps @ (other.coefficients - model.coefficients)
+    return float(np.sqrt((np.abs(map_change_m) ** 2).mean() / 2))
 
 
 def maps_to_try(measurements: Measurements) -> Iterator[tuple[str, Measurements]]:
@@ -179,11 +183,17 @@ def maps_to_try(measurements: Measurements) -> Iterator[tuple[str, Measurements]
         yield text, replace(measurements, artifact=with_nodes(artifact, text, "map"))
 
 
-def _improved(before: float, rest: float, more: float, dof: float) -> float:
+def _improved(squares_coarse: float, squares_fine: float, n_further: float, dof: float) -> float:
     """Return the probability of such an improvement by chance (method eq. 12.4)."""
-    if rest < dof * FLOOR**2:  # there is no F of rounding
-        return 1.0 if before < 4 * (dof + more) * FLOOR**2 else 0.0
-    return float(fdtrc(more, dof, max(before - rest, 0.0) / more / (rest / dof)))
+    if squares_fine < dof * FLOOR**2:  # there is no F of rounding
+        return 1.0 if squares_coarse < 4 * (dof + n_further) * FLOOR**2 else 0.0
+    return float(
+        fdtrc(
+            n_further,
+            dof,
+            max(squares_coarse - squares_fine, 0.0) / n_further / (squares_fine / dof),
+        )
+    )
 
 
 def line_adequacy_of(model: ModelFit) -> Adequacy | None:
@@ -196,18 +206,20 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
         return None
     finer = min(2 * coarse.harmonics, (coarse.n_lines - 1) // 2)
     fine = HarmonicSystem(coarse.turns, coarse.weight, finer)
-    more = fine.n_told - coarse.n_told
+    n_further = fine.n_told - coarse.n_told
     dof = coarse.n_readings - int(coarse.mark_read.sum()) - fine.n_told - (coarse.n_views - 1)
-    if more < 1 or dof < 1:
+    if n_further < 1 or dof < 1:
         return None
-    (before, coarse_map), (rest, fine_map) = (_fitted_lines(one, y) for one in (coarse, fine))
-    square = float(((fine_map - coarse_map) ** 2).mean()) - rest / dof * (
+    (squares_coarse, coarse_map), (squares_fine, fine_map) = (
+        _fitted_lines(lines, y) for lines in (coarse, fine)
+    )
+    square = float(((fine_map - coarse_map) ** 2).mean()) - squares_fine / dof * (
         fine.mean_variance - coarse.mean_variance
     )
     return Adequacy(
-        _improved(before, rest, more, dof),
+        _improved(squares_coarse, squares_fine, n_further, dof),
         float(np.sqrt(max(square, 0.0))),
-        more,
+        n_further,
         (coarse.harmonics,),
     )
 
@@ -215,8 +227,8 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
 def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarray]:
     """Return the squares of residuals of lines fitted alone, and their map without its mean."""
     field, phi = lines.fitted(y, np.linalg.pinv(lines.schur, rcond=GAP, hermitian=True))
-    rest = lines.plate(y, field, phi)[1]
-    return float((lines.weight * rest**2).sum()), field - field.mean()
+    residuals_rad = lines.plate(y, field, phi)[1]
+    return float((lines.weight * residuals_rad**2).sum()), field - field.mean()
 
 
 def known_places(system: PlacedEquations) -> np.ndarray:
@@ -228,10 +240,15 @@ def known_places(system: PlacedEquations) -> np.ndarray:
 
 def _halves(system: PlacedEquations) -> tuple[np.ndarray, np.ndarray]:
     """Return the same places in half pitches of the map from its first node, int (P,) each."""
-    known = system.known_sites
+    known_sites = system.known_sites
     s, t = np.indices([2 * size - 1 for size in system.grid.views.shape]).reshape(2, -1)
     low, high = (s // 2, t // 2), ((s + 1) // 2, (t + 1) // 2)
-    inside = known[low] & known[high] & known[low[0], high[1]] & known[high[0], low[1]]
+    inside = (
+        known_sites[low]
+        & known_sites[high]
+        & known_sites[low[0], high[1]]
+        & known_sites[high[0], low[1]]
+    )
     return s[inside], t[inside]
 
 
@@ -239,23 +256,23 @@ def _squares(system: PlacedEquations, y: np.ndarray) -> float:
     return float((system.grid.weight * np.abs(grid_residuals(system, y)) ** 2).sum())
 
 
-def _apart(one: ModelFit, other: ModelFit) -> np.ndarray:
+def _apart(smooth: ModelFit, model: ModelFit) -> np.ndarray:
     """Return the squared difference of two maps of the same readings at places, (2 P,), m^2."""
-    at = known_places(_of_marks(other))
-    field = _datum_of(at).without(_alone(one, at) - _alone(other, at))
+    places_m = known_places(_of_marks(model))
+    field = _datum_of(places_m).without(_alone(smooth, places_m) - _alone(model, places_m))
     return np.concatenate([field.real, field.imag]) ** 2
 
 
-def _alone(model: ModelFit, at: np.ndarray) -> np.ndarray:
+def _alone(model: ModelFit, places_m: np.ndarray) -> np.ndarray:
     """Return the map of the marks alone at places, in no particular datum, complex (P,), m."""
     system = _of_marks(model)
     spline = system.grid.views.spline
-    return spline.rows(at) @ spline.coefficients(system.alone(model.y)[0]).ravel()
+    return spline.rows(places_m) @ spline.coefficients(system.alone(model.y)[0]).ravel()
 
 
-def _datum_of(at: np.ndarray) -> Gauge:
+def _datum_of(places_m: np.ndarray) -> Gauge:
     """Return the datum of a map at places, complex (P,)."""
-    return Gauge(at / abs(at).max(), np.ones(len(at), dtype=bool), scale=True)
+    return Gauge(places_m / abs(places_m).max(), np.ones(len(places_m), dtype=bool), scale=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,38 +298,40 @@ class _Further:
     @classmethod
     def of(cls, fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray) -> "_Further":
         """Return it for refined and coarse equations of the same readings y."""
-        at, grid = known_places(coarse), fine.grid
+        places_m, grid = known_places(coarse), fine.grid
         spline, nodes = grid.views.spline, coarse.grid.views.spline
         matrix, couple = grid.matrix, grid.coupling
         b, d = grid.right_side(y)
         within = np.linalg.pinv(grid.block, hermitian=True, rcond=GAP)
-        both = np.concatenate([couple.real, couple.imag])
-        held = both @ within
+        coupling = np.concatenate([couple.real, couple.imag])
+        elimination = coupling @ within
         normal = np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]])
-        normal -= held @ both.T
-        right = np.concatenate([b.real, b.imag]) - held @ d
+        normal -= elimination @ coupling.T
+        right = np.concatenate([b.real, b.imag]) - elimination @ d
         contained = nodes.within(spline)
         further = np.eye(len(b)) - contained @ spline.rows(nodes.places_m.ravel()).toarray()
-        inside, beside = (np.kron(np.eye(2), part) for part in (contained, further))
-        inverse = np.linalg.pinv(inside.T @ normal @ inside, hermitian=True, rcond=GAP)
-        answer = inverse @ (inside.T @ normal)
-        left = beside.T @ (normal - normal @ inside @ answer)
-        told, vectors = np.linalg.eigh(left @ beside)
-        moved = (inside @ (answer @ beside) - beside) @ vectors
-        scalar = np.asarray(spline.rows(at) @ np.hstack(np.split(moved, 2)))
-        field = scalar[:, : moved.shape[1]] + 1j * scalar[:, moved.shape[1] :]
-        field = _datum_of(at).without(field)
-        alone = right - normal @ inside @ (inverse @ (inside.T @ right))
+        coarse_basis, further_basis = (np.kron(np.eye(2), part) for part in (contained, further))
+        inverse = np.linalg.pinv(coarse_basis.T @ normal @ coarse_basis, hermitian=True, rcond=GAP)
+        answer = inverse @ (coarse_basis.T @ normal)
+        projected = further_basis.T @ (normal - normal @ coarse_basis @ answer)
+        eigenvalues, vectors = np.linalg.eigh(projected @ further_basis)
+        coefficient_errors = (coarse_basis @ (answer @ further_basis) - further_basis) @ vectors
+        scalar = np.asarray(spline.rows(places_m) @ np.hstack(np.split(coefficient_errors, 2)))
+        field = (
+            scalar[:, : coefficient_errors.shape[1]] + 1j * scalar[:, coefficient_errors.shape[1] :]
+        )
+        field = _datum_of(places_m).without(field)
+        alone = right - normal @ coarse_basis @ (inverse @ (coarse_basis.T @ right))
         return cls(
-            np.maximum(told, 0.0),
-            vectors.T @ (beside.T @ alone),
+            np.maximum(eigenvalues, 0.0),
+            vectors.T @ (further_basis.T @ alone),
             np.concatenate([field.real, field.imag]),
         )
 
     def size(self, sigma_m: float) -> float:
         """Return the likeliest standard deviation of the coefficients, m (method eq. 12.6)."""
-        seen = self.told > GAP * self.told.max()
-        values, right = self.told[seen], self.right[seen]
+        determined = self.told > GAP * self.told.max()
+        values, right = self.told[determined], self.right[determined]
         least = sigma_m / np.sqrt(values.max())
         sizes = np.concatenate([[0.0], least * np.geomspace(*SIZES)])
         variance = values * sigma_m**2 + np.multiply.outer(sizes, values) ** 2
