@@ -116,8 +116,8 @@ class _Seen:
 
 def check_placing(measurements: Measurements) -> None:
     """Raise PlacingError if the plate is not placed as planned in a view."""
-    if found := misplaced(measurements):
-        raise said(found, f"plan '{measurements.plan_id}', ")
+    if fault := misplaced(measurements):
+        raise said(fault, f"plan '{measurements.plan_id}', ")
 
 
 def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
@@ -127,16 +127,18 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     one of them.
     """
     artifact, repeated = measurements.artifact, [v for v in measurements.views if v.dof_xy]
-    every = [
-        (view.view, seen)
+    window_views = [
+        (view.view, readings)
         for view in measurements.views
         if sum(map(abs, view.view.cell or (0, 0))) < 2  # the others would cost seconds
-        and (seen := _seen(artifact, view)) is not None
+        and (readings := _seen(artifact, view)) is not None
     ]
-    told = [(view, seen) for view, seen in every if view.cell in (None, (0, 0))]
-    if len(told) < 3:
-        told = every
-    views = [seen for _, seen in told]
+    compared_views = [
+        (view, readings) for view, readings in window_views if view.cell in (None, (0, 0))
+    ]
+    if len(compared_views) < 3:
+        compared_views = window_views
+    views = [readings for _, readings in compared_views]
     if len(views) < 3:
         return None
     sigma = (
@@ -162,21 +164,23 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     if square < EXPLAINED:
         return None
     tried = []
-    names = list(dict.fromkeys(view.plan_view for view, _ in told))
-    for view, seen in told:
+    names = list(dict.fromkeys(view.plan_view for view, _ in compared_views))
+    for view, readings in compared_views:
         if view.cell not in (None, (0, 0)) or (
             len(names) == 2 and view.plan_view == names[0]
         ):  # their relative pose alone counts
             continue
-        moved = [
-            number for number, (also, _) in enumerate(told) if also.plan_view == view.plan_view
+        moved_views = [
+            number
+            for number, (also, _) in enumerate(compared_views)
+            if also.plan_view == view.plan_view
         ]
-        kept = _Kept(views, moved, *sizes)
-        for pose in _poses(seen, artifact):
-            likelihood, left = kept.with_moved(
-                [_moved(views[number], seen.pose, pose) for number in moved]
+        fixed_readings = _Kept(views, moved_views, *sizes)
+        for pose in _poses(readings, artifact):
+            likelihood, mean_square = fixed_readings.with_moved(
+                [_moved(views[number], readings.pose, pose) for number in moved_views]
             )
-            tried.append((likelihood - planned, left, view, seen.pose, pose))
+            tried.append((likelihood - planned, mean_square, view, readings.pose, pose))
     tried.sort(key=lambda item: -item[0])
     best = max(tried[0][0] if tried else 0.0, 0.0)
     enough = max(CONTRADICTED, LEFT * square)
@@ -184,11 +188,11 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
         return mirrored
     if not tried:
         return None
-    gain, left, view, before, pose = tried[0]
+    gain, mean_square, view, planned_pose, pose = tried[0]
     second = tried[1][0] if len(tried) > 1 else 0.0
-    if gain < BETTER or gain - second < CLEARLY or left > enough:
+    if gain < BETTER or gain - second < CLEARLY or mean_square > enough:
         return None
-    return Misplaced.of(view.plan_view, before, pose, gain)
+    return Misplaced.of(view.plan_view, planned_pose, pose, gain)
 
 
 def _mirrored(
@@ -200,52 +204,57 @@ def _mirrored(
 ) -> Mirrored | None:
     """Return the reflections that gain the most, if that is more than `least`."""
     gains = {}
-    for name, of in MIRRORS.items():
-        likelihood, left = _likelihood(
-            [replace(seen, place=of(seen.place), deviation=of(seen.deviation)) for seen in views],
+    for name, reflect in MIRRORS.items():
+        likelihood, mean_square = _likelihood(
+            [
+                replace(
+                    readings, place=reflect(readings.place), deviation=reflect(readings.deviation)
+                )
+                for readings in views
+            ],
             *sizes,
         )
-        if likelihood - planned > least and left < enough:
+        if likelihood - planned > least and mean_square < enough:
             gains[name] = likelihood - planned
     best = max(gains.values(), default=0.0)
     axes = tuple(name for name, gain in gains.items() if gain > best - CLEARLY)
     return Mirrored(axes, best) if axes else None
 
 
-def _moved(seen: _Seen, planned: AnyPose, pose: AnyPose) -> _Seen:
+def _moved(readings: _Seen, planned: AnyPose, pose: AnyPose) -> _Seen:
     """Return the readings of a cell of images at the pose of their view; the camera stays."""
-    if seen.pose == planned:
-        return replace(seen, pose=pose)
-    (a, b), (x, y), (u, v) = seen.pose.shift, planned.shift, pose.shift
-    return replace(seen, pose=replace(pose, shift=(a + u - x, b + v - y)))
+    if readings.pose == planned:
+        return replace(readings, pose=pose)
+    (a, b), (x, y), (u, v) = readings.pose.shift, planned.shift, pose.shift
+    return replace(readings, pose=replace(pose, shift=(a + u - x, b + v - y)))
 
 
 def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
     """Yield other poses of a plate on the lattice: turned, shifted differently, not at all."""
     a, b = pose.shift
     yield from (replace(pose, quarter_turns=q) for q in range(4) if q != pose.q)
-    beside = {(0, 0), (-a, -b), (b, a), (-b, -a), (a + 1, b), (a - 1, b), (a, b + 1), (a, b - 1)}
-    yield from (replace(pose, shift=shift) for shift in sorted(beside - {pose.shift}))
+    shifts = {(0, 0), (-a, -b), (b, a), (-b, -a), (a + 1, b), (a - 1, b), (a, b + 1), (a, b - 1)}
+    yield from (replace(pose, shift=shift) for shift in sorted(shifts - {pose.shift}))
 
 
-def _poses(seen: _Seen, artifact: Artifact) -> Iterator[AnyPose]:
+def _poses(readings: _Seen, artifact: Artifact) -> Iterator[AnyPose]:
     """Yield the other poses with which the readings of a view are of marks of the plate."""
-    pose = seen.pose
+    pose = readings.pose
     if isinstance(pose, LatticePose):
         yield from other_poses(pose)
         return
     phase, shift = pose.phase, complex(*pose.shift)
     for turn, step in motions(artifact, phase, shift):
-        moved = shift + phase * step
-        other = replace(pose, phase=phase * turn, shift=(moved.real, moved.imag))
-        if on_marks(artifact, replace(seen, pose=other).marks)[1].mean() >= ON_MARKS:
-            yield other
+        new_shift = shift + phase * step
+        new_pose = replace(pose, phase=phase * turn, shift=(new_shift.real, new_shift.imag))
+        if on_marks(artifact, replace(readings, pose=new_pose).marks)[1].mean() >= ON_MARKS:
+            yield new_pose
 
 
 def on_marks(artifact: Artifact, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest marks of a plate, flat, to places (n,), pitches, and if they are there."""
-    known = (artifact.x_m + 1j * artifact.y_m).ravel() / artifact.grid_pitch_m
-    away = np.abs(places[:, None] - known)
+    marks = (artifact.x_m + 1j * artifact.y_m).ravel() / artifact.grid_pitch_m
+    away = np.abs(places[:, None] - marks)
     return away.argmin(axis=1), away.min(axis=1) < SAME_MARK
 
 
@@ -257,13 +266,13 @@ def motions(artifact: Artifact, phase: complex, shift: complex) -> list[tuple[co
     """
     if artifact.marks is not None:
         marks = (artifact.x_m + 1j * artifact.y_m).ravel() / artifact.grid_pitch_m
-        found = [*_symmetries(marks), *((1, step) for step in _steps(phase, shift))]
+        candidates = [*_symmetries(marks), *((1, step) for step in _steps(phase, shift))]
         return [
             motion
-            for number, motion in enumerate(found)
+            for number, motion in enumerate(candidates)
             if not any(
                 abs(motion[0] - turn) + abs(motion[1] - step) < SAME_MARK
-                for turn, step in found[:number]
+                for turn, step in candidates[:number]
             )
         ]
     steps = {
@@ -287,7 +296,7 @@ def _steps(phase: complex, shift: complex) -> list[complex]:
 def _symmetries(marks: np.ndarray) -> Iterator[tuple[complex, complex]]:
     """Yield the turns, and shifts by the least step between two marks, that may fit on a list."""
     outer = marks[np.abs(np.abs(marks) - np.abs(marks).max()) < SAME_MARK]
-    yield from ((other / outer[0] / abs(other / outer[0]), 0j) for other in outer[1:])
+    yield from ((mark / outer[0] / abs(mark / outer[0]), 0j) for mark in outer[1:])
     steps = marks - marks[np.abs(marks).argmin()]
     steps = steps[np.abs(steps) > SAME_MARK]
     yield from ((1 + 0j, step) for step in steps[np.argsort(np.abs(steps))[:4]].tolist())
@@ -313,21 +322,24 @@ def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
 def _sizes(views: list[_Seen], sigma: float) -> tuple[float, float]:
     """Return the noise of a mean and the spread of stage and plate errors, m, by component."""
     total, free = 0.0, 0
-    for seen in views:
-        motion = _motion(seen)
-        lies = np.linalg.lstsq(motion, seen.deviation, rcond=None)[0]
-        rest = seen.deviation - motion @ lies
-        total, free = total + float(np.sum(np.abs(rest) ** 2)), free + len(rest) - FREE
-    share = np.concatenate([1 / seen.count for seen in views]).mean()
+    for readings in views:
+        motion = _motion(readings)
+        lies = np.linalg.lstsq(motion, readings.deviation, rcond=None)[0]
+        residuals_m = readings.deviation - motion @ lies
+        total, free = (
+            total + float(np.sum(np.abs(residuals_m) ** 2)),
+            free + len(residuals_m) - FREE,
+        )
+    share = np.concatenate([1 / readings.count for readings in views]).mean()
     return sigma * float(np.sqrt(share)), float(np.sqrt(total / (2 * max(free, 1))))
 
 
-def _motion(seen: _Seen) -> np.ndarray:
+def _motion(readings: _Seen) -> np.ndarray:
     """Return the columns of a view's own parameters, complex (n, FREE).
 
     Offset, rotation, strain and bending; the residual belongs to the marks.
     """
-    z = seen.place / WINDOW
+    z = readings.place / WINDOW
     return np.stack([np.ones(len(z)), z, z.conj(), z * z, z * z.conj(), z.conj() ** 2], axis=1)
 
 
@@ -343,7 +355,7 @@ def _alike(views: list[_Seen], nodes: float) -> np.ndarray:
     nodes : float
         Distance of the nodes of the map, in pitches; 0 on the lattice.
     """
-    site = np.concatenate([seen.place for seen in views])
+    site = np.concatenate([readings.place for readings in views])
     if not nodes:
         return np.equal.outer(site, site)
     x, y = (np.subtract.outer(part, part) for part in (site.real, site.imag))
@@ -367,37 +379,47 @@ class _Kept:
     ----------
     views : list of _Seen
         Readings of all views.
-    moved : list of int
+    moved_views : list of int
         Those of which other poses are tried.
     noise, spread, stage
         As `_likelihood` takes them.
     """
 
     def __init__(
-        self, views: list[_Seen], moved: list[int], noise: float, spread: float, stage: np.ndarray
+        self,
+        views: list[_Seen],
+        moved_views: list[int],
+        noise: float,
+        spread: float,
+        stage: np.ndarray,
     ) -> None:
         self.noise, self.spread, self.free = noise, spread, FREE * len(views)
-        of_view = np.repeat(np.arange(len(views)), [len(seen.place) for seen in views])
-        tried = np.isin(of_view, moved)
-        kept = np.flatnonzero(~tried)
-        self.beside, self.own = stage[np.ix_(kept, tried)], stage[np.ix_(tried, tried)]
-        self.views = [seen for number, seen in enumerate(views) if number not in moved]
+        of_view = np.repeat(np.arange(len(views)), [len(readings.place) for readings in views])
+        tried = np.isin(of_view, moved_views)
+        fixed = np.flatnonzero(~tried)
+        self.beside, self.own = stage[np.ix_(fixed, tried)], stage[np.ix_(tried, tried)]
+        self.views = [
+            readings for number, readings in enumerate(views) if number not in moved_views
+        ]
         self.factor = np.linalg.cholesky(
-            self._covariance(self.views, self.views, stage[np.ix_(kept, kept)])
+            self._covariance(self.views, self.views, stage[np.ix_(fixed, fixed)])
         )
         self.sizes = np.diag(self.factor).real
         self.white = np.linalg.solve(self.factor, self._columns(self.views, 0))
 
-    def with_moved(self, moved: list[_Seen]) -> tuple[float, float]:
+    def with_moved(self, moved_readings: list[_Seen]) -> tuple[float, float]:
         """Return the likelihood of all readings with those of the others at these poses."""
         white, sizes = self.white, self.sizes
-        if moved:
-            beside = self.whiten @ self._covariance(self.views, moved, self.beside)
+        if moved_readings:
+            whitened_cross = self.whiten @ self._covariance(self.views, moved_readings, self.beside)
             factor = np.linalg.cholesky(
-                self._covariance(moved, moved, self.own) - beside.conj().T @ beside
+                self._covariance(moved_readings, moved_readings, self.own)
+                - whitened_cross.conj().T @ whitened_cross
             )
-            rest = self._columns(moved, len(self.views)) - beside.conj().T @ white
-            white = np.concatenate([white, np.linalg.solve(factor, rest)])
+            residual_columns = (
+                self._columns(moved_readings, len(self.views)) - whitened_cross.conj().T @ white
+            )
+            white = np.concatenate([white, np.linalg.solve(factor, residual_columns)])
             sizes = np.concatenate([sizes, np.diag(factor).real])
         inner = white[:, :-1].conj().T @ white
         square = (
@@ -416,8 +438,8 @@ class _Kept:
         """Return the covariance of readings, `stage` that of the stage's errors in them."""
         (turn, mark), (other_turn, other_mark) = map(_on_plate, (some, others))
         covariance = self.spread**2 / 2 * stage.astype(complex)
-        one, other = np.equal.outer(mark, other_mark).nonzero()
-        covariance[one, other] += self.spread**2 / 2 * turn[one] * other_turn[other].conj()
+        row, column = np.equal.outer(mark, other_mark).nonzero()
+        covariance[row, column] += self.spread**2 / 2 * turn[row] * other_turn[column].conj()
         if some is others:
             covariance.flat[:: len(mark) + 1] += self.noise**2
         return covariance
@@ -428,10 +450,10 @@ class _Kept:
         Complex (n, free + 1).
         """
         rows = [np.zeros((0, self.free + 1), dtype=complex)]
-        for number, seen in enumerate(views, first):
-            row = np.zeros((len(seen.place), self.free + 1), dtype=complex)
-            row[:, FREE * number : FREE * (number + 1)] = _motion(seen)
-            row[:, -1] = seen.deviation
+        for number, readings in enumerate(views, first):
+            row = np.zeros((len(readings.place), self.free + 1), dtype=complex)
+            row[:, FREE * number : FREE * (number + 1)] = _motion(readings)
+            row[:, -1] = readings.deviation
             rows.append(row)
         return np.concatenate(rows)
 
@@ -440,8 +462,10 @@ def _on_plate(views: list[_Seen]) -> tuple[np.ndarray, np.ndarray]:
     """Return turns of the plate and marks of all readings, complex (n,) each."""
     none = np.zeros(0, dtype=complex)
     return (
-        np.concatenate([none, *(np.full(len(seen.place), seen.pose.phase) for seen in views)]),
-        np.round(np.concatenate([none, *(seen.marks for seen in views)]), 3),
+        np.concatenate(
+            [none, *(np.full(len(readings.place), readings.pose.phase) for readings in views)]
+        ),
+        np.round(np.concatenate([none, *(readings.marks for readings in views)]), 3),
     )
 
 
