@@ -313,7 +313,7 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
         means = placed.means((beside * placed.phase)[None], stood[row].size)[0]
         stood[row] = means.reshape(stood[row].shape)
     with_it, halfway, without = (
-        squares(problem, fit(problem, model.y - k * stood))[0] for k in range(3)
+        squares(problem, fit(problem, model.y - k * stood), of_noise=False)[0] for k in range(3)
     )
     noise = max(model.found.xy.sigma, LEAST_NOISE_M)
     information = (with_it + without) / 2 - halfway
@@ -357,7 +357,7 @@ def _lines_sign_findings(
     for sign in (1, -1):  # of the readings before they were turned into the frame of the plate
         y = np.where(angular.weight > 0, sign * (angular.y + turn) - turn, 0.0)
         read = replace(problem, angular=replace(angular, y=y))
-        squared.append(squares(read, fit(read, model.y))[0])
+        squared.append(squares(read, fit(read, model.y), of_noise=False)[0])
     worse = (squared[1] - squared[0]) / max(solved.xy.sigma, LEAST_NOISE_M) ** 2
     return [] if worse > -2 * np.log(SHOWN) else [Finding("lines_sign_not_shown")]
 
