@@ -128,6 +128,7 @@ RESULT = {
     "default), details, text",
     "input": "file and sha256 of the bag",
     "covariance_terms": "terms and factors (r, 2, N, N), for the exact comparison of results; "
+    "those of lack_of_fit add to variances alone; "
     "up to 31 × 31 sites, and not with `--model none`; beside: what they make "
     "of the plate, (r, 2, N, N), of both angular maps, (r, 2, K), and of the "
     "microscope, (r, 4), the last two times the plate's longer half width; "

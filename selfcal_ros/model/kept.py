@@ -80,7 +80,8 @@ class Factors:
     terms : tuple of str
         The term, or the effect, that each factor belongs to.
     of_map : float array (r, 2, nx, ny)
-        Factors L of the covariance L' L of Gx, then Gy.
+        Factors L of the covariance L' L of Gx, then Gy. Those `of_each_place` add to its diagonal
+        alone.
     beside : dict of float array (s, ...)
         What each factor makes of other quantities: `plate` (s, 2, nx, ny), as those of the map;
         `lines` (s, 2, K), the angular maps of stage and plate, and those of the block of the
