@@ -71,12 +71,12 @@ class StepWatch:
         stamps_ns, received_ns : int64 array (n,)
             Stamps, and instants of reception.
         """
-        both = np.concatenate([self._rest, np.stack([stamps_ns, received_ns])], axis=1)
-        whole = both.shape[1] // GROUP * GROUP
-        self._rest = both[:, whole:]
-        if not whole:
+        messages = np.concatenate([self._rest, np.stack([stamps_ns, received_ns])], axis=1)
+        n_grouped = messages.shape[1] // GROUP * GROUP
+        self._rest = messages[:, n_grouped:]
+        if not n_grouped:
             return []
-        stamps, received = both[:, :whole].reshape(2, -1, GROUP)
+        stamps, received = messages[:, :n_grouped].reshape(2, -1, GROUP)
         offset = stamps - received
         self._groups = np.concatenate(
             [
@@ -91,9 +91,9 @@ class StepWatch:
             ],
             axis=1,
         )
-        found = self._look()
+        steps = self._look()
         self._groups = self._groups[:, -2 * BESIDE :]
-        return found
+        return steps
 
     def _look(self) -> list[ClockStep]:
         """Return the steps within a group with neighbours on both sides."""
@@ -138,8 +138,8 @@ class StepWatch:
         """
         offset_ns, _, received_ns = before.tolist()
         if self._nearest is not None:
-            known, when = self._nearest
-            offset_ns = max(offset_ns, known - max(received_ns - when, 0) // SLEW)
+            nearest_ns, when = self._nearest
+            offset_ns = max(offset_ns, nearest_ns - max(received_ns - when, 0) // SLEW)
         self._nearest = offset_ns, received_ns
         return self._nearest
 
@@ -177,16 +177,16 @@ def step_lines(steps: Mapping[str, Iterable[ClockStep]], timeline: Timeline) -> 
     timeline : Timeline
         Commands of the session.
     """
-    found = sorted(
+    remaining = sorted(
         ((step, topic) for topic, mine in steps.items() for step in mine),
         key=lambda item: (item[0].before_ns, item[1]),
     )
     lines = []
-    while found:
-        step, _ = found[0]
-        same = [item for item in found if _alike(item[0], step)]
-        found = [item for item in found if item not in same]
-        topics = " and ".join(sorted({topic for _, topic in same}))
+    while remaining:
+        step, _ = remaining[0]
+        alike = [item for item in remaining if _alike(item[0], step)]
+        remaining = [item for item in remaining if item not in alike]
+        topics = " and ".join(sorted({topic for _, topic in alike}))
         lines.append(_line(topics, step, timeline))
     return lines
 
@@ -203,10 +203,10 @@ def future_lines(topics: Collection[str]) -> list[str]:
     )
 
 
-def _alike(one: ClockStep, other: ClockStep) -> bool:
+def _alike(step: ClockStep, other: ClockStep) -> bool:
     return (
-        abs(one.by_ns - other.by_ns) < 0.1 * abs(other.by_ns)
-        and abs(one.before_ns - other.before_ns) < abs(other.by_ns) + 10_000_000_000
+        abs(step.by_ns - other.by_ns) < 0.1 * abs(other.by_ns)
+        and abs(step.before_ns - other.before_ns) < abs(other.by_ns) + 10_000_000_000
     )
 
 

@@ -129,12 +129,12 @@ class Collector:
         ):
             self._rejected_input[inputs.Reason.ENCODER_MALFORMED] += count
             return
-        finite, known = np.ones(count, dtype=bool), False
+        finite, joint_known = np.ones(count, dtype=bool), False
         for column, name in enumerate(names):
             joint = self._joint(name)
             if joint is None:
                 continue
-            known = True
+            joint_known = True
             good = np.isfinite(positions[:, column])
             finite &= good
             joint.store.add_block(
@@ -144,7 +144,7 @@ class Collector:
             )
         if not finite.all():
             self._rejected_input[inputs.Reason.ENCODER_NOT_FINITE] += int((~finite).sum())
-        if not known and count:
+        if not joint_known and count:
             self._rejected_input[inputs.Reason.ENCODER_UNKNOWN_JOINT] += count
         self._grow(count)
 
@@ -197,9 +197,9 @@ class Collector:
     def newest_command(self) -> inputs.Command | None:
         """The command with the latest stamp, the last received of equal ones; no stray."""
         if self._newest is None and self._commands:
-            kept = set(without_strays(self._commands))
+            regular = set(without_strays(self._commands))
             self._newest = max(
-                (c for c in reversed(self._commands) if c in kept), key=lambda c: c.stamp_ns
+                (c for c in reversed(self._commands) if c in regular), key=lambda c: c.stamp_ns
             )
         return self._newest
 
@@ -255,14 +255,14 @@ class Collector:
             sense=self.sense,
         )
         progress = {
-            index: view_progress(timeline, index, found, self._min_repeats)
-            for index, found in readings.items()
+            index: view_progress(timeline, index, view_readings, self._min_repeats)
+            for index, view_readings in readings.items()
         }
-        parts = tuple(part for view in readings.values() for part in view.parts)
+        cells = tuple(cell for view in readings.values() for cell in view.parts)
         return Measurements(
             timeline.plan_id,
             timeline.artifact,
-            parts,
+            cells,
             sense=self.sense,
             rejected=dict(sorted(loose.items())),
             run_id=timeline.run_id,
@@ -330,15 +330,15 @@ def view_progress(
     """Return the progress of a view."""
     artifact, view = timeline.planned_view(index)
     grid, angular = expected_marks(artifact, view)
-    done, done_theta = n_read_enough(artifact, view, readings, min_repeats)
-    checked = min(max(count_stops(view, part)[1] for part in readings.parts), view.check_marks)
+    grid_done, angular_done = n_read_enough(artifact, view, readings, min_repeats)
+    checked = min(max(count_stops(view, cell)[1] for cell in readings.parts), view.check_marks)
     return ViewProgress(
         index,
         view,
         grid,
-        grid_done=done,
+        grid_done=grid_done,
         angular_expected=angular,
-        angular_done=done_theta,
+        angular_done=angular_done,
         readings=readings,
         end_ns=max(i.end_ns for i in timeline.of_view(index)),
         artifact=artifact,

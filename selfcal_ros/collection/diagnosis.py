@@ -132,16 +132,20 @@ def main_reason(
     if total < AT_LEAST or not bad:
         return None
     reason = max(sorted(bad), key=lambda name: bad[name])
-    count = sum(bad.get(one, 0) for one in PLACED) if placed and reason in PLACED else bad[reason]
+    count = (
+        sum(bad.get(placed_reason, 0) for placed_reason in PLACED)
+        if placed and reason in PLACED
+        else bad[reason]
+    )
     return (reason, count, total) if count > MOST * total else None
 
 
 def diagnose(evidence: Evidence) -> RejectionFinding | None:
     """Return why most of the detections were rejected; None if no reason dominates."""
-    found = main_reason(evidence.rejected, evidence.used, placed=bool(evidence.lies))
-    if found is None:
+    main = main_reason(evidence.rejected, evidence.used, placed=bool(evidence.lies))
+    if main is None:
         return None
-    reason, count, total = found
+    reason, count, total = main
     cause = None
     if reason == Reason.NO_ENCODER:
         cause = _joints(evidence) or _clock(evidence) or _rate(evidence)
@@ -161,10 +165,10 @@ def _joints(e: Evidence) -> str | None:
                 f"no encoder sample came that can be used, {e.rejected[reason]} were rejected "
                 f"as {reason}; {remedy}"
             )
-    seen = ", ".join(repr(name) for name in e.seen_joints) or "none"
+    received = ", ".join(repr(name) for name in e.seen_joints) or "none"
     missing = ", ".join(repr(name) for name in e.missing_joints)
     return (
-        f"no encoder sample of the joint {missing} arrived; joints received: {seen}; set "
+        f"no encoder sample of the joint {missing} arrived; joints received: {received}; set "
         "joint_x, joint_y, joint_theta"
     )
 
@@ -263,8 +267,8 @@ def _stopped(e: Evidence) -> str | None:
     for view in e.marks:
         stage, sites = view.stage[-STOPPED:], view.sites[-STOPPED:]
         still = len(stage) == STOPPED and np.abs(stage - stage[-1]).max() < 1 / 4
-        moved = np.abs(view.stage - stage[-1]).max() > 1 / 2
-        if still and moved and np.abs(sites - sites[-1]).max() > 1:
+        had_moved = np.abs(view.stage - stage[-1]).max() > 1 / 2
+        if still and had_moved and np.abs(sites - sites[-1]).max() > 1:
             return (
                 f"the stage has stopped: it is indicated at {_place(e, stage[-1] * e.pitch_m)} "
                 f"at each of the last {STOPPED} marks; check the encoder and what publishes "
@@ -311,19 +315,21 @@ def _away(e: Evidence, changed: Callable[[np.ndarray], np.ndarray]) -> float:
 
 def fault_text(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
     """Return the fault and the remedy for a combination that fits."""
-    what, remedy = [], []
+    faults, remedy = [], []
     if SCALES[scale]:
-        what.append(f"the indicated positions are {SCALES[scale]}")
+        faults.append(f"the indicated positions are {SCALES[scale]}")
         remedy.append("publish joint positions in metres")
     if swapped:
-        what.append("x and y are exchanged")
+        faults.append("x and y are exchanged")
         remedy.append("exchange joint_x and joint_y")
     if signs == (-1, -1):
-        other = next(s for s in Sense if s is not sense)
-        what.append("the stage is indicated at minus the marks' sites")
-        remedy.append(f"the sense is reversed: measurement_sense {other} (--sense {other})")
+        other_sense = next(s for s in Sense if s is not sense)
+        faults.append("the stage is indicated at minus the marks' sites")
+        remedy.append(
+            f"the sense is reversed: measurement_sense {other_sense} (--sense {other_sense})"
+        )
     elif signs != (1, 1):
         axis = "x" if signs == (-1, 1) else "y"
-        what.append(f"{axis} is indicated with the wrong sign")
+        faults.append(f"{axis} is indicated with the wrong sign")
         remedy.append(f"reverse the sign of {axis}")
-    return f"{' and '.join(what)}; {', and '.join(remedy)}"
+    return f"{' and '.join(faults)}; {', and '.join(remedy)}"

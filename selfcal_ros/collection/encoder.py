@@ -99,8 +99,8 @@ class JointSamples:
         stamps, positions, speeds = stamps[order], positions[order], speeds[order]
         first = np.flatnonzero(np.diff(stamps, prepend=NEVER))
         # from the first of each stamp to all of them: on a circle the last may be nearer
-        beside = np.repeat(positions[first], np.diff(first, append=len(stamps)))
-        spread = np.abs(self._difference(positions - beside))
+        first_positions = np.repeat(positions[first], np.diff(first, append=len(stamps)))
+        spread = np.abs(self._difference(positions - first_positions))
         self.t, self.p = stamps[first], positions[first]
         self.bad = (np.maximum.reduceat(spread, first) if len(first) else spread) > limits.agreement
         self.speed = _fastest(speeds, first)  # with its sign
@@ -228,25 +228,25 @@ class JointSamples:
         sample = np.flatnonzero(owner < len(stamps_ns))
         owner = owner[sample]
         away = np.abs(p[sample] - positions[owner])
-        moved = (away > threshold) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
+        displaced = (away > threshold) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
         limit = np.full(len(stamps_ns), threshold)
-        doubtful = np.unique(owner[moved])  # the noise is computed only where it matters
+        doubtful = np.unique(owner[displaced])  # the noise is computed only where it matters
         limit[doubtful] = np.fmax(
             threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(stamps_ns[doubtful])
         )
-        moved &= away > limit[owner]
+        displaced &= away > limit[owner]
         last = np.full(len(stamps_ns), -1)
-        last[owner[moved]] = sample[moved]  # the last sample of each owner
+        last[owner[displaced]] = sample[displaced]  # the last sample of each owner
         broken = np.diff(t, prepend=t[0]) > self.limits.max_gap_ns
         broken[0] = True
         resumed = np.full(len(stamps_ns), -1)
         resumed[owner[broken[sample]]] = sample[broken[sample]]
-        found = (last >= 0) & (last >= resumed)
-        out[found] = np.sign(positions[found] - p[last[found]])
+        has_motion = (last >= 0) & (last >= resumed)
+        out[has_motion] = np.sign(positions[has_motion] - p[last[has_motion]])
         lost = (resumed >= 0) | ~np.isfinite(positions)
         lost |= np.diff(stamps_ns, prepend=stamps_ns[0]) > LOOK_BACK_NS
         lost |= limit > max(MOST_NOISE_M, threshold)
-        out[lost & ~found] = 0
+        out[lost & ~has_motion] = 0
         return out
 
     def _noise_near(self, stamps_ns: np.ndarray) -> np.ndarray:
@@ -325,8 +325,8 @@ class JointSamples:
         move_right, fast_right, near_right = self._step_to(after + 1)
         # between two samples: their step; at a sample: the smaller of the adjacent steps
         calm = (near_left & ~fast_left) | (near_right & ~fast_right)
-        both = ~calm & (near_left | near_right)
-        moving = np.where(exact, both, fast)
+        fast_on_both_sides = ~calm & (near_left | near_right)
+        moving = np.where(exact, fast_on_both_sides, fast)
         reported = np.isfinite(v[before]) & np.isfinite(v[after])
         rate = np.fmax(v[before], v[after])
         moving = np.where(reported & exact, rate > self.limits.max_speed, moving)

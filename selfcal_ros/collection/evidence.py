@@ -132,31 +132,35 @@ class DetectionsSeen:
             return {None: size}
         marks = self._named(views) if rejected.keys() & set(PLACED) else {}
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
-        seen = seen_poses(marks, limit, self.rules.max_rotation_rad)
-        joints, told = not any(one.planned for one in seen.values()), texts(seen)
+        poses = seen_poses(marks, limit, self.rules.max_rotation_rad)
+        joints, faults = not any(pose.planned for pose in poses.values()), texts(poses)
         alike = (
-            told.get(next(iter(views)), "") if len(views) == 1 else mirrored_alike(seen.values())
+            faults.get(next(iter(views)), "") if len(views) == 1 else mirrored_alike(poses.values())
         )
-        whole = self._evidence(rejected, used, marks, joints=joints, lies=alike)
-        finding = diagnose(whole)
-        found: dict[int | None, RejectionFinding | None] = {
+        session_evidence = self._evidence(rejected, used, marks, joints=joints, lies=alike)
+        finding = diagnose(session_evidence)
+        finding_of_view: dict[int | None, RejectionFinding | None] = {
             index: diagnose(
                 self._evidence(
                     readings.rejected,
                     readings.used,
                     {i: marks[i] for i in marks if i == index},
-                    joints=joints and not told,
-                    lies=told.get(index, ""),
+                    joints=joints and not faults,
+                    lies=faults.get(index, ""),
                     view=index,
                 )
             )
             for index, readings in views.items()
         }
-        named = {index: one for index, one in found.items() if one is not None}
+        named = {
+            index: view_finding
+            for index, view_finding in finding_of_view.items()
+            if view_finding is not None
+        }
         if finding is None or (
             not alike
-            and told.keys() & named.keys()
-            and not (finding.reason in PLACED and joints and wrong_joints(whole))
+            and faults.keys() & named.keys()
+            and not (finding.reason in PLACED and joints and wrong_joints(session_evidence))
         ):
             return named
         return {None: finding}
@@ -169,31 +173,33 @@ class DetectionsSeen:
         bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
         plate, outside = self.artifact, unknown >= AT_LEAST and unknown > MOST * bad
         asked = _asked(plate, [view.view for view in views.values() if view.view.grid])
-        parts = [part for view in views.values() for part in view.parts]
+        cells = [cell for view in views.values() for cell in view.parts]
         unread = [
-            whole.difference(*(np.unique(getattr(part, axis)).tolist() for part in parts))
-            for axis, whole in zip("mn", asked, strict=True)
+            asked_rows.difference(*(np.unique(getattr(cell, axis)).tolist() for cell in cells))
+            for axis, asked_rows in zip("mn", asked, strict=True)
         ]
         if plate.marks is not None or not (outside or any(unread)):
             return None
-        here = (self.table["kind"] == Kind.GRID) & self.table["has_id"] & (self.view_of >= 0)
-        view_of = self.view_of[here]
-        found = [
-            _rows(self.table[axis][here], view_of, limits)
+        named = (self.table["kind"] == Kind.GRID) & self.table["has_id"] & (self.view_of >= 0)
+        view_of = self.view_of[named]
+        seen_rows = [
+            _rows(self.table[axis][named], view_of, limits)
             for axis, limits in zip("mn", plate.limits, strict=True)
         ]
         if len(np.unique(view_of)) < 2:  # rows that are missing may follow
-            found = [rows | whole for rows, whole in zip(found, asked, strict=True)]
-        if not all(found) or any(max(rows) - min(rows) + 1 != len(rows) for rows in found):
+            seen_rows = [
+                rows | asked_rows for rows, asked_rows in zip(seen_rows, asked, strict=True)
+            ]
+        if not all(seen_rows) or any(max(rows) - min(rows) + 1 != len(rows) for rows in seen_rows):
             return None
-        sides, planned = (tuple(map(len, rows)) for rows in (found, asked))
+        sides, planned = (tuple(map(len, rows)) for rows in (seen_rows, asked))
         on_plate = all(
             low <= min(rows) and max(rows) <= high
-            for rows, (low, high) in zip(found, plate.limits, strict=True)
+            for rows, (low, high) in zip(seen_rows, plate.limits, strict=True)
         )
         if sides == planned or outside is on_plate:
             return None
-        (m, n), (nx, ny) = ((f"{min(rows)} to {max(rows)}" for rows in found), plate.shape)
+        (m, n), (nx, ny) = ((f"{min(rows)} to {max(rows)}" for rows in seen_rows), plate.shape)
         exchanged = " (the sides are exchanged)" if sides == (ny, nx) else ""
         return RejectionFinding(
             Reason.UNKNOWN_MARK,
@@ -214,8 +220,8 @@ class DetectionsSeen:
         view: int | None = None,
     ) -> Evidence:
         """Return the facts on a view, or on all."""
-        here = np.ones(len(self.table), dtype=bool) if view is None else self.view_of == view
-        table, encoder = self.table[here], self.encoder()
+        of_view = np.ones(len(self.table), dtype=bool) if view is None else self.view_of == view
+        table, encoder = self.table[of_view], self.encoder()
         kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
         missing = tuple(
             encoder.names[axis]
@@ -246,7 +252,7 @@ class DetectionsSeen:
 
     def _named(self, views: Mapping[int, ViewReadings]) -> dict[int, NamedMarks]:
         """Return view_index -> the last of its marks with ids, as `sense` has them."""
-        found, pitch = {}, self.artifact.grid_pitch_m
+        named_marks, pitch = {}, self.artifact.grid_pitch_m
         for index, readings in views.items():
             table = self.table[np.flatnonzero(self.view_of == index)[-LOOKED_AT:]]
             stage = self.exposures.at(table["stamp"])
@@ -259,7 +265,7 @@ class DetectionsSeen:
             x, y = self.artifact.places(table["m"][good], table["n"][good])
             offset = np.stack([table["ox"][good], table["oy"][good]])
             cells = places_of_cells(readings.view, offset)
-            found[index] = NamedMarks(
+            named_marks[index] = NamedMarks(
                 readings.view.name,
                 readings.view.on_stage(self.artifact),
                 x + 1j * y,
@@ -268,7 +274,7 @@ class DetectionsSeen:
                 _complex(offset - cells) / pitch,
                 listed=self.artifact.marks is not None,
             )
-        return found
+        return named_marks
 
 
 def _rows(ids: np.ndarray, view_of: np.ndarray, limits: tuple[int, int]) -> set[int]:

@@ -41,7 +41,7 @@ def expected_marks(artifact: Artifact, view: View) -> tuple[int, int]:
     """
     lines = artifact.angular_count if view.angular else 0
     if view.image is not None and view.grid:
-        return sum(int(shown.sum()) for shown in marks_shown(artifact, view)), lines
+        return sum(int(marks.sum()) for marks in marks_shown(artifact, view)), lines
     return int(mark_rows(artifact, view)[1].sum()), lines
 
 
@@ -50,23 +50,23 @@ def n_read_enough(
 ) -> tuple[int, int]:
     """Return the numbers of grid marks and lines read often enough, see `read_enough`."""
     if not readings.cells:
-        done, done_theta = read_enough(view, readings, min_repeats)
-        return int(done.sum()), int(done_theta.sum())
-    shown = marks_shown(artifact, view)
+        enough, enough_theta = read_enough(view, readings, min_repeats)
+        return int(enough.sum()), int(enough_theta.sum())
+    cell_marks = marks_shown(artifact, view)
     return (
         sum(
-            int((marks & _read(artifact, part, min_repeats)).sum())
-            for marks, part in zip(shown, readings.cells, strict=True)
+            int((marks & _read(artifact, cell, min_repeats)).sum())
+            for marks, cell in zip(cell_marks, readings.cells, strict=True)
         ),
         int(read_enough(view, readings, min_repeats)[1].sum()),
     )
 
 
-def _read(artifact: Artifact, part: ViewReadings, min_repeats: int) -> np.ndarray:
+def _read(artifact: Artifact, cell: ViewReadings, min_repeats: int) -> np.ndarray:
     """Return the marks that were read often enough in a cell, bool (nx, ny)."""
-    done = read_enough(part.view, part, min_repeats)[0]
+    enough = read_enough(cell.view, cell, min_repeats)[0]
     out = np.zeros(artifact.shape, dtype=bool)
-    out[artifact.index(part.m[done], part.n[done])] = True
+    out[artifact.index(cell.m[enough], cell.n[enough])] = True
     return out
 
 
@@ -75,8 +75,8 @@ def _missing_stops(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the marks (m, n) at which an image has to be taken again: not all of it was read."""
     stops = np.zeros(artifact.shape, dtype=bool)
-    for marks, part in zip(marks_shown(artifact, view), readings.cells, strict=True):
-        stops |= beside(marks & ~_read(artifact, part, min_repeats), artifact, part.view, -1)
+    for marks, cell in zip(marks_shown(artifact, view), readings.cells, strict=True):
+        stops |= beside(marks & ~_read(artifact, cell, min_repeats), artifact, cell.view, -1)
     i, j = np.nonzero(stops)
     return artifact.marks_at(i[:NAMED_AT_MOST], j[:NAMED_AT_MOST])
 
@@ -89,13 +89,13 @@ def read_enough(
     As often as the plan asks; with `min_repeats`, this many good readings suffice once the mark was
     read as often as the plan asks, outliers included.
     """
-    found = []
+    masks = []
     for count, tries in _tried(view, readings):
         enough = count >= view.repeats
         if min_repeats:
             enough |= (tries >= view.repeats) & (count >= min_repeats)
-        found.append(enough)
-    return found[0], found[1]
+        masks.append(enough)
+    return masks[0], masks[1]
 
 
 def _tried(view: View, readings: ViewReadings) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -120,13 +120,13 @@ def missing_marks(
     grid, angular = expected_marks(artifact, view)
     end = np.cumsum(count)
     of_zero = end - count - first  # number of the mark n = 0 of each row
-    done, done_theta = read_enough(view, readings, min_repeats)
-    lines = first_missing(np.sort(readings.k[done_theta]), angular)
+    enough, enough_theta = read_enough(view, readings, min_repeats)
+    lines = first_missing(np.sort(readings.k[enough_theta]), angular)
     if readings.cells:
         m, n = _missing_stops(artifact, view, readings, min_repeats)
         return Missing(tuple(m.tolist()), tuple(n.tolist()), tuple(lines.tolist()))
-    row = artifact.index(readings.m[done], readings.n[done])[0]
-    number = first_missing(np.sort(of_zero[row] + readings.n[done]), grid)
+    row = artifact.index(readings.m[enough], readings.n[enough])[0]
+    number = first_missing(np.sort(of_zero[row] + readings.n[enough]), grid)
     row = np.searchsorted(end, number, "right")
     return Missing(
         tuple(artifact.marks_at(row, row)[0].tolist()),
@@ -135,10 +135,10 @@ def missing_marks(
     )
 
 
-def first_missing(done: np.ndarray, total: int) -> np.ndarray:
-    """Return the first of the numbers 0..total-1 that are not in `done` (rising, each once)."""
-    rank = np.arange(min(total - len(done), NAMED_AT_MOST))
-    return rank + np.searchsorted(done - np.arange(len(done)), rank, "right")
+def first_missing(read_numbers: np.ndarray, total: int) -> np.ndarray:
+    """Return the first of the numbers 0..total-1 not in `read_numbers` (rising, each once)."""
+    rank = np.arange(min(total - len(read_numbers), NAMED_AT_MOST))
+    return rank + np.searchsorted(read_numbers - np.arange(len(read_numbers)), rank, "right")
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class ViewProgress:
     def needed(self) -> int:
         """Smallest number of detections needed to complete the view."""
         repeats, have = self.view.repeats, 0
-        tried = [pair for part in self.readings.parts for pair in _tried(part.view, part)]
+        tried = [pair for cell in self.readings.parts for pair in _tried(cell.view, cell)]
         for count, tries in tried:
             more = repeats - count
             if self.min_repeats:
@@ -201,7 +201,7 @@ class ViewProgress:
 
         Marks that are complete would be none until the last pass over the plate.
         """
-        wanted = (
+        planned = (
             self.view.repeats * (self.grid_expected + self.angular_expected) + self.check_expected
         )
-        return 1 - self.needed / wanted if wanted else 1.0
+        return 1 - self.needed / planned if planned else 1.0

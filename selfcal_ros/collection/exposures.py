@@ -102,13 +102,13 @@ class Exposures:
 
     def _index(self, stamps_ns: np.ndarray) -> np.ndarray | slice:
         """Return the indices of some instants; consecutive ones as a slice, to avoid copies."""
-        known = self._stamps.rows
+        instants = self._stamps.rows
         if len(stamps_ns):
-            first = int(np.searchsorted(known, stamps_ns[0]))
-            here = slice(first, first + len(stamps_ns))
-            if np.array_equal(known[here], stamps_ns):
-                return here
-        return np.searchsorted(known, stamps_ns)
+            first = int(np.searchsorted(instants, stamps_ns[0]))
+            rows = slice(first, first + len(stamps_ns))
+            if np.array_equal(instants[rows], stamps_ns):
+                return rows
+        return np.searchsorted(instants, stamps_ns)
 
     def update(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Take further instants of exposure, and the encoder samples since the last call.
@@ -127,12 +127,12 @@ class Exposures:
         if not (stamps_ns[1:] > stamps_ns[:-1]).all():
             stamps_ns = np.unique(stamps_ns)
         due = self._insert(stamps_ns, due)
-        known = np.flatnonzero(due & (self._joints[0]["approach"] != NEW))
-        before = self._at_instants(known)
+        looked_up = np.flatnonzero(due & (self._joints[0]["approach"] != NEW))
+        before = self._at_instants(looked_up)
         for group in self._groups(np.flatnonzero(due)):
             self._look_up(group)
         changed = np.zeros(len(due), dtype=bool)
-        changed[known] = _differ(before, self._at_instants(known))
+        changed[looked_up] = _differ(before, self._at_instants(looked_up))
         return self._fill(due, changed)
 
     def _due_to_samples(self) -> np.ndarray:
@@ -150,13 +150,13 @@ class Exposures:
 
     def _insert(self, stamps_ns: np.ndarray, due: np.ndarray) -> np.ndarray:
         """Add new instants; return `due` with them and the following ones."""
-        known = self._stamps.rows
-        at = np.searchsorted(known, stamps_ns)
+        instants = self._stamps.rows
+        at = np.searchsorted(instants, stamps_ns)
         fresh = np.ones(len(stamps_ns), dtype=bool)
-        inside = at < len(known)
-        fresh[inside] = known[at[inside]] != stamps_ns[inside]
+        inside = at < len(instants)
+        fresh[inside] = instants[at[inside]] != stamps_ns[inside]
         at, stamps_ns = at[fresh], stamps_ns[fresh]
-        behind = at[at < len(known)]
+        behind = at[at < len(instants)]
         due[behind] = True  # the time since the previous exposure has changed
         self._stamps.insert(at, stamps_ns)
         for joint in self._joints:
@@ -206,17 +206,17 @@ class Exposures:
         """Look up a group of instants, all between its ends."""
         start, end = self._window(group)
         index = np.arange(group[0], group[-1] + 1)
-        here = slice(group[0], group[-1] + 1)
-        stamps, since = self._stamps.rows[here], self._since(index)
+        rows = slice(group[0], group[-1] + 1)
+        stamps, since = self._stamps.rows[rows], self._since(index)
         for number, (joint, track) in enumerate(zip(self._joints, self._tracks, strict=True)):
             series = track.between(start, end)
             position, codes = series.query(stamps)
-            joint["position"][here], joint["reason"][here] = position, codes
-            joint["moving"][here] = series.moving(stamps, codes)
+            joint["position"][rows], joint["reason"][rows] = position, codes
+            joint["moving"][rows] = series.moving(stamps, codes)
             linear = number < N_LINEAR
             if linear:
-                joint["motion"][here] = self._motions(series, index, position)
-            joint["first"][here], joint["last"][here] = series.decided_by(
+                joint["motion"][rows] = self._motions(series, index, position)
+            joint["first"][rows], joint["last"][rows] = series.decided_by(
                 stamps, since if linear else None
             )
 
@@ -227,9 +227,9 @@ class Exposures:
         if first == 0:
             return series.approach(stamps[index], position, threshold=self._threshold_m)
         # after the previous exposure, whose own samples may be incomplete here
-        both = np.concatenate([stamps[first - 1 : first], stamps[index]])
+        with_previous = np.concatenate([stamps[first - 1 : first], stamps[index]])
         return series.approach(
-            both, np.concatenate([[np.nan], position]), threshold=self._threshold_m
+            with_previous, np.concatenate([[np.nan], position]), threshold=self._threshold_m
         )[1:]
 
     def _fill(self, due: np.ndarray, changed: np.ndarray) -> np.ndarray:
@@ -237,15 +237,15 @@ class Exposures:
         if not due.any():
             return NO_STAMPS
         start = int(due.argmax())  # nothing changes before the first one looked up
-        changed, known = changed[start:], np.zeros(0, dtype=bool)
+        changed, looked_up = changed[start:], np.zeros(0, dtype=bool)
         for joint in self._joints[:N_LINEAR]:
             old = joint["approach"][start:]
             before = joint["approach"][start - 1 : start] if start else np.zeros(1, dtype=np.int8)
-            found = encoder.filled(np.concatenate([before, joint["motion"][start:]]))[1:]
-            known = old != NEW
-            changed |= found != old
-            joint["approach"][start:] = found
-        return self._stamps.rows[start:][changed & known]
+            approach = encoder.filled(np.concatenate([before, joint["motion"][start:]]))[1:]
+            looked_up = old != NEW
+            changed |= approach != old
+            joint["approach"][start:] = approach
+        return self._stamps.rows[start:][changed & looked_up]
 
 
 def _differ(before: list[np.ndarray], after: list[np.ndarray]) -> np.ndarray:

@@ -231,18 +231,18 @@ def good_sigmas(sigma: np.ndarray) -> np.ndarray:
 
     A collector accepts no others, so that a solver can use its output.
     """
-    known = (sigma >= SMALLEST_SIGMA) & (sigma <= LARGEST)
-    least = np.median(sigma[known]) / SIGMA_SPAN if known.any() else 0.0
-    return (sigma == 0) | (known & (sigma >= least))
+    in_range = (sigma >= SMALLEST_SIGMA) & (sigma <= LARGEST)
+    least = np.median(sigma[in_range]) / SIGMA_SPAN if in_range.any() else 0.0
+    return (sigma == 0) | (in_range & (sigma >= least))
 
 
 def _check_values(
-    where: str, table: ViewReadings | GridVisits, told: Iterable[str], perhaps: Iterable[str]
+    where: str, table: ViewReadings | GridVisits, required: Iterable[str], perhaps: Iterable[str]
 ) -> None:
     """Raise InputError for values that are too large, or NaN where required."""
-    for name in (*told, *perhaps):
+    for name in (*required, *perhaps):
         size = np.abs(getattr(table, name))
-        if np.any(size > LARGEST) or (name in told and np.isnan(size).any()):
+        if np.any(size > LARGEST) or (name in required and np.isnan(size).any()):
             raise InputError(where, f"{name} is not a number up to {LARGEST:g}", "give m and rad")
         if name in ("u", "u_theta") and np.any((size > 0) & (size < SMALLEST_U)):
             raise InputError(where, f"{name} is below {SMALLEST_U:g}", "give m and rad")

@@ -63,10 +63,10 @@ def canonical(detections: np.ndarray) -> np.ndarray:
     """
     d = detections.copy()
     grid, angular = d["kind"] == Kind.GRID, d["kind"] == Kind.ANGULAR
-    for field, used in (("ox", grid), ("oy", grid), ("ot", angular)):
-        d[field] = np.where(used, d[field] + 0.0, 0.0)
-    for field, used in (("m", grid), ("n", grid), ("k", angular)):
-        d[field] *= used & d["has_id"]
+    for field, has_field in (("ox", grid), ("oy", grid), ("ot", angular)):
+        d[field] = np.where(has_field, d[field] + 0.0, 0.0)
+    for field, has_field in (("m", grid), ("n", grid), ("k", angular)):
+        d[field] *= has_field & d["has_id"]
     for field in ("sigma", "score"):
         d[field] += 0.0
     return d
@@ -92,9 +92,9 @@ def clean(
         Whether scores are reported (any detection of the session has one above 0).
     """
     rejected: Counter = Counter()
-    known = (detections["kind"] == Kind.GRID) | (detections["kind"] == Kind.ANGULAR)
-    rejected[Reason.UNKNOWN_KIND] = int((~known).sum())
-    d = _where(known, detections)
+    known_kind = (detections["kind"] == Kind.GRID) | (detections["kind"] == Kind.ANGULAR)
+    rejected[Reason.UNKNOWN_KIND] = int((~known_kind).sum())
+    d = _where(known_kind, detections)
     finite = d["sigma"] >= 0
     for field in ("ox", "oy", "ot", "sigma", "score"):
         finite &= np.isfinite(d[field])
@@ -138,11 +138,11 @@ def _canonical(d: np.ndarray) -> np.ndarray:
     if (step > 0).all():  # in order of arrival
         return d
     d = d[np.argsort(d["stamp"], kind="stable")]
-    same = d["stamp"][1:] == d["stamp"][:-1]
-    if not same.any():
+    same_stamp = d["stamp"][1:] == d["stamp"][:-1]
+    if not same_stamp.any():
         return d
-    beside = np.append(same, False) | np.append(False, same)
-    d = np.concatenate([d[~beside], np.unique(d[beside])])
+    shares_stamp = np.append(same_stamp, False) | np.append(False, same_stamp)
+    d = np.concatenate([d[~shares_stamp], np.unique(d[shares_stamp])])
     return d[np.argsort(d["stamp"], kind="stable")]
 
 
@@ -161,46 +161,48 @@ def reduce_view(
         artifact, view, grid, exposures=exposures, rules=rules, rejected=rejected, places=places
     )
     lines = _reduce_angular(artifact, view, angular, exposures, rules, rejected, marks.phi_rad)
-    parts = []
+    cells = []
     for number, sub in enumerate(view.sub_views):
-        here = _reduce_grid(artifact, sub, marks.of_cell(number), rules, rejected, places)
+        grid_fields = _reduce_grid(artifact, sub, marks.of_cell(number), rules, rejected, places)
         with_lines = lines if sub.cell in (None, (0, 0)) else {}
-        parts.append(
+        cells.append(
             replace(
                 ViewReadings(sub),
-                **here,
+                **grid_fields,
                 **with_lines,
-                used=int(here["count"].sum() + (lines["count_theta"].sum() if with_lines else 0)),
+                used=int(
+                    grid_fields["count"].sum() + (lines["count_theta"].sum() if with_lines else 0)
+                ),
             )
         )
-    whole = parts[0] if parts[0].view is view else _of_image(view, parts, lines)
+    readings = cells[0] if cells[0].view is view else _of_image(view, cells, lines)
     return replace(
-        with_rejections(whole, dict(sorted((str(r), c) for r, c in rejected.items()))),
+        with_rejections(readings, dict(sorted((str(r), c) for r, c in rejected.items()))),
         places=places.places(),
     )
 
 
-def _of_image(view: View, parts: Sequence[ViewReadings], lines: dict) -> ViewReadings:
+def _of_image(view: View, cells: Sequence[ViewReadings], lines: dict) -> ViewReadings:
     """Return the readings of a view with images from those of its cells, and of its lines."""
-    dof = sum(part.dof_xy for part in parts)
-    squares = sum(part.dof_xy * part.sigma_xy**2 for part in parts if part.dof_xy)
+    dof = sum(cell.dof_xy for cell in cells)
+    squares = sum(cell.dof_xy * cell.sigma_xy**2 for cell in cells if cell.dof_xy)
     return replace(
         ViewReadings(view),
         **lines,
-        cells=tuple(parts),
+        cells=tuple(cells),
         dof_xy=dof,
         sigma_xy=float(np.sqrt(squares / dof)) if dof else float("nan"),
-        used=sum(part.used for part in parts),
+        used=sum(cell.used for cell in cells),
     )
 
 
 def with_rejections(readings: ViewReadings, rejected: dict[str, int]) -> ViewReadings:
     """Return the readings of a view with its rejections; of an image, in the cell of the axis."""
     cells = tuple(
-        replace(part, rejected=rejected, places=readings.places)
-        if part.view.cell == (0, 0)
-        else part
-        for part in readings.cells
+        replace(cell, rejected=rejected, places=readings.places)
+        if cell.view.cell == (0, 0)
+        else cell
+        for cell in readings.cells
     )
     return replace(readings, rejected=rejected, cells=cells)
 
@@ -224,22 +226,22 @@ class _GridMarks:
 
     def of_cell(self, number: int) -> "_GridMarks":
         """Return the detections in one cell of the image."""
-        here = self.cell == number
-        if here.all():
+        in_cell = self.cell == number
+        if in_cell.all():
             return self
         index, deviation, residual, position, approach = (
-            np.compress(here, values, axis=-1)
+            np.compress(in_cell, values, axis=-1)
             for values in (self.index, self.deviation, self.residual, self.position, self.approach)
         )
         return _GridMarks(
-            self.detections[here],
+            self.detections[in_cell],
             index,
             deviation,
             residual,
             position,
             approach,
             self.phi_rad,
-            self.cell[here],
+            self.cell[in_cell],
         )
 
 
@@ -258,20 +260,21 @@ def _grid_marks(
     position = np.stack([stage.x.position, stage.y.position])
     why = _reasons((stage.x, stage.y), (stage.theta,))
     d, (position, approach) = _keep(d, why, rejected, position, stage.approach, places=places)
-    found, number = _identified(artifact, view, d, position, rules)
+    assignment, number = _identified(artifact, view, d, position, rules)
     d, (position, index, deviation, residual, approach, number) = _keep(
         d,
-        found.reasons,
+        assignment.reasons,
         rejected,
         position,
-        found.index,
-        found.deviation,
-        found.residual,
+        assignment.index,
+        assignment.deviation,
+        assignment.residual,
         approach,
         number,
         places=places,
     )
-    told = found.phi_error_rad <= np.pi / 2 / max(artifact.angular_count, 1)  # a quarter line
+    quarter_line_rad = np.pi / 2 / max(artifact.angular_count, 1)
+    phi_determined = assignment.phi_error_rad <= quarter_line_rad
     return _GridMarks(
         d,
         index,
@@ -279,7 +282,7 @@ def _grid_marks(
         residual,
         position,
         approach,
-        found.rigid.phi_rad if told else None,
+        assignment.rigid.phi_rad if phi_determined else None,
         number,
     )
 
@@ -291,24 +294,28 @@ def _identified(
 
     Marks of a displaced plate are displaced in the image, and lie beside it without ids.
     """
-    found, number = _identified_at(artifact, view, d, position, rules)
-    if view.image is None or not np.isin(found.reasons, DISPLACED).any():
-        return found, number
+    assignment, number = _identified_at(artifact, view, d, position, rules)
+    if view.image is None or not np.isin(assignment.reasons, DISPLACED).any():
+        return assignment, number
     offset = np.stack([d["ox"], d["oy"]])
-    named = d["has_id"] & (found.reasons != Reason.UNKNOWN_MARK)
+    named = d["has_id"] & (assignment.reasons != Reason.UNKNOWN_MARK)
     marks = artifact.places(d["m"][named], d["n"][named])
     away = offset[:, named] + _reading(rules.sense, position[:, named], 0.0)
     away -= np.stack(view.on_stage(artifact).site_of(*marks)) * artifact.grid_pitch_m
     plate = (
         0j
         if named.any()
-        else displacement(artifact, view, found.rigid, _reading(rules.sense, position, offset))
+        else displacement(artifact, view, assignment.rigid, _reading(rules.sense, position, offset))
     )
     tried = _identified_at(
         artifact, view, d, position, rules, plate=plate, shift=stops.shift_of(view, offset, away)
     )
     scaled = _identified_at(artifact, view, d, position, rules, of_cell=True)
-    return tried if plate else max((found, number), scaled, tried, key=lambda one: _found(one[0]))
+    return (
+        tried
+        if plate
+        else max((assignment, number), scaled, tried, key=lambda attempt: _found(attempt[0]))
+    )
 
 
 DISPLACED = (
@@ -330,10 +337,10 @@ def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.nda
     pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
     centred = reading_m - np.array(pose.shift)[:, None] * pitch
     on_plate = artifact.nearest(*pose.turned_back(*(rigid.undo(centred) / pitch)))
-    beside = (
+    pitches_off = (
         stops.middle_of(row, side) for row, side in zip(on_plate, artifact.shape, strict=True)
     )
-    x, y = pose.turned(*(np.array([float(number)]) for number in beside))
+    x, y = pose.turned(*(np.array([float(number)]) for number in pitches_off))
     return complex(x[0], y[0])
 
 
@@ -351,27 +358,27 @@ def _identified_at(
     """Return marks and cells with a displacement of the image, cells, and of the plate, pitches."""
     offset = np.stack([d["ox"], d["oy"]])
     number = stops.numbers_of(view, stops.cells_of(view, offset, shift))
-    beside = stops.places_of_cells(view, offset, shift)
+    cell_places_m = stops.places_of_cells(view, offset, shift)
     away = np.array([[plate.real], [plate.imag]]) * artifact.grid_pitch_m + (
-        stops.middles(view, number, offset - beside) if of_cell else 0.0
+        stops.middles(view, number, offset - cell_places_m) if of_cell else 0.0
     )
-    found = identify.identify_grid(
+    assignment = identify.identify_grid(
         artifact,
         view,
         _reading(rules.sense, position, offset) - away,
         ids=np.stack([d["m"], d["n"]]),
         has_id=d["has_id"],
         rules=rules.identity,
-        stage_m=_reading(rules.sense, position, beside),
-        beside_m=beside if view.image else None,
+        stage_m=_reading(rules.sense, position, cell_places_m),
+        beside_m=cell_places_m if view.image else None,
     )
-    found = replace(found, deviation=found.deviation + away)
-    found.reasons[number < 0] = Reason.OUTSIDE_IMAGE
-    astray = found.reasons == Reason.NOT_AT_MARK
+    assignment = replace(assignment, deviation=assignment.deviation + away)
+    assignment.reasons[number < 0] = Reason.OUTSIDE_IMAGE
+    astray = assignment.reasons == Reason.NOT_AT_MARK
     if astray.any():
-        astray &= np.isin(d["stamp"], d["stamp"][found.reasons == None])  # noqa: E711
-        found.reasons[astray] = Reason.SEVERAL
-    return found, number
+        astray &= np.isin(d["stamp"], d["stamp"][assignment.reasons == None])  # noqa: E711
+        assignment.reasons[astray] = Reason.SEVERAL
+    return assignment, number
 
 
 def _reduce_grid(
@@ -444,7 +451,7 @@ def _reduce_angular(
     # an offset beyond half a turn is invalid, though it may wrap to a small one
     why[(why == None) & (np.abs(d["ot"]) > np.pi)] = Reason.TOO_FAR  # noqa: E711
     d, (theta,) = _keep(d, why, rejected, stage.theta.position)
-    found = identify.identify_angular(
+    assignment = identify.identify_angular(
         artifact,
         view,
         _reading(rules.sense, theta, d["ot"]),
@@ -453,11 +460,11 @@ def _reduce_angular(
         rules=rules.identity,
         phi_rad=phi,
     )
-    d, (k, v, rest) = _keep(
-        d, found.reasons, rejected, found.index, found.deviation, found.residual
+    d, (k, v, residual) = _keep(
+        d, assignment.reasons, rejected, assignment.index, assignment.deviation, assignment.residual
     )
     means = reduce_repeats(
-        k, v[None], d["sigma"], limit=rules.outlier_limit, extent=4 * np.pi, residual=rest[None]
+        k, v[None], d["sigma"], limit=rules.outlier_limit, extent=4 * np.pi, residual=residual[None]
     )
     _count(rejected, Reason.OUTLIER, means.outlier)
     place = identify.wrap(v - d["ot"])  # of the axis relative to the line, without full turns
@@ -489,15 +496,15 @@ def _reading(sense: Sense, position: np.ndarray, offset: np.ndarray | float) -> 
     return offset - position if sense is Sense.PLATE_MOVES else position + offset
 
 
-def _reasons(needed: Sequence[JointAt], others: Sequence[JointAt]) -> np.ndarray:
+def _reasons(needed: Sequence[JointAt], still: Sequence[JointAt]) -> np.ndarray:
     """Return the first reason of each detection, or None: each counts once.
 
-    The position of `needed` joints must be known, the others must not move.
+    The position of `needed` joints must be known, those of `still` must not move.
     """
     codes = needed[0].code
     for joint in needed[1:]:
         codes = np.where(codes == GOOD, joint.code, codes)
-    for joint in others:
+    for joint in still:
         codes = np.where((codes == GOOD) & joint.moving, MOVING, codes)
     return REASONS[codes]
 

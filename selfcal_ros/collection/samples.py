@@ -142,19 +142,20 @@ class SampleStore:
         """Add samples in any order; `speeds` None or NaN if unknown."""
         start = 0
         while start < len(stamps):
-            taken = min(self._limits.block - self._filled, len(stamps) - start)
-            here, part = (slice(at, at + taken) for at in (self._filled, start))
-            t = self._filling[0][here]
-            t[:] = stamps[part]
-            np.add(positions[part], 0.0, out=self._filling[1][here])  # -0.0 and 0.0 sort as equal
-            self._filling[2][here] = np.nan if speeds is None else speeds[part]
+            count = min(self._limits.block - self._filled, len(stamps) - start)
+            target, source = (slice(at, at + count) for at in (self._filled, start))
+            t = self._filling[0][target]
+            t[:] = stamps[source]
+            # -0.0 and 0.0 sort as equal
+            np.add(positions[source], 0.0, out=self._filling[1][target])
+            self._filling[2][target] = np.nan if speeds is None else speeds[source]
             self._rising &= bool(t[0] >= self._last_ns and (t[1:] >= t[:-1]).all())
             self._last_ns = max(self._last_ns, int(t[-1]))
             self.newest_ns = max(self.newest_ns, int(t.max()))
             self._unseen.append(t)
-            self._filled += taken
-            self._count += taken
-            start += taken
+            self._filled += count
+            self._count += count
+            start += count
             if self._filled == self._limits.block:
                 self._close()
 
@@ -173,12 +174,14 @@ class SampleStore:
 
     def _close(self) -> None:
         stamps, positions, speeds = self._open()
-        told = bool(np.isfinite(speeds).any() or np.isinf(speeds).any())
-        columns = (stamps, positions, speeds) if told else (stamps, positions)
-        self._blocks.append(_Block(int(stamps[0]), int(stamps[-1]), len(stamps), told, columns))
+        has_speeds = bool(np.isfinite(speeds).any() or np.isinf(speeds).any())
+        columns = (stamps, positions, speeds) if has_speeds else (stamps, positions)
+        self._blocks.append(
+            _Block(int(stamps[0]), int(stamps[-1]), len(stamps), has_speeds, columns)
+        )
         self._firsts, self._lasts, self._counts = (
-            np.append(known, new)
-            for known, new in (
+            np.append(values, new)
+            for values, new in (
                 (self._firsts, stamps[0]),
                 (self._lasts, stamps[-1]),
                 (self._counts, len(stamps)),
@@ -186,9 +189,9 @@ class SampleStore:
         )
         self._filling, self._filled, self._rising = self._empty(), 0, True
         self._last_ns = np.iinfo(np.int64).min
-        held = [number for number, block in enumerate(self._blocks) if block.columns]
-        if len(held) > self._limits.in_memory and not self.problem:
-            self._store(min(held, key=lambda number: self._blocks[number].last_ns))
+        loaded = [number for number, block in enumerate(self._blocks) if block.columns]
+        if len(loaded) > self._limits.in_memory and not self.problem:
+            self._store(min(loaded, key=lambda number: self._blocks[number].last_ns))
 
     def _store(self, number: int) -> None:
         """Move a block to the file."""
@@ -260,37 +263,39 @@ class SampleStore:
         """Return which blocks may have samples between two stamps."""
         return (self._lasts >= start_ns) & (self._firsts <= end_ns)
 
-    def near(self, start_ns: int, end_ns: int, beside: int) -> Samples:
+    def near(self, start_ns: int, end_ns: int, neighbours: int) -> Samples:
         """Return the samples from `start_ns` to `end_ns`, and their neighbours, in any order.
 
-        On each side at least the `beside` nearest stamps are included with all of their samples,
-        or as many as exist. Samples received in the order of their stamps keep it. The result
-        may be owned by the store and must not be written to.
+        On each side at least the `neighbours` nearest stamps are included with all of their
+        samples, or as many as exist. Samples received in the order of their stamps keep it. The
+        result may be owned by the store and must not be written to.
         """
         open_samples = self._open()
-        parts = [_cut(open_samples, start_ns, end_ns, beside)] if len(open_samples[0]) else []
-        parts += [
-            _cut(self._columns(self._blocks[number]), start_ns, end_ns, beside)
+        pieces = [_cut(open_samples, start_ns, end_ns, neighbours)] if len(open_samples[0]) else []
+        pieces += [
+            _cut(self._columns(self._blocks[number]), start_ns, end_ns, neighbours)
             for number in np.flatnonzero(self._touched(start_ns, end_ns))
         ]
         before = np.flatnonzero(self._lasts < start_ns)
         after = np.flatnonzero(self._firsts > end_ns)
-        for side, sign, edge, known in (
+        for side, sign, edge, nearest in (
             (before, -1, start_ns, -self._lasts[before]),
             (after, 1, end_ns, self._firsts[after]),
         ):
-            for at in np.argsort(known, kind="stable"):
-                if known[at] > _nth(parts, edge, sign, beside):
+            for at in np.argsort(nearest, kind="stable"):
+                if nearest[at] > _nth(pieces, edge, sign, neighbours):
                     break
-                parts.append(_cut(self._columns(self._blocks[side[at]]), start_ns, end_ns, beside))
-        parts = [part for part in parts if len(part[0])]
-        return _joined(sorted(parts, key=lambda part: part[0][0]))
+                pieces.append(
+                    _cut(self._columns(self._blocks[side[at]]), start_ns, end_ns, neighbours)
+                )
+        pieces = [piece for piece in pieces if len(piece[0])]
+        return _joined(sorted(pieces, key=lambda piece: piece[0][0]))
 
 
-def _joined(parts: list[Samples]) -> Samples:
-    if len(parts) < 2:
-        return parts[0] if parts else (NO_STAMPS, np.zeros(0), np.zeros(0))
-    stamps, positions, speeds = (np.concatenate(column) for column in zip(*parts, strict=True))
+def _joined(pieces: list[Samples]) -> Samples:
+    if len(pieces) < 2:
+        return pieces[0] if pieces else (NO_STAMPS, np.zeros(0), np.zeros(0))
+    stamps, positions, speeds = (np.concatenate(column) for column in zip(*pieces, strict=True))
     return stamps, positions, speeds
 
 
@@ -300,21 +305,21 @@ def _with_speeds(columns: tuple[np.ndarray, ...]) -> Samples:
     return stamps, positions, speeds[0] if speeds else np.full(len(stamps), np.nan)
 
 
-def _nth(parts: list[Samples], edge: int, sign: int, n: int) -> float:
+def _nth(pieces: list[Samples], edge: int, sign: int, n: int) -> float:
     """Return sign times the n-th stamp before or after an edge, infinity if there are fewer."""
     beyond = [
         t[: np.searchsorted(t, edge)] if sign < 0 else t[np.searchsorted(t, edge, "right") :]
-        for t, _, _ in parts
+        for t, _, _ in pieces
     ]
     stamps = np.unique(sign * np.concatenate([NO_STAMPS, *beyond]))
     return float("inf") if len(stamps) < n else int(stamps[n - 1])
 
 
-def _cut(columns: tuple[np.ndarray, ...], start_ns: int, end_ns: int, beside: int) -> Samples:
-    """Return the samples between two stamps and of at least `beside` stamps on either side."""
+def _cut(columns: tuple[np.ndarray, ...], start_ns: int, end_ns: int, neighbours: int) -> Samples:
+    """Return the samples between two stamps and of at least `neighbours` stamps on either side."""
     t = columns[0]
-    low = _reach(t[: np.searchsorted(t, start_ns)][::-1], beside)
-    high = _reach(t[np.searchsorted(t, end_ns, "right") :], beside)
+    low = _reach(t[: np.searchsorted(t, start_ns)][::-1], neighbours)
+    high = _reach(t[np.searchsorted(t, end_ns, "right") :], neighbours)
     first = int(np.searchsorted(t, start_ns)) - low
     last = int(np.searchsorted(t, end_ns, "right")) + high
     return _with_speeds(tuple(column[first:last] for column in columns))

@@ -138,7 +138,7 @@ def without_strays(commands: Iterable[Command]) -> list[Command]:
     Strays are commands of runs that have not begun, within a run that names itself and whose
     first command was received, until its DONE or ABORT: forged, or left over from a recording.
     """
-    kept: list[Command] = []
+    regular: list[Command] = []
     begun: set[tuple[str, str]] = set()
     current: tuple[str, str] | None = None
     for command in sorted(set(commands), key=_sort_key):
@@ -150,8 +150,8 @@ def without_strays(commands: Iterable[Command]) -> list[Command]:
             continue
         if run == current and command.phase in (Phase.DONE, Phase.ABORT):
             current = None
-        kept.append(command)
-    return kept
+        regular.append(command)
+    return regular
 
 
 def build_timeline(commands: Iterable[Command]) -> Timeline:
@@ -359,19 +359,19 @@ class ViewCache:
         for index in self._assign(timeline):
             self._readings.pop(index, None)
         for index, view in timeline.views.items():
-            found = self._readings.get(index)
-            if found is None or found.view != view:
+            cached = self._readings.get(index)
+            if cached is None or cached.view != view:
                 self._readings[index] = self._reduce(timeline, index, exposures)
         return {index: self._readings[index] for index in timeline.views}, self._loose(timeline)
 
     def _assign(self, timeline: Timeline) -> set[int]:
         """Find the view of each detection; return the views whose detections have changed."""
-        known = len(self.view_of)
-        old = self.view_of[:known].copy() if timeline is not self._timeline else None
+        n_assigned = len(self.view_of)
+        old = self.view_of[:n_assigned].copy() if timeline is not self._timeline else None
         if self._timeline is None or timeline.artifact != self._timeline.artifact:
             self._readings = {}
-        start = 0 if old is not None else known
-        self._place.insert(np.full(len(self._table) - known, known), {})
+        start = 0 if old is not None else n_assigned
+        self._place.insert(np.full(len(self._table) - n_assigned, n_assigned), {})
         view_of = np.array(
             [
                 -1 if interval.view_index is None else interval.view_index
@@ -380,13 +380,15 @@ class ViewCache:
             + [-1]
         )
         for begin in range(start, len(self._table), TOGETHER):
-            here = slice(begin, begin + TOGETHER)
-            interval = timeline.assign(self.table["stamp"][here])
-            self._place["interval"][here], self._place["view"][here] = interval, view_of[interval]
-        touched = _different(self.view_of[known:])
+            rows = slice(begin, begin + TOGETHER)
+            interval = timeline.assign(self.table["stamp"][rows])
+            self._place["interval"][rows], self._place["view"][rows] = interval, view_of[interval]
+        touched = _different(self.view_of[n_assigned:])
         if old is not None:
-            moved = old != self.view_of[:known]
-            touched |= _different(old[moved]) | _different(self.view_of[:known][moved])
+            reassigned = old != self.view_of[:n_assigned]
+            touched |= _different(old[reassigned]) | _different(
+                self.view_of[:n_assigned][reassigned]
+            )
         stamps = np.concatenate(self._changed)
         self._timeline, self._changed = timeline, [NO_STAMPS]
         return touched | _different(view_of[timeline.assign(stamps)])

@@ -113,13 +113,13 @@ def identify_grid(
     limit_m = rules.stage_limit_m(artifact) + view.check_offset_m
     astray = _astray(pose, marks, stage_m, artifact, limit_m, among=has_id)
     named, free = has_id & ~named_unknown & ~astray, ~has_id
-    known, fit = _settle(pose, centred, artifact, marks, (named, free), rules)
-    rigid = known.rigid if fit.marks < 3 else fit.rigid
+    estimate, fit = _settle(pose, centred, artifact, marks, (named, free), rules)
+    rigid = estimate.rigid if fit.marks < 3 else fit.rigid
     far, unsure, ambiguous = (np.zeros(marks.shape[1], dtype=bool) for _ in range(3))
     if free.any():
-        nominal = known.rigid.undo(centred[:, free])
+        nominal = estimate.rigid.undo(centred[:, free])
         marks[:, free], ratio, distance, apart = _nearest(pose, nominal, artifact)
-        error, reach = known.error_at(nominal), TOO_FAR_FROM_ANY * pitch
+        error, reach = estimate.error_at(nominal), TOO_FAR_FROM_ANY * pitch
         unsure[free] = (error > SURE * pitch) & (distance <= reach + error)
         ambiguous[free] = (distance <= reach) & ~unsure[free] & (error > SURE * apart)
         ambiguous[free] |= (distance <= reach) & (ratio > rules.ambiguity_ratio)
@@ -165,10 +165,10 @@ def _astray(
         return np.zeros(marks.shape[1], dtype=bool)
     astray = np.empty(marks.shape[1], dtype=bool)
     for start in range(0, len(astray), PART):
-        here = slice(start, start + PART)
-        site = np.stack(pose.site_of(*artifact.places(*marks[:, here]))) * artifact.grid_pitch_m
-        away = np.clip(stage_m[:, here] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
-        astray[here] = distances(away) > limit_m
+        columns = slice(start, start + PART)
+        site = np.stack(pose.site_of(*artifact.places(*marks[:, columns]))) * artifact.grid_pitch_m
+        away = np.clip(stage_m[:, columns] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
+        astray[columns] = distances(away) > limit_m
     return astray & among
 
 
@@ -181,7 +181,7 @@ def _nearest(
 
     Also, of a list of marks, the distance of the two nearest ones from each other, m.
     """
-    pitch, every = artifact.grid_pitch_m, np.full(centred.shape[1], np.inf)
+    pitch, far_apart_m = artifact.grid_pitch_m, np.full(centred.shape[1], np.inf)
     if artifact.marks:
         plate = np.stack(pose.turned_back(centred[0], centred[1]))
         away, two = artifact.marks.tree.query(np.nan_to_num(plate.T, nan=OFF_ANY_PLATE_M), 2)
@@ -195,7 +195,7 @@ def _nearest(
     away = np.abs(plate - np.stack(artifact.places(*mark)))
     first = distances(away)
     second = np.minimum(np.hypot(1 - away[0], away[1]), np.hypot(away[0], 1 - away[1]))
-    return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch, every
+    return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch, far_apart_m
 
 
 def _settle(
@@ -216,24 +216,28 @@ def _settle(
     about = _about(pose, ids, artifact)
     use, fit = named, rigids.fit_motion(*rigids.columns_where(named, about, centred - about))
     innermost = _innermost_of_list if artifact.marks else _innermost
-    known = (
+    estimate = (
         fit.known(pitch, rules.max_rotation_rad)
         if named.any()
         else innermost(_rows(pose, artifact), centred[:, free], artifact, rules.max_rotation_rad)
     )
     while free.any():
-        nominal = known.rigid.undo(centred)
+        nominal = estimate.rigid.undo(centred)
         nearest, ratio, _, apart = _nearest(pose, nominal, artifact)
-        sure = (known.error_at(nominal) <= SURE * np.minimum(pitch, apart)) & (ratio < 0.5)
+        sure = (estimate.error_at(nominal) <= SURE * np.minimum(pitch, apart)) & (ratio < 0.5)
         wider = named | (free & sure)
         if wider.sum() <= use.sum():
             break
         use, mark = wider, np.where(named, ids, nearest)
         about = _about(pose, mark, artifact)
         fit = rigids.fit_motion(*rigids.columns_where(use, about, centred - about))
-        known = fit.known(pitch, rules.max_rotation_rad)
-    whole = named.any() or artifact.marks
-    return (known, fit) if whole else _folded(_rows(pose, artifact), known, fit, pitch)
+        estimate = fit.known(pitch, rules.max_rotation_rad)
+    offset_determined = named.any() or artifact.marks
+    return (
+        (estimate, fit)
+        if offset_determined
+        else _folded(_rows(pose, artifact), estimate, fit, pitch)
+    )
 
 
 def _rows(pose: StagePose, artifact: Artifact) -> StagePose:
@@ -285,9 +289,10 @@ def _innermost_of_list(
     some = np.stack(pose.turned_back(*near[:, :LOOKED_AT]))
     among = marks.tree.query(some.T, CANDIDATES)[1]
     offsets = (some[:, :, None] - marks.places_m[:, among]).reshape(2, -1)
-    there = some[:, None] - offsets[:, :, None]
+    on_plate_m = some[:, None] - offsets[:, :, None]
     hits = (
-        marks.tree.query(there.reshape(2, -1).T)[0].reshape(len(offsets[0]), -1) < ON_MARK * pitch
+        marks.tree.query(on_plate_m.reshape(2, -1).T)[0].reshape(len(offsets[0]), -1)
+        < ON_MARK * pitch
     ).sum(axis=1)
     away = np.where(hits >= 0.9 * hits.max(), np.hypot(*offsets), np.inf)
     x, y = map(float, pose.turned(*offsets[:, int(away.argmin())]))
@@ -300,22 +305,22 @@ def _innermost_of_list(
 
 
 def _folded(
-    rows: StagePose, known: rigids.MotionEstimate, fit: rigids.RigidFit, pitch: float
+    rows: StagePose, estimate: rigids.MotionEstimate, fit: rigids.RigidFit, pitch: float
 ) -> tuple[rigids.MotionEstimate, rigids.RigidFit]:
     """Return the motion whose offset at the plate's centre is below half a pitch.
 
     Marks without ids determine it only up to whole pitches, and not at all if they are so far out
     that the rotation does not give the offset at the centre.
     """
-    if known.error_at(np.zeros((2, 1)))[0] > SURE * pitch:
-        return replace(known, offset_error_m=float("inf")), fit
-    offset = rows.turned_back(*np.array([known.rigid.tx_m, known.rigid.ty_m]))
+    if estimate.error_at(np.zeros((2, 1)))[0] > SURE * pitch:
+        return replace(estimate, offset_error_m=float("inf")), fit
+    offset = rows.turned_back(*np.array([estimate.rigid.tx_m, estimate.rigid.ty_m]))
     x, y = map(float, rows.turned(*np.rint(np.array(offset) / pitch) * pitch))
-    moved = [
+    folded = [
         replace(rigid, tx_m=rigid.tx_m - x, ty_m=rigid.ty_m - y)
-        for rigid in (known.rigid, fit.rigid)
+        for rigid in (estimate.rigid, fit.rigid)
     ]
-    return replace(known, rigid=moved[0]), replace(fit, rigid=moved[1])
+    return replace(estimate, rigid=folded[0]), replace(fit, rigid=folded[1])
 
 
 def _about(pose: StagePose, marks: np.ndarray, artifact: Artifact) -> np.ndarray:
@@ -358,16 +363,17 @@ def identify_angular(
             np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)), reasons, rigids.Rigid()
         )
     step = 2 * np.pi / count
-    whole, part = divmod(view.on_stage(artifact).s, 1)
-    base, between = int(whole), part * step  # a turn between two lines only for a Fourier map
+    whole_lines, fraction = divmod(view.on_stage(artifact).s, 1)
+    # a turn between two lines only for a Fourier map
+    base, between = int(whole_lines), fraction * step
     reading_rad = wrap(reading_rad - between) if between else reading_rad
-    known = has_id & (ids >= 0) & (ids < count)
-    rotation_known = phi_rad is not None or known.any()
+    has_known_id = has_id & (ids >= 0) & (ids < count)
+    rotation_known = phi_rad is not None or has_known_id.any()
     if phi_rad is None:
-        named = wrap(reading_rad - (ids + base) * step)[known]
+        named = wrap(reading_rad - (ids + base) * step)[has_known_id]
         phi_rad = _middle(named, 2 * np.pi) if len(named) else _middle(reading_rad, step)
     nearest = np.rint(wrap(reading_rad - phi_rad) / step).astype(np.int64) - base
-    line = np.where(known, ids, np.remainder(nearest, count))
+    line = np.where(has_known_id, ids, np.remainder(nearest, count))
     deviation = wrap(reading_rad - (line + base) * step)
     residual = wrap(deviation - phi_rad)
     away = np.abs(residual)
@@ -376,7 +382,7 @@ def identify_angular(
     reasons[~has_id & (away > rules.ambiguity_ratio * (step - away))] = Reason.AMBIGUOUS
     if not rotation_known and not _nearest_line_is_sure(phi_rad, step, rules.max_rotation_rad):
         reasons[~has_id] = Reason.ROTATION
-    reasons[has_id & ~known] = Reason.UNKNOWN_MARK
+    reasons[has_id & ~has_known_id] = Reason.UNKNOWN_MARK
     return MarkAssignment(line, deviation, residual, reasons, rigids.Rigid(phi_rad))
 
 
@@ -397,8 +403,8 @@ def _middle(angles_rad: np.ndarray, period_rad: float) -> float:
         return 0.0
     turn = 2 * np.pi / period_rad
     start = np.angle(np.exp(1j * turn * angles_rad).mean()) / turn
-    rest = np.remainder(angles_rad - start + period_rad / 2, period_rad) - period_rad / 2
-    middle = start + np.median(rest)
+    about_start_rad = np.remainder(angles_rad - start + period_rad / 2, period_rad) - period_rad / 2
+    middle = start + np.median(about_start_rad)
     return float(middle - period_rad * np.rint(middle / period_rad))
 
 

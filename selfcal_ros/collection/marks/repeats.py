@@ -47,11 +47,11 @@ def median(values: np.ndarray, *, overwrite: bool = False) -> float:
         Whether their order may be changed, which saves a copy.
     """
     half = len(values) // 2
-    part = values if overwrite else values.copy()
-    part.partition(half)
+    partitioned = values if overwrite else values.copy()
+    partitioned.partition(half)
     if len(values) % 2:
-        return float(part[half])
-    return float((part[:half].max() + part[half]) / 2)
+        return float(partitioned[half])
+    return float((partitioned[:half].max() + partitioned[half]) / 2)
 
 
 def row_medians(values: np.ndarray) -> np.ndarray:
@@ -130,9 +130,9 @@ def reduce_repeats(
         outlier = _outliers(key, judged, _relative(sigma), (limit, extent), residual)
     means = average(key[~outlier], values[:, ~outlier], sigma[~outlier])
     if fitted:
-        told = average(key[~outlier], judged[:, ~outlier], sigma[~outlier])
-        dof = max(told.dof - fitted, 0)
-        pooled = told.sigma * np.sqrt(told.dof / dof) if dof else float("nan")
+        judged_means = average(key[~outlier], judged[:, ~outlier], sigma[~outlier])
+        dof = max(judged_means.dof - fitted, 0)
+        pooled = judged_means.sigma * np.sqrt(judged_means.dof / dof) if dof else float("nan")
         means = replace(means, sigma=float(pooled), dof=dof)
     return replace(means, outlier=outlier)
 
@@ -153,9 +153,9 @@ def average(
     )
     total = np.bincount(inverse, weight, len(marks))
     mean = _means(values, weight, inverse, total)
-    rest = values - mean[:, inverse]
+    residual = values - mean[:, inverse]
     dof = int(len(values) * (count - 1).sum())
-    pooled = float(np.sqrt((rest**2).sum() / dof)) if dof else float("nan")
+    pooled = float(np.sqrt((residual**2).sum() / dof)) if dof else float("nan")
     u = np.where(declared, best / np.sqrt(total), np.nan) if declared.any() else np.zeros(0)
     more = mean[:0] if companions is None else _means(companions, weight, inverse, total)
     return Means(marks, mean, count, u, pooled, dof, np.zeros(len(key), dtype=bool), more)
@@ -222,11 +222,11 @@ def _outliers(
         floor = max(floor, (STEPS + 0.5) * _sensor_step(groups, values, floor))
     for group in groups:
         share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
-        for part in _parts(group, group.shape[1]):
-            repeats = np.take(values, part, axis=1)
+        for members in _parts(group, group.shape[1]):
+            repeats = np.take(values, members, axis=1)
             away = np.abs(repeats - row_medians(repeats))
-            bad = (away > np.maximum(cut * share * relative[part], floor)).any(axis=0)
-            out[part] = bad | (2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1])
+            bad = (away > np.maximum(cut * share * relative[members], floor)).any(axis=0)
+            out[members] = bad | (2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1])
     return out
 
 
@@ -256,8 +256,8 @@ def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> 
     if len(spread) < 3:
         return 0.0
     steps = spread / spread.min()
-    whole = (np.abs(steps - np.rint(steps)) < 1e-3) & (steps < STEPS + 0.5)
-    return float(spread.min()) if whole.sum() >= max(3, 0.75 * len(steps)) else 0.0
+    whole_steps = (np.abs(steps - np.rint(steps)) < 1e-3) & (steps < STEPS + 0.5)
+    return float(spread.min()) if whole_steps.sum() >= max(3, 0.75 * len(steps)) else 0.0
 
 
 @lru_cache(64)
@@ -276,24 +276,24 @@ def _pair_scale(
     """Return the robust standard deviation of one reading, and the number of pairs."""
     if not groups:
         return float("nan"), 0
-    every = np.empty(
+    differences = np.empty(
         len(values) * sum(len(group) * len(pairs_of(group.shape[1])[0]) for group in groups)
     )
-    done, alike = 0, bool((relative == 1).all())  # as where no sigma is declared
+    filled, alike = 0, bool((relative == 1).all())  # as where no sigma is declared
     for group in groups:
         i, j = pairs_of(group.shape[1])
-        for part in _parts(group, len(i)):
-            weights, repeats = relative[part], np.take(values, part, axis=1)
+        for members in _parts(group, len(i)):
+            weights, repeats = relative[members], np.take(values, members, axis=1)
             norm = (
                 np.sqrt(2)
                 if alike
                 else np.hypot(np.take(weights, i, axis=1), np.take(weights, j, axis=1))
             )
             apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
-            every[done : done + apart.size] = (np.abs(apart) / norm).ravel()
-            done += apart.size
+            differences[filled : filled + apart.size] = (np.abs(apart) / norm).ravel()
+            filled += apart.size
     independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
-    return median(every, overwrite=True) / 0.6744897501960817, independent
+    return median(differences, overwrite=True) / 0.6744897501960817, independent
 
 
 def grid_visits(
@@ -332,36 +332,43 @@ def grid_visits(
     step_m : float
         Motion of the stage along an axis that ends a visit, m.
     """
-    kept = ~means.outlier
-    if not kept.any():
+    no_outlier = ~means.outlier
+    if not no_outlier.any():
         return None
-    moved = np.abs(np.diff(deviation - offset, prepend=(deviation - offset)[:, :1])) > step_m
-    number = np.cumsum((np.diff(key, prepend=key[:1]) != 0) | moved.any(axis=0))[kept]
-    key, stamps_ns = key[kept], stamps_ns[kept]
+    stage_moves = np.abs(np.diff(deviation - offset, prepend=(deviation - offset)[:, :1])) > step_m
+    number = np.cumsum((np.diff(key, prepend=key[:1]) != 0) | stage_moves.any(axis=0))[no_outlier]
+    key, stamps_ns = key[no_outlier], stamps_ns[no_outlier]
     begins = np.diff(number, prepend=-1) != 0
     first, visit = np.flatnonzero(begins), np.cumsum(begins) - 1
     since = (stamps_ns - stamps_ns[first][visit]).astype(float)
-    found = average(visit, deviation[:, kept], sigma[kept], np.vstack([offset[:, kept], since]))
+    visits = average(
+        visit,
+        deviation[:, no_outlier],
+        sigma[no_outlier],
+        np.vstack([offset[:, no_outlier], since]),
+    )
     mark = np.searchsorted(means.key, key[first])
     order = np.argsort(mark, kind="stable")  # visits are numbered in the order of their stamps
-    offset_x, offset_y, since = found.companions[:, order]
+    offset_x, offset_y, since = visits.companions[:, order]
     came_x, came_y = (
-        np.where(_differs(row[kept], visit, first), 0, row[kept][first]).astype(np.int8)[order]
+        np.where(_differs(row[no_outlier], visit, first), 0, row[no_outlier][first]).astype(
+            np.int8
+        )[order]
         for row in approach
     )
     return GridVisits(
         mark[order],
-        found.mean[0, order],
-        found.mean[1, order],
-        found.count[order],
+        visits.mean[0, order],
+        visits.mean[1, order],
+        visits.count[order],
         stamps_ns[first][order] + np.rint(since).astype(np.int64),
         offset_x,
         offset_y,
         came_x,
         came_y,
-        u=found.u[order] if len(found.u) else found.u,
-        sigma_m=found.sigma,
-        dof=found.dof,
+        u=visits.u[order] if len(visits.u) else visits.u,
+        sigma_m=visits.sigma,
+        dof=visits.dof,
     )
 
 
@@ -390,8 +397,10 @@ def repeat_motion(
         Outliers among the repeats.
     """
     if outlier.any():
-        there, seen = _about_means(key, place), _about_means(key, offset)
-        follows = ((there + seen) ** 2).sum(axis=0) <= FOLLOWS**2 * (there**2).sum(axis=0)
+        place_about, offset_about = _about_means(key, place), _about_means(key, offset)
+        follows = ((place_about + offset_about) ** 2).sum(axis=0) <= FOLLOWS**2 * (
+            place_about**2
+        ).sum(axis=0)
         keep = ~outlier | follows
         key, place, offset = key[keep], place[:, keep], offset[:, keep]
     free = len(key) - int(np.count_nonzero(np.bincount(key))) - SLOW

@@ -29,9 +29,12 @@ class Rigid:
 
     def at(self, p: np.ndarray) -> np.ndarray:
         """Return the deviation at nominal positions `p` (2, n) about the plate centre."""
-        turn, one = np.sin(self.phi_rad), np.cos(self.phi_rad) - 1
+        turn, cos_less_1 = np.sin(self.phi_rad), np.cos(self.phi_rad) - 1
         return np.stack(
-            [one * p[0] - turn * p[1] + self.tx_m, turn * p[0] + one * p[1] + self.ty_m]
+            [
+                cos_less_1 * p[0] - turn * p[1] + self.tx_m,
+                turn * p[0] + cos_less_1 * p[1] + self.ty_m,
+            ]
         )
 
     def undo(self, q: np.ndarray) -> np.ndarray:
@@ -112,9 +115,9 @@ class RigidFit:
         scatter = COVERAGE * np.sqrt((expected + self.squares_m2) / freedom)
         weight, error = 0.0, max_rotation_rad
         if self.power_m2 and max_rotation_rad:
-            found = scatter / np.sqrt(self.power_m2)
-            weight = max_rotation_rad**2 / (max_rotation_rad**2 + found**2)
-            error = weight * found + (1 - weight) * max_rotation_rad
+            fit_error_rad = scatter / np.sqrt(self.power_m2)
+            weight = max_rotation_rad**2 / (max_rotation_rad**2 + fit_error_rad**2)
+            error = weight * fit_error_rad + (1 - weight) * max_rotation_rad
         rigid = _through(
             weight * self.rigid.phi_rad, self.centre_m, self.rigid.at(np.array(self.centre_m))
         )
@@ -125,8 +128,8 @@ class RigidFit:
 
 def _through(phi_rad: float, centre: tuple[float, float], deviation: np.ndarray) -> Rigid:
     """Return the motion that turns by phi and has a given deviation at a point."""
-    rest = deviation - Rigid(phi_rad).at(np.array(centre))
-    return Rigid(float(phi_rad), float(rest[0]), float(rest[1]))
+    shift_m = deviation - Rigid(phi_rad).at(np.array(centre))
+    return Rigid(float(phi_rad), float(shift_m[0]), float(shift_m[1]))
 
 
 def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
@@ -157,12 +160,12 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
         near, read = columns_where(keep, p, deviation)
         rigid, middle, power = _least_squares(near, read)
     near, read = columns_where(keep, p, deviation)
-    rest = read - rigid.at(near)
-    other = (near[:, 1:] != near[:, :-1]).any(axis=0)  # than the one before
-    first = near[:, np.append(True, other)]
+    residual = read - rigid.at(near)
+    differs = (near[:, 1:] != near[:, :-1]).any(axis=0)  # from the one before
+    first = near[:, np.append(True, differs)]
     marks = len(np.unique(first[0] + 1j * first[1]))
     share = marks / keep.sum()  # repeats of a mark are not further marks
-    return RigidFit(rigid, middle, marks, float(power * share), float((rest**2).sum() * share))
+    return RigidFit(rigid, middle, marks, float(power * share), float((residual**2).sum() * share))
 
 
 def _median_motion(p: np.ndarray, deviation: np.ndarray) -> Rigid:

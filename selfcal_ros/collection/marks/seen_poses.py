@@ -94,15 +94,15 @@ class SeenPose:
     mirrored: bool
     mirror: str = ""
 
-    def text(self, others: str) -> str:
-        """Return what is wrong, and the remedy, in one line; `others`: what other views show."""
+    def text(self, other_views: str) -> str:
+        """Return what is wrong, and the remedy, in one line; `other_views`: what they show."""
         if self.mirrored:
             return (
                 f"{self.mirror}, or the plate lies upside down; correct the ids, or place "
-                f"the plate as planned and measure this view again{others}"
+                f"the plate as planned and measure this view again{other_views}"
             )
         error = said(self.pose)
-        return f"{error.what} (or its ids are those of other marks); {error.remedy}{others}"
+        return f"{error.what} (or its ids are those of other marks); {error.remedy}{other_views}"
 
 
 def seen_poses(
@@ -119,52 +119,61 @@ def seen_poses(
     max_rotation_rad : float
         Largest rotation of a plate that lies as planned.
     """
-    found = ((index, _found_pose(view, limit, max_rotation_rad)) for index, view in views.items())
-    return {index: seen for index, seen in found if seen is not None}
+    found_poses = (
+        (index, _found_pose(view, limit, max_rotation_rad)) for index, view in views.items()
+    )
+    return {index: seen_pose for index, seen_pose in found_poses if seen_pose is not None}
 
 
-def texts(seen: Mapping[int, SeenPose]) -> dict[int, str]:
+def texts(poses: Mapping[int, SeenPose]) -> dict[int, str]:
     """Return view_index -> what is wrong with views that are not seen as planned."""
-    wrong = {index: one for index, one in seen.items() if not one.planned}
-    right = len(wrong) < len(seen)
-    others = (
+    wrong = {index: seen_pose for index, seen_pose in poses.items() if not seen_pose.planned}
+    right = len(wrong) < len(poses)
+    other_views = (
         "; other views are as planned: leave the joints and the sense as they are"
         if (right)
         else ""
     )
     exchanged = dict(_exchanged(wrong))
     return {
-        index: f"{exchanged[index]}{others}" if index in exchanged else one.text(others)
-        for index, one in wrong.items()
+        index: f"{exchanged[index]}{other_views}"
+        if index in exchanged
+        else seen_pose.text(other_views)
+        for index, seen_pose in wrong.items()
     }
 
 
-def mirrored_alike(seen: Iterable[SeenPose]) -> str:
+def mirrored_alike(poses: Iterable[SeenPose]) -> str:
     """Return what the ids are, if those of all views are mirrored alike, and remedy; else empty."""
-    mirrors = {one.mirror if one.mirrored else "" for one in seen}
+    mirrors = {seen_pose.mirror if seen_pose.mirrored else "" for seen_pose in poses}
     mirror = mirrors.pop() if len(mirrors) == 1 else ""
     return f"{mirror}, or the plate lies upside down; correct the ids" if mirror else ""
 
 
 def _exchanged(wrong: Mapping[int, SeenPose]) -> Iterator[tuple[int, str]]:
     """Yield the views in which the plate lies as planned for another one, and this one."""
-    for index, one in wrong.items():
-        for other, seen in wrong.items():
-            if other != index and not one.mirrored and _lies_as(one, seen) and _lies_as(seen, one):
+    for index, seen_pose in wrong.items():
+        for other_index, other_pose in wrong.items():
+            if (
+                other_index != index
+                and not seen_pose.mirrored
+                and _lies_as(seen_pose, other_pose)
+                and _lies_as(other_pose, seen_pose)
+            ):
                 yield (
                     index,
                     (
-                        f"the plate lies as planned for view '{seen.pose.view}', and there "
+                        f"the plate lies as planned for view '{other_pose.pose.view}', and there "
                         "as planned for this one: the views are exchanged; measure them in "
                         "the order of the plan, or exchange them in the plan"
                     ),
                 )
 
 
-def _lies_as(one: SeenPose, other: SeenPose) -> bool:
-    a, b = one.pose, other.pose
+def _lies_as(seen_pose: SeenPose, other_pose: SeenPose) -> bool:
+    a, b = seen_pose.pose, other_pose.pose
     return (
-        not other.mirrored
+        not other_pose.mirrored
         and a.found_deg == b.planned_deg
         and bool(np.hypot(*np.subtract(a.found_shift, b.planned_shift)) < NEAR)
     )
@@ -175,28 +184,31 @@ def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> Seen
     if not view.spread:
         return None
     pose, axis = view.pose, view.stage + view.cells
-    planned = float(np.quantile(np.abs(axis - view.sites), 0.9))
+    planned_distance = float(np.quantile(np.abs(axis - view.sites), 0.9))
     as_planned = Misplaced.of(view.view, pose, pose)
     fits = [
         (*_fitted(view.marks, at, mirrored), mirrored)
         for mirrored in (False, True)
         for at in (axis, axis + view.offsets)
     ]
-    turn, shift, left, mirrored = min(fits, key=lambda fit: fit[2])
-    if planned <= limit and left > SURELY * planned:
+    turn, shift, fitted_distance, mirrored = min(fits, key=lambda fit: fit[2])
+    if planned_distance <= limit and fitted_distance > SURELY * planned_distance:
         return SeenPose(as_planned, planned=True, mirrored=False)
-    if left > limit:
+    if fitted_distance > limit:
         return None
     if mirrored:
         back = np.degrees(np.angle(turn)) - pose.turn_deg
         return SeenPose(
             as_planned, planned=False, mirrored=True, mirror=_mirror(back, listed=view.listed)
         )
-    found = replace(
+    misplaced = replace(
         as_planned, found_deg=_turn(turn, pose, max_rotation_rad), found_shift=_shift(shift, pose)
     )
-    same = (found.found_deg, found.found_shift) == (found.planned_deg, found.planned_shift)
-    return SeenPose(found, planned=same, mirrored=False)
+    lies_as_planned = (misplaced.found_deg, misplaced.found_shift) == (
+        misplaced.planned_deg,
+        misplaced.planned_shift,
+    )
+    return SeenPose(misplaced, planned=lies_as_planned, mirrored=False)
 
 
 def _fitted(
@@ -215,26 +227,26 @@ def _fitted(
     if abs(size - 1) > SAME_SIZE:
         return 1, 0, float("inf")
     turn = motion[1] / size
-    rest = at - turn * z
-    shift = complex(np.median(rest.real), np.median(rest.imag))
-    return turn, shift, float(np.quantile(np.abs(rest - shift), 0.9))
+    shifts = at - turn * z
+    shift = complex(np.median(shifts.real), np.median(shifts.imag))
+    return turn, shift, float(np.quantile(np.abs(shifts - shift), 0.9))
 
 
 def _turn(turn: complex, pose: StagePose, max_rotation_rad: float) -> float:
     """Return a turn, 0 to 360 deg: a likely one, if it is within the rotation of a plate."""
     deg = float(np.degrees(np.angle(turn)))
     likely = (pose.turn_deg, -pose.turn_deg, 0.0, *(pose.turn_deg + 90.0 * q for q in (1, 2, 3)))
-    away = [abs((deg - one + 180) % 360 - 180) for one in likely]
+    away = [abs((deg - candidate_deg + 180) % 360 - 180) for candidate_deg in likely]
     best = int(np.argmin(away))
-    found = likely[best] if away[best] < np.degrees(max_rotation_rad) else round(deg)
-    return float(found % 360)
+    turn_deg = likely[best] if away[best] < np.degrees(max_rotation_rad) else round(deg)
+    return float(turn_deg % 360)
 
 
 def _shift(shift: complex, pose: StagePose) -> tuple[float, float]:
     """Return a shift, pitches: a likely one, if it is near."""
     a, b = pose.shift
     likely = [(a, b), (-a, -b), (0, 0), (b, a), (-b, -a), (round(shift.real), round(shift.imag))]
-    away = [abs(shift - complex(*one)) for one in likely]
+    away = [abs(shift - complex(*candidate)) for candidate in likely]
     best = int(np.argmin(away))
     return likely[best] if away[best] < NEAR else (round(shift.real, 1), round(shift.imag, 1))
 
@@ -245,5 +257,5 @@ def _mirror(turn_deg: float, *, listed: bool) -> str:
     if abs(turn_deg - 90 * quarter) > 45 * NEAR:
         return "the ids are mirrored"
     m, n = ("x", "y") if listed else ("m", "n")
-    what = "the list has" if listed else "the ids have"
-    return f"{what} {MIRRORS[90 * quarter % 360].format(m=m, n=n)}"
+    subject = "the list has" if listed else "the ids have"
+    return f"{subject} {MIRRORS[90 * quarter % 360].format(m=m, n=n)}"

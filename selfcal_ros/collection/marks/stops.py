@@ -70,31 +70,43 @@ def shift_of(view: View, offset_m: np.ndarray, away_m: np.ndarray) -> complex:
     away_m : float array (2, k)
         Measured offsets minus those expected with the stage at its site, of the known marks.
     """
-    steps, known = _steps(view, offset_m), _steps(view, away_m)
-    part = complex(
+    steps, known_steps = _steps(view, offset_m), _steps(view, away_m)
+    fraction = complex(
         *(
             float(np.angle(np.exp(2j * np.pi * axis).mean())) / (2 * np.pi)
             for axis in (steps.real, steps.imag)
         )
     )
-    cells, known = _rounded(steps - part), known - part
+    cells, known_steps = _rounded(steps - fraction), known_steps - fraction
     nx, ny = (view.image.nx, view.image.ny) if view.image else (1, 1)
-    return part + complex(
-        middle_of(cells.real, nx, known.real), middle_of(cells.imag, ny, known.imag)
+    return fraction + complex(
+        middle_of(cells.real, nx, known_steps.real), middle_of(cells.imag, ny, known_steps.imag)
     )
 
 
-def middle_of(numbers: np.ndarray, width: int, known: np.ndarray | None = None) -> int:
+def middle_of(numbers: np.ndarray, width: int, known_numbers: np.ndarray | None = None) -> int:
     """Return the middle of the `width` neighbouring whole numbers that hold most of `numbers`.
 
     Of several that hold as many, but for a quarter of a number's share, that of the median of the
-    `known` ones, else 0.
+    `known_numbers`, else 0.
     """
     low = int(max(numbers.min(), -MOST_CELLS)) - width
     count = np.bincount(np.clip(numbers - low, 0, 2 * MOST_CELLS).astype(int))
-    held = np.convolve(np.append(count, np.zeros(width, int)), np.ones(width, int), mode="valid")
-    best = np.arange(len(held))[held >= held.max() - len(numbers) / (4 * width)] + low + width // 2
-    middle = round(float(np.median(known))) if known is not None and len(known) else 0
+    window_count = np.convolve(
+        np.append(count, np.zeros(width, int)), np.ones(width, int), mode="valid"
+    )
+    best = (
+        np.arange(len(window_count))[
+            window_count >= window_count.max() - len(numbers) / (4 * width)
+        ]
+        + low
+        + width // 2
+    )
+    middle = (
+        round(float(np.median(known_numbers)))
+        if known_numbers is not None and len(known_numbers)
+        else 0
+    )
     return int(best[0]) if len(best) == 1 else middle if middle in best else 0
 
 
@@ -104,8 +116,8 @@ def numbers_of(view: View, cells: np.ndarray) -> np.ndarray:
         return np.zeros(len(cells), dtype=int)
     hx, hy = view.image.nx // 2, view.image.ny // 2
     x, y = np.clip([cells.real, cells.imag], -hx - hy - 1, hx + hy + 1).astype(int)
-    shown = (np.abs(x) <= hx) & (np.abs(y) <= hy)
-    return np.where(shown, (x + hx) * (2 * hy + 1) + y + hy, -1)
+    in_image = (np.abs(x) <= hx) & (np.abs(y) <= hy)
+    return np.where(in_image, (x + hx) * (2 * hy + 1) + y + hy, -1)
 
 
 def middles(view: View, number: np.ndarray, away_m: np.ndarray) -> np.ndarray:
@@ -155,8 +167,8 @@ def beside(marks: np.ndarray, artifact: Artifact, sub_view: View, sign: int = 1)
     m, n = np.nonzero(marks)
     step_m, step_n = sub_view.step_on_plate(artifact)
     m, n = m + sign * step_m, n + sign * step_n
-    there = (m >= 0) & (m < marks.shape[0]) & (n >= 0) & (n < marks.shape[1])
-    out[m[there], n[there]] = True
+    on_plate = (m >= 0) & (m < marks.shape[0]) & (n >= 0) & (n < marks.shape[1])
+    out[m[on_plate], n[on_plate]] = True
     return out
 
 
@@ -204,8 +216,12 @@ def _scatter(key: np.ndarray, place_m: np.ndarray) -> float:
         some = group[:: -(-len(group) // LOOKED_AT)]
         i, j = pairs_of(some.shape[1])
         apart.append(np.abs(place_m[:, some[:, i]] - place_m[:, some[:, j]]).reshape(2, -1))
-    every = np.concatenate(apart, axis=1)
-    return float(np.quantile(every, 0.25, axis=1).min()) / QUARTILE if every.size else 0.0
+    differences_m = np.concatenate(apart, axis=1)
+    return (
+        float(np.quantile(differences_m, 0.25, axis=1).min()) / QUARTILE
+        if differences_m.size
+        else 0.0
+    )
 
 
 def _medians(key: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -243,10 +259,10 @@ def without_aside(
     about = np.stack([row - _medians(key, row) for row in deviation_m])
     out, fitted = deviation_m.copy(), 0
     for along in aside:
-        here = along != 0
-        if here.any():
-            slope = np.median(about[:, here] / along[here], axis=1)
-            out[:, here] -= slope[:, None] * along[here]
+        at_check_stops = along != 0
+        if at_check_stops.any():
+            slope = np.median(about[:, at_check_stops] / along[at_check_stops], axis=1)
+            out[:, at_check_stops] -= slope[:, None] * along[at_check_stops]
             fitted += 2
     return out, fitted
 

@@ -56,12 +56,12 @@ def plan_of(data: object, where: str, folder: Path) -> Plan:
     }
     if not sources or not isinstance(data, dict):
         return plan_from_dict(data, where)
-    known = (
+    result_plan = (
         {}
         if "artifact" in data
         else plan_to_dict(Plan("", read_result(next(iter(sources.values()))).plate, ()))
     )
-    plate = {key: known[key] for key in ("artifact", "map") if key in known}
+    plate = {key: result_plan[key] for key in ("artifact", "map") if key in result_plan}
     return plan_from_dict(plate | data | sources, where)
 
 
@@ -188,10 +188,10 @@ def _reference(
 
 
 def _terms(
-    given: list[str], measurements: Measurements | None
+    entries: list[str], measurements: Measurements | None
 ) -> tuple[tuple[ModelTerm, ...], str]:
     """Return the terms of the model, and where they come from: ``options`` or ``plan``."""
-    words = [word for text in given for part in text.split(",") if (word := part.strip())]
+    words = [word for text in entries for item in text.split(",") if (word := item.strip())]
     if words == [NO_TERMS]:
         return (), ""
     if NO_TERMS in words:
@@ -207,10 +207,12 @@ def _terms(
         )
     if not words and measurements is not None:
         return planned, "plan"
-    terms = parse_terms(given, "model_terms")
+    terms = parse_terms(entries, "model_terms")
     # the microscope's uncertainty in the plan is no choice of a model
-    known = [term for term in planned if term.parts and term.name not in {t.name for t in terms}]
-    return (*terms, *known), "options"
+    microscope_terms = [
+        term for term in planned if term.parts and term.name not in {t.name for t in terms}
+    ]
+    return (*terms, *microscope_terms), "options"
 
 
 def _assumed(settings: SolverSettings) -> tuple[ModelTerm, ...]:

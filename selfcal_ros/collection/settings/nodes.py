@@ -585,7 +585,7 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
     Sections count if they are ``/**``, ``**``, the node's name, or end with ``/`` + its name;
     a section of a node that this package does not have is an error.
     """
-    found: dict[str, Any] = {}
+    overrides: dict[str, Any] = {}
     for name, section in _sections(data, "", where):
         last = name.rsplit("/", 1)[-1]
         if last not in ("**", "*") and last not in NODE_PARAMETERS:
@@ -595,15 +595,15 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
         if last == node or last in ("**", "*"):
             flat = dict(_flatten(section, ""))
             if last != node:  # a wild-card section may hold parameters of other nodes
-                known = {parameter.name for parameter in NODE_PARAMETERS[node]}
+                names_of_node = {parameter.name for parameter in NODE_PARAMETERS[node]}
                 everywhere = {p.name for table in NODE_PARAMETERS.values() for p in table}
                 flat = {
                     key: value
                     for key, value in flat.items()
-                    if key in known or key not in everywhere
+                    if key in names_of_node or key not in everywhere
                 }
-            found |= flat
-    return found
+            overrides |= flat
+    return overrides
 
 
 def _sections(data: object, prefix: str, where: str) -> list[tuple[str, dict]]:

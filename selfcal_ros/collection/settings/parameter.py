@@ -102,12 +102,12 @@ class Settings:
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:
         """Return the parameters, those shared by all nodes last."""
-        own = [item for item in fields(cls) if item.name in cls.__annotations__]
+        of_node = [item for item in fields(cls) if item.name in cls.__annotations__]
         shared = [item for item in fields(cls) if item.name not in cls.__annotations__]
         defaults = cls()
         return tuple(
             Parameter(item.name, getattr(defaults, item.name), **item.metadata)
-            for item in (*own, *shared)
+            for item in (*of_node, *shared)
         )
 
     @classmethod
