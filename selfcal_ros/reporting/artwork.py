@@ -91,12 +91,12 @@ def artwork_of(
     outlines.append(_circle(0.2 * step) + high + 0.75 * step)  # the corner (h, h)
     markers = _markers(plate, step) if aruco else []
     outlines += markers
-    beside = (AWAY + SIDE / 2 if markers else 0) * step
-    edge = float(np.hypot(*places.T).max()) + 1.5 * step + beside
+    marker_reach_mm = (AWAY + SIDE / 2 if markers else 0) * step
+    edge = float(np.hypot(*places.T).max()) + 1.5 * step + marker_reach_mm
     for angle in plate.theta_rad:
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         outlines.append((_box(step, step / 20) + np.array([edge + step / 2, 0.0])) @ turn)
-    bottom = -(edge + step) if plate.angular_count else float(low[1]) - beside
+    bottom = -(edge + step) if plate.angular_count else float(low[1]) - marker_reach_mm
     length, below = round_down(float(high[0] - low[0]) / 2), bottom - 1.5 * step
     left = float(low[0])
     outlines.append(_box(length, step / 10) + np.array([left + length / 2, below]))
@@ -106,13 +106,13 @@ def artwork_of(
         [
             (f"{length:g} mm", left, below + 0.2 * step, letters),
             (plan.plan_id, left, below - 0.6 * step, letters),
-            *_numbers(plate, step, beside),
+            *_numbers(plate, step, marker_reach_mm),
         ],
     )
 
 
 def _numbers(
-    plate: Artifact, step: float, beside: float
+    plate: Artifact, step: float, marker_reach_mm: float
 ) -> Iterator[tuple[str, float, float, float]]:
     """Yield the numbers m below the columns of a lattice, and n to the left of its rows."""
     if plate.marks:
@@ -121,9 +121,9 @@ def _numbers(
     x, y = plate.x_m[:, 0] * MM_PER_M, plate.y_m[0] * MM_PER_M
     for m, at in zip(plate.m[:, 0].tolist(), x.tolist(), strict=True):
         middle = at - 0.3 * letters * len(str(m))
-        yield str(m), middle, float(y[0]) - beside - 0.8 * step, letters
+        yield str(m), middle, float(y[0]) - marker_reach_mm - 0.8 * step, letters
     for n, at in zip(plate.n[0].tolist(), y.tolist(), strict=True):
-        yield str(n), float(x[0]) - beside - 0.9 * step, at - 0.35 * letters, letters
+        yield str(n), float(x[0]) - marker_reach_mm - 0.9 * step, at - 0.35 * letters, letters
 
 
 def _markers(plate: Artifact, step: float) -> list[np.ndarray]:
@@ -145,13 +145,13 @@ def _markers(plate: Artifact, step: float) -> list[np.ndarray]:
     patterns = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY))
     cells = patterns.markerSize + 2  # with its frame
     side = SIDE * step / cells
-    found = []
+    outlines = []
     for number, centre in enumerate(edge_markers(*plate.shape) * step):
         black = cv2.aruco.generateImageMarker(patterns, number, cells) == 0
         for row, column, length in _runs(black):
             middle = (column + length / 2 - cells / 2, cells / 2 - row - 0.5)
-            found.append(_box(length * side, side) + centre + np.array(middle) * side)
-    return found
+            outlines.append(_box(length * side, side) + centre + np.array(middle) * side)
+    return outlines
 
 
 def _runs(black: np.ndarray) -> Iterator[tuple[int, int, int]]:
@@ -319,9 +319,9 @@ def _gds(art: Artwork) -> bytes:
         return file.read_bytes()
 
 
-def _missing(what: str, package: str) -> InputError:
+def _missing(format_name: str, package: str) -> InputError:
     return InputError(
-        what,
+        format_name,
         f"the package {package} is not installed",
         f"pip install {package}, or write .svg or .pdf",
     )

@@ -132,10 +132,10 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple, tuple]:
         if all(_is_plain(row.get(k)) for row in rows)
         and any(row.get(k) not in (None, "") for row in rows)
     ]
-    shown = rows[:MAX_ROWS]
-    columns = [_column(key, [row.get(key) for row in shown]) for key in keys]
+    shown_rows = rows[:MAX_ROWS]
+    columns = [_column(key, [row.get(key) for row in shown_rows]) for key in keys]
     table = (tuple(_heading(key) for key in keys), *zip(*columns, strict=True))
-    more = len(rows) - len(shown)
+    more = len(rows) - len(shown_rows)
     return table, ((f"{more} more rows are in the result file",) if more else ())
 
 
@@ -193,10 +193,10 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
     `about` overrides the result; what it has beyond `ABOUT`, as the number of a certificate, comes
     first.
     """
-    made = result.provenance
-    known = {**made.extra, **{key: value for key, value in about.items() if value}}
+    provenance = result.provenance
+    facts = {**provenance.extra, **{key: value for key, value in about.items() if value}}
     first, last = (
-        str(known.get(key, "")).replace("T", " ")[:16]
+        str(facts.get(key, "")).replace("T", " ")[:16]
         for key in ("first_exposure", "last_exposure")
     )
     measured = f"{first} to {last.removeprefix(first[:11])} UTC"
@@ -205,13 +205,15 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
         (
             *((_words(key), printable(value)) for key, value in about.items() if key not in ABOUT),
             *(
-                (_words(key), printable(known.get(key) or f"{UNKNOWN} (not given: {hint})"))
+                (_words(key), printable(facts.get(key) or f"{UNKNOWN} (not given: {hint})"))
                 for key, hint in ABOUT.items()
             ),
             ("measured", measured if first else UNKNOWN),
             (
                 "evaluated",
-                f"{made.created[:16].replace('T', ' ')} UTC" if made.created else UNKNOWN,
+                f"{provenance.created[:16].replace('T', ' ')} UTC"
+                if provenance.created
+                else UNKNOWN,
             ),
         ),
     )
@@ -271,19 +273,21 @@ def provenance_section(result: CalibrationResult) -> Section:
         ("result schema", SCHEMA),
         ("software", f"selfcal_ros {__version__}"),
     ]
-    made = result.provenance
+    provenance = result.provenance
     facts += [
         (_words(key), said(value))
         for key, value in (
-            ("created", made.created),
-            ("solved_by", made.version and f"selfcal_ros {made.version}"),
+            ("created", provenance.created),
+            ("solved_by", provenance.version and f"selfcal_ros {provenance.version}"),
             ("run", result.run_id),
-            *made.extra.items(),
+            *provenance.extra.items(),
         )
         if value
     ]
-    if math.isfinite(made.duration_s):
-        facts.append(("duration", f"{made.duration_s:.0f} s from the first exposure to the last"))
+    if math.isfinite(provenance.duration_s):
+        facts.append(
+            ("duration", f"{provenance.duration_s:.0f} s from the first exposure to the last")
+        )
     if length := reference_to_dict(result.reference):
         facts += [
             (f"reference {_words(key)}", said(value))
@@ -338,7 +342,7 @@ def chapters(
     more : sequence of Chapter
         Chapters of others; they follow the uncertainty.
     """
-    found = [
+    drafts = [
         Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
         _maps(result, truth),
         _causes(result),
@@ -381,16 +385,16 @@ def chapters(
             sections=(convention_section(result), provenance_section(result)),
         ),
     ]
-    kept = [
+    trimmed = [
         Chapter(
             c.title,
             c.figures,
             tuple(s for s in c.sections if s.facts or s.table or s.notes),
             c.alert,
         )
-        for c in found
+        for c in drafts
     ]
-    return [c for c in kept if c.figures or c.sections]
+    return [c for c in trimmed if c.figures or c.sections]
 
 
 def _figures(*pairs: tuple[Drawing | None, str]) -> tuple[CaptionedFigure, ...]:
@@ -574,21 +578,21 @@ def _where(budget: Budget) -> str:
 
 
 def _residuals(result: CalibrationResult) -> Chapter:
-    found = residuals_in(result)
+    view_residuals = residuals_in(result)
     pairs = (
         (
-            residual_maps(result, found),
+            residual_maps(result, view_residuals),
             "Residuals of the fit at each mark. Random directions are "
             "noise; neighbours that point the same way are an effect outside the model.",
         ),
         (
-            distributions(found, "xy"),
+            distributions(view_residuals, "xy"),
             "Bars against the normal curve of the same rms, and the same "
             "residuals against normal quantiles: dots off the line at its ends are outliers.",
         ),
-        (distributions(found, "theta"), "The same for the angular lines."),
+        (distributions(view_residuals, "theta"), "The same for the angular lines."),
         (
-            courses(found, result.noise.sigma_xy),
+            courses(view_residuals, result.noise.sigma_xy),
             "Means over sixtieths of the view's duration. A "
             "curve that leaves the band shows a drift.",
         ),

@@ -52,8 +52,8 @@ def write_report(
     """
     check_name(path)
     printed = is_pdf(path)
-    found = chapters(result, truth_arrays(result.error_map, truth), more)
-    text = report_html(result, found, heading(result, about or {}), printed=printed)
+    report_chapters = chapters(result, truth_arrays(result.error_map, truth), more)
+    text = report_html(result, report_chapters, heading(result, about or {}), printed=printed)
     if printed:
         write_bytes(path, printed_page(text, path))
     else:
@@ -200,7 +200,11 @@ SHORT = 24
 
 
 def report_html(
-    result: CalibrationResult, found: Sequence[Chapter], head: Section, *, printed: bool = False
+    result: CalibrationResult,
+    report_chapters: Sequence[Chapter],
+    head: Section,
+    *,
+    printed: bool = False,
 ) -> str:
     """Return the report as one HTML document that needs nothing from outside.
 
@@ -208,7 +212,7 @@ def report_html(
     ----------
     result : CalibrationResult
         What was found.
-    found : sequence of Chapter
+    report_chapters : sequence of Chapter
         Its chapters.
     head : Section
         What was calibrated, by whom and when.
@@ -216,17 +220,17 @@ def report_html(
         For paper: light colours, no links, nothing that needs a pointer.
     """
     turning = "" if printed else turning_map(result)
-    parts = [
+    blocks = [
         f'<p class="verdict {_grade(result)}">{_text(state_sentence(result))}</p>',
         _section(head, titled=False),
-        "" if printed else _contents(found),
+        "" if printed else _contents(report_chapters),
         *(
             _chapter(chapter, printed=printed, more=turning if chapter.title == MAP else "")
-            for chapter in found
+            for chapter in report_chapters
         ),
     ]
     return page(
-        _text(f"Stage calibration: plan {result.plan_id}"), "\n".join(parts), turns=bool(turning)
+        _text(f"Stage calibration: plan {result.plan_id}"), "\n".join(blocks), turns=bool(turning)
     )
 
 
@@ -244,14 +248,14 @@ def _anchor(title: str) -> str:
     return re.sub(r"[^a-z]+", "-", title.lower()).strip("-")
 
 
-def _contents(found: Sequence[Chapter]) -> str:
-    links = "".join(f'<a href="#{_anchor(c.title)}">{_text(c.title)}</a>' for c in found)
+def _contents(report_chapters: Sequence[Chapter]) -> str:
+    links = "".join(f'<a href="#{_anchor(c.title)}">{_text(c.title)}</a>' for c in report_chapters)
     return f"<nav>{links}</nav>"
 
 
 def _chapter(chapter: Chapter, *, printed: bool, more: str) -> str:
     figures = "\n".join(_figure(figure, printed=printed) for figure in chapter.figures)
-    parts = [
+    blocks = [
         f"<h2>{_text(chapter.title)}</h2>",
         f'<div class="figures">\n{figures}\n</div>' if figures else "",
         more,
@@ -263,7 +267,7 @@ def _chapter(chapter: Chapter, *, printed: bool, more: str) -> str:
     kind = ' class="attention"' if chapter.alert else ""
     return (
         f'<section id="{_anchor(chapter.title)}"{kind}>'
-        + "\n".join(part for part in parts if part)
+        + "\n".join(block for block in blocks if block)
         + "</section>"
     )
 
@@ -276,19 +280,19 @@ def _figure(figure: CaptionedFigure, *, printed: bool) -> str:
 
 def _section(section: Section, *, titled: bool) -> str:
     """Return a section with its facts, its table and its notes."""
-    parts = [f"<h3>{_text(section.title)}</h3>"] if titled and section.title else []
+    blocks = [f"<h3>{_text(section.title)}</h3>"] if titled and section.title else []
     if section.facts:
         rows = "".join(
             f"<tr><th>{_text(label)}</th><td>{_text(value)}</td></tr>"
             for label, value in section.facts
         )
-        parts.append(f'<table class="facts"><tbody>{rows}</tbody></table>')
+        blocks.append(f'<table class="facts"><tbody>{rows}</tbody></table>')
     if section.table:
-        parts.append(_table(section.table))
+        blocks.append(_table(section.table))
     if section.notes:
         items = "".join(f"<li>{_text(note)}</li>" for note in section.notes)
-        parts.append(f"<ul>{items}</ul>")
-    return "\n".join(parts)
+        blocks.append(f"<ul>{items}</ul>")
+    return "\n".join(blocks)
 
 
 def _table(table: tuple[tuple[str, ...], ...]) -> str:

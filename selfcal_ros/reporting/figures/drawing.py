@@ -41,9 +41,9 @@ _RAMPS = {
 }
 
 
-def _mixed(stops: tuple[str, ...], part: float) -> str:
-    """Return the colour at `part` (0 to 1) of a gradient with evenly spaced stops."""
-    place = part * (len(stops) - 1)
+def _mixed(stops: tuple[str, ...], fraction: float) -> str:
+    """Return the colour at `fraction` (0 to 1) of a gradient with evenly spaced stops."""
+    place = fraction * (len(stops) - 1)
     index = min(int(place), len(stops) - 2)
     low, high = (
         tuple(int(stops[i][at : at + 2], 16) for at in (1, 3, 5)) for i in (index, index + 1)
@@ -58,8 +58,8 @@ def _all_colours() -> dict[str, tuple[str, str]]:
     for name, (light, dark) in _RAMPS.items():
         count = 2 * SIDES + 1 if name == "d" else LEVELS
         for i in range(count):
-            part = i / (count - 1)
-            colours[f"{name}{i}"] = (_mixed(light, part), _mixed(dark, part))
+            fraction = i / (count - 1)
+            colours[f"{name}{i}"] = (_mixed(light, fraction), _mixed(dark, fraction))
     return colours
 
 

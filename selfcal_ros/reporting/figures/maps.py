@@ -76,7 +76,7 @@ def difference_picture(
     verdict : str
         Heading.
     """
-    first, other = a.error_map, b.error_map
+    map_a, map_b = a.error_map, b.error_map
     noise = replace(
         a.noise, k_xy=max(a.noise.k_xy, b.noise.k_xy), k_theta=max(a.noise.k_theta, b.noise.k_theta)
     )
@@ -84,23 +84,23 @@ def difference_picture(
     of_b = replace(
         b,
         error_map=replace(
-            other, **{name: getattr(first, name) + difference[name] for name in names}
+            map_b, **{name: getattr(map_a, name) + difference[name] for name in names}
         ),
     )
     of_both = replace(
         a,
         noise=noise,
         error_map=replace(
-            first,
+            map_a,
             **difference,
             **{
-                f"u_{name}": np.hypot(*(getattr(emap, f"u_{name}") for emap in (first, other)))
+                f"u_{name}": np.hypot(*(getattr(emap, f"u_{name}") for emap in (map_a, map_b)))
                 for name in names
             },
         ),
     )
-    shown = [("A", a), ("B, in the datum of A", of_b), ("B − A", of_both)]
-    pictures = [error_map(result, title=title) for title, result in shown]
+    titled = [("A", a), ("B, in the datum of A", of_b), ("B − A", of_both)]
+    pictures = [error_map(result, title=title) for title, result in titled]
     if np.isfinite(difference["g_theta"]).any():
         pictures.append(
             angular_map(of_both, title="B − A in θ in arcsec, outwards = counter-clockwise")
@@ -109,7 +109,7 @@ def difference_picture(
 
 
 def verification_picture(
-    before: CalibrationResult, after: CalibrationResult, found: Verification, sentence: str
+    before: CalibrationResult, after: CalibrationResult, verification: Verification, sentence: str
 ) -> draw.Drawing:
     """Return the maps without and with the correction side by side, at one scale.
 
@@ -117,19 +117,21 @@ def verification_picture(
     ----------
     before, after : CalibrationResult
         Maps on the same nodes.
-    found : Verification
+    verification : Verification
         What was found; the map after is drawn in the datum of the map before.
     sentence : str
         Heading.
     """
-    with_it = replace(after, error_map=replace(after.error_map, gx=found.gx, gy=found.gy))
+    with_it = replace(
+        after, error_map=replace(after.error_map, gx=verification.gx, gy=verification.gy)
+    )
     largest = max(
-        float(np.nanmax(np.hypot(each.error_map.gx, each.error_map.gy)))
-        for each in (before, with_it)
+        float(np.nanmax(np.hypot(result.error_map.gx, result.error_map.gy)))
+        for result in (before, with_it)
     )
     pictures = [
-        error_map(each, title=title, largest_m=largest)
-        for title, each in (("Without the correction", before), ("With the correction", with_it))
+        error_map(result, title=title, largest_m=largest)
+        for title, result in (("Without the correction", before), ("With the correction", with_it))
     ]
     return _side_by_side(
         pictures, sentence, f"without: {_origin(before)}", f"with: {_origin(after)}"
@@ -144,9 +146,9 @@ def _side_by_side(pictures: list[draw.Drawing], heading: str, *foot: str) -> dra
     for line in wrap(heading, 52 * len(pictures)):
         drawing.label(drawing.width / 2, top, line, size=13, anchor="middle", bold=True)
         top += 18
-    for column, part in enumerate(pictures):
-        drawing.add(part, margin + column * (parts.WIDTH + margin), top)
-    drawing.height = top + max(part.height for part in pictures) + 44
+    for column, picture in enumerate(pictures):
+        drawing.add(picture, margin + column * (parts.WIDTH + margin), top)
+    drawing.height = top + max(picture.height for picture in pictures) + 44
     for number, line in enumerate(foot):
         drawing.height += 14 * (number > 0)
         drawing.label(margin, drawing.height - 14, line, size=10, colour="soft")
@@ -188,7 +190,7 @@ def error_map(
     )
 
     def shown(along: Iterable[np.ndarray], scale: float = 1.0) -> np.ndarray:
-        return np.stack([part[sites].ravel() for part in along]) * scale
+        return np.stack([component[sites].ravel() for component in along]) * scale
 
     at = shown((artifact.x_m, artifact.y_m), MM_PER_M)
     around = shown(U, factor * MM_PER_M)
@@ -242,12 +244,12 @@ def _frame(drawing: draw.Drawing, artifact: Artifact, ends_mm: list[np.ndarray])
 
 def _ellipses(frame: draw.Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
     """Draw U (2, P) around the heads (2, P); return whether it is large enough to be seen."""
-    known = np.isfinite(u_mm + tips_mm).all(axis=0)
-    radii = (u_mm * np.array([[frame.per_x], [frame.per_y]]))[:, known]
+    finite = np.isfinite(u_mm + tips_mm).all(axis=0)
+    radii = (u_mm * np.array([[frame.per_x], [frame.per_y]]))[:, finite]
     if radii.max(initial=0.0) < 0.7:
         return False
     frame.drawing.discs(
-        [frame.at(x, y) for x, y in tips_mm[:, known].T],
+        [frame.at(x, y) for x, y in tips_mm[:, finite].T],
         list(map(tuple, radii.T)),
         fill="band",
         opacity=0.6,
@@ -262,10 +264,10 @@ def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
         return
     radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
     for index in np.ndindex(artifact.shape):
-        x, y = (float(part[index]) * MM_PER_M for part in (artifact.x_m, artifact.y_m))
+        x, y = (float(values[index]) * MM_PER_M for values in (artifact.x_m, artifact.y_m))
         gx, gy, ux, uy = (
-            significant(float(part[index]) * scale)
-            for part, scale in (
+            significant(float(values[index]) * scale)
+            for values, scale in (
                 (emap.gx, UM_PER_M),
                 (emap.gy, UM_PER_M),
                 (emap.u_gx, k * UM_PER_M),
@@ -318,10 +320,10 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
         "components" if of == "stage" else f"{of}-components",
         f"Components of the error, and their U with k = {k:.3g}",
     )
-    both = [ERRORS[of][0] + axis for axis in "xy"]
+    error_names = [ERRORS[of][0] + axis for axis in "xy"]
     for names, pair, scale in (
-        (both, errors, parts.Scale("d", -end, end)),
-        ([f"U({name})" for name in both], u, parts.range_scale("v", u)),
+        (error_names, errors, parts.Scale("d", -end, end)),
+        ([f"U({name})" for name in error_names], u, parts.range_scale("v", u)),
     ):
         for column, (name, values) in enumerate(zip(names, pair, strict=True)):
             box = (left + column * (side + gap), top, side)
@@ -365,9 +367,9 @@ def angular_map(
         "angular-map" if of == "stage" else f"{of}-angular", title, CENTRE[1] + 230
     )
     curves = [np.abs(error) + np.nan_to_num(u)] + ([] if true is None else [np.abs(true)])
-    known = np.concatenate(curves)
-    known = known[np.isfinite(known)]
-    span = 1.05 * float(known.max()) if known.size and known.max() > 0 else 1.0
+    magnitudes = np.concatenate(curves)
+    magnitudes = magnitudes[np.isfinite(magnitudes)]
+    span = 1.05 * float(magnitudes.max()) if magnitudes.size and magnitudes.max() > 0 else 1.0
     angles = emap.artifact.theta_rad
     _rings(drawing, span)
     entries = [("ink", "measured")]
@@ -434,10 +436,12 @@ def _scale(drawing: draw.Drawing, span: float) -> None:
         drawing.label(x, y + 4, words, size=draw.TICK, anchor="middle")
 
 
-def _between(known: np.ndarray) -> list[tuple[int, int]]:
+def _between(line_known: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs of neighbouring lines that are both known."""
-    count = len(known)
-    return [(i, (i + 1) % count) for i in range(count) if known[i] and known[(i + 1) % count]]
+    count = len(line_known)
+    return [
+        (i, (i + 1) % count) for i in range(count) if line_known[i] and line_known[(i + 1) % count]
+    ]
 
 
 def _curve(

@@ -109,7 +109,7 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
         if item.fill:
             vertices.append(line[0])
             codes.append(Outline.CLOSEPOLY)
-    dash = (0, tuple(part * points for part in item.dash)) if item.dash else "solid"
+    dash = (0, tuple(length * points for length in item.dash)) if item.dash else "solid"
     fill, stroke = to_rgba(_light(item.fill), item.opacity), to_rgba(_light(item.stroke))
     axes.add_artist(
         PathPatch(
@@ -162,8 +162,8 @@ def _label(item: Label, axes: Axes, points: float, order: int) -> None:
 
 def drawable(text: object, limit: int = 300) -> str:
     """Return `text` as one line of characters in the font, truncated at `limit`."""
-    known = _characters()
-    line = "".join(c if c.isprintable() and c in known else "?" for c in str(text)[: limit + 1])
+    in_font = _characters()
+    line = "".join(c if c.isprintable() and c in in_font else "?" for c in str(text)[: limit + 1])
     return line if len(line) <= limit else line[: limit - 1] + "…"
 
 

@@ -83,8 +83,8 @@ def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scal
             outlines.setdefault(int(level[i, first]), []).append(
                 (low, (high[0], low[1]), high, (low[0], high[1]))
             )
-    for found in sorted(outlines):
-        frame.drawing.shapes(outlines[found], fill="none" if found < 0 else f"{scale.ramp}{found}")
+    for shade in sorted(outlines):
+        frame.drawing.shapes(outlines[shade], fill="none" if shade < 0 else f"{scale.ramp}{shade}")
 
 
 def _clipped(frame: draw.Frame, point: draw.Point) -> draw.Point:
@@ -100,9 +100,9 @@ def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
     top = 2 * draw.SIDES if scale.ramp == "d" else draw.LEVELS - 1
     with np.errstate(invalid="ignore", over="ignore"):
         offset, span = np.asarray(values) - scale.low, scale.high - scale.low
-        part = np.clip(offset / span if span else 0.4 + 0 * offset, 0, 1)
-        step = np.rint(part * top) if scale.ramp == "d" else np.floor(part * draw.LEVELS)
-    return np.where(np.isfinite(part), np.minimum(step, top), -1).astype(int)
+        fraction = np.clip(offset / span if span else 0.4 + 0 * offset, 0, 1)
+        step = np.rint(fraction * top) if scale.ramp == "d" else np.floor(fraction * draw.LEVELS)
+    return np.where(np.isfinite(fraction), np.minimum(step, top), -1).astype(int)
 
 
 def scale_bar(
@@ -111,11 +111,17 @@ def scale_bar(
     """Draw a colour bar from bottom to top, with round numbers on its right."""
     left, top, width, height = box
     count = 2 * draw.SIDES + 1 if scale.ramp == "d" else draw.LEVELS
-    each = height / count
+    step_height = height / count
     for step in range(count):
-        drawing.box(left, top + height - (step + 1) * each, width, each, fill=f"{scale.ramp}{step}")
+        drawing.box(
+            left,
+            top + height - (step + 1) * step_height,
+            width,
+            step_height,
+            fill=f"{scale.ramp}{step}",
+        )
     drawing.box(*box, stroke="soft")
-    inset = each / 2 if scale.ramp == "d" else 0.0  # its outer steps are centred on the ends
+    inset = step_height / 2 if scale.ramp == "d" else 0.0  # its outer steps are centred on the ends
     frame = draw.Frame(
         drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0), (scale.low, scale.high)
     )
@@ -134,8 +140,8 @@ def scale_bar(
 
 def round_end(values: np.ndarray) -> float:
     """Return the end of a colour scale: a rounded number not below the largest magnitude."""
-    known = np.abs(values[np.isfinite(values)])
-    largest = float(known.max()) if known.size else 0.0
+    magnitudes = np.abs(values[np.isfinite(values)])
+    largest = float(magnitudes.max()) if magnitudes.size else 0.0
     if largest <= 0:
         return 1.0
     step = draw.round_step(largest, 5) / 2
@@ -147,8 +153,8 @@ def range_scale(ramp: str, values: np.ndarray) -> Scale:
 
     Its ends are equal if the values agree to 1 %, or if none is known.
     """
-    known = values[np.isfinite(values)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     if high - low <= 0.01 * high:
         return Scale(ramp, high, high)
     step = draw.round_step(high - low, 5) / 2
@@ -157,10 +163,10 @@ def range_scale(ramp: str, values: np.ndarray) -> Scale:
 
 def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
     """Return the round factor by which the longest vectors become as long as their spacing."""
-    known = lengths_m[np.isfinite(lengths_m)]
-    if not known.size or known.max() <= 0:
+    finite_m = lengths_m[np.isfinite(lengths_m)]
+    if not finite_m.size or finite_m.max() <= 0:
         return 1.0
-    typical = max(float(np.percentile(known, 95)), float(known.max()) / 2)
+    typical = max(float(np.percentile(finite_m, 95)), float(finite_m.max()) / 2)
     factor = 1.2 * spacing_m / typical
     if not math.isfinite(factor):
         return 1.0
@@ -326,8 +332,8 @@ def chart(
 
 def _span(values: Sequence[np.ndarray], margin: float) -> tuple[float, float]:
     """Return a range that includes all values, with a margin at either end."""
-    known = np.concatenate(values)
-    known = known[np.isfinite(known)]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    finite = np.concatenate(values)
+    finite = finite[np.isfinite(finite)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     room = margin * (high - low) or abs(low) or 1.0
     return low - room, high + room

@@ -48,7 +48,7 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
     if aside := {view.check_offset_m for view in views if view.check_marks}:
         legend.append(
             "crosses: check stops, measured again with the stage "
-            f"{' or '.join(f'{each * UM_PER_M:.6g}' for each in sorted(aside))} µm off"
+            f"{' or '.join(f'{offset_m * UM_PER_M:.6g}' for offset_m in sorted(aside))} µm off"
         )
     for line in legend:
         drawing.height += 18
@@ -101,8 +101,10 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     else:
         drawing.discs(_at(frame, place.reshape(2, -1)), 1.0, fill="soft")
     if view.check_marks:
-        there = pose.marks_in_field(artifact)[1]
-        for x, y in _at(frame, there[:, check_marks(there, view.check_marks)] * pitch * MM_PER_M):
+        field_sites = pose.marks_in_field(artifact)[1]
+        for x, y in _at(
+            frame, field_sites[:, check_marks(field_sites, view.check_marks)] * pitch * MM_PER_M
+        ):
             drawing.lines(
                 [[(x - 6, y), (x + 6, y)], [(x, y - 6), (x, y + 6)]], stroke="c0", width=1.6
             )
@@ -135,12 +137,12 @@ def rejected_in(result: CalibrationResult) -> list[Place]:
 
     Malformed entries are left out.
     """
-    found: list[Place] = []
+    places: list[Place] = []
     for row in _rows(result.extra.get("rejected_at")):
         columns = [row.get(key) for key in ("reason", "x", "y")]
         if not all(isinstance(column, list | tuple | np.ndarray) for column in columns):
             continue
-        found += [
+        places += [
             (str(row.get("view")), str(reason), x * MM_PER_M, y * MM_PER_M)
             for reason, x, y in zip(*columns, strict=False)
             if _number(x) and _number(y)
@@ -151,8 +153,8 @@ def rejected_in(result: CalibrationResult) -> list[Place]:
     for row in _rows(removed):
         view = views.get(str(row.get("view")))
         if view is not None and row.get("kind") == "grid":
-            found += _marked(result, view, row.get("mark"))
-    return found
+            places += _marked(result, view, row.get("mark"))
+    return places
 
 
 def _rows(value: object) -> list[dict]:
@@ -166,18 +168,18 @@ def _number(value: object) -> bool:
 def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[Place]:
     if not isinstance(mark, list) or len(mark) != 2 or not all(map(_number, mark)):
         return []
-    m, n = (np.array(part) for part in mark)
+    m, n = (np.array(component) for component in mark)
     if result.plate.marks and not result.plate.has(m, n):
         return []
-    at = (part * result.plate.grid_pitch_m for part in result.plate.places(m, n))
+    at = (component * result.plate.grid_pitch_m for component in result.plate.places(m, n))
     x, y = places_mm(view.rotation, (view.translation_x, view.translation_y), *at)
     return [(view.name, "outlier_among_views", float(x), float(y))]
 
 
 def rejected_map(result: CalibrationResult) -> Drawing | None:
     """Return where readings were rejected in each view, coloured by reason; None if nowhere."""
-    found = rejected_in(result)
-    names = [view.name for view in result.views if any(view.name == row[0] for row in found)]
+    places = rejected_in(result)
+    names = [view.name for view in result.views if any(view.name == row[0] for row in places)]
     if not names:
         return None
     artifact = result.plate
@@ -185,14 +187,14 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {
         reason: f"c{i % SERIES}"
-        for i, (reason, _) in enumerate(Counter(row[1] for row in found).most_common())
+        for i, (reason, _) in enumerate(Counter(row[1] for row in places).most_common())
     }
     drawing = parts.titled("rejected", "Positions of rejected grid readings")
     for title, frame in zip(names, parts.panels(drawing, names, reach), strict=True):
         low, high = frame.at(-field[0], -field[1]), frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
         for reason, colour in colours.items():
-            at = [(x, y) for view, why, x, y in found if (view, why) == (title, reason)]
+            at = [(x, y) for view, why, x, y in places if (view, why) == (title, reason)]
             inside = [
                 (min(max(x, -reach[0]), reach[0]), min(max(y, -reach[1]), reach[1])) for x, y in at
             ]
@@ -201,7 +203,7 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     _legend(
         drawing,
         {
-            reason: (colour, sum(row[1] == reason for row in found))
+            reason: (colour, sum(row[1] == reason for row in places))
             for reason, colour in colours.items()
         },
     )
@@ -254,11 +256,11 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
 
 def stage_yaw(result: CalibrationResult) -> draw.Drawing | None:
     """Return the yaw of the stage at its nodes in colour; None without images."""
-    found = result.stage_yaw
-    if found is None:
+    yaw_map = result.stage_yaw
+    if yaw_map is None:
         return None
-    place = np.stack([found.x, found.y]) * MM_PER_M
-    yaw, u = found.yaw * URAD_PER_RAD, found.u_yaw * URAD_PER_RAD
+    place = np.stack([yaw_map.x, yaw_map.y]) * MM_PER_M
+    yaw, u = yaw_map.yaw * URAD_PER_RAD, yaw_map.u_yaw * URAD_PER_RAD
     half = [np.diff(np.unique(along)).min(initial=np.inf) / 2 for along in place]
     dx, dy = (side if np.isfinite(side) else min(half) for side in half)
     x, y = (float(np.abs(along).max()) + side for along, side in zip(place, (dx, dy), strict=True))

@@ -62,28 +62,28 @@ def residuals_in(result: CalibrationResult) -> list[ViewResiduals]:
 
     A malformed part counts as absent.
     """
-    kept = result.extra.get("residuals")
-    rows = kept.get("views") if isinstance(kept, dict) else None
+    stored = result.extra.get("residuals")
+    rows = stored.get("views") if isinstance(stored, dict) else None
     if not isinstance(rows, list) or len(rows) != len(result.views):
         return []
     shape, lines = result.plate.shape, (result.plate.angular_count,)
-    found = []
+    residuals = []
     for view, row in zip(result.views, rows, strict=True):
-        part = row if isinstance(row, dict) else {}
-        found.append(
+        entry = row if isinstance(row, dict) else {}
+        residuals.append(
             ViewResiduals(
                 view,
-                np.stack([_array(part.get(k), shape) for k in ("dx", "dy")]),
-                _course(part.get("course")),
-                _array(part.get("dtheta"), lines),
+                np.stack([_array(entry.get(k), shape) for k in ("dx", "dy")]),
+                _course(entry.get("course")),
+                _array(entry.get("dtheta"), lines),
             )
         )
-    return found
+    return residuals
 
 
 def _course(value: object) -> np.ndarray:
-    part = value if isinstance(value, dict) else {}
-    columns = [part.get(key) for key in ("time_s", "dx", "dy", "count")]
+    entry = value if isinstance(value, dict) else {}
+    columns = [entry.get(key) for key in ("time_s", "dx", "dy", "count")]
     try:
         array = np.array(columns, dtype=float)
     except (TypeError, ValueError):
@@ -99,9 +99,9 @@ def _array(value: object, shape: tuple[int, ...]) -> np.ndarray:
     return array if array.shape == shape else np.full(shape, np.nan)
 
 
-def residual_maps(result: CalibrationResult, found: Sequence[ViewResiduals]) -> Drawing | None:
+def residual_maps(result: CalibrationResult, residuals: Sequence[ViewResiduals]) -> Drawing | None:
     """Return the grid residuals of every view as vectors at the marks; None if there are none."""
-    views = [v for v in found if np.isfinite(v.xy_m).any()]
+    views = [v for v in residuals if np.isfinite(v.xy_m).any()]
     if not views:
         return None
     artifact = result.plate
@@ -135,12 +135,12 @@ MOST_DOTS = 400
 """Dots of a normal plot; of more, evenly spaced ones are shown."""
 
 
-def distributions(found: Sequence[ViewResiduals], kind: str) -> Drawing | None:
+def distributions(residuals: Sequence[ViewResiduals], kind: str) -> Drawing | None:
     """Return a histogram and a normal plot of every view.
 
     Parameters
     ----------
-    found : sequence of ViewResiduals
+    residuals : sequence of ViewResiduals
         The residuals.
     kind : str
         ``xy`` (both coordinates, µm) or ``theta`` (arcsec).
@@ -149,16 +149,16 @@ def distributions(found: Sequence[ViewResiduals], kind: str) -> Drawing | None:
     unit = "µm" if xy else "arcsec"
     rows = [
         (v.view.name, (v.xy_m * UM_PER_M if xy else v.theta_rad * ARCSEC_PER_RAD).ravel())
-        for v in found
+        for v in residuals
     ]
     rows = [(name, np.sort(values[np.isfinite(values)])) for name, values in rows]
     rows = [(name, values) for name, values in rows if len(values)]
     if not rows:
         return None
-    what = "grid" if xy else "angular"
+    mark_kind = "grid" if xy else "angular"
     drawing = parts.titled(
         f"distributions-{kind}",
-        f"Distribution of the {what} residuals by view",
+        f"Distribution of the {mark_kind} residuals by view",
         44 + 148.0 * len(rows),
     )
     end = 1.05 * span_of(np.concatenate([values for _, values in rows]).tolist())
@@ -246,12 +246,12 @@ def _some(count: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, MOST_DOTS).round().astype(int)).tolist()
 
 
-def courses(found: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
+def courses(residuals: Sequence[ViewResiduals], sigma_m: float) -> Drawing | None:
     """Return the mean grid residuals over the time of each view; None if times are unknown.
 
     The band contains 95 % of the means of random noise `sigma_m` (m, one reading).
     """
-    views = [v for v in found if v.course.shape[1] > 1]
+    views = [v for v in residuals if v.course.shape[1] > 1]
     if not views:
         return None
     drawing = parts.titled("courses", "Mean residuals over the time of each view, µm")

@@ -73,12 +73,12 @@ def aligned_numbers(values: Sequence[float], digits: int = 3, *, more: int = 3) 
     The largest has `digits` significant digits, and up to `more` decimals are added until the
     smallest has two; values beyond are in scientific form.
     """
-    known = [abs(v) for v in values if math.isfinite(v) and v != 0]
-    if not known or max(known) >= 1e7 or max(known) < 1e-6:
+    sizes = [abs(v) for v in values if math.isfinite(v) and v != 0]
+    if not sizes or max(sizes) >= 1e7 or max(sizes) < 1e-6:
         return [significant(v, digits) for v in values]
-    wanted = 1 - math.floor(math.log10(min(known)))
+    decimals_of_smallest = 1 - math.floor(math.log10(min(sizes)))
     base = decimals_for(values, digits)
-    decimals = min(max(base, wanted), base + more)
+    decimals = min(max(base, decimals_of_smallest), base + more)
     return [fixed(value, decimals) for value in values]
 
 
@@ -222,10 +222,10 @@ def anywhere_m(result: CalibrationResult) -> tuple[float, float, float]:
     from selfcal_ros.estimation.verdict.uncertainty import budgets  # with scipy, not for figures
 
     try:
-        known = budgets(result)
+        result_budgets = budgets(result)
     except InputError:
         return (math.nan,) * 3
-    for budget in known:
+    for budget in result_budgets:
         if budget.quantity == "xy" and budget.anywhere:
             return budget.u_rms, budget.u_max, budget.U_max
     return (math.nan,) * 3
@@ -244,15 +244,15 @@ _SUMMARY_FIELDS = (
 
 def map_figures(emap: ErrorMap) -> MapFigures:
     """Return the figures of an error map; unknown sites and lines do not count."""
-    known = emap.valid
-    g = np.stack([emap.gx, emap.gy])[:, known]
-    u = emap.u_xy[:, known]
-    max_error, index = largest(np.where(known, np.hypot(emap.gx, emap.gy), np.nan))
+    valid = emap.valid
+    g = np.stack([emap.gx, emap.gy])[:, valid]
+    u = emap.u_xy[:, valid]
+    max_error, index = largest(np.where(valid, np.hypot(emap.gx, emap.gy), np.nan))
     max_theta, line = largest(emap.g_theta)
     u_theta = emap.u_g_theta[np.isfinite(emap.g_theta)]
     return MapFigures(
-        known.size,
-        int(known.sum()),
+        valid.size,
+        int(valid.sum()),
         max_error,
         max_site=_site(emap, index),
         rms_error_m=rms(g),
@@ -313,12 +313,12 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
 
 def _common(theta_rad: np.ndarray, u_rad: np.ndarray) -> float:
     """Return the constant of an angular difference: its mean, weighted where u is known."""
-    known = np.isfinite(theta_rad)
-    weighted = known & np.isfinite(u_rad) & (u_rad > 0)
+    finite = np.isfinite(theta_rad)
+    weighted = finite & np.isfinite(u_rad) & (u_rad > 0)
     if weighted.any():
         smallest = u_rad[weighted].min()
         return float(np.average(theta_rad[weighted], weights=(smallest / u_rad[weighted]) ** 2))
-    return float(theta_rad[known].mean()) if known.any() else 0.0
+    return float(theta_rad[finite].mean()) if finite.any() else 0.0
 
 
 def _in_units(difference: np.ndarray, u: np.ndarray) -> tuple[float, float, float]:
@@ -387,10 +387,10 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     worst = int(np.argmax(np.hypot(*cells[2:4])))
     x, y = cells[:2, worst] * MM_PER_M
     size, u = math.hypot(*cells[2:4, worst]), math.hypot(*cells[4:6, worst]) / math.sqrt(2)
-    parts = [
+    distortions = [
         name
         for name, power in (("quadratic", (2, 0)), ("radial (cubic)", (2, 1)))
-        if power in [one.power for one in camera.coefficients]
+        if power in [coefficient.power for coefficient in camera.coefficients]
     ]
     return (
         (
@@ -404,7 +404,7 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
             f"{told(camera.stretch, camera.u_stretch, PERCENT, '%')}, "
             f"{told(camera.shear, camera.u_shear, PERCENT, '%')}",
         ),
-        ("distortion", " and ".join(parts) or "none shown"),
+        ("distortion", " and ".join(distortions) or "none shown"),
         (
             "largest error",
             f"{significant(size * UM_PER_M)} ± {significant(u * UM_PER_M)} µm at "
@@ -421,14 +421,21 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
 
 def yaw_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     """Return the yaw of the stage shown by images; empty without images."""
-    found = result.stage_yaw
-    if found is None:
+    yaw_map = result.stage_yaw
+    if yaw_map is None:
         return ()
     low, high, mean_u = (
         significant(value * URAD_PER_RAD)
-        for value in (found.yaw.min(), found.yaw.max(), math.sqrt(np.mean(found.u_yaw**2)))
+        for value in (yaw_map.yaw.min(), yaw_map.yaw.max(), math.sqrt(np.mean(yaw_map.u_yaw**2)))
     )
-    shown = (
-        f"p = {found.p:.1g}" if found.p < TURNS else f"not more than its noise, p = {found.p:.2g}"
+    significance = (
+        f"p = {yaw_map.p:.1g}"
+        if yaw_map.p < TURNS
+        else f"not more than its noise, p = {yaw_map.p:.2g}"
     )
-    return (("yaw of the stage", f"{low} to {high} ± {mean_u} µrad (k=1) about its mean; {shown}"),)
+    return (
+        (
+            "yaw of the stage",
+            f"{low} to {high} ± {mean_u} µrad (k=1) about its mean; {significance}",
+        ),
+    )

@@ -152,9 +152,9 @@ def measurement_section(result: CalibrationResult) -> Section:
         else f"{nx} × {ny} marks, pitch {pitch:.6g} mm"
     )
     x, y = (2 * half * pitch for half in artifact.reach)
-    seen = result.observability
-    done = {without_cell(view.name) for view in filter(_in_the_map(result), result.views)}
-    views = f"{counted_views(result.views)}, {len(done)} measured"
+    observability = result.observability
+    measured_names = {without_cell(view.name) for view in filter(_in_the_map(result), result.views)}
+    views = f"{counted_views(result.views)}, {len(measured_names)} measured"
     facts = [
         ("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
         (
@@ -174,8 +174,9 @@ def measurement_section(result: CalibrationResult) -> Section:
         ),
         (
             "identifiable",
-            f"{'yes' if seen.identifiable else 'NO'} (rank {seen.rank} of "
-            f"{seen.unknowns} unknowns, {counted(seen.deficiency, 'undetermined mode')})",
+            f"{'yes' if observability.identifiable else 'NO'} "
+            f"(rank {observability.rank} of {observability.unknowns} unknowns, "
+            f"{counted(observability.deficiency, 'undetermined mode')})",
         ),
     ]
     plate_map = result.artifact_map
@@ -207,7 +208,7 @@ def measured(view: ViewResult) -> bool:
 
 def _in_the_map(result: CalibrationResult) -> Callable[[ViewResult], bool]:
     """Return whether a view was measured, and no finding says that most of it is missing."""
-    missing = {found.view for found in result.findings if found.name == "view_left_out"}
+    missing = {finding.view for finding in result.findings if finding.name == "view_left_out"}
     return lambda view: measured(view) and without_cell(view.name) not in missing
 
 
@@ -242,7 +243,7 @@ def position_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
     if site is None:
         return ""
     pitch, at = emap.artifact.grid_pitch_m, emap.artifact.places(*map(np.array, site))
-    x, y = (f"{float(part) * pitch * MM_PER_M:.6g}" for part in at)
+    x, y = (f"{float(coordinate) * pitch * MM_PER_M:.6g}" for coordinate in at)
     return f"at x {x} mm, y {y} mm"
 
 
@@ -287,7 +288,7 @@ def error_section(result: CalibrationResult) -> Section:
 def _between_nodes(result: CalibrationResult) -> list[tuple[str, str]]:
     """Return U of one coordinate anywhere in the field, where the map is interpolated."""
     try:
-        known = budgets(result)
+        result_budgets = budgets(result)
     except InputError:  # damaged factors: the map can be shown all the same
         return []
     return [
@@ -296,7 +297,7 @@ def _between_nodes(result: CalibrationResult) -> list[tuple[str, str]]:
             f"U {um(budget.U_rms)} rms, at most {um(budget.U_max)} "
             f"(k={budget.k:.3g}), the map interpolated between its nodes",
         )
-        for budget in known
+        for budget in result_budgets
         if budget.quantity == "xy" and budget.anywhere
     ]
 
@@ -310,11 +311,11 @@ def _first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
 
 def _slope_text(
-    emap: ErrorMap, found: tuple[float, float], symbol: str, unit: str, meaning: str
+    emap: ErrorMap, slope_and_u: tuple[float, float], symbol: str, unit: str, meaning: str
 ) -> str:
     """Return a slope, with its standard uncertainty, and what it means."""
     length = (max(emap.artifact.shape) - 1) * emap.artifact.grid_pitch_m
-    value, u = found
+    value, u = slope_and_u
     spread = f" ± {u * UM_PER_M:.3g} (k=1)" if math.isfinite(u) else ""
     return (
         f"{symbol} {significant(value * UM_PER_M)}{spread} {unit} = {um(value * length)} over "
@@ -374,20 +375,20 @@ def noise_section(noise: Noise) -> Section:
         ("x, y", "xy", UM_PER_M, "µm"),
         ("θ", "theta", ARCSEC_PER_RAD, "arcsec"),
     ):
-        used, repeats, residuals = (
+        sigma, repeats, residuals = (
             getattr(noise, f"sigma_{name}{suffix}") for suffix in ("", "_repeats", "_residuals")
         )
-        if not any(map(math.isfinite, (used, repeats, residuals))):
+        if not any(map(math.isfinite, (sigma, repeats, residuals))):
             continue
         dofs = [getattr(noise, f"dof_{name}_{kind}") for kind in ("repeats", "residuals")]
         ratio = residuals / repeats if repeats > 0 else float("nan")
-        shown = aligned_numbers([value * scale for value in (used, repeats, residuals)])
+        texts = aligned_numbers([value * scale for value in (sigma, repeats, residuals)])
         rows.append(
             (
                 f"{label} ({unit})",
-                *shown[:2],
+                *texts[:2],
                 _dof(dofs[0]),
-                shown[2],
+                texts[2],
                 _dof(dofs[1]),
                 significant(ratio),
             )
@@ -457,21 +458,21 @@ def rejected_section(result: CalibrationResult) -> Section:
 
 def attention_section(result: CalibrationResult) -> Section:
     """Return unseen modes, advice and warnings, which require action."""
-    seen = result.observability
-    lines = [f"undetermined mode: {printable(mode.text)}" for mode in seen.modes]
-    lines += [f"advice: {printable(advice.text)}" for advice in seen.advice]
+    observability = result.observability
+    lines = [f"undetermined mode: {printable(mode.text)}" for mode in observability.modes]
+    lines += [f"advice: {printable(advice.text)}" for advice in observability.advice]
     lines += [f"warning: {printable(warning)}" for warning in result.warnings]
     return Section("Attention", notes=tuple(lines))
 
 
 def state_sentence(result: CalibrationResult) -> str:
     """Return the state of a calibration in one sentence."""
-    seen, figures = result.observability, map_figures(result.error_map)
-    if not seen.identifiable:
-        advice = f"; {printable(seen.advice[0].text)}" if seen.advice else ""
+    observability, figures = result.observability, map_figures(result.error_map)
+    if not observability.identifiable:
+        advice = f"; {printable(observability.advice[0].text)}" if observability.advice else ""
         return (
-            f"Not a calibration: {counted(seen.deficiency, 'mode')} of the stage error cannot "
-            f"be determined from the marks that were read{advice}."
+            f"Not a calibration: {counted(observability.deficiency, 'mode')} of the stage error "
+            f"cannot be determined from the marks that were read{advice}."
         )
     if not figures.n_known and not figures.n_lines_known:
         return "No calibration: no site of the error map is known."
@@ -480,8 +481,10 @@ def state_sentence(result: CalibrationResult) -> str:
     if result.verdict.grade is Grade.GOOD and result.recheck is None:
         assumed = assumption_text(result)
         return text + f" {assumed}." * bool(assumed)
-    said = printable(result.verdict.sentence).rstrip(".")
-    return f"{said}. {text}" if result.verdict.qualified else f"{said}. Map as it is: {text}"
+    sentence = printable(result.verdict.sentence).rstrip(".")
+    return (
+        f"{sentence}. {text}" if result.verdict.qualified else f"{sentence}. Map as it is: {text}"
+    )
 
 
 def state_line(result: CalibrationResult) -> str:
@@ -495,15 +498,15 @@ def state_line(result: CalibrationResult) -> str:
     if not result.observability.identifiable or not (figures.n_known or figures.n_lines_known):
         return state_sentence(result)
 
-    parts = []
+    clauses = []
     if figures.n_known:
-        parts.append(f"error up to {um(figures.max_error_m)}")
-        parts.append(f"U {um(result.noise.k_xy * figures.max_u_m)} at the nodes")
-        parts.append(f"{um(anywhere_m(result)[2])} anywhere")
-    line = ", ".join(parts)
+        clauses.append(f"error up to {um(figures.max_error_m)}")
+        clauses.append(f"U {um(result.noise.k_xy * figures.max_u_m)} at the nodes")
+        clauses.append(f"{um(anywhere_m(result)[2])} anywhere")
+    line = ", ".join(clauses)
     if figures.n_lines_known:
         u_theta = arcsec(result.noise.k_theta * figures.max_u_theta_rad)
-        line += f"{'; ' * bool(parts)}θ up to {arcsec(figures.max_theta_rad)}, U {u_theta}"
+        line += f"{'; ' * bool(clauses)}θ up to {arcsec(figures.max_theta_rad)}, U {u_theta}"
 
     if result.recheck is not None and verdict.qualified:
         return f"{verdict.sentence}: {line}."
@@ -527,13 +530,13 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     if not figures.n_known:
         return text
     k = result.noise.k_xy
-    which = "each" if share else "every site"
-    known, between = "uncertainty not known", anywhere_m(result)[2]
+    sites = "each" if share else "every site"
+    uncertainty, between = "uncertainty not known", anywhere_m(result)[2]
     if math.isfinite(figures.max_u_m):
         also = f", any place to ±{um(between)}" if math.isfinite(between) else ""
-        known = f"{which} known to ±{um(k * figures.max_u_m)}{also} or better (k={k:.3g})"
+        uncertainty = f"{sites} known to ±{um(k * figures.max_u_m)}{also} or better (k={k:.3g})"
     where = position_text(result.error_map, figures.max_site)
-    return f"{text}: largest error {um(figures.max_error_m)} {where}, {known}"
+    return f"{text}: largest error {um(figures.max_error_m)} {where}, {uncertainty}"
 
 
 def _theta_clause(figures: MapFigures, k: float) -> str:
@@ -586,9 +589,9 @@ def _section_lines(section: Section, spell: Callable[[str], str]) -> list[str]:
     facts = [(spell(label), spell(value)) for label, value in section.facts]
     table = [[spell(cell) for cell in row] for row in section.table]
     numeric = numeric_columns(section.table) if section.table else []
-    left = next((i for i, number in enumerate(numeric) if number), len(numeric))
+    text_columns = next((i for i, number in enumerate(numeric) if number), len(numeric))
     return (
         aligned(facts, left=2)
-        + aligned(table, left=max(left, 1))
+        + aligned(table, left=max(text_columns, 1))
         + [f"  {spell(note)}" for note in section.notes]
     )

@@ -53,28 +53,28 @@ def unit_of(name: str, si: str) -> DisplayUnit:
     return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, DisplayUnit(1.0, si))
 
 
-def plus_minus(found: Finding, unit: DisplayUnit, times: float = 1.0) -> str:
+def plus_minus(finding: Finding, unit: DisplayUnit, times: float = 1.0) -> str:
     """Return size without sign, uncertainty with two digits, and unit of a finding.
 
     Parameters
     ----------
-    found : Finding
+    finding : Finding
         Finding with size and u.
     unit : Unit
         Display unit.
     times : float
         Factor of the size.
     """
-    value, u = (times * unit.per_si * each for each in (abs(found.size), found.u))
+    value, u = (times * unit.per_si * size_si for size_si in (abs(finding.size), finding.u))
     digits = 3
     if math.isfinite(u) and u > 0:
         digits = min(max(1 - math.floor(math.log10(u)), 0), 9)
     return f"{value:.{digits}f} ± {u:.{digits}f} {unit.name}"
 
 
-def _either(found: Finding, positive: str, negative: str) -> str:
+def _either(finding: Finding, positive: str, negative: str) -> str:
     """Return one of two directions, by the sign of a size."""
-    return positive if found.size >= 0 else negative
+    return positive if finding.size >= 0 else negative
 
 
 def _slipped(of: dict[str, Any]) -> str:
@@ -325,15 +325,15 @@ SENTENCES: dict[str, Words] = {
 }
 
 
-def _noise_contradicted(found: Finding, of: dict[str, Any]) -> str:
-    kind, unit = ("grid", UM) if found.unit == "m" else ("angular", ARCSEC)
+def _noise_contradicted(finding: Finding, of: dict[str, Any]) -> str:
+    kind, unit = ("grid", UM) if finding.unit == "m" else ("angular", ARCSEC)
     name = "the detections' own sigma" if of["declared"] else "repeats"
     return (
-        f"{kind} readings: residuals show a noise of {found.size * unit.per_si:.3g} "
+        f"{kind} readings: residuals show a noise of {finding.size * unit.per_si:.3g} "
         f"{unit.name}, {name} {of['stated'] * unit.per_si:.3g} {unit.name}; "
         + (
             "the readings contain something other than random noise"
-            if found.size > of["stated"]
+            if finding.size > of["stated"]
             else "repeats share what single readings do not (drift between passes), or the stated "
             "noise is too large"
         )
@@ -346,19 +346,19 @@ def held_out_text(view: str, tenth: int) -> str:
 
 
 def _unchecked(sites: list[list[int]], lines: list[int]) -> str:
-    what = " and ".join(
+    subject = " and ".join(
         _counted(places, kind)
         for places, kind in (([tuple(site) for site in sites], "site"), (lines, "line"))
         if places
     )
-    rest, them = (
+    predicate, them = (
         ("rests on a single reading", "it")
         if len(sites) + len(lines) == 1
         else ("rest on single readings", "them")
     )
     return (
-        f"{what} of the map {rest} that no other checks; an error in {them} goes into the map, "
-        "and no residual shows it: measure the missing marks, or add a view"
+        f"{subject} of the map {predicate} that no other checks; an error in {them} goes into "
+        "the map, and no residual shows it: measure the missing marks, or add a view"
     )
 
 
@@ -376,25 +376,25 @@ def _outliers_removed(number: int, first: list[dict[str, Any]]) -> str:
         f"({item['standardised']:.1f} sigma)"
         for item in first
     )
-    rest = f" and {number - len(first)} more" if number > len(first) else ""
-    return f"removed {number} outlier{'s' * (number != 1)}: {named}{rest}"
+    more = f" and {number - len(first)} more" if number > len(first) else ""
+    return f"removed {number} outlier{'s' * (number != 1)}: {named}{more}"
 
 
-def _slip_found(found: Finding, of: dict[str, Any]) -> str:
+def _slip_found(finding: Finding, of: dict[str, Any]) -> str:
     places = [
         f"before {place['axis']} = {place['first']}"
-        + ("" if place["view"] == found.view else f" in view '{place['view']}'")
+        + ("" if place["view"] == finding.view else f" in view '{place['view']}'")
         for place in of["places"]
     ]
     spoils = "; this spoils the map: measure the view again"
     if len(places) > 1:
         return (
-            f"view '{found.view}': the plate slipped by about {_slipped(of)}, "
+            f"view '{finding.view}': the plate slipped by about {_slipped(of)}, "
             f"{' or '.join(places)}; the readings do not determine which"
             f"{spoils if of['spoils'] else '; the view is left out'}"
         )
     return (
-        f"view '{found.view}': the plate slipped {places[0]} by {_slipped(of)}; treated as two "
+        f"view '{finding.view}': the plate slipped {places[0]} by {_slipped(of)}; treated as two "
         f"placements{spoils if of['spoils'] else ''}"
     )
 
@@ -456,10 +456,10 @@ def what_it_is(cause: Cause) -> str:
         return cause.text
 
 
-def _larger_term(cause: Cause, given: float) -> str:
+def _larger_term(cause: Cause, assumed_si: float) -> str:
     name = cause.name
     unit = unit_of(name, cause.unit)
-    ratio = cause.size / given
+    ratio = cause.size / assumed_si
     where = f" in view '{cause.view}'" if cause.view else ""
     return (
         f"a term '{name}' as large as {cause.size * unit.per_si:.3g} {unit.name}{where}, "
@@ -467,19 +467,21 @@ def _larger_term(cause: Cause, given: float) -> str:
     )
 
 
-def sentence_of(found: Finding) -> str:
+def sentence_of(finding: Finding) -> str:
     """Return the sentence of a finding, for a cause with its remedies."""
-    if found.name in SENTENCES:
-        return SENTENCES[found.name](found, found.details)
-    if not isinstance(found, Cause):
-        raise KeyError(f"no words for {found.name}")
-    return f"{what_it_is(found)}: {advice(found)}"
+    if finding.name in SENTENCES:
+        return SENTENCES[finding.name](finding, finding.details)
+    if not isinstance(finding, Cause):
+        raise KeyError(f"no words for {finding.name}")
+    return f"{what_it_is(finding)}: {advice(finding)}"
 
 
 def worded(result: CalibrationResult) -> CalibrationResult:
     """Return a result with the texts of its findings; existing texts are kept."""
     findings = tuple(map(_with_text, result.findings))
-    new = (found.text for found, old in zip(findings, result.findings, strict=True) if not old.text)
+    new = (
+        finding.text for finding, old in zip(findings, result.findings, strict=True) if not old.text
+    )
     verdict = worded_verdict(result.verdict, result.noise)
     assumed = assumption_text(result) if verdict.qualified and not result.verdict.sentence else ""
     if assumed:
@@ -518,10 +520,10 @@ def assumption_text(result: CalibrationResult) -> str:
     for budget in budgets(result) if result.budget else []:
         if budget.anywhere or not budget.assumptions:
             continue
-        what = " and ".join(map(_assumed, budget.assumptions))
+        assumptions = " and ".join(map(_assumed, budget.assumptions))
         unit, of = (UM, "U") if budget.quantity == "xy" else (ARCSEC, "U of θ")
         texts.append(
-            f"{of} assumes {what}, which the readings do not show: {TIMES} times as much "
+            f"{of} assumes {assumptions}, which the readings do not show: {TIMES} times as much "
             f"would make it up to {budget.U_max_if_larger * unit.per_si:.3g} {unit.name}"
         )
     return "; ".join(texts)
@@ -530,14 +532,14 @@ def assumption_text(result: CalibrationResult) -> str:
 def _assumed(line: BudgetLine) -> str:
     name = line.component.removeprefix(TERM)
     unit = PERCENT if name in ("microscope", "line_scale") else unit_of(name, line.unit)
-    given = line.details.get("given")  # a file may have lost it
-    size_si = given if isinstance(given, float) else line.u
+    stated_si = line.details.get("given")  # a file may have lost it
+    size_si = stated_si if isinstance(stated_si, float) else line.u
     size = f"{size_si * unit.per_si:.3g} {unit.name} (k=1)"
     return _ASSUMED.get(name, f"a {name} of {{}}").format(size)
 
 
-def _with_text[Kind: Finding](found: Kind) -> Kind:
-    return found if found.text else replace(found, text=sentence_of(found))
+def _with_text[Kind: Finding](finding: Kind) -> Kind:
+    return finding if finding.text else replace(finding, text=sentence_of(finding))
 
 
 def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
@@ -545,16 +547,16 @@ def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
 
     `noise` of the same result tells whether there was something to compare residuals with.
     """
-    new = [found for found in (*verdict.failed, *verdict.causes) if not found.text]
+    new = [finding for finding in (*verdict.failed, *verdict.causes) if not finding.text]
     if verdict.sentence and not new:
         return verdict
     reasons = (
         *verdict.reasons,
         *(
-            f"the readings show {what_it_is(found)}"
-            if isinstance(found, Cause)
-            else sentence_of(found)
-            for found in new
+            f"the readings show {what_it_is(finding)}"
+            if isinstance(finding, Cause)
+            else sentence_of(finding)
+            for finding in new
         ),
     )
     causes = tuple(replace(_with_text(cause), remedies=remedies(cause)) for cause in verdict.causes)

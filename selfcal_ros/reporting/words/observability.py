@@ -18,26 +18,32 @@ NAMED = 4
 """Sites of a group that are named."""
 
 
-def worded_observability(seen: Observability) -> Observability:
+def worded_observability(observability: Observability) -> Observability:
     """Return an observability with its modes and advice in words; existing texts are kept."""
     return replace(
-        seen, modes=tuple(map(worded, seen.modes)), advice=tuple(map(worded, seen.advice))
+        observability,
+        modes=tuple(map(worded, observability.modes)),
+        advice=tuple(map(worded, observability.advice)),
     )
 
 
 def told(error: NotIdentifiableError) -> NotIdentifiableError:
     """Return the error with the advice of its observability in its line, if it is not yet there."""
-    seen = error.observability
-    if not isinstance(seen, Observability) or all(advice.text for advice in seen.advice):
+    observability = error.observability
+    if not isinstance(observability, Observability) or all(
+        advice.text for advice in observability.advice
+    ):
         return error
-    seen = worded_observability(seen)
-    advice = "; ".join(advice.text for advice in seen.advice)
-    return NotIdentifiableError(f"{error}: {advice}", seen)
+    observability = worded_observability(observability)
+    advice = "; ".join(advice.text for advice in observability.advice)
+    return NotIdentifiableError(f"{error}: {advice}", observability)
 
 
-def worded(found: Finding) -> Finding:
+def worded(finding: Finding) -> Finding:
     """Return a mode or an advice with its sentence; an existing one is kept."""
-    return found if found.text else replace(found, text=SENTENCES[found.name](found.details))
+    return (
+        finding if finding.text else replace(finding, text=SENTENCES[finding.name](finding.details))
+    )
 
 
 def describe_view(view: View, artifact: Artifact) -> str:
@@ -46,21 +52,21 @@ def describe_view(view: View, artifact: Artifact) -> str:
     if not view.grid:
         lines = view.on_stage(artifact).turn_lines or 0
         of_lines = "" if artifact.harmonics else f"{lines} line{'s' * (lines != 1)} ("
-        what = (
+        description = (
             f"an angular view turned by {of_lines}{360 * lines / artifact.angular_count:g} deg"
             + ")" * bool(of_lines)
         )
     elif 1e-6 < turn < 360 - 1e-6:
-        what = f"a view turned by {turn:.6g} deg"
+        description = f"a view turned by {turn:.6g} deg"
     else:
-        what = "an unturned view"
+        description = "an unturned view"
     unit, name = (1 / MM_PER_M, "mm") if artifact.marks else (artifact.grid_pitch_m, "pitch")
     steps = [round(shift / unit, 3) + 0.0 for shift in view.translation_m]
     shifted = [
         f"{step:+g} {name} along {axis}" for step, axis in zip(steps, "XY", strict=True) if step
     ]
-    also = " shifted by " if what.startswith("an unturned") else " and shifted by "
-    return what + (also + " and ".join(shifted) if shifted else "")
+    also = " shifted by " if description.startswith("an unturned") else " and shifted by "
+    return description + (also + " and ".join(shifted) if shifted else "")
 
 
 def _add(of: Mapping[str, Any]) -> str:

@@ -55,12 +55,12 @@ def counted_views(views: Sequence[ViewResult], of: Callable[[ViewResult], bool] 
     return f"{share}{number} view{'s' * (number != 1)}{images}"
 
 
-def few_read_text(found: Finding, of: dict[str, Any]) -> str:
+def few_read_text(finding: Finding, of: dict[str, Any]) -> str:
     """Return the sentence on cells of images with few readings."""
     where = " and ".join(
-        f"in cell {cell_label(one['cell'])} of the images"
-        f"{f' of view {one["view"]!r}' * bool(one['view'])} ({one['read']} of {one['shown']})"
-        for one in of["cells"]
+        f"in cell {cell_label(cell['cell'])} of the images"
+        f"{f' of view {cell["view"]!r}' * bool(cell['view'])} ({cell['read']} of {cell['shown']})"
+        for cell in of["cells"]
     )
     unknown = (
         "the camera's error could not be determined"
@@ -72,28 +72,28 @@ def few_read_text(found: Finding, of: dict[str, Any]) -> str:
     )
 
 
-def view_left_out_text(found: Finding, of: dict[str, Any]) -> str:
+def view_left_out_text(finding: Finding, of: dict[str, Any]) -> str:
     """Return the sentence on a view of which nothing, or a small part, became readings."""
     rejected = ", ".join(f"{reason} {count}" for reason, count in of["rejected"].items())
     read = of.get("read", [0, 0])  # older results name only views without readings
     if any(read):
-        parts = " and ".join(
-            f"{got} of {wanted} {kind}"
-            for got, wanted, kind in zip(read, of["asked"], ("marks", "lines"), strict=True)
-            if wanted
+        counts = " and ".join(
+            f"{got} of {asked} {kind}"
+            for got, asked, kind in zip(read, of["asked"], ("marks", "lines"), strict=True)
+            if asked
         )
-        text = f"view '{found.view}' is only partly in the map: {parts} became readings"
+        text = f"view '{finding.view}' is only partly in the map: {counts} became readings"
     else:
-        text = f"view '{found.view}' is not part of the map: " + (
+        text = f"view '{finding.view}' is not part of the map: " + (
             "none of its detections became a reading" if rejected else "nothing was detected in it"
         )
     return f"{text} ({rejected})" if rejected else text
 
 
-def repeats_contradict_text(found: Finding, of: dict[str, Any]) -> str:
+def repeats_contradict_text(finding: Finding, of: dict[str, Any]) -> str:
     """Return the sentence on a view in which many readings are outliers among repeats."""
     return (
-        f"{of['rejected']} of {of['of']} readings of view '{found.view}' contradict the other "
+        f"{of['rejected']} of {of['of']} readings of view '{finding.view}' contradict the other "
         "repeats of their marks and were left out: the plate slipped within the view, or a "
         "second publisher sent readings (ros2 topic info -v); measure it again"
     )
@@ -107,10 +107,10 @@ def of_few_read(findings: Sequence[Finding]) -> str:
     """Return what the first sentence on a result says of cells with few readings."""
     cells = list(
         dict.fromkeys(
-            tuple(one["cell"])
-            for found in findings
-            if found.name == "few_read"
-            for one in found.details.get("cells", [])
+            tuple(cell["cell"])
+            for finding in findings
+            if finding.name == "few_read"
+            for cell in finding.details.get("cells", [])
         )
     )
     return f", few of them read in {_named(cells)}" if cells else ""
@@ -128,12 +128,12 @@ def line_text(line: BudgetLine) -> str:
     if "given" in of and "remaining" not in of:
         return f"size {of['given']:.3g}, what the readings do not determine of it"
     if "given" in of:
-        given = f"size {of['given']:.3g}, " + (
+        size_text = f"size {of['given']:.3g}, " + (
             "of which the readings"
             if of["allowed"] is None
             else f"too small for the readings; of {of['allowed']:.3g}, which they allow, they"
         )
-        return f"{given} leave {of['remaining']:.0%}"
+        return f"{size_text} leave {of['remaining']:.0%}"
     if of.get("cause") == LACK_OF_FIT:
         return "residuals beyond the scatter of repeats, met in full at every place"
     if "cause" in of:
@@ -165,18 +165,18 @@ ONE_PASS = (
 )
 
 
-def recheck_sentence(found: Recheck) -> str:
+def recheck_sentence(recheck: Recheck) -> str:
     """Return the verdict of a recheck in one sentence."""
-    since, scale, clearest = _since(found.of), found.scale, _clearest(found.largest)
-    if found.changed:
-        return _changed(since, clearest, found.p)
+    since, scale, clearest = _since(recheck.of), recheck.scale, _clearest(recheck.largest)
+    if recheck.changed:
+        return _changed(since, clearest, recheck.p)
     if scale.changed:
         return (
             f"{_scale_changed(since, scale.change, scale.u, scale.p)}; otherwise no "
-            f"change beyond its uncertainty (p = {found.p:.2g}); {clearest}"
+            f"change beyond its uncertainty (p = {recheck.p:.2g}); {clearest}"
         )
     return (
-        f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {found.p:.2g}); "
+        f"{STILL_GOOD}: no change since {since} beyond its uncertainty (p = {recheck.p:.2g}); "
         f"{clearest}"
     )
 
@@ -202,17 +202,17 @@ def _scale_changed(since: str, change: float, u: float, p: float) -> str:
     )
 
 
-def scale_changed_text(found: Finding, of: Mapping[str, Any]) -> str:
+def scale_changed_text(finding: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of encoders whose scale against the plate has changed."""
-    return _scale_changed(_since(str(of["of"])), found.size, found.u, found.p)
+    return _scale_changed(_since(str(of["of"])), finding.size, finding.u, finding.p)
 
 
-def other_plate_text(found: Finding, of: Mapping[str, Any]) -> str:
+def other_plate_text(finding: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why what was read is not the plate that is known."""
     since = _since(str(of["of"]))
     return (
-        f"another plate, or the plate has changed, in view '{printable(found.view)}': its "
-        f"marks differ from {since} by {found.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
+        f"another plate, or the plate has changed, in view '{printable(finding.view)}': its "
+        f"marks differ from {since} by {finding.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
         "u, and neighbouring marks are not correlated, unlike the errors of a stage: check "
         "which plate it is, that it is clean and lies as planned; if it has changed, calibrate "
         "again"
@@ -226,26 +226,26 @@ def _clearest(of: LargestChange) -> str:
     )
 
 
-def recheck_lines(found: Recheck) -> list[str]:
+def recheck_lines(recheck: Recheck) -> list[str]:
     """Return what a recheck found in a few lines: both maps, and the scale."""
     out = [
-        f"XY     rms {found.rms * UM_PER_M:.5f} µm per axis, "
-        f"u {found.u_rms * UM_PER_M:.5f} µm, p = {found.p_xy:.2g}"
+        f"XY     rms {recheck.rms * UM_PER_M:.5f} µm per axis, "
+        f"u {recheck.u_rms * UM_PER_M:.5f} µm, p = {recheck.p_xy:.2g}"
     ]
-    if (sizes := found.detectable) is not None:
+    if (sizes := recheck.detectable) is not None:
         out.append(
             f"detectable in 9 of 10 cases: {sizes.one_node * UM_PER_M:.2g} µm at one node, "
             f"or a smooth change of {sizes.smooth * UM_PER_M:.2g} µm rms per axis"
         )
-    if (turn := found.largest_theta) is not None:
+    if (turn := recheck.largest_theta) is not None:
         out.append(
             f"theta  clearest at line {turn.line}: "
             f"{turn.change * ARCSEC_PER_RAD:+.4f} ± {turn.u * ARCSEC_PER_RAD:.4f} "
-            f"arcsec (k=1), p = {found.p_theta:.2g}"
+            f"arcsec (k=1), p = {recheck.p_theta:.2g}"
         )
-    if found.passes == 1:
+    if recheck.passes == 1:
         out.append(ONE_PASS)
-    scale = found.scale
+    scale = recheck.scale
     return [
         *out,
         f"scale  {scale.change * UM_PER_M:+.4f} ± {scale.u * UM_PER_M:.4f} µm/m "
@@ -253,24 +253,24 @@ def recheck_lines(found: Recheck) -> list[str]:
     ]
 
 
-def changed_text(found: Finding, of: Mapping[str, Any]) -> str:
+def changed_text(finding: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of a stage that has changed."""
-    return _changed(_since(str(of["of"])), _clearest_of(found, of), found.p)
+    return _changed(_since(str(of["of"])), _clearest_of(finding, of), finding.p)
 
 
-def changed_or_drifted_text(found: Finding, of: Mapping[str, Any]) -> str:
+def changed_or_drifted_text(finding: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why a change that one pass shows is not qualified."""
     return (
-        f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
-        f"(p = {found.p:.2g}); {ONE_PASS}"
+        f"the map differs from {_since(str(of['of']))}, {_clearest_of(finding, of)} "
+        f"(p = {finding.p:.2g}); {ONE_PASS}"
     )
 
 
-def changed_or_microscope_text(found: Finding, of: Mapping[str, Any]) -> str:
+def changed_or_microscope_text(finding: Finding, of: Mapping[str, Any]) -> str:
     """Return the reason why a change that a microscope explains too is not qualified."""
     return (
-        f"the map differs from {_since(str(of['of']))}, {_clearest_of(found, of)} "
-        f"(p = {found.p:.2g}); a changed stage, or a microscope with a scale wrong by "
+        f"the map differs from {_since(str(of['of']))}, {_clearest_of(finding, of)} "
+        f"(p = {finding.p:.2g}); a changed stage, or a microscope with a scale wrong by "
         f"{of['scale']:+.1%} ± {of['u_scale']:.1%} and turned by "
         f"{of['turn'] * MRAD_PER_RAD:+.2g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad (k=1) "
         "explains it alike: measure check stops (check_stops in the plan), or correct the "
@@ -278,24 +278,24 @@ def changed_or_microscope_text(found: Finding, of: Mapping[str, Any]) -> str:
     )
 
 
-def microscope_off_text(found: Finding, of: Mapping[str, Any]) -> str:
+def microscope_off_text(finding: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of a microscope that is not as assumed, which the readings correct."""
     return (
-        f"the scale of the microscope is wrong by {found.size:+.2%} ± {found.u:.2%} and it is "
+        f"the scale of the microscope is wrong by {finding.size:+.2%} ± {finding.u:.2%} and it is "
         f"turned by {of['turn'] * MRAD_PER_RAD:+.3g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad "
         "(k=1), as visits of one mark at several places show: the readings were corrected by "
         "that; correct the pixel size before the next calibration"
     )
 
 
-def _clearest_of(found: Finding, of: Mapping[str, Any]) -> str:
-    return _clearest(LargestChange(of["x"], of["y"], found.axis, found.size, found.u))
+def _clearest_of(finding: Finding, of: Mapping[str, Any]) -> str:
+    return _clearest(LargestChange(of["x"], of["y"], finding.axis, finding.size, finding.u))
 
 
-def misfit_text(found: Finding, _: Mapping[str, Any]) -> str:
+def misfit_text(finding: Finding, _: Mapping[str, Any]) -> str:
     """Return the reason why readings do not fit a known plate."""
     return (
-        f"residuals are {found.size:.2f} times what the noise and the known plate allow "
-        f"(p = {found.p:.2g}): is it that plate, does it lie as planned, and has the map "
+        f"residuals are {finding.size:.2f} times what the noise and the known plate allow "
+        f"(p = {finding.p:.2g}): is it that plate, does it lie as planned, and has the map "
         "enough nodes?"
     )

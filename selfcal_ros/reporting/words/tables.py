@@ -37,7 +37,7 @@ def why_text(why: Finding | None, artifact: Artifact) -> str:
     return f"cannot be held out: the rest does not identify the stage; {more}"
 
 
-def validation_json(found: list[HeldOut], artifact: Artifact) -> list[dict[str, Any]]:
+def validation_json(held_out: list[HeldOut], artifact: Artifact) -> list[dict[str, Any]]:
     """Return the validation for ``extra["validation"]`` of a result: SI units."""
     return [
         {
@@ -53,30 +53,30 @@ def validation_json(found: list[HeldOut], artifact: Artifact) -> list[dict[str, 
             "limit": item.limit,
             "exceeds": item.exceeds,
         }
-        for item in found
+        for item in held_out
     ]
 
 
-def validation_text(found: list[HeldOut], artifact: Artifact) -> list[str]:
+def validation_text(held_out: list[HeldOut], artifact: Artifact) -> list[str]:
     """Return one line for each held-out set, µm and arcsec."""
     lines = []
-    for item in found:
+    for item in held_out:
         name, why = held_out_text(item.view, item.tenth), why_text(item.why, artifact)
         if not item.n_grid and not item.n_angular:
             lines.append(f"{name}: {why}")
             continue
-        parts = []
+        predictions = []
         if item.n_grid:
-            parts.append(
+            predictions.append(
                 f"{item.n_grid} marks predicted within {item.rms_m * UM_PER_M:.4g} µm "
                 f"rms, {item.max_m * UM_PER_M:.4g} µm at most "
                 f"({item.ratio:.2f} times the noise{_limit_text(item, why)})"
             )
         if item.n_angular:
-            parts.append(
+            predictions.append(
                 f"{item.n_angular} lines within {item.rms_rad * ARCSEC_PER_RAD:.4g} arcsec rms"
             )
-        lines.append(f"{name}: " + ", ".join(parts))
+        lines.append(f"{name}: " + ", ".join(predictions))
     return lines
 
 
@@ -101,10 +101,10 @@ def quantity_text(budget: Budget) -> str:
     return _QUANTITIES[budget.quantity, budget.anywhere]
 
 
-def budget_text(found: list[Budget]) -> list[str]:
+def budget_text(budgets: list[Budget]) -> list[str]:
     """Return the budgets as a table, µm and arcsec."""
     lines = []
-    for budget in found:
+    for budget in budgets:
         factor, unit = (UM_PER_M, "µm") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
         lines += [
             f"uncertainty of {quantity_text(budget)}, {unit}",
@@ -144,31 +144,31 @@ def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
     ):
         lines = [line for line in budget.lines if line.quantity == quantity]
         for line in lines:
-            found = budget.removals.get((quantity, line.component))
+            removal = budget.removals.get((quantity, line.component))
             out.append(
                 f"  {name if line is lines[0] else '':20}{line.component:18}"
                 f"{line.effect_rms * factor:9.3g} {unit}{100 * budget.share(line):5.0f} %"
-                + ("" if found is None else f"  {removal_text(found, line, plan)}")
+                + ("" if removal is None else f"  {removal_text(removal, line, plan)}")
             )
         if lines:
-            whole, noise = (
+            expanded, noise = (
                 2 * factor * budget.u_rms(quantity, noise_only=only) for only in (False, True)
             )
             larger = 2 * factor * budget.u_rms(quantity, if_larger=True)
             out.append(
-                f"  {'':20}U (k = 2) {whole:17.3g} {unit}; from noise alone {noise:.3g} "
+                f"  {'':20}U (k = 2) {expanded:17.3g} {unit}; from noise alone {noise:.3g} "
                 f"{unit}; {larger:.3g} {unit} if all that is assumed were {TIMES} times "
                 "as large"
             )
     return out
 
 
-def removal_text(found: Removal, line: BudgetLine, plan: Plan) -> str:
+def removal_text(removal: Removal, line: BudgetLine, plan: Plan) -> str:
     """Return what removes a line of a plan's budget, and what is left of it."""
-    if found.step is None:
+    if removal.step is None:
         return _CERTIFICATES.get(line.component, f"declare a smaller {line.component}:SIZE")
     factor, unit = (NM_PER_M, "nm") if line.quantity == "xy" else (URAD_PER_RAD, "µrad")
-    return f"{step_text(found.step, plan)}: {found.effect_rms * factor:.3g} {unit}"
+    return f"{step_text(removal.step, plan)}: {removal.effect_rms * factor:.3g} {unit}"
 
 
 def step_text(step: plan_check.Step, plan: Plan) -> str:

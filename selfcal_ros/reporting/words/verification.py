@@ -46,73 +46,73 @@ def with_verification(
     before: CalibrationResult, after: CalibrationResult, *, names: tuple[str, str]
 ) -> tuple[CalibrationResult, Verification]:
     """Return the result with the correction on, with its ``verification``, and what that found."""
-    found = verify(before, after, names=names)
-    passed = found.passed and is_believed(after, found)
-    kept = {
+    verification = verify(before, after, names=names)
+    passed = verification.passed and is_believed(after, verification)
+    entry = {
         "of": names[0],
-        "sentence": verification_sentence(found),
-        "better": found.better,
+        "sentence": verification_sentence(verification),
+        "better": verification.better,
         "passed": passed,
-        "fault": str(found.fault),
-        "theta_fault": str(found.theta_fault),
-        "remains": found.remains,
-        "correlation": found.alike,
-        "axes": {name: asdict(axis) for name, axis in found.axes.items()},
-        "remaining": None if found.remaining is None else asdict(found.remaining),
+        "fault": str(verification.fault),
+        "theta_fault": str(verification.theta_fault),
+        "remains": verification.remains,
+        "correlation": verification.alike,
+        "axes": {name: asdict(axis) for name, axis in verification.axes.items()},
+        "remaining": None if verification.remaining is None else asdict(verification.remaining),
     }
-    return replace(after, extra={**after.extra, VERIFICATION: plain(kept)}), found
+    return replace(after, extra={**after.extra, VERIFICATION: plain(entry)}), verification
 
 
-def verification_sentence(found: Verification) -> str:
+def verification_sentence(verification: Verification) -> str:
     """Return the verdict in one sentence."""
-    both = [found.axes[name] for name in "xy"]
+    axes = [verification.axes[name] for name in "xy"]
     was, now, U_was, U_now = (
-        significant(UM_PER_M * math.sqrt(sum(getattr(axis, name) ** 2 for axis in both) / 2))
+        significant(UM_PER_M * math.sqrt(sum(getattr(axis, name) ** 2 for axis in axes) / 2))
         for name in ("rms_before", "rms_after", "U_before", "U_after")
     )
-    head = "Better" if found.better else "Not better"
+    head = "Better" if verification.better else "Not better"
     text = (
         f"{head}: the error is {was} µm rms per axis without the correction, {now} µm with it "
         f"(U of a node {U_was} and {U_now} µm)"
     )
-    return "; ".join([text, *_why(found)])
+    return "; ".join([text, *_why(verification)])
 
 
-def _why(found: Verification) -> list[str]:
+def _why(verification: Verification) -> list[str]:
     """Return the further parts of the sentence."""
-    parts = []
-    if found.fault is TableFault.FACTOR:
-        mean = sum(found.axes[name].factor for name in "xy") / 2
-        parts.append(
+    clauses = []
+    if verification.fault is TableFault.FACTOR:
+        mean = sum(verification.axes[name].factor for name in "xy") / 2
+        clauses.append(
             f"{significant(mean)} times the correction acts: look for a wrong unit or "
             "scale of the table"
         )
-    elif found.fault is TableFault.AXES_DIFFER:
-        parts.append(
+    elif verification.fault is TableFault.AXES_DIFFER:
+        clauses.append(
             "the axes differ: "
             + ", ".join(
-                f"{significant(found.axes[name].factor)} times the correction acts in {name}"
+                f"{significant(verification.axes[name].factor)} times the correction acts in {name}"
                 for name in "xy"
             )
             + ": compare their tables"
         )
-    elif found.fault is not TableFault.NONE:
-        parts.append(_FAULTS[found.fault])
-    elif found.remains:
-        parts.append(
+    elif verification.fault is not TableFault.NONE:
+        clauses.append(_FAULTS[verification.fault])
+    elif verification.remains:
+        clauses.append(
             "more remains than the uncertainties explain: the stage has changed a little "
             "since, or an older table is loaded"
         )
     else:
-        parts.append(
+        clauses.append(
             "the correction acts as the map says"
-            if found.better
+            if verification.better
             else "the difference is within the uncertainties"
         )
-    theta = found.axes.get("theta")
-    if theta is not None and found.theta_fault is not TableFault.NONE:
-        parts.append(_of_theta(found.theta_fault, theta))
-    return parts
+    theta = verification.axes.get("theta")
+    if theta is not None and verification.theta_fault is not TableFault.NONE:
+        clauses.append(_of_theta(verification.theta_fault, theta))
+    return clauses
 
 
 def _of_theta(fault: TableFault, theta: AxisError) -> str:
@@ -122,7 +122,7 @@ def _of_theta(fault: TableFault, theta: AxisError) -> str:
     return f"that of θ {_ACTS.get(fault, 'is not that of this map')}"
 
 
-def verification_text(found: Verification) -> str:
+def verification_text(verification: Verification) -> str:
     """Return the sentence, and the error of each axis before and after."""
     rows = [
         [
@@ -136,7 +136,7 @@ def verification_text(found: Verification) -> str:
             "acts",
         ]
     ]
-    for name, axis in found.axes.items():
+    for name, axis in verification.axes.items():
         unit, scale = UNIT[name]
         values = (
             axis.rms_before,
@@ -158,7 +158,7 @@ def verification_text(found: Verification) -> str:
         )
     return "\n".join(
         [
-            verification_sentence(found),
+            verification_sentence(verification),
             "",
             *aligned(rows),
             "",
