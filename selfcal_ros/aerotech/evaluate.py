@@ -152,9 +152,9 @@ class BoundTable1D:
             out[self.axis] -= self.expansion * position
 
 
-def _linear(values: np.ndarray, entry: np.ndarray, part: np.ndarray) -> np.ndarray:
+def _linear(values: np.ndarray, entry: np.ndarray, fraction: np.ndarray) -> np.ndarray:
     after = np.minimum(entry + 1, len(values) - 1)
-    return (1 - part) * values[entry] + part * values[after]
+    return (1 - fraction) * values[entry] + fraction * values[after]
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,8 +314,10 @@ class CalEvaluator:
         total = {axis: np.zeros(flat[0].size) for axis in self.outputs}
         for start in range(0, flat[0].size, BLOCK):
             block = slice(start, start + BLOCK)
-            part = {axis: array[block] for axis, array in zip(self.inputs, flat, strict=True)}
+            block_positions = {
+                axis: array[block] for axis, array in zip(self.inputs, flat, strict=True)
+            }
             out = {axis: array[block] for axis, array in total.items()}
             for bound in self._bound:
-                bound.add_to(out, part)
+                bound.add_to(out, block_positions)
         return {axis: array.reshape(shape) for axis, array in total.items()}

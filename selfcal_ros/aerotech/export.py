@@ -128,11 +128,11 @@ class AxisCorrection:
     corrections_m: np.ndarray
 
 
-def length_m(text: str, what: str) -> float:
+def length_m(text: str, where: str) -> float:
     """Return a length such as 5um or 200mm in m; InputError without number or unit."""
     match = _LENGTH.fullmatch(text.strip())
     if match is None or not np.isfinite(float(match[1])):
-        raise InputError(what, f"'{text}' is not a length", "write a number with m, mm, um or nm")
+        raise InputError(where, f"'{text}' is not a length", "write a number with m, mm, um or nm")
     return float(match[1]) * _LENGTH_UNITS_M[match[2]]
 
 

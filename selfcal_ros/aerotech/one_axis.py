@@ -38,13 +38,13 @@ Pair = tuple[Axis, Axis]
 
 
 def leaves_too_much(
-    left: tuple[float, float], before: tuple[float, float], u: float, *, rounding: float = 0.0
+    residual: tuple[float, float], before: tuple[float, float], u: float, *, rounding: float = 0.0
 ) -> bool:
     """Tell whether more is left of an error than U, or 5 % of it.
 
     Parameters
     ----------
-    left, before : (float, float)
+    residual, before : (float, float)
         What a table leaves of the error, and the error, m or rad: rms and largest.
     u : float
         Standard uncertainty of the error, rms. U is 2 u, and 4 u at one node.
@@ -52,16 +52,16 @@ def leaves_too_much(
         What the digits of a table leave.
     """
     return any(
-        rest > max(LEFT_OF_A_MAP * size, limit * u, rounding)
-        for rest, size, limit in zip(left, before, (2, 4), strict=True)
+        remaining > max(LEFT_OF_A_MAP * size, limit * u, rounding)
+        for remaining, size, limit in zip(residual, before, (2, 4), strict=True)
     )
 
 
 def known_rms(*u: np.ndarray) -> float:
     """Return the root mean square of the vectors of u where it is known, else 0."""
     squares = np.sum(np.square(u), axis=0)
-    known = squares[np.isfinite(squares)]
-    return float(np.sqrt(known.mean())) if known.size else 0.0
+    finite = squares[np.isfinite(squares)]
+    return float(np.sqrt(finite.mean())) if finite.size else 0.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def one_axis_fit(
     setup : MachineSetup
         Settings of the controller.
     """
-    whole, _ = fill_unknown(error_map)
+    filled_map, _ = fill_unknown(error_map)
     names: dict[int, Axis] = {frame.x_axis: "x", frame.y_axis: "y"}
     loaded: dict[Pair, list[Table1D]] = defaultdict(list)
     for table in tables:
@@ -139,18 +139,23 @@ def one_axis_fit(
     along_own: list[_PairOfAxes] = []
     across: list[_PairOfAxes] = []
     for pair, of_pair in loaded.items():
-        part = _PairOfAxes(whole, of_pair, pair, frame=frame, setup=setup)
-        (along_own if pair[0] == pair[1] else across).append(part)
+        pair_tables = _PairOfAxes(filled_map, of_pair, pair, frame=frame, setup=setup)
+        (along_own if pair[0] == pair[1] else across).append(pair_tables)
 
-    parts = [part.judged(part.targets, part.correction) for part in along_own]
-    parts += [part.judged(part.shapes, part.shape, ", without its slope") for part in across]
-    turning = [part for part in across if part.has_slope]
+    parts = [
+        pair_tables.judged(pair_tables.targets, pair_tables.correction) for pair_tables in along_own
+    ]
+    parts += [
+        pair_tables.judged(pair_tables.shapes, pair_tables.shape, ", without its slope")
+        for pair_tables in across
+    ]
+    turning = [pair_tables for pair_tables in across if pair_tables.has_slope]
     squareness_left = 0.0
     if turning:
-        parts.append(_squareness(whole, turning, across))
+        parts.append(_squareness(filled_map, turning, across))
     elif across:
-        squareness_left = _squareness_of(whole)
-    return OneAxisFit(tuple(parts), _beyond(whole, tuple(loaded)), squareness_left)
+        squareness_left = _squareness_of(filled_map)
+    return OneAxisFit(tuple(parts), _beyond(filled_map, tuple(loaded)), squareness_left)
 
 
 class _PairOfAxes:
@@ -170,7 +175,7 @@ class _PairOfAxes:
 
     def __init__(
         self,
-        whole: ErrorMap,
+        filled_map: ErrorMap,
         tables: list[Table1D],
         pair: Pair,
         *,
@@ -178,12 +183,12 @@ class _PairOfAxes:
         setup: MachineSetup,
     ) -> None:
         self.pair = pair
-        self.u = known_rms(whole.u_gx if pair[1] == "x" else whole.u_gy)
+        self.u = known_rms(filled_map.u_gx if pair[1] == "x" else filled_map.u_gy)
         bound = [bound_1d(table, setup) for table in tables]
         slopes, shapes = zip(*(_makes(table) for table in bound), strict=True)
         self.has_slope, self.has_shape = any(slopes), any(shapes)
 
-        self.nodes = whole.artifact.x_m[:, 0] if pair[0] == "x" else whole.artifact.y_m[0]
+        self.nodes = filled_map.artifact.x_m[:, 0] if pair[0] == "x" else filled_map.artifact.y_m[0]
         places = [_stage_positions(table, pair[0], frame) for table in bound]
         inside = [p[(p > self.nodes[0]) & (p < self.nodes[-1])] for p in places]
         self.places = np.unique(np.concatenate([self.nodes, *inside]))
@@ -194,7 +199,7 @@ class _PairOfAxes:
         sign = {"x": frame.sign_x, "y": frame.sign_y}[pair[1]]
         added = CalEvaluator(tables, setup).corrections({axes[pair[0]]: machine})[axes[pair[1]]]
         self.correction = sign * frame.unit_m * added
-        self.targets = [_mean_line(whole, pair), map_line(whole, *pair).corrections_m]
+        self.targets = [_mean_line(filled_map, pair), map_line(filled_map, *pair).corrections_m]
 
     @property
     def shape(self) -> np.ndarray:
@@ -204,8 +209,8 @@ class _PairOfAxes:
     @property
     def shapes(self) -> list[np.ndarray]:
         """What it may be at the nodes, m: of tables of squareness alone, nothing."""
-        found = [target - self.slope(target) * self.nodes for target in self.targets]
-        return found if self.has_shape else [*found, np.zeros(len(self.nodes))]
+        target_shapes = [target - self.slope(target) * self.nodes for target in self.targets]
+        return target_shapes if self.has_shape else [*target_shapes, np.zeros(len(self.nodes))]
 
     def slope(self, values: np.ndarray) -> float:
         """Return the least-squares slope of values at the nodes."""
@@ -219,20 +224,20 @@ class _PairOfAxes:
         Between the nodes the error of the stage is known to the difference of the straight line
         and the cubic spline.
         """
-        found = []
+        candidates = []
         for target in targets:
             line = np.interp(self.places, self.nodes, target)
-            left = correction - line
-            left = left - left[self.at_nodes].mean()
-            left = np.maximum(np.abs(left) - np.abs(self._spline(target) - line), 0.0)
-            found.append((rms(left[self.at_nodes]), float(left.max())))
-        rms_left, largest_left = min(found)
-        part = targets[0] - targets[0].mean()
+            residual_m = correction - line
+            residual_m = residual_m - residual_m[self.at_nodes].mean()
+            residual_m = np.maximum(np.abs(residual_m) - np.abs(self._spline(target) - line), 0.0)
+            candidates.append((rms(residual_m[self.at_nodes]), float(residual_m.max())))
+        rms_left, largest_left = min(candidates)
+        centred = targets[0] - targets[0].mean()
         along, corrected = self.pair
         return OneAxisPart(
             f"{corrected} from the position of {along}{without}",
-            rms(part),
-            float(np.abs(part).max()),
+            rms(centred),
+            float(np.abs(centred).max()),
             rms_left,
             largest_left,
             self.u,
@@ -261,62 +266,67 @@ def _stage_positions(table: BoundTable1D, axis: Axis, frame: MachineFrame) -> np
 
 
 def _squareness(
-    whole: ErrorMap, turning: list[_PairOfAxes], across: list[_PairOfAxes]
+    filled_map: ErrorMap, turning: list[_PairOfAxes], across: list[_PairOfAxes]
 ) -> OneAxisPart:
     """Return what tables with slopes leave of the squareness of a map.
 
     A turn of both axes alike is the choice of the frame: only the sum of the slopes counts. In the
     frame of the map each slope may be that of the map, too.
     """
-    added = [part.slope(part.correction[part.at_nodes]) for part in across]
-    whole_slope = _squareness_of(whole)
-    own = [
-        max(
-            abs(slope - part.slope(target))
-            for slope, part, target in zip(added, across, targets, strict=True)
-            if part.has_slope
-        )
-        for targets in product(*(part.targets for part in across))
+    added = [
+        pair_tables.slope(pair_tables.correction[pair_tables.at_nodes]) for pair_tables in across
     ]
-    left = min(abs(sum(added) - whole_slope), *own)
+    map_slope = _squareness_of(filled_map)
+    slope_misfits = [
+        max(
+            abs(slope - pair_tables.slope(target))
+            for slope, pair_tables, target in zip(added, across, targets, strict=True)
+            if pair_tables.has_slope
+        )
+        for targets in product(*(pair_tables.targets for pair_tables in across))
+    ]
+    residual_slope = min(abs(sum(added) - map_slope), *slope_misfits)
     nodes, u = turning[0].nodes, turning[0].u
     far = float(np.abs(nodes).max())
     return OneAxisPart(
         "squareness",
-        abs(whole_slope) * rms(nodes),
-        abs(whole_slope) * far,
-        left * rms(nodes),
-        left * far,
+        abs(map_slope) * rms(nodes),
+        abs(map_slope) * far,
+        residual_slope * rms(nodes),
+        residual_slope * far,
         u,
     )
 
 
-def _beyond(whole: ErrorMap, pairs: Sequence[Pair]) -> float:
+def _beyond(filled_map: ErrorMap, pairs: Sequence[Pair]) -> float:
     """Return what is left of a map by the best 1D tables of these axes, rms of the vectors, m."""
-    left = np.stack([whole.gx, whole.gy])
+    residual_m = np.stack([filled_map.gx, filled_map.gy])
     for along, corrected in pairs:
-        line = _mean_line(whole, (along, corrected))
-        left["xy".index(corrected)] -= line[:, None] if along == "x" else line[None, :]
+        line = _mean_line(filled_map, (along, corrected))
+        residual_m["xy".index(corrected)] -= line[:, None] if along == "x" else line[None, :]
     if any(along != corrected for along, corrected in pairs):  # square, and in any turn
-        x, y = whole.artifact.x_m, whole.artifact.y_m
-        left -= np.stack(
-            [y * _slope(y.ravel(), left[0].ravel()), x * _slope(x.ravel(), left[1].ravel())]
+        x, y = filled_map.artifact.x_m, filled_map.artifact.y_m
+        residual_m -= np.stack(
+            [
+                y * _slope(y.ravel(), residual_m[0].ravel()),
+                x * _slope(x.ravel(), residual_m[1].ravel()),
+            ]
         )
-    left -= left.mean(axis=(1, 2), keepdims=True)
-    return float(np.sqrt((left**2).sum(axis=0).mean()))
+    residual_m -= residual_m.mean(axis=(1, 2), keepdims=True)
+    return float(np.sqrt((residual_m**2).sum(axis=0).mean()))
 
 
-def _mean_line(whole: ErrorMap, pair: Pair) -> np.ndarray:
+def _mean_line(filled_map: ErrorMap, pair: Pair) -> np.ndarray:
     """Return the error of an axis against the position of one axis, mean over the other, m."""
-    field = whole.gx if pair[1] == "x" else whole.gy
+    field = filled_map.gx if pair[1] == "x" else filled_map.gy
     return field.mean(axis=1 if pair[0] == "x" else 0)
 
 
-def _squareness_of(whole: ErrorMap) -> float:
+def _squareness_of(filled_map: ErrorMap) -> float:
     """Return the sum of the slopes of y along x and of x along y, rad; a turn cancels in it."""
-    artifact = whole.artifact
-    return _slope(artifact.x_m[:, 0], _mean_line(whole, ("x", "y"))) + _slope(
-        artifact.y_m[0], _mean_line(whole, ("y", "x"))
+    artifact = filled_map.artifact
+    return _slope(artifact.x_m[:, 0], _mean_line(filled_map, ("x", "y"))) + _slope(
+        artifact.y_m[0], _mean_line(filled_map, ("y", "x"))
     )
 
 

@@ -68,10 +68,10 @@ class _Reader:
     def _numbers(self, block: list[str], first: int) -> None:
         assert self.open is not None, "numbers outside a table go to `_line`"
         counts = np.array([len(line.split()) for line in block])
-        said = np.flatnonzero(counts)
+        with_words = np.flatnonzero(counts)
         self.open.words.extend(" ".join(block).split())
-        self.open.lines.extend((said + first).tolist())
-        self.open.counts.extend(counts[said].tolist())
+        self.open.lines.extend((with_words + first).tolist())
+        self.open.counts.extend(counts[with_words].tolist())
 
     def _line(self, number_: int, line: str, *, odd: bool) -> None:
         """Process a line that is not just numbers."""
@@ -128,15 +128,15 @@ class _Reader:
     def _directive(self, line: int, text: str) -> None:
         match = _TOKEN.match(text)
         assert match is not None, "the pattern takes any text"
-        word, rest = match[1], text[match.end() :]
+        word, arguments = match[1], text[match.end() :]
         if word.upper() == "END":
-            self._end(line, word, rest)
+            self._end(line, word, arguments)
         elif word.upper() in _STARTS:
             if word != word.upper():
                 self.findings.tolerated(
                     line, "a token in mixed case", "write :START, :START2D, :GALVO2D, :END"
                 )
-            self._start(line, _STARTS[word.upper()], rest)
+            self._start(line, _STARTS[word.upper()], arguments)
         else:
             self.findings.error(
                 line,
@@ -144,8 +144,8 @@ class _Reader:
                 "known are :START, :START2D, :GALVO2D and :END",
             )
 
-    def _start(self, line: int, kind: model.TableKind, rest: str) -> None:
-        if rest and rest[0] not in " \t":
+    def _start(self, line: int, kind: model.TableKind, arguments: str) -> None:
+        if arguments and arguments[0] not in " \t":
             self.findings.error(line, f"no blank after {kind.start}", "put one")
         if self.open is not None and not self.open.counts:
             if kind is not self.open.kind:
@@ -157,7 +157,7 @@ class _Reader:
                 )
                 self.open.broken = self.open.broken_head = True
                 return
-            self.open.heads.append((line, rest))
+            self.open.heads.append((line, arguments))
             return
         if self.open is not None:
             self.findings.error(
@@ -178,14 +178,14 @@ class _Reader:
         self.first_kind = self.first_kind or kind
         if kind is not self.first_kind:
             rules.mixed_kinds(line, (kind, self.first_kind), self.findings)
-        self.open = _Open(kind, [(line, rest)])
+        self.open = _Open(kind, [(line, arguments)])
 
-    def _end(self, line: int, word: str, rest: str) -> None:
+    def _end(self, line: int, word: str, trailing: str) -> None:
         if word != "END":
             self.findings.tolerated(
                 line, "a token in mixed case", "write :START, :START2D, :GALVO2D, :END"
             )
-        if rest.strip():
+        if trailing.strip():
             self.findings.tolerated(line, "text after :END is ignored", "start it with a semicolon")
         if self.open is None:
             self.findings.error(line, ":END without a start", "remove it or start the table")
@@ -213,9 +213,9 @@ class _Reader:
         header.broken |= table.broken_head
         values = _numbers(table, self.findings) if not table.broken else None
         make = _table_1d if table.kind is model.TableKind.ONE_D else _table_2d
-        made = make(header, values, (table.lines, table.counts), self.findings)
-        if made is not None:
-            self.tables.append(made)
+        parsed = make(header, values, (table.lines, table.counts), self.findings)
+        if parsed is not None:
+            self.tables.append(parsed)
 
 
 def _numbers(table: _Open, findings: model.CalFindings) -> np.ndarray | None:

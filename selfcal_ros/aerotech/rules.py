@@ -92,11 +92,11 @@ def _table_1d(table: Table1D, findings: CalFindings) -> None:
 
     def ignored(name: str, without: str) -> None:
         if getattr(table, name) is not None and getattr(table, without) is None:
-            word, other = (n.upper().replace("_", "") for n in (name, without))
+            word, needed_word = (n.upper().replace("_", "") for n in (name, without))
             findings.warning(
                 table.lines.get(name, table.line),
-                f"{word} is ignored without {other}",
-                f"add {other} or remove it",
+                f"{word} is ignored without {needed_word}",
+                f"add {needed_word} or remove it",
             )
 
     ignored("home_offset", "home_direction")
@@ -236,17 +236,19 @@ def check_counts(tables: Sequence[Table], findings: CalFindings) -> None:
     """Add a finding for every exceeded limit on the number of tables."""
     limits = {TableKind.ONE_D: MAX_1D_TABLES, TableKind.TWO_D: MAX_2D_TABLES}
     for kind, limit in limits.items():
-        same = [table for table in tables if table.kind is kind]
-        if len(same) > limit:
+        of_kind = [table for table in tables if table.kind is kind]
+        if len(of_kind) > limit:
             findings.error(
-                same[limit].line, f"{len(same)} {kind} tables in the file", f"it may have {limit}"
+                of_kind[limit].line,
+                f"{len(of_kind)} {kind} tables in the file",
+                f"it may have {limit}",
             )
-    seen: Counter[int] = Counter()
+    tables_of_axis: Counter[int] = Counter()
     scanners: dict[int, int] = {}
     for table in tables:
         if isinstance(table, Table1D):
-            seen[table.axis] += 1
-            if seen[table.axis] == MAX_1D_TABLES_PER_AXIS + 1:
+            tables_of_axis[table.axis] += 1
+            if tables_of_axis[table.axis] == MAX_1D_TABLES_PER_AXIS + 1:
                 findings.error(
                     table.line,
                     f"more than {MAX_1D_TABLES_PER_AXIS} tables correct axis {table.axis}",

@@ -118,7 +118,7 @@ class TableVerification:
             (self.entries, (error_map.u_gx, error_map.u_gy)),
             (self.lines, (error_map.u_g_theta,)),
         )
-        found = [
+        failing = [
             residual
             for residual, u in pairs
             if residual is not None
@@ -130,8 +130,8 @@ class TableVerification:
         ]
         return [
             residual
-            for residual in found
-            if residual is not self.entries or self.sites not in found
+            for residual in failing
+            if residual is not self.entries or self.sites not in failing
         ]
 
 
@@ -173,8 +173,10 @@ def verify_tables(
     in_one_axis = [table for table in xy if isinstance(table, Table1D)]
     if xy:
         evaluator = CalEvaluator(xy, setup_of(frame))
-        sites, *rest = plane_residuals(error_map, frame, plane_correction(evaluator, frame), active)
-        between = rest[0] if rest else None
+        sites, *between_sites = plane_residuals(
+            error_map, frame, plane_correction(evaluator, frame), active
+        )
+        between = between_sites[0] if between_sites else None
         error = error_map if active is None else combined(error_map, frame, active)
         if len(in_one_axis) == len(xy):
             one_axis = one_axis_fit(error, in_one_axis, frame, setup_of(frame))
@@ -193,10 +195,10 @@ def _at_entries(
     Between the sites the error of the stage is known to the difference of the bilinear map and the
     spline through its sites.
     """
-    whole, _ = fill_unknown(error_map)
-    plate = whole.artifact
+    filled_map, _ = fill_unknown(error_map)
+    plate = filled_map.artifact
     plane = replace(
-        whole,
+        filled_map,
         artifact=replace(plate, angular_count=0, harmonics=0),
         g_theta=np.zeros(0),
         u_g_theta=np.zeros(0),
@@ -226,15 +228,15 @@ def _at_entries(
     added = np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
     error = np.stack(Compensator(plane).error(*position))
     doubt = np.abs(np.stack(Compensator(plane, method="bicubic").error(*position)) - error)
-    left = error - added
-    left = left - left[:, :sites].mean(axis=1, keepdims=True)
-    left = np.sign(left) * np.maximum(np.abs(left) - doubt, 0.0)
+    residual_m = error - added
+    residual_m = residual_m - residual_m[:, :sites].mean(axis=1, keepdims=True)
+    residual_m = np.sign(residual_m) * np.maximum(np.abs(residual_m) - doubt, 0.0)
     mean = error[:, :sites].mean(axis=1)
     return Residual(
         "entries",
         position[:, sites:],
         (error - mean[:, None])[:, sites:],
-        left[:, sites:],
+        residual_m[:, sites:],
         mean,
         np.zeros(2),
     )
@@ -279,19 +281,19 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
     InputError
         If a table corrects or needs an axis outside the frame of the file.
     """
-    found = verify_tables(result.error_map, cal.tables, frame_of_file(cal) or MachineFrame())
+    verification = verify_tables(result.error_map, cal.tables, frame_of_file(cal) or MachineFrame())
     rows = []
-    for residual in found.residuals:
+    for residual in verification.residuals:
         unit, scale = ("arcsec", ARCSEC_PER_RAD) if residual.place == "lines" else ("µm", UM_PER_M)
         sizes = [
-            size(which) * scale
+            size(state) * scale
             for size in (residual.rms, residual.largest)
-            for which in BEFORE_AND_AFTER
+            for state in BEFORE_AND_AFTER
         ]
         rows.append((PLACES[residual.place], *fixed_column(sizes, 4), unit))
     header = ("error", "rms before", "after", "largest before", "after", "unit")
     figure = CaptionedFigure(
-        controller_figure(found),
+        controller_figure(verification),
         "A simulated controller moves to the nodes and to the middle of every "
         "cell, without and with the exported table. What remains between the "
         "nodes is the controller's linear interpolation.",
@@ -304,33 +306,33 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
     return Chapter(TITLE, (figure,), (leaves,))
 
 
-def controller_figure(found: TableVerification) -> Drawing:
+def controller_figure(verification: TableVerification) -> Drawing:
     """Return the error of the controller, true − commanded, before and after at one scale."""
     drawing = parts.titled(
         "before-after", "Controller: true − commanded, without its constant shift"
     )
-    fields = [residual for residual in found.residuals if residual.place != "lines"]
-    shown = [_shown(residual) for residual in fields]
+    fields = [residual for residual in verification.residuals if residual.place != "lines"]
+    selections = [_shown(residual) for residual in fields]
     if fields:
         reach = (np.abs(fields[0].position).max(axis=1) * 1.2 * MM_PER_M).tolist()
         lengths = np.concatenate([np.hypot(*residual.before) for residual in fields])
-        factor = parts.enlargement(lengths, min(spacing for _, spacing in shown))
+        factor = parts.enlargement(lengths, min(spacing for _, spacing in selections))
         frames = parts.panels(
             drawing,
             [
-                f"{which}, {PLACES[residual.place]}"
+                f"{state}, {PLACES[residual.place]}"
                 for residual in fields
-                for which in BEFORE_AND_AFTER
+                for state in BEFORE_AND_AFTER
             ],
             reach,
             68.0,
         )
         for number, frame in enumerate(frames):
-            (residual, which), (take, _) = _pair(fields, number), shown[number // 2]
+            (residual, state), (take, _) = _pair(fields, number), selections[number // 2]
             parts.arrows(
                 frame,
                 residual.position[:, take] * MM_PER_M,
-                getattr(residual, which)[:, take],
+                getattr(residual, state)[:, take],
                 factor,
                 width=0.9,
             )
@@ -339,15 +341,15 @@ def controller_figure(found: TableVerification) -> Drawing:
             drawing.label(
                 left,
                 top + height + 32,
-                _sizes(residual, which, "µm", UM_PER_M),
+                _sizes(residual, state, "µm", UM_PER_M),
                 size=11,
                 colour="soft",
             )
         parts.arrow_key(frames[0], factor, (46, drawing.height + 26))
         drawing.label(150, drawing.height + 30, "one scale for all; axes in mm")
         drawing.height += 40
-    if found.lines is not None:
-        _draw_lines(drawing, found.lines)
+    if verification.lines is not None:
+        _draw_lines(drawing, verification.lines)
     return drawing
 
 
@@ -364,8 +366,8 @@ def _shown(residual: Residual) -> tuple[np.ndarray, float]:
     return take, step * (spacing or 1.0)
 
 
-def _sizes(residual: Residual, which: str, unit: str, scale: float) -> str:
-    rms, largest = (size(which) * scale for size in (residual.rms, residual.largest))
+def _sizes(residual: Residual, state: str, unit: str, scale: float) -> str:
+    rms, largest = (size(state) * scale for size in (residual.rms, residual.largest))
     if largest < 1e-4:
         return f"below 0.0001 {unit} everywhere"
     return f"rms {significant(rms)}, largest {significant(largest)} {unit}"
@@ -379,13 +381,13 @@ def _draw_lines(drawing: Drawing, residual: Residual) -> None:
         drawing,
         (62, top, 410, 150),
         [
-            parts.Curve(angle, getattr(residual, which)[0] * ARCSEC_PER_RAD, colour, dots=2.0)
-            for which, colour in zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)
+            parts.Curve(angle, getattr(residual, state)[0] * ARCSEC_PER_RAD, colour, dots=2.0)
+            for state, colour in zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)
         ],
         title=PLACES["lines"],
         labels=("θ in °", "arcsec"),
     )
-    for number, (which, colour) in enumerate(zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)):
-        sizes = _sizes(residual, which, "arcsec", ARCSEC_PER_RAD)
-        parts.legend(drawing, [(colour, f"{which}: {sizes}")], (62, top + 206 + 18 * number))
+    for number, (state, colour) in enumerate(zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)):
+        sizes = _sizes(residual, state, "arcsec", ARCSEC_PER_RAD)
+        parts.legend(drawing, [(colour, f"{state}: {sizes}")], (62, top + 206 + 18 * number))
     drawing.height = top + 236
