@@ -117,8 +117,8 @@ class Geometry:
         by_errors[:, j, i, j, i] += np.moveaxis(sign.T[:, None, :, None] * w, 2, 0)
         by_tilts = np.zeros((n_k, dim, n, n_k, dim - 1))
         k = np.arange(n_k)
-        moved = np.tensordot(vectors, by_tilt, axes=(2, 1))  # (j, i, k, m)
-        by_tilts[k, :, :, k] = sign[:, :, None, None] * np.moveaxis(moved, 2, 0)
+        readings_by_tilt = np.tensordot(vectors, by_tilt, axes=(2, 1))  # (j, i, k, m)
+        by_tilts[k, :, :, k] = sign[:, :, None, None] * np.moveaxis(readings_by_tilt, 2, 0)
         rows = n_k * dim * n
         return by_errors.reshape(rows, -1), by_tilts.reshape(rows, -1)
 
@@ -174,9 +174,9 @@ def _solver(matrix: np.ndarray, data: StepDiagonal) -> np.ndarray:
 
 
 def _solution(
-    data: StepDiagonal, geometry: Geometry, found: tuple[np.ndarray, np.ndarray, np.ndarray]
+    data: StepDiagonal, geometry: Geometry, estimate: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> Adjusted:
-    errors, tilt, gain = found
+    errors, tilt, gain = estimate
     by_errors, _ = geometry.derivatives(errors, tilt)
     is_linear = np.zeros(geometry.free.shape, dtype=bool)
     for j in range(data.dim):

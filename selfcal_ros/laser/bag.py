@@ -70,18 +70,18 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
         If a topic is missing or empty.
     """
     reader = BagReader(Path(path))
-    wanted = {topics.laser: _laser_value(topics), topics.position: _position_value(topics)}
-    if len(wanted) < 2:
+    value_of_topic = {topics.laser: _laser_value(topics), topics.position: _position_value(topics)}
+    if len(value_of_topic) < 2:
         raise InputError("--position-topic", "it is the laser's topic", "name two topics")
-    found: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in wanted}
-    others: set[str] = set()
+    samples_of_topic: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in value_of_topic}
+    other_topics: set[str] = set()
     unstamped: set[str] = set()
     for stream in streams(reader.files, reader.lost):
         decoders: dict[int, Callable] = {}
         for channel, message in stream.messages():
-            topic = _match(channel.topic, wanted)
+            topic = _match(channel.topic, value_of_topic)
             if topic is None:
-                others.add(channel.topic)
+                other_topics.add(channel.topic)
                 continue
             if channel.id not in decoders:
                 decoders[channel.id] = _decoder(stream, channel, f"{path}: topic {topic}")
@@ -95,13 +95,15 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
                     f"{stamp} ns is not a log time",
                     "record the bag again",
                 )
-            found[topic].append((stamp, wanted[topic](name, decoded, f"{path}: topic {topic}")))
-    for topic, samples in found.items():
+            samples_of_topic[topic].append(
+                (stamp, value_of_topic[topic](name, decoded, f"{path}: topic {topic}"))
+            )
+    for topic, samples in samples_of_topic.items():
         if not samples:
             raise NoDataError(
                 f"{path}: topic {topic}",
                 "no message of it in the bag",
-                "the bag has " + (", ".join(sorted(others)) or "no other topic"),
+                "the bag has " + (", ".join(sorted(other_topics)) or "no other topic"),
             )
     notes = [f"{path}: {line}" for line in reader.lost]
     if len(unstamped) == 1:
@@ -109,13 +111,13 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
             f"{path}: {unstamped.pop()} has no stamps and is used at its log time, the "
             "other topic at its stamps: both clocks must agree"
         )
-    laser_ns, laser = _sorted(found[topics.laser])
-    position_ns, positions = _sorted(found[topics.position])
+    laser_ns, laser = _sorted(samples_of_topic[topics.laser])
+    position_ns, positions = _sorted(samples_of_topic[topics.position])
     return Recording(laser_ns, laser * topics.laser_unit_m, position_ns, positions), notes
 
 
-def _match(topic: str, wanted: dict[str, Callable]) -> str | None:
-    return next((name for name in wanted if name.strip("/") == topic.strip("/")), None)
+def _match(topic: str, value_of_topic: dict[str, Callable]) -> str | None:
+    return next((name for name in value_of_topic if name.strip("/") == topic.strip("/")), None)
 
 
 def _decoder(stream: McapStream, channel: Any, where: str) -> Callable:
@@ -189,14 +191,14 @@ def _joints(message: Any, joints: Sequence[str], where: str) -> list[float]:
 
 
 def _number(message: Any, field: str, where: str) -> float:
-    for part in field.split("."):
-        if not hasattr(message, part):
+    for name in field.split("."):
+        if not hasattr(message, name):
             raise InputError(
                 where,
                 f"the message has no field '{field}'",
                 "name the field with --laser-field, a.b for a nested one",
             )
-        message = getattr(message, part)
+        message = getattr(message, name)
     try:
         return float(message)
     except (TypeError, ValueError) as error:

@@ -275,19 +275,19 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
             where, "not a finite number", "measure the block again or correct the cell"
         )
     ratio = value_m / nominal_m
-    shown = f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
+    values_text = f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
     if _is_near(ratio):
         return
     if _is_near(-ratio):
         raise InputError(
             where,
-            f"{shown}: the sign is wrong",
+            f"{values_text}: the sign is wrong",
             "readings are positive on every diagonal (np: R_x = -l . dx)",
         )
     for factor, unit in _UNITS.items():
         if _is_near(ratio / factor):
-            raise InputError(where, f"{shown}: it looks like {unit}", "give millimetres")
-    raise InputError(where, shown, "check the unit and --step-x, --step-y")
+            raise InputError(where, f"{values_text}: it looks like {unit}", "give millimetres")
+    raise InputError(where, values_text, "check the unit and --step-x, --step-y")
 
 
 def check_linear(value_m: float, step_m: float, where: str) -> None:

@@ -155,8 +155,8 @@ def readings_are_equal(data: StepDiagonal) -> bool:
     linear errors (source, Table 1 b).
     """
     r = data.readings_m
-    same = np.ptp(r, axis=1) <= EQUAL_RELATIVE * np.abs(r).max()
-    return bool(data.n_blocks > 1 and np.ptp(data.steps_m) == 0 and same.all())
+    block_is_equal = np.ptp(r, axis=1) <= EQUAL_RELATIVE * np.abs(r).max()
+    return bool(data.n_blocks > 1 and np.ptp(data.steps_m) == 0 and block_is_equal.all())
 
 
 def block_gain(data: StepDiagonal) -> np.ndarray:
@@ -274,21 +274,21 @@ def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT) -> StepDiag
     lengths = length_closure(data) or (None, None)
     if form is not Form.EXACT:
         return _paper(data, form, lengths)
-    found = adjust(data)
+    adjusted = adjust(data)
     mirror = {
         name: np.arctan(tilt).tolist()
-        for name, tilt in zip(data.diagonals, found.tilt, strict=True)
+        for name, tilt in zip(data.diagonals, adjusted.tilt, strict=True)
     }
     between, u_between, residual = None, None, None
     if len(data.diagonals) > 1:
-        residual = rms(found.residuals_m)
+        residual = rms(adjusted.residuals_m)
         if data.dim == 2:
-            alone = [adjust(data.pick([name])) for name in data.diagonals]
-            between, u_between = between_diagonals(data, alone)
+            by_diagonal = [adjust(data.pick([name])) for name in data.diagonals]
+            between, u_between = between_diagonals(data, by_diagonal)
     return StepDiagonalResult(
         data.steps_m,
-        found.errors_m,
-        propagated(data, found.by_readings, found.by_linear),
+        adjusted.errors_m,
+        propagated(data, adjusted.by_readings, adjusted.by_linear),
         Method.NEW,
         form,
         mirror,
@@ -305,13 +305,13 @@ def _paper(
         return solve_diagonal(data, readings, linear, form=form)
 
     readings, linear = data.readings_m, data.linear_mean_m
-    alone = solve(readings, linear)
+    by_diagonal = solve(readings, linear)
     by_readings = jacobian(lambda r: solve(r, linear).mean(axis=0), readings)
     by_linear = jacobian(lambda e: solve(readings, e).mean(axis=0), linear)
-    between = alone[0] - alone[1] if len(alone) == 2 else None
+    between = by_diagonal[0] - by_diagonal[1] if len(by_diagonal) == 2 else None
     return StepDiagonalResult(
         data.steps_m,
-        alone.mean(axis=0),
+        by_diagonal.mean(axis=0),
         propagated(data, by_readings, by_linear),
         Method.NEW,
         form,

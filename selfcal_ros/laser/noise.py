@@ -176,7 +176,7 @@ def length_closure(data: StepDiagonal) -> tuple[float, float | None] | None:
 
 
 def between_diagonals(
-    data: StepDiagonal, alone: list[Adjusted]
+    data: StepDiagonal, by_diagonal: list[Adjusted]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the errors from pp alone minus those from np alone, and their uncertainties.
 
@@ -184,13 +184,13 @@ def between_diagonals(
     ----------
     data : StepDiagonal
         Both diagonals.
-    alone : list of Adjusted
+    by_diagonal : list of Adjusted
         Solutions of the single diagonals, in the order of `data`.
     """
-    one, other = alone
-    difference = one.errors_m - other.errors_m
-    by_readings = np.hstack([one.by_readings, -other.by_readings])
-    covariance = propagated(data, by_readings, one.by_linear - other.by_linear)
+    first, second = by_diagonal
+    difference = first.errors_m - second.errors_m
+    by_readings = np.hstack([first.by_readings, -second.by_readings])
+    covariance = propagated(data, by_readings, first.by_linear - second.by_linear)
     if covariance is None:
         return difference, None
     return difference, np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(difference.shape)
@@ -216,18 +216,20 @@ def check_lengths(data: StepDiagonal) -> None:
     if abs(excess[worst]) <= LENGTH_TOLERANCE:
         return
     smaller = _excess(square, steps + 1e-3 * linear)[worst]
-    what = (
+    disagreement = (
         f"diagonals and linear errors disagree by "
         f"{excess[worst] * np.linalg.norm(steps) * MM_PER_M:.4g} mm"
     )
     if abs(smaller) < 0.1 * abs(excess[worst]):
         raise InputError(
             f"block {worst + 1}",
-            what + "; the linear errors look like micrometres",
+            disagreement + "; the linear errors look like micrometres",
             "give ex_x, ey_y in mm",
         )
     raise InputError(
-        f"block {worst + 1}", what, "check the steps, the units, and that both are of one machine"
+        f"block {worst + 1}",
+        disagreement,
+        "check the steps, the units, and that both are of one machine",
     )
 
 

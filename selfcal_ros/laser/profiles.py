@@ -40,27 +40,27 @@ class Value:
     u: float | None = None
 
 
-def positions_m(found: StepDiagonalResult, axis: int) -> np.ndarray:
+def positions_m(result: StepDiagonalResult, axis: int) -> np.ndarray:
     """Return the nominal positions of the ends of the blocks, (n+1,), m, from 0."""
-    return np.arange(found.n_blocks + 1) * found.steps_m[axis]
+    return np.arange(result.n_blocks + 1) * result.steps_m[axis]
 
 
-def profile_m(found: StepDiagonalResult, axis: int, direction: int) -> np.ndarray:
+def profile_m(result: StepDiagonalResult, axis: int, direction: int) -> np.ndarray:
     """Return the accumulated error in `direction` along `axis`, (n+1,), m, 0 at the start."""
-    return np.concatenate([[0.0], np.cumsum(found.errors_m[axis, :, direction])])
+    return np.concatenate([[0.0], np.cumsum(result.errors_m[axis, :, direction])])
 
 
-def u_profile_m(found: StepDiagonalResult, axis: int, direction: int) -> np.ndarray | None:
+def u_profile_m(result: StepDiagonalResult, axis: int, direction: int) -> np.ndarray | None:
     """Return the standard uncertainty of the profile, (n+1,), m; None if unknown."""
-    if found.covariance is None:
+    if result.covariance is None:
         return None
-    rows = _accumulate(found.n_blocks)
-    block = _block(found, (axis, direction), (axis, direction))
+    rows = _accumulate(result.n_blocks)
+    block = _block(result, (axis, direction), (axis, direction))
     return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, block, rows), 0.0))
 
 
 def straightness(
-    found: StepDiagonalResult,
+    result: StepDiagonalResult,
     axis: int,
     direction: int,
     line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
@@ -70,75 +70,75 @@ def straightness(
     Its uncertainty is that of the distance between the two extreme points; as a peak-to-valley
     value it is biased upwards unless the noise is much smaller.
     """
-    rows = _accumulate(found.n_blocks) - np.outer(
-        np.arange(found.n_blocks + 1), _slope_row(found.n_blocks, line)
+    rows = _accumulate(result.n_blocks) - np.outer(
+        np.arange(result.n_blocks + 1), _slope_row(result.n_blocks, line)
     )
-    residual = rows @ found.errors_m[axis, :, direction]
+    residual = rows @ result.errors_m[axis, :, direction]
     row = rows[np.argmax(residual)] - rows[np.argmin(residual)]
     value = float(np.ptp(residual))
-    if found.covariance is None:
+    if result.covariance is None:
         return Value(value)
-    block = _block(found, (axis, direction), (axis, direction))
+    block = _block(result, (axis, direction), (axis, direction))
     return Value(value, float(np.sqrt(max(row @ block @ row, 0.0))))
 
 
 def slope(
-    found: StepDiagonalResult,
+    result: StepDiagonalResult,
     axis: int,
     direction: int,
     line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
 ) -> float:
     """Return the slope of a profile: rad for a transverse one, relative for a linear one."""
-    row = _slope_row(found.n_blocks, line) / found.steps_m[axis]
-    return float(row @ found.errors_m[axis, :, direction])
+    row = _slope_row(result.n_blocks, line) / result.steps_m[axis]
+    return float(row @ result.errors_m[axis, :, direction])
 
 
 def u_slope(
-    found: StepDiagonalResult,
+    result: StepDiagonalResult,
     axis: int,
     direction: int,
     line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
 ) -> float | None:
     """Return the standard uncertainty of `slope`; None if unknown."""
-    if found.covariance is None:
+    if result.covariance is None:
         return None
-    row = _slope_row(found.n_blocks, line) / found.steps_m[axis]
-    block = _block(found, (axis, direction), (axis, direction))
+    row = _slope_row(result.n_blocks, line) / result.steps_m[axis]
+    block = _block(result, (axis, direction), (axis, direction))
     return float(np.sqrt(max(row @ block @ row, 0.0)))
 
 
 def squareness(
-    found: StepDiagonalResult,
+    result: StepDiagonalResult,
     first: int = 0,
     second: int = 1,
     line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
 ) -> Value:
     """Return the squareness of two axes over the range of the second, m (sign: see above)."""
-    row = _slope_row(found.n_blocks, line)
-    of_first = row * found.steps_m[second] / found.steps_m[first] * found.n_blocks
-    of_second = row * found.n_blocks
+    row = _slope_row(result.n_blocks, line)
+    of_first = row * result.steps_m[second] / result.steps_m[first] * result.n_blocks
+    of_second = row * result.n_blocks
     value = float(
-        of_second @ found.errors_m[second, :, first] + of_first @ found.errors_m[first, :, second]
+        of_second @ result.errors_m[second, :, first] + of_first @ result.errors_m[first, :, second]
     )
-    if found.covariance is None:
+    if result.covariance is None:
         return Value(value)
     a, b = (second, first), (first, second)
     variance = (
-        of_second @ _block(found, a, a) @ of_second
-        + of_first @ _block(found, b, b) @ of_first
-        + 2 * of_second @ _block(found, a, b) @ of_first
+        of_second @ _block(result, a, a) @ of_second
+        + of_first @ _block(result, b, b) @ of_first
+        + 2 * of_second @ _block(result, a, b) @ of_first
     )
     return Value(value, float(np.sqrt(max(variance, 0.0))))
 
 
 def squareness_rad(
-    found: StepDiagonalResult,
+    result: StepDiagonalResult,
     first: int = 0,
     second: int = 1,
     line: ReferenceLine = ReferenceLine.LEAST_SQUARES,
 ) -> float:
     """Return the squareness as an angle, rad: 90 deg minus the angle between the axes."""
-    return slope(found, second, first, line) + slope(found, first, second, line)
+    return slope(result, second, first, line) + slope(result, first, second, line)
 
 
 def axis_pairs(dim: int) -> list[tuple[int, int]]:
@@ -164,12 +164,14 @@ def _slope_row(n: int, line: ReferenceLine) -> np.ndarray:
     return (centred / (centred @ centred)) @ _accumulate(n)
 
 
-def _block(found: StepDiagonalResult, one: tuple[int, int], other: tuple[int, int]) -> np.ndarray:
+def _block(
+    result: StepDiagonalResult, row_kind: tuple[int, int], column_kind: tuple[int, int]
+) -> np.ndarray:
     """Return the covariance between two kinds (axis, direction) of errors, (n, n)."""
-    assert found.covariance is not None, "asked for where nothing is known of the noise"
-    dim, n = found.dim, found.n_blocks
-    shaped = found.covariance.reshape(dim, n, dim, dim, n, dim)
-    return shaped[one[0], :, one[1], other[0], :, other[1]]
+    assert result.covariance is not None, "asked for where nothing is known of the noise"
+    dim, n = result.dim, result.n_blocks
+    shaped = result.covariance.reshape(dim, n, dim, dim, n, dim)
+    return shaped[row_kind[0], :, row_kind[1], column_kind[0], :, column_kind[1]]
 
 
 Axis = Literal["x", "y"]
@@ -194,21 +196,21 @@ class MapEquivalent:
     u_scale_difference: float | None = None
 
 
-def map_equivalent(found: StepDiagonalResult) -> MapEquivalent:
+def map_equivalent(result: StepDiagonalResult) -> MapEquivalent:
     """Return O and R of an error map with this squareness and these linear errors."""
-    u = squareness(found).u
-    span = found.steps_m[1] * found.n_blocks
-    o = -squareness_rad(found) / 2
+    u = squareness(result).u
+    span = result.steps_m[1] * result.n_blocks
+    o = -squareness_rad(result) / 2
     u_o = None if u is None else u / span / 2
-    if found.method != Method.NEW:
+    if result.method != Method.NEW:
         return MapEquivalent(o, u_o)
-    u_x, u_y = (u_slope(found, axis, axis) for axis in (0, 1))
+    u_x, u_y = (u_slope(result, axis, axis) for axis in (0, 1))
     u_r = None if u_x is None or u_y is None else float(np.hypot(u_x, u_y) / 2)
-    return MapEquivalent(o, u_o, (slope(found, 1, 1) - slope(found, 0, 0)) / 2, u_r)
+    return MapEquivalent(o, u_o, (slope(result, 1, 1) - slope(result, 0, 0)) / 2, u_r)
 
 
 def axis_corrections(
-    found: StepDiagonalResult,
+    result: StepDiagonalResult,
 ) -> dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]]:
     """Return (along, corrected) -> positions and corrections -E, m, of every profile of X and Y.
 
@@ -221,19 +223,19 @@ def axis_corrections(
     InputError
         For a 3D measurement: the tables of the package have no Z axis.
     """
-    if found.dim != 2:
+    if result.dim != 2:
         raise InputError(
             "calibration table",
             "body diagonals measure three axes, the tables hold x and y",
             "export a measurement of face diagonals",
         )
-    x, y = (positions_m(found, axis) for axis in (0, 1))
-    turn = slope(found, 0, 1)
+    x, y = (positions_m(result, axis) for axis in (0, 1))
+    turn = slope(result, 0, 1)
     lines: dict[tuple[Axis, Axis], tuple[np.ndarray, np.ndarray]] = {
-        ("x", "y"): (x, turn * x - profile_m(found, 0, 1)),
-        ("y", "x"): (y, -turn * y - profile_m(found, 1, 0)),
+        ("x", "y"): (x, turn * x - profile_m(result, 0, 1)),
+        ("y", "x"): (y, -turn * y - profile_m(result, 1, 0)),
     }
-    if found.method == Method.NEW:
-        lines["x", "x"] = x, -profile_m(found, 0, 0)
-        lines["y", "y"] = y, -profile_m(found, 1, 1)
+    if result.method == Method.NEW:
+        lines["x", "x"] = x, -profile_m(result, 0, 0)
+        lines["y", "y"] = y, -profile_m(result, 1, 1)
     return lines

@@ -28,7 +28,7 @@ CONVENTION = {
 
 
 def outcome(
-    found: StepDiagonalResult,
+    result: StepDiagonalResult,
     data: StepDiagonal,
     *,
     line: profiles.ReferenceLine = profiles.ReferenceLine.LEAST_SQUARES,
@@ -38,43 +38,43 @@ def outcome(
 
     Parameters
     ----------
-    found, data : StepDiagonalResult, StepDiagonal
+    result, data : StepDiagonalResult, StepDiagonal
         Result and the measurement behind it.
     line : ReferenceLine
         Reference line of straightness and squareness.
     warnings : sequence of str
         Warnings for the reader.
     """
-    kinds = [(j, c) for j in range(found.dim) for c in range(found.dim)]
-    out: dict[str, Any] = {"schema": SCHEMA, "method": str(found.method)}
-    if found.method == Method.NEW:
-        out["form"] = str(found.form)
+    kinds = [(j, c) for j in range(result.dim) for c in range(result.dim)]
+    out: dict[str, Any] = {"schema": SCHEMA, "method": str(result.method)}
+    if result.method == Method.NEW:
+        out["form"] = str(result.form)
     out |= {
         "unit": "mm",
         "line": str(line),
-        "n_blocks": found.n_blocks,
+        "n_blocks": result.n_blocks,
         "diagonals": list(data.diagonals),
         "n_repeats": int(data.counts.max()),
-        **{f"step_{AXES[j]}": step / M_PER_MM for j, step in enumerate(found.steps_m)},
+        **{f"step_{AXES[j]}": step / M_PER_MM for j, step in enumerate(result.steps_m)},
     }
-    out |= {profiles.name_of(j, c): _mm(found.errors_m[j, :, c]) for j, c in kinds}
-    u = found.u_errors_m
+    out |= {profiles.name_of(j, c): _mm(result.errors_m[j, :, c]) for j, c in kinds}
+    u = result.u_errors_m
     if u is not None:
         out |= {f"u_{profiles.name_of(j, c)}": _mm(u[j, :, c]) for j, c in kinds}
-    out |= geometry(found, line)
+    out |= geometry(result, line)
     out["profiles"] = {
         f"p{profiles.name_of(j, c)[1:]}": {
-            "position": _mm(profiles.positions_m(found, j)),
-            "error": _mm(profiles.profile_m(found, j, c)),
-            "u": _mm_or_none(profiles.u_profile_m(found, j, c)),
+            "position": _mm(profiles.positions_m(result, j)),
+            "error": _mm(profiles.profile_m(result, j, c)),
+            "u": _mm_or_none(profiles.u_profile_m(result, j, c)),
         }
         for j, c in kinds
     }
-    out["scale"] = {AXES[j]: profiles.slope(found, j, j, line) for j in range(found.dim)}
-    if found.dim == 2:
-        out["error_map_equivalent"] = vars(profiles.map_equivalent(found))
-    out["mirror_rad"] = found.mirror_rad
-    out["closure"] = _closure(found)
+    out["scale"] = {AXES[j]: profiles.slope(result, j, j, line) for j in range(result.dim)}
+    if result.dim == 2:
+        out["error_map_equivalent"] = vars(profiles.map_equivalent(result))
+    out["mirror_rad"] = result.mirror_rad
+    out["closure"] = _closure(result)
     readings, linear = reading_noise(data), linear_noise(data)
     out["noise"] = {
         "reading": readings.sigma_m / M_PER_MM,
@@ -84,7 +84,7 @@ def outcome(
         "linear_dof": linear.dof,
     }
     out["convention"] = CONVENTION
-    out["warnings"] = [*warnings, *_advice(found)]
+    out["warnings"] = [*warnings, *_advice(result)]
     return plain(out)
 
 
@@ -103,28 +103,28 @@ def _value(prefix: str, value: profiles.Value) -> dict[str, float | None]:
     }
 
 
-def geometry(found: StepDiagonalResult, line: profiles.ReferenceLine) -> dict[str, Any]:
+def geometry(result: StepDiagonalResult, line: profiles.ReferenceLine) -> dict[str, Any]:
     """Return squareness and straightness, mm: in 3D one name per pair, and the short names."""
-    out: dict[str, Any] = _value("squareness", profiles.squareness(found, line=line))
-    out["squareness_rad"] = profiles.squareness_rad(found, line=line)
+    out: dict[str, Any] = _value("squareness", profiles.squareness(result, line=line))
+    out["squareness_rad"] = profiles.squareness_rad(result, line=line)
     for axis in range(2):
         out |= _value(
-            f"straightness_{AXES[axis]}", profiles.straightness(found, axis, 1 - axis, line)
+            f"straightness_{AXES[axis]}", profiles.straightness(result, axis, 1 - axis, line)
         )
-    if found.dim == 2:
+    if result.dim == 2:
         return out
-    for j, c in profiles.axis_pairs(found.dim):
-        out |= _value(f"squareness_{AXES[j]}{AXES[c]}", profiles.squareness(found, j, c, line))
-    for j in range(found.dim):
-        for c in range(found.dim):
+    for j, c in profiles.axis_pairs(result.dim):
+        out |= _value(f"squareness_{AXES[j]}{AXES[c]}", profiles.squareness(result, j, c, line))
+    for j in range(result.dim):
+        for c in range(result.dim):
             if c != j:
                 name = f"straightness_{AXES[j]}_in_{AXES[c]}"
-                out |= _value(name, profiles.straightness(found, j, c, line))
+                out |= _value(name, profiles.straightness(result, j, c, line))
     return out
 
 
-def _closure(found: StepDiagonalResult) -> dict[str, Any]:
-    closure = found.closure
+def _closure(result: StepDiagonalResult) -> dict[str, Any]:
+    closure = result.closure
     out: dict[str, Any] = {
         key: None if value is None else value / M_PER_MM
         for key, value in (
@@ -144,12 +144,12 @@ CLOSURE_SHARE = 2e-6
 """Closure of the lengths, relative to the diagonal, for a misalignment of 2 mrad."""
 
 
-def _advice(found: StepDiagonalResult) -> list[str]:
+def _advice(result: StepDiagonalResult) -> list[str]:
     out = []
-    diagonal = found.n_blocks * float(np.linalg.norm(found.steps_m))
-    lengths = found.closure.lengths_m
+    diagonal = result.n_blocks * float(np.linalg.norm(result.steps_m))
+    lengths = result.closure.lengths_m
     if (
-        found.method == Method.NEW
+        result.method == Method.NEW
         and lengths is not None
         and abs(lengths) > CLOSURE_SHARE * diagonal
     ):
@@ -158,7 +158,7 @@ def _advice(found: StepDiagonalResult) -> list[str]:
             f"{lengths * UM_PER_M:.3g} um: the laser is off the machine's diagonal, or "
             "the linear errors are of another state of the machine"
         )
-    if found.covariance is not None and not found.covariance.any():
+    if result.covariance is not None and not result.covariance.any():
         out.append("all repeats are identical: an uncertainty of zero cannot be right")
     return out
 
@@ -192,27 +192,27 @@ def summary(result: dict[str, Any]) -> str:
 
 def coverage(data: StepDiagonal) -> float:
     """Return k for 95.45 % at the fewer degrees of freedom: of readings or of linear errors."""
-    known = [noise.dof for noise in (reading_noise(data), linear_noise(data)) if noise.dof]
-    return coverage_factor(min(known)) if known else float("nan")
+    dofs = [noise.dof for noise in (reading_noise(data), linear_noise(data)) if noise.dof]
+    return coverage_factor(min(dofs)) if dofs else float("nan")
 
 
-def profiles_figure(found: StepDiagonalResult, data: StepDiagonal) -> Drawing:
+def profiles_figure(result: StepDiagonalResult, data: StepDiagonal) -> Drawing:
     """Return every accumulated error over its axis, with its expanded uncertainty."""
     k = coverage(data)
-    bars = "" if found.covariance is None else f"; bars: U, k = {k:.3g}"
-    drawing = titled("profiles", f"Step diagonal, {found.method} formulation{bars}")
-    drawing.width, drawing.height = 240.0 * found.dim, 40.0 + 190 * found.dim
-    for j in range(found.dim):
-        for c in range(found.dim):
-            u = profiles.u_profile_m(found, j, c)
+    bars = "" if result.covariance is None else f"; bars: U, k = {k:.3g}"
+    drawing = titled("profiles", f"Step diagonal, {result.method} formulation{bars}")
+    drawing.width, drawing.height = 240.0 * result.dim, 40.0 + 190 * result.dim
+    for j in range(result.dim):
+        for c in range(result.dim):
+            u = profiles.u_profile_m(result, j, c)
             kind = "linear" if j == c else "transverse"
             chart(
                 drawing,
                 (56 + 240 * c, 56 + 190 * j, 176, 110),
                 [
                     Curve(
-                        profiles.positions_m(found, j) * MM_PER_M,
-                        profiles.profile_m(found, j, c) * UM_PER_M,
+                        profiles.positions_m(result, j) * MM_PER_M,
+                        profiles.profile_m(result, j, c) * UM_PER_M,
                         "c0",
                         dots=2.0,
                         U=None if u is None else k * u * UM_PER_M,
@@ -232,9 +232,9 @@ def truth_of(machine: StepMachine) -> dict[str, Any]:
         for j in range(machine.dim)
         for c in range(machine.dim)
     }
-    found = geometry(truth, profiles.ReferenceLine.LEAST_SQUARES)
+    truth_geometry = geometry(truth, profiles.ReferenceLine.LEAST_SQUARES)
     return {
         "unit": "mm",
         **errors,
-        **{key: value for key, value in found.items() if not key.startswith("u_")},
+        **{key: value for key, value in truth_geometry.items() if not key.startswith("u_")},
     }

@@ -332,7 +332,7 @@ def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
     if raw == "case_study":
         return case_study_machine()
     kinds = [name_of(j, c) for j in range(3) for c in range(3)]
-    found = checked_fields(
+    fields = checked_fields(
         raw,
         where,
         {"steps_mm": list},
@@ -344,21 +344,21 @@ def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
             **dict.fromkeys(kinds, (list, None)),
         },
     )
-    steps = tuple(np.array(_numbers(found["steps_mm"], f"{where}: steps_mm", (2, 3))) * M_PER_MM)
+    steps = tuple(np.array(_numbers(fields["steps_mm"], f"{where}: steps_mm", (2, 3))) * M_PER_MM)
     if min(steps) <= 0:
         raise InputError(f"{where}: steps_mm", "a step is not positive", "give lengths in mm")
     dim = len(steps)
-    listed = {kind: found[kind] for kind in kinds if found[kind] is not None}
+    listed = {kind: fields[kind] for kind in kinds if fields[kind] is not None}
     if listed and {"blocks", "sigma_um"} & cast(dict, raw).keys():
         raise InputError(where, "errors are both listed and drawn", "give one of them")
     if listed:
         errors = _errors(listed, where, dim)
     else:
-        blocks = _count(found["blocks"], f"{where}: blocks", MAX_BLOCKS)
-        sigma = _number(found["sigma_um"], f"{where}: sigma_um", positive=True) * M_PER_UM
+        blocks = _count(fields["blocks"], f"{where}: blocks", MAX_BLOCKS)
+        sigma = _number(fields["sigma_um"], f"{where}: sigma_um", positive=True) * M_PER_UM
         errors = random_machine(steps, blocks, rng, sigma_m=sigma).errors_m
-    turns = _turns(found["turns_urad"], f"{where}: turns_urad", errors.shape)
-    return StepMachine(steps, errors, turns, found["stacked"])
+    turns = _turns(fields["turns_urad"], f"{where}: turns_urad", errors.shape)
+    return StepMachine(steps, errors, turns, fields["stacked"])
 
 
 def _errors(listed: Mapping[str, list], where: str, dim: int) -> np.ndarray:
@@ -386,11 +386,11 @@ def _errors(listed: Mapping[str, list], where: str, dim: int) -> np.ndarray:
 
 def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray | None:
     axes = "xyz"[: shape[0]]
-    given = checked_fields(raw, where, {}, dict.fromkeys(axes, (list, None)))
+    fields = checked_fields(raw, where, {}, dict.fromkeys(axes, (list, None)))
     if not raw:
         return None
     turns = np.zeros((shape[0], shape[1], 3))
-    for axis, rows in given.items():
+    for axis, rows in fields.items():
         if rows is None:
             continue
         if len(rows) != shape[1]:
@@ -405,7 +405,7 @@ def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray |
 
 def _setup(raw: object, where: str, dim: int) -> SetUp:
     straight = (list, [0.0] * (dim - 1))
-    given = checked_fields(
+    fields = checked_fields(
         raw,
         where,
         {},
@@ -418,12 +418,12 @@ def _setup(raw: object, where: str, dim: int) -> SetUp:
         },
     )
     laser_rad, mirror_rad = (
-        tuple(np.array(_numbers(given[key], f"{where}: {key}", (dim - 1,))) * RAD_PER_MRAD)
+        tuple(np.array(_numbers(fields[key], f"{where}: {key}", (dim - 1,))) * RAD_PER_MRAD)
         for key in ("laser_mrad", "mirror_mrad")
     )
-    x, y, z = np.array(_numbers(given["abbe_mm"], f"{where}: abbe_mm", (3,))) * M_PER_MM
-    scale = _number(given["scale_ppm"], f"{where}: scale_ppm") * ONE_PER_PPM
-    return SetUp(laser_rad, mirror_rad, given["to_machine"], (x, y, z), scale)
+    x, y, z = np.array(_numbers(fields["abbe_mm"], f"{where}: abbe_mm", (3,))) * M_PER_MM
+    scale = _number(fields["scale_ppm"], f"{where}: scale_ppm") * ONE_PER_PPM
+    return SetUp(laser_rad, mirror_rad, fields["to_machine"], (x, y, z), scale)
 
 
 def _number(value: object, where: str, *, positive: bool = False) -> float:
@@ -443,8 +443,8 @@ def _number(value: object, where: str, *, positive: bool = False) -> float:
 
 def _numbers(value: list, where: str, lengths: tuple[int, ...] | range) -> list[float]:
     if len(value) not in lengths:
-        wanted = " or ".join(map(str, lengths)) if len(lengths) < 4 else f"1 to {lengths[-1]}"
-        raise InputError(where, f"{value!r} is not a list of {wanted} numbers", "give one")
+        length_text = " or ".join(map(str, lengths)) if len(lengths) < 4 else f"1 to {lengths[-1]}"
+        raise InputError(where, f"{value!r} is not a list of {length_text} numbers", "give one")
     return [_number(item, where) for item in value]
 
 

@@ -74,15 +74,15 @@ def read_table(
     """
     rows = _rows(path)
     header = _header(path, rows, columns)
-    known = {BLOCK, *columns.readings, *columns.errors}
-    known |= {name_of(j, j) for j in range(3)}
-    known |= {
+    known_columns = {BLOCK, *columns.readings, *columns.errors}
+    known_columns |= {name_of(j, j) for j in range(3)}
+    known_columns |= {
         f"r{axis}_{name}"
         for names in laser_data.DIAGONALS.values()
         for name in names
         for axis in laser_data.AXES
     }
-    ignored = [name for name in header if name not in known]
+    ignored = [name for name in header if name not in known_columns]
     warnings = [f"{path}: column '{name}' is not used" for name in ignored]
     cells: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
     first_line: dict[int, int] = {}
@@ -110,14 +110,14 @@ def dimension_of(path: str | os.PathLike) -> int:
 
 def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
     lines = read_text(path).splitlines()
-    kept = [
+    filled_lines = [
         (number, line)
         for number, line in enumerate(lines, 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    if not kept:
+    if not filled_lines:
         raise NoDataError(str(path), "the table is empty", "give a header and one row per block")
-    rows = [(number, csv_cells(line, f"{path}:{number}")) for number, line in kept]
+    rows = [(number, csv_cells(line, f"{path}:{number}")) for number, line in filled_lines]
     if len(rows) == 1:
         raise NoDataError(str(path), "the table has a header only", "give one row per block")
     return rows
@@ -204,7 +204,7 @@ def _values(
     for index, name in enumerate(columns.readings):
         k, j = divmod(index, len(steps))
         of_diagonal = columns.readings[k * len(steps) : (k + 1) * len(steps)]
-        if not any(named[other] for other in of_diagonal):
+        if not any(named[column] for column in of_diagonal):
             continue
         place = f"{where}: {name}"
         readings[k, j] = _number(named[name], place) * M_PER_MM

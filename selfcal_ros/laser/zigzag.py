@@ -142,8 +142,8 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     _same_length(named, dim)
     origin = _origin(named)
     runs = {
-        name: [_readings(chain, name, origin, rule) for chain in each]
-        for name, each in named.items()
+        name: [_readings(chain, name, origin, rule) for chain in chains_of_run]
+        for name, chains_of_run in named.items()
     }
     diagonals = tuple(name for name in DIAGONALS[dim] if name in runs)
     if not diagonals:
@@ -206,9 +206,9 @@ def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
     return rests
 
 
-def _end_of_rest(positions: np.ndarray, known: tuple[int, int], tolerance_m: float) -> int:
-    """Return the end of the interval from known[0] within the tolerance."""
-    start, end = known
+def _end_of_rest(positions: np.ndarray, interval: tuple[int, int], tolerance_m: float) -> int:
+    """Return the end of the interval from interval[0] within the tolerance."""
+    start, end = interval
     low, high = positions[start:end].min(axis=0), positions[start:end].max(axis=0)
     while end < len(positions):
         low, high = np.minimum(low, positions[end]), np.maximum(high, positions[end])
@@ -238,8 +238,8 @@ def _mean_laser(
     # Half of the samples are within the median of `away`. If they are all equal, the laser's
     # resolution hides its noise, and only the motion of the axes is known.
     usual = float(np.median(away)) or rule.rest_tolerance_m / OUTLIER
-    kept = away <= OUTLIER * usual
-    return rule.laser_sign * float(distances[kept].mean()), int((~kept).sum())
+    regular = away <= OUTLIER * usual
+    return rule.laser_sign * float(distances[regular].mean()), int((~regular).sum())
 
 
 def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:
@@ -248,13 +248,13 @@ def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:
     out: list[Move | None] = []
     for before, after in pairwise(rests):
         change = after.position_m - before.position_m
-        moved = np.abs(change) > rule.step_tolerance * steps
-        if not moved.any():
+        axes_moved = np.abs(change) > rule.step_tolerance * steps
+        if not axes_moved.any():
             # A rest interrupted by a twitch of an axis: joining its parts would hide the
             # twitch. The run ends here.
             out.append(None)
             continue
-        axis = int(np.argmax(moved))
+        axis = int(np.argmax(axes_moved))
         fits = abs(abs(change[axis]) - steps[axis]) <= rule.step_tolerance * steps[axis]
         out.append(
             Move(
@@ -263,7 +263,7 @@ def _moves(rests: Sequence[Rest], rule: CutRule) -> list[Move | None]:
                 min(before.position_m[axis], after.position_m[axis]),
                 after.laser_m - before.laser_m,
             )
-            if moved.sum() == 1 and fits
+            if axes_moved.sum() == 1 and fits
             else None
         )
     return out
@@ -287,15 +287,15 @@ def _chains(moves: Sequence[Move | None]) -> list[list[Move]]:
 
 
 def _continues(chain: list[Move], move: Move) -> bool:
-    same = [earlier for earlier in chain if earlier.axis == move.axis]
-    if same and same[-1].sense != move.sense:
+    same_axis = [earlier for earlier in chain if earlier.axis == move.axis]
+    if same_axis and same_axis[-1].sense != move.sense:
         return False
     period = next(
         (index for index in range(1, len(chain)) if chain[index].axis == chain[0].axis), None
     )
     if period is None:
         # The first cycle is not closed: X may follow X (a run of one axis) or close the cycle.
-        return not same or move.axis == chain[0].axis
+        return not same_axis or move.axis == chain[0].axis
     return chain[len(chain) - period].axis == move.axis
 
 
@@ -318,7 +318,9 @@ def _blocks_of(chain: list[Move], name: str, dim: int) -> int:
 def _origin(named: dict[str, list[list[Move]]]) -> dict[int, float]:
     """Return the lowest position of a move on every axis, m."""
     origin: dict[int, float] = {}
-    for move in (move for each in named.values() for chain in each for move in chain):
+    for move in (
+        move for chains_of_run in named.values() for chain in chains_of_run for move in chain
+    ):
         origin[move.axis] = min(origin.get(move.axis, np.inf), move.low_m)
     return origin
 
@@ -326,7 +328,7 @@ def _origin(named: dict[str, list[list[Move]]]) -> dict[int, float]:
 def _readings(chain: list[Move], name: str, origin: dict[int, float], rule: CutRule) -> np.ndarray:
     """Return the readings of a run, (D, n), or (n,) for a run of one axis; by position."""
     dim, steps = len(rule.steps_m), np.array(rule.steps_m)
-    alone = len(name) == 1
+    single_axis = len(name) == 1
     n = _blocks_of(chain, name, dim)
     if n > MAX_BLOCKS:
         raise InputError("recording", f"{n} blocks", f"at most {MAX_BLOCKS} are handled")
@@ -340,18 +342,18 @@ def _readings(chain: list[Move], name: str, origin: dict[int, float], rule: CutR
                 f"the run has {n} blocks only and starts elsewhere on the axis",
                 "run all diagonals and axes over the same range",
             )
-        nominal = steps[move.axis] if alone else (steps**2 / np.linalg.norm(steps))[move.axis]
+        nominal = steps[move.axis] if single_axis else (steps**2 / np.linalg.norm(steps))[move.axis]
         check_reading(move.reading_m, nominal, where)
         out[move.axis, block] = move.reading_m
-    return out[chain[0].axis] if alone else out
+    return out[chain[0].axis] if single_axis else out
 
 
 def _same_length(named: dict[str, list[list[Move]]], dim: int) -> None:
     lengths = {
-        name: {_blocks_of(chain, name, dim) for chain in each} for name, each in named.items()
+        name: {_blocks_of(chain, name, dim) for chain in chains} for name, chains in named.items()
     }
-    if len({length for each in lengths.values() for length in each}) > 1:
-        counts = ", ".join(f"{name} {sorted(each)}" for name, each in sorted(lengths.items()))
+    if len({length for of_run in lengths.values() for length in of_run}) > 1:
+        counts = ", ".join(f"{name} {sorted(of_run)}" for name, of_run in sorted(lengths.items()))
         raise InputError(
             "recording",
             f"runs of different numbers of blocks: {counts}",
@@ -359,10 +361,10 @@ def _same_length(named: dict[str, list[list[Move]]], dim: int) -> None:
         )
 
 
-def _stack(each: list[np.ndarray]) -> np.ndarray:
+def _stack(arrays: list[np.ndarray]) -> np.ndarray:
     """Return arrays (repeats, ...) side by side, (most repeats, number, ...), NaN where fewer."""
-    most = max(map(len, each))
-    out = np.full((most, len(each), *each[0].shape[1:]), np.nan)
-    for index, array in enumerate(each):
+    most = max(map(len, arrays))
+    out = np.full((most, len(arrays), *arrays[0].shape[1:]), np.nan)
+    for index, array in enumerate(arrays):
         out[: len(array), index] = array
     return out
