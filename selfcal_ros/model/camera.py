@@ -99,9 +99,9 @@ class StageYawMap:
 
 def shown_by_images(data: Any) -> tuple[CameraErrors | None, StageYawMap | None]:
     """Return the camera and the yaw of the stage from ``camera`` of RESULT.json."""
-    found = dict(read(dict, data or {}))
-    yaw = read(StageYawMap | None, found.pop("yaw", None))
-    return (read(CameraErrors, found) if found else None), yaw
+    fields = dict(read(dict, data or {}))
+    yaw = read(StageYawMap | None, fields.pop("yaw", None))
+    return (read(CameraErrors, fields) if fields else None), yaw
 
 
 def camera_to_dict(camera: CameraErrors | None, yaw: StageYawMap | None) -> dict[str, Any]:

@@ -94,12 +94,14 @@ def datum_modes(artifact: Artifact, *, scale: bool) -> np.ndarray:
         Whether magnification belongs to the datum (stage: yes, plate: no).
     """
     x, y = artifact.x_m, artifact.y_m
-    one, zero = np.ones(artifact.shape), np.zeros(artifact.shape)
-    modes = [(one, zero), (zero, one), (-y, x)]
+    ones, zeros = np.ones(artifact.shape), np.zeros(artifact.shape)
+    modes = [(ones, zeros), (zeros, ones), (-y, x)]
     return np.array([*modes, (x, y)] if scale else modes)
 
 
-def datum_columns(artifact: Artifact, kind: str, known: np.ndarray, *, scale: bool) -> np.ndarray:
+def datum_columns(
+    artifact: Artifact, kind: str, known_places: np.ndarray, *, scale: bool
+) -> np.ndarray:
     """Return the modes of the datum over known places as columns, (values, modes).
 
     Parameters
@@ -108,14 +110,14 @@ def datum_columns(artifact: Artifact, kind: str, known: np.ndarray, *, scale: bo
         Lattice of the map.
     kind : str
         ``xy``, or ``theta``, whose datum is a constant.
-    known : bool array (nx, ny) or (K,)
+    known_places : bool array (nx, ny) or (K,)
         Places of the values: Gx, then Gy of these sites, or these lines.
     scale : bool
         Whether magnification belongs to the datum.
     """
     if kind == "theta":
-        return np.ones((int(known.sum()), 1))
-    modes = datum_modes(artifact, scale=scale)[:, :, known]
+        return np.ones((int(known_places.sum()), 1))
+    modes = datum_modes(artifact, scale=scale)[:, :, known_places]
     return modes.reshape(len(modes), -1).T
 
 
@@ -125,28 +127,28 @@ def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:
     Sites with NaN stay NaN and are ignored. With the modes of `datum_modes` the result
     satisfies Hu eq. 5 (stage) or eq. 11 (plate).
     """
-    known = np.isfinite(field_m).all(axis=0)
-    basis = modes[:, :, known].reshape(len(modes), -1).T
+    known_sites = np.isfinite(field_m).all(axis=0)
+    basis = modes[:, :, known_sites].reshape(len(modes), -1).T
     basis = basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
-    coefficients = np.linalg.lstsq(basis, field_m[:, known].ravel(), rcond=None)[0]
+    coefficients = np.linalg.lstsq(basis, field_m[:, known_sites].ravel(), rcond=None)[0]
     out = field_m.copy()
-    out[:, known] -= (basis @ coefficients).reshape(2, -1)
+    out[:, known_sites] -= (basis @ coefficients).reshape(2, -1)
     return out
 
 
 def first_order(artifact: Artifact, g_m: np.ndarray) -> tuple[float, float]:
     """Return O and R (Hu eq. 6) of a map (2, nx, ny), m; NaN where it is unknown."""
-    known = np.isfinite(g_m).all(axis=0)
+    known_sites = np.isfinite(g_m).all(axis=0)
     half_m = float(np.abs([artifact.x_m, artifact.y_m]).max())
     x, y = artifact.x_m / half_m, artifact.y_m / half_m
     rigid = datum_modes(artifact, scale=True)
     rigid[2:] /= half_m
-    modes = np.concatenate([rigid, [(y, x), (x, -y)]])[:, :, known]
+    modes = np.concatenate([rigid, [(y, x), (x, -y)]])[:, :, known_sites]
     rows = modes.reshape(len(modes), -1)
     # A few sites may not separate the modes: the smallest coefficients that fit.
     inverse = np.linalg.pinv(rows @ rows.T, rcond=1e-12, hermitian=True)
-    found = inverse @ (rows @ g_m[:, known].ravel())
-    return float(found[4]) / half_m, float(found[5]) / half_m
+    coefficients = inverse @ (rows @ g_m[:, known_sites].ravel())
+    return float(coefficients[4]) / half_m, float(coefficients[5]) / half_m
 
 
 def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
@@ -179,7 +181,7 @@ def _slope(values: np.ndarray, pitch_m: float) -> np.ndarray:
     return np.tensordot(steps / (steps @ steps), values, axes=1)
 
 
-def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+def slope_rows(z_m: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
     """Return the slopes of `half_axis_slopes` as rows over the sites, complex (4, nx, ny).
 
     The row of a half axis with fewer than two known sites is zero.
@@ -188,7 +190,7 @@ def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
     ----------
     z_m : complex array (nx, ny)
         Site positions, m.
-    known : bool array (nx, ny)
+    known_sites : bool array (nx, ny)
         Sites to use.
     """
     hx, hy = (size // 2 for size in z_m.shape)
@@ -199,12 +201,12 @@ def slope_rows(z_m: np.ndarray, known: np.ndarray) -> np.ndarray:
         (np.s_[:hx, hy], 1j),
         (np.s_[hx, :hy], -1),
     )
-    for row, (part, unit) in zip(out, halves, strict=True):
-        good = known[part]
+    for row, (half_axis, unit) in zip(out, halves, strict=True):
+        good = known_sites[half_axis]
         if good.sum() >= 2:
-            at = (z_m[part].real + z_m[part].imag) * good
+            at = (z_m[half_axis].real + z_m[half_axis].imag) * good
             centred = (at - at.sum() / good.sum()) * good
-            row[part] = unit * centred / (centred @ centred)
+            row[half_axis] = unit * centred / (centred @ centred)
     return out
 
 
@@ -255,7 +257,7 @@ def _squares(
     """Return the squared errors of known nodes predicted from neighbours, less noise, (k,)."""
     reach = pitches * max(weights)
     if ring:
-        values, u = (np.pad(part, reach, mode="wrap") for part in (values, u))
+        values, u = (np.pad(series, reach, mode="wrap") for series in (values, u))
     n = len(values)
     middle = slice(reach, max(n - reach, reach))
     error, power = values[middle], u[middle] ** 2
@@ -275,5 +277,5 @@ def share_between(position: np.ndarray) -> np.ndarray:
 
     The parabola 4 s (1 - s) over a cell, with the mean square `CELL_MEAN`: 0 at the nodes.
     """
-    part = position - np.floor(position)
-    return 4 * part * (1 - part)
+    fraction = position - np.floor(position)
+    return 4 * fraction * (1 - fraction)

@@ -167,19 +167,19 @@ class Kept:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON form: the keys of what there is."""
-        parts = {
+        sections = {
             ADDED: self.added,
             FACTORS: self.factors and self.factors.to_dict(),
             ANGULAR: dict(self.angular) or None,
             IMAGES: self.images,
             COVARIANCE: {
                 key: value
-                for kind, kept in self.covariances.items()
-                for key, value in ((kind, kept.lower), (f"scale_{kind}", kept.scale))
+                for kind, covariance in self.covariances.items()
+                for key, value in ((kind, covariance.lower), (f"scale_{kind}", covariance.scale))
             }
             or None,
         }
-        return {key: plain(part) for key, part in parts.items() if part is not None}
+        return {key: plain(section) for key, section in sections.items() if section is not None}
 
 
 def kept_from_dict(
@@ -231,29 +231,29 @@ def kept_from_dict(
 
 
 def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...], lines: int) -> Factors:
-    kept = read(dict, data)
-    terms = read(tuple[str, ...], kept["terms"])
+    fields = read(dict, data)
+    terms = read(tuple[str, ...], fields["terms"])
     factors = _numbers(
-        kept["factors"], (len(terms), 2, *of_map), FACTORS, "no factors of this lattice"
+        fields["factors"], (len(terms), 2, *of_map), FACTORS, "no factors of this lattice"
     )
     shapes = {"plate": (2, *of_plate), "lines": (2, lines)}
-    beside = dict(read(dict, kept.get("beside", {})))
-    with_map, known = read(int, beside.pop("with_map", 0)), {}
-    for name, values in beside.items():
-        known[name] = _numbers(
+    quantities = dict(read(dict, fields.get("beside", {})))
+    with_map, quantity_values = read(int, quantities.pop("with_map", 0)), {}
+    for name, values in quantities.items():
+        quantity_values[name] = _numbers(
             values,
             (len(read(list, values)), *shapes.get(name, (4,))),
             FACTORS,
             f"no {name} of this plate",
         )
-    numbers = {len(values) for values in known.values()}
-    if known and (len(numbers) > 1 or not 0 <= with_map <= min(*numbers, len(terms))):
+    numbers = {len(values) for values in quantity_values.values()}
+    if quantity_values and (len(numbers) > 1 or not 0 <= with_map <= min(*numbers, len(terms))):
         raise ValueError(f"{FACTORS}: quantities beside the map of other factors")
-    on_plate = kept.get("effects_on_plate")
+    on_plate = fields.get("effects_on_plate")
     return Factors(
         terms,
         factors,
-        known,
+        quantity_values,
         with_map,
         None
         if on_plate is None
@@ -266,9 +266,9 @@ def _numbers(
 ) -> np.ndarray:
     """Return numbers of a shape; ValueError says where they are wrong, and what is."""
     try:
-        found = read(np.ndarray, value).reshape(shape)
+        numbers = read(np.ndarray, value).reshape(shape)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{where}: {wrong}") from error
-    if finite and not np.isfinite(found).all():
+    if finite and not np.isfinite(numbers).all():
         raise ValueError(f"{where}: {wrong}")
-    return found
+    return numbers

@@ -111,14 +111,14 @@ def marks_of(
             "give each mark an id, x and y",
         )
     where = where or [f"artifact marks[{i}]" for i in range(len(ids))]
-    whole = where[0].rpartition(":")[0] if where and ":" in where[0] else "artifact marks"
+    where_of_list = where[0].rpartition(":")[0] if where and ":" in where[0] else "artifact marks"
     if not MARKS_RANGE[0] <= len(ids) <= MARKS_RANGE[1]:
         raise InputError(
-            whole,
+            where_of_list,
             f"{len(ids)} marks, not {MARKS_RANGE[0]} to {MARKS_RANGE[1]}",
             "list the marks of the plate, one a line",
         )
-    known: dict[int, str] = {}
+    where_of_id: dict[int, str] = {}
     for number, x, y, place in zip(ids, x_m, y_m, where, strict=True):
         if not -(2**31) <= number < 2**31:
             raise InputError(place, f"id {number} is no 32 bit integer", "number the marks anew")
@@ -134,43 +134,43 @@ def marks_of(
                 f"({x:g}, {y:g}) m of mark {number} is beyond every plate ({MOST_M:g} m)",
                 "is it in mm? give x and y in m",
             )
-        if number in known:
+        if number in where_of_id:
             raise InputError(
                 place,
-                f"the id {number} is used already in {known[number]}",
+                f"the id {number} is used already in {where_of_id[number]}",
                 "give every mark its own id",
             )
-        known[number] = place
+        where_of_id[number] = place
     order = np.argsort(ids)
-    found = MarkList(
+    marks = MarkList(
         tuple(int(ids[i]) for i in order),
         tuple(float(x_m[i]) for i in order),
         tuple(float(y_m[i]) for i in order),
     )
-    _check_places(found, whole, known)
-    return found
+    _check_places(marks, where_of_list, where_of_id)
+    return marks
 
 
-def _check_places(marks: MarkList, whole: str, known: dict[int, str]) -> None:
+def _check_places(marks: MarkList, where_of_list: str, where_of_id: dict[int, str]) -> None:
     """Raise InputError for marks at one place, on one line, or off the plate's centre."""
     nearest = int(marks.neighbours[0].argmin())
     if marks.neighbours[0][nearest] < LEAST_DISTANCE_M:
         first, second = sorted((nearest, int(marks.neighbours[1][nearest])))
         raise InputError(
-            known[marks.ids[second]],
+            where_of_id[marks.ids[second]],
             f"marks {marks.ids[first]} and {marks.ids[second]} lie at one place",
             "delete one of them",
         )
     length, width = np.linalg.svd(marks.places_m - marks.places_m.mean(axis=1)[:, None])[1]
     if width < THINNEST * length:
         raise InputError(
-            whole, "all marks lie on one line", "use a plate with marks in two directions"
+            where_of_list, "all marks lie on one line", "use a plate with marks in two directions"
         )
     low, high = marks.places_m.min(axis=1), marks.places_m.max(axis=1)
     middle = (low + high) / 2
     if (np.abs(middle) > FARTHEST_CENTRE * (high - low) / 2).any():
         raise InputError(
-            whole,
+            where_of_list,
             f"the marks lie about ({middle[0]:g}, {middle[1]:g}) m, not about the plate's centre",
             "count x and y from the centre of the plate: subtract this place from all",
         )

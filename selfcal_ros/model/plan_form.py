@@ -108,7 +108,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
     if not views:
         raise InputError(where, "the plan has no views", "add at least one view")
     for index, view in enumerate(views):
-        if view.name in [other.name for other in views[:index]]:
+        if view.name in [earlier.name for earlier in views[:index]]:
             raise InputError(
                 f"{where}: views[{index}]",
                 f"the name '{view.name}' is used twice",
@@ -209,19 +209,19 @@ def _check_degrees(rotation_deg: float, where: str) -> None:
 
 def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, float]:
     """Return the translation of a view in PLAN.yaml, m; (0, 0) if it has none."""
-    given = [key for key in ("translation_pitch", "translation_mm") if raw[key] is not None]
-    if len(given) > 1:
-        raise InputError(where, f"{' and '.join(given)} are given", "leave one of them out")
-    if given == ["translation_pitch"] and artifact.marks is not None:
+    keys = [key for key in ("translation_pitch", "translation_mm") if raw[key] is not None]
+    if len(keys) > 1:
+        raise InputError(where, f"{' and '.join(keys)} are given", "leave one of them out")
+    if keys == ["translation_pitch"] and artifact.marks is not None:
         raise InputError(
             f"{where}: translation_pitch",
             "a list of marks has no pitch",
             "give translation_mm: [a, b]",
         )
-    shift = raw[given[0]] if given else [0, 0]
+    shift = raw[keys[0]] if keys else [0, 0]
     if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
-        raise InputError(f"{where}: {given[0]}", "not two numbers", "give [a, b]")
-    if given == ["translation_mm"]:
+        raise InputError(f"{where}: {keys[0]}", "not two numbers", "give [a, b]")
+    if keys == ["translation_mm"]:
         return shift[0] / MM_PER_M, shift[1] / MM_PER_M
     return shift[0] * artifact.grid_pitch_m, shift[1] * artifact.grid_pitch_m
 
@@ -248,13 +248,13 @@ def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
 
 def plan_to_dict(plan: Plan) -> dict[str, Any]:
     """Return a plan in the format of PLAN.yaml."""
-    artifact, own = plan.artifact, map_to_dict(plan.artifact)
+    artifact, map_fields = plan.artifact, map_to_dict(plan.artifact)
     marks, offset_m = plan.check_stops
     image = next((view.image for view in plan.views if view.image), None)
     return {
         "plan_id": plan.plan_id,
         "artifact": artifact_to_dict(artifact),
-        **({"map": own} if own else {}),
+        **({"map": map_fields} if map_fields else {}),
         "views": [view_to_dict(view, artifact) for view in plan.views],
         **({"check_stops": {"marks": marks, "offset": offset_m}} if marks else {}),
         **({"image": dict(vars(image))} if image else {}),

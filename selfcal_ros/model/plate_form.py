@@ -12,15 +12,15 @@ from selfcal_ros.model.marks import marks_of
 
 def map_to_dict(artifact: Artifact) -> dict[str, Any]:
     """Return what a map has of its own in the form of ``map`` in PLAN.yaml; empty if nothing."""
-    grid, own = artifact.map_grid, {}
+    grid, map_fields = artifact.map_grid, {}
     if grid is not None:
-        own = {
+        map_fields = {
             "grid_size": grid.size,
             "grid_pitch": grid.pitch_m,
             "interpolation": str(grid.interpolation),
             **({"grid_size_y": grid.size_y} if grid.size_y else {}),
         }
-    return own | ({"harmonics": artifact.harmonics} if artifact.harmonics else {})
+    return map_fields | ({"harmonics": artifact.harmonics} if artifact.harmonics else {})
 
 
 def map_grid_from_dict(data: dict[str, Any]) -> MapGrid | None:
@@ -43,8 +43,8 @@ def map_grid_from_dict(data: dict[str, Any]) -> MapGrid | None:
 
 def harmonics_of(data: dict, where: str) -> int:
     """Return the harmonics of the angular map in a plan; 0 if it does not give them."""
-    given = {"harmonics": data.get("harmonics", 0)}
-    return checked_fields(given, where, {"harmonics": int})["harmonics"]
+    fields = {"harmonics": data.get("harmonics", 0)}
+    return checked_fields(fields, where, {"harmonics": int})["harmonics"]
 
 
 def map_grid_of(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
@@ -164,8 +164,8 @@ def with_nodes(artifact: Artifact, text: str, where: str) -> Artifact:
             f"'{text}' is not NODES[:INTERPOLATION]",
             "give a number of nodes a side from 3 on, e.g. 9:bicubic",
         )
-    given = {"grid_size": int(size), "interpolation": interpolation or str(Interpolation.BICUBIC)}
+    fields = {"grid_size": int(size), "interpolation": interpolation or str(Interpolation.BICUBIC)}
     field = artifact.field
     if field.half[0] == field.half[1]:
-        given["grid_pitch"] = 2 * field.half[0] * field.grid_pitch_m / (int(size) - 1)
-    return replace(artifact, map_grid=map_grid_of(given, artifact, where))
+        fields["grid_pitch"] = 2 * field.half[0] * field.grid_pitch_m / (int(size) - 1)
+    return replace(artifact, map_grid=map_grid_of(fields, artifact, where))

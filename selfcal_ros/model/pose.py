@@ -369,10 +369,10 @@ def nearest_step(value: float) -> int | None:
 
 def whole_steps(value: float, where: str, unit: str, remedy: str) -> int:
     """Return the whole number that a value is meant to be; InputError if it is not near one."""
-    whole = nearest_step(value)
-    if whole is None:
+    steps = nearest_step(value)
+    if steps is None:
         raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps", remedy)
-    return whole
+    return steps
 
 
 def turn_in_lines(turn_rad: float, artifact: Artifact) -> float | None:

@@ -336,9 +336,11 @@ def left_out(measurements: Measurements, index: int) -> Measurements:
     return replace(measurements, views=views)
 
 
-def without(measurements: Measurements, gone: Iterable[Key], *, mark: bool = False) -> Measurements:
+def without(
+    measurements: Measurements, removed: Iterable[Key], *, mark: bool = False
+) -> Measurements:
     """Return the measurement without some readings; `mark` counts them as rejected."""
-    views, keys = [], set(gone)
+    views, keys = [], set(removed)
     for index, view in enumerate(measurements.views):
         marks = {key[2] for key in keys if key[0] == index and key[1] == "grid"}
         lines = {key[2][0] for key in keys if key[0] == index and key[1] == "angular"}
@@ -370,9 +372,9 @@ def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
     return hashlib.sha256(repr((_KNOWN[readings], sorted(rejected.items()))).encode()).hexdigest()
 
 
-def view_digest(parts: Sequence[ViewReadings], rejected: dict[str, int]) -> str:
+def view_digest(cells: Sequence[ViewReadings], rejected: dict[str, int]) -> str:
     """Return one digest of the readings of a view: of all cells, if it has images."""
-    digests = [readings_digest(part, rejected) for part in parts]
+    digests = [readings_digest(cell, rejected) for cell in cells]
     if len(digests) == 1:
         return digests[0]
     return hashlib.sha256(repr(digests).encode()).hexdigest()
@@ -429,7 +431,7 @@ def placing_digest(artifact: Artifact, view: View) -> str:
     )
     text = ",".join(float(number).hex() for number in numbers)
     text += "".join(
-        repr(part) for part in (artifact.map_grid, view.image, artifact.marks) if part is not None
+        repr(item) for item in (artifact.map_grid, view.image, artifact.marks) if item is not None
     )
     text += f",{artifact.harmonics}" if artifact.harmonics else ""
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -163,10 +163,10 @@ class Recheck:
         return {**_given(self), "calibration": _given(self.calibration)}
 
 
-def _given(part: Any) -> dict[str, Any]:
+def _given(record: Any) -> dict[str, Any]:
     """Return the fields of a dataclass as JSON values, without those that were left out."""
     return {
         field.name: plain(value)
-        for field in fields(part)
-        if (value := getattr(part, field.name)) is not None or field.default is MISSING
+        for field in fields(record)
+        if (value := getattr(record, field.name)) is not None or field.default is MISSING
     }

@@ -147,7 +147,7 @@ class ReferenceLength:
             raise InputError(where, f"'{text}' is not {form}:LENGTH:U", example) from error
         for mark in marks:
             if not artifact.has(*map(np.array, mark)):
-                known = (
+                remedy = (
                     "write the ids of marks in its list"
                     if artifact.marks
                     else (
@@ -156,7 +156,7 @@ class ReferenceLength:
                         )
                     )
                 )
-                raise InputError(where, f"the plate has no mark {mark}", known)
+                raise InputError(where, f"the plate has no mark {mark}", remedy)
         nominal = artifact.grid_pitch_m * math.dist(
             *(tuple(map(float, artifact.places(*map(np.array, mark)))) for mark in marks)
         )
@@ -215,12 +215,12 @@ class ReferenceLength:
             numbers = [*map(number_of, text.split(":"))]
         except ValueError:
             numbers = []
-        known = dict(zip(names, [*numbers, 20.0], strict=False))
+        values = dict(zip(names, [*numbers, 20.0], strict=False))
         if (
             len(numbers) not in (4, 5)
             or not all(map(math.isfinite, numbers))
-            or min(known["u_temperature_k"], known["u_expansion_per_k"]) < 0
-            or not (LEAST_EXPANSION_PER_K <= known["expansion_per_k"] <= MAX_EXPANSION_PER_K)
+            or min(values["u_temperature_k"], values["u_expansion_per_k"]) < 0
+            or not (LEAST_EXPANSION_PER_K <= values["expansion_per_k"] <= MAX_EXPANSION_PER_K)
         ):
             raise InputError(
                 "reference length",
@@ -228,18 +228,18 @@ class ReferenceLength:
                 "write e.g. 20.4:0.05:0.5e-6:0.05e-6 (degC, K, 1/K, 1/K)",
             )
         for name in ("temperature_c", "certified_at_c"):
-            check_celsius(known[name], "reference length", f" in '{text}'")
-        warmer = known["temperature_c"] - known["certified_at_c"]
+            check_celsius(values[name], "reference length", f" in '{text}'")
+        warmer = values["temperature_c"] - values["certified_at_c"]
         sign = 1 if self.kind.of_plate else -1  # a longer scale indicates less
         return replace(
             self,
-            relative_error=self.relative_error + sign * known["expansion_per_k"] * warmer,
+            relative_error=self.relative_error + sign * values["expansion_per_k"] * warmer,
             u_relative=math.hypot(
                 self.u_relative,
-                known["expansion_per_k"] * known["u_temperature_k"],
-                warmer * known["u_expansion_per_k"],
+                values["expansion_per_k"] * values["u_temperature_k"],
+                warmer * values["u_expansion_per_k"],
             ),
-            certified=Certified(self.relative_error, self.u_relative, **known),
+            certified=Certified(self.relative_error, self.u_relative, **values),
         )
 
 

@@ -176,8 +176,8 @@ class Noise:
 
         Where they are not known, those of the noise alone.
         """
-        found = float(getattr(self, f"dof_map_{kind}"))
-        return found if found > 0 else float(getattr(self, f"dof_{kind}"))
+        map_dof = float(getattr(self, f"dof_map_{kind}"))
+        return map_dof if map_dof > 0 else float(getattr(self, f"dof_{kind}"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,7 +316,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
             **artifact_to_dict(artifact),
             **{key: plain(getattr(amap, key)) for key in ("magnification", "u_magnification")},
         },
-        **({"map": own} if (own := map_to_dict(artifact)) else {}),
+        **({"map": map_fields} if (map_fields := map_to_dict(artifact)) else {}),
         "run_id": result.run_id,
         "verdict": plain(verdict_to_dict(result.verdict)),
         "model": plain(result.model),
@@ -357,11 +357,15 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "noise": plain(result.noise),
         "rejected": dict(result.rejected),
         "warnings": list(result.warnings),
-        "findings": plain([finding_to_dict(found) for found in result.findings]),
+        "findings": plain([finding_to_dict(finding) for finding in result.findings]),
         "budget": plain([line_to_dict(line) for line in result.budget]),
         "input": dict(result.input),
         **({} if result.recheck is None else {"recheck": result.recheck.to_dict()}),
-        **({"camera": shown} if (shown := camera_to_dict(result.camera, result.stage_yaw)) else {}),
+        **(
+            {"camera": camera_fields}
+            if (camera_fields := camera_to_dict(result.camera, result.stage_yaw))
+            else {}
+        ),
         **result.kept.to_dict(),
         **{key: plain(value) for key, value in result.extra.items()},
     }
@@ -381,12 +385,12 @@ def digests_of(data: dict[str, Any]) -> dict[str, str]:
     """
     provenance = dict(data.get("provenance") or {})
     provenance.pop("created", None)
-    found = {}
+    digests = {}
     for key, value in {**data, "provenance": provenance}.items():
         text = json.dumps(value, sort_keys=True, separators=(",", ":"))
-        found[key] = hashlib.sha256(text.encode()).hexdigest()[:16]
-    found.pop(DIGEST, None)
-    return found
+        digests[key] = hashlib.sha256(text.encode()).hexdigest()[:16]
+    digests.pop(DIGEST, None)
+    return digests
 
 
 def require_unchanged(data: dict[str, Any], where: str) -> bool:
@@ -474,7 +478,7 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
 
 def _parse(data: dict) -> CalibrationResult:
     raw = data["artifact"]
-    grid, own = data.get("map", {}), read(int, data.get("map", {}).get("harmonics", 0))
+    grid, harmonics = data.get("map", {}), read(int, data.get("map", {}).get("harmonics", 0))
     artifact = (
         Artifact(
             raw["grid_size"],
@@ -485,7 +489,7 @@ def _parse(data: dict) -> CalibrationResult:
         if "marks" not in raw
         else artifact_of({key: raw[key] for key in ("marks", "angular_count")}, "artifact")
     )
-    artifact = replace(artifact, map_grid=map_grid_from_dict(grid), harmonics=own)
+    artifact = replace(artifact, map_grid=map_grid_from_dict(grid), harmonics=harmonics)
     emap, amap = data["error_map"], data["artifact_map"]
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.field.shape)
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
@@ -496,14 +500,14 @@ def _parse(data: dict) -> CalibrationResult:
         scale_difference=read(float, emap["scale_difference"]),
         datum_theta=ThetaDatum(emap["datum_theta"]),
     )
-    seen = _seen_from_dict(read(dict, data["observability"]))
+    observability = _seen_from_dict(read(dict, data["observability"]))
     camera, stage_yaw = shown_by_images(data.get("camera"))
     return CalibrationResult(
         read(str, data["plan_id"]),
         error_map,
         _plate(amap, artifact, raw),
         views=tuple(map(_view, data["views"])),
-        observability=seen,
+        observability=observability,
         noise=read(Noise, data["noise"]),
         rejected={key: read(int, value) for key, value in data["rejected"].items()},
         input={key: read(str, value) for key, value in data["input"].items()},
@@ -512,7 +516,7 @@ def _parse(data: dict) -> CalibrationResult:
         sense=read(str, data.get("measurement_sense", "microscope_moves")),
         extra={key: value for key, value in data.items() if key not in _KNOWN},
         kept=kept_from_dict(data, artifact.field.shape, artifact.shape, artifact.angular_count),
-        verdict=verdict_from_dict(data.get("verdict"), identifiable=seen.identifiable),
+        verdict=verdict_from_dict(data.get("verdict"), identifiable=observability.identifiable),
         model=read(ModelResult, data.get("model") or {}),
         reference=reference_from_dict(data.get("reference")),
         provenance=provenance_from_dict(data.get("provenance")),
@@ -561,13 +565,13 @@ def _view(v: dict) -> ViewResult:
     )
 
 
-def _seen_to_dict(seen: Observability) -> dict[str, Any]:
+def _seen_to_dict(observability: Observability) -> dict[str, Any]:
     """Return the JSON form of an observability: modes and advice in words."""
     words = {
-        "modes": [found.text for found in seen.modes],
-        "advice": [found.text for found in seen.advice],
+        "modes": [finding.text for finding in observability.modes],
+        "advice": [finding.text for finding in observability.advice],
     }
-    return plain(replace(seen, modes=(), advice=())) | words
+    return plain(replace(observability, modes=(), advice=())) | words
 
 
 def _seen_from_dict(data: dict[str, Any]) -> Observability:

@@ -98,8 +98,8 @@ def default_of(block: Block) -> ModelTerm:
     return ModelTerm(block.name, max(block.sizes))
 
 
-def nominal_terms(known: Collection[str], *, visits: bool) -> list[ModelTerm]:
-    """Return terms that are not assumed by default, except those `known`, in nominal sizes.
+def nominal_terms(known_terms: Collection[str], *, visits: bool) -> list[ModelTerm]:
+    """Return terms that are not assumed by default, except `known_terms`, in nominal sizes.
 
     `visits`: whether the visits of all views are known, as some terms require.
     """
@@ -107,7 +107,7 @@ def nominal_terms(known: Collection[str], *, visits: bool) -> list[ModelTerm]:
         ModelTerm(block.name, block.nominal)
         for block in blocks().values()
         if block.nominal
-        and not (block.sizes or block.part_of or block.name in known)
+        and not (block.sizes or block.part_of or block.name in known_terms)
         and (visits or not block.needs_visits)
     ]
 
@@ -154,24 +154,24 @@ def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
     InputError
         For an unknown or duplicate term, or an invalid size.
     """
-    found: dict[str, ModelTerm] = {}
-    for text in (part.strip() for item in texts for part in item.split(",")):
+    terms: dict[str, ModelTerm] = {}
+    for text in (piece.strip() for item in texts for piece in item.split(",")):
         if not text:
             continue
         name, colon, size = text.partition(":")
         if name not in blocks():
             raise InputError(where, f"the term '{name}' is unknown", known_are(name, blocks()))
         term = _term(name, size.split(":") if colon else [], f"{where}: {name}")
-        if term.name in found:
+        if term.name in terms:
             raise InputError(where, f"the term '{name}' is given twice", "remove one")
-        found[term.name] = term
-    return in_order(found.values())
+        terms[term.name] = term
+    return in_order(terms.values())
 
 
 def in_order(terms: Iterable[ModelTerm]) -> tuple[ModelTerm, ...]:
     """Return terms in the order of the blocks."""
-    found = {term.name: term for term in terms}
-    return tuple(found[name] for name in blocks() if name in found)
+    term_of_name = {term.name: term for term in terms}
+    return tuple(term_of_name[name] for name in blocks() if name in term_of_name)
 
 
 def _term(name: str, texts: list[str], where: str) -> ModelTerm:
@@ -184,7 +184,7 @@ def _term(name: str, texts: list[str], where: str) -> ModelTerm:
             f"{len(sizes)} sizes are given",
             "give one"
             + (
-                f", or those of {':'.join([name, *(part.upper() for part, _ in parts)])}"
+                f", or those of {':'.join([name, *(part_name.upper() for part_name, _ in parts)])}"
                 if parts
                 else ""
             ),

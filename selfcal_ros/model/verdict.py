@@ -240,7 +240,7 @@ class Provenance:
     extra: dict[str, Any] = field(default_factory=dict)
 
 
-def finding_to_dict(found: Finding) -> dict[str, Any]:
+def finding_to_dict(finding: Finding) -> dict[str, Any]:
     """Return the JSON form of a finding, or of a cause.
 
     Raises
@@ -248,11 +248,11 @@ def finding_to_dict(found: Finding) -> dict[str, Any]:
     ValueError
         If it has no sentence.
     """
-    if not found.text:
-        raise ValueError(f"the finding '{found.name}' is not worded")
-    data = {**vars(found), "mark": list(found.mark)}
-    if isinstance(found, Cause):
-        data["remedies"] = [{remedy.kind: remedy.value} for remedy in found.remedies]
+    if not finding.text:
+        raise ValueError(f"the finding '{finding.name}' is not worded")
+    data = {**vars(finding), "mark": list(finding.mark)}
+    if isinstance(finding, Cause):
+        data["remedies"] = [{remedy.kind: remedy.value} for remedy in finding.remedies]
     return data
 
 
@@ -261,16 +261,16 @@ def findings_from_list(kind: type, data: Any) -> tuple:
     return tuple(
         read(
             kind,
-            found
+            finding
             | {
                 "remedies": [
                     {"kind": name, "value": value}
-                    for remedy in found.get("remedies", [])
+                    for remedy in finding.get("remedies", [])
                     for name, value in remedy.items()
                 ]
             },
         )
-        for found in read(list, data)
+        for finding in read(list, data)
     )
 
 
@@ -281,7 +281,7 @@ def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
         "grade": str(verdict.grade),
         "sentence": verdict.sentence,
         "reasons": list(verdict.reasons),
-        "failed": [finding_to_dict(found) for found in verdict.failed],
+        "failed": [finding_to_dict(finding) for finding in verdict.failed],
         "causes": [finding_to_dict(cause) for cause in verdict.causes],
         "enlarged_by": [vars(item) for item in verdict.enlarged_by],
     }
@@ -318,18 +318,18 @@ def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
             BudgetLine,
             row | {"dof": math.inf if row["dof"] is None else row["dof"], "kind": row["type"]},
         )
-        for row in (read(dict, one) for one in read(list, rows))
+        for row in (read(dict, line) for line in read(list, rows))
     )
 
 
 def provenance_from_dict(data: dict | None) -> Provenance:
     """Return the provenance of a result, as far as known."""
-    known = ("created", "duration_s", "version")
+    own_fields = ("created", "duration_s", "version")
     return (
         Provenance()
         if data is None
         else read(
             Provenance,
-            data | {"extra": {key: value for key, value in data.items() if key not in known}},
+            data | {"extra": {key: value for key, value in data.items() if key not in own_fields}},
         )
     )

@@ -179,11 +179,11 @@ class View:
                 f"{self.check_offset_m:g} m is more than a quarter of the pitch",
                 f"stop at most {most:g} m off the mark; 20e-6 is usual",
             )
-        there = self.on_stage(artifact).n_in_field(artifact) if self.grid else 0
-        if self.check_marks > there:
+        n_in_field = self.on_stage(artifact).n_in_field(artifact) if self.grid else 0
+        if self.check_marks > n_in_field:
             raise InputError(
                 where,
-                f"{self.check_marks} marks are requested, {there} lie in the field",
+                f"{self.check_marks} marks are requested, {n_in_field} lie in the field",
                 "ask for fewer marks",
             )
 
@@ -216,10 +216,10 @@ class View:
             If the pose is off the lattice, or grid marks are requested at a turn that is
             not a whole quarter.
         """
-        where, beside = f"view '{self.name}'", self._beside(artifact)
+        where, quarter_shift = f"view '{self.name}'", self._beside(artifact)
         a, b = (
             self._half_steps(step, artifact)
-            if beside
+            if quarter_shift
             else whole_steps(step, f"{where} translation", "pitch", f"place the plate on the {OFF}")
             for step in self._pitches(artifact)
         )
@@ -246,8 +246,8 @@ class View:
         """Return whether the grid marks, if any are wanted, lie on the artifact's lattice."""
         if artifact.marks is not None:
             return False
-        turn, beside = self.rotation_rad / (math.pi / 2), self._beside(artifact)
-        steps = (*(step - beside for step in self._pitches(artifact)), turn)
+        turn, quarter_shift = self.rotation_rad / (math.pi / 2), self._beside(artifact)
+        steps = (*(step - quarter_shift for step in self._pitches(artifact)), turn)
         return not self.grid or all(nearest_step(step) is not None for step in steps)
 
     def _beside(self, artifact: Artifact) -> float:
@@ -257,8 +257,8 @@ class View:
 
     def _half_steps(self, step: float, artifact: Artifact) -> float:
         """Return the odd multiple of 1/2 that a translation in pitches is meant to be."""
-        whole = nearest_step(step - 0.5)
-        if whole is None:
+        whole_pitches = nearest_step(step - 0.5)
+        if whole_pitches is None:
             nx, ny = artifact.shape
             raise InputError(
                 f"view '{self.name}' translation",
@@ -266,7 +266,7 @@ class View:
                 f"{nx} x {ny} marks lie between rows at a shift of {step:.6g} pitch",
                 f"shift it by [0.5, 0.5] pitch to place it on the {OFF}",
             )
-        return whole + 0.5
+        return whole_pitches + 0.5
 
     def _pitches(self, artifact: Artifact) -> tuple[float, float]:
         """Return the translation in pitches; InputError unless the pose is finite."""
@@ -331,12 +331,18 @@ def shared_rotations(placings: Sequence[int], cells: Sequence[tuple[int, int]]) 
     the middle of the cell: where it is known in x and y, readings are freed from it. Cells in one
     line do not tell it: then each has a rotation of its own.
     """
-    seen = {
-        placing: [cell for one, cell in zip(placings, cells, strict=True) if one == placing]
+    cells_of_placing = {
+        placing: [
+            cell
+            for placing_of_cell, cell in zip(placings, cells, strict=True)
+            if placing_of_cell == placing
+        ]
         for placing in placings
     }
     return tuple(
-        placing if all(len(set(along)) > 1 for along in zip(*seen[placing], strict=True)) else row
+        placing
+        if all(len(set(along)) > 1 for along in zip(*cells_of_placing[placing], strict=True))
+        else row
         for row, placing in enumerate(placings)
     )
 

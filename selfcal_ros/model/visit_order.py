@@ -187,8 +187,8 @@ def _visits(
     index, number = np.concatenate(rows), np.repeat(np.arange(len(rows)), [*map(len, rows)])
     aside = view.check_offset_m * np.array(sides).T[:, number]
     exposures = np.where(aside.any(axis=0), 1, together)
-    other = (np.diff(index, prepend=-1) != 0) | np.diff(aside, prepend=0.0).any(axis=0)
-    first = np.flatnonzero(other)
+    new_stop = (np.diff(index, prepend=-1) != 0) | np.diff(aside, prepend=0.0).any(axis=0)
+    first = np.flatnonzero(new_stop)
     count = np.add.reduceat(exposures, first)
     time = np.cumsum(count) - (count + 1) / 2
     (m, n), (i, j) = marks[:, index[first]], sites[:, index[first]]
@@ -232,6 +232,6 @@ def approach_signs(position: np.ndarray, threshold: float = 0.0) -> np.ndarray:
         Sign of the last motion before each stop; 0 until the axis has moved.
     """
     step = np.diff(position, prepend=position[:1])
-    moved = np.abs(step) > threshold
-    last = np.maximum.accumulate(np.where(moved, np.arange(len(step)), 0))
-    return np.where(moved[last], np.sign(step[last]), 0).astype(np.int8)
+    has_moved = np.abs(step) > threshold
+    last = np.maximum.accumulate(np.where(has_moved, np.arange(len(step)), 0))
+    return np.where(has_moved[last], np.sign(step[last]), 0).astype(np.int8)
