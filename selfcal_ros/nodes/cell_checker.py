@@ -58,16 +58,18 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         self.session.take_health(node, message.level[0], message.message)
 
     def _take_diagnostics(self, message: Any) -> None:
-        own = self.get_fully_qualified_name().lstrip("/")
+        own_name = self.get_fully_qualified_name().lstrip("/")
         for status in message.status:
-            if status.name != own:
+            if status.name != own_name:
                 self.session.take_diagnosis(status.name, status.level[0], status.message)
 
     def _tick(self) -> None:
         if self.finished.done():
             return
-        others = self.get_publishers_info_by_topic(self.resolve_topic_name(names.COMMAND.name))
-        if len(others) > 1:
+        command_publishers = self.get_publishers_info_by_topic(
+            self.resolve_topic_name(names.COMMAND.name)
+        )
+        if len(command_publishers) > 1:
             self.say(Level.ERROR, "another node sends view commands: end the sequencer first")
             self._end(ExitCode.BAD_INPUT)
             return

@@ -75,7 +75,7 @@ class MapsOfOneNode:
         if self._has_rivals():
             raise self._of_several(topic)
         self._waiting.append((time.monotonic(), topic, partial(take, message)))
-        of_topic = [one for one in self._waiting if one[1] == topic]
+        of_topic = [entry for entry in self._waiting if entry[1] == topic]
         if len(of_topic) > MOST_WAITING:
             self._waiting.remove(of_topic[0])
             raise InputError(

@@ -62,14 +62,18 @@ def map_geometry(error_map: ErrorMap) -> MapGeometry:
     step = math.ceil(max(artifact.shape) / MOST_SITES)
     spacing = step * artifact.grid_pitch_m
     m, n = artifact.m[:, 0], artifact.n[0]
-    shown = error_map.valid & ((m % step == 0)[:, None] & (n % step == 0)[None, :])
-    x, y, zero = artifact.x_m[shown], artifact.y_m[shown], np.zeros(np.count_nonzero(shown))
+    shown_sites = error_map.valid & ((m % step == 0)[:, None] & (n % step == 0)[None, :])
+    x, y, zero = (
+        artifact.x_m[shown_sites],
+        artifact.y_m[shown_sites],
+        np.zeros(np.count_nonzero(shown_sites)),
+    )
     sites = np.column_stack((x, y, zero))
-    errors = np.column_stack((error_map.gx[shown], error_map.gy[shown], zero))
+    errors = np.column_stack((error_map.gx[shown_sites], error_map.gy[shown_sites], zero))
     longest = float(np.linalg.norm(errors, axis=1).max(initial=0.0))
     factor = enlargement(spacing, longest)
     ends = np.stack((sites, sites + factor * errors), axis=1).reshape(-1, 3)
-    u = np.hypot(error_map.u_gx[shown], error_map.u_gy[shown])
+    u = np.hypot(error_map.u_gx[shown_sites], error_map.u_gy[shown_sites])
     largest = float(np.max(u, where=np.isfinite(u), initial=0.0))
     legend = (
         f"stage error (indicated - true), enlarged {factor:,.0f} x, longest "
@@ -89,8 +93,8 @@ def enlargement(spacing_m: float, longest_m: float) -> float:
 
 
 def _colours(u: np.ndarray, largest: float) -> np.ndarray:
-    part = (u / largest if largest > 0 else np.zeros_like(u))[:, None]
-    colours = (1 - part) * CERTAIN + part * UNCERTAIN
+    fraction = (u / largest if largest > 0 else np.zeros_like(u))[:, None]
+    colours = (1 - fraction) * CERTAIN + fraction * UNCERTAIN
     colours[~np.isfinite(u)] = UNKNOWN
     return colours
 
@@ -196,8 +200,8 @@ def rejected_marker(measurement: Any, frame_id: str) -> Marker:
     """
     wide = measurement.map_grid_pitch or measurement.grid_pitch or UNKNOWN_PITCH_M
     places = np.stack([measurement.rejected_x, measurement.rejected_y], axis=1)
-    known = np.isfinite(places).all(axis=1)
-    above = np.full((known.sum(), 1), wide / 20)  # the vectors of the map
+    finite = np.isfinite(places).all(axis=1)
+    above = np.full((finite.sum(), 1), wide / 20)  # the vectors of the map
     return fill(
         Marker(),
         {
@@ -205,11 +209,11 @@ def rejected_marker(measurement: Any, frame_id: str) -> Marker:
             "ns": "rejected",
             "id": int(measurement.view_index),
             "type": Marker.POINTS,
-            "action": Marker.ADD if known.any() else Marker.DELETE,
+            "action": Marker.ADD if finite.any() else Marker.DELETE,
             "scale": {"x": wide / 5, "y": wide / 5},
             "color": _colour(RED),
             "pose": {"orientation": {"w": 1.0}},
-            "points": _points(np.hstack([places[known], above])),
+            "points": _points(np.hstack([places[finite], above])),
         },
     )
 

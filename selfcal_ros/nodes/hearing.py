@@ -25,10 +25,12 @@ def not_heard(node: Node, publishers: Mapping[str, Publisher], by: str) -> list[
     by : str
         Name of the listening node with its namespace.
     """
-    found = {topic: _reliabilities(node, publisher, by) for topic, publisher in publishers.items()}
+    reliabilities = {
+        topic: _reliabilities(node, publisher, by) for topic, publisher in publishers.items()
+    }
     return [
         topic + (" reliably (another publisher offers best effort)" if heard else "")
-        for topic, heard in found.items()
+        for topic, heard in reliabilities.items()
         if ReliabilityPolicy.RELIABLE not in heard
     ]
 
@@ -55,7 +57,7 @@ def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
     return matched >= len(readers) and by in [_name(reader) for reader in readers]
 
 
-def others_on(node: Node, topics: Iterable[str], own: Iterable[str]) -> dict[str, list[str]]:
+def others_on(node: Node, topics: Iterable[str], own_nodes: Iterable[str]) -> dict[str, list[str]]:
     """Return the nodes that publish on topics, with these topics, but not `own`.
 
     Parameters
@@ -67,13 +69,13 @@ def others_on(node: Node, topics: Iterable[str], own: Iterable[str]) -> dict[str
     own : iterable of str
         Names of nodes with their namespaces; each may publish on a topic once.
     """
-    found: dict[str, list[str]] = {}
-    allowed = Counter(own)
+    topics_of_node: dict[str, list[str]] = {}
+    allowed = Counter(own_nodes)
     for topic in topics:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-        for other in Counter(map(_name, offers)) - allowed:
-            found.setdefault(other, []).append(topic)
-    return found
+        for name in Counter(map(_name, offers)) - allowed:
+            topics_of_node.setdefault(name, []).append(topic)
+    return topics_of_node
 
 
 def _name(reader: TopicEndpointInfo) -> str:

@@ -111,11 +111,14 @@ class JointTrajectoryMachine:
             time.sleep(0.05)
 
     def _on_states(self, message: JointState) -> None:
-        known = dict(zip(message.name, message.position, strict=False))
-        if all(joint in known for joint in self._joints):
+        position_of_joint = dict(zip(message.name, message.position, strict=False))
+        if all(joint in position_of_joint for joint in self._joints):
             with self._news:
                 count, _ = self._states
-                self._states = count + 1, tuple(float(known[joint]) for joint in self._joints)
+                self._states = (
+                    count + 1,
+                    tuple(float(position_of_joint[joint]) for joint in self._joints),
+                )
                 self._news.notify_all()
 
     def _on_image(self, message: ImageMessage) -> None:
@@ -141,12 +144,12 @@ class JointTrajectoryMachine:
 
     def move_to(self, position: tuple[float, ...]) -> None:
         """Send a trajectory of one point, and wait for its time."""
-        here = self.position()
+        start = self.position()
         needed_s = max(
             LEAST_S,
             *(
                 abs(to - at) / speed
-                for to, at, speed in zip(position, here, self._speeds, strict=True)
+                for to, at, speed in zip(position, start, self._speeds, strict=True)
             ),
         )
         self._send(position, needed_s)
@@ -179,9 +182,9 @@ class JointTrajectoryMachine:
     def stop(self) -> None:
         """Send the joints to where they are."""
         with self._news:
-            here = self._states[1]
-        if here and self._trajectory.get_subscription_count():
-            self._send(here, LEAST_S)
+            position = self._states[1]
+        if position and self._trajectory.get_subscription_count():
+            self._send(position, LEAST_S)
 
     def close(self) -> None:
         """Leave the graph."""

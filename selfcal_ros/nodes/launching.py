@@ -87,18 +87,21 @@ def refuse_wrong(context: LaunchContext) -> None:
     Or if `rate` is not a number. launch_ros ignores the first, and on the others leaves the nodes
     running that it had started.
     """
-    given = context.launch_configurations
+    configurations = context.launch_configurations
     try:
-        float(given.get("rate", "1"))
+        float(configurations.get("rate", "1"))
     except ValueError:
         raise InputError(
-            f"rate:={given['rate']}",
+            f"rate:={configurations['rate']}",
             "not a number",
             "give the speed; 0 = as fast as the nodes can follow",
         ) from None
-    if not Path(given["params"]).is_file():
-        raise InputError(f"params:={given['params']}", "no such file", "check the path")
-    if given["foxglove"] == "true" and "foxglove_bridge" not in get_packages_with_prefixes():
+    if not Path(configurations["params"]).is_file():
+        raise InputError(f"params:={configurations['params']}", "no such file", "check the path")
+    if (
+        configurations["foxglove"] == "true"
+        and "foxglove_bridge" not in get_packages_with_prefixes()
+    ):
         raise InputError(
             "foxglove:=true",
             "there is no package foxglove_bridge",

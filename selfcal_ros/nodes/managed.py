@@ -184,8 +184,8 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         self.say(Level.ERROR, f"cannot {step}: {first_line(error)}")
         if not isinstance(error, SelfcalError):
             for line in traceback.format_exception(error):
-                for part in line.splitlines():
-                    self.say(Level.ERROR, part)
+                for printed_line in line.splitlines():
+                    self.say(Level.ERROR, printed_line)
         self.report()
         return TransitionCallbackReturn.ERROR
 

@@ -84,8 +84,8 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
     def _kept(self, topic: names.Topic) -> KeptTopic:
-        own, heard = kept_names(self, topic)
-        return KeptTopic(own, offered(topic), heard)
+        name_in_bag, heard = kept_names(self, topic)
+        return KeptTopic(name_in_bag, offered(topic), heard)
 
     def _journal_folder(self) -> str:
         """Return the folder of this cell's journals, one per namespace."""

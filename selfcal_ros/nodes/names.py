@@ -112,30 +112,30 @@ COMMANDED = (MOTION, CORRECTED_MOTION)
 
 def mismatched(node: Node, heard_on: Mapping[str, Topic]) -> Diagnosis:
     """Name the publishers whose quality of service keeps their messages from this node."""
-    found = []
+    faults = []
     for name, topic in heard_on.items():
         for offer in node.get_publishers_info_by_topic(name):
             verdict, reason = qos_check_compatible(offer.qos_profile, topic.qos)
             if verdict == QoSCompatibility.ERROR:
                 why = reason.removeprefix("ERROR: ").rstrip(";. ")
-                found.append(
+                faults.append(
                     f"{topic.name}: no messages are received from {_name(offer)} ({why}); "
                     "offer the QoS in docs/reference/ros2.md"
                 )
-    return Diagnosis(Level.ERROR if found else Level.OK, "; ".join(found))
+    return Diagnosis(Level.ERROR if faults else Level.OK, "; ".join(faults))
 
 
 def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
     """Name all publishers of a topic that has more than one."""
-    found = []
+    shared_topics = []
     for topic in topics:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
         if len(offers) > 1:
-            found.append(
+            shared_topics.append(
                 f"{topic} has {len(offers)} publishers: "
                 f"{', '.join(sorted(map(_name, offers)))}; only one is allowed"
             )
-    return Diagnosis(Level.WARN if found else Level.OK, "; ".join(found))
+    return Diagnosis(Level.WARN if shared_topics else Level.OK, "; ".join(shared_topics))
 
 
 def rivals(node: Node, topics: Iterable[str]) -> str:
@@ -143,14 +143,14 @@ def rivals(node: Node, topics: Iterable[str]) -> str:
 
     A node is told by its participant as well: two processes may bear one name.
     """
-    found = []
+    shared_topics = []
     for topic in topics:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
         if len({(_name(offer), bytes(offer.endpoint_gid[:PARTICIPANT])) for offer in offers}) > 1:
-            found.append(
+            shared_topics.append(
                 f"{topic} has {len(offers)} publishers: {', '.join(sorted(map(_name, offers)))}"
             )
-    return "; ".join(found)
+    return "; ".join(shared_topics)
 
 
 def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
@@ -158,11 +158,11 @@ def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
 
     Readers of a bag expect the names of the contract, after a namespace.
     """
-    own, heard = (
+    name_in_bag, heard = (
         f"{node.get_namespace().rstrip('/')}/{topic.name}",
         node.resolve_topic_name(topic.name),
     )
-    return own, heard if heard != own else ""
+    return name_in_bag, heard if heard != name_in_bag else ""
 
 
 def offered(topic: Topic) -> dict:

@@ -66,9 +66,9 @@ class Player:
         beside_others: bool = False,
     ) -> None:
         self.node, self.rate, self._bag = node, rate, bag
-        own = node.get_namespace().rstrip("/")
-        self.listener = listener if listener.startswith("/") else f"{own}/{listener}"
-        self.detector = f"{own}/{DetectorSettings.NODE}"
+        own_namespace = node.get_namespace().rstrip("/")
+        self.listener = listener if listener.startswith("/") else f"{own_namespace}/{listener}"
+        self.detector = f"{own_namespace}/{DetectorSettings.NODE}"
         self.playlist = Playlist(Path(bag), namespace, seed)
         if not len(self.playlist):
             raise NoDataError(bag, "no message on the topics of the contract", "see the README")
@@ -92,7 +92,7 @@ class Player:
         self._own = [
             node.get_fully_qualified_name(),
             *(
-                f"{own}/{name}"
+                f"{own_namespace}/{name}"
                 for name in (SequencerSettings.NODE, CollectorSettings.NODE, SolverSettings.NODE)
             ),
         ]
@@ -102,9 +102,9 @@ class Player:
         self._tells = partial(node.count_publishers, received.name)
         node.subscribe(received, self._on_received)
         if images:
-            taken = names.of_node(self.detector, names.RECEIVED)
-            self._detector_tells = partial(node.count_publishers, taken.name)
-            node.subscribe(taken, self._on_taken)
+            taken_topic = names.of_node(self.detector, names.RECEIVED)
+            self._detector_tells = partial(node.count_publishers, taken_topic.name)
+            node.subscribe(taken_topic, self._on_taken)
 
     taken: int | None = None
     """Images that the detector has taken."""
@@ -177,32 +177,32 @@ class Player:
         """
         self._looked_s = time.monotonic()
         looked_s = self._looked_s - self._created_s
-        others = self._others()
+        other_nodes = self._others()
         named = {
-            other: topics
-            for other, topics in others.items()
-            if not other.endswith(UNNAMED) or looked_s > NAME_S
+            name: topics
+            for name, topics in other_nodes.items()
+            if not name.endswith(UNNAMED) or looked_s > NAME_S
         }
-        for other, topics in named.items():
+        for name, topics in named.items():
             raise InputError(
                 f"ROS domain {self.node.context.get_domain_id()}",
-                f"{other} publishes {', '.join(topics)} as well; {self._at} messages were played",
+                f"{name} publishes {', '.join(topics)} as well; {self._at} messages were played",
                 "end it, or play in another ROS domain",
             )
-        return not others and (looked_s >= LOOK_S or not self.alone_on)
+        return not other_nodes and (looked_s >= LOOK_S or not self.alone_on)
 
     def _others(self) -> dict[str, list[str]]:
         """Return who else publishes on which topics; selfcal's nodes may, on topics of their own.
 
         A node of that name on another topic is somebody else's.
         """
-        found: dict[str, list[str]] = {}
+        topics_of_node: dict[str, list[str]] = {}
         for topic in self.alone_on:
             played = topic in self._publishers and topic != COMMAND_TOPIC
-            own = self._own[:1] if played else self._own
-            for other, topics in others_on(self.node, [topic], own).items():
-                found.setdefault(other, []).extend(topics)
-        return found
+            own_nodes = self._own[:1] if played else self._own
+            for name, topics in others_on(self.node, [topic], own_nodes).items():
+                topics_of_node.setdefault(name, []).extend(topics)
+        return topics_of_node
 
     def step(self) -> None:
         """Publish the messages due now.
@@ -255,10 +255,10 @@ class Player:
     def _room(self, played_s: float) -> int:
         """Return the number of messages that subscribers can take, `played_s` after the first."""
         images = self.sent.get(IMAGES, 0)
-        others = self._at - images
+        other_messages = self._at - images
         room = (
             WINDOW
-            - others
+            - other_messages
             + (
                 int(UNHEARD_RATE * played_s / 2)
                 if self.heard is None

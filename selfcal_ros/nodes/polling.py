@@ -67,11 +67,11 @@ class ByTheClock:
         """Take waiting messages, up to `most`; return the number of skipped sequence numbers."""
         is_empty = False
         for _ in range(most):
-            taken = subscription.handle.take_message(subscription.msg_type, True)
-            if taken is None:
+            message_and_info = subscription.handle.take_message(subscription.msg_type, True)
+            if message_and_info is None:
                 is_empty = True
                 break
-            self._take(*taken)
+            self._take(*message_and_info)
         numbers, self._numbers = self._numbers, []
         return self._missing(numbers, subscription.get_publisher_count(), is_empty)
 

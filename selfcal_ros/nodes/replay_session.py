@@ -63,7 +63,7 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         return time.monotonic() > self._deadline
 
     def _wait_for_nodes(self) -> None:
-        alone = [
+        unheard = [
             f"{node} does not listen to {', '.join(topics)}"
             for node, topics in (
                 (self.player.listener, self.player.unheard()),
@@ -72,11 +72,11 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
             if topics
         ]
         ready = self._finish.service_is_ready() and self._save.service_is_ready()
-        if self.player.is_alone() and not alone and ready:
+        if self.player.is_alone() and not unheard and ready:
             self._go(self._play)
         elif self._late():
             self._end(
-                " and ".join(alone) or "no services of collector and solver", ExitCode.INTERNAL
+                " and ".join(unheard) or "no services of collector and solver", ExitCode.INTERNAL
             )
 
     def _play(self) -> None:

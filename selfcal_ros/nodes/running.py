@@ -63,8 +63,8 @@ def _init(argv: list[str] | None) -> None:
     try:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     except (RCLError, UnknownROSArgsError) as error:
-        what = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
-        raise InputError("arguments after --ros-args", what, "correct them") from error
+        reason = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
+        raise InputError("arguments after --ros-args", reason, "correct them") from error
 
 
 def _keep_what_is_loaded() -> None:

@@ -61,7 +61,7 @@ def answering_later(service: Any) -> Any:
 
     def send_response(response: Any, header: Any) -> None:
         if isinstance(response, Later):
-            response.ask(lambda known: send(known, header))
+            response.ask(lambda answer: send(answer, header))
         else:
             send(response, header)
 

@@ -141,9 +141,9 @@ class Solver(ManagedNode[SolverSettings]):
         self.guarded(self._advance)()
 
     def _go_on(self) -> None:
-        done = self._begun - (self._running is not None)
+        n_done = self._begun - (self._running is not None)
         idle = self._running is None and not self.session.stale
-        due = [item for item in self._waiting if idle or item[0] <= done]
+        due = [item for item in self._waiting if idle or item[0] <= n_done]
         self._waiting = [item for item in self._waiting if item not in due]
         for _, then in due:
             then()

@@ -52,29 +52,29 @@ class StageSimulator(CellNode[SimulatorSettings]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(SimulatorSettings, **kwargs)
-        given = self.settings
-        self._settings = settings_of(asdict(given) | {"sense": given.measurement_sense})
-        camera, spread = camera_of(given.camera) if given.camera else (None, None)
-        self._camera, self._spread = camera, spread_of(asdict(given), spread)
+        settings = self.settings
+        self._settings = settings_of(asdict(settings) | {"sense": settings.measurement_sense})
+        camera, spread = camera_of(settings.camera) if settings.camera else (None, None)
+        self._camera, self._spread = camera, spread_of(asdict(settings), spread)
         self.publish(images=camera is not None)
-        self._time, self._step_ns = SimulatedClock(), round(NS_PER_S / given.encoder_rate)
+        self._time, self._step_ns = SimulatedClock(), round(NS_PER_S / settings.encoder_rate)
         self.machine: SimulatedMachine | None = None
         self._visitor: Visitor | None = None
         self._events: Iterator[Event] = iter(())
         self._next: Event | None = None
         self._duty = Duty()
         self._free_ns = 0  # stamp from which it is idle
-        if given.plan:
-            self._prepare(read_plan(given.plan))
+        if settings.plan:
+            self._prepare(read_plan(settings.plan))
         self.subscribe(names.COMMAND, self._on_command)
         self.subscribe(names.STATUS_AS_IT_COMES, self._on_status)
         self.every(0.005, self._on_timer)
 
     def _prepare(self, plan: Plan) -> None:
         """Draw a machine with the plate of a plan, and a placing for each of its views."""
-        given = self.settings
+        settings = self.settings
         self.machine = SimulatedMachine.of(
-            Simulation(plan, given.seed, self._spread, self._settings, camera=self._camera),
+            Simulation(plan, settings.seed, self._spread, self._settings, camera=self._camera),
             self._time,
         )
         cell = Cell(
@@ -89,8 +89,8 @@ class StageSimulator(CellNode[SimulatorSettings]):
             self.machine,
             cell,
             self._time,
-            given.seed,
-            consecutive=given.consecutive,
+            settings.seed,
+            consecutive=settings.consecutive,
             step_ns=self._step_ns,
             detects=self._camera is None,
         )
@@ -100,11 +100,11 @@ class StageSimulator(CellNode[SimulatorSettings]):
                 truth,
                 phi_rad=np.copysign(np.maximum(abs(truth.phi_rad), CHECK_TURN_RAD), truth.phi_rad),
             )
-        if given.truth_path:
+        if settings.truth_path:
             write_truth(
-                Path(given.truth_path),
+                Path(settings.truth_path),
                 self.machine.truth,
-                seed=given.seed,
+                seed=settings.seed,
                 cell=asdict(self._settings),
             )
 
