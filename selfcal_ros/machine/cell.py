@@ -129,17 +129,17 @@ class Cell:
         return value - self.origin.get(axis, 0.0)
 
     def require_limits(
-        self, axis: str, value: float, what: str, start: float | None = None
+        self, axis: str, value: float, motion: str, start: float | None = None
     ) -> None:
         """Raise MachineError for a machine's position that is not a number or leaves the limits.
 
         From a `start` beyond the limits a move back towards them is allowed.
         """
         if not math.isfinite(value):
-            raise MachineError(f"{what}: {axis} = {value} is not a position", str(self.path))
+            raise MachineError(f"{motion}: {axis} = {value} is not a position", str(self.path))
         if axis not in self.limits:
             raise MachineError(
-                f"{what} moves {axis}, which has no limits",
+                f"{motion} moves {axis}, which has no limits",
                 f"{self.path}: limits",
                 f"give limits: {{{axis}: [low, high]}}",
             )
@@ -148,7 +148,7 @@ class Cell:
             return
         if not low <= value <= high:
             raise MachineError(
-                f"{what} is at {axis} = {value:.6g}, beyond the limits {low:g} to {high:g}",
+                f"{motion} is at {axis} = {value:.6g}, beyond the limits {low:g} to {high:g}",
                 f"{self.path}: limits",
                 "correct limits or origin, or take a smaller plan",
             )
@@ -255,10 +255,10 @@ def _mapping(data: Any, where: str) -> dict[str, Any]:
     return data
 
 
-def _only(data: Mapping[str, Any], known: Any, where: str) -> None:
+def _only(data: Mapping[str, Any], known_keys: Any, where: str) -> None:
     for key in data:
-        if key not in known:
-            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known))
+        if key not in known_keys:
+            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known_keys))
 
 
 def _numbers(

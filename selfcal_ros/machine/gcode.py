@@ -109,9 +109,9 @@ class GcodeMachine:
 
     def move_to(self, position: tuple[float, ...]) -> None:
         """Move, and wait for the end of the motion."""
-        here = self._talk.position()
+        start = self._talk.position()
         native = [_from_si(axis, value) for axis, value in zip(self.axes, position, strict=True)]
-        way = math.hypot(*(to - at for to, at in zip(native, here, strict=True)))
+        way = math.hypot(*(to - at for to, at in zip(native, start, strict=True)))
         words = " ".join(
             f"{LETTERS[axis]}{value:.6f}" for axis, value in zip(self.axes, native, strict=True)
         )
@@ -249,7 +249,7 @@ class _Grbl(_Talk):
 
     def _parsed(self, answer: str) -> tuple[str, list[float]]:
         state, *fields = answer.strip("<>").split("|")
-        parts = dict(part.partition(":")[::2] for part in fields)
+        report = dict(field.partition(":")[::2] for field in fields)
         state = state.partition(":")[0].lower()
         if state in ("alarm", "door", "sleep"):
             raise MachineError(
@@ -257,14 +257,14 @@ class _Grbl(_Talk):
                 "controller",
                 "find out why, then home or unlock it ($H, $X)",
             )
-        if "WCO" in parts:
-            self._offset = _numbers(parts["WCO"])
-        if "MPos" in parts:
-            return state, self._chosen(_numbers(parts["MPos"]))
-        if "WPos" in parts and hasattr(self, "_offset"):
+        if "WCO" in report:
+            self._offset = _numbers(report["WCO"])
+        if "MPos" in report:
+            return state, self._chosen(_numbers(report["MPos"]))
+        if "WPos" in report and hasattr(self, "_offset"):
             at = [
                 value + off
-                for value, off in zip(_numbers(parts["WPos"]), self._offset, strict=True)
+                for value, off in zip(_numbers(report["WPos"]), self._offset, strict=True)
             ]
             return state, self._chosen(at)
         raise MachineError(
@@ -322,15 +322,15 @@ class _Marlin(_Talk):
 
     def position(self) -> list[float]:
         for answer in self._ok(self.QUERY):
-            told, _, counted = answer.partition("Count")
-            found = {letter: float(value) for letter, value in NUMBER.findall(told)}
-            found |= {
+            logical, _, counted = answer.partition("Count")
+            position_of_letter = {letter: float(value) for letter, value in NUMBER.findall(logical)}
+            position_of_letter |= {
                 letter: float(value) / self._per_mm[letter]
                 for letter, value in NUMBER.findall(counted)
                 if self._per_mm.get(letter)
             }
-            if {LETTERS[axis] for axis in self._axes} <= found.keys():
-                return [found[LETTERS[axis]] for axis in self._axes]
+            if {LETTERS[axis] for axis in self._axes} <= position_of_letter.keys():
+                return [position_of_letter[LETTERS[axis]] for axis in self._axes]
         raise MachineError("M114 tells no position of all axes", "controller", "correct axes")
 
     def move(self, travel: _Travel) -> None:
@@ -405,7 +405,7 @@ NUMBER = re.compile(r"\b([XYZABC]):\s*(-?\d+\.?\d*)")
 
 def _numbers(text: str) -> list[float]:
     try:
-        return [float(part) for part in text.split(",")]
+        return [float(number) for number in text.split(",")]
     except ValueError:
         raise MachineError(
             f"'{text}' is not a position", "controller", "check baud, cable and its shield"

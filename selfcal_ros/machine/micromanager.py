@@ -117,10 +117,10 @@ class MicroManagerMachine:
             if self._core.hasProperty(self._stage, name)
         )
 
-    def _call(self, what: str, function: Any, *values: Any) -> Any:
+    def _call(self, action: str, function: Any, *values: Any) -> Any:
         """Call the core; its errors become those of a machine."""
         return called(
-            f"{self._where}: {what}", function, *values, remedy="check the device and its cables"
+            f"{self._where}: {action}", function, *values, remedy="check the device and its cables"
         )
 
     def position(self) -> tuple[float, ...]:

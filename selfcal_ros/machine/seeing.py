@@ -53,13 +53,13 @@ class Eye:
         )
 
     def detections(
-        self, shown: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
+        self, image_or_offsets: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
     ) -> list[Detection]:
         """Return the detections in an image or of offsets.
 
         Parameters
         ----------
-        shown : Image or list of Offset
+        image_or_offsets : Image or list of Offset
             What the machine returned.
         stamp_ns : int
             Its instant, unless it has its own.
@@ -73,10 +73,10 @@ class Eye:
         InputError
             If the cell has no detector for it.
         """
-        if isinstance(shown, Image):
-            picture = self.trusted(shown, position)
-            return self._of_images().take_picture(picture, shown.stamp_ns or stamp_ns)
-        return [_detection(offset, stamp_ns) for offset in shown]
+        if isinstance(image_or_offsets, Image):
+            picture = self.trusted(image_or_offsets, position)
+            return self._of_images().take_picture(picture, image_or_offsets.stamp_ns or stamp_ns)
+        return [_detection(offset, stamp_ns) for offset in image_or_offsets]
 
     def _of_images(self) -> "ImageDetector":
         if self._detector is None:

@@ -101,22 +101,22 @@ class Trial:
         """
         visitor = Visitor(self.machine, self.cell, self.clock)
         self.position = visitor.sample()
-        shown = visitor.show()
-        if not isinstance(shown, Image):
+        image_or_offsets = visitor.show()
+        if not isinstance(image_or_offsets, Image):
             self._visitor = visitor
-            seen = [(item.x, item.y) for item in shown if item.theta is None]
-            if not seen:
+            offsets = [(item.x, item.y) for item in image_or_offsets if item.theta is None]
+            if not offsets:
                 raise NoDataError("machine.offsets", "no mark is seen", "move to a mark first")
-            return None, seen
-        given = self.cell.detector
-        if given is None or not given.mark_size:
+            return None, offsets
+        settings = self.cell.detector
+        if settings is None or not settings.mark_size:
             raise InputError(
                 f"{self.cell.path}: detector",
                 "the size of the marks is not stated",
                 "give detector: {mark: disc, mark_size: ...}, in m",
             )
-        picture = visitor.eye.trusted(shown, self.position.positions)
-        size, marks = self._sized(picture, given)
+        picture = visitor.eye.trusted(image_or_offsets, self.position.positions)
+        size, marks = self._sized(picture, settings)
         if not marks:
             raise NoDataError(
                 "machine.image",
@@ -126,12 +126,12 @@ class Trial:
             )
         self.mark_pixels = size
         in_pixels = replace(
-            given,
+            settings,
             pixel_size=1.0,
             mark_size=size,
             turn=0.0,
             mirror=False,
-            mark_width=given.mark_width * size / given.mark_size,
+            mark_width=settings.mark_width * size / settings.mark_size,
         )
         # offsets are pixels in it: those that matter here are those of the stage
         self._visitor = Visitor(self.machine, replace(self.cell, detector=in_pixels), self.clock)
@@ -140,22 +140,24 @@ class Trial:
     def _sized(
         self,
         picture: Picture,
-        given: DetectorSettings,
+        settings: DetectorSettings,
     ) -> tuple[float, list[tuple[float, float]]]:
         """Return the size of a mark, px, and the places of all, columns and rows."""
-        known = self.mark_pixels or (given.mark_size / given.pixel_size if given.pixel_size else 0)
-        best: tuple[float, float, list[tuple[float, float]]] = (0.0, known, [])
-        for size in [known] if known else _sizes(picture.values.shape):
-            width = given.mark_width * size / given.mark_size
+        known_size_px = self.mark_pixels or (
+            settings.mark_size / settings.pixel_size if settings.pixel_size else 0
+        )
+        best: tuple[float, float, list[tuple[float, float]]] = (0.0, known_size_px, [])
+        for size in [known_size_px] if known_size_px else _sizes(picture.values.shape):
+            width = settings.mark_width * size / settings.mark_size
             detector = MarkDetector(
-                replace(given, pixel_size=1.0, mark_size=size, mark_width=width),
+                replace(settings, pixel_size=1.0, mark_size=size, mark_width=width),
                 str(self.cell.path),
             )
-            found, _ = detector.marks(picture)
-            score = sum(mark.score for mark in found) * size
+            marks, _ = detector.marks(picture)
+            score = sum(mark.score for mark in marks) * size
             if score > best[0]:
-                fitted = [mark.fit.shape.get("size", size) for mark in found]
-                best = score, float(np.median(fitted)), [(mark.u, mark.v) for mark in found]
+                fitted = [mark.fit.shape.get("size", size) for mark in marks]
+                best = score, float(np.median(fitted)), [(mark.u, mark.v) for mark in marks]
         return best[1], best[2]
 
     @property
@@ -228,15 +230,15 @@ class Trial:
                 "machine.image",
                 "let the camera expose when it is asked (software trigger), or drop a frame",
             )
-        found = camera_pose(np.array(positions), images, self.cell.sense)
+        pose = camera_pose(np.array(positions), images, self.cell.sense)
         assert self.cell.detector is not None
         require_size(
-            found,
+            pose,
             mark_size_m=self.cell.detector.mark_size,
             mark_pixels=self.mark_pixels,
             where=str(self.cell.path),
         )
-        return found
+        return pose
 
     def _true(self, axis: str, at: EncoderSample) -> float:
         """Return the place of the mark nearest to the axis as position and image tell it, m."""

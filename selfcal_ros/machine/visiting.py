@@ -326,7 +326,7 @@ class Visitor:
                 raise self._sees_nothing(view, empty, at_first=empty > number)
 
     def _sees_nothing(self, view: View, empty: int, *, at_first: bool) -> NoDataError:
-        which = "first" if at_first else "last"
+        first_or_last = "first" if at_first else "last"
         remedy = (
             "place the plate as the view says, check focus, light, and mark_size and "
             "pixel_size in CELL.yaml"
@@ -339,7 +339,7 @@ class Visitor:
             )
         return NoDataError(
             f"view '{view.name}'",
-            f"nothing is seen at the {which} {empty} stops{self.eye.why}",
+            f"nothing is seen at the {first_or_last} {empty} stops{self.eye.why}",
             remedy,
         )
 
@@ -396,8 +396,8 @@ class Visitor:
         MachineError
             If the target is beyond the limits, the position does not follow or does not rest.
         """
-        last, left = self._last, self._left()
-        start = dict(zip(self.axes, left.positions, strict=True))
+        last, departure = self._last, self._left()
+        start = dict(zip(self.axes, departure.positions, strict=True))
         if "theta" in self.axes and "theta" in target:
             turns = round((target["theta"] - start["theta"]) / math.tau)
             target = target | {"theta": self._within_limits(target["theta"] + turns * math.tau)}
@@ -415,9 +415,9 @@ class Visitor:
         if self.cell.settle.time:
             self.clock.sleep(self.cell.settle.time)
         arrival = self._rest(start, goal, target)
-        if last is None or left.stamp_ns - last.stamp_ns > self.step_ns:
-            self._untold.append(left)  # what was read at rest meanwhile may have been told
-        self._untold += self._track(left, arrival)
+        if last is None or departure.stamp_ns - last.stamp_ns > self.step_ns:
+            self._untold.append(departure)  # what was read at rest meanwhile may have been told
+        self._untold += self._track(departure, arrival)
         return arrival
 
     def _left(self) -> EncoderSample:
@@ -568,35 +568,37 @@ class Visitor:
             if self.clock.now_ns() - before.stamp_ns > self.step_ns:
                 before = self.sample()
             began = self.clock.now_ns()
-            shown = self.show(kind)
+            image_or_offsets = self.show(kind)
             ended = self.clock.now_ns()
             after = self.sample()
-            moved = _difference(before, after)
+            motion = _difference(before, after)
             self._last = after
-            if self._rests(moved):
-                found = self._found(shown, (began + ended) // 2, before.positions)
-                self._check_stamps(found, before, after)
-                return before, found, after
+            if self._rests(motion):
+                detections = self._found(image_or_offsets, (began + ended) // 2, before.positions)
+                self._check_stamps(detections, before, after)
+                return before, detections, after
             self._check_axes(before, after)
-            self._check_left_alone(moved)
-        axis = max(self.axes, key=lambda name: abs(moved[name]))
+            self._check_left_alone(motion)
+        axis = max(self.axes, key=lambda name: abs(motion[name]))
         raise MachineError(
-            f"{axis} moved by {_shown(axis, moved[axis])} during {TRIES} exposures",
+            f"{axis} moved by {_shown(axis, motion[axis])} during {TRIES} exposures",
             "machine",
             "wait longer: settle: time in CELL.yaml",
         )
 
     def _found(
-        self, shown: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
+        self, image_or_offsets: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
     ) -> list[Detection | Photo]:
-        if isinstance(shown, Image) and not self.detects:
-            return [Photo(shown.stamp_ns or stamp_ns, np.asarray(shown.pixels))]
-        return [*self.eye.detections(shown, stamp_ns, position)]
+        if isinstance(image_or_offsets, Image) and not self.detects:
+            return [
+                Photo(image_or_offsets.stamp_ns or stamp_ns, np.asarray(image_or_offsets.pixels))
+            ]
+        return [*self.eye.detections(image_or_offsets, stamp_ns, position)]
 
     def _check_stamps(
-        self, found: list[Detection | Photo], before: EncoderSample, after: EncoderSample
+        self, detections: list[Detection | Photo], before: EncoderSample, after: EncoderSample
     ) -> None:
-        for item in found:
+        for item in detections:
             if not before.stamp_ns <= item.stamp_ns <= after.stamp_ns:
                 late_s = (item.stamp_ns - after.stamp_ns) / NS_PER_S
                 raise MachineError(
@@ -608,14 +610,16 @@ class Visitor:
 
     def _visit(self, stop: Stop, *, only_nearest: bool) -> Iterator[Event]:
         at = self.go(stop.target)
-        told, self._untold = self._untold, []
-        yield from told
-        before, found, after = self.expose(stop.kind)
-        found = [item for item in found if isinstance(item, Photo) or item.kind == stop.kind]
+        untold, self._untold = self._untold, []
+        yield from untold
+        before, detections, after = self.expose(stop.kind)
+        detections = [
+            item for item in detections if isinstance(item, Photo) or item.kind == stop.kind
+        ]
         if only_nearest and stop.kind == Kind.GRID:
-            found = sorted(found, key=_from_axis)[:1]
+            detections = sorted(detections, key=_from_axis)[:1]
         yield from self._track(at, before)
-        events = [*self._track(before, after), *found]
+        events = [*self._track(before, after), *detections]
         yield from sorted(events, key=lambda event: event.stamp_ns)
 
     def _track(self, before: EncoderSample, after: EncoderSample) -> Iterator[EncoderSample]:
@@ -626,13 +630,13 @@ class Visitor:
         """
         count = (after.stamp_ns - before.stamp_ns - 1) // self.step_ns
         for number in range(1, count + 1):
-            part = number / (count + 1)
-            stamp = before.stamp_ns + round(part * (after.stamp_ns - before.stamp_ns))
+            fraction = number / (count + 1)
+            stamp = before.stamp_ns + round(fraction * (after.stamp_ns - before.stamp_ns))
             yield EncoderSample(
                 stamp,
                 after.names,
                 tuple(
-                    early + part * (late - early)
+                    early + fraction * (late - early)
                     for early, late in zip(before.positions, after.positions, strict=True)
                 ),
             )
