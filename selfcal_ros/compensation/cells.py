@@ -51,14 +51,14 @@ def _slopes(values: np.ndarray) -> np.ndarray:
     for end, inward in ((0, 1), (-1, -1)):
         f0, f1, f2 = (values[end + k * inward] for k in range(3))
         slope[end] = inward * (4 * f1 - 5 * f0 + f2) / 2
-    before, own = [0.0, *[1.0] * (n - 2), 2.0], [1.0, *[4.0] * (n - 2), 1.0]
+    before, diagonal = [0.0, *[1.0] * (n - 2), 2.0], [1.0, *[4.0] * (n - 2), 1.0]
     after = [2.0, *[1.0] * (n - 2), 0.0]
     if n == 3:  # both ends give the same condition: the parabola has no third derivative
         before[2], slope[2] = 0.0, (values[0] - 4 * values[1] + 3 * values[2]) / 2
     for i in range(1, n):  # each row minus the previous one
-        part = 1 / (own[i] - before[i] * after[i - 1])
-        after[i] *= part
-        slope[i] = (slope[i] - before[i] * slope[i - 1]) * part
+        factor = 1 / (diagonal[i] - before[i] * after[i - 1])
+        after[i] *= factor
+        slope[i] = (slope[i] - before[i] * slope[i - 1]) * factor
     for i in range(n - 2, -1, -1):
         slope[i] -= after[i] * slope[i + 1]
     return slope
@@ -145,12 +145,12 @@ class Cells:
         """
         out = np.empty((2, len(s)))
         for start in range(0, len(s), self.block):
-            part = slice(start, start + self.block)
+            block = slice(start, start + self.block)
             i, j = (
-                np.clip(np.floor(w[part]), 0, size - 2).astype(np.int64)
+                np.clip(np.floor(w[block]), 0, size - 2).astype(np.int64)
                 for w, size in zip((s, t), self.shape, strict=True)
             )
-            out[:, part] = self._polynomials(self._rows(i, j), s[part] - i, t[part] - j)
+            out[:, block] = self._polynomials(self._rows(i, j), s[block] - i, t[block] - j)
         return out
 
     def solve_in_cell(
@@ -173,9 +173,9 @@ class Cells:
         for _ in range(MAX_ITERATIONS):
             first, second = self._polynomials(rows, u, v)
             un, vn = us - scale * first, vt - scale * second
-            moved = max(_largest(un - u), _largest(vn - v))
+            change = max(_largest(un - u), _largest(vn - v))
             u, v = un, vn
-            if not moved * shrink > REST:
+            if not change * shrink > REST:
                 break
         with np.errstate(invalid="ignore"):
             stayed = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (i + us == s) & (j + vt == t)
@@ -192,9 +192,9 @@ class Cells:
         for _ in range(MAX_ITERATIONS):
             un = us - scale * _horner_point(first, u, v, side)
             vn = vt - scale * _horner_point(second, u, v, side)
-            moved = max(abs(un - u), abs(vn - v))
+            change = max(abs(un - u), abs(vn - v))
             u, v = un, vn
-            if not moved * shrink > REST:
+            if not change * shrink > REST:
                 break
         if 0 <= us <= 1 and 0 <= vt <= 1 and 0 <= u <= 1 and 0 <= v <= 1:
             return i + u, j + v
@@ -221,18 +221,18 @@ class Cells:
     def solve_point_anywhere(self, s: float, t: float, scale: float) -> tuple[float, float]:
         """Return `solve` of one finite position, bit for bit, faster; NaN next to unknown nodes."""
         (nx, ny), side = self.shape, self.degree + 1
-        a, b, rest = s, t, REST * max(self.shape)
+        a, b, tolerance = s, t, REST * max(self.shape)
         for _ in range(MAX_ITERATIONS):
             at_a, at_b = min(max(a, 0.0), nx - 1.0), min(max(b, 0.0), ny - 1.0)
             i, j = min(int(at_a), nx - 2), min(int(at_b), ny - 2)
             first, second = self.coefficients[i * (ny - 1) + j].tolist()
             an = s - scale * _horner_point(first, at_a - i, at_b - j, side)
             bn = t - scale * _horner_point(second, at_a - i, at_b - j, side)
-            moved = abs(an - a) + abs(bn - b)
-            if math.isnan(moved):
+            change = abs(an - a) + abs(bn - b)
+            if math.isnan(change):
                 return math.nan, math.nan
             a, b = an, bn
-            if not moved > rest:
+            if not change > tolerance:
                 break
         return a, b
 
@@ -328,8 +328,8 @@ def bicubic_cells(fields: np.ndarray, *, local: bool = False) -> Cells:
     See `cubic_pieces`.
     """
     along_x = cubic_pieces(fields.swapaxes(0, 1), local=local)  # p, i, field, j
-    both = cubic_pieces(along_x.transpose(3, 0, 1, 2), local=local)  # q, j, p, i, field
-    return _cells(both.transpose(4, 3, 1, 2, 0), 4, fields)
+    along_xy = cubic_pieces(along_x.transpose(3, 0, 1, 2), local=local)  # q, j, p, i, field
+    return _cells(along_xy.transpose(4, 3, 1, 2, 0), 4, fields)
 
 
 def _cells(c: np.ndarray, side: int, fields: np.ndarray) -> Cells:

@@ -112,10 +112,10 @@ class Circle:
         return low if u == 0 else low + u * (high - low)
 
 
-def steep(what: str) -> InputError:
+def steep(places: str) -> InputError:
     """Return the refusal of a map that cannot be inverted."""
     return InputError(
         "error map",
-        f"the error changes between neighbouring {what} by more than a quarter of their distance",
+        f"the error changes between neighbouring {places} by more than a quarter of their distance",
         "such a map cannot be inverted: check its units (m, rad)",
     )

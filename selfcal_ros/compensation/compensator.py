@@ -161,13 +161,13 @@ class Compensator:
         """
         x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
         out = self._blocks(self._invert(self._cells.solve_in_cell), (x, y), self._cells.block)
-        left = np.isnan(out[0])
-        if left.any():
-            found = self._blocks(
-                self._invert(self._cells.solve), (x[left], y[left]), self._cells.block
+        unsolved = np.isnan(out[0])
+        if unsolved.any():
+            solutions = self._blocks(
+                self._invert(self._cells.solve), (x[unsolved], y[unsolved]), self._cells.block
             )
-            for axis, part in zip(out, found, strict=True):
-                axis[left] = part
+            for axis, values in zip(out, solutions, strict=True):
+                axis[unsolved] = values
         self._refuse_outside(*out)
         return out
 
@@ -384,8 +384,8 @@ class Compensator:
         shape, x, y = x.shape, x.ravel(), y.ravel()
         out_x, out_y = np.empty(x.size), np.empty(x.size)
         for start in range(0, x.size, block):
-            part = slice(start, start + block)
-            out_x[part], out_y[part] = field(x[part], y[part])
+            chunk = slice(start, start + block)
+            out_x[chunk], out_y[chunk] = field(x[chunk], y[chunk])
         return out_x.reshape(shape), out_y.reshape(shape)
 
     def _refuse_outside(self, x_m: ArrayLike, y_m: ArrayLike) -> None:

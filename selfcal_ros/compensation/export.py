@@ -33,19 +33,19 @@ def fill_unknown(error_map: ErrorMap) -> tuple[ErrorMap, int]:
     rows, columns, weights = [], [], []
     right = np.zeros((2, unknown.sum()))
     for shift in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        here, there = _neighbours(shift, unknown.shape)
-        row = number[here]
+        site, neighbour = _neighbours(shift, unknown.shape)
+        row = number[site]
         take = row >= 0
         rows.append(row[take])
         columns.append(row[take])
         weights.append(np.ones(take.sum()))
-        free = take & (number[there] >= 0)
+        free = take & (number[neighbour] >= 0)
         rows.append(row[free])
-        columns.append(number[there][free])
+        columns.append(number[neighbour][free])
         weights.append(-np.ones(free.sum()))
-        known = take & (number[there] < 0)
+        known_neighbour = take & (number[neighbour] < 0)
         for out, field in zip(right, (error_map.gx, error_map.gy), strict=True):
-            np.add.at(out, row[known], field[there][known])
+            np.add.at(out, row[known_neighbour], field[neighbour][known_neighbour])
     gx, gy = error_map.gx.copy(), error_map.gy.copy()
     if unknown.any():
         place = np.concatenate(rows), np.concatenate(columns)
@@ -56,11 +56,11 @@ def fill_unknown(error_map: ErrorMap) -> tuple[ErrorMap, int]:
 
 def _neighbours(shift: tuple[int, int], shape: tuple[int, int]) -> tuple[tuple, tuple]:
     """Return slices of the sites that have a neighbour at `shift`, and of that neighbour."""
-    here, there = [], []
+    sites, neighbours = [], []
     for step, size in zip(shift, shape, strict=True):
-        here.append(slice(max(0, -step), size - max(0, step)))
-        there.append(slice(max(0, step), size - max(0, -step)))
-    return tuple(here), tuple(there)
+        sites.append(slice(max(0, -step), size - max(0, step)))
+        neighbours.append(slice(max(0, step), size - max(0, -step)))
+    return tuple(sites), tuple(neighbours)
 
 
 def provenance(
@@ -135,9 +135,9 @@ def verdict_lines(result: CalibrationResult) -> list[str]:
     """Return the verdict with what U assumes, and its reasons unless it is good, in ASCII."""
     verdict, when = result.verdict, result.provenance.extra.get("last_exposure", "")
     measured = [f"measured until {when}"] if when else []
-    said = verdict.sentence or verdict.grade.replace("_", " ")
+    sentence = verdict.sentence or verdict.grade.replace("_", " ")
     lines = [
-        f"verdict: {said if verdict.qualified else 'NOT QUALIFIED'}",
+        f"verdict: {sentence if verdict.qualified else 'NOT QUALIFIED'}",
         *(f"because: {reason}" for reason in verdict.reasons),
     ]
     return [*measured, *map(to_ascii, lines)]

@@ -141,15 +141,16 @@ def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
         If they state different frames; one may be without theta.
     """
     stated = [frame for line in comments if line.startswith(_MARK) and (frame := _stated(line))]
-    whole = max(stated, key=lambda frame: frame.theta_axis is not None, default=None)
+    full_frame = max(stated, key=lambda frame: frame.theta_axis is not None, default=None)
     for frame in stated:
-        if whole is not None and frame not in (whole, _plane(whole)):
+        if full_frame is not None and frame not in (full_frame, _plane(full_frame)):
             raise InputError(
                 "comments",
-                f"the tables are for different axes, '{frame.comment()}' and '{whole.comment()}'",
+                f"the tables are for different axes, '{frame.comment()}' and "
+                f"'{full_frame.comment()}'",
                 "write them with the same options",
             )
-    return whole
+    return full_frame
 
 
 def _plane(frame: MachineFrame) -> MachineFrame:

@@ -80,26 +80,26 @@ class Residual:
     shift_before: np.ndarray
     shift_after: np.ndarray
 
-    def rms(self, which: str) -> float:
-        """Return the root mean square of the residual vectors `which`: before or after."""
-        return float(np.sqrt(np.mean(np.sum(np.square(getattr(self, which)), axis=0))))
+    def rms(self, state: str) -> float:
+        """Return the root mean square of the residual vectors `state`: before or after."""
+        return float(np.sqrt(np.mean(np.sum(np.square(getattr(self, state)), axis=0))))
 
-    def largest(self, which: str) -> float:
-        """Return the length of the largest residual vector `which`: before or after."""
-        return float(np.sqrt(np.max(np.sum(np.square(getattr(self, which)), axis=0))))
+    def largest(self, state: str) -> float:
+        """Return the length of the largest residual vector `state`: before or after."""
+        return float(np.sqrt(np.max(np.sum(np.square(getattr(self, state)), axis=0))))
 
 
 def residual_of(place: str, position: np.ndarray, reached: list[np.ndarray]) -> Residual:
     """Return the residuals from the positions reached before and after, (axes, P) each."""
     residuals = [true - position for true in reached]
     # A known site next to an unknown one cannot be inverted exactly: omit it.
-    known = np.isfinite(residuals).all(axis=(0, 1))
-    if not known.any():
+    finite = np.isfinite(residuals).all(axis=(0, 1))
+    if not finite.any():
         raise InputError("error map", "no site can be verified", "measure more sites")
-    residuals = [residual[:, known] for residual in residuals]
+    residuals = [residual[:, finite] for residual in residuals]
     shifts = [residual.mean(axis=1) for residual in residuals]
     before, after = (r - s[:, None] for r, s in zip(residuals, shifts, strict=True))
-    return Residual(place, position[:, known], before, after, *shifts)
+    return Residual(place, position[:, finite], before, after, *shifts)
 
 
 def reached(
@@ -146,15 +146,15 @@ def plane_residuals(
     cubic spline through the sites at the centres of the cells, so that the residual there is
     the error of the controller's interpolation.
     """
-    plate, known = error_map.artifact, error_map.valid
+    plate, valid = error_map.artifact, error_map.valid
     plane = replace(
         error_map,
         artifact=replace(plate, angular_count=0, harmonics=0),
         g_theta=np.zeros(0),
         u_g_theta=np.zeros(0),
     )
-    places = [("sites", np.stack([plate.x_m[known], plate.y_m[known]]), Compensator(plane))]
-    if known.all():
+    places = [("sites", np.stack([plate.x_m[valid], plate.y_m[valid]]), Compensator(plane))]
+    if valid.all():
         centres = np.stack(
             [along[:-1, :-1].ravel() + plate.grid_pitch_m / 2 for along in (plate.x_m, plate.y_m)]
         )
@@ -189,10 +189,10 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
     px, py = frame.to_machine(plate.x_m + error_map.gx, plate.y_m + error_map.gy)
     cx, cy = active(px, py)
     added = np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
-    own = np.stack([error_map.gx, error_map.gy])
+    map_error = np.stack([error_map.gx, error_map.gy])
     limit_m = plate.grid_pitch_m / 4
     step_m = _steepest(added)
-    if step_m > limit_m or _steepest(own + added) > limit_m >= _steepest(own):
+    if step_m > limit_m or _steepest(map_error + added) > limit_m >= _steepest(map_error):
         raise _misfit(
             active,
             (px, py),
@@ -200,7 +200,7 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
             f"neighbouring sites {plate.grid_pitch_m / M_PER_MM:g} mm apart",
             frame.unit,
         )
-    gx, gy = own + added
+    gx, gy = map_error + added
     return replace(error_map, gx=gx, gy=gy)
 
 
@@ -210,7 +210,7 @@ def _steepest(fields: np.ndarray) -> float:
 
 
 def _misfit(
-    active: Correction, at: tuple[np.ndarray, np.ndarray], what: str, unit: str
+    active: Correction, at: tuple[np.ndarray, np.ndarray], fault: str, unit: str
 ) -> InputError:
     """Return the refusal of an active table that is too steep at positions of the controller."""
     spans = [(float(np.nanmin(p)), float(np.nanmax(p))) for p in at]
@@ -225,11 +225,11 @@ def _misfit(
         return InputError(
             "--onto",
             f"the active table covers only part of the field: {table} "
-            f"{unit}, the map {stage}; beyond it the table {what}",
+            f"{unit}, the map {stage}; beyond it the table {fault}",
             "name the table of this stage, in this unit (--unit)",
         )
     return InputError(
-        "--onto", f"the active table {what}", "is it that of this stage, in this unit?"
+        "--onto", f"the active table {fault}", "is it that of this stage, in this unit?"
     )
 
 
