@@ -153,12 +153,12 @@ def read_siemens(sources: Sequence[Source], wiring: Wiring) -> Correction:
                 "export the tables again",
             )
         table = int(match[2])
-        known: dict[Any, Any] = settings if match[1] else entries.setdefault(table, {})
+        stated: dict[Any, Any] = settings if match[1] else entries.setdefault(table, {})
         place = (table, match[1]) if match[1] else (int(match[3]), 0)
-        if place in known:
+        if place in stated:
             raise InputError(line.where, "it is given twice", "keep one of them")
         is_axis = match[1] in CEC_KEYS[:2]
-        known[place] = match[4] if is_axis else numbers(match[4], line.where, "N")[0]
+        stated[place] = match[4] if is_axis else numbers(match[4], line.where, "N")[0]
     grids = [
         _cec_grid(table, values, settings, axes, source.where) for table, values in entries.items()
     ]
@@ -183,23 +183,23 @@ def _cec_grid(
     where: str,
 ) -> tuple[int, int, Grid]:
     """Return input axis, output axis and values of a table."""
-    found: list[Any] = [settings.get((table, key)) for key in CEC_KEYS]
+    table_settings: list[Any] = [settings.get((table, key)) for key in CEC_KEYS]
     place = f"{where}: table {table}"
-    if None in found or any(axis not in axes for axis in found[:2]):
+    if None in table_settings or any(axis not in axes for axis in table_settings[:2]):
         raise InputError(
             place,
             "a setting is missing, or an axis is not one of the stage",
             f"the axes are {' and '.join(axes)} (--x-axis, --y-axis)",
         )
-    step, first, last, *rest = found[2:]
-    if any(rest) or not step > 0 or abs((last - first) / step - (len(values) - 1)) > 1e-6:
+    step, first, last, *other_settings = table_settings[2:]
+    if any(other_settings) or not step > 0 or abs((last - first) / step - (len(values) - 1)) > 1e-6:
         raise InputError(
             place,
             f"{len(values)} values from {first} to {last} in steps of {step}",
             "they do not fit, or direction, multiplication or modulo is set",
         )
     return (
-        axes[found[0]],
-        axes[found[1]],
+        axes[table_settings[0]],
+        axes[table_settings[1]],
         Grid((first, 0.0), (step, 1.0), filled(values, (len(values), 1), place)),
     )

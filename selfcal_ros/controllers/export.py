@@ -295,8 +295,8 @@ def checklist(
 
 def place_to_look(frame: MachineFrame, correct: Correction, table: ErrorMap) -> str:
     """Return where the controller corrects by most relative to its zero, and by how much."""
-    known = table.valid
-    px, py = frame.to_machine(table.artifact.x_m[known], table.artifact.y_m[known])
+    valid = table.valid
+    px, py = frame.to_machine(table.artifact.x_m[valid], table.artifact.y_m[valid])
     at_zero = [float(np.ravel(c)[0]) for c in correct(np.zeros(1), np.zeros(1))]
     cx, cy = (
         frame.unit_m * (np.asarray(c) - zero)

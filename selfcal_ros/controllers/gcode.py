@@ -87,7 +87,7 @@ def corrected_program(text: str, where: str, rewriter: "Rewriter") -> str:
     for number, line in enumerate(text.split("\n"), 1):
         end = "\r" * line.endswith("\r")
         lines = rewriter.line(line.removesuffix("\r"), f"{where}:{number}")
-        out += [made + end for made in lines]
+        out += [corrected + end for corrected in lines]
     return "\n".join(out)
 
 
@@ -179,10 +179,11 @@ class Rewriter:
     def _read(self, text: str) -> ProgramLine:
         """Return the codes, words and comments of a line."""
         pattern = PRINTER_WORD if self._printer else WORD
-        left = pattern.sub("", text)
-        if left:
+        unmatched = pattern.sub("", text)
+        if unmatched:
             self._refuse(
-                f"{left[0]!r} does not belong to a word of {self.dialect}", remedy(left[0].upper())
+                f"{unmatched[0]!r} does not belong to a word of {self.dialect}",
+                remedy(unmatched[0].upper()),
             )
         line = ProgramLine([], {}, [])
         for letter, value, comment in pattern.findall(text):
@@ -197,8 +198,8 @@ class Rewriter:
                 self._refuse("the line does not begin with a command", remedy(letter))
             elif letter:
                 line.values[letter] = value
-        moved = line.named("XYZ") and not self._printer
-        if moved and not line.code(*ACTS):
+        names_axes = line.named("XYZ") and not self._printer
+        if names_axes and not line.code(*ACTS):
             if not self._motion:
                 self._refuse("the line does not name its command", "begin it with one")
             line.codes.append(self._motion)
@@ -224,9 +225,9 @@ class Rewriter:
         crowded = len(line.codes) > 1 and (self._printer or bool(acts and "path" in modes))
         if crowded or len(acts) > 1 or len(modes) > len(set(modes)):
             self._refuse(f"{names} in one line", "write a line for each")
-        known = "".join(code.words for code in line.codes) + ALWAYS * (not self._printer)
+        letters = "".join(code.words for code in line.codes) + ALWAYS * (not self._printer)
         for letter, value in line.values.items():
-            if known.count(letter) != 1:
+            if letters.count(letter) != 1:
                 self._refuse(f"{letter} is not a word of {names or self.dialect}", remedy(letter))
             if not value and not line.code("home", "unknown"):
                 self._refuse(f"{letter} has no number", "give one")
@@ -330,10 +331,10 @@ class Rewriter:
             path_m = np.array([end_m, end_m])
 
         commanded_m = path_m + np.dot((1, 1j), self._correct(path_m.real, path_m.imag))
-        kept = simplified(commanded_m, limit_m)[1:]
+        vertices = simplified(commanded_m, limit_m)[1:]
         lines: list[str] = []
-        shared = self._shared(line) if len(kept) > 1 else {}
-        for i in kept:
+        shared = self._shared(line) if len(vertices) > 1 else {}
+        for i in vertices:
             place = {"X": commanded_m[i].real / unit_m, "Y": commanded_m[i].imag / unit_m}
             for axis, start in shared.items():
                 way = line.number(axis) - start

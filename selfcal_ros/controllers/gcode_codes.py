@@ -102,8 +102,8 @@ def _list(text: str) -> dict[str, Code]:
     """Return the codes of lines "effect: codes words" by their names."""
     codes: dict[str, Code] = {}
     for line in text.strip().splitlines():
-        does, _, rest = line.partition(": ")
-        names = rest.split()
+        does, _, codes_and_words = line.partition(": ")
+        names = codes_and_words.split()
         words = names.pop() if names[-1].isalpha() else ""
         codes |= {name: Code(name, does, words) for name in names}
     return codes

@@ -145,11 +145,11 @@ def plain(value: float) -> str:
 
 def lines_of(source: Source, comment: str) -> list[Line]:
     """Return the lines with content; `comment` is a pattern of what is removed from each."""
-    found = [
+    lines = [
         Line(re.sub(comment, " ", text).strip(), f"{source.where}:{number}")
         for number, text in enumerate(source.text.splitlines(), 1)
     ]
-    return [line for line in found if line.text]
+    return [line for line in lines if line.text]
 
 
 def numbers(text: str, where: str, pattern: str) -> list[float]:
@@ -163,10 +163,10 @@ def numbers(text: str, where: str, pattern: str) -> list[float]:
     form = pattern.replace("N", f"({NUMBER})").replace("I", r"([-+]?\d{1,15})")
     match = re.fullmatch(form, text, re.ASCII | re.I)
     if match is None:
-        shown = re.sub(r"\\(.)", r"\1", pattern.replace(r"\s*", " ").replace(r"\s+", " "))
+        form_text = re.sub(r"\\(.)", r"\1", pattern.replace(r"\s*", " ").replace(r"\s+", " "))
         raise InputError(
             where,
-            f"'{text[:60]}' is not of the form {shown}",
+            f"'{text[:60]}' is not of the form {form_text}",
             "N is a number, I an integer: export the table again",
         )
     values = [float(group) for group in match.groups()]

@@ -285,7 +285,7 @@ def read_beckhoff(sources: Sequence[Source], wiring: Wiring) -> Correction:
 
 def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]:
     where = source.where
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     entries: dict[tuple[int, int], float] = {}
     text = re.sub(r"/\*.*?\*/", lambda match: "\n" * match[0].count("\n"), source.text, flags=re.S)
     for line in lines_of(Source(text, where), "#.*"):
@@ -302,10 +302,10 @@ def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]
                 "export the list again",
             )
         place = (int(match[3]), int(match[2])) if match[2] else match[1]
-        known: dict[Any, Any] = entries if match[2] else found
-        if place in known:
+        stated: dict[Any, Any] = entries if match[2] else settings
+        if place in stated:
             raise InputError(line.where, f"{match[1]} is given twice", "keep one of them")
-        known[place] = (
+        stated[place] = (
             match[4] if match[1] == "kopf.log_achs_name" else numbers(match[4], line.where, "N")[0]
         )
     keys = [
@@ -319,10 +319,10 @@ def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]
         "master2_ax_nr",
     ]
     names = ["kopf.achs_nr", *(f"kw.crosscomp2.{key}" for key in keys)]
-    missing = [name for name in names if name not in found]
+    missing = [name for name in names if name not in settings]
     if missing:
         raise InputError(where, f"{missing[0]} is missing", "export the list again")
-    slave, step, last1, last2, first1, first2, unit, *axes = (int(found[name]) for name in names)
+    slave, step, last1, last2, first1, first2, unit, *axes = (int(settings[name]) for name in names)
     if (
         step < 1
         or unit != 1
