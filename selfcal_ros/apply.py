@@ -60,10 +60,12 @@ class StageMap(Compensator):
                 result.observability,
             )
         grid = result.plate.map_grid
-        whole = grid is not None and bool(result.error_map.valid.all())
+        all_known = grid is not None and bool(result.error_map.valid.all())
         fitted: Interpolation | None = grid.interpolation.value if grid else None
-        own: Interpolation = fitted if fitted and whole else "bilinear"
-        super().__init__(result.error_map, method=method or own, outside=outside, fitted=fitted)
+        default_method: Interpolation = fitted if fitted and all_known else "bilinear"
+        super().__init__(
+            result.error_map, method=method or default_method, outside=outside, fitted=fitted
+        )
         self.result = result
 
     def __repr__(self) -> str:
@@ -179,14 +181,14 @@ class StageMap(Compensator):
                 "leave it out: its uncertainty is not known",
             )
         weights = self._weights(x, y)
-        used = weights.any(axis=0)
-        if not self.error_map.valid.ravel()[used].all():
+        used_sites = weights.any(axis=0)
+        if not self.error_map.valid.ravel()[used_sites].all():
             raise InputError(
                 "covariance",
                 "a point lies next to an unknown site",
                 "leave the point out, or measure the site",
             )
-        sites = covariance_of(self.result, "xy", used.reshape(self.error_map.artifact.shape))
+        sites = covariance_of(self.result, "xy", used_sites.reshape(self.error_map.artifact.shape))
         if sites.ndim == 1:
             raise InputError(
                 "covariance",
@@ -194,16 +196,16 @@ class StageMap(Compensator):
                 "solve again with uncertainties; fields beyond 31 x 31 marks have none",
             )
         # what has a sign of its own at each place has it between the sites as well
-        alone = lack_of_fit_m(self.result) ** 2
-        sites[np.diag_indices_from(sites)] -= alone
-        both = np.kron(np.eye(2), weights[:, used])
+        lack_of_fit_m2 = lack_of_fit_m(self.result) ** 2
+        sites[np.diag_indices_from(sites)] -= lack_of_fit_m2
+        weights_xy = np.kron(np.eye(2), weights[:, used_sites])
         cells = np.stack([self._cell(x, 0), self._cell(y, 1)])
         alike = (cells[:, :, None] == cells[:, None, :]).all(axis=0)
-        cover = both @ sites @ both.T
-        cover[np.diag_indices_from(cover)] += alone
+        cover = weights_xy @ sites @ weights_xy.T
+        cover[np.diag_indices_from(cover)] += lack_of_fit_m2
         for axis, more in enumerate(self._between(x, y)):
-            part = slice(axis * len(x), (axis + 1) * len(x))
-            cover[part, part] += alike * np.outer(more, more)
+            rows = slice(axis * len(x), (axis + 1) * len(x))
+            cover[rows, rows] += alike * np.outer(more, more)
         return cover
 
     def _cell(self, p_m: np.ndarray, axis: int) -> np.ndarray:
@@ -236,11 +238,13 @@ class StageMap(Compensator):
             raise InputError("distance", "its ends coincide", "give two points")
         (ax, ay), (bx, by) = self.error(x1, y1), self.error(x2, y2)
         u = np.full(len(length), np.nan)
-        known = np.flatnonzero(self.inside(x1, y1) & self.inside(x2, y2))
-        for start in range(0, len(known), MAX_POINTS // 2):
-            part = known[start : start + MAX_POINTS // 2]
-            cover = self.covariance(np.append(x1[part], x2[part]), np.append(y1[part], y2[part]))
-            u[part] = _along(cover, dx[part] / length[part], dy[part] / length[part])
+        inside = np.flatnonzero(self.inside(x1, y1) & self.inside(x2, y2))
+        for start in range(0, len(inside), MAX_POINTS // 2):
+            chunk = inside[start : start + MAX_POINTS // 2]
+            cover = self.covariance(
+                np.append(x1[chunk], x2[chunk]), np.append(y1[chunk], y2[chunk])
+            )
+            u[chunk] = _along(cover, dx[chunk] / length[chunk], dy[chunk] / length[chunk])
         return np.hypot(dx + bx - ax, dy + by - ay) - length, u
 
     def length_uncertainty(self, *, anywhere: bool = True) -> tuple[float, float]:
@@ -282,12 +286,12 @@ class StageMap(Compensator):
             square += 2 * (ex**2 * worst[0] + ey**2 * worst[1])
         U = self.result.noise.k_xy * np.sqrt(np.maximum(square, 0.0))
         size = U.max() or 1.0  # both unknowns near one
-        found = linprog(
+        solution = linprog(
             [1.0, (length / length.max()).mean()],
             b_ub=-U / size,
             A_ub=-np.stack([np.ones(len(U)), length / length.max()], axis=1),
         )
-        return float(found.x[0] * size), float(found.x[1] * size / length.max())
+        return float(solution.x[0] * size), float(solution.x[1] * size / length.max())
 
     def _places(self, *, between: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return x and y of at most about `MOST_NODES` known nodes along a side, m, (P,).
@@ -341,9 +345,9 @@ def _library(name: str) -> ModuleType:
 def _along(cover: np.ndarray, ex: np.ndarray, ey: np.ndarray) -> np.ndarray:
     """Return u of e . (G2 - G1) for pairs, from the covariance of Gx1, Gx2, Gy1, Gy2."""
     pairs = len(ex)
-    parts = cover.reshape(4, pairs, 4, pairs)[:, np.arange(pairs), :, np.arange(pairs)]
+    covariances = cover.reshape(4, pairs, 4, pairs)[:, np.arange(pairs), :, np.arange(pairs)]
     row = np.stack([-ex, ex, -ey, ey], axis=1)
-    return np.sqrt(np.maximum(np.einsum("pa,pab,pb->p", row, parts, row), 0.0))
+    return np.sqrt(np.maximum(np.einsum("pa,pab,pb->p", row, covariances, row), 0.0))
 
 
 def _of_difference(cover: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:

@@ -71,17 +71,17 @@ Located = Iterator[tuple[dict[str, Any], np.ndarray]]
 of the finding, and the weights of the coefficients."""
 
 
-def by_coefficient(found: Any, names: tuple[str, ...]) -> Located:
+def by_coefficient(explanation: Any, names: tuple[str, ...]) -> Located:
     """Yield every coefficient: the usual `Block.located`.
 
     Parameters
     ----------
-    found : Explanation
+    explanation : Explanation
         With `columns`, `values` and `covariance` of the coefficients.
     names : tuple of str
         Names of the views that the columns count.
     """
-    for column, weights in zip(found.columns, np.eye(len(found.columns)), strict=True):
+    for column, weights in zip(explanation.columns, np.eye(len(explanation.columns)), strict=True):
         yield (
             {
                 "view": names[column.view] if column.view != SHARED else "",
@@ -205,7 +205,9 @@ def blocks() -> dict[str, Block]:
     """
     from importlib.metadata import entry_points  # slow, and only this needs it
 
-    found = {name: import_module(f"selfcal_ros.estimation.terms.{name}").BLOCK for name in BUILT_IN}
+    block_by_name = {
+        name: import_module(f"selfcal_ros.estimation.terms.{name}").BLOCK for name in BUILT_IN
+    }
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
         where = f"block '{point.name}' ({point.value})"
         try:
@@ -216,14 +218,14 @@ def blocks() -> dict[str, Block]:
                 f"it cannot be loaded: {error}",
                 "repair or remove the package that registers it",
             ) from error
-        if not isinstance(block, Block) or block.name != point.name or block.name in found:
+        if not isinstance(block, Block) or block.name != point.name or block.name in block_by_name:
             raise InputError(
                 where,
                 "it is not a selfcal_ros.blocks.Block of this name, or another block has the name",
                 "correct the package that registers it",
             )
-        found[block.name] = block
-    return found
+        block_by_name[block.name] = block
+    return block_by_name
 
 
 def block_of(name: str) -> Block:
@@ -234,7 +236,7 @@ def block_of(name: str) -> Block:
     InputError
         If there is none.
     """
-    found = blocks()
-    if name not in found:
-        raise InputError("model", f"the term '{name}' is unknown", known_are(name, found))
-    return found[name]
+    known_blocks = blocks()
+    if name not in known_blocks:
+        raise InputError("model", f"the term '{name}' is unknown", known_are(name, known_blocks))
+    return known_blocks[name]

@@ -84,22 +84,22 @@ class NoDataError(InputError):
     exit_code = ExitCode.NO_DATA
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known_names: Iterable[str]) -> str:
     """Return ``did you mean 'x'?`` with the names most similar to `word`, at most two; or "".
 
     The same words in another order count as most similar.
     """
-    names = {str(name).lower(): str(name) for name in known}
+    names = {str(name).lower(): str(name) for name in known_names}
     words = sorted(re.split("[-_/]+", word.lower()))
-    found = [name for name in names if sorted(re.split("[-_/]+", name)) == words][:2] or (
+    similar = [name for name in names if sorted(re.split("[-_/]+", name)) == words][:2] or (
         get_close_matches(word.lower(), names, n=2, cutoff=0.7)
     )
-    return f"did you mean {' or '.join(repr(names[name]) for name in found)}?" if found else ""
+    return f"did you mean {' or '.join(repr(names[name]) for name in similar)}?" if similar else ""
 
 
-def known_are(word: str, known: Iterable[str]) -> str:
+def known_are(word: str, known_names: Iterable[str]) -> str:
     """Return the remedy for an unknown name: similar names, then all known ones."""
-    names = [str(name) for name in known]
+    names = [str(name) for name in known_names]
     hint = did_you_mean(word, names)
     return f"{hint} known are {', '.join(names)}".strip()
 

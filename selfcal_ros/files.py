@@ -85,14 +85,14 @@ class _Strict(Composer, SafeConstructor, Resolver):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         """Return the mapping of a node; refuse duplicate keys."""
-        seen = set()
+        keys = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                if (key.tag, key.value) in seen:
+                if (key.tag, key.value) in keys:
                     raise yaml.constructor.ConstructorError(
                         None, None, f"the key '{key.value}' is given twice", key.start_mark
                     )
-                seen.add((key.tag, key.value))
+                keys.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
     def whole_number(self, node: yaml.ScalarNode) -> int:
@@ -129,10 +129,10 @@ if yaml.__with_libyaml__:
     LOADERS.insert(0, FastYamlLoader)
 
 
-def _yaml_size(node: yaml.Node, known: dict[int, int]) -> int:
+def _yaml_size(node: yaml.Node, size_of_node: dict[int, int]) -> int:
     """Return the number of values below a node; infinite for a node that contains itself."""
-    if id(node) not in known:
-        known[id(node)] = MAX_YAML_NODES + 1  # until known
+    if id(node) not in size_of_node:
+        size_of_node[id(node)] = MAX_YAML_NODES + 1  # until known
         children = (
             [item for pair in node.value for item in pair]
             if isinstance(node, yaml.MappingNode)
@@ -140,8 +140,8 @@ def _yaml_size(node: yaml.Node, known: dict[int, int]) -> int:
             if isinstance(node, yaml.SequenceNode)
             else ()
         )
-        known[id(node)] = 1 + sum(_yaml_size(child, known) for child in children)
-    return known[id(node)]
+        size_of_node[id(node)] = 1 + sum(_yaml_size(child, size_of_node) for child in children)
+    return size_of_node[id(node)]
 
 
 def _whole(value: int | str) -> int:
@@ -212,13 +212,13 @@ def _regular(path: str | os.PathLike, limit: int) -> bytes:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if stat.S_ISREG(os.stat(path).st_mode):  # opening a device may have side effects
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | AT_ONCE)) as file:
-            found = os.fstat(file.fileno())
-            if stat.S_ISREG(found.st_mode) and found.st_size <= limit:
-                return file.read(found.st_size)
-            if stat.S_ISREG(found.st_mode):
+            status = os.fstat(file.fileno())
+            if stat.S_ISREG(status.st_mode) and status.st_size <= limit:
+                return file.read(status.st_size)
+            if stat.S_ISREG(status.st_mode):
                 raise InputError(
                     str(path),
-                    f"has {found.st_size} bytes, more than {limit}",
+                    f"has {status.st_size} bytes, more than {limit}",
                     "name a smaller file",
                 )
     raise InputError(str(path), "is not a regular file", "name a file on a disk")
@@ -427,8 +427,8 @@ def read(kind: Any, value: Any) -> Any:
     kind = str if get_origin(kind) is Literal else get_origin(kind) or kind
     if issubclass(kind, StrEnum):
         return kind(value)
-    wanted = Integral if kind is int else kind
-    if not isinstance(value, wanted) or (kind is int and isinstance(value, bool)):
+    python_type = Integral if kind is int else kind
+    if not isinstance(value, python_type) or (kind is int and isinstance(value, bool)):
         raise ValueError(f"{value!r} is not of type {kind.__name__}")
     return value
 

@@ -89,8 +89,8 @@ def _replacement(target: Path) -> Iterator[BinaryIO]:
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """Yield a hidden folder in `parent` that is removed when the block ends."""
     if not portable.LOCKS:  # then a folder cannot be opened, either
-        with TemporaryDirectory(dir=parent, prefix=".selfcal.", ignore_cleanup_errors=True) as made:
-            yield Path(made)
+        with TemporaryDirectory(dir=parent, prefix=".selfcal.", ignore_cleanup_errors=True) as name:
+            yield Path(name)
         return
     temporary, fd = _temporary(parent, folder=True)
     try:
@@ -170,10 +170,10 @@ def check_outputs(
         If an output is an input file (or in an input folder), two outputs are
         the same file, or an output is a folder or has no folder.
     """
-    taken = {os.path.realpath(name) for name in inputs if name}
-    taken |= {
+    occupied = {os.path.realpath(name) for name in inputs if name}
+    occupied |= {
         os.path.realpath(file)
-        for folder in map(Path, list(taken))
+        for folder in map(Path, list(occupied))
         if folder.is_dir()
         for file in folder.iterdir()
     }
@@ -185,7 +185,7 @@ def check_outputs(
             continue  # a pipe or /dev/null accepts any number of outputs
         if target.is_dir():
             raise InputError(str(name), "it is a folder", "name a file")
-        if str(target) in taken:
+        if str(target) in occupied:
             raise InputError(str(name), "would be overwritten", "name another output file")
         if not target.parent.is_dir():
             raise InputError(
@@ -193,7 +193,7 @@ def check_outputs(
                 "cannot be written (No such file or directory)",
                 "name an existing, writable folder",
             )
-        taken.add(str(target))
+        occupied.add(str(target))
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
@@ -246,8 +246,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     if isinstance(value, np.ndarray):
-        whole = value.dtype.kind in "fiub" and bool(np.isfinite(value).all())
-        return value.tolist() if whole else plain(value.tolist())
+        finite_numbers = value.dtype.kind in "fiub" and bool(np.isfinite(value).all())
+        return value.tolist() if finite_numbers else plain(value.tolist())
     return value
 
 

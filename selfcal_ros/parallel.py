@@ -35,7 +35,7 @@ Progress = Callable[[int, int], None]
 """Called with the number of items done, and the total."""
 
 
-def silent(done: int, total: int) -> None:
+def silent(n_done: int, total: int) -> None:
     """Do nothing."""
 
 
@@ -144,13 +144,13 @@ def mapped(
 
     `progress` is called with the number of items done, and the total.
     """
-    found: list[Any] = [None] * len(items)
-    for done, outcome in enumerate(outcomes(function, items, workers=workers), 1):
+    results: list[Any] = [None] * len(items)
+    for n_done, outcome in enumerate(outcomes(function, items, workers=workers), 1):
         if outcome.error is not None:
             raise outcome.error
-        found[outcome.index] = outcome.value
-        progress(done, len(items))
-    return found
+        results[outcome.index] = outcome.value
+        progress(n_done, len(items))
+    return results
 
 
 def mapped_in_parts(
@@ -165,14 +165,14 @@ def mapped_in_parts(
 
     For items too small to be sent to a worker individually.
     """
-    parts = [list(items[start : start + size]) for start in range(0, len(items), size)]
-    found = mapped(
+    chunks = [list(items[start : start + size]) for start in range(0, len(items), size)]
+    chunk_results = mapped(
         function,
-        parts,
+        chunks,
         workers=workers,
-        progress=lambda done, _: progress(min(done * size, len(items)), len(items)),
+        progress=lambda n_done, _: progress(min(n_done * size, len(items)), len(items)),
     )
-    return [value for part in found for value in part]
+    return [value for chunk in chunk_results for value in chunk]
 
 
 def _tried(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:

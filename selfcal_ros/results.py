@@ -34,14 +34,14 @@ def active_map(folder: str | os.PathLike) -> tuple[Path, str]:
             f"name a RESULT.json, or: selfcal history {folder} --activate RESULT.json",
         )
     name, _, since = read_text(path).strip().partition("\n")
-    found = Path(folder, name)
-    if not found.is_file():
+    map_path = Path(folder, name)
+    if not map_path.is_file():
         raise InputError(
             str(path),
             f"names '{name}', which is not there",
             f"selfcal history {folder} --activate RESULT.json",
         )
-    return found, since.strip()
+    return map_path, since.strip()
 
 
 def read_result(path: str | os.PathLike, limit: int | None = None) -> CalibrationResult:

@@ -37,9 +37,9 @@ def missing_ros() -> str:
     built = importlib.import_module("selfcal_msgs.msg")
     for name, text in message_texts().items():
         kind = getattr(built, name, None)
-        known = kind.get_fields_and_field_types() if kind else {}
+        field_names = kind.get_fields_and_field_types() if kind else {}
         for field in fields_of(text):
-            if field not in known:
+            if field not in field_names:
                 return (
                     f"the selfcal_msgs in this environment is of another version: its {name} "
                     f"has no {field}; build it again: {NEEDED['selfcal_msgs']}"
