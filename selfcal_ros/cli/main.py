@@ -115,9 +115,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if COMPLETE in os.environ:
             _complete()
-        code = _run(sys.argv[1:] if argv is None else argv)
-        sys.stdout.flush()
-        return code
+        return _run(sys.argv[1:] if argv is None else argv)
     except BrokenPipeError:  # whoever read has enough
         say_no_more(sys.stdout, sys.stderr)
         return int(ExitCode.DONE)
@@ -138,7 +136,9 @@ def _run(words: list[str]) -> int:
         args.words = words
         prefix = args.leaf.prog
         check_existing(args)
-        return int(args.run(args))
+        code = int(args.run(args))
+        sys.stdout.flush()  # here a full disk is still an error with a line
+        return code
     except SelfcalError as error:
         fault = (misplaced(args) if args is not None else None) or error
         if isinstance(fault, NotIdentifiableError):
@@ -166,10 +166,12 @@ def _run(words: list[str]) -> int:
 
 def _refused(line: str, code: int) -> int:
     """Print a line on stderr, if somebody reads it, and return the exit code."""
-    try:
-        print(line, file=sys.stderr, flush=True)
-    except BrokenPipeError:
-        say_no_more(sys.stdout, sys.stderr)
+    for stream, text in ((sys.stdout, ""), (sys.stderr, line + "\n")):
+        try:
+            stream.write(text)
+            stream.flush()
+        except OSError:  # nobody reads it, or it fills a disk
+            say_no_more(stream)
     return int(code)
 
 
@@ -195,6 +197,14 @@ class Parser(argparse.ArgumentParser):
         self.set_defaults(leaf=self)
         self.register("type", float, number_of)  # float() reads 1_0 as 10, and other digits
         self.register("type", int, whole_number_of)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """Print help or version; argparse passes over a disk that is full."""
+        if file is not sys.stdout:
+            super()._print_message(message, file)
+            return
+        file.write(message)
+        file.flush()
 
     def format_help(self) -> str:
         """Return the help, with the example as it is typed."""

@@ -137,5 +137,38 @@ def test_nobody_reads_what_is_printed(words, code):
     assert done.returncode == code
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        "",
+        "--help",
+        "--version",
+        "help solve",
+        "cal export --help",
+        "plan check config/plans/hu.yaml",
+    ],
+)
+def test_a_disk_that_is_full_is_said_in_a_line(words, unbuffered):
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            [*SELFCAL, *words.split()],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            cwd=ROOT,
+            env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
+        )
+    assert done.returncode == 2
+    assert re.fullmatch(r"selfcal[ a-z]*: .*No space left on device.*\n", done.stderr)
+
+
+def test_a_line_that_does_not_fit_on_the_disk_leaves_the_exit_code():
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run([*SELFCAL, "solve", "no.bag"], stderr=full, check=False)
+    assert done.returncode == 2
+
+
 def test_every_verb_is_in_a_group():
     assert all(isinstance(verb, Verb) and verb.group in GROUPS for verb in VERBS.values())
