@@ -8,7 +8,7 @@ from typing import Any
 
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.settings.nodes import RecorderSettings
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.names import MatchedInput, kept_names, offered
@@ -38,6 +38,7 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
             raw=True,
         )
         self._failed, self._unrecorded = "", 0
+        self.exit_code = ExitCode.DONE
         self.every(1.0, self._flush)
 
     def _record(self, topic: str, data: bytes) -> None:
@@ -52,6 +53,7 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
     def _fail(self, error: InputError) -> None:
         """Stop recording: after an incomplete write, later messages could not be read."""
         self._failed, self._unrecorded = str(error), self._unrecorded + 1
+        self.exit_code = error.exit_code
         self.say(
             Level.ERROR,
             f"recording has ended: {error}; what was recorded is readable, "

@@ -93,13 +93,13 @@ def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
             finished.add_done_callback(lambda _: stop.set_result(None))
         _keep_what_is_loaded()
         spin(node, stop)
-        code = int(getattr(node, "exit_code", ExitCode.DONE))
     except SelfcalError as error:
         print(f"selfcal: {error}", file=sys.stderr)
         code = int(error.exit_code)
     finally:
         if node is not None:
             getattr(node, "close", lambda: None)()
+            code = code or int(getattr(node, "exit_code", ExitCode.DONE))  # `close` may set it
             node.destroy_node()
         rclpy.try_shutdown()
         ignore_signals()

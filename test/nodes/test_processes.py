@@ -4,6 +4,7 @@
 import contextlib
 import fcntl
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -18,7 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from selfcal_ros.cli import processes
 from selfcal_ros.cli.replay import NODES
 from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
-from selfcal_ros.nodes import running
+from selfcal_ros.nodes import names, running
 from test.support.forked import Fork, Forks
 from test.support.sessions import plan_file, small_bag, small_plan
 from test.support.shared_memory import remove_stale
@@ -195,6 +196,28 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
         assert problem in line
         assert " at /" not in line
         assert "Traceback" not in err
+
+
+def test_a_recorder_whose_disk_is_full_ends_with_code_2(graph, group, tmp_path):
+    bag = f"bag:={tmp_path / 'recorded'}"
+    recorder = group.start("-m", "selfcal_ros.nodes.bag_recorder", "--ros-args", "-p", bag)
+    diagnostics: list = []
+    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 100)
+    graph.until(lambda: diagnostics, "the recorder")
+    [file] = tmp_path.glob("recorded/*.mcap")
+    resource.prlimit(
+        recorder.pid, resource.RLIMIT_FSIZE, (file.stat().st_size, resource.RLIM_INFINITY)
+    )
+    publisher = graph.publisher(names.ENCODER)
+    publisher.publish(names.ENCODER.type(name=["x"], position=[0.25]))
+    graph.until(
+        lambda: any("recording has ended" in m.status[0].message for m in diagnostics),
+        "the end of the recording",
+    )
+    recorder.send_signal(signal.SIGTERM)
+    code, _, err = ended(recorder)
+    assert code == 2
+    assert err.count("recording has ended") == 1 and "Traceback" not in err
 
 
 @pytest.mark.parametrize("whole_group", [True, False], ids=["ctrl-c", "kill -INT"])
