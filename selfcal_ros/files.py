@@ -433,6 +433,11 @@ def read(kind: Any, value: Any) -> Any:
     return value
 
 
+def yaml_text(value: Any) -> str:
+    """Return `value` as YAML, keys in their order."""
+    return yaml.dump(value, Dumper=YamlDumper, sort_keys=False)
+
+
 def write_yaml(path: str | os.PathLike, value: Any) -> None:
     """Write `value` as YAML, keys in their order, to `path` atomically."""
-    write_text(path, yaml.dump(value, Dumper=YamlDumper, sort_keys=False))
+    write_text(path, yaml_text(value))

@@ -9,7 +9,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
 from functools import cache
 from pathlib import Path
@@ -204,7 +204,31 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 
 def write_text(path: str | os.PathLike, text: str) -> None:
     """Write `text` as UTF-8 to `path` atomically."""
-    write_bytes(path, text.encode(errors="backslashreplace"))  # file names may not be UTF-8
+    write_bytes(path, utf8(text))
+
+
+def utf8(text: str) -> bytes:
+    """Return text as UTF-8; of a file name that is not, the bytes are escaped."""
+    return text.encode(errors="backslashreplace")
+
+
+def write_together(contents: Mapping[str | os.PathLike, bytes]) -> None:
+    """Write several files atomically: all of them, or none where the disk holds only some.
+
+    The last one is there first.
+
+    Raises
+    ------
+    InputError
+        As `atomic_file`, with the first file that cannot be written.
+    """
+    with contextlib.ExitStack() as replacements:
+        for path, data in contents.items():
+            file = replacements.enter_context(atomic_file(path))
+            file.write(data)
+            file.flush()
+            if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                os.fsync(file.fileno())  # a full disk is met before the first of them is replaced
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:

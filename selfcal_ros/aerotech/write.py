@@ -2,7 +2,7 @@
 """Write calibration files in the strict form, never silently over an existing file."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from selfcal_ros.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.aerotech.rules import check_tables
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
-from selfcal_ros.outputs import write_bytes
+from selfcal_ros.outputs import write_together
 
 
 def decimal(value: float) -> str:
@@ -135,35 +135,38 @@ def refuse_existing(paths: Sequence[str | os.PathLike], *, force: bool) -> None:
             )
 
 
-def write_cal(
-    path: str | os.PathLike, text: str, *, force: bool = False, now: datetime | None = None
-) -> Path | None:
-    """Write a calibration file atomically and return the backup of the file it replaces.
+def write_cals(
+    texts: Mapping[str, str], *, force: bool = False, now: datetime | None = None
+) -> dict[str, Path | None]:
+    """Write calibration files, all or none of them; return path -> backup of what it replaces.
 
     Parameters
     ----------
-    path : path
-        File to write.
-    text : str
-        Its content, from `cal_text`.
+    texts : dict
+        Path -> content, from `cal_text`.
     force : bool
-        Whether an existing file may be replaced; it is kept as ``NAME.<date>.bak``.
+        Whether existing files may be replaced; they are kept as ``NAME.<date>.bak``.
     now : datetime, optional
-        Date of the backup, UTC.
+        Date of the backups, UTC.
 
     Raises
     ------
     InputError
-        If the file exists and `force` is false, or it cannot be written.
+        If a file exists and `force` is false, or one cannot be written.
     """
-    refuse_existing([path], force=force)
-    target, backup = Path(path), None
-    if target.exists():
-        stamp = (now or datetime.now(UTC)).strftime("%Y-%m-%dT%H%M%SZ")
-        backup, count = target.with_name(f"{target.name}.{stamp}.bak"), 1
-        while backup.exists():
-            count += 1
-            backup = target.with_name(f"{target.name}.{stamp}-{count}.bak")
-        write_bytes(backup, read_bytes(target))
-    write_bytes(target, text.encode())
+    refuse_existing(list(texts), force=force)
+    stamp = (now or datetime.now(UTC)).strftime("%Y-%m-%dT%H%M%SZ")
+    backups = {path: _backup(Path(path), stamp) if Path(path).exists() else None for path in texts}
+    contents: dict[str | os.PathLike, bytes] = {path: text.encode() for path, text in texts.items()}
+    contents |= {backup: read_bytes(path) for path, backup in backups.items() if backup}
+    write_together(contents)
+    return backups
+
+
+def _backup(target: Path, stamp: str) -> Path:
+    """Return a name beside a file that is still free."""
+    backup, count = target.with_name(f"{target.name}.{stamp}.bak"), 1
+    while backup.exists():
+        count += 1
+        backup = target.with_name(f"{target.name}.{stamp}-{count}.bak")
     return backup

@@ -6,10 +6,10 @@ import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from selfcal_ros.aerotech.write import refuse_existing, write_cal
+from selfcal_ros.aerotech.write import write_cals
 from selfcal_ros.cli.terminal import STDOUT, exit_code, say
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.outputs import check_outputs, write_bytes
+from selfcal_ros.outputs import check_outputs, utf8, write_bytes
 
 
 def deliver(
@@ -38,7 +38,7 @@ def deliver(
     **data
         More JSON on the file.
     """
-    raw = content.encode(errors="backslashreplace") if isinstance(content, str) else content
+    raw = utf8(content) if isinstance(content, str) else content
     if args.output == STDOUT:
         text = raw.decode()
         say(args, text.removesuffix("\n"), {key: text})
@@ -51,7 +51,7 @@ def deliver(
 def replace_files(
     args: argparse.Namespace, texts: Mapping[str, str], sources: Iterable[str | None]
 ) -> dict[str, str | None]:
-    """Write files, keep those that they replace; return path -> the old one.
+    """Write files, all or none; keep those that they replace; return path -> the old one.
 
     Raises
     ------
@@ -59,8 +59,7 @@ def replace_files(
         If one of them is a source, cannot be written, or exists and ``--force`` is not given.
     """
     check_outputs(sources, texts)
-    refuse_existing(list(texts), force=args.force)
-    backups = {path: write_cal(path, text, force=args.force) for path, text in texts.items()}
+    backups = write_cals(texts, force=args.force)
     return {path: str(backup) if backup else None for path, backup in backups.items()}
 
 

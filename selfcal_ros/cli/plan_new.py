@@ -31,7 +31,7 @@ from selfcal_ros.estimation.observability.suggest import (
     score_plan,
 )
 from selfcal_ros.estimation.terms.planned import Assumed
-from selfcal_ros.files import write_yaml
+from selfcal_ros.files import yaml_text
 from selfcal_ros.machine.cell import PLACERS, SHIPPED
 from selfcal_ros.machine.visiting import stops
 from selfcal_ros.model.artifact import Artifact
@@ -41,7 +41,7 @@ from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
-from selfcal_ros.outputs import check_outputs, write_text
+from selfcal_ros.outputs import check_outputs, utf8, write_together
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.observability import describe_view, worded_observability
 from selfcal_ros.units import MM_PER_M, UM_PER_M
@@ -199,12 +199,12 @@ def run(args: argparse.Namespace) -> int:
     with late_progress("judging plans") as progress:
         plan = _best(answers, artifact, path.stem, lambda: progress(0, None))
         prediction = _budget(plan), _next(plan)
-    write_yaml(path, plan_to_dict(plan))
-    write_text(cell_path, _cell_text(answers, simulation.name))
+    texts = {path: yaml_text(plan_to_dict(plan)), cell_path: _cell_text(answers, simulation.name)}
     if simulated:
         folder = path.resolve().parent
         named = path.name if folder == simulation.resolve().parent else str(path.resolve())
-        write_yaml(simulation, _simulation(answers, named))
+        texts[simulation] = yaml_text(_simulation(answers, named))
+    write_together({name: utf8(text) for name, text in texts.items()})
     say(
         args,
         "\n".join(_text(answers, plan, prediction, outputs)),

@@ -10,7 +10,7 @@ from pathlib import Path
 from selfcal_ros import __version__
 from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
 from selfcal_ros.aerotech.model import Table1D
-from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cal
+from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cals
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.terminal import add_json, busy, put, say, tell
 from selfcal_ros.compensation.frame import MachineFrame
@@ -194,7 +194,7 @@ def _write_cal(args: argparse.Namespace, identified: "StepDiagonalResult") -> No
         frame.comment(),
     ]
     text = cal_text(correction_tables(identified, frame), comments=comments, decimals=DECIMALS)
-    backup = write_cal(args.cal, text, force=args.force)
+    backup = write_cals({args.cal: text}, force=args.force)[args.cal]
     if backup:
         print(f"selfcal step-diagonal: the old {args.cal} is {backup}", file=sys.stderr)
 

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from selfcal_ros.aerotech.model import Severity, Table1D, Table2D, same_table
 from selfcal_ros.aerotech.read import parse_cal
-from selfcal_ros.aerotech.write import cal_text, decimal, write_cal
+from selfcal_ros.aerotech.write import cal_text, decimal, write_cals
 from selfcal_ros.errors import InputError
 from test.support.cal_tables import tables_1d, tables_2d, tables_galvo
+from test.support.disks import files_no_larger_than
 
 WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 
@@ -99,6 +100,10 @@ def test_what_would_read_back_differently_is_not_written(table, what, decimals):
     assert str(caught.value).startswith("calibration file") and what in str(caught.value)
 
 
+def write_cal(path, text, **kwargs):
+    return write_cals({path: text}, **kwargs)[path]
+
+
 def test_an_existing_file_stays_unless_forced_and_then_as_a_dated_backup(tmp_path):
     path = tmp_path / "f.cal"
     assert write_cal(path, "old\n") is None
@@ -110,6 +115,17 @@ def test_an_existing_file_stays_unless_forced_and_then_as_a_dated_backup(tmp_pat
     assert first.name == "f.cal.2026-01-02T030405Z.bak" and first.read_text() == "old\n"
     assert second.name == "f.cal.2026-01-02T030405Z-2.bak" and second.read_text() == "new\n"
     assert path.read_text() == "newer\n" and len(list(tmp_path.iterdir())) == 3
+
+
+def test_of_two_files_on_a_full_disk_none_is_replaced(tmp_path):
+    x, y = tmp_path / "x.cal", tmp_path / "y.cal"
+    write_cals({x: "old x\n", y: "old y\n"})
+    with files_no_larger_than(1000), pytest.raises(InputError, match=r"y.cal: cannot be written"):
+        write_cals({x: "new x\n", y: "y" * 2000}, force=True)
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {
+        "x.cal": "old x\n",
+        "y.cal": "old y\n",
+    }
 
 
 def test_folders_are_refused(tmp_path):

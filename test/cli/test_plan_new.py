@@ -12,6 +12,7 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.files import read_yaml
 from selfcal_ros.machine.cell import SHIPPED, read_cell
+from test.support.disks import files_no_larger_than
 from test.support.terminals import SELFCAL, in_terminal
 
 STAGE = ["--travel", "50mm", "--marks", "5", "--pitch", "10mm"]
@@ -54,6 +55,17 @@ def test_its_plan_is_checked_drawn_and_measured(options, minutes, capsys):
     result = json.loads(capsys.readouterr().out)
     assert len(result["views"]) == len(promised["views"]) * (3 if options is CAMERA else 1)
     assert all(view["rejected"] == 0 for view in result["views"])
+
+
+def test_on_a_full_disk_none_of_its_files_is_left(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plan_new, "_cell_text", lambda *_: "#" * 20_000)
+    with files_no_larger_than(10_000):
+        assert new(*STAGE, "--minutes", "20") == 2
+    assert capsys.readouterr().err == (
+        "selfcal plan new: cell.yaml: cannot be written (File too large); "
+        "name an existing, writable folder\n"
+    )
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_camera_shows_an_odd_number_of_marks():
