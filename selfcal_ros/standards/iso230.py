@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, digamma, polygamma
 
 from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
@@ -287,14 +287,13 @@ def axis_figures(
     shift = np.zeros(len(sites)) if approach_in_model else sign * reversal / 2
     up, down = -(error - shift + reversal / 2), -(error - shift - reversal / 2)
     rng = np.random.default_rng(0)
-    size = (DRAWS, len(sites))
     u = u_reversal * np.sqrt(np.mean(s_up**2 + s_down**2) / 2)
     turned = _true_values(reversal, u, rng)
     draws = bidirectional(
         -(drawn - shift + turned / 2),
         -(drawn - shift - turned / 2),
-        s_up * np.sqrt(rng.chisquare(dof_up, size) / dof_up),
-        s_down * np.sqrt(rng.chisquare(dof_down, size) / dof_down),
+        _true_scatters(s_up, dof_up, rng),
+        _true_scatters(s_down, dof_down, rng),
     )
     values_of = bidirectional(up, down, s_up, s_down)
     return AxisFigures(
@@ -317,19 +316,46 @@ def axis_figures(
 def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return draws of the true values at positions, (DRAWS, n), given measured ones with u.
 
-    The largest of measured values is larger than the largest true one. Values that differ by no
-    more than their noise (chi-square test, 1 %) are taken as equal, which makes the bias largest.
-    Otherwise the true ones are normal about their mean, with a variance t^2 that is drawn given
-    the measured ones; its prior makes the share u^2 / (u^2 + t^2) of noise uniform (Daniels, 1999).
+    The largest of measured values is larger than the largest true one.
+    """
+    if not (u > 0).all():
+        return np.broadcast_to(values, (DRAWS, len(values)))
+    centre, true_share = _true_shares(values, u, rng)
+    drawn = rng.standard_normal((DRAWS, len(values))) * u * np.sqrt(true_share)
+    return centre + true_share * (values - centre) + drawn
+
+
+def _true_scatters(s: np.ndarray, dof: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return draws of the true standard deviations at positions, (DRAWS, n), given measured ones.
+
+    As `_true_values`, of their logarithms: the largest s is larger than the largest true one.
+    """
+    noise = rng.chisquare(dof, (DRAWS, len(s))) / dof
+    if not (s > 0).all():
+        return s * np.sqrt(noise)
+    u, bias = np.sqrt(polygamma(1, dof / 2)) / 2, (digamma(dof / 2) - np.log(dof / 2)) / 2
+    centre, true_share = _true_shares(np.log(s) - bias, u, rng)
+    drawn = np.log(noise) / 2 * np.sqrt(true_share)
+    return np.exp(centre + true_share * (np.log(s) - centre) + drawn)
+
+
+def _true_shares(
+    values: np.ndarray, u: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return draws of the centre of values with u, (DRAWS, 1), and of how much about it is true.
+
+    Values that differ by no more than their noise (chi-square test, 1 %) are taken as equal, which
+    makes the bias of the largest of them largest: nothing about the centre is true. Otherwise the
+    true ones are normal about their mean, with a variance t^2 that is drawn given the measured
+    ones; its prior makes the share u^2 / (u^2 + t^2) of noise uniform (Daniels, 1999). The share of
+    truth is then (DRAWS, n).
     """
     n = len(values)
-    if not (u > 0).all():
-        return np.broadcast_to(values, (DRAWS, n))
     equal = 1 / u**2
     common = equal @ values / equal.sum()
     if chdtrc(n - 1, equal @ (values - common) ** 2) > LEVEL:
-        drawn = common + rng.standard_normal((DRAWS, 1)) / np.sqrt(equal.sum())
-        return np.repeat(drawn, n, axis=1)
+        centre = common + rng.standard_normal((DRAWS, 1)) / np.sqrt(equal.sum())
+        return centre, np.zeros((DRAWS, n))
     share = (np.arange(SHARES) + 0.5) / SHARES
     variance = np.mean(u**2) * (1 / share - 1)[:, None] + u**2
     weight = 1 / variance
@@ -337,10 +363,8 @@ def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) ->
     fit = 0.5 * (np.log(weight) - weight * (values - mean[:, None]) ** 2).sum(axis=1)
     fit -= 0.5 * np.log(weight.sum(axis=1))
     chosen = rng.choice(SHARES, DRAWS, p=np.exp(fit - fit.max()) / np.exp(fit - fit.max()).sum())
-    about = mean[chosen] + rng.standard_normal(DRAWS) / np.sqrt(weight[chosen].sum(axis=1))
-    true_share = 1 - u**2 * weight[chosen]
-    drawn = rng.standard_normal((DRAWS, n)) * u * np.sqrt(true_share)
-    return about[:, None] + true_share * (values - about[:, None]) + drawn
+    centre = mean[chosen] + rng.standard_normal(DRAWS) / np.sqrt(weight[chosen].sum(axis=1))
+    return centre[:, None], 1 - u**2 * weight[chosen]
 
 
 def _positions(
