@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.combine import Combination, Part, combine
+from selfcal_ros.estimation.comparison.combine import Combination, Member, combine
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
@@ -96,7 +96,7 @@ def combined(case: Case, seed: int) -> tuple[Combination, np.ndarray, np.ndarray
             ),
             OPTIONS,
         )
-        parts.append(Part(f"{run}.json", result.error_map, result))
+        parts.append(Member(f"{run}.json", result.error_map, result))
     found = combine(parts)
     emap = found.result.error_map
     off = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g, datum_modes(ARTIFACT, scale=True))

@@ -10,7 +10,7 @@ from typing import Any
 
 from selfcal_ros.cli.terminal import STDOUT, add_json, aside, busy, file_of, put
 from selfcal_ros.errors import InputError
-from selfcal_ros.estimation.comparison.combine import Part, combine
+from selfcal_ros.estimation.comparison.combine import Member, combine
 from selfcal_ros.estimation.comparison.external import map_from_table
 from selfcal_ros.files import read_text
 from selfcal_ros.model.error_map import rms
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def read_parts(names: Sequence[str]) -> list[Part]:
+def read_parts(names: Sequence[str]) -> list[Member]:
     """Return the maps of files; those of CSV files on the lattice of the first result."""
     tables = [name for name in names if name.lower().endswith(".csv")]
     results = {name: read_result(name) for name in names if name not in tables}
@@ -75,9 +75,9 @@ def read_parts(names: Sequence[str]) -> list[Part]:
         )
     artifact = next(iter(results.values())).artifact
     return [
-        Part(name, results[name].error_map, results[name])
+        Member(name, results[name].error_map, results[name])
         if name in results
-        else Part(name, map_from_table(read_text(name), name, artifact))
+        else Member(name, map_from_table(read_text(name), name, artifact))
         for name in names
     ]
 

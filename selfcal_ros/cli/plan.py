@@ -145,7 +145,7 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
         if alone is not None and observability.identifiable:
             terms = (*model, *plan_terms.assumed_terms(args.model, declared, plan))
             budget = plan_budget(
-                plan, terms, assumed, alone, asked=[term.name for term in declared]
+                plan, terms, assumed, alone, declared=[term.name for term in declared]
             )
     observability = worded_observability(observability)
     if args.json:
@@ -212,7 +212,7 @@ def _judge(
                 "leave it out of --model and of model_terms, or add what it acts on (angular "
                 "lines, images of several marks)",
             )
-    observability = terms.told(without[0])
+    observability = terms.with_free_terms(without[0])
     joint = terms.predicted(without[1]) if observability.identifiable else None
     return observability, joint, check_terms(terms, sizes, CAUSE_LEVEL)
 

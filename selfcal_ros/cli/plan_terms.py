@@ -275,7 +275,7 @@ def terms_json(checks: Iterable[TermCheck]) -> list[dict[str, Any]]:
     return [
         {
             "name": str(c.name),
-            "told": c.told,
+            "told": c.determined,
             "unseen_modes": c.unseen_modes,
             "model": c.model,
             "size": c.size,
@@ -297,7 +297,7 @@ def terms_text(plan: Plan, checks: Iterable[TermCheck], assumed: Assumed) -> lis
         f"{'largest':>10} {'detected':>9}",
     ]
     for c in checks:
-        separable = "yes" if c.told else f"no, {_modes(c.unseen_modes)}"
+        separable = "yes" if c.determined else f"no, {_modes(c.unseen_modes)}"
         lines.append(
             f"  {c.name:<13}{c.model or '-':<7}{separable:<17}{size_text(c):>12}"
             f"  {c.effect_rms_m * UM_PER_M:7.5f} µm {c.effect_max_m * UM_PER_M:7.5f} µm"

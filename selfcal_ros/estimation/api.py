@@ -83,11 +83,13 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         return recheck(_as_calibrated(measurements, plate), options, plate)
     camera, measurements = _camera(measurements, options)
     if camera is not None:  # the microscope that images show, in place of the assumed one
-        (scale, turn), other = camera.u_coefficients[1:3]
-        known = microscope_term(float(scale), float(turn), float(other.max()))
+        (scale, turn), others_u = camera.u_coefficients[1:3]
+        microscope = microscope_term(float(scale), float(turn), float(others_u.max()))
         options = replace(
             options,
-            assumed=tuple(known if term.block.of_microscope else term for term in options.assumed),
+            assumed=tuple(
+                microscope if term.block.of_microscope else term for term in options.assumed
+            ),
         )
     solved = solve_joint(measurements, options)
     converged = solved.converged
@@ -152,7 +154,7 @@ def _agree(result: CalibrationResult) -> bool:
     """Return whether the readings agree, whatever the sign of the offsets."""
     verdict = result.verdict
     of_repeats = {"sign_not_shown", "scale_of_offsets", "lines_sign_not_shown"}
-    failed = {found.name for found in verdict.failed} - {BY_LINES}
+    failed = {finding.name for finding in verdict.failed} - {BY_LINES}
     if verdict.failed and not failed:
         return _fits(result)
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
@@ -166,12 +168,12 @@ def _fits(result: CalibrationResult) -> bool:
     An effect beyond U leaves a result unqualified, and contradicts no wiring; one that is not
     plausible does, such as a microscope whose scale of -1 undoes it.
     """
-    found = [
+    causes_of_blocks = [
         (cause, block_of(cause.name)) for cause in result.verdict.causes if cause.name in blocks()
     ]
-    failed = {found.name for found in result.verdict.failed}
+    failed = {causes_of_blocks.name for causes_of_blocks in result.verdict.failed}
     return failed <= {BY_LINES} and not any(
-        block.between or abs(cause.size) > block.plausible for cause, block in found
+        block.between or abs(cause.size) > block.plausible for cause, block in causes_of_blocks
     )
 
 
@@ -192,9 +194,9 @@ def _check_turned(measurements: Measurements, options: Options, *, contradicted:
             return None
 
     def agree(wiring: Turned, options: Options) -> bool:
-        if (found := solution(wiring)) is None:
+        if (turned_solution := solution(wiring)) is None:
             return False
-        result = judged(*found, options, advise=False).result
+        result = judged(*turned_solution, options, advise=False).result
         return _agree(result) or (contradicted and options.finite_rotations and _fits(result))
 
     if not options.finite_rotations:  # a linear model mistakes rotations for a wrong wiring
@@ -202,12 +204,14 @@ def _check_turned(measurements: Measurements, options: Options, *, contradicted:
         if agree(AS_IS, options):
             return
     plain = replace(options, causes=False)
-    shown = sign_is_shown(measurements)  # repeats beside the marks
-    fitting = [] if shown else [pair for pair in PAIRS if any(agree(one, plain) for one in pair)]
+    sign_known = sign_is_shown(measurements)  # repeats beside the marks
+    fitting = (
+        [] if sign_known else [pair for pair in PAIRS if any(agree(sign, plain) for sign in pair)]
+    )
     candidates = fitting[0] if len(fitting) == 1 else () if fitting else (OTHER_LINES,)
-    found = [wiring for wiring in candidates if agree(wiring, options)]
-    if found:
-        raise turned_error(measurements, found)
+    agreeing = [wiring for wiring in candidates if agree(wiring, options)]
+    if agreeing:
+        raise turned_error(measurements, agreeing)
 
 
 def robust_calibrate(
@@ -243,12 +247,14 @@ def robust_calibrate(
     check_wiring(measurements)
     cleaned = clean(measurements, options)
     result = calibrate(cleaned.measurements, replace(options, robust=False))
-    left = tuple(
-        found for found in cleaned.findings if found.name in LEFT or found.details.get("spoils")
+    spoiling = tuple(
+        finding
+        for finding in cleaned.findings
+        if finding.name in LEFT or finding.details.get("spoils")
     )
     verdict = result.verdict
-    if left:
-        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *left))
+    if spoiling:
+        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *spoiling))
     return replace(
         result,
         findings=(*result.findings, *cleaned.findings),

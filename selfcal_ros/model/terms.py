@@ -17,7 +17,7 @@ MAX_DRIFT_DEGREE = 9
 DRIFT_DEGREE = 3
 """Default degree of this polynomial."""
 
-UNTOLD = 0.3
+UNDETERMINED = 0.3
 """Effect in standard uncertainties of the map, rms, from which a term that the readings do not
 determine is assumed in its nominal size."""
 

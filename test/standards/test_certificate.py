@@ -17,7 +17,7 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.estimation.comparison.combine import Part, combine
+from selfcal_ros.estimation.comparison.combine import Member, combine
 from selfcal_ros.estimation.comparison.covariance import covariance_of, first_order_u
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import known_plate
@@ -462,7 +462,7 @@ def run(seed, reference=None):
     readings = simulate_measurements(
         truth, plan, np.random.default_rng(seed), sigma_m=2e-8, sigma_theta_rad=2e-5
     )
-    return Part(
+    return Member(
         f"{seed}.json",
         (
             found := worded(calibrate(readings, Options(reference=reference, causes=False)))
@@ -486,7 +486,7 @@ def test_a_mean_is_traceable_if_all_its_runs_are():
         assert ("used at 21 °C" in text) is (warm in references) and "used at 20.4 °C" in text
         assert [named(root, f"readings of {part.name}") != [] for part in parts] == [True, True]
         assert is_traceable(result_from_dict(result_to_dict(mean), "m")) is traceable
-    table = Part("t.csv", run(7).error_map)
+    table = Member("t.csv", run(7).error_map)
     assert not is_traceable(combine([run(5, cold), table], keep_scale=True).result)
 
 

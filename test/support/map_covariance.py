@@ -40,7 +40,7 @@ class MapCovariance:
 def map_covariance(measurements: Measurements, options: Options) -> MapCovariance:
     """Return the covariance of the map that `calibrate` gives for the same arguments."""
     model = fit_joint(measurements, replace(options, uncertainty=True))
-    problem, found = model.problem, model.found
+    problem, found = model.problem, model.fitted
     field = Covariance(
         problem.system,
         found.inverse,

@@ -73,10 +73,10 @@ class Misplaced:
 
     @classmethod
     def of(
-        cls, view: str, planned: StagePose, found: StagePose, gain: float = float("inf")
+        cls, view: str, planned: StagePose, lies: StagePose, gain: float = float("inf")
     ) -> "Misplaced":
         """Return the difference of two poses."""
-        return cls(view, planned.turn_deg, found.turn_deg, planned.shift, found.shift, gain)
+        return cls(view, planned.turn_deg, lies.turn_deg, planned.shift, lies.shift, gain)
 
 
 @dataclass(frozen=True)
@@ -358,7 +358,7 @@ def _alike(views: list[_Seen], nodes: float) -> np.ndarray:
     site = np.concatenate([readings.place for readings in views])
     if not nodes:
         return np.equal.outer(site, site)
-    x, y = (np.subtract.outer(part, part) for part in (site.real, site.imag))
+    x, y = (np.subtract.outer(coordinate, coordinate) for coordinate in (site.real, site.imag))
     return np.exp(-(x * x + y * y) / (2 * nodes**2))
 
 
@@ -469,29 +469,32 @@ def _on_plate(views: list[_Seen]) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def said(found: Misplaced | Mirrored, where: str = "") -> PlacingError:
+def said(pose_fault: Misplaced | Mirrored, where: str = "") -> PlacingError:
     """Return in one line how the plate is placed, and how to continue."""
-    if isinstance(found, Mirrored):
+    if isinstance(pose_fault, Mirrored):
         return PlacingError(
             f"{where}all views",
             "the plate turns and shifts as in a mirrored "
-            f"frame: stage and offsets have {', or '.join(found.axes)}",
+            f"frame: stage and offsets have {', or '.join(pose_fault.axes)}",
             "correct the axes of both, so that a plate turned counter-clockwise "
             "turns from +x to +y",
         )
-    if found.found_deg != found.planned_deg:
-        what = f"the plate lies turned by {found.found_deg:g}°, not by {found.planned_deg:g}°"
-        wrong_way = (found.found_deg + found.planned_deg) % 360 == 0
+    if pose_fault.found_deg != pose_fault.planned_deg:
+        fault = (
+            f"the plate lies turned by {pose_fault.found_deg:g}°, "
+            f"not by {pose_fault.planned_deg:g}°"
+        )
+        wrong_way = (pose_fault.found_deg + pose_fault.planned_deg) % 360 == 0
         how = "turn it counter-clockwise" if wrong_way else "turn it as planned"
     else:
-        what = (
-            f"the plate lies shifted by {_pitches(found.found_shift)}, not by "
-            f"{_pitches(found.planned_shift)}"
+        fault = (
+            f"the plate lies shifted by {_pitches(pose_fault.found_shift)}, not by "
+            f"{_pitches(pose_fault.planned_shift)}"
         )
         how = "shift it as planned"
     return PlacingError(
-        f"{where}view '{found.view}'",
-        what,
+        f"{where}view '{pose_fault.view}'",
+        fault,
         f"{how} and measure this view again, or correct its pose in the plan",
     )
 

@@ -111,20 +111,20 @@ def wiring_faults(measurements: Measurements) -> list[WiringFault]:
 
     From all views together, else from the first view that shows a fault by itself.
     """
-    found = []
+    faults = []
     for kind, name in (("grid", "motion"), ("angular", "motion_theta")):
-        told = [
+        motions = [
             (view.view.name, motion)
             for view in measurements.views
             if (motion := getattr(view, name)) is not None and motion.dof > 1
         ]
-        tries = (len(AXES[kind]) ** 3 + len(AXES[kind])) * (len(told) + 1)
-        for view, motion in _together(told):
+        tries = (len(AXES[kind]) ** 3 + len(AXES[kind])) * (len(motions) + 1)
+        for view, motion in _together(motions):
             responses = _wrong(motion, AXES[kind], BEYOND_DOUBT / tries)
             if responses:
-                found.append(WiringFault(view, kind, responses))
+                faults.append(WiringFault(view, kind, responses))
                 break
-    return found
+    return faults
 
 
 def sign_is_shown(measurements: Measurements) -> bool:
@@ -165,8 +165,11 @@ def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResp
     if motion is None:
         return None
     limits = max(1 - BEYOND * u_scale, 0.0), 1 + BEYOND * u_scale
-    each = [_p_of_scale(motion, [(i, i)], limits) for i in range(2)]
-    axis, p = int(np.argmin(each)), min(*each, _p_of_scale(motion, [(0, 0), (1, 1)], limits))
+    p_of_axes = [_p_of_scale(motion, [(i, i)], limits) for i in range(2)]
+    axis, p = (
+        int(np.argmin(p_of_axes)),
+        min(*p_of_axes, _p_of_scale(motion, [(0, 0), (1, 1)], limits)),
+    )
     return (
         replace(_response(motion, (axis, axis), AXES["grid"]), p=6 * p)
         if (6 * p < F_LEVEL)
@@ -180,22 +183,23 @@ def _of_all_views(measurements: Measurements) -> RepeatMotion | None:
     if not motions:
         return None
     motion = _sum(motions)
-    moved = np.diag(motion.products) > LEAST_NOISE_M**2 * motion.dof
-    return motion if motion.dof > 1 and bool(moved.all()) else None
+    has_moved = np.diag(motion.products) > LEAST_NOISE_M**2 * motion.dof
+    return motion if motion.dof > 1 and bool(has_moved.all()) else None
 
 
 def _sum(motions: Sequence[RepeatMotion]) -> RepeatMotion:
     return RepeatMotion(
-        np.sum([one.products for one in motions], axis=0), sum(one.dof for one in motions)
+        np.sum([motion.products for motion in motions], axis=0),
+        sum(motion.dof for motion in motions),
     )
 
 
-def _together(told: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:
+def _together(motions: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:
     """Yield the sums of all views, then those of each view with its name."""
-    if told:
-        yield "", _sum([motion for _, motion in told])
-    if len(told) > 1:
-        yield from told
+    if motions:
+        yield "", _sum([motion for _, motion in motions])
+    if len(motions) > 1:
+        yield from motions
 
 
 @cache
@@ -217,13 +221,13 @@ def _wrong(
     """Return the offsets that follow the stage wrongly; none if in doubt."""
     limits = HALVED, DOUBLED
     n, least = len(axes), LEAST_NOISE_M**2 * motion.dof
-    moved = np.diag(motion.products) > np.repeat([least, 0.0], n)
-    if not moved[:n].any() or not moved[n:].any():
+    has_moved = np.diag(motion.products) > np.repeat([least, 0.0], n)
+    if not has_moved[:n].any() or not has_moved[n:].any():
         return ()
     wiring, out = _wiring(motion, level), []
     for j in range(n):
         i = int(np.abs(wiring[j]).argmax())
-        if not (moved[i] and moved[n + j]) or motion.products[i, n + j] * wiring[j, i] >= 0:
+        if not (has_moved[i] and has_moved[n + j]) or motion.products[i, n + j] * wiring[j, i] >= 0:
             continue
         response = _response(motion, (i, j), axes)
         if response.p >= F_LEVEL or response.most < LEAST_SLOPE:
@@ -243,29 +247,31 @@ def _wiring(motion: RepeatMotion, level: float) -> np.ndarray:
     def likely(wiring: np.ndarray) -> float:
         return float(-np.trace(motion.products[:n, n:] @ wiring))
 
-    right, *others = _wirings(n)
-    sure = [wiring for wiring in others if _p_for(motion, wiring, right) < level]
+    right, *wrong_wirings = _wirings(n)
+    sure = [wiring for wiring in wrong_wirings if _p_for(motion, wiring, right) < level]
     if not sure:
         return right
     best = max(sure, key=likely)
     straight = [
-        wiring for wiring in others if wiring[0, 0] and _p_for(motion, best, wiring) > F_LEVEL
+        wiring
+        for wiring in wrong_wirings
+        if wiring[0, 0] and _p_for(motion, best, wiring) > F_LEVEL
     ]
     return max(straight, key=likely, default=best)
 
 
-def _p_for(motion: RepeatMotion, wiring: np.ndarray, other: np.ndarray) -> float:
+def _p_for(motion: RepeatMotion, wiring: np.ndarray, alternative: np.ndarray) -> float:
     """Return the probability of the evidence for one wiring and against another.
 
     The evidence is tr(C (D' - D)): negative, or 0 without motion, if the other one is true.
     """
     n = len(wiring)
-    change = other - wiring
+    change = alternative - wiring
     size2 = np.trace(motion.products[:n, :n] @ change.T @ motion.products[n:, n:] @ change)
     if not size2 > 0:
         return 1.0
-    found, rank = np.trace(motion.products[:n, n:] @ change), int(np.linalg.matrix_rank(change))
-    return _p_of(float(found / np.sqrt(rank * size2)), rank * (motion.dof - 1) + 1)
+    evidence, rank = np.trace(motion.products[:n, n:] @ change), int(np.linalg.matrix_rank(change))
+    return _p_of(float(evidence / np.sqrt(rank * size2)), rank * (motion.dof - 1) + 1)
 
 
 def _p_of_scale(
@@ -278,15 +284,15 @@ def _p_of_scale(
     if even the largest is below it.
     """
     n, (least, most) = len(motion.products) // 2, limits
-    both = np.zeros((2, 2))
+    summed = np.zeros((2, 2))
     for i, j in pairs:
-        one = motion.products[np.ix_([i, n + j], [i, n + j])]
-        both += np.where(np.eye(2, dtype=bool), one, abs(one))
+        of_pair = motion.products[np.ix_([i, n + j], [i, n + j])]
+        summed += np.where(np.eye(2, dtype=bool), of_pair, abs(of_pair))
     place, offset = np.eye(2)
     dof = len(pairs) * (motion.dof - 1) + 1
     return min(
-        _p_of(_correlation(both, place, offset - most * place), dof),
-        _p_of(_correlation(both, offset, least * place - offset), dof),
+        _p_of(_correlation(summed, place, offset - most * place), dof),
+        _p_of(_correlation(summed, offset, least * place - offset), dof),
     )
 
 
@@ -305,8 +311,8 @@ def _p_of(correlation: float, dof: int) -> float:
     if correlation <= 0:
         return 0.5
     density = lgamma((d + 1) / 2) - lgamma(d / 2) - 0.5 * log(pi)
-    left = log(max(1 - correlation**2, 1e-30))
-    return min(0.5, exp(max(d / 2 * left + density - log(d * correlation), -700.0)))
+    log_uncorrelated = log(max(1 - correlation**2, 1e-30))
+    return min(0.5, exp(max(d / 2 * log_uncorrelated + density - log(d * correlation), -700.0)))
 
 
 def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) -> OffsetResponse:
@@ -335,7 +341,7 @@ def worded(fault: WiringFault) -> WiringError:
         for r in responses
     )
     if any(response.crossed for response in responses):
-        what = "exchanged axes: " + " and ".join(
+        fault_text = "exchanged axes: " + " and ".join(
             f"offset_{r.offset} follows {r.axis}" for r in responses
         )
         remedy = (
@@ -343,7 +349,7 @@ def worded(fault: WiringFault) -> WiringError:
             "are exchanged, correct joint_x and joint_y"
         )
     elif any(response.slope > 0 for response in responses):
-        what = (
+        fault_text = (
             "offsets of the other sign: "
             + names
             + (" rise" if len(responses) > 1 else " rises")
@@ -354,7 +360,7 @@ def worded(fault: WiringFault) -> WiringError:
             "stamp the detections with the time of the exposure"
         )
     else:
-        what = (
+        fault_text = (
             f"offsets in wrong units: {names} "
             + ", ".join(f"{abs(r.slope):.3g}" for r in responses)
             + " times what the stage moves"
@@ -363,7 +369,7 @@ def worded(fault: WiringFault) -> WiringError:
             "rad" if fault.kind == "angular" else "m"
         )
     where = "stage/mark_detections" + (f" of view '{fault.view}'" if fault.view else "")
-    return WiringError(where, f"{what} (slope among repeats of {numbers})", remedy)
+    return WiringError(where, f"{fault_text} (slope among repeats of {numbers})", remedy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -419,12 +425,12 @@ def shows_offsets(measurements: Measurements) -> bool:
     )
 
 
-def turned_error(measurements: Measurements, found: Sequence[Turned]) -> WiringError:
+def turned_error(measurements: Measurements, wirings: Sequence[Turned]) -> WiringError:
     """Return the error for the wirings with which alone the readings agree."""
-    what = ", or ".join(wiring.what for wiring in found)
+    texts = ", or ".join(wiring.what for wiring in wirings)
     return WiringError(
         f"plan '{measurements.plan_id}', stage/mark_detections",
-        f"{what}: only so do the readings of all views agree",
+        f"{texts}: only so do the readings of all views agree",
         "publish mark - optical axis along the stage's axes (a "
         "camera: --turn and --mirror, `selfcal camera init` finds them); check_stops in the plan "
         "show it in the first view",
@@ -466,7 +472,8 @@ def with_offsets(
         weight = (least[visits.mark] / visits.u) ** 2  # one of each mark is 1, however small
     weight = weight / np.bincount(visits.mark, weight)[visits.mark]
     dx, dy = (
-        np.bincount(visits.mark, weight * part, len(view.m)) for part in (change.real, change.imag)
+        np.bincount(visits.mark, weight * component, len(view.m))
+        for component in (change.real, change.imag)
     )
     return replace(
         view,
@@ -488,6 +495,6 @@ def _turned_motion(motion: RepeatMotion | None, back: np.ndarray) -> RepeatMotio
     if motion is None:
         return None
     n = len(back)
-    both = np.eye(2 * n)
-    both[n:, n:] = back
-    return replace(motion, products=both @ motion.products @ both.T)
+    transformation = np.eye(2 * n)
+    transformation[n:, n:] = back
+    return replace(motion, products=transformation @ motion.products @ transformation.T)

@@ -36,8 +36,8 @@ from selfcal_ros.estimation.joint.solve import factors_of
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.equations import TRACE
 from selfcal_ros.estimation.verdict.uncertainty import (
+    DETERMINED_BELOW,
     INTERPOLATION,
-    TOLD,
     budget_lines,
     remaining_part,
 )
@@ -73,7 +73,7 @@ OTHER_UNIT = 300.0
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class Member:
     """A map to be combined: its file, and its calibration; None for a map of other origin."""
 
     name: str
@@ -82,66 +82,69 @@ class Part:
 
 
 def require_own_readings(
-    parts: Sequence[Part], common: Mapping[str, np.ndarray], *, scale: bool
+    members: Sequence[Member], common: Mapping[str, np.ndarray], *, scale: bool
 ) -> None:
     """Refuse a map that equals another but for its datum, or has another unit or sign.
 
     Parameters
     ----------
-    parts : sequence of Part
+    members : sequence of Member
         The maps.
     common : mapping
         ``xy``, ``theta`` -> places known in all maps.
     scale : bool
         Whether magnification belongs to the datum.
     """
-    first = next(index for index, part in enumerate(parts) if part.result is not None)
-    for kind, known in common.items():
-        q = np.linalg.qr(datum_columns(parts[first].error_map.artifact, kind, known, scale=scale))[
-            0
-        ]
+    first = next(index for index, member in enumerate(members) if member.result is not None)
+    for kind, known_places in common.items():
+        q = np.linalg.qr(
+            datum_columns(members[first].error_map.artifact, kind, known_places, scale=scale)
+        )[0]
         maps, u = (
-            np.array([part.error_map.of(kind)[of][:, known].ravel() for part in parts])
+            np.array([member.error_map.of(kind)[of][:, known_places].ravel() for member in members])
             for of in (0, 1)
         )
         maps -= maps @ q @ q.T
-        for index, part in enumerate(parts):
-            if part.result is None:
+        for index, member in enumerate(members):
+            if member.result is None:
                 ratio = rms(maps[index]) / max(rms(maps[first]), rms(u[first]))
                 if ratio > OTHER_UNIT:
                     raise InputError(
-                        part.name,
+                        member.name,
                         f"its errors are {ratio:.2g} times those of "
-                        f"{parts[first].name}: is it in µ{KINDS[kind]}?",
+                        f"{members[first].name}: is it in µ{KINDS[kind]}?",
                         "give m and rad",
                     )
                 if _is_opposite(*(maps[n] / np.maximum(u[n], NO_NOISE) for n in (index, first))):
                     raise InputError(
-                        part.name,
-                        f"of the opposite sign to {parts[first].name}: its "
+                        member.name,
+                        f"of the opposite sign to {members[first].name}: its "
                         "negative agrees, and it does not",
                         "give G = indicated - true",
                     )
-            for other in range(index if kind == "xy" else 0):
-                if rms((maps[index] - maps[other]) / np.minimum(u[index], u[other])) < NEGLIGIBLE:
+            for earlier in range(index if kind == "xy" else 0):
+                if (
+                    rms((maps[index] - maps[earlier]) / np.minimum(u[index], u[earlier]))
+                    < NEGLIGIBLE
+                ):
                     raise InputError(
-                        part.name,
-                        f"of the same readings as {parts[other].name}: their maps are equal",
+                        member.name,
+                        f"of the same readings as {members[earlier].name}: their maps are equal",
                         "leave one of them out",
                     )
 
 
-def _is_opposite(one: np.ndarray, other: np.ndarray) -> bool:
+def _is_opposite(values: np.ndarray, reference: np.ndarray) -> bool:
     """Return whether two maps, over their u, are each other's negative beyond doubt.
 
     Both are beyond noise, of more values than agree in sign by chance, and their sum is as much
     less than their difference.
     """
-    sizes = rms(one), rms(other)
-    if min(sizes) < BEYOND or 0.5 ** len(one) > SHOWN:
+    sizes = rms(values), rms(reference)
+    if min(sizes) < BEYOND or 0.5 ** len(values) > SHOWN:
         return False
-    one, other = one / sizes[0], other / sizes[1]
-    return BEYOND * rms(one + other) < rms(one - other)
+    values, reference = values / sizes[0], reference / sizes[1]
+    return BEYOND * rms(values + reference) < rms(values - reference)
 
 
 def shared_reference(
@@ -163,24 +166,24 @@ def shared_reference(
         None if a run has no reference length; that of all runs if it is the same; otherwise
         the weighted mean, with that of each in `runs`.
     """
-    own = [result for result in results if result is not None]
-    found = [result.reference for result in own if result.reference]
-    if len(found) < len(own):
+    calibrations = [result for result in results if result is not None]
+    references = [result.reference for result in calibrations if result.reference]
+    if len(references) < len(calibrations):
         return None
-    if len(own) < len(results):
-        found = [replace(each, certified=None) for each in found]
-    if all(each == found[0] for each in found):
-        return found[0]
+    if len(calibrations) < len(results):
+        references = [replace(reference, certified=None) for reference in references]
+    if all(reference == references[0] for reference in references):
+        return references[0]
     share = np.array([weight for result, weight in zip(results, weights, strict=True) if result])
-    errors = np.array([each.relative_error for each in found])
-    names = dict.fromkeys(each.certificate or "none" for each in found)
+    errors = np.array([reference.relative_error for reference in references])
+    names = dict.fromkeys(reference.certificate or "none" for reference in references)
     return replace(
-        found[0],
+        references[0],
         certified=None,
         relative_error=float(share @ errors / share.sum()),
-        u_relative=max(each.u_relative for each in found),
+        u_relative=max(reference.u_relative for reference in references),
         certificate="; ".join(names),
-        runs=tuple(found),
+        runs=tuple(references),
     )
 
 
@@ -196,7 +199,7 @@ def exposures(results: Sequence[CalibrationResult | None]) -> dict[str, str]:
 
 
 SINGLE = 0.8
-"""Part of the scatter between runs above which a single shape is nearly all of it."""
+"""Member of the scatter between runs above which a single shape is nearly all of it."""
 TINY = np.finfo(float).tiny
 
 
@@ -290,15 +293,15 @@ class Mean:
 
 def independent_of(removed: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal columns of `removed`, and of what `shapes` add to them, (d, r), (d, m)."""
-    known = np.linalg.qr(removed)[0] if removed.size else removed
-    datum = known.shape[1]
+    basis = np.linalg.qr(removed)[0] if removed.size else removed
+    datum = basis.shape[1]
     for shape in shapes.T:
-        rest = shape / max(np.linalg.norm(shape), TINY)
+        independent = shape / max(np.linalg.norm(shape), TINY)
         for _ in range(2):  # the second time removes rounding
-            rest = rest - known @ (known.T @ rest)
-        if np.linalg.norm(rest) > TRACE:
-            known = np.column_stack([known, rest / np.linalg.norm(rest)])
-    return known[:, :datum], known[:, datum:]
+            independent = independent - basis @ (basis.T @ independent)
+        if np.linalg.norm(independent) > TRACE:
+            basis = np.column_stack([basis, independent / np.linalg.norm(independent)])
+    return basis[:, :datum], basis[:, datum:]
 
 
 def _independent_number(covariance: np.ndarray) -> float:
@@ -330,8 +333,8 @@ def variance_between(squares: np.ndarray, within: np.ndarray) -> float:
 def _scatter(squares: np.ndarray, within: np.ndarray) -> float:
     """Return the scatter of values about their weighted means, over their variances."""
     weight = 1 / np.maximum(within, TINY)
-    rest = squares - weight @ squares / weight.sum()
-    return float((weight @ rest**2).mean())
+    deviations = squares - weight @ squares / weight.sum()
+    return float((weight @ deviations**2).mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,22 +374,22 @@ def _families(
     """Return the families of values: one for each shape, and what is left, if anything is."""
     amplitude = values @ shapes
     within = np.stack([variances_of(c, shapes) for c in covariances])
-    found = [
+    families = [
         _Family(amplitude[:, [m]], within[:, m], shape**2, 1) for m, shape in enumerate(shapes.T)
     ]
-    known = np.concatenate([q, shapes], axis=1)
-    n_rest = len(known) - known.shape[1]
+    removed = np.concatenate([q, shapes], axis=1)
+    n_rest = len(removed) - removed.shape[1]
     if n_rest:
         total = np.array([variances(c).sum() for c in covariances])
-        found.append(
+        families.append(
             _Family(
-                (values - amplitude @ shapes.T) * np.sqrt(len(known) / n_rest),
+                (values - amplitude @ shapes.T) * np.sqrt(len(removed) / n_rest),
                 np.maximum(total - within.sum(axis=1), 0.0) / n_rest,
-                np.maximum(1 - (known**2).sum(axis=1), 0.0),
+                np.maximum(1 - (removed**2).sum(axis=1), 0.0),
                 n_rest,
             )
         )
-    return found
+    return families
 
 
 def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> Mean:
@@ -403,11 +406,11 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
     """
     q, shapes = independent_of(removed, shapes)
     values = np.stack([run.values - q @ (q.T @ run.values) for run in runs])
-    own = [without(run.covariance, q) for run in runs]
+    covariances = [without(run.covariance, q) for run in runs]
     shares = np.array([run.shares for run in runs], dtype=float)
-    families = _families(values, own, q, shapes)
+    families = _families(values, covariances, q, shapes)
     spread = np.sum([family.between * family.share for family in families], axis=0)
-    weights = 1 / np.maximum([variances(c).sum() + spread.sum() for c in own], TINY)
+    weights = 1 / np.maximum([variances(c).sum() + spread.sum() for c in covariances], TINY)
     weights = weights / weights.sum()
     shared = [without(run.common, q) for run in runs if run.shares]
     common = _sum(
@@ -415,9 +418,9 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         np.append(0.0, weights[shares > 0] / max(weights @ shares, TINY)),
     )
     pooled = weights**2
-    within = sum(w * variances(c) for w, c in zip(pooled, own, strict=True))
+    power_within = sum(w * variances(c) for w, c in zip(pooled, covariances, strict=True))
     between = pooled.sum() * spread
-    covariance = _sum([*own, common], np.append(pooled, (weights @ shares) ** 2))
+    covariance = _sum([*covariances, common], np.append(pooled, (weights @ shares) ** 2))
     added = spread
     if covariance.ndim == 2:
         of_shapes = np.array([family.between for family in families[: shapes.shape[1]]])
@@ -427,16 +430,16 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         )
     covariance = covariance + pooled.sum() * added
     shared_part = (weights @ shares) ** 2 * variances(common)
-    p = _p_between(families, runs, own)
+    p = _p_between(families, runs, covariances)
     of_one = max(families[: shapes.shape[1]], key=lambda family: family.between, default=None)
     if p < USUAL_LEVEL and of_one and of_one.between > SINGLE * spread.sum():
         dof = _dof_of_single(of_one, weights, shared_part)
     else:
-        dof = _dof(runs, own, families, weights, whole=within + shared_part + between)
+        dof = _dof(runs, covariances, families, weights, power=power_within + shared_part + between)
     return Mean(
         weights @ values,
         covariance,
-        within,
+        power_within,
         shared_part,
         between,
         float(np.sqrt(spread.mean())),
@@ -444,7 +447,8 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         weights,
         dof,
         tuple(
-            _deviation(i, runs, values, own, common, weights, q, added) for i in range(len(runs))
+            _deviation(i, runs, values, covariances, common, weights, q, added)
+            for i in range(len(runs))
         ),
     )
 
@@ -461,46 +465,51 @@ def _sum(covariances: list[np.ndarray], factors: np.ndarray) -> np.ndarray:
     )
 
 
-def _p_between(families: list[_Family], runs: list[RunValues], own: list[np.ndarray]) -> float:
+def _p_between(
+    families: list[_Family], runs: list[RunValues], covariances: list[np.ndarray]
+) -> float:
     """Return the probability of the scatter between runs by chance: the worst, Bonferroni."""
-    dof, together = _noise_dof(runs, own, np.ones(len(runs))), _sum(own, np.ones(len(own)))
-    found = []
+    dof, total = (
+        _noise_dof(runs, covariances, np.ones(len(runs))),
+        _sum(covariances, np.ones(len(covariances))),
+    )
+    probabilities = []
     for family in families:
         k = len(runs) - 1
         scatter = _scatter(family.values, family.within)
-        found.append(float(fdtrc(k * family.number(together), dof, scatter / k)))
-    return min(1.0, len(found) * min(found, default=1.0))
+        probabilities.append(float(fdtrc(k * family.number(total), dof, scatter / k)))
+    return min(1.0, len(probabilities) * min(probabilities, default=1.0))
 
 
-def _noise_dof(runs: list[RunValues], own: list[np.ndarray], factors: np.ndarray) -> float:
+def _noise_dof(runs: list[RunValues], covariances: list[np.ndarray], factors: np.ndarray) -> float:
     """Return the degrees of freedom of a sum of the runs' covariances (Welch-Satterthwaite)."""
-    power = [float(f * variances(c).mean()) for f, c in zip(factors, own, strict=True)]
+    power = [float(f * variances(c).mean()) for f, c in zip(factors, covariances, strict=True)]
     return min(joint_dof(*zip(power, [run.dof for run in runs], strict=True)), MANY_DOF)
 
 
 def _dof(
     runs: list[RunValues],
-    own: list[np.ndarray],
+    covariances: list[np.ndarray],
     families: list[_Family],
     weights: np.ndarray,
     *,
-    whole: np.ndarray,
+    power: np.ndarray,
 ) -> float:
     """Return the degrees of freedom of the mean's u, the median of all values.
 
     A variance between runs is a difference: its uncertainty is that of the scatter between runs,
     which contains the part within runs, with one degree of freedom less than there are runs.
     """
-    pooled = _sum(own, weights**2)
-    terms = np.zeros(len(whole))
+    pooled = _sum(covariances, weights**2)
+    terms = np.zeros(len(power))
     for family in families:
         k = (len(runs) - 1) * family.number(pooled)
         terms = terms + _scatter_of_mean(family, weights) ** 2 / k
-    for run, c, w in zip(runs, own, weights, strict=True):
+    for run, c, w in zip(runs, covariances, weights, strict=True):
         if 0 < run.dof < MANY_DOF:
             terms = terms + (w**2 * variances(c)) ** 2 / run.dof
-    found = (whole**2 / np.maximum(terms, TINY))[whole > 0]
-    return min(float(np.median(found)), MANY_DOF) if len(found) else MANY_DOF
+    dof_of_values = (power**2 / np.maximum(terms, TINY))[power > 0]
+    return min(float(np.median(dof_of_values)), MANY_DOF) if len(dof_of_values) else MANY_DOF
 
 
 def _scatter_of_mean(family: _Family, weights: np.ndarray) -> np.ndarray:
@@ -524,29 +533,35 @@ def _deviation(
     i: int,
     runs: list[RunValues],
     values: np.ndarray,
-    own: list[np.ndarray],
+    covariances: list[np.ndarray],
     common: np.ndarray,
     weights: np.ndarray,
     q: np.ndarray,
     between: np.ndarray,
 ) -> Deviation:
     """Return the deviation of run i from the weighted mean of the others."""
-    others = np.where(np.arange(len(runs)) == i, 0.0, weights)
-    others = others / others.sum()
-    rest = values[i] - others @ values
-    factors = others**2 + (np.arange(len(runs)) == i)
+    weights_of_others = np.where(np.arange(len(runs)) == i, 0.0, weights)
+    weights_of_others = weights_of_others / weights_of_others.sum()
+    deviation = values[i] - weights_of_others @ values
+    factors = weights_of_others**2 + (np.arange(len(runs)) == i)
     shares = np.array([run.shares for run in runs], dtype=float)
-    total = _sum([*own, common], np.append(factors, (shares[i] - others @ shares) ** 2))
-    dof = _noise_dof(runs, own, factors)
+    total = _sum(
+        [*covariances, common], np.append(factors, (shares[i] - weights_of_others @ shares) ** 2)
+    )
+    dof = _noise_dof(runs, covariances, factors)
     full = all(run.covariance.ndim == 2 for run in runs)
-    test = significance(rest, ReducedNoise(total if full else variances(total), q, dof))
+    test = significance(deviation, ReducedNoise(total if full else variances(total), q, dof))
     u = np.sqrt(variances(total))
-    e_n = np.divide(rest, coverage_factor(dof) * u, out=np.zeros_like(rest), where=u > 0)
-    return Deviation(e_n, test, _p_scatter(i, values, own, others, between))
+    e_n = np.divide(deviation, coverage_factor(dof) * u, out=np.zeros_like(deviation), where=u > 0)
+    return Deviation(e_n, test, _p_scatter(i, values, covariances, weights_of_others, between))
 
 
 def _p_scatter(
-    i: int, values: np.ndarray, own: list[np.ndarray], others: np.ndarray, between: np.ndarray
+    i: int,
+    values: np.ndarray,
+    covariances: list[np.ndarray],
+    weights_of_others: np.ndarray,
+    between: np.ndarray,
 ) -> float:
     """Return the probability that run i is so much farther from the mean than the others are.
 
@@ -556,18 +571,18 @@ def _p_scatter(
     runs = len(values)
     if runs < 3:
         return float("nan")
-    power = np.array([variances(c).sum() + variances(between).sum() for c in own])
-    mean = others @ values
-    of_mean = others**2 @ power
-    left = np.flatnonzero(np.arange(runs) != i)
-    scatter = ((values[left] - mean) ** 2).sum()
-    expected = ((1 - 2 * others[left]) * power[left] + of_mean).sum()
+    power = np.array([variances(c).sum() + variances(between).sum() for c in covariances])
+    mean = weights_of_others @ values
+    of_mean = weights_of_others**2 @ power
+    other_runs = np.flatnonzero(np.arange(runs) != i)
+    scatter = ((values[other_runs] - mean) ** 2).sum()
+    expected = ((1 - 2 * weights_of_others[other_runs]) * power[other_runs] + of_mean).sum()
     ratio = (
         ((values[i] - mean) ** 2).sum()
         / max(power[i] + of_mean, TINY)
         / max(scatter / max(expected, TINY), TINY)
     )
-    total = _sum([*own, between], np.append(np.full(runs, 1 / runs), 1.0))
+    total = _sum([*covariances, between], np.append(np.full(runs, 1 / runs), 1.0))
     number = max(_independent_number(total), 1.0)
     return float(fdtrc(number, number * (runs - 2), ratio))
 
@@ -596,7 +611,7 @@ class Combination:
 
 
 @one_thread()
-def combine(parts: Sequence[Part], *, keep_scale: bool = False) -> Combination:
+def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combination:
     """Return the weighted mean of several maps of one stage.
 
     Differences of datum are removed first. The weight of a run is the inverse of its mean variance
@@ -605,7 +620,7 @@ def combine(parts: Sequence[Part], *, keep_scale: bool = False) -> Combination:
 
     Parameters
     ----------
-    parts : sequence of Part
+    members : sequence of Member
         Two or more; at least one is a calibration, which gives the lattice.
     keep_scale : bool
         Keep the magnification: every calibration has a reference length.
@@ -615,86 +630,88 @@ def combine(parts: Sequence[Part], *, keep_scale: bool = False) -> Combination:
     InputError
         If the maps cannot be combined.
     """
-    first = _checked(parts, keep_scale=keep_scale)
+    first = _checked(members, keep_scale=keep_scale)
     common = {
         kind: np.logical_and.reduce(
-            [np.isfinite(part.error_map.of(kind)).all(axis=(0, 1)) for part in parts]
+            [np.isfinite(member.error_map.of(kind)).all(axis=(0, 1)) for member in members]
         )
         for kind in KINDS
     }
-    known, lines = common["xy"], common["theta"]
-    if known.sum() < 3:
+    known_sites, lines = common["xy"], common["theta"]
+    if known_sites.sum() < 3:
         raise InputError(
-            parts[-1].name,
-            f"{int(known.sum())} sites are known with their uncertainty in all maps",
+            members[-1].name,
+            f"{int(known_sites.sum())} sites are known with their uncertainty in all maps",
             "combine maps that overlap",
         )
-    require_own_readings(parts, common, scale=not keep_scale)
-    shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known)}
+    require_own_readings(members, common, scale=not keep_scale)
+    shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known_sites)}
     if lines.sum() > 1:
         shapes["theta"] = _waves(lines)
     means = {
         kind: mean_of(
-            [_run(part, kind, common[kind], keep_scale=keep_scale) for part in parts],
+            [_run(member, kind, common[kind], keep_scale=keep_scale) for member in members],
             datum_columns(first.artifact, kind, common[kind], scale=not keep_scale),
             of_kind,
         )
         for kind, of_kind in shapes.items()
     }
-    result = _result(parts, first, means, common)
+    result = _result(members, first, means, common)
     if not keep_scale:
         result = replace(result, reference=None)
-    return Combination(result, known, means["xy"], means.get("theta"))
+    return Combination(result, known_sites, means["xy"], means.get("theta"))
 
 
-def _checked(parts: Sequence[Part], *, keep_scale: bool) -> CalibrationResult:
+def _checked(members: Sequence[Member], *, keep_scale: bool) -> CalibrationResult:
     """Return the first calibration; InputError if the maps cannot be combined."""
-    own = [part for part in parts if part.result is not None]
-    if len(parts) < 2 or not own:
+    calibrations = [member for member in members if member.result is not None]
+    if len(members) < 2 or not calibrations:
         raise InputError(
-            parts[0].name if parts else "RESULT.json",
+            members[0].name if members else "RESULT.json",
             "a single map, or no RESULT.json among them",
             "give two or more, one of them a RESULT.json",
         )
-    for part in own:
+    for member in calibrations:
         require_same_lattice(
-            own[0].error_map.artifact, part.error_map.artifact, (own[0].name, part.name)
+            calibrations[0].error_map.artifact,
+            member.error_map.artifact,
+            (calibrations[0].name, member.name),
         )
-        result = part.result
+        result = member.result
         if result is None or not result.verdict.qualified:
-            raise InputError(part.name, "its calibration is not qualified", "leave it out")
+            raise InputError(member.name, "its calibration is not qualified", "leave it out")
         if keep_scale and result.reference is None:
             raise InputError(
                 "--keep-scale",
-                f"{part.name} has no reference length, so its magnification is unknown",
+                f"{member.name} has no reference length, so its magnification is unknown",
                 "omit it, or solve with --reference",
             )
-    for index, part in enumerate(parts):
-        _require_single_run(part, parts[:index])
-    found = own[0].result
-    assert found is not None
-    return found
+    for index, member in enumerate(members):
+        _require_single_run(member, members[:index])
+    first = calibrations[0].result
+    assert first is not None
+    return first
 
 
-def _require_single_run(part: Part, others: Sequence[Part]) -> None:
+def _require_single_run(member: Member, earlier_members: Sequence[Member]) -> None:
     """Refuse a map that is not of one recording alone, or of that of another map."""
-    result = part.result
+    result = member.result
     if result is None:
         return
     if result.method == COMBINED:
-        raise InputError(part.name, "a mean of several runs", "name these runs themselves")
-    for other in others:
-        if other.result is None:
+        raise InputError(member.name, "a mean of several runs", "name these runs themselves")
+    for earlier in earlier_members:
+        if earlier.result is None:
             continue
-        if _same_recording(result, other.result):
+        if _same_recording(result, earlier.result):
             raise InputError(
-                part.name, f"of the same recording as {other.name}", "leave one of them out"
+                member.name, f"of the same recording as {earlier.name}", "leave one of them out"
             )
         plate = _readings_of_plate(result)
-        if plate and plate == _readings_of_plate(other.result):
+        if plate and plate == _readings_of_plate(earlier.result):
             raise InputError(
-                part.name,
-                f"of the same plate errors as {other.name}: both rest on one calibration",
+                member.name,
+                f"of the same plate errors as {earlier.name}: both rest on one calibration",
                 "leave one of them out",
             )
 
@@ -706,26 +723,26 @@ def _readings_of_plate(result: CalibrationResult) -> str:
     return readings.get("sha256", "")
 
 
-def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
+def _same_recording(first: CalibrationResult, second: CalibrationResult) -> bool:
     """Whether two results are of one bag, or of one run at the same time with the same noise."""
-    digest = one.input.get("sha256")
-    if digest and digest == other.input.get("sha256"):
+    digest = first.input.get("sha256")
+    if digest and digest == second.input.get("sha256"):
         return True
-    run, also = (
+    first_run, second_run = (
         (
             result.run_id,
             result.provenance.extra.get("first_exposure"),
             result.provenance.extra.get("last_exposure"),
         )
-        for result in (one, other)
+        for result in (first, second)
     )
     return (
-        all(run)
-        and run == also
+        all(first_run)
+        and first_run == second_run
         and bool(
             np.isclose(
-                one.noise.sigma_xy_repeats,
-                other.noise.sigma_xy_repeats,
+                first.noise.sigma_xy_repeats,
+                second.noise.sigma_xy_repeats,
                 rtol=NEGLIGIBLE,
                 atol=0.0,
                 equal_nan=True,
@@ -734,19 +751,19 @@ def _same_recording(one: CalibrationResult, other: CalibrationResult) -> bool:
     )
 
 
-def _run(part: Part, kind: str, known: np.ndarray, *, keep_scale: bool) -> RunValues:
-    values, u = (of[:, known].ravel() for of in part.error_map.of(kind))
-    result, factors = part.result, np.zeros((0, len(values)))
+def _run(member: Member, kind: str, known_places: np.ndarray, *, keep_scale: bool) -> RunValues:
+    values, u = (of[:, known_places].ravel() for of in member.error_map.of(kind))
+    result, factors = member.result, np.zeros((0, len(values)))
     if result is None:
         return RunValues(values, u**2, np.zeros(len(u)), False, np.inf)
-    covariance = covariance_of(result, kind, known)
+    covariance = covariance_of(result, kind, known_places)
     if kind == "xy":
-        factors = _common(result, known, keep_scale=keep_scale)
+        factors = _common(result, known_places, keep_scale=keep_scale)
     common = factors.T @ factors if covariance.ndim == 2 else (factors**2).sum(axis=0)
     return RunValues(values, covariance - common, common, True, result.noise.dof_of(kind))
 
 
-def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -> np.ndarray:
+def _common(result: CalibrationResult, known_sites: np.ndarray, *, keep_scale: bool) -> np.ndarray:
     """Return factors L (r, 2n) of the covariance L' L of what the runs of a machine share, m.
 
     Terms of the microscope that are known from elsewhere, and the reference length.
@@ -756,26 +773,29 @@ def _common(result: CalibrationResult, known: np.ndarray, *, keep_scale: bool) -
         name
         for name, block in blocks().items()
         if block.shared
-        if name in terms and remaining_part(terms[name]) >= TOLD
+        if name in terms and remaining_part(terms[name]) >= DETERMINED_BELOW
     ]
-    kept = factors_of(result)
-    factors = kept.of_map[np.isin(kept.terms, names)][:, :, known]
-    factors = factors.reshape(len(factors), 2 * int(known.sum()))
+    saved = factors_of(result)
+    factors = saved.of_map[np.isin(saved.terms, names)][:, :, known_sites]
+    factors = factors.reshape(len(factors), 2 * int(known_sites.sum()))
     factors = factors * np.nan_to_num(result.noise.sigma_xy)
     if keep_scale and result.reference is not None:
-        at = result.artifact
-        place = np.concatenate([at.x_m[known], at.y_m[known]]) * result.reference.u_relative
+        lattice = result.artifact
+        place = (
+            np.concatenate([lattice.x_m[known_sites], lattice.y_m[known_sites]])
+            * result.reference.u_relative
+        )
         factors = np.concatenate([factors, place[None]])
     return factors
 
 
-def _polynomials(x: np.ndarray, y: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _polynomials(x: np.ndarray, y: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
     """Return polynomials of position up to `DEGREE` as columns over Gx, then Gy; the shear first.
 
     The first two are non-orthogonality O and scale difference R (Hu eq. 6).
     """
     size = max(np.abs(x).max(), np.abs(y).max())
-    x, y = x[known] / size, y[known] / size
+    x, y = x[known_sites] / size, y[known_sites] / size
     zero = np.zeros(len(x))
     columns = [(y, x), (x, -y)]
     for degree in range(2, DEGREE + 1):
@@ -791,16 +811,16 @@ def _waves(lines: np.ndarray) -> np.ndarray:
 
 
 def _result(
-    parts: Sequence[Part],
+    members: Sequence[Member],
     first: CalibrationResult,
     means: Mapping[str, Mean],
     common: Mapping[str, np.ndarray],
 ) -> CalibrationResult:
     """Return the means as a result: of ``xy``, and ``theta`` if it is known, by their places."""
-    plate, known = first.plate, common["xy"]
-    shapes = {"xy": (2, *known.shape), "theta": (1, len(common["theta"]))}
-    maps = {of: np.full(shape, np.nan) for of, shape in shapes.items()}
-    u = {of: np.full(shape, np.nan) for of, shape in shapes.items()}
+    plate, known_sites = first.plate, common["xy"]
+    shapes = {"xy": (2, *known_sites.shape), "theta": (1, len(common["theta"]))}
+    maps = {kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()}
+    u = {kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()}
     dof, k = dict.fromkeys(KINDS, np.nan), dict.fromkeys(KINDS, 2.0)
     for kind, mean in means.items():
         for out, values in ((maps[kind], mean.values), (u[kind], mean.u)):
@@ -821,9 +841,9 @@ def _result(
         r,
         ThetaDatum.ZERO_MEAN,
     )
-    unknown, unknowns = np.full(plate.shape, np.nan), 2 * int(known.sum())
-    runs = [part.result for part in parts]
-    found = CalibrationResult(
+    unknown, unknowns = np.full(plate.shape, np.nan), 2 * int(known_sites.sum())
+    runs = [member.result for member in members]
+    result = CalibrationResult(
         "+".join(dict.fromkeys(run.plan_id for run in runs if run)),
         emap,
         ArtifactMap(unknown, unknown, np.full(plate.angular_count, np.nan)),
@@ -839,24 +859,24 @@ def _result(
             dof_map_xy=dof["xy"],
             dof_map_theta=dof["theta"],
         ),
-        input={"file": ", ".join(part.name for part in parts)},
+        input={"file": ", ".join(member.name for member in members)},
         method=COMBINED,
         sense=first.sense,
-        extra={COMBINED: _runs(parts, means)},
-        kept=kept_covariances(_covariances(parts, means)),
-        verdict=_verdict(parts, means),
+        extra={COMBINED: _runs(members, means)},
+        kept=kept_covariances(_covariances(members, means)),
+        verdict=_verdict(members, means),
         model=ModelResult(first.model.misalignment),
         reference=shared_reference(runs, means["xy"].weights),
         provenance=Provenance(version=__version__, extra=exposures(runs)),
-        findings=(Finding("not_in_all", details={"sites": int((~known).sum())}),)
-        if not known.all()
+        findings=(Finding("not_in_all", details={"sites": int((~known_sites).sum())}),)
+        if not known_sites.all()
         else (),
         placed_plate=first.placed_plate,
     )
-    return replace(found, budget=_budget(found, means))
+    return replace(result, budget=_budget(result, means))
 
 
-def _runs(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
+def _runs(members: Sequence[Member], means: Mapping[str, Mean]) -> dict[str, Any]:
     """Return the runs with their deviations."""
     facts: dict[str, Any] = {}
     for kind, mean in means.items():
@@ -865,26 +885,26 @@ def _runs(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, Any]:
             f"p_between{SUFFIX[kind]}": mean.p_between,
         }
     facts["runs"] = []
-    for index, part in enumerate(parts):
+    for index, member in enumerate(members):
         run = {
-            "file": part.name,
-            "run_id": part.result.run_id if part.result else "",
-            "sha256": part.result.input.get("sha256", "") if part.result else "",
+            "file": member.name,
+            "run_id": member.result.run_id if member.result else "",
+            "sha256": member.result.input.get("sha256", "") if member.result else "",
             "weight": float(means["xy"].weights[index]),
         }
         for kind, mean in means.items():
-            run |= _of_run(mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(parts))
+            run |= _of_run(mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(members))
         facts["runs"].append(run)
     return facts
 
 
-def _covariances(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, np.ndarray]:
+def _covariances(members: Sequence[Member], means: Mapping[str, Mean]) -> dict[str, np.ndarray]:
     """Return the covariances of the means whose runs all have theirs."""
-    own = all(part.result is not None for part in parts)
+    all_calibrations = all(member.result is not None for member in members)
     return {
         kind: mean.covariance
         for kind, mean in means.items()
-        if (own or kind == "theta")
+        if (all_calibrations or kind == "theta")
         and mean.covariance.ndim == 2
         and all(
             deviation.test is None or deviation.test.correlated for deviation in mean.deviations
@@ -892,19 +912,19 @@ def _covariances(parts: Sequence[Part], means: Mapping[str, Mean]) -> dict[str, 
     }
 
 
-def _of_run(found: Deviation, kind: str, limit: float) -> dict[str, Any]:
-    test = found.test
+def _of_run(deviation: Deviation, kind: str, limit: float) -> dict[str, Any]:
+    test = deviation.test
     return {
-        f"e_n_rms{kind}": rms(found.e_n),
-        f"e_n_largest{kind}": float(abs(found.e_n).max()),
-        f"beyond{kind}": float((abs(found.e_n) > 1).mean()),
+        f"e_n_rms{kind}": rms(deviation.e_n),
+        f"e_n_largest{kind}": float(abs(deviation.e_n).max()),
+        f"beyond{kind}": float((abs(deviation.e_n) > 1).mean()),
         f"p{kind}": np.nan if test is None else min(1.0, 2 * min(test.p, test.p_z)),
         f"agrees{kind}": None if test is None else not test.significant,
-        f"stands_out{kind}": bool(found.p_scatter < limit),
+        f"stands_out{kind}": bool(deviation.p_scatter < limit),
     }
 
 
-def _verdict(parts: Sequence[Part], means: Mapping[str, Mean]) -> Verdict:
+def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
     """Return the verdict: enlarged if a run's U was, or if the runs differ by more than their U."""
     enlarged: dict[str, Enlargement] = {}
     failed = []
@@ -918,16 +938,18 @@ def _verdict(parts: Sequence[Part], means: Mapping[str, Mean]) -> Verdict:
                     mean.u_between,
                     unit=unit,
                     p=mean.p_between,
-                    details={"runs": len(parts), "quantity": kind},
+                    details={"runs": len(members), "quantity": kind},
                 )
             )
-    for part in parts:
-        for item in part.result.verdict.enlarged_by if part.result else ():
+    for member in members:
+        for item in member.result.verdict.enlarged_by if member.result else ():
             before = enlarged.get(item.name)
             if before is None or before.u_rms < item.u_rms:
                 enlarged[item.name] = item
     of_runs = [
-        part.name for part in parts if part.result and part.result.verdict.grade is Grade.ENLARGED
+        member.name
+        for member in members
+        if member.result and member.result.verdict.grade is Grade.ENLARGED
     ]
     if of_runs:
         failed.append(Finding("enlarged_runs", details={"runs": of_runs}))

@@ -40,7 +40,7 @@ from selfcal_ros.model.view import View, shared_rotations
 
 
 def covariance_of(
-    result: CalibrationResult, kind: str, known: np.ndarray, *, plate: bool = False
+    result: CalibrationResult, kind: str, known_places: np.ndarray, *, plate: bool = False
 ) -> np.ndarray:
     """Return the covariance of the known values of a map, m^2 or rad^2.
 
@@ -50,7 +50,7 @@ def covariance_of(
         The result.
     kind : str
         ``xy``: Gx, then Gy; or ``theta``.
-    known : bool array (nx, ny) or (K,)
+    known_places : bool array (nx, ny) or (K,)
         Sites or lines with an error.
     plate : bool
         Whether it is the map of the plate.
@@ -61,27 +61,27 @@ def covariance_of(
         The covariance; the variances if the correlations are unknown.
     """
     emap = (plate_as_map(result) if plate else result).error_map
-    u = emap.of(kind)[1][:, known].ravel()
+    u = emap.of(kind)[1][:, known_places].ravel()
     if plate:
-        kept = together(result)
-        cover = None if kept is None else kept.of_plate(kind, known)
+        kept_parts = together(result)
+        cover = None if kept_parts is None else kept_parts.of_plate(kind, known_places)
         return u**2 if cover is None else cover
     if kind in result.kept.covariances:
-        return _stored(result, kind, known)
-    found = behind(result)
-    if found is None or not np.isfinite(u).all():
+        return _stored(result, kind, known_places)
+    factors = behind(result)
+    if factors is None or not np.isfinite(u).all():
         return u**2
-    cover = found.of_sites(known) if kind == "xy" else found.of_lines(known)
+    cover = factors.of_sites(known_places) if kind == "xy" else factors.of_lines(known_places)
     return u**2 if cover is None else _sized(cover, u)
 
 
-def unit_rows(known: np.ndarray) -> np.ndarray:
+def unit_rows(known_sites: np.ndarray) -> np.ndarray:
     """Return the functionals Gx, then Gy, at the known sites, complex (2n, nx, ny)."""
-    at = np.flatnonzero(known.ravel())
-    rows = np.zeros((2 * len(at), known.size), dtype=complex)
-    rows[np.arange(len(at)), at] = 1.0
-    rows[len(at) + np.arange(len(at)), at] = 1j
-    return rows.reshape(-1, *known.shape)
+    sites = np.flatnonzero(known_sites.ravel())
+    rows = np.zeros((2 * len(sites), known_sites.size), dtype=complex)
+    rows[np.arange(len(sites)), sites] = 1.0
+    rows[len(sites) + np.arange(len(sites)), sites] = 1j
+    return rows.reshape(-1, *known_sites.shape)
 
 
 def kept_covariances(covers: Mapping[str, np.ndarray]) -> Kept:
@@ -101,19 +101,19 @@ def kept_covariances(covers: Mapping[str, np.ndarray]) -> Kept:
     )
 
 
-def _stored(result: CalibrationResult, kind: str, known: np.ndarray) -> np.ndarray:
+def _stored(result: CalibrationResult, kind: str, known_places: np.ndarray) -> np.ndarray:
     """Return the stored covariance of the known values, which are among those of the map."""
     values = result.error_map.of(kind)[0]
-    there = np.isfinite(values).all(axis=0)
+    in_map = np.isfinite(values).all(axis=0)
     try:
-        full = result.kept.covariances[kind].matrix(len(values) * int(there.sum()))
+        full = result.kept.covariances[kind].matrix(len(values) * int(in_map.sum()))
     except ValueError as error:
         raise InputError(
             "map_covariance",
             "no covariance of this map",
             "write the map again with `selfcal combine`",
         ) from error
-    chosen = np.tile(known[there], len(values))
+    chosen = np.tile(known_places[in_map], len(values))
     return full[np.ix_(chosen, chosen)]
 
 
@@ -131,31 +131,31 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
     """
     unknown = float("nan"), float("nan")
     if result.kept.covariances:
-        known, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
-        cover = covariance_of(result, "xy", known)
+        known_sites, pitch_m = result.error_map.valid, result.artifact.grid_pitch_m
+        cover = covariance_of(result, "xy", known_sites)
         if cover.ndim == 1:
             return unknown
         z = (result.artifact.x_m + 1j * result.artifact.y_m) / pitch_m
-        shear = Gauge(z, known, scale=True).shear[:, known]
+        shear = Gauge(z, known_sites, scale=True).shear[:, known_sites]
         rows = np.concatenate([shear.real, shear.imag], axis=1)
         variance = np.diag(rows @ cover @ rows.T) / pitch_m**2
     else:
-        found = behind(result)
-        if found is None or found.lacks_terms:
+        factors = behind(result)
+        if factors is None or factors.lacks_terms:
             return unknown
-        shear = found.system.gauge.shear
-        kept, row = factors_of(result), turned_over(result.sense, shear).conj()
-        common = _complex(kept.of_map[~kept.of_each_place])
-        moved = np.real(np.tensordot(common, row, axes=((1, 2), (1, 2))))
+        shear = factors.system.gauge.shear
+        saved, row = factors_of(result), turned_over(result.sense, shear).conj()
+        common = _complex(saved.of_map[~saved.of_each_place])
+        of_terms = np.real(np.tensordot(common, row, axes=((1, 2), (1, 2))))
         added = result.kept.added
         variance = (
-            np.diag(found.maps.of(shear))
-            + (moved**2).sum(axis=0)
+            np.diag(factors.maps.of(shear))
+            + (of_terms**2).sum(axis=0)
             + (0.0 if added is None else added)
         )
         variance = variance * result.noise.sigma_xy**2
         variance += lack_of_fit_m(result) ** 2 * (abs(shear) ** 2).sum(axis=(1, 2))
-        variance = variance / found.half_width_m**2
+        variance = variance / factors.half_width_m**2
     o, r = np.sqrt(variance)
     return float(o), float(r)
 
@@ -255,15 +255,15 @@ def _kept_cells(images: ImagesKept, n_views: int) -> list[tuple[int, tuple[int, 
     return list(zip(images.placing, images.step, strict=True))
 
 
-def _is_read(kept: Any) -> bool:
+def _is_read(weights: Any) -> bool:
     """Return whether any weight is not zero; NaN counts, and is refused with the weights."""
     try:
-        return bool(np.any(np.array(kept, dtype=float)))
+        return bool(np.any(np.array(weights, dtype=float)))
     except (TypeError, ValueError):
         return True
 
 
-def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
+def _weights(weights: Any, field: np.ndarray, where: str) -> np.ndarray:
     """Return weights in full: a single number stands for the whole field.
 
     Raises
@@ -271,9 +271,9 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
     InputError
         If they are not weights of this field.
     """
-    shape = field.shape if isinstance(kept, list | np.ndarray) else ()
+    shape = field.shape if isinstance(weights, list | np.ndarray) else ()
     try:
-        weight = np.array(kept, dtype=float).reshape(shape) * (field if shape == () else 1.0)
+        weight = np.array(weights, dtype=float).reshape(shape) * (field if shape == () else 1.0)
     except (TypeError, ValueError):
         weight = np.array(np.nan)
     if not (np.isfinite(weight) & (weight >= 0)).all():
@@ -283,9 +283,9 @@ def _weights(kept: Any, field: np.ndarray, where: str) -> np.ndarray:
     return weight
 
 
-def _not_kept(what: str) -> InputError:
+def _not_kept(missing: str) -> InputError:
     """Return the error of a result whose factors do not have what belongs to them."""
-    return InputError(FACTORS, f"no {what}", "write the result again with `selfcal solve`")
+    return InputError(FACTORS, f"no {missing}", "write the result again with `selfcal solve`")
 
 
 @dataclass(frozen=True, eq=False)
@@ -350,18 +350,18 @@ class Together:
         if not share_of(self.result):
             return None
         grid = self.system.grid
-        seen = _kept_cells(cast(ImagesKept, self.result.kept.images), grid.n_views)
+        cells_of_views = _kept_cells(cast(ImagesKept, self.result.kept.images), grid.n_views)
         return ImageNoise(
-            stops_of(seen, grid.read),
+            stops_of(cells_of_views, grid.read),
             grid.read,
             grid.weight[grid.read],
             np.zeros((0, 2, 3)),
             np.zeros((0, 2, 3 * grid.n_views)),
         )
 
-    def stage_rows(self, known: np.ndarray) -> np.ndarray:
+    def stage_rows(self, known_sites: np.ndarray) -> np.ndarray:
         """Return the functionals Gx, then Gy, at sites, in the frame of the equations."""
-        return turned_over(self.result.sense, unit_rows(known))
+        return turned_over(self.result.sense, unit_rows(known_sites))
 
     def of_noise(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance of functionals of both maps for noise of marks and images."""
@@ -372,33 +372,41 @@ class Together:
             self.maps.sensitivities(sites, marks)
         )
 
-    def of_sites(self, known: np.ndarray) -> np.ndarray | None:
+    def of_sites(self, known_sites: np.ndarray) -> np.ndarray | None:
         """Return the covariance of Gx, then Gy, at sites for unit noise, None if it is not kept."""
-        if known.size > MAX_FULL or self.lacks_terms:
+        if known_sites.size > MAX_FULL or self.lacks_terms:
             return None
-        factors = self._kept.of_map[:, :, known].reshape(-1, 2 * int(known.sum()))
-        return self.of_noise(self.stage_rows(known)) + _product(factors, self._kept.of_each_place)
+        factors = self._kept.of_map[:, :, known_sites].reshape(-1, 2 * int(known_sites.sum()))
+        return self.of_noise(self.stage_rows(known_sites)) + _product(
+            factors, self._kept.of_each_place
+        )
 
-    def of_lines(self, known: np.ndarray) -> np.ndarray | None:
+    def of_lines(self, known_lines: np.ndarray) -> np.ndarray | None:
         """Return the covariance of Gtheta at lines for their unit noise, None if it is not kept."""
         result, system = self.result, self.system
-        if len(known) > MAX_FULL or not system.angular.n_views:
+        if len(known_lines) > MAX_FULL or not system.angular.n_views:
             return None
         conditions = conditions_for(
             system, ThetaDatum(result.error_map.datum_theta), Sense(result.sense), self.half_width_m
         )
-        to_datum = np.eye(len(known)) - conditions.gain @ conditions.rows
-        rows = lines_turned_over(result.sense, to_datum)[known]
+        to_datum = np.eye(len(known_lines)) - conditions.gain @ conditions.rows
+        rows = lines_turned_over(result.sense, to_datum)[known_lines]
         return lines_alone(system).of(rows.T, np.zeros(rows.T.shape))
 
-    def of_plate(self, kind: str, known: np.ndarray) -> np.ndarray | None:
+    def of_plate(self, kind: str, known_places: np.ndarray) -> np.ndarray | None:
         """Return the covariance of the plate's map, ``xy`` or ``theta``, None if it is not kept."""
         if kind == "xy":
             nowhere = np.zeros(self.sites.shape, dtype=bool)
-            return self.cover(nowhere, known)[:-4, :-4] if self.marks[known].all() else None
+            return (
+                self.cover(nowhere, known_places)[:-4, :-4]
+                if self.marks[known_places].all()
+                else None
+            )
         lines, cover = self.lines()
-        at = len(known) + np.flatnonzero(known)
-        return cover[np.ix_(at, at)] if lines[1][known].all() else None
+        lines_of_plate = len(known_places) + np.flatnonzero(known_places)
+        return (
+            cover[np.ix_(lines_of_plate, lines_of_plate)] if lines[1][known_places].all() else None
+        )
 
     @property
     def _kept(self) -> Factors:
@@ -419,20 +427,20 @@ class Together:
 
     def _beside(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return the factors of a quantity beside the map in this shape, (r, ...)."""
-        beside = self._kept.beside
-        if beside and name not in beside:
+        saved = self._kept.beside
+        if saved and name not in saved:
             raise _not_kept(f"{name} of this plate")
-        return beside.get(name, np.zeros((0, *shape))).reshape(-1, *shape)
+        return saved.get(name, np.zeros((0, *shape))).reshape(-1, *shape)
 
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the effect of terms and causes on G, A and the microscope, (r, q)."""
         plate, stage = self._beside("plate", (2, *marks.shape)), self._kept.of_map
-        effects, here = len(self._effects), 2 * int(sites.sum())
+        effects, n_of_stage = len(self._effects), 2 * int(sites.sum())
         n, r = len(stage) - effects, len(plate)
-        maps = np.zeros((r + effects, here + 2 * int(marks.sum()) + 4))
-        of_stage = stage[:, :, sites].reshape(len(stage), here)
-        maps[:n, :here], maps[r:, :here] = of_stage[:n], of_stage[n:]
-        maps[:r, here:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - here - 4)
+        maps = np.zeros((r + effects, n_of_stage + 2 * int(marks.sum()) + 4))
+        of_stage = stage[:, :, sites].reshape(len(stage), n_of_stage)
+        maps[:n, :n_of_stage], maps[r:, :n_of_stage] = of_stage[:n], of_stage[n:]
+        maps[:r, n_of_stage:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - n_of_stage - 4)
         maps[:r, -4:] = self._beside(block_of_offsets().name, (4,)) / self.half_width_m
         return maps
 
@@ -470,25 +478,25 @@ class Together:
     @cached_property
     def _ratio(self) -> float:
         """Variance of the stage's map over that of white noise and terms."""
-        emap, known = self.result.error_map, self.sites
-        white = np.trace(self.of_noise(self.stage_rows(known)))
-        factors = self._kept.of_map[..., known]
+        emap, sites = self.result.error_map, self.sites
+        white = np.trace(self.of_noise(self.stage_rows(sites)))
+        factors = self._kept.of_map[..., sites]
         white += (factors**2).sum()
-        effects = (self._effects[..., known] ** 2).sum()
-        found = (emap.u_gx[known] ** 2 + emap.u_gy[known] ** 2).sum()
+        effects = (self._effects[..., sites] ** 2).sum()
+        stated = (emap.u_gx[sites] ** 2 + emap.u_gy[sites] ** 2).sum()
         sigma = max(self.result.noise.sigma_xy, np.finfo(float).tiny)
-        return float(max((found / sigma**2 - effects) / (white - effects), 0.0))
+        return float(max((stated / sigma**2 - effects) / (white - effects), 0.0))
 
     @cached_property
     def _ratio_of_plate(self) -> float:
         """The same for the plate's map, on which noise of images acts differently."""
-        plate, known = self.result.artifact_map, self.marks
-        rows = unit_rows(known)
+        plate, marks = self.result.artifact_map, self.marks
+        rows = unit_rows(marks)
         white = np.trace(self.of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
-        white += (self._beside("plate", (2, *known.shape))[..., known] ** 2).sum()
-        found = (plate.u_ax[known] ** 2 + plate.u_ay[known] ** 2).sum()
-        found -= self._effects_on_plate[:, known].sum() * self.result.noise.sigma_xy**2
-        return float(found / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
+        white += (self._beside("plate", (2, *marks.shape))[..., marks] ** 2).sum()
+        stated = (plate.u_ax[marks] ** 2 + plate.u_ay[marks] ** 2).sum()
+        stated -= self._effects_on_plate[:, marks].sum() * self.result.noise.sigma_xy**2
+        return float(stated / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
 
     def lines(self) -> tuple[np.ndarray, np.ndarray]:
         """Return lines known in both angular maps, bool (2, K), and their covariance, rad^2.
@@ -497,15 +505,15 @@ class Together:
         """
         result, angular = self.result, self.system.angular
         count, emap, plate = angular.n_lines, result.error_map, result.artifact_map
-        known = np.isfinite(
+        known_lines = np.isfinite(
             np.stack([emap.g_theta + emap.u_g_theta, plate.a_theta + plate.u_a_theta])
         )
-        if not angular.n_views or count > MAX_FULL or not known.any(axis=1).all():
+        if not angular.n_views or count > MAX_FULL or not known_lines.any(axis=1).all():
             return np.zeros((2, count), dtype=bool), np.zeros((2 * count, 2 * count))
         centre = np.zeros((2 * count, 2 * count))
-        for part, here in enumerate(known):
-            at = part * count + np.flatnonzero(here)
-            centre[np.ix_(at, at)] = np.eye(len(at)) - 1 / len(at)
+        for map_number, of_map in enumerate(known_lines):
+            rows = map_number * count + np.flatnonzero(of_map)
+            centre[np.ix_(rows, rows)] = np.eye(len(rows)) - 1 / len(rows)
         stage, noise = lines_turned_over(result.sense, centre[:, :count].T), result.noise
         cover = LinesCovariance(self.maps, (noise.sigma_xy, noise.sigma_theta)).of(
             stage, centre[:, count:].T
@@ -514,9 +522,9 @@ class Together:
             self._beside("lines", (2 * count,)) @ centre.T * (noise.sigma_xy / self.half_width_m)
         )
         cover = cover + terms.T @ terms
-        white = np.diag(cover)[:count][known[0]].sum()
-        found = (emap.u_g_theta[known[0]] ** 2).sum()
-        return known, cover * max(float(found / white), 1.0)
+        white = np.diag(cover)[:count][known_lines[0]].sum()
+        stated = (emap.u_g_theta[known_lines[0]] ** 2).sum()
+        return known_lines, cover * max(float(stated / white), 1.0)
 
 
 def behind(result: CalibrationResult) -> Together | None:
@@ -530,22 +538,28 @@ def together(result: CalibrationResult) -> Together | None:
     incomplete = result.model.terms and not factors_of(result).beside
     if incomplete or max(result.artifact.m.size, result.plate.m.size) > MAX_FULL:
         return None
-    found = behind(result)
-    return found if found is not None and found.marks.any() else None
+    factors = behind(result)
+    return factors if factors is not None and factors.marks.any() else None
 
 
 def plate_as_map(result: CalibrationResult) -> CalibrationResult:
     """Return the result with the map of its plate in place of that of the stage."""
-    found = result.artifact_map
+    plate_map = result.artifact_map
     artifact = replace(result.plate, map_grid=None, harmonics=0)
     nothing, none = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
-    o, r = first_order(artifact, np.stack([found.ax, found.ay]))
+    o, r = first_order(artifact, np.stack([plate_map.ax, plate_map.ay]))
     u_x, u_y, u_theta = (
         u if u.size else empty
-        for u, empty in ((found.u_ax, nothing), (found.u_ay, nothing), (found.u_a_theta, none))
+        for u, empty in (
+            (plate_map.u_ax, nothing),
+            (plate_map.u_ay, nothing),
+            (plate_map.u_a_theta, none),
+        )
     )
     return replace(
         result,
         placed_plate=None,
-        error_map=ErrorMap(artifact, found.ax, found.ay, u_x, u_y, found.a_theta, u_theta, o, r),
+        error_map=ErrorMap(
+            artifact, plate_map.ax, plate_map.ay, u_x, u_y, plate_map.a_theta, u_theta, o, r
+        ),
     )

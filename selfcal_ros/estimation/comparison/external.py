@@ -43,27 +43,27 @@ def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
     """
     grid = {name: np.full(artifact.shape, np.nan) for name in XY[2:]}
     circle = {name: np.full(artifact.angular_count, np.nan) for name in THETA[1:]}
-    seen: set[tuple[int, ...]] = set()
+    places_read: set[tuple[int, ...]] = set()
     for row in _rows(text, where):
         is_site = np.isfinite([row.cells["x"], row.cells["y"]]).all()
-        at = _site(row, artifact) if is_site else _line(row, artifact)
-        if at in seen:
+        place = _site(row, artifact) if is_site else _line(row, artifact)
+        if place in places_read:
             raise InputError(row.place, "its site is in the table twice", "delete one of the rows")
-        seen.add(at)
+        places_read.add(place)
         for name, values in (grid if is_site else circle).items():
-            values[at] = row.cells[name]
-            if name.startswith("u_") and (values[at] <= 0 or values[at] > 1):
+            values[place] = row.cells[name]
+            if name.startswith("u_") and (values[place] <= 0 or values[place] > 1):
                 raise InputError(
                     row.place,
-                    f"{name} {values[at]:g} is not a standard uncertainty",
+                    f"{name} {values[place]:g} is not a standard uncertainty",
                     "give it in m (rad), k = 1",
                 )
-    known = np.isfinite(list(grid.values())).all(axis=0)
-    if not known.any():
+    known_sites = np.isfinite(list(grid.values())).all(axis=0)
+    if not known_sites.any():
         raise InputError(
             where, "no site has an error and its uncertainty", "fill the columns gx, gy, u_gx, u_gy"
         )
-    gx, gy, u_gx, u_gy = (np.where(known, values, np.nan) for values in grid.values())
+    gx, gy, u_gx, u_gy = (np.where(known_sites, values, np.nan) for values in grid.values())
     return ErrorMap(artifact, gx, gy, u_gx, u_gy, circle["g_theta"], circle["u_g_theta"])
 
 
@@ -89,7 +89,7 @@ def _rows(text: str, where: str) -> list[_Row]:
             f"no column {', '.join(missing)}",
             "give x, y, gx, gy, u_gx, u_gy in m, as `selfcal table` writes",
         )
-    found = []
+    rows = []
     for place, line in lines[1:]:
         cells = csv_cells(line, place)
         if len(cells) != len(head):
@@ -104,8 +104,8 @@ def _rows(text: str, where: str) -> list[_Row]:
             raise InputError(place, "a cell is not a number", "correct the line") from None
         if any(abs(value) > 1e3 for value in values.values()):
             raise InputError(place, "a value beyond 1000 m or rad", "give m and rad")
-        found.append(_Row(place, dict.fromkeys((*XY, *THETA), np.nan) | values))
-    return found
+        rows.append(_Row(place, dict.fromkeys((*XY, *THETA), np.nan) | values))
+    return rows
 
 
 def _site(row: _Row, artifact: Artifact) -> tuple[int, ...]:

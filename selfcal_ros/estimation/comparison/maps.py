@@ -255,8 +255,8 @@ class MapDifference:
     @property
     def max_theta_rad(self) -> float:
         """Largest angular difference, rad; NaN without angular maps."""
-        known = self.d_theta[np.isfinite(self.d_theta)]
-        return float(np.abs(known).max()) if len(known) else float("nan")
+        differences = self.d_theta[np.isfinite(self.d_theta)]
+        return float(np.abs(differences).max()) if len(differences) else float("nan")
 
 
 @one_thread()
@@ -289,10 +289,10 @@ def compare(
     covariance = partial(covariance_of, plate=plates)
     pair = [(plate_as_map(result) if plates else result).error_map for result in (a, b)]
     require_same_lattice(pair[0].artifact, pair[1].artifact, names)
-    known = int((pair[0].valid & pair[1].valid).sum())
-    if known < 3:
+    n_known = int((pair[0].valid & pair[1].valid).sum())
+    if n_known < 3:
         raise InputError(
-            names[1], f"{known} sites are known in both maps", "compare maps that overlap"
+            names[1], f"{n_known} sites are known in both maps", "compare maps that overlap"
         )
 
     xy, theta = (
@@ -337,20 +337,22 @@ def _difference(
 ) -> _Difference:
     """Return the second map minus the first."""
     (old, _), (new, _) = (emap.of(kind) for emap in maps)
-    known = np.isfinite(new - old).all(axis=0)
-    columns = datum_columns(maps[0].artifact, kind, known, scale=scale)
+    known_places = np.isfinite(new - old).all(axis=0)
+    columns = datum_columns(maps[0].artifact, kind, known_places, scale=scale)
     out = np.full(old.shape, np.nan)
-    if not known.any():
+    if not known_places.any():
         return _Difference(out, np.full(columns.shape[1], np.nan), None)
 
-    values, size = (new - old)[:, known].ravel(), np.linalg.norm(columns, axis=0)
+    values, size = (new - old)[:, known_places].ravel(), np.linalg.norm(columns, axis=0)
     datum = np.linalg.lstsq(columns / size, values, rcond=None)[0] / size
     values = values - columns @ datum
-    out[:, known] = values.reshape(len(out), -1)
-    if known.sum() < 2:
+    out[:, known_places] = values.reshape(len(out), -1)
+    if known_places.sum() < 2:
         return _Difference(out, datum, None)
 
-    total = np.sum(of_one_kind([covariance(result, kind, known) for result in results]), axis=0)
+    total = np.sum(
+        of_one_kind([covariance(result, kind, known_places) for result in results]), axis=0
+    )
     power = [float(np.nan_to_num(rms(emap.of(kind)[1]))) ** 2 for emap in maps]
     dof = joint_dof(
         *zip(power, [getattr(result.noise, f"dof_{kind}") for result in results], strict=True)
@@ -360,14 +362,14 @@ def _difference(
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:
     """Raise InputError unless both maps have the same lattice."""
-    for what, one, other in (
+    for items, of_first, of_second in (
         ("sites", a.shape, b.shape),
         ("angular lines", a.angular_count, b.angular_count),
     ):
-        if one != other:
+        if of_first != of_second:
             raise InputError(
                 f"{names[0]} and {names[1]}",
-                f"the lattices differ: {one} and {other} {what}",
+                f"the lattices differ: {of_first} and {of_second} {items}",
                 "compare maps of the same plate",
             )
     if a.marks != b.marks:
@@ -385,14 +387,16 @@ def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> No
         )
 
 
-def joint_dof(*parts: tuple[float, float]) -> float:
+def joint_dof(*contributions: tuple[float, float]) -> float:
     """Return the degrees of freedom of a sum of variances (Welch-Satterthwaite).
 
     A variance without degrees of freedom, one of declared noise, counts as known.
     """
-    whole = sum(variance for variance, _ in parts)
-    of_parts = sum(variance**2 / (dof if dof > 0 else np.inf) for variance, dof in parts)
-    return float(whole) ** 2 / max(float(of_parts), float(np.finfo(float).tiny))
+    total = sum(variance for variance, _ in contributions)
+    of_contributions = sum(
+        variance**2 / (dof if dof > 0 else np.inf) for variance, dof in contributions
+    )
+    return float(total) ** 2 / max(float(of_contributions), float(np.finfo(float).tiny))
 
 
 @dataclass(frozen=True)
@@ -433,8 +437,8 @@ def compare_with_laser(result: CalibrationResult, laser: dict, where: str) -> li
     InputError
         If the laser's result has no first-order terms of an error map.
     """
-    parts = laser.get("error_map_equivalent")
-    if not isinstance(parts, dict) or parts.get("nonorthogonality") is None:
+    equivalent = laser.get("error_map_equivalent")
+    if not isinstance(equivalent, dict) or equivalent.get("nonorthogonality") is None:
         raise InputError(
             where,
             "no error_map_equivalent with a nonorthogonality",
@@ -447,11 +451,11 @@ def compare_with_laser(result: CalibrationResult, laser: dict, where: str) -> li
     u_map = first_order_u(result)
     out = []
     for (name, value), u_of_map in zip(of_map.items(), u_map, strict=True):
-        if parts.get(name) is None:
+        if equivalent.get(name) is None:
             continue
-        u_laser = parts.get(f"u_{name}")
+        u_laser = equivalent.get(f"u_{name}")
         u = float(np.hypot(u_of_map, np.nan if u_laser is None else u_laser))
-        gap = abs(float(parts[name]) - value)
+        gap = abs(float(equivalent[name]) - value)
         p = 2 * float(ndtr(-gap / u)) if u > 0 else float("nan")
-        out.append(LaserDifference(name, value, float(parts[name]), u, p))
+        out.append(LaserDifference(name, value, float(equivalent[name]), u, p))
     return out

@@ -246,8 +246,8 @@ class _Maps:
     def unexplained(self, explained: np.ndarray) -> float:
         """Return the part of the squares that is unexplained, noise taken off."""
         size = max(_square(self.action), _square(self.before))
-        left = _square(self.action - explained) - float(variances(self.cover).sum())
-        return max(left, 0.0) / size if size else 0.0
+        remaining = _square(self.action - explained) - float(variances(self.cover).sum())
+        return max(remaining, 0.0) / size if size else 0.0
 
     @property
     def explained(self) -> bool:
@@ -264,12 +264,12 @@ def require_correctable(result: CalibrationResult, where: str) -> None:
         )
 
 
-def is_believed(after: CalibrationResult, found: "Verification") -> bool:
+def is_believed(after: CalibrationResult, verification: "Verification") -> bool:
     """Return whether the readings with the correction on may be believed.
 
     Against a known plate, a stage that is corrected wrongly looks like another plate.
     """
-    named = found.fault not in (TableFault.NONE, TableFault.OTHER, TableFault.OLDER)
+    named = verification.fault not in (TableFault.NONE, TableFault.OTHER, TableFault.OLDER)
     other_plate = {cause.name for cause in after.verdict.failed} == {"other_plate"}
     return after.verdict.qualified or (named and other_plate)
 
@@ -305,17 +305,17 @@ def verify(
     """
     require_same_lattice(before.artifact, after.artifact, names)
     first, second = before.error_map, after.error_map
-    known = np.isfinite(first.gx + first.gy + second.gx + second.gy)
-    if known.sum() < 3:
+    known_nodes = np.isfinite(first.gx + first.gy + second.gx + second.gy)
+    if known_nodes.sum() < 3:
         raise InputError(
             names[1],
-            f"{int(known.sum())} nodes are known in both maps",
+            f"{int(known_nodes.sum())} nodes are known in both maps",
             "measure where the map is known",
         )
-    maps = _maps(before, after, "xy", known)
+    maps = _maps(before, after, "xy", known_nodes)
     if not np.isfinite(maps.cover).all():
         raise InputError(
-            names[0] if np.isfinite(second.u_gx[known]).all() else names[1],
+            names[0] if np.isfinite(second.u_gx[known_nodes]).all() else names[1],
             "has no uncertainty, so nothing can be verified",
             "solve it again with --uncertainty always",
         )
@@ -336,25 +336,25 @@ def verify(
             theta_fault = _theta_fault(circle)
         g_theta[lines] = circle.after
         axes |= _axes(circle, (before, after))
-    gx, gy = np.full((2, *known.shape), np.nan)
-    gx[known], gy[known] = maps.by_axis(maps.after)
+    gx, gy = np.full((2, *known_nodes.shape), np.nan)
+    gx[known_nodes], gy[known_nodes] = maps.by_axis(maps.after)
     return Verification(
         better, fault, theta_fault, maps.remains, axes, maps.alike, maps.remaining, gx, gy, g_theta
     )
 
 
 def _maps(
-    before: CalibrationResult, after: CalibrationResult, kind: str, known: np.ndarray
+    before: CalibrationResult, after: CalibrationResult, kind: str, known_places: np.ndarray
 ) -> _Maps:
     """Return both maps over known places; scale is datum unless both have one."""
     pair = (before, after)
     keep_scale = all(result.reference is not None for result in pair)
-    columns = datum_columns(before.artifact, kind, known, scale=not keep_scale)
+    columns = datum_columns(before.artifact, kind, known_places, scale=not keep_scale)
     datum = np.linalg.qr(columns / np.linalg.norm(columns, axis=0))[0]
-    values = [result.error_map.of(kind)[0][:, known].ravel() for result in pair]
+    values = [result.error_map.of(kind)[0][:, known_places].ravel() for result in pair]
     covers = [
         without(cover, datum)
-        for cover in of_one_kind([covariance_of(result, kind, known) for result in pair])
+        for cover in of_one_kind([covariance_of(result, kind, known_places) for result in pair])
     ]
     dof = joint_dof(
         *(
@@ -362,8 +362,8 @@ def _maps(
             for cover, result in zip(covers, pair, strict=True)
         )
     )
-    free = [each - datum @ (datum.T @ each) for each in values]
-    return _Maps(kind, known, free[0], free[1], covers[0], covers[1], datum, dof)
+    free = [values_of_map - datum @ (datum.T @ values_of_map) for values_of_map in values]
+    return _Maps(kind, known_places, free[0], free[1], covers[0], covers[1], datum, dof)
 
 
 def _axes(maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult]) -> dict[str, AxisError]:
@@ -402,29 +402,29 @@ def _fault(maps: _Maps, emap: ErrorMap) -> TableFault:
         return TableFault.TOO_SMALL
     if maps.explained:
         return _of_factors(maps.factors)
-    others = {}
+    unexplained = {}
     for fault, field_of in _arranged(emap.gx, emap.gy).items():
-        here = np.stack(field_of)[:, maps.known]
-        if np.isfinite(here).all():
-            moved = maps.free(_columns(here))
-            weights = np.linalg.lstsq(moved, maps.action, rcond=None)[0]
+        arranged = np.stack(field_of)[:, maps.known]
+        if np.isfinite(arranged).all():
+            action = maps.free(_columns(arranged))
+            weights = np.linalg.lstsq(action, maps.action, rcond=None)[0]
             if _kind(weights[0], 0.0) or _kind(weights[1], 0.0):
-                others[fault] = maps.unexplained(moved @ weights)
-    likely = min(others, key=lambda name: others[name], default=TableFault.OTHER)
-    return likely if others.get(likely, np.inf) < NEAR else TableFault.OTHER
+                unexplained[fault] = maps.unexplained(action @ weights)
+    likely = min(unexplained, key=lambda name: unexplained[name], default=TableFault.OTHER)
+    return likely if unexplained.get(likely, np.inf) < NEAR else TableFault.OTHER
 
 
 def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[TableFault, tuple[np.ndarray, np.ndarray]]:
     """Return a map (nx, ny) as it acts with each fault of arrangement."""
-    found = {
+    arrangements = {
         TableFault.COMPONENTS: (gy, gx),
         TableFault.MIRRORED_X: (gx[::-1], gy[::-1]),
         TableFault.MIRRORED_Y: (gx[:, ::-1], gy[:, ::-1]),
         TableFault.MIRRORED: (gx[::-1, ::-1], gy[::-1, ::-1]),
     }
     if gx.shape[0] == gx.shape[1]:
-        found |= {TableFault.PLACES: (gx.T, gy.T), TableFault.TRANSPOSED: (gy.T, gx.T)}
-    return found
+        arrangements |= {TableFault.PLACES: (gx.T, gy.T), TableFault.TRANSPOSED: (gy.T, gx.T)}
+    return arrangements
 
 
 def _kind(factor: float, u: float) -> TableFault | None:
@@ -444,8 +444,8 @@ def _of_factors(factors: list[tuple[float, float]]) -> TableFault:
         return TableFault.OTHER
     if TableFault.FACTOR not in kinds:
         return kinds.pop() if len(kinds) == 1 else TableFault.AXES_DIFFER
-    shown = [(value, u) for value, u in factors if _kind(value, u)]
-    values, u = np.transpose(shown)
+    kind_shown = [(value, u) for value, u in factors if _kind(value, u)]
+    values, u = np.transpose(kind_shown)
     apart = float(values.max() - values.min())
     if apart <= max(NEAR * abs(values).max(), BEYOND * float(np.linalg.norm(u))):
         return TableFault.FACTOR

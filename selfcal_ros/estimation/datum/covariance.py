@@ -79,12 +79,12 @@ def scale_of_plate(system: NormalEquations, reference: ReferenceLength) -> np.nd
     InputError
         If one of the two marks was not measured.
     """
-    z, known = system.grid.views.z, system.known_marks
+    z, known_marks = system.grid.views.z, system.known_marks
     if reference.marks is None:
-        return Gauge(z, known, scale=True).dual(3)
+        return Gauge(z, known_marks, scale=True).dual(3)
     first, second = (system.grid.views.index_of(*mark) for mark in reference.marks)
-    for mark, at in zip(reference.marks, (first, second), strict=True):
-        if not known[at]:
+    for mark, index in zip(reference.marks, (first, second), strict=True):
+        if not known_marks[index]:
             raise InputError(
                 "reference length",
                 f"the mark {mark} was not measured",
@@ -97,9 +97,9 @@ def scale_of_plate(system: NormalEquations, reference: ReferenceLength) -> np.nd
 
 def _slope(system: NormalEquations, kind: ReferenceKind) -> np.ndarray:
     """Return the row of the slope of Gx on x, or Gy on y, over the known sites, (sites,)."""
-    z, known = system.grid.views.z_sites, system.known_sites
+    z, known_sites = system.grid.views.z_sites, system.known_sites
     along, unit = (z.real, 1) if kind is ReferenceKind.STAGE_X else (z.imag, 1j)
-    centred = np.where(known, along - along[known].mean(), 0.0)
+    centred = np.where(known_sites, along - along[known_sites].mean(), 0.0)
     return (unit * centred / (centred**2).sum()).ravel()
 
 
@@ -215,9 +215,9 @@ class MapsCovariance:
         """
         grid, of_terms = self.system.grid, self._of_terms(g, a)
         cov = np.real(a.conj().T @ (grid.noise_of_means[:, None] * a))
-        g, moved = grid.functionals(g, a)
+        g, misalignments = grid.functionals(g, a)
         cov += np.real(g.conj().T @ grid.solve(g))
-        return cov, moved, of_terms
+        return cov, misalignments, of_terms
 
     def sensitivities(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
         """Return those of functionals as in `of` to the readings, over their weights, plate frame.
@@ -226,12 +226,16 @@ class MapsCovariance:
         """
         grid, terms = self.system.grid, self.terms
         g, a, _ = self._functionals(sites, marks)
-        field, parameters, taken = self._solved(g, a)
-        maps = (field - terms.fields @ taken).T.reshape(-1, *grid.views.shape)
-        y = np.tensordot(taken.T, terms.columns, axes=1) if len(taken) else np.zeros(1)
-        rest = grid.plate(-y, maps, (parameters - self._moved @ taken).T)[1]
+        field, parameters, of_coefficients = self._solved(g, a)
+        maps = (field - terms.fields @ of_coefficients).T.reshape(-1, *grid.views.shape)
+        y = (
+            np.tensordot(of_coefficients.T, terms.columns, axes=1)
+            if len(of_coefficients)
+            else np.zeros(1)
+        )
+        residuals = grid.plate(-y, maps, (parameters - self._moved @ of_coefficients).T)[1]
         of_mark = (grid.noise_of_means[:, None] * a).T.reshape(-1, 1, *grid.views.plate_shape)
-        return np.where(grid.read, of_mark, 0) - rest
+        return np.where(grid.read, of_mark, 0) - residuals
 
     def variance_of_scale(self, reference: ReferenceLength) -> float:
         """Return the variance of the scale that an exact reference would set, at the unit."""
@@ -254,13 +258,13 @@ class MapsCovariance:
     def maps_of_terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps for a unit of each coefficient in the datum, (sites, p), (marks, p)."""
         out = []
-        for own, plate, known in (
+        for fields_of_terms, plate, is_known in (
             (self.terms.fields, False, self.system.known_sites),
             (self.terms.plates, True, self.system.known_marks),
         ):
             fields, g, a = self._datum(plate=plate)
-            moved = own + fields @ self._of_terms(g, a).T
-            out.append(np.where(known.reshape(-1, 1), moved, 0.0))
+            of_coefficients = fields_of_terms + fields @ self._of_terms(g, a).T
+            out.append(np.where(is_known.reshape(-1, 1), of_coefficients, 0.0))
         return out[0], out[1]
 
     def _of_terms(self, g: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -327,25 +331,25 @@ class MapsCovariance:
 
         With sites (sites, k) and misalignments (3 views, k), each without terms, and terms (p, k).
         """
-        grid, taken = self.system.grid, -self.terms.covariance @ self._of_terms(g, a)
-        g, moved = grid.functionals(g, a)
-        parameters = self._p @ moved
-        return grid.solve(g) - grid.response @ parameters, parameters, taken
+        grid, of_coefficients = self.system.grid, -self.terms.covariance @ self._of_terms(g, a)
+        g, misalignments = grid.functionals(g, a)
+        parameters = self._p @ misalignments
+        return grid.solve(g) - grid.response @ parameters, parameters, of_coefficients
 
     def _of_map(self, *, plate: bool) -> np.ndarray:
         """Return the variances of a map in its datum, (2, places), but for the reference's own."""
         grid, (fields, g, a) = self.system.grid, self._datum(plate=plate)
-        field, parameters, taken = self._solved(g, a)
-        own, answer, of_terms = grid.variance_of_sites, grid.response, self.terms.fields
+        field, parameters, of_coefficients = self._solved(g, a)
+        own_variance, answer, of_terms = grid.variance_of_sites, grid.response, self.terms.fields
         if plate:
             noise = grid.noise_of_means
             field = self._plates(field, parameters) + noise[:, None] * a
-            own, of_terms = noise + grid.variance_of_means, self.terms.plates
+            own_variance, of_terms = noise + grid.variance_of_means, self.terms.plates
             answer = self._plates(-answer, np.eye(len(self._p)))
         return in_datum(
-            own,
+            own_variance,
             ((answer, self._p), (of_terms, self.terms.covariance)),
-            field - of_terms @ taken,
+            field - of_terms @ of_coefficients,
             fields,
             self.of_free(g, a),
         )
@@ -411,7 +415,7 @@ def conditions_for(
     InputError
         For ``xy_axes`` if a half axis has no sites or no line, or is not completely determined.
     """
-    known, n_lines = system.known_lines, system.angular.n_lines
+    known_lines, n_lines = system.known_lines, system.angular.n_lines
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         if n_lines % 4:
             raise InputError(
@@ -422,9 +426,9 @@ def conditions_for(
         sites = turned_over(sense, system.known_sites, sign=1)
         slopes = turned_over(sense, slope_rows(system.grid.views.z_sites * half_width_m, sites))
         rows = lines_turned_over(sense, np.eye(n_lines)[:, :: n_lines // 4]).T
-        _require_axes(sites, [bool(known[row != 0].all()) for row in rows])
+        _require_axes(sites, [bool(known_lines[row != 0].all()) for row in rows])
         return _solve_conditions(system, rows, slopes)
-    rows = np.atleast_2d(known / max(known.sum(), 1))
+    rows = np.atleast_2d(known_lines / max(known_lines.sum(), 1))
     return Conditions(
         ThetaDatum.ZERO_MEAN,
         rows,
@@ -434,23 +438,23 @@ def conditions_for(
     )
 
 
-def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
+def _require_axes(known_sites: np.ndarray, lines: list[bool]) -> None:
     """Raise InputError unless all four half axes and their lines are determined."""
-    if not all(size % 2 for size in known.shape):
+    if not all(size % 2 for size in known_sites.shape):
         raise InputError(
             "theta datum xy_axes",
-            f"no sites of {known.shape[0]} x {known.shape[1]} lie on the axes",
+            f"no sites of {known_sites.shape[0]} x {known_sites.shape[1]} lie on the axes",
             "use zero_mean, or odd numbers of sites",
         )
-    hx, hy = (size // 2 for size in known.shape)
+    hx, hy = (size // 2 for size in known_sites.shape)
     halves = (
-        ("+x", known[hx + 1 :, hy]),
-        ("+y", known[hx, hy + 1 :]),
-        ("-x", known[:hx, hy]),
-        ("-y", known[hx, :hy]),
+        ("+x", known_sites[hx + 1 :, hy]),
+        ("+y", known_sites[hx, hy + 1 :]),
+        ("-x", known_sites[:hx, hy]),
+        ("-y", known_sites[hx, :hy]),
     )
     for (name, half), line in zip(halves, lines, strict=True):
-        what = (
+        fault = (
             "has one site, which gives no slope"
             if len(half) < 2
             else f"is known at {int(half.sum())} of {len(half)} sites"
@@ -459,10 +463,10 @@ def _require_axes(known: np.ndarray, lines: list[bool]) -> None:
             if not line
             else ""
         )
-        if what:
+        if fault:
             raise InputError(
                 "theta datum xy_axes",
-                f"the half axis along {name} {what}",
+                f"the half axis along {name} {fault}",
                 "measure what is missing there, or use zero_mean",
             )
 
@@ -544,8 +548,8 @@ class LinesCovariance:
         closure, y, n = self.of(*misclosure), self.angular.response, self.angular.n_lines
         inverse = np.concatenate(
             [
-                self.angular.solve(np.eye(n, len(here), -here[0]))[here, here - here[0]]
-                for here in self._blocks()
+                self.angular.solve(np.eye(n, len(block), -block[0]))[block, block - block[0]]
+                for block in self._blocks()
             ]
         )
         phi = self.cover.inverse[np.ix_(self.system.phi_at, self.system.phi_at)] * (
@@ -575,15 +579,21 @@ class LinesCovariance:
             np.zeros((count, 1)),
             (of_sites, of_marks),
         )
-        own = np.zeros(count)
-        for here in self._blocks():
-            one = np.eye(count, len(here), -here[0])
-            rows, factors, of_terms, _ = self._free(0 * one, one)
-            own[here] = self._theta2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
-            own[here] += self._xy2 * np.einsum("vl,vw,wl->l", factors, self.cover.inverse, factors)
-            own[here] += np.einsum("pl,pq,ql->l", of_terms, self._of_terms, of_terms)
+        own_variance = np.zeros(count)
+        for block in self._blocks():
+            unit = np.eye(count, len(block), -block[0])
+            rows, factors, of_terms, _ = self._free(0 * unit, unit)
+            own_variance[block] = self._theta2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
+            own_variance[block] += self._xy2 * np.einsum(
+                "vl,vw,wl->l", factors, self.cover.inverse, factors
+            )
+            own_variance[block] += np.einsum("pl,pq,ql->l", of_terms, self._of_terms, of_terms)
         variance = in_datum(
-            own + self._of_means, (), self._spread(*datum)[1], np.ones((count, 1)), self.of(*datum)
+            own_variance + self._of_means,
+            (),
+            self._spread(*datum)[1],
+            np.ones((count, 1)),
+            self.of(*datum),
         )[0]
         return np.where(system.known_plate_lines, variance, np.nan)
 
@@ -634,12 +644,12 @@ class LinesCovariance:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the covariance of functionals with both free maps, (K, k) each."""
         rows, factors, of_terms, _ = self._free(stage, plate, maps)
-        moved = self._of_terms @ of_terms
+        coefficients = self._of_terms @ of_terms
         phi = self._xy2 / self.cover.length * (self.cover.inverse @ factors)[self.system.phi_at]
         field = self._theta2 * self.angular.solve(rows) - self.angular.response @ phi
         of_plate = self.angular.plate(np.zeros(1), field.T, phi.T)[0].T
         of_plate += self._of_means[:, None] * plate
-        return field + self.terms[0] @ moved, of_plate + self.terms[1] @ moved
+        return field + self.terms[0] @ coefficients, of_plate + self.terms[1] @ coefficients
 
     @property
     def _of_terms(self) -> np.ndarray:

@@ -107,7 +107,7 @@ class FittedCamera(Distortion):
         """What a result keeps of it."""
         scale, shear = self.coefficients[1:3]
         u_scale, u_turn = self.u_coefficients[1]
-        known = {
+        cells_by_place = {
             cell: CameraCell(z.real, z.imag, e.real, e.imag, *u)
             for cell, z, e, u in zip(self.cells, self.place, self.error, self.u, strict=True)
         }
@@ -128,8 +128,8 @@ class FittedCamera(Distortion):
                 )
             ),
             cells=tuple(
-                known.get(cell)
-                or CameraCell(*(part * self.image.pitch_m for part in cell), *[math.nan] * 4)
+                cells_by_place.get(cell)
+                or CameraCell(*(step * self.image.pitch_m for step in cell), *[math.nan] * 4)
                 for cell in self.image.cells
             ),
             noise_image=self.noise_image,
@@ -166,27 +166,29 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
             + 1j * parameters[..., 2 : 3 * grid.n_views : 3]
         )
 
-    noises = images.noises(model.found.residuals)
+    noises = images.noises(model.fitted.residuals)
     drawn = offsets(images.parameters)
-    layout = _layout([one.view for one in readings], image, grid.read.sum(axis=(1, 2)) > 1)
+    layout = _layout(
+        [view_readings.view for view_readings in readings], image, grid.read.sum(axis=(1, 2)) > 1
+    )
     if layout is None:
         return None
     cells, rows, errors = layout
-    found, drawn = errors(offsets(model.found.parameters)), errors(drawn)
+    error_of_cell, drawn = errors(offsets(model.fitted.parameters)), errors(drawn)
     samples = noises.mark * drawn[:, 0] + noises.image * drawn[:, 1]
     published = np.array(
         [_place([readings[row] for row in column[column >= 0]]) for column in rows.T]
     )
     if not _determined(published, POWERS[1]):
         return None
-    error = found
+    error = error_of_cell
     for _ in range(MAX_STEPS):  # from the optical axis on, not from the offsets in its cell
         before = error
-        powers, fit = _polynomial(published - error, found, samples)
-        error = found - (fit @ found)[0]
+        powers, fit = _polynomial(published - error, error_of_cell, samples)
+        error = error_of_cell - (fit @ error_of_cell)[0]
         if np.array_equal(error, before):
             break
-    moved = samples @ fit.T
+    drawn_corrections = samples @ fit.T
     return FittedCamera(
         powers,
         fit @ error,
@@ -194,8 +196,8 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
         cells,
         published - error,
         error,
-        _spread(samples - moved[:, :1]),
-        _spread(moved),
+        _spread(samples - drawn_corrections[:, :1]),
+        _spread(drawn_corrections),
         noises.image,
         noises.mark,
     )
@@ -206,16 +208,18 @@ Layout = tuple[list[tuple[int, int]], np.ndarray, Callable[[np.ndarray], np.ndar
 function from offsets (..., views) to those of cells relative to the one nearest the axis."""
 
 
-def _layout(views: Sequence[View], image: ImageCells, seen: np.ndarray) -> Layout | None:
-    """Return how offsets of sub-views, those `seen`, depend on view and cell.
+def _layout(views: Sequence[View], image: ImageCells, usable: np.ndarray) -> Layout | None:
+    """Return how offsets of sub-views, those `usable`, depend on view and cell.
 
     A gap has the value that the least squares of both effects give it, so that means over the
     views are the estimates. None if the views do not connect the cells.
     """
-    at = {(views[row].plan_view, views[row].cell): row for row in np.flatnonzero(seen).tolist()}
-    names = list(dict.fromkeys(name for name, _ in at))
-    cells = [cell for cell in image.cells if any((name, cell) in at for name in names)]
-    rows = np.array([[at.get((name, cell), -1) for cell in cells] for name in names])
+    row_of = {
+        (views[row].plan_view, views[row].cell): row for row in np.flatnonzero(usable).tolist()
+    }
+    names = list(dict.fromkeys(name for name, _ in row_of))
+    cells = [cell for cell in image.cells if any((name, cell) in row_of for name in names)]
+    rows = np.array([[row_of.get((name, cell), -1) for cell in cells] for name in names])
     effects = np.concatenate(
         [
             np.repeat(np.eye(len(names)), len(cells), axis=0),
@@ -223,15 +227,15 @@ def _layout(views: Sequence[View], image: ImageCells, seen: np.ndarray) -> Layou
         ],
         axis=1,
     )
-    known = rows >= 0
-    if np.linalg.matrix_rank(effects[known.ravel()]) < len(names) + len(cells) - 1:
+    is_read = rows >= 0
+    if np.linalg.matrix_rank(effects[is_read.ravel()]) < len(names) + len(cells) - 1:
         return None
-    gaps = effects[~known.ravel()] @ np.linalg.pinv(effects[known.ravel()])
+    gaps = effects[~is_read.ravel()] @ np.linalg.pinv(effects[is_read.ravel()])
     middle = min(range(len(cells)), key=lambda index: abs(complex(*cells[index])))
 
     def errors(offset: np.ndarray) -> np.ndarray:
         of_cell = offset[..., rows]
-        of_cell[..., ~known] = of_cell[..., known] @ gaps.T
+        of_cell[..., ~is_read] = of_cell[..., is_read] @ gaps.T
         return (of_cell - of_cell[..., middle, None]).mean(axis=-2)
 
     return cells, rows, errors
@@ -252,17 +256,17 @@ def _polynomial(
     powers: tuple[tuple[int, int], ...] = POWERS[1]
     fit = _fitted(place, powers)
     for degree in (3, 2):
-        more = (*powers, *POWERS[degree])
-        if not _determined(place, more):
+        wider_powers = (*powers, *POWERS[degree])
+        if not _determined(place, wider_powers):
             continue
-        wider = _fitted(place, more)
+        wider = _fitted(place, wider_powers)
         added = (wider @ error)[len(powers) + 1 :]
         drawn = (samples @ wider.T)[:, len(powers) + 1 :]
-        both = np.concatenate([drawn.real, drawn.imag], axis=1)
-        value, (k, n) = np.concatenate([added.real, added.imag]), both.shape
-        squares = value @ np.linalg.solve(both.T @ both / k, value)
+        drawn_parts = np.concatenate([drawn.real, drawn.imag], axis=1)
+        value, (k, n) = np.concatenate([added.real, added.imag]), drawn_parts.shape
+        squares = value @ np.linalg.solve(drawn_parts.T @ drawn_parts / k, value)
         if fdtrc(n, k - n, squares * (k - n) / (n * (k - 1))) < F_LEVEL:
-            powers, fit = more, wider
+            powers, fit = wider_powers, wider
     return powers, fit
 
 
@@ -320,8 +324,16 @@ def known_camera(result: CalibrationResult) -> Distortion | None:
     if result.camera is None:
         return None
     return Distortion(
-        [(a, b) for a, b in (one.power for one in result.camera.coefficients)],
-        np.array([0, *(complex(one.x, one.y) for one in result.camera.coefficients)]),
+        [(a, b) for a, b in (coefficient.power for coefficient in result.camera.coefficients)],
+        np.array(
+            [
+                0,
+                *(
+                    complex(coefficient.x, coefficient.y)
+                    for coefficient in result.camera.coefficients
+                ),
+            ]
+        ),
     )
 
 
@@ -348,7 +360,9 @@ def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[F
     few = []
     counts = _read_and_shown(measurements)
     for cell in dict.fromkeys(cell for _, cell in counts):
-        of_views = {name: count for (name, at), count in counts.items() if at == cell}
+        of_views = {
+            name: count for (name, cell_of_count), count in counts.items() if cell_of_count == cell
+        }
         total = np.sum(list(of_views.values()), axis=0)
         few += [
             (name, cell, count)
@@ -370,8 +384,8 @@ def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[F
             details={
                 "unknown": unknown,
                 "cells": [
-                    {"view": name, "cell": list(cell), "read": int(read), "shown": int(shown)}
-                    for name, cell, (read, shown) in few
+                    {"view": name, "cell": list(cell), "read": int(n_read), "shown": int(n_shown)}
+                    for name, cell, (n_read, n_shown) in few
                 ],
             },
         ),
@@ -383,22 +397,27 @@ def _read_and_shown(
 ) -> dict[tuple[str, tuple[int, int]], tuple[int, int]]:
     """Return for views and cells how many marks were read, and how many the images showed."""
     stops: dict[str, set[tuple[int, int]]] = {}
-    parts = [
-        (one.view.plan_view, one.view.cell, one.view.step_on_plate(measurements.artifact), one)
-        for one in measurements.views
-        if one.view.cell is not None
+    sub_views = [
+        (
+            view_readings.view.plan_view,
+            view_readings.view.cell,
+            view_readings.view.step_on_plate(measurements.artifact),
+            view_readings,
+        )
+        for view_readings in measurements.views
+        if view_readings.view.cell is not None
     ]
-    for name, _, (m, n), one in parts:
+    for name, _, (m, n), view_readings in sub_views:
         stops.setdefault(name, set()).update(
-            zip((one.m - m).tolist(), (one.n - n).tolist(), strict=True)
+            zip((view_readings.m - m).tolist(), (view_readings.n - n).tolist(), strict=True)
         )
     (first_m, last_m), (first_n, last_n) = measurements.artifact.limits
     return {
         (name, cell): (
-            len(one.m),
+            len(view_readings.m),
             sum(first_m <= i + m <= last_m and first_n <= j + n <= last_n for i, j in stops[name]),
         )
-        for name, cell, (m, n), one in parts
+        for name, cell, (m, n), view_readings in sub_views
     }
 
 
@@ -407,24 +426,29 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
 
     None without images, or if they do not determine it up to its mean.
     """
-    images, ground = model.problem.images, model.problem.ground
+    images, inputs = model.problem.images, model.problem.inputs
     name = next((term.name for term in model.problem.terms if term.block.of_images), None)
     if images is None or name is None or model.equations is None:
         return None
     free = replace(model.equations, columns=model.equations.columns.scaled(name, math.inf))
     rows = free.rows([name]) & (free.norm > free.norm.max() * TRACE)
-    seen = rows[free.rows([name])]
-    if np.linalg.matrix_rank(free.untold(free.free)[rows], tol=TRACE) > 1:
+    rows_of_yaw = rows[free.rows([name])]
+    if np.linalg.matrix_rank(free.undetermined(free.free)[rows], tol=TRACE) > 1:
         return None
-    noise, taken = model.found.xy, model.coefficients
+    noise, coefficients = model.fitted.xy, model.coefficients
     now = score(
-        free, model.found.both_residuals, squares(model.problem, model.found), coefficients=taken
+        free,
+        model.fitted.both_residuals,
+        squares(model.problem, model.fitted),
+        coefficients=coefficients,
     )
     inverse = free.inverse(noise.sigma)
-    values = taken + inverse @ (free.unbiased_sums(now.total) - free.prior(noise.sigma) * taken)
+    values = coefficients + inverse @ (
+        free.unbiased_sums(now.total) - free.prior(noise.sigma) * coefficients
+    )
     centred = np.eye(int(rows.sum())) - 1 / rows.sum()
     to_map = centred @ inverse[rows]
-    share = images.noises(model.found.residuals).share
+    share = images.noises(model.fitted.residuals).share
     grid, fit = free.system.grid, free.projected
     sensitivities = grid.plate(
         np.tensordot(to_map, free.columns.grid, axes=1),
@@ -433,16 +457,16 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     )[1]
     covariance = to_map[:, rows] @ centred + share * images.added_covariance(sensitivities)
     covariance *= noise.sigma**2
-    turned, n = centred @ values[rows], len(centred) - 1
-    statistic = turned @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ turned
+    yaw_rad, n = centred @ values[rows], len(centred) - 1
+    statistic = yaw_rad @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw_rad
     x, y = (
-        sense.sign * axis.ravel()[seen]  # (1.6) and its rotations
-        for axis in np.meshgrid(*ground.node_axes_m, indexing="ij")
+        sense.sign * axis.ravel()[rows_of_yaw]  # (1.6) and its rotations
+        for axis in np.meshgrid(*inputs.node_axes_m, indexing="ij")
     )
     return StageYawMap(
         x,
         y,
-        sense.sign * turned,
+        sense.sign * yaw_rad,
         np.sqrt(np.diag(covariance)),
         float(fdtrc(n, min(noise.dof, MANY_DOF), statistic / n)),
     )

@@ -128,55 +128,57 @@ class ImageNoise:
 
     def sums(self, residual: np.ndarray) -> np.ndarray:
         """Return the sum of squares of residuals (views, nx, ny), and that of images' sums, m^2."""
-        one = np.sqrt(self.weight) * residual[self.read]
-        together = np.bincount(self.stop, one.real) + 1j * np.bincount(self.stop, one.imag)
-        return np.array([(abs(one) ** 2).sum(), (abs(together) ** 2).sum()])
+        weighted = np.sqrt(self.weight) * residual[self.read]
+        of_images = np.bincount(self.stop, weighted.real) + 1j * np.bincount(
+            self.stop, weighted.imag
+        )
+        return np.array([(abs(weighted) ** 2).sum(), (abs(of_images) ** 2).sum()])
 
     def noises(self, residual: np.ndarray) -> TwoNoises:
         """Return the noises that residuals (views, nx, ny) show."""
         expected, sums = self.drawn.mean(axis=0), self.sums(residual)
-        both = np.linalg.inv(expected[:, :2])
-        found = both @ sums
-        if found.min() < 0:  # one of the two alone
-            alone = int(found[1] > found[0])
-            both = np.zeros((2, 2))
-            both[alone, 0] = 1 / expected[0, alone]
-            found = both @ sums
-        mark, image = np.sqrt(found)
+        from_sums = np.linalg.inv(expected[:, :2])
+        variances = from_sums @ sums
+        if variances.min() < 0:  # one of the two alone
+            larger = int(variances[1] > variances[0])
+            from_sums = np.zeros((2, 2))
+            from_sums[larger, 0] = 1 / expected[0, larger]
+            variances = from_sums @ sums
+        mark, image = np.sqrt(variances)
         drawn = self.drawn @ [mark**2, image**2, mark * image]
         return TwoNoises(
             float(image),
             float(mark),
-            _dof_of(drawn @ ([1, self.gain] @ both)),
-            _dof_of(drawn @ both[0]),
+            _dof_of(drawn @ ([1, self.gain] @ from_sums)),
+            _dof_of(drawn @ from_sums[0]),
         )
 
-    def own(self, rest: np.ndarray) -> np.ndarray:
+    def own(self, sensitivities: np.ndarray) -> np.ndarray:
         """Return the variances, (k,), for unit noise of each mark by itself."""
-        return (abs(self._each_and_together(rest)[0]) ** 2).sum(axis=1)
+        return (abs(self._each_and_together(sensitivities)[0]) ** 2).sum(axis=1)
 
-    def added(self, rest: np.ndarray) -> np.ndarray:
+    def added(self, sensitivities: np.ndarray) -> np.ndarray:
         """Return what full correlation within images adds to variances, (k,), for unit noise.
 
         Parameters
         ----------
-        rest : complex array (k, views, nx, ny)
+        sensitivities : complex array (k, views, nx, ny)
             Sensitivities of k coordinates over the weights, see `added_variances`.
         """
-        one, together = self._each_and_together(rest)
-        return (abs(together) ** 2).sum(axis=1) - (abs(one) ** 2).sum(axis=1)
+        of_marks, of_images = self._each_and_together(sensitivities)
+        return (abs(of_images) ** 2).sum(axis=1) - (abs(of_marks) ** 2).sum(axis=1)
 
-    def added_covariance(self, rest: np.ndarray) -> np.ndarray:
+    def added_covariance(self, sensitivities: np.ndarray) -> np.ndarray:
         """Return the same of all pairs of coordinates, (k, k)."""
-        one, together = self._each_and_together(rest)
-        return (together @ together.conj().T - one @ one.conj().T).real
+        of_marks, of_images = self._each_and_together(sensitivities)
+        return (of_images @ of_images.conj().T - of_marks @ of_marks.conj().T).real
 
-    def _each_and_together(self, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _each_and_together(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return sensitivities to readings of unit noise, (k, n), and to images, (k, stops)."""
-        one = np.sqrt(self.weight) * rest[:, self.read]
-        together = np.zeros((len(rest), int(self.stop.max()) + 1), dtype=complex)
-        np.add.at(together.T, self.stop, one.T)
-        return one, together
+        of_marks = np.sqrt(self.weight) * sensitivities[:, self.read]
+        of_images = np.zeros((len(sensitivities), int(self.stop.max()) + 1), dtype=complex)
+        np.add.at(of_images.T, self.stop, of_marks.T)
+        return of_marks, of_images
 
 
 def marks_of_image(stop: np.ndarray) -> float:
@@ -196,7 +198,7 @@ def image_noise(
     views: Sequence[View],
     system: NormalEquations,
     *,
-    ground: TermInputs,
+    inputs: TermInputs,
     terms: Sequence[ModelTerm] = (),
 ) -> ImageNoise | None:
     """Return the images behind grid readings; None without images.
@@ -209,7 +211,7 @@ def image_noise(
         All views of the measurement; sub-views of one view have images in common.
     system : NormalEquations
         The grid readings.
-    ground : TermInputs
+    inputs : TermInputs
         What is made of the readings.
     terms : sequence of ModelTerm
         Terms of the model that only images show.
@@ -217,7 +219,7 @@ def image_noise(
     key = cells_seen(artifact, [views[index] for index in system.grid_index])
     if key is None:
         return None
-    nominal = replace(ground, visits=(None,) * len(ground.names))
+    nominal = replace(inputs, visits=(None,) * len(inputs.names))
     return _known.get(
         system,
         (key, tuple(term.name for term in terms)),
@@ -264,10 +266,12 @@ def _drawn(system: NormalEquations, views: CellsSeen, columns: np.ndarray) -> Im
             rng.normal(size=(size, 2)) @ [1, 1j] for size in (len(stops), stops.max() + 1)
         )
         solved = [_solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
-        power += [one[2] for one in solved]
-        left, parameters[:] = zip(*(fitted.freed(*one[:2]) for one in solved), strict=True)
-        row[:, :2] = np.stack([plain.sums(one) for one in left], axis=1)
-        row[:, 2] = plain.sums(left[0] + left[1]) - row[:, 0] - row[:, 1]
+        power += [of_noise[2] for of_noise in solved]
+        residuals, parameters[:] = zip(
+            *(fitted.freed(*of_noise[:2]) for of_noise in solved), strict=True
+        )
+        row[:, :2] = np.stack([plain.sums(of_noise) for of_noise in residuals], axis=1)
+        row[:, 2] = plain.sums(residuals[0] + residuals[1]) - row[:, 0] - row[:, 1]
     return replace(plain, gain=float(power[1] / power[0]))
 
 
@@ -298,5 +302,5 @@ def _solved(system: NormalEquations, values: np.ndarray) -> tuple[np.ndarray, np
     y = np.zeros(grid.read.shape, dtype=complex)
     y[grid.read] = values
     field, parameters, _, residual = system.in_datum(y, *system.alone(y))
-    known = np.where(system.known_sites, field, 0)
-    return residual, parameters, float((abs(known) ** 2).sum())
+    map_values = np.where(system.known_sites, field, 0)
+    return residual, parameters, float((abs(map_values) ** 2).sum())

@@ -68,7 +68,7 @@ class ModelFit:
     ----------
     problem : Problem
         As it was solved, with the noise that terms leave.
-    found : JointFit
+    fitted : JointFit
         Maps and misalignments, terms taken off.
     equations : TermEquations or None
         Equations of the terms; None without terms.
@@ -84,7 +84,7 @@ class ModelFit:
     """
 
     problem: Problem
-    found: JointFit
+    fitted: JointFit
     equations: TermEquations | None
     coefficients: np.ndarray
     y: np.ndarray
@@ -96,19 +96,19 @@ class ModelFit:
         """Covariance of the coefficients for unit noise of one grid reading, (p, p)."""
         if self.equations is None:
             return np.zeros((0, 0))
-        return self.equations.inverse(self.found.xy.sigma)
+        return self.equations.inverse(self.fitted.xy.sigma)
 
     def visits_about_means(self) -> Iterator[tuple[int, ViewVisits, np.ndarray]]:
         """Yield row and visits of each view, and what they have more than the means of their marks.
 
         Complex (V,), plate frame, m, without the terms.
         """
-        known = (
+        of_terms = (
             [] if self.equations is None else self.equations.columns.at_visits(self.coefficients)
         )
-        for row, visits in enumerate(self.problem.ground.visits):
+        for row, visits in enumerate(self.problem.inputs.visits):
             if visits is not None:
-                y = visits.y - (known[row] if known else 0.0)
+                y = visits.y - (of_terms[row] if of_terms else 0.0)
                 yield row, visits, visits.about_means(y[None], self.problem.system.grid.n_marks)[0]
 
     @property
@@ -116,8 +116,8 @@ class ModelFit:
         """What the terms' uncertainty does to the maps; None without terms."""
         if self.equations is None:
             return None
-        now = equations_of(self.problem, self.found, self.equations.columns)
-        return spread_of(now, now.inverse(self.found.xy.sigma))
+        now = equations_of(self.problem, self.fitted, self.equations.columns)
+        return spread_of(now, now.inverse(self.fitted.xy.sigma))
 
 
 def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
@@ -127,8 +127,8 @@ def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
     if len(columns.lines.at):
         on_lines[columns.lines.at] = columns.lines.values
     plates = [
-        system.grid.plate(*one)[0].ravel()
-        for one in zip(
+        system.grid.plate(*effects)[0].ravel()
+        for effects in zip(
             columns.grid,
             fit.fields.T.reshape(-1, *system.grid.views.shape),
             fit.parameters[: 3 * system.grid.n_views].T,
@@ -157,12 +157,12 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     smallest, found_at = np.inf, 0
     for number in range(MAX_STEPS):
         change = state.step()
-        largest = max(float(np.abs(state.found.parameters).max()), problem.largest_turn_m)
+        largest = max(float(np.abs(state.fitted.parameters).max()), problem.largest_turn_m)
         if change <= max(ROUNDED * largest, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and 2 * change > before
-        part = NEGLIGIBLE if number < LATE else OF_NOISE_LATE
-        if stuck and (change <= FLOOR or state.within_noise(part)):
+        small_share = NEGLIGIBLE if number < LATE else OF_NOISE_LATE
+        if stuck and (change <= FLOOR or state.within_noise(small_share)):
             return state.finished()
         if change < smallest:
             smallest, found_at = change, number
@@ -183,14 +183,14 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     )
 
 
-def equations_of(problem: Problem, found: JointFit, columns: TermColumns) -> TermEquations:
-    """Return the equations of columns about the estimate `found`."""
-    noises = filter(np.isfinite, (found.xy.declared, found.xy.repeats, found.xy.residuals))
+def equations_of(problem: Problem, fitted: JointFit, columns: TermColumns) -> TermEquations:
+    """Return the equations of columns about the estimate `fitted`."""
+    noises = filter(np.isfinite, (fitted.xy.declared, fitted.xy.repeats, fitted.xy.residuals))
     return equations_of_columns(
         problem.system,
         columns,
-        found.inverse,
-        ratio=found.ratio,
+        fitted.inverse,
+        ratio=fitted.ratio,
         half_width_m=problem.half_width_m,
         noise_m=min(noises, default=0.0),
     )
@@ -204,22 +204,22 @@ class _State:
         self.lines_read = problem.angular.y
         self.moving = Moving(problem)
         self.y = problem.grid.y
-        self.found = fit(problem, self.y, self.theta)
+        self.fitted = fit(problem, self.y, self.theta)
         self.offset_steps = LATE
         self.moved_m, self.changed = np.zeros(problem.system.size), np.zeros_like(self.y)
         self.fell = self.rounds = False
         self.equations: TermEquations | None = None
         self.of_offsets = any(term.block.of_microscope for term in problem.terms)
         if problem.terms:
-            ground = without_noise(problem.ground, self.found.residuals)
-            self._linearise(term_columns(ground, problem.terms))
+            inputs = without_noise(problem.inputs, self.fitted.residuals)
+            self._linearise(term_columns(inputs, problem.terms))
         equations = self.equations
         self.coefficients = self.stepped = np.zeros(equations.n if equations else 0)
 
     def _linearise(self, columns: TermColumns) -> None:
         """Set up the equations of the terms about the present solution."""
-        self.weights, self.ratio = self.found.inverse, self.found.ratio
-        self.equations = equations_of(self.problem, self.found, columns)
+        self.weights, self.ratio = self.fitted.inverse, self.fitted.ratio
+        self.equations = equations_of(self.problem, self.fitted, columns)
 
     def _refresh(self, equations: TermEquations) -> None:
         """Set up the equations again where visits, offsets or weights have changed."""
@@ -230,26 +230,26 @@ class _State:
 
     def _anew(self, before: TermColumns) -> TermColumns:
         """Return the columns for the present visits and noise-free offsets."""
-        ground = without_noise(
-            self.moving.ground(self.found),
-            self.found.residuals,
+        inputs = without_noise(
+            self.moving.inputs(self.fitted),
+            self.fitted.residuals,
             before.at_visits(self.coefficients),
         )
-        columns = term_columns(ground, self.problem.terms)
+        columns = term_columns(inputs, self.problem.terms)
         rows = columns.having(lambda block: block.of_microscope)
         effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
             self.coefficients, rows
         )
-        largest = max(float(np.abs(self.found.parameters).max()), self.problem.largest_turn_m)
+        largest = max(float(np.abs(self.fitted.parameters).max()), self.problem.largest_turn_m)
         if self.of_offsets and np.abs(effect).max() <= ROUNDED * largest:
             self.offset_steps = self.steps
         return columns
 
     def _stale(self, equations: TermEquations) -> bool:
         """Return whether the weights of angular readings differ from those in the equations."""
-        now, then = self.found.inverse, self.weights
+        now, then = self.fitted.inverse, self.weights
         if len(equations.columns.lines.at) and (
-            abs(self.found.ratio - self.ratio) > NEGLIGIBLE * self.ratio
+            abs(self.fitted.ratio - self.ratio) > NEGLIGIBLE * self.ratio
         ):
             return True
         return bool(np.abs(now - then).max() > NEGLIGIBLE * np.abs(then).max())
@@ -261,45 +261,45 @@ class _State:
         on them: all rotations together, that of a view of lines alone. What is taken off the
         readings may where the misalignments take it up; not so what places of the stage change.
         """
-        parameters, y, coefficients = self.found.parameters, self.y, self.coefficients
+        parameters, y, coefficients = self.fitted.parameters, self.y, self.coefficients
         if self.equations is not None:
             self._refresh(self.equations)
         self.steps += 1
         if self.equations is not None:
             self._solve_terms(self.equations)
         elif self.problem.moves:
-            self.problem = replace(self.problem, repeats_xy=self.moving.repeats(self.found))
-        taken = self.moving.taken(self.found.field)
+            self.problem = replace(self.problem, repeats_xy=self.moving.repeats(self.fitted))
+        place_change = self.moving.taken(self.fitted.field)
         self.y = np.where(
             self.problem.system.grid.read,
-            self.problem.grid.y - self._excess() - self._of_terms() - taken,
+            self.problem.grid.y - self._excess() - self._of_terms() - place_change,
             0.0,
         )
-        self.found = fit(self.problem, self.y, self.theta)
-        self.moved_m = np.abs(self.found.parameters - parameters)
+        self.fitted = fit(self.problem, self.y, self.theta)
+        self.moved_m = np.abs(self.fitted.parameters - parameters)
         self.changed, self.stepped = self.y - y, self.coefficients - coefficients
         return max(
             min(float(self.moved_m.max()), float(np.abs(self.changed).max())), self.moving.change
         )
 
-    def within_noise(self, part: float) -> bool:
+    def within_noise(self, share: float) -> bool:
         """Return whether the last step was below a part of what the noise makes of it.
 
         Of a misalignment that the readings alone determine, and of a coefficient, that is its
         standard uncertainty; of a misalignment that the datum fixes, and of what else is taken off
         a reading, that of the mean of all readings of a view.
         """
-        sigma, weight = self.found.xy.sigma, self.problem.grid.weight
+        sigma, weight = self.fitted.xy.sigma, self.problem.grid.weight
         if not np.isfinite(sigma):
             return False
         of_view = sigma / np.sqrt(weight.reshape(len(weight), -1).sum(axis=1).max())
-        spread = np.diag(self.found.inverse)
-        told = spread > ROUNDED * spread.max(initial=0.0)
-        noise = np.where(told, sigma * np.sqrt(np.where(told, spread, 0.0)), of_view)
-        still = bool((self.moved_m <= part * noise).all()) or (
-            self._changed_besides_m <= part * of_view and self._terms_are_still(part * sigma)
+        spread = np.diag(self.fitted.inverse)
+        determined = spread > ROUNDED * spread.max(initial=0.0)
+        noise = np.where(determined, sigma * np.sqrt(np.where(determined, spread, 0.0)), of_view)
+        still = bool((self.moved_m <= share * noise).all()) or (
+            self._changed_besides_m <= share * of_view and self._terms_are_still(share * sigma)
         )
-        return still and self.moving.change <= part * of_view
+        return still and self.moving.change <= share * of_view
 
     @property
     def _changed_besides_m(self) -> float:
@@ -310,25 +310,25 @@ class _State:
         """Return whether the last step of each coefficient was below a part of its noise."""
         if self.equations is None:
             return True
-        variances = np.maximum(np.diag(self.equations.inverse(self.found.xy.sigma)), 0.0)
+        variances = np.maximum(np.diag(self.equations.inverse(self.fitted.xy.sigma)), 0.0)
         return bool((np.abs(self.stepped) <= part_m * np.sqrt(variances)).all())
 
     def finished(self) -> ModelFit:
         if self.equations is not None and self._stale(self.equations):
             self._linearise(self.equations.columns)
-        problem = replace(self.problem, ground=self.moving.ground(self.found))
-        return ModelFit(problem, self.found, self.equations, self.coefficients, self.y)
+        problem = replace(self.problem, inputs=self.moving.inputs(self.fitted))
+        return ModelFit(problem, self.fitted, self.equations, self.coefficients, self.y)
 
     def _solve_terms(self, equations: TermEquations) -> None:
         now = score(
             equations,
-            self.found.both_residuals,
-            squares(self.problem, self.found, of_noise=False),  # less those `_of_lines`
+            self.fitted.both_residuals,
+            squares(self.problem, self.fitted, of_noise=False),  # less those `_of_lines`
             coefficients=self.coefficients,
         )
         sums = residual_sums(equations, now)
         total, dof = _of_lines(
-            self.problem, self.found, equations, equations.free_inverse @ now.total
+            self.problem, self.fitted, equations, equations.free_inverse @ now.total
         )
         if sums.dof_between - dof < DECLARED_DOF or total > sums.between:
             total, dof = 0.0, 0.0
@@ -343,18 +343,22 @@ class _State:
             if sums.dof_within >= 1
             else self.problem.repeats_xy,
         )
-        sigma = self.found.xy.sigma if np.isfinite(self.found.xy.sigma) else 0.0
+        sigma = self.fitted.xy.sigma if np.isfinite(self.fitted.xy.sigma) else 0.0
         inverse = equations.inverse(sigma)
         self.coefficients = next_coefficients(
             equations, now, self.coefficients, sigma_m=sigma, inverse=inverse
         )
         lines = equations.columns.lines
         if len(lines.at):
-            taken = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
-            own = equations.columns.having(lambda block: block.of_lines and not block.turns_lines)
-            within = inverse[np.ix_(own, own)]
-            dof = float(np.sum(within * equations.information[np.ix_(own, own)]))
-            angular = replace(self.problem.angular, y=self.lines_read - taken)
+            line_values = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
+            columns_of_lines = equations.columns.having(
+                lambda block: block.of_lines and not block.turns_lines
+            )
+            within = inverse[np.ix_(columns_of_lines, columns_of_lines)]
+            dof = float(
+                np.sum(within * equations.information[np.ix_(columns_of_lines, columns_of_lines)])
+            )
+            angular = replace(self.problem.angular, y=self.lines_read - line_values)
             self.problem = replace(self.problem, angular=angular, dof_lines=dof)
             self.theta = angular_part(self.problem)
 
@@ -383,14 +387,14 @@ class _State:
     def _excess(self) -> np.ndarray | float:
         """Return `Problem.excess` of the present solution."""
         return self.problem.excess(
-            self.found.parameters,
-            self.found.plate + self._of_terms(lambda block: block.of_plate),
-            self.problem.system.grid.views.gather(self.found.field)
+            self.fitted.parameters,
+            self.fitted.plate + self._of_terms(lambda block: block.of_plate),
+            self.problem.system.grid.views.gather(self.fitted.field)
             + self._of_terms(lambda block: block.of_map),
         )
 
 
-def squares(problem: Problem, found: JointFit, *, of_noise: bool = True) -> tuple[float, float]:
+def squares(problem: Problem, fitted: JointFit, *, of_noise: bool = True) -> tuple[float, float]:
     """Return the weighted squares of all residuals, m^2, and their degrees of freedom.
 
     Grid and angular readings together, as they share the rotations: angular residuals in units of
@@ -398,20 +402,20 @@ def squares(problem: Problem, found: JointFit, *, of_noise: bool = True) -> tupl
     (`of_noise`), lines that have less than they are weighted with do not count.
     """
     system = problem.system
-    total = float((system.grid.weight * abs(found.residuals) ** 2).sum())
+    total = float((system.grid.weight * abs(fitted.residuals) ** 2).sum())
     dof = grid_dof(problem)
-    if found.ratio > 0:
+    if fitted.ratio > 0:
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += max(shared - 1, 0)
-        if not of_noise or lines_have_their_weight(problem, found):
-            squares_rad = float((system.angular.weight * found.residuals_theta**2).sum())
-            total += found.ratio * problem.half_width_m**2 * squares_rad
+        if not of_noise or lines_have_their_weight(problem, fitted):
+            squares_rad = float((system.angular.weight * fitted.residuals_theta**2).sum())
+            total += fitted.ratio * problem.half_width_m**2 * squares_rad
             dof += system.angular.n_readings - system.rank_angular
     return total, dof
 
 
 def _of_lines(
-    problem: Problem, found: JointFit, equations: TermEquations, more: np.ndarray
+    problem: Problem, fitted: JointFit, equations: TermEquations, more: np.ndarray
 ) -> tuple[float, float]:
     """Return the part of lines in `squares` and their degrees of freedom, all columns free.
 
@@ -420,21 +424,21 @@ def _of_lines(
 
     Parameters
     ----------
-    problem, found, equations : Problem, JointFit, TermEquations
+    problem, fitted, equations : Problem, JointFit, TermEquations
         A solution, and the columns about it.
     more : float array (p,)
         Free coefficients of the columns less those of the solution.
     """
-    if not found.ratio > 0:
+    if not fitted.ratio > 0:
         return 0.0, 0.0
     system, angular = problem.system, problem.system.angular
     columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)
     weight = equations.line_weight * angular.weight
-    rotations = found.ratio * found.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
+    rotations = fitted.ratio * fitted.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
     followed = np.einsum("vk,pvk,qvk->pq", weight, columns, columns) * equations.free_inverse
-    rest = found.residuals_theta - np.tensordot(more, columns, axes=1)
+    residuals = fitted.residuals_theta - np.tensordot(more, columns, axes=1)
     return (
-        float((weight * rest**2).sum()),
+        float((weight * residuals**2).sum()),
         angular.n_readings - angular.rank - float(rotations.sum() + followed.sum()),
     )
 
@@ -451,10 +455,10 @@ class FinerEquations(PlacedEquations):
     def rank_grid(self) -> int:
         """Rank of the grid readings, coefficients counted as far as they are determined."""
         of_plate = 2 * int(self.grid.mark_read.sum())
-        return round(told_coefficients(self)) + of_plate + self.rank_schur
+        return round(determined_coefficients(self)) + of_plate + self.rank_schur
 
 
-def told_coefficients(system: PlacedEquations) -> float:
+def determined_coefficients(system: PlacedEquations) -> float:
     """Return the real coefficients of a map that the readings determine."""
     grid = system.grid
     return 2 * (grid.n_sites - grid.vague * float(grid.variance_of_sites.sum()))
@@ -480,13 +484,13 @@ def is_untested(problem: Problem) -> bool:
     system = placed(problem)
     if system is None or is_too_large(system):
         return system is not None
-    views, left = system.grid.views, equations_left(system.grid)
-    if views.spline.axes[0].degree == 1 or left > 2 * math.prod(views.spline.refined.shape):
+    views, n_left = system.grid.views, equations_left(system.grid)
+    if views.spline.axes[0].degree == 1 or n_left > 2 * math.prod(views.spline.refined.shape):
         return False
     fine = PlacedSystem(views.artifact, views.poses, system.grid.weight, views.spline.refined)
     return (
-        left
-        - told_coefficients(
+        n_left
+        - determined_coefficients(
             PlacedEquations(fine, system.angular, system.grid_index, system.angular_index)
         )
         < 1
@@ -510,9 +514,9 @@ def finer(model: ModelFit) -> ModelFit | None:
     fits = [
         fine
         for spline in splines
-        if (fine := with_map(model, spline)) is not None and np.isfinite(fine.found.xy.residuals)
+        if (fine := with_map(model, spline)) is not None and np.isfinite(fine.fitted.xy.residuals)
     ]
-    return min(fits, key=lambda fine: fine.found.xy.residuals, default=None)
+    return min(fits, key=lambda fine: fine.fitted.xy.residuals, default=None)
 
 
 def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
@@ -524,53 +528,53 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
     if system is None:
         return None
     grid = system.grid
-    other = FinerEquations(
+    system_of_map = FinerEquations(
         PlacedSystem(grid.views.artifact, grid.views.poses, grid.weight, spline, grid.rotations),
         system.angular,
         system.grid_index,
         system.angular_index,
     )
-    flat = np.zeros((len(problem.conditions.rows), *other.grid.views.shape), dtype=complex)
+    flat = np.zeros((len(problem.conditions.rows), *system_of_map.grid.views.shape), dtype=complex)
     problem = replace(
         problem,
-        system=other,
+        system=system_of_map,
         places=None,
         residuals_xy=None,
         conditions=replace(problem.conditions, slopes=flat),
     )
-    refitted = replace(model, problem=problem, found=fit(problem, model.y))
+    refitted = replace(model, problem=problem, fitted=fit(problem, model.y))
     if model.equations is None:
         return refitted
-    weighted = np.isfinite(refitted.found.xy.sigma)
+    weighted = np.isfinite(refitted.fitted.xy.sigma)
     return _with_terms(refitted, model.equations.columns) if weighted else None
 
 
 def _with_terms(model: ModelFit, columns: TermColumns) -> ModelFit:
     """Return a fit with the coefficients of the terms fitted once more."""
-    problem, found = model.problem, model.found
-    equations = equations_of(problem, found, columns)
+    problem, fitted = model.problem, model.fitted
+    equations = equations_of(problem, fitted, columns)
     now = score(
-        equations, found.both_residuals, squares(problem, found), coefficients=model.coefficients
+        equations, fitted.both_residuals, squares(problem, fitted), coefficients=model.coefficients
     )
     values = next_coefficients(
         equations,
         now,
         model.coefficients,
-        sigma_m=found.xy.sigma,
-        inverse=equations.inverse(found.xy.sigma),
+        sigma_m=fitted.xy.sigma,
+        inverse=equations.inverse(fitted.xy.sigma),
     )
     y = np.where(
         problem.system.grid.read,
         model.y - columns.shapes.combined(values - model.coefficients),
         0.0,
     )
-    found = fit(problem, y)
+    fitted = fit(problem, y)
     return replace(
         model,
-        found=found,
+        fitted=fitted,
         y=y,
         coefficients=values,
-        equations=equations_of(problem, found, columns),
+        equations=equations_of(problem, fitted, columns),
     )
 
 
@@ -603,12 +607,14 @@ def fit_model(
         return replace(model, sizes=sizes)
     for term in problem.terms:
         first = term.block.shared or term.block.between
-        alone = _size_tests(model, [term] if first else [])
-        if any(test.contradicted for test in alone):
-            simpler = settled(_raised(problem, alone), check)
-            rest = _size_tests(simpler, [other for other in problem.terms if other is not term])
-            if not any(test.contradicted for test in rest):
-                sizes = (*alone, *rest)
+        first_sizes = _size_tests(model, [term] if first else [])
+        if any(test.contradicted for test in first_sizes):
+            simpler = settled(_raised(problem, first_sizes), check)
+            other_sizes = _size_tests(
+                simpler, [another for another in problem.terms if another is not term]
+            )
+            if not any(test.contradicted for test in other_sizes):
+                sizes = (*first_sizes, *other_sizes)
                 break
     return replace(settled(_raised(problem, sizes), check), sizes=sizes, given=problem.terms)
 
@@ -652,10 +658,10 @@ def _tests_of(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ..
         return ()
     scored = score(
         equations,
-        model.found.both_residuals,
-        squares(model.problem, model.found),
+        model.fitted.both_residuals,
+        squares(model.problem, model.fitted),
         coefficients=model.coefficients,
     )
     right = scored.total + equations.information @ model.coefficients
-    noise, excess = model.found.xy, noise_excess(model.problem, model.found.residuals)
+    noise, excess = model.fitted.xy, noise_excess(model.problem, model.fitted.residuals)
     return size_tests(equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof))

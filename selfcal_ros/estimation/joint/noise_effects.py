@@ -28,17 +28,19 @@ def axis_contrast(model: ModelFit) -> float:
     """
     problem = model.problem
     squares, dof = np.zeros(2), 0.0
-    for _, visits, rest in model.visits_about_means():
+    for _, visits, residuals in model.visits_about_means():
         if visits.repeated:
-            rest = rest / visits.phase
-            squares += visits.weight @ np.stack([rest.real, rest.imag], axis=1) ** 2
+            residuals = residuals / visits.phase
+            squares += visits.weight @ np.stack([residuals.real, residuals.imag], axis=1) ** 2
             dof += len(visits.mark) - len(np.unique(visits.mark))
     if 2 * dof < MIN_REPEAT_DOF:
-        rest = model.found.residuals * model.problem.to_stage[:, None, None]
+        residuals = model.fitted.residuals * model.problem.to_stage[:, None, None]
         weight = problem.system.grid.weight
-        squares = np.array([(weight * part**2).sum() for part in (rest.real, rest.imag)])
-        dof = model.found.xy.dof_residuals / 2
-    dof /= noise_excess(problem, model.found.residuals)
+        squares = np.array(
+            [(weight * coordinate**2).sum() for coordinate in (residuals.real, residuals.imag)]
+        )
+        dof = model.fitted.xy.dof_residuals / 2
+    dof /= noise_excess(problem, model.fitted.residuals)
     small, large = sorted(squares)
     if not (
         dof >= 1
@@ -62,8 +64,8 @@ def structured(
         turn = model.problem.to_stage[:, None, None] ** 2
         weight = model.problem.system.grid.weight
 
-        def along_x(rest: np.ndarray) -> np.ndarray:
-            return np.einsum("vij,kvij->k", weight, (turn * rest**2).real)
+        def along_x(sensitivities: np.ndarray) -> np.ndarray:
+            return np.einsum("vij,kvij->k", weight, (turn * sensitivities**2).real)
 
         added = contrast * added_variances(cover, along_x, rows)
     if len(correlation := time_correlation(model)):
@@ -82,15 +84,15 @@ def image_variances(
     sensitivities: then noise of a mark must not make more than the variance itself.
     """
     images = model.problem.images
-    if images is None or not (share := images.noises(model.found.residuals).share):
+    if images is None or not (share := images.noises(model.fitted.residuals).share):
         return 0.0
     added = added_variances(cover, images.added, rows, plate=plate)
-    whole = (
+    variance = (
         (cover.of_plate if plate else cover.of_stage) if rows is None else np.diag(cover.of(rows))
     )
-    if (added < -whole).any():
-        own = added_variances(cover, images.own, rows, plate=plate)
-        added = added * np.minimum(1.0, whole / np.where(own > 0, own, 1.0))
+    if (added < -variance).any():
+        of_marks = added_variances(cover, images.own, rows, plate=plate)
+        added = added * np.minimum(1.0, variance / np.where(of_marks > 0, of_marks, 1.0))
     return share * added
 
 
@@ -118,22 +120,24 @@ def added_variances(
     if rows is not None:
         return of(cover.sensitivities(rows))
     views = cover.system.grid.views
-    shape, other = (views.plate_shape, views.shape) if plate else (views.shape, views.plate_shape)
-    n, out = shape[0] * shape[1], []
+    shape, other_shape = (
+        (views.plate_shape, views.shape) if plate else (views.shape, views.plate_shape)
+    )
+    n, variances = shape[0] * shape[1], []
     for start in range(0, n, BLOCK):
         unit = np.eye(min(BLOCK, n - start), n, start).reshape(-1, *shape)
-        nothing = np.zeros((len(unit), *other))
-        out.append(
+        nothing = np.zeros((len(unit), *other_shape))
+        variances.append(
             [
                 of(
                     cover.sensitivities(
-                        *((nothing, unit * part) if plate else (unit * part, nothing))
+                        *((nothing, unit * axis) if plate else (unit * axis, nothing))
                     )
                 )
-                for part in (1, 1j)
+                for axis in (1, 1j)
             ]
         )
-    return np.concatenate(out, axis=1).reshape(2, *shape)
+    return np.concatenate(variances, axis=1).reshape(2, *shape)
 
 
 TESTED = 5
@@ -151,17 +155,20 @@ def time_correlation(model: ModelFit) -> np.ndarray:
     """
     views = _by_time(model)
     lags = int(PART * min((len(order) for _, _, order, _ in views), default=0))
-    if lags < TESTED or not model.found.xy.sigma > FLOOR:
+    if lags < TESTED or not model.fitted.xy.sigma > FLOOR:
         return np.zeros(0)
     products, number = np.zeros(lags + 1), 0
-    for _, _, order, rest in views:
-        one = rest[order]
-        products += [float(np.vdot(one[: len(one) - k], one[k:]).real) for k in range(lags + 1)]
-        number += len(one)
-    found = products[1:] / products[0]
-    p = float(chdtrc(TESTED, 2 * number * float((found[:TESTED] ** 2).sum())))
-    found = found * (1 - np.arange(1, lags + 1) / (lags + 1))
-    return found if p < F_LEVEL and 1 + 2 * found.sum() > SAME**2 else np.zeros(0)
+    for _, _, order, residuals in views:
+        in_order = residuals[order]
+        products += [
+            float(np.vdot(in_order[: len(in_order) - k], in_order[k:]).real)
+            for k in range(lags + 1)
+        ]
+        number += len(in_order)
+    correlation = products[1:] / products[0]
+    p = float(chdtrc(TESTED, 2 * number * float((correlation[:TESTED] ** 2).sum())))
+    correlation = correlation * (1 - np.arange(1, lags + 1) / (lags + 1))
+    return correlation if p < F_LEVEL and 1 + 2 * correlation.sum() > SAME**2 else np.zeros(0)
 
 
 def correlated_variances(
@@ -170,13 +177,14 @@ def correlated_variances(
     """Return what correlated noise adds to the variances, as `added_variances`."""
     views = _by_time(model)
 
-    def of(rest: np.ndarray) -> np.ndarray:
-        total = np.zeros(len(rest))
+    def of(sensitivities: np.ndarray) -> np.ndarray:
+        total = np.zeros(len(sensitivities))
         for row, visits, order, _ in views:
-            one = (np.sqrt(visits.weight) * rest[:, row].reshape(len(rest), -1)[:, visits.mark])[
-                :, order
-            ]
-            power = abs(np.fft.fft(one, 2 * one.shape[1])) ** 2
+            in_order = (
+                np.sqrt(visits.weight)
+                * sensitivities[:, row].reshape(len(sensitivities), -1)[:, visits.mark]
+            )[:, order]
+            power = abs(np.fft.fft(in_order, 2 * in_order.shape[1])) ** 2
             products = np.fft.ifft(power).real[:, 1 : len(correlation) + 1]
             total += 2 * products @ correlation
         return total
@@ -191,8 +199,9 @@ def _by_time(model: ModelFit) -> list[tuple[int, ViewVisits, np.ndarray, np.ndar
             row,
             visits,
             np.argsort(visits.time, kind="stable"),
-            np.sqrt(visits.weight) * (rest + model.found.residuals[row].reshape(-1)[visits.mark]),
+            np.sqrt(visits.weight)
+            * (residuals + model.fitted.residuals[row].reshape(-1)[visits.mark]),
         )
-        for row, visits, rest in model.visits_about_means()
+        for row, visits, residuals in model.visits_about_means()
         if visits.repeated
     ]

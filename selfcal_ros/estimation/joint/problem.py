@@ -121,9 +121,9 @@ def coverage_factor(dof: float) -> float:
     return float(stdtrit(min(dof, MANY_DOF), (1 + COVERAGE) / 2))
 
 
-def pooled(parts: Iterable[tuple[float, float]]) -> tuple[float, float]:
+def pooled(noises: Iterable[tuple[float, float]]) -> tuple[float, float]:
     """Return the pooled standard deviation and degrees of freedom of (sigma, dof) pairs."""
-    good = [(sigma, dof) for sigma, dof in parts if dof > 0 and np.isfinite(sigma)]
+    good = [(sigma, dof) for sigma, dof in noises if dof > 0 and np.isfinite(sigma)]
     total = float(sum(dof for _, dof in good))
     if not total:
         return float("nan"), 0.0
@@ -164,7 +164,7 @@ def noise_estimate(
         chosen = base
     else:
         chosen = residuals
-    found = NoiseEstimate(
+    estimate = NoiseEstimate(
         sigma=chosen[0],
         dof=chosen[1],
         repeats=repeats[0],
@@ -174,13 +174,13 @@ def noise_estimate(
         declared=declared,
         p=p,
     )
-    if found.contradicted:
+    if estimate.contradicted:
         sigma, dof = max(base, residuals)
-        return replace(found, sigma=sigma, dof=dof)
+        return replace(estimate, sigma=sigma, dof=dof)
     if np.isfinite(declared):
-        both, dof = pooled(((declared, DECLARED_DOF), residuals))
-        return replace(found, sigma=max(declared, both), dof=dof)
-    return found
+        pooled_sigma, dof = pooled(((declared, DECLARED_DOF), residuals))
+        return replace(estimate, sigma=max(declared, pooled_sigma), dof=dof)
+    return estimate
 
 
 def _same_noise(base: tuple[float, float], residuals: tuple[float, float], floor: float) -> float:
@@ -252,7 +252,7 @@ class Problem:
     repeats_theta: tuple[float, float]
     half_width_m: float
     conditions: Conditions
-    ground: TermInputs
+    inputs: TermInputs
     reference: ReferenceLength | None = None
     rigid: bool = True
     terms: tuple[ModelTerm, ...] = ()
@@ -324,14 +324,17 @@ def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     """Return the noise of the grid readings, given their residuals (views, nx, ny)."""
     grid = problem.system.grid
     total = float((grid.weight * (residual.real**2 + residual.imag**2)).sum())
-    found = problem.residuals_xy or sigma_of(total, grid_dof(problem))
+    residuals = problem.residuals_xy or sigma_of(total, grid_dof(problem))
     repeats = problem.repeats_xy
     if problem.images is not None and total > 0:  # of which residuals show only part
-        taken = problem.images.taken if problem.residuals_xy else 0
-        alone, noises = sigma_of(total, grid_dof(problem) - taken), problem.images.noises(residual)
-        found = found[0] * noises.sigma / alone[0], min(noises.dof, found[1])
+        n_taken = problem.images.taken if problem.residuals_xy else 0
+        without_images, noises = (
+            sigma_of(total, grid_dof(problem) - n_taken),
+            problem.images.noises(residual),
+        )
+        residuals = residuals[0] * noises.sigma / without_images[0], min(noises.dof, residuals[1])
         repeats = repeats[0], repeats[1] / noises.excess(problem.images.marks)
-    return noise_estimate(repeats, found, problem.grid.sigma_declared, floor=FLOOR)
+    return noise_estimate(repeats, residuals, problem.grid.sigma_declared, floor=FLOOR)
 
 
 def noise_excess(problem: Problem, residual: np.ndarray) -> float:
@@ -371,9 +374,9 @@ def least_noise_rad(problem: Problem, sigma_xy: float) -> float:
     return max(LEAST_NOISE_RAD, LEAST_OF_MARKS * sigma_xy / problem.half_width_m)
 
 
-def lines_have_their_weight(problem: Problem, found: "JointFit") -> bool:
+def lines_have_their_weight(problem: Problem, fitted: "JointFit") -> bool:
     """Return whether lines weigh as their noise says; not if that is less than counts."""
-    return not found.theta.sigma < least_noise_rad(problem, found.xy.sigma)
+    return not fitted.theta.sigma < least_noise_rad(problem, fitted.xy.sigma)
 
 
 def bounded_ratio(
@@ -427,7 +430,7 @@ def problem_of(
     measurements: Measurements,
     options: Options,
     system: NormalEquations,
-    ground: TermInputs,
+    inputs: TermInputs,
     *,
     readings: tuple[GridData, AngularData],
     terms: tuple[ModelTerm, ...],
@@ -439,27 +442,27 @@ def problem_of(
     ----------
     measurements, options
         The readings and how they are solved.
-    system, ground, readings
+    system, inputs, readings
         What is made of the readings.
     terms, images
         As in `Problem`.
     """
     rigid = options.finite_rotations
     conditions = conditions_for(
-        system, options.datum_theta, measurements.sense, ground.half_width_m
+        system, options.datum_theta, measurements.sense, inputs.half_width_m
     )
     problem = Problem(
         system,
         *readings,
         *repeats_of(measurements),
-        ground.half_width_m,
+        inputs.half_width_m,
         conditions,
-        ground,
+        inputs,
         options.reference,
         rigid,
         terms,
         turn_rad=np.zeros(len(readings[0].index)),
-        places=places_of(measurements, readings[0], ground, system.known_sites),
+        places=places_of(measurements, readings[0], inputs, system.known_sites),
         at_places=options.at_places,
         images=images,
     )
@@ -487,7 +490,7 @@ def turned(problem: Problem) -> Problem:
             phase=v.phase * complex(f),
             frame=v.frame * complex(f),
         )
-        for v, f, e in zip(problem.ground.visits, frame, bent, strict=True)
+        for v, f, e in zip(problem.inputs.visits, frame, bent, strict=True)
     )
     lines = problem.angular.y.copy()
     for row, index in enumerate(problem.angular.index):
@@ -499,7 +502,7 @@ def turned(problem: Problem) -> Problem:
         grid=replace(problem.grid, y=y),
         turn_rad=phi,
         angular=replace(problem.angular, y=lines),
-        ground=replace(problem.ground, visits=visits),
+        inputs=replace(problem.inputs, visits=visits),
     )
 
 
@@ -627,10 +630,10 @@ def angular_part(problem: Problem) -> AngularPart:
     residual = angular_residuals(problem.system, y)
     dof = angular.n_readings - problem.system.rank_angular - problem.dof_lines
     total = float((angular.weight * residual**2).sum())
-    found = noise_estimate(
+    noise = noise_estimate(
         problem.repeats_theta, sigma_of(total, dof), problem.angular.sigma_declared, floor=FLOOR
     )
-    return AngularPart(*angular.reduced(y), found)
+    return AngularPart(*angular.reduced(y), noise)
 
 
 FAR = 0.02
@@ -665,32 +668,32 @@ class Moving:
         self.change = float(np.abs(self.moved - before).max())
         return self.places.changes(self.moved, self.problem.turn_rad)
 
-    def ground(self, found: JointFit) -> TermInputs:
+    def inputs(self, fitted: JointFit) -> TermInputs:
         """Return the inputs with visits corrected for differences of the stage error."""
-        ground = self.problem.ground
+        inputs = self.problem.inputs
         if self.places is None or self.moved is None:
-            return ground
+            return inputs
         about = self.places.about(
-            found.field, self.places.errors(found.field, self.moved), self.problem.turn_rad
+            fitted.field, self.places.errors(fitted.field, self.moved), self.problem.turn_rad
         )
         return replace(
-            ground,
+            inputs,
             visits=tuple(
                 None if view is None else replace(view, y=view.y - more)
-                for view, more in zip(ground.visits, about, strict=True)
+                for view, more in zip(inputs.visits, about, strict=True)
             ),
         )
 
-    def repeats(self, found: JointFit) -> tuple[float, float]:
+    def repeats(self, fitted: JointFit) -> tuple[float, float]:
         """Return (sigma, dof) of the repeats, corrected for differences of the stage error."""
         sigma, dof = self.problem.repeats_xy
-        less = squares_within(self.problem.ground.visits) - squares_within(
-            self.ground(found).visits
+        less = squares_within(self.problem.inputs.visits) - squares_within(
+            self.inputs(fitted).visits
         )
         return sigma_of(max(sigma**2 * dof - less, 0.0), dof)
 
 
-def noise_gain(problem: Problem, found: JointFit) -> np.ndarray:
+def noise_gain(problem: Problem, fitted: JointFit) -> np.ndarray:
     """Return the standard uncertainty of each node over that without places, (nx, ny).
 
     Between its nodes a spline is smoother than the nodes, so that readings there tell less of each
@@ -700,21 +703,21 @@ def noise_gain(problem: Problem, found: JointFit) -> np.ndarray:
 
     Parameters
     ----------
-    problem, found : Problem, JointFit
+    problem, fitted : Problem, JointFit
         A solution.
     """
     places, grid = problem.places, problem.system.grid
     if places is None or not problem.moves or places.distance < FAR:
         return np.ones(grid.views.shape)
-    rng, sigma_m = np.random.default_rng(0), max(found.xy.sigma, np.finfo(float).tiny)
+    rng, sigma_m = np.random.default_rng(0), max(fitted.xy.sigma, np.finfo(float).tiny)
     lines = angular_part(problem)
     still = replace(lines, free=0 * lines.free, d=0 * lines.d)
-    there, sums = places.errors(found.field), np.zeros((2, *grid.views.shape))
+    error_there, sums = places.errors(fitted.field), np.zeros((2, *grid.views.shape))
     for _ in range(math.ceil(SAMPLES / grid.n_sites)):
         y = sigma_m * noise_of(rng, grid.weight.shape, grid.weight)
         plain = now = fit(problem, y, still).field
         for _ in range(MAX_STEPS):
-            changes = places.changes(places.moved(now, there), problem.turn_rad)
+            changes = places.changes(places.moved(now, error_there), problem.turn_rad)
             before, now = now, fit(problem, y - changes, still).field
             if np.abs(now - before).max() <= NEGLIGIBLE * np.abs(now).max():
                 break

@@ -56,7 +56,7 @@ from selfcal_ros.estimation.terms.columns import TermColumns
 from selfcal_ros.estimation.terms.equations import (
     FREE,
     TermEquations,
-    require_terms_told,
+    require_terms_determined,
     roots_by_term,
 )
 from selfcal_ros.estimation.terms.visits import check_visits, ground_of
@@ -175,7 +175,7 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
     model : ModelFit
         The solution, with its residuals in the plate frame.
     """
-    problem, found = model.problem, model.found
+    problem, fitted = model.problem, model.fitted
     if problem.system.grid.n_readings > MAX_READINGS:
         return {}
     starts = [
@@ -186,8 +186,9 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
     views, at_visits = (
         [],
         {
-            row: (rest + found.residuals[row].reshape(-1)[visits.mark]) * problem.to_stage[row]
-            for row, visits, rest in model.visits_about_means()
+            row: (residuals + fitted.residuals[row].reshape(-1)[visits.mark])
+            * problem.to_stage[row]
+            for row, visits, residuals in model.visits_about_means()
         },
     )
     for index, view in enumerate(measurements.views):
@@ -195,32 +196,37 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
         if index in problem.grid.index:
             row = problem.grid.index.index(index)
             read = problem.grid.weight[row] > 0
-            rest = np.where(read, found.residuals[row], np.nan) * problem.to_stage[row]
-            entry |= {"dx": np.round(rest.real, DECIMALS_M), "dy": np.round(rest.imag, DECIMALS_M)}
+            residuals = np.where(read, fitted.residuals[row], np.nan) * problem.to_stage[row]
+            entry |= {
+                "dx": np.round(residuals.real, DECIMALS_M),
+                "dy": np.round(residuals.imag, DECIMALS_M),
+            }
             if starts and view.visits is not None and len(view.visits.mark):
                 entry["course"] = _course(view.visits, at_visits[row], min(starts))
         if index in problem.angular.index:
             row = problem.angular.index.index(index)
-            rest = np.where(problem.angular.weight[row] > 0, found.residuals_theta[row], np.nan)
-            entry["dtheta"] = np.round(rest, DECIMALS_RAD)
+            residuals = np.where(
+                problem.angular.weight[row] > 0, fitted.residuals_theta[row], np.nan
+            )
+            entry["dtheta"] = np.round(residuals, DECIMALS_RAD)
         views.append(entry)
     return {RESIDUALS: {"views": views}}
 
 
-def _course(visits: GridVisits, rest: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
+def _course(visits: GridVisits, residuals: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
     """Return the mean residual in each of `MAX_PARTS` intervals of the view's time.
 
     Or of each visit, if there are fewer.
     """
     order = np.argsort(visits.stamp_ns, kind="stable")
-    parts = np.array_split(np.arange(len(order)), min(len(order), MAX_PARTS))
-    starts = np.array([part[0] for part in parts])
+    intervals = np.array_split(np.arange(len(order)), min(len(order), MAX_PARTS))
+    starts = np.array([interval[0] for interval in intervals])
     counts = visits.count[order]
     count = np.add.reduceat(counts, starts)
     since_s = (visits.stamp_ns - start_ns) / NS_PER_S
     columns = {
         name: np.add.reduceat(values[order] * counts, starts) / count
-        for name, values in (("time_s", since_s), ("dx", rest.real), ("dy", rest.imag))
+        for name, values in (("time_s", since_s), ("dx", residuals.real), ("dy", residuals.imag))
     }
     return {
         "time_s": np.round(columns["time_s"], DECIMALS_S),
@@ -238,7 +244,7 @@ def saved_terms(
     cover: MapsCovariance,
     columns: TermColumns,
     sense: Sense,
-    beside: dict[str, np.ndarray] | None = None,
+    other_effects: dict[str, np.ndarray] | None = None,
 ) -> Factors | None:
     """Return the factors of the terms; None for large fields.
 
@@ -250,45 +256,47 @@ def saved_terms(
         The terms.
     sense : Sense
         What moved: the factors are in the stage frame.
-    beside : dict of float array (p, ...), optional
+    other_effects : dict of float array (p, ...), optional
         What a unit of each coefficient makes of other quantities, see `Factors`.
     """
-    shape, beside = cover.system.grid.views.shape, beside or {}
+    shape, other_effects = cover.system.grid.views.shape, other_effects or {}
     if cover.system.grid.n_sites > MAX_FULL:
         return None
     maps = cover.maps_of_terms()[0]
     maps = turned_over(sense, maps.reshape(*shape, maps.shape[1]), axes=(0, 1))
-    both = np.concatenate(
+    coordinates = np.concatenate(
         [maps.real.reshape(-1, maps.shape[2]), maps.imag.reshape(-1, maps.shape[2])]
     )
-    others = np.concatenate(
+    other_quantities = np.concatenate(
         [
             np.zeros((0, maps.shape[2])),
-            *(values.reshape(len(values), -1).T for values in beside.values()),
+            *(values.reshape(len(values), -1).T for values in other_effects.values()),
         ]
     )
-    factors, names, moved, alone = [], [], [], []
+    factors, names, beside_map, beside_alone = [], [], [], []
     for name, root in roots_by_term(cover.terms.covariance, columns):
-        left, size, right = np.linalg.svd(both @ root, full_matrices=False)
-        kept = size > NEGLIGIBLE
-        factors += list((left[:, kept] * size[kept]).T.reshape(-1, 2, *shape))
-        names += [name] * int(kept.sum())
-        shown = right[kept].T @ right[kept]
-        moved += list((others @ root @ right[kept].T).T)
-        left, size, _ = np.linalg.svd(others @ (root - root @ shown), full_matrices=False)
-        alone += list((left * size).T[size > NEGLIGIBLE])
-    found = Factors(tuple(names), rounded(np.array(factors).reshape(-1, 2, *shape)))
-    if not beside:
-        return found
-    all_of = np.array([*moved, *alone]).reshape(-1, len(others))
-    ends = np.cumsum([values[0].size for values in beside.values()])[:-1]
+        directions, size, right = np.linalg.svd(coordinates @ root, full_matrices=False)
+        significant = size > NEGLIGIBLE
+        factors += list((directions[:, significant] * size[significant]).T.reshape(-1, 2, *shape))
+        names += [name] * int(significant.sum())
+        projector = right[significant].T @ right[significant]
+        beside_map += list((other_quantities @ root @ right[significant].T).T)
+        directions, size, _ = np.linalg.svd(
+            other_quantities @ (root - root @ projector), full_matrices=False
+        )
+        beside_alone += list((directions * size).T[size > NEGLIGIBLE])
+    factors_of_map = Factors(tuple(names), rounded(np.array(factors).reshape(-1, 2, *shape)))
+    if not other_effects:
+        return factors_of_map
+    all_of = np.array([*beside_map, *beside_alone]).reshape(-1, len(other_quantities))
+    ends = np.cumsum([values[0].size for values in other_effects.values()])[:-1]
     return replace(
-        found,
+        factors_of_map,
         with_map=len(names),
         beside={
-            name: rounded(part.reshape(len(part), *values.shape[1:]))
-            for (name, values), part in zip(
-                beside.items(), np.split(all_of, ends, axis=1), strict=True
+            name: rounded(values_of.reshape(len(values_of), *values.shape[1:]))
+            for (name, values), values_of in zip(
+                other_effects.items(), np.split(all_of, ends, axis=1), strict=True
             )
         },
     )
@@ -300,7 +308,7 @@ def factors_of(result: CalibrationResult) -> Factors:
 
 
 def angular_terms(
-    cover: MapsCovariance, columns: TermColumns, sigma_m: float, known: np.ndarray
+    cover: MapsCovariance, columns: TermColumns, sigma_m: float, known_lines: np.ndarray
 ) -> dict[str, np.ndarray]:
     """Return the contribution of each term of the lines to u of the angular map, rad, (K,).
 
@@ -310,17 +318,17 @@ def angular_terms(
         As in `saved_terms`.
     sigma_m : float
         Noise of one grid reading, m.
-    known : bool array (K,)
+    known_lines : bool array (K,)
         Lines of the map; their mean is the datum.
     """
-    out = {}
+    u_of_terms = {}
     for name in dict.fromkeys(columns.columns[at].term for at in columns.lines.at):
         rows = columns.rows([name])
-        moved = cover.terms.turned[:, rows]
-        moved = moved - moved[known].mean(axis=0)
-        power = np.einsum("kp,pq,kq->k", moved, cover.terms.covariance[np.ix_(rows, rows)], moved)
-        out[str(name)] = rounded(np.sqrt(np.maximum(power, 0.0)) * sigma_m)
-    return out
+        turned = cover.terms.turned[:, rows]
+        turned = turned - turned[known_lines].mean(axis=0)
+        power = np.einsum("kp,pq,kq->k", turned, cover.terms.covariance[np.ix_(rows, rows)], turned)
+        u_of_terms[str(name)] = rounded(np.sqrt(np.maximum(power, 0.0)) * sigma_m)
+    return u_of_terms
 
 
 def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
@@ -350,10 +358,10 @@ def solve_joint(
         assumed.
     """
     with one_thread():
-        model, seen, whole = _fitted(measurements, options, whole_only=whole_only)
+        model, observability, as_assumed = _fitted(measurements, options, whole_only=whole_only)
         return replace(
-            _solved(measurements, options, model=model, seen=seen),
-            converged=whole or model.found.xy.sigma < LEAST_NOISE_M,
+            _solved(measurements, options, model=model, observability=observability),
+            converged=as_assumed or model.fitted.xy.sigma < LEAST_NOISE_M,
         )
 
 
@@ -374,18 +382,19 @@ def _fitted(
     of_visits = tuple(term for term in options.assumed if term.block.needs_visits)
     failed: NotSettledError | None = None
     for assumed in dict.fromkeys((options.assumed, of_visits, ())):
-        problem, seen = prepare(measurements, replace(options, assumed=assumed))
+        problem, observability = prepare(measurements, replace(options, assumed=assumed))
         for at_places in (True, False) if problem.moves else (False,):
             try:
                 model = fit_model(
-                    replace(problem, at_places=at_places), partial(require_terms_told, seen=seen)
+                    replace(problem, at_places=at_places),
+                    partial(require_terms_determined, observability=observability),
                 )
             except NotSettledError as error:
                 if whole_only:
                     raise
                 failed = error
                 continue
-            return model, seen, assumed == options.assumed and at_places == problem.moves
+            return model, observability, assumed == options.assumed and at_places == problem.moves
     raise failed or AssertionError("something was tried")
 
 
@@ -406,93 +415,97 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
             "record detections of the plate's marks in at least three views",
         )
     system = system_of(grid, angular)
-    seen = measured_observability(
+    observability = measured_observability(
         system, measurements.artifact, tuple(v.view for v in measurements.views)
     )
-    if not seen.identifiable:
+    if not observability.identifiable:
         plan = Plan(
             measurements.plan_id, measurements.artifact, tuple(v.view for v in measurements.views)
         )
         if not identifies(plan.artifact, plan.views):
-            seen = with_unseen_modes(seen, system, plan).observability
+            observability = with_unseen_modes(observability, system, plan).observability
         raise NotIdentifiableError(
             "the marks that were read do not identify the stage "
-            f"({seen.deficiency} mode{'s' * (seen.deficiency != 1)} "
+            f"({observability.deficiency} mode{'s' * (observability.deficiency != 1)} "
             "undetermined)",
-            seen,
+            observability,
         )
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    ground = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
+    inputs = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
     # as a column, offsets would explain the noise that they hold
-    ground = replace(
-        ground, line_offsets=ground.line_offsets - angular_residuals(system, angular.y)
+    inputs = replace(
+        inputs, line_offsets=inputs.line_offsets - angular_residuals(system, angular.y)
     )
     terms = tuple(
         term
         for term in options.model_terms(
-            visits=all(v is not None for v in ground.visits), assumed=options.finite_rotations
+            visits=all(v is not None for v in inputs.visits), assumed=options.finite_rotations
         )
-        if ground.has(term.name)
+        if inputs.has(term.name)
     )
     images = image_noise(
         measurements.artifact,
         [v.view for v in measurements.views],
         system,
-        ground=ground,
+        inputs=inputs,
         terms=[term for term in terms if term.block.of_images],
     )
     return problem_of(
-        measurements, options, system, ground, readings=(grid, angular), terms=terms, images=images
-    ), seen
+        measurements, options, system, inputs, readings=(grid, angular), terms=terms, images=images
+    ), observability
 
 
 def _solved(
-    measurements: Measurements, options: Options, *, model: ModelFit, seen: Observability
+    measurements: Measurements, options: Options, *, model: ModelFit, observability: Observability
 ) -> Solved:
-    problem, found = model.problem, model.found
-    asked = options.uncertainty
-    wanted = problem.system.grid.n_sites <= UNASKED_SITES if asked is None else asked
-    exact = options.reference is not None and found.xy.sigma == 0
-    least = NO_NOISE if exact else found.xy.sigma  # 0 would hide the u of the reference
+    problem, fitted = model.problem, model.fitted
+    asked_for = options.uncertainty
+    with_uncertainty = (
+        problem.system.grid.n_sites <= UNASKED_SITES if asked_for is None else asked_for
+    )
+    exact = options.reference is not None and fitted.xy.sigma == 0
+    least = NO_NOISE if exact else fitted.xy.sigma  # 0 would hide the u of the reference
     sigma = np.full(problem.system.known_sites.shape, least)
-    if wanted:
-        sigma = sigma * noise_gain(problem, found)
+    if with_uncertainty:
+        sigma = sigma * noise_gain(problem, fitted)
     cover = None
     # the datum of the axes is tested in any case
-    if wanted or problem.conditions.datum is ThetaDatum.XY_AXES:
+    if with_uncertainty or problem.conditions.datum is ThetaDatum.XY_AXES:
         cover = MapsCovariance(
             problem.system,
-            found.inverse,
+            fitted.inverse,
             options.reference,
             terms=model.spread,
             half_width_m=problem.half_width_m,
             sigma_m=least,
         )
-    error_map, closure, kept = _error_map(measurements, model, cover, sigma, wanted=wanted)
-    artifact_map = _artifact_map(model, cover if wanted else None, rms(sigma))
+    error_map, closure, kept_parts = _error_map(
+        measurements, model, cover, sigma, with_uncertainty=with_uncertainty
+    )
+    artifact_map = _artifact_map(model, cover if with_uncertainty else None, rms(sigma))
     findings = (
         *_unchecked(problem.system, measurements.sense),
         *_magnification(artifact_map, options),
     )
-    if not wanted and asked is None:
+    if not with_uncertainty and asked_for is None:
         findings = (Finding("no_uncertainty"), *findings)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
-        axes = misclosure_test(found.misclosure, closure)
+        axes = misclosure_test(fitted.misclosure, closure)
     result = CalibrationResult(
         measurements.plan_id,
         error_map,
         artifact_map,
         views_of(
-            measurements, problem, np.where(problem.system.known_views, found.parameters, np.nan)
+            measurements, problem, np.where(problem.system.known_views, fitted.parameters, np.nan)
         ),
-        seen,
-        noise_of(found.xy, found.theta),
+        observability,
+        noise_of(fitted.xy, fitted.theta),
         measurements.all_rejected(),
         findings=findings,
         sense=str(measurements.sense),
         extra=kept_residuals(measurements, model),
-        kept=replace(kept, images=_kept_images(measurements, model)),
+        kept=replace(kept_parts, images=_kept_images(measurements, model)),
         run_id=measurements.run_id,
         model=ModelResult(
             "rigid" if problem.rigid else "linear",
@@ -500,32 +513,32 @@ def _solved(
         ),
         placed_plate=measurements.artifact.placed,
     )
-    return Solved(result, found.xy, found.theta, model, axes)
+    return Solved(result, fitted.xy, fitted.theta, model, axes)
 
 
 def _kept_images(measurements: Measurements, model: ModelFit) -> ImagesKept | None:
     """Return what a result keeps of the noise of images in its grid views; None without."""
     views = [measurements.views[index].view for index in model.problem.grid.index]
-    seen = cells_seen(measurements.artifact, views)
-    if model.problem.images is None or seen is None:
+    cells_of_views = cells_seen(measurements.artifact, views)
+    if model.problem.images is None or cells_of_views is None:
         return None
-    noises = model.problem.images.noises(model.found.residuals)
-    names = list(dict.fromkeys(name for name, _ in seen))
+    noises = model.problem.images.noises(model.fitted.residuals)
+    names = list(dict.fromkeys(name for name, _ in cells_of_views))
     return ImagesKept(
         noises.share,
         noises.dof_mark,
-        tuple(names.index(name) for name, _ in seen),
-        tuple(step for _, step in seen),
+        tuple(names.index(name) for name, _ in cells_of_views),
+        tuple(step for _, step in cells_of_views),
     )
 
 
-def _magnification(found: ArtifactMap, options: Options) -> tuple[Finding, ...]:
+def _magnification(plate_map: ArtifactMap, options: Options) -> tuple[Finding, ...]:
     """Return whether plate and encoders differ in scale by more than is plausible."""
     if options.reference is not None or not (
-        abs(found.magnification) > options.magnification_limit
+        abs(plate_map.magnification) > options.magnification_limit
     ):
         return ()
-    return (Finding("magnification", found.magnification, found.u_magnification, "m/m"),)
+    return (Finding("magnification", plate_map.magnification, plate_map.u_magnification, "m/m"),)
 
 
 def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
@@ -572,17 +585,19 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
     if model.equations is None:
         return ()
     columns, covariance = model.equations.columns.columns, model.covariance
-    told = np.abs(model.equations.untold(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
-    given = {term.name: term.size for term in model.given}
+    determined = (
+        np.abs(model.equations.undetermined(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
+    )
+    size_before = {term.name: term.size for term in model.given}
     out = []
     for term in model.problem.terms:
         estimates = tuple(
             TermEstimate(
-                model.problem.ground.name_of(c.term, c.view),
+                model.problem.inputs.name_of(c.term, c.view),
                 c.component,
-                float(model.coefficients[i]) if told[i] else float("nan"),
-                float(np.sqrt(max(covariance[i, i], 0.0)) * model.found.xy.sigma)
-                if told[i]
+                float(model.coefficients[i]) if determined[i] else float("nan"),
+                float(np.sqrt(max(covariance[i, i], 0.0)) * model.fitted.xy.sigma)
+                if determined[i]
                 else float("nan"),
                 c.unit,
             )
@@ -590,13 +605,13 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
             if c.term == term.name
         )
         size = None if term.free else term.size
-        before = None if term.free else given.get(term.name, term.size)
+        size_given = None if term.free else size_before.get(term.name, term.size)
         out.append(
             TermResult(
                 str(term.name),
-                before,
+                size_given,
                 estimates,
-                size if size != before else None,
+                size if size != size_given else None,
                 "declared" if term.name in declared else "default",
             )
         )
@@ -609,47 +624,49 @@ def _error_map(
     cover: MapsCovariance | None,
     sigma: np.ndarray,
     *,
-    wanted: bool,
+    with_uncertainty: bool,
 ) -> tuple[ErrorMap, np.ndarray | None, Kept]:
     """Return the map in the stage frame, the covariance of the angular misclosure, factors.
 
     `sigma` is the noise of a reading as it counts at each site, m; what is kept has
-    no images yet. The uncertainty is given if it is `wanted`.
+    no images yet. The uncertainty is given if it is `with_uncertainty`.
     """
-    problem, found = model.problem, model.found
+    problem, fitted = model.problem, model.fitted
     system, length = problem.system, problem.half_width_m
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
     u_theta, closure = np.full(system.angular.n_lines, np.nan), None
-    kept = Kept()
+    kept_parts = Kept()
     if cover is not None:
-        lines = LinesCovariance(cover, (found.xy.sigma, found.theta.sigma))
-        if wanted:
+        lines = LinesCovariance(cover, (fitted.xy.sigma, fitted.theta.sigma))
+        if with_uncertainty:
             variance = cover.of_stage
             if system.grid.n_sites <= MAX_NODES:
                 more = structured(model, cover)
                 variance = variance + more
                 if np.any(more):  # O and R are combinations of nodes, whose noises are correlated
-                    kept = Kept(added=np.asarray(structured(model, cover, system.gauge.shear)))
+                    kept_parts = Kept(
+                        added=np.asarray(structured(model, cover, system.gauge.shear))
+                    )
             u_x, u_y = np.sqrt(np.maximum(variance, 0.0)) * sigma
-        if wanted and model.equations is not None:
+        if with_uncertainty and model.equations is not None:
             columns = model.equations.columns
-            kept = replace(
-                kept,
+            kept_parts = replace(
+                kept_parts,
                 factors=saved_terms(
                     cover,
                     columns,
                     measurements.sense,
                     _beside_map(model, lines, measurements.sense),
                 ),
-                angular=angular_terms(cover, columns, found.xy.sigma, system.known_lines),
+                angular=angular_terms(cover, columns, fitted.xy.sigma, system.known_lines),
             )
         if system.angular.n_views:
             variance, closure = lines.of_stage(problem.conditions)
-            u_theta = np.sqrt(variance) if wanted else u_theta
-    known = system.known_sites
-    field = np.where(known, found.field, complex(np.nan, np.nan))
-    g_theta = np.where(system.known_lines, found.g_theta, np.nan)
-    o, r = system.gauge.first_order(found.field)
+            u_theta = np.sqrt(variance) if with_uncertainty else u_theta
+    known_sites = system.known_sites
+    field = np.where(known_sites, fitted.field, complex(np.nan, np.nan))
+    g_theta = np.where(system.known_lines, fitted.g_theta, np.nan)
+    o, r = system.gauge.first_order(fitted.field)
     sense = measurements.sense
     field = turned_over(sense, field)
     u_x, u_y = (turned_over(sense, u, sign=1) for u in (u_x, u_y))
@@ -668,7 +685,7 @@ def _error_map(
             problem.conditions.datum,
         ),
         closure,
-        kept,
+        kept_parts,
     )
 
 
@@ -689,8 +706,8 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
     measured = -length * np.array(
         [
             [
-                column.term == of_offsets.name and column.component == part
-                for part in MICROSCOPE_PARTS
+                column.term == of_offsets.name and column.component == component
+                for component in MICROSCOPE_PARTS
             ]
             for column in columns.columns
         ],
@@ -707,16 +724,16 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
 
 def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float) -> ArtifactMap:
     """Return the plate's map; `sigma_m` is the noise of a reading as it counts there."""
-    problem, found = model.problem, model.found
+    problem, fitted = model.problem, model.fitted
     system, length = problem.system, problem.half_width_m
-    plate = np.where(system.known_marks, found.plate, complex(np.nan, np.nan))
-    alone = ReferenceLength(ReferenceKind.ARTIFACT, 0.0)
-    scale = scale_of(system, alone, field=found.field, plate=found.plate, half_width_m=length)
-    u, sigma = float("nan"), found.xy.sigma
+    plate = np.where(system.known_marks, fitted.plate, complex(np.nan, np.nan))
+    unscaled = ReferenceLength(ReferenceKind.ARTIFACT, 0.0)
+    scale = scale_of(system, unscaled, field=fitted.field, plate=fitted.plate, half_width_m=length)
+    u, sigma = float("nan"), fitted.xy.sigma
     u_x = u_y = np.full(plate.shape, np.nan)
     u_theta = np.full(system.angular.n_lines, np.nan)
     if cover is not None:
-        u = float(np.sqrt(cover.variance_of_scale(alone))) * sigma / length
+        u = float(np.sqrt(cover.variance_of_scale(unscaled))) * sigma / length
     # the plate's covariance takes a factor of its own, as large as that of the stage
     if cover is not None and math.isfinite(u) and system.grid.n_sites <= UNASKED_SITES:
         variance = cover.of_plate
@@ -724,11 +741,11 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
             variance = variance + image_variances(model, cover, plate=True)
         u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:
-            u_theta = np.sqrt(LinesCovariance(cover, (sigma, found.theta.sigma)).of_plate())
+            u_theta = np.sqrt(LinesCovariance(cover, (sigma, fitted.theta.sigma)).of_plate())
     return ArtifactMap(
         plate.real.copy(),
         plate.imag.copy(),
-        np.where(system.known_plate_lines, found.a_theta, np.nan),
+        np.where(system.known_plate_lines, fitted.a_theta, np.nan),
         scale / length,
         u,
         u_x,

@@ -39,16 +39,16 @@ class Components:
     @property
     def first_sites(self) -> np.ndarray:
         """The first site of every component, int (components,)."""
-        known = np.flatnonzero(self.of_site >= 0)
+        sites = np.flatnonzero(self.of_site >= 0)
         out = np.zeros(len(self.balanced), dtype=int)
-        out[self.of_site[known[::-1]]] = known[::-1]
+        out[self.of_site[sites[::-1]]] = sites[::-1]
         return out
 
     @property
     def largest(self) -> int:
         """The component with the most sites; the first one if equal."""
-        known = self.of_site[self.of_site >= 0]
-        return int(np.bincount(known, minlength=len(self.balanced)).argmax())
+        component_of_site = self.of_site[self.of_site >= 0]
+        return int(np.bincount(component_of_site, minlength=len(self.balanced)).argmax())
 
 
 def components(
@@ -69,19 +69,21 @@ def components(
     first = np.empty(n_marks, dtype=int)
     first[mark[::-1]] = np.arange(len(mark))[::-1]
     # a mark joins the site of its first reading to its other sites
-    other = np.flatnonzero(first[mark] != np.arange(len(mark)))
-    start = first[mark[other]]
-    turn = (q[other] - q[start]) % 4
+    further = np.flatnonzero(first[mark] != np.arange(len(mark)))
+    start = first[mark[further]]
+    turn = (q[further] - q[start]) % 4
     label = (
-        _cover(site[start], site[other], turn, n_sites)
+        _cover(site[start], site[further], turn, n_sites)
         if turn.any()
-        else _connect(site[start], site[other], n_sites)[None]
+        else _connect(site[start], site[further], n_sites)[None]
     )
     touched = np.zeros(n_sites, dtype=bool)
     touched[site] = True
     # the copies of a site are in all components of the cover over its own component
-    _, one, number = np.unique(label.min(axis=0)[touched], return_index=True, return_inverse=True)
-    copies = label[:, np.flatnonzero(touched)[one]]
+    _, first_of_each, number = np.unique(
+        label.min(axis=0)[touched], return_index=True, return_inverse=True
+    )
+    copies = label[:, np.flatnonzero(touched)[first_of_each]]
     balanced = (copies[1:] != copies[0]).all(axis=0)
     of_site[touched] = number
     of_mark[mark] = of_site[site]
@@ -106,7 +108,7 @@ def _cover(a: np.ndarray, b: np.ndarray, turn: np.ndarray, n: int) -> np.ndarray
 
 
 def free_turns(
-    site: np.ndarray, mark: np.ndarray, q: np.ndarray, parts: Components
+    site: np.ndarray, mark: np.ndarray, q: np.ndarray, components_read: Components
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the quarter turns of a component's free vector, int (sites,), (marks,).
 
@@ -117,11 +119,14 @@ def free_turns(
     ----------
     site, mark, q : int arrays (readings,)
         As for `components`.
-    parts : Components
+    components_read : Components
         The components of these readings.
     """
-    of_site, of_mark = np.zeros(len(parts.of_site), dtype=int), np.zeros(len(parts.of_mark), int)
-    free = parts.balanced[parts.of_site[site]]
+    of_site, of_mark = (
+        np.zeros(len(components_read.of_site), dtype=int),
+        np.zeros(len(components_read.of_mark), int),
+    )
+    free = components_read.balanced[components_read.of_site[site]]
     if not free.any():
         return of_site, of_mark
     ends, place = np.unique(np.stack([site, mark + len(of_site)])[:, free], return_inverse=True)
@@ -129,12 +134,12 @@ def free_turns(
     # a vector v of a mark appears as i^q v on its site
     label = _cover(end, start, q[free], len(ends))
     at_site = ends < len(of_site)
-    part = np.where(
+    component = np.where(
         at_site,
-        parts.of_site[np.where(at_site, ends, 0)],
-        parts.of_mark[np.where(at_site, 0, ends - len(of_site))],
+        components_read.of_site[np.where(at_site, ends, 0)],
+        components_read.of_mark[np.where(at_site, 0, ends - len(of_site))],
     )
-    home = label[0][np.searchsorted(ends, parts.first_sites[part])]
+    home = label[0][np.searchsorted(ends, components_read.first_sites[component])]
     turn = np.argmax(label == home, axis=0)
     of_site[ends[at_site]], of_mark[ends[~at_site] - len(of_site)] = turn[at_site], turn[~at_site]
     return of_site, of_mark
@@ -158,18 +163,18 @@ def rest_on_one(site: np.ndarray, mark: np.ndarray, *, n_sites: int, n_marks: in
     """
     ends = np.stack([site, mark + n_sites])
     number = np.broadcast_to(np.arange(len(site)), ends.shape)
-    left = np.bincount(ends.ravel(), minlength=n_sites + n_marks)
+    n_left = np.bincount(ends.ravel(), minlength=n_sites + n_marks)
     # for a node with one reading left this sum is the index of that reading
     total = np.bincount(ends.ravel(), number.ravel(), n_sites + n_marks).astype(np.int64)
-    read = left[:n_sites] > 0
-    last = np.flatnonzero(left == 1)
+    read = n_left[:n_sites] > 0
+    last = np.flatnonzero(n_left == 1)
     while len(last):
         off = np.unique(total[last])
         at = ends[:, off].ravel()
-        np.subtract.at(left, at, 1)
+        np.subtract.at(n_left, at, 1)
         np.subtract.at(total, at, np.tile(off, 2))
-        last = np.unique(at[left[at] == 1])
-    return read & (left[:n_sites] == 0)
+        last = np.unique(at[n_left[at] == 1])
+    return read & (n_left[:n_sites] == 0)
 
 
 class Gauge:
@@ -185,9 +190,9 @@ class Gauge:
         Whether magnification belongs to the datum (stage: yes, plate: no).
     """
 
-    def __init__(self, z: np.ndarray, known: np.ndarray, *, scale: bool) -> None:
-        self.z, self.known, self.scale = z, known, scale
-        self._rows = _modes(z, known)[: 4 if scale else 3]
+    def __init__(self, z: np.ndarray, is_known: np.ndarray, *, scale: bool) -> None:
+        self.z, self.known, self.scale = z, is_known, scale
+        self._rows = _modes(z, is_known)[: 4 if scale else 3]
         self._gram_inverse = _inverse((self._rows.conj() @ self._rows.T).real)
 
     def parts(self, field: np.ndarray) -> np.ndarray:
@@ -198,11 +203,11 @@ class Gauge:
         """Return the row that gives one of `parts`, complex (nx, ny), real inner product."""
         return (self._gram_inverse[mode] @ self._rows).reshape(self.known.shape)
 
-    def remove(self, field: np.ndarray, parts: np.ndarray) -> np.ndarray:
-        """Return `field` minus the modes with coefficients `parts`."""
-        shift, slope = complex(parts[0], parts[1]), complex(0.0, parts[2])
+    def remove(self, field: np.ndarray, modes: np.ndarray) -> np.ndarray:
+        """Return `field` minus the modes with coefficients `modes`."""
+        shift, slope = complex(modes[0], modes[1]), complex(0.0, modes[2])
         if self.scale:
-            slope += parts[3]
+            slope += modes[3]
         return field - shift - slope * self.z
 
     @cached_property
@@ -232,15 +237,15 @@ class Gauge:
 
     def first_order(self, field: np.ndarray) -> tuple[float, float]:
         """Return O and R of `field`, times the half width."""
-        known = np.where(self.known, field, 0.0).conj().reshape(-1)
-        both = (self.shear.reshape(2, -1) @ known).real
-        return float(both[0]), float(both[1])
+        field_known = np.where(self.known, field, 0.0).conj().reshape(-1)
+        o_and_r = (self.shear.reshape(2, -1) @ field_known).real
+        return float(o_and_r[0]), float(o_and_r[1])
 
 
-def _modes(z: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _modes(z: np.ndarray, is_known: np.ndarray) -> np.ndarray:
     """Return the modes 1, i, iz, z over the known sites, complex (4, sites)."""
     out = np.empty((4, z.size), dtype=complex)
-    out[0], out[3] = known.reshape(-1), (z * known).reshape(-1)
+    out[0], out[3] = is_known.reshape(-1), (z * is_known).reshape(-1)
     out[1], out[2] = 1j * out[0], 1j * out[3]
     return out
 

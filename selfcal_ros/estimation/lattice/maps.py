@@ -62,14 +62,14 @@ class LatticeViews:
     def reach(self) -> int:
         """Largest folded distance, in pitches, of two sites visited by one mark, rounded up."""
         out = 0.0
-        for (p, r), (turn, other) in zip(
+        for (p, r), (turn, other_turn) in zip(
             product(self.shifts, repeat=2), product(self.phases, repeat=2), strict=True
         ):
             (a, b), (c, d) = (p.real, p.imag), (r.real, r.imag)
             out = max(
                 out,
                 max(abs(a - c), abs(b - d))
-                if turn == other
+                if turn == other_turn
                 else max(abs(a), abs(b)) + max(abs(c), abs(d)),
             )
         return ceil(out)
@@ -111,7 +111,7 @@ class LatticeViews:
     @cached_property
     def from_corner(self) -> tuple[np.ndarray, np.ndarray]:
         """Places of the marks in the pitch of the map from its first node, (views, nx, ny) each."""
-        turn, shift = (part[:, None, None] for part in (self.phases, self.shifts))
+        turn, shift = (of_views[:, None, None] for of_views in (self.phases, self.shifts))
         at = (turn * self.places + shift) / self.node_pitch
         return at.real + self.half[0], at.imag + self.half[1]
 
@@ -125,8 +125,8 @@ class LatticeViews:
     def site_index(self) -> np.ndarray:
         """Flat index of the node nearest to every mark, int (views, nx, ny); -1 off the field."""
         i, j = (
-            np.clip(np.rint(part).astype(int), 0, size - 1)
-            for part, size in zip(self.from_corner, self.shape, strict=True)
+            np.clip(np.rint(coordinate).astype(int), 0, size - 1)
+            for coordinate, size in zip(self.from_corner, self.shape, strict=True)
         )
         return np.where(self.in_field, i * self.shape[1] + j, -1)
 
@@ -151,8 +151,8 @@ class LatticeViews:
         """Flat index of the one mark on every site in each view, int (views, nx, ny); -1 = none."""
         out = np.full((len(self.poses), self.shape[0] * self.shape[1]), -1)
         for mark_on, site in zip(out, self.site_index.reshape(out.shape), strict=True):
-            here = np.flatnonzero(site >= 0)
-            mark_on[site[here]] = here
+            marks = np.flatnonzero(site >= 0)
+            mark_on[site[marks]] = marks
         return out.reshape(-1, *self.shape)
 
     def add_scattered(self, out: np.ndarray, index: int, marks: np.ndarray) -> None:
@@ -233,8 +233,8 @@ class Axis:
     @property
     def refined(self) -> "Axis":
         """The spline with a further knot in the middle of each interval: it contains this one."""
-        each = np.unique(self.knots)
-        knots = np.sort(np.concatenate([self.knots, (each[:-1] + each[1:]) / 2]))
+        distinct = np.unique(self.knots)
+        knots = np.sort(np.concatenate([self.knots, (distinct[:-1] + distinct[1:]) / 2]))
         nodes = np.array(
             [knots[i + 1 : i + self.degree + 1].mean() for i in range(len(knots) - self.degree - 1)]
         )
@@ -324,8 +324,8 @@ class MapSpline:
         (bx, ix), (by, iy) = self.axes[0].rows(at.real), self.axes[1].rows(at.imag)
         values = bx[:, :, None] * by[:, None, :]
         index = ix[:, :, None] * self.shape[1] + iy[:, None, :]
-        each = values[0].size if len(values) else 1
-        ends = np.arange(0, len(at) * each + 1, each)
+        n_of_place = values[0].size if len(values) else 1
+        ends = np.arange(0, len(at) * n_of_place + 1, n_of_place)
         return csr_matrix(
             (values.ravel(), index.ravel(), ends), shape=(len(at), self.shape[0] * self.shape[1])
         )
@@ -440,8 +440,8 @@ class PlacedViews(LatticeViews):
     def near(self, nodes: np.ndarray) -> np.ndarray:
         """Return the marks whose cell of the map has only `nodes` as corners, (views, nx, ny)."""
         i, j = (
-            np.clip(np.floor(part + EDGE).astype(int), 0, size - 2)
-            for part, size in zip(self.from_corner, self.shape, strict=True)
+            np.clip(np.floor(coordinate + EDGE).astype(int), 0, size - 2)
+            for coordinate, size in zip(self.from_corner, self.shape, strict=True)
         )
         return self.in_field & (
             nodes[i, j] & nodes[i + 1, j] & nodes[i, j + 1] & nodes[i + 1, j + 1]

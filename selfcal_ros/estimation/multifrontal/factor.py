@@ -152,9 +152,9 @@ def _entries(
     rows, values = [np.arange(len(diagonal))], [diagonal]
     columns = rows.copy()
     for i, j in combinations(range(len(weight)), 2):
-        both = np.flatnonzero((weight[i] > 0) & (weight[j] > 0))
-        a, b = variable[i][both], variable[j][both]
-        value = -weight[i][both] * relative_weight[j][both]
+        in_both = np.flatnonzero((weight[i] > 0) & (weight[j] > 0))
+        a, b = variable[i][in_both], variable[j][in_both]
+        value = -weight[i][in_both] * relative_weight[j][in_both]
         rows.append(a)
         columns.append(b)
         # an entry and its mirror image may coincide on the diagonal
@@ -192,24 +192,24 @@ class Front:
     @property
     def size(self) -> int:
         """Number of values stored by the front."""
-        own = self.stop - self.start
-        return own * (own + len(self.boundary))
+        n_own = self.stop - self.start
+        return n_own * (n_own + len(self.boundary))
 
     def blocks(self, storage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return views of the blocks (own, own) and (b, own), by columns."""
-        own, middle = self.stop - self.start, self.offset + (self.stop - self.start) ** 2
+        n_own, middle = self.stop - self.start, self.offset + (self.stop - self.start) ** 2
         return (
-            storage[self.offset : middle].reshape(own, own).T,
-            storage[middle : self.offset + self.size].reshape(own, -1).T,
+            storage[self.offset : middle].reshape(n_own, n_own).T,
+            storage[middle : self.offset + self.size].reshape(n_own, -1).T,
         )
 
     def places(self, variables: np.ndarray) -> np.ndarray:
         """Return the positions of variables in this front: its own first, then its boundary."""
-        own = self.stop - self.start
+        n_own = self.stop - self.start
         return np.where(
             variables < self.stop,
             variables - self.start,
-            own + np.searchsorted(self.boundary, variables),
+            n_own + np.searchsorted(self.boundary, variables),
         )
 
 
@@ -271,11 +271,13 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
     lengths = [len(piece) for piece, _ in pieces]
     front = np.repeat(np.arange(len(pieces)), lengths)[column[inner]]
     fronts = _fronts(pieces, row[inner], front, size=size)
-    total = sum(one.size for one in fronts)
+    total = sum(piece_front.size for piece_front in fronts)
     at = total + (column - n) * (size - n) + row - n
     at[inner] = _addresses(fronts, row[inner], column[inner], front=front, size=size)
-    both = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
-    return Dissection(order, fronts, top, both[:total], both[total:].reshape(size - n, size - n).T)
+    values = np.bincount(at, folded.values, minlength=total + (size - n) ** 2)
+    return Dissection(
+        order, fronts, top, values[:total], values[total:].reshape(size - n, size - n).T
+    )
 
 
 def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
@@ -301,21 +303,23 @@ def _addresses(
     fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *, front: np.ndarray, size: int
 ) -> np.ndarray:
     """Return the storage positions of entries (row, column) of the lower triangle."""
-    start = np.array([one.start for one in fronts])[front]
-    own = np.array([one.stop for one in fronts])[front] - start
-    widths = np.array([len(one.boundary) for one in fronts])
+    start = np.array([item.start for item in fronts])[front]
+    n_own = np.array([item.stop for item in fronts])[front] - start
+    widths = np.array([len(item.boundary) for item in fronts])
     keys = np.concatenate(
         [
             np.zeros(0, dtype=int),
-            *(number * size + one.boundary for number, one in enumerate(fronts)),
+            *(number * size + item.boundary for number, item in enumerate(fronts)),
         ]
     )
     before = np.cumsum(widths) - widths
     place = np.searchsorted(keys, front * size + row) - before[front]
-    offset = np.array([one.offset for one in fronts])[front]
+    offset = np.array([item.offset for item in fronts])[front]
     column = column - start
     return offset + np.where(
-        row < start + own, column * own + row - start, own * own + column * widths[front] + place
+        row < start + n_own,
+        column * n_own + row - start,
+        n_own * n_own + column * widths[front] + place,
     )
 
 
@@ -391,15 +395,15 @@ class Factor:
 
     def _close(self, updates: dict[int, np.ndarray]) -> np.ndarray:
         """Join the copies of the cut sites and invert the remainder, complex (cut, cut)."""
-        folded, rest = self.folded, self.dissection.rest
+        folded, remainder = self.folded, self.dissection.rest
         for number in self.dissection.top:
             places = self.dissection.fronts[number].boundary - self._n_free
-            _extend((rest,), places, updates.pop(number))
-        rest = _mirrored(np.tril(rest))
+            _extend((remainder,), places, updates.pop(number))
+        remainder = _mirrored(np.tril(remainder))
         size = len(folded.cut)
-        joined = np.zeros((len(rest), size), dtype=complex)
-        joined[np.arange(len(rest)), folded.copy_of] = folded.copy_phase
-        closed = joined.conj().T @ (rest @ joined)
+        joined = np.zeros((len(remainder), size), dtype=complex)
+        joined[np.arange(len(remainder)), folded.copy_of] = folded.copy_phase
+        closed = joined.conj().T @ (remainder @ joined)
         closed[np.diag_indices(size)] += folded.pins
         if not size:
             return closed
@@ -444,20 +448,20 @@ class Factor:
     def _forward(self, work: np.ndarray) -> None:
         real = work.view(float)
         for front, (inverse, below) in zip(self.dissection.fronts, self._blocks, strict=True):
-            own = inverse @ real[front.start : front.stop]
-            real[front.start : front.stop] = own
+            values = inverse @ real[front.start : front.stop]
+            real[front.start : front.stop] = values
             if len(below):
-                real[front.boundary] -= below @ own
+                real[front.boundary] -= below @ values
 
     def _backward(self, work: np.ndarray) -> None:
         real = work.view(float)
         for front, (inverse, below) in zip(
             reversed(self.dissection.fronts), reversed(self._blocks), strict=True
         ):
-            own = real[front.start : front.stop]
+            values = real[front.start : front.stop]
             if len(below):
-                own = own - below.T @ real[front.boundary]
-            real[front.start : front.stop] = inverse.T @ own
+                values = values - below.T @ real[front.boundary]
+            real[front.start : front.stop] = inverse.T @ values
 
     @cached_property
     def variances(self) -> tuple[np.ndarray, np.ndarray]:
@@ -479,8 +483,8 @@ class Factor:
         def of_means(z: np.ndarray, mine: np.ndarray, at: np.ndarray) -> np.ndarray:
             return np.einsum("vk,wk,vwk->k", shares[:, mine], shares[:, mine], z[at[:, None], at])
 
-        own, means = np.empty(len(folded.phase)), np.zeros(len(marks))
-        own[folded.cut] = self._cut_inverse.diagonal().real
+        of_sites, means = np.empty(len(folded.phase)), np.zeros(len(marks))
+        of_sites[folded.cut] = self._cut_inverse.diagonal().real
         copies = self._cut_inverse[folded.copy_of[:, None], folded.copy_of]
         copies = (folded.copy_phase[:, None] * copies * folded.copy_phase.conj()).real
         mine = marks[(after >= n) & (after < folded.size)]
@@ -492,23 +496,23 @@ class Factor:
         for number in range(len(fronts) - 1, -1, -1):
             front = fronts[number]
             z = self._selected(number, needed.pop(number))
-            own[sites[front.start : front.stop]] = z.diagonal()[: front.stop - front.start]
+            of_sites[sites[front.start : front.stop]] = z.diagonal()[: front.stop - front.start]
             mine = marks[slice(*np.searchsorted(after, (front.start, front.stop)))]
             means[mine] = of_means(z, mine, front.places(place[:, mine]))
             for child in front.children:
                 places = front.places(fronts[child].boundary)
                 needed[child] = z[places[:, None], places]
-        return own, means
+        return of_sites, means
 
     def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
         """Return the inverse over one front, given the inverse over its boundary."""
         lower, below = self._blocks[number]
         inverse, weight = lower.T @ lower, lower.T @ below.T
-        own = len(inverse)
-        z = np.empty((own + len(z22),) * 2, order="F")
+        n_own = len(inverse)
+        z = np.empty((n_own + len(z22),) * 2, order="F")
         z12 = weight @ z22
-        z[own:, own:], z[:own, own:], z[own:, :own] = z22, -z12, -z12.T
-        z[:own, :own] = inverse + z12 @ weight.T
+        z[n_own:, n_own:], z[:n_own, n_own:], z[n_own:, :n_own] = z22, -z12, -z12.T
+        z[:n_own, :n_own] = inverse + z12 @ weight.T
         return z
 
 
@@ -531,10 +535,10 @@ def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarr
     update : float array (b, b)
         Its upper triangle is not used.
     """
-    own = len(blocks[0])
-    inner = int(np.searchsorted(places, own))
+    n_own = len(blocks[0])
+    inner = int(np.searchsorted(places, n_own))
     first, last = slice(inner), slice(inner, len(places))
-    to = {first: places[first], last: places[last] - own}
+    to = {first: places[first], last: places[last] - n_own}
     for block, (rows, columns) in zip(
         blocks, ((first, first), (last, first), (last, last)), strict=False
     ):
@@ -556,8 +560,8 @@ def _eliminate(
     if not len(f21):
         return inverse, f21, f22
     below = blas.dtrmm(1.0, inverse, f21, side=1, lower=1, trans_a=1, overwrite_b=1)
-    rest = blas.dsyrk(-1.0, below, beta=1.0, c=f22, lower=1, overwrite_c=1)
-    return inverse, below, rest
+    schur = blas.dsyrk(-1.0, below, beta=1.0, c=f22, lower=1, overwrite_c=1)
+    return inverse, below, schur
 
 
 _lock = RLock()

@@ -90,8 +90,8 @@ class AngularSystem(PlateEliminated):
         """Return maps (..., K) at the plate lines in each view, (..., views, K)."""
         flat = field.reshape(math.prod(field.shape[:-1]), self.n_lines).T
         out = np.zeros((self.n_views, *flat.shape))
-        for each, rows in zip(out, self.rows, strict=True):
-            each[...] = rows @ flat
+        for of_view, rows in zip(out, self.rows, strict=True):
+            of_view[...] = rows @ flat
         return out.transpose(2, 0, 1).reshape(*field.shape[:-1], *self.weight.shape)
 
     def adjoint(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -101,9 +101,9 @@ class AngularSystem(PlateEliminated):
             sites += columns @ view
         return sites, readings.sum(axis=-1).T
 
-    def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
+    def covariance(self, matrix: np.ndarray, first: int, second: int) -> np.ndarray:
         """Return the covariances (K,) of the map (K, K) at plate lines in one and another view."""
-        return matrix[self.site[one], self.site[other]]
+        return matrix[self.site[first], self.site[second]]
 
     @cached_property
     def _factor(self) -> Any:
@@ -195,14 +195,14 @@ class HarmonicSystem(AngularSystem):
         return self._spectrum[0] > GAP * self.weight.sum()
 
     @property
-    def n_told(self) -> int:
+    def n_determined(self) -> int:
         """Number of coefficients that the readings determine, however badly; not the constant."""
         return int(self._told.sum())
 
     @property
     def mean_variance(self) -> float:
         """Mean variance of what they determine of the map, for unit noise of a reading."""
-        values, vectors = (part[..., self._told] for part in self._spectrum)
+        values, vectors = (values_of[..., self._told] for values_of in self._spectrum)
         return float(((vectors[1:] ** 2).sum(axis=0) / values).sum() / 2)
 
     @cached_property
@@ -218,15 +218,15 @@ class HarmonicSystem(AngularSystem):
         unit = fourier_coefficients(np.eye(self.n_lines), self.harmonics)
         return tuple(self.basis @ unit)
 
-    def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
+    def covariance(self, matrix: np.ndarray, first: int, second: int) -> np.ndarray:
         """Return the covariances (K,) of the map (K, K) at plate lines in one and another view."""
-        return np.einsum("ka,ka->k", self.rows[one] @ matrix, self.rows[other])
+        return np.einsum("ka,ka->k", self.rows[first] @ matrix, self.rows[second])
 
     @cached_property
     def _spectrum(self) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues and vectors of the matrix over the coefficients, plate eliminated."""
-        own = over_nodes(tuple(self.basis), self.weight, self.relative_weight)[0]
-        values, vectors = np.linalg.eigh((own + own.T) / 2)
+        matrix = over_nodes(tuple(self.basis), self.weight, self.relative_weight)[0]
+        values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
         return values, vectors
 
     @cached_property

@@ -94,9 +94,9 @@ class PlateEliminated(ABC):
     @property
     def rank(self) -> int:
         """Rank of one coordinate of the readings with known misalignments (method eq. 6.1)."""
-        parts = self.components
-        nodes = np.count_nonzero(parts.of_site >= 0) + np.count_nonzero(parts.of_mark >= 0)
-        return int(nodes - np.count_nonzero(parts.balanced))
+        connected = self.components
+        nodes = np.count_nonzero(connected.of_site >= 0) + np.count_nonzero(connected.of_mark >= 0)
+        return int(nodes - np.count_nonzero(connected.balanced))
 
     @cached_property
     def unchecked(self) -> np.ndarray:
@@ -109,9 +109,9 @@ class PlateEliminated(ABC):
     @cached_property
     def pins(self) -> np.ndarray:
         """The pinned sites: those never visited, and one of each free component."""
-        parts = self.components
-        held = parts.first_sites[parts.balanced]
-        return np.concatenate([np.flatnonzero(parts.of_site < 0), held])
+        connected = self.components
+        one_of_each = connected.first_sites[connected.balanced]
+        return np.concatenate([np.flatnonzero(connected.of_site < 0), one_of_each])
 
     @abstractmethod
     def solve(self, right: np.ndarray) -> np.ndarray:
@@ -122,7 +122,7 @@ class PlateEliminated(ABC):
         """Return maps at the marks of each view, frame of the readings, (..., views, *marks)."""
 
     @abstractmethod
-    def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
+    def covariance(self, matrix: np.ndarray, first: int, second: int) -> np.ndarray:
         """Return the covariances of a map at the marks of one and another view, (*marks,).
 
         `matrix` is that of the map, (sites, sites); the frame is that of the readings.
@@ -232,12 +232,12 @@ class PlateEliminated(ABC):
         -------
         array (sites, k), float array (p, k)
         """
-        taken = np.zeros((len(self.response.T), sites.shape[1]))
+        misalignments = np.zeros((len(self.response.T), sites.shape[1]))
         if marks.any():
-            each = marks.T.reshape(-1, 1, *self.weight.shape[1:])
-            of_sites, taken = self.adjoint(self.relative_weight * each)
+            of_marks = marks.T.reshape(-1, 1, *self.weight.shape[1:])
+            of_sites, misalignments = self.adjoint(self.relative_weight * of_marks)
             sites = sites - of_sites
-        return sites, -taken - np.real(self.response.conj().T @ sites)
+        return sites, -misalignments - np.real(self.response.conj().T @ sites)
 
 
 def over_nodes(
@@ -253,12 +253,12 @@ def over_nodes(
         Weights, and shares in the mean of a mark.
     """
     count = len(rows)
-    own = sum(
-        row.conj().T @ (diags(one) @ row)
-        for row, one in zip(rows, weight.reshape(count, -1), strict=True)
+    of_views = sum(
+        row.conj().T @ (diags(view_weight) @ row)
+        for row, view_weight in zip(rows, weight.reshape(count, -1), strict=True)
     )
     mean = sum(
-        diags(part) @ row
-        for row, part in zip(rows, relative_weight.reshape(count, -1), strict=True)
+        diags(view_share) @ row
+        for row, view_share in zip(rows, relative_weight.reshape(count, -1), strict=True)
     )
-    return own - mean.conj().T @ (diags(weight.sum(axis=0).ravel()) @ mean), mean
+    return of_views - mean.conj().T @ (diags(weight.sum(axis=0).ravel()) @ mean), mean

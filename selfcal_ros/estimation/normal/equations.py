@@ -142,16 +142,16 @@ class NormalEquations:
         field, parameters : complex array (nx, ny), float array (size,) or (3 views,)
             Their map and misalignments, in no datum.
         """
-        parts = self.gauge.parts(field)
-        field = self.gauge.remove(field, parts)
+        modes = self.gauge.parts(field)
+        field = self.gauge.remove(field, modes)
         rigid = self.rigid[:, : len(parameters)]
-        parameters = parameters - parts @ rigid[: len(parts)]
+        parameters = parameters - modes @ rigid[: len(modes)]
         plate, residuals = self.grid.plate(y, field, parameters[: 3 * self.grid.n_views])
-        parts = self.plate_gauge.parts(plate)
+        modes = self.plate_gauge.parts(plate)
         return (
             field,
-            parameters - parts @ rigid[4:],
-            self.plate_gauge.remove(plate, parts),
+            parameters - modes @ rigid[4:],
+            self.plate_gauge.remove(plate, modes),
             residuals,
         )
 
@@ -163,15 +163,15 @@ class NormalEquations:
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
-        held, let_go = self._held
-        out = np.linalg.inv(self.normal(ratio) + held) - let_go
+        held_modes, let_go = self._held
+        out = np.linalg.inv(self.normal(ratio) + held_modes) - let_go
         return (out + out.T) / 2
 
     @cached_property
     def _held(self) -> tuple[np.ndarray, np.ndarray]:
         """Matrix that makes the normal matrix regular, and its effect on the inverse."""
-        held = self.grid_scale * (self._null @ self._null.T)
-        return held, held / self.grid_scale**2
+        held_modes = self.grid_scale * (self._null @ self._null.T)
+        return held_modes, held_modes / self.grid_scale**2
 
     @cached_property
     def rank_grid(self) -> int:
@@ -237,16 +237,18 @@ class NormalEquations:
     def known_sites(self) -> np.ndarray:
         """Sites whose error is determined up to the datum, bool (nx, ny)."""
         hidden = self.unseen[: 3 * self.grid.n_views]
-        parts = self.grid.components
-        known = (parts.of_site >= 0) & ~parts.balanced[parts.of_site]
-        if np.any(np.abs(hidden) > TRACE) and known.any():
-            moved = self.grid.response @ hidden
-            gauge = Gauge(self.grid.views.z_sites, known.reshape(self.grid.views.shape), scale=True)
-            for column in moved.T:
+        components = self.grid.components
+        is_known = (components.of_site >= 0) & ~components.balanced[components.of_site]
+        if np.any(np.abs(hidden) > TRACE) and is_known.any():
+            fields = self.grid.response @ hidden
+            gauge = Gauge(
+                self.grid.views.z_sites, is_known.reshape(self.grid.views.shape), scale=True
+            )
+            for column in fields.T:
                 field = column.reshape(self.grid.views.shape)
                 residual = gauge.remove(field, gauge.parts(field)).ravel()
-                known &= abs(residual) <= TRACE
-        return known.reshape(self.grid.views.shape)
+                is_known &= abs(residual) <= TRACE
+        return is_known.reshape(self.grid.views.shape)
 
     @property
     def loose_modes(self) -> np.ndarray:
@@ -269,13 +271,13 @@ class NormalEquations:
     @cached_property
     def known_views(self) -> np.ndarray:
         """Misalignments determined up to the datum, bool (size,)."""
-        known = np.ones(self.size, dtype=bool)
+        is_known = np.ones(self.size, dtype=bool)
         n, nothing = 3 * self.grid.n_views, np.zeros(self.grid.weight.shape)
         for column in self.unseen.T:
             # an unseen mode may contain rigid parts: take it in the datum
             field = -(self.grid.response @ column[:n]).reshape(self.grid.views.shape)
-            known &= abs(self.in_datum(nothing, field, column)[1]) <= TRACE
-        return known & (self._turn_of_lines == 0) if self.apart else known
+            is_known &= abs(self.in_datum(nothing, field, column)[1]) <= TRACE
+        return is_known & (self._turn_of_lines == 0) if self.apart else is_known
 
     @cached_property
     def known_marks(self) -> np.ndarray:
@@ -287,15 +289,15 @@ class NormalEquations:
     @cached_property
     def known_lines(self) -> np.ndarray:
         """Stage lines determined up to one constant, bool (K,)."""
-        parts = self.angular.components
-        known = parts.of_site >= 0
-        if len(parts.balanced):
-            known &= parts.of_site == parts.largest
-        if self.unseen.shape[1] and known.any():
-            moved = self.angular.response @ self.unseen[self.phi_at]
-            moved = moved - moved[known].mean(axis=0)
-            known = known & np.all(abs(moved) <= TRACE, axis=1)
-        return known
+        components = self.angular.components
+        is_known = components.of_site >= 0
+        if len(components.balanced):
+            is_known &= components.of_site == components.largest
+        if self.unseen.shape[1] and is_known.any():
+            fields = self.angular.response @ self.unseen[self.phi_at]
+            fields = fields - fields[is_known].mean(axis=0)
+            is_known = is_known & np.all(abs(fields) <= TRACE, axis=1)
+        return is_known
 
     @cached_property
     def known_plate_lines(self) -> np.ndarray:
@@ -324,7 +326,7 @@ def pseudo_inverse(values: np.ndarray, vectors: np.ndarray, scale: float) -> np.
 
 
 def in_datum(
-    own: np.ndarray,
+    own_variance: np.ndarray,
     answers: Sequence[tuple[np.ndarray, np.ndarray]],
     spread: np.ndarray,
     fields: np.ndarray,
@@ -336,7 +338,7 @@ def in_datum(
 
     Parameters
     ----------
-    own : float array (places,)
+    own_variance : float array (places,)
         Variance of each value by the readings alone.
     answers : sequence of (places, p) and (p, p)
         What misalignments or terms make of the map, and their covariance.
@@ -348,11 +350,11 @@ def in_datum(
         Covariance of the functionals.
     """
     out = []
-    for part in (np.real, np.imag):
-        field = part(fields)
-        value = own + np.einsum("pk,pk->p", field @ inner + 2 * part(spread), field)
+    for coordinate in (np.real, np.imag):
+        field = coordinate(fields)
+        value = own_variance + np.einsum("pk,pk->p", field @ inner + 2 * coordinate(spread), field)
         for answer, covariance in answers:
-            value += np.einsum("pa,pa->p", part(answer) @ covariance, part(answer))
+            value += np.einsum("pa,pa->p", coordinate(answer) @ covariance, coordinate(answer))
         out.append(value)
     return np.maximum(out, 0.0)
 
@@ -373,8 +375,8 @@ def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
 def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
     """Return noise of variance 1 / weight on each axis, complex `shape`; 0 where weight is 0."""
     root = np.sqrt(np.where(weight > 0, weight, 1.0))
-    both = rng.standard_normal((2, *shape)) / root * (weight > 0)
-    return both[0] + 1j * both[1]
+    coordinates = rng.standard_normal((2, *shape)) / root * (weight > 0)
+    return coordinates[0] + 1j * coordinates[1]
 
 
 CORE = 0.75
@@ -503,8 +505,8 @@ class PlacedSystem(GridSystem):
     def _over_coefficients(self) -> tuple[csr_matrix, csr_matrix]:
         """The matrix over the spline's coefficients, and the rows of the means of the marks."""
         rows = [
-            phase.conjugate() * one
-            for phase, one in zip(self.views.phases, self.views.rows, strict=True)
+            phase.conjugate() * view_rows
+            for phase, view_rows in zip(self.views.phases, self.views.rows, strict=True)
         ]
         return over_nodes(rows, self.weight, self.relative_weight)
 
@@ -534,9 +536,9 @@ class PlacedSystem(GridSystem):
         )
         out = np.zeros(self.n_marks)
         for start in range(0, self.n_marks, BLOCK):
-            here = rows[start : start + BLOCK]
+            block = rows[start : start + BLOCK]
             out[start : start + BLOCK] = np.real(
-                here.conj().multiply(here @ cover).sum(axis=1)
+                block.conj().multiply(block @ cover).sum(axis=1)
             ).ravel()
         return out
 
@@ -569,20 +571,20 @@ class PlacedEquations(NormalEquations):
             return np.zeros(views.shape, dtype=bool)
         ratio = self.grid_scale / self.angular_scale if self.angular.n_views else 0.0
         inverse = self.inverse(ratio) if ratio else self.grid_inverse
-        known = some & (np.maximum(abs(views.z_sites.real), abs(views.z_sites.imag)) < CORE)
-        if known.sum() < 3:  # three nodes a side
-            known = some
+        is_known = some & (np.maximum(abs(views.z_sites.real), abs(views.z_sites.imag)) < CORE)
+        if is_known.sum() < 3:  # three nodes a side
+            is_known = some
         settled = 0
         for _ in range(MAX_STEPS):
-            if known.sum() < 3 or settled == 2:
+            if is_known.sum() < 3 or settled == 2:
                 break
-            datum = Gauge(views.z_sites, known, scale=not self.grid.known_plate)
+            datum = Gauge(views.z_sites, is_known, scale=not self.grid.known_plate)
             largest = np.maximum(*self._variances(datum, inverse)).reshape(views.shape)
             best = largest[some].min()
             settled += int(best < KNOWN**2)
             # if the core itself has nodes that are not determined: the datum of the better ones
-            known = some & (largest < (KNOWN**2 if best < KNOWN**2 else 4 * best))
-        return known & (settled == 2) & (known.sum() >= 3)
+            is_known = some & (largest < (KNOWN**2 if best < KNOWN**2 else 4 * best))
+        return is_known & (settled == 2) & (is_known.sum() >= 3)
 
     def _variances(self, datum: Gauge, inverse: np.ndarray) -> np.ndarray:
         """Return the variances of Gx and Gy at the nodes in a datum over some, (2, nodes).
@@ -590,11 +592,13 @@ class PlacedEquations(NormalEquations):
         `inverse` is the covariance of the misalignments, (size, size).
         """
         n, rigid = 3 * self.grid.n_views, datum.orthonormal
-        factor, response, own = self.grid.factor, self.grid.response, inverse[:n, :n]
-        spread = factor.inverse @ rigid + response @ (own @ np.real(response.conj().T @ rigid))
+        factor, response, misalignments = self.grid.factor, self.grid.response, inverse[:n, :n]
+        spread = factor.inverse @ rigid + response @ (
+            misalignments @ np.real(response.conj().T @ rigid)
+        )
         return in_datum(
             self.grid.variance_of_sites,
-            ((response, own),),
+            ((response, misalignments),),
             spread,
             -datum.everywhere,
             np.real(rigid.conj().T @ spread),
@@ -692,7 +696,7 @@ class Memo[Key, Value]:
 
     def get(self, system: NormalEquations, key: Key, make: Callable[[], Value]) -> Value:
         """Return the value of `key` for `system`, computed by `make` the first time."""
-        known = self._values.setdefault(system, {})
-        if key not in known:
-            known[key] = make()
-        return known[key]
+        values = self._values.setdefault(system, {})
+        if key not in values:
+            values[key] = make()
+        return values[key]

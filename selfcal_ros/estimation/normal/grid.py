@@ -83,13 +83,13 @@ class GridSystem(PlateEliminated):
     @cached_property
     def differences(self) -> np.ndarray:
         """Differences between rotations that are one, orthonormal (3 views, k)."""
-        found = []
+        differences = []
         for first in dict.fromkeys(self.rotations):
             views = np.flatnonzero(np.array(self.rotations) == first)
             apart = np.zeros((3 * self.n_views, len(views) - 1))
             apart[3 * views] = helmert(len(views)).T
-            found.append(apart)
-        return np.hstack([np.zeros((3 * self.n_views, 0)), *found])
+            differences.append(apart)
+        return np.hstack([np.zeros((3 * self.n_views, 0)), *differences])
 
     @property
     def n_misalignments(self) -> int:
@@ -119,10 +119,10 @@ class GridSystem(PlateEliminated):
         """Return maps, complex (sites,) or (..., nx, ny), at the marks, (..., views, nx, ny)."""
         return self.views.gather(field.reshape(self.views.shape) if field.ndim == 1 else field)
 
-    def covariance(self, matrix: np.ndarray, one: int, other: int) -> np.ndarray:
+    def covariance(self, matrix: np.ndarray, first: int, second: int) -> np.ndarray:
         """Return the covariances of the map at marks of one and another view, (nx, ny)."""
         site, phase = np.maximum(self.views.site_index, 0), self.views.phases
-        return phase[one].conj() * matrix[site[one], site[other]] * phase[other]
+        return phase[first].conj() * matrix[site[first], site[second]] * phase[second]
 
     def adjoint(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return sums of readings (k, views, nx, ny) at sites, (sites, k), and over misalignments.
@@ -137,8 +137,8 @@ class GridSystem(PlateEliminated):
 
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
         """Return phi i z + tau at every mark, complex (..., views, nx, ny), from (..., 3 views)."""
-        each = parameters.reshape(*parameters.shape[:-1], self.n_views, 3)
-        phi, tau = each[..., 0], each[..., 1] + 1j * each[..., 2]
+        of_views = parameters.reshape(*parameters.shape[:-1], self.n_views, 3)
+        phi, tau = of_views[..., 0], of_views[..., 1] + 1j * of_views[..., 2]
         return phi[..., None, None] * self.shapes[0] + tau[..., None, None]
 
     def free_parts_small(
@@ -154,24 +154,24 @@ class GridSystem(PlateEliminated):
         field, plate : complex array (nx, ny)
             G and A in their datum, m.
         """
-        parts = self.components
-        if not parts.balanced.any():
+        components = self.components
+        if not components.balanced.any():
             return field, plate
-        (at_site, at_mark), n = self.free_turns, len(parts.balanced)
-        sites = np.flatnonzero((parts.of_site >= 0) & parts.balanced[parts.of_site])
-        marks = np.flatnonzero((parts.of_mark >= 0) & parts.balanced[parts.of_mark])
-        part, unit = parts.of_mark[marks], PHASES[at_mark[marks]]
+        (at_site, at_mark), n = self.free_turns, len(components.balanced)
+        sites = np.flatnonzero((components.of_site >= 0) & components.balanced[components.of_site])
+        marks = np.flatnonzero((components.of_mark >= 0) & components.balanced[components.of_mark])
+        component, unit = components.of_mark[marks], PHASES[at_mark[marks]]
         back = unit.conj() * plate.ravel()[marks]
-        mean = np.bincount(part, back.real, n) + 1j * np.bincount(part, back.imag, n)
-        mean /= np.maximum(np.bincount(part, minlength=n), 1)
+        mean = np.bincount(component, back.real, n) + 1j * np.bincount(component, back.imag, n)
+        mean /= np.maximum(np.bincount(component, minlength=n), 1)
         field, plate = field.copy(), plate.copy()
-        field.ravel()[sites] += PHASES[at_site[sites]] * mean[parts.of_site[sites]]
-        plate.ravel()[marks] -= unit * mean[part]
+        field.ravel()[sites] += PHASES[at_site[sites]] * mean[components.of_site[sites]]
+        plate.ravel()[marks] -= unit * mean[component]
         return field, plate
 
 
 def of_misalignments(sums: np.ndarray) -> np.ndarray:
     """Return sums over phi and tau of each view (2 views, ...) as phi, Re tau, Im tau."""
     pairs = sums.reshape(-1, 2, *sums.shape[1:])
-    parts = (pairs[:, 0].real, pairs[:, 1].real, pairs[:, 1].imag)
-    return np.stack(parts, axis=1).reshape(-1, *sums.shape[1:])
+    phi_and_tau = (pairs[:, 0].real, pairs[:, 1].real, pairs[:, 1].imag)
+    return np.stack(phi_and_tau, axis=1).reshape(-1, *sums.shape[1:])

@@ -98,8 +98,8 @@ def predict(
         Sense.MICROSCOPE_MOVES,
         artifact.grid_pitch_m * max(artifact.reach),
     )
-    known = replace(conditions, slopes=np.zeros_like(conditions.slopes))
-    return Prediction(ux, uy, np.sqrt(repeats * lines_alone(system).of_stage(known)[0]))
+    flat = replace(conditions, slopes=np.zeros_like(conditions.slopes))
+    return Prediction(ux, uy, np.sqrt(repeats * lines_alone(system).of_stage(flat)[0]))
 
 
 SEARCH_SIZE = 11
@@ -141,21 +141,23 @@ class PlanCheck:
 def check_plan(plan: Plan) -> PlanCheck:
     """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
-    seen = with_unchecked(full_observability(system, plan.artifact, plan.views), system)
-    if not seen.identifiable:
-        return with_unseen_modes(seen, system, plan)
+    observability = with_unchecked(full_observability(system, plan.artifact, plan.views), system)
+    if not observability.identifiable:
+        return with_unseen_modes(observability, system, plan)
     return PlanCheck(
-        seen,
+        observability,
         unknown_sites=0 if plan.artifact.map_grid is None else int((~system.known_sites).sum()),
     )
 
 
-def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) -> PlanCheck:
+def with_unseen_modes(
+    observability: Observability, system: NormalEquations, plan: Plan
+) -> PlanCheck:
     """Return the check of a deficient set of readings: unseen modes, and cures.
 
     Parameters
     ----------
-    seen : Observability
+    observability : Observability
         Rank and deficiency.
     system : NormalEquations
         The readings, possibly incomplete.
@@ -168,7 +170,9 @@ def with_unseen_modes(seen: Observability, system: NormalEquations, plan: Plan) 
         add_views(plan.artifact, *cure, name="or_add_views" if number else "add_views")
         for number, cure in enumerate(cures[:3])
     )
-    return PlanCheck(replace(seen, modes=modes, advice=advice or seen.advice), cures)
+    return PlanCheck(
+        replace(observability, modes=modes, advice=advice or observability.advice), cures
+    )
 
 
 @one_thread()
@@ -210,13 +214,13 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
     """
     angular = angular and artifact.angular_count > 0
     pitch = artifact.grid_pitch_m
-    beside = artifact.quarter_shift * pitch
+    quarter_shift_m = artifact.quarter_shift * pitch
     names = {(0, 0): "", (1, 0): "+x", (0, 1): "+y", (-1, 0): "-x", (0, -1): "-y"}
     views = [
         View(
             f"{90 * q}deg{name}",
             q * math.pi / 2,
-            (a * pitch + q % 2 * beside, b * pitch + q % 2 * beside),
+            (a * pitch + q % 2 * quarter_shift_m, b * pitch + q % 2 * quarter_shift_m),
             True,
             angular and (bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0),
         )
@@ -252,14 +256,14 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
     ]
     grid_only = [view for view in candidates if view.grid]
     small = smaller(plan, SEARCH_SIZE)
-    found: list[tuple[View, ...]] = [()]
+    cures: list[tuple[View, ...]] = [()]
     if not _grid_seen(small, ()):
         for size in (1, 2):
             good = (views for views in combinations(grid_only, size) if _grid_seen(small, views))
-            found = list(islice(good, MAX_CURES))
-            if found:
+            cures = list(islice(good, MAX_CURES))
+            if cures:
                 break
-    for views in found:
+    for views in cures:
         cure = next(
             (
                 more
@@ -375,9 +379,9 @@ def _in_order(view: View, order: str) -> View:
 
 def unused_name(name: str, views: Iterable[View]) -> str:
     """Return `name`, numbered if another view of the plan has it."""
-    taken = {view.name for view in views}
+    names = {view.name for view in views}
     tail = 2
     out = name
-    while out in taken:
+    while out in names:
         out, tail = f"{name}_{tail}", tail + 1
     return out

@@ -64,8 +64,8 @@ def _identifies(artifact: Artifact, views: tuple[View, ...]) -> bool:
     system = planned_system(artifact, views)
     if artifact.map_grid is not None:
         return _nodes_known(system)
-    parts = system.grid.components
-    if parts.balanced.any() or min(parts.of_site.min(), parts.of_mark.min()) < 0:
+    components = system.grid.components
+    if components.balanced.any() or min(components.of_site.min(), components.of_mark.min()) < 0:
         return False
     middle = smaller(Plan("", artifact, views), FULL_SIZE)
     if middle.artifact != artifact and not deficiency(planned_system(middle.artifact, views)):
@@ -87,9 +87,9 @@ def smaller(plan: Plan, size: int) -> Plan:
         for view in with_sub_views(plan.views)
     ]
     room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
-    part = min(1.0, max(size, room) / max(plan.artifact.shape))
+    share = min(1.0, max(size, room) / max(plan.artifact.shape))
     nx, ny = (
-        max(2 * round((n * part - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
+        max(2 * round((n * share - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
         for n in plan.artifact.shape
     )
     plate = Artifact(
@@ -182,13 +182,13 @@ def measured_observability(
     return with_unchecked(_measured_observability(system, artifact, views), system)
 
 
-def with_unchecked(seen: Observability, system: NormalEquations) -> Observability:
+def with_unchecked(observability: Observability, system: NormalEquations) -> Observability:
     """Return the observability with the counts of unchecked sites and lines."""
     return (
-        seen
-        if not seen.identifiable
+        observability
+        if not observability.identifiable
         else replace(
-            seen,
+            observability,
             unchecked_sites=int(system.unchecked_sites.sum()),
             unchecked_lines=int(system.unchecked_lines.sum()),
         )
@@ -216,10 +216,10 @@ def _measured_observability(
             },
         )
         return Observability(full.rank, full.unknowns, full.deficiency, False, advice=(missing,))
-    kept = 2 * int(sites.sum() + system.known_marks.sum())
-    kept += int(system.known_views[: 3 * system.grid.n_views].sum())
-    kept -= system.grid.differences.shape[1]
-    return Observability(kept, kept, 0, True)
+    n_determined = 2 * int(sites.sum() + system.known_marks.sum())
+    n_determined += int(system.known_views[: 3 * system.grid.n_views].sum())
+    n_determined -= system.grid.differences.shape[1]
+    return Observability(n_determined, n_determined, 0, True)
 
 
 def _nodes_known(system: NormalEquations) -> bool:
@@ -238,13 +238,13 @@ def _nodes_known(system: NormalEquations) -> bool:
 def _placed_observability(
     system: NormalEquations, artifact: Artifact, views: tuple[View, ...]
 ) -> Observability:
-    known, grid = int(system.known_sites.sum()), system.grid
+    n_known, grid = int(system.known_sites.sum()), system.grid
     if _nodes_known(system):
-        kept = 2 * (known + int(system.known_marks.sum())) + grid.n_misalignments
-        return Observability(kept, kept, 0, True)
-    missing = len(system.loose_modes) or 2 * (grid.n_sites - known)
+        n_determined = 2 * (n_known + int(system.known_marks.sum())) + grid.n_misalignments
+        return Observability(n_determined, n_determined, 0, True)
+    missing = len(system.loose_modes) or 2 * (grid.n_sites - n_known)
     missing += angular_deficiency(system)
-    advice = advice_for(artifact, views) if known < DETERMINED * grid.n_sites else ()
+    advice = advice_for(artifact, views) if n_known < DETERMINED * grid.n_sites else ()
     return Observability(
         unknowns_of(system) - missing, unknowns_of(system), max(missing, 1), False, advice=advice
     )
@@ -297,11 +297,11 @@ def add_views(artifact: Artifact, *views: View, name: str = "add_views") -> Find
 
 def _usual_views(artifact: Artifact) -> tuple[View, View, View]:
     """Return a quarter turn, on the lattice, and a shift by one pitch along X and along Y."""
-    pitch, beside = artifact.grid_pitch_m, artifact.quarter_shift * artifact.grid_pitch_m
+    pitch, quarter_shift_m = artifact.grid_pitch_m, artifact.quarter_shift * artifact.grid_pitch_m
     lines = artifact.angular_count > 0
     turned = lines and artifact.angular_count % 4 == 0
     return (
-        View("", math.pi / 2, (beside, beside), True, turned),
+        View("", math.pi / 2, (quarter_shift_m, quarter_shift_m), True, turned),
         View("", 0.0, (pitch, 0.0), True, lines),
         View("", 0.0, (0.0, pitch), True, lines),
     )
@@ -410,11 +410,13 @@ def _known_families(system: NormalEquations) -> Iterator[Finding]:
 
 def _component_family(grid: GridSystem) -> Iterator[Finding]:
     """Yield the family of vectors left free by balanced components, unless one spans all."""
-    parts = grid.components
-    free = np.flatnonzero(parts.balanced)
-    if len(free) < 2 and not (len(free) == 1 and len(parts.balanced) > 1):
+    components = grid.components
+    free = np.flatnonzero(components.balanced)
+    if len(free) < 2 and not (len(free) == 1 and len(components.balanced) > 1):
         return
-    label = np.where((parts.of_site >= 0) & np.isin(parts.of_site, free), parts.of_site, -1)
+    label = np.where(
+        (components.of_site >= 0) & np.isin(components.of_site, free), components.of_site, -1
+    )
     yield _shape_of(grid, label.reshape(grid.views.shape), n=len(free))
 
 
@@ -448,7 +450,7 @@ def _period(label: np.ndarray) -> tuple[int, int] | None:
     out = []
     for axis in (0, 1):
         size = label.shape[axis]
-        moved = [
+        periods = [
             p
             for p in range(1, size // 2 + 1)
             if np.array_equal(
@@ -456,9 +458,9 @@ def _period(label: np.ndarray) -> tuple[int, int] | None:
                 np.take(label, range(size - p), axis=axis),
             )
         ]
-        if not moved:
+        if not periods:
             return None
-        out.append(moved[0])
+        out.append(periods[0])
     return (out[0], out[1]) if max(out) > 1 else None
 
 
@@ -471,13 +473,13 @@ def _angular_families(angular: AngularSystem) -> Iterator[Finding]:
                 details={"harmonics": [*map(int, angular.missed)], "turned": angular.n_views > 1},
             )
         return
-    parts = angular.components
-    n, lines = len(parts.balanced), np.arange(len(parts.of_site))
-    if n > 1 and np.array_equal(parts.of_site, parts.of_site[lines % n]):
+    components = angular.components
+    n, lines = len(components.balanced), np.arange(len(components.of_site))
+    if n > 1 and np.array_equal(components.of_site, components.of_site[lines % n]):
         yield Finding("periodic_lines", details={"period": n, "of": len(lines)})
     elif n > 1:
         yield Finding("groups_of_lines", details={"count": n})
-    if missing := int((parts.of_site < 0).sum()):
+    if missing := int((components.of_site < 0).sum()):
         yield Finding("lines_never_visited", details={"count": missing})
 
 
@@ -496,12 +498,12 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
         Views of grid marks.
     """
     square, listed = artifact.shape[0] == artifact.shape[1], artifact.marks is not None
-    moved = []
+    forms_of_views = []
     for view in views:
         turn = round(view.pose.turn_rad / (math.pi / 2), 9) % 4
         shift = complex(*(round(step / artifact.grid_pitch_m, 6) for step in view.pose.shift_m))
-        moved.append(_forms(turn, shift, square=square, listed=listed))
-    return min(tuple(sorted(form)) for form in zip(*moved, strict=True))
+        forms_of_views.append(_forms(turn, shift, square=square, listed=listed))
+    return min(tuple(sorted(form)) for form in zip(*forms_of_views, strict=True))
 
 
 @lru_cache(maxsize=1024)

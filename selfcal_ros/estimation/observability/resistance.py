@@ -38,7 +38,7 @@ from selfcal_ros.estimation.options import OWED
 from selfcal_ros.estimation.terms.equations import (
     FREE,
     TermEquations,
-    require_terms_told,
+    require_terms_determined,
     roots_by_term,
 )
 from selfcal_ros.estimation.terms.planned import (
@@ -49,7 +49,7 @@ from selfcal_ros.estimation.terms.planned import (
 )
 from selfcal_ros.model.error_map import rms
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.terms import TIMES, UNTOLD, ModelTerm, nominal_terms
+from selfcal_ros.model.terms import TIMES, UNDETERMINED, ModelTerm, nominal_terms
 from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.model.view import Plan
 
@@ -87,7 +87,7 @@ class TermCheck:
     power: float
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         """Whether the readings separate it from the stage."""
         return self.unseen_modes == 0
 
@@ -137,25 +137,27 @@ class PlannedTerms:
         self.every = planned_equations(plan, system, sized, assumed)
         self.of_model = with_terms(self.every, self.model)
 
-    def require_told(self, seen: Observability) -> None:
+    def require_determined(self, observability: Observability) -> None:
         """Raise NotIdentifiableError if free terms of the model hide modes of the stage."""
         if self.of_model.free.any():
-            require_terms_told(self.of_model, seen)
+            require_terms_determined(self.of_model, observability)
 
-    def told(self, seen: Observability) -> Observability:
+    def with_free_terms(self, observability: Observability) -> Observability:
         """Return the observability of the plan with the free terms of its model as unknowns.
 
         Parameters
         ----------
-        seen : Observability
+        observability : Observability
             Observability without them.
         """
         try:
-            self.require_told(seen)
+            self.require_determined(observability)
         except NotIdentifiableError as error:
             return error.observability
         free = int(self.of_model.free.sum())
-        return replace(seen, rank=seen.rank + free, unknowns=seen.unknowns + free)
+        return replace(
+            observability, rank=observability.rank + free, unknowns=observability.unknowns + free
+        )
 
     @one_thread()
     def check(self, name: str, size: float, level: float) -> TermCheck:
@@ -183,41 +185,41 @@ class PlannedTerms:
         )
 
     @one_thread()
-    def predicted(self, alone: Prediction) -> Prediction:
-        """Return the prediction `alone` with the contribution of the model's terms added."""
-        return with_part_of_terms(alone, self.of_model, self.repeats)
+    def predicted(self, without_terms: Prediction) -> Prediction:
+        """Return a prediction with the contribution of the model's terms added."""
+        return with_part_of_terms(without_terms, self.of_model, self.repeats)
 
     def _others(self, name: str) -> list[ModelTerm]:
         return [term for term in self.model if term.name != name]
 
     def _unseen_modes(self, name: str) -> int:
-        others = [term for term in self._others(name) if term.free]
-        return _n_unseen(with_terms(self.every, [*others, ModelTerm(name)])) - _n_unseen(
-            with_terms(self.every, others)
+        other_free_terms = [term for term in self._others(name) if term.free]
+        return _n_unseen(with_terms(self.every, [*other_free_terms, ModelTerm(name)])) - _n_unseen(
+            with_terms(self.every, other_free_terms)
         )
 
     def _effect(self, name: str, size: float) -> tuple[float, float]:
         """Return rms and largest effect of the term on the map."""
-        every, term = self.every, self.every.rows([name])
-        model, taken, _ = self._remainder(name, self._others(name), self.assumed.sigma_m)
-        fields = every.maps[:, term] - every.maps[:, model] @ taken
-        known = every.system.known_sites.ravel()
+        all_terms, term = self.every, self.every.rows([name])
+        model, explained, _ = self._remainder(name, self._others(name), self.assumed.sigma_m)
+        fields = all_terms.maps[:, term] - all_terms.maps[:, model] @ explained
+        known_sites = all_terms.system.known_sites.ravel()
         spread = size * np.sqrt(
-            np.stack([(fields.real**2).sum(axis=1), (fields.imag**2).sum(axis=1)])[:, known]
+            np.stack([(fields.real**2).sum(axis=1), (fields.imag**2).sum(axis=1)])[:, known_sites]
         )
         return rms(spread), float(spread.max())
 
     def _power(self, name: str, size: float, level: float) -> float:
-        every = self.every
-        others = [ModelTerm(term.name) for term in self._others(name)]
-        beside = with_terms(every, others)
-        values, rank = self._information(name, others)
-        grid = every.system.grid
+        all_terms = self.every
+        other_terms = [ModelTerm(term.name) for term in self._others(name)]
+        of_others = with_terms(all_terms, other_terms)
+        values, rank = self._information(name, other_terms)
+        grid = all_terms.system.grid
         dof = (
             2 * grid.n_readings
-            - every.system.rank_grid
-            + every.columns.within.dof
-            - beside.rank()
+            - all_terms.system.rank_grid
+            + all_terms.columns.within.dof
+            - of_others.rank()
             - rank
         )
         if rank == 0 or dof <= 0:
@@ -228,34 +230,37 @@ class PlannedTerms:
         return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
 
     def _remainder(
-        self, name: str, others: Sequence[ModelTerm], sigma_m: float
+        self, name: str, other_terms: Sequence[ModelTerm], sigma_m: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the columns of other terms, bool (p,), and what they take of those of a term.
 
         The latter (o, t), and the information that is left on the term, (t, t).
         """
-        every, term = self.every, self.every.rows([name])
-        beside, columns = with_terms(every, others), rows_of(every.columns, others)
-        cross = every.information[np.ix_(columns, term)]
-        taken = beside.inverse(sigma_m) @ beside.unbiased_sums(cross)
-        return columns, taken, every.information[np.ix_(term, term)] - cross.T @ taken
+        all_terms, term = self.every, self.every.rows([name])
+        of_others, columns = (
+            with_terms(all_terms, other_terms),
+            rows_of(all_terms.columns, other_terms),
+        )
+        cross = all_terms.information[np.ix_(columns, term)]
+        explained = of_others.inverse(sigma_m) @ of_others.unbiased_sums(cross)
+        return columns, explained, all_terms.information[np.ix_(term, term)] - cross.T @ explained
 
-    def _information(self, name: str, others: Sequence[ModelTerm]) -> tuple[np.ndarray, int]:
+    def _information(self, name: str, other_terms: Sequence[ModelTerm]) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term given others, and its rank."""
-        every, term = self.every, self.every.rows([name])
-        rest = self._remainder(name, others, 0.0)[2]
-        norm = every.norm[term]
-        scaled = np.linalg.eigvalsh(rest / np.outer(norm, norm))
-        rank = int((scaled > every.limit(term)).sum())
-        return np.linalg.eigvalsh(rest)[len(rest) - rank :], rank
+        all_terms, term = self.every, self.every.rows([name])
+        information = self._remainder(name, other_terms, 0.0)[2]
+        norm = all_terms.norm[term]
+        scaled = np.linalg.eigvalsh(information / np.outer(norm, norm))
+        rank = int((scaled > all_terms.limit(term)).sum())
+        return np.linalg.eigvalsh(information)[len(information) - rank :], rank
 
 
-def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) -> Prediction:
+def with_part_of_terms(without_terms: Prediction, terms: TermEquations, repeats: int) -> Prediction:
     """Return a prediction with the contribution of terms added.
 
     Parameters
     ----------
-    alone : Prediction
+    without_terms : Prediction
         Without terms.
     terms : TermEquations
         Their equations.
@@ -263,16 +268,16 @@ def with_part_of_terms(alone: Prediction, terms: TermEquations, repeats: int) ->
         Repeats of the averaged reading whose noise is the unit.
     """
     (x, y), lines = terms.variances(terms.inverse(terms.noise_m) * repeats)
-    shape = alone.ux.shape
+    shape = without_terms.ux.shape
     u_theta = (
-        np.sqrt(alone.u_theta**2 + terms.line_weight * lines)
-        if (len(alone.u_theta))
-        else alone.u_theta
+        np.sqrt(without_terms.u_theta**2 + terms.line_weight * lines)
+        if (len(without_terms.u_theta))
+        else without_terms.u_theta
     )
     return replace(
-        alone,
-        ux=np.sqrt(alone.ux**2 + x.reshape(shape)),
-        uy=np.sqrt(alone.uy**2 + y.reshape(shape)),
+        without_terms,
+        ux=np.sqrt(without_terms.ux**2 + x.reshape(shape)),
+        uy=np.sqrt(without_terms.uy**2 + y.reshape(shape)),
         u_theta=u_theta,
     )
 
@@ -281,9 +286,11 @@ def check_terms(
     planned: PlannedTerms, sizes: Mapping[str, float], level: float
 ) -> tuple[TermCheck, ...]:
     """Return the checks against all terms; `sizes` override the nominal ones."""
-    own = {term.name: term.size for term in planned.model if not term.free}
-    wanted = nominal_sizes() | own | dict(sizes)
-    return tuple(planned.check(name, wanted[name], level) for name in blocks() if name in wanted)
+    sizes_of_model = {term.name: term.size for term in planned.model if not term.free}
+    all_sizes = nominal_sizes() | sizes_of_model | dict(sizes)
+    return tuple(
+        planned.check(name, all_sizes[name], level) for name in blocks() if name in all_sizes
+    )
 
 
 def _n_unseen(equations: TermEquations) -> int:
@@ -336,12 +343,12 @@ class PlanBudget:
 
     def u_rms(self, quantity: str, *, noise_only: bool = False, if_larger: bool = False) -> float:
         """Return the standard uncertainty, rms over the map; NaN without such a map."""
-        parts = [
+        effects_m = [
             line.effect_rms
             for line in (self.if_larger if if_larger else self.lines)
             if line.quantity == quantity and (line.component == NOISE or not noise_only)
         ]
-        return float(np.sqrt(np.sum(np.square(parts)))) if parts else float("nan")
+        return float(np.sqrt(np.sum(np.square(effects_m)))) if effects_m else float("nan")
 
     def share(self, line: BudgetLine) -> float:
         """Return the share of a line in u^2."""
@@ -353,9 +360,9 @@ def plan_budget(
     plan: Plan,
     terms: Sequence[ModelTerm],
     assumed: Assumed,
-    alone: Prediction,
+    without_terms: Prediction,
     *,
-    asked: Iterable[str] = (),
+    declared: Iterable[str] = (),
 ) -> PlanBudget:
     """Return the predicted budget of a plan that identifies the stage and its free terms.
 
@@ -367,21 +374,21 @@ def plan_budget(
         All terms of the model, assumed ones included.
     assumed : Assumed
         Noise, offsets, visiting order.
-    alone : Prediction
+    without_terms : Prediction
         Uncertainty without terms, from `predict_plan`.
-    asked : iterable of str
+    declared : iterable of str
         The terms that somebody declared, also to be zero; the others are defaults.
     """
-    plan, asked = predicted_on(plan), set(asked)
-    budget = _budget(plan, terms, assumed, alone, asked=asked)
-    if more := _untold(budget, plan, terms, assumed, asked=asked):
+    plan, declared = predicted_on(plan), set(declared)
+    budget = _budget(plan, terms, assumed, without_terms, declared=declared)
+    if more := _undetermined_terms(budget, plan, terms, assumed, declared=declared):
         terms = [*terms, *more]
-        budget = _budget(plan, terms, assumed, alone, asked=asked)
-    larger = [term if term.name in asked else term.scaled(TIMES) for term in terms]
+        budget = _budget(plan, terms, assumed, without_terms, declared=declared)
+    larger = [term if term.name in declared else term.scaled(TIMES) for term in terms]
     return replace(
         budget,
         removals=_removals(budget, plan, terms, assumed),
-        if_larger=_budget(plan, larger, assumed, alone, asked=asked).lines,
+        if_larger=_budget(plan, larger, assumed, without_terms, declared=declared).lines,
     )
 
 
@@ -389,9 +396,9 @@ def _budget(
     plan: Plan,
     terms: Sequence[ModelTerm],
     assumed: Assumed,
-    alone: Prediction,
+    without_terms: Prediction,
     *,
-    asked: Collection[str],
+    declared: Collection[str],
 ) -> PlanBudget:
     """Return the lines of the budget."""
     n = unit_repeats(plan)
@@ -400,19 +407,24 @@ def _budget(
     lines = []
     for at, (quantity, sigma, unit, gains) in enumerate(
         (
-            ("xy", assumed.sigma_m, "m", np.stack([alone.ux, alone.uy]).reshape(2, -1)),
-            ("theta", assumed.sigma_rad, "rad", alone.u_theta),
+            (
+                "xy",
+                assumed.sigma_m,
+                "m",
+                np.stack([without_terms.ux, without_terms.uy]).reshape(2, -1),
+            ),
+            ("theta", assumed.sigma_rad, "rad", without_terms.u_theta),
         )
     ):
         if not gains.size:
             continue
-        known = np.isfinite(gains)
-        noise = (gains**2 * sigma**2 / n + (0.0 if free is None else free[at]))[known]
+        determined = np.isfinite(gains)
+        noise = (gains**2 * sigma**2 / n + (0.0 if free is None else free[at]))[determined]
         lines.append(_line(quantity, NOISE, noise, u=sigma, unit=unit, source="readings"))
         for term in terms:
-            effect = effects[term.name][at][known] if term.name in effects else np.zeros(1)
+            effect = effects[term.name][at][determined] if term.name in effects else np.zeros(1)
             if effect.mean() > TRACE * noise.mean():
-                source = "declared" if term.name in asked else "default"
+                source = "declared" if term.name in declared else "default"
                 lines.append(
                     _line(
                         quantity,
@@ -426,18 +438,18 @@ def _budget(
     return PlanBudget(tuple(lines), {})
 
 
-def _untold(
+def _undetermined_terms(
     budget: PlanBudget,
     plan: Plan,
     terms: Sequence[ModelTerm],
     assumed: Assumed,
     *,
-    asked: Iterable[str],
+    declared: Iterable[str],
 ) -> list[ModelTerm]:
     """Return the terms that readings of the plan will not determine: they will be assumed."""
-    more = nominal_terms({*asked, *(term.name for term in terms)}, visits=True)
+    more = nominal_terms({*declared, *(term.name for term in terms)}, visits=True)
     effects = effects_of_terms(plan, [*terms, *more], assumed) if terms and more else {}
-    least = (UNTOLD * budget.u_rms("xy")) ** 2
+    least = (UNDETERMINED * budget.u_rms("xy")) ** 2
     return [term for term in more if term.name in effects and effects[term.name][0].mean() > least]
 
 

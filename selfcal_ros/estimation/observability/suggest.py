@@ -59,10 +59,10 @@ Pose = tuple[int, float, float]
 def posed(view: View, pose: Pose, pitch_m: float) -> View:
     """Return the view at a pose, named after it."""
     turn, *shift = pose
-    moved = "".join(f"{step:+g}{axis}" for step, axis in zip(shift, "xy", strict=True) if step)
+    shift_text = "".join(f"{step:+g}{axis}" for step, axis in zip(shift, "xy", strict=True) if step)
     return replace(
         view,
-        name=f"{turn}deg{moved}",
+        name=f"{turn}deg{shift_text}",
         rotation_rad=math.radians(turn),
         translation_m=(shift[0] * pitch_m, shift[1] * pitch_m),
     )
@@ -70,7 +70,7 @@ def posed(view: View, pose: Pose, pitch_m: float) -> View:
 
 def pose_of_view(view: View, pitch_m: float) -> Pose:
     """Return the pose of a view, rounded to whole degrees and tenths of a pitch."""
-    x, y = (round(part / pitch_m, 1) for part in view.translation_m)
+    x, y = (round(step_m / pitch_m, 1) for step_m in view.translation_m)
     return round(math.degrees(view.rotation_rad)) % 360, x, y
 
 
@@ -102,20 +102,20 @@ def best_pose(
     value : callable
         Key of a pose, the smallest is the best.
     """
-    known: dict[Pose, tuple[float, ...]] = {}
+    values: dict[Pose, tuple[float, ...]] = {}
 
     def key(pose: Pose) -> tuple[float, ...]:
-        if pose not in known:
-            known[pose] = value(pose)
-        return known[pose]
+        if pose not in values:
+            values[pose] = value(pose)
+        return values[pose]
 
-    found = []
+    local_best = []
     for best in sorted(starts, key=key)[:FINALISTS]:
         for turn, shift in STEPS:
             while key(near := min(_neighbours(best, turn, shift, reach), key=key)) < key(best):
                 best = near
-        found.append(best)
-    return min(found, key=key)
+        local_best.append(best)
+    return min(local_best, key=key)
 
 
 def _neighbours(pose: Pose, turn: int, shift: float, reach: float) -> Iterator[Pose]:
@@ -251,21 +251,21 @@ def score_plan(
     if plan.artifact.map_grid is None:
         unseen = deficiency(system)
     else:
-        seen = full_observability(system, plan.artifact, plan.views)
-        unseen = 0 if seen.identifiable else max(seen.deficiency, 1)
+        observability = full_observability(system, plan.artifact, plan.views)
+        unseen = 0 if observability.identifiable else max(observability.deficiency, 1)
         unknown_sites = int((~system.known_sites).sum())
     if unseen:
         return PlanScore(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
-    found: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
+    prediction: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
     if against is not None and against.every:
         terms = planned_equations(plan, system, against.every, against.assumed)
         hidden = terms.unseen(terms.free).shape[1]
         if hidden:
             return PlanScore(hidden, inf, inf, inf, of_terms=True)
-        found = with_part_of_terms(found, terms, repeats)
-    theta = found.rms_theta if len(found.u_theta) else 0.0
-    return PlanScore(0, found.rms_xy, found.max_xy, theta, unknown_sites=unknown_sites)
+        prediction = with_part_of_terms(prediction, terms, repeats)
+    theta = prediction.rms_theta if len(prediction.u_theta) else 0.0
+    return PlanScore(0, prediction.rms_xy, prediction.max_xy, theta, unknown_sites=unknown_sites)
 
 
 @one_thread()
@@ -306,10 +306,10 @@ def rank_next(
     if plan.artifact.map_grid:
         views += _anywhere(plan, views, lambda added: score(added).key(criterion))
     steps = [*views, *more_repeats(plan)]
-    terms, every = (against.terms, against.every) if against else ((), ())
+    terms, all_terms = (against.terms, against.every) if against else ((), ())
     if any(term.block.change == "order" for term in terms):
         steps += other_orders(plan)
-    if any(term.block.change == "check_stops" for term in every):
+    if any(term.block.change == "check_stops" for term in all_terms):
         steps += check_stops(plan)
     out = []
     for number, step in enumerate(steps):
@@ -352,14 +352,14 @@ def best_plan(
     like = like or View("")
     candidates = [measured_like(view, like) for view in candidate_views(artifact, angular=angular)]
     pool = [view for view in candidates if view.grid]
-    whole = Plan("best", artifact, ())
-    small = smaller(whole, SEARCH_SIZE)
+    empty_plan = Plan("best", artifact, ())
+    small = smaller(empty_plan, SEARCH_SIZE)
     tried, how = _search(
         small, pool, n_views - 1 - fixed, criterion=criterion, against=against, progress=progress
     )
-    if small is not whole:
+    if small is not empty_plan:
         how = replace(how, size=SEARCH_SIZE)
-    judged = whole if max(artifact.shape) <= FULL_SIZE else small
+    judged = empty_plan if max(artifact.shape) <= FULL_SIZE else small
 
     def with_lines(chosen: tuple[int, ...]) -> Plan:
         views = (pool[0], *(pool[i] for i in chosen), *(candidates[-1:] if angular else []))
@@ -443,7 +443,7 @@ def _search(
     By their grid marks alone; one of mirror-image plans, unless terms of the visits differ in them.
     """
     pool = [replace(view, angular=False) for view in pool]
-    known: dict[tuple, tuple[float, ...]] = {}
+    keys: dict[tuple, tuple[float, ...]] = {}
     one_by_one = against is not None and any(term.block.needs_visits for term in against.terms)
     if against is not None:  # no choice of views determines the default terms of the visits
         against = replace(
@@ -453,17 +453,17 @@ def _search(
 
     def key(chosen: tuple[int, ...]) -> tuple[float, ...]:
         views = (pool[0], *(pool[i] for i in chosen))
-        same = tuple(sorted(chosen)) if one_by_one else equivalent_key(field.artifact, views)
-        if same not in known:
+        equivalent = tuple(sorted(chosen)) if one_by_one else equivalent_key(field.artifact, views)
+        if equivalent not in keys:
             plan = replace(field, views=_named(views))
-            known[same] = score_plan(plan, against=against).key(criterion)
-            progress(len(known), None)
-        return known[same]
+            keys[equivalent] = score_plan(plan, against=against).key(criterion)
+            progress(len(keys), None)
+        return keys[equivalent]
 
     n_plans = comb(len(pool) + free - 1, free)
     if n_plans <= (FEW if one_by_one else EXHAUSTIVE):
-        every = combinations_with_replacement(range(len(pool)), free)
-        return {chosen: key(chosen) for chosen in every}, Search(n_plans)
+        choices = combinations_with_replacement(range(len(pool)), free)
+        return {chosen: key(chosen) for chosen in choices}, Search(n_plans)
     return _exchange(key, len(pool), free), Search(None)
 
 
@@ -488,11 +488,11 @@ def _exchange(
     while improved:
         improved = False
         for place in range(free):
-            rest = now[:place] + now[place + 1 :]
-            best = min(((*rest, i) for i in range(n_pool)), key=value)
+            others_kept = now[:place] + now[place + 1 :]
+            best = min(((*others_kept, i) for i in range(n_pool)), key=value)
             if value(best) < value(now):
                 now, improved = best, True
-    return {chosen: found for chosen, found in tried.items() if len(chosen) == free}
+    return {chosen: key_of_plan for chosen, key_of_plan in tried.items() if len(chosen) == free}
 
 
 def _named(views: Iterable[View]) -> tuple[View, ...]:

@@ -133,8 +133,8 @@ def _mixing(system: NormalEquations) -> np.ndarray:
         for _ in range(FEW_DRAWS):
             noise = np.zeros(grid.weight.shape, dtype=complex)
             noise[u] = noise_of(rng, noise[u].shape, grid.weight[u])
-            rest = grid_residuals(system, noise)
-            mixing[:, u] += (abs(rest) ** 2 * grid.weight).sum(axis=(1, 2)) / FEW_DRAWS
+            residuals = grid_residuals(system, noise)
+            mixing[:, u] += (abs(residuals) ** 2 * grid.weight).sum(axis=(1, 2)) / FEW_DRAWS
     return (mixing + mixing.T) / 2
 
 
@@ -153,13 +153,13 @@ def noisy_views(residuals: Residuals, measurements: Measurements) -> tuple[tuple
 
     By their own repeats, and by residuals.
     """
-    found = {cause.view: cause.size for cause in noisier_views(scatter_of_views(measurements))}
+    ratios = {cause.view: cause.size for cause in noisier_views(scatter_of_views(measurements))}
     names = [measurements.views[index].view.name for index in residuals.problem.grid.index]
-    for name, (own, others, dof) in zip(names, view_noise(residuals), strict=True):
-        ratio = float(own / max(others, own / MAX_RATIO, FLOOR))
+    for name, (own_noise, noise_of_others, dof) in zip(names, view_noise(residuals), strict=True):
+        ratio = float(own_noise / max(noise_of_others, own_noise / MAX_RATIO, FLOOR))
         if ratio > NOISY_RESIDUALS and dof >= MIN_VIEW_DOF:
-            found[name] = max(ratio, found.get(name, 0.0))
-    return tuple((name, found[name]) for name in names if name in found)
+            ratios[name] = max(ratio, ratios.get(name, 0.0))
+    return tuple((name, ratios[name]) for name in names if name in ratios)
 
 
 AMBIGUOUS = 16.0
@@ -258,28 +258,28 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) 
         (_second_misalignment(problem, place, clipped)[1], place)
         for place in _places(problem, measurements)
     ]
-    sizes, left, places = [], [], []
+    sizes, squares_left, places = [], [], []
     for gain, place in sorted(gains, key=lambda tried: -tried[0])[:PLACES]:
         if gain >= sigma_m**2 * chdtri(3, BEYOND_DOUBT / len(gains)):
             size, _ = _second_misalignment(problem, place, marks.residual)
             after = grid_residuals(problem.system, _slipped(problem, place, size))
             places.append(replace(place, chi2=gain / sigma_m**2))
             sizes.append(size)
-            left.append((abs(marks.residual - after) ** 2 * marks.weight)[marks.weight > 0])
+            squares_left.append((abs(marks.residual - after) ** 2 * marks.weight)[marks.weight > 0])
     if not places:
         return None
     # residuals are smaller than the noise by the part that the fit follows
-    dof_part = (marks.dof - 3) / (2 * len(left[0]))
-    variance = np.maximum(np.median(left, axis=1) / chdtri(2, 0.5) / dof_part, FLOOR**2)
-    losses = np.minimum(left, CLIP**2 * variance.min()).sum(axis=1)
+    dof_part = (marks.dof - 3) / (2 * len(squares_left[0]))
+    variance = np.maximum(np.median(squares_left, axis=1) / chdtri(2, 0.5) / dof_part, FLOOR**2)
+    losses = np.minimum(squares_left, CLIP**2 * variance.min()).sum(axis=1)
     order = np.argsort(losses, kind="stable")
     best, (phi, x, y) = places[order[0]], sizes[order[0]]
-    moved = complex(x, y) * problem.grid.poses[problem.grid.index.index(best.index)].phase
+    shift = complex(x, y) * problem.grid.poses[problem.grid.index.index(best.index)].phase
     near = losses < losses.min() + AMBIGUOUS * variance[order[0]]
     return Slip(
         **asdict(best),
-        tx_m=moved.real,
-        ty_m=moved.imag,
+        tx_m=shift.real,
+        ty_m=shift.imag,
         phi_rad=float(phi) / problem.half_width_m,
         alternatives=tuple(places[at] for at in order[1:] if near[at]),
     )
@@ -342,10 +342,10 @@ def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     """
     view = measurements.views[slip.index]
     after = getattr(view, slip.axis) >= slip.first
-    parts = [_part(view, ~after, ""), _part(view, after, AFTER_SLIP)]
+    placements = [_part(view, ~after, ""), _part(view, after, AFTER_SLIP)]
     if len(view.k):
-        parts.append(_part(view, np.zeros(len(view.m), dtype=bool), " lines"))
-    views = (*measurements.views[: slip.index], *parts, *measurements.views[slip.index + 1 :])
+        placements.append(_part(view, np.zeros(len(view.m), dtype=bool), " lines"))
+    views = (*measurements.views[: slip.index], *placements, *measurements.views[slip.index + 1 :])
     return replace(measurements, views=views)
 
 
@@ -375,15 +375,15 @@ def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> C
     """
     model = fit_joint(measurements, options)
     row = model.problem.grid.index.index(slip.index)
-    found = find_explanations(
+    explanations = find_explanations(
         model,
         slips=True,
         readings=False,
         placed=PlacedSlip(row, after_slip(model.problem, slip), 2 * MAX_PLACES),
     )
-    if not found or found[0].name == SLIP:
+    if not explanations or explanations[0].name == SLIP:
         return None
-    return cause_of(found[0], model.problem.ground)
+    return cause_of(explanations[0], model.problem.inputs)
 
 
 OUTLIER_LEVEL = 0.01
@@ -451,13 +451,13 @@ def clean(measurements: Measurements, options: Options) -> OutlierScreening:
         datum_theta=ThetaDatum.ZERO_MEAN,
     )
     screened = _without_slips(measurements, options, linear)
-    gone, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
-    removed = tuple(sorted(gone.values(), key=lambda item: (item.kind, item.view, item.mark)))
+    outliers, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
+    removed = tuple(sorted(outliers.values(), key=lambda item: (item.kind, item.view, item.mark)))
     noisy = noisy_views(residuals, screened.measurements)
     findings = [*screened.notes, *_findings(removed, noisy, stopped)]
     unchecked = int((np.isnan(residuals.marks.squares) & (residuals.marks.weight > 0)).sum())
     return OutlierScreening(
-        without(screened.measurements, gone, mark=True),
+        without(screened.measurements, outliers, mark=True),
         removed,
         screened.slips,
         noisy,
@@ -480,23 +480,25 @@ class _Screened:
 def _without_slips(measurements: Measurements, options: Options, linear: Options) -> _Screened:
     """Return the readings split at slips, minus terms that explain them better than a slip."""
     flattened = _flattened(measurements, options)
-    at = _Screened(measurements, flattened, residuals_of(flattened, linear))
+    screened = _Screened(measurements, flattened, residuals_of(flattened, linear))
     for _ in range(2 * MAX_CAUSES + 1):
-        slip = find_slip(at.residuals, robust_sigma(at.residuals.marks), at.flattened)
+        slip = find_slip(
+            screened.residuals, robust_sigma(screened.residuals.marks), screened.flattened
+        )
         if slip is None:
-            return at
-        if len(at.slips) == MAX_CAUSES:
+            return screened
+        if len(screened.slips) == MAX_CAUSES:
             break
-        cause = likelier_term(at.measurements, options, slip)
+        cause = likelier_term(screened.measurements, options, slip)
         if cause is None:
-            at, done = _split(at, slip, linear)
-            if not done:
-                return at
+            screened, could_split = _split(screened, slip, linear)
+            if not could_split:
+                return screened
             continue
-        at = replace(
-            at,
+        screened = replace(
+            screened,
             notes=(
-                *at.notes,
+                *screened.notes,
                 Finding(
                     "taken_for_slip",
                     cause.size,
@@ -517,12 +519,13 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
         )
         options = replace(options, terms=(*options.terms, ModelTerm(cause.name)))
         try:
-            flattened = _flattened(at.measurements, options)
+            flattened = _flattened(screened.measurements, options)
         except (NotIdentifiableError, InputError):
-            return at
-        at = replace(at, flattened=flattened, residuals=residuals_of(flattened, linear))
+            return screened
+        screened = replace(screened, flattened=flattened, residuals=residuals_of(flattened, linear))
     return replace(
-        at, notes=(*at.notes, Finding("slips_given_up", details={"slips": len(at.slips)}))
+        screened,
+        notes=(*screened.notes, Finding("slips_given_up", details={"slips": len(screened.slips)})),
     )
 
 
@@ -560,36 +563,36 @@ def _reject(
     measurements: Measurements, options: Options, residuals: Residuals
 ) -> tuple[dict[Key, Removed], Residuals, Finding | None]:
     """Remove outliers round by round; return them, the last residuals, and why it stopped early."""
-    gone: dict[Key, Removed] = {}
+    outliers: dict[Key, Removed] = {}
     n_readings = sum(len(view.m) + len(view.k) for view in measurements.views)
     for _ in range(MAX_STEPS):
-        found = _worst(residuals, measurements)
-        if not found:
+        worst = _worst(residuals, measurements)
+        if not worst:
             break
-        if len(gone) + len(found) > MAX_REMOVED * n_readings:
+        if len(outliers) + len(worst) > MAX_REMOVED * n_readings:
             return (
                 {},
                 residuals_of(measurements, options),
                 Finding("too_many_outliers", details={"limit": MAX_REMOVED}),
             )
         try:
-            residuals = residuals_of(without(measurements, gone | found), options)
+            residuals = residuals_of(without(measurements, outliers | worst), options)
         except NotIdentifiableError:
-            return gone, residuals, Finding("outliers_kept")
-        gone |= found
+            return outliers, residuals, Finding("outliers_kept")
+        outliers |= worst
     else:
         return (
-            *_restored(measurements, options, gone, residuals),
+            *_restored(measurements, options, outliers, residuals),
             Finding("outliers_given_up", details={"rounds": MAX_STEPS}),
         )
-    return (*_restored(measurements, options, gone, residuals), None)
+    return (*_restored(measurements, options, outliers, residuals), None)
 
 
 def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Removed]:
     """Return the outliers of one round: the largest, one for each mark and site, and one line."""
     problem = residuals.problem
     sites = problem.system.grid.views.site_index
-    found: dict[Key, Removed] = {}
+    outliers: dict[Key, Removed] = {}
     for readings, of_views in ((residuals.marks, problem.grid), (residuals.lines, problem.angular)):
         ratio = np.nan_to_num(readings.squares, nan=0.0) / robust_sigma(readings) ** 2
         # by rounded ratios, so that equal ones keep the order of the readings
@@ -598,18 +601,22 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
             chdtri(readings.coordinates, residuals.level),
             NEAR_LARGEST * float(ratio.max(initial=0.0)),
         )
-        taken: dict[object, float] = {}
+        largest_of_node: dict[object, float] = {}
         for number in order[: int((ratio > floor).sum())]:
             at = tuple(int(i) for i in np.unravel_index(number, ratio.shape))
             grid = readings.kind == "grid"
             nodes = (("mark", at[1:]), ("site", int(sites[at]))) if grid else ("lines",)
-            above = max((taken[node] for node in nodes if node in taken), default=0.0)
+            above = max(
+                (largest_of_node[node] for node in nodes if node in largest_of_node), default=0.0
+            )
             if above > (1 + TRACE) * ratio[at]:
                 continue
-            taken |= {node: float(ratio[at]) for node in nodes if node not in taken}
+            largest_of_node |= {
+                node: float(ratio[at]) for node in nodes if node not in largest_of_node
+            }
             index = of_views.index[at[0]]
             mark = problem.system.grid.views.mark_at(*at[1:]) if grid else at[1:]
-            found[index, readings.kind, mark] = Removed(
+            outliers[index, readings.kind, mark] = Removed(
                 measurements.views[index].view.name,
                 readings.kind,
                 mark,
@@ -617,32 +624,33 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
                 float(1 - readings.redundancy[at]),
                 float(abs(readings.residual[at])),
             )
-    return found
+    return outliers
 
 
 def _restored(
-    measurements: Measurements, options: Options, gone: dict[Key, Removed], residuals: Residuals
+    measurements: Measurements, options: Options, outliers: dict[Key, Removed], residuals: Residuals
 ) -> tuple[dict[Key, Removed], Residuals]:
     """Restore readings, one by one, that agree with the good ones.
 
     Readings that were removed together, each the only check of the other, are restored together.
     """
-    for key in sorted(gone, key=lambda k: gone[k].standardised):
-        if key not in gone:
+    for key in sorted(outliers, key=lambda k: outliers[k].standardised):
+        if key not in outliers:
             continue
         mates = {
             k
-            for k in gone
+            for k in outliers
             if k[1] == key[1]
-            and abs(gone[k].standardised - gone[key].standardised) <= TRACE * gone[key].standardised
+            and abs(outliers[k].standardised - outliers[key].standardised)
+            <= TRACE * outliers[key].standardised
         }
-        for back in dict.fromkeys((frozenset([key]), frozenset(mates))):
-            rest = {k: v for k, v in gone.items() if k not in back}
-            again = residuals_of(without(measurements, rest), options)
-            if all(_agrees(again, one) for one in back):
-                gone, residuals = rest, again
+        for restored in dict.fromkeys((frozenset([key]), frozenset(mates))):
+            still_out = {k: v for k, v in outliers.items() if k not in restored}
+            residuals_without = residuals_of(without(measurements, still_out), options)
+            if all(_agrees(residuals_without, restored_key) for restored_key in restored):
+                outliers, residuals = still_out, residuals_without
                 break
-    return gone, residuals
+    return outliers, residuals
 
 
 def _agrees(residuals: Residuals, key: Key) -> bool:
@@ -686,8 +694,8 @@ def _findings(
 
 def _flattened(measurements: Measurements, options: Options) -> Measurements:
     """Return the readings minus the effects of finite rotations, terms and stage positions."""
-    seen = any(view.visits is not None for view in measurements.views)
-    if options.misalignment_model == "linear" and not (options.terms or seen):
+    with_visits = any(view.visits is not None for view in measurements.views)
+    if options.misalignment_model == "linear" and not (options.terms or with_visits):
         return measurements
     model = fit_joint(measurements, options)
     problem = model.problem
@@ -696,8 +704,8 @@ def _flattened(measurements: Measurements, options: Options) -> Measurements:
         view = views[index]
         marks = problem.system.grid.views.z * problem.half_width_m
         flat = model.y[row] + 1j * problem.turn_rad[row] * marks
-        at = measurements.artifact.index(view.m, view.n)
-        linear = flat[at] * problem.grid.poses[row].phase
+        marks_read = measurements.artifact.index(view.m, view.n)
+        linear = flat[marks_read] * problem.grid.poses[row].phase
         views[index] = replace(view, dx=linear.real, dy=linear.imag, visits=None)
     return replace(measurements, views=tuple(views))
 

@@ -79,64 +79,68 @@ class HeldReadings:
     moved: np.ndarray
 
 
-def held_readings(model: ModelFit, kept: Measurements, held: Measurements) -> HeldReadings:
-    """Return the grid readings `held` with the columns of the terms that `kept` was fitted with."""
-    problem, grid = model.problem, grid_data(held)
+def held_readings(model: ModelFit, fitted: Measurements, held_out: Measurements) -> HeldReadings:
+    """Return the grid readings `held_out` with the columns of the terms of the fit of `fitted`."""
+    problem, grid = model.problem, grid_data(held_out)
     rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1 for i in grid.index)
-    ground = ground_of(held, grid, problem.half_width_m)
-    places = places_of(held, grid, ground, problem.system.known_sites)
-    moved: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
+    inputs = ground_of(held_out, grid, problem.half_width_m)
+    places = places_of(held_out, grid, inputs, problem.system.known_sites)
+    place_change: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
     if problem.moves and places is not None:
-        moved = places.changes(places.moved(model.found.field), np.zeros(len(grid.index)))
+        place_change = places.changes(places.moved(model.fitted.field), np.zeros(len(grid.index)))
     equations = model.equations
     n = 0 if equations is None else equations.n
-    out: np.ndarray = np.zeros((n, *grid.y.shape), dtype=complex)
-    own = [out[:0]]
+    of_terms: np.ndarray = np.zeros((n, *grid.y.shape), dtype=complex)
+    own_columns = [of_terms[:0]]
     if equations is not None:
-        ground = _in_time_of(ground, grid, kept, held)
-        columns = term_columns(ground, problem.terms)
-        at = {(c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)}
+        inputs = _in_time_of(inputs, grid, fitted, held_out)
+        columns = term_columns(inputs, problem.terms)
+        row_of_column = {
+            (c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)
+        }
         for column, block in zip(columns.columns, columns.grid, strict=True):
             if block_of(column.term).of_lines:
                 continue  # its views are those with lines, and no mark has a part of it
             shared = column.view == -1
-            row = -1 if shared else _fitted_row(problem.ground, ground, rows, column.view)
+            row = -1 if shared else _fitted_row(problem.inputs, inputs, rows, column.view)
             if row < 0 and not shared:
-                own.append(np.where(np.isfinite(column.size), column.size, 0.0) * block[None])
-            elif (key := (column.term, row, column.component)) in at:
-                out[at[key]] += block
-    return HeldReadings(grid, out, rows, np.concatenate(own), moved)
+                own_columns.append(
+                    np.where(np.isfinite(column.size), column.size, 0.0) * block[None]
+                )
+            elif (key := (column.term, row, column.component)) in row_of_column:
+                of_terms[row_of_column[key]] += block
+    return HeldReadings(grid, of_terms, rows, np.concatenate(own_columns), place_change)
 
 
-def _fitted_row(fitted: TermInputs, held: TermInputs, rows: tuple[int, ...], first: int) -> int:
+def _fitted_row(fitted: TermInputs, held_out: TermInputs, rows: tuple[int, ...], first: int) -> int:
     """Return the first view of a placing in the fit; -1 if no view of it was fitted."""
-    known = [rows[view] for view in held.members[first] if rows[view] >= 0]
+    fitted_rows = [rows[view] for view in held_out.members[first] if rows[view] >= 0]
     return (
-        next(first for first, members in fitted.members.items() if known[0] in members)
-        if known
+        next(first for first, members in fitted.members.items() if fitted_rows[0] in members)
+        if fitted_rows
         else -1
     )
 
 
 def _in_time_of(
-    ground: TermInputs, grid: GridData, kept: Measurements, held: Measurements
+    inputs: TermInputs, grid: GridData, fitted: Measurements, held_out: Measurements
 ) -> TermInputs:
     """Return the inputs with times of visits relative to those of the fitted views, -1 to 1."""
     visits: list[ViewVisits | None] = []
-    placings = ground.placings or range(len(ground.names))
-    ranges = time_ranges([kept.views[index] for index in grid.index], placings)
-    for index, placing, view in zip(grid.index, placings, ground.visits, strict=True):
-        own = held.views[index].visits
-        if view is None or own is None or placing not in ranges:
+    placings = inputs.placings or range(len(inputs.names))
+    ranges = time_ranges([fitted.views[index] for index in grid.index], placings)
+    for index, placing, view in zip(grid.index, placings, inputs.visits, strict=True):
+        own_visits = held_out.views[index].visits
+        if view is None or own_visits is None or placing not in ranges:
             visits.append(view)
             continue
         first, last = ranges[placing]
-        time = 2 * (own.stamp_ns - first) / max(last - first, 1) - 1
+        time = 2 * (own_visits.stamp_ns - first) / max(last - first, 1) - 1
         visits.append(replace(view, time=time))
-    return replace(ground, visits=tuple(visits))
+    return replace(inputs, visits=tuple(visits))
 
 
-def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
+def prediction_errors(solved: Solved, held_out: HeldReadings) -> np.ndarray:
     """Return the errors of prediction of held grid readings, complex (views, nx, ny), m.
 
     Plate frame; NaN where a mark was not held, or cannot be predicted. A misalignment that the
@@ -144,19 +148,30 @@ def prediction_errors(solved: Solved, held: HeldReadings) -> np.ndarray:
     """
     model, result = solved.joint, solved.result
     problem, system = model.problem, model.problem.system
-    views = maps_of(held.grid)
-    known = (held.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
-    plate, marks = model.found.plate, views.z * problem.half_width_m
-    error = held.grid.y - held.moved - np.tensordot(model.coefficients, held.columns, axes=1)
-    error = np.where(known, error - views.gather(model.found.field) - plate, complex(np.nan))
-    for one, here, index, pose in zip(error, known, held.grid.index, held.grid.poses, strict=True):
+    views = maps_of(held_out.grid)
+    predictable = (held_out.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
+    plate, marks = model.fitted.plate, views.z * problem.half_width_m
+    error = (
+        held_out.grid.y
+        - held_out.moved
+        - np.tensordot(model.coefficients, held_out.columns, axes=1)
+    )
+    error = np.where(predictable, error - views.gather(model.fitted.field) - plate, complex(np.nan))
+    for error_of_view, predictable_marks, index, pose in zip(
+        error, predictable, held_out.grid.index, held_out.grid.poses, strict=True
+    ):
         view = result.views[index]
         phi, tau = view.phi, complex(view.tx, view.ty) * pose.phase.conjugate()
         if not np.isfinite([phi, view.tx, view.ty]).all():
-            phi, tau = _fitted_placing(one[here], marks[here], plate[here], rigid=problem.rigid)
+            phi, tau = _fitted_placing(
+                error_of_view[predictable_marks],
+                marks[predictable_marks],
+                plate[predictable_marks],
+                rigid=problem.rigid,
+            )
         if problem.rigid:
-            one -= rotation_excess(phi, marks, plate)
-        one -= 1j * phi * marks + tau
+            error_of_view -= rotation_excess(phi, marks, plate)
+        error_of_view -= 1j * phi * marks + tau
     return error
 
 
@@ -175,25 +190,25 @@ def _fitted_placing(
     return phi, tau
 
 
-def line_errors(solved: Solved, held: AngularData) -> np.ndarray:
+def line_errors(solved: Solved, held_out: AngularData) -> np.ndarray:
     """Return the errors of prediction of held readings of lines, (views, K), rad.
 
     As of `prediction_errors`; of terms of the lines where any line of their view was fitted.
     """
     model = solved.joint
-    system, found, fitted = model.problem.system, model.found, model.problem.angular.index
-    field = np.where(system.known_lines, found.g_theta, np.nan)
-    plate = np.where((held.weight > 0) & system.known_plate_lines, found.a_theta, np.nan)
-    lines = lines_of(held)
-    error = held.y - lines.gather(field) - plate
+    system, joint_fit, fitted = model.problem.system, model.fitted, model.problem.angular.index
+    field = np.where(system.known_lines, joint_fit.g_theta, np.nan)
+    plate = np.where((held_out.weight > 0) & system.known_plate_lines, joint_fit.a_theta, np.nan)
+    lines = lines_of(held_out)
+    error = held_out.y - lines.gather(field) - plate
     terms = NO_LINES if model.equations is None else model.equations.columns.lines
-    for one, index in zip(error, held.index, strict=True):
+    for error_of_view, index in zip(error, held_out.index, strict=True):
         if index in fitted and len(terms.at):
-            one -= model.coefficients[terms.at] @ terms.values[:, fitted.index(index)]
+            error_of_view -= model.coefficients[terms.at] @ terms.values[:, fitted.index(index)]
         phi = solved.result.views[index].phi
-        if not np.isfinite(phi) and np.isfinite(one).any():
-            phi = np.nanmean(one)
-        one -= phi
+        if not np.isfinite(phi) and np.isfinite(error_of_view).any():
+            phi = np.nanmean(error_of_view)
+        error_of_view -= phi
     return error
 
 
@@ -214,7 +229,7 @@ class PredictionLimit:
 
 
 def prediction_limit(
-    model: ModelFit, held: HeldReadings, known: np.ndarray, weight: np.ndarray
+    model: ModelFit, held_out: HeldReadings, predictable: np.ndarray, weight: np.ndarray
 ) -> PredictionLimit:
     """Return the distribution of the prediction error of held-out grid readings.
 
@@ -222,9 +237,9 @@ def prediction_limit(
     ----------
     model : ModelFit
         The fit without them.
-    held : HeldReadings
+    held_out : HeldReadings
         The readings that are predicted.
-    known : bool array (views, nx, ny)
+    predictable : bool array (views, nx, ny)
         Which of them can be predicted.
     weight : float array (views, nx, ny)
         Their weights.
@@ -234,27 +249,31 @@ def prediction_limit(
     n = int(np.clip(READINGS_DRAWN // grid.weight.size, FEW_DRAWS, N_DRAWS))
     noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
     fields, parameters, coefficients = _fitted(model, noise, rng)
-    own = noise_of(rng, (n, *weight.shape), weight)
-    own_terms = rng.standard_normal((len(held.own), n)) / max(model.found.xy.sigma, FLOOR)
-    views, columns = maps_of(held.grid), np.zeros((0, *grid.weight.shape))
+    own_noise = noise_of(rng, (n, *weight.shape), weight)
+    own_terms = rng.standard_normal((len(held_out.own), n)) / max(model.fitted.xy.sigma, FLOOR)
+    views, columns = maps_of(held_out.grid), np.zeros((0, *grid.weight.shape))
     if model.equations is not None:
         columns = model.equations.columns.grid
     squares = np.zeros(n)
     for draw in range(n):
         field = fields[:, draw].reshape(grid.views.shape)
-        taken = noise[draw] - np.tensordot(coefficients[:, draw], columns, axes=1)
-        plate = grid.plate(taken, field, parameters[:, draw])[0]
-        error = own[draw] - views.gather(field) - plate
-        error -= np.tensordot(coefficients[:, draw], held.columns, axes=1)
-        error += np.tensordot(own_terms[:, draw], held.own, axes=1)
+        readings = noise[draw] - np.tensordot(coefficients[:, draw], columns, axes=1)
+        plate = grid.plate(readings, field, parameters[:, draw])[0]
+        error = own_noise[draw] - views.gather(field) - plate
+        error -= np.tensordot(coefficients[:, draw], held_out.columns, axes=1)
+        error += np.tensordot(own_terms[:, draw], held_out.own, axes=1)
         misaligned = grid.misaligned(parameters[:, draw])
-        for one, here, fitted in zip(error, known, held.rows, strict=True):
+        for error_of_view, predictable_marks, fitted in zip(
+            error, predictable, held_out.rows, strict=True
+        ):
             if fitted >= 0:
-                one -= misaligned[fitted]
-            elif here.any():
-                phi, tau = fitted_misalignment(views.z[here], one[here])
-                one -= 1j * phi * views.z + tau
-        squares[draw] = (weight * abs(error) ** 2)[known].sum() / (2 * known.sum())
+                error_of_view -= misaligned[fitted]
+            elif predictable_marks.any():
+                phi, tau = fitted_misalignment(
+                    views.z[predictable_marks], error_of_view[predictable_marks]
+                )
+                error_of_view -= 1j * phi * views.z + tau
+        squares[draw] = (weight * abs(error) ** 2)[predictable].sum() / (2 * predictable.sum())
     mean = float(squares.mean())
     return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
 
@@ -265,17 +284,19 @@ def _fitted(
     """Fit k draws of unit noise: maps (sites, k), misalignments (3 views, k), terms (p, k)."""
     problem = model.problem
     grid, n = problem.system.grid, 3 * problem.system.grid.n_views
-    found = model.found
-    drawn = [grid.fitted(one, found.inverse[:n, :n]) for one in noise]
-    fields, parameters = (np.stack(part, axis=1) for part in zip(*drawn, strict=True))
+    joint_fit = model.fitted
+    drawn = [grid.fitted(draw, joint_fit.inverse[:n, :n]) for draw in noise]
+    fields, parameters = (
+        np.stack(solutions_of, axis=1) for solutions_of in zip(*drawn, strict=True)
+    )
     if model.equations is None:
         return fields, parameters, np.zeros((0, len(noise)))
-    now = equations_of(problem, found, model.equations.columns)
+    now = equations_of(problem, joint_fit, model.equations.columns)
     shapes = now.columns.shapes
     right = np.stack(
         [
-            shapes.against(shapes.sums(grid.weight * grid.plate(one, *fitted)[1]))
-            for one, fitted in zip(noise, drawn, strict=True)
+            shapes.against(shapes.sums(grid.weight * grid.plate(draw, *fitted)[1]))
+            for draw, fitted in zip(noise, drawn, strict=True)
         ],
         axis=1,
     )
@@ -285,9 +306,9 @@ def _fitted(
     feigned = np.sqrt(now.position_noise)[:, None]
     right = now.unbiased_sums(right + feigned * rng.standard_normal((now.n, len(noise))))
     # a term with a size is not 0: its estimate minus its value is drawn
-    prior = np.where(now.free, 0.0, found.xy.sigma / now.columns.size)
+    prior = np.where(now.free, 0.0, joint_fit.xy.sigma / now.columns.size)
     right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))
-    coefficients = now.inverse(found.xy.sigma) @ right
+    coefficients = now.inverse(joint_fit.xy.sigma) @ right
     return (
         fields - now.projected.fields @ coefficients,
         parameters - now.projected.parameters[:n] @ coefficients,
@@ -393,7 +414,7 @@ def _held_out(
     measurements: Measurements, options: Options, chosen: list[tuple[np.ndarray, np.ndarray]]
 ) -> HeldOut:
     """Calibrate without the chosen readings, and predict them."""
-    kept, held = (
+    fitted, held_out = (
         replace(
             measurements,
             views=tuple(
@@ -404,26 +425,29 @@ def _held_out(
         for flip in (True, False)
     )
     try:
-        solved = solve_joint(kept, options)
+        solved = solve_joint(fitted, options)
     except (NotIdentifiableError, NoDataError):
-        return HeldOut(why=_rest_not_identified(kept, held))
+        return HeldOut(why=_rest_not_identified(fitted, held_out))
     except NotSettledError:
         return HeldOut(why=Finding("rest_not_converged"))
-    of = held_readings(solved.joint, kept, held)
-    error, angles = prediction_errors(solved, of), line_errors(solved, angular_data(held))
-    known = np.isfinite(error)
-    both = np.stack([error[known].real, error[known].imag])
+    predicted = held_readings(solved.joint, fitted, held_out)
+    error, angles = (
+        prediction_errors(solved, predicted),
+        line_errors(solved, angular_data(held_out)),
+    )
+    predictable = np.isfinite(error)
+    coordinates = np.stack([error[predictable].real, error[predictable].imag])
     lines_off = angles[np.isfinite(angles)]
-    if not both.size and not lines_off.size:
+    if not coordinates.size and not lines_off.size:
         return HeldOut(why=Finding("nothing_to_predict"))
-    ratio, limit, why = _judged(solved, of, known=known, error=error)
+    ratio, limit, why = _judged(solved, predicted, predictable=predictable, error=error)
     return HeldOut(
         "",
         0,
-        both.shape[1],
+        coordinates.shape[1],
         len(lines_off),
-        rms(both) if both.size else NOTHING,
-        float(abs(both).max()) if both.size else NOTHING,
+        rms(coordinates) if coordinates.size else NOTHING,
+        float(abs(coordinates).max()) if coordinates.size else NOTHING,
         rms(lines_off) if lines_off.size else NOTHING,
         ratio,
         why,
@@ -432,39 +456,43 @@ def _held_out(
 
 
 def _judged(
-    solved: Solved, held: HeldReadings, *, known: np.ndarray, error: np.ndarray
+    solved: Solved, held_out: HeldReadings, *, predictable: np.ndarray, error: np.ndarray
 ) -> tuple[float, float, Finding | None]:
     """Return error over noise, its limit, and why there is no limit."""
     noise, model = solved.result.noise, solved.joint
-    if not known.any():
+    if not predictable.any():
         return NOTHING, NOTHING, None
-    weight = held.grid.weight
-    if np.isfinite(held.grid.sigma_declared) and np.isfinite(noise.sigma_xy_declared):
+    weight = held_out.grid.weight
+    if np.isfinite(held_out.grid.sigma_declared) and np.isfinite(noise.sigma_xy_declared):
         # each is relative to what its own detections declare on average
-        weight = weight * (noise.sigma_xy_declared / held.grid.sigma_declared) ** 2
-    square = float((weight * abs(error) ** 2)[known].sum()) / (2 * int(known.sum()))
+        weight = weight * (noise.sigma_xy_declared / held_out.grid.sigma_declared) ** 2
+    square = float((weight * abs(error) ** 2)[predictable].sum()) / (2 * int(predictable.sum()))
     ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
-    own = [str(term.name) for term in model.problem.terms if term.free and term.block.by_placing]
-    if own and -1 in held.rows:
-        return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own})
+    own_terms = [
+        str(term.name) for term in model.problem.terms if term.free and term.block.by_placing
+    ]
+    if own_terms and -1 in held_out.rows:
+        return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own_terms})
     if not (noise.sigma_xy > FLOOR and noise.dof_xy > 0):
         return ratio, NOTHING, None
-    return ratio, prediction_limit(model, held, known, weight).ratio(noise.dof_xy), None
+    return ratio, prediction_limit(model, held_out, predictable, weight).ratio(noise.dof_xy), None
 
 
-def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
+def _rest_not_identified(fitted: Measurements, held_out: Measurements) -> Finding:
     """Return the finding that the rest does not identify the stage, with a view to be added."""
     views = tuple(
         replace(v.view, grid=bool(len(v.m)), angular=bool(len(v.k)))
-        for v in kept.views
+        for v in fitted.views
         if len(v.m) or len(v.k)
     )
-    gone = {pose_of(v.view, held.artifact) for v in held.views if len(v.m) or len(v.k)}
-    plan = Plan("", kept.artifact, views)
-    if max(kept.artifact.shape) > FULL_SIZE and views:
+    poses_held_out = {
+        pose_of(v.view, held_out.artifact) for v in held_out.views if len(v.m) or len(v.k)
+    }
+    plan = Plan("", fitted.artifact, views)
+    if max(fitted.artifact.shape) > FULL_SIZE and views:
         plan = smaller(plan, SEARCH_SIZE)
     for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
-        if pose_of(more, plan.artifact) not in gone and identifies(
+        if pose_of(more, plan.artifact) not in poses_held_out and identifies(
             plan.artifact, (*plan.views, more)
         ):
             return Finding(
@@ -482,7 +510,7 @@ def _rest_not_identified(kept: Measurements, held: Measurements) -> Finding:
     return Finding("rest_not_identified")
 
 
-def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationResult:
+def judged_by(result: CalibrationResult, predictions: list[HeldOut]) -> CalibrationResult:
     """Return the result, disqualified if a prediction error exceeds its limit."""
     failed = tuple(
         Finding(
@@ -492,7 +520,7 @@ def judged_by(result: CalibrationResult, found: list[HeldOut]) -> CalibrationRes
             view=item.view,
             details={"tenth": item.tenth, "limit": item.limit},
         )
-        for item in found
+        for item in predictions
         if item.exceeds
     )
     if not failed:

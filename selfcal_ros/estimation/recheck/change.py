@@ -79,7 +79,7 @@ class ChangeTests(ReducedNoise):
         factor = np.linalg.cholesky(self._smooth.T @ self.remaining @ self._smooth)
         return np.linalg.solve(factor, self._smooth.T)
 
-    def seen(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
+    def normalised(self, values: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return changes (2n, draws) as the three statistics see them, with unit variance.
 
         Along their axes (rank, draws), at the nodes (2, n, draws), as polynomials (k, draws).
@@ -96,7 +96,7 @@ class ChangeTests(ReducedNoise):
     @cached_property
     def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
         """Statistics of noise, each in order, (3, DRAWS), and the least rank from above, sorted."""
-        drawn = statistics(self.seen(self._noise))
+        drawn = statistics(self.normalised(self._noise))
         ranks = DRAWS - np.argsort(np.argsort(drawn, axis=1), axis=1)
         return np.sort(drawn, axis=1), np.sort(ranks.min(axis=0))
 
@@ -105,22 +105,22 @@ class ChangeTests(ReducedNoise):
 
         A change beyond all draws has the bound, which is close there, if that is smaller.
         """
-        found, (drawn, least) = statistics(self.seen(values[:, None]))[:, 0], self._ranked
+        of_change, (drawn, least) = statistics(self.normalised(values[:, None]))[:, 0], self._ranked
         rank = min(
-            DRAWS - int(np.searchsorted(row, one)) + 1
-            for row, one in zip(drawn, found, strict=True)
+            DRAWS - int(np.searchsorted(row, statistic)) + 1
+            for row, statistic in zip(drawn, of_change, strict=True)
         )
         p = (1 + int(np.searchsorted(least, rank, side="right"))) / (1 + DRAWS)
-        return p if rank > 1 else min(p, self._bound(values, found))
+        return p if rank > 1 else min(p, self._bound(values, of_change))
 
-    def _bound(self, values: np.ndarray, found: np.ndarray) -> float:
+    def _bound(self, values: np.ndarray, of_change: np.ndarray) -> float:
         """Return a bound of the probability (Bonferroni)."""
-        each = [
+        probabilities = [
             float(2 * len(self.u) * stdtr(min(self.dof, MANY_DOF), -np.abs(values / self.u).max())),
-            of_square(found[0], self.rank, self.dof),
-            of_square(found[2], self._smooth.shape[1], self.dof),
+            of_square(of_change[0], self.rank, self.dof),
+            of_square(of_change[2], self._smooth.shape[1], self.dof),
         ]
-        return min(len(each) * min(each), 1.0)
+        return min(len(probabilities) * min(probabilities), 1.0)
 
     def detectable(self, level: float) -> Detectable:
         """Return the changes of which POWER are found if the tests have a level.
@@ -132,35 +132,38 @@ class ChangeTests(ReducedNoise):
         limits = drawn[:, -rank][:, None]
         rng, noise = np.random.default_rng(1), self._noise[:, ::2]
         n, number = len(self.places), np.arange(noise.shape[1])
-        at, turn = rng.integers(n, size=len(number)), 2 * np.pi * rng.random(len(number))
-        one = np.zeros(noise.shape)
-        one[at, number], one[at + n, number] = np.cos(turn), np.sin(turn)
+        nodes, turn = rng.integers(n, size=len(number)), 2 * np.pi * rng.random(len(number))
+        at_one_node = np.zeros(noise.shape)
+        at_one_node[nodes, number], at_one_node[nodes + n, number] = np.cos(turn), np.sin(turn)
         smooth = self._smooth @ rng.standard_normal((self._smooth.shape[1], len(number)))
         smooth /= np.sqrt((smooth**2).mean(axis=0))
         return Detectable(
-            *(self._size(self.without(shape), noise, limits) for shape in (one, smooth))
+            *(self._size(self.without(shape), noise, limits) for shape in (at_one_node, smooth))
         )
 
     def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
         """Return the size of a change of given shape of which POWER are found, by bisection."""
         low, high = 0.0, 20 * rms(self.u)
-        unchanged, unit = self.seen(noise), self.seen(shape)
+        unchanged, unit = self.normalised(noise), self.normalised(shape)
         for _ in range(10):
             size = (low + high) / 2
-            changed = tuple(one + size * other for one, other in zip(unchanged, unit, strict=True))
-            found = (statistics(changed) >= limits).any(axis=0)
-            low, high = (low, size) if found.mean() >= POWER else (size, high)
+            changed = tuple(
+                of_noise + size * of_shape
+                for of_noise, of_shape in zip(unchanged, unit, strict=True)
+            )
+            is_found = (statistics(changed) >= limits).any(axis=0)
+            low, high = (low, size) if is_found.mean() >= POWER else (size, high)
         return high
 
 
-def statistics(seen: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Return the three statistics of changes as `ChangeTests.seen` returns them, (3, draws).
+def statistics(changes: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Return the three statistics of changes as `ChangeTests.normalised` returns them, (3, draws).
 
     Sums of squares; at the nodes of sixth powers, between a sum that all nodes share alike and the
     largest alone.
     """
-    every, at_nodes, smooth = ((part**2).sum(axis=0) for part in seen)
-    return np.stack([every, (at_nodes**3).sum(axis=0), smooth])
+    all_axes, at_nodes, smooth = ((values**2).sum(axis=0) for values in changes)
+    return np.stack([all_axes, (at_nodes**3).sum(axis=0), smooth])
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,17 +290,19 @@ def change_by_effects(
 ) -> OtherCause:
     """Return the effects, of those in `rows`, that explain a change of the XY map best."""
     common, values, tests = _compared(new, artifact, plate)
-    made = tests.without(new.moved[common[new.known]][:, rows])
+    of_effects = tests.without(new.of_effects[common[new.known]][:, rows])
     change = tests.without(values)
-    white_made, white = (tests.white((part.T / tests.u).T) for part in (made, change))
-    information = white_made.T @ white_made
+    white_effects, white = (
+        tests.white((changes.T / tests.u).T) for changes in (of_effects, change)
+    )
+    information = white_effects.T @ white_effects
     covariance = np.linalg.pinv(information, hermitian=True)
-    found = covariance @ (white_made.T @ white)
+    effects = covariance @ (white_effects.T @ white)
     return OtherCause(
-        found,
+        effects,
         np.sqrt(covariance.diagonal()),
-        of_square(float(found @ information @ found), len(rows), tests.dof),
-        tests.p(change - made @ found),
+        of_square(float(effects @ information @ effects), len(rows), tests.dof),
+        tests.p(change - of_effects @ effects),
     )
 
 
@@ -330,14 +335,14 @@ def _difference(
     dof : float
         Degrees of freedom of the calibration.
     """
-    here, rows = common[new.known], rows[common]
-    by_calibration, longer = -np.hstack([rows, new.from_plate[here]]), new.from_length[here]
+    in_both, rows = common[new.known], rows[common]
+    by_calibration, longer = -np.hstack([rows, new.from_plate[in_both]]), new.from_length[in_both]
     of_new = new.covariances(0.0)
-    of_noise = (of_new[NOISE] + of_new[TERMS])[np.ix_(here, here)]
+    of_noise = (of_new[NOISE] + of_new[TERMS])[np.ix_(in_both, in_both)]
     of_old = by_calibration @ new.effects.before @ by_calibration.T
     of_old += plate.variance_of_expansion * np.outer(longer, longer)
     return (
-        new.values[here] - rows @ old,
+        new.values[in_both] - rows @ old,
         of_noise + of_old,
         joint_dof((np.trace(of_noise), new.dof), (np.trace(of_old), dof)),
     )
@@ -376,9 +381,9 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
 
     Rows (n, s), and nodes of the other map, bool (n,).
     """
-    known, old = plate.together.sites.ravel(), plate.result.artifact
+    known_sites, old = plate.together.sites.ravel(), plate.result.artifact
     if artifact.shape == old.shape and abs(artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP:
-        return np.eye(len(known))[:, known], known
+        return np.eye(len(known_sites))[:, known_sites], known_sites
     return rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
 
 
@@ -398,11 +403,11 @@ def recheck_found(
         float(change.values[change.worst]),
         float(change.u[change.worst]),
     )
-    tested = [part.p for part in (change, lines) if part.test is not None]
+    tested = [of_map.p for of_map in (change, lines) if of_map.test is not None]
     p = min(len(tested) * min(tested), 1.0) if tested else float("nan")
     scale = ScaleChange(change.p_scale < USUAL_LEVEL, change.scale, change.u_scale, change.p_scale)
     (dx, dy), (u_dx, u_dy) = change.values, change.u
-    found = Recheck(
+    outcome = Recheck(
         plate.where,
         _calibration(plate.result),
         p < USUAL_LEVEL,
@@ -420,12 +425,12 @@ def recheck_found(
         passes=passes,
     )
     if change.tests is not None:
-        found = replace(found, detectable=change.tests.detectable(USUAL_LEVEL / len(tested)))
+        outcome = replace(outcome, detectable=change.tests.detectable(USUAL_LEVEL / len(tested)))
     if lines.test is None:
-        return found
+        return outcome
     (line,) = lines.worst
     return replace(
-        found,
+        outcome,
         p_theta=lines.p,
         significance_theta=lines.test,
         d_theta=lines.values,

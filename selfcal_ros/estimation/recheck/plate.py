@@ -117,13 +117,15 @@ class KnownPlate:
     @property
     def of_offsets(self) -> np.ndarray:
         """Coefficients of the microscope that it found, (4,); NaN if it did not estimate them."""
-        found = {
-            each.component: each.value
+        values = {
+            estimate.component: estimate.value
             for term in self.result.model.terms
             if block_of(term.name).of_microscope
-            for each in term.estimates
+            for estimate in term.estimates
         }
-        return np.array([found.get(part, 0.0 if found else np.nan) for part in MICROSCOPE_PARTS])
+        return np.array(
+            [values.get(component, 0.0 if values else np.nan) for component in MICROSCOPE_PARTS]
+        )
 
 
 def reference_now(result: CalibrationResult, where: str, at: str) -> ReferenceLength | None:
@@ -160,11 +162,11 @@ def reference_now(result: CalibrationResult, where: str, at: str) -> ReferenceLe
         before, relative_error=certified.relative_error, u_relative=certified.u_relative
     ).at_temperature(at)
     for name in ("expansion_per_k", "u_expansion_per_k", "certified_at_c"):
-        changed, known = getattr(now.certified, name), getattr(certified, name)
-        if not np.isclose(changed, known, rtol=1e-9, atol=0.0):
+        value_now, certified_value = getattr(now.certified, name), getattr(certified, name)
+        if not np.isclose(value_now, certified_value, rtol=1e-9, atol=0.0):
             raise InputError(
                 "--reference-at",
-                f"{name} is {changed:g}, and {known:g} in {where}",
+                f"{name} is {value_now:g}, and {certified_value:g} in {where}",
                 "change the temperature alone",
             )
     return now
@@ -215,22 +217,22 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     InputError
         If they are of another plate.
     """
-    mine, other = measurements.artifact, plate.result.plate
-    if (mine.shape, mine.angular_count, mine.marks) != (
-        other.shape,
-        other.angular_count,
-        other.marks,
-    ) or abs(mine.grid_pitch_m / other.grid_pitch_m - 1) > GAP:
+    artifact, of_calibration = measurements.artifact, plate.result.plate
+    if (artifact.shape, artifact.angular_count, artifact.marks) != (
+        of_calibration.shape,
+        of_calibration.angular_count,
+        of_calibration.marks,
+    ) or abs(artifact.grid_pitch_m / of_calibration.grid_pitch_m - 1) > GAP:
         raise InputError(
             plate.where,
-            f"its plate has {_described(other)}, not {_described(mine)}",
+            f"its plate has {_described(of_calibration)}, not {_described(artifact)}",
             "name the calibration of that plate",
         )
-    if mine.map_grid is None and other.map_grid is not None:
-        mine = replace(mine, map_grid=other.map_grid)
-    if not mine.harmonics:
-        mine = replace(mine, harmonics=other.harmonics)
-    return replace(measurements, artifact=mine)
+    if artifact.map_grid is None and of_calibration.map_grid is not None:
+        artifact = replace(artifact, map_grid=of_calibration.map_grid)
+    if not artifact.harmonics:
+        artifact = replace(artifact, harmonics=of_calibration.harmonics)
+    return replace(measurements, artifact=artifact)
 
 
 def _described(artifact: Artifact) -> str:
@@ -248,15 +250,22 @@ def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarr
 
     Rows (P, s), and the places where it is known, bool (P,).
     """
-    known, old, grid = plate.together.sites, plate.result.artifact, plate.result.plate.map_grid
+    known_sites, old, grid = (
+        plate.together.sites,
+        plate.result.artifact,
+        plate.result.plate.map_grid,
+    )
     how = Interpolation.BICUBIC if grid is None else grid.interpolation
-    spline, n = MapSpline.of(old, how if known.all() else Interpolation.BILINEAR), known.size
-    unit = spline.coefficients(np.eye(n).reshape(n, *known.shape)).reshape(n, n).T
+    spline, n = (
+        MapSpline.of(old, how if known_sites.all() else Interpolation.BILINEAR),
+        known_sites.size,
+    )
+    unit = spline.coefficients(np.eye(n).reshape(n, *known_sites.shape)).reshape(n, n).T
     rows = spline.rows(places) @ unit
-    inside = np.abs(rows[:, ~known.ravel()]).sum(axis=1) < EDGE
+    inside = np.abs(rows[:, ~known_sites.ravel()]).sum(axis=1) < EDGE
     reach = (np.array(old.half) + EDGE) * old.grid_pitch_m
     inside &= (np.abs(places.real) <= reach[0]) & (np.abs(places.imag) <= reach[1])
-    return rows[:, known.ravel()], inside
+    return rows[:, known_sites.ravel()], inside
 
 
 LEAST = 0.01
@@ -273,7 +282,7 @@ RAYLEIGH_MEDIAN = math.sqrt(2 * math.log(2))
 
 
 @dataclass(frozen=True, eq=False)
-class _Read:
+class _ReadMarks:
     """Readings of one view: marks, complex (n,), and offsets less the stage, stage frame, m."""
 
     marks: np.ndarray
@@ -282,7 +291,7 @@ class _Read:
     shift: complex
     u: float
 
-    def left(
+    def remaining_at(
         self,
         plate: np.ndarray,
         artifact: Artifact,
@@ -292,23 +301,28 @@ class _Read:
 
         `pose`: factor of a further turn, and shift of the plate's centre, in its pitches.
         """
-        mark, there = on_marks(artifact, (self.marks - pose[1]) / pose[0])
-        if there.mean() < ON_MARKS:
+        mark, is_on_plate = on_marks(artifact, (self.marks - pose[1]) / pose[0])
+        if is_on_plate.mean() < ON_MARKS:
             return None
-        rest = self.offsets - self.turn * pose[0] * np.where(there, plate.flat[mark], np.nan)
-        here = np.isfinite(rest)
-        if here.sum() < LEAST_READINGS:
+        differences = self.offsets - self.turn * pose[0] * np.where(
+            is_on_plate, plate.flat[mark], np.nan
+        )
+        readable = np.isfinite(differences)
+        if readable.sum() < LEAST_READINGS:
             return None
-        z = self.marks[here]
+        z = self.marks[readable]
         free = np.stack([np.ones(len(z)), z, z.conj()], axis=1)
-        left, weight = rest[here], np.ones((len(z), 1))
+        remaining, weight = differences[readable], np.ones((len(z), 1))
         for _ in range(STEPS):  # least sum of lengths: single marks may be far off
-            left = (
-                rest[here]
-                - free @ np.linalg.lstsq(weight * free, weight[:, 0] * rest[here], rcond=None)[0]
+            remaining = (
+                differences[readable]
+                - free
+                @ np.linalg.lstsq(weight * free, weight[:, 0] * differences[readable], rcond=None)[
+                    0
+                ]
             )
-            weight = np.maximum(abs(left), self.u)[:, None] ** -0.5
-        return left, here
+            weight = np.maximum(abs(remaining), self.u)[:, None] ** -0.5
+        return remaining, readable
 
 
 def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> Finding | None:
@@ -330,22 +344,28 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
     PlacingError
         If the plate is not placed as planned.
     """
-    for view in (one for one in measurements.views if one.view.cell in (None, (0, 0))):
-        seen = _read(view, measurements, plate, sigma)
-        planned = None if seen is None else seen.left(plate.field, measurements.artifact, PLANNED)
-        if seen is None or planned is None:
+    for view in (
+        readings for readings in measurements.views if readings.view.cell in (None, (0, 0))
+    ):
+        read_marks = _read(view, measurements, plate, sigma)
+        planned = (
+            None
+            if read_marks is None
+            else read_marks.remaining_at(plate.field, measurements.artifact, PLANNED)
+        )
+        if read_marks is None or planned is None:
             continue
-        rest, here = planned
-        if (many := _size(rest) / seen.u) ** 2 < CONTRADICTED:
+        remaining, readable = planned
+        if (many := _size(remaining) / read_marks.u) ** 2 < CONTRADICTED:
             continue
-        other = _other_pose(seen, plate.field, measurements.artifact)
-        if other is not None:
-            raise said(_misplaced(view, seen, other), f"plan '{measurements.plan_id}', ")
-        if _of_marks(seen.marks[here], rest, seen.u):
+        other_pose = _other_pose(read_marks, plate.field, measurements.artifact)
+        if other_pose is not None:
+            raise said(_misplaced(view, read_marks, other_pose), f"plan '{measurements.plan_id}', ")
+        if _of_marks(read_marks.marks[readable], remaining, read_marks.u):
             return Finding(
                 "other_plate",
-                _size(rest),
-                seen.u,
+                _size(remaining),
+                read_marks.u,
                 "m",
                 view=view.view.name,
                 details={"times": many, "of": plate.where},
@@ -355,14 +375,14 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
 
 def _read(
     view: ViewReadings, measurements: Measurements, plate: KnownPlate, sigma: float
-) -> _Read | None:
+) -> _ReadMarks | None:
     """Return the readings of a view less the stage as it was, where it was known."""
     artifact, pitch = measurements.artifact, measurements.artifact.grid_pitch_m
     if not len(view.m):
         return None
-    at, old = view.view.pose.places(artifact, view.m, view.n), plate.result.error_map
+    places, old = view.view.pose.places(artifact, view.m, view.n), plate.result.error_map
     sign = measurements.sense.sign
-    rows, there = rows_at(sign * at, plate)
+    rows, stage_known = rows_at(sign * places, plate)
     stage = sign * (rows @ (old.gx + 1j * old.gy)[plate.together.sites])
     marks = plate.result.artifact_map
     u = [
@@ -371,9 +391,9 @@ def _read(
         rms(np.stack([marks.u_ax, marks.u_ay])),
         LEAST * rms(np.stack([marks.ax, marks.ay])),
     ]
-    offsets = np.where(there, view.dx + 1j * view.dy - stage, complex(np.nan, np.nan))
+    offsets = np.where(stage_known, view.dx + 1j * view.dy - stage, complex(np.nan, np.nan))
     x, y = artifact.places(view.m, view.n)
-    return _Read(
+    return _ReadMarks(
         x + 1j * y,
         offsets,
         complex(np.exp(1j * view.view.rotation_rad)),
@@ -383,7 +403,7 @@ def _read(
 
 
 def _other_pose(
-    seen: _Read, plate: np.ndarray, artifact: Artifact
+    read_marks: _ReadMarks, plate: np.ndarray, artifact: Artifact
 ) -> tuple[complex, complex] | None:
     """Return the pose that explains the readings much better than the planned one; else None.
 
@@ -391,13 +411,15 @@ def _other_pose(
     of them count as not tried: some gain by chance.
     """
     tried = []
-    for pose in motions(artifact, seen.turn, seen.shift):
-        here, planned = (seen.left(plate, artifact, each) for each in (pose, PLANNED))
-        if here is None or planned is None:
+    for pose in motions(artifact, read_marks.turn, read_marks.shift):
+        at_pose, planned = (
+            read_marks.remaining_at(plate, artifact, tried_pose) for tried_pose in (pose, PLANNED)
+        )
+        if at_pose is None or planned is None:
             continue
-        before, after = (max(_size(rest), seen.u) for rest, _ in (planned, here))
+        before, after = (max(_size(remaining), read_marks.u) for remaining, _ in (planned, at_pose))
         if before**2 > CONTRADICTED * after**2:
-            tried.append((2 * len(here[0]) * float(np.log(before / after)), pose))
+            tried.append((2 * len(at_pose[0]) * float(np.log(before / after)), pose))
     tried.sort(key=lambda item: -item[0])
     second = tried[1][0] if len(tried) > 1 else 0.0
     if not tried or tried[0][0] < BETTER or tried[0][0] - second < CLEARLY:
@@ -405,16 +427,19 @@ def _other_pose(
     return tried[0][1]
 
 
-def _size(rest: np.ndarray) -> float:
+def _size(remaining: np.ndarray) -> float:
     """Return the standard deviation of a component by the median, which few marks do not move."""
-    return float(np.median(np.abs(rest))) / RAYLEIGH_MEDIAN
+    return float(np.median(np.abs(remaining))) / RAYLEIGH_MEDIAN
 
 
-def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[complex, complex]) -> Misplaced:
+def _misplaced(
+    view: ViewReadings, read_marks: _ReadMarks, pose: tuple[complex, complex]
+) -> Misplaced:
     """Return how the plate lies, turns in degrees, shifts in pitches along the stage's axes."""
-    deg, moved = np.degrees(view.view.rotation_rad), seen.shift + seen.turn * pose[1]
-    planned, found = (
-        tuple(float(np.round(part, 6)) for part in (at.real, at.imag)) for at in (seen.shift, moved)
+    deg, shift = np.degrees(view.view.rotation_rad), read_marks.shift + read_marks.turn * pose[1]
+    planned, lies_at = (
+        tuple(float(np.round(coordinate, 6)) for coordinate in (place.real, place.imag))
+        for place in (read_marks.shift, shift)
     )
     turned = deg + np.degrees(np.angle(pose[0]))
     return Misplaced(
@@ -422,11 +447,11 @@ def _misplaced(view: ViewReadings, seen: _Read, pose: tuple[complex, complex]) -
         round(float(deg) % 360, 6),
         round(float(turned) % 360, 6),
         (planned[0], planned[1]),
-        (found[0], found[1]),
+        (lies_at[0], lies_at[1]),
     )
 
 
-def _of_marks(marks: np.ndarray, rest: np.ndarray, u: float) -> bool:
+def _of_marks(marks: np.ndarray, remaining: np.ndarray, u: float) -> bool:
     """Return whether what is left is of the marks: a stage alone changes continuously.
 
     Both are normal: of the stage with a correlation that falls with the distance, exponentially, of
@@ -435,16 +460,16 @@ def _of_marks(marks: np.ndarray, rest: np.ndarray, u: float) -> bool:
     Single marks that are far off count as far off as others.
     """
     away = np.abs(marks[:, None] - marks)
-    rest = rest / np.maximum(np.abs(rest) / (BEYOND * _size(rest)), 1.0)
+    remaining = remaining / np.maximum(np.abs(remaining) / (BEYOND * _size(remaining)), 1.0)
     best = {True: -math.inf, False: -math.inf}
     length = 1.0
     while length < 2 * away.max():
         alike, axes = np.linalg.eigh(np.exp(-away / length))
-        power = np.abs(axes.T @ rest) ** 2
-        for own in 2.0 ** np.arange(-20, 20):
-            variance = np.mean(power / (alike + own)) / 2
-            likelihood = -len(rest) * np.log(variance) - np.log(alike + own).sum()
-            differs = bool(own * variance > CONTRADICTED * u**2)
+        power = np.abs(axes.T @ remaining) ** 2
+        for own_variance in 2.0 ** np.arange(-20, 20):
+            variance = np.mean(power / (alike + own_variance)) / 2
+            likelihood = -len(remaining) * np.log(variance) - np.log(alike + own_variance).sum()
+            differs = bool(own_variance * variance > CONTRADICTED * u**2)
             best[differs] = max(best[differs], float(likelihood))
         length *= 2
     return best[True] > best[False]

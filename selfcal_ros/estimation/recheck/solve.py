@@ -140,10 +140,13 @@ class Rechecked:
         artifact, xy = self.artifact, self.in_datum
         variance = np.sum(list(self.variances.values()), axis=0)
         (gx, gy), (u_x, u_y) = (
-            xy.whole(part).reshape(2, *artifact.shape) for part in (xy.values, np.sqrt(variance))
+            xy.on_whole_map(values).reshape(2, *artifact.shape)
+            for values in (xy.values, np.sqrt(variance))
         )
         u_theta = np.sqrt(np.diag(self.of_lines))
-        theta, u_theta = (self.lines.whole(part) for part in (self.lines.values, u_theta))
+        theta, u_theta = (
+            self.lines.on_whole_map(values) for values in (self.lines.values, u_theta)
+        )
         o, r = first_order(artifact, np.stack([gx, gy]))
         return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o, r, ThetaDatum.ZERO_MEAN)
 
@@ -158,15 +161,19 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
         )
     measurements = on_plate(measurements, plate)
     problem = _problem(measurements, options, plate)
-    seen = None if measurements.has_images else _seen_by_visits(problem)
-    if seen is not None:
+    microscope = None if measurements.has_images else _seen_by_visits(problem)
+    if microscope is not None:
         sigma, dof = problem.repeats_xy
-        measurements = replace(measurements, views=tuple(map(seen.corrected, measurements.views)))
+        measurements = replace(
+            measurements, views=tuple(map(microscope.corrected, measurements.views))
+        )
         problem = replace(
-            _problem(measurements, options, plate), repeats_xy=(min(sigma, seen.sigma), dof)
+            _problem(measurements, options, plate), repeats_xy=(min(sigma, microscope.sigma), dof)
         )
     xy, theta = _noise(measurements, problem, plate)
-    readings = _readings(measurements, problem, options, plate=plate, sigma=xy.sigma, seen=seen)
+    readings = _readings(
+        measurements, problem, options, plate=plate, sigma=xy.sigma, microscope=microscope
+    )
     solution = solve_marks(readings)
     return Rechecked(
         measurements,
@@ -177,7 +184,7 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
         _new_lines(readings, plate, theta),
         xy,
         theta,
-        seen,
+        microscope,
     )
 
 
@@ -204,7 +211,7 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     readings, solution, problem = solved.readings, solved.solution, solved.readings.problem
     covers = {"xy": np.sum(list(solved.covariances.values()), axis=0), "theta": solved.of_lines}
     change = map_change(solved.new, solved.artifact, plate)
-    found = recheck_found(
+    outcome = recheck_found(
         change,
         line_change(solved.lines, plate),
         solved.artifact,
@@ -213,21 +220,21 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     )
     noise = _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate)
     declared = {term.name for term in options.terms}
-    changes = _findings(found) + _off(solved)
-    other = check_plate(solved.measurements, plate, solved.xy.sigma)
+    changes = _findings(outcome) + _off(solved)
+    other_plate = check_plate(solved.measurements, plate, solved.xy.sigma)
     failed = (
-        (other,)
-        if other is not None
+        (other_plate,)
+        if other_plate is not None
         else _misfit(
             solution.square,
             readings.dof,
             dof_of_marks(plate.result) if measurements.has_images else solved.xy.dof,
         )
     )
-    if not failed and found.changed and found.passes == 1 and "drift" not in declared:
+    if not failed and outcome.changed and outcome.passes == 1 and "drift" not in declared:
         failed = (replace(changes[0], name="changed_or_drifted"),)
-    if found.changed:
-        failed += _by_microscope(solved, found, changes[0])
+    if outcome.changed:
+        failed += _by_microscope(solved, outcome, changes[0])
     unknowns = 2 * int(readings.known.sum()) + problem.system.grid.n_misalignments
     terms = tuple(
         TermResult(
@@ -256,20 +263,26 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         reference=plate.reference,
         provenance=provenance_of(measurements, options),
         placed_plate=solved.measurements.artifact.placed,
-        recheck=found,
+        recheck=outcome,
     )
     return replace(result, budget=tuple(_budget(result, solved.variances, plate)))
 
 
-def _findings(found: Recheck) -> tuple[Finding, ...]:
+def _findings(outcome: Recheck) -> tuple[Finding, ...]:
     """Return what has changed: the map, and the scale that is not part of it."""
-    largest, scale, of = found.largest, found.scale, {"of": found.of}
+    largest, scale, of = outcome.largest, outcome.scale, {"of": outcome.of}
     where = {"x": largest.x, "y": largest.y, **of}
     out: tuple[Finding, ...] = ()
-    if found.changed:
+    if outcome.changed:
         out = (
             Finding(
-                "changed", largest.change, largest.u, "m", found.p, axis=largest.axis, details=where
+                "changed",
+                largest.change,
+                largest.u,
+                "m",
+                outcome.p,
+                axis=largest.axis,
+                details=where,
             ),
         )
     if scale.changed:
@@ -284,7 +297,7 @@ def _off(solved: Rechecked) -> tuple[Finding, ...]:
         return ()
     values = solved.microscope.values
     u = np.sqrt(solved.microscope.covariance.diagonal())
-    sizes = [term.size_of(part) for part in SIMILAR]
+    sizes = [term.size_of(component) for component in SIMILAR]
     if (np.abs(values[:2]) <= BEYOND * np.array(sizes)).all():
         return ()
     return (
@@ -306,7 +319,7 @@ SAME_VARIANCE = 1e-6
 """Relative change of a variance at which its estimate ends."""
 
 
-def _by_microscope(solved: Rechecked, found: Recheck, changed: Finding) -> tuple[Finding, ...]:
+def _by_microscope(solved: Rechecked, outcome: Recheck, changed: Finding) -> tuple[Finding, ...]:
     """Return a finding if another microscope explains a change as well as a changed stage does.
 
     Its scale and its turn may be any, if neither visits of one mark at several places nor the model
@@ -320,13 +333,16 @@ def _by_microscope(solved: Rechecked, found: Recheck, changed: Finding) -> tuple
         for row, column in enumerate(columns)
         if column.term == block.name and column.component in SIMILAR
     ]
-    of_lines = found.p_theta is not None and 2 * found.p_theta < USUAL_LEVEL
+    of_lines = outcome.p_theta is not None and 2 * outcome.p_theta < USUAL_LEVEL
     if not rows or of_lines or readings.shows_microscope:
         return ()
-    other = change_by_effects(solved.new, solved.artifact, solved.plate, rows)
-    if min(other.p_left, 1.0) < USUAL_LEVEL or other.p_none >= USUAL_LEVEL:
+    explained_by = change_by_effects(solved.new, solved.artifact, solved.plate, rows)
+    if min(explained_by.p_left, 1.0) < USUAL_LEVEL or explained_by.p_none >= USUAL_LEVEL:
         return ()
-    (scale, turn), (u_scale, u_turn) = readings.effects.mean[rows] + other.values, other.u
+    (scale, turn), (u_scale, u_turn) = (
+        readings.effects.mean[rows] + explained_by.values,
+        explained_by.u,
+    )
     return (
         replace(
             changed,
@@ -354,9 +370,9 @@ def _problem(measurements: Measurements, options: Options, plate: KnownPlate) ->
         )
     system = system_of(replace(grid, known_plate=True), Marks((), angular.weight[:0], ()))
     length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    ground = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
-    terms = _terms(options, visits=all(v is not None for v in ground.visits))
-    return problem_of(measurements, options, system, ground, readings=(grid, angular), terms=terms)
+    inputs = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
+    terms = _terms(options, visits=all(v is not None for v in inputs.visits))
+    return problem_of(measurements, options, system, inputs, readings=(grid, angular), terms=terms)
 
 
 def _readings(
@@ -366,7 +382,7 @@ def _readings(
     *,
     plate: KnownPlate,
     sigma: float,
-    seen: "SeenMicroscope | None",
+    microscope: "SeenMicroscope | None",
 ) -> PlateReadings:
     """Return the readings with what has an effect on them, for the noise of one reading, m.
 
@@ -387,28 +403,41 @@ def _readings(
     columns = _columns(problem, of_mark, of_stop)
     offsets, declared = plate.of_offsets, any(term.block.of_microscope for term in options.terms)
     of_microscope = columns.having(lambda block: block.of_microscope)
-    known = of_microscope & (np.isfinite(offsets).all() and not declared and seen is None)
-    parts = np.array(
-        [MICROSCOPE_PARTS.index(columns.columns[at].component) for at in np.flatnonzero(known)],
+    known_offsets = of_microscope & (
+        np.isfinite(offsets).all() and not declared and microscope is None
+    )
+    components = np.array(
+        [
+            MICROSCOPE_PARTS.index(columns.columns[column].component)
+            for column in np.flatnonzero(known_offsets)
+        ],
         dtype=int,
     )
     source = np.where(
-        columns.rows([PLATE]) | known, PLATE, np.where(columns.rows([NOISE]), NOISE, TERMS)
+        columns.rows([PLATE]) | known_offsets, PLATE, np.where(columns.rows([NOISE]), NOISE, TERMS)
     )
     start, end = 2 * int(sites.sum()), 2 * int(sites.sum() + marks.sum())
-    kept = np.append(np.arange(end), end + parts)
-    before, now = plate.together.cover(sites, marks)[np.ix_(kept, kept)], plate.field[marks]
+    of_plate_and_offsets = np.append(np.arange(end), end + components)
+    before, now = (
+        plate.together.cover(sites, marks)[np.ix_(of_plate_and_offsets, of_plate_and_offsets)],
+        plate.field[marks],
+    )
     effects = Effects.of(
         source,
         columns.size,
-        np.concatenate([now.real, now.imag, offsets[parts]]),
+        np.concatenate([now.real, now.imag, offsets[components]]),
         before=before,
-        length=plate.length_at(marks)[kept[start:] - start],
+        length=plate.length_at(marks)[of_plate_and_offsets[start:] - start],
     )
-    if seen is not None:
-        effects = effects.known_as(of_microscope, seen.covariance)
+    if microscope is not None:
+        effects = effects.known_as(of_microscope, microscope.covariance)
     return PlateReadings(
-        problem, measurements.sense, columns, effects, variance, shows_microscope=seen is not None
+        problem,
+        measurements.sense,
+        columns,
+        effects,
+        variance,
+        shows_microscope=microscope is not None,
     )
 
 
@@ -444,8 +473,8 @@ class SeenMicroscope:
         missing = complex(scale, turn) * offset + complex(stretch, shear) * offset.conj()
         number = np.bincount(visits.mark, visits.count, len(view.m))
         dx, dy = (
-            np.bincount(visits.mark, visits.count * part, len(view.m)) / np.maximum(number, 1)
-            for part in (missing.real, missing.imag)
+            np.bincount(visits.mark, visits.count * coordinate, len(view.m)) / np.maximum(number, 1)
+            for coordinate in (missing.real, missing.imag)
         )
         return replace(
             view,
@@ -462,35 +491,39 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
     of the motion. What other terms make of the visits is fitted beside it. None if the visits do
     not tell its scale and turn well.
     """
-    made = ColumnBuilder(without_noise(problem.ground, np.zeros(problem.grid.y.shape)))
-    made.add_terms(problem.terms)
-    columns = made.done()
+    builder = ColumnBuilder(without_noise(problem.inputs, np.zeros(problem.grid.y.shape)))
+    builder.add_terms(problem.terms)
+    columns = builder.done()
     of_offsets, within = columns.having(lambda block: block.of_microscope), columns.within
     if not of_offsets.any() or not within.dof:
         return None
     free = np.array([column.component in SIMILAR for column in columns.columns]) & of_offsets
     size = np.where(free, ANY, columns.size)
 
-    found, covariance = np.zeros(len(size)), np.diag(size**2)
+    fitted_values, covariance = np.zeros(len(size)), np.diag(size**2)
     variance = within.total / within.dof
     for _ in range(MAX_STEPS):  # the scatter that is left weighs the visits against the sizes
         if not variance > FLOOR**2:
             return None
         covariance = np.linalg.inv(np.diag(size**-2) + within.gram / variance)
-        found = covariance @ within.right / variance
-        left = within.total - 2 * found @ within.right + found @ within.gram @ found
-        before, variance = variance, float(left) / within.dof
+        fitted_values = covariance @ within.right / variance
+        remaining = (
+            within.total
+            - 2 * fitted_values @ within.right
+            + fitted_values @ within.gram @ fitted_values
+        )
+        before, variance = variance, float(remaining) / within.dof
         if abs(variance - before) <= SAME_VARIANCE * before:
             break
-    slope = complex(*found[free])  # E / (1 + E)
-    values = found[of_offsets] / abs(1 - slope) ** 2
+    slope = complex(*fitted_values[free])  # E / (1 + E)
+    coefficients = fitted_values[of_offsets] / abs(1 - slope) ** 2
     exact = slope / (1 - slope)
-    values[free[of_offsets]] = exact.real, exact.imag
+    coefficients[free[of_offsets]] = exact.real, exact.imag
     covariance = covariance[np.ix_(of_offsets, of_offsets)] / abs(1 - slope) ** 4
     u = np.sqrt(covariance.diagonal()[free[of_offsets]])
     if (u > WELL * columns.size[free]).any():
         return None
-    return SeenMicroscope(values, covariance, float(np.sqrt(variance)))
+    return SeenMicroscope(coefficients, covariance, float(np.sqrt(variance)))
 
 
 def _require_noise(sigma: float) -> None:
@@ -508,14 +541,14 @@ def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> Term
 
     The latter for offsets as they were seen.
     """
-    made = ColumnBuilder(without_noise(problem.ground, np.zeros(problem.grid.y.shape)))
+    builder = ColumnBuilder(without_noise(problem.inputs, np.zeros(problem.grid.y.shape)))
     for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
-        numbers = [made.add(dict(enumerate(shape.reshape(len(shape), -1)))) for shape in shapes]
+        numbers = [builder.add(dict(enumerate(shape.reshape(len(shape), -1)))) for shape in shapes]
         for axis, unit in AXES:
             for number in numbers:
-                made.column(Column(name, SHARED, axis, 1.0), number, unit)
-    made.add_terms(problem.terms)
-    return made.done()
+                builder.column(Column(name, SHARED, axis, 1.0), number, unit)
+    builder.add_terms(problem.terms)
+    return builder.done()
 
 
 def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:
@@ -576,10 +609,10 @@ def _noise(
 def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewMap:
     """Return the angular map, stage frame; nothing is known where no known line was read."""
     angular, of_terms = readings.problem.angular, readings.columns.lines
-    (_, known), before = plate.together.lines()
-    count = len(known)
+    (_, known_lines), before = plate.together.lines()
+    count = len(known_lines)
     lines = lines_of(
-        replace(angular, weight=np.where(known, angular.weight, 0.0), known_plate=True)
+        replace(angular, weight=np.where(known_lines, angular.weight, 0.0), known_plate=True)
     )
     if lines.n_readings:
         _require_noise(theta.sigma)
@@ -618,13 +651,13 @@ def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
     return (Finding("plate_misfit", ratio, unit="m/m", p=p),)
 
 
-def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate) -> Noise:
+def _with_coverage(noise: Noise, variances: dict[str, np.ndarray], plate: KnownPlate) -> Noise:
     """Return the noise with degrees of freedom and k of the map's uncertainty."""
     before = plate.result.noise
     dof = joint_dof(
-        (parts[NOISE].mean(), noise.dof_xy),
-        (parts[PLATE].mean(), before.dof_of("xy")),
-        (parts[TEMPERATURE].mean() + parts[TERMS].mean(), np.inf),
+        (variances[NOISE].mean(), noise.dof_xy),
+        (variances[PLATE].mean(), before.dof_of("xy")),
+        (variances[TEMPERATURE].mean() + variances[TERMS].mean(), np.inf),
     )
     dof_theta = min(noise.dof_theta, before.dof_of("theta"))
     return replace(
@@ -637,7 +670,7 @@ def _with_coverage(noise: Noise, parts: dict[str, np.ndarray], plate: KnownPlate
 
 
 def _budget(
-    result: CalibrationResult, parts: dict[str, np.ndarray], plate: KnownPlate
+    result: CalibrationResult, variances: dict[str, np.ndarray], plate: KnownPlate
 ) -> Iterator[BudgetLine]:
     """Yield the lines of the budget: noise, known plate, its temperature, terms; interpolation."""
     noise, of_plate, inf = result.noise, plate.result.artifact_map, float("inf")
@@ -661,7 +694,7 @@ def _budget(
         TEMPERATURE: ("B", float(np.sqrt(plate.variance_of_length)), "m/m", inf, "declared"),
         TERMS: ("B", float("nan"), "m", inf, "default"),
     }
-    for name, variance in parts.items():
+    for name, variance in variances.items():
         if name == TEMPERATURE and plate.reference is None:
             continue
         (kind, u, unit, dof, source), u_map = rows[name], np.sqrt(variance)
@@ -704,13 +737,15 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
         As `selfcal_ros.estimation.recheck.solve.recheck`.
     """
     readings = replace(planned_readings(plan.artifact, plan.views), plan_id=plan.plan_id)
-    found: Rechecked = recheck_of(readings, Options(assumed=(), misalignment_model="linear"), plate)
+    solved: Rechecked = recheck_of(
+        readings, Options(assumed=(), misalignment_model="linear"), plate
+    )
     noise = plate.result.noise
     root = np.sqrt(min(view.repeats for view in plan.views))
     unit = noise.sigma_xy / root
-    emap = found.error_map()
+    emap = solved.error_map()
     u_theta = emap.u_g_theta[np.isfinite(emap.u_g_theta)] * root / noise.sigma_theta
     return PlannedRecheck(
         Prediction(emap.u_gx / unit, emap.u_gy / unit, u_theta),
-        rms(map_change(found.new, found.artifact, plate).u) / unit,
+        rms(map_change(solved.new, solved.artifact, plate).u) / unit,
     )

@@ -14,7 +14,7 @@ import numpy as np
 from selfcal_ros.errors import NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.comparison.covariance import unit_rows
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
-from selfcal_ros.estimation.joint.model_fit import placed, told_coefficients
+from selfcal_ros.estimation.joint.model_fit import determined_coefficients, placed
 from selfcal_ros.estimation.joint.problem import Moving, NoiseEstimate, Problem
 from selfcal_ros.estimation.normal.angular import FLOOR, GAP, MAX_STEPS, AngularSystem
 from selfcal_ros.estimation.normal.equations import pseudo_inverse
@@ -64,17 +64,17 @@ class Effects:
         length: np.ndarray,
     ) -> "Effects":
         """Return effects with sizes (p,), of which the calibration knows values `plate` (k,)."""
-        known, here = source == PLATE, len(before) - len(plate)
+        of_plate, n_of_stage = source == PLATE, len(before) - len(plate)
         mean, covariance = np.zeros(len(size)), np.diag(size**2)
-        mean[known] = plate
-        covariance[np.ix_(known, known)] = before[here:, here:]
+        mean[of_plate] = plate
+        covariance[np.ix_(of_plate, of_plate)] = before[n_of_stage:, n_of_stage:]
         return cls(source, mean, covariance, before, length)
 
-    def known_as(self, here: np.ndarray, covariance: np.ndarray) -> "Effects":
-        """Return the effects with those `here`, bool (p,), known to be 0 by themselves."""
-        mean, all_known = np.where(here, 0.0, self.mean), self.covariance.copy()
-        all_known[here], all_known[:, here] = 0.0, 0.0
-        all_known[np.ix_(here, here)] = covariance
+    def known_as(self, rows: np.ndarray, covariance: np.ndarray) -> "Effects":
+        """Return the effects with those `rows`, bool (p,), known to be 0 by themselves."""
+        mean, all_known = np.where(rows, 0.0, self.mean), self.covariance.copy()
+        all_known[rows], all_known[:, rows] = 0.0, 0.0
+        all_known[np.ix_(rows, rows)] = covariance
         return replace(self, mean=mean, covariance=all_known)
 
     def projected(
@@ -99,11 +99,11 @@ class Effects:
             Of the noise of a reading.
         """
         free, right, gram = columns
-        moved = inverse @ right
-        information = (gram - right.T @ moved) / variance
+        misalignments = inverse @ right
+        information = (gram - right.T @ misalignments) / variance
         return (
-            free - response @ moved,
-            moved,
+            free - response @ misalignments,
+            misalignments,
             np.linalg.inv(np.eye(len(gram)) + self.covariance @ information),
         )
 
@@ -120,7 +120,7 @@ class NewMap:
         Those, m or rad; of XY maps without translation and rotation, scale relative to the plate.
     white : float array (q, q)
         Their covariance by the noise that each reading has by itself.
-    moved : float array (q, p)
+    of_effects : float array (q, p)
         What a unit of each effect makes of them.
     effects : Effects
         The effects.
@@ -131,14 +131,14 @@ class NewMap:
     known: np.ndarray
     values: np.ndarray
     white: np.ndarray
-    moved: np.ndarray
+    of_effects: np.ndarray
     effects: Effects
     dof: float
 
     @property
     def from_plate(self) -> np.ndarray:
         """What the effects that the calibration knows make of the map, (q, k)."""
-        return self.moved[:, self.effects.source == PLATE]
+        return self.of_effects[:, self.effects.source == PLATE]
 
     @property
     def from_length(self) -> np.ndarray:
@@ -148,10 +148,13 @@ class NewMap:
     def without(self, modes: np.ndarray) -> "NewMap":
         """Return the map without its least-squares parts in modes, (n, d)."""
         basis = np.linalg.qr(modes[self.known])[0]
-        values, white, moved = (
-            part - basis @ (basis.T @ part) for part in (self.values, self.white, self.moved)
+        values, white, of_effects = (
+            values_of - basis @ (basis.T @ values_of)
+            for values_of in (self.values, self.white, self.of_effects)
         )
-        return replace(self, values=values, moved=moved, white=white - (white @ basis) @ basis.T)
+        return replace(
+            self, values=values, of_effects=of_effects, white=white - (white @ basis) @ basis.T
+        )
 
     def covariances(self, variance_of_length: float) -> dict[str, np.ndarray]:
         """Return the covariances of the map by their sources, which add up, (q, q) each.
@@ -160,14 +163,16 @@ class NewMap:
         """
         out = {}
         for source in (NOISE, PLATE, TERMS):
-            here = self.effects.source == source
-            part = self.moved[:, here]
-            out[source] = part @ self.effects.covariance[np.ix_(here, here)] @ part.T
+            of_source = self.effects.source == source
+            response = self.of_effects[:, of_source]
+            out[source] = (
+                response @ self.effects.covariance[np.ix_(of_source, of_source)] @ response.T
+            )
         out[NOISE] = out[NOISE] + self.white
         out[TEMPERATURE] = variance_of_length * np.outer(self.from_length, self.from_length)
         return out
 
-    def whole(self, values: np.ndarray) -> np.ndarray:
+    def on_whole_map(self, values: np.ndarray) -> np.ndarray:
         """Return values (q,) at their places in the whole map, (n,), NaN elsewhere."""
         out = np.full(len(self.known), np.nan)
         out[self.known] = values
@@ -211,16 +216,16 @@ class PlateReadings:
             If less than half of the nodes near the readings are.
         """
         system = self.problem.system
-        known, n = system.known_sites, system.grid.n_sites
+        known_sites, n = system.known_sites, system.grid.n_sites
         read = np.count_nonzero(system.grid.components.of_site >= 0)
-        if known.sum() >= max(3, read / 2):
-            return known
-        unknown = int((~known).sum())
+        if known_sites.sum() >= max(3, read / 2):
+            return known_sites
+        unknown = int((~known_sites).sum())
         fewer = ", or give the map fewer nodes" * (placed(self.problem) is not None)
         raise NotIdentifiableError(
             f"a view of the known plate that leaves {unknown} of {n} nodes of the map "
             f"unknown: measure more of its marks{fewer}",
-            Observability(2 * int(known.sum()), 2 * n, 2 * unknown, False),
+            Observability(2 * int(known_sites.sum()), 2 * n, 2 * unknown, False),
         )
 
     @property
@@ -230,7 +235,7 @@ class PlateReadings:
         rank = (
             system.rank_grid
             if on_map is None
-            else (round(told_coefficients(on_map)) + on_map.rank_schur)
+            else (round(determined_coefficients(on_map)) + on_map.rank_schur)
         )
         return 2 * system.grid.n_readings - rank
 
@@ -249,7 +254,7 @@ class PlateSolution:
         Sum of squares of the residuals, in units of their covariance.
     fields : complex array (nodes, p)
         Error of the stage that is found for a unit of each effect if that is not known.
-    left : float array (p, p)
+    remaining : float array (p, p)
         What an estimate of the effects leaves of a unit of each.
     """
 
@@ -257,7 +262,7 @@ class PlateSolution:
     parameters: np.ndarray
     square: float
     fields: np.ndarray
-    left: np.ndarray
+    remaining: np.ndarray
 
 
 def solve_marks(readings: PlateReadings) -> PlateSolution:
@@ -276,13 +281,13 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
     problem, shapes, effects = readings.problem, readings.columns.shapes, readings.effects
     system, grid, gauge = problem.system, problem.system.grid, problem.system.gauge
     reduced = reduce_columns(grid, shapes)
-    fields, moved, left = effects.projected(
+    fields, misalignments, remaining = effects.projected(
         (reduced.free, reduced.right, reduced.gram),
         grid.response,
         system.grid_inverse,
         readings.variance,
     )
-    gain = left @ effects.covariance / readings.variance
+    gain = remaining @ effects.covariance / readings.variance
     linear = problem.grid.y - shapes.combined(effects.mean)
     plate = shapes.combined(effects.mean, readings.columns.rows([PLATE]))
     moving, lacking = Moving(problem), np.zeros(grid.read.shape, dtype=complex)
@@ -291,19 +296,19 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
         field, parameters = system.alone(y)
         residuals = grid.plate(y, field, parameters)[1]
         right = shapes.against(shapes.sums(grid.weight * residuals))
-        shown = gain @ right
-        field = field - (fields @ shown).reshape(field.shape)
-        parts = gauge.parts(field)
-        field = gauge.remove(field, parts)
-        parameters = parameters - moved @ shown - parts @ system.rigid[:3]
+        estimated = gain @ right
+        field = field - (fields @ estimated).reshape(field.shape)
+        modes = gauge.parts(field)
+        field = gauge.remove(field, modes)
+        parameters = parameters - misalignments @ estimated - modes @ system.rigid[:3]
         lacking = grid.read * (
             moving.taken(np.where(readings.known, field, 0.0))
             + problem.excess(parameters, plate, grid.views.gather(field))
         )
         if np.abs(lacking - before).max() <= FLOOR:
-            square = float((grid.weight * np.abs(residuals) ** 2).sum() - shown @ right)
+            square = float((grid.weight * np.abs(residuals) ** 2).sum() - estimated @ right)
             return PlateSolution(
-                field.ravel(), parameters, square / readings.variance, fields, left
+                field.ravel(), parameters, square / readings.variance, fields, remaining
             )
     raise NotSettledError(
         "recheck",
@@ -316,47 +321,47 @@ def _map_of(
     rows: np.ndarray,
     field: np.ndarray,
     fields: np.ndarray,
-    left: np.ndarray,
+    remaining: np.ndarray,
     *,
     effects: Effects,
-    alone: np.ndarray,
-    known: np.ndarray,
+    covariance: np.ndarray,
+    known_values: np.ndarray,
     dof: float,
 ) -> NewMap:
     """Return the map whose values are functionals, rows (n, q), of a field (n,).
 
-    `fields` and `left` are those of `PlateSolution`, `alone` (q, q) is the covariance of the values
+    `fields` and `remaining` are those of `PlateSolution`, `covariance` (q, q) is that of the values
     if all effects are known.
     """
     fields = np.real(rows.conj().T @ fields)
-    moved = fields @ left
+    of_effects = fields @ remaining
     return NewMap(
-        known,
+        known_values,
         np.real(rows.conj().T @ field),
-        alone + moved @ effects.covariance @ (fields - moved).T,
-        moved,
+        covariance + of_effects @ effects.covariance @ (fields - of_effects).T,
+        of_effects,
         effects,
         dof,
     )
 
 
-def map_of_marks(readings: PlateReadings, found: PlateSolution, dof: float) -> NewMap:
+def map_of_marks(readings: PlateReadings, solution: PlateSolution, dof: float) -> NewMap:
     """Return the map of a solution."""
     system = readings.problem.system
-    known = turned_over(readings.sense, readings.known, sign=1)
-    rows = turned_over(readings.sense, unit_rows(known)).reshape(-1, known.size).T
+    known_sites = turned_over(readings.sense, readings.known, sign=1)
+    rows = turned_over(readings.sense, unit_rows(known_sites)).reshape(-1, known_sites.size).T
     rows = system.gauge.without(rows)
-    alone = readings.variance * MapsCovariance(system, system.grid_inverse).of_free(
+    white = readings.variance * MapsCovariance(system, system.grid_inverse).of_free(
         rows, np.zeros((system.grid.n_marks, rows.shape[1]))
     )
     return _map_of(
         rows,
-        found.field,
-        found.fields,
-        found.left,
+        solution.field,
+        solution.fields,
+        solution.remaining,
         effects=readings.effects,
-        alone=alone,
-        known=np.tile(known.ravel(), 2),
+        covariance=white,
+        known_values=np.tile(known_sites.ravel(), 2),
         dof=dof,
     )
 
@@ -386,33 +391,33 @@ def map_of_lines(
         Of a line.
     """
     scale, spectrum, variance = lines.weight.sum(), np.linalg.eigh(lines.schur), noise.sigma**2
-    told = np.count_nonzero(spectrum[0] > GAP * scale) == lines.n_views - 1
-    known = lines_turned_over(sense, (lines.components.of_site >= 0) & told, sign=1)
-    if not known.any():
+    determined = np.count_nonzero(spectrum[0] > GAP * scale) == lines.n_views - 1
+    known_lines = lines_turned_over(sense, (lines.components.of_site >= 0) & determined, sign=1)
+    if not known_lines.any():
         nothing = np.zeros((0, len(effects.mean)))
-        return NewMap(known, np.zeros(0), np.zeros((0, 0)), nothing, effects, noise.dof)
+        return NewMap(known_lines, np.zeros(0), np.zeros((0, 0)), nothing, effects, noise.dof)
     inverse = pseudo_inverse(spectrum[0], spectrum[1], scale)
-    fields, _, left = effects.projected(
+    fields, _, remaining = effects.projected(
         lines_eliminated(lines, columns), lines.response, inverse, variance
     )
     y = y - np.tensordot(effects.mean, columns.values, axes=1)
     field, phi = lines.fitted(y, inverse)
-    shown = (
-        left
+    estimated = (
+        remaining
         @ effects.covariance
         @ columns.sums(lines.weight * lines.plate(y, field, phi)[1])
         / variance
     )
-    centre = np.eye(lines.n_lines)[:, known]
+    centre = np.eye(lines.n_lines)[:, known_lines]
     rows = lines_turned_over(sense, centre - centre.mean(axis=1, keepdims=True))
-    alone = lines.solve(rows) + lines.response @ (inverse @ (lines.response.T @ rows))
+    white = lines.solve(rows) + lines.response @ (inverse @ (lines.response.T @ rows))
     return _map_of(
         rows,
-        field - fields @ shown,
+        field - fields @ estimated,
         fields,
-        left,
+        remaining,
         effects=effects,
-        alone=variance * rows.T @ alone,
-        known=known,
+        covariance=variance * rows.T @ white,
+        known_values=known_lines,
         dof=noise.dof,
     )

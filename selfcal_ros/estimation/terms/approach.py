@@ -17,19 +17,19 @@ from selfcal_ros.model.terms import ModelTerm
 def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     """Yield the signs along x and along y."""
     # in the nominal frame, as the map: an approach that every visit has is the map's
-    found = inputs.at_visits(
+    signs = inputs.at_visits(
         lambda visits: (
             inputs.sense.sign * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
         ),
         nominal=True,
     )
-    for coefficient, (marks, visits) in zip(AXES, found, strict=False):
+    for coefficient, (marks, visits) in zip(AXES, signs, strict=False):
         yield Pattern((coefficient,), marks, visits)
 
 
-def located(found: Any, names: tuple[str, ...]) -> Located:
+def located(explanation: Any, names: tuple[str, ...]) -> Located:
     """Yield each axis."""
-    for fields, weights in by_coefficient(found, names):
+    for fields, weights in by_coefficient(explanation, names):
         yield {"axis": fields["details"]["part"]}, weights
 
 

@@ -59,15 +59,15 @@ class Shapes:
         for view, (rows, values) in enumerate(zip(self.rows, self.values, strict=True)):
             at = np.full(self.n, -1)
             at[rows] = np.arange(len(rows))
-            here = np.flatnonzero(at[self.of_column] >= 0)
-            out[here, view] = (self.unit[here, None] * values[at[self.of_column[here]]]).reshape(
-                -1, *self.lattice
-            )
+            columns = np.flatnonzero(at[self.of_column] >= 0)
+            out[columns, view] = (
+                self.unit[columns, None] * values[at[self.of_column[columns]]]
+            ).reshape(-1, *self.lattice)
         return out
 
-    def of_columns(self, each: np.ndarray) -> np.ndarray:
+    def of_columns(self, of_shapes: np.ndarray) -> np.ndarray:
         """Return values linear in the shapes, complex (..., q), for the columns, (..., p)."""
-        return each[..., self.of_column] * self.unit
+        return of_shapes[..., self.of_column] * self.unit
 
     def products(self, inner: np.ndarray) -> np.ndarray:
         """Return real inner products of the columns, (p, p), from those of the shapes, (q, q)."""
@@ -81,15 +81,15 @@ class Shapes:
     def sums(self, field: np.ndarray) -> np.ndarray:
         """Return the sums of conj(field) times each shape, (q,); field (views, nx, ny)."""
         out = np.zeros(self.n, dtype=complex)
-        for rows, values, one in zip(self.rows, self.values, field, strict=True):
-            out[rows] += values @ one.reshape(-1).conj()
+        for rows, values, of_view in zip(self.rows, self.values, field, strict=True):
+            out[rows] += values @ of_view.reshape(-1).conj()
         return out
 
     def squares(self, weight: np.ndarray) -> np.ndarray:
         """Return the weighted sum of squares of each column, (p,); weight (views, nx, ny)."""
         out = np.zeros(self.n)
-        for rows, values, one in zip(self.rows, self.values, weight, strict=True):
-            out[rows] += (values.real**2 + values.imag**2) @ one.reshape(-1)
+        for rows, values, of_view in zip(self.rows, self.values, weight, strict=True):
+            out[rows] += (values.real**2 + values.imag**2) @ of_view.reshape(-1)
         return out[self.of_column]
 
     def combined(self, coefficients: np.ndarray, only: np.ndarray | None = None) -> np.ndarray:
@@ -97,12 +97,14 @@ class Shapes:
 
         `only`, bool (p,), selects columns.
         """
-        here = slice(None) if only is None else only
-        each: np.ndarray = np.zeros(self.n, dtype=complex)
-        np.add.at(each, self.of_column[here], (coefficients * self.unit)[here])
+        selected = slice(None) if only is None else only
+        coefficient_of_shape: np.ndarray = np.zeros(self.n, dtype=complex)
+        np.add.at(
+            coefficient_of_shape, self.of_column[selected], (coefficients * self.unit)[selected]
+        )
         out = np.empty((len(self.rows), *self.lattice), dtype=complex)
-        for one, rows, values in zip(out, self.rows, self.values, strict=True):
-            one[...] = (each[rows] @ values).reshape(self.lattice)
+        for of_view, rows, values in zip(out, self.rows, self.values, strict=True):
+            of_view[...] = (coefficient_of_shape[rows] @ values).reshape(self.lattice)
         return out
 
     def part(self, columns: np.ndarray) -> "Shapes":
@@ -144,11 +146,11 @@ def shapes_of(
     """
     rows, values = [], []
     for view in range(len(weight)):
-        here = [at for at, mean in enumerate(means) if view in mean]
-        rows.append(np.array(here, dtype=int))
+        shapes_of_view = [at for at, mean in enumerate(means) if view in mean]
+        rows.append(np.array(shapes_of_view, dtype=int))
         values.append(
-            np.array([means[at][view] for at in here], dtype=complex).reshape(
-                len(here), weight[0].size
+            np.array([means[at][view] for at in shapes_of_view], dtype=complex).reshape(
+                len(shapes_of_view), weight[0].size
             )
         )
     return Shapes(
@@ -183,14 +185,16 @@ class WithinMarks:
     dof: int
 
 
-def within_marks(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shapes) -> WithinMarks:
+def within_marks(
+    visits: Sequence[ViewVisits | None], at_visits: AtVisits, shapes: Shapes
+) -> WithinMarks:
     """Return within-mark sums lost by averaging.
 
     Parameters
     ----------
     visits : sequence of ViewVisits or None
         Visits of each view.
-    at : list of dict
+    at_visits : list of dict
         Values of each shape at the visits, as in `TermColumns`.
     shapes : Shapes
         Those at the means, and the columns.
@@ -199,17 +203,17 @@ def within_marks(visits: Sequence[ViewVisits | None], at: AtVisits, shapes: Shap
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
     against: np.ndarray = np.zeros(shapes.n, dtype=complex)
     dof = 0
-    for view, seen in enumerate(visits):
-        if seen is None or not seen.repeated:
+    for view, view_visits in enumerate(visits):
+        if view_visits is None or not view_visits.repeated:
             continue
-        dof += 2 * (len(seen.mark) - len(np.unique(seen.mark)))
-        here = [number for number, values in enumerate(at) if view in values]
-        if here:
-            values = np.array([at[number][view] for number in here])
+        dof += 2 * (len(view_visits.mark) - len(np.unique(view_visits.mark)))
+        shapes_of_view = [number for number, values in enumerate(at_visits) if view in values]
+        if shapes_of_view:
+            values = np.array([at_visits[number][view] for number in shapes_of_view])
             # about the means of their marks: then those of the others drop out
-            weighted = np.conj(seen.about_means(values, n_marks)) * seen.weight
-            inner[np.ix_(here, here)] += weighted @ values.T
-            against[here] += (weighted @ seen.y).conj()
+            weighted = np.conj(view_visits.about_means(values, n_marks)) * view_visits.weight
+            inner[np.ix_(shapes_of_view, shapes_of_view)] += weighted @ values.T
+            against[shapes_of_view] += (weighted @ view_visits.y).conj()
     gram = shapes.products(inner)
     return WithinMarks((gram + gram.T) / 2, shapes.against(against), squares_within(visits), dof)
 
@@ -285,13 +289,13 @@ class TermColumns:
 
     def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which columns belong to the terms `names`, bool (p,)."""
-        wanted = set(names)
-        return np.array([column.term in wanted for column in self.columns], dtype=bool)
+        terms = set(names)
+        return np.array([column.term in terms for column in self.columns], dtype=bool)
 
     def having(self, trait: Callable[[Block], bool]) -> np.ndarray:
         """Return which columns are those of blocks with a trait, bool (p,)."""
-        found = {name for name, block in blocks().items() if trait(block)}
-        return self.rows(found)
+        terms = {name for name, block in blocks().items() if trait(block)}
+        return self.rows(terms)
 
     def scaled(self, name: str, factor: float) -> "TermColumns":
         """Return the same columns with the sizes of the term `name` multiplied by `factor`."""
@@ -308,7 +312,7 @@ class TermColumns:
 class ColumnBuilder:
     """Columns under construction: their shapes at the marks (marks,) by view, and at the visits."""
 
-    ground: TermInputs
+    inputs: TermInputs
     columns: list[Column] = field(default_factory=list)
     of_column: list[int] = field(default_factory=list)
     unit: list[complex] = field(default_factory=list)
@@ -333,8 +337,8 @@ class ColumnBuilder:
         for term in terms:
             block = block_of(term.name)
             if block.needs_visits:
-                _require_visits(self.ground, term.name)
-            patterns = list(block.patterns(self.ground, term))
+                _require_visits(self.inputs, term.name)
+            patterns = list(block.patterns(self.inputs, term))
             numbers: dict[int, int] = {}  # patterns may share the values of their marks
             for pattern in patterns:
                 if (values := id(pattern.marks)) not in numbers:
@@ -348,9 +352,9 @@ class ColumnBuilder:
 
     def done(self) -> TermColumns:
         """Return the columns."""
-        shapes = shapes_of(self.means, self.of_column, self.unit, self.ground.weight)
+        shapes = shapes_of(self.means, self.of_column, self.unit, self.inputs.weight)
         at, values = zip(*self.lines, strict=True) if self.lines else ((), ())
-        within = within_marks(self.ground.visits, self.at, shapes)
+        within = within_marks(self.inputs.visits, self.at, shapes)
         return TermColumns(
             tuple(self.columns),
             shapes,
@@ -360,12 +364,12 @@ class ColumnBuilder:
         )
 
 
-def term_columns(ground: TermInputs, terms: Iterable[ModelTerm]) -> TermColumns:
+def term_columns(inputs: TermInputs, terms: Iterable[ModelTerm]) -> TermColumns:
     """Return the columns of `terms`.
 
     Parameters
     ----------
-    ground : TermInputs
+    inputs : TermInputs
         Plate, views, visits.
     terms : iterable of ModelTerm
         What is wanted.
@@ -375,13 +379,13 @@ def term_columns(ground: TermInputs, terms: Iterable[ModelTerm]) -> TermColumns:
     InputError
         If a term needs to know the visits of a view, and they are not known.
     """
-    made = ColumnBuilder(ground)
-    made.add_terms(terms)
-    return made.done()
+    builder = ColumnBuilder(inputs)
+    builder.add_terms(terms)
+    return builder.done()
 
 
-def _require_visits(ground: TermInputs, name: str) -> None:
-    for view, visits in zip(ground.names, ground.visits, strict=True):
+def _require_visits(inputs: TermInputs, name: str) -> None:
+    for view, visits in zip(inputs.names, inputs.visits, strict=True):
         if visits is None:
             raise InputError(
                 f"view '{view}'",

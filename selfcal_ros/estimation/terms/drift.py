@@ -27,28 +27,28 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     """Yield the polynomials of each placing, along x and along y."""
     orders = range(1, inputs.drift_degree + 1)
     for first, members in inputs.members.items():
-        found = inputs.at_visits(
+        polynomials = inputs.at_visits(
             lambda visits: np.stack([polynomial(order, visits.time) for order in orders]), members
         )
-        for order, (marks, visits) in zip(orders, found, strict=False):
+        for order, (marks, visits) in zip(orders, polynomials, strict=False):
             yield Pattern(
                 tuple((f"{axis} P{order}", unit) for axis, unit in AXES), marks, visits, view=first
             )
 
 
-def located(found: Any, names: tuple[str, ...]) -> Located:
+def located(explanation: Any, names: tuple[str, ...]) -> Located:
     """Yield the range of the path of each view along each axis."""
-    for view in sorted({column.view for column in found.columns}):
+    for view in sorted({column.view for column in explanation.columns}):
         for axis in "xy":
             shape = np.array(
                 [
                     polynomial(int(c.component[3:]), TIMES)
                     if c.view == view and c.component[0] == axis
                     else 0 * TIMES
-                    for c in found.columns
+                    for c in explanation.columns
                 ]
             )
-            path = found.values @ shape
+            path = explanation.values @ shape
             yield (
                 {"view": names[view], "axis": axis},
                 (shape[:, int(path.argmax())] - shape[:, int(path.argmin())]),

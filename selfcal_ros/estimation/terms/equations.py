@@ -79,10 +79,10 @@ class ReducedColumns:
 @lru_cache(maxsize=2)
 def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
     """Return columns with the sites eliminated; the last ones are kept."""
-    sites, inner, asked = _marks_eliminated(grid, shapes)
+    sites, inner, coupling = _marks_eliminated(grid, shapes)
     inner -= grid.factor.products(sites)
     return ReducedColumns(
-        grid, shapes, sites, (inner + inner.conj().T) / 2, asked - _coupled(grid, sites)
+        grid, shapes, sites, (inner + inner.conj().T) / 2, coupling - _coupled(grid, sites)
     )
 
 
@@ -91,29 +91,31 @@ def _marks_eliminated(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return s (sites, q), inner products (q, q) and the coupling to the views (2 views, q)."""
     n, marks = grid.n_views, grid.n_marks
-    weight, part = (array.reshape(n, marks) for array in (grid.weight, grid.relative_weight))
+    weight, relative_weight = (
+        array.reshape(n, marks) for array in (grid.weight, grid.relative_weight)
+    )
     to_views = grid.shapes.reshape(2, marks).conj()
     means: np.ndarray = np.zeros((shapes.n, marks), dtype=complex)
     sites: np.ndarray = np.zeros((shapes.n, *grid.views.shape), dtype=complex)
     inner: np.ndarray = np.zeros((shapes.n, shapes.n), dtype=complex)
-    asked: np.ndarray = np.zeros((n, 2, shapes.n), dtype=complex)
+    coupling: np.ndarray = np.zeros((n, 2, shapes.n), dtype=complex)
     for v, (rows, values) in enumerate(zip(shapes.rows, shapes.values, strict=True)):
         weighted = values * weight[v]
-        means[rows] += values * part[v]
+        means[rows] += values * relative_weight[v]
         inner[rows[:, None], rows] += values.conj() @ weighted.T
-        asked[v][:, rows] += to_views @ weighted.T
-        here = np.zeros((len(rows), *grid.views.shape), dtype=complex)
-        grid.views.add_scattered(here, v, weighted.reshape(len(rows), *shapes.lattice))
-        sites[rows] += here
+        coupling[v][:, rows] += to_views @ weighted.T
+        of_view = np.zeros((len(rows), *grid.views.shape), dtype=complex)
+        grid.views.add_scattered(of_view, v, weighted.reshape(len(rows), *shapes.lattice))
+        sites[rows] += of_view
     # minus the mean of each mark, which all views share
     inner -= (means * weight.sum(axis=0)).conj() @ means.T
-    asked -= (to_views * weight[:, None]) @ means.T
+    coupling -= (to_views * weight[:, None]) @ means.T
     for v in range(n):
         grid.views.add_scattered(sites, v, (means * -weight[v]).reshape(-1, *shapes.lattice))
     return (
         np.ascontiguousarray(sites.reshape(shapes.n, grid.n_sites).T),
         inner,
-        asked.reshape(2 * n, shapes.n),
+        coupling.reshape(2 * n, shapes.n),
     )
 
 
@@ -278,7 +280,7 @@ class TermEquations:
         """Coefficients to be determined by the readings alone, bool (p,)."""
         return np.isinf(self.columns.size)
 
-    def untold(
+    def undetermined(
         self, rows: np.ndarray, limit: float | None = None, *, unknown: np.ndarray | None = None
     ) -> np.ndarray:
         """Return undetermined combinations of the coefficients `rows`, (p, k).
@@ -301,22 +303,22 @@ class TermEquations:
         self, rows: np.ndarray, unknown: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         scaled = self.information / np.outer(self.norm, self.norm)
-        told = scaled[np.ix_(rows, rows)]
+        information = scaled[np.ix_(rows, rows)]
         if unknown is not None:
             couple = scaled[np.ix_(rows, unknown)]
-            told = (
-                told
+            information = (
+                information
                 - couple
                 @ np.linalg.pinv(scaled[np.ix_(unknown, unknown)], hermitian=True)
                 @ couple.T
             )
-        values, vectors = np.linalg.eigh(told)
+        values, vectors = np.linalg.eigh(information)
         return values, vectors
 
     @cached_property
-    def _untold_free(self) -> np.ndarray:
+    def _undetermined_free(self) -> np.ndarray:
         """Undetermined combinations of the free coefficients, (p, k)."""
-        return self.untold(self.free)
+        return self.undetermined(self.free)
 
     def limit(self, rows: np.ndarray) -> float:
         """Return the eigenvalue of the scaled equations of `rows` that counts as zero.
@@ -324,9 +326,11 @@ class TermEquations:
         Offsets of lines are told apart from their noise only where they stand alone: among others
         theirs is a combination of its own.
         """
-        of_marks, of_lines = (float(part[rows].max(initial=0.0)) for part in self._noise_of_offsets)
-        alone = self._noise_of_offsets[1][rows].all()
-        return max(GAP, OVER_NOISE * (of_lines if alone else of_marks))
+        of_marks, of_lines = (
+            float(noise_shares[rows].max(initial=0.0)) for noise_shares in self._noise_of_offsets
+        )
+        lines_alone = self._noise_of_offsets[1][rows].all()
+        return max(GAP, OVER_NOISE * (of_lines if lines_alone else of_marks))
 
     @cached_property
     def _noise_of_offsets(self) -> tuple[np.ndarray, np.ndarray]:
@@ -346,16 +350,16 @@ class TermEquations:
     @cached_property
     def maps(self) -> np.ndarray:
         """Map for a unit of each coefficient in the datum, complex (sites, p); 0 where unknown."""
-        known = self.system.known_sites.ravel()[:, None]
-        fields = np.where(known, self.projected.fields, 0.0)
-        return np.where(known, self.system.gauge.without(fields), 0.0)
+        known_sites = self.system.known_sites.ravel()[:, None]
+        fields = np.where(known_sites, self.projected.fields, 0.0)
+        return np.where(known_sites, self.system.gauge.without(fields), 0.0)
 
     @cached_property
     def turned(self) -> np.ndarray:
         """Angular map for a unit of each coefficient in the datum, sign reversed, (K, p)."""
-        known = self.system.known_lines
+        known_lines = self.system.known_lines
         turned = self.projected.turned
-        return turned - turned[known].mean(axis=0) if known.any() else turned
+        return turned - turned[known_lines].mean(axis=0) if known_lines.any() else turned
 
     def variances(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the variances that coefficients with a covariance (p, p) give the maps.
@@ -363,26 +367,26 @@ class TermEquations:
         (2, sites) of the XY map, and (K,) of the angular one.
         """
         x, y, lines = (
-            (part @ covariance * part).sum(axis=1)
-            for part in (self.maps.real, self.maps.imag, self.turned)
+            (effect @ covariance * effect).sum(axis=1)
+            for effect in (self.maps.real, self.maps.imag, self.turned)
         )
         return np.stack([x, y]), lines
 
     def unseen(self, rows: np.ndarray) -> np.ndarray:
         """Return undetermined combinations of `rows` that change the map, scaled, (p, modes)."""
-        untold = self.untold(rows)
-        if not untold.shape[1]:
-            return untold
+        undetermined = self.undetermined(rows)
+        if not undetermined.shape[1]:
+            return undetermined
         grid = self.system.grid
-        unit = untold / self.norm[:, None]
-        moved = self.maps @ unit * np.sqrt(grid.weight.sum() / grid.n_sites)
+        unit = undetermined / self.norm[:, None]
+        of_map = self.maps @ unit * np.sqrt(grid.weight.sum() / grid.n_sites)
         lines = (self.turned @ unit)[self.system.known_lines]
         lines = lines * np.sqrt(
             self.line_weight * self.system.angular.weight.sum() / max(len(lines), 1)
         )
-        both = np.concatenate([moved.real, moved.imag, lines])
-        _, size, right = np.linalg.svd(both, full_matrices=False)
-        return untold @ right[size > TRACE].T  # the smallest true ones are 1e-2
+        maps = np.concatenate([of_map.real, of_map.imag, lines])
+        _, size, right = np.linalg.svd(maps, full_matrices=False)
+        return undetermined @ right[size > TRACE].T  # the smallest true ones are 1e-2
 
     def rows(self, names: Iterable[str]) -> np.ndarray:
         """Return which coefficients belong to the terms `names`, bool (p,)."""
@@ -447,19 +451,21 @@ class TermEquations:
         scale = np.where(self.free, 1 / self.norm, self.columns.size)
         matrix = self.unbiased * np.outer(scale, scale)
         matrix[np.diag_indices(len(scale))] += self.prior(sigma_m) * scale**2
-        hold = self._untold_free
+        undetermined = self._undetermined_free
         # sized coefficients may be determined far better than free ones in these units; the
         # diagonal of an undetermined free one is rounding
         diagonal = np.maximum(np.diag(matrix), np.finfo(float).tiny)
-        own = np.sqrt(np.where(self.free & (diagonal <= GAP), 1.0, diagonal))
-        null = np.linalg.qr(own[:, None] * hold)[0]
-        found = (
-            np.linalg.pinv(matrix / np.outer(own, own) + null @ null.T, hermitian=True, rcond=1e-14)
+        unit = np.sqrt(np.where(self.free & (diagonal <= GAP), 1.0, diagonal))
+        null = np.linalg.qr(unit[:, None] * undetermined)[0]
+        inverse = (
+            np.linalg.pinv(
+                matrix / np.outer(unit, unit) + null @ null.T, hermitian=True, rcond=1e-14
+            )
             - null @ null.T
         )
-        found /= np.outer(own, own)
-        told = np.eye(self.n) - hold @ hold.T
-        return told @ found @ told * np.outer(scale, scale)
+        inverse /= np.outer(unit, unit)
+        determined = np.eye(self.n) - undetermined @ undetermined.T
+        return determined @ inverse @ determined * np.outer(scale, scale)
 
     @cached_property
     def free_inverse(self) -> np.ndarray:
@@ -472,20 +478,20 @@ class TermEquations:
             self.columns.having(lambda block: block.of_offsets and block.of_lines)
         )
 
-    def inverse_without(self, known: np.ndarray) -> np.ndarray:
-        """Return the covariance of free coefficients (p, p) if those in `known` are known."""
-        free = ~known
-        untold, norm = self.untold(free)[free], self.norm[free]
+    def inverse_without(self, known_rows: np.ndarray) -> np.ndarray:
+        """Return the covariance of free coefficients (p, p) if those in `known_rows` are."""
+        free = ~known_rows
+        undetermined, norm = self.undetermined(free)[free], self.norm[free]
         scaled = self.information[np.ix_(free, free)] / np.outer(norm, norm)
         out = np.zeros((self.n, self.n))
         out[np.ix_(free, free)] = (
-            np.linalg.inv(scaled + untold @ untold.T) - untold @ untold.T
+            np.linalg.inv(scaled + undetermined @ undetermined.T) - undetermined @ undetermined.T
         ) / np.outer(norm, norm)
         return out
 
     def rank(self) -> int:
         """Return the number of combinations of all coefficients determined by the readings."""
-        return self.n - self.untold(np.ones(self.n, dtype=bool)).shape[1]
+        return self.n - self.undetermined(np.ones(self.n, dtype=bool)).shape[1]
 
 
 def equations_of_columns(
@@ -587,37 +593,37 @@ def score(
     columns, weight = equations.columns, equations.system.grid.weight
     shapes = columns.shapes
     within = columns.within
-    taken = np.zeros(equations.n) if coefficients is None else coefficients
+    subtracted = np.zeros(equations.n) if coefficients is None else coefficients
     between = shapes.against(shapes.sums(weight * residuals[0]))
     between[columns.lines.at] += equations.line_weight * columns.lines.sums(
         equations.system.angular.weight * residuals[1]
     )
-    inner = within.total - 2 * taken @ within.right + taken @ within.gram @ taken
+    inner = within.total - 2 * subtracted @ within.right + subtracted @ within.gram @ subtracted
     sums = Sums(*squares, float(inner), within.dof)
-    return Score(between, within.right - within.gram @ taken, sums)
+    return Score(between, within.right - within.gram @ subtracted, sums)
 
 
-def residual_sums(equations: TermEquations, found: Score) -> Sums:
+def residual_sums(equations: TermEquations, scored: Score) -> Sums:
     """Return the residuals of all columns with free coefficients.
 
     The noise comes from this fit: a size that is too small would leave part of its term.
     """
     inverse = equations.free_inverse
-    more = inverse @ found.total
+    more = inverse @ scored.total
     gram, within = equations.projected.gram, equations.columns.within.gram
-    between = found.sums.between - 2 * more @ found.between + more @ gram @ more
-    inner = found.sums.within - 2 * more @ found.within + more @ within @ more
+    between = scored.sums.between - 2 * more @ scored.between + more @ gram @ more
+    inner = scored.sums.within - 2 * more @ scored.within + more @ within @ more
     return Sums(
         max(float(between), 0.0),
-        found.sums.dof_between - float(np.sum(inverse * gram)),
+        scored.sums.dof_between - float(np.sum(inverse * gram)),
         max(float(inner), 0.0),
-        found.sums.dof_within - float(np.sum(inverse * within)),
+        scored.sums.dof_within - float(np.sum(inverse * within)),
     )
 
 
 def next_coefficients(
     equations: TermEquations,
-    found: Score,
+    scored: Score,
     coefficients: np.ndarray,
     *,
     sigma_m: float,
@@ -629,7 +635,7 @@ def next_coefficients(
     ----------
     equations : TermEquations
         The columns.
-    found : Score
+    scored : Score
         Score at `coefficients`.
     coefficients : float array (p,)
         Present coefficients of the estimate.
@@ -638,10 +644,10 @@ def next_coefficients(
     inverse : float array (p, p)
         `TermEquations.inverse` of it.
     """
-    right = equations.unbiased_sums(found.total)
+    right = equations.unbiased_sums(scored.total)
     # no reading tells anything of these: what is there is rounding
-    untold = equations.untold(np.ones(equations.n, dtype=bool), ROUNDED)
-    right = right - equations.norm * (untold @ (untold.T @ (right / equations.norm)))
+    undetermined = equations.undetermined(np.ones(equations.n, dtype=bool), ROUNDED)
+    right = right - equations.norm * (undetermined @ (undetermined.T @ (right / equations.norm)))
     prior = equations.prior(sigma_m)
     return coefficients + inverse @ (right - prior * coefficients)
 
@@ -659,17 +665,17 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
     A part is the reduction of the covariance if that term, and those before it, are
     known: the parts add up to the covariance.
     """
-    rest, out = covariance.copy(), []
+    remaining, out = covariance.copy(), []
     sized = dict.fromkeys(c.term for c in columns.columns if np.isfinite(c.size))
     for name in sized:
-        root = root_of(rest, columns.rows([name]))
-        rest = rest - root @ root.T
+        root = root_of(remaining, columns.rows([name]))
+        remaining = remaining - root @ root.T
         out.append((str(name), root))
     free = np.isinf(columns.size)
-    own = np.sqrt(np.maximum(np.diag(covariance)[free], np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(rest[np.ix_(free, free)] / np.outer(own, own))
-    root = np.zeros((len(free), len(own)))
-    root[free] = own[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    u = np.sqrt(np.maximum(np.diag(covariance)[free], np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(remaining[np.ix_(free, free)] / np.outer(u, u))
+    root = np.zeros((len(free), len(u)))
+    root[free] = u[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     out.append((FREE, root))
     return out
 
@@ -754,20 +760,20 @@ def size_test(
         Noise of one grid reading, m, and its degrees of freedom.
     """
     columns = equations.columns.columns
-    every = equations.rows([term.name])
+    of_term = equations.rows([term.name])
     families = [
-        every & np.array([column.component in family for column in columns])
+        of_term & np.array([column.component in family for column in columns])
         for family in term.block.families
     ]
-    whole, *parts = [
+    together, *of_families = [
         _coefficients_test(equations, right, term, noise, rows=rows, among=1 + len(families))
-        for rows in (every, *families)
+        for rows in (of_term, *families)
     ]
     return replace(
-        min((whole, *parts), key=lambda test: test.p),
-        rank=whole.rank,
-        statistic=whole.statistic,
-        p_together=whole.p_together,
+        min((together, *of_families), key=lambda test: test.p),
+        rank=together.rank,
+        statistic=together.statistic,
+        p_together=together.p_together,
     )
 
 
@@ -782,7 +788,7 @@ def _coefficients_test(
 ) -> SizeTest:
     """Return the test of a size by the coefficients `rows`, bool (p,), one of `among` tests."""
     sigma, dof = noise
-    values, information, of_size = _told(equations, right, rows, sigma)
+    values, information, of_size = _estimates_if_free(equations, right, rows, sigma)
     rank = len(values)
     if not rank:
         return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0, 1.0)
@@ -796,9 +802,11 @@ def _coefficients_test(
     def statistic(size: float) -> float:
         return float((squares / variances(size)).sum())
 
-    found = statistic(term.size)
-    p = float(fdtrc(rank, min(dof, MANY_DOF), found / rank))
-    test = SizeTest(term.name, term.size, term.size, term.size, found, rank, p, min(1.0, among * p))
+    of_given = statistic(term.size)
+    p = float(fdtrc(rank, min(dof, MANY_DOF), of_given / rank))
+    test = SizeTest(
+        term.name, term.size, term.size, term.size, of_given, rank, p, min(1.0, among * p)
+    )
     if not test.raised:
         return test
     beyond = np.sqrt((squares / of_unit).sum())  # the statistic is below its square / size^2
@@ -810,16 +818,19 @@ def _coefficients_test(
         return high
 
     tail = TAIL if test.contradicted else DOUBT_LEVEL
-    shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
+    size_shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
     # the limit of few coefficients is far above what they show
-    allowed = min(allowed, max(term.size, term.block.plausible, shown))
-    wider = float(np.log(variances(shown) / variances(term.size)).sum())
+    allowed = min(allowed, max(term.size, term.block.plausible, size_shown))
+    wider = float(np.log(variances(size_shown) / variances(term.size)).sum())
     return replace(
-        test, shown=shown, allowed=allowed, evidence=float(found - statistic(shown) - wider) / 2
+        test,
+        shown=size_shown,
+        allowed=allowed,
+        evidence=float(of_given - statistic(size_shown) - wider) / 2,
     )
 
 
-def _told(
+def _estimates_if_free(
     equations: TermEquations, right: np.ndarray, rows: np.ndarray, sigma_m: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the estimates of coefficients taken as free.
@@ -827,23 +838,30 @@ def _told(
     The determined combinations, scaled by the columns' norms, (r,), the information on them for
     unit noise, (r,), and their covariance for a largest size of 1, (r, r).
     """
-    rest = ~rows
-    prior = np.where(rest, np.sqrt(equations.prior(sigma_m)), 0.0)
+    other_columns = ~rows
+    prior = np.where(other_columns, np.sqrt(equations.prior(sigma_m)), 0.0)
     norm = np.hypot(equations.norm, prior)
     scaled = equations.unbiased / np.outer(norm, norm) + np.diag((prior / norm) ** 2)
-    hidden = equations.untold(equations.free & rest)[rest]
-    held = (
-        np.linalg.pinv(scaled[np.ix_(rest, rest)] + hidden @ hidden.T, hermitian=True, rcond=1e-14)
+    hidden = equations.undetermined(equations.free & other_columns)[other_columns]
+    of_others = (
+        np.linalg.pinv(
+            scaled[np.ix_(other_columns, other_columns)] + hidden @ hidden.T,
+            hermitian=True,
+            rcond=1e-14,
+        )
         - hidden @ hidden.T
     )
-    couple, scores = scaled[np.ix_(rows, rest)] @ held, equations.unbiased_sums(right) / norm
-    told_by = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(rest, rows)]
-    size, vectors = np.linalg.eigh((told_by + told_by.T) / 2)
-    told = size > equations.limit(rows)
-    vectors, size = vectors[:, told], size[told]
-    values = vectors.T @ (scores[rows] - couple @ scores[rest]) / size
-    own = equations.columns.size[rows]
-    turned = vectors * (norm[rows] * own / own.max())[:, None]
+    couple, scores = (
+        scaled[np.ix_(rows, other_columns)] @ of_others,
+        equations.unbiased_sums(right) / norm,
+    )
+    information = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(other_columns, rows)]
+    size, vectors = np.linalg.eigh((information + information.T) / 2)
+    determined = size > equations.limit(rows)
+    vectors, size = vectors[:, determined], size[determined]
+    values = vectors.T @ (scores[rows] - couple @ scores[other_columns]) / size
+    sizes = equations.columns.size[rows]
+    turned = vectors * (norm[rows] * sizes / sizes.max())[:, None]
     return values, size, turned.T @ turned
 
 
@@ -865,7 +883,7 @@ def size_tests(
     terms : sequence of ModelTerm
         All terms.
     """
-    found: list[SizeTest] = []
+    raised: list[SizeTest] = []
     sized = [term for term in terms if not term.free and equations.rows([term.name]).any()]
     if not np.isfinite(noise[0]):
         return ()
@@ -873,14 +891,14 @@ def size_tests(
         tests = [size_test(equations, right, term, noise) for term in sized]
         failed = [test for test in tests if test.raised]
         if not failed:
-            return (*found, *tests)
+            return (*raised, *tests)
         worst = max(failed, key=lambda test: test.evidence)
-        found.append(worst)
+        raised.append(worst)
         sized = [term for term in sized if term.name != worst.name]
         equations = replace(
             equations, columns=equations.columns.scaled(worst.name, worst.allowed / worst.given)
         )
-    return tuple(found)
+    return tuple(raised)
 
 
 def unseen_by_term(equations: TermEquations) -> dict[str, int]:
@@ -901,14 +919,14 @@ def unseen_by_term(equations: TermEquations) -> dict[str, int]:
     return out
 
 
-def require_terms_told(equations: TermEquations, seen: Observability) -> None:
+def require_terms_determined(equations: TermEquations, observability: Observability) -> None:
     """Raise NotIdentifiableError if free terms hide modes of the stage.
 
     Parameters
     ----------
     equations : TermEquations
         The terms.
-    seen : Observability
+    observability : Observability
         Observability without terms.
     """
     modes = equations.unseen(equations.free).shape[1]
@@ -921,11 +939,11 @@ def require_terms_told(equations: TermEquations, seen: Observability) -> None:
     )
     advice = tuple(Finding("separate_term", details={"term": name}) for name in by_term)
     free = int(equations.free.sum())
-    found = replace(
-        seen,
-        unknowns=seen.unknowns + free,
-        rank=seen.rank + free - modes,
-        deficiency=seen.deficiency + modes,
+    with_terms = replace(
+        observability,
+        unknowns=observability.unknowns + free,
+        rank=observability.rank + free - modes,
+        deficiency=observability.deficiency + modes,
         identifiable=False,
         modes=alike,
         advice=advice,
@@ -933,5 +951,5 @@ def require_terms_told(equations: TermEquations, seen: Observability) -> None:
     raise NotIdentifiableError(
         f"the readings do not separate {' and '.join(by_term)} from the stage "
         f"({modes} mode{'s' * (modes != 1)} undetermined)",
-        found,
+        with_terms,
     )

@@ -25,12 +25,12 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
             yield Pattern(((component, 1),), view=view, lines=values)
 
 
-def located(found: Any, names: tuple[str, ...]) -> Located:
+def located(explanation: Any, names: tuple[str, ...]) -> Located:
     """Yield the size of each view's eccentricity."""
-    for view in sorted({column.view for column in found.columns}):
-        mine = np.array([column.view == view for column in found.columns])
-        size = float(np.hypot.reduce(found.values[mine]))
-        yield {"view": names[view]}, np.where(mine, found.values, 0.0) / (size or 1.0)
+    for view in sorted({column.view for column in explanation.columns}):
+        mine = np.array([column.view == view for column in explanation.columns])
+        size = float(np.hypot.reduce(explanation.values[mine]))
+        yield {"view": names[view]}, np.where(mine, explanation.values, 0.0) / (size or 1.0)
 
 
 BLOCK = Block(

@@ -96,23 +96,23 @@ class StagePlaces:
         """Return a field at the nominal place of each reading, (P,)."""
         return self.views.gather(field)[self.at] * self.views.phases[self.at[0]]
 
-    def errors(self, field: np.ndarray, moved: np.ndarray | None = None) -> np.ndarray:
+    def errors(self, field: np.ndarray, differences: np.ndarray | None = None) -> np.ndarray:
         """Return the stage error where the stage stood, (P,), m, given that at the sites."""
         at_site = self._at_nominal(_filled(field, self.known))
-        return at_site + (self.moved(field) if moved is None else moved)
+        return at_site + (self.moved(field) if differences is None else differences)
 
-    def changes(self, moved: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
+    def changes(self, differences: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
         """Return what differences of the stage error do to the readings, (views, nx, ny), m.
 
         Parameters
         ----------
-        moved : complex array (P,)
+        differences : complex array (P,)
             Differences, frame of the equations, m.
         turn_rad : float array (views,)
             Angle by which the frame of each view's readings is turned.
         """
         out = np.zeros((len(self.about_m), *self.views.plate_shape), dtype=complex)
-        out[self.at] = moved * self._phase(turn_rad)[self.at[0]]
+        out[self.at] = differences * self._phase(turn_rad)[self.at[0]]
         return out
 
     def about(
@@ -144,41 +144,51 @@ class StagePlaces:
 
     def _cells(self, field: np.ndarray, *, local: bool = False) -> Cells:
         """Return the interpolant of a field between the nodes of the map."""
-        both = np.stack([field.real, field.imag])
+        components = np.stack([field.real, field.imag])
         if self.views.bilinear:
-            return bilinear_cells(both)
-        return bicubic_cells(both, local=local)
+            return bilinear_cells(components)
+        return bicubic_cells(components, local=local)
 
     def _phase(self, turn_rad: np.ndarray) -> np.ndarray:
         """Return the factor of each view from the stage frame to that of its readings."""
         return self.views.phases.conj() * np.exp(-1j * turn_rad)
 
 
-def _filled(field: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _filled(field: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
     """Return a field with unknown sites on straight lines through known ones of row and column."""
-    if known.all():
+    if known_sites.all():
         return field
-    rows_first, columns_first = _along_both(field, known), _along_both(field.T, known.T).T
+    rows_first, columns_first = (
+        _along_both(field, known_sites),
+        _along_both(field.T, known_sites.T).T,
+    )
     return (rows_first + columns_first) / 2
 
 
-def _along_both(field: np.ndarray, known: np.ndarray) -> np.ndarray:
+def _along_both(field: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
     """Return a field filled along rows and columns with two known sites, then with one."""
     for least in (2, 2, 1, 1):
-        field, known = field.copy(), known.copy()
-        for row in np.flatnonzero((known.sum(axis=1) >= least) & ~known.all(axis=1)):
-            at, left = np.flatnonzero(known[row]), np.flatnonzero(~known[row])
-            above = np.clip(np.searchsorted(at, left), min(1, len(at) - 1), len(at) - 1)
-            a, b = at[above - 1], at[above]
+        field, known_sites = field.copy(), known_sites.copy()
+        for row in np.flatnonzero((known_sites.sum(axis=1) >= least) & ~known_sites.all(axis=1)):
+            places_known, unknown = (
+                np.flatnonzero(known_sites[row]),
+                np.flatnonzero(~known_sites[row]),
+            )
+            above = np.clip(
+                np.searchsorted(places_known, unknown),
+                min(1, len(places_known) - 1),
+                len(places_known) - 1,
+            )
+            a, b = places_known[above - 1], places_known[above]
             slope = (field[row, b] - field[row, a]) / np.maximum(b - a, 1)
-            field[row, left] = field[row, a] + (left - a) * slope
-            known[row] = True
-        field, known = field.T, known.T
+            field[row, unknown] = field[row, a] + (unknown - a) * slope
+            known_sites[row] = True
+        field, known_sites = field.T, known_sites.T
     return field
 
 
 def places_of(
-    measurements: Measurements, grid: GridData, ground: TermInputs, known: np.ndarray
+    measurements: Measurements, grid: GridData, inputs: TermInputs, known_sites: np.ndarray
 ) -> StagePlaces | None:
     """Return where the stage stood; None where it stood at the sites, or no visit tells.
 
@@ -186,9 +196,9 @@ def places_of(
     ----------
     measurements : Measurements
         The readings.
-    grid, ground : GridData, TermInputs
+    grid, inputs : GridData, TermInputs
         What is made of them.
-    known : bool array (nx, ny)
+    known_sites : bool array (nx, ny)
         Sites whose error is known.
     """
     views = maps_of(grid)
@@ -196,21 +206,21 @@ def places_of(
     located = np.zeros(away.shape, dtype=bool)
     marks: list[np.ndarray | None] = []
     about: list[np.ndarray | None] = []
-    for row, (index, visits) in enumerate(zip(grid.index, ground.visits, strict=True)):
-        found = measurements.views[index].visits
-        if visits is None or found is None:
+    for row, (index, visits) in enumerate(zip(grid.index, inputs.visits, strict=True)):
+        read_visits = measurements.views[index].visits
+        if visits is None or read_visits is None:
             marks.append(None)
             about.append(None)
             continue
-        stood = found.dx - found.offset_x + 1j * (found.dy - found.offset_y)
+        stood = read_visits.dx - read_visits.offset_x + 1j * (read_visits.dy - read_visits.offset_y)
         mean = visits.means(stood[None], grid.y[0].size)[0]
         away[row], located[row].reshape(-1)[visits.mark] = mean.reshape(grid.y.shape[1:]), True
         marks.append(visits.mark)
         about.append(stood - mean[visits.mark])
-    located &= views.near(known) & (grid.weight > 0)
-    pitch_m = ground.half_width_m / views.unit * views.node_pitch
+    located &= views.near(known_sites) & (grid.weight > 0)
+    pitch_m = inputs.half_width_m / views.unit * views.node_pitch
     if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
         return None
     return StagePlaces(
-        views, pitch_m, known, np.nonzero(located), away[located], tuple(marks), tuple(about)
+        views, pitch_m, known_sites, np.nonzero(located), away[located], tuple(marks), tuple(about)
     )

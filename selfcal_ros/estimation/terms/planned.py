@@ -153,17 +153,17 @@ def _visits(
     """
     view, (turn, away) = readings.view, lies
     order = assumed.order or view.visit_order or DEFAULT_ORDER
-    found = (
+    sequence = (
         visit_sequence(artifact, view, order=order, rng=rng)
         if parse_order(order).name == "random"
         else _sequence(artifact, replace(view, name=""), order)
     )
-    n = len(found)
-    sites = (found.i + 1j * found.j) * artifact.grid_pitch_m
-    aside = found.aside_m[0] + 1j * found.aside_m[1]
+    n = len(sequence)
+    sites = (sequence.i + 1j * sequence.j) * artifact.grid_pitch_m
+    aside = sequence.aside_m[0] + 1j * sequence.aside_m[1]
     stops = assumed.stop_error_m * (rng.normal(size=n) + 1j * rng.normal(size=n))
     phase = complex(view.pose.phase)
-    mark = artifact.flat(found.m, found.n)
+    mark = artifact.flat(sequence.m, sequence.n)
     near = (
         mark
         if artifact.marks
@@ -171,13 +171,13 @@ def _visits(
             *(
                 np.clip(at, *ends).astype(int)  # the nearest, off the lattice
                 for at, ends in zip(
-                    artifact.nearest(found.i, found.j), artifact.limits, strict=True
+                    artifact.nearest(sequence.i, sequence.j), artifact.limits, strict=True
                 )
             )
         )
     )
     stage, plate = errors[0].ravel()[near], errors[1].ravel()[mark] * phase
-    u, v = artifact.places(found.m, found.n)
+    u, v = artifact.places(sequence.m, sequence.n)
     arm = (u + 1j * v) * artifact.grid_pitch_m * phase
     offset = np.exp(-1j * turn) * (np.expm1(1j * turn) * arm + away + plate - stage - stops - aside)
     # the sense of measurement does not matter: the stage's motion and its part of a reading
@@ -186,8 +186,8 @@ def _visits(
         np.searchsorted(artifact.flat(readings.m, readings.n), mark),
         np.zeros(n),
         np.zeros(n),
-        found.count,
-        np.rint(2 * found.time).astype(int),
+        sequence.count,
+        np.rint(2 * sequence.time).astype(int),
         offset.real,
         offset.imag,
         approach_signs((sites + aside).real),
@@ -209,9 +209,9 @@ def planned_equations(
     Without terms of the lines rotations are those from the grid, as in `predict`: lines add little
     to them.
     """
-    ground = planned_ground(plan.artifact, plan.views, assumed)
-    columns = term_columns(ground, terms)
-    n, length = 3 * system.grid.n_views, ground.half_width_m
+    inputs = planned_ground(plan.artifact, plan.views, assumed)
+    columns = term_columns(inputs, terms)
+    n, length = 3 * system.grid.n_views, inputs.half_width_m
     inverse, ratio = np.zeros((system.size, system.size)), 0.0
     inverse[:n, :n] = system.grid_inverse
     if len(columns.lines.at):
@@ -222,8 +222,8 @@ def planned_equations(
     )
 
 
-def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:
-    """Return the equations of some of the terms of `every`, with their own sizes.
+def with_terms(equations: TermEquations, terms: Iterable[ModelTerm]) -> TermEquations:
+    """Return the equations of some of the terms of `equations`, with their own sizes.
 
     Parameters
     ----------
@@ -233,28 +233,30 @@ def with_terms(every: TermEquations, terms: Iterable[ModelTerm]) -> TermEquation
         Free ones have no columns of the plate in the first view, as in `term_columns`.
     """
     sizes: dict[str, float] = {term.name: term.size for term in terms}
-    known = every.columns
-    rows = rows_of(known, terms)
+    all_columns = equations.columns
+    rows = rows_of(all_columns, terms)
     columns = tuple(
         replace(column, size=sizes[column.term])
-        for column, here in zip(known.columns, rows, strict=True)
-        if here
+        for column, is_chosen in zip(all_columns.columns, rows, strict=True)
+        if is_chosen
     )
-    inner = known.within
+    inner = all_columns.within
     within = WithinMarks(inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof)
-    part, of_lines = every.projected, rows[known.lines.at]
-    lines = LineColumns(np.cumsum(rows)[known.lines.at[of_lines]] - 1, known.lines.values[of_lines])
+    projected, of_lines = equations.projected, rows[all_columns.lines.at]
+    lines = LineColumns(
+        np.cumsum(rows)[all_columns.lines.at[of_lines]] - 1, all_columns.lines.values[of_lines]
+    )
     return TermEquations(
-        every.system,
-        TermColumns(columns, known.shapes.part(rows), within, known.at, lines),
+        equations.system,
+        TermColumns(columns, all_columns.shapes.part(rows), within, all_columns.at, lines),
         ProjectedColumns(
-            lambda: part.fields[:, rows],
-            part.parameters[:, rows],
-            part.gram[np.ix_(rows, rows)],
-            part.turned[:, rows],
+            lambda: projected.fields[:, rows],
+            projected.parameters[:, rows],
+            projected.gram[np.ix_(rows, rows)],
+            projected.turned[:, rows],
         ),
-        every.noise_m,
-        every.line_weight,
+        equations.noise_m,
+        equations.line_weight,
     )
 
 

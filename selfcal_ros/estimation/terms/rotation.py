@@ -19,28 +19,34 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
         yield Pattern((("turn", 1),), view=view, lines=values)
 
 
-def located(found: Any, names: tuple[str, ...]) -> Located:
+def located(explanation: Any, names: tuple[str, ...]) -> Located:
     """Yield the view that differs most from all others: a common rotation belongs to the datum."""
-    n, unit = len(found.values), np.eye(len(found.values))
+    n, unit = len(explanation.values), np.eye(len(explanation.values))
     apart = []
     for at in range(n):
-        others = [unit[at] - unit[other] for other in range(n) if other != at]
+        differences = [unit[at] - unit[another] for another in range(n) if another != at]
         apart.append(
             min(
-                (abs(found.values @ weights) / _u(found, weights) for weights in others),
+                (
+                    abs(explanation.values @ weights) / _u(explanation, weights)
+                    for weights in differences
+                ),
                 default=0.0,
             )
         )
     at = int(np.argmax(apart))
     weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
     # u is that of the difference from the nearest
-    nearest = abs(float(found.values @ weights)) / max(apart[at], 1e-300)
-    yield {"view": names[found.columns[at].view], "u": max(_u(found, weights), nearest)}, weights
+    nearest = abs(float(explanation.values @ weights)) / max(apart[at], 1e-300)
+    yield (
+        {"view": names[explanation.columns[at].view], "u": max(_u(explanation, weights), nearest)},
+        weights,
+    )
 
 
-def _u(found: Any, weights: np.ndarray) -> float:
+def _u(explanation: Any, weights: np.ndarray) -> float:
     """Return the standard uncertainty of weights @ values, at least the least number."""
-    return max(float(np.sqrt(max(weights @ found.covariance @ weights, 0.0))), 1e-300)
+    return max(float(np.sqrt(max(weights @ explanation.covariance @ weights, 0.0))), 1e-300)
 
 
 BLOCK = Block(

@@ -97,8 +97,8 @@ def squares_within(visits: Iterable[ViewVisits | None]) -> float:
     total = 0.0
     for view in visits:
         if view is not None and view.repeated:
-            rest = view.about_means(view.y[None], 1 + int(view.mark.max()))[0]
-            total += float(view.weight @ np.abs(rest) ** 2)
+            deviations = view.about_means(view.y[None], 1 + int(view.mark.max()))[0]
+            total += float(view.weight @ np.abs(deviations) ** 2)
     return total
 
 
@@ -126,9 +126,9 @@ def _visits_of(
     if visits is None or not len(visits.mark) or ends is None:
         return None
     mark = flat[visits.mark]
-    own = _own_weights(visits, mark, grid.y[row].size)
-    total = np.bincount(mark, own, grid.y[row].size)
-    weight = own / total[mark] * grid.weight[row].reshape(-1)[mark]
+    visit_weight = _own_weights(visits, mark, grid.y[row].size)
+    total = np.bincount(mark, visit_weight, grid.y[row].size)
+    weight = visit_weight / total[mark] * grid.weight[row].reshape(-1)[mark]
     phase = grid.poses[row].phase.conjugate()
     return ViewVisits(
         mark,
@@ -188,8 +188,8 @@ def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarr
     if not len(visits.u):
         return count
     good = np.isfinite(visits.u) & (visits.u > 0)
-    whole = np.bincount(mark, ~good, n_marks)[mark] == 0
-    return np.where(whole, 1 / np.where(good, visits.u, 1.0) ** 2, count)
+    all_declared = np.bincount(mark, ~good, n_marks)[mark] == 0
+    return np.where(all_declared, 1 / np.where(good, visits.u, 1.0) ** 2, count)
 
 
 def view_time(instants: np.ndarray, first: float, last: float) -> np.ndarray:
@@ -379,7 +379,7 @@ def ground_of(
     *,
     drift_degree: int = DRIFT_DEGREE,
 ) -> TermInputs:
-    """Return the ground of a measurement whose grid readings are `grid`."""
+    """Return the inputs of a measurement whose grid readings are `grid`."""
     lines = [v for v in measurements.views if len(v.k)]
     shared = tuple(row for row, view in enumerate(lines) if len(view.m))
     z = maps_of(grid).z
@@ -426,9 +426,9 @@ def _line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
 
 
 def without_noise(
-    ground: TermInputs, residuals: np.ndarray, of_terms: Sequence[np.ndarray | float] = ()
+    inputs: TermInputs, residuals: np.ndarray, of_terms: Sequence[np.ndarray | float] = ()
 ) -> TermInputs:
-    """Return the ground with offsets from which the noise of the readings is taken off.
+    """Return the inputs with offsets from which the noise of the readings is taken off.
 
     The offset that a microscope saw holds the noise of its reading. As a column it would explain
     just that noise, and nothing else where offsets hardly differ. What the estimate leaves of each
@@ -436,7 +436,7 @@ def without_noise(
 
     Parameters
     ----------
-    ground : TermInputs
+    inputs : TermInputs
         With the offsets as they were seen.
     residuals : complex array (views, nx, ny)
         Residuals of the means of the marks, plate frame, m.
@@ -444,11 +444,11 @@ def without_noise(
         What terms make of each visit of each view, (V,), plate frame, m; none without terms.
     """
     visits = []
-    terms = of_terms or [0.0] * len(ground.visits)
-    for view, residual, known in zip(ground.visits, residuals, terms, strict=True):
+    terms = of_terms or [0.0] * len(inputs.visits)
+    for view, residual, of_model in zip(inputs.visits, residuals, terms, strict=True):
         if view is not None:
-            rest = view.about_means((view.y - known)[None], residual.size)[0]
-            rest = rest + residual.reshape(-1)[view.mark]
-            view = replace(view, offset=view.offset - rest * np.conj(view.phase))
+            residuals_of_visits = view.about_means((view.y - of_model)[None], residual.size)[0]
+            residuals_of_visits = residuals_of_visits + residual.reshape(-1)[view.mark]
+            view = replace(view, offset=view.offset - residuals_of_visits * np.conj(view.phase))
         visits.append(view)
-    return replace(ground, visits=tuple(visits))
+    return replace(inputs, visits=tuple(visits))

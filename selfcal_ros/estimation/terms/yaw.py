@@ -23,8 +23,8 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     views = range(len(inputs.names))
     places = np.array([inputs.on_stage(view) for view in views])
     along = [
-        _hats(part, axis)
-        for part, axis in zip((places.real, places.imag), inputs.node_axes_m, strict=True)
+        _hats(coordinate, axis)
+        for coordinate, axis in zip((places.real, places.imag), inputs.node_axes_m, strict=True)
     ]
     phases = np.array(
         [
@@ -33,14 +33,14 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
         ]
     )
     unit = -1j * phases[:, None] * (inputs.weight.reshape(places.shape) > 0)
-    beside = unit * _beside_cells(inputs)
-    turned = unit * inputs.cells_m[:, None] + beside
-    seen = [view for view in views if turned[view].any()]
+    beside_cells = unit * _beside_cells(inputs)
+    turned = unit * inputs.cells_m[:, None] + beside_cells
+    turned_views = [view for view in views if turned[view].any()]
     nodes = list(product(*along))
     for number, (of_x, of_y) in enumerate(nodes):
         # a constant yaw is a turn of the camera: it does not act beside the cells
-        values = turned * of_x * of_y - beside / len(nodes)
-        yield Pattern(((f"node {number}", 1),), {view: values[view] for view in seen})
+        values = turned * of_x * of_y - beside_cells / len(nodes)
+        yield Pattern(((f"node {number}", 1),), {view: values[view] for view in turned_views})
 
 
 def _hats(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
@@ -68,9 +68,12 @@ def _beside_cells(inputs: TermInputs) -> np.ndarray:
     return out
 
 
-def located(found: Any, names: tuple[str, ...]) -> Located:
+def located(explanation: Any, names: tuple[str, ...]) -> Located:
     """Yield the size of every node's."""
-    return (({}, weights * np.sign(found.values)) for _, weights in by_coefficient(found, names))
+    return (
+        ({}, weights * np.sign(explanation.values))
+        for _, weights in by_coefficient(explanation, names)
+    )
 
 
 BLOCK = Block(

@@ -62,7 +62,7 @@ class PlacedSlip:
 
 
 def reading_columns(
-    made: ColumnBuilder, residuals: np.ndarray, phases: np.ndarray
+    builder: ColumnBuilder, residuals: np.ndarray, phases: np.ndarray
 ) -> Iterator[tuple[range, int, tuple[int, int]]]:
     """Add the columns of the readings with the largest residuals.
 
@@ -71,24 +71,24 @@ def reading_columns(
 
     Parameters
     ----------
-    made : ColumnBuilder
+    builder : ColumnBuilder
         The columns.
     residuals : complex array (views, nx, ny)
         Residuals of the means of the marks, plate frame, m.
     phases : complex array (views,)
         From the stage frame to the plate frame in each view.
     """
-    weight = made.ground.weight
+    weight = builder.inputs.weight
     squares = np.where(weight > 0, weight * abs(residuals) ** 2, -1.0)
     largest = np.argsort(squares, axis=None, kind="stable")[::-1][:MOST]
     for view, i, j in np.transpose(np.unravel_index(largest, squares.shape)).tolist():
         if squares[view, i, j] >= 0:
             mean = np.zeros(squares.shape[1:], dtype=complex)
             mean[i, j] = phases[view]
-            shape = made.add({view: mean.reshape(-1)})
+            shape_at = builder.add({view: mean.reshape(-1)})
             for axis, unit in AXES:
-                made.column(Column(READING, view, axis, np.inf), shape, unit)
-            yield range(len(made.columns) - 2, len(made.columns)), view, (i, j)
+                builder.column(Column(READING, view, axis, np.inf), shape_at, unit)
+            yield range(len(builder.columns) - 2, len(builder.columns)), view, (i, j)
 
 
 SLIP = "slip"
@@ -97,24 +97,28 @@ PLACES = 12
 """Number of instants in each view, or of places along it, at which a slip is tried."""
 
 
-def slip_columns(made: ColumnBuilder) -> Iterator[tuple[range, int, float]]:
+def slip_columns(builder: ColumnBuilder) -> Iterator[tuple[range, int, float]]:
     """Add the columns of slips at some instants of the visits; yield indices, view and instant.
 
     Views whose visits are unknown have none. An instant is a part of the view's visits, 0..1.
     """
-    for view, visits in enumerate(made.ground.visits):
+    for view, visits in enumerate(builder.inputs.visits):
         if visits is None:
             continue
         rank = np.argsort(np.argsort(visits.time, kind="stable"), kind="stable")
-        for part in (np.arange(1, PLACES + 1) / (PLACES + 1)).tolist():
-            after = rank >= round(part * len(rank))
+        for share_before in (np.arange(1, PLACES + 1) / (PLACES + 1)).tolist():
+            after = rank >= round(share_before * len(rank))
             if 3 <= after.sum() <= len(after) - 3:
-                at = made.ground.z.reshape(-1)[visits.mark]
-                yield add_slip(made, view, (after * visits.phase, after * at), visits), view, part
+                places = builder.inputs.z.reshape(-1)[visits.mark]
+                yield (
+                    add_slip(builder, view, (after * visits.phase, after * places), visits),
+                    view,
+                    share_before,
+                )
 
 
 def add_slip(
-    made: ColumnBuilder,
+    builder: ColumnBuilder,
     view: int,
     values: tuple[np.ndarray, np.ndarray],
     visits: ViewVisits | None = None,
@@ -125,7 +129,7 @@ def add_slip(
 
     Parameters
     ----------
-    made : ColumnBuilder
+    builder : ColumnBuilder
         The columns.
     view : int
         The grid view.
@@ -135,15 +139,17 @@ def add_slip(
     visits : ViewVisits, optional
         The visits.
     """
-    for one, parts in zip(values, (AXES, (("phi", 1j),)), strict=True):
+    for motion, components in zip(values, (AXES, (("phi", 1j),)), strict=True):
         shape = (
-            made.add({view: one})
+            builder.add({view: motion})
             if visits is None
-            else made.add({view: visits.means(one[None], made.ground.z.size)[0]}, {view: one})
+            else builder.add(
+                {view: visits.means(motion[None], builder.inputs.z.size)[0]}, {view: motion}
+            )
         )
-        for text, unit in parts:
-            made.column(Column(SLIP, view, text, np.inf), shape, unit)
-    return range(len(made.columns) - 3, len(made.columns))
+        for component, unit in components:
+            builder.column(Column(SLIP, view, component, np.inf), shape, unit)
+    return range(len(builder.columns) - 3, len(builder.columns))
 
 
 OFF_SITES = "off_sites"
@@ -177,17 +183,17 @@ class OffSites:
     ----------
     cause : Cause
         The cause.
-    moved : complex array (nx, ny)
+    map_change : complex array (nx, ny)
         Effect on the map along x and y, frame of the equations, m.
-    shown : bool
+    residuals_show_it : bool
         Whether residuals show it as well.
     bounded : bool
         Whether the effect is smaller than the uncertainty that it enlarges.
     """
 
     cause: Cause
-    moved: np.ndarray
-    shown: bool
+    map_change: np.ndarray
+    residuals_show_it: bool
     bounded: bool
 
 
@@ -205,28 +211,30 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     if places is None:
         return None
     u = np.maximum(_uncertainty(model, error_map), LEAST_U_M)
-    known = problem.system.known_sites
-    there = places.errors(model.found.field)
-    changed = places.changes(_missed(problem, places, model.found.field, there), problem.turn_rad)
-    if not rms(_parts(changed)) > SMALL * rms(u):
+    known_sites = problem.system.known_sites
+    error_there = places.errors(model.fitted.field)
+    reading_change = places.changes(
+        _missed(problem, places, model.fitted.field, error_there), problem.turn_rad
+    )
+    if not rms(_parts(reading_change)) > SMALL * rms(u):
         return None
-    before, other = model.found.xy.residuals, fit(problem, model.y - changed)
-    if other.xy.residuals < before:  # part of the residual noise is this effect
-        u = u * (other.xy.residuals / before)
-    moved = np.where(known, model.found.field - other.field, 0.0)
-    ratio = np.where(known, np.abs(_parts(moved)) / u, 0.0)
-    if not (rms(ratio[:, known]) > RMS_MATTERS or ratio.max() > NODE_MATTERS):
+    before, corrected = model.fitted.xy.residuals, fit(problem, model.y - reading_change)
+    if corrected.xy.residuals < before:  # part of the residual noise is this effect
+        u = u * (corrected.xy.residuals / before)
+    map_change = np.where(known_sites, model.fitted.field - corrected.field, 0.0)
+    ratio = np.where(known_sites, np.abs(_parts(map_change)) / u, 0.0)
+    if not (rms(ratio[:, known_sites]) > RMS_MATTERS or ratio.max() > NODE_MATTERS):
         return None
-    noise = np.maximum(_noise(problem, places, there, u), FLOOR)
-    effect = np.abs(_parts(moved))
-    p = effect.size * math.erfc(float((effect / noise).max()) / math.sqrt(2))
+    u_of_effect = np.maximum(_noise(problem, places, error_there, u), FLOOR)
+    effect = np.abs(_parts(map_change))
+    p = effect.size * math.erfc(float((effect / u_of_effect).max()) / math.sqrt(2))
     if p >= CAUSE_LEVEL:
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
     cause = Cause(
         OFF_SITES,
         float(effect[worst]),
-        float(noise[worst]),
+        float(u_of_effect[worst]),
         "m",
         p,
         details={"away": places.distance * places.pitch_m},
@@ -235,14 +243,14 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     )
     return OffSites(
         cause,
-        moved,
-        bool(other.xy.residuals < SHOWN * before),
-        rms(ratio[:, known]) < model.found.xy.k,
+        map_change,
+        bool(corrected.xy.residuals < SHOWN * before),
+        rms(ratio[:, known_sites]) < model.fitted.xy.k,
     )
 
 
 def _missed(
-    problem: Problem, places: StagePlaces, field: np.ndarray, there: np.ndarray
+    problem: Problem, places: StagePlaces, field: np.ndarray, error_there: np.ndarray
 ) -> np.ndarray:
     """Return the part of a field at the positions of the stage that a solution omits, (P,), m.
 
@@ -257,24 +265,28 @@ def _missed(
     there : complex array (P,)
         Stage error of the solution at the positions of the stage.
     """
-    smooth = places.moved(field, there)
-    return ROUGH * (places.moved(field, there, local=True) - smooth) if problem.moves else smooth
+    smooth = places.moved(field, error_there)
+    return (
+        ROUGH * (places.moved(field, error_there, local=True) - smooth) if problem.moves else smooth
+    )
 
 
-def _noise(problem: Problem, places: StagePlaces, there: np.ndarray, u: np.ndarray) -> np.ndarray:
+def _noise(
+    problem: Problem, places: StagePlaces, error_there: np.ndarray, u: np.ndarray
+) -> np.ndarray:
     """Return the standard deviation of `_missed` at each site for noise u of the nodes, m.
 
     Both (2, nx, ny).
     """
-    rng, at = np.random.default_rng(0), places.site
+    rng, sites = np.random.default_rng(0), places.site
     total, n_sites = np.zeros((2, u[0].size)), u[0].size
     for _ in range(FEW_DRAWS):
         drawn = rng.normal(0, u)
-        missed = _missed(problem, places, drawn[0] + 1j * drawn[1], there)
-        total += [np.bincount(at, part**2, n_sites) for part in _parts(missed)]
-    return np.sqrt(total / (FEW_DRAWS * np.maximum(np.bincount(at, minlength=n_sites), 1))).reshape(
-        u.shape
-    )
+        missed = _missed(problem, places, drawn[0] + 1j * drawn[1], error_there)
+        total += [np.bincount(sites, coordinate**2, n_sites) for coordinate in _parts(missed)]
+    return np.sqrt(
+        total / (FEW_DRAWS * np.maximum(np.bincount(sites, minlength=n_sites), 1))
+    ).reshape(u.shape)
 
 
 def _parts(field: np.ndarray) -> np.ndarray:
@@ -288,9 +300,9 @@ def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
     """
     u, grid = error_map.u_xy, model.problem.system.grid
     if not np.isfinite(u).any():
-        return np.full_like(u, model.found.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
+        return np.full_like(u, model.fitted.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
     u = np.nan_to_num(u, nan=rms(u))
-    return turned_over(model.problem.ground.sense, u, sign=1)
+    return turned_over(model.problem.inputs.sense, u, sign=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,7 +311,7 @@ class Explained:
 
     Attributes
     ----------
-    at : int array (k,)
+    columns : int array (k,)
         The columns.
     inverse, rank : float array (k, k), int
         Pseudo-inverse of their information, and its rank.
@@ -311,7 +323,7 @@ class Explained:
         Remaining squares of the means of the marks, m^2, and their degrees of freedom.
     """
 
-    at: np.ndarray
+    columns: np.ndarray
     inverse: np.ndarray
     rank: int
     values: np.ndarray
@@ -332,7 +344,7 @@ class Candidates:
         Right-hand sides and sums of squares of the residuals.
     prior : float array (p,)
         Information on each coefficient of the model from its size; 0 for all others.
-    taken : float array (p,)
+    coefficients : float array (p,)
         Estimated coefficients of the model; 0 for all others.
     excess, common : float
         Variance of what is common to the marks of an image, over that of a reading, and in m^2.
@@ -341,25 +353,25 @@ class Candidates:
     equations: TermEquations
     right: Score
     prior: np.ndarray
-    taken: np.ndarray
+    coefficients: np.ndarray
     excess: float = 1.0
     common: float = 0.0
 
     def explain(self, rows: np.ndarray) -> Explained:
         """Fit the columns of `rows`, bool (p,), together."""
-        sums, at = self.right.sums, np.flatnonzero(rows)
-        square = np.ix_(at, at)
+        sums, chosen = self.right.sums, np.flatnonzero(rows)
+        square = np.ix_(chosen, chosen)
         size, vectors = np.linalg.eigh(self._scaled[square])
-        told = size > self.equations.limit(rows & (self.prior == 0))
-        vectors = vectors[:, told] / self._norm[at, None]
-        inverse = (vectors / size[told]) @ vectors.T
-        right, gram = self._total[at], self.equations.projected.gram[square]
+        determined = size > self.equations.limit(rows & (self.prior == 0))
+        vectors = vectors[:, determined] / self._norm[chosen, None]
+        inverse = (vectors / size[determined]) @ vectors.T
+        right, gram = self._total[chosen], self.equations.projected.gram[square]
         values = inverse @ right
-        between = sums.between + values @ (gram @ values - 2 * self.right.between[at])
+        between = sums.between + values @ (gram @ values - 2 * self.right.between[chosen])
         return Explained(
-            at,
+            chosen,
             inverse,
-            int(told.sum()),
+            int(determined.sum()),
             values,
             float(right @ values),
             float(between),
@@ -378,7 +390,7 @@ class Candidates:
 
     @cached_property
     def _total(self) -> np.ndarray:
-        return self.equations.unbiased_sums(self.right.total) - self.prior * self.taken
+        return self.equations.unbiased_sums(self.right.total) - self.prior * self.coefficients
 
     @cached_property
     def everything(self) -> tuple[float, float]:
@@ -393,11 +405,11 @@ class Candidates:
         counts. NaN and 0 if the columns use up all degrees of freedom.
         """
         sums, between, dof = self.right.sums, fitted.between, fitted.dof_between
-        both = sums.dof - fitted.rank
-        if sums.dof_within >= 1 and both > 0:
-            total = (sums.total - fitted.explained) / both
+        dof_of_both = sums.dof - fitted.rank
+        if sums.dof_within >= 1 and dof_of_both > 0:
+            total = (sums.total - fitted.explained) / dof_of_both
             if dof <= 0 or between / dof <= total:
-                return max(total, 0.0), both
+                return max(total, 0.0), dof_of_both
         return (max(between, 0.0) / dof, dof) if dof > 0 else (float("nan"), 0.0)
 
 
@@ -418,15 +430,15 @@ class Explanation:
         Estimates of the coefficients and their covariance, SI units.
     p : float
         Probability of explaining as much by chance.
-    whole : bool
+    determined : bool
         Whether the readings determine all coefficients.
     effect_m, effect_rad : float
         Effect on a coordinate of the map and on the angular map, rms, as far as determined.
-    part : float
+    share_before : float
         Part of the view's visits before a slip; otherwise NaN.
     mark : tuple of int, optional
         Mark (m, n) of a single reading; otherwise None.
-    moved, turned : complex array (sites,), float array (K,), optional
+    map_change, angle_change : complex array (sites,), float array (K,), optional
         Effect on the maps in their datum, in the frame of the equations, m and rad.
     rank : int
         Place among the explanations; those of equal rank explain the same equally well.
@@ -437,27 +449,29 @@ class Explanation:
     values: np.ndarray
     covariance: np.ndarray
     p: float
-    whole: bool
+    determined: bool
     effect_m: float
-    part: float = float("nan")
+    share_before: float = float("nan")
     mark: tuple[int, int] | None = None
-    moved: np.ndarray | None = None
+    map_change: np.ndarray | None = None
     rank: int = 0
     effect_rad: float = 0.0
-    turned: np.ndarray | None = None
+    angle_change: np.ndarray | None = None
 
     def with_effect(self, equations: TermEquations, coefficients: np.ndarray) -> "Explanation":
         """Return the explanation with the effect of `coefficients` (p,) on the maps."""
         system = equations.system
-        moved = equations.maps @ coefficients
-        turned = np.where(system.known_lines, -(equations.turned @ coefficients), 0.0)
-        known, lines = (max(int(at.sum()), 1) for at in (system.known_sites, system.known_lines))
+        map_change = equations.maps @ coefficients
+        angle_change = np.where(system.known_lines, -(equations.turned @ coefficients), 0.0)
+        n_sites, n_lines = (
+            max(int(at.sum()), 1) for at in (system.known_sites, system.known_lines)
+        )
         return replace(
             self,
-            moved=moved,
-            turned=turned,
-            effect_m=float(np.sqrt((abs(moved) ** 2).sum() / (2 * known))),
-            effect_rad=float(np.sqrt((turned**2).sum() / lines)),
+            map_change=map_change,
+            angle_change=angle_change,
+            effect_m=float(np.sqrt((abs(map_change) ** 2).sum() / (2 * n_sites))),
+            effect_rad=float(np.sqrt((angle_change**2).sum() / n_lines)),
         )
 
 
@@ -468,7 +482,7 @@ class Group:
     name: str
     rows: np.ndarray
     view: int = -1
-    part: float = float("nan")
+    share_before: float = float("nan")
     places: int = 1
     mark: tuple[int, int] | None = None
 
@@ -488,51 +502,59 @@ def find_explanations(
         A slip that competes with the others.
     """
     problem = model.problem
-    known = () if model.equations is None else model.equations.columns.at_visits(model.coefficients)
-    ground = without_noise(problem.ground, model.found.residuals, known)
-    own = [term.name for term in problem.terms]
-    told = all(visits is not None for visits in ground.visits)
-    more = [
+    at_visits = (
+        () if model.equations is None else model.equations.columns.at_visits(model.coefficients)
+    )
+    inputs = without_noise(problem.inputs, model.fitted.residuals, at_visits)
+    own_terms = [term.name for term in problem.terms]
+    visits_known = all(visits is not None for visits in inputs.visits)
+    further_terms = [
         ModelTerm(block.name)
         for block in blocks().values()
-        if block.name not in own and (told or not block.needs_visits)
+        if block.name not in own_terms and (visits_known or not block.needs_visits)
     ]
-    made, views = ColumnBuilder(ground), problem.system.grid.views
-    made.add_terms((*problem.terms, *more))
-    groups = list(_groups(made.columns, [term.name for term in more]))
-    phases, every = views.phases.conj(), int(np.count_nonzero(ground.weight))
+    builder, views = ColumnBuilder(inputs), problem.system.grid.views
+    builder.add_terms((*problem.terms, *further_terms))
+    groups = list(_groups(builder.columns, [term.name for term in further_terms]))
+    phases, n_readings = views.phases.conj(), int(np.count_nonzero(inputs.weight))
     if slips:
-        steps = list(slip_columns(made))
+        steps = list(slip_columns(builder))
         groups += [
-            Group(SLIP, np.array(rows), view, part, len(steps)) for rows, view, part in steps
+            Group(SLIP, np.array(rows), view, share_before, len(steps))
+            for rows, view, share_before in steps
         ]
     if readings:
         groups += [
-            Group(READING, np.array(rows), view, places=every, mark=views.mark_at(*place))
-            for rows, view, place in reading_columns(made, model.found.residuals, phases)
+            Group(READING, np.array(rows), view, places=n_readings, mark=views.mark_at(*place))
+            for rows, view, place in reading_columns(builder, model.fitted.residuals, phases)
         ]
     if placed is not None:
-        moved, turned = placed.after * phases[placed.view], placed.after * ground.z
-        rows = add_slip(made, placed.view, (moved.reshape(-1), turned.reshape(-1)))
+        shift, rotation = placed.after * phases[placed.view], placed.after * inputs.z
+        rows = add_slip(builder, placed.view, (shift.reshape(-1), rotation.reshape(-1)))
         groups.append(Group(SLIP, np.array(rows), placed.view, places=placed.places))
-    columns = made.done()
+    columns = builder.done()
     groups = [
         replace(group, rows=np.isin(np.arange(len(columns.columns)), group.rows))
         for group in groups
     ]
-    equations = equations_of(problem, model.found, columns)
-    taken = np.zeros(equations.n)
-    taken[: len(model.coefficients)] = model.coefficients
-    right = score(
-        equations, model.found.both_residuals, squares(problem, model.found), coefficients=taken
+    equations = equations_of(problem, model.fitted, columns)
+    coefficients = np.zeros(equations.n)
+    coefficients[: len(model.coefficients)] = model.coefficients
+    right_side = score(
+        equations,
+        model.fitted.both_residuals,
+        squares(problem, model.fitted),
+        coefficients=coefficients,
     )
     # images determine the yaw: no other cause may gain from a size that is too small for it
-    sized = columns.rows([name for name in own if not block_of(name).of_images])
-    prior = np.where(sized, equations.prior(model.found.xy.sigma), 0.0)
-    excess = noise_excess(problem, model.found.residuals)
-    common = excess * model.found.xy.residuals**2 if problem.images else 0.0
+    sized = columns.rows([name for name in own_terms if not block_of(name).of_images])
+    prior = np.where(sized, equations.prior(model.fitted.xy.sigma), 0.0)
+    excess = noise_excess(problem, model.fitted.residuals)
+    common = excess * model.fitted.xy.residuals**2 if problem.images else 0.0
     return select_explanations(
-        Candidates(equations, right, prior, taken, excess, common), groups, columns.rows(own)
+        Candidates(equations, right_side, prior, coefficients, excess, common),
+        groups,
+        columns.rows(own_terms),
     )
 
 
@@ -542,46 +564,46 @@ def _groups(columns: Sequence[Column], names: Iterable[str]) -> Iterator[Group]:
     By their indices.
     """
     of_view = np.array([c.view for c in columns], dtype=int)
-    alone = np.array(
+    tested_alone = np.array(
         [c.term in blocks() and blocks()[c.term].alone(c.component) for c in columns], dtype=bool
     )
     for name in names:
-        whole = np.array([c.term == name for c in columns], dtype=bool)
-        parts = [whole]
-        for view in sorted(set(of_view[whole].tolist()) - {-1}):
-            here = whole & (of_view == view)
-            parts.append(here)
-            if (here & alone).any():
-                parts.append(here & alone)
+        of_term = np.array([c.term == name for c in columns], dtype=bool)
+        groups_of_term = [of_term]
+        for view in sorted(set(of_view[of_term].tolist()) - {-1}):
+            of_view_and_term = of_term & (of_view == view)
+            groups_of_term.append(of_view_and_term)
+            if (of_view_and_term & tested_alone).any():
+                groups_of_term.append(of_view_and_term & tested_alone)
         yield from (
-            Group(str(name), np.flatnonzero(rows), places=len(parts))
-            for rows in parts
+            Group(str(name), np.flatnonzero(rows), places=len(groups_of_term))
+            for rows in groups_of_term
             if rows.any()
         )
 
 
 def select_explanations(
-    pool: Candidates, groups: list[Group], taken: np.ndarray
+    pool: Candidates, groups: list[Group], in_model: np.ndarray
 ) -> list[Explanation]:
-    """Return the explanations, each tested together with `taken` and those before it."""
-    found: list[Explanation] = []
+    """Return the explanations, each tested together with `in_model` and those before it."""
+    explanations: list[Explanation] = []
     rank = 0
-    while groups and len(found) < MAX_CAUSES:
-        before = pool.explain(taken)
+    while groups and len(explanations) < MAX_CAUSES:
+        before = pool.explain(in_model)
         tests = [
-            (_test(pool, before, pool.explain(taken | group.rows), group), group)
+            (_test(pool, before, pool.explain(in_model | group.rows), group), group)
             for group in groups
         ]
-        good = [
+        significant = [
             (test, group) for test, group in tests if test is not None and test[0] < CAUSE_LEVEL
         ]
-        if not good:
+        if not significant:
             break
-        best = max(good, key=lambda item: item[0][1])[1]
+        best = max(significant, key=lambda item: item[0][1])[1]
         as_good = [
             (test, group)
-            for test, group in good
-            if group is best or _replaces(pool, taken, group, best)
+            for test, group in significant
+            if group is best or _replaces(pool, in_model, group, best)
         ]
         # the best part of each term; what all views share is simpler than what each view has
         as_good.sort(key=lambda item: (not _is_shared(item[1].name), -item[0][1]))
@@ -589,30 +611,30 @@ def select_explanations(
         for (p, _), group in as_good:
             if group.name not in names:
                 names.append(group.name)
-                found.append(replace(_explanation(pool, taken, group, p), rank=rank))
+                explanations.append(replace(_explanation(pool, in_model, group, p), rank=rank))
         rank += 1
-        taken = taken | best.rows
+        in_model = in_model | best.rows
         groups = [
             g
             for g in groups
-            if (g.rows & ~taken).any()
+            if (g.rows & ~in_model).any()
             and (g.name == best.name or g.name not in names)
             and not (best.name == SLIP == g.name and g.view == best.view)
         ]
-    return found
+    return explanations
 
 
 def _is_shared(name: str) -> bool:
     return name in blocks() and blocks()[name].shared
 
 
-def _replaces(pool: Candidates, taken: np.ndarray, group: Group, best: Group) -> bool:
+def _replaces(pool: Candidates, in_model: np.ndarray, group: Group, best: Group) -> bool:
     """Return whether `best` explains nothing beyond what `group` explains."""
     if any(name not in blocks() or blocks()[name].between for name in (group.name, best.name)):
         return False
-    known = taken | group.rows
-    more = _test(pool, pool.explain(known), pool.explain(known | best.rows), best)
-    return more is None or more[0] >= CAUSE_LEVEL
+    with_group = in_model | group.rows
+    beyond_group = _test(pool, pool.explain(with_group), pool.explain(with_group | best.rows), best)
+    return beyond_group is None or beyond_group[0] >= CAUSE_LEVEL
 
 
 def _test(
@@ -622,36 +644,36 @@ def _test(
 
     `before` is the fit without the group, `after` the one with it.
     """
-    gained, more = max(after.explained - before.explained, 0.0), after.rank - before.rank
+    gained, n_gained = max(after.explained - before.explained, 0.0), after.rank - before.rank
     variance, dof = pool.noise(after)
-    if more <= 0 or not variance > FLOOR**2:  # NaN where nothing is left to test against
+    if n_gained <= 0 or not variance > FLOOR**2:  # NaN where nothing is left to test against
         return None
-    p = float(fdtrc(more, dof / pool.excess, gained / more / max(variance, pool.common)))
+    p = float(fdtrc(n_gained, dof / pool.excess, gained / n_gained / max(variance, pool.common)))
     # of all readings together, so that explanations are compared by the same squares
-    whole, n = pool.everything
-    rest = max(whole - after.explained, FLOOR**2)
-    evidence = n * math.log1p(gained / rest) - more * math.log(n)
+    total_squares, n = pool.everything
+    unexplained = max(total_squares - after.explained, FLOOR**2)
+    evidence = n * math.log1p(gained / unexplained) - n_gained * math.log(n)
     return min(p * group.places, 1.0), evidence - 2 * math.log(group.places)
 
 
-def _explanation(pool: Candidates, taken: np.ndarray, group: Group, p: float) -> Explanation:
-    fitted = pool.explain(taken | group.rows)
+def _explanation(pool: Candidates, in_model: np.ndarray, group: Group, p: float) -> Explanation:
+    fitted = pool.explain(in_model | group.rows)
     variance, _ = pool.noise(fitted)
-    here = group.rows[fitted.at]
-    own = np.zeros(len(group.rows))
-    own[group.rows] = fitted.values[here]
+    of_group = group.rows[fitted.columns]
+    coefficients = np.zeros(len(group.rows))
+    coefficients[group.rows] = fitted.values[of_group]
     columns = tuple(compress(pool.equations.columns.columns, group.rows))
     return Explanation(
         group.name,
         columns,
-        fitted.values[here],
-        variance * fitted.inverse[np.ix_(here, here)],
+        fitted.values[of_group],
+        variance * fitted.inverse[np.ix_(of_group, of_group)],
         p,
         pool.explain(group.rows).rank == int(group.rows.sum()),
         0.0,
-        group.part,
+        group.share_before,
         group.mark,
-    ).with_effect(pool.equations, own)
+    ).with_effect(pool.equations, coefficients)
 
 
 NOISY = 1.5
@@ -659,53 +681,61 @@ NOISY = 1.5
 uncertainty does not cover it."""
 
 
-def cause_of(found: Explanation, ground: TermInputs) -> Cause:
+def cause_of(explanation: Explanation, inputs: TermInputs) -> Cause:
     """Return an explanation of the residuals, or a term of the model, as a cause.
 
     Parameters
     ----------
-    found : Explanation
+    explanation : Explanation
         The explanation.
-    ground : TermInputs
+    inputs : TermInputs
         Of the fit: names of the views, unit of a slip's rotation.
     """
-    names = ground.names_of(found.name)
+    names = inputs.names_of(explanation.name)
     options = list(
-        _OTHERS[found.name](found, names, ground.half_width_m)
-        if found.name in _OTHERS
-        else block_of(found.name).located(found, names)
+        _OTHERS[explanation.name](explanation, names, inputs.half_width_m)
+        if explanation.name in _OTHERS
+        else block_of(explanation.name).located(explanation, names)
     )
     fields, value, u = max(
-        ((fields, *_linear(found, weights)) for fields, weights in options),
+        ((fields, *_linear(explanation, weights)) for fields, weights in options),
         key=lambda sized: abs(sized[1]) / max(sized[2], 1e-300),
     )
-    unit = blocks()[found.name].unit if found.name in blocks() else "m"
-    largest = 0.0 if found.moved is None else float(np.abs(found.moved).max(initial=0.0))
+    unit = blocks()[explanation.name].unit if explanation.name in blocks() else "m"
+    largest = (
+        0.0
+        if explanation.map_change is None
+        else float(np.abs(explanation.map_change).max(initial=0.0))
+    )
     return Cause(
         **{
-            "name": found.name,
+            "name": explanation.name,
             "size": value,
             "u": u,
             "unit": unit,
-            "p": found.p,
-            "effect_rms": found.effect_m,
+            "p": explanation.p,
+            "effect_rms": explanation.effect_m,
             "effect_max": largest,
-            "told": found.whole,
+            "told": explanation.determined,
             **fields,
         }
     )
 
 
-def fitted_term(model: ModelFit, name: str, p: float = 1.0, *, whole: bool = True) -> Explanation:
+def fitted_term(
+    model: ModelFit, name: str, p: float = 1.0, *, determined: bool = True
+) -> Explanation:
     """Return a term of the model with its fitted coefficients and its effect."""
     if model.equations is None:
         raise ValueError(f"the model does not have the term {name}")
-    equations = equations_of(model.problem, model.found, model.equations.columns)
+    equations = equations_of(model.problem, model.fitted, model.equations.columns)
     rows = equations.rows([name])
-    covariance = model.covariance[np.ix_(rows, rows)] * model.found.xy.sigma**2
+    covariance = model.covariance[np.ix_(rows, rows)] * model.fitted.xy.sigma**2
     columns = tuple(compress(equations.columns.columns, rows))
-    found = Explanation(str(name), columns, model.coefficients[rows], covariance, p, whole, 0.0)
-    return found.with_effect(equations, np.where(rows, model.coefficients, 0.0))
+    explanation = Explanation(
+        str(name), columns, model.coefficients[rows], covariance, p, determined, 0.0
+    )
+    return explanation.with_effect(equations, np.where(rows, model.coefficients, 0.0))
 
 
 def scatter_of_views(
@@ -715,25 +745,25 @@ def scatter_of_views(
 
     If marks were visited again, from the visits after subtraction of the fitted terms.
     """
-    again = (
+    revisited = (
         {}
         if model is None or model.equations is None
         else {
-            model.problem.grid.index[row]: (visits, rest)
-            for row, visits, rest in model.visits_about_means()
+            model.problem.grid.index[row]: (visits, residuals)
+            for row, visits, residuals in model.visits_about_means()
             if visits.repeated
         }
     )
-    out = []
+    scatter = []
     for index, view in enumerate(measurements.views):
         sigma, dof = view.sigma_xy, float(view.dof_xy)
-        if index in again:
-            visits, rest = again[index]
+        if index in revisited:
+            visits, residuals = revisited[index]
             dof = 2.0 * (len(visits.mark) - len(np.unique(visits.mark)))
-            sigma = float(np.sqrt(visits.weight @ abs(rest) ** 2 / dof))
+            sigma = float(np.sqrt(visits.weight @ abs(residuals) ** 2 / dof))
         if len(view.m) and dof > 0 and np.isfinite(sigma):
-            out.append((view.view.name, sigma, dof))
-    return out
+            scatter.append((view.view.name, sigma, dof))
+    return scatter
 
 
 def noisier_views(views: Sequence[tuple[str, float, float]]) -> list[Cause]:
@@ -744,44 +774,49 @@ def noisier_views(views: Sequence[tuple[str, float, float]]) -> list[Cause]:
     views : sequence of (str, float, float)
         Name, noise of one reading, m, and degrees of freedom of each view.
     """
-    found = []
+    causes = []
     for index, (name, sigma, dof) in enumerate(views):
-        others, rest = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
-        if not rest or not others > FLOOR:
+        other_noise, other_dof = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
+        if not other_dof or not other_noise > FLOOR:
             continue
-        ratio = sigma / others
-        p = float(fdtrc(dof, rest, ratio**2)) * len(views)
+        ratio = sigma / other_noise
+        p = float(fdtrc(dof, other_dof, ratio**2)) * len(views)
         if p < CAUSE_LEVEL and ratio > NOISY:
-            u = float(ratio * np.sqrt((1 / dof + 1 / rest) / 2))
-            found.append(Cause("noise", float(ratio), u, "m/m", p, name))
-    return found
+            u = float(ratio * np.sqrt((1 / dof + 1 / other_dof) / 2))
+            causes.append(Cause("noise", float(ratio), u, "m/m", p, name))
+    return causes
 
 
-def _linear(found: Explanation, weights: np.ndarray) -> tuple[float, float]:
+def _linear(explanation: Explanation, weights: np.ndarray) -> tuple[float, float]:
     """Return weights @ values and its standard uncertainty."""
-    variance = float(weights @ found.covariance @ weights)
-    return float(weights @ found.values), math.sqrt(max(variance, 0.0))
+    variance = float(weights @ explanation.covariance @ weights)
+    return float(weights @ explanation.values), math.sqrt(max(variance, 0.0))
 
 
-def _reading(found: Explanation, names: tuple[str, ...], _: float) -> Located:
-    if found.mark is None:
+def _reading(explanation: Explanation, names: tuple[str, ...], _: float) -> Located:
+    if explanation.mark is None:
         raise ValueError("a reading without its mark")
     yield (
-        {"view": names[found.columns[0].view], "mark": found.mark},
-        (found.values / np.hypot(*found.values)),
+        {"view": names[explanation.columns[0].view], "mark": explanation.mark},
+        (explanation.values / np.hypot(*explanation.values)),
     )
 
 
-def _slip(found: Explanation, names: tuple[str, ...], half_width_m: float) -> Located:
-    order = {column.component: i for i, column in enumerate(found.columns)}
-    x, y, phi = (float(found.values[order[part]]) for part in ("x", "y", "phi"))
+def _slip(explanation: Explanation, names: tuple[str, ...], half_width_m: float) -> Located:
+    order = {column.component: i for i, column in enumerate(explanation.columns)}
+    x, y, phi = (float(explanation.values[order[component]]) for component in ("x", "y", "phi"))
     size = math.hypot(x, y)
     toward = np.zeros(3)
     toward[order["x"]], toward[order["y"]] = (x / size, y / size) if size else (1.0, 0.0)
     yield (
         {
-            "view": names[found.columns[0].view],
-            "details": {"after": found.part, "x": x, "y": y, "phi": phi / half_width_m},
+            "view": names[explanation.columns[0].view],
+            "details": {
+                "after": explanation.share_before,
+                "x": x,
+                "y": y,
+                "phi": phi / half_width_m,
+            },
         },
         toward,
     )
@@ -802,9 +837,14 @@ def turned_too_far(
     between = next((term.name for term in model.problem.terms if block_of(term.name).between), None)
     if between is None:
         return None
-    held = fitted_term(model, between)
-    first = len(model.problem.ground.with_lines) - len(held.values)  # fewer if the term is free
-    values, covariance = np.pad(held.values, (first, 0)), np.pad(held.covariance, (first, 0))
+    rotations = fitted_term(model, between)
+    first = len(model.problem.inputs.with_lines) - len(
+        rotations.values
+    )  # fewer if the term is free
+    values, covariance = (
+        np.pad(rotations.values, (first, 0)),
+        np.pad(rotations.covariance, (first, 0)),
+    )
     apart, variance = abs(values[:, None] - values), np.diag(covariance)
     spread = variance[:, None] + variance - 2 * covariance
     of_u = apart / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
@@ -816,7 +856,7 @@ def turned_too_far(
     if not apart[of_u > BEYOND].max(initial=0.0) > np.ptp(phi) / 2:
         return None
     p = math.erfc(float(of_u.max()) / math.sqrt(2))
-    return replace(cause_of(held, model.problem.ground), p=p)
+    return replace(cause_of(rotations, model.problem.inputs), p=p)
 
 
 def line_cause(model: ModelFit, measurements: Measurements) -> Cause | None:
@@ -842,7 +882,7 @@ def line_cause(model: ModelFit, measurements: Measurements) -> Cause | None:
     v, k = (int(i) for i in np.unravel_index(int(squares.argmax()), squares.shape))
     if not lines.noise_without((v, k)) > FLOOR:
         return None
-    least = least_noise_rad(problem, model.found.xy.sigma)
+    least = least_noise_rad(problem, model.fitted.xy.sigma)
     p = min(lines.p_outlier((v, k), least) * problem.system.angular.n_readings, 1.0)
     checked = lines.redundancy[v, k]
     u = lines.noise_without((v, k), least) / math.sqrt(lines.weight[v, k] * checked)

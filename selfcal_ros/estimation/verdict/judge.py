@@ -44,14 +44,14 @@ from selfcal_ros.estimation.verdict.search import (
     search_causes,
 )
 from selfcal_ros.estimation.verdict.uncertainty import (
-    TOLD,
+    DETERMINED_BELOW,
     Effect,
     budget_lines,
     enlarged,
     enlargements,
     with_coverage,
 )
-from selfcal_ros.estimation.verdict.untold import untold_effects
+from selfcal_ros.estimation.verdict.undetermined import undetermined_effects
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.readings import AFTER_SLIP, REPEAT_OUTLIER, Measurements, ViewReadings
@@ -86,8 +86,8 @@ def judged(
     """
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
-    own, failed = checked is solved, []
-    if not own and checked.model is not None and checked.model.problem.rigid:
+    is_same, failed = checked is solved, []
+    if not is_same and checked.model is not None and checked.model.problem.rigid:
         failed.append(
             Finding(
                 "finite_rotation",
@@ -111,14 +111,14 @@ def judged(
         else cause
         for cause in searched.causes
     )
-    if own:
+    if is_same:
         solved = searched.solved
         noises = _noise_findings(solved)
-    failed += _scale_findings(solved if own else checked, measurements, options, causes)
+    failed += _scale_findings(solved if is_same else checked, measurements, options, causes)
     result = replace(solved.result, reference=options.reference)
     effects = [*searched.effects, *_beyond_repeats(solved)]
-    result = with_coverage(enlarged(result, [*effects, *untold_effects(solved, options)]))
-    bounded = searched.bounded and (own or not causes) and not _unexplained_noise(solved)
+    result = with_coverage(enlarged(result, [*effects, *undetermined_effects(solved, options)]))
+    bounded = searched.bounded and (is_same or not causes) and not _unexplained_noise(solved)
     grade = (
         Grade.GOOD
         if not (failed or noises or causes)
@@ -126,7 +126,7 @@ def judged(
         if bounded and not failed and result.has_uncertainty
         else Grade.NOT_QUALIFIED
     )
-    shown = [
+    named = [
         *((cause.name, cause.unit) for cause in causes),
         *((LACK_OF_FIT, noise.unit) for noise in noises),
     ]  # else a line of the budget alone
@@ -141,7 +141,7 @@ def judged(
                 effect
                 for effect in effects
                 if effect.name not in (ROUGHNESS, LACK_OF_FIT)
-                or (effect.name, effect.unit) in shown
+                or (effect.name, effect.unit) in named
             ],
         ),
     )
@@ -179,14 +179,16 @@ def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
     """
     if solved.model is None:
         return
-    emap, found, system = solved.result.error_map, solved.model.found, solved.model.problem.system
+    emap, fitted, system = solved.result.error_map, solved.model.fitted, solved.model.problem.system
     shape = emap.gx.shape
-    size_m = _lack_of_fit(solved.xy, system.grid.weight, abs(found.residuals))
+    size_m = _lack_of_fit(solved.xy, system.grid.weight, abs(fitted.residuals))
     if size_m:
         sign = 1 - 2 * (np.indices(shape).sum(axis=0) % 2)
-        each = np.where(emap.valid, sign * size_m, 0.0)
-        yield Effect(LACK_OF_FIT, np.stack([each, each]), np.zeros(len(emap.g_theta)))
-    size_rad = _lack_of_fit(solved.theta, system.angular.weight, found.residuals_theta)
+        alternating_m = np.where(emap.valid, sign * size_m, 0.0)
+        yield Effect(
+            LACK_OF_FIT, np.stack([alternating_m, alternating_m]), np.zeros(len(emap.g_theta))
+        )
+    size_rad = _lack_of_fit(solved.theta, system.angular.weight, fitted.residuals_theta)
     if size_rad:
         yield Effect(
             LACK_OF_FIT, np.zeros((2, *shape)), np.where(np.isfinite(emap.g_theta), size_rad, 0.0)
@@ -207,10 +209,10 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
     """
     if not (noise.p_of_known < LACK_LEVEL and noise.residuals > noise.known):
         return 0.0
-    each = weight.reshape(len(weight), -1)
-    squares = (each * residuals.reshape(each.shape) ** 2).sum(axis=1)
-    share = (each > 0).sum(axis=1) / (each > 0).sum()
-    dof = noise.dof_residuals * share
+    weight_of_views = weight.reshape(len(weight), -1)
+    squares = (weight_of_views * residuals.reshape(weight_of_views.shape) ** 2).sum(axis=1)
+    share_of_view = (weight_of_views > 0).sum(axis=1) / (weight_of_views > 0).sum()
+    dof = noise.dof_residuals * share_of_view
     largest = (
         noise.residuals**2
         * squares
@@ -218,7 +220,11 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
         * noise.dof_residuals
         / chdtri(dof, 1 - DOUBT_LEVEL)
     )
-    return float(np.sqrt(max(largest.max() - noise.known**2, 0.0) / each[each > 0].mean()))
+    return float(
+        np.sqrt(
+            max(largest.max() - noise.known**2, 0.0) / weight_of_views[weight_of_views > 0].mean()
+        )
+    )
 
 
 def _unexplained_noise(solved: Solved) -> bool:
@@ -239,8 +245,8 @@ def checked_by(
     solution.
     """
     nx, ny = measurements.artifact.shape
-    wanted = failed or nx * ny <= ALWAYS_SITES
-    if options.causes is False or not wanted or options.misalignment_model != "linear":
+    is_checked = failed or nx * ny <= ALWAYS_SITES
+    if options.causes is False or not is_checked or options.misalignment_model != "linear":
         return solved
     try:
         linear = (
@@ -261,8 +267,10 @@ def _sign_findings(solved: Solved, measurements: Measurements, options: Options)
     rotations that lines share, and their squares), or the microscope was declared. Lines share
     rotations with the other sign as well if it is that of their own offsets, too.
     """
-    seen = all(view.visits is not None for view in measurements.views if len(view.m))
-    if _is_declared(options) or not seen or sign_is_shown(measurements):  # nothing can show it
+    visits_known = all(view.visits is not None for view in measurements.views if len(view.m))
+    if (
+        _is_declared(options) or not visits_known or sign_is_shown(measurements)
+    ):  # nothing can show it
         return []
     model = solved.model if options.finite_rotations else _rigid_fit(measurements, options)
     if model is None or model.equations is None:
@@ -272,15 +280,15 @@ def _sign_findings(solved: Solved, measurements: Measurements, options: Options)
     scale = [
         at for at in np.flatnonzero(rows) if equations.columns.columns[at].component == "scale"
     ]
-    if not scale or not np.isfinite(model.found.xy.sigma):
+    if not scale or not np.isfinite(model.fitted.xy.sigma):
         return []
     lines = equations.columns.having(lambda block: block.of_offsets and block.of_lines)
 
     def is_shown(*, by_lines: bool) -> bool:
-        untold = equations.untold(rows, unknown=None if by_lines else lines)
+        undetermined = equations.undetermined(rows, unknown=None if by_lines else lines)
         spread = equations.inverse_without(lines & by_lines)[scale[0], scale[0]]
-        hidden = np.abs(untold[scale[0]]).max(initial=0.0) > NEGLIGIBLE
-        return not hidden and 0 <= spread * model.found.xy.sigma**2 <= SIGN_U**2
+        hidden = np.abs(undetermined[scale[0]]).max(initial=0.0) > NEGLIGIBLE
+        return not hidden and 0 <= spread * model.fitted.xy.sigma**2 <= SIGN_U**2
 
     with_lines = is_shown(by_lines=True)
     if with_lines and (is_shown(by_lines=False) or sign_of_lines_is_shown(measurements)):
@@ -304,18 +312,18 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
     problem = replace(model.problem, terms=())  # with its noise: lines weigh the same for each k
     stood = np.zeros_like(model.y)
     for row, (index, placed) in enumerate(
-        zip(problem.grid.index, problem.ground.visits, strict=True)
+        zip(problem.grid.index, problem.inputs.visits, strict=True)
     ):
         visits = measurements.views[index].visits
         if visits is None or placed is None:
             continue
-        beside = visits.dx - visits.offset_x + 1j * (visits.dy - visits.offset_y)
-        means = placed.means((beside * placed.phase)[None], stood[row].size)[0]
+        motion = visits.dx - visits.offset_x + 1j * (visits.dy - visits.offset_y)
+        means = placed.means((motion * placed.phase)[None], stood[row].size)[0]
         stood[row] = means.reshape(stood[row].shape)
     with_it, halfway, without = (
         squares(problem, fit(problem, model.y - k * stood), of_noise=False)[0] for k in range(3)
     )
-    noise = max(model.found.xy.sigma, LEAST_NOISE_M)
+    noise = max(model.fitted.xy.sigma, LEAST_NOISE_M)
     information = (with_it + without) / 2 - halfway
     if not information > noise**2:
         return False
@@ -376,10 +384,10 @@ def _scale_findings(
     u = 0.0 if term is None else term.size_of("scale")
     fitted = [
         estimate
-        for each in solved.result.model.terms
-        if term is not None and each.name == term.name
-        for estimate in each.estimates
-        if estimate.component == "scale" and estimate.u < TOLD * u
+        for term_result in solved.result.model.terms
+        if term is not None and term_result.name == term.name
+        for estimate in term_result.estimates
+        if estimate.component == "scale" and estimate.u < DETERMINED_BELOW * u
     ]
     if (
         np.isinf(u)
@@ -387,19 +395,19 @@ def _scale_findings(
         or any(cause.name in blocks() and blocks()[cause.name].of_microscope for cause in causes)
     ):
         return []
-    found = contradicted_scale(measurements, u)
+    response = contradicted_scale(measurements, u)
     return (
         []
-        if found is None
+        if response is None
         else [
             Finding(
                 "scale_of_offsets",
-                -found.slope,
-                found.u_slope,
+                -response.slope,
+                response.u_slope,
                 unit="m/m",
-                p=found.p,
-                axis=found.axis,
-                details={"most": found.most, "u_scale": u},
+                p=response.p,
+                axis=response.axis,
+                details={"most": response.most, "u_scale": u},
             )
         ]
     )
@@ -433,24 +441,30 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     if solved.model is None:
         return []
     problem = solved.model.problem
-    held = any(term.block.of_time for term in problem.terms)
-    visits = [view for view in problem.ground.visits if view is not None]
-    once = len(visits) == len(problem.ground.visits) and not any(v.repeated for v in visits)
-    return [Finding("visited_once")] if once and not held and problem.repeats_xy[1] > 0 else []
+    time_fitted = any(term.block.of_time for term in problem.terms)
+    visits = [view for view in problem.inputs.visits if view is not None]
+    visited_once = len(visits) == len(problem.inputs.visits) and not any(v.repeated for v in visits)
+    return (
+        [Finding("visited_once")]
+        if visited_once and not time_fitted and problem.repeats_xy[1] > 0
+        else []
+    )
 
 
 def views_findings(measurements: Measurements) -> Iterator[Finding]:
     """Yield the views whose repeats often contradict each other, then those left out."""
-    used: Counter[str] = Counter()
+    n_used: Counter[str] = Counter()
     rejected: dict[str, Counter[str]] = {}
     for view in measurements.views:
         name = view.view.plan_view
-        used[name] += view.used
+        n_used[name] += view.used
         rejected.setdefault(name, Counter()).update(view.rejected)
     for name, counts in rejected.items():
-        lost, total = counts[REPEAT_OUTLIER], counts[REPEAT_OUTLIER] + used[name]
-        if lost > max(FEW_OUTLIERS, MAX_REMOVED * total):
-            yield Finding("repeats_contradict", view=name, details={"rejected": lost, "of": total})
+        n_lost, total = counts[REPEAT_OUTLIER], counts[REPEAT_OUTLIER] + n_used[name]
+        if n_lost > max(FEW_OUTLIERS, MAX_REMOVED * total):
+            yield Finding(
+                "repeats_contradict", view=name, details={"rejected": n_lost, "of": total}
+            )
     yield from _left_out_findings(measurements)
 
 
@@ -460,17 +474,17 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
     A kind of mark that no view has is not missed in a view that has the other. The parts of a view
     in which the plate slipped are one view.
     """
-    artifact, parts = measurements.artifact, dict[str, list[ViewReadings]]()
-    for part in measurements.views:
-        whole = replace(part.view, name=part.view.name.split(AFTER_SLIP)[0])
-        parts.setdefault(whole.plan_view, []).append(part)
-    known = (
-        any(len(part.m) for part in measurements.views),
-        any(len(part.k) for part in measurements.views),
+    artifact, readings_of_view = measurements.artifact, dict[str, list[ViewReadings]]()
+    for readings in measurements.views:
+        view_of_part = replace(readings.view, name=readings.view.name.split(AFTER_SLIP)[0])
+        readings_of_view.setdefault(view_of_part.plan_view, []).append(readings)
+    kinds_read = (
+        any(len(readings.m) for readings in measurements.views),
+        any(len(readings.k) for readings in measurements.views),
     )
-    for name, of in parts.items():
-        views = {part.view.cell: part.view for part in of}.values()
-        asked = (
+    for name, readings_of_cells in readings_of_view.items():
+        views = {readings.view.cell: readings.view for readings in readings_of_cells}.values()
+        n_planned = (
             sum(
                 int(view.on_stage(artifact).mark_rows(artifact)[1].sum())
                 for view in views
@@ -478,19 +492,24 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
             ),
             artifact.angular_count * any(view.angular for view in views),
         )
-        read = (sum(len(part.m) for part in of), sum(len(part.k) for part in of))
-        few = any(
-            seen and got < DETERMINED * wanted
-            for seen, got, wanted in zip(known, read, asked, strict=True)
+        n_read = (
+            sum(len(readings.m) for readings in readings_of_cells),
+            sum(len(readings.k) for readings in readings_of_cells),
         )
-        if few or not any(read):
-            rejected = sum((Counter(part.rejected) for part in of), Counter[str]())
+        few = any(
+            kind_read and got < DETERMINED * planned
+            for kind_read, got, planned in zip(kinds_read, n_read, n_planned, strict=True)
+        )
+        if few or not any(n_read):
+            rejected = sum(
+                (Counter(readings.rejected) for readings in readings_of_cells), Counter[str]()
+            )
             yield Finding(
                 "view_left_out",
                 view=name,
                 details={
-                    "read": list(read),
-                    "asked": list(asked),
+                    "read": list(n_read),
+                    "asked": list(n_planned),
                     "rejected": {str(reason): count for reason, count in rejected.most_common(3)},
                 },
             )

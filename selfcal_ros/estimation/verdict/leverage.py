@@ -70,11 +70,11 @@ class Alone:
         """
         skew = abs(self.skew)
         good = self.redundancy - skew > CHECKED
-        both = np.where(good, self.redundancy**2 - skew**2, 1.0)
-        form = self.redundancy * abs(self.residual) ** 2 + np.real(
+        determinant = np.where(good, self.redundancy**2 - skew**2, 1.0)
+        numerator = self.redundancy * abs(self.residual) ** 2 + np.real(
             np.conj(self.skew) * self.residual**2
         )
-        return np.where(good, form / both * self.weight, np.nan)
+        return np.where(good, numerator / determinant * self.weight, np.nan)
 
     def noise_without(self, at: tuple[int, ...], least: float = FLOOR) -> float:
         """Return the noise that the residuals show without one reading, at least `least`.
@@ -82,9 +82,15 @@ class Alone:
         NaN where the others do not check the reading, or have no noise to compare it with.
         """
         dof = self.dof - self.coordinates
-        rest = float((self.weight * abs(self.residual) ** 2).sum()) - float(self.squares[at])
-        known = dof > 0 and np.isfinite(rest)
-        return max(float(np.sqrt(max(rest, 0.0) / dof)), least) if known else float("nan")
+        squares_of_others = float((self.weight * abs(self.residual) ** 2).sum()) - float(
+            self.squares[at]
+        )
+        is_checked = dof > 0 and np.isfinite(squares_of_others)
+        return (
+            max(float(np.sqrt(max(squares_of_others, 0.0) / dof)), least)
+            if is_checked
+            else float("nan")
+        )
 
     def p_outlier(self, at: tuple[int, ...], least: float = FLOOR) -> float:
         """Return the probability that a good reading fits the others as badly; NaN if unknown.
@@ -125,29 +131,31 @@ def lines_alone(system: NormalEquations, y: np.ndarray) -> Alone:
 
 
 def exact_leverage(
-    part: GridSystem | AngularSystem, misaligned: np.ndarray
+    system: GridSystem | AngularSystem, misaligned: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return 1 - h and the skew of every reading of one kind, (views, *marks).
 
     `misaligned` is the covariance of the misalignments for unit noise of these readings alone.
     """
-    weight, total = part.weight, part.weight.sum(axis=0)
-    inverse = part.solve(np.eye(part.n_sites))
+    weight, total = system.weight, system.weight.sum(axis=0)
+    inverse = system.solve(np.eye(system.n_sites))
     variance = np.zeros(weight.shape)
-    for v in range(part.n_views):
-        own = -part.relative_weight
-        own[v] += 1
-        for i in range(part.n_views):
-            for j in range(part.n_views):
-                variance[v] += np.real(own[i] * part.covariance(inverse, i, j) * own[j])
-    maps = part.response.T.reshape(len(misaligned), *part.shape)
-    basis = part.centred(part.misaligned(np.eye(len(misaligned))) - part.gather(maps))
+    for v in range(system.n_views):
+        own_weight = -system.relative_weight
+        own_weight[v] += 1
+        for i in range(system.n_views):
+            for j in range(system.n_views):
+                variance[v] += np.real(
+                    own_weight[i] * system.covariance(inverse, i, j) * own_weight[j]
+                )
+    maps = system.response.T.reshape(len(misaligned), *system.shape)
+    basis = system.centred(system.misaligned(np.eye(len(misaligned))) - system.gather(maps))
     answer = np.tensordot(misaligned, basis, axes=1)
-    spread = (np.conj(basis) * answer).real.sum(axis=0) / part.coordinates
+    spread = (np.conj(basis) * answer).real.sum(axis=0) / system.coordinates
     h = weight * (1 / np.where(total > 0, total, 1.0) + (variance + spread))
     return (
         np.where(weight > 0, np.clip(1 - h, 0.0, 1.0), 0.0),
-        weight * (basis * answer).sum(axis=0) / part.coordinates,
+        weight * (basis * answer).sum(axis=0) / system.coordinates,
     )
 
 

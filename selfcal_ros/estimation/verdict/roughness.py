@@ -17,10 +17,10 @@ from scipy.special import fdtrc
 
 from selfcal_ros.estimation.joint.model_fit import (
     ModelFit,
+    determined_coefficients,
     equations_left,
     is_too_large,
     placed,
-    told_coefficients,
     with_map,
 )
 from selfcal_ros.estimation.joint.problem import F_LEVEL
@@ -127,7 +127,7 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     if refit is None:
         return None
     fine = _of_marks(refit)
-    n = [told_coefficients(equations) for equations in (fine, coarse)]
+    n = [determined_coefficients(equations) for equations in (fine, coarse)]
     squares_coarse, squares_refit = _squares(coarse, model.y), _squares(fine, refit.y)
     readings = equations_left(grid)
     n_further, dof, p = n[0] - n[1], readings - n[0], 1.0
@@ -164,11 +164,11 @@ def _of_marks(model: ModelFit) -> PlacedEquations:
     return PlacedEquations(system.grid, AngularSystem((), np.zeros((0, 0))), system.grid_index, ())
 
 
-def _of_terms(model: ModelFit, other: ModelFit) -> float:
+def _of_terms(model: ModelFit, of_other_map: ModelFit) -> float:
     """Return what the terms change of a map by what another map makes of them, rms, m."""
     if model.equations is None:
         return 0.0
-    map_change_m = model.equations.maps @ (other.coefficients - model.coefficients)
+    map_change_m = model.equations.maps @ (of_other_map.coefficients - model.coefficients)
     return float(np.sqrt((np.abs(map_change_m) ** 2).mean() / 2))
 
 
@@ -206,8 +206,8 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
         return None
     finer = min(2 * coarse.harmonics, (coarse.n_lines - 1) // 2)
     fine = HarmonicSystem(coarse.turns, coarse.weight, finer)
-    n_further = fine.n_told - coarse.n_told
-    dof = coarse.n_readings - int(coarse.mark_read.sum()) - fine.n_told - (coarse.n_views - 1)
+    n_further = fine.n_determined - coarse.n_determined
+    dof = coarse.n_readings - int(coarse.mark_read.sum()) - fine.n_determined - (coarse.n_views - 1)
     if n_further < 1 or dof < 1:
         return None
     (squares_coarse, coarse_map), (squares_fine, fine_map) = (
@@ -283,7 +283,7 @@ class _Further:
 
     Attributes
     ----------
-    told : float array (2 n,)
+    information : float array (2 n,)
         Eigenvalues of the information on e, real and imaginary parts, for unit noise.
     right : float array (2 n,)
         Right-hand side along its eigenvectors, m.
@@ -291,7 +291,7 @@ class _Further:
         Error of the coarse map at places, datum taken out, for a unit along each eigenvector.
     """
 
-    told: np.ndarray
+    information: np.ndarray
     right: np.ndarray
     error: np.ndarray
 
@@ -310,7 +310,7 @@ class _Further:
         right = np.concatenate([b.real, b.imag]) - elimination @ d
         contained = nodes.within(spline)
         further = np.eye(len(b)) - contained @ spline.rows(nodes.places_m.ravel()).toarray()
-        coarse_basis, further_basis = (np.kron(np.eye(2), part) for part in (contained, further))
+        coarse_basis, further_basis = (np.kron(np.eye(2), basis) for basis in (contained, further))
         inverse = np.linalg.pinv(coarse_basis.T @ normal @ coarse_basis, hermitian=True, rcond=GAP)
         answer = inverse @ (coarse_basis.T @ normal)
         projected = further_basis.T @ (normal - normal @ coarse_basis @ answer)
@@ -321,17 +321,17 @@ class _Further:
             scalar[:, : coefficient_errors.shape[1]] + 1j * scalar[:, coefficient_errors.shape[1] :]
         )
         field = _datum_of(places_m).without(field)
-        alone = right - normal @ coarse_basis @ (inverse @ (coarse_basis.T @ right))
+        right_of_further = right - normal @ coarse_basis @ (inverse @ (coarse_basis.T @ right))
         return cls(
             np.maximum(eigenvalues, 0.0),
-            vectors.T @ (further_basis.T @ alone),
+            vectors.T @ (further_basis.T @ right_of_further),
             np.concatenate([field.real, field.imag]),
         )
 
     def size(self, sigma_m: float) -> float:
         """Return the likeliest standard deviation of the coefficients, m (method eq. 12.6)."""
-        determined = self.told > GAP * self.told.max()
-        values, right = self.told[determined], self.right[determined]
+        determined = self.information > GAP * self.information.max()
+        values, right = self.information[determined], self.right[determined]
         least = sigma_m / np.sqrt(values.max())
         sizes = np.concatenate([[0.0], least * np.geomspace(*SIZES)])
         variance = values * sigma_m**2 + np.multiply.outer(sizes, values) ** 2
@@ -342,5 +342,5 @@ class _Further:
         size = self.size(sigma_m)
         if not size:
             return np.zeros(len(self.error))
-        share = size**2 / (sigma_m**2 + size**2 * self.told)
+        share = size**2 / (sigma_m**2 + size**2 * self.information)
         return (self.error @ (share * self.right)) ** 2 + self.error**2 @ (share * sigma_m**2)

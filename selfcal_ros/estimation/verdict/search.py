@@ -98,24 +98,24 @@ def search_causes(
     advise : bool
         Whether remedies are tried.
     """
-    found = SearchResult(solved)
+    search = SearchResult(solved)
     if options.causes is False or solved.model is None:
-        return found
+        return search
     sizes = [test for test in solved.model.sizes if test.contradicted]
-    place = (
+    off_sites = (
         None
         if measurements.artifact.map_grid
         else off_sites_cause(solved.model, solved.result.error_map)
     )
-    failed = failed or bool(sizes or place)
+    failed = failed or bool(sizes or off_sites)
     sites = solved.model.problem.system.grid.n_sites
     if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
-        _search(found, measurements, options, failed=failed)
-    solved, tests = found.solved, found.solved.joint.sizes
+        _search(search, measurements, options, failed=failed)
+    solved, tests = search.solved, search.solved.joint.sizes
     raised = {
         str(test.name): _raised_cause(solved, test)
         for test in tests
-        if (test.contradicted or not _is_plausible(test)) and test.name not in found.terms
+        if (test.contradicted or not _is_plausible(test)) and test.name not in search.terms
     }
     scales = (
         _either_scale(solved, measurements, options)
@@ -124,45 +124,47 @@ def search_causes(
     )
     raised = scales | {name: cause for name, cause in raised.items() if name not in scales}
     names = [name for name, cause in raised.items() if cause is not None]
-    found.bounded &= not any(_beyond_u(solved, test) for test in tests)
+    search.bounded &= not any(_beyond_u(solved, test) for test in tests)
     plausible = all(map(_is_plausible, tests))
     between = any(block_of(name).between for name in raised)
-    alike = bool(scales) or (between and _as_a_microscope(found, measurements, options))
-    found.causes[:0] = [cause for cause in raised.values() if cause is not None]
-    _allow_for_plates(found, names, measurements, options)
+    alike = bool(scales) or (between and _as_a_microscope(search, measurements, options))
+    search.causes[:0] = [cause for cause in raised.values() if cause is not None]
+    _allow_for_plates(search, names, measurements, options)
     turned = turned_too_far(solved.joint, solved.result, measurements)
     if turned is not None:
-        found.bounded = False
-        if turned.name not in [cause.name for cause in found.causes]:
-            found.causes.append(turned)
+        search.bounded = False
+        if turned.name not in [cause.name for cause in search.causes]:
+            search.causes.append(turned)
     for rough in filter(None, (adequacy_of(solved.joint), line_adequacy_of(solved.joint))):
-        found.effects.append(rough.effect(solved.result))
+        search.effects.append(rough.effect(solved.result))
         if (cause := rough.cause) is not None:
             nodes = _better_map(measurements, options) if advise and not rough.of_lines else ""
-            found.causes.append(replace(cause, remedies=(Remedy("map", nodes),) if nodes else ()))
-    if place is not None:
-        found.causes.insert(0 if place.shown else len(found.causes), place.cause)
-        found.effects.append(
+            search.causes.append(replace(cause, remedies=(Remedy("map", nodes),) if nodes else ()))
+    if off_sites is not None:
+        search.causes.insert(
+            0 if off_sites.residuals_show_it else len(search.causes), off_sites.cause
+        )
+        search.effects.append(
             effect_of_field(
-                place.cause.name,
-                place.moved,
+                off_sites.cause.name,
+                off_sites.map_change,
                 measurements.sense,
                 np.zeros(measurements.artifact.angular_count),
             )
         )
-        found.bounded &= place.bounded
-    found.solved, found.terms = _from_readings(solved, found.terms), [*names, *found.terms]
-    found.bounded &= plausible
-    if advise and found.causes:
-        tried = found.terms and plausible and not alike
-        model = _best_model(found, measurements, options) if tried else None
+        search.bounded &= off_sites.bounded
+    search.solved, search.terms = _from_readings(solved, search.terms), [*names, *search.terms]
+    search.bounded &= plausible
+    if advise and search.causes:
+        tried = search.terms and plausible and not alike
+        model = _best_model(search, measurements, options) if tried else None
         faulty = (
             *(name for name, block in blocks().items() if block.of_time),
             READING,
             *([turned.name] if turned else []),
         )
-        found.causes = [_advised(cause, model, found.terms, faulty) for cause in found.causes]
-    return found
+        search.causes = [_advised(cause, model, search.terms, faulty) for cause in search.causes]
+    return search
 
 
 def _better_map(measurements: Measurements, options: Options) -> str:
@@ -207,10 +209,12 @@ def _best_model(searched: SearchResult, measurements: Measurements, options: Opt
     Its terms are free, or have the sizes that the readings allow: of the two models, if nothing
     contradicts them, the one with the smaller uncertainty.
     """
-    used = {term.name: term for term in searched.solved.joint.problem.terms}
+    terms_used = {term.name: term for term in searched.solved.joint.problem.terms}
     best, least = None, np.inf
     for free in (True, False):
-        terms = [ModelTerm(name) if free else used[name].rounded_up for name in searched.terms]
+        terms = [
+            ModelTerm(name) if free else terms_used[name].rounded_up for name in searched.terms
+        ]
         tried = replace(options, terms=merged(options.terms, terms))
         if (solved := _uncontradicted(measurements, tried)) is not None:
             emap = solved.result.error_map
@@ -252,57 +256,61 @@ def is_searched(sites: int, options: Options, *, failed: bool) -> bool:
 
 
 def _search(
-    found: SearchResult, measurements: Measurements, options: Options, *, failed: bool
+    search: SearchResult, measurements: Measurements, options: Options, *, failed: bool
 ) -> None:
     """Add terms while the readings show any; then bound the effects of all other causes."""
-    left: list[Explanation] = []
+    explanations: list[Explanation] = []
     for _ in range(MAX_CAUSES + 1):
-        left = _explanations(found.solved, failed=failed)
-        first = [item for item in left if item.rank == 0 and item.name in blocks()]
-        if not first or not _join(found, first, measurements, options):
+        explanations = _explanations(search.solved, failed=failed)
+        first = [item for item in explanations if item.rank == 0 and item.name in blocks()]
+        if not first or not _join(search, first, measurements, options):
             break
         failed = False
-    for item in left:
-        _bound(found, item, measurements)
-    if (line := line_cause(found.solved.joint, measurements)) is not None:
-        found.causes.append(line)
+    for item in explanations:
+        _bound(search, item, measurements)
+    if (line := line_cause(search.solved.joint, measurements)) is not None:
+        search.causes.append(line)
         lines = measurements.artifact.angular_count  # the error of a reading at most
-        found.effects.append(
+        search.effects.append(
             Effect(
                 line.name,
                 np.zeros((2, *measurements.artifact.field.shape)),
                 np.full(lines, abs(line.size) / np.sqrt(max(lines, 1))),
             )
         )
-    if not found.causes:
-        _noisy_views(found, measurements)
+    if not search.causes:
+        _noisy_views(search, measurements)
 
 
 def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
     """Return explanations of the residuals of a solution, the most likely first."""
     model = solved.joint
-    found = [
+    explanations = [
         item for item in find_explanations(model, slips=False) if failed or _counts(item, solved)
     ]
-    if found or failed:
-        found = [
+    if explanations or failed:
+        explanations = [
             item for item in find_explanations(model, slips=True) if failed or _counts(item, solved)
         ]
-    if not found or (fine := finer(model)) is None:
-        return found
-    still = {item.name for item in find_explanations(fine, slips=True)}
-    return [item for item in found if item.name in still]
+    if not explanations or (fine := finer(model)) is None:
+        return explanations
+    names_in_finer_map = {item.name for item in find_explanations(fine, slips=True)}
+    return [item for item in explanations if item.name in names_in_finer_map]
 
 
-def _counts(found: Explanation, solved: Solved) -> bool:
+def _counts(explanation: Explanation, solved: Solved) -> bool:
     """Return whether an explanation matters for the map."""
-    if not found.whole or found.name == READING:  # one node may be far off, and the rest not
+    if (
+        not explanation.determined or explanation.name == READING
+    ):  # one node may be far off, and the rest not
         return True
     emap = solved.result.error_map
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
     if not np.isfinite(u).any():
         return True
-    return found.effect_m > MATTERS * rms(u) or found.effect_rad > MATTERS * rms(emap.u_g_theta)
+    return explanation.effect_m > MATTERS * rms(u) or explanation.effect_rad > MATTERS * rms(
+        emap.u_g_theta
+    )
 
 
 def solved_with(
@@ -321,27 +329,29 @@ def _hardly(name: str) -> ModelTerm:
 
 
 def _join(
-    found: SearchResult, first: list[Explanation], measurements: Measurements, options: Options
+    search: SearchResult, first: list[Explanation], measurements: Measurements, options: Options
 ) -> bool:
     """Add the first of equally good explanations to the model; the others enlarge u.
 
     Return whether it joined.
     """
-    ground = found.solved.joint.problem.ground
-    names = [*found.terms, first[0].name]
+    inputs = search.solved.joint.problem.inputs
+    names = [*search.terms, first[0].name]
     solved = solved_with(measurements, options, [_hardly(n) for n in names])
     if solved is None or not any(
         test.name == first[0].name and test.contradicted for test in solved.joint.sizes
     ):
         return False
-    for other in first[1:]:
-        twin = solved_with(measurements, options, [_hardly(n) for n in (*found.terms, other.name)])
+    for alternative in first[1:]:
+        twin = solved_with(
+            measurements, options, [_hardly(n) for n in (*search.terms, alternative.name)]
+        )
         if twin is not None:
-            found.effects.append(difference(other.name, twin.result, solved.result))
-    found.causes += [cause_of(item, ground) for item in first]
-    found.solved, found.terms = solved, names
-    found.causes[-len(first)] = cause_of(
-        fitted_term(solved.joint, first[0].name, first[0].p, whole=first[0].whole), ground
+            search.effects.append(difference(alternative.name, twin.result, solved.result))
+    search.causes += [cause_of(item, inputs) for item in first]
+    search.solved, search.terms = solved, names
+    search.causes[-len(first)] = cause_of(
+        fitted_term(solved.joint, first[0].name, first[0].p, determined=first[0].determined), inputs
     )
     return True
 
@@ -360,19 +370,21 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     A size that is not plausible is a fault, however little of it is seen in the map.
     """
     term = next(term for term in solved.result.model.terms if term.name == test.name)
-    parts = enlargements(solved.result, [term.name], [])
+    contributions = enlargements(solved.result, [term.name], [])
     u = rms(solved.result.error_map.u_xy)
-    of = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
+    u_of_map = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
     # the part that no reading determines is in the uncertainty, as far as that is known
-    little = bool(parts) and all(part.u_rms < MATTERS * of[part.unit] for part in parts)
-    held = fitted_term(
-        solved.joint, term.name, test.p, whole=little or test.rank == len(term.estimates)
+    little = bool(contributions) and all(
+        contribution.u_rms < MATTERS * u_of_map[contribution.unit] for contribution in contributions
     )
-    if not _counts(held, solved) and _is_plausible(test):
+    fitted = fitted_term(
+        solved.joint, term.name, test.p, determined=little or test.rank == len(term.estimates)
+    )
+    if not _counts(fitted, solved) and _is_plausible(test):
         return None
     block = block_of(test.name)
     if (block.between or block.shared) and abs(
-        (cause := cause_of(held, solved.joint.problem.ground)).size
+        (cause := cause_of(fitted, solved.joint.problem.inputs)).size
     ) > BEYOND * cause.u:
         return cause  # otherwise the readings do not determine which view or part it is
     largest = max(term.estimates, key=lambda e: abs(e.value))
@@ -393,15 +405,15 @@ def _beyond_u(solved: Solved, test: SizeTest) -> bool:
     if not test.p_together < BEYOND_DOUBT or test.rank == len(term.estimates):
         return False
     emap = solved.result.error_map
-    whole = {"m": rms(emap.u_xy), "rad": rms(emap.u_g_theta)}
+    u_of_map = {"m": rms(emap.u_xy), "rad": rms(emap.u_g_theta)}
     return any(
-        2 * part.u_rms**2 > whole[part.unit] ** 2
-        for part in enlargements(solved.result, [term.name], [])
+        2 * contribution.u_rms**2 > u_of_map[contribution.unit] ** 2
+        for contribution in enlargements(solved.result, [term.name], [])
     )
 
 
 def _allow_for_plates(
-    found: SearchResult, raised: Collection[str], measurements: Measurements, options: Options
+    search: SearchResult, raised: Collection[str], measurements: Measurements, options: Options
 ) -> None:
     """Add plates that differ as causes beside scales of offsets that explain no more than they do.
 
@@ -420,16 +432,16 @@ def _allow_for_plates(
         ]
         if not contradicted or plausible != contradicted:
             continue
-        found.causes += filter(None, (_raised_cause(twin, test) for test in contradicted))
-        found.effects.append(difference(name, twin.result, found.solved.result))
+        search.causes += filter(None, (_raised_cause(twin, test) for test in contradicted))
+        search.effects.append(difference(name, twin.result, search.solved.result))
 
 
-def _as_a_microscope(found: SearchResult, measurements: Measurements, options: Options) -> bool:
+def _as_a_microscope(search: SearchResult, measurements: Measurements, options: Options) -> bool:
     """Return whether a microscope of another scale explains the rotation of lines equally well.
 
     If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
     """
-    known = next(
+    microscope = next(
         (
             term
             for term in options.model_terms(visits=True)
@@ -437,55 +449,59 @@ def _as_a_microscope(found: SearchResult, measurements: Measurements, options: O
         ),
         None,
     )
-    twin = _with_wide(known, measurements, options) if known else None
-    if known is None or twin is None:
+    twin = _with_wide(microscope, measurements, options) if microscope else None
+    if microscope is None or twin is None:
         return False
-    held = fitted_term(twin.joint, known.name)
-    effect = difference(str(known.name), twin.result, found.solved.result)
+    fitted = fitted_term(twin.joint, microscope.name)
+    effect = difference(str(microscope.name), twin.result, search.solved.result)
     if not _counts(
-        replace(held, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)), found.solved
+        replace(fitted, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)), search.solved
     ):
         return False
-    cause = cause_of(held, twin.joint.problem.ground)
-    found.causes.append(cause)
-    found.effects.append(effect)
-    found.bounded &= not abs(cause.size) > max(known.size, known.block.plausible)
+    cause = cause_of(fitted, twin.joint.problem.inputs)
+    search.causes.append(cause)
+    search.effects.append(effect)
+    search.bounded &= not abs(cause.size) > max(microscope.size, microscope.block.plausible)
     return True
 
 
-def _bound(found: SearchResult, item: Explanation, measurements: Measurements) -> None:
+def _bound(search: SearchResult, item: Explanation, measurements: Measurements) -> None:
     """Add a cause outside the model, with its effect on the map as far as determined."""
-    model = found.solved.joint
-    cause = cause_of(item, model.problem.ground)
-    if cause.name in [known.name for known in found.causes] and cause.name in blocks():
+    model = search.solved.joint
+    cause = cause_of(item, model.problem.inputs)
+    if cause.name in [named.name for named in search.causes] and cause.name in blocks():
         return
-    found.causes.append(cause)
-    found.bounded &= item.whole
-    if item.moved is not None and item.turned is not None:
-        field = item.moved.reshape(model.problem.system.grid.views.shape)
-        found.effects.append(effect_of_field(item.name, field, measurements.sense, item.turned))
+    search.causes.append(cause)
+    search.bounded &= item.determined
+    if item.map_change is not None and item.angle_change is not None:
+        field = item.map_change.reshape(model.problem.system.grid.views.shape)
+        search.effects.append(
+            effect_of_field(item.name, field, measurements.sense, item.angle_change)
+        )
 
 
-def _noisy_views(found: SearchResult, measurements: Measurements) -> None:
+def _noisy_views(search: SearchResult, measurements: Measurements) -> None:
     """Add the views whose visits scatter more than those of the others.
 
     A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
     """
-    views = scatter_of_views(measurements, found.solved.joint)
-    emap, noisy = found.solved.result.error_map, noisier_views(views)
+    views = scatter_of_views(measurements, search.solved.joint)
+    emap, noisy = search.solved.result.error_map, noisier_views(views)
     largest = max((sigma for name, sigma, _ in views if name in [c.view for c in noisy]), default=0)
-    if (ratio := largest / found.solved.xy.sigma) > 1:
+    if (ratio := largest / search.solved.xy.sigma) > 1:
         more = np.nan_to_num(emap.u_xy) * np.sqrt(ratio**2 - 1)
-        found.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
-    found.causes += sorted(noisy, key=lambda cause: cause.p)
+        search.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
+    search.causes += sorted(noisy, key=lambda cause: cause.p)
 
 
-def _with_wide(known: ModelTerm, measurements: Measurements, options: Options) -> Solved | None:
+def _with_wide(
+    microscope: ModelTerm, measurements: Measurements, options: Options
+) -> Solved | None:
     """Return the solution with a term so wide that it need not share what it explains by itself.
 
     None if there is none, or the readings contradict another size.
     """
-    wider = known.scaled(max(BEYOND * known.block.plausible / known.size, 1.0))
+    wider = microscope.scaled(max(BEYOND * microscope.block.plausible / microscope.size, 1.0))
     twin = solved_with(measurements, options, [wider])
     contradicted = twin is None or any(test.contradicted for test in twin.joint.sizes)
     return None if contradicted else twin
@@ -504,6 +520,6 @@ def _either_scale(
             twin = _with_wide(term, measurements, options)
             if twin is None:
                 return {}
-            cause = cause_of(fitted_term(twin.joint, term.name), twin.joint.problem.ground)
+            cause = cause_of(fitted_term(twin.joint, term.name), twin.joint.problem.inputs)
             causes[str(term.name)] = replace(cause, details=cause.details | {"either": True})
     return causes if len(causes) > 1 else {}

@@ -24,7 +24,7 @@ from selfcal_ros.model.result import CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
 from selfcal_ros.model.verdict import BudgetLine, Enlargement, TermResult
 
-TOLD = 0.5
+DETERMINED_BELOW = 0.5
 """Share of a term's size left by the readings below which they determine the term (type A)."""
 
 
@@ -71,9 +71,9 @@ def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray)
     return Effect(name, np.stack([field.real, field.imag]), lines_turned_over(sense, theta))
 
 
-def difference(name: str, one: CalibrationResult, other: CalibrationResult) -> Effect:
+def difference(name: str, result: CalibrationResult, other: CalibrationResult) -> Effect:
     """Return the difference of two maps of the same readings; 0 where one is unknown."""
-    a, b = one.error_map, other.error_map
+    a, b = result.error_map, other.error_map
     theta = a.g_theta - b.g_theta
     if np.isfinite(theta).any():
         theta = theta - np.nanmean(theta)
@@ -85,7 +85,7 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     effects = [effect for effect in effects if effect.xy.any() or effect.theta.any()]
     if not effects:
         return result
-    emap, plate, kept = result.error_map, result.artifact_map, result.kept
+    emap, plate, kept_parts = result.error_map, result.artifact_map, result.kept
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
     of_plate = sum(
         (np.mean(effect.xy**2) if effect.plate is None else effect.plate**2 for effect in effects),
@@ -94,8 +94,8 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
     if emap.gx.size <= MAX_FULL and result.noise.sigma_xy > 0:
         before, sigma = factors_of(result), result.noise.sigma_xy
-        kept = replace(
-            kept,
+        kept_parts = replace(
+            kept_parts,
             factors=replace(
                 before,
                 terms=(*before.terms, *(effect.name for effect in effects)),
@@ -105,11 +105,11 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
                 on_plate=rounded(of_plate / sigma**2),
             ),
         )
-    turned = dict(kept.angular)
+    turned = dict(kept_parts.angular)
     for effect in effects:
         if effect.theta.any():
             turned[effect.name] = np.hypot(turned.get(effect.name, 0.0), effect.theta)
-    kept = replace(kept, angular=turned)
+    kept_parts = replace(kept_parts, angular=turned)
     emap = replace(
         emap,
         u_gx=np.sqrt(emap.u_gx**2 + power[0]),
@@ -122,7 +122,7 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
             u_ax=np.sqrt(plate.u_ax**2 + of_plate[0]),
             u_ay=np.sqrt(plate.u_ay**2 + of_plate[1]),
         )
-    return replace(result, error_map=emap, artifact_map=plate, kept=kept)
+    return replace(result, error_map=emap, artifact_map=plate, kept=kept_parts)
 
 
 def enlargements(
@@ -133,7 +133,7 @@ def enlargements(
     To u of the XY map, or of the angular map (rad) if only that changes.
     """
     variance = variance_of_terms(result)
-    found = [
+    contributions = [
         Enlargement(name, float(np.sqrt(power.mean())), float(np.sqrt(power.max())))
         for name in dict.fromkeys(names)
         if (power := variance.get(name)) is not None
@@ -141,13 +141,13 @@ def enlargements(
     for name in dict.fromkeys(names):
         if name in result.kept.angular:
             u = result.kept.angular[name]
-            found.append(Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad"))
+            contributions.append(Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad"))
     for effect in effects:
         values = effect.xy if effect.unit == "m" else effect.theta
-        found.append(
+        contributions.append(
             Enlargement(effect.name, rms(values), float(np.abs(values).max(initial=0)), effect.unit)
         )
-    return tuple(sorted(found, key=lambda item: -item.u_rms))
+    return tuple(sorted(contributions, key=lambda item: -item.u_rms))
 
 
 def remaining_part(term: TermResult) -> float:
@@ -163,17 +163,17 @@ def variance_of_reference(result: CalibrationResult) -> np.ndarray:
 
 def known_beforehand(result: CalibrationResult) -> np.ndarray:
     """Return the variance of the map that does not come from readings, (2, nx, ny), m^2."""
-    found = variance_of_reference(result)
+    power = variance_of_reference(result)
     terms = {term.name: term for term in result.model.terms}
     for name, variance in variance_of_terms(result).items():
-        if _not_told(terms.get(name)):
-            found += variance
-    return found
+        if _is_undetermined(terms.get(name)):
+            power += variance
+    return power
 
 
-def _not_told(term: TermResult | None) -> bool:
+def _is_undetermined(term: TermResult | None) -> bool:
     """Return whether the readings do not determine a term; an effect is none."""
-    return term is None or remaining_part(term) >= TOLD
+    return term is None or remaining_part(term) >= DETERMINED_BELOW
 
 
 def with_coverage(result: CalibrationResult) -> CalibrationResult:
@@ -184,19 +184,19 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
     noise, emap = result.noise, result.error_map
     terms = {term.name: term for term in result.model.terms}
     of_lines = sum(
-        (u**2 for name, u in result.kept.angular.items() if _not_told(terms.get(name))),
+        (u**2 for name, u in result.kept.angular.items() if _is_undetermined(terms.get(name))),
         np.zeros(emap.u_g_theta.shape),
     )
     changed: dict[str, float] = {}
-    for kind, power, known in (
+    for kind, power, known_variance in (
         ("xy", emap.u_xy**2, known_beforehand(result)),
         ("theta", emap.u_g_theta**2, of_lines),
     ):
         dof, at = getattr(noise, f"dof_{kind}"), np.isfinite(power)
-        if dof > 0 and known[at].any():
-            whole = float(power[at].mean())
-            told = max(whole - float(known[at].mean()), 0.0)
-            dof *= (whole / told) ** 2 if told > 0 else float("inf")
+        if dof > 0 and known_variance[at].any():
+            total = float(power[at].mean())
+            of_readings = max(total - float(known_variance[at].mean()), 0.0)
+            dof *= (total / of_readings) ** 2 if of_readings > 0 else float("inf")
             changed[f"k_{kind}"] = coverage_factor(dof)
         changed[f"dof_map_{kind}"] = dof
     return replace(result, noise=replace(noise, **changed))
@@ -284,7 +284,7 @@ def budgets(result: CalibrationResult) -> list[Budget]:
     Two of each: at the nodes of the map, and anywhere between them, where interpolation adds its
     error. None without an uncertainty map.
     """
-    lines, found = result.budget or tuple(budget_lines(result)), []
+    lines, all_budgets = result.budget or tuple(budget_lines(result)), []
     emap = result.error_map
     for quantity, u in (("xy", emap.u_xy), ("theta", emap.u_g_theta)):
         dof = _or_infinite(result.noise.dof_of(quantity))
@@ -294,7 +294,7 @@ def budgets(result: CalibrationResult) -> list[Budget]:
         between = sum(line.effect_rms**2 for line in anywhere[len(nodes) :])
         more = (1 + between / at_nodes) ** 2 if at_nodes > 0 else 1.0
         worst = float(np.max(u, initial=0.0, where=np.isfinite(u)))
-        found += (
+        all_budgets += (
             [
                 Budget(quantity, False, nodes, dof, worst),
                 Budget(quantity, True, anywhere, dof * more, worst),
@@ -302,7 +302,7 @@ def budgets(result: CalibrationResult) -> list[Budget]:
             if nodes
             else []
         )
-    return found
+    return all_budgets
 
 
 def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
@@ -323,8 +323,8 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
     yield _reference_line(np.sqrt(of_reference), result.reference)
     yield _interpolation_xy(result)
     if np.isfinite(emap.u_g_theta).any():
-        own = emap.u_g_theta**2 - sum(u**2 for u in result.kept.angular.values())
-        yield _noise_line("theta", np.sqrt(np.maximum(own, 0.0)), noise)
+        power_of_noise = emap.u_g_theta**2 - sum(u**2 for u in result.kept.angular.values())
+        yield _noise_line("theta", np.sqrt(np.maximum(power_of_noise, 0.0)), noise)
         for name, u in result.kept.angular.items():
             yield _term_line("theta", name, u, result)
         yield _interpolation_theta(result)
@@ -416,20 +416,20 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
             "readings",
             {"cause": name},
         )
-    part = remaining_part(term)
-    told = part < TOLD
-    largest = max(term.estimates, key=lambda each: abs(np.nan_to_num(each.value)))
+    remaining = remaining_part(term)
+    determined = remaining < DETERMINED_BELOW
+    largest = max(term.estimates, key=lambda estimate: abs(np.nan_to_num(estimate.value)))
     return BudgetLine(
         quantity,
         TERM + name,
-        "A" if told else "B",
+        "A" if determined else "B",
         largest.value,
         largest.u,
         largest.unit,
         *effect,
-        _dof(result.noise, quantity) if told else np.inf,
-        "readings" if told or term.size_used else term.source,
-        {"given": term.size or term.solved_with, "allowed": term.size_used, "remaining": part},
+        _dof(result.noise, quantity) if determined else np.inf,
+        "readings" if determined or term.size_used else term.source,
+        {"given": term.size or term.solved_with, "allowed": term.size_used, "remaining": remaining},
     )
 
 
@@ -461,14 +461,14 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     emap = result.error_map
     if result.plate.map_grid is not None:
         return _interpolation("xy", 0.0, 0.0)
-    found = [
+    errors = [
         [error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0)) for axis in (0, 1)]
         for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))
     ]
     return _interpolation(
         "xy",
-        np.sqrt(np.mean([x[0] ** 2 + y[0] ** 2 for x, y in found])),
-        max(np.hypot(x[1], y[1]) for x, y in found),
+        np.sqrt(np.mean([x[0] ** 2 + y[0] ** 2 for x, y in errors])),
+        max(np.hypot(x[1], y[1]) for x, y in errors),
     )
 
 

@@ -12,7 +12,7 @@ from selfcal_ros.apply import StageMap
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import (
-    Part,
+    Member,
     RunValues,
     _families,
     _of_run,
@@ -57,7 +57,7 @@ def calibrated(seed, *, options=None, artifact=ARTIFACT, truth=None, sigma=2e-8)
 
 
 def part(name, result):
-    return Part(name, result.error_map, result)
+    return Member(name, result.error_map, result)
 
 
 def run_at(run_id, **changed):
@@ -293,7 +293,7 @@ def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     other = replace(
         thrice(A)[0].error_map, u_gx=2 * emap.u_gx, u_gy=2 * emap.u_gy, u_g_theta=2 * emap.u_g_theta
     )
-    found = combine([part("a", A), Part("b", other)])
+    found = combine([part("a", A), Member("b", other)])
     np.testing.assert_allclose(found.xy.weights, [0.8, 0.2], atol=0.02)
     np.testing.assert_allclose(found.theta.weights, [0.8, 0.2], atol=0.03)
     assert "xy" not in found.result.kept.covariances
@@ -371,7 +371,7 @@ def test_large_fields_are_combined_by_their_variances():
     ]
     found = combine(
         [
-            Part(name, emap, replace(result_of(emap), input={}))
+            Member(name, emap, replace(result_of(emap), input={}))
             for name, emap in zip("abc", maps, strict=True)
         ]
     )
@@ -394,7 +394,7 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
     ("parts", "message"),
     [
         ([part("a", A)], "a single map"),
-        ([Part("a", A.error_map), Part("b", B.error_map)], "no RESULT.json among them"),
+        ([Member("a", A.error_map), Member("b", B.error_map)], "no RESULT.json among them"),
         (
             [part("a", A), part("b", replace(B, verdict=Verdict(Grade.NOT_QUALIFIED)))],
             "b: its calibration is not qualified",
@@ -414,9 +414,9 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
             [part("a", run_at("1")), part("b", run_at("1", gx=B.error_map.gx))],
             "b: of the same recording as a",
         ),
-        ([part("a", A), Part("b", scaled(B.error_map, 1e6))], r"b: .* of a: is it in µm\?"),
+        ([part("a", A), Member("b", scaled(B.error_map, 1e6))], r"b: .* of a: is it in µm\?"),
         (
-            [part("a", A), Part("b", replace(B.error_map, g_theta=1e6 * B.error_map.g_theta))],
+            [part("a", A), Member("b", replace(B.error_map, g_theta=1e6 * B.error_map.g_theta))],
             r"b: .* of a: is it in µrad\?",
         ),
         (
@@ -458,7 +458,7 @@ def test_a_table_as_coarse_as_its_errors_is_no_other_unit():
         u_gx=u,
         u_gy=u,
     )
-    assert combine([part("a", A), Part("b", coarse)]).xy.weights[0] > 0.99
+    assert combine([part("a", A), Member("b", coarse)]).xy.weights[0] > 0.99
 
 
 def test_sets_of_runs_differ_by_their_seed_alone():

@@ -78,7 +78,7 @@ def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shar
         random_truth(ARTIFACT, len(plan.views), rng), plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-6
     )
     model = fit_model(prepare(readings, BARE)[0])
-    assert squares(model.problem, model.found)[1] == dense_dof(plan)
+    assert squares(model.problem, model.fitted)[1] == dense_dof(plan)
 
 
 @pytest.mark.parametrize(

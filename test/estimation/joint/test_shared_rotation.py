@@ -62,7 +62,7 @@ def test_map_and_rotations_of_marks_and_lines_are_those_of_one_least_squares(mis
     measurements = with_lines(missing)
     solved = solve_joint(measurements, LINEAR)
     length = solved.model.problem.half_width_m
-    found, at = solution(measurements, solved.model.found.ratio * length**2)
+    found, at = solution(measurements, solved.model.fitted.ratio * length**2)
     sites = np.prod(measurements.artifact.shape)
     emap = solved.result.error_map
     np.testing.assert_allclose(

@@ -82,7 +82,7 @@ def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
     matrix = np.hstack([matrix, of_yaw(measurements) / PITCH])
     inverse = np.linalg.pinv(matrix, rcond=1e-10)
     y = np.concatenate([np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views])
-    noises = solved.model.problem.images.noises(solved.model.found.residuals)
+    noises = solved.model.problem.images.noises(solved.model.fitted.residuals)
     assert noises.image > 2 * noises.mark > 0
     covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
         stops[:, None] == stops, np.eye(2)
@@ -176,7 +176,7 @@ def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image
     np.testing.assert_allclose(
         np.stack([emap.gx, emap.gy], axis=-1).ravel(), field, atol=1e-3 * emap.u_gx.mean()
     )
-    noises = solved.model.problem.images.noises(solved.model.found.residuals)
+    noises = solved.model.problem.images.noises(solved.model.fitted.residuals)
     covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
         stops[:, None] == stops, np.eye(2)
     )

@@ -55,7 +55,7 @@ def test_a_free_term_adds_to_the_noise():
     plan = plan_of("0, 90, tx", 5, repeats=4)
     assumed = Assumed(SIGMA, order="x_back_y_back")
     terms = parse_terms(["drift", "plate_strain:2e-7"], "")
-    found, dense = budget_of(plan, terms, assumed, asked=["plate_strain"]), Dense(plan, assumed)
+    found, dense = budget_of(plan, terms, assumed, declared=["plate_strain"]), Dense(plan, assumed)
     free = SIGMA * dense.gain((terms[0],))
     assert effects(found)[NOISE] == pytest.approx(free, rel=1e-6)
     assert effects(found)["plate_strain"] == pytest.approx(
@@ -154,8 +154,8 @@ def test_a_larger_assumption_changes_what_the_readings_leave_of_it_and_nothing_d
     plan, assumed = plan_of("0, 90, tx", 5, repeats=2), Assumed(1e-9, order="x_back_y_back")
     terms = parse_terms(["plate_strain:7e-8", "plate_shape:5e-9"], "")
     larger = parse_terms(["plate_strain:7e-8", "plate_shape:15e-9"], "")
-    found = budget_of(plan, terms, assumed, asked=["plate_strain", "drift", "approach"])
-    wanted = budget_of(plan, larger, assumed, asked=["plate_strain", "drift", "approach"])
+    found = budget_of(plan, terms, assumed, declared=["plate_strain", "drift", "approach"])
+    wanted = budget_of(plan, larger, assumed, declared=["plate_strain", "drift", "approach"])
     assert found.u_rms("xy", if_larger=True) == pytest.approx(wanted.u_rms("xy"), rel=1e-9)
     assert found.u_rms("xy", if_larger=True) > 2 * found.u_rms("xy")
 

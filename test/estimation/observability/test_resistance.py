@@ -47,7 +47,7 @@ def test_each_term_as_the_dense_matrix_has_it(name, order, sense):
     size = {"microscope": 1e-4}.get(name, nominal_sizes()[name])
     found = planned.check(name, size, LEVEL)
     assert found.unseen_modes == dense.n_unseen([ModelTerm(name)])
-    assert found.told is (found.unseen_modes == 0)
+    assert found.determined is (found.unseen_modes == 0)
     assert (found.effect_rms_m, found.effect_max_m) == pytest.approx(
         dense.effect([], name, size), rel=1e-6
     )
@@ -94,7 +94,7 @@ def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
     assumed = Assumed(SIGMA, 10e-6, 2, order)
     planned, dense = PlannedTerms(plan, model, assumed), dense_of(plan, assumed, sense)
     alone = predict_plan(plan, ThetaDatum.ZERO_MEAN)
-    seen = planned.told(check_plan(plan).observability)
+    seen = planned.with_free_terms(check_plan(plan).observability)
     free = [term for term in model if term.free]
     assert seen.deficiency == dense.n_unseen(free)
     if seen.identifiable:
@@ -145,13 +145,13 @@ def test_free_terms_that_are_not_told_are_named_with_their_cure():
     seen = check_plan(plan).observability
     planned = PlannedTerms(plan, parse_terms(["drift"], ""), Assumed(order="raster"))
     with pytest.raises(NotIdentifiableError, match=r"do not separate drift .*\(7 modes"):
-        planned.require_told(seen)
-    found = planned.told(seen)
+        planned.require_determined(seen)
+    found = planned.with_free_terms(seen)
     assert (found.rank, found.unknowns) == (seen.rank + 18 - 7, seen.unknowns + 18)
     assert (found.deficiency, found.identifiable) == (7, False)
     assert in_words(found.advice)[0].startswith("drift: visit the marks in more than one order")
     sized = PlannedTerms(plan, parse_terms(["drift:1e-8"], ""), Assumed(order="raster"))
-    assert sized.told(seen) == seen
+    assert sized.with_free_terms(seen) == seen
 
 
 def test_shifts_of_both_signs_damp_bent_plates():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariance of the coefficients, against one that is solved where nothing is untold."""
+"""Covariance of the coefficients, against one that is solved where nothing is undetermined."""
 
 from types import SimpleNamespace
 
@@ -58,10 +58,10 @@ def test_untold_combinations_have_no_covariance_and_the_others_their_own(
         columns = columns_of(rng, free, sized, hidden)
         size = np.r_[np.full(free, np.inf), 10.0 ** rng.uniform(-9, -6, sized)]
         own = equations(columns, size, rng.uniform(1, 9, free + sized), taken=[0] if taken else [])
-        untold = own.untold(np.isinf(size))
-        assert untold.shape[1] == max(hidden, taken)
-        # coefficients x of which no untold combination has a part, sizes as readings of them
-        basis = null_space(untold.T) if hidden + taken else np.eye(len(size))
+        undetermined = own.undetermined(np.isinf(size))
+        assert undetermined.shape[1] == max(hidden, taken)
+        # coefficients x of which no undetermined combination has a part, sizes as readings of them
+        basis = null_space(undetermined.T) if hidden + taken else np.eye(len(size))
         basis /= own.norm[:, None]
         prior = np.diag(np.where(np.isinf(size), 0.0, (SIGMA / size) ** 2))
         inner = basis.T @ (own.information + prior) @ basis

@@ -47,8 +47,8 @@ def measured(plan=PLAN, strain=0.0):
 
 def columns_of(measurements, name, size):
     problem, _ = prepare(measurements, BARE)
-    ground = replace(problem.ground, drift_degree=2)
-    return ground, term_columns(ground, [ModelTerm(name, size)])
+    inputs = replace(problem.inputs, drift_degree=2)
+    return inputs, term_columns(inputs, [ModelTerm(name, size)])
 
 
 def test_cells_belong_to_the_placing_of_their_view():
@@ -66,27 +66,27 @@ def test_cells_belong_to_the_placing_of_their_view():
     ],
 )
 def test_a_placing_has_its_columns_in_all_cells(name, size, count):
-    ground, columns = columns_of(measured(), name, size)
+    inputs, columns = columns_of(measured(), name, size)
     assert len(columns.columns) == count
     rows = {column.view for column in columns.columns}
     assert rows == ({0, 9} if np.isfinite(size) else {9})
     for column, block in zip(columns.columns, columns.grid, strict=True):
         there = np.abs(block).reshape(18, -1).max(axis=1) > 0
         assert there.tolist() == [column.view <= row < column.view + 9 for row in range(18)]
-        assert ground.name_of(name, column.view) == ("0", "90")[column.view // 9]
+        assert inputs.name_of(name, column.view) == ("0", "90")[column.view // 9]
 
 
 def test_marks_of_one_image_have_one_time():
     """The first and the last exposure of the placing are its ends, not those of each cell."""
     measurements = measured()
-    ground, _ = columns_of(measurements, "drift", 1e-8)
+    inputs, _ = columns_of(measurements, "drift", 1e-8)
     times = {}
-    for row, visits in enumerate(ground.visits[:9]):
+    for row, visits in enumerate(inputs.visits[:9]):
         stamps = measurements.views[row].visits.stamp_ns
         for stamp, time in zip(stamps.tolist(), visits.time.tolist(), strict=True):
             assert times.setdefault(stamp, time) == time
     assert min(times.values()) == -1 and max(times.values()) == 1
-    assert min(max(visits.time) for visits in ground.visits[:9]) < 1
+    assert min(max(visits.time) for visits in inputs.visits[:9]) < 1
 
 
 def test_u_holds_a_strain_that_all_cells_share():
@@ -117,6 +117,6 @@ def test_views_without_images_are_placings_of_their_own():
         views=tuple(replace(view, repeats=2) for view in plan_of("0, 90, tx", 5, count=0).views),
     )
     measurements = measured(plan)
-    ground, columns = columns_of(measurements, "plate_strain", 1e-6)
+    inputs, columns = columns_of(measurements, "plate_strain", 1e-6)
     assert [column.view for column in columns.columns] == [0] * 3 + [1] * 3 + [2] * 3
-    assert ground.members == {0: [0], 1: [1], 2: [2]}
+    assert inputs.members == {0: [0], 1: [1], 2: [2]}

@@ -19,7 +19,7 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
     grounds = [
         planned_ground(artifact, plan.views, assumed) for artifact in (plan.artifact, placed)
     ]
-    for one, other in zip(*(ground.visits for ground in grounds), strict=True):
+    for one, other in zip(*(inputs.visits for inputs in grounds), strict=True):
         for name in ("mark", "weight", "offset", "phase", "approach_x", "approach_y"):
             np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-18)
 
@@ -27,8 +27,8 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
 def test_a_check_stop_is_approached_as_its_place_beside_the_mark_tells():
     plan = plan_of("0, 90, tx", 5)
     views = [replace(view, check_marks=1, check_offset_m=2e-5) for view in plan.views]
-    ground = planned_ground(plan.artifact, views, Assumed())
-    for view, visits in zip(views, ground.visits, strict=True):
+    inputs = planned_ground(plan.artifact, views, Assumed())
+    for view, visits in zip(views, inputs.visits, strict=True):
         off = np.flatnonzero(visit_sequence(plan.artifact, view).aside_m.any(axis=0))
         # from the mark in the last corner to +x of that in the middle, then to its -x, +y and -y
         assert len(off) == 4 and (np.diff(off) == 1).all()

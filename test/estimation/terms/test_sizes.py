@@ -128,7 +128,7 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
         terms = tuple(
             ModelTerm(term.name) if term.name == without else term for term in wanted.terms
         )
-        return DenseFit(readings, terms, (model.found.xy.sigma, 1.0), places=False).squares
+        return DenseFit(readings, terms, (model.fitted.xy.sigma, 1.0), places=False).squares
 
     tests = {test.name: test for test in model.sizes}
     for name in ("plate_scale", "plate_shape", "approach"):

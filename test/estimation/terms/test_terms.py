@@ -261,9 +261,9 @@ def test_no_columns_make_nothing_of_any_visit():
     rng = np.random.default_rng(1)
     plan = Plan("one", Artifact(5, 0.01), (View("a"),))
     readings = simulate_measurements(random_truth(plan.artifact, 1, rng), plan, rng, visits=True)
-    ground = ground_of(readings, grid_data(readings), 0.02)
-    columns = term_columns(ground, [ModelTerm("plate_scale")])
+    inputs = ground_of(readings, grid_data(readings), 0.02)
+    columns = term_columns(inputs, [ModelTerm("plate_scale")])
     assert columns.columns == () and columns.at_visits(np.zeros(0)) == [0.0]
-    free = term_columns(replace(ground, drift_degree=1), [ModelTerm("drift")])
+    free = term_columns(replace(inputs, drift_degree=1), [ModelTerm("drift")])
     (drift,) = free.at_visits(np.array([2.0, 3.0]))
-    np.testing.assert_allclose(drift, (2 + 3j) * ground.visits[0].time)
+    np.testing.assert_allclose(drift, (2 + 3j) * inputs.visits[0].time)

@@ -126,7 +126,7 @@ def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
         used = readings[:, list(chosen)]
         values = np.linalg.pinv(used) @ left
         rank = np.linalg.matrix_rank(used) if chosen else 0
-        assert found.rank == rank and found.at.tolist() == list(chosen)
+        assert found.rank == rank and found.columns.tolist() == list(chosen)
         rest = left - used @ values
         assert found.explained == pytest.approx(left @ left - rest @ rest)
         assert used @ found.values == pytest.approx(used @ values, abs=1e-9)

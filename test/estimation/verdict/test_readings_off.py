@@ -123,10 +123,10 @@ def test_those_with_the_largest_residuals_are_tried():
     plan = hu_plan(Artifact(3, 0.01, 4))
     rng = np.random.default_rng(0)
     readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=1e-8)
-    ground = prepare(readings, Options())[0].ground
-    residuals = np.zeros(ground.weight.shape, dtype=complex)
+    inputs = prepare(readings, Options())[0].inputs
+    residuals = np.zeros(inputs.weight.shape, dtype=complex)
     residuals[1, 0, 2], residuals[0, 1, 1] = 3e-8j, 2e-8
-    made = ColumnBuilder(ground)
+    made = ColumnBuilder(inputs)
     suspects = list(reading_columns(made, residuals, np.array([1, -1j, 1])))
     columns = made.done()
     assert [(view, place) for _, view, place in suspects[:2]] == [(1, (0, 2)), (0, (1, 1))]

@@ -19,10 +19,10 @@ from selfcal_ros.estimation.terms.columns import term_columns
 from selfcal_ros.estimation.terms.equations import root_of
 from selfcal_ros.estimation.verdict.uncertainty import Effect, effect_of_field
 from selfcal_ros.model.error_map import rms
-from selfcal_ros.model.terms import UNTOLD, nominal_terms
+from selfcal_ros.model.terms import UNDETERMINED, nominal_terms
 
 
-def untold_effects(solved: Solved, options: Options) -> Iterator[Effect]:
+def undetermined_effects(solved: Solved, options: Options) -> Iterator[Effect]:
     """Yield what terms outside the model, each in its nominal size, would add to u of the XY maps.
 
     One for each independent combination of their coefficients: what the readings determine of a
@@ -38,37 +38,39 @@ def untold_effects(solved: Solved, options: Options) -> Iterator[Effect]:
     model, emap = solved.model, solved.result.error_map
     if model is None or not (options.assumed and options.finite_rotations):
         return
-    if not solved.result.has_uncertainty or not np.isfinite(model.found.xy.sigma):
+    if not solved.result.has_uncertainty or not np.isfinite(model.fitted.xy.sigma):
         return
-    problem, found = model.problem, model.found
-    known = {term.name for term in (*options.terms, *problem.terms)}
-    visited = all(visits is not None for visits in problem.ground.visits)
-    more = nominal_terms(known, visits=visited)
-    least = UNTOLD * rms(emap.u_xy)
+    problem, fitted = model.problem, model.fitted
+    named_terms = {term.name for term in (*options.terms, *problem.terms)}
+    visited = all(visits is not None for visits in problem.inputs.visits)
+    more = nominal_terms(named_terms, visits=visited)
+    least = UNDETERMINED * rms(emap.u_xy)
     for term in more:
-        columns = term_columns(problem.ground, (*problem.terms, term))
-        equations = equations_of(problem, found, columns)
-        covariance = equations.inverse(found.xy.sigma)
+        columns = term_columns(problem.inputs, (*problem.terms, term))
+        equations = equations_of(problem, fitted, columns)
+        covariance = equations.inverse(fitted.xy.sigma)
         maps = MapsCovariance(
             problem.system,
-            found.inverse,
+            fitted.inverse,
             options.reference,
             half_width_m=problem.half_width_m,
             terms=spread_of(equations, covariance),
         ).maps_of_terms()
-        both = np.concatenate([part for values in maps for part in (values.real, values.imag)])
-        root = found.xy.sigma * root_of(covariance, equations.rows([term.name]))
-        moved, size, _ = np.linalg.svd(both @ root, full_matrices=False)
-        added = (moved * size).T[size > NEGLIGIBLE * size.max(initial=0.0)]
+        coordinates = np.concatenate(
+            [component for values in maps for component in (values.real, values.imag)]
+        )
+        root = fitted.xy.sigma * root_of(covariance, equations.rows([term.name]))
+        directions, size, _ = np.linalg.svd(coordinates @ root, full_matrices=False)
+        added = (directions * size).T[size > NEGLIGIBLE * size.max(initial=0.0)]
         if np.sqrt((added[:, : 2 * emap.gx.size] ** 2).sum(axis=0).mean()) > least:
-            for each in added:
-                yield _effect(str(term.name), each, solved)
+            for effect in added:
+                yield _effect(str(term.name), effect, solved)
 
 
-def _effect(name: str, both: np.ndarray, solved: Solved) -> Effect:
+def _effect(name: str, coordinates: np.ndarray, solved: Solved) -> Effect:
     """Return the effect on Gx, Gy, Ax, Ay, one after the other, in the frame of the equations."""
     emap, plate = solved.result.error_map, solved.result.artifact_map
-    stage, of_plate = np.split(both, [2 * emap.gx.size])
+    stage, of_plate = np.split(coordinates, [2 * emap.gx.size])
     x, y = stage.reshape(2, *emap.gx.shape)
-    found = effect_of_field(name, x + 1j * y, solved.result.sense, np.zeros(len(emap.g_theta)))
-    return replace(found, plate=of_plate.reshape(2, *plate.ax.shape))
+    effect = effect_of_field(name, x + 1j * y, solved.result.sense, np.zeros(len(emap.g_theta)))
+    return replace(effect, plate=of_plate.reshape(2, *plate.ax.shape))
