@@ -371,16 +371,23 @@ def fit_joint(measurements: Measurements, options: Options) -> ModelFit:
         return _fitted(measurements, options)[0]
 
 
+NEARLY_EXACT_M = 1e-10
+"""Noise of a reading, m, below which it may be what the sizes of assumed terms leave of exact
+readings: no sensor is so good."""
+
+
 def _fitted(
     measurements: Measurements, options: Options, *, whole_only: bool = False
 ) -> tuple[ModelFit, Observability, bool]:
     """Return the fit, what the readings determine, and if it has all that is assumed.
 
     Where that does not converge with the places of the stage readings count for their sites, and
-    then less is assumed, unless it is `whole_only` that counts.
+    then less is assumed, unless it is `whole_only` that counts. Less is assumed as well where it
+    leaves nothing of the residuals: then the readings are exact.
     """
     of_visits = tuple(term for term in options.assumed if term.block.needs_visits)
     failed: NotSettledError | None = None
+    nearly_exact: tuple[ModelFit, Observability, bool] | None = None
     for assumed in dict.fromkeys((options.assumed, of_visits, ())):
         problem, observability = prepare(measurements, replace(options, assumed=assumed))
         for at_places in (True, False) if problem.moves else (False,):
@@ -394,7 +401,16 @@ def _fitted(
                     raise
                 failed = error
                 continue
-            return model, observability, assumed == options.assumed and at_places == problem.moves
+            as_assumed = assumed == options.assumed and at_places == problem.moves
+            solution = model, observability, as_assumed
+            sigma_m = model.fitted.xy.sigma
+            if nearly_exact is not None and sigma_m < LEAST_NOISE_M:
+                return solution
+            if not LEAST_NOISE_M <= sigma_m < NEARLY_EXACT_M:
+                return nearly_exact or solution
+            nearly_exact = nearly_exact or solution
+    if nearly_exact is not None:
+        return nearly_exact
     raise failed or AssertionError("something was tried")
 
 
