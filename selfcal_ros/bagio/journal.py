@@ -23,6 +23,7 @@ from selfcal_ros.bagio.journal_file import (
     Content,
     JournalFile,
     finish_file,
+    is_of_another_recorder,
     message_record,
     records,
     scan_file,
@@ -56,7 +57,8 @@ def resume(folder: str | os.PathLike) -> "Journal | None":
     Raises
     ------
     InputError
-        If another process writes this journal, or it cannot be read or written.
+        If another process writes this journal, it is another recorder's, or it cannot be read or
+        written.
     """
     journal = claim(folder)
     return journal.resume() if journal else None
@@ -68,6 +70,7 @@ class Claim:
     def __init__(self, path: Path) -> None:
         self.path = path
         with _as_input_error(path):
+            _refuse_other_recordings(path)
             self._lock = _locked(path)
 
     def resume(self) -> "Journal | None":
@@ -94,7 +97,8 @@ def claim(folder: str | os.PathLike) -> Claim | None:
     Raises
     ------
     InputError
-        If another process writes this journal, or the folder cannot be read.
+        If another process writes this journal, it is another recorder's, or the folder cannot be
+        read.
     """
     journals = newest(folder)
     return Claim(journals[0]) if journals else None
@@ -406,6 +410,17 @@ def _is_over(commands: list[tuple[int, Phase]]) -> bool:
     """Return whether the last command, by stamp, ends a run, or would hide every later run."""
     latest_ns = time.time_ns() + MAX_AHEAD_NS
     return bool(commands) and (commands[-1][1] in OVER or commands[-1][0] > latest_ns)
+
+
+def _refuse_other_recordings(bag: Path) -> None:
+    """Refuse the folder of another recorder, which may still write: it would be cut off."""
+    for file in _files(bag):
+        if is_of_another_recorder(file):
+            raise InputError(
+                str(file),
+                "is not of a journal: another recorder writes it, or wrote it",
+                "move its folder elsewhere, or name another folder for the journal",
+            )
 
 
 def _locked(path: Path) -> int:

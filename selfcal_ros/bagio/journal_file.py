@@ -98,6 +98,17 @@ def front() -> bytes:
     return MAGIC + records(Header(profile="ros2", library="selfcal_ros journal"))
 
 
+def is_of_another_recorder(path: Path) -> bool:
+    """Return whether another recorder writes a file: its header is another, or still to come.
+
+    A file of a journal is never empty; what is damaged from its first bytes on may be one.
+    """
+    own = front()
+    with path.open("rb") as file:
+        beginning = file.read(len(own))
+    return not beginning or (beginning.startswith(MAGIC) and not own.startswith(beginning))
+
+
 def ending(content: Content) -> bytes:
     """Return the end of a file: repeated declarations, statistics, and checksums."""
     entry = content.entry

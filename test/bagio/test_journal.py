@@ -317,6 +317,27 @@ def test_a_recording_beside_the_journals_is_left_alone(tmp_path, name):
     assert {file: file.read_bytes() for file in (tmp_path / name).iterdir()} == before
 
 
+@pytest.mark.parametrize("begun", ["whole", "header", "empty"])
+def test_a_recording_with_the_name_of_a_journal_is_refused_as_it_is(tmp_path, begun):
+    """`begun` is what a running recorder has written so far."""
+    folder = tmp_path / "journal_20261127T102030Z"
+    with declared(BagWriter(folder)) as recorder:
+        topic, data = raw(command(Phase.PLACE, NOW))
+        recorder.write_raw(topic, data, NOW + 5)
+    file = folder / f"{folder.name}_0.mcap"
+    if begun != "whole":
+        (folder / "metadata.yaml").unlink()
+        os.truncate(
+            file, {"header": file.read_bytes().index(b"selfcal_ros") + 11, "empty": 0}[begun]
+        )
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(
+        InputError, match=f"^{file}: is not of a journal: another recorder writes it, or wrote it; "
+    ):
+        resume(tmp_path)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
 def test_a_journal_has_one_writer(tmp_path):
     with declared(start(tmp_path, NOW)) as writer:
         record(writer, samples(1))
