@@ -474,6 +474,19 @@ def test_without_a_folder_there_is_no_journal(events, expected):
     assert desk.reception.diagnosis().values == {}
 
 
+def test_a_journal_that_is_refused_gets_no_other_beside_it(tmp_path):
+    """That would be the newest one, and be continued instead at the next start."""
+    hands, settings = Hands(), settings_of("measurement_collector", journal=str(tmp_path))
+    with journal.start(tmp_path, START_NS) as other:
+        keeper = JournalKeeper(settings.journal, TOPICS, settings, hands.ports)
+        with pytest.raises(InputError, match="another process writes this journal"):
+            keeper.open(AtOnce())
+        hands.pass_time(60)
+        keeper.flush()
+        keeper.close()
+    assert list(tmp_path.iterdir()) == [other.path]
+
+
 class Locked:
     """A journal that cannot be taken up, for a reason that is not the disk's."""
 
