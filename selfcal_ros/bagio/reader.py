@@ -147,6 +147,12 @@ class BagReader:
         except (InputError, KeyError, TypeError, ValueError):
             self.lost.append("metadata.yaml is damaged and was not used")
             return []
+        others = [path for path in info["relative_file_paths"] if not path.endswith(SUFFIXES)]
+        if others:
+            shown = ", ".join(map(repr, others))[:200]
+            self.lost.append(f"metadata.yaml lists {shown}, not an .mcap file: it was not read")
+        elif not names:
+            self.lost.append("metadata.yaml lists no file and was not used")
         return [name for name in dict.fromkeys(names) if name.endswith(SUFFIXES)]
 
     @property

@@ -255,6 +255,23 @@ def test_a_file_that_metadata_lists_but_nobody_has_is_said(tmp_path, events, exp
 
 
 @pytest.mark.parametrize(
+    ("names", "line"),
+    [
+        (["../.."], "metadata.yaml lists '../..', not an .mcap file: it was not read"),
+        (
+            ["..", "/", "a.mcap"],
+            "metadata.yaml lists '..', '/', not an .mcap file: it was not read",
+        ),
+        ([], "metadata.yaml lists no file and was not used"),
+    ],
+)
+def test_what_metadata_lists_besides_recordings_is_said(tmp_path, events, expected, names, line):
+    Foreign().write(tmp_path / "bag" / "a.mcap", events)
+    listing(tmp_path / "bag", *names)
+    assert solved(tmp_path / "bag") == (expected, [line])
+
+
+@pytest.mark.parametrize(
     "text",
     [
         "",
