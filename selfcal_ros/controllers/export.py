@@ -252,9 +252,7 @@ def export(
             f"bends between the nodes of the map, up to {UM_PER_M * bent:.3g} um, is "
             "lost"
         )
-    head = [
-        form.comment + "".join(c if c.isprintable() else " " for c in line) for line in comments
-    ]
+    head = [form.comment + _plain(line) for line in comments]
     files = {
         names[part]: "\n".join([*lines, "", *head] if form.comments_last else [*head, *lines])
         + "\n"
@@ -268,6 +266,15 @@ def export(
     return Exported(
         files, residuals, bent, checklist(form, wiring, list(files), correct, table), remains
     )
+
+
+def _plain(text: str) -> str:
+    """Return text for a comment: on its line, and nothing that begins or ends a comment of its own.
+
+    Beckhoff's ``/* */`` comments go on over lines.
+    """
+    line = "".join(c if c.isprintable() else " " for c in text)
+    return line.replace("*/", "* /").replace("/*", "/ *")
 
 
 def checklist(

@@ -230,6 +230,18 @@ def test_the_comment_tells_where_a_file_comes_from(name):
         assert first.startswith(mark) != FORMATS[name].comments_last
 
 
+@pytest.mark.parametrize("plan_id", ["a\nb", "/* a", "*/ a /* b", "/*/", "a; # b", "\x0b\u2028"])
+@pytest.mark.parametrize("name", FORMATS)
+def test_no_name_in_a_comment_changes_what_is_read(name, plan_id):
+    wiring, at = wiring_of(FRAMES[0], name), np.linspace(-30.0, 30.0, 5)
+    read = []
+    for plan in ("demo", plan_id):
+        result = replace(result_of(sayable(name)), plan_id=plan, input={"file": plan})
+        made = export(name, result, wiring, "out.txt", command=plan)
+        read.append(loaded(name, sources_of(made), wiring)(at, at[::-1]))
+    np.testing.assert_array_equal(*read)
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_map_with_holes_is_refused(name):
     with pytest.raises(InputError, match="1 sites are unknown, and a table has no holes"):
