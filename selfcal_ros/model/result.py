@@ -30,7 +30,7 @@ from selfcal_ros.model.plate_form import (
     map_grid_from_dict,
     map_to_dict,
 )
-from selfcal_ros.model.readings import Measurements
+from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.reference import ReferenceLength, reference_from_dict, reference_to_dict
 from selfcal_ros.model.verdict import (
@@ -513,7 +513,7 @@ def _parse(data: dict) -> CalibrationResult:
         input={key: read(str, value) for key, value in data["input"].items()},
         warnings=read(tuple[str, ...], data.get("warnings", [])),
         method=read(str, data.get("method", "joint")),
-        sense=read(str, data.get("measurement_sense", "microscope_moves")),
+        sense=str(read(Sense, data.get("measurement_sense", "microscope_moves"))),
         extra={key: value for key, value in data.items() if key not in _KNOWN},
         kept=kept_from_dict(data, artifact.field.shape, artifact.shape, artifact.angular_count),
         verdict=verdict_from_dict(data.get("verdict"), identifiable=observability.identifiable),

@@ -44,7 +44,14 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
     core, zone = details["certificate"], timedelta(days=1)
     times = [str(result.provenance.extra.get(f"{end}_exposure", "")) for end in ("first", "last")]
     if all(times) and "clock" not in core:
-        first, last = (date.fromisoformat(text[:10]) for text in times)
+        try:
+            first, last = (date.fromisoformat(text[:10]) for text in times)
+        except ValueError as error:
+            raise InputError(
+                "certificate",
+                f"the times of the readings are not dates: {' to '.join(times)}",
+                "solve their bag again, or explain the clock of the readings in certificate.clock",
+            ) from error
         begin, end = (date.fromisoformat(core[name]) for name in ("begin", "end"))
         if first < begin - zone or last > end + zone:
             raise InputError(

@@ -164,6 +164,7 @@ def damaged(path, value):
         (("error_map", "nonorthogonality"), "0", "'0' is not a number"),
         (("error_map", "datum_theta"), "free", "'free' is not a valid ThetaDatum"),
         (("plan_id",), 3, "3 is not of type str"),
+        (("measurement_sense",), "plate_move", "'plate_move' is not a valid Sense"),
         (("views", 0, "rotation"), None, "the pose of view 'identity' is not finite"),
         (("views", 0, "used"), True, "True is not of type int"),
         (("noise", "sigma_xy"), "small", "'small' is not a number"),

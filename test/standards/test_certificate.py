@@ -352,6 +352,11 @@ def exposed(first, last):
     return replace(RESULT, provenance=made)
 
 
+def test_times_of_readings_that_are_not_dates_are_refused():
+    with pytest.raises(InputError, match="the times of the readings are not dates: yesterdayT23"):
+        certificate(exposed("yesterday", "2026-11-21"), details())
+
+
 @pytest.mark.parametrize(
     ("first", "last", "good"),
     [
