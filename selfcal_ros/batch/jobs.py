@@ -22,7 +22,7 @@ from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.observability import told
+from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.units import ARCSEC_PER_RAD, PPM_PER_ONE, UM_PER_M
 
 
@@ -85,7 +85,7 @@ def solved(
         if not isinstance(error.observability, results.Observability):
             raise
         result = worded(results.unidentified_result(session.measurements, error.observability))
-        problem = told(error)
+        problem = with_advice(error)
     return results.with_input(result, source, session.lost), problem
 
 

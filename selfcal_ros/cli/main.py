@@ -142,9 +142,9 @@ def _run(words: list[str]) -> int:
     except SelfcalError as error:
         fault = (misplaced(args) if args is not None else None) or error
         if isinstance(fault, NotIdentifiableError):
-            from selfcal_ros.reporting.words.observability import told  # numpy: half a second
+            from selfcal_ros.reporting.words.observability import with_advice  # slow: numpy
 
-            fault = told(fault)
+            fault = with_advice(fault)
         return _refused(f"{prefix}: {fault}", fault.exit_code)
     except KeyboardInterrupt:
         return _refused(f"{prefix}: interrupted", 128 + signal.SIGINT)

@@ -205,7 +205,7 @@ def _judge(
     """
     terms = PlannedTerms(plan, model, assumed, sizes)
     for term in model:
-        if not terms.every.rows([term.name]).any():
+        if not terms.all_terms.rows([term.name]).any():
             raise InputError(
                 f"model: {term.name}",
                 "no reading of this plan depends on it",

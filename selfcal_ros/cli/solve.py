@@ -48,7 +48,7 @@ from selfcal_ros.outputs import check_outputs, write_json
 from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.observability import told
+from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.reporting.words.phrases import recheck_lines
 from selfcal_ros.reporting.words.tables import budget_text, validation_json, validation_text
 
@@ -257,7 +257,7 @@ def run(args: argparse.Namespace) -> int:
         with busy("solving"):
             result = _calibrated(args, measurements, options, method=solver.method)
     except NotIdentifiableError as refused:
-        error = told(refused)
+        error = with_advice(refused)
         if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
             result = worded(with_places(result, measurements.views))

@@ -105,7 +105,7 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
     return replace(
         result,
         findings=(*result.findings, *few_read(measurements, camera)),
-        camera=None if camera is None else camera.shown,
+        camera=None if camera is None else camera.as_result,
         stage_yaw=yaw_of(solved.joint, measurements.sense),
     )
 

@@ -24,7 +24,7 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Pha
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.checks.placing import Misplaced, misplaced, said
+from selfcal_ros.estimation.checks.placing import Misplaced, misplaced, placing_error
 from selfcal_ros.estimation.checks.wiring import check_wiring
 from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.cell import Cell
@@ -378,7 +378,7 @@ class Run:
         misplacement = misplaced(measurements)
         if not isinstance(misplacement, Misplaced) or misplacement.view != view:
             return False
-        error = said(misplacement)
+        error = placing_error(misplacement)
         if self.cell.placing == "robot":
             raise error
         self.desk.say(f"{error}; the view is measured anew")

@@ -250,10 +250,10 @@ def convention_section(result: CalibrationResult) -> Section:
     return Section("Conventions", tuple(facts))
 
 
-def said(value: Any) -> str:
+def text_of(value: Any) -> str:
     """Return a value as text; the entries of a mapping are listed."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{_words(key)}: {said(item)}" for key, item in value.items())
+        return ", ".join(f"{_words(key)}: {text_of(item)}" for key, item in value.items())
     return f"{value:.6g}" if isinstance(value, float) else printable(str(value))
 
 
@@ -275,7 +275,7 @@ def provenance_section(result: CalibrationResult) -> Section:
     ]
     provenance = result.provenance
     facts += [
-        (_words(key), said(value))
+        (_words(key), text_of(value))
         for key, value in (
             ("created", provenance.created),
             ("solved_by", provenance.version and f"selfcal_ros {provenance.version}"),
@@ -290,7 +290,7 @@ def provenance_section(result: CalibrationResult) -> Section:
         )
     if length := reference_to_dict(result.reference):
         facts += [
-            (f"reference {_words(key)}", said(value))
+            (f"reference {_words(key)}", text_of(value))
             for key, value in length.items()
             if value != ""
         ]

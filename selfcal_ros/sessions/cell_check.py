@@ -22,8 +22,8 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.checks.wiring import (
     sign_of_lines_is_shown,
+    wiring_error,
     wiring_faults,
-    worded,
 )
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
@@ -600,7 +600,7 @@ class CellCheck:
             Whether they do, and whether they show how they do not.
         """
         [view] = measurements.views
-        faults = [worded(fault) for fault in wiring_faults(measurements)]
+        faults = [wiring_error(fault) for fault in wiring_faults(measurements)]
         slopes = {
             "x": _slope(view.motion, 0),
             "y": _slope(view.motion, 1),

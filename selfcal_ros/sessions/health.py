@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.errors import SelfcalError, first_line, printable
-from selfcal_ros.estimation.checks.placing import misplaced, said
-from selfcal_ros.estimation.checks.wiring import wiring_faults, worded
+from selfcal_ros.estimation.checks.placing import misplaced, placing_error
+from selfcal_ros.estimation.checks.wiring import wiring_error, wiring_faults
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.units import NS_PER_S
 
@@ -304,7 +304,7 @@ class CellChecks:
     def take(self, measurements: Measurements) -> None:
         """Check the readings of all views so far."""
         faults = {
-            f"{fault.view} {fault.kind}": str(worded(fault))
+            f"{fault.view} {fault.kind}": str(wiring_error(fault))
             for fault in wiring_faults(measurements)
         }
         for place in faults.keys() - self._miswired.keys():
@@ -324,7 +324,7 @@ class CellChecks:
         ):
             return
         self._marks, misplacement = marks, misplaced(measurements)
-        line = str(said(misplacement)) if misplacement else ""
+        line = str(placing_error(misplacement)) if misplacement else ""
         if line and line != self._misplaced:
             self._say(Level.ERROR, line)
         self._misplaced = line

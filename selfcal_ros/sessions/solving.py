@@ -34,7 +34,7 @@ from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.summary.numbers import counted, summary_numbers
 from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.observability import told
+from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.reporting.words.verification import with_verification
 from selfcal_ros.sessions.clocks import PlanRun, begins_in_future, supersedes
 from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
@@ -78,7 +78,7 @@ def solve(job: Job) -> SolvingOutcome:
         return SolvingOutcome(job, _finished(job, outcome), None)
     except NotIdentifiableError as error:
         result = results.unidentified_result(job.measurements, error.observability)
-        return SolvingOutcome(job, _finished(job, result), told(error))
+        return SolvingOutcome(job, _finished(job, result), with_advice(error))
     except Exception as error:  # reported by `take`, in the thread of the session
         return SolvingOutcome(job, None, error)
 

@@ -15,7 +15,7 @@ from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import COMBINED, CalibrationResult
-from selfcal_ros.reporting.chapters import convention_section, said
+from selfcal_ros.reporting.chapters import convention_section, text_of
 from selfcal_ros.reporting.words.phrases import dof_text, line_text
 from selfcal_ros.reporting.words.tables import quantity_text
 from selfcal_ros.standards.details import UNITS
@@ -309,7 +309,7 @@ def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str
         ("clock of the readings", core.get("clock")),
     ):
         if value:
-            yield name.replace("_", " "), said(value)
+            yield name.replace("_", " "), text_of(value)
     if np.isfinite(provenance.duration_s):
         yield "duration", f"{provenance.duration_s:.0f} s"
     for run in result.extra.get(COMBINED, {}).get("runs", ()):

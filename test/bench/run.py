@@ -83,7 +83,7 @@ def error_of(field, truth) -> float:
     gauge = Gauge(z, known, scale=True)
     left = field[0] - truth.g[0] + 1j * (field[1] - truth.g[1])
     left = np.where(known, left, 0.0)
-    left = gauge.remove(left, gauge.parts(left))[known]
+    left = gauge.remove(left, gauge.coefficients(left))[known]
     return float(max(abs(left.real).max(), abs(left.imag).max()))
 
 

@@ -123,7 +123,7 @@ def test_a_recheck_knows_no_plate(folder, capsys):
 
 
 def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
-    """Alone, relative to the plan: the plate is that of the result."""
+    """FitOfKind, relative to the plan: the plate is that of the result."""
     plan = {"plan_id": "morning", "artifact_from": "r.json", "views": [{"name": "again"}]}
     (folder / "plan.yaml").write_text(json.dumps(plan))
     assert main(["plan", "check", str(folder / "plan.yaml"), "--json"]) == 0

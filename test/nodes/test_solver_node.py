@@ -27,7 +27,7 @@ from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.observability import told
+from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.sessions.compensating import read_result
 from selfcal_ros.sessions.solving import SolvingOutcome
 from test.support.maps import random_map, result_of
@@ -274,7 +274,7 @@ def test_a_deficient_plan_is_told_with_advice_and_publishes_no_map(solve, graph,
     with pytest.raises(NotIdentifiableError) as unidentified:
         calibrate(measurements)
     last = summaries[-1]
-    assert last.state == str(told(unidentified.value))  # never cut
+    assert last.state == str(with_advice(unidentified.value))  # never cut
     assert not last.identifiable
     assert last.rank_deficiency > 0
     assert last.advice

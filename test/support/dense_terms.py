@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import f as central_f
 from scipy.stats import ncf
 
-from selfcal_ros.estimation.terms.planned import planned_ground
+from selfcal_ros.estimation.terms.planned import planned_inputs
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
 
@@ -32,7 +32,7 @@ class Dense:
         self.nx, self.ny = plan.artifact.shape
         self.half = plan.artifact.grid_pitch_m * max(plan.artifact.half)
         # offsets and random orders are an assumption of the plan: they are taken as they are
-        self.visits = planned_ground(plan.artifact, plan.views, assumed).visits
+        self.visits = planned_inputs(plan.artifact, plan.views, assumed).visits
         self.rows, self.weight, self.about, self.times = [], [], [], []
         for v, visits in enumerate(self.visits):
             self._view(v, visits)

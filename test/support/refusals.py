@@ -9,7 +9,7 @@ import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.model.verdict import Finding
-from selfcal_ros.reporting.words.observability import told, worded
+from selfcal_ros.reporting.words.observability import with_advice, worded
 
 
 @contextmanager
@@ -17,7 +17,7 @@ def refused(match: str) -> Iterator[pytest.ExceptionInfo[NotIdentifiableError]]:
     """Require that readings are refused, with a match in the line that is shown."""
     with pytest.raises(NotIdentifiableError) as caught:
         yield caught
-    assert re.search(match, str(told(caught.value)))
+    assert re.search(match, str(with_advice(caught.value)))
 
 
 def in_words(findings: tuple[Finding, ...]) -> list[str]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.estimation.checks.placing import Misplaced, said
+from selfcal_ros.estimation.checks.placing import Misplaced, placing_error
 from selfcal_ros.model.pose import StagePose
 
 AT_LEAST = 5
@@ -101,7 +101,7 @@ class SeenPose:
                 f"{self.mirror}, or the plate lies upside down; correct the ids, or place "
                 f"the plate as planned and measure this view again{other_views}"
             )
-        error = said(self.pose)
+        error = placing_error(self.pose)
         return f"{error.what} (or its ids are those of other marks); {error.remedy}{other_views}"
 
 

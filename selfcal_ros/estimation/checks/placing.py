@@ -100,7 +100,7 @@ MIRRORS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _WindowReadings:
     """Readings of one view in the window: places, complex (n,), pitches, deviations, m, repeats."""
 
     pose: AnyPose
@@ -117,7 +117,7 @@ class _Seen:
 def check_placing(measurements: Measurements) -> None:
     """Raise PlacingError if the plate is not placed as planned in a view."""
     if fault := misplaced(measurements):
-        raise said(fault, f"plan '{measurements.plan_id}', ")
+        raise placing_error(fault, f"plan '{measurements.plan_id}', ")
 
 
 def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
@@ -131,7 +131,7 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
         (view.view, readings)
         for view in measurements.views
         if sum(map(abs, view.view.cell or (0, 0))) < 2  # the others would cost seconds
-        and (readings := _seen(artifact, view)) is not None
+        and (readings := _readings_in_window(artifact, view)) is not None
     ]
     compared_views = [
         (view, readings) for view, readings in window_views if view.cell in (None, (0, 0))
@@ -175,10 +175,10 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
             for number, (also, _) in enumerate(compared_views)
             if also.plan_view == view.plan_view
         ]
-        fixed_readings = _Kept(views, moved_views, *sizes)
+        fixed_readings = _FactoredReadings(views, moved_views, *sizes)
         for pose in _poses(readings, artifact):
             likelihood, mean_square = fixed_readings.with_moved(
-                [_moved(views[number], readings.pose, pose) for number in moved_views]
+                [_at_pose(views[number], readings.pose, pose) for number in moved_views]
             )
             tried.append((likelihood - planned, mean_square, view, readings.pose, pose))
     tried.sort(key=lambda item: -item[0])
@@ -196,7 +196,7 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
 
 
 def _mirrored(
-    views: list[_Seen],
+    views: list[_WindowReadings],
     planned: float,
     sizes: tuple[float, float, np.ndarray],
     least: float,
@@ -221,7 +221,7 @@ def _mirrored(
     return Mirrored(axes, best) if axes else None
 
 
-def _moved(readings: _Seen, planned: AnyPose, pose: AnyPose) -> _Seen:
+def _at_pose(readings: _WindowReadings, planned: AnyPose, pose: AnyPose) -> _WindowReadings:
     """Return the readings of a cell of images at the pose of their view; the camera stays."""
     if readings.pose == planned:
         return replace(readings, pose=pose)
@@ -237,7 +237,7 @@ def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
     yield from (replace(pose, shift=shift) for shift in sorted(shifts - {pose.shift}))
 
 
-def _poses(readings: _Seen, artifact: Artifact) -> Iterator[AnyPose]:
+def _poses(readings: _WindowReadings, artifact: Artifact) -> Iterator[AnyPose]:
     """Yield the other poses with which the readings of a view are of marks of the plate."""
     pose = readings.pose
     if isinstance(pose, LatticePose):
@@ -302,7 +302,7 @@ def _symmetries(marks: np.ndarray) -> Iterator[tuple[complex, complex]]:
     yield from ((1 + 0j, step) for step in steps[np.argsort(np.abs(steps))[:4]].tolist())
 
 
-def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
+def _readings_in_window(artifact: Artifact, view: ViewReadings) -> _WindowReadings | None:
     """Return the readings of a view in the window; None if too few, or without a grid."""
     pose = view.view.on_stage(artifact)
     if not pose.has_sites or not len(view.m):
@@ -311,7 +311,7 @@ def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
     inside = np.maximum(np.abs(i), np.abs(j)) <= WINDOW + EDGE
     if inside.sum() < LEAST_READINGS:
         return None
-    return _Seen(
+    return _WindowReadings(
         cast(AnyPose, pose),
         (i + 1j * j)[inside],
         (view.dx + 1j * view.dy)[inside],
@@ -319,7 +319,7 @@ def _seen(artifact: Artifact, view: ViewReadings) -> _Seen | None:
     )
 
 
-def _sizes(views: list[_Seen], sigma: float) -> tuple[float, float]:
+def _sizes(views: list[_WindowReadings], sigma: float) -> tuple[float, float]:
     """Return the noise of a mean and the spread of stage and plate errors, m, by component."""
     total, free = 0.0, 0
     for readings in views:
@@ -334,7 +334,7 @@ def _sizes(views: list[_Seen], sigma: float) -> tuple[float, float]:
     return sigma * float(np.sqrt(share)), float(np.sqrt(total / (2 * max(free, 1))))
 
 
-def _motion(readings: _Seen) -> np.ndarray:
+def _motion(readings: _WindowReadings) -> np.ndarray:
     """Return the columns of a view's own parameters, complex (n, FREE).
 
     Offset, rotation, strain and bending; the residual belongs to the marks.
@@ -343,14 +343,14 @@ def _motion(readings: _Seen) -> np.ndarray:
     return np.stack([np.ones(len(z)), z, z.conj(), z * z, z * z.conj(), z.conj() ** 2], axis=1)
 
 
-def _alike(views: list[_Seen], nodes: float) -> np.ndarray:
+def _alike(views: list[_WindowReadings], nodes: float) -> np.ndarray:
     """Return the correlation of the stage's errors at the places of all readings, (n, n).
 
     Neither another pose of the plate nor a mirrored frame changes it.
 
     Parameters
     ----------
-    views : list of _Seen
+    views : list of _WindowReadings
         Readings.
     nodes : float
         Distance of the nodes of the map, in pitches; 0 on the lattice.
@@ -363,21 +363,21 @@ def _alike(views: list[_Seen], nodes: float) -> np.ndarray:
 
 
 def _likelihood(
-    views: list[_Seen], noise: float, spread: float, stage: np.ndarray
+    views: list[_WindowReadings], noise: float, spread: float, stage: np.ndarray
 ) -> tuple[float, float]:
     """Return the log-likelihood of all readings, and their mean standardised square.
 
     Each view's own parameters are removed. `stage`: see `_alike`.
     """
-    return _Kept(views, [], noise, spread, stage).with_moved([])
+    return _FactoredReadings(views, [], noise, spread, stage).with_moved([])
 
 
-class _Kept:
+class _FactoredReadings:
     """Readings that stay while others are tried at many poses, factored once for all of them.
 
     Parameters
     ----------
-    views : list of _Seen
+    views : list of _WindowReadings
         Readings of all views.
     moved_views : list of int
         Those of which other poses are tried.
@@ -387,7 +387,7 @@ class _Kept:
 
     def __init__(
         self,
-        views: list[_Seen],
+        views: list[_WindowReadings],
         moved_views: list[int],
         noise: float,
         spread: float,
@@ -407,7 +407,7 @@ class _Kept:
         self.sizes = np.diag(self.factor).real
         self.white = np.linalg.solve(self.factor, self._columns(self.views, 0))
 
-    def with_moved(self, moved_readings: list[_Seen]) -> tuple[float, float]:
+    def with_moved(self, moved_readings: list[_WindowReadings]) -> tuple[float, float]:
         """Return the likelihood of all readings with those of the others at these poses."""
         white, sizes = self.white, self.sizes
         if moved_readings:
@@ -434,7 +434,9 @@ class _Kept:
         """What makes the readings that stay independent, with unit noise, complex (n, n)."""
         return np.linalg.inv(self.factor)
 
-    def _covariance(self, some: list[_Seen], others: list[_Seen], stage: np.ndarray) -> np.ndarray:
+    def _covariance(
+        self, some: list[_WindowReadings], others: list[_WindowReadings], stage: np.ndarray
+    ) -> np.ndarray:
         """Return the covariance of readings, `stage` that of the stage's errors in them."""
         (turn, mark), (other_turn, other_mark) = map(_on_plate, (some, others))
         covariance = self.spread**2 / 2 * stage.astype(complex)
@@ -444,7 +446,7 @@ class _Kept:
             covariance.flat[:: len(mark) + 1] += self.noise**2
         return covariance
 
-    def _columns(self, views: list[_Seen], first: int) -> np.ndarray:
+    def _columns(self, views: list[_WindowReadings], first: int) -> np.ndarray:
         """Return the columns of all views' own parameters, and the deviations; `first`: of these.
 
         Complex (n, free + 1).
@@ -458,7 +460,7 @@ class _Kept:
         return np.concatenate(rows)
 
 
-def _on_plate(views: list[_Seen]) -> tuple[np.ndarray, np.ndarray]:
+def _on_plate(views: list[_WindowReadings]) -> tuple[np.ndarray, np.ndarray]:
     """Return turns of the plate and marks of all readings, complex (n,) each."""
     none = np.zeros(0, dtype=complex)
     return (
@@ -469,7 +471,7 @@ def _on_plate(views: list[_Seen]) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def said(pose_fault: Misplaced | Mirrored, where: str = "") -> PlacingError:
+def placing_error(pose_fault: Misplaced | Mirrored, where: str = "") -> PlacingError:
     """Return in one line how the plate is placed, and how to continue."""
     if isinstance(pose_fault, Mirrored):
         return PlacingError(

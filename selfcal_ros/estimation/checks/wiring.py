@@ -102,7 +102,7 @@ class WiringFault:
 
 def check_wiring(measurements: Measurements) -> None:
     """Raise WiringError for the first fault of `wiring_faults`."""
-    for error in map(worded, wiring_faults(measurements)):
+    for error in map(wiring_error, wiring_faults(measurements)):
         raise WiringError(f"plan '{measurements.plan_id}', {error.where}", error.what, error.remedy)
 
 
@@ -331,7 +331,7 @@ def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) 
     )
 
 
-def worded(fault: WiringFault) -> WiringError:
+def wiring_error(fault: WiringFault) -> WiringError:
     """Return the error for a fault: in one line, what is wrong and how to correct it."""
     responses = fault.responses
     names = " and ".join(f"offset_{response.offset}" for response in responses)

@@ -242,11 +242,11 @@ def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
     """Return the first of the grid views that have the rotation of each, see `rotations_of`."""
     if result.kept.images is None:
         return tuple(range(n_views))
-    placings, steps = zip(*_kept_cells(result.kept.images, n_views), strict=True)
+    placings, steps = zip(*_cells_of_views(result.kept.images, n_views), strict=True)
     return shared_rotations([placings.index(number) for number in placings], steps)
 
 
-def _kept_cells(images: ImagesKept, n_views: int) -> list[tuple[int, tuple[int, int]]]:
+def _cells_of_views(images: ImagesKept, n_views: int) -> list[tuple[int, tuple[int, int]]]:
     """Return the placing of the plate in each grid view of a result, and the step of its cell."""
     if not len(images.placing) == len(images.step) == n_views:
         raise InputError(
@@ -283,7 +283,7 @@ def _weights(weights: Any, field: np.ndarray, where: str) -> np.ndarray:
     return weight
 
 
-def _not_kept(missing: str) -> InputError:
+def _missing_error(missing: str) -> InputError:
     """Return the error of a result whose factors do not have what belongs to them."""
     return InputError(FACTORS, f"no {missing}", "write the result again with `selfcal solve`")
 
@@ -350,7 +350,7 @@ class Together:
         if not share_of(self.result):
             return None
         grid = self.system.grid
-        cells_of_views = _kept_cells(cast(ImagesKept, self.result.kept.images), grid.n_views)
+        cells_of_views = _cells_of_views(cast(ImagesKept, self.result.kept.images), grid.n_views)
         return ImageNoise(
             stops_of(cells_of_views, grid.read),
             grid.read,
@@ -376,9 +376,9 @@ class Together:
         """Return the covariance of Gx, then Gy, at sites for unit noise, None if it is not kept."""
         if known_sites.size > MAX_FULL or self.lacks_terms:
             return None
-        factors = self._kept.of_map[:, :, known_sites].reshape(-1, 2 * int(known_sites.sum()))
+        factors = self._saved.of_map[:, :, known_sites].reshape(-1, 2 * int(known_sites.sum()))
         return self.of_noise(self.stage_rows(known_sites)) + _product(
-            factors, self._kept.of_each_place
+            factors, self._saved.of_each_place
         )
 
     def of_lines(self, known_lines: np.ndarray) -> np.ndarray | None:
@@ -409,39 +409,39 @@ class Together:
         )
 
     @property
-    def _kept(self) -> Factors:
+    def _saved(self) -> Factors:
         return factors_of(self.result)
 
     @property
     def _effects(self) -> np.ndarray:
         """Effects that are not terms of the model, for unit noise, (e, 2, nx, ny)."""
-        return self._kept.of_map[self._kept.with_map :]
+        return self._saved.of_map[self._saved.with_map :]
 
     @property
     def _effects_on_plate(self) -> np.ndarray:
         """What they add to the variance of the plate's map, for unit noise, (2, nx, ny)."""
-        added = self._kept.on_plate
+        added = self._saved.on_plate
         if added is None and len(self._effects):
-            raise _not_kept("effects on the plate")
+            raise _missing_error("effects on the plate")
         return np.zeros((2, *self.marks.shape)) if added is None else added
 
-    def _beside(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    def _saved_factors(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
         """Return the factors of a quantity beside the map in this shape, (r, ...)."""
-        saved = self._kept.beside
+        saved = self._saved.beside
         if saved and name not in saved:
-            raise _not_kept(f"{name} of this plate")
+            raise _missing_error(f"{name} of this plate")
         return saved.get(name, np.zeros((0, *shape))).reshape(-1, *shape)
 
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the effect of terms and causes on G, A and the microscope, (r, q)."""
-        plate, stage = self._beside("plate", (2, *marks.shape)), self._kept.of_map
+        plate, stage = self._saved_factors("plate", (2, *marks.shape)), self._saved.of_map
         effects, n_of_stage = len(self._effects), 2 * int(sites.sum())
         n, r = len(stage) - effects, len(plate)
         maps = np.zeros((r + effects, n_of_stage + 2 * int(marks.sum()) + 4))
         of_stage = stage[:, :, sites].reshape(len(stage), n_of_stage)
         maps[:n, :n_of_stage], maps[r:, :n_of_stage] = of_stage[:n], of_stage[n:]
         maps[:r, n_of_stage:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - n_of_stage - 4)
-        maps[:r, -4:] = self._beside(block_of_offsets().name, (4,)) / self.half_width_m
+        maps[:r, -4:] = self._saved_factors(block_of_offsets().name, (4,)) / self.half_width_m
         return maps
 
     def cover(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
@@ -470,7 +470,7 @@ class Together:
             root = np.sqrt(np.repeat([self._ratio, self._ratio_of_plate, 1.0], [s, m, 4]))
             cover *= np.outer(root, root)
         effects = factors[terms:]
-        cover += _product(effects, self._kept.of_each_place[self._kept.with_map :])
+        cover += _product(effects, self._saved.of_each_place[self._saved.with_map :])
         if len(effects):
             cover[range(s, s + m), range(s, s + m)] += self._effects_on_plate[:, marks].ravel()
         return cover * self.result.noise.sigma_xy**2
@@ -480,7 +480,7 @@ class Together:
         """Variance of the stage's map over that of white noise and terms."""
         emap, sites = self.result.error_map, self.sites
         white = np.trace(self.of_noise(self.stage_rows(sites)))
-        factors = self._kept.of_map[..., sites]
+        factors = self._saved.of_map[..., sites]
         white += (factors**2).sum()
         effects = (self._effects[..., sites] ** 2).sum()
         stated = (emap.u_gx[sites] ** 2 + emap.u_gy[sites] ** 2).sum()
@@ -493,7 +493,7 @@ class Together:
         plate, marks = self.result.artifact_map, self.marks
         rows = unit_rows(marks)
         white = np.trace(self.of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
-        white += (self._beside("plate", (2, *marks.shape))[..., marks] ** 2).sum()
+        white += (self._saved_factors("plate", (2, *marks.shape))[..., marks] ** 2).sum()
         stated = (plate.u_ax[marks] ** 2 + plate.u_ay[marks] ** 2).sum()
         stated -= self._effects_on_plate[:, marks].sum() * self.result.noise.sigma_xy**2
         return float(stated / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
@@ -519,7 +519,9 @@ class Together:
             stage, centre[:, count:].T
         )
         terms = (
-            self._beside("lines", (2 * count,)) @ centre.T * (noise.sigma_xy / self.half_width_m)
+            self._saved_factors("lines", (2 * count,))
+            @ centre.T
+            * (noise.sigma_xy / self.half_width_m)
         )
         cover = cover + terms.T @ terms
         white = np.diag(cover)[:count][known_lines[0]].sum()

@@ -103,7 +103,7 @@ class FittedCamera(Distortion):
         return dict(zip(self.cells, self.place + self.error, strict=True))
 
     @property
-    def shown(self) -> CameraErrors:
+    def as_result(self) -> CameraErrors:
         """What a result keeps of it."""
         scale, shear = self.coefficients[1:3]
         u_scale, u_turn = self.u_coefficients[1]

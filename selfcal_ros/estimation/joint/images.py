@@ -117,7 +117,7 @@ class ImageNoise:
     gain: float = 1.0
 
     @property
-    def taken(self) -> int:
+    def dof_of_terms(self) -> int:
         """Degrees of freedom that these terms take."""
         return 0 if self.fitted is None else self.fitted.rank
 
@@ -153,9 +153,9 @@ class ImageNoise:
             _dof_of(drawn @ from_sums[0]),
         )
 
-    def own(self, sensitivities: np.ndarray) -> np.ndarray:
+    def of_marks(self, sensitivities: np.ndarray) -> np.ndarray:
         """Return the variances, (k,), for unit noise of each mark by itself."""
-        return (abs(self._each_and_together(sensitivities)[0]) ** 2).sum(axis=1)
+        return (abs(self._by_marks_and_images(sensitivities)[0]) ** 2).sum(axis=1)
 
     def added(self, sensitivities: np.ndarray) -> np.ndarray:
         """Return what full correlation within images adds to variances, (k,), for unit noise.
@@ -165,15 +165,15 @@ class ImageNoise:
         sensitivities : complex array (k, views, nx, ny)
             Sensitivities of k coordinates over the weights, see `added_variances`.
         """
-        of_marks, of_images = self._each_and_together(sensitivities)
+        of_marks, of_images = self._by_marks_and_images(sensitivities)
         return (abs(of_images) ** 2).sum(axis=1) - (abs(of_marks) ** 2).sum(axis=1)
 
     def added_covariance(self, sensitivities: np.ndarray) -> np.ndarray:
         """Return the same of all pairs of coordinates, (k, k)."""
-        of_marks, of_images = self._each_and_together(sensitivities)
+        of_marks, of_images = self._by_marks_and_images(sensitivities)
         return (of_images @ of_images.conj().T - of_marks @ of_marks.conj().T).real
 
-    def _each_and_together(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _by_marks_and_images(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return sensitivities to readings of unit noise, (k, n), and to images, (k, stops)."""
         of_marks = np.sqrt(self.weight) * sensitivities[:, self.read]
         of_images = np.zeros((len(sensitivities), int(self.stop.max()) + 1), dtype=complex)
@@ -301,6 +301,6 @@ def _solved(system: NormalEquations, values: np.ndarray) -> tuple[np.ndarray, np
     grid = system.grid
     y = np.zeros(grid.read.shape, dtype=complex)
     y[grid.read] = values
-    field, parameters, _, residual = system.in_datum(y, *system.alone(y))
+    field, parameters, _, residual = system.in_datum(y, *system.grid_fit(y))
     map_values = np.where(system.known_sites, field, 0)
     return residual, parameters, float((abs(map_values) ** 2).sum())

@@ -269,7 +269,7 @@ class _State:
             self._solve_terms(self.equations)
         elif self.problem.moves:
             self.problem = replace(self.problem, repeats_xy=self.moving.repeats(self.fitted))
-        place_change = self.moving.taken(self.fitted.field)
+        place_change = self.moving.change_of_readings(self.fitted.field)
         self.y = np.where(
             self.problem.system.grid.read,
             self.problem.grid.y - self._excess() - self._of_terms() - place_change,

@@ -91,7 +91,7 @@ def image_variances(
         (cover.of_plate if plate else cover.of_stage) if rows is None else np.diag(cover.of(rows))
     )
     if (added < -variance).any():
-        of_marks = added_variances(cover, images.own, rows, plate=plate)
+        of_marks = added_variances(cover, images.of_marks, rows, plate=plate)
         added = added * np.minimum(1.0, variance / np.where(of_marks > 0, of_marks, 1.0))
     return share * added
 

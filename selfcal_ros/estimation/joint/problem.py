@@ -327,7 +327,7 @@ def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     residuals = problem.residuals_xy or sigma_of(total, grid_dof(problem))
     repeats = problem.repeats_xy
     if problem.images is not None and total > 0:  # of which residuals show only part
-        n_taken = problem.images.taken if problem.residuals_xy else 0
+        n_taken = problem.images.dof_of_terms if problem.residuals_xy else 0
         without_images, noises = (
             sigma_of(total, grid_dof(problem) - n_taken),
             problem.images.noises(residual),
@@ -658,13 +658,13 @@ class Moving:
         self.moved: np.ndarray | None = None
         """Stage error where the stage stood less that at the site, at each reading, m."""
 
-    def taken(self, field: np.ndarray) -> np.ndarray | float:
+    def change_of_readings(self, field: np.ndarray) -> np.ndarray | float:
         """Return that contribution, (views, nx, ny), m, and store its change."""
         if self.places is None:
             return 0.0
         before: np.ndarray | float = 0.0 if self.moved is None else self.moved
         near = None if self.moved is None else self.places.errors(field, self.moved)
-        self.moved = self.places.moved(field, near)
+        self.moved = self.places.differences(field, near)
         self.change = float(np.abs(self.moved - before).max())
         return self.places.changes(self.moved, self.problem.turn_rad)
 
@@ -717,7 +717,7 @@ def noise_gain(problem: Problem, fitted: JointFit) -> np.ndarray:
         y = sigma_m * noise_of(rng, grid.weight.shape, grid.weight)
         plain = now = fit(problem, y, still).field
         for _ in range(MAX_STEPS):
-            changes = places.changes(places.moved(now, error_there), problem.turn_rad)
+            changes = places.changes(places.differences(now, error_there), problem.turn_rad)
             before, now = now, fit(problem, y - changes, still).field
             if np.abs(now - before).max() <= NEGLIGIBLE * np.abs(now).max():
                 break

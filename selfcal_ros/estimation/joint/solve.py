@@ -59,7 +59,7 @@ from selfcal_ros.estimation.terms.equations import (
     require_terms_determined,
     roots_by_term,
 )
-from selfcal_ros.estimation.terms.visits import check_visits, ground_of
+from selfcal_ros.estimation.terms.visits import check_visits, term_inputs
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
 from selfcal_ros.model.kept import Factors, ImagesKept, Kept, rounded
 from selfcal_ros.model.readings import (
@@ -447,7 +447,7 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
             observability,
         )
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    inputs = ground_of(measurements, grid, half_width_m, drift_degree=options.drift_degree)
+    inputs = term_inputs(measurements, grid, half_width_m, drift_degree=options.drift_degree)
     # as a column, offsets would explain the noise that they hold
     inputs = replace(
         inputs, line_offsets=inputs.line_offsets - angular_residuals(system, angular.y)

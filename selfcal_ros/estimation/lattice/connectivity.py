@@ -195,7 +195,7 @@ class Gauge:
         self._rows = _modes(z, is_known)[: 4 if scale else 3]
         self._gram_inverse = _inverse((self._rows.conj() @ self._rows.T).real)
 
-    def parts(self, field: np.ndarray) -> np.ndarray:
+    def coefficients(self, field: np.ndarray) -> np.ndarray:
         """Return the coefficients of the modes (1, i, iz, z) in `field`, (modes,)."""
         return self._gram_inverse @ (self._rows @ field.conj().reshape(-1)).real
 

@@ -142,7 +142,7 @@ class LatticeViews:
         field : complex array (..., nx, ny)
             G, or several fields.
         """
-        out = _taken(field, self.site_index)
+        out = _at_indices(field, self.site_index)
         out *= self.phases.conj()[:, None, None]
         return out
 
@@ -157,7 +157,7 @@ class LatticeViews:
 
     def add_scattered(self, out: np.ndarray, index: int, marks: np.ndarray) -> None:
         """Add the scatter of one view's fields over the marks to `out`, (..., nx, ny) both."""
-        out += _taken(marks, self._mark_on[index]) * self.phases[index]
+        out += _at_indices(marks, self._mark_on[index]) * self.phases[index]
 
     def scatter(self, marks: np.ndarray) -> np.ndarray:
         """Return the adjoint of `gather`: sums over views at every site, complex (..., nx, ny)."""
@@ -167,7 +167,7 @@ class LatticeViews:
         return out
 
 
-def _taken(fields: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _at_indices(fields: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Return values of fields (..., nx, ny) at flat indices, complex (..., *at); 0 at -1."""
     *several, nx, ny = fields.shape
     flat = np.zeros((*several, nx * ny + 1), dtype=complex)

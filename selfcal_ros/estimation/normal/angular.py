@@ -184,25 +184,25 @@ class HarmonicSystem(AngularSystem):
     @cached_property
     def missed(self) -> tuple[int, ...]:
         """The harmonics that the readings do not determine, from 1."""
-        lost = self._spectrum[1][1:, ~self._told] / GAP  # the constant is a datum
+        lost = self._spectrum[1][1:, ~self._determined] / GAP  # the constant is a datum
         variance = np.diag(self._inverse)[1:] + (lost**2).sum(axis=1)
         variance = variance.reshape(-1, 2).sum(axis=1) / 2
         return tuple(int(h) + 1 for h in np.flatnonzero(~(variance < KNOWN**2)))
 
     @cached_property
-    def _told(self) -> np.ndarray:
+    def _determined(self) -> np.ndarray:
         """Combinations of coefficients that the readings determine, bool (2 H + 1,)."""
         return self._spectrum[0] > GAP * self.weight.sum()
 
     @property
     def n_determined(self) -> int:
         """Number of coefficients that the readings determine, however badly; not the constant."""
-        return int(self._told.sum())
+        return int(self._determined.sum())
 
     @property
     def mean_variance(self) -> float:
         """Mean variance of what they determine of the map, for unit noise of a reading."""
-        values, vectors = (values_of[..., self._told] for values_of in self._spectrum)
+        values, vectors = (values_of[..., self._determined] for values_of in self._spectrum)
         return float(((vectors[1:] ** 2).sum(axis=0) / values).sum() / 2)
 
     @cached_property
@@ -233,7 +233,7 @@ class HarmonicSystem(AngularSystem):
     def _inverse(self) -> np.ndarray:
         """Covariance of the coefficients for unit noise; what is undetermined is held."""
         values, vectors = self._spectrum
-        return (vectors / np.where(self._told, values, self.weight.sum())) @ vectors.T
+        return (vectors / np.where(self._determined, values, self.weight.sum())) @ vectors.T
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution at the lines for (K,) or (K, k)."""

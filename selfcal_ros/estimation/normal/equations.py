@@ -125,7 +125,7 @@ class NormalEquations:
         """Pseudo-inverse of the grid's misalignment matrix: their covariance, unit noise."""
         return pseudo_inverse(*self._spectrum, self.grid_scale)
 
-    def alone(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def grid_fit(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return map and misalignments of grid readings `y` fitted alone, in no datum."""
         field, parameters = self.grid.fitted(y, self.grid_inverse)
         return field.reshape(self.grid.views.shape), parameters
@@ -142,12 +142,12 @@ class NormalEquations:
         field, parameters : complex array (nx, ny), float array (size,) or (3 views,)
             Their map and misalignments, in no datum.
         """
-        modes = self.gauge.parts(field)
+        modes = self.gauge.coefficients(field)
         field = self.gauge.remove(field, modes)
         rigid = self.rigid[:, : len(parameters)]
         parameters = parameters - modes @ rigid[: len(modes)]
         plate, residuals = self.grid.plate(y, field, parameters[: 3 * self.grid.n_views])
-        modes = self.plate_gauge.parts(plate)
+        modes = self.plate_gauge.coefficients(plate)
         return (
             field,
             parameters - modes @ rigid[4:],
@@ -163,12 +163,12 @@ class NormalEquations:
 
     def inverse(self, ratio: float) -> np.ndarray:
         """Return the pseudo-inverse of `normal`: covariance of the misalignments, unit noise."""
-        held_modes, let_go = self._held
+        held_modes, let_go = self._regularised
         out = np.linalg.inv(self.normal(ratio) + held_modes) - let_go
         return (out + out.T) / 2
 
     @cached_property
-    def _held(self) -> tuple[np.ndarray, np.ndarray]:
+    def _regularised(self) -> tuple[np.ndarray, np.ndarray]:
         """Matrix that makes the normal matrix regular, and its effect on the inverse."""
         held_modes = self.grid_scale * (self._null @ self._null.T)
         return held_modes, held_modes / self.grid_scale**2
@@ -246,7 +246,7 @@ class NormalEquations:
             )
             for column in fields.T:
                 field = column.reshape(self.grid.views.shape)
-                residual = gauge.remove(field, gauge.parts(field)).ravel()
+                residual = gauge.remove(field, gauge.coefficients(field)).ravel()
                 is_known &= abs(residual) <= TRACE
         return is_known.reshape(self.grid.views.shape)
 
@@ -361,7 +361,7 @@ def in_datum(
 
 def grid_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     """Return the residuals of the grid readings `y` (views, nx, ny), fitted alone."""
-    return system.grid.plate(y, *system.alone(y))[1]
+    return system.grid.plate(y, *system.grid_fit(y))[1]
 
 
 def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
@@ -558,7 +558,7 @@ class PlacedEquations(NormalEquations):
         gauge = Gauge(views.z_sites, np.ones(views.shape, dtype=bool), scale=True)
         fields = (self.grid.response @ self.unseen[: 3 * self.grid.n_views]).T
         return any(
-            np.abs(gauge.remove(field, gauge.parts(field))).max() > TRACE
+            np.abs(gauge.remove(field, gauge.coefficients(field))).max() > TRACE
             for field in fields.reshape(-1, *views.shape)
         )
 

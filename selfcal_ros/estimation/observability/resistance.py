@@ -134,8 +134,8 @@ class PlannedTerms:
             for name, block in blocks().items()
             if name in names
         ]
-        self.every = planned_equations(plan, system, sized, assumed)
-        self.of_model = with_terms(self.every, self.model)
+        self.all_terms = planned_equations(plan, system, sized, assumed)
+        self.of_model = with_terms(self.all_terms, self.model)
 
     def require_determined(self, observability: Observability) -> None:
         """Raise NotIdentifiableError if free terms of the model hide modes of the stage."""
@@ -189,19 +189,19 @@ class PlannedTerms:
         """Return a prediction with the contribution of the model's terms added."""
         return with_part_of_terms(without_terms, self.of_model, self.repeats)
 
-    def _others(self, name: str) -> list[ModelTerm]:
+    def _other_terms(self, name: str) -> list[ModelTerm]:
         return [term for term in self.model if term.name != name]
 
     def _unseen_modes(self, name: str) -> int:
-        other_free_terms = [term for term in self._others(name) if term.free]
-        return _n_unseen(with_terms(self.every, [*other_free_terms, ModelTerm(name)])) - _n_unseen(
-            with_terms(self.every, other_free_terms)
-        )
+        other_free_terms = [term for term in self._other_terms(name) if term.free]
+        return _n_unseen(
+            with_terms(self.all_terms, [*other_free_terms, ModelTerm(name)])
+        ) - _n_unseen(with_terms(self.all_terms, other_free_terms))
 
     def _effect(self, name: str, size: float) -> tuple[float, float]:
         """Return rms and largest effect of the term on the map."""
-        all_terms, term = self.every, self.every.rows([name])
-        model, explained, _ = self._remainder(name, self._others(name), self.assumed.sigma_m)
+        all_terms, term = self.all_terms, self.all_terms.rows([name])
+        model, explained, _ = self._remainder(name, self._other_terms(name), self.assumed.sigma_m)
         fields = all_terms.maps[:, term] - all_terms.maps[:, model] @ explained
         known_sites = all_terms.system.known_sites.ravel()
         spread = size * np.sqrt(
@@ -210,8 +210,8 @@ class PlannedTerms:
         return rms(spread), float(spread.max())
 
     def _power(self, name: str, size: float, level: float) -> float:
-        all_terms = self.every
-        other_terms = [ModelTerm(term.name) for term in self._others(name)]
+        all_terms = self.all_terms
+        other_terms = [ModelTerm(term.name) for term in self._other_terms(name)]
         of_others = with_terms(all_terms, other_terms)
         values, rank = self._information(name, other_terms)
         grid = all_terms.system.grid
@@ -236,7 +236,7 @@ class PlannedTerms:
 
         The latter (o, t), and the information that is left on the term, (t, t).
         """
-        all_terms, term = self.every, self.every.rows([name])
+        all_terms, term = self.all_terms, self.all_terms.rows([name])
         of_others, columns = (
             with_terms(all_terms, other_terms),
             rows_of(all_terms.columns, other_terms),
@@ -247,7 +247,7 @@ class PlannedTerms:
 
     def _information(self, name: str, other_terms: Sequence[ModelTerm]) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term given others, and its rank."""
-        all_terms, term = self.every, self.every.rows([name])
+        all_terms, term = self.all_terms, self.all_terms.rows([name])
         information = self._remainder(name, other_terms, 0.0)[2]
         norm = all_terms.norm[term]
         scaled = np.linalg.eigvalsh(information / np.outer(norm, norm))

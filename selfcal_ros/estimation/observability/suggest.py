@@ -56,7 +56,7 @@ Pose = tuple[int, float, float]
 """Turn in degrees, shift along x and y in pitches."""
 
 
-def posed(view: View, pose: Pose, pitch_m: float) -> View:
+def view_at(view: View, pose: Pose, pitch_m: float) -> View:
     """Return the view at a pose, named after it."""
     turn, *shift = pose
     shift_text = "".join(f"{step:+g}{axis}" for step, axis in zip(shift, "xy", strict=True) if step)
@@ -198,7 +198,7 @@ class Against:
     by_default: tuple[ModelTerm, ...] = ()
 
     @property
-    def every(self) -> tuple[ModelTerm, ...]:
+    def all_terms(self) -> tuple[ModelTerm, ...]:
         """All terms."""
         return (*self.terms, *self.by_default)
 
@@ -258,8 +258,8 @@ def score_plan(
         return PlanScore(unseen, inf, inf, inf)
     repeats = repeats or unit_repeats(plan)
     prediction: Prediction = predict(system, plan.artifact, datum, repeats=repeats)
-    if against is not None and against.every:
-        terms = planned_equations(plan, system, against.every, against.assumed)
+    if against is not None and against.all_terms:
+        terms = planned_equations(plan, system, against.all_terms, against.assumed)
         hidden = terms.unseen(terms.free).shape[1]
         if hidden:
             return PlanScore(hidden, inf, inf, inf, of_terms=True)
@@ -306,7 +306,7 @@ def rank_next(
     if plan.artifact.map_grid:
         views += _anywhere(plan, views, lambda added: score(added).key(criterion))
     steps = [*views, *more_repeats(plan)]
-    terms, all_terms = (against.terms, against.every) if against else ((), ())
+    terms, all_terms = (against.terms, against.all_terms) if against else ((), ())
     if any(term.block.change == "order" for term in terms):
         steps += other_orders(plan)
     if any(term.block.change == "check_stops" for term in all_terms):
@@ -391,7 +391,7 @@ def _anywhere(
     pitch_m, added = plan.artifact.grid_pitch_m, steps[0].views[-1]
 
     def views(pose: Pose) -> tuple[View, ...]:
-        view = posed(added, pose, pitch_m)
+        view = view_at(added, pose, pitch_m)
         return *plan.views, replace(view, name=unused_name(view.name, plan.views))
 
     reach = reach_of(plan.artifact)
@@ -412,7 +412,7 @@ def _moved_off_the_lattice(
     now, before, pitch_m = views, None, artifact.grid_pitch_m
 
     def instead(views: tuple[View, ...], at: int, pose: Pose) -> tuple[View, ...]:
-        return *views[:at], posed(views[at], pose, pitch_m), *views[at + 1 :]
+        return *views[:at], view_at(views[at], pose, pitch_m), *views[at + 1 :]
 
     def value(views: tuple[View, ...], at: int) -> Callable[[Pose], tuple[float, ...]]:
         return lambda pose: key(instead(views, at, pose))

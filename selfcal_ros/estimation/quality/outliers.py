@@ -55,7 +55,7 @@ from selfcal_ros.estimation.verdict.causes import (
 from selfcal_ros.estimation.verdict.leverage import (
     FEW_DRAWS,
     MAX_REMOVED,
-    Alone,
+    FitOfKind,
     lines_alone,
     marks_alone,
 )
@@ -78,8 +78,8 @@ class Residuals:
     """Residuals of all readings: the problem that they pose, marks and lines by themselves."""
 
     problem: Problem
-    marks: Alone
-    lines: Alone
+    marks: FitOfKind
+    lines: FitOfKind
 
     @property
     def level(self) -> float:
@@ -342,14 +342,14 @@ def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     """
     view = measurements.views[slip.index]
     after = getattr(view, slip.axis) >= slip.first
-    placements = [_part(view, ~after, ""), _part(view, after, AFTER_SLIP)]
+    placements = [_placement_of(view, ~after, ""), _placement_of(view, after, AFTER_SLIP)]
     if len(view.k):
-        placements.append(_part(view, np.zeros(len(view.m), dtype=bool), " lines"))
+        placements.append(_placement_of(view, np.zeros(len(view.m), dtype=bool), " lines"))
     views = (*measurements.views[: slip.index], *placements, *measurements.views[slip.index + 1 :])
     return replace(measurements, views=views)
 
 
-def _part(view: ViewReadings, marks: np.ndarray, suffix: str) -> ViewReadings:
+def _placement_of(view: ViewReadings, marks: np.ndarray, suffix: str) -> ViewReadings:
     """Return some marks of a view, or its lines if there are none, as a placement of their own."""
     lines = not marks.any()
     named = replace(view.view, name=view.view.name + suffix, grid=not lines, angular=lines)
@@ -551,7 +551,7 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
     ), True
 
 
-def robust_sigma(readings: Alone) -> float:
+def robust_sigma(readings: FitOfKind) -> float:
     """Return the noise from the median of standardised squares, at least FLOOR."""
     squares = readings.squares[np.isfinite(readings.squares)]
     if not len(squares):

@@ -41,7 +41,7 @@ from selfcal_ros.estimation.observability.rank import identifies, smaller
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import NO_LINES, term_columns
 from selfcal_ros.estimation.terms.places import places_of
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, ground_of, time_ranges
+from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, term_inputs, time_ranges
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
@@ -65,29 +65,31 @@ class HeldReadings:
         Effect of a unit of each fitted coefficient on them, plate frame.
     rows : tuple of int
         Row of each of their views in the fit; -1 if it was not fitted.
-    own : complex array (q, views, nx, ny)
+    own_columns : complex array (q, views, nx, ny)
         Effect on them of one standard deviation of each coefficient with a size that belongs to a
         view that was not fitted, plate frame, m.
-    moved : complex array (views, nx, ny)
+    place_change : complex array (views, nx, ny)
         Effect on them of the stage's distance from the sites, plate frame, m.
     """
 
     grid: GridData
     columns: np.ndarray
     rows: tuple[int, ...]
-    own: np.ndarray
-    moved: np.ndarray
+    own_columns: np.ndarray
+    place_change: np.ndarray
 
 
 def held_readings(model: ModelFit, fitted: Measurements, held_out: Measurements) -> HeldReadings:
     """Return the grid readings `held_out` with the columns of the terms of the fit of `fitted`."""
     problem, grid = model.problem, grid_data(held_out)
     rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1 for i in grid.index)
-    inputs = ground_of(held_out, grid, problem.half_width_m)
+    inputs = term_inputs(held_out, grid, problem.half_width_m)
     places = places_of(held_out, grid, inputs, problem.system.known_sites)
     place_change: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
     if problem.moves and places is not None:
-        place_change = places.changes(places.moved(model.fitted.field), np.zeros(len(grid.index)))
+        place_change = places.changes(
+            places.differences(model.fitted.field), np.zeros(len(grid.index))
+        )
     equations = model.equations
     n = 0 if equations is None else equations.n
     of_terms: np.ndarray = np.zeros((n, *grid.y.shape), dtype=complex)
@@ -153,7 +155,7 @@ def prediction_errors(solved: Solved, held_out: HeldReadings) -> np.ndarray:
     plate, marks = model.fitted.plate, views.z * problem.half_width_m
     error = (
         held_out.grid.y
-        - held_out.moved
+        - held_out.place_change
         - np.tensordot(model.coefficients, held_out.columns, axes=1)
     )
     error = np.where(predictable, error - views.gather(model.fitted.field) - plate, complex(np.nan))
@@ -250,7 +252,9 @@ def prediction_limit(
     noise = noise_of(rng, (n, *grid.weight.shape), grid.weight)
     fields, parameters, coefficients = _fitted(model, noise, rng)
     own_noise = noise_of(rng, (n, *weight.shape), weight)
-    own_terms = rng.standard_normal((len(held_out.own), n)) / max(model.fitted.xy.sigma, FLOOR)
+    own_terms = rng.standard_normal((len(held_out.own_columns), n)) / max(
+        model.fitted.xy.sigma, FLOOR
+    )
     views, columns = maps_of(held_out.grid), np.zeros((0, *grid.weight.shape))
     if model.equations is not None:
         columns = model.equations.columns.grid
@@ -261,7 +265,7 @@ def prediction_limit(
         plate = grid.plate(readings, field, parameters[:, draw])[0]
         error = own_noise[draw] - views.gather(field) - plate
         error -= np.tensordot(coefficients[:, draw], held_out.columns, axes=1)
-        error += np.tensordot(own_terms[:, draw], held_out.own, axes=1)
+        error += np.tensordot(own_terms[:, draw], held_out.own_columns, axes=1)
         misaligned = grid.misaligned(parameters[:, draw])
         for error_of_view, predictable_marks, fitted in zip(
             error, predictable, held_out.rows, strict=True
@@ -440,7 +444,7 @@ def _held_out(
     lines_off = angles[np.isfinite(angles)]
     if not coordinates.size and not lines_off.size:
         return HeldOut(why=Finding("nothing_to_predict"))
-    ratio, limit, why = _judged(solved, predicted, predictable=predictable, error=error)
+    ratio, limit, why = _ratio_and_limit(solved, predicted, predictable=predictable, error=error)
     return HeldOut(
         "",
         0,
@@ -455,7 +459,7 @@ def _held_out(
     )
 
 
-def _judged(
+def _ratio_and_limit(
     solved: Solved, held_out: HeldReadings, *, predictable: np.ndarray, error: np.ndarray
 ) -> tuple[float, float, Finding | None]:
     """Return error over noise, its limit, and why there is no limit."""

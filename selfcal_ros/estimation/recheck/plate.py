@@ -23,7 +23,7 @@ from selfcal_ros.estimation.checks.placing import (
     Misplaced,
     motions,
     on_marks,
-    said,
+    placing_error,
 )
 from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.comparison.covariance import Together, together
@@ -360,7 +360,9 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
             continue
         other_pose = _other_pose(read_marks, plate.field, measurements.artifact)
         if other_pose is not None:
-            raise said(_misplaced(view, read_marks, other_pose), f"plan '{measurements.plan_id}', ")
+            raise placing_error(
+                _misplaced(view, read_marks, other_pose), f"plan '{measurements.plan_id}', "
+            )
         if _of_marks(read_marks.marks[readable], remaining, read_marks.u):
             return Finding(
                 "other_plate",

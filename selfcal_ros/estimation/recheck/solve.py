@@ -63,7 +63,7 @@ from selfcal_ros.estimation.terms.columns import (
     LineColumns,
     TermColumns,
 )
-from selfcal_ros.estimation.terms.visits import ground_of, without_noise
+from selfcal_ros.estimation.terms.visits import term_inputs, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of, views_findings
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
@@ -370,7 +370,7 @@ def _problem(measurements: Measurements, options: Options, plate: KnownPlate) ->
         )
     system = system_of(replace(grid, known_plate=True), Marks((), angular.weight[:0], ()))
     length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    inputs = ground_of(measurements, grid, length, drift_degree=options.drift_degree)
+    inputs = term_inputs(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in inputs.visits))
     return problem_of(measurements, options, system, inputs, readings=(grid, angular), terms=terms)
 
@@ -493,7 +493,7 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
     """
     builder = ColumnBuilder(without_noise(problem.inputs, np.zeros(problem.grid.y.shape)))
     builder.add_terms(problem.terms)
-    columns = builder.done()
+    columns = builder.build()
     of_offsets, within = columns.having(lambda block: block.of_microscope), columns.within
     if not of_offsets.any() or not within.dof:
         return None
@@ -548,7 +548,7 @@ def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> Term
             for number in numbers:
                 builder.column(Column(name, SHARED, axis, 1.0), number, unit)
     builder.add_terms(problem.terms)
-    return builder.done()
+    return builder.build()
 
 
 def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:

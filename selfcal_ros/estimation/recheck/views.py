@@ -293,16 +293,16 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
     moving, lacking = Moving(problem), np.zeros(grid.read.shape, dtype=complex)
     for _ in range(MAX_STEPS):
         y, before = np.where(grid.read, linear - lacking, 0.0), lacking
-        field, parameters = system.alone(y)
+        field, parameters = system.grid_fit(y)
         residuals = grid.plate(y, field, parameters)[1]
         right = shapes.against(shapes.sums(grid.weight * residuals))
         estimated = gain @ right
         field = field - (fields @ estimated).reshape(field.shape)
-        modes = gauge.parts(field)
+        modes = gauge.coefficients(field)
         field = gauge.remove(field, modes)
         parameters = parameters - misalignments @ estimated - modes @ system.rigid[:3]
         lacking = grid.read * (
-            moving.taken(np.where(readings.known, field, 0.0))
+            moving.change_of_readings(np.where(readings.known, field, 0.0))
             + problem.excess(parameters, plate, grid.views.gather(field))
         )
         if np.abs(lacking - before).max() <= FLOOR:

@@ -107,7 +107,7 @@ class Shapes:
             of_view[...] = (coefficient_of_shape[rows] @ values).reshape(self.lattice)
         return out
 
-    def part(self, columns: np.ndarray) -> "Shapes":
+    def chosen(self, columns: np.ndarray) -> "Shapes":
         """Return some of the columns, bool (p,); the shapes are the same."""
         return replace(self, of_column=self.of_column[columns], unit=self.unit[columns])
 
@@ -350,7 +350,7 @@ class ColumnBuilder:
                         column = Column(term.name, pattern.view, component, size)
                         self.column(column, numbers[values], unit)
 
-    def done(self) -> TermColumns:
+    def build(self) -> TermColumns:
         """Return the columns."""
         shapes = shapes_of(self.means, self.of_column, self.unit, self.inputs.weight)
         at, values = zip(*self.lines, strict=True) if self.lines else ((), ())
@@ -381,7 +381,7 @@ def term_columns(inputs: TermInputs, terms: Iterable[ModelTerm]) -> TermColumns:
     """
     builder = ColumnBuilder(inputs)
     builder.add_terms(terms)
-    return builder.done()
+    return builder.build()
 
 
 def _require_visits(inputs: TermInputs, name: str) -> None:

@@ -70,7 +70,7 @@ class StagePlaces:
         s, t = self.views.from_corner
         return s[self.at], t[self.at]
 
-    def moved(
+    def differences(
         self, field: np.ndarray, near: np.ndarray | None = None, *, local: bool = False
     ) -> np.ndarray:
         """Return the stage error where the stage stood less that at the site, (P,), m.
@@ -99,7 +99,7 @@ class StagePlaces:
     def errors(self, field: np.ndarray, differences: np.ndarray | None = None) -> np.ndarray:
         """Return the stage error where the stage stood, (P,), m, given that at the sites."""
         at_site = self._at_nominal(_filled(field, self.known))
-        return at_site + (self.moved(field) if differences is None else differences)
+        return at_site + (self.differences(field) if differences is None else differences)
 
     def changes(self, differences: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
         """Return what differences of the stage error do to the readings, (views, nx, ny), m.

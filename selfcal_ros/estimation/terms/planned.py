@@ -28,7 +28,7 @@ from selfcal_ros.estimation.terms.equations import (
     TermEquations,
     equations_of_columns,
 )
-from selfcal_ros.estimation.terms.visits import TermInputs, ground_of
+from selfcal_ros.estimation.terms.visits import TermInputs, term_inputs
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, ViewReadings
 from selfcal_ros.model.terms import DRIFT_DEGREE, ModelTerm
@@ -85,7 +85,7 @@ class Assumed:
     error_rad: float = 10e-6
 
 
-def planned_ground(artifact: Artifact, views: Sequence[View], assumed: Assumed) -> TermInputs:
+def planned_inputs(artifact: Artifact, views: Sequence[View], assumed: Assumed) -> TermInputs:
     """Return the inputs for planned views.
 
     Parameters
@@ -116,7 +116,7 @@ def planned_ground(artifact: Artifact, views: Sequence[View], assumed: Assumed) 
             view = replace(view, dtheta=of_lines[index] + lies[0])
         expected.append(view)
     readings = replace(planned, views=tuple(expected))
-    return ground_of(
+    return term_inputs(
         readings,
         grid_data(readings),
         artifact.grid_pitch_m * max(artifact.reach),
@@ -209,7 +209,7 @@ def planned_equations(
     Without terms of the lines rotations are those from the grid, as in `predict`: lines add little
     to them.
     """
-    inputs = planned_ground(plan.artifact, plan.views, assumed)
+    inputs = planned_inputs(plan.artifact, plan.views, assumed)
     columns = term_columns(inputs, terms)
     n, length = 3 * system.grid.n_views, inputs.half_width_m
     inverse, ratio = np.zeros((system.size, system.size)), 0.0
@@ -248,7 +248,7 @@ def with_terms(equations: TermEquations, terms: Iterable[ModelTerm]) -> TermEqua
     )
     return TermEquations(
         equations.system,
-        TermColumns(columns, all_columns.shapes.part(rows), within, all_columns.at, lines),
+        TermColumns(columns, all_columns.shapes.chosen(rows), within, all_columns.at, lines),
         ProjectedColumns(
             lambda: projected.fields[:, rows],
             projected.parameters[:, rows],

@@ -126,7 +126,7 @@ def _visits_of(
     if visits is None or not len(visits.mark) or ends is None:
         return None
     mark = flat[visits.mark]
-    visit_weight = _own_weights(visits, mark, grid.y[row].size)
+    visit_weight = _visit_weights(visits, mark, grid.y[row].size)
     total = np.bincount(mark, visit_weight, grid.y[row].size)
     weight = visit_weight / total[mark] * grid.weight[row].reshape(-1)[mark]
     phase = grid.poses[row].phase.conjugate()
@@ -182,7 +182,7 @@ def check_visits(measurements: Measurements) -> None:
                 )
 
 
-def _own_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
+def _visit_weights(visits: GridVisits, mark: np.ndarray, n_marks: int) -> np.ndarray:
     """Return 1/u^2 if all visits of a mark declare u, else the repeats: as for its mean."""
     count = visits.count.astype(float)
     if not len(visits.u):
@@ -372,7 +372,7 @@ class TermInputs:
         return (*self.names_of(term), "")[view]
 
 
-def ground_of(
+def term_inputs(
     measurements: Measurements,
     grid: GridData,
     half_width_m: float,

@@ -216,17 +216,17 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     reading_change = places.changes(
         _missed(problem, places, model.fitted.field, error_there), problem.turn_rad
     )
-    if not rms(_parts(reading_change)) > SMALL * rms(u):
+    if not rms(_coordinates(reading_change)) > SMALL * rms(u):
         return None
     before, corrected = model.fitted.xy.residuals, fit(problem, model.y - reading_change)
     if corrected.xy.residuals < before:  # part of the residual noise is this effect
         u = u * (corrected.xy.residuals / before)
     map_change = np.where(known_sites, model.fitted.field - corrected.field, 0.0)
-    ratio = np.where(known_sites, np.abs(_parts(map_change)) / u, 0.0)
+    ratio = np.where(known_sites, np.abs(_coordinates(map_change)) / u, 0.0)
     if not (rms(ratio[:, known_sites]) > RMS_MATTERS or ratio.max() > NODE_MATTERS):
         return None
     u_of_effect = np.maximum(_noise(problem, places, error_there, u), FLOOR)
-    effect = np.abs(_parts(map_change))
+    effect = np.abs(_coordinates(map_change))
     p = effect.size * math.erfc(float((effect / u_of_effect).max()) / math.sqrt(2))
     if p >= CAUSE_LEVEL:
         return None
@@ -265,9 +265,11 @@ def _missed(
     there : complex array (P,)
         Stage error of the solution at the positions of the stage.
     """
-    smooth = places.moved(field, error_there)
+    smooth = places.differences(field, error_there)
     return (
-        ROUGH * (places.moved(field, error_there, local=True) - smooth) if problem.moves else smooth
+        ROUGH * (places.differences(field, error_there, local=True) - smooth)
+        if problem.moves
+        else smooth
     )
 
 
@@ -283,13 +285,13 @@ def _noise(
     for _ in range(FEW_DRAWS):
         drawn = rng.normal(0, u)
         missed = _missed(problem, places, drawn[0] + 1j * drawn[1], error_there)
-        total += [np.bincount(sites, coordinate**2, n_sites) for coordinate in _parts(missed)]
+        total += [np.bincount(sites, coordinate**2, n_sites) for coordinate in _coordinates(missed)]
     return np.sqrt(
         total / (FEW_DRAWS * np.maximum(np.bincount(sites, minlength=n_sites), 1))
     ).reshape(u.shape)
 
 
-def _parts(field: np.ndarray) -> np.ndarray:
+def _coordinates(field: np.ndarray) -> np.ndarray:
     return np.stack([field.real, field.imag])
 
 
@@ -532,7 +534,7 @@ def find_explanations(
         shift, rotation = placed.after * phases[placed.view], placed.after * inputs.z
         rows = add_slip(builder, placed.view, (shift.reshape(-1), rotation.reshape(-1)))
         groups.append(Group(SLIP, np.array(rows), placed.view, places=placed.places))
-    columns = builder.done()
+    columns = builder.build()
     groups = [
         replace(group, rows=np.isin(np.arange(len(columns.columns)), group.rows))
         for group in groups

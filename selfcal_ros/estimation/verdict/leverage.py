@@ -33,7 +33,7 @@ CHECKED = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Alone:
+class FitOfKind:
     """Readings of one kind, marks or lines, fitted by themselves.
 
     Attributes
@@ -101,14 +101,14 @@ class Alone:
         return float(fdtrc(n, self.dof - n, self.squares[at] / n / noise**2))
 
 
-def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> Alone:
+def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> FitOfKind:
     """Return the grid readings y, complex (views, nx, ny), m, fitted by themselves."""
     redundancy, skew = (
         exact_leverage(system.grid, system.grid_inverse)
         if exact
         else (drawn_redundancy(system), np.zeros(y.shape))
     )
-    return Alone(
+    return FitOfKind(
         "grid",
         grid_residuals(system, y),
         system.grid.weight,
@@ -118,9 +118,9 @@ def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> Alone
     )
 
 
-def lines_alone(system: NormalEquations, y: np.ndarray) -> Alone:
+def lines_alone(system: NormalEquations, y: np.ndarray) -> FitOfKind:
     """Return the readings of lines y, (views, K), rad, fitted by themselves."""
-    return Alone(
+    return FitOfKind(
         "angular",
         angular_residuals(system, y),
         system.angular.weight,

@@ -259,15 +259,17 @@ def _squares(system: PlacedEquations, y: np.ndarray) -> float:
 def _apart(smooth: ModelFit, model: ModelFit) -> np.ndarray:
     """Return the squared difference of two maps of the same readings at places, (2 P,), m^2."""
     places_m = known_places(_of_marks(model))
-    field = _datum_of(places_m).without(_alone(smooth, places_m) - _alone(model, places_m))
+    field = _datum_of(places_m).without(
+        _map_of_marks(smooth, places_m) - _map_of_marks(model, places_m)
+    )
     return np.concatenate([field.real, field.imag]) ** 2
 
 
-def _alone(model: ModelFit, places_m: np.ndarray) -> np.ndarray:
+def _map_of_marks(model: ModelFit, places_m: np.ndarray) -> np.ndarray:
     """Return the map of the marks alone at places, in no particular datum, complex (P,), m."""
     system = _of_marks(model)
     spline = system.grid.views.spline
-    return spline.rows(places_m) @ spline.coefficients(system.alone(model.y)[0]).ravel()
+    return spline.rows(places_m) @ spline.coefficients(system.grid_fit(model.y)[0]).ravel()
 
 
 def _datum_of(places_m: np.ndarray) -> Gauge:

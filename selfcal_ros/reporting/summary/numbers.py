@@ -381,7 +381,7 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
         return yaw
     cells = camera.known_cells
 
-    def told(value: float, u: float, scale: float, unit: str) -> str:
+    def value_text(value: float, u: float, scale: float, unit: str) -> str:
         return f"{significant(value * scale)} ± {significant(u * scale)} {unit} (k=1)"
 
     worst = int(np.argmax(np.hypot(*cells[2:4])))
@@ -395,14 +395,14 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     return (
         (
             "scale",
-            told(camera.scale, camera.u_scale, PERCENT, "%")
+            value_text(camera.scale, camera.u_scale, PERCENT, "%")
             + ", positive: published offsets too long",
         ),
-        ("rotation", told(camera.rotation, camera.u_rotation, MRAD_PER_RAD, "mrad")),
+        ("rotation", value_text(camera.rotation, camera.u_rotation, MRAD_PER_RAD, "mrad")),
         (
             "stretch, shear",
-            f"{told(camera.stretch, camera.u_stretch, PERCENT, '%')}, "
-            f"{told(camera.shear, camera.u_shear, PERCENT, '%')}",
+            f"{value_text(camera.stretch, camera.u_stretch, PERCENT, '%')}, "
+            f"{value_text(camera.shear, camera.u_shear, PERCENT, '%')}",
         ),
         ("distortion", " and ".join(distortions) or "none shown"),
         (

@@ -27,7 +27,7 @@ def worded_observability(observability: Observability) -> Observability:
     )
 
 
-def told(error: NotIdentifiableError) -> NotIdentifiableError:
+def with_advice(error: NotIdentifiableError) -> NotIdentifiableError:
     """Return the error with the advice of its observability in its line, if it is not yet there."""
     observability = error.observability
     if not isinstance(observability, Observability) or all(

@@ -18,8 +18,8 @@ from selfcal_ros.estimation.checks.wiring import (
     _response,
     check_wiring,
     contradicted_scale,
+    wiring_error,
     wiring_faults,
-    worded,
 )
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
@@ -224,7 +224,7 @@ def test_one_view_that_is_wired_wrongly_is_named():
     views = [motion(rng), motion(rng), motion(rng, wiring=WIRINGS["-x-y"])]
     (fault,) = wiring_faults(measured(*views))
     assert fault.view == "v2"
-    assert worded(fault).where == "stage/mark_detections of view 'v2'"
+    assert wiring_error(fault).where == "stage/mark_detections of view 'v2'"
 
 
 def test_no_clean_measurement_of_three_hundred_is_refused():
@@ -328,7 +328,7 @@ def test_a_session_with_wrong_offsets_is_refused(sense, with_ids, spoilt, expect
 
 def test_exchanged_joints_look_the_same_as_exchanged_offsets():
     readings = measured_session(exchanged, sense=Sense.MICROSCOPE_MOVES, with_ids=True)
-    lines = {str(worded(fault)) for fault in wiring_faults(readings)}
+    lines = {str(wiring_error(fault)) for fault in wiring_faults(readings)}
     assert lines and all(
         line.endswith("; or, if the joints are exchanged, correct joint_x and joint_y")
         for line in lines

@@ -17,11 +17,11 @@ PLAN = plan_of("0,90,tx,270-2tx+ty", Artifact(7, 0.01, 0, 5))
 
 def in_datum(system, field, parameters):
     """Return map, misalignments and plate in their datum, as a solution gets there."""
-    parts = system.gauge.parts(field)
+    parts = system.gauge.coefficients(field)
     field = system.gauge.remove(field, parts)
     parameters = parameters - parts @ system.rigid[:4]
     plate, _ = system.grid.plate(np.zeros(system.grid.weight.shape), field, parameters)
-    return field, system.plate_gauge.remove(plate, system.plate_gauge.parts(plate))
+    return field, system.plate_gauge.remove(plate, system.plate_gauge.coefficients(plate))
 
 
 @pytest.mark.parametrize("kind", ReferenceKind)

@@ -18,7 +18,7 @@ from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.estimation.lattice.readings import angular_data, grid_data
 from selfcal_ros.estimation.normal.equations import system_of
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.estimation.terms.visits import ground_of
+from selfcal_ros.estimation.terms.visits import term_inputs
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm
@@ -168,7 +168,7 @@ def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
         measurements.artifact,
         [v.view for v in measurements.views],
         system,
-        inputs=ground_of(measurements, grid, 1.0),
+        inputs=term_inputs(measurements, grid, 1.0),
     )
     left = np.eye(len(matrix)) - matrix @ inverse
     together = np.kron(stops[:, None] == stops, np.eye(2))

@@ -10,11 +10,11 @@ from selfcal_ros.estimation.observability.suggest import (
     best_plan,
     best_pose,
     pose_of_view,
-    posed,
     rank_next,
     reach_of,
     score_plan,
     start_poses,
+    view_at,
 )
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
@@ -55,7 +55,7 @@ def test_the_reach_is_a_fifth_of_the_plate_and_at_least_a_pitch(size, reach):
 
 
 def test_a_pose_is_read_from_the_view_that_it_makes():
-    view = posed(View("", repeats=3), (217, 1.4, -0.8), 0.01)
+    view = view_at(View("", repeats=3), (217, 1.4, -0.8), 0.01)
     assert view.name == "217deg+1.4x-0.8y" and view.repeats == 3
     assert view.rotation_rad == pytest.approx(math.radians(217))
     assert view.translation_m == pytest.approx((0.014, -0.008))
@@ -72,7 +72,7 @@ def test_a_plan_of_any_pose_gets_a_view_of_any_pose():
     for change in ((1, 0, 0), (-1, 0, 0), (0, -0.1, 0), (0, 0, 0.1)):
         near = tuple(a + b for a, b in zip(found, change, strict=True))
         if max(map(abs, near[1:])) <= reach_of(PLATE):
-            views = (*PLAN.views, posed(best.view, near, 0.01))
+            views = (*PLAN.views, view_at(best.view, near, 0.01))
             assert score_plan(replace(PLAN, views=views), repeats=2).rms_xy >= best.score.rms_xy
     plan = replace(PLAN, views=best.views)
     again = plan_from_dict(plan_to_dict(plan), "plan")

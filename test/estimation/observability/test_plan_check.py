@@ -27,7 +27,7 @@ from selfcal_ros.estimation.observability.rank import (
     unseen_modes,
 )
 from selfcal_ros.model.view import View
-from selfcal_ros.reporting.words.observability import describe_view, told
+from selfcal_ros.reporting.words.observability import describe_view, with_advice
 from test.support.options import BARE, bare
 from test.support.plans import POSES, QIAO_TABLES, plan_of
 from test.support.refusals import in_words
@@ -310,7 +310,7 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
     readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng)
     with pytest.raises(NotIdentifiableError) as refusal:
         calibrate(readings, BARE)
-    error = told(refusal.value)
+    error = with_advice(refusal.value)
     assert str(error).startswith(
         "the marks that were read do not identify the stage (2 modes "
         "undetermined): add a view turned by 90 deg; or add a view "
@@ -320,7 +320,7 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
         "scale_difference",
     ]
     assert error.observability.advice[1].text == "or add a view turned by 270 deg"
-    assert told(error) is error
+    assert with_advice(error) is error
 
 
 @pytest.mark.parametrize("datum", ["xy_axes", "zero_mean"])

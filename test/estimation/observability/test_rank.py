@@ -18,7 +18,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
 from selfcal_ros.model.readings import subset
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.reporting.words.observability import told
+from selfcal_ros.reporting.words.observability import with_advice
 from test.support.lattice_plans import plan_of
 from test.support.placed import SIX, plate
 from test.support.refusals import in_words, refused
@@ -82,7 +82,7 @@ def test_deficient_plans_are_refused_by_name(names, needs, lines):
     readings = simulate_measurements(random_truth(artifact, len(plan.views), rng), plan, rng)
     with refused(needs) as caught:
         calibrate(readings)
-    assert "\n" not in str(told(caught.value))
+    assert "\n" not in str(with_advice(caught.value))
     seen = caught.value.observability
     assert not seen.identifiable
     assert seen.deficiency == plan_observability(plan).deficiency > 0

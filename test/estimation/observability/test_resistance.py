@@ -12,7 +12,7 @@ from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability import plan_check, resistance
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
 from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms, nominal_sizes
-from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_ground
+from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_inputs
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
@@ -174,7 +174,7 @@ def test_shifts_of_both_signs_damp_bent_plates():
 def test_a_plate_bent_in_one_view_only(views, worst):
     """10 nm of (x^2 - y^2, -2xy), which no turn and no single shift tells from the stage."""
     plan = plan_of(views, 11)
-    every = PlannedTerms(plan, (), Assumed()).every
+    every = PlannedTerms(plan, (), Assumed()).all_terms
     found = []
     for view in range(len(plan.views)):
         b = [
@@ -215,7 +215,7 @@ def test_terms_of_the_model_are_judged_as_the_readings_would_be(text):
 
 def test_the_assumed_offsets_are_misalignments_and_stop_errors():
     plan = plan_of("0, 90, tx", 31)
-    exact = planned_ground(
+    exact = planned_inputs(
         plan.artifact, plan.views, Assumed(stop_error_m=1e-15, error_m=1e-15)
     ).visits
     for view, visits in zip(plan.views, exact, strict=True):
@@ -233,7 +233,7 @@ def test_the_assumed_offsets_are_misalignments_and_stop_errors():
             ({"stop_error_m": 5e-6, "error_m": 1e-15}, 5e-6),
             ({"stop_error_m": 1e-15, "error_m": 2e-6}, 2e-6 * 2**0.5),
         ):
-            rough = planned_ground(plan.artifact, plan.views, Assumed(**more))
+            rough = planned_inputs(plan.artifact, plan.views, Assumed(**more))
             added = rough.visits[plan.views.index(view)].offset - visits.offset
             n = len(added)
             for part in (added.real, added.imag):

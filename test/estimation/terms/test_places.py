@@ -9,7 +9,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from selfcal_ros.estimation.lattice.readings import grid_data
 from selfcal_ros.estimation.terms.places import _filled, places_of
-from selfcal_ros.estimation.terms.visits import ground_of
+from selfcal_ros.estimation.terms.visits import term_inputs
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import View
@@ -56,7 +56,7 @@ def readings(stands_m, sense=Sense.MICROSCOPE_MOVES):
 def found_in(measurements, known=None):
     grid = grid_data(measurements)
     known = np.ones((N, N), dtype=bool) if known is None else known
-    return places_of(measurements, grid, ground_of(measurements, grid, 3 * PITCH_M), known)
+    return places_of(measurements, grid, term_inputs(measurements, grid, 3 * PITCH_M), known)
 
 
 def stands(x, y):
@@ -78,8 +78,8 @@ def test_the_error_is_that_of_the_true_place_in_the_stage_frame(sense):
     sign = -1 if sense is Sense.PLATE_MOVES else 1
     h = sign * FIELD[:, ::sign, ::sign]
     field = h[0] + 1j * h[1]
-    near = places.errors(field, places.moved(field))
-    moved = places.moved(field, near)
+    near = places.errors(field, places.differences(field))
+    moved = places.differences(field, near)
     at = np.flatnonzero((np.abs(places.site // N - 3) < 3) & (np.abs(places.site % N - 3) < 3))
     x, y = sign * SITES[places.site[at] // N], sign * SITES[places.site[at] % N]
     true = x + 1.2e-3 + 1j * (y - 0.7e-3) - sign * near[at]  # indicated less the error
@@ -117,7 +117,7 @@ def test_beyond_the_outermost_sites_the_spline_goes_on():
     true = places._place(np.zeros(2 * N * N))
     x, y = ((part - 3) * PITCH_M / 0.03 for part in true)
     assert x.max() > 1 and y.max() > 1
-    moved = places.moved(cubic, np.zeros(2 * N * N))
+    moved = places.differences(cubic, np.zeros(2 * N * N))
     np.testing.assert_allclose(
         moved + cubic.reshape(-1)[places.site], x**3 + 0.5j * y**2, atol=1e-14
     )
@@ -164,4 +164,4 @@ def test_readings_at_unknown_sites_are_left_alone():
     field = FIELD[0] + 1j * FIELD[1]
     other = field.copy()
     other[0, 0] = 99.0
-    np.testing.assert_array_equal(places.moved(field), places.moved(other))
+    np.testing.assert_array_equal(places.differences(field), places.differences(other))

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.estimation.terms.planned import Assumed, planned_ground
+from selfcal_ros.estimation.terms.planned import Assumed, planned_inputs
 from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.visit_order import visit_sequence
 from test.support.plans import plan_of
@@ -17,7 +17,7 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
     placed = replace(plan.artifact, map_grid=MapGrid(5, plan.artifact.grid_pitch_m))
     assumed = Assumed(order="serpentine@plate")
     grounds = [
-        planned_ground(artifact, plan.views, assumed) for artifact in (plan.artifact, placed)
+        planned_inputs(artifact, plan.views, assumed) for artifact in (plan.artifact, placed)
     ]
     for one, other in zip(*(inputs.visits for inputs in grounds), strict=True):
         for name in ("mark", "weight", "offset", "phase", "approach_x", "approach_y"):
@@ -27,7 +27,7 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
 def test_a_check_stop_is_approached_as_its_place_beside_the_mark_tells():
     plan = plan_of("0, 90, tx", 5)
     views = [replace(view, check_marks=1, check_offset_m=2e-5) for view in plan.views]
-    inputs = planned_ground(plan.artifact, views, Assumed())
+    inputs = planned_inputs(plan.artifact, views, Assumed())
     for view, visits in zip(views, inputs.visits, strict=True):
         off = np.flatnonzero(visit_sequence(plan.artifact, view).aside_m.any(axis=0))
         # from the mark in the last corner to +x of that in the middle, then to its -x, +y and -y

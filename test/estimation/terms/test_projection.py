@@ -88,5 +88,7 @@ def test_what_is_left_of_columns_and_their_maps_are_those_of_a_dense_solution(sy
     assert projected.gram == pytest.approx(left.T @ left, abs=1e-9)
     for mine, wanted in zip(projected.fields.T, found[: 2 * grid.n_sites].T, strict=True):
         moved = mine - (wanted[::2] + 1j * wanted[1::2])
-        rest = system.gauge.remove(moved.reshape(SHAPE), system.gauge.parts(moved.reshape(SHAPE)))
+        rest = system.gauge.remove(
+            moved.reshape(SHAPE), system.gauge.coefficients(moved.reshape(SHAPE))
+        )
         assert np.abs(rest[system.known_sites]).max() < 1e-9

@@ -62,4 +62,4 @@ def test_columns_are_added_up_by_their_coefficients(made, only):
 def test_some_columns_are_the_same_columns(made):
     shapes, full = made
     some = np.array([True, False, True, True, False, True, False])
-    assert np.array_equal(shapes.part(some).grid, full[some])
+    assert np.array_equal(shapes.chosen(some).grid, full[some])

@@ -10,13 +10,13 @@ from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.lattice.readings import grid_data
 from selfcal_ros.estimation.terms.columns import term_columns
-from selfcal_ros.estimation.terms.visits import ground_of
+from selfcal_ros.estimation.terms.visits import term_inputs
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.observability import told
+from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.options import bare
@@ -138,7 +138,7 @@ def test_a_drift_that_looks_like_the_stage_is_refused_and_a_size_widens_u():
     _, readings = measured(plan_of(order="raster", repeats=1), still, sigma_m=20e-9)
     with pytest.raises(NotIdentifiableError) as caught:
         calibrate(readings, bare(terms=parse_terms(["drift"], ""), drift_degree=1))
-    assert str(told(caught.value)).startswith(
+    assert str(with_advice(caught.value)).startswith(
         "the readings do not separate drift from the stage (2 modes undetermined): drift: visit "
         "the marks in more than one order"
     )
@@ -261,7 +261,7 @@ def test_no_columns_make_nothing_of_any_visit():
     rng = np.random.default_rng(1)
     plan = Plan("one", Artifact(5, 0.01), (View("a"),))
     readings = simulate_measurements(random_truth(plan.artifact, 1, rng), plan, rng, visits=True)
-    inputs = ground_of(readings, grid_data(readings), 0.02)
+    inputs = term_inputs(readings, grid_data(readings), 0.02)
     columns = term_columns(inputs, [ModelTerm("plate_scale")])
     assert columns.columns == () and columns.at_visits(np.zeros(0)) == [0.0]
     free = term_columns(replace(inputs, drift_degree=1), [ModelTerm("drift")])

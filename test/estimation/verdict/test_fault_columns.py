@@ -6,7 +6,7 @@ import pytest
 
 from selfcal_ros.estimation.lattice.readings import grid_data
 from selfcal_ros.estimation.terms.columns import ColumnBuilder
-from selfcal_ros.estimation.terms.visits import ground_of
+from selfcal_ros.estimation.terms.visits import term_inputs
 from selfcal_ros.estimation.verdict.causes import slip_columns
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.simulation.cell import CellSettings
@@ -21,7 +21,7 @@ def inputs():
     readings = simulate_measurements(
         random_truth(plan.artifact, 3, rng), plan, rng, settings=CellSettings(), visits=True
     )
-    return ground_of(readings, grid_data(readings), 0.03)
+    return term_inputs(readings, grid_data(readings), 0.03)
 
 
 @pytest.mark.parametrize("view", [0, 1])
@@ -42,7 +42,7 @@ def test_twelve_instants_divide_the_visits_of_a_view_evenly(inputs, view):
 def test_each_column_moves_its_own_view_alone(inputs):
     building = ColumnBuilder(inputs)
     found = list(slip_columns(building))
-    made = building.done()
+    made = building.build()
     for mine, view, _ in found:
         assert [made.columns[at].component for at in mine] == ["x", "y", "phi"]
         for at in mine:

@@ -128,7 +128,7 @@ def test_those_with_the_largest_residuals_are_tried():
     residuals[1, 0, 2], residuals[0, 1, 1] = 3e-8j, 2e-8
     made = ColumnBuilder(inputs)
     suspects = list(reading_columns(made, residuals, np.array([1, -1j, 1])))
-    columns = made.done()
+    columns = made.build()
     assert [(view, place) for _, view, place in suspects[:2]] == [(1, (0, 2)), (0, (1, 1))]
     assert len(suspects) == MOST and len(columns.columns) == 2 * MOST
     first = columns.grid[np.array(suspects[0][0])]

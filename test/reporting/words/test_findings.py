@@ -52,7 +52,7 @@ def explanation(name, components, values, u, **more):
         np.array(values, dtype=float),
         u**2 * np.eye(len(values)),
         1e-6,
-        more.pop("whole", True),
+        more.pop("determined", True),
         0.0,
         **more,
     )
@@ -177,7 +177,7 @@ def strained(part, size):
             "m",
         ),
         (
-            explanation("plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, whole=False),
+            explanation("plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, determined=False),
             "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
             "in view '90' relative to view "
             f"'0', part of which cannot be separated from the stage: {CLAMP}",
@@ -211,7 +211,11 @@ def strained(part, size):
         # a rotation is in units of what it does at the half width, 0.05 m
         (
             explanation(
-                "slip", [(1, "x"), (1, "y"), (1, "phi")], [3e-7, -4e-7, 5e-8], 1e-8, part=0.4
+                "slip",
+                [(1, "x"), (1, "y"), (1, "phi")],
+                [3e-7, -4e-7, 5e-8],
+                1e-8,
+                share_before=0.4,
             ),
             "a plate that slipped by (0.3, -0.4) µm and 1 µrad after "
             "about 40% of view '90': measure the "
