@@ -416,6 +416,8 @@ def read(kind: Any, value: Any) -> Any:
         return make(**{name: read(_hints(make)[name], data[name]) for name in needed})
     if get_origin(kind) is tuple:
         return tuple(read(inner[0], item) for item in read(list, value))
+    if get_origin(kind) is dict and inner[1] is not Any:
+        return {name: read(inner[1], item) for name, item in read(dict, value).items()}
     if get_origin(kind) is UnionType:  # of a kind and None
         return None if value is None else read(inner[0], value)
     if kind is np.ndarray:  # null is NaN here as well

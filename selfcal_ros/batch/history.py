@@ -13,7 +13,7 @@ import numpy as np
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.comparison.maps import MapDifference, compare
 from selfcal_ros.files import read_text
-from selfcal_ros.model.result import SCHEMA, VERIFICATION, CalibrationResult
+from selfcal_ros.model.result import SCHEMA, CalibrationResult
 from selfcal_ros.results import read_result
 
 S_PER_DAY = 86400.0
@@ -104,7 +104,7 @@ def history(folder: Path) -> list[Entry]:
     for path in sorted(folder.rglob("*.json")):
         if _is_result(path):
             result = read_result(path)
-            if result.observability.identifiable and VERIFICATION not in result.extra:
+            if result.observability.identifiable and result.verification is None:
                 entries.append(Entry(path, result, _measured(result, str(path))))
     if not entries:
         raise NoDataError(

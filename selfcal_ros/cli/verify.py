@@ -15,7 +15,7 @@ from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.estimation.comparison.verification import is_believed, require_correctable
 from selfcal_ros.model.readings import Measurements
-from selfcal_ros.model.result import VERIFICATION, CalibrationResult, with_input
+from selfcal_ros.model.result import CalibrationResult, with_input
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.verification import verification_text, with_verification
@@ -49,23 +49,24 @@ def run(args: argparse.Namespace) -> int:
     after = _after(args, before)
     with busy("comparing"):
         after, verification = with_verification(before, after, names=(args.map, args.bag))
-    verdict = after.extra[VERIFICATION]
+    verified = after.verification
+    assert verified is not None
     if args.plot:
         from selfcal_ros.reporting.figures.maps import verification_picture  # loads matplotlib
         from selfcal_ros.reporting.figures.paper import save_picture  # likewise
 
         save_picture(
-            verification_picture(before, after, verification, verdict["sentence"]), args.plot
+            verification_picture(before, after, verification, verified.sentence), args.plot
         )
     say(
         args,
         verification_text(verification),
-        verdict
+        plain(verified)
         | plain({"gx": verification.gx, "gy": verification.gy, "g_theta": verification.g_theta}),
     )
     if not is_believed(after, verification):
         say_unless_qualified(after, f"selfcal verify: {args.bag}")
-    return int(ExitCode.DONE if verdict["passed"] else ExitCode.NOT_QUALIFIED)
+    return int(ExitCode.DONE if verified.passed else ExitCode.NOT_QUALIFIED)
 
 
 def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationResult:

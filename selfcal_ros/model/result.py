@@ -48,6 +48,7 @@ from selfcal_ros.model.verdict import (
     verdict_from_dict,
     verdict_to_dict,
 )
+from selfcal_ros.model.verified import Verified
 from selfcal_ros.outputs import plain
 
 SCHEMA = "selfcal.result/1"
@@ -185,8 +186,9 @@ class CalibrationResult:
     """The result of a calibration.
 
     `kept` is what the covariances of the maps follow from, `extra` tables for reports. `recheck` is
-    what views of a known plate show to have changed; None of a calibration. `camera`
-    and `stage_yaw` are what images of several marks show, None without.
+    what views of a known plate show to have changed; None of a calibration. `verification` is what
+    a correction did that was on, None without one. `camera` and `stage_yaw` are what images of
+    several marks show, None without.
     `findings` are the data of warnings; `warnings` are their sentences, added by
     `selfcal_ros.reporting.words.findings.worded`, and those of the collection. `read_from` is the
     name of the file and its SHA-256, of a result that was read from one.
@@ -214,6 +216,7 @@ class CalibrationResult:
     budget: tuple[BudgetLine, ...] = ()
     placed_plate: Artifact | None = None
     recheck: Recheck | None = None
+    verification: Verified | None = None
     camera: CameraErrors | None = None
     stage_yaw: StageYawMap | None = None
     read_from: tuple[str, str] | None = None
@@ -367,6 +370,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
             else {}
         ),
         **result.kept.to_dict(),
+        **({} if result.verification is None else {VERIFICATION: plain(result.verification)}),
         **{key: plain(value) for key, value in result.extra.items()},
     }
     return with_digests(data)
@@ -448,6 +452,7 @@ _KNOWN = {
     "map",
     "recheck",
     "camera",
+    VERIFICATION,
     DIGEST,
     *KEYS,
 }
@@ -525,6 +530,7 @@ def _parse(data: dict) -> CalibrationResult:
         budget=budget_from_list(data.get("budget", [])),
         placed_plate=artifact if artifact.map_grid else None,
         recheck=read(Recheck | None, data.get("recheck")),
+        verification=read(Verified | None, data.get(VERIFICATION)),
         camera=camera,
         stage_yaw=stage_yaw,
     )

@@ -13,7 +13,8 @@ from selfcal_ros.errors import printable
 from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.reference import reference_to_dict
-from selfcal_ros.model.result import COMBINED, SCHEMA, CalibrationResult
+from selfcal_ros.model.result import COMBINED, SCHEMA, VERIFICATION, CalibrationResult
+from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.maps import (
     angular_map,
@@ -72,6 +73,13 @@ _SENSE = {
     "microscope_moves": "the microscope moves over a resting plate",
     "plate_moves": "the plate rides on the stage under a fixed microscope",
 }
+
+
+def _tables(result: CalibrationResult) -> dict[str, Any]:
+    """Return the tables of a result, with what a correction did that was on."""
+    if result.verification is None:
+        return result.extra
+    return {**result.extra, VERIFICATION: plain(result.verification)}
 
 
 def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
@@ -379,7 +387,7 @@ def chapters(
             ),
             (sections.measurement_section(result), sections.views_section(result)),
         ),
-        Chapter("Details", sections=tuple(extra_sections(result.extra))),
+        Chapter("Details", sections=tuple(extra_sections(_tables(result)))),
         Chapter(
             "How to read the numbers",
             sections=(convention_section(result), provenance_section(result)),

@@ -19,7 +19,7 @@ from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages import to_model
 from selfcal_ros.messages.to_model import PositionEditor
 from selfcal_ros.model.error_map import ErrorMap, first_order
-from selfcal_ros.model.result import VERIFICATION, CalibrationResult
+from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.summary.numbers import summary_figures
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports, merged
 from selfcal_ros.units import MS_PER_S, S_PER_NS
@@ -78,11 +78,11 @@ class CompensatingSession:
 
     def _load_file(self, path: str) -> None:
         result = results.read_result(path)
-        if VERIFICATION in result.extra:
+        if result.verification is not None:
             raise InputError(
                 path,
                 "was measured with the correction on, so it is not a map to correct with",
-                f"name {result.extra[VERIFICATION]['of']}",
+                f"name {result.verification.of}",
             )
         if self._settings.require_qualified and not is_qualified(result):
             raise InputError(
@@ -580,6 +580,6 @@ def is_qualified(result: CalibrationResult) -> bool:
 
     Of a verification: whether the correction passed it.
     """
-    if VERIFICATION in result.extra:
-        return bool(result.extra[VERIFICATION]["passed"])
+    if result.verification is not None:
+        return result.verification.passed
     return result.observability.identifiable and result.verdict.qualified

@@ -433,7 +433,7 @@ class SolvingSession:
 
     def _publish(self, result: results.CalibrationResult) -> None:
         shown = self.shown
-        of_stage = results.VERIFICATION not in result.extra  # else of what a correction leaves
+        of_stage = result.verification is None  # else of what a correction leaves
         is_map = shown.problem is None and of_stage
         if is_map:
             self._ports.publish(

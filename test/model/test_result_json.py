@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.reference import ReferenceLength
@@ -29,6 +30,7 @@ from selfcal_ros.model.verdict import (
     TermResult,
     Verdict,
 )
+from selfcal_ros.model.verified import AxisError, Verified
 from selfcal_ros.model.view import View
 from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.words.findings import worded
@@ -142,6 +144,19 @@ def test_plain_makes_json_types():
     assert plain(value) == {"a": None, "b": [3, [1.0, None]], "c": True}
 
 
+AXIS = AxisError(8e-7, 3e-8, 2e-6, 9e-8, 3e-8, 3e-8, 0.98, 0.01)
+VERIFIED = plain(
+    Verified("m.json", "better", True, True, "none", "off", False, 0.9, {"x": AXIS, "y": AXIS})
+)
+
+
+def test_what_a_correction_did_is_read_as_it_was_written():
+    result = replace(known_result(5, 8)[0], verification=read(Verified, VERIFIED))
+    again = through_json(result)
+    assert again.verification == result.verification
+    assert again.verification.axes["y"] == AXIS and not again.extra
+
+
 def damaged(path, value):
     data = copy.deepcopy(result_to_dict(known_result(5, 8)[0]))
     at = data
@@ -173,6 +188,9 @@ def damaged(path, value):
         (("observability", "identifiable"), 1, "1 is not of type bool"),
         (("observability", "unchecked_sites"), 1.5, "1.5 is not of type int"),
         (("views",), 3, "'int' object is not iterable"),
+        (("verification",), "passed", "'passed' is not of type dict"),
+        (("verification",), VERIFIED | {"passed": "yes"}, "'yes' is not of type bool"),
+        (("verification",), VERIFIED | {"axes": {"x": 0.0}}, "0.0 is not of type dict"),
     ],
 )
 def test_damaged_results_are_refused(path, value, message):

@@ -34,6 +34,7 @@ from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL
 from selfcal_ros.model.error_map import ErrorMap, datum_columns, rms
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verified import AxisError
 
 AXES = {"xy": ("x", "y"), "theta": ("theta",)}
 """Axes of each map."""
@@ -63,24 +64,6 @@ class TableFault(StrEnum):
     OLDER = "older_map"
     OTHER = "other_map"
     TOO_SMALL = "too_small"
-
-
-@dataclass(frozen=True)
-class AxisError:
-    """Error of one axis, m or rad: rms and largest over the nodes, U (k u, rms) of a node.
-
-    `factor` is the part of the correction that acts, 1 as it should, `u_factor` its standard
-    uncertainty; NaN where the map does not show it.
-    """
-
-    rms_before: float
-    rms_after: float
-    largest_before: float
-    largest_after: float
-    U_before: float
-    U_after: float
-    factor: float
-    u_factor: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.pose import without_cell
-from selfcal_ros.model.result import VERIFICATION, CalibrationResult, Noise, ViewResult
+from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.outputs import to_ascii
 from selfcal_ros.reporting.summary.numbers import (
@@ -493,8 +493,8 @@ def state_line(result: CalibrationResult) -> str:
     It shows 128 characters. What U owes to assumptions and the reason of a grade below good follow.
     """
     figures, verdict = map_figures(result.error_map), result.verdict
-    if VERIFICATION in result.extra:
-        return str(result.extra[VERIFICATION]["sentence"])
+    if result.verification is not None:
+        return result.verification.sentence
     if not result.observability.identifiable or not (figures.n_known or figures.n_lines_known):
         return state_sentence(result)
 

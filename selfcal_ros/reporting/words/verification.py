@@ -2,17 +2,16 @@
 """Sentence and table of what a correction does in the machine."""
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 from selfcal_ros.estimation.comparison.verification import (
-    AxisError,
     TableFault,
     Verification,
     is_believed,
     verify,
 )
-from selfcal_ros.model.result import VERIFICATION, CalibrationResult
-from selfcal_ros.outputs import plain
+from selfcal_ros.model.result import CalibrationResult
+from selfcal_ros.model.verified import AxisError, Verified
 from selfcal_ros.reporting.summary.numbers import aligned, significant
 from selfcal_ros.units import ARCSEC_PER_RAD, UM_PER_M
 
@@ -48,19 +47,19 @@ def with_verification(
     """Return the result with the correction on, with its ``verification``, and what that found."""
     verification = verify(before, after, names=names)
     passed = verification.passed and is_believed(after, verification)
-    entry = {
-        "of": names[0],
-        "sentence": verification_sentence(verification),
-        "better": verification.better,
-        "passed": passed,
-        "fault": str(verification.fault),
-        "theta_fault": str(verification.theta_fault),
-        "remains": verification.remains,
-        "correlation": verification.alike,
-        "axes": {name: asdict(axis) for name, axis in verification.axes.items()},
-        "remaining": None if verification.remaining is None else asdict(verification.remaining),
-    }
-    return replace(after, extra={**after.extra, VERIFICATION: plain(entry)}), verification
+    verified = Verified(
+        of=names[0],
+        sentence=verification_sentence(verification),
+        better=verification.better,
+        passed=passed,
+        fault=str(verification.fault),
+        theta_fault=str(verification.theta_fault),
+        remains=verification.remains,
+        correlation=verification.alike,
+        axes=dict(verification.axes),
+        remaining=verification.remaining,
+    )
+    return replace(after, verification=verified), verification
 
 
 def verification_sentence(verification: Verification) -> str:
