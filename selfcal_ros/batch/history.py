@@ -129,7 +129,7 @@ def _is_result(path: Path) -> bool:
 
 def _measured(result: CalibrationResult, where: str) -> datetime:
     provenance = result.provenance
-    text = provenance.extra.get("first_exposure") or provenance.created
+    text = provenance.first_exposure or provenance.created
     try:
         when = datetime.fromisoformat(str(text))
     except ValueError:

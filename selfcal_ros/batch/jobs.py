@@ -104,7 +104,7 @@ def _with_result(result: results.CalibrationResult) -> folder.Record:
         "plan_id": result.plan_id,
         "run_id": result.run_id,
         "plate": [*artifact.shape, artifact.grid_pitch_m, artifact.angular_count],
-        "first_exposure": result.provenance.extra.get("first_exposure"),
+        "first_exposure": result.provenance.first_exposure or None,
         "quantities": quantities(result),
     }
 

@@ -329,7 +329,7 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                 "created": provenance.created,
                 "duration_s": provenance.duration_s,
                 "version": provenance.version,
-                **provenance.extra,
+                **provenance.facts,
             }
         ),
         "dof": plain({kind: result.noise.dof_of(kind) for kind in ("xy", "theta")}),

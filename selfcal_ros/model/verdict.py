@@ -231,13 +231,23 @@ class Provenance:
     version : str
         Version of this package.
     extra : dict
-        Further keys: recorded, visit_order, source.
+        Further facts for reports: stage, operator, visit_order.
+    first_exposure, last_exposure : str
+        Time of the first and the last reading, ISO 8601; empty if unknown.
     """
 
     created: str = ""
     duration_s: float = float("nan")
     version: str = ""
     extra: dict[str, Any] = field(default_factory=dict)
+    first_exposure: str = ""
+    last_exposure: str = ""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What reports list of it by name: `extra`, and the times of the exposures if known."""
+        times = {"first_exposure": self.first_exposure, "last_exposure": self.last_exposure}
+        return {**self.extra, **{name: time for name, time in times.items() if time}}
 
 
 def finding_to_dict(finding: Finding) -> dict[str, Any]:
@@ -324,7 +334,7 @@ def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
 
 def provenance_from_dict(data: dict | None) -> Provenance:
     """Return the provenance of a result, as far as known."""
-    own_fields = ("created", "duration_s", "version")
+    own_fields = ("created", "duration_s", "version", "first_exposure", "last_exposure")
     return (
         Provenance()
         if data is None

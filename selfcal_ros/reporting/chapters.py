@@ -202,7 +202,7 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
     first.
     """
     provenance = result.provenance
-    facts = {**provenance.extra, **{key: value for key, value in about.items() if value}}
+    facts = {**provenance.facts, **{key: value for key, value in about.items() if value}}
     first, last = (
         str(facts.get(key, "")).replace("T", " ")[:16]
         for key in ("first_exposure", "last_exposure")
@@ -288,7 +288,7 @@ def provenance_section(result: CalibrationResult) -> Section:
             ("created", provenance.created),
             ("solved_by", provenance.version and f"selfcal_ros {provenance.version}"),
             ("run", result.run_id),
-            *provenance.extra.items(),
+            *provenance.facts.items(),
         )
         if value
     ]

@@ -305,7 +305,7 @@ def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str
     for name, value in (
         ("run", result.run_id),
         ("evaluated", provenance.created),
-        *provenance.extra.items(),
+        *provenance.facts.items(),
         ("clock of the readings", core.get("clock")),
     ):
         if value:

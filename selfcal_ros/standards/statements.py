@@ -42,7 +42,7 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
         )
     _require_temperature(result, details["conditions"])
     core, zone = details["certificate"], timedelta(days=1)
-    times = [str(result.provenance.extra.get(f"{end}_exposure", "")) for end in ("first", "last")]
+    times = [result.provenance.first_exposure, result.provenance.last_exposure]
     if all(times) and "clock" not in core:
         try:
             first, last = (date.fromisoformat(text[:10]) for text in times)

@@ -38,9 +38,7 @@ def write(path, *, day=0, bow_m=0.0, noise_m=1e-9, **changes):
     )
     result = calibrate(readings, Options())
     when = (BEGAN + timedelta(days=day)).isoformat()
-    result = replace(
-        result, provenance=replace(result.provenance, extra={"first_exposure": when}), **changes
-    )
+    result = replace(result, provenance=replace(result.provenance, first_exposure=when), **changes)
     write_json(path, result_to_dict(result))
     return path
 

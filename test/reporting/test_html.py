@@ -380,12 +380,14 @@ def test_extras_of_other_forms_are_left_to_the_file():
 
 def test_a_report_begins_with_stage_serial_number_operator_and_dates():
     result, _ = known_result(3, 8)
-    times = {
-        "first_exposure": "2026-11-21T15:28:54.617+00:00",
-        "last_exposure": "2026-11-21T16:29:26.532+00:00",
-        "stage": "bag's",
-    }
-    made = Provenance("2026-11-23T08:51:45+00:00", 3.0, "0.1.0", times)
+    made = Provenance(
+        "2026-11-23T08:51:45+00:00",
+        3.0,
+        "0.1.0",
+        {"stage": "bag's"},
+        "2026-11-21T15:28:54.617+00:00",
+        "2026-11-21T16:29:26.532+00:00",
+    )
     result = replace(result, provenance=made)
     found = heading(result, {"stage": "XY <1>", "operator": "N. N.", "serial_number": ""})
     assert found.facts == (
@@ -398,7 +400,7 @@ def test_a_report_begins_with_stage_serial_number_operator_and_dates():
     assert dict(heading(result, {}).facts)["stage"] == "bag's"
     html = report_html(result, [], found)
     assert html.index('class="verdict') < html.index("XY &lt;1&gt;") < html.index("N. N.")
-    late = replace(made, extra={**times, "last_exposure": "2026-11-22T00:10:00.000+00:00"})
+    late = replace(made, last_exposure="2026-11-22T00:10:00.000+00:00")
     assert dict(heading(replace(result, provenance=late), {}).facts)["measured"] == (
         "2026-11-21 15:28 to 2026-11-22 00:10 UTC"
     )

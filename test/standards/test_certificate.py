@@ -343,11 +343,9 @@ def test_the_datum_is_that_of_the_result():
 def exposed(first, last):
     made = replace(
         RESULT.provenance,
-        extra={
-            "first_exposure": f"{first}T23:30:00.000+00:00",
-            "last_exposure": f"{last}T01:00:00+00:00",
-            "visit_order": {"identity": "x_back_y_back"},
-        },
+        extra={"visit_order": {"identity": "x_back_y_back"}},
+        first_exposure=f"{first}T23:30:00.000+00:00",
+        last_exposure=f"{last}T01:00:00+00:00",
     )
     return replace(RESULT, provenance=made)
 

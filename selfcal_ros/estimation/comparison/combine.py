@@ -187,15 +187,16 @@ def shared_reference(
     )
 
 
-def exposures(results: Sequence[CalibrationResult | None]) -> dict[str, str]:
-    """Return the first and the last exposure of all runs, where they are known."""
-    times = [
-        [str(result.provenance.extra.get(f"{end}_exposure", "")) for result in results if result]
-        for end in ("first", "last")
-    ]
-    if not all(map(all, times)):
-        return {}
-    return {"first_exposure": min(times[0]), "last_exposure": max(times[1])}
+def of_all_runs(results: Sequence[CalibrationResult | None]) -> Provenance:
+    """Return the provenance of a mean: the first and the last exposure, if all runs have theirs."""
+    runs = [result.provenance for result in results if result]
+    if not all(run.first_exposure and run.last_exposure for run in runs):
+        return Provenance(version=__version__)
+    return Provenance(
+        version=__version__,
+        first_exposure=min(run.first_exposure for run in runs),
+        last_exposure=max(run.last_exposure for run in runs),
+    )
 
 
 SINGLE = 0.8
@@ -731,8 +732,8 @@ def _same_recording(first: CalibrationResult, second: CalibrationResult) -> bool
     first_run, second_run = (
         (
             result.run_id,
-            result.provenance.extra.get("first_exposure"),
-            result.provenance.extra.get("last_exposure"),
+            result.provenance.first_exposure,
+            result.provenance.last_exposure,
         )
         for result in (first, second)
     )
@@ -867,7 +868,7 @@ def _result(
         verdict=_verdict(members, means),
         model=ModelResult(first.model.misalignment),
         reference=shared_reference(runs, means["xy"].weights),
-        provenance=Provenance(version=__version__, extra=exposures(runs)),
+        provenance=of_all_runs(runs),
         findings=(Finding("not_in_all", details={"sites": int((~known_sites).sum())}),)
         if not known_sites.all()
         else (),

@@ -440,9 +440,12 @@ def recheck_found(
 
 
 def _calibration(result: CalibrationResult) -> PlateCalibration:
-    first, last = (
-        result.provenance.extra.get(name) or None for name in ("first_exposure", "last_exposure")
-    )
+    provenance = result.provenance
     return PlateCalibration(
-        result.plan_id, result.run_id, result.provenance.created, dict(result.input), first, last
+        result.plan_id,
+        result.run_id,
+        provenance.created,
+        dict(result.input),
+        provenance.first_exposure or None,
+        provenance.last_exposure or None,
     )

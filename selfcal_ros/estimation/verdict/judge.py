@@ -536,11 +536,10 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     }
     if options.terms_from:
         extra["model_terms_from"] = options.terms_from
-    duration = float("nan")
-    if first >= FIRST_DATE_NS:
-        extra |= {"first_exposure": _iso(first), "last_exposure": _iso(last)}
-        duration = (last - first) / NS_PER_S
-    return Provenance("", duration, __version__, extra)
+    if first < FIRST_DATE_NS:
+        return Provenance(version=__version__, extra=extra)
+    duration_s = (last - first) / NS_PER_S
+    return Provenance("", duration_s, __version__, extra, _iso(first), _iso(last))
 
 
 def _iso(stamp_ns: int) -> str:

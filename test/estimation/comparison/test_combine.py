@@ -67,7 +67,7 @@ def run_at(run_id, **changed):
         A,
         run_id=run_id,
         error_map=replace(A.error_map, **changed),
-        provenance=replace(A.provenance, extra=times),
+        provenance=replace(A.provenance, **times),
     )
 
 

@@ -312,8 +312,8 @@ def test_the_origin_is_from_the_first_exposure_to_the_last():
     span_s = (int(stamps.max()) - int(stamps.min())) * 1e-9
     assert found.duration_s == pytest.approx(span_s) and span_s > 0
     begin, end = (
-        datetime.fromisoformat(found.extra[name]).timestamp()
-        for name in ("first_exposure", "last_exposure")
+        datetime.fromisoformat(time).timestamp()
+        for time in (found.first_exposure, found.last_exposure)
     )
     assert begin == pytest.approx(int(stamps.min()) * 1e-9, abs=1e-3)
     assert end - begin == pytest.approx(span_s, abs=2e-3)
