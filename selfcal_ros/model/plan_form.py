@@ -6,7 +6,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.files import checked_fields
 from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.plate_form import (
@@ -32,6 +32,8 @@ MAX_VIEWS = 1000
 """Largest number of views of a plan."""
 ROUNDED = 1e-3
 """Relative difference up to which a number is one of rad that was rounded, as 1.57."""
+MOST_CHARACTERS = 200
+"""Largest length of the name of a plan or view."""
 
 
 def plan_from_dict(data: object, where: str) -> Plan:
@@ -116,7 +118,7 @@ def plan_from_dict(data: object, where: str) -> Plan:
             )
     terms = terms_of(fields["model_terms"], where)
     return Plan(
-        fields["plan_id"],
+        _name(fields["plan_id"], f"{where}: plan_id"),
         artifact,
         views,
         with_microscope(terms, fields["microscope"], f"{where}: microscope"),
@@ -147,6 +149,21 @@ def _with_checks(view: View, marks: int, offset_m: float, artifact: Artifact, wh
     except InputError as error:
         raise InputError(f"{where}: {error.where}", error.what, error.remedy) from error
     return checked
+
+
+def _name(text: str, where: str) -> str:
+    """Return the name of a plan or view, which has to fit in commands, lines and drawings."""
+    if not text.isprintable():
+        raise InputError(
+            where,
+            f"'{printable(text)}' has characters that cannot be printed, such as a line break",
+            "write the name in one line",
+        )
+    if len(text) > MOST_CHARACTERS:
+        raise InputError(
+            where, f"a name of {len(text)} characters", f"give one of at most {MOST_CHARACTERS}"
+        )
+    return text
 
 
 def _order(text: str, where: str) -> str:
@@ -186,7 +203,7 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
     if not (raw["grid"] or raw["angular"]):
         raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
     return View(
-        raw["name"],
+        _name(raw["name"], f"{where}: name"),
         turn,
         (a, b),
         raw["grid"],

@@ -215,6 +215,19 @@ def test_a_plate_without_angular_count_has_no_lines():
         ({}, "f: the key 'plan_id' is missing; add it"),
         (plan_with(extra=1), "f: extra: unknown key; known are plan_id, artifact, views, visit"),
         (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; correct the value"),
+        (
+            plan_with(plan_id="a\r\x1b[31m\u202e"),
+            r"f: plan_id: 'a\r\x1b[31m\u202e' has characters that cannot be printed, such as",
+        ),
+        (plan_with(plan_id="n" * 201), "f: plan_id: a name of 201 characters; give one of at m"),
+        (
+            plan_with(views=[{"name": "a\nb"}]),
+            r"f: views[0]: name: 'a\nb' has characters that cannot be printed, such as a line br",
+        ),
+        (
+            plan_with(views=[{"name": "a" * 10_000}]),
+            "f: views[0]: name: a name of 10000 characters; give one of at most 200",
+        ),
         (plan_with(views=[]), "f: the plan has no views; add at least one view"),
         (plan_with(views=[3]), "f: views[0]: not a mapping of keys to values"),
         (plan_with(views=[{"name": "a"}] * 1001), "f: views: 1001 views are more than 1000; "),
