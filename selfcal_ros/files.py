@@ -97,7 +97,7 @@ class _Strict(Composer, SafeConstructor, Resolver):
 
     def whole_number(self, node: yaml.ScalarNode) -> int:
         """Return a whole number that fits into 64 bits."""
-        return _whole(self.construct_yaml_int(node) if len(node.value) < 70 else node.value)
+        return _whole_number(self.construct_yaml_int(node) if len(node.value) < 70 else node.value)
 
     yaml_constructors: ClassVar = SafeConstructor.yaml_constructors | {
         "tag:yaml.org,2002:int": whole_number
@@ -144,7 +144,7 @@ def _yaml_size(node: yaml.Node, size_of_node: dict[int, int]) -> int:
     return size_of_node[id(node)]
 
 
-def _whole(value: int | str) -> int:
+def _whole_number(value: int | str) -> int:
     """Return a whole number; ValueError, without its digits, beyond 64 bits."""
     if isinstance(value, str) and len(value) < 25:
         value = int(value)
@@ -285,7 +285,7 @@ def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) ->
     if limit is not None and text.count(",") >= MAX_JSON_VALUES:
         raise InputError(str(path), f"more than {MAX_JSON_VALUES} values", "name a smaller file")
     try:
-        return json.loads(text, parse_int=_whole)
+        return json.loads(text, parse_int=_whole_number)
     except json.JSONDecodeError as error:
         raise InputError(
             f"{path}:{error.lineno}:{error.colno}",

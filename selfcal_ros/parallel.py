@@ -208,10 +208,10 @@ def _with_processes(
                 if suspects and not running:
                     break
         for index in sorted(suspects):
-            yield _alone(function, items, index)
+            yield _in_own_process(function, items, index)
 
 
-def _alone(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
+def _in_own_process(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
     """Return the outcome of an item in a separate process."""
     with _pool(1, function) as pool:
         future = pool.submit(function, items[index])

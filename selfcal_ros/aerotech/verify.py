@@ -312,7 +312,7 @@ def controller_figure(verification: TableVerification) -> Drawing:
         "before-after", "Controller: true − commanded, without its constant shift"
     )
     fields = [residual for residual in verification.residuals if residual.place != "lines"]
-    selections = [_shown(residual) for residual in fields]
+    selections = [_thinned(residual) for residual in fields]
     if fields:
         reach = (np.abs(fields[0].position).max(axis=1) * 1.2 * MM_PER_M).tolist()
         lengths = np.concatenate([np.hypot(*residual.before) for residual in fields])
@@ -357,7 +357,7 @@ def _pair(fields: list[Residual], number: int) -> tuple[Residual, str]:
     return fields[number // 2], BEFORE_AND_AFTER[number % 2]
 
 
-def _shown(residual: Residual) -> tuple[np.ndarray, float]:
+def _thinned(residual: Residual) -> tuple[np.ndarray, float]:
     """Return every second, third, ... point along each side as a mask, and their spacing, m."""
     sides = [np.unique(side, return_inverse=True) for side in residual.position]
     step = max(1, -(-max(len(values) for values, _ in sides) // parts.MAX_ARROWS))

@@ -207,7 +207,7 @@ class McapStream:
                 file.seek(offset)
                 start = offset if file.read(1) == bytes([Opcode.CHUNK]) else sure
                 yield from self._salvage(file, start, error)
-                offset = sure = self._found(file, start)
+                offset = sure = self._next_record(file, start)
                 if offset == size:
                     return
                 continue
@@ -341,7 +341,7 @@ class McapStream:
             "are read"
         )
 
-    def _found(self, file: BinaryIO, start: int) -> int:
+    def _next_record(self, file: BinaryIO, start: int) -> int:
         """Return where reading can continue after `start`."""
         with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
             return mcap_salvage.next_record(data, start, None if self._chunked else self.channels)
@@ -359,7 +359,7 @@ class McapStream:
         self, file: BinaryIO, start: int, error: Exception
     ) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield the readable part of the record at `start`, and report the rest."""
-        stop, size = self._found(file, start), self._size
+        stop, size = self._next_record(file, start), self._size
         file.seek(start)
         count = 0
         for item in mcap_chunk.gathered(list(mcap_salvage.front_of_chunk(file.read(stop - start)))):

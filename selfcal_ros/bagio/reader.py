@@ -108,7 +108,7 @@ class BagReader:
             (name for name in present if name.removesuffix(".zstd") not in present - {name}),
             key=_natural,
         )
-        listed = self._listed()
+        listed = self._files_of_metadata()
         names = (
             listed if present.intersection(listed) else recordings
         )  # the files may have been renamed
@@ -137,7 +137,7 @@ class BagReader:
             )
         return files
 
-    def _listed(self) -> list[str]:
+    def _files_of_metadata(self) -> list[str]:
         metadata = self.path / "metadata.yaml"
         if not metadata.is_file():
             return []

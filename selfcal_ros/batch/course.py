@@ -160,7 +160,7 @@ def courses(
         [p for course in course_of_quantity.values() for p in (course.p_trend, course.p_change)]
     ).reshape(-1, 2)
     return {
-        name: _judged(course, pair, days, table[name])
+        name: _with_finding(course, pair, days, table[name])
         for (name, course), pair in zip(course_of_quantity.items(), adjusted, strict=True)
     }
 
@@ -174,7 +174,9 @@ def _adjusted(p: Sequence[float]) -> np.ndarray:
     return false_discovery_control(p)
 
 
-def _judged(course: Course, adjusted: np.ndarray, days: np.ndarray, values: np.ndarray) -> Course:
+def _with_finding(
+    course: Course, adjusted: np.ndarray, days: np.ndarray, values: np.ndarray
+) -> Course:
     finding = CourseKind.NONE
     if adjusted.min() <= COURSE_LEVEL:
         finding = (

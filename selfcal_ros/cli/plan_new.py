@@ -237,14 +237,14 @@ def _answers(args: argparse.Namespace) -> Known:
     for item in QUESTIONS:
         answer = getattr(args, item.name)
         if answer is None and asks:
-            values[item.name] = _asked(item)
+            values[item.name] = _answer_to(item)
         else:
             text = item.default if answer is None else answer
             values[item.name] = item.read(text, f"--{item.name}")
     return Known(**values)
 
 
-def _asked(item: Question) -> Any:
+def _answer_to(item: Question) -> Any:
     """Ask until the answer can be read."""
     while True:
         default = f" [{item.default}]" if item.default else ""

@@ -104,19 +104,24 @@ def screen(
     now = headed("now", fitted(wrapped(_task(picture), width), height // 4), width)
     nodes = headed("nodes", fitted(wrapped(_health(picture), width), height // 8), width)
     log_rows = headed(
-        "log", last_fitted([_said(line) for line in log] or [Text("-")], width, height // 8), width
+        "log",
+        last_fitted([_log_line(line) for line in log] or [Text("-")], width, height // 8),
+        width,
     )
     rows = height - len(now) - len(nodes) - len(log_rows) - 1
     left = (width - BETWEEN) // 2
-    halves = (_measured(picture, left, rows), _found(picture, width - BETWEEN - left, rows))
+    halves = (
+        _measured(picture, left, rows),
+        _verdict_and_map(picture, width - BETWEEN - left, rows),
+    )
     side_by_side = [
-        _beside(width, *(half[row] if row < len(half) else Text() for half in halves))
+        _one_row(width, *(half[row] if row < len(half) else Text() for half in halves))
         for row in range(rows)
     ]
     return Group(*now, *side_by_side, *nodes, *log_rows, keys)
 
 
-def _beside(width: int, left: Text, right: Text) -> Text:
+def _one_row(width: int, left: Text, right: Text) -> Text:
     """Return one row of both halves of the screen."""
     first = (width - BETWEEN) // 2
     left, right = left.copy(), right.copy()
@@ -185,7 +190,7 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     """Return view, run and current task."""
     command, health = picture["command"], picture["health"].get("pose_sequencer")
     values = health["values"] if health else {}
-    views = _whole(values.get("views")) or (command or {}).get("views_planned", 0)
+    views = _whole_number(values.get("views")) or (command or {}).get("views_planned", 0)
     name, index = (command or {}).get("view_name", ""), (command or {}).get("view_index", 0)
     heading = "no view yet"
     if command and views:
@@ -207,7 +212,7 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     ]
 
 
-def _whole(text: Any) -> int:
+def _whole_number(text: Any) -> int:
     """Return the whole number in a text, 0 if it is none."""
     text = str(text)
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 0
@@ -282,7 +287,7 @@ def _worst_mark(cells: list[str]) -> str:
     return next((sign for sign in ".?o" if sign in cells), " ")
 
 
-def _found(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
+def _verdict_and_map(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
     """Return verdict and map."""
     solved_map = picture["map"]
     um = solved_map["um"] if solved_map else []
@@ -372,7 +377,7 @@ def _health(picture: dict[str, Any]) -> list[Text]:
     return [*texts, *([Text.assemble(("ok: ", "green"), ", ".join(well))] if well else [])]
 
 
-def _said(line: str) -> Text:
+def _log_line(line: str) -> Text:
     """Return a line of the log, without the time for lines of nodes."""
     match = PREFIX.match(line)
     if match is None:

@@ -216,7 +216,7 @@ def _seconds(offset_s: float) -> str:
 
 def _stage(e: Evidence) -> str | None:
     """Return why the stage is away from the marks; None if it is not or unknown."""
-    elsewhen = _at_another_time(e) or _stopped(e)
+    elsewhen = _at_another_time(e) or _encoder_stopped(e)
     if elsewhen:
         return elsewhen
     joints = wrong_joints(e) if e.joints else None
@@ -262,7 +262,7 @@ def _at_another_time(e: Evidence) -> str | None:
     return None
 
 
-def _stopped(e: Evidence) -> str | None:
+def _encoder_stopped(e: Evidence) -> str | None:
     """Return that the encoder stands still since some mark; not if it never moved."""
     for view in e.marks:
         stage, sites = view.stage[-STOPPED:], view.sites[-STOPPED:]

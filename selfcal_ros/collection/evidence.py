@@ -172,7 +172,7 @@ class DetectionsSeen:
         unknown = rejected.get(Reason.UNKNOWN_MARK, 0)
         bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
         plate, outside = self.artifact, unknown >= AT_LEAST and unknown > MOST * bad
-        asked = _asked(plate, [view.view for view in views.values() if view.view.grid])
+        asked = _planned_marks(plate, [view.view for view in views.values() if view.view.grid])
         cells = [cell for view in views.values() for cell in view.parts]
         unread = [
             asked_rows.difference(*(np.unique(getattr(cell, axis)).tolist() for cell in cells))
@@ -294,7 +294,7 @@ def _rows(ids: np.ndarray, view_of: np.ndarray, limits: tuple[int, int]) -> set[
     }
 
 
-def _asked(artifact: Artifact, views: Iterable[View]) -> tuple[set[int], set[int]]:
+def _planned_marks(artifact: Artifact, views: Iterable[View]) -> tuple[set[int], set[int]]:
     """Return the m, and the n, of the marks that views ask for."""
     m, n = set(), set()
     for view in views:

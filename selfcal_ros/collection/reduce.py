@@ -314,7 +314,7 @@ def _identified(
     return (
         tried
         if plate
-        else max((assignment, number), scaled, tried, key=lambda attempt: _found(attempt[0]))
+        else max((assignment, number), scaled, tried, key=lambda attempt: _n_identified(attempt[0]))
     )
 
 
@@ -328,7 +328,7 @@ DISPLACED = (
 """Reasons of rejection of marks in images of a displaced plate."""
 
 
-def _found(marks: identify.MarkAssignment) -> int:
+def _n_identified(marks: identify.MarkAssignment) -> int:
     return int((marks.reasons == None).sum())  # noqa: E711
 
 

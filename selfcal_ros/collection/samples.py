@@ -271,9 +271,13 @@ class SampleStore:
         result may be owned by the store and must not be written to.
         """
         open_samples = self._open()
-        pieces = [_cut(open_samples, start_ns, end_ns, neighbours)] if len(open_samples[0]) else []
+        pieces = (
+            [_samples_between(open_samples, start_ns, end_ns, neighbours)]
+            if len(open_samples[0])
+            else []
+        )
         pieces += [
-            _cut(self._columns(self._blocks[number]), start_ns, end_ns, neighbours)
+            _samples_between(self._columns(self._blocks[number]), start_ns, end_ns, neighbours)
             for number in np.flatnonzero(self._touched(start_ns, end_ns))
         ]
         before = np.flatnonzero(self._lasts < start_ns)
@@ -286,7 +290,9 @@ class SampleStore:
                 if nearest[at] > _nth(pieces, edge, sign, neighbours):
                     break
                 pieces.append(
-                    _cut(self._columns(self._blocks[side[at]]), start_ns, end_ns, neighbours)
+                    _samples_between(
+                        self._columns(self._blocks[side[at]]), start_ns, end_ns, neighbours
+                    )
                 )
         pieces = [piece for piece in pieces if len(piece[0])]
         return _joined(sorted(pieces, key=lambda piece: piece[0][0]))
@@ -315,7 +321,9 @@ def _nth(pieces: list[Samples], edge: int, sign: int, n: int) -> float:
     return float("inf") if len(stamps) < n else int(stamps[n - 1])
 
 
-def _cut(columns: tuple[np.ndarray, ...], start_ns: int, end_ns: int, neighbours: int) -> Samples:
+def _samples_between(
+    columns: tuple[np.ndarray, ...], start_ns: int, end_ns: int, neighbours: int
+) -> Samples:
     """Return the samples between two stamps and of at least `neighbours` stamps on either side."""
     t = columns[0]
     low = _reach(t[: np.searchsorted(t, start_ns)][::-1], neighbours)

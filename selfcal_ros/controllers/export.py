@@ -244,7 +244,7 @@ def export(
         *provenance(result, frame, filled=filled, command=command),
         *form.notes,
         *(IMPLIED if form.sign_is_implied else ()),
-        _left(residuals[0]),
+        _remaining_text(residuals[0]),
     ]
     if active is not None:
         comments.append(
@@ -261,7 +261,7 @@ def export(
     remains = (
         ""
         if residuals[0].rms("after") < HELD * residuals[0].rms("before")
-        else (_left(residuals[0]))
+        else (_remaining_text(residuals[0]))
     )
     return Exported(
         files, residuals, bent, checklist(form, wiring, list(files), correct, table), remains
@@ -318,7 +318,7 @@ def place_to_look(frame: MachineFrame, correct: Correction, table: ErrorMap) -> 
     )
 
 
-def _left(sites: Residual) -> str:
+def _remaining_text(sites: Residual) -> str:
     """Return what remains at the nodes, in words."""
     rms, largest = (UM_PER_M * size("after") for size in (sites.rms, sites.largest))
     return (

@@ -166,7 +166,7 @@ class Rewriter:
         lines = [text]
         act = line.code(*MOVES)
         if act and (line.named("XYZE") or act.does in IN_PLANE):
-            lines = self._moved(act, line)
+            lines = self._move_lines(act, line)
         if line.code("set E"):
             self._at["E"] = line.number("E")
         for code in line.codes:
@@ -270,7 +270,7 @@ class Rewriter:
             self._motion = code if code.does in MOVES else None
         self._ended |= code.does == "end"
 
-    def _moved(self, act: Code, line: ProgramLine) -> list[str]:
+    def _move_lines(self, act: Code, line: ProgramLine) -> list[str]:
         """Return the lines of a move, each with its command."""
         relative = self._modes.get("distance") == "G91"
         for mode, moves in NEEDED.items():

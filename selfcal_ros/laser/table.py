@@ -151,21 +151,21 @@ def _header(path: str | os.PathLike, rows: list, columns: RequiredColumns) -> li
     if missing:
         raise InputError(
             where,
-            f"the column {_listed(missing)} is missing",
+            f"the column {_names_text(missing)} is missing",
             "the table needs " + ", ".join([BLOCK, *columns.readings]),
         )
     lacking = [name for name in columns.errors if name not in header]
     if lacking:
         raise InputError(
             where,
-            f"the column {_listed(lacking)} is missing",
+            f"the column {_names_text(lacking)} is missing",
             "the new formulation needs the linear errors, measured directly along "
             "the axes; without them use --method conventional",
         )
     return header
 
 
-def _listed(names: Sequence[str]) -> str:
+def _names_text(names: Sequence[str]) -> str:
     return ", ".join(f"'{name}'" for name in names)
 
 

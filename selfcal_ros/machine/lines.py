@@ -52,7 +52,7 @@ class Lines:
             self._serial.write(data)
             self._serial.flush()
         except self._lost as error:
-            raise self._gone(error) from error
+            raise self._lost_connection(error) from error
 
     def receive(self, timeout_s: float | None = None) -> str:
         """Return the next line that is not empty.
@@ -69,7 +69,7 @@ class Lines:
             try:
                 data += self._serial.readline(LONGEST)
             except self._lost as error:
-                raise self._gone(error) from error
+                raise self._lost_connection(error) from error
             if data.endswith((b"\n", b"\r")) and data.strip():
                 return data.decode("ascii", "replace").strip()
             if not data.strip():
@@ -83,13 +83,13 @@ class Lines:
         try:
             self._serial.reset_input_buffer()
         except self._lost as error:
-            raise self._gone(error) from error
+            raise self._lost_connection(error) from error
 
     def close(self) -> None:
         """Close the port."""
         self._serial.close()
 
-    def _gone(self, error: Exception) -> MachineError:
+    def _lost_connection(self, error: Exception) -> MachineError:
         return MachineError(
             f"the connection was lost ({error})",
             self._port,

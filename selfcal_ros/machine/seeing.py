@@ -104,7 +104,7 @@ class Eye:
         self._kind = self._kind or kind
         if kind != self._kind:
             raise MachineError(
-                f"an image is {_said(kind)}, those before were {_said(self._kind)}",
+                f"an image is {_kind_text(kind)}, those before were {_kind_text(self._kind)}",
                 "machine.image",
                 "set the camera to one size and type; see whether it was reset",
             )
@@ -139,7 +139,7 @@ class Eye:
         return Picture(pixels, int(np.iinfo(pixels.dtype).max))
 
 
-def _said(kind: tuple[object, ...]) -> str:
+def _kind_text(kind: tuple[object, ...]) -> str:
     dtype, height, width = kind
     return f"{width} x {height} {dtype}"
 

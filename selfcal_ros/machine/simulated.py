@@ -172,7 +172,7 @@ class SimulatedMachine:
         """Expose; None without a camera."""
         if self._camera is None:
             return None
-        offsets = self._seen()
+        offsets = self._measured_offsets()
         near = np.hypot(*offsets) < self._camera.reach_m
         return Image(self._camera.image(offsets[:, near], self._rng, angles=self._angle))
 
@@ -183,7 +183,7 @@ class SimulatedMachine:
         """
         settings, seen_offsets = self._settings, []
         declared = settings.declare_sigma
-        offsets = self._seen()
+        offsets = self._measured_offsets()
         for cell in self._cells if offsets.size and self._camera is None else []:
             away = np.hypot(offsets[0] - cell.real, offsets[1] - cell.imag)
             nearest = int(np.argmin(away))
@@ -224,7 +224,7 @@ class SimulatedMachine:
         """Return the time, 0..1 of the view, (1,)."""
         return np.array([min(1.0, self._n_exposed / max(self._n_expected - 1, 1))])
 
-    def _seen(self) -> np.ndarray:
+    def _measured_offsets(self) -> np.ndarray:
         """Expose; return the offsets of all marks as the microscope measures them, (2, V), m.
 
         A mark beyond the field has an offset, too.

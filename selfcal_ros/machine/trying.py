@@ -176,9 +176,9 @@ class Trial:
             If the images contradict the moves.
         """
         with self._visitor.stopping():
-            return self._moved()
+            return self._move_findings()
 
-    def _moved(self) -> Findings:
+    def _move_findings(self) -> Findings:
         visitor = self._visitor
         visitor.first_move(marks=False, step_m=self.step_m)
         start = visitor.sample()

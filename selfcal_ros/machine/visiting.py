@@ -396,7 +396,7 @@ class Visitor:
         MachineError
             If the target is beyond the limits, the position does not follow or does not rest.
         """
-        last, departure = self._last, self._left()
+        last, departure = self._last, self._where_it_was_left()
         start = dict(zip(self.axes, departure.positions, strict=True))
         if "theta" in self.axes and "theta" in target:
             turns = round((target["theta"] - start["theta"]) / math.tau)
@@ -420,7 +420,7 @@ class Visitor:
         self._untold += self._track(departure, arrival)
         return arrival
 
-    def _left(self) -> EncoderSample:
+    def _where_it_was_left(self) -> EncoderSample:
         """Return where the stage rests; raise if it is not where it was left."""
         now = self.sample()
         if self._last is not None:
@@ -432,7 +432,8 @@ class Visitor:
         axis = self._farthest(motion)
         if abs(motion[axis]) > self.cell.settle.of(axis, "arrival"):
             raise MachineError(
-                f"{axis} has changed by {_shown(axis, motion[axis])} at rest, without a command",
+                f"{axis} has changed by {_length_text(axis, motion[axis])} at rest, "
+                "without a command",
                 "machine.position",
                 "see whether it was moved by hand, was reset, or has lost its zero; home it",
             )
@@ -516,7 +517,7 @@ class Visitor:
         )
         return MachineError(
             f"{axis} does not come to rest in {self.cell.settle.patience:g} s: two readings differ "
-            f"by {_shown(axis, motion[axis])}",
+            f"by {_length_text(axis, motion[axis])}",
             "machine",
             "tune the axis, or raise settle: within or patience in CELL.yaml",
         )
@@ -547,7 +548,7 @@ class Visitor:
         )
         return MachineError(
             f"{axis} was sent to {goal[axis]:.6g} and indicates {indicated:.6g} {when}, "
-            f"{_shown(axis, away[axis])} away"
+            f"{_length_text(axis, away[axis])} away"
             f"{reason and ': '}{reason}",
             "machine",
             "check drives, limit switches and the unit of the positions, or raise settle: arrival",
@@ -574,19 +575,21 @@ class Visitor:
             motion = _difference(before, after)
             self._last = after
             if self._rests(motion):
-                detections = self._found(image_or_offsets, (began + ended) // 2, before.positions)
+                detections = self._detections(
+                    image_or_offsets, (began + ended) // 2, before.positions
+                )
                 self._check_stamps(detections, before, after)
                 return before, detections, after
             self._check_axes(before, after)
             self._check_left_alone(motion)
         axis = max(self.axes, key=lambda name: abs(motion[name]))
         raise MachineError(
-            f"{axis} moved by {_shown(axis, motion[axis])} during {TRIES} exposures",
+            f"{axis} moved by {_length_text(axis, motion[axis])} during {TRIES} exposures",
             "machine",
             "wait longer: settle: time in CELL.yaml",
         )
 
-    def _found(
+    def _detections(
         self, image_or_offsets: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
     ) -> list[Detection | Photo]:
         if isinstance(image_or_offsets, Image) and not self.detects:
@@ -719,12 +722,14 @@ class Visitor:
         else:
             cross_axis = "y" if axis == "x" else "x"
             reason = _reason(axis, expected, along, across) or (
-                f"the marks moved by {_shown(axis, along)} along {axis} and "
-                f"{_shown(cross_axis, across)} along {cross_axis}"
+                f"the marks moved by {_length_text(axis, along)} along {axis} and "
+                f"{_length_text(cross_axis, across)} along {cross_axis}"
             )
             remedy = "correct pixel_size, turn, mirror and sense in CELL.yaml: `selfcal cell try`"
         raise MachineError(
-            f"the stage moved by {_shown(axis, step)} along {axis}: {reason}", "first move", remedy
+            f"the stage moved by {_length_text(axis, step)} along {axis}: {reason}",
+            "first move",
+            remedy,
         )
 
 
@@ -764,7 +769,7 @@ def _change(
     return (x, y) if axis == "x" else (y, x)
 
 
-def _shown(axis: str, value: float) -> str:
+def _length_text(axis: str, value: float) -> str:
     return f"{value:.3g} rad" if axis == "theta" else f"{value * UM_PER_M:.4g} um"
 
 

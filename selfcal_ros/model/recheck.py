@@ -160,10 +160,10 @@ class Recheck:
 
     def to_dict(self) -> dict[str, Any]:
         """Return ``recheck`` of RESULT.json."""
-        return {**_given(self), "calibration": _given(self.calibration)}
+        return {**_filled_fields(self), "calibration": _filled_fields(self.calibration)}
 
 
-def _given(record: Any) -> dict[str, Any]:
+def _filled_fields(record: Any) -> dict[str, Any]:
     """Return the fields of a dataclass as JSON values, without those that were left out."""
     return {
         field.name: plain(value)

@@ -216,7 +216,7 @@ class View:
             If the pose is off the lattice, or grid marks are requested at a turn that is
             not a whole quarter.
         """
-        where, quarter_shift = f"view '{self.name}'", self._beside(artifact)
+        where, quarter_shift = f"view '{self.name}'", self._quarter_shift(artifact)
         a, b = (
             self._half_steps(step, artifact)
             if quarter_shift
@@ -246,11 +246,11 @@ class View:
         """Return whether the grid marks, if any are wanted, lie on the artifact's lattice."""
         if artifact.marks is not None:
             return False
-        turn, quarter_shift = self.rotation_rad / (math.pi / 2), self._beside(artifact)
+        turn, quarter_shift = self.rotation_rad / (math.pi / 2), self._quarter_shift(artifact)
         steps = (*(step - quarter_shift for step in self._pitches(artifact)), turn)
         return not self.grid or all(nearest_step(step) is not None for step in steps)
 
-    def _beside(self, artifact: Artifact) -> float:
+    def _quarter_shift(self, artifact: Artifact) -> float:
         """Return by how much more than whole pitches the plate is shifted on its lattice."""
         quarter = nearest_step(self.rotation_rad / (math.pi / 2))
         return artifact.quarter_shift if self.grid and quarter is not None and quarter % 2 else 0

@@ -59,7 +59,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self.session = CollectingSession(self.settings, ports)
         journal = JournalKeeper(
             self._journal_folder(),
-            {topic.name: self._kept(topic) for topic in names.INPUTS},
+            {topic.name: self._kept_topic(topic) for topic in names.INPUTS},
             self.settings,
             ports,
         )
@@ -83,7 +83,7 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         }
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
 
-    def _kept(self, topic: names.Topic) -> KeptTopic:
+    def _kept_topic(self, topic: names.Topic) -> KeptTopic:
         name_in_bag, heard = kept_names(self, topic)
         return KeptTopic(name_in_bag, offered(topic), heard)
 

@@ -177,7 +177,7 @@ class Player:
         """
         self._looked_s = time.monotonic()
         looked_s = self._looked_s - self._created_s
-        other_nodes = self._others()
+        other_nodes = self._other_publishers()
         named = {
             name: topics
             for name, topics in other_nodes.items()
@@ -191,7 +191,7 @@ class Player:
             )
         return not other_nodes and (looked_s >= LOOK_S or not self.alone_on)
 
-    def _others(self) -> dict[str, list[str]]:
+    def _other_publishers(self) -> dict[str, list[str]]:
         """Return who else publishes on which topics; selfcal's nodes may, on topics of their own.
 
         A node of that name on another topic is somebody else's.

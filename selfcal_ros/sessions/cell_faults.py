@@ -204,7 +204,7 @@ def _faults(
             command,
             (
                 *(
-                    _moved(sample, settings, scale=scale, swapped=swapped, signs=signs)
+                    _sample_at(sample, settings, scale=scale, swapped=swapped, signs=signs)
                     for sample in samples
                 ),
                 *readings,
@@ -326,7 +326,7 @@ def _turned(
     )
 
 
-def _moved(
+def _sample_at(
     sample: EncoderSample,
     settings: CollectorSettings,
     *,

@@ -19,10 +19,10 @@ def progress_line(command: Command, view: ViewProgress | None) -> str:
     head = f"view {command.view_index + 1}{of_all} '{printable(command.placed().name)}'"
     if command.phase == Phase.PLACE or view is None:
         return f"{head}: the plate is to be placed" if command.phase == Phase.PLACE else head
-    return f"{head}: {', '.join(_parts(view))}"
+    return f"{head}: {', '.join(_phrases(view))}"
 
 
-def _parts(view: ViewProgress) -> list[str]:
+def _phrases(view: ViewProgress) -> list[str]:
     """Return what is done, what was rejected, and the noise of a view."""
     parts = [
         f"{done} of {expected} {what}"

@@ -386,7 +386,7 @@ def read_simulation(path: str | Path) -> Simulation:
         round(top["start_time"] * NS_PER_S),
         top["compression"],
         top["noise_seed"] if "noise_seed" in data else None,
-        _placed(data.get("placed", []), plan, f"{where}: placed"),
+        _actual_poses(data.get("placed", []), plan, f"{where}: placed"),
         camera,
         *_correction(data.get("correction", {}), Path(path)),
     )
@@ -440,7 +440,7 @@ def _plan(plan: Any, path: Path) -> Plan:
     return plan_of(plan, f"{path}: plan", path.parent)
 
 
-def _placed(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:
+def _actual_poses(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]:
     """Return the actual poses of the named views; empty if none."""
     if not views:
         return ()

@@ -106,7 +106,7 @@ def _si(name: str, *content: ET.Element | str | None) -> ET.Element:
     return _node(SI, name, *content)
 
 
-def _given(name: str, value: str | None) -> ET.Element | None:
+def _dcc_if_given(name: str, value: str | None) -> ET.Element | None:
     return _dcc(name, value) if value else None
 
 
@@ -122,7 +122,7 @@ def _administration(result: CalibrationResult, details: dict[str, Any]) -> ET.El
         _dcc(
             "respPerson",
             _dcc("person", _content("name", person["name"])),
-            _given("role", person.get("role")),
+            _dcc_if_given("role", person.get("role")),
             _dcc("mainSigner", str(not i).lower()),
         )
         for i, person in enumerate(details["persons"])
@@ -150,7 +150,7 @@ def _administration(result: CalibrationResult, details: dict[str, Any]) -> ET.El
         _dcc("items", _dcc("item", *_thing(item, "manufacturer"))),
         _dcc(
             "calibrationLaboratory",
-            _given("calibrationLaboratoryCode", lab.get("code")),
+            _dcc_if_given("calibrationLaboratoryCode", lab.get("code")),
             _dcc("contact", *_contact(lab)),
         ),
         _dcc("respPersons", *persons),
@@ -186,7 +186,7 @@ def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
         yield _content("description", ", ".join(descriptions))
     if "manufacturer" in item:
         yield _dcc("manufacturer", _content("name", item["manufacturer"]))
-    yield _given("model", item.get("model"))
+    yield _dcc_if_given("model", item.get("model"))
     if "serial_number" in item:
         yield _dcc(
             "identifications", _identification(issuer, item["serial_number"], "serial number")
@@ -195,15 +195,15 @@ def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
 
 def _contact(details: dict[str, str]) -> Iterator[ET.Element | None]:
     yield _content("name", details["name"])
-    yield _given("eMail", details.get("email"))
-    yield _given("phone", details.get("phone"))
+    yield _dcc_if_given("eMail", details.get("email"))
+    yield _dcc_if_given("phone", details.get("phone"))
     yield _dcc(
         "location",
         _dcc("city", details["city"]),
         _dcc("countryCode", details["country"]),
-        _given("postCode", details.get("post_code")),
-        _given("street", details.get("street")),
-        _given("streetNo", details.get("number")),
+        _dcc_if_given("postCode", details.get("post_code")),
+        _dcc_if_given("street", details.get("street")),
+        _dcc_if_given("streetNo", details.get("number")),
     )
 
 

@@ -164,10 +164,12 @@ def fit_marks(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fi
 def _fitted(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit | None]:
     fits: list[Fit | None] = [None] * len(starts)
     step = max(1, windows.values.shape[1] // FEW)
-    parameters, settled = _settled(model, windows, starts, step)
+    parameters, settled = _unweighted_fits(model, windows, starts, step)
     if step > 1 and not settled.all():
         noisy = Windows(windows.disc, windows.values[~settled])
-        parameters[~settled], settled[~settled] = _settled(model, noisy, starts[~settled], 1)
+        parameters[~settled], settled[~settled] = _unweighted_fits(
+            model, noisy, starts[~settled], 1
+        )
     settled &= parameters[:, 3] != 0
     which = np.flatnonzero(settled)
     some = Windows(windows.disc, windows.values[which])
@@ -222,7 +224,7 @@ def _normal(jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return normal / scale[:, None, :] / scale[:, :, None], scale
 
 
-def _each(solver: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
+def _solutions(solver: Callable[..., np.ndarray], *arrays: np.ndarray) -> np.ndarray:
     """Return the solution of each mark; NaN where its matrix is singular."""
     try:
         return solver(*arrays)
@@ -246,7 +248,7 @@ def _solved(
     normal, scale = _normal(jacobian)
     damped = normal + damping[:, None, None] * np.eye(normal.shape[1])
     gradient = (jacobian @ residual[..., None])[..., 0] / scale
-    return _each(np.linalg.solve, damped, gradient[..., None])[..., 0], normal, scale
+    return _solutions(np.linalg.solve, damped, gradient[..., None])[..., 0], normal, scale
 
 
 def _diverged(p: np.ndarray, radius: float) -> np.ndarray:
@@ -254,7 +256,7 @@ def _diverged(p: np.ndarray, radius: float) -> np.ndarray:
     return ~(near & (np.abs(p[:, 2 + LIGHTING :]).max(axis=1) < 10 * radius))
 
 
-def _settled(
+def _unweighted_fits(
     model: MarkModel,
     windows: Windows,
     starts: np.ndarray,
@@ -383,7 +385,7 @@ def _fits(
     """Return the fits of marks that have settled; None where the uncertainty is not known."""
     shape, residual, variance, spread = modelled
     normal, scale = normal_and_scale
-    variances = np.diagonal(_each(np.linalg.inv, normal), axis1=1, axis2=2)[:, :2].copy()
+    variances = np.diagonal(_solutions(np.linalg.inv, normal), axis1=1, axis2=2)[:, :2].copy()
     variances[~(variances > 0)] = np.nan  # rounding, of a matrix that is almost singular
     sigmas = np.sqrt(variances) / scale[:, :2]
     away = windows.values - windows.values.mean(axis=1, keepdims=True)

@@ -222,7 +222,7 @@ def _outliers(
         floor = max(floor, (STEPS + 0.5) * _sensor_step(groups, values, floor))
     for group in groups:
         share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
-        for members in _parts(group, group.shape[1]):
+        for members in _batches(group, group.shape[1]):
             repeats = np.take(values, members, axis=1)
             away = np.abs(repeats - row_medians(repeats))
             bad = (away > np.maximum(cut * share * relative[members], floor)).any(axis=0)
@@ -238,7 +238,7 @@ def groups_of(key: np.ndarray) -> list[np.ndarray]:
     return [order[start[count == r][:, None] + np.arange(r)] for r in np.unique(count) if r > 1]
 
 
-def _parts(group: np.ndarray, width: int) -> Iterator[np.ndarray]:
+def _batches(group: np.ndarray, width: int) -> Iterator[np.ndarray]:
     """Yield the marks of a group in parts, for work with `width` numbers per mark."""
     size = max(1, PART // width)
     for start in range(0, len(group), size):
@@ -282,7 +282,7 @@ def _pair_scale(
     filled, alike = 0, bool((relative == 1).all())  # as where no sigma is declared
     for group in groups:
         i, j = pairs_of(group.shape[1])
-        for members in _parts(group, len(i)):
+        for members in _batches(group, len(i)):
             weights, repeats = relative[members], np.take(values, members, axis=1)
             norm = (
                 np.sqrt(2)
