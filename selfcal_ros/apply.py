@@ -105,7 +105,8 @@ class StageMap(Compensator):
         InputError
             If pandas is not installed.
         """
-        plate, emap = self.error_map.artifact, self.error_map
+        plate = self.error_map.artifact
+        emap = self.error_map
         columns = {
             "x": plate.x_m,
             "y": plate.y_m,
@@ -129,7 +130,8 @@ class StageMap(Compensator):
         InputError
             If xarray is not installed.
         """
-        emap, plate = self.error_map, self.error_map.artifact
+        emap = self.error_map
+        plate = self.error_map.artifact
         coordinates = {"x": plate.x_m[:, 0], "y": plate.y_m[0]}
         maps: dict[str, tuple] = {
             name: (("x", "y"), getattr(emap, name), {"units": "m"})
@@ -271,8 +273,11 @@ class StageMap(Compensator):
         i, j = np.triu_indices(len(x), 1)
         if not len(i):
             raise InputError("distance", "fewer than two sites are known", "measure more")
-        cover, dx, dy = self.covariance(x, y), x[j] - x[i], y[j] - y[i]
-        length, n = np.hypot(dx, dy), len(x)
+        cover = self.covariance(x, y)
+        dx = x[j] - x[i]
+        dy = y[j] - y[i]
+        length = np.hypot(dx, dy)
+        n = len(x)
         ex, ey = dx / length, dy / length
         square = sum(
             weight * _of_difference(cover, at, to)

@@ -238,15 +238,13 @@ def write_json(path: str | os.PathLike, value: Any) -> None:
 
 def json_text(value: Any, depth: int = 0) -> str:
     """Return strict JSON (no NaN), a key or row on a line: lists of numbers are not broken."""
-    inner, ends = [], "[]"
+    inner = []
+    ends = "[]"
     if isinstance(value, dict):
-        ends, inner = (
-            "{}",
-            [
-                f"{json.dumps(str(key))}: {json_text(item, depth + 1)}"
-                for key, item in value.items()
-            ],
-        )
+        ends = "{}"
+        inner = [
+            f"{json.dumps(str(key))}: {json_text(item, depth + 1)}" for key, item in value.items()
+        ]
     elif isinstance(value, list | tuple) and any(
         isinstance(item, dict | list | tuple) for item in value
     ):

@@ -63,7 +63,8 @@ def read_result(path: str | os.PathLike, limit: int | None = None) -> Calibratio
     """
     if os.path.isdir(path):
         path = active_map(path)[0]
-    raw, where = read_bytes(path, limit), str(path)
+    raw = read_bytes(path, limit)
+    where = str(path)
     data = parse_json(raw, path, limit)
     result = result_from_dict(data, where)
     if not require_unchanged(data, where):

@@ -237,13 +237,15 @@ def _expansion(table: Table1D, setup: MachineSetup) -> float:
 def bound_2d(table: Table2D, setup: MachineSetup) -> BoundTable2D:
     """Return a 2D or galvo table in primary units, biased if position (0, 0) is inside."""
     place = f"the table of line {table.line}" if table.line else "the table"
-    tracks, values = [], np.moveaxis(table.values, 2, 0)
+    tracks = []
+    values = np.moveaxis(table.values, 2, 0)
     for dim, (end, axis) in enumerate((("row", table.row_axis), ("col", table.column_axis))):
         unit = setup.unit(axis, table.position_unit, f"POSUNIT of {place}")
         distance = getattr(table, f"sample_{end}") * unit
         count = table.values.shape[dim]
         if table.galvo:
-            start, rollover = -(count - 1) / 2 * distance, None
+            start = -(count - 1) / 2 * distance
+            rollover = None
         else:
             then = getattr(table, f"absolute_feedback_offset_{end}")
             start = -(getattr(table, f"offset_{end}") or 0.0) * unit + _feedback_shift(

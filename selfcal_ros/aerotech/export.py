@@ -87,7 +87,8 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
     InputError
         If the frame has no theta axis, or the map has unknown angular lines or none.
     """
-    count, g = error_map.artifact.angular_count, error_map.g_theta
+    count = error_map.artifact.angular_count
+    g = error_map.g_theta
     if frame.theta_axis is None:
         raise InputError("theta axis", "it is not named", "give its index")
     if not count:
@@ -100,7 +101,8 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
         )
     counts = frame.theta_counts_per_unit
     lines = np.arange(0 if counts else -count, count + 1)
-    sign, first = frame.sign_theta, float(lines[0]) * 360 / count
+    sign = frame.sign_theta
+    first = float(lines[0]) * 360 / count
     return Table1D(
         frame.theta_axis,
         tidy(sign * 360 / count),
@@ -234,7 +236,8 @@ def map_line(
     """
     artifact = error_map.artifact
     across, positions = (1, artifact.x_m[:, 0]) if along == "x" else (0, artifact.y_m[0])
-    field, size = error_map.gx if corrected == "x" else error_map.gy, artifact.shape[across]
+    field = error_map.gx if corrected == "x" else error_map.gy
+    size = artifact.shape[across]
     values = (field.take((size - 1) // 2, across) + field.take(size // 2, across)) / 2
     if not np.isfinite(values).all():
         raise InputError(
@@ -269,7 +272,8 @@ def map_orthogonality(error_map: ErrorMap, along: Literal["x", "y"]) -> AxisCorr
 
 def without_slope(line: AxisCorrection) -> AxisCorrection:
     """Return `line` without its least-squares straight line, as for straightness."""
-    x, c = line.positions_m - line.positions_m.mean(), line.corrections_m
+    x = line.positions_m - line.positions_m.mean()
+    c = line.corrections_m
     return AxisCorrection(line.positions_m, c - c.mean() - x * (x @ c) / (x @ x))
 
 
@@ -296,7 +300,8 @@ def line_table(
     homes = {"x": frame.home_x_m, "y": frame.home_y_m}
     step = (line.positions_m[-1] - line.positions_m[0]) / (len(line.positions_m) - 1)
     first = line.positions_m[0] - homes[along]
-    sign, unit_m = signs[along], frame.unit_m
+    sign = signs[along]
+    unit_m = frame.unit_m
     return Table1D(
         axes[corrected],
         tidy(sign * step / unit_m),

@@ -128,7 +128,8 @@ class _Reader:
     def _directive(self, line: int, text: str) -> None:
         match = _TOKEN.match(text)
         assert match is not None, "the pattern takes any text"
-        word, arguments = match[1], text[match.end() :]
+        word = match[1]
+        arguments = text[match.end() :]
         if word.upper() == "END":
             self._end(line, word, arguments)
         elif word.upper() in _STARTS:
@@ -207,7 +208,8 @@ class _Reader:
             self.open.broken = True
 
     def _close(self) -> None:
-        table, self.open = self.open, None
+        table = self.open
+        self.open = None
         assert table is not None, "called with a table open"
         header = read_header(table.kind, table.heads, self.findings)
         header.broken |= table.broken_head
@@ -313,7 +315,8 @@ def _rows_are_whole(
     """Return whether the lines form whole rows; a finding names a line that does not."""
     width = columns * outputs
     want = f"a row has {columns} columns of {outputs} values = {width}"
-    lines, on_lines = layout[0], np.array(layout[1])
+    lines = layout[0]
+    on_lines = np.array(layout[1])
     ends = np.cumsum(on_lines)
     if np.all(on_lines == width):
         return True

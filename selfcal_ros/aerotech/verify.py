@@ -217,7 +217,8 @@ def _at_entries(
                 p[(p > side[0]) & (p < side[-1])] for p, side in zip(entries, nodes, strict=True)
             ]
             places.append(np.stack(np.meshgrid(*inside)).reshape(2, -1))
-    sites, position = plate.x_m.size, np.concatenate(places, axis=1)
+    sites = plate.x_m.size
+    position = np.concatenate(places, axis=1)
     pitches = (position[:, sites:] - position[:, :1]) / plate.grid_pitch_m
     between = (np.abs(pitches - np.round(pitches)) > UNIFORM).any(axis=0)
     position = position[:, np.append(np.full(sites, True), between)]
@@ -328,7 +329,8 @@ def controller_figure(verification: TableVerification) -> Drawing:
             68.0,
         )
         for number, frame in enumerate(frames):
-            (residual, state), (take, _) = _pair(fields, number), selections[number // 2]
+            residual, state = _pair(fields, number)
+            take, _ = selections[number // 2]
             parts.arrows(
                 frame,
                 residual.position[:, take] * MM_PER_M,

@@ -165,7 +165,8 @@ def write_cals(
 
 def _backup(target: Path, stamp: str) -> Path:
     """Return a name beside a file that is still free."""
-    backup, count = target.with_name(f"{target.name}.{stamp}.bak"), 1
+    backup = target.with_name(f"{target.name}.{stamp}.bak")
+    count = 1
     while backup.exists():
         count += 1
         backup = target.with_name(f"{target.name}.{stamp}-{count}.bak")

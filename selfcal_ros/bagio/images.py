@@ -491,7 +491,8 @@ def encoder_track(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
 
     Samples without these joints are left out.
     """
-    stamps, places = [np.zeros(0, np.int64)], [np.zeros((0, 2))]
+    stamps = [np.zeros(0, np.int64)]
+    places = [np.zeros((0, 2))]
     for _, block in BagReader(Path(path)).columns():
         if isinstance(block, EncoderBlock) and {"x", "y"} <= set(block.names):
             stamps.append(block.stamps_ns)

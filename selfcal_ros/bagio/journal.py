@@ -126,7 +126,8 @@ def unfinished(folder: str | os.PathLike, journal: Path | None = None) -> list[P
         newest_journal = journal or _newest(bag)[1]
         if newest_journal is None:
             return []
-        bag, files = newest_journal, _files(newest_journal)
+        bag = newest_journal
+        files = _files(newest_journal)
         commands = [
             command
             for file in files
@@ -278,7 +279,8 @@ class Journal(Closing):
         self._declare(topic, bag_topic)
 
     def _declare(self, topic: str, bag_topic: BagTopic) -> None:
-        number, definition = len(self._channels) + 1, definition_of(topic, bag_topic.type)
+        number = len(self._channels) + 1
+        definition = definition_of(topic, bag_topic.type)
         schema = Schema(
             id=number, name=bag_topic.type, encoding="ros2msg", data=definition.encode()
         )
@@ -311,13 +313,15 @@ class Journal(Closing):
             If the disk is full or fails: the messages since the last flush are not in the
             journal and are counted in `n_lost`.
         """
-        waiting, self._waiting = self._waiting, []
+        waiting = self._waiting
+        self._waiting = []
         with _as_input_error(self.path):
             if waiting:
                 self._append(waiting)
                 self._n_appended += len(waiting)
                 self._unsynced_s = self._unsynced_s or time.monotonic()
-            failed, self._failed = self._failed, None
+            failed = self._failed
+            self._failed = None
             if failed is not None:
                 raise failed
 

@@ -63,7 +63,9 @@ class Content:
 
     def add(self, channel: int, log_times_ns: list[int]) -> None:
         """Count messages by their log times, at least one."""
-        entry, first, last = self.entry, min(log_times_ns), max(log_times_ns)
+        entry = self.entry
+        first = min(log_times_ns)
+        last = max(log_times_ns)
         entry.first_ns = first if entry.first_ns is None else min(entry.first_ns, first)
         entry.last_ns = max(entry.last_ns, last)
         entry.count += len(log_times_ns)

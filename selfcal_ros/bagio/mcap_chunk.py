@@ -171,8 +171,11 @@ class _Places:
 
     def find(self, offset: int) -> int:
         """Skip the messages from `offset` on; return the beginning of the next other record."""
-        data, size, single = self.data, len(self.data), self.single
-        waited, patience = 0, PATIENCE
+        data = self.data
+        size = len(self.data)
+        single = self.single
+        waited = 0
+        patience = PATIENCE
         while offset + FRONT <= size:
             opcode, length = mcap_salvage.HEAD.unpack_from(data, offset)
             end = offset + mcap_salvage.HEAD.size + length
@@ -187,14 +190,17 @@ class _Places:
                 patience = (
                     PATIENCE if taken_messages >= FIRST_LOOK else min(2 * patience, MAX_PATIENCE)
                 )
-                offset, waited = offset + taken_messages // max(len(sizes), 1) * int(sizes.sum()), 0
+                offset = offset + taken_messages // max(len(sizes), 1) * int(sizes.sum())
+                waited = 0
         return offset
 
     def _run(self, start: int, sizes: np.ndarray) -> int:
         """Take messages with repeating sizes from `start` on; return their number."""
-        stride, offsets = int(sizes.sum()), np.cumsum(sizes) - sizes
+        stride = int(sizes.sum())
+        offsets = np.cumsum(sizes) - sizes
         possible = (len(self.data) - start) // stride
-        taken_runs, look = 0, max(FIRST_LOOK // len(sizes), 1)
+        taken_runs = 0
+        look = max(FIRST_LOOK // len(sizes), 1)
         while taken_runs < possible:
             count = min(look, possible - taken_runs)
             good = np.ones(count, dtype=bool)
@@ -264,7 +270,8 @@ def _items(data: bytes) -> list[MessageBlock | Schema | Channel]:
         if offset == len(data):
             break
         opcode, length = mcap_salvage.HEAD.unpack_from(data, offset)
-        start, offset = offset + mcap_salvage.HEAD.size, offset + mcap_salvage.HEAD.size + length
+        start = offset + mcap_salvage.HEAD.size
+        offset = offset + mcap_salvage.HEAD.size + length
         if offset > len(data) or opcode == Opcode.MESSAGE:
             raise ValueError("a record does not fit into its chunk")
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -353,7 +360,8 @@ def _content(file: BinaryIO) -> bytes:
 
 
 def _parsed(content: bytes) -> Summary:
-    summary, offset = Summary(), 0
+    summary = Summary()
+    offset = 0
     while offset < len(content):
         opcode, length = mcap_salvage.HEAD.unpack_from(content, offset)
         offset += mcap_salvage.HEAD.size

@@ -135,7 +135,9 @@ def lz4_chunk(data: bytes, declared: int) -> bytes:
         If the frame is damaged.
     """
     check_size(lz4.frame.get_frame_info(data)["content_size"], len(data), declared)
-    decoder, out, size = lz4.frame.LZ4FrameDecompressor(), [], 0
+    decoder = lz4.frame.LZ4FrameDecompressor()
+    out = []
+    size = 0
     for start in range(0, len(data), BLOCK):  # a block expands by at most 255
         out.append(decoder.decompress(data[start : start + BLOCK]))
         size += len(out[-1])

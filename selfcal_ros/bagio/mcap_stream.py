@@ -217,7 +217,8 @@ class McapStream:
             data_ended = data_ended or opcode == Opcode.DATA_END
             last = offset
             if opcode in CHECKED:  # only the record after a message confirms its length
-                sure, clean = offset if opcode == Opcode.MESSAGE else end, end
+                sure = offset if opcode == Opcode.MESSAGE else end
+                clean = end
             if passed and opcode == Opcode.MESSAGE_INDEX:
                 self._n_read += (end - offset - mcap_salvage.HEAD.size - INDEX.size) // INDEX_ENTRY
             offset = end
@@ -359,7 +360,8 @@ class McapStream:
         self, file: BinaryIO, start: int, error: Exception
     ) -> Iterator[mcap_chunk.MessageBlock]:
         """Yield the readable part of the record at `start`, and report the rest."""
-        stop, size = self._next_record(file, start), self._size
+        stop = self._next_record(file, start)
+        size = self._size
         file.seek(start)
         count = 0
         for item in mcap_chunk.gathered(list(mcap_salvage.front_of_chunk(file.read(stop - start)))):

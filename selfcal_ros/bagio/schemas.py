@@ -188,7 +188,8 @@ def _field(store: Typestore, name: str, kind: Any) -> Field:
     node, inner = kind
     count = None
     if node == Nodetype.SEQUENCE:
-        (node, inner), count = inner[0], SEQUENCE
+        node, inner = inner[0]
+        count = SEQUENCE
     elif node == Nodetype.ARRAY:
         (node, inner), count = inner
     if node == Nodetype.NAME:
@@ -226,7 +227,8 @@ def other_field(store: Typestore, name: str, last: str) -> str:
     Every field up to `last` must be present, and common fields must have the same type. Unknown
     fields, and bounds on the length of a string or array, are ignored.
     """
-    type_of_field, required = dict(store.fielddefs[name][1]), True
+    type_of_field = dict(store.fielddefs[name][1])
+    required = True
     for part, wanted in typestore().fielddefs[name][1]:
         if part not in type_of_field and required:
             return f"no field '{part}'"

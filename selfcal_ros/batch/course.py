@@ -88,7 +88,8 @@ def course_of(
     from scipy import stats  # a second, for a series alone
 
     slope, _, low, high = stats.theilslopes(values, days, 0.95)
-    change, p_change = step_of(values), pettitt(values, rng, orders=orders)
+    change = step_of(values)
+    p_change = pettitt(values, rng, orders=orders)
     return Course(
         len(values),
         (float(slope), float(low), float(high)),
@@ -147,7 +148,8 @@ def courses(
     seed, orders : int
         Seed and number of the random orders.
     """
-    rng, course_of_quantity = np.random.default_rng(seed), {}
+    rng = np.random.default_rng(seed)
+    course_of_quantity = {}
     for name, values in table.items():
         has_value = np.isfinite(values)
         if has_value.sum() >= FEWEST:
@@ -191,7 +193,9 @@ def _with_finding(
 def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> CourseKind:
     """Return the better of a line and a step (BIC of Laplace errors, 2 and 3 unknowns)."""
     has_value = np.isfinite(values)
-    t, x, n = days[has_value], values[has_value], int(has_value.sum())
+    t = days[has_value]
+    x = values[has_value]
+    n = int(has_value.sum())
     line = x - course.slope_per_day[0] * t
     after = np.flatnonzero(has_value) >= course.change
     step = x - np.where(after, course.after, course.before)

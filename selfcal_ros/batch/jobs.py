@@ -94,7 +94,8 @@ def _without_result(error: SelfcalError) -> folder.Record:
 
 
 def _with_result(result: results.CalibrationResult) -> folder.Record:
-    good, artifact = result.verdict.qualified, result.artifact
+    good = result.verdict.qualified
+    artifact = result.artifact
     return {
         "exit_code": int(ExitCode.DONE if good else ExitCode.NOT_QUALIFIED),
         "qualified": good,

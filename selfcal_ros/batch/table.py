@@ -132,7 +132,8 @@ def csv_text(records: Sequence[Record]) -> str:
     )
     writer.writerow([*BASE, "cause", "cause_view", *compared, *names])
     for record in ordered:
-        quantities, causes = record.get("quantities", {}), record.get("causes", [])
+        quantities = record.get("quantities", {})
+        causes = record.get("causes", [])
         likeliest = causes[0] if causes else {"name": "", "view": ""}
         writer.writerow(
             [_field(record.get(name)) for name in BASE]

@@ -132,7 +132,8 @@ def refuse_other_unit(stage: StageMap, points: np.ndarray, where: str) -> None:
 
 def _say_better(stage: StageMap, points: np.ndarray) -> None:
     """Recommend bicubic interpolation if it at least halves u between the nodes."""
-    emap, used = stage.error_map, rms(stage.halfway)
+    emap = stage.error_map
+    used = rms(stage.halfway)
     x, y = points[:, :2].T
     plain = np.array(stage.uncertainty(x, y)) if used else np.zeros(1)
     if stage.method == "bicubic" or not emap.valid.all() or not rms(plain) > 2 * rms(emap.u_xy):
@@ -196,7 +197,8 @@ def corrected(
 
     Those outside are left empty, or with `edge` corrected as the nearest point of the field.
     """
-    names, what = AXES[: points.shape[1]], "true" if inverse else "command"
+    names = AXES[: points.shape[1]]
+    what = "true" if inverse else "command"
     x, y, *theta = points.T
     corrected_axes = list(stage.correct(x, y) if inverse else stage.command(x, y))
     u = list((stage.uncertainty_indicated if inverse else stage.uncertainty)(x, y))

@@ -25,12 +25,10 @@ SEEN = 1 << 14
 """Bytes at the beginning of a file by which its kind is recognised."""
 
 BAG, RESULT, PLAN, SIMULATION = "a bag", "a result", "a plan", "a simulation"
-PARAMETERS, CAL, TABLE, PROGRAM = (
-    "a parameter file of nodes",
-    "a calibration file",
-    "a table of numbers",
-    "a G-code program",
-)
+PARAMETERS = "a parameter file of nodes"
+CAL = "a calibration file"
+TABLE = "a table of numbers"
+PROGRAM = "a G-code program"
 CELL = "a cell"
 WANTED = {
     "BAG": BAG,

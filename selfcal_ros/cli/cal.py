@@ -303,7 +303,8 @@ def _export(args: argparse.Namespace) -> int:
         *provenance(result, frame, filled=filled, command=command(args)),
         "zero at home by the controller",
     ]
-    error_map, active = result.error_map, _active(args, frame)
+    error_map = result.error_map
+    active = _active(args, frame)
     if active is not None:
         error_map = combined(error_map, frame, active)
         say_bent(args, bends_between(error_map, frame, active))
@@ -363,7 +364,8 @@ def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
     InputError
         As `require_plausible`, unless the map was accepted as steep.
     """
-    result, filled = read_result(args.result), 0
+    result = read_result(args.result)
+    filled = 0
     if not result.observability.identifiable:
         raise NotIdentifiableError(
             f"{args.result}: the measured plan does not identify the stage; "

@@ -333,7 +333,8 @@ def _orthogonality(args: argparse.Namespace) -> int:
 
 
 def _line(args: argparse.Namespace) -> int:
-    frame, result = _frame(args), None
+    frame = _frame(args)
+    result = None
     corrected: Axis = args.along
     if args.sub_verb == "straightness":
         corrected = "y" if args.along == "x" else "x"

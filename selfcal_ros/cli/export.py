@@ -102,7 +102,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _wiring(args: argparse.Namespace) -> "Wiring":
-    count_options, args.counts_per_unit = args.counts_per_unit, None
+    count_options = args.counts_per_unit
+    args.counts_per_unit = None
     args.unit = args.unit or FORMATS[args.format].unit
     frame = frame_of(args)
     counts = numbers(count_options, "--counts-per-unit", positive=True)

@@ -253,7 +253,8 @@ def _check_json(
 def _check_text(
     plan: Plan, checked: tuple[Observability, int], predicted: Prediction | None
 ) -> list[str]:
-    artifact, (observability, unknown) = plan.artifact, checked
+    artifact = plan.artifact
+    observability, unknown = checked
     marks = (
         f"{artifact.shape[0]} x {artifact.shape[1]}"
         if artifact.marks is None
@@ -317,7 +318,8 @@ def _known_text(plan: Plan, unknown: int) -> str:
 
 def _nodes_text(plan: Plan) -> list[str]:
     """Return the nodes of a map that is not on the plate's lattice, in a line."""
-    grid, (nx, ny) = plan.artifact.map_grid, plan.artifact.field.shape
+    grid = plan.artifact.map_grid
+    nx, ny = plan.artifact.field.shape
     nodes = (
         []
         if grid is None

@@ -474,7 +474,8 @@ def _text(
     prediction: tuple[PlanBudget, tuple[View, float]],
     outputs: list[Path],
 ) -> Iterator[str]:
-    (budget, (further, factor)), artifact = prediction, plan.artifact
+    budget, (further, factor) = prediction
+    artifact = plan.artifact
     nx, ny = artifact.shape
     span = " x ".join(f"{(count - 1) * answers.pitch * MM_PER_M:g}" for count in artifact.shape)
     travel = " x ".join(f"{side * MM_PER_M:g}" for side in answers.travel)

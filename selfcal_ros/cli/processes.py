@@ -76,7 +76,8 @@ def process(
     Ctrl-C reaches the process from the terminal, too. It is blocked from the start, and unblocked
     by `nodes.running.run` after the imports, when it can be handled.
     """
-    child, before = None, signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    child = None
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],

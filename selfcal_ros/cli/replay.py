@@ -110,7 +110,8 @@ def run(args: argparse.Namespace) -> int:
             f"give a number from 0 to {MOST_DOMAIN}",
         )
     check_outputs([args.bag, args.params], [file_of(args)])
-    source, detector = bag_input(args.bag), detector_of(args)
+    source = bag_input(args.bag)
+    detector = detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
     bag = bag_lines(args.bag, settings, args.namespace)
     for line in bag.faults:  # first: what the nodes say of the readings follows from them
@@ -185,7 +186,8 @@ def _detected(args: argparse.Namespace, settings: DetectorSettings, folder: Path
     """Return the bag of marks that `selfcal detect` finds in the images of a bag."""
     from selfcal_ros.vision.exposures import ImageDetector  # with scipy, for images only
 
-    detector, marks_bag = ImageDetector(settings, args.bag), folder / "detected"
+    detector = ImageDetector(settings, args.bag)
+    marks_bag = folder / "detected"
     ImageBag(Path(args.bag), args.namespace).write_detected(
         marks_bag,
         detector.take,

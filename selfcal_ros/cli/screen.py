@@ -188,7 +188,8 @@ def _state(values: dict[str, str], command: dict[str, Any]) -> str:
 
 def _task(picture: dict[str, Any]) -> list[Text]:
     """Return view, run and current task."""
-    command, health = picture["command"], picture["health"].get("pose_sequencer")
+    command = picture["command"]
+    health = picture["health"].get("pose_sequencer")
     values = health["values"] if health else {}
     views = _whole_number(values.get("views")) or (command or {}).get("views_planned", 0)
     name, index = (command or {}).get("view_name", ""), (command or {}).get("view_index", 0)
@@ -310,10 +311,8 @@ def _verdict(picture: dict[str, Any]) -> list[Text]:
     summary = picture["summary"]
     if summary is None:
         return [Text("no view has been solved yet")]
-    word, colour = (
-        "not qualified" if summary["identifiable"] else "not identified yet",
-        "bold yellow",
-    )
+    word = "not qualified" if summary["identifiable"] else "not identified yet"
+    colour = "bold yellow"
     if summary["qualified"]:
         word, colour = (
             ("good within an enlarged U", "bold yellow")
@@ -321,7 +320,8 @@ def _verdict(picture: dict[str, Any]) -> list[Text]:
             else ("good", "bold green")
         )
     done, planned = summary["views"]
-    run, now = summary["run_id"], (picture["command"] or {}).get("run_id", "")
+    run = summary["run_id"]
+    now = (picture["command"] or {}).get("run_id", "")
     earlier = "; an earlier run" if run and now and run != now else ""
     texts = [
         Text.assemble((word, colour), f"; views {done} of {planned}{earlier}"),

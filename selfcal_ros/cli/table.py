@@ -68,7 +68,9 @@ def run(args: argparse.Namespace) -> int:
 def csv_bytes(result: "CalibrationResult") -> bytes:
     """Return the maps as CSV: nominal positions of sites and lines, errors, uncertainties."""
     emap, plate = result.error_map, result.artifact
-    rows, x_m, y_m = [",".join(COLUMNS)], plate.x_m, plate.y_m
+    rows = [",".join(COLUMNS)]
+    x_m = plate.x_m
+    y_m = plate.y_m
     for i, j in ((i, j) for i in range(plate.shape[0]) for j in range(plate.shape[1])):
         m, n = i - plate.middle[0], j - plate.middle[1]
         cells = [
@@ -90,7 +92,8 @@ def _cell(value: float) -> str:
 def npz_bytes(result: "CalibrationResult") -> bytes:
     """Return the maps as arrays by the names of RESULT.json, [i, j] = site i - Nx//2, j - Ny//2."""
     emap, plate = result.error_map, result.artifact
-    out, plate_marks = io.BytesIO(), result.plate.marks
+    out = io.BytesIO()
+    plate_marks = result.plate.marks
     marks = (
         {}
         if plate_marks is None

@@ -129,7 +129,8 @@ class Collector:
         ):
             self._rejected_input[inputs.Reason.ENCODER_MALFORMED] += count
             return
-        finite, joint_known = np.ones(count, dtype=bool), False
+        finite = np.ones(count, dtype=bool)
+        joint_known = False
         for column, name in enumerate(names):
             joint = self._joint(name)
             if joint is None:
@@ -286,7 +287,8 @@ class Collector:
 
     def missing_commands(self) -> list[str]:
         """Return which commands of the run were lost, as far as that is seen, one line each."""
-        timeline, stamps = self.timeline, self._views.table["stamp"]
+        timeline = self.timeline
+        stamps = self._views.table["stamp"]
         lines = [
             f"no command of view {index} of the plan (from 0) is there: what was measured in "
             f"it counts in no view, or in another; receive and record {COMMAND_TOPIC} whole"

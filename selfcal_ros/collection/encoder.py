@@ -257,7 +257,8 @@ class JointSamples:
         """
 
         def off(t: np.ndarray, p: np.ndarray) -> np.ndarray:
-            step, dt = self._difference(np.diff(p)), np.diff(t)
+            step = self._difference(np.diff(p))
+            dt = np.diff(t)
             return np.abs(step[..., :-1] * dt[..., 1:] - step[..., 1:] * dt[..., :-1]) / (
                 dt[..., :-1] + dt[..., 1:]
             )

@@ -133,7 +133,8 @@ class DetectionsSeen:
         marks = self._named(views) if rejected.keys() & set(PLACED) else {}
         limit = self.rules.stage_limit_m(self.artifact) / self.artifact.grid_pitch_m
         poses = seen_poses(marks, limit, self.rules.max_rotation_rad)
-        joints, faults = not any(pose.planned for pose in poses.values()), texts(poses)
+        joints = not any(pose.planned for pose in poses.values())
+        faults = texts(poses)
         alike = (
             faults.get(next(iter(views)), "") if len(views) == 1 else mirrored_alike(poses.values())
         )
@@ -171,7 +172,8 @@ class DetectionsSeen:
         """Return that the ids are those of a plate with more or fewer rows; None if not."""
         unknown = rejected.get(Reason.UNKNOWN_MARK, 0)
         bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
-        plate, outside = self.artifact, unknown >= AT_LEAST and unknown > MOST * bad
+        plate = self.artifact
+        outside = unknown >= AT_LEAST and unknown > MOST * bad
         asked = _planned_marks(plate, [view.view for view in views.values() if view.view.grid])
         cells = [cell for view in views.values() for cell in view.parts]
         unread = [
@@ -199,7 +201,8 @@ class DetectionsSeen:
         )
         if sides == planned or outside is on_plate:
             return None
-        (m, n), (nx, ny) = ((f"{min(rows)} to {max(rows)}" for rows in seen_rows), plate.shape)
+        m, n = (f"{min(rows)} to {max(rows)}" for rows in seen_rows)
+        nx, ny = plate.shape
         exchanged = " (the sides are exchanged)" if sides == (ny, nx) else ""
         return RejectionFinding(
             Reason.UNKNOWN_MARK,
@@ -221,7 +224,8 @@ class DetectionsSeen:
     ) -> Evidence:
         """Return the facts on a view, or on all."""
         of_view = np.ones(len(self.table), dtype=bool) if view is None else self.view_of == view
-        table, encoder = self.table[of_view], self.encoder()
+        table = self.table[of_view]
+        encoder = self.encoder()
         kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
         missing = tuple(
             encoder.names[axis]
@@ -252,7 +256,8 @@ class DetectionsSeen:
 
     def _named(self, views: Mapping[int, ViewReadings]) -> dict[int, NamedMarks]:
         """Return view_index -> the last of its marks with ids, as `sense` has them."""
-        named_marks, pitch = {}, self.artifact.grid_pitch_m
+        named_marks = {}
+        pitch = self.artifact.grid_pitch_m
         for index, readings in views.items():
             table = self.table[np.flatnonzero(self.view_of == index)[-LOOKED_AT:]]
             stage = self.exposures.at(table["stamp"])

@@ -172,7 +172,8 @@ class ViewProgress:
     @property
     def needed(self) -> int:
         """Smallest number of detections needed to complete the view."""
-        repeats, have = self.view.repeats, 0
+        repeats = self.view.repeats
+        have = 0
         tried = [pair for cell in self.readings.parts for pair in _tried(cell.view, cell)]
         for count, tries in tried:
             more = repeats - count

@@ -179,7 +179,8 @@ class Exposures:
         If halves need as many samples as the whole, as in a completely shuffled session, a group
         is not split.
         """
-        groups, waiting = [], [(due, np.inf)] if len(due) else []
+        groups = []
+        waiting = [(due, np.inf)] if len(due) else []
         while waiting:
             group, before = waiting.pop()
             start, end = self._window(group)
@@ -207,7 +208,8 @@ class Exposures:
         start, end = self._window(group)
         index = np.arange(group[0], group[-1] + 1)
         rows = slice(group[0], group[-1] + 1)
-        stamps, since = self._stamps.rows[rows], self._since(index)
+        stamps = self._stamps.rows[rows]
+        since = self._since(index)
         for number, (joint, track) in enumerate(zip(self._joints, self._tracks, strict=True)):
             series = track.between(start, end)
             position, codes = series.query(stamps)
@@ -223,7 +225,8 @@ class Exposures:
     def _motions(
         self, series: encoder.JointSamples, index: np.ndarray, position: np.ndarray
     ) -> np.ndarray:
-        stamps, first = self._stamps.rows, index[0]
+        stamps = self._stamps.rows
+        first = index[0]
         if first == 0:
             return series.approach(stamps[index], position, threshold=self._threshold_m)
         # after the previous exposure, whose own samples may be incomplete here
@@ -237,7 +240,8 @@ class Exposures:
         if not due.any():
             return NO_STAMPS
         start = int(due.argmax())  # nothing changes before the first one looked up
-        changed, looked_up = changed[start:], np.zeros(0, dtype=bool)
+        changed = changed[start:]
+        looked_up = np.zeros(0, dtype=bool)
         for joint in self._joints[:N_LINEAR]:
             old = joint["approach"][start:]
             before = joint["approach"][start - 1 : start] if start else np.zeros(1, dtype=np.int8)

@@ -250,7 +250,8 @@ def _check_values(
 
 def check_plate(artifact: Artifact, views: Iterable[ViewReadings]) -> None:
     """Raise InputError for a plate that is too large for the marks read."""
-    marks, sites = sum(len(view.m) for view in views), math.prod(artifact.shape)
+    marks = sum(len(view.m) for view in views)
+    sites = math.prod(artifact.shape)
     if sites > SITES_A_MARK * (1 + marks):
         raise InputError(
             MEASUREMENT_TOPIC,

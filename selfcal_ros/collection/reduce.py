@@ -49,10 +49,12 @@ class PlaceList:
 
     def places(self) -> RejectedPlaces:
         """Return the positions; if more than `RejectedPlaces.MOST`, an even selection."""
-        reason, at = np.concatenate(self._reason), np.concatenate(self._at, axis=1)
+        reason = np.concatenate(self._reason)
+        at = np.concatenate(self._at, axis=1)
         if len(reason) > RejectedPlaces.MOST:
             chosen = np.linspace(0, len(reason) - 1, RejectedPlaces.MOST).round().astype(int)
-            reason, at = reason[chosen], at[:, chosen]
+            reason = reason[chosen]
+            at = at[:, chosen]
         return RejectedPlaces(tuple(map(str, reason)), *at)
 
 
@@ -114,7 +116,8 @@ def clean(
     low = unique[:0]
     if scored:
         below = unique["score"] < rules.min_score
-        low, unique = unique[below], _where(~below, unique)
+        low = unique[below]
+        unique = _where(~below, unique)
         rejected[Reason.LOW_SCORE] = len(low)
     return unique, low, +rejected
 
@@ -124,7 +127,8 @@ def with_low_scores(readings: ViewReadings, low: np.ndarray, exposures: Exposure
     low = low[low["kind"] == Kind.GRID]
     if not len(low):
         return readings
-    stage, places = exposures.at(low["stamp"]), PlaceList(readings.places)
+    stage = exposures.at(low["stamp"])
+    places = PlaceList(readings.places)
     places.add(
         np.full(len(low), Reason.LOW_SCORE, dtype=object),
         np.stack([stage.x.position, stage.y.position]),
@@ -334,7 +338,8 @@ def _n_identified(marks: identify.MarkAssignment) -> int:
 
 def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.ndarray) -> complex:
     """Return by how many whole pitches marks without ids lie beside the plate, stage frame."""
-    pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
+    pose = view.on_stage(artifact)
+    pitch = artifact.grid_pitch_m
     centred = reading_m - np.array(pose.shift)[:, None] * pitch
     on_plate = artifact.nearest(*pose.turned_back(*(rigid.undo(centred) / pitch)))
     pitches_off = (
@@ -390,7 +395,8 @@ def _reduce_grid(
     places: PlaceList,
 ) -> dict:
     """Return the grid readings of a view, or of a sub-view: offsets from the place of its cell."""
-    d, key = marks.detections, artifact.flat(*marks.index)
+    d = marks.detections
+    key = artifact.flat(*marks.index)
     offset = np.stack([d["ox"] - view.cell_m.real, d["oy"] - view.cell_m.imag])
     means = reduce_repeats(
         key,

@@ -242,7 +242,8 @@ class SampleStore:
 
     def new_stamps(self) -> np.ndarray:
         """Return the stamps added since the last call, rising."""
-        unseen, self._unseen = self._unseen, []
+        unseen = self._unseen
+        self._unseen = []
         stamps = np.concatenate([NO_STAMPS, *unseen])
         return stamps if (stamps[1:] >= stamps[:-1]).all() else np.sort(stamps)
 

@@ -244,7 +244,9 @@ def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
         )
         fresh = command.run_id or (str(command.stamp_ns) if anew or not run else run)
         if fresh != run:
-            run, ended, later = fresh, False, False
+            run = fresh
+            ended = False
+            later = False
         ended |= over
         later |= command.phase == Phase.MEASURE and command.view_index > 0
         out.append(run)
@@ -297,7 +299,8 @@ def _intervals(ordered: list[Command], runs: list[str | None], run_id: str) -> l
         elif command.phase == Phase.MEASURE and command.stamp_ns < began[command.view_index]:
             reason = Reason.SUPERSEDED
         elif command.phase == Phase.MEASURE:
-            index, reason = command.view_index, None
+            index = command.view_index
+            reason = None
         out.append(Interval(interval.start_ns, interval.end_ns, index, reason))
     return out
 

@@ -39,7 +39,10 @@ def cubic_pieces(values: np.ndarray, *, periodic: bool = False, local: bool = Fa
         slope = np.gradient(values, axis=0, edge_order=2) if local else _slopes(values)
     if periodic:
         values, slope = (np.concatenate([rows, rows[:1]]) for rows in (values, slope))
-    low, left, right, step = values[:-1], slope[:-1], slope[1:], np.diff(values, axis=0)
+    low = values[:-1]
+    left = slope[:-1]
+    right = slope[1:]
+    step = np.diff(values, axis=0)
     return np.stack([low, left, 3 * step - 2 * left - right, left + right - 2 * step])
 
 
@@ -54,7 +57,8 @@ def _slopes(values: np.ndarray) -> np.ndarray:
     before, diagonal = [0.0, *[1.0] * (n - 2), 2.0], [1.0, *[4.0] * (n - 2), 1.0]
     after = [2.0, *[1.0] * (n - 2), 0.0]
     if n == 3:  # both ends give the same condition: the parabola has no third derivative
-        before[2], slope[2] = 0.0, (values[0] - 4 * values[1] + 3 * values[2]) / 2
+        before[2] = 0.0
+        slope[2] = (values[0] - 4 * values[1] + 3 * values[2]) / 2
     for i in range(1, n):  # each row minus the previous one
         factor = 1 / (diagonal[i] - before[i] * after[i - 1])
         after[i] *= factor
@@ -220,8 +224,11 @@ class Cells:
 
     def solve_point_anywhere(self, s: float, t: float, scale: float) -> tuple[float, float]:
         """Return `solve` of one finite position, bit for bit, faster; NaN next to unknown nodes."""
-        (nx, ny), side = self.shape, self.degree + 1
-        a, b, tolerance = s, t, REST * max(self.shape)
+        nx, ny = self.shape
+        side = self.degree + 1
+        a = s
+        b = t
+        tolerance = REST * max(self.shape)
         for _ in range(MAX_ITERATIONS):
             at_a, at_b = min(max(a, 0.0), nx - 1.0), min(max(b, 0.0), ny - 1.0)
             i, j = min(int(at_a), nx - 2), min(int(at_b), ny - 2)
@@ -316,8 +323,10 @@ def _known_corners(
 
 def bilinear_cells(fields: np.ndarray) -> Cells:
     """Return the bilinear interpolant of `fields` (2, nx, ny); NaN nodes are allowed."""
-    f00, f10 = fields[:, :-1, :-1], fields[:, 1:, :-1]
-    f01, f11 = fields[:, :-1, 1:], fields[:, 1:, 1:]
+    f00 = fields[:, :-1, :-1]
+    f10 = fields[:, 1:, :-1]
+    f01 = fields[:, :-1, 1:]
+    f11 = fields[:, 1:, 1:]
     c = np.stack([f00, f01 - f00, f10 - f00, f11 - f10 - f01 + f00], axis=-1)
     return _cells(c, 2, fields)
 

@@ -94,7 +94,8 @@ class Circle:
         if self._pieces is not None:
             c = self._pieces[:, i]
             return ((c[3] * u + c[2]) * u + c[1]) * u + c[0]
-        low, high = self._closed[i], self._closed[i + 1]
+        low = self._closed[i]
+        high = self._closed[i + 1]
         # A line of zero weight is ignored, so that a known line stays known.
         return np.where(u == 0, low, low + u * (high - low))
 
@@ -104,11 +105,13 @@ class Circle:
             return float(self.at(np.asarray(angle_rad)))
         s = angle_rad * (self._count / (2 * np.pi))
         below = math.floor(s)
-        u, i = s - below, below % self._count
+        u = s - below
+        i = below % self._count
         if self._piece_points is not None:
             c0, c1, c2, c3 = self._piece_points[i]
             return ((c3 * u + c2) * u + c1) * u + c0
-        low, high = self._points[i], self._points[i + 1]
+        low = self._points[i]
+        high = self._points[i + 1]
         return low if u == 0 else low + u * (high - low)
 
 

@@ -179,12 +179,15 @@ class Compensator:
         InputError
             As `correct`.
         """
-        (hx, hy), pitch = self.error_map.artifact.half, self._pitch
+        hx, hy = self.error_map.artifact.half
+        pitch = self._pitch
         s, t = x_m / pitch + hx, y_m / pitch + hy
         a, b = self._cells.solve_point(s, t, 1 / pitch)
         if math.isnan(a):  # the solution is in another cell, outside, or does not exist
             a, b = self._cells.solve_point_anywhere(s, t, 1 / pitch)
-        x, y, snap = (a - hx) * pitch, (b - hy) * pitch, SNAP * pitch
+        x = (a - hx) * pitch
+        y = (b - hy) * pitch
+        snap = SNAP * pitch
         is_inside = abs(x) <= hx * pitch + snap and abs(y) <= hy * pitch + snap
         if math.isnan(a) or (self.outside == "refuse" and not is_inside):
             x, y = map(float, self.correct(x_m, y_m))
@@ -232,7 +235,8 @@ class Compensator:
         InputError
             As `correct`.
         """
-        indicated_inside, places = self.inside(x_m, y_m), []
+        indicated_inside = self.inside(x_m, y_m)
+        places = []
         for true, half in zip(self.correct(x_m, y_m), self.error_map.artifact.half, strict=True):
             edge = half * self._pitch
             places.append(np.where(indicated_inside, np.clip(true, -edge, edge), true))
@@ -241,7 +245,8 @@ class Compensator:
     @cached_property
     def halfway(self) -> np.ndarray:
         """The error of interpolation halfway between sites, rms, m: [of Gx, Gy; along x, y]."""
-        emap, cubic = self.error_map, self.method == "bicubic"
+        emap = self.error_map
+        cubic = self.method == "bicubic"
         if self._is_fitted:
             return np.zeros((2, 2))
         return np.array(
@@ -329,7 +334,8 @@ class Compensator:
             If the map has no angular lines.
         """
         self._refuse_no_theta()
-        angle, count = np.asarray(theta_rad, dtype=float), self.error_map.artifact.angular_count
+        angle = np.asarray(theta_rad, dtype=float)
+        count = self.error_map.artifact.angular_count
         return np.hypot(
             self._u_theta.at(angle),
             self._halfway_theta * share_between(angle * (count / (2 * np.pi))),
@@ -337,7 +343,8 @@ class Compensator:
 
     @cached_property
     def _halfway_theta(self) -> float:
-        emap, cubic = self.error_map, self.method == "bicubic"
+        emap = self.error_map
+        cubic = self.method == "bicubic"
         if emap.artifact.harmonics:
             return 0.0
         return error_halfway(emap.g_theta, emap.u_g_theta, cubic=cubic, ring=True)[0]
@@ -347,7 +354,8 @@ class Compensator:
 
         Splines pass beyond the values of their nodes; bilinear ones do not.
         """
-        artifact, count = self.error_map.artifact, PER_STEP * self.error_map.artifact.angular_count
+        artifact = self.error_map.artifact
+        count = PER_STEP * self.error_map.artifact.angular_count
         places = [
             np.linspace(-half, half, round(2 * half * PER_STEP) + 1) * self._pitch
             for half in artifact.half
@@ -381,7 +389,9 @@ class Compensator:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Apply `field` block by block to broadcast positions."""
         x, y = np.broadcast_arrays(*(np.asarray(p, dtype=float) for p in position))
-        shape, x, y = x.shape, x.ravel(), y.ravel()
+        shape = x.shape
+        x = x.ravel()
+        y = y.ravel()
         out_x, out_y = np.empty(x.size), np.empty(x.size)
         for start in range(0, x.size, block):
             chunk = slice(start, start + block)

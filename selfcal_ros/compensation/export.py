@@ -133,7 +133,8 @@ def _uncertainty_line(result: CalibrationResult) -> str:
 
 def verdict_lines(result: CalibrationResult) -> list[str]:
     """Return the verdict with what U assumes, and its reasons unless it is good, in ASCII."""
-    verdict, when = result.verdict, result.provenance.last_exposure
+    verdict = result.verdict
+    when = result.provenance.last_exposure
     measured = [f"measured until {when}"] if when else []
     sentence = verdict.sentence or verdict.grade.replace("_", " ")
     lines = [

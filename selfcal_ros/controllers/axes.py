@@ -58,7 +58,8 @@ def write_linuxcnc(error_map: ErrorMap, wiring: Wiring) -> Texts:
     after homing would lie in the dead band of the controller's ramp and never be applied.
     """
     (x, y), [(cx, *_), (_, cy, _)] = _means(error_map, wiring)
-    files, unit_m = {}, wiring.frame.unit_m
+    files = {}
+    unit_m = wiring.frame.unit_m
     for name, positions, values in (("x", x, cx), ("y", y, cy)):
         at = positions
         if len(at) > MAX_LINES:
@@ -100,8 +101,10 @@ def read_linuxcnc(sources: Sequence[Source], wiring: Wiring) -> Correction:
 
 def write_siemens(error_map: ErrorMap, wiring: Wiring) -> Texts:
     """Return four CEC tables: x and y from the position of x, then from that of y."""
-    frame, (at, means) = wiring.frame, _means(error_map, wiring)
-    axes, lines = (frame.x_axis, frame.y_axis), ["%_N_NC_CEC_INI", "CHANDATA(1)"]
+    frame = wiring.frame
+    at, means = _means(error_map, wiring)
+    axes = (frame.x_axis, frame.y_axis)
+    lines = ["%_N_NC_CEC_INI", "CHANDATA(1)"]
     table = 0
     for output, (of_x, of_y, mean) in zip(axes, means, strict=True):
         for source, positions, values in zip(axes, at, (of_x, of_y - mean), strict=True):

@@ -226,7 +226,9 @@ def export(
     InputError
         If an option does not fit the format, or the map has unknown sites.
     """
-    form, frame, emap = FORMATS[name], wiring.frame, result.error_map
+    form = FORMATS[name]
+    frame = wiring.frame
+    emap = result.error_map
     if wiring.negate and not form.sign_is_implied:
         raise InputError("--negate", f"the sense of {name} is known", "leave it out")
     if wiring.integers and name != "beckhoff":
@@ -284,7 +286,8 @@ def checklist(
 
     That is the node at which the controller corrects by most, relative to its zero.
     """
-    frame, names = wiring.frame, [Path(file).name for file in files]
+    frame = wiring.frame
+    names = [Path(file).name for file in files]
     steps = [
         step.format(
             files=" and ".join(names),

@@ -371,7 +371,8 @@ class Rewriter:
         sweep = sense * cmath.phase(to_m / from_m) % (2 * math.pi)
         unsure = not NO_TURN_RAD < sweep < 2 * math.pi - NO_TURN_RAD
         if start_m == end_m:
-            sweep, unsure = 2 * math.pi, False
+            sweep = 2 * math.pi
+            unsure = False
         if unsure or abs(abs(to_m) - abs(from_m)) > self._tolerance_m / 2:
             self._refuse(
                 f"the arc ends at {abs(to_m) / abs(from_m):.6f} times its radius, "
@@ -396,7 +397,8 @@ class Rewriter:
         """Return a coordinate as text; increments are those of the rounded positions."""
         digits = self._decimals + (self._modes["unit"] == "G20") + (axis in "ZE")
         place = round(place, digits)
-        before, self._sent[axis] = self._sent[axis], place
+        before = self._sent[axis]
+        self._sent[axis] = place
         value = round(place - before if self._relative(axis) else place, digits) + 0.0
         text = f"{value:.{digits}f}".rstrip("0")
         return text + "0" * text.endswith(".")
@@ -418,7 +420,8 @@ def _text(act: Code, line: ProgramLine, places: Mapping[str, str]) -> str:
 
 def simplified(path: np.ndarray, tolerance: float) -> np.ndarray:
     """Return the indices of points between which motion at an even pace is within a tolerance."""
-    keep, waiting = {0, len(path) - 1}, [(0, len(path) - 1)]
+    keep = {0, len(path) - 1}
+    waiting = [(0, len(path) - 1)]
     while waiting:
         i, j = waiting.pop()
         inner = np.arange(i + 1, j)

@@ -108,7 +108,8 @@ def wanted(error_map: ErrorMap, wiring: Wiring) -> Correction:
         If a site is unknown: a table has no holes.
     """
     require_known(error_map)
-    stage, frame = Compensator(error_map), wiring.frame
+    stage = Compensator(error_map)
+    frame = wiring.frame
     sense = (-1.0 if wiring.negate else 1.0) / frame.unit_m
 
     def correct(px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -44,7 +44,8 @@ MAX_POINTS = 10_201
 
 def write_kmotion(error_map: ErrorMap, wiring: Wiring) -> Texts:
     """Return a Geo Table: absolute positions to command, rows along y, columns along x."""
-    unit_m, (x, y) = wiring.frame.unit_m, nodes(error_map, wiring.frame)
+    unit_m = wiring.frame.unit_m
+    x, y = nodes(error_map, wiring.frame)
     px, py = np.meshgrid(x, y)
     cx, cy = wanted(error_map, wiring)(px, py)
     lines = [
@@ -118,14 +119,16 @@ def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
     has keep its ends apart. Entry [0, 0] is zero: all positions move by a constant. If the zero is
     not at a site, the cells are a whole fraction of the map's, so that its nodes are met.
     """
-    frame, counts = wiring.frame, _counts(wiring)
+    frame = wiring.frame
+    counts = _counts(wiring)
     spans, shape, at = [], [], []
     for positions, per in zip(nodes(error_map, frame), counts, strict=True):
         cell = positions[0] / spacing(positions)
         split = next((k for k in range(1, 11) if abs(cell * k - round(cell * k)) < 1e-6), COARSEST)
         entries = split * (len(positions) + 1)
         span = round(entries / split * spacing(positions) * per)
-        entry, middle = np.arange(entries + 1) * span / entries, positions[[0, -1]].mean() * per
+        entry = np.arange(entries + 1) * span / entries
+        middle = positions[[0, -1]].mean() * per
         at.append((entry - span * np.floor((entry - middle) / span + 0.5)) / per)
         spans.append(span)
         shape.append(entries)
@@ -176,7 +179,8 @@ def read_pmac(sources: Sequence[Source], wiring: Wiring) -> Correction:
                 line.where, f"'{line.text[:60]}' is not part of a table", "export the tables again"
             )
     grids = [_pmac_grid(*table) for table in tables]
-    counts, motors = _counts(wiring), (wiring.frame.x_axis, wiring.frame.y_axis)
+    counts = _counts(wiring)
+    motors = (wiring.frame.x_axis, wiring.frame.y_axis)
     for axes, (line, *_) in zip((axes for axes, _ in grids), tables, strict=True):
         if not set(axes) <= set(motors):
             raise InputError(
@@ -220,7 +224,8 @@ def _pmac_grid(line: Line, head: list[int], entries: list[int]) -> tuple[tuple, 
 
 def write_beckhoff(error_map: ErrorMap, wiring: Wiring) -> Texts:
     """Return the list of each slave axis: integer positions of 0.1 um, one interval."""
-    frame, per = wiring.frame, wiring.frame.unit_m / TENTH_UM
+    frame = wiring.frame
+    per = wiring.frame.unit_m / TENTH_UM
     x, y = (positions * per for positions in nodes(error_map, frame))
     step = max(1, round(spacing(x)))
     first = [round(positions[0]) for positions in (x, y)]
@@ -260,7 +265,8 @@ def write_beckhoff(error_map: ErrorMap, wiring: Wiring) -> Texts:
 
 def read_beckhoff(sources: Sequence[Source], wiring: Wiring) -> Correction:
     """Return the correction by the lists of the slave axes; the edge holds outside."""
-    frame, per = wiring.frame, wiring.frame.unit_m / TENTH_UM
+    frame = wiring.frame
+    per = wiring.frame.unit_m / TENTH_UM
     grids = {}
     for source in sources:
         slave, grid = _beckhoff_grid(source, (frame.x_axis, frame.y_axis))

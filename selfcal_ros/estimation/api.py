@@ -282,7 +282,8 @@ def _camera(
     measurements: Measurements, options: Options
 ) -> tuple[FittedCamera | None, Measurements]:
     """Return the camera shown by images of several marks, and the readings corrected for it."""
-    straight, camera = measurements, None
+    straight = measurements
+    camera = None
     if not measurements.has_images:
         return None, measurements
     plain = replace(

@@ -203,7 +203,8 @@ def identify_wang(data: StepDiagonal) -> StepDiagonalResult:
             f"only {', '.join(data.diagonals)} measured",
             "the conventional formulation needs every diagonal; measure the others",
         )
-    readings, gain = data.readings_m, block_gain(data)
+    readings = data.readings_m
+    gain = block_gain(data)
     errors = solve_blocks(data, readings, gain)
     covariance = None
     noise = reading_noise(data)

@@ -168,7 +168,8 @@ def length_closure(data: StepDiagonal) -> tuple[float, float | None] | None:
         return None
     diagonals = data.readings_m.sum(axis=(1, 2))
     sides = data.linear_mean_m.sum(axis=1) + data.n_blocks * np.array(data.steps_m)
-    mean, side = rms(diagonals), float(np.linalg.norm(sides))
+    mean = rms(diagonals)
+    side = float(np.linalg.norm(sides))
     by_readings = np.repeat(diagonals / (len(diagonals) * mean), data.dim * data.n_blocks)
     by_linear = -np.repeat(sides / side, data.n_blocks)
     variance = propagated(data, by_readings[None], by_linear[None])

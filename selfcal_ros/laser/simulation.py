@@ -134,7 +134,8 @@ def simulate_step_diagonal(
     rng : numpy.random.Generator
         Source of the noise.
     """
-    names, noise = DIAGONALS[machine.dim], measurement.noise
+    names = DIAGONALS[machine.dim]
+    noise = measurement.noise
     n = machine.n_blocks
     samples = np.empty((noise.repeats, len(names), machine.dim, n))
     for k, name in enumerate(names):
@@ -163,7 +164,9 @@ def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np
     vectors = np.zeros((machine.dim, machine.n_blocks, 3))
     vectors[:, :, : machine.dim] = step_vectors(machine.steps_m, machine.errors_m)
     turns = np.zeros(vectors.shape) if machine.turns_rad is None else machine.turns_rad
-    order, centres, angles = [], [np.zeros(3)], [np.zeros(3)]
+    order = []
+    centres = [np.zeros(3)]
+    angles = [np.zeros(3)]
     carried = np.zeros((machine.dim + 1, 3))  # turn of the axes before axis j
     for block in range(machine.n_blocks):
         for j, sign in enumerate(signs):

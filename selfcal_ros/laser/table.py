@@ -244,7 +244,8 @@ def _in_order(cells: dict[int, list], path: str | os.PathLike) -> list[list]:
 
 
 def _assemble(blocks: list[list], columns: RequiredColumns) -> laser_data.StepDiagonal:
-    repeats, dim = max(map(len, blocks)), len(columns.steps_m)
+    repeats = max(map(len, blocks))
+    dim = len(columns.steps_m)
     samples = np.full((repeats, len(columns.diagonals), dim, len(blocks)), np.nan)
     linear = np.full((repeats, dim, len(blocks)), np.nan)
     for i, rows in enumerate(blocks):

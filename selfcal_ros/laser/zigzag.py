@@ -125,7 +125,8 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     _check(series)
     rests = find_rests(series, rule)
     moves = _moves(rests, rule)
-    chains, notes = _chains(moves), []
+    chains = _chains(moves)
+    notes = []
     outliers = sum(rest.outliers for rest in rests)
     if outliers:
         notes.append(f"{outliers} outlying laser sample(s) within a rest are left out")
@@ -185,17 +186,21 @@ def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
     without a laser sample after settling are ignored.
     """
     stamps, positions = series.position_ns, series.position_m
-    rests, start, end = [], 0, 1
+    rests = []
+    start = 0
+    end = 1
     while start < len(stamps):
         end = _end_of_rest(positions, (start, end), rule.rest_tolerance_m)
-        first, last = stamps[start], stamps[end - 1]
+        first = stamps[start]
+        last = stamps[end - 1]
         if last - first >= rule.min_rest_s * NS_PER_S:
             laser = _mean_laser(series, (first, last), rule)
             if laser is not None:
                 rests.append(
                     Rest(positions[start:end].mean(axis=0), laser[0], int(first), laser[1])
                 )
-            start, end = end, end + 1
+            start = end
+            end = end + 1
         elif end == len(stamps):
             break
         else:
@@ -327,7 +332,8 @@ def _origin(named: dict[str, list[list[Move]]]) -> dict[int, float]:
 
 def _readings(chain: list[Move], name: str, origin: dict[int, float], rule: CutRule) -> np.ndarray:
     """Return the readings of a run, (D, n), or (n,) for a run of one axis; by position."""
-    dim, steps = len(rule.steps_m), np.array(rule.steps_m)
+    dim = len(rule.steps_m)
+    steps = np.array(rule.steps_m)
     single_axis = len(name) == 1
     n = _blocks_of(chain, name, dim)
     if n > MAX_BLOCKS:

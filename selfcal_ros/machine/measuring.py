@@ -321,9 +321,11 @@ class Run:
 
     def _measure_view(self) -> None:
         """Measure the view that the plate lies for, until it is complete."""
-        index, number = self._sequencer.index, len(self.plan.views)
+        index = self._sequencer.index
+        number = len(self.plan.views)
         view = self.plan.views[index]
-        resumed, self._resumed = self._resumed, False
+        resumed = self._resumed
+        self._resumed = False
         self.desk.say(f"view {index + 1} of {number} '{view.name}'")
         if not self.desk.may_move("the stage makes a small move, then goes to its marks"):
             raise InputError(
@@ -335,7 +337,8 @@ class Run:
             return
         if not resumed:
             self._visit(None)
-        needed_before, rounds = math.inf, 0
+        needed_before = math.inf
+        rounds = 0
         progress = self._progress()
         while not progress.complete:
             rounds = rounds + 1 if progress.needed >= needed_before else 0

@@ -111,7 +111,8 @@ class Eye:
         full = (self._settings.full_scale if self._settings else 0) or int(
             np.iinfo(pixels.dtype).max
         )
-        last, self._before = self._before, (pixels.copy(), position)
+        last = self._before
+        self._before = (pixels.copy(), position)
         self.newest = self._before[0]
         if (
             last is not None

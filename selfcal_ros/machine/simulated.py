@@ -87,7 +87,9 @@ class SimulatedMachine:
         self._lay(placing.command)
 
     def _lay(self, command: Command) -> None:
-        index, view, artifact = command.view_index, command.placed(), command.plate()
+        index = command.view_index
+        view = command.placed()
+        artifact = command.plate()
         self._index = index
         m, n = physics.all_marks(artifact)
         self._marks = np.stack([m, n])
@@ -118,7 +120,8 @@ class SimulatedMachine:
 
         To the same target again the stage only scatters: another exposure of a visit.
         """
-        settings, target = self._settings, np.array(position)
+        settings = self._settings
+        target = np.array(position)
         if self._clock is not None:
             self._free_ns = self._clock.now_ns() + settings.period_ns
             self._clock.sleep((1 - DWELL) * settings.exposure_period_s)
@@ -149,7 +152,8 @@ class SimulatedMachine:
 
     def _followed(self, target: np.ndarray) -> np.ndarray:
         """Return the position in which mark and line, if followed, are as intended there, (3,)."""
-        truth, goal = self.truth, target.copy()
+        truth = self.truth
+        goal = target.copy()
         if not self._settings.follow_mark:
             return goal
         sign = -1 if self._settings.sense is Sense.PLATE_MOVES else 1
@@ -181,7 +185,8 @@ class SimulatedMachine:
 
         One mark, or one in each cell of a view of images.
         """
-        settings, seen_offsets = self._settings, []
+        settings = self._settings
+        seen_offsets = []
         declared = settings.declare_sigma
         offsets = self._measured_offsets()
         for cell in self._cells if offsets.size and self._camera is None else []:
@@ -231,7 +236,9 @@ class SimulatedMachine:
         """
         if self._clock is not None:
             self._clock.sleep(max(0, self._free_ns - self._clock.now_ns()) / NS_PER_S)
-        truth, settings, tau = self.truth, self._settings, self._tau()
+        truth = self.truth
+        settings = self._settings
+        tau = self._tau()
         position = self._position[:2, None]
         stage = physics.true_position(
             truth,

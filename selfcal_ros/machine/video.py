@@ -101,7 +101,8 @@ class VideoCamera:
         MachineError
             If none comes: the camera is disconnected.
         """
-        began, fresh = time.monotonic(), 0
+        began = time.monotonic()
+        fresh = 0
         while fresh < (FRESH if self._is_live else 1):
             fresh += self._grab() >= WAITED * self._period_s
             if time.monotonic() - began > PATIENCE_S:

@@ -396,7 +396,8 @@ class Visitor:
         MachineError
             If the target is beyond the limits, the position does not follow or does not rest.
         """
-        last, departure = self._last, self._where_it_was_left()
+        last = self._last
+        departure = self._where_it_was_left()
         start = dict(zip(self.axes, departure.positions, strict=True))
         if "theta" in self.axes and "theta" in target:
             turns = round((target["theta"] - start["theta"]) / math.tau)
@@ -540,7 +541,8 @@ class Visitor:
         }
         axis = self._farthest(moving or away)
         cross_axis = {"x": "y", "y": "x"}.get(axis, "")
-        indicated, step = goal[axis] + away[axis], goal[axis] - start[axis]
+        indicated = goal[axis] + away[axis]
+        step = goal[axis] - start[axis]
         reason = (
             _reason(axis, step, indicated - start[axis], away.get(cross_axis, 0.0))
             if (abs(step) > self.cell.settle.of(axis, "within"))
@@ -613,7 +615,8 @@ class Visitor:
 
     def _visit(self, stop: Stop, *, only_nearest: bool) -> Iterator[Event]:
         at = self.go(stop.target)
-        untold, self._untold = self._untold, []
+        untold = self._untold
+        self._untold = []
         yield from untold
         before, detections, after = self.expose(stop.kind)
         detections = [
@@ -710,15 +713,11 @@ class Visitor:
         if follows:
             return
         if abs(along) <= FOLLOWS * abs(step) and abs(along_again - expected) <= FOLLOWS * abs(step):
-            reason, remedy = (
-                "the image is late by one frame",
-                ("let the camera expose when it is asked (software trigger), or drop a frame"),
-            )
+            reason = "the image is late by one frame"
+            remedy = "let the camera expose when it is asked (software trigger), or drop a frame"
         elif abs(along) <= FOLLOWS * abs(step) and abs(across) <= FOLLOWS * abs(step):
-            reason, remedy = (
-                "the marks stand still",
-                ("check that the camera returns new images, and that the stage really moves"),
-            )
+            reason = "the marks stand still"
+            remedy = "check that the camera returns new images, and that the stage really moves"
         else:
             cross_axis = "y" if axis == "x" else "x"
             reason = _reason(axis, expected, along, across) or (

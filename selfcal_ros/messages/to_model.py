@@ -365,7 +365,8 @@ def error_map(message: Any) -> ErrorMap:
         not finite, no error is known, or the datum is unknown.
     """
     artifact = artifact_of(message)
-    sites, lines = math.prod(artifact.shape), artifact.angular_count
+    sites = math.prod(artifact.shape)
+    lines = artifact.angular_count
     for name, size in (
         ("gx", sites),
         ("gy", sites),

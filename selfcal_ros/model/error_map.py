@@ -244,7 +244,8 @@ def error_halfway(
     coarse = float(over_four.mean()) if len(over_four) else 0.0
     shrunk = np.clip(over_two.mean() / coarse, _SMOOTH**2, 1.0) if coarse > 0 else _SMOOTH**2
     if cubic and (ring or len(values) > 2 * max(_CUBIC)):
-        over_two, shrunk = _squares(values, u, _CUBIC, 1, ring), shrunk**2
+        over_two = _squares(values, u, _CUBIC, 1, ring)
+        shrunk = shrunk**2
         if not len(over_two):
             return 0.0, 0.0
     mean, largest = np.sqrt(shrunk * np.maximum([over_two.mean(), over_two.max()], 0.0))
@@ -260,7 +261,8 @@ def _squares(
         values, u = (np.pad(series, reach, mode="wrap") for series in (values, u))
     n = len(values)
     middle = slice(reach, max(n - reach, reach))
-    error, power = values[middle], u[middle] ** 2
+    error = values[middle]
+    power = u[middle] ** 2
     for distance, weight in weights.items():
         low, high = (
             slice(reach + step, max(n - reach, reach) + step)

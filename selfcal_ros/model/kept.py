@@ -238,7 +238,8 @@ def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...], line
     )
     shapes = {"plate": (2, *of_plate), "lines": (2, lines)}
     quantities = dict(read(dict, fields.get("beside", {})))
-    with_map, quantity_values = read(int, quantities.pop("with_map", 0)), {}
+    with_map = read(int, quantities.pop("with_map", 0))
+    quantity_values = {}
     for name, values in quantities.items():
         quantity_values[name] = _numbers(
             values,

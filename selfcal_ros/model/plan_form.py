@@ -265,7 +265,8 @@ def view_to_dict(view: View, artifact: Artifact) -> dict[str, Any]:
 
 def plan_to_dict(plan: Plan) -> dict[str, Any]:
     """Return a plan in the format of PLAN.yaml."""
-    artifact, map_fields = plan.artifact, map_to_dict(plan.artifact)
+    artifact = plan.artifact
+    map_fields = map_to_dict(plan.artifact)
     marks, offset_m = plan.check_stops
     image = next((view.image for view in plan.views if view.image), None)
     return {

@@ -12,7 +12,8 @@ from selfcal_ros.model.marks import marks_of
 
 def map_to_dict(artifact: Artifact) -> dict[str, Any]:
     """Return what a map has of its own in the form of ``map`` in PLAN.yaml; empty if nothing."""
-    grid, map_fields = artifact.map_grid, {}
+    grid = artifact.map_grid
+    map_fields = {}
     if grid is not None:
         map_fields = {
             "grid_size": grid.size,

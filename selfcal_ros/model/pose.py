@@ -166,7 +166,8 @@ class LatticePose(StagePose):
 
     def beyond_field(self, site: np.ndarray, artifact: Artifact) -> np.ndarray:
         """Return which sites (2, ...) lie beyond the plate's lattice on the stage, bool (...)."""
-        (x, y), (hx, hy) = np.abs(site), artifact.half
+        x, y = np.abs(site)
+        hx, hy = artifact.half
         return (x > hx) | (y > hy)
 
     def mark_rows(self, artifact: Artifact) -> tuple[np.ndarray, np.ndarray]:
@@ -175,7 +176,8 @@ class LatticePose(StagePose):
         x, y = (-hx - self.a, hx - self.a), (-hy - self.b, hy - self.b)  # of R^q (u, v)
         minus_x, minus_y = (-x[1], -x[0]), (-y[1], -y[0])
         u, v = ((x, y), (y, minus_x), (minus_x, minus_y), (minus_y, x))[self.q]
-        first, row = max(v[0], -hy), np.arange(artifact.shape[0]) - hx
+        first = max(v[0], -hy)
+        row = np.arange(artifact.shape[0]) - hx
         count = int(max(min(v[1], hy) - first + 1, 0))
         n = int(first - artifact.off_centre[1])
         return np.full(len(row), n), np.where((row >= u[0]) & (row <= u[1]), count, 0)
@@ -276,7 +278,8 @@ class Pose:
 
     def in_field(self, artifact: Artifact) -> np.ndarray:
         """Return the marks of the plate that lie in the stage's field, bool (nx, ny)."""
-        places, (hx, hy) = self.places(artifact, artifact.m, artifact.n), artifact.field_half_m
+        places = self.places(artifact, artifact.m, artifact.n)
+        hx, hy = artifact.field_half_m
         rounding = EDGE * artifact.grid_pitch_m
         return (np.abs(places.real) <= hx + rounding) & (np.abs(places.imag) <= hy + rounding)
 
@@ -380,7 +383,8 @@ def turn_in_lines(turn_rad: float, artifact: Artifact) -> float | None:
 
     None if it is not whole, or not finite, or the plate has no lines.
     """
-    lines, count = turn_rad * artifact.angular_count / (2 * math.pi), artifact.angular_count
+    lines = turn_rad * artifact.angular_count / (2 * math.pi)
+    count = artifact.angular_count
     if not count:
         return None
     step = nearest_step(lines)

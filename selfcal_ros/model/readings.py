@@ -340,7 +340,8 @@ def without(
     measurements: Measurements, removed: Iterable[Key], *, mark: bool = False
 ) -> Measurements:
     """Return the measurement without some readings; `mark` counts them as rejected."""
-    views, keys = [], set(removed)
+    views = []
+    keys = set(removed)
     for index, view in enumerate(measurements.views):
         marks = {key[2] for key in keys if key[0] == index and key[1] == "grid"}
         lines = {key[2][0] for key in keys if key[0] == index and key[1] == "angular"}
@@ -385,7 +386,8 @@ _KNOWN: WeakKeyDictionary[ViewReadings, str] = WeakKeyDictionary()
 
 
 def _digest(readings: ViewReadings) -> str:
-    digest, visits = hashlib.sha256(), readings.visits
+    digest = hashlib.sha256()
+    visits = readings.visits
     for table, columns in ((readings, COLUMNS), *(((visits, VISIT_COLUMNS),) if visits else ())):
         for name, kind in columns:
             digest.update(np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes())

@@ -131,7 +131,8 @@ class ReferenceLength:
         InputError
             If the text is something else, or the marks are not two of the plate.
         """
-        where, form = "reference length", "ID:ID" if artifact.marks else "M,N:M,N"
+        where = "reference length"
+        form = "ID:ID" if artifact.marks else "M,N:M,N"
         example = f"write e.g. {'17:42' if artifact.marks else '-5,0:5,0'}:0.1000002:5e-9 (m)"
         try:
             first, second, *numbers = text.split(":")

@@ -267,8 +267,10 @@ def unidentified_result(
 ) -> CalibrationResult:
     """Return the result of a plan that does not identify the stage, with unknown maps."""
     artifact = measurements.artifact
-    grid, circle = np.full(artifact.field.shape, np.nan), np.full(artifact.angular_count, np.nan)
-    plate, nan = np.full(artifact.shape, np.nan), math.nan
+    grid = np.full(artifact.field.shape, np.nan)
+    circle = np.full(artifact.angular_count, np.nan)
+    plate = np.full(artifact.shape, np.nan)
+    nan = math.nan
     views = tuple(
         ViewResult(
             v.view.name,
@@ -410,7 +412,8 @@ def require_unchanged(data: dict[str, Any], where: str) -> bool:
     InputError
         If the digests are missing, or a key does not have its own; the message names the key.
     """
-    now, written = digests_of(data), data.get(DIGEST)
+    now = digests_of(data)
+    written = data.get(DIGEST)
     version = (data.get("provenance") or {}).get("version") or ""
     if written is None and WITHOUT_DIGESTS.fullmatch(str(version)):
         return False
@@ -483,7 +486,8 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
 
 def _parse(data: dict) -> CalibrationResult:
     raw = data["artifact"]
-    grid, harmonics = data.get("map", {}), read(int, data.get("map", {}).get("harmonics", 0))
+    grid = data.get("map", {})
+    harmonics = read(int, data.get("map", {}).get("harmonics", 0))
     artifact = (
         Artifact(
             raw["grid_size"],

@@ -175,7 +175,8 @@ def in_order(terms: Iterable[ModelTerm]) -> tuple[ModelTerm, ...]:
 
 
 def _term(name: str, texts: list[str], where: str) -> ModelTerm:
-    sizes, parts = [parse_size(text, where) for text in texts], block_of(name).parts
+    sizes = [parse_size(text, where) for text in texts]
+    parts = block_of(name).parts
     if len(sizes) < 2:
         return ModelTerm(name, sizes[0] if sizes else math.inf)
     if len(sizes) != len(parts):

@@ -216,7 +216,8 @@ class View:
             If the pose is off the lattice, or grid marks are requested at a turn that is
             not a whole quarter.
         """
-        where, quarter_shift = f"view '{self.name}'", self._quarter_shift(artifact)
+        where = f"view '{self.name}'"
+        quarter_shift = self._quarter_shift(artifact)
         a, b = (
             self._half_steps(step, artifact)
             if quarter_shift
@@ -246,7 +247,8 @@ class View:
         """Return whether the grid marks, if any are wanted, lie on the artifact's lattice."""
         if artifact.marks is not None:
             return False
-        turn, quarter_shift = self.rotation_rad / (math.pi / 2), self._quarter_shift(artifact)
+        turn = self.rotation_rad / (math.pi / 2)
+        quarter_shift = self._quarter_shift(artifact)
         steps = (*(step - quarter_shift for step in self._pitches(artifact)), turn)
         return not self.grid or all(nearest_step(step) is not None for step in steps)
 

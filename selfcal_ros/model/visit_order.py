@@ -184,7 +184,8 @@ def _visits(
     stops = SIDES if view.check_marks else ()
     rows = [*passes[:half], *[check_marks(sites, view.check_marks)] * len(stops), *passes[half:]]
     sides = [(0, 0)] * half + list(stops) + [(0, 0)] * (len(passes) - half)
-    index, number = np.concatenate(rows), np.repeat(np.arange(len(rows)), [*map(len, rows)])
+    index = np.concatenate(rows)
+    number = np.repeat(np.arange(len(rows)), [*map(len, rows)])
     aside = view.check_offset_m * np.array(sides).T[:, number]
     exposures = np.where(aside.any(axis=0), 1, together)
     new_stop = (np.diff(index, prepend=-1) != 0) | np.diff(aside, prepend=0.0).any(axis=0)

@@ -43,11 +43,14 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
 
     def diagnosis(self) -> Diagnosis:
         """Return the progress, and the node it waits for."""
-        level, line = Level.OK, "playing"
+        level = Level.OK
+        line = "playing"
         if not self._started:
-            level, line = Level.WARN, self._waits_for()
+            level = Level.WARN
+            line = self._waits_for()
         elif self.player.stalled_s > STALLED_S:
-            level, line = Level.WARN, f"{self.player.listener} takes no more messages"
+            level = Level.WARN
+            line = f"{self.player.listener} takes no more messages"
         return Diagnosis(level, line, {"played": self.player.played, "total": self.player.total})
 
     def _waits_for(self) -> str:

@@ -148,7 +148,8 @@ class NodeBase[S: Settings](Answering):
 
     def say(self, level: Level, line: str) -> None:
         """Write one line to the log."""
-        logger, line = self.get_logger(), printable(line)
+        logger = self.get_logger()
+        line = printable(line)
         if level == Level.OK:  # a line each: rclpy distinguishes call sites by their location
             logger.info(line)
         elif level == Level.WARN:

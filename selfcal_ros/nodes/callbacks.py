@@ -101,7 +101,8 @@ class Guarded(Node):
             yield item
 
     def _guard(self, service: Any) -> None:
-        answer, place = service.callback, service.srv_name.rpartition("/")[2]
+        answer = service.callback
+        place = service.srv_name.rpartition("/")[2]
 
         @wraps(answer)
         def call(request: Any, response: Any) -> Any:

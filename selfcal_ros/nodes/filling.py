@@ -61,13 +61,12 @@ def map_geometry(error_map: ErrorMap) -> MapGeometry:
     artifact = error_map.artifact
     step = math.ceil(max(artifact.shape) / MOST_SITES)
     spacing = step * artifact.grid_pitch_m
-    m, n = artifact.m[:, 0], artifact.n[0]
+    m = artifact.m[:, 0]
+    n = artifact.n[0]
     shown_sites = error_map.valid & ((m % step == 0)[:, None] & (n % step == 0)[None, :])
-    x, y, zero = (
-        artifact.x_m[shown_sites],
-        artifact.y_m[shown_sites],
-        np.zeros(np.count_nonzero(shown_sites)),
-    )
+    x = artifact.x_m[shown_sites]
+    y = artifact.y_m[shown_sites]
+    zero = np.zeros(np.count_nonzero(shown_sites))
     sites = np.column_stack((x, y, zero))
     errors = np.column_stack((error_map.gx[shown_sites], error_map.gy[shown_sites], zero))
     longest = float(np.linalg.norm(errors, axis=1).max(initial=0.0))

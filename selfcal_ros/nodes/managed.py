@@ -101,7 +101,8 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
 
         An executor may still call callbacks that were due when they were removed.
         """
-        inner, step = super().guarded(callback, place), self._making
+        inner = super().guarded(callback, place)
+        step = self._making
         if not step:
             return inner
         mine = self._made[step]

@@ -101,7 +101,8 @@ IMAGE_TYPES = {"raw": Image, "compressed": CompressedImage}
 
 def image_topics(transport: str, depth: int) -> tuple[Topic, Topic]:
     """Return the topic of images, reliable and with best effort."""
-    name, kind = topics.IMAGE_TOPICS[transport], IMAGE_TYPES[transport]
+    name = topics.IMAGE_TOPICS[transport]
+    kind = IMAGE_TYPES[transport]
     return Topic(name, kind, _qos(depth)), Topic(name, kind, _qos(depth, reliable=False))
 
 
@@ -158,10 +159,8 @@ def kept_names(node: Node, topic: Topic) -> tuple[str, str]:
 
     Readers of a bag expect the names of the contract, after a namespace.
     """
-    name_in_bag, heard = (
-        f"{node.get_namespace().rstrip('/')}/{topic.name}",
-        node.resolve_topic_name(topic.name),
-    )
+    name_in_bag = f"{node.get_namespace().rstrip('/')}/{topic.name}"
+    heard = node.resolve_topic_name(topic.name)
     return name_in_bag, heard if heard != name_in_bag else ""
 
 

@@ -72,7 +72,8 @@ class ByTheClock:
                 is_empty = True
                 break
             self._take(*message_and_info)
-        numbers, self._numbers = self._numbers, []
+        numbers = self._numbers
+        self._numbers = []
         return self._missing(numbers, subscription.get_publisher_count(), is_empty)
 
     def _take(self, data: bytes, info: dict[str, int]) -> None:

@@ -83,7 +83,8 @@ def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
     """
     stop = Future()
     complete_on_signal(stop)
-    node, code = None, int(ExitCode.DONE)
+    node = None
+    code = int(ExitCode.DONE)
     try:
         _init(argv)
         node = make_node()

@@ -85,7 +85,8 @@ class Solver(ManagedNode[SolverSettings]):
             self._rejected_in = of_run
             for before in self._rejected.values():
                 before.action = Marker.DELETE
-        marker, view = rejected_marker(message, self.settings.frame_id), message.view_index
+        marker = rejected_marker(message, self.settings.frame_id)
+        view = message.view_index
         if view in self._rejected or marker.action == Marker.ADD:
             self._rejected[view] = marker
 
@@ -128,7 +129,8 @@ class Solver(ManagedNode[SolverSettings]):
 
     def _take(self, running: Future[SolvingOutcome]) -> None:
         """Take a solution."""
-        outcome, self._running = running.result(), None
+        outcome = running.result()
+        self._running = None
         try:
             self.session.take(outcome)
         finally:

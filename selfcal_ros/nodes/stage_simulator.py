@@ -132,7 +132,9 @@ class StageSimulator(CellNode[SimulatorSettings]):
     def _measure(self, command: Command, again: Again | None) -> None:
         """Visit the commanded view, or what is missing of it."""
         check_simulated(command)
-        view, plate, index = command.placed(), command.plate(), command.view_index
+        view = command.placed()
+        plate = command.plate()
+        index = command.view_index
         if (
             self.machine is None
             or self.machine.truth.artifact != plate

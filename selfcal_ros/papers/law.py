@@ -314,7 +314,8 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     solution = law.solve(hu_readings(measurements.artifact, views))
     spread = _propagate(law, views)
     xy, theta = _noise(solution, spread, measurements.views)
-    noise, sense = noise_of(xy, theta), measurements.sense
+    noise = noise_of(xy, theta)
+    sense = measurements.sense
     u_g, u_theta = spread.uncertainty(noise)
     if options.uncertainty is False:
         u_g, u_theta = np.full_like(u_g, np.nan), np.full_like(u_theta, np.nan)
@@ -513,10 +514,12 @@ def _quadratic_form(residuals: np.ndarray, *, exact: bool) -> tuple[float, float
     """Return mean and effective degrees of freedom (Satterthwaite) of the sum of squares."""
     if exact:
         gram = residuals.T @ residuals
-        mean, twice_squares = float(np.trace(gram)), 2 * float((gram**2).sum())
+        mean = float(np.trace(gram))
+        twice_squares = 2 * float((gram**2).sum())
     else:
         sums = (residuals**2).sum(axis=0)
-        mean, twice_squares = float(sums.mean()), float(sums.var(ddof=1))
+        mean = float(sums.mean())
+        twice_squares = float(sums.var(ddof=1))
     return mean, 2 * mean**2 / twice_squares
 
 

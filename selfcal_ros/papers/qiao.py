@@ -160,7 +160,8 @@ def reproduce_qiao(
     errors = mapped_in_parts(
         partial(_all_errors_um, truth), draws, workers=workers, progress=progress
     )
-    normal, uniform = errors[:n_draws], errors[n_draws:]
+    normal = errors[:n_draws]
+    uniform = errors[n_draws:]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES).rms_xy
     return QiaoReproduction(
         np.array([[s.rank for s in row] for row in observability]),
@@ -220,7 +221,8 @@ def _minimum_norm(truth: Truth, plan: Plan) -> np.ndarray:
     Columns are the readings of unit truths, lengths counted in pitches so that rotations weigh
     like lengths.
     """
-    artifact, n_views = plan.artifact, len(plan.views)
+    artifact = plan.artifact
+    n_views = len(plan.views)
     sites = artifact.m.size
     columns = []
     for column in range(4 * sites + 3 * n_views):
@@ -238,7 +240,8 @@ def _minimum_norm(truth: Truth, plan: Plan) -> np.ndarray:
 
 
 def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> Truth:
-    sites, pitch = artifact.m.size, artifact.grid_pitch_m
+    sites = artifact.m.size
+    pitch = artifact.grid_pitch_m
     shape = (2, *artifact.shape)
     tail = vector[4 * sites :].reshape(n_views, 3)
     return Truth(
@@ -309,7 +312,8 @@ def qiao_text(reproduction: QiaoReproduction) -> str:
 
 
 def _noise_text(reproduction: QiaoReproduction) -> list[str]:
-    n, (x, y) = len(reproduction.rms_um), reproduction.rms_um[0]
+    n = len(reproduction.rms_um)
+    x, y = reproduction.rms_um[0]
     over_draws, uniform = (rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um))
     return [
         f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",

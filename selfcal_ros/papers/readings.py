@@ -25,10 +25,12 @@ def grid_deviation(
     """
     artifact = truth.artifact
     place, site = physics.mark_places(truth, index, view, physics.all_marks(artifact))
-    pose, sign = view.on_stage(artifact), sense.sign
+    pose = view.on_stage(artifact)
+    sign = sense.sign
     sites = np.stack(pose.site_of(*artifact.places(*physics.all_marks(artifact))))
     inside = ~pose.beyond_field(sites, artifact)
-    out, stop = np.full_like(site, np.nan), sign * site[:, inside]
+    out = np.full_like(site, np.nan)
+    stop = sign * site[:, inside]
     if artifact.map_grid is None:  # at a node, without the rounding of `stage_error`
         i, j = np.rint(stop / artifact.grid_pitch_m + np.array(artifact.half)[:, None]).astype(int)
         error = truth.g[:, i, j] + physics.stage_bending(truth, stop, index)

@@ -74,7 +74,8 @@ def artwork_of(
     InputError
         If the marks touch each other, or there can be no markers.
     """
-    plate, size = plan.artifact, size_m * MM_PER_M
+    plate = plan.artifact
+    size = size_m * MM_PER_M
     places = np.stack([plate.x_m.ravel(), plate.y_m.ravel()], axis=1) * MM_PER_M
     nearest = _nearest(places)
     most = nearest / (3 if mark == "corner" else 1.5)  # two squares meet in a corner
@@ -97,7 +98,8 @@ def artwork_of(
         turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
         outlines.append((_box(step, step / 20) + np.array([edge + step / 2, 0.0])) @ turn)
     bottom = -(edge + step) if plate.angular_count else float(low[1]) - marker_reach_mm
-    length, below = round_down(float(high[0] - low[0]) / 2), bottom - 1.5 * step
+    length = round_down(float(high[0] - low[0]) / 2)
+    below = bottom - 1.5 * step
     left = float(low[0])
     outlines.append(_box(length, step / 10) + np.array([left + length / 2, below]))
     letters = 0.35 * step
@@ -118,7 +120,8 @@ def _numbers(
     if plate.marks:
         return
     letters = 0.25 * step
-    x, y = plate.x_m[:, 0] * MM_PER_M, plate.y_m[0] * MM_PER_M
+    x = plate.x_m[:, 0] * MM_PER_M
+    y = plate.y_m[0] * MM_PER_M
     for m, at in zip(plate.m[:, 0].tolist(), x.tolist(), strict=True):
         middle = at - 0.3 * letters * len(str(m))
         yield str(m), middle, float(y[0]) - marker_reach_mm - 0.8 * step, letters
@@ -174,7 +177,8 @@ def _shapes(mark: str, size: float, width: float) -> list[np.ndarray]:
     if mark == "disc":
         return [_circle(size / 2)]
     if mark == "ring":
-        outer, inner = _circle(size / 2), _circle(size / 2 - width)
+        outer = _circle(size / 2)
+        inner = _circle(size / 2 - width)
         return [np.concatenate([outer, outer[:1], inner[:1], inner[:0:-1], inner[:1]])]
     if mark == "cross":
         a, b = size / 2, width / 2
@@ -237,7 +241,10 @@ def save_artwork(art: Artwork, path: str | os.PathLike, paper: str = "") -> None
                 "omit --paper, or plan a smaller plate",
             )
         x, y = (right + left) / 2, (high + low) / 2
-        left, low, right, high = x - across / 2, y - along / 2, x + across / 2, y + along / 2
+        left = x - across / 2
+        low = y - along / 2
+        right = x + across / 2
+        high = y + along / 2
     if kind == ".svg":
         write_text(path, _svg(art, (left, low, right, high)))
     elif kind == ".pdf":

@@ -114,7 +114,8 @@ def grouped(items: list[CheckItem], fault: str) -> list[CheckItem]:
 
 def checked_view(plan: Plan) -> tuple[Artifact, View]:
     """Return the middle of a plan's plate, and its view: straight, with check stops."""
-    plate, listed = plan.artifact, plan.artifact.marks
+    plate = plan.artifact
+    listed = plan.artifact.marks
     nx, ny = (MARKS + 1 - size % 2 for size in plate.shape)  # about the same centre
     plate = (
         replace(plate, marks=listed.innermost(MARKS**2))
@@ -347,7 +348,8 @@ class CellCheck:
         progress = self._collected()[1]
         if not len(progress.readings.m):
             return None
-        before, end = len(self._seen), self._ports.now_s() + REVISIT_S + self._pause_s
+        before = len(self._seen)
+        end = self._ports.now_s() + REVISIT_S + self._pause_s
         mark = {
             "missing_m": [int(progress.readings.m[0])],
             "missing_n": [int(progress.readings.n[0])],
@@ -363,7 +365,8 @@ class CellCheck:
         """Send commands again that the cell has already executed."""
         count = 0
         for command in commands:
-            before, ended = len(self._events), self._command
+            before = len(self._events)
+            ended = self._command
             self._publish(command)
             yield from self._wait(self._pause_s)
             count += self._exposed_since(ended, before)
@@ -456,7 +459,8 @@ class CellCheck:
 
     def _judge_encoder(self) -> bool:
         """Tell joints, rate and clock; return whether the joints are there."""
-        settings, (stamps, ages) = self._settings, np.array(self._samples).T
+        settings = self._settings
+        stamps, ages = np.array(self._samples).T
         missing = [joint for joint in self._wanted_joints if joint not in self._joints]
         self._tell(
             "joints",
@@ -489,7 +493,9 @@ class CellCheck:
         return not missing
 
     def _judge_readings(self, measurements: Measurements, progress: ViewProgress) -> None:
-        rejected, total, first = measurements.all_rejected(), len(self._seen), len(self.items)
+        rejected = measurements.all_rejected()
+        total = len(self._seen)
+        first = len(self.items)
         ages = [age for _, age, _ in self._seen] or [0]
         age, earliest = (float(value) * S_PER_NS for value in (np.median(ages), min(ages)))
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
@@ -523,7 +529,8 @@ class CellCheck:
         figure += "".join(f", {count} {reason}" for reason, count in mistaken.items())
         remedy = "; ".join(REMEDY[reason] for reason in mistaken)
         if fault is not None:
-            figure, remedy = f"{fault.what} ({figure})", fault.remedy
+            figure = f"{fault.what} ({figure})"
+            remedy = fault.remedy
         self._tell("ids", not mistaken and fault is None, figure, remedy)
         self._judge_loss(progress, rejected, total)
         follows, signs_told = self._judge_wiring(measurements, progress.check_done)

@@ -65,7 +65,8 @@ def explaining(
         except InputError:  # an even and an odd side do not lie so
             continue
         if outcome > best:
-            faults, best = [], outcome
+            faults = []
+            best = outcome
         if outcome == best:
             faults.append(fault)
     return (

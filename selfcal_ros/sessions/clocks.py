@@ -73,7 +73,8 @@ class ClockWatch:
         if self._live:
             watch = self._watches.setdefault(topic, StepWatch(self._limit_s))
             self.steps.setdefault(topic, []).extend(watch.add(stamps_ns, steady_ns))
-        offset, now_s = int((stamps_ns - now_ns).max()), float(steady_ns[-1]) * S_PER_NS
+        offset = int((stamps_ns - now_ns).max())
+        now_s = float(steady_ns[-1]) * S_PER_NS
         if topic == DETECTION_TOPIC and offset < 0:
             return
         if self._bins and now_s - self._bins[-1][0] < BIN_S:
@@ -134,7 +135,8 @@ class RosTime:
         """Return the state of ROS time at `now_ns`; called once a second."""
         if not simulated:
             return Diagnosis(Level.OK, "")
-        moves, self._last_ns = now_ns != self._last_ns, now_ns
+        moves = now_ns != self._last_ns
+        self._last_ns = now_ns
         state = "not heard" if now_ns == 0 else "moves" if moves else "stands"
         if state != self._state:
             self._state = state

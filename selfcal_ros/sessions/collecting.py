@@ -108,7 +108,8 @@ class CollectingSession:
         """Compare stamps with their reception."""
         ages = np.atleast_1d(age_ns)
         if len(ages) != len(stamps_ns):  # for another number of messages: that of the newest
-            ages, stamps_ns = ages[-1:], stamps_ns.max(keepdims=True)
+            ages = ages[-1:]
+            stamps_ns = stamps_ns.max(keepdims=True)
         self._clock.data(
             topic,
             stamps_ns,
@@ -462,7 +463,8 @@ class CollectingSession:
             "encoder_rate": f"{rate:.0f}",
             "encoder_gap_s": f"{gap:.4f}",
         }
-        jitter, limit = self._encoder_rate.take_jitter_s(), self.settings.encoder_jitter_limit
+        jitter = self._encoder_rate.take_jitter_s()
+        limit = self.settings.encoder_jitter_limit
         if math.isfinite(jitter):
             values["encoder_jitter_s"] = f"{jitter:.6f}"
         last = self.collector.newest_command
@@ -485,7 +487,8 @@ class CollectingSession:
 
     def _repeatability(self) -> Diagnosis:
         """Return the repeatability of the newest view, WARN beyond the limits."""
-        values, problems = {}, []
+        values = {}
+        problems = []
         for value, limit, name, scale, unit in (
             (
                 self._noise[0],

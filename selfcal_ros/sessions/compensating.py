@@ -113,7 +113,8 @@ class CompensatingSession:
             )
         self._waits = waits
         if not waits:
-            message, self._map = self._map, None
+            message = self._map
+            self._map = None
             try:
                 self._refuse_other_frame(message)
                 error_map = to_model.error_map(message)
@@ -199,7 +200,8 @@ class CompensatingSession:
         With unknown nodes there is no spline: such a map is interpolated bilinearly.
         """
         self._refuse_large(error_map, [error_map.gx, error_map.gy], error_map.g_theta, source)
-        method, fitted = self._settings.interpolation, None
+        method = self._settings.interpolation
+        fitted = None
         if interpolation and interpolation not in get_args(Interpolation):
             raise InputError(
                 f"the map of {source}",
@@ -232,7 +234,8 @@ class CompensatingSession:
         An angular error moves the farthest site, or what is as far as `LEAST_RADIUS_M`, by its
         angle times the radius.
         """
-        artifact, limit_m = error_map.artifact, self._settings.max_correction
+        artifact = error_map.artifact
+        limit_m = self._settings.max_correction
         radius_m = max(math.hypot(*artifact.half) * artifact.grid_pitch_m, LEAST_RADIUS_M)
         largest_m = max(
             np.abs(part[~np.isnan(part)]).max(initial=0.0)
@@ -259,7 +262,8 @@ class CompensatingSession:
         publish : callable (data)
             Takes each corrected sample.
         """
-        waiting, self._waiting = self._waiting, []
+        waiting = self._waiting
+        self._waiting = []
         samples = waiting if lost + len(waiting) <= KEEPS_UP else waiting[-1:]
         skipped = lost + len(waiting) - len(samples)
         self._skipped += skipped
@@ -300,7 +304,9 @@ class CompensatingSession:
 
         None if it must not be passed on: without a map, damaged, or as `_corrected`.
         """
-        sample, use, corrected = self._editor.read(data), self.compensator, None
+        sample = self._editor.read(data)
+        use = self.compensator
+        corrected = None
         if sample is not None and use is not None:
             corrected = self._corrected(*sample, (use.command, use.command_theta))
         if corrected is None:
@@ -416,23 +422,28 @@ class CompensatingSession:
         return merged(self._state(), [self._pace()])
 
     def _pace(self) -> Diagnosis:
-        ages_s, self._ages_s = self._ages_s, []
-        skipped, self._skipped = self._skipped, 0
-        oldest, limit = max(ages_s, default=0.0), self._settings.max_age
+        ages_s = self._ages_s
+        self._ages_s = []
+        skipped = self._skipped
+        self._skipped = 0
+        oldest = max(ages_s, default=0.0)
+        limit = self._settings.max_age
         lines = []
         if skipped:
             lines.append(
                 f"{skipped} samples skipped since the last status: newer ones arrived "
                 "before they could be corrected, or they were lost in transport"
             )
-        refused, self._commands_refused = self._commands_refused, 0
+        refused = self._commands_refused
+        self._commands_refused = 0
         if refused:
             lines.append(
                 f"{refused} commands refused since the last status and not passed on: no "
                 "map, no complete position, a joint named twice, or a position where the "
                 "map is unknown"
             )
-        strange, self._strange = self._strange, ()
+        strange = self._strange
+        self._strange = ()
         if strange and (refused or not ages_s):  # beside samples of the stage they may be others
             stage_joints = ", ".join(
                 (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
@@ -441,14 +452,16 @@ class CompensatingSession:
                 f"joints {printable(', '.join(strange))} are not of the stage ({stage_joints}): "
                 "correct joint_x, joint_y and joint_theta, or the publisher"
             )
-        frame, self._other_frame = self._other_frame, ""
+        frame = self._other_frame
+        self._other_frame = ""
         if frame:
             lines.append(
                 f"commands name the frame {printable(frame)!r}, but are corrected as "
                 f"positions in {self._settings.frame_id!r}: transform them first, or set "
                 "frame_id if it is the stage's"
             )
-        outside, self._outside = self._outside, 0
+        outside = self._outside
+        self._outside = 0
         if outside:
             lines.append(
                 f"{outside} positions outside the field since the last status, corrected "

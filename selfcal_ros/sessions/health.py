@@ -243,7 +243,9 @@ class Rate:
 
     def add(self, stamps_ns: np.ndarray) -> None:
         """Take messages by their stamps, int64 array (n,) in the order of arrival, n > 0."""
-        now, count, latest_ns = self._now_s(), len(stamps_ns), int(stamps_ns.max())
+        now = self._now_s()
+        count = len(stamps_ns)
+        latest_ns = int(stamps_ns.max())
         while len(self._bins) > 1 and now - self._bins[0][0] > self.WINDOW_S:
             self._bins.popleft()
         before_ns = max((newest for _, _, newest in self._bins), default=stamps_ns[0])
@@ -270,7 +272,8 @@ class Rate:
 
     def take_gap_ns(self) -> int:
         """Return the longest gap between stamps since the last call."""
-        gap, self.longest_gap_ns = self.longest_gap_ns, 0
+        gap = self.longest_gap_ns
+        self.longest_gap_ns = 0
         return gap
 
     def take_jitter_s(self) -> float:

@@ -228,12 +228,14 @@ class JournalKeeper:
         """Return once the files of the unfinished run, as soon as they are known; else []."""
         if self._looking is None or not self._looking.done():
             return []
-        looking, self._looking = self._looking, None
+        looking = self._looking
+        self._looking = None
         try:
             looked = looking.result()
             return self._take_up(looked) if self._left_ago_s is None else self._tell_left(looked)
         finally:
-            early, self._early = self._early, []
+            early = self._early
+            self._early = []
             for item in early:
                 self.write(*item)
 
@@ -290,7 +292,8 @@ class JournalKeeper:
 
     def flush(self) -> None:
         """Write the messages taken; a failure is reported once, and when it is over."""
-        n_taken, self._n_taken = self._n_taken, 0
+        n_taken = self._n_taken
+        self._n_taken = 0
         try:
             if self._journal is None:
                 self._try_again()
@@ -334,7 +337,8 @@ class JournalKeeper:
                 if self._claim is not None:
                     self._claim.close()
         if self._journal is not None:
-            journal, self._journal = self._journal, None
+            journal = self._journal
+            self._journal = None
             try:
                 journal.close()
             except InputError as error:

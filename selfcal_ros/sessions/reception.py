@@ -144,7 +144,8 @@ class Reception:
             waiting = []
             self._adopt(self._restoring)
             adopted = True
-        waiting, self._held = [*self._held, *waiting], []
+        waiting = [*self._held, *waiting]
+        self._held = []
         self._feed(waiting)
         return adopted or bool(came)
 
@@ -266,7 +267,8 @@ class Resting:
 
     def end(self) -> list[Sample]:
         """Return and release the held samples, oldest first."""
-        samples, self._held = self._held, deque()
+        samples = self._held
+        self._held = deque()
         return [*samples]
 
     def sample(self, data: bytes, received_ns: int, *, measuring: bool) -> list[Sample]:

@@ -120,7 +120,8 @@ class SequencingSession:
         plan = self.machine.need_plan()
         if not (self._settings.resume and self._fresh and collector):
             return ""
-        health, phase = collector.values, collector.values.get("phase", "")
+        health = collector.values
+        phase = collector.values.get("phase", "")
         index, stamp_ns = collector.number("view"), collector.number("command_stamp")
         if (
             health.get("plan_id") != plan.plan_id
@@ -300,14 +301,18 @@ class SequencingSession:
 
     def diagnosis(self) -> Diagnosis:
         """Return the diagnosis of the node."""
-        state, level = str(self.machine.state), Level.OK
+        state = str(self.machine.state)
+        level = Level.OK
         if self.waiting:
-            state, level = f"waiting for {', '.join(self.missing())}", Level.WARN
+            state = f"waiting for {', '.join(self.missing())}"
+            level = Level.WARN
         elif self.machine.state is State.MEASURING and self._stalled:
             state, level = self._stalled, Level.WARN
         for line in filter(None, (self._silent, self._set_back)):
-            state, level = f"{line}; {state}", Level.WARN
-        plan, view = self.machine.plan, self.current
+            state = f"{line}; {state}"
+            level = Level.WARN
+        plan = self.machine.plan
+        view = self.current
         return Diagnosis(
             level,
             state,

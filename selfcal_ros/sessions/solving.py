@@ -126,8 +126,10 @@ def pure_noise(marks: int) -> Measurements:
     marks : int
         Marks along each side of the plate.
     """
-    plate, rng = Artifact(marks, 0.01, 8), np.random.default_rng(1)
-    lines, views = np.arange(plate.angular_count), []
+    plate = Artifact(marks, 0.01, 8)
+    rng = np.random.default_rng(1)
+    lines = np.arange(plate.angular_count)
+    views = []
     for number, view in enumerate(
         (
             View("identity"),
@@ -139,7 +141,8 @@ def pure_noise(marks: int) -> Measurements:
         on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.limits[0][1])
         m, n = plate.m[on_field], plate.n[on_field]
         dx, dy, offset_x, offset_y = rng.normal(0.0, 2e-8, (4, len(m)))
-        once, mark = np.ones(len(m), dtype=int), np.arange(len(m))
+        once = np.ones(len(m), dtype=int)
+        mark = np.arange(len(m))
         visits = GridVisits(
             mark, dx, dy, once, (1000 * number + mark) * NS_PER_S, offset_x, offset_y, once, once
         )
@@ -249,7 +252,8 @@ class SolvingSession:
         check_view(
             to_model.view_readings(message), to_model.artifact_of(message), int(message.view_index)
         )
-        run, now_ns = PlanRun(message.plan_id, message.run_id), self._ports.now_ns()
+        run = PlanRun(message.plan_id, message.run_id)
+        now_ns = self._ports.now_ns()
         if begins_in_future(run, now_ns):
             raise InputError(
                 MEASUREMENT_TOPIC,
@@ -449,7 +453,8 @@ class SolvingSession:
 
     def _publish_summary(self) -> None:
         """Publish what is shown, also that there is no map: an earlier summary says otherwise."""
-        shown, result = self.shown, self.shown.result
+        shown = self.shown
+        result = self.shown.result
         planned = self._planned_views(shown.run)
         advice = [f"{counted(planned - shown.views_done, 'view')} to come"]
         if not self._unfinished():
@@ -490,7 +495,8 @@ class SolvingSession:
 
     def _state(self) -> str:
         if self._unfinished():
-            n_done, planned = self.shown.views_done, self._planned_views(self.shown.run)
+            n_done = self.shown.views_done
+            planned = self._planned_views(self.shown.run)
             views = (
                 f"{n_done} of {planned} views measured"
                 if planned
@@ -538,7 +544,8 @@ class SolvingSession:
 
     def _newer(self, runs: Iterable[PlanRun]) -> str:
         """Return a note on a run that is newer than the published one; "" if none."""
-        now_ns, published_ns = self._ports.now_ns(), begun_ns(self.shown.run.run_id)
+        now_ns = self._ports.now_ns()
+        published_ns = begun_ns(self.shown.run.run_id)
         later = [
             (begun, run)
             for run in runs

@@ -235,7 +235,8 @@ def plate_picture(
     if not count.any() or (n_missing > 0 and not named):
         return [], 1
     i, j = map(np.arange, artifact.shape)
-    m, n = artifact.marks_at(i, i)[0][:, None], artifact.marks_at(j, j)[1]
+    m = artifact.marks_at(i, i)[0][:, None]
+    n = artifact.marks_at(j, j)[1]
     signs = ((n >= first[:, None]) & (n < (first + count)[:, None])).astype(np.int8)
     if n_missing > len(named):  # marks after the last named one are unknown
         signs[(signs > 0) & ((m > named[-1][0]) | ((m == named[-1][0]) & (n > named[-1][1])))] = 2

@@ -102,7 +102,9 @@ def write_files(
         raise InputError("SIM.yaml", "the cell has no camera", "add the key 'camera'")
     truth, arrivals, _ = simulation.run()
     rng = np.random.default_rng((simulation.seed, simulation.noise_seed or 0, IMAGES))
-    view, last, rows = "", inputs.EncoderSample(0, (), (0.0, 0.0)), [",".join(COLUMNS)]
+    view = ""
+    last = inputs.EncoderSample(0, (), (0.0, 0.0))
+    rows = [",".join(COLUMNS)]
     with new_bag(path) as folder:
         folder.mkdir()
         for number, (_, event) in enumerate(arrivals):
@@ -151,7 +153,8 @@ def write_truth(path: Path, truth: Truth, **provenance: object) -> None:
     """
     g = truth.g
     if truth.artifact.map_grid is not None:
-        nodes, still = truth.artifact.field, replace(truth, stage_bend_m=truth.stage_bend_m[:0])
+        nodes = truth.artifact.field
+        still = replace(truth, stage_bend_m=truth.stage_bend_m[:0])
         places = np.stack([nodes.x_m.ravel(), nodes.y_m.ravel()])
         g = stage_error(still, places).reshape(2, *nodes.shape)
     write_json(

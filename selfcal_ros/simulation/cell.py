@@ -348,7 +348,8 @@ def view_events(
     rests for a period, and approaches the first grid mark in + direction.
     """
     stops, detected = _exposures(truth, index, plan.views[index], settings, rng)
-    period_ns, step_ns = settings.period_ns, round(NS_PER_S / settings.encoder_rate_hz)
+    period_ns = settings.period_ns
+    step_ns = round(NS_PER_S / settings.encoder_rate_hz)
     end_ns = start_ns + period_ns * len(stops)
     exposed = 0
     for stamp in range(start_ns, end_ns + 1, step_ns):

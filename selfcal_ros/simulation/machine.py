@@ -329,7 +329,8 @@ def random_truth(
         yaw = _stage(artifact, replace(spread, g_m=spread.stage_yaw_rad), rng)[0][0]
         yaw = yaw - yaw.mean()  # the rest turns the image as the camera's turn does
     rng = placing or rng
-    phi, t = rng.normal(0, spread.phi_rad, n_views), rng.normal(0, spread.t_m, (n_views, 2))
+    phi = rng.normal(0, spread.phi_rad, n_views)
+    t = rng.normal(0, spread.t_m, (n_views, 2))
     drawn = _of_views(spread, n_views, rng)
     if spread.phi_common_rad or spread.t_common_m:
         phi += rng.normal(0, spread.phi_common_rad)

@@ -110,7 +110,8 @@ def mark_places(
         True and nominal position, m.
     """
     m, n = marks
-    pose, pitch = view.on_stage(truth.artifact), truth.artifact.grid_pitch_m
+    pose = view.on_stage(truth.artifact)
+    pitch = truth.artifact.grid_pitch_m
     x, y = truth.artifact.places(m, n)
     site = np.stack(pose.site_of(x, y)) * pitch
     arm = np.stack(pose.turned(*np.stack([x, y]) * pitch))
@@ -132,7 +133,8 @@ def mark_places(
 
 def _bow(truth: Truth, m: np.ndarray, n: np.ndarray) -> np.ndarray:
     """Return the height of marks on the plate, (V,), m; the plate is part of a sphere."""
-    (hx, hy), (x, y) = truth.artifact.reach, truth.artifact.places(m, n)
+    hx, hy = truth.artifact.reach
+    x, y = truth.artifact.places(m, n)
     return truth.plate_bow_m * (1 - (x / hx) ** 2 - (y / hy) ** 2)
 
 
@@ -150,7 +152,8 @@ def _tilted(
         return np.zeros_like(arm), np.zeros_like(height)
     kx, ky = tilt / angle
     along = kx * arm[1] - ky * arm[0]  # axis x arm, upwards
-    sine, one_less_cosine = np.sin(angle), 2 * np.sin(angle / 2) ** 2
+    sine = np.sin(angle)
+    one_less_cosine = 2 * np.sin(angle / 2) ** 2
     aside = np.array([[ky], [-kx]])
     return aside * (
         sine * height + one_less_cosine * along
@@ -243,7 +246,8 @@ def encoder_error(truth: Truth, position: np.ndarray) -> np.ndarray:
 
     Linear between lines, plus waves.
     """
-    count, g = truth.artifact.angular_count, truth.g_theta
+    count = truth.artifact.angular_count
+    g = truth.g_theta
     place = position * (count / (2 * np.pi))
     if len(truth.waves_theta.number):
         g = g - truth.waves_theta.at(np.arange(count)[None])[0]

@@ -224,7 +224,8 @@ def blurred_pixels(count: int, blur_px: float) -> np.ndarray:
     sigma, n = blur_px * FINE, count * FINE
     away = np.arange(-int(5 * sigma + 0.5), int(5 * sigma + 0.5) + 1)
     weight = np.exp(-((away / max(sigma, np.finfo(float).tiny)) ** 2) / 2)
-    point, means = np.arange(n)[:, None], np.zeros((count, n))
+    point = np.arange(n)[:, None]
+    means = np.zeros((count, n))
     np.add.at(means, (point // FINE, np.clip(point + away, 0, n - 1)), weight / weight.sum() / FINE)
     return means
 
@@ -287,8 +288,11 @@ def exposures(
             "simulate detections instead",
         )
     artifact, reach = truth.artifact, camera.reach_m
-    (m, n), (i, j) = physics.all_marks(artifact), artifact.middle
-    place, index, angle = np.zeros((2, 0)), -1, 0.0
+    m, n = physics.all_marks(artifact)
+    i, j = artifact.middle
+    place = np.zeros((2, 0))
+    index = -1
+    angle = 0.0
     for _, group in groupby(events, key=lambda event: (event.stamp_ns, _is_grid(event))):
         simultaneous = list(group)
         for event in simultaneous:
@@ -306,7 +310,8 @@ def exposures(
             yield from simultaneous
             continue
         first = next(iter(offset_of_mark))
-        away, stage = place - place[:, [first]], place[:, [first]]
+        away = place - place[:, [first]]
+        stage = place[:, [first]]
         away = physics.with_yaw(truth, sense, -stage if sense is Sense.PLATE_MOVES else stage, away)
         offsets = np.array([offset_of_mark[first]]).T + physics.seen_offset(truth, away)
         offsets[:, list(offset_of_mark)] = np.array(list(offset_of_mark.values())).T

@@ -93,7 +93,8 @@ def apply_faults(
         Source of the draw.
     """
     ledger: Counter = Counter()
-    first, last = events[0].stamp_ns, events[-1].stamp_ns
+    first = events[0].stamp_ns
+    last = events[-1].stamp_ns
     gap = first + (last - first) // 3
     step_at = first + (last - first) // 2
     step = round(faults.clock_step_s * NS_PER_S)
@@ -147,7 +148,8 @@ def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Ev
         return [replace(event, offset_x=float("nan"), offset_theta=float("nan"))]
     if name == "unknown_mark":
         return [replace(event, has_id=True, m=9999, n=0, k=2**31)]
-    size, angle = rng.uniform(1, 20), rng.uniform(0, 2 * np.pi)
+    size = rng.uniform(1, 20)
+    angle = rng.uniform(0, 2 * np.pi)
     if event.kind == Kind.ANGULAR:
         return [
             replace(
@@ -482,7 +484,8 @@ def _correction(data: Any, path: Path) -> tuple[ErrorMap | None, float]:
 
 def corrected(truth: Truth, table: ErrorMap, times: float) -> Truth:
     """Return a machine whose controller subtracts a table, bilinear between its nodes."""
-    controller, plate = Compensator(table), truth.artifact
+    controller = Compensator(table)
+    plate = truth.artifact
     g = truth.g - times * np.stack(controller.error(plate.x_m, plate.y_m))
     if not controller.has_theta or not plate.angular_count:
         return replace(truth, g=g)

@@ -228,7 +228,8 @@ def _statements(result: CalibrationResult, details: dict[str, Any]) -> Iterator[
 
 
 def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> ET.Element:
-    result, core = stage.result, details["certificate"]
+    result = stage.result
+    core = details["certificate"]
     conditions = [
         _dcc("influenceCondition", _content("name", item["name"]), _dcc("data", _condition(item)))
         for item in details["conditions"]
@@ -412,7 +413,9 @@ def _list(
 
 def _maps(stage: StageMap) -> Iterator[ET.Element]:
     """Yield the maps: positions, errors and U of all known nodes and lines."""
-    result, emap, plate = stage.result, stage.error_map, stage.error_map.artifact
+    result = stage.result
+    emap = stage.error_map
+    plate = stage.error_map.artifact
     has_u = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
     k = result.noise.k_xy
     yield _result(
@@ -510,7 +513,8 @@ def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
 
 def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
     """Yield U of distances, a + b L, and the covariance of all nodes if requested."""
-    emap, plate = stage.error_map, stage.error_map.artifact
+    emap = stage.error_map
+    plate = stage.error_map.artifact
     has_u = emap.valid & np.isfinite(emap.u_gx + emap.u_gy)
     try:
         a, b = stage.length_uncertainty()

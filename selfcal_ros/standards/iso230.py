@@ -141,7 +141,8 @@ def _groups(
     if visits is None or not len(visits.mark):
         return
     artifact = measurements.artifact
-    pose, off = view.view.lattice_pose(artifact), artifact.off_centre
+    pose = view.view.lattice_pose(artifact)
+    off = artifact.off_centre
     x, y = pose.site_of(*artifact.places(view.m, view.n))
     values = sign * (visits.dx, visits.dy)[axis]
     approach = (visits.approach_x, visits.approach_y)[axis]
@@ -156,10 +157,12 @@ def _groups(
 def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:
     """Return the pooled repeats of a site; None if a direction has none, or no second one."""
     weight = weighted_reversal = 0.0
-    square, dof = np.zeros(2), np.zeros(2, dtype=int)
+    square = np.zeros(2)
+    dof = np.zeros(2, dtype=int)
     signs = np.concatenate([approach for _, approach in parts])
     for values, approach in parts:
-        means, counts = np.zeros(2), np.zeros(2, dtype=int)
+        means = np.zeros(2)
+        counts = np.zeros(2, dtype=int)
         for side, wanted in enumerate((1, -1)):
             repeats = values[approach == wanted]
             counts[side] = len(repeats)
@@ -169,7 +172,8 @@ def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:
                 dof[side] += len(repeats) - 1
         if counts.all():
             w = 1 / (1 / counts).sum()
-            weight, weighted_reversal = weight + w, weighted_reversal + w * (means[0] - means[1])
+            weight = weight + w
+            weighted_reversal = weighted_reversal + w * (means[0] - means[1])
     if not weight or not dof.all():
         return None
     s = np.sqrt(square / dof)
@@ -248,12 +252,14 @@ def axis_figures(
         If the line has fewer than three positions.
     """
     sites = _positions(stage, axis, line, repeats)
-    plate, emap = stage.error_map.artifact, stage.error_map
+    plate = stage.error_map.artifact
+    emap = stage.error_map
     index = plate.index(*np.array(sites).T)
     error = (emap.gx, emap.gy)[axis][index]
     drawn = error + _map_draws(stage, index, axis)
     along = (plate.x_m[:, 0], plate.y_m[0])[axis]
-    position, left_out = along[index[axis]], np.delete(along, index[axis])
+    position = along[index[axis]]
+    left_out = np.delete(along, index[axis])
     line_m = (line + plate.off_centre[1 - axis]) * plate.grid_pitch_m
     nothing = np.full(len(sites), np.nan)
     if repeats is None:
@@ -285,7 +291,8 @@ def axis_figures(
         )
     )
     shift = np.zeros(len(sites)) if approach_in_model else sign * reversal / 2
-    up, down = -(error - shift + reversal / 2), -(error - shift - reversal / 2)
+    up = -(error - shift + reversal / 2)
+    down = -(error - shift - reversal / 2)
     rng = np.random.default_rng(0)
     u = u_reversal * np.sqrt(np.mean(s_up**2 + s_down**2) / 2)
     turned = _true_values(reversal, u, rng)
@@ -333,7 +340,8 @@ def _true_scatters(s: np.ndarray, dof: np.ndarray, rng: np.random.Generator) -> 
     noise = rng.chisquare(dof, (DRAWS, len(s))) / dof
     if not (s > 0).all():
         return s * np.sqrt(noise)
-    u, bias = np.sqrt(polygamma(1, dof / 2)) / 2, (digamma(dof / 2) - np.log(dof / 2)) / 2
+    u = np.sqrt(polygamma(1, dof / 2)) / 2
+    bias = (digamma(dof / 2) - np.log(dof / 2)) / 2
     centre, true_share = _true_shares(np.log(s) - bias, u, rng)
     drawn = np.log(noise) / 2 * np.sqrt(true_share)
     return np.exp(centre + true_share * (np.log(s) - centre) + drawn)
@@ -372,7 +380,8 @@ def _positions(
 ) -> list[tuple[int, int]]:
     """Return the known sites along a line, with repeats if there are some."""
     plate, valid = stage.error_map.artifact, stage.error_map.valid
-    (first, last), (low, high) = plate.limits[axis], plate.limits[1 - axis]
+    first, last = plate.limits[axis]
+    low, high = plate.limits[1 - axis]
     sites = [(i, line) if axis == 0 else (line, i) for i in range(first, last + 1)]
     known_sites = [
         site
@@ -495,7 +504,8 @@ def diagonal_figures(stage: StageMap) -> list[PathFigures]:
 
     def figures(path: np.ndarray) -> dict[str, np.ndarray]:
         d = (path * e).sum(axis=-2)
-        first, second = d[..., :count], d[..., count:]
+        first = d[..., :count]
+        second = d[..., count:]
         lengths = [part[..., -1] - part[..., 0] for part in (first, second)]
         return {
             "1 M": np.ptp(first, axis=-1),

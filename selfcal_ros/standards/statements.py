@@ -41,7 +41,8 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
             "solve again with --uncertainty always",
         )
     _require_temperature(result, details["conditions"])
-    core, zone = details["certificate"], timedelta(days=1)
+    core = details["certificate"]
+    zone = timedelta(days=1)
     times = [result.provenance.first_exposure, result.provenance.last_exposure]
     if all(times) and "clock" not in core:
         try:
@@ -122,14 +123,12 @@ def known_plate_texts(result: CalibrationResult) -> list[str]:
     if result.recheck is None:
         return []
     calibration = result.recheck.calibration
-    readings, dates = (
-        calibration.readings,
-        [
-            instant[:10]
-            for instant in (calibration.first_exposure, calibration.last_exposure)
-            if instant
-        ],
-    )
+    readings = calibration.readings
+    dates = [
+        instant[:10]
+        for instant in (calibration.first_exposure, calibration.last_exposure)
+        if instant
+    ]
     facts = [
         f"plan {calibration.plan_id}",
         *([f"run {calibration.run_id}"] if calibration.run_id else []),

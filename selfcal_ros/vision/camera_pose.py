@@ -66,7 +66,9 @@ def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
     ]
     limit = min(apart) / 2 if apart else np.inf
     numbers: list[np.ndarray] = []
-    count, before, tracks_before = 0, np.zeros((0, 2)), np.zeros(0, dtype=int)
+    count = 0
+    before = np.zeros((0, 2))
+    tracks_before = np.zeros(0, dtype=int)
     for places in images:
         mine = np.full(len(places), -1)
         for index, place in enumerate(places):
@@ -74,7 +76,8 @@ def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
             if len(away) and away.min() < limit:
                 mine[index] = tracks_before[away.argmin()]
             else:
-                mine[index], count = count, count + 1
+                mine[index] = count
+                count = count + 1
         numbers.append(mine)
         if len(places):
             before, tracks_before = places, mine

@@ -130,7 +130,8 @@ class MarkDetector:
         InputError
             If there are more possible marks than `max_marks`.
         """
-        image, full = picture.values, self.settings.full_scale or picture.full_scale
+        image = picture.values
+        full = self.settings.full_scale or picture.full_scale
         possible = candidates(
             image,
             mark=self.settings.mark,
@@ -179,7 +180,8 @@ class MarkDetector:
                 for candidate in possible
             ]
         )
-        waiting, is_second = np.arange(len(possible)), False
+        waiting = np.arange(len(possible))
+        is_second = False
         while len(waiting):
             off_centre = []
             for index, fit in self._fits(image, (columns, rows), starts, waiting, full):
@@ -194,7 +196,8 @@ class MarkDetector:
                 rows[index] += dv
                 starts[index] = list(fit.shape.values())
                 off_centre.append(index)
-            waiting, is_second = np.array(off_centre, dtype=int), True
+            waiting = np.array(off_centre, dtype=int)
+            is_second = True
         return out
 
     def _fits(
@@ -357,7 +360,8 @@ def offset(
 
     The axis is the centre of the image; rows run along -y before the turn.
     """
-    right, up = u - (shape[1] - 1) / 2, (shape[0] - 1) / 2 - v
+    right = u - (shape[1] - 1) / 2
+    up = (shape[0] - 1) / 2 - v
     if settings.mirror:
         right = -right
     turn = np.deg2rad(settings.turn)

@@ -47,7 +47,9 @@ def circled(
             [u - radius, v - radius, u + radius, v + radius], outline=REJECTED, width=line
         )
         draw.text((u - radius, v + radius + line), reason, fill=REJECTED)
-    u, v, arm = (pixels.shape[1] - 1) / 2, (pixels.shape[0] - 1) / 2, size_px / 2
+    u = (pixels.shape[1] - 1) / 2
+    v = (pixels.shape[0] - 1) / 2
+    arm = size_px / 2
     draw.line([u - arm, v, u + arm, v], fill=AXIS, width=line)
     draw.line([u, v - arm, u, v + arm], fill=AXIS, width=line)
     out = io.BytesIO()

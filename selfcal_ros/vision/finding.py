@@ -75,7 +75,8 @@ def _templates(
     Those of the second half of the turns of a mark without sign, a corner, are the negatives of
     those of the first half.
     """
-    model, half = MODELS[mark], _half(size)
+    model = MODELS[mark]
+    half = _half(size)
     v, u = np.mgrid[-half : half + 1, -half : half + 1].astype(float)
     templates = []
     angles = np.arange(ANGLES if sign else ANGLES // 2) * model.turns / ANGLES
@@ -194,7 +195,8 @@ def _largest(values: np.ndarray, reach: int) -> np.ndarray:
         width = 1  # of the maxima so far
         while width < side:
             step = min(width, side - width)
-            values, width = np.maximum(values[:-step], values[step:]), width + step
+            values = np.maximum(values[:-step], values[step:])
+            width = width + step
     return values
 
 

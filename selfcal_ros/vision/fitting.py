@@ -192,7 +192,8 @@ def _image(
     columns = p.T[..., None].astype(PRECISION)
     shape, derivatives = model.shape(u - columns[0], v - columns[1], columns[2 + LIGHTING :])
     light = 1 + columns[4] * u + columns[5] * v
-    level, bright = columns[2] + columns[3] * shape, columns[3] * light
+    level = columns[2] + columns[3] * shape
+    bright = columns[3] * light
     jacobian = np.empty((len(p), p.shape[1], len(u)), dtype=PRECISION)
     for row, derivative in zip((0, 1, *range(2 + LIGHTING, p.shape[1])), derivatives, strict=True):
         np.multiply(derivative, bright, out=jacobian[:, row])
@@ -267,13 +268,17 @@ def _unweighted_fits(
     They are a start for the weighted ones: every `step`-th pixel of a mark serves.
     """
     some = slice(None, None, step)
-    u, v, values = windows.disc.u[some], windows.disc.v[some], windows.values[:, some]
+    u = windows.disc.u[some]
+    v = windows.disc.v[some]
+    values = windows.values[:, some]
     radius = windows.disc.inside.shape[0] / 2
     p = _first(model.shape(u, v, starts.T[..., None].astype(PRECISION))[0], values, starts)
     image, jacobian, _ = _image(model, u, v, p)
     residual = values - image
-    cost, damping = _dot(residual, residual), np.full(len(p), 1e-3)
-    settled, running = np.zeros(len(p), dtype=bool), np.arange(len(p))
+    cost = _dot(residual, residual)
+    damping = np.full(len(p), 1e-3)
+    settled = np.zeros(len(p), dtype=bool)
+    running = np.arange(len(p))
     for _ in range(ROUNDS):
         if not len(running):
             break
@@ -317,7 +322,8 @@ def _variance(
         return _dot(values, part.astype(PRECISION)) / np.maximum(part.sum(axis=1), 1)
 
     mean = np.maximum(mean_of(square, used) * factor, 1e-12)
-    on_ground, on_mark = used & (shape < CLEAR), used & (shape > 1 - CLEAR)
+    on_ground = used & (shape < CLEAR)
+    on_mark = used & (shape > 1 - CLEAR)
     low, high = (
         np.maximum(mean_of(square, part) * factor, mean / 10) for part in (on_ground, on_mark)
     )
@@ -342,7 +348,8 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
     for rounds in range(1, WEIGHTED_ROUNDS[1] + 1):
         if not len(running):
             break
-        values, before = windows.values[running], p[running]
+        values = windows.values[running]
+        before = p[running]
         image, jacobian, shape = _image(model, disc.u, disc.v, before)
         residual = values - image
         spread = MAD * row_medians(np.abs(residual))
@@ -415,7 +422,8 @@ def _stains(
 
     The order is that of `Fit`: bright, dark, inner, outer.
     """
-    disc, (shape, residual, spread) = windows.disc, modelled
+    disc = windows.disc
+    shape, residual, spread = modelled
     squares = np.zeros((len(p), *disc.inside.shape), dtype=PRECISION)
     squares[:, disc.inside] = residual
     mean = ndimage.uniform_filter(squares, (0, 3, 3), mode="constant")[:, disc.inside] / disc.near
@@ -438,7 +446,8 @@ def _stains(
     beyond = 0.25 * (high - low)
     bright = stained & (mean > 0) & (values > high + beyond)
     dark = stained & (mean < 0) & (values < low - beyond)
-    neither, inner = stained & ~bright & ~dark, shape > 0.5
+    neither = stained & ~bright & ~dark
+    inner = shape > 0.5
     counts[some] = np.stack(
         [part.sum(axis=1) for part in (bright, dark, neither & inner, neither & ~inner)], axis=1
     )
@@ -453,7 +462,8 @@ def _median_of_part(values: np.ndarray, part: np.ndarray, level: np.ndarray) -> 
     count = part.sum(axis=1)
     ranked = np.sort(np.where(part, values, np.inf), axis=1)
     rows = np.arange(len(values))
-    low, high = np.maximum(count - 1, 0) // 2, count // 2
+    low = np.maximum(count - 1, 0) // 2
+    high = count // 2
     with np.errstate(invalid="ignore"):  # inf - inf where there is none
         middle = (ranked[rows, low] + ranked[rows, np.minimum(high, values.shape[1] - 1)]) / 2
     return np.where(count > 0, middle, level)

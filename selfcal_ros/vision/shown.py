@@ -51,8 +51,10 @@ def _threshold(image: np.ndarray) -> float | None:
     values = (edges[:-1] + edges[1:]) / 2
     below = np.cumsum(counts)[:-1]
     above = image.size - below
-    total, sums = float(counts @ values), np.cumsum(counts * values)[:-1]
-    mean_below, mean_above = sums / np.maximum(below, 1), (total - sums) / np.maximum(above, 1)
+    total = float(counts @ values)
+    sums = np.cumsum(counts * values)[:-1]
+    mean_below = sums / np.maximum(below, 1)
+    mean_above = (total - sums) / np.maximum(above, 1)
     between = below * above * np.square(mean_above - mean_below)
     return float(edges[1:-1][np.argmax(between)])
 

@@ -95,7 +95,8 @@ def identify_grid(
     beside_m : float array (2, n), optional
         Place in the image at which each mark is seen; None = at the optical axis.
     """
-    pose, pitch = view.on_stage(artifact), artifact.grid_pitch_m
+    pose = view.on_stage(artifact)
+    pitch = artifact.grid_pitch_m
     reasons = np.full(reading_m.shape[1], None, dtype=object)
     if not view.grid:
         reasons[:] = Reason.NOT_IN_VIEW
@@ -112,14 +113,16 @@ def identify_grid(
     centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
     limit_m = rules.stage_limit_m(artifact) + view.check_offset_m
     astray = _astray(pose, marks, stage_m, artifact, limit_m, among=has_id)
-    named, free = has_id & ~named_unknown & ~astray, ~has_id
+    named = has_id & ~named_unknown & ~astray
+    free = ~has_id
     estimate, fit = _settle(pose, centred, artifact, marks, (named, free), rules)
     rigid = estimate.rigid if fit.marks < 3 else fit.rigid
     far, unsure, ambiguous = (np.zeros(marks.shape[1], dtype=bool) for _ in range(3))
     if free.any():
         nominal = estimate.rigid.undo(centred[:, free])
         marks[:, free], ratio, distance, apart = _nearest(pose, nominal, artifact)
-        error, reach = estimate.error_at(nominal), TOO_FAR_FROM_ANY * pitch
+        error = estimate.error_at(nominal)
+        reach = TOO_FAR_FROM_ANY * pitch
         unsure[free] = (error > SURE * pitch) & (distance <= reach + error)
         ambiguous[free] = (distance <= reach) & ~unsure[free] & (error > SURE * apart)
         ambiguous[free] |= (distance <= reach) & (ratio > rules.ambiguity_ratio)
@@ -181,7 +184,8 @@ def _nearest(
 
     Also, of a list of marks, the distance of the two nearest ones from each other, m.
     """
-    pitch, far_apart_m = artifact.grid_pitch_m, np.full(centred.shape[1], np.inf)
+    pitch = artifact.grid_pitch_m
+    far_apart_m = np.full(centred.shape[1], np.inf)
     if artifact.marks:
         plate = np.stack(pose.turned_back(centred[0], centred[1]))
         away, two = artifact.marks.tree.query(np.nan_to_num(plate.T, nan=OFF_ANY_PLATE_M), 2)
@@ -212,9 +216,11 @@ def _settle(
     are used only where the motion known so far cannot confuse them: around the named marks, or
     around the innermost one if none is named; the motion from these reaches further out.
     """
-    (named, free), pitch = kinds, artifact.grid_pitch_m
+    named, free = kinds
+    pitch = artifact.grid_pitch_m
     about = _about(pose, ids, artifact)
-    use, fit = named, rigids.fit_motion(*rigids.columns_where(named, about, centred - about))
+    use = named
+    fit = rigids.fit_motion(*rigids.columns_where(named, about, centred - about))
     innermost = _innermost_of_list if artifact.marks else _innermost
     estimate = (
         fit.known(pitch, rules.max_rotation_rad)
@@ -228,7 +234,8 @@ def _settle(
         wider = named | (free & sure)
         if wider.sum() <= use.sum():
             break
-        use, mark = wider, np.where(named, ids, nearest)
+        use = wider
+        mark = np.where(named, ids, nearest)
         about = _about(pose, mark, artifact)
         fit = rigids.fit_motion(*rigids.columns_where(use, about, centred - about))
         estimate = fit.known(pitch, rules.max_rotation_rad)
@@ -365,7 +372,8 @@ def identify_angular(
     step = 2 * np.pi / count
     whole_lines, fraction = divmod(view.on_stage(artifact).s, 1)
     # a turn between two lines only for a Fourier map
-    base, between = int(whole_lines), fraction * step
+    base = int(whole_lines)
+    between = fraction * step
     reading_rad = wrap(reading_rad - between) if between else reading_rad
     has_known_id = has_id & (ids >= 0) & (ids < count)
     rotation_known = phi_rad is not None or has_known_id.any()

@@ -125,7 +125,8 @@ def reduce_repeats(
         weighted by 1/sigma^2. `sigma` is the pooled repeatability (NaN without repeats),
         `dof` its degrees of freedom, `outlier` a mask over the readings.
     """
-    outlier, (judged, fitted) = np.zeros(len(key), dtype=bool), steady or (values, 0)
+    outlier = np.zeros(len(key), dtype=bool)
+    judged, fitted = steady or (values, 0)
     if limit > 0 and len(key):
         outlier = _outliers(key, judged, _relative(sigma), (limit, extent), residual)
     means = average(key[~outlier], values[:, ~outlier], sigma[~outlier])
@@ -283,7 +284,8 @@ def _pair_scale(
     for group in groups:
         i, j = pairs_of(group.shape[1])
         for members in _batches(group, len(i)):
-            weights, repeats = relative[members], np.take(values, members, axis=1)
+            weights = relative[members]
+            repeats = np.take(values, members, axis=1)
             norm = (
                 np.sqrt(2)
                 if alike
@@ -339,7 +341,8 @@ def grid_visits(
     number = np.cumsum((np.diff(key, prepend=key[:1]) != 0) | stage_moves.any(axis=0))[no_outlier]
     key, stamps_ns = key[no_outlier], stamps_ns[no_outlier]
     begins = np.diff(number, prepend=-1) != 0
-    first, visit = np.flatnonzero(begins), np.cumsum(begins) - 1
+    first = np.flatnonzero(begins)
+    visit = np.cumsum(begins) - 1
     since = (stamps_ns - stamps_ns[first][visit]).astype(float)
     visits = average(
         visit,
@@ -402,7 +405,9 @@ def repeat_motion(
             place_about**2
         ).sum(axis=0)
         keep = ~outlier | follows
-        key, place, offset = key[keep], place[:, keep], offset[:, keep]
+        key = key[keep]
+        place = place[:, keep]
+        offset = offset[:, keep]
     free = len(key) - int(np.count_nonzero(np.bincount(key))) - SLOW
     if free <= 0:
         return None
@@ -417,7 +422,8 @@ def repeat_motion(
 
 def _about_means(key: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values (c, n) minus the mean of their mark."""
-    first, count = np.zeros(key.max() + 1, dtype=int), np.bincount(key)
+    first = np.zeros(key.max() + 1, dtype=int)
+    count = np.bincount(key)
     first[key[::-1]] = np.arange(len(key))[::-1]  # for equal indices the last assignment remains
     values = values - values[:, first[key]]  # exact if repeats are equal
     return values - np.stack([np.bincount(key, row) for row in values])[:, key] / count[key]

@@ -29,7 +29,8 @@ class Rigid:
 
     def at(self, p: np.ndarray) -> np.ndarray:
         """Return the deviation at nominal positions `p` (2, n) about the plate centre."""
-        turn, cos_less_1 = np.sin(self.phi_rad), np.cos(self.phi_rad) - 1
+        turn = np.sin(self.phi_rad)
+        cos_less_1 = np.cos(self.phi_rad) - 1
         return np.stack(
             [
                 cos_less_1 * p[0] - turn * p[1] + self.tx_m,
@@ -113,7 +114,8 @@ class RigidFit:
         expected = EXPECTED_WEIGHT * (EXPECTED_SCATTER * pitch_m) ** 2
         freedom = EXPECTED_WEIGHT + max(2 * self.marks - 3, 0)
         scatter = COVERAGE * np.sqrt((expected + self.squares_m2) / freedom)
-        weight, error = 0.0, max_rotation_rad
+        weight = 0.0
+        error = max_rotation_rad
         if self.power_m2 and max_rotation_rad:
             fit_error_rad = scatter / np.sqrt(self.power_m2)
             weight = max_rotation_rad**2 / (max_rotation_rad**2 + fit_error_rad**2)
@@ -154,7 +156,8 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
     keep = np.zeros(p.shape[1], dtype=bool)
     for _ in range(5):
         distance = distances(deviation - rigid.at(p))
-        before, keep = keep, distance <= 3 * median(distance) + 1e-9
+        before = keep
+        keep = distance <= 3 * median(distance) + 1e-9
         if (keep == before).all():  # the same marks give the same motion
             break
         near, read = columns_where(keep, p, deviation)

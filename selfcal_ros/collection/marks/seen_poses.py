@@ -183,7 +183,8 @@ def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> Seen
     """Return how the marks of a view are seen; None if they do not show it."""
     if not view.spread:
         return None
-    pose, axis = view.pose, view.stage + view.cells
+    pose = view.pose
+    axis = view.stage + view.cells
     planned_distance = float(np.quantile(np.abs(axis - view.sites), 0.9))
     as_planned = Misplaced.of(view.view, pose, pose)
     fits = [
@@ -218,7 +219,8 @@ def _fitted(
 ) -> tuple[complex, complex, float]:
     """Return the turn, the shift and what nine of ten distances are below, pitches."""
     z = marks.conj() if mirrored else marks
-    free, weight = np.stack([np.ones(len(z)), z], axis=1), np.ones((len(z), 1))
+    free = np.stack([np.ones(len(z)), z], axis=1)
+    weight = np.ones((len(z), 1))
     motion = np.zeros(2, dtype=complex)
     for _ in range(STEPS):
         motion = np.linalg.lstsq(weight * free, weight[:, 0] * at, rcond=None)[0]

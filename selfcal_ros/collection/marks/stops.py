@@ -77,7 +77,8 @@ def shift_of(view: View, offset_m: np.ndarray, away_m: np.ndarray) -> complex:
             for axis in (steps.real, steps.imag)
         )
     )
-    cells, known_steps = _rounded(steps - fraction), known_steps - fraction
+    cells = _rounded(steps - fraction)
+    known_steps = known_steps - fraction
     nx, ny = (view.image.nx, view.image.ny) if view.image else (1, 1)
     return fraction + complex(
         middle_of(cells.real, nx, known_steps.real), middle_of(cells.imag, ny, known_steps.imag)
@@ -133,7 +134,8 @@ def middles(view: View, number: np.ndarray, away_m: np.ndarray) -> np.ndarray:
         Of marks from the places of their cells; without any on the axis all displacements are 0.
     """
     axis = numbers_of(view, np.zeros(1, dtype=complex))[0]
-    out, cells = np.zeros_like(away_m), np.unique(number[number >= 0])
+    out = np.zeros_like(away_m)
+    cells = np.unique(number[number >= 0])
     for cell in cells if axis in cells else ():
         out[:, number == cell] = np.median(away_m[:, number == cell], axis=1, keepdims=True)
     return (
@@ -257,7 +259,8 @@ def without_aside(
     if aside is None or not aside.any():
         return deviation_m, 0
     about = np.stack([row - _medians(key, row) for row in deviation_m])
-    out, fitted = deviation_m.copy(), 0
+    out = deviation_m.copy()
+    fitted = 0
     for along in aside:
         at_check_stops = along != 0
         if at_check_stops.any():

@@ -126,7 +126,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     Or that the frame is mirrored, if that explains all views clearly better than another pose of
     one of them.
     """
-    artifact, repeated = measurements.artifact, [v for v in measurements.views if v.dof_xy]
+    artifact = measurements.artifact
+    repeated = [v for v in measurements.views if v.dof_xy]
     window_views = [
         (view.view, readings)
         for view in measurements.views
@@ -225,7 +226,9 @@ def _at_pose(readings: _WindowReadings, planned: AnyPose, pose: AnyPose) -> _Win
     """Return the readings of a cell of images at the pose of their view; the camera stays."""
     if readings.pose == planned:
         return replace(readings, pose=pose)
-    (a, b), (x, y), (u, v) = readings.pose.shift, planned.shift, pose.shift
+    a, b = readings.pose.shift
+    x, y = planned.shift
+    u, v = pose.shift
     return replace(readings, pose=replace(pose, shift=(a + u - x, b + v - y)))
 
 
@@ -243,7 +246,8 @@ def _poses(readings: _WindowReadings, artifact: Artifact) -> Iterator[AnyPose]:
     if isinstance(pose, LatticePose):
         yield from other_poses(pose)
         return
-    phase, shift = pose.phase, complex(*pose.shift)
+    phase = pose.phase
+    shift = complex(*pose.shift)
     for turn, step in motions(artifact, phase, shift):
         new_shift = shift + phase * step
         new_pose = replace(pose, phase=phase * turn, shift=(new_shift.real, new_shift.imag))
@@ -326,10 +330,8 @@ def _sizes(views: list[_WindowReadings], sigma: float) -> tuple[float, float]:
         motion = _motion(readings)
         lies = np.linalg.lstsq(motion, readings.deviation, rcond=None)[0]
         residuals_m = readings.deviation - motion @ lies
-        total, free = (
-            total + float(np.sum(np.abs(residuals_m) ** 2)),
-            free + len(residuals_m) - FREE,
-        )
+        total = total + float(np.sum(np.abs(residuals_m) ** 2))
+        free = free + len(residuals_m) - FREE
     share = np.concatenate([1 / readings.count for readings in views]).mean()
     return sigma * float(np.sqrt(share)), float(np.sqrt(total / (2 * max(free, 1))))
 

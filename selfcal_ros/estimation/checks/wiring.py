@@ -166,10 +166,8 @@ def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResp
         return None
     limits = max(1 - BEYOND * u_scale, 0.0), 1 + BEYOND * u_scale
     p_of_axes = [_p_of_scale(motion, [(i, i)], limits) for i in range(2)]
-    axis, p = (
-        int(np.argmin(p_of_axes)),
-        min(*p_of_axes, _p_of_scale(motion, [(0, 0), (1, 1)], limits)),
-    )
+    axis = int(np.argmin(p_of_axes))
+    p = min(*p_of_axes, _p_of_scale(motion, [(0, 0), (1, 1)], limits))
     return (
         replace(_response(motion, (axis, axis), AXES["grid"]), p=6 * p)
         if (6 * p < F_LEVEL)
@@ -220,11 +218,13 @@ def _wrong(
 ) -> tuple[OffsetResponse, ...]:
     """Return the offsets that follow the stage wrongly; none if in doubt."""
     limits = HALVED, DOUBLED
-    n, least = len(axes), LEAST_NOISE_M**2 * motion.dof
+    n = len(axes)
+    least = LEAST_NOISE_M**2 * motion.dof
     has_moved = np.diag(motion.products) > np.repeat([least, 0.0], n)
     if not has_moved[:n].any() or not has_moved[n:].any():
         return ()
-    wiring, out = _wiring(motion, level), []
+    wiring = _wiring(motion, level)
+    out = []
     for j in range(n):
         i = int(np.abs(wiring[j]).argmax())
         if not (has_moved[i] and has_moved[n + j]) or motion.products[i, n + j] * wiring[j, i] >= 0:
@@ -270,7 +270,8 @@ def _p_for(motion: RepeatMotion, wiring: np.ndarray, alternative: np.ndarray) ->
     size2 = np.trace(motion.products[:n, :n] @ change.T @ motion.products[n:, n:] @ change)
     if not size2 > 0:
         return 1.0
-    evidence, rank = np.trace(motion.products[:n, n:] @ change), int(np.linalg.matrix_rank(change))
+    evidence = np.trace(motion.products[:n, n:] @ change)
+    rank = int(np.linalg.matrix_rank(change))
     return _p_of(float(evidence / np.sqrt(rank * size2)), rank * (motion.dof - 1) + 1)
 
 
@@ -283,7 +284,8 @@ def _p_of_scale(
     the position: o - s p correlates with p if even the smallest scale is beyond s, s p - o with o
     if even the largest is below it.
     """
-    n, (least, most) = len(motion.products) // 2, limits
+    n = len(motion.products) // 2
+    least, most = limits
     summed = np.zeros((2, 2))
     for i, j in pairs:
         of_pair = motion.products[np.ix_([i, n + j], [i, n + j])]
@@ -317,8 +319,10 @@ def _p_of(correlation: float, dof: int) -> float:
 
 def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) -> OffsetResponse:
     """Return the response of offset j to axis i, `at` = (i, j)."""
-    (i, j), n = at, len(axes)
-    place, offset = motion.products[i, i], motion.products[n + j, n + j]
+    i, j = at
+    n = len(axes)
+    place = motion.products[i, i]
+    offset = motion.products[n + j, n + j]
     cross = float(motion.products[i, n + j])
     r2 = min(cross**2 / (place * offset), 1.0)
     return OffsetResponse(
@@ -391,7 +395,8 @@ class Turned:
     what: str
 
 
-TURN, MIRROR = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([-1.0, 1.0])
+TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
+MIRROR = np.diag([-1.0, 1.0])
 AS_IS = Turned(np.eye(2), 1, "the offsets are as they are published")
 OTHER_LINES = Turned(
     np.eye(2), -1, "offset_theta has the other sign, or the offsets are turned by 180°"

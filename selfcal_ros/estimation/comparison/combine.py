@@ -470,10 +470,8 @@ def _p_between(
     families: list[_Family], runs: list[RunValues], covariances: list[np.ndarray]
 ) -> float:
     """Return the probability of the scatter between runs by chance: the worst, Bonferroni."""
-    dof, total = (
-        _noise_dof(runs, covariances, np.ones(len(runs))),
-        _sum(covariances, np.ones(len(covariances))),
-    )
+    dof = _noise_dof(runs, covariances, np.ones(len(runs)))
+    total = _sum(covariances, np.ones(len(covariances)))
     probabilities = []
     for family in families:
         k = len(runs) - 1
@@ -754,7 +752,8 @@ def _same_recording(first: CalibrationResult, second: CalibrationResult) -> bool
 
 def _run(member: Member, kind: str, known_places: np.ndarray, *, keep_scale: bool) -> RunValues:
     values, u = (of[:, known_places].ravel() for of in member.error_map.of(kind))
-    result, factors = member.result, np.zeros((0, len(values)))
+    result = member.result
+    factors = np.zeros((0, len(values)))
     if result is None:
         return RunValues(values, u**2, np.zeros(len(u)), False, np.inf)
     covariance = covariance_of(result, kind, known_places)
@@ -818,11 +817,13 @@ def _result(
     common: Mapping[str, np.ndarray],
 ) -> CalibrationResult:
     """Return the means as a result: of ``xy``, and ``theta`` if it is known, by their places."""
-    plate, known_sites = first.plate, common["xy"]
+    plate = first.plate
+    known_sites = common["xy"]
     shapes = {"xy": (2, *known_sites.shape), "theta": (1, len(common["theta"]))}
     maps = {kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()}
     u = {kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()}
-    dof, k = dict.fromkeys(KINDS, np.nan), dict.fromkeys(KINDS, 2.0)
+    dof = dict.fromkeys(KINDS, np.nan)
+    k = dict.fromkeys(KINDS, 2.0)
     for kind, mean in means.items():
         for out, values in ((maps[kind], mean.values), (u[kind], mean.u)):
             out[:, common[kind]] = values.reshape(len(out), -1)
@@ -842,7 +843,8 @@ def _result(
         r,
         ThetaDatum.ZERO_MEAN,
     )
-    unknown, unknowns = np.full(plate.shape, np.nan), 2 * int(known_sites.sum())
+    unknown = np.full(plate.shape, np.nan)
+    unknowns = 2 * int(known_sites.sum())
     runs = [member.result for member in members]
     result = CalibrationResult(
         "+".join(dict.fromkeys(run.plan_id for run in runs if run)),
@@ -931,7 +933,9 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
     failed = []
     for kind, mean in means.items():
         if mean.p_between < USUAL_LEVEL:
-            u, name, unit = np.sqrt(mean.between), BETWEEN + SUFFIX[kind], KINDS[kind]
+            u = np.sqrt(mean.between)
+            name = BETWEEN + SUFFIX[kind]
+            unit = KINDS[kind]
             enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)
             failed.append(
                 Finding(

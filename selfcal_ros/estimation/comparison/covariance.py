@@ -144,7 +144,8 @@ def first_order_u(result: CalibrationResult) -> tuple[float, float]:
         if factors is None or factors.lacks_terms:
             return unknown
         shear = factors.system.gauge.shear
-        saved, row = factors_of(result), turned_over(result.sense, shear).conj()
+        saved = factors_of(result)
+        row = turned_over(result.sense, shear).conj()
         common = _complex(saved.of_map[~saved.of_each_place])
         of_terms = np.real(np.tensordot(common, row, axes=((1, 2), (1, 2))))
         added = result.kept.added
@@ -193,7 +194,8 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
     artifact = result.plate
     grid, lines = [], []
     for index, v in enumerate(result.views):
-        in_grid, of_grid = _is_read(v.read_grid), f"view '{v.name}', read.grid"
+        in_grid = _is_read(v.read_grid)
+        of_grid = f"view '{v.name}', read.grid"
         view = View(
             v.name,
             v.rotation,
@@ -434,9 +436,12 @@ class Together:
 
     def _factors(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
         """Return the effect of terms and causes on G, A and the microscope, (r, q)."""
-        plate, stage = self._saved_factors("plate", (2, *marks.shape)), self._saved.of_map
-        effects, n_of_stage = len(self._effects), 2 * int(sites.sum())
-        n, r = len(stage) - effects, len(plate)
+        plate = self._saved_factors("plate", (2, *marks.shape))
+        stage = self._saved.of_map
+        effects = len(self._effects)
+        n_of_stage = 2 * int(sites.sum())
+        n = len(stage) - effects
+        r = len(plate)
         maps = np.zeros((r + effects, n_of_stage + 2 * int(marks.sum()) + 4))
         of_stage = stage[:, :, sites].reshape(len(stage), n_of_stage)
         maps[:n, :n_of_stage], maps[r:, :n_of_stage] = of_stage[:n], of_stage[n:]
@@ -455,7 +460,8 @@ class Together:
             Of the known ones.
         """
         s, m = 2 * int(sites.sum()), 2 * int(marks.sum())
-        rows_g, rows_a = self.stage_rows(sites), unit_rows(marks)
+        rows_g = self.stage_rows(sites)
+        rows_a = unit_rows(marks)
         exact = np.zeros((s + m + 4, s + m + 4))
         exact[:-4, :-4] = self.of_noise(
             np.concatenate([rows_g, np.zeros((m, *rows_g.shape[1:]))]),
@@ -478,7 +484,8 @@ class Together:
     @cached_property
     def _ratio(self) -> float:
         """Variance of the stage's map over that of white noise and terms."""
-        emap, sites = self.result.error_map, self.sites
+        emap = self.result.error_map
+        sites = self.sites
         white = np.trace(self.of_noise(self.stage_rows(sites)))
         factors = self._saved.of_map[..., sites]
         white += (factors**2).sum()
@@ -490,7 +497,8 @@ class Together:
     @cached_property
     def _ratio_of_plate(self) -> float:
         """The same for the plate's map, on which noise of images acts differently."""
-        plate, marks = self.result.artifact_map, self.marks
+        plate = self.result.artifact_map
+        marks = self.marks
         rows = unit_rows(marks)
         white = np.trace(self.of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
         white += (self._saved_factors("plate", (2, *marks.shape))[..., marks] ** 2).sum()
@@ -503,7 +511,8 @@ class Together:
 
         (2 K, 2 K), the maps without their means over these lines; 0 elsewhere.
         """
-        result, angular = self.result, self.system.angular
+        result = self.result
+        angular = self.system.angular
         count, emap, plate = angular.n_lines, result.error_map, result.artifact_map
         known_lines = np.isfinite(
             np.stack([emap.g_theta + emap.u_g_theta, plate.a_theta + plate.u_a_theta])
@@ -514,7 +523,8 @@ class Together:
         for map_number, of_map in enumerate(known_lines):
             rows = map_number * count + np.flatnonzero(of_map)
             centre[np.ix_(rows, rows)] = np.eye(len(rows)) - 1 / len(rows)
-        stage, noise = lines_turned_over(result.sense, centre[:, :count].T), result.noise
+        stage = lines_turned_over(result.sense, centre[:, :count].T)
+        noise = result.noise
         cover = LinesCovariance(self.maps, (noise.sigma_xy, noise.sigma_theta)).of(
             stage, centre[:, count:].T
         )

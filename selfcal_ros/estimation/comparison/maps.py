@@ -112,7 +112,8 @@ class ReducedNoise:
 
         By the symmetric root of their correlation, which rounding does not turn as it turns axes.
         """
-        rng, (size, axes) = np.random.default_rng(0), self._axes
+        rng = np.random.default_rng(0)
+        size, axes = self._axes
         ratio = (axes * size) @ (axes.T @ rng.standard_normal((len(axes), DRAWS)))
         if self.dof > MANY_DOF:
             return ratio
@@ -145,7 +146,9 @@ def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | Non
     covariance, dof = spread.covariance, spread.dof
     if not np.isfinite(covariance).all() or not covariance.any():
         return None
-    ratio, varies, rank = values / spread.u, spread.varies, spread.rank
+    ratio = values / spread.u
+    varies = spread.varies
+    rank = spread.rank
     square = float(spread.squares(np.where(varies, ratio, 0.0)))
     p = of_square(square, rank, dof)
     largest = float(abs(ratio[varies]).max())
@@ -343,7 +346,8 @@ def _difference(
     if not known_places.any():
         return _Difference(out, np.full(columns.shape[1], np.nan), None)
 
-    values, size = (new - old)[:, known_places].ravel(), np.linalg.norm(columns, axis=0)
+    values = (new - old)[:, known_places].ravel()
+    size = np.linalg.norm(columns, axis=0)
     datum = np.linalg.lstsq(columns / size, values, rcond=None)[0] / size
     values = values - columns @ datum
     out[:, known_places] = values.reshape(len(out), -1)

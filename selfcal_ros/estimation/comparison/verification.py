@@ -217,7 +217,8 @@ class _Maps:
         What the map has of noise is in the correction as well: that part of the sum of products is
         taken off.
         """
-        columns, noise = self.columns, self.by_axis(variances(self.cover_before)).sum(axis=1)
+        columns = self.columns
+        noise = self.by_axis(variances(self.cover_before)).sum(axis=1)
         products = columns.T @ columns
         if np.linalg.matrix_rank(products) < len(products):
             return [(float("nan"), float("nan"))] * len(products)

@@ -79,7 +79,8 @@ def scale_of_plate(system: NormalEquations, reference: ReferenceLength) -> np.nd
     InputError
         If one of the two marks was not measured.
     """
-    z, known_marks = system.grid.views.z, system.known_marks
+    z = system.grid.views.z
+    known_marks = system.known_marks
     if reference.marks is None:
         return Gauge(z, known_marks, scale=True).dual(3)
     first, second = (system.grid.views.index_of(*mark) for mark in reference.marks)
@@ -90,14 +91,16 @@ def scale_of_plate(system: NormalEquations, reference: ReferenceLength) -> np.nd
                 f"the mark {mark} was not measured",
                 "measure it, or take another reference",
             )
-    apart, row = z[second] - z[first], np.zeros(z.shape, dtype=complex)
+    apart = z[second] - z[first]
+    row = np.zeros(z.shape, dtype=complex)
     row[second], row[first] = (sign * apart / abs(apart) ** 2 for sign in (1, -1))
     return row
 
 
 def _slope(system: NormalEquations, kind: ReferenceKind) -> np.ndarray:
     """Return the row of the slope of Gx on x, or Gy on y, over the known sites, (sites,)."""
-    z, known_sites = system.grid.views.z_sites, system.known_sites
+    z = system.grid.views.z_sites
+    known_sites = system.known_sites
     along, unit = (z.real, 1) if kind is ReferenceKind.STAGE_X else (z.imag, 1j)
     centred = np.where(known_sites, along - along[known_sites].mean(), 0.0)
     return (unit * centred / (centred**2).sum()).ravel()
@@ -213,7 +216,8 @@ class MapsCovariance:
         The covariance of the part that is of sites and marks alone, (k, k), and the factors of
         the misalignments, (3 views, k), and of the terms, (p, k).
         """
-        grid, of_terms = self.system.grid, self._of_terms(g, a)
+        grid = self.system.grid
+        of_terms = self._of_terms(g, a)
         cov = np.real(a.conj().T @ (grid.noise_of_means[:, None] * a))
         g, misalignments = grid.functionals(g, a)
         cov += np.real(g.conj().T @ grid.solve(g))
@@ -224,7 +228,8 @@ class MapsCovariance:
 
         Complex (k, views, nx, ny).
         """
-        grid, terms = self.system.grid, self.terms
+        grid = self.system.grid
+        terms = self.terms
         g, a, _ = self._functionals(sites, marks)
         field, parameters, of_coefficients = self._solved(g, a)
         maps = (field - terms.fields @ of_coefficients).T.reshape(-1, *grid.views.shape)
@@ -286,8 +291,10 @@ class MapsCovariance:
 
         And the share of the reference's length in each, (k,).
         """
-        count, views = len(sites), self.system.grid.views
-        g, grown = sites.reshape(count, -1).T, np.zeros(count)
+        count = len(sites)
+        views = self.system.grid.views
+        g = sites.reshape(count, -1).T
+        grown = np.zeros(count)
         a = np.zeros((views.z.size, count)) if marks is None else marks.reshape(count, -1).T
         if self._scale is not None:
             grown = np.real(views.z_sites.reshape(-1).conj() @ g - views.z.reshape(-1).conj() @ a)
@@ -308,17 +315,21 @@ class MapsCovariance:
         The map is the free one plus each field (places, k) times its functional of the free maps,
         (sites, k) and (marks, k).
         """
-        system, views = self.system, self.system.grid.views
+        system = self.system
+        views = self.system.grid.views
         if plate:
-            z, basis = views.z.reshape(-1), system.plate_gauge.orthonormal
+            z = views.z.reshape(-1)
+            basis = system.plate_gauge.orthonormal
             fields = np.column_stack([-basis, system.plate_gauge.without(z)])
             g = np.column_stack(
                 [np.zeros((views.z_sites.size, basis.shape[1])), system.gauge.dual(3).reshape(-1)]
             )
             a = np.column_stack([basis, np.zeros(len(z))])
         else:
-            z, g = -views.z_sites.reshape(-1), system.gauge.orthonormal
-            fields, a = -g, np.zeros((views.z.size, g.shape[1]))
+            z = -views.z_sites.reshape(-1)
+            g = system.gauge.orthonormal
+            fields = -g
+            a = np.zeros((views.z.size, g.shape[1]))
         if self._scale is not None:
             fields, g, a = (
                 np.column_stack(pair)
@@ -331,20 +342,25 @@ class MapsCovariance:
 
         With sites (sites, k) and misalignments (3 views, k), each without terms, and terms (p, k).
         """
-        grid, of_coefficients = self.system.grid, -self.terms.covariance @ self._of_terms(g, a)
+        grid = self.system.grid
+        of_coefficients = -self.terms.covariance @ self._of_terms(g, a)
         g, misalignments = grid.functionals(g, a)
         parameters = self._p @ misalignments
         return grid.solve(g) - grid.response @ parameters, parameters, of_coefficients
 
     def _of_map(self, *, plate: bool) -> np.ndarray:
         """Return the variances of a map in its datum, (2, places), but for the reference's own."""
-        grid, (fields, g, a) = self.system.grid, self._datum(plate=plate)
+        grid = self.system.grid
+        fields, g, a = self._datum(plate=plate)
         field, parameters, of_coefficients = self._solved(g, a)
-        own_variance, answer, of_terms = grid.variance_of_sites, grid.response, self.terms.fields
+        own_variance = grid.variance_of_sites
+        answer = grid.response
+        of_terms = self.terms.fields
         if plate:
             noise = grid.noise_of_means
             field = self._plates(field, parameters) + noise[:, None] * a
-            own_variance, of_terms = noise + grid.variance_of_means, self.terms.plates
+            own_variance = noise + grid.variance_of_means
+            of_terms = self.terms.plates
             answer = self._plates(-answer, np.eye(len(self._p)))
         return in_datum(
             own_variance,
@@ -415,7 +431,8 @@ def conditions_for(
     InputError
         For ``xy_axes`` if a half axis has no sites or no line, or is not completely determined.
     """
-    known_lines, n_lines = system.known_lines, system.angular.n_lines
+    known_lines = system.known_lines
+    n_lines = system.angular.n_lines
     if datum is ThetaDatum.XY_AXES and system.angular.n_views:
         if n_lines % 4:
             raise InputError(
@@ -479,7 +496,8 @@ def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndar
     response = angular.response[:, free]
     spread = angular.solve(rows.T)
     spread = spread + response @ (inverse @ (response.T @ rows.T))
-    n, ones = len(rows), rows.sum(axis=1)
+    n = len(rows)
+    ones = rows.sum(axis=1)
     border = np.zeros((n + 1, n + 1))
     border[:n, :n] = rows @ spread
     border[:n, n] = border[n, :n] = ones
@@ -537,7 +555,8 @@ class LinesCovariance:
     @cached_property
     def terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Free angular maps of stage and plate for a unit of each coefficient, (K, p)."""
-        terms, field = self.cover.terms, -self.cover.terms.turned
+        terms = self.cover.terms
+        field = -self.cover.terms.turned
         phi = terms.parameters[self.system.phi_at] / self.cover.length
         return field, self.angular.plate(terms.lines, field.T, phi.T)[0].T
 
@@ -545,7 +564,9 @@ class LinesCovariance:
         """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure."""
         rows = conditions.rows.T
         misclosure = -rows, np.zeros(rows.shape), self.cover.functionals(conditions.slopes)
-        closure, y, n = self.of(*misclosure), self.angular.response, self.angular.n_lines
+        closure = self.of(*misclosure)
+        y = self.angular.response
+        n = self.angular.n_lines
         inverse = np.concatenate(
             [
                 self.angular.solve(np.eye(n, len(block), -block[0]))[block, block - block[0]]
@@ -569,7 +590,9 @@ class LinesCovariance:
 
         The rotations of the views are those for which neither stage nor plate is turned.
         """
-        system, angular, count = self.system, self.angular, self.angular.n_lines
+        system = self.system
+        angular = self.angular
+        count = self.angular.n_lines
         of_sites, of_marks = (
             -gauge.dual(2).reshape(-1, 1) / self.cover.length
             for gauge in (system.gauge, system.plate_gauge)
@@ -666,7 +689,8 @@ def lines_alone(system: NormalEquations) -> LinesCovariance:
 
     The grid determines them thousands of times better than the lines.
     """
-    angular, inverse = system.angular, np.zeros((system.size, system.size))
+    angular = system.angular
+    inverse = np.zeros((system.size, system.size))
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
     at = system.phi_at[free]
     inverse[np.ix_(at, at)] = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)

@@ -61,7 +61,8 @@ class Distortion:
         """Return the error at published offsets, complex, m: that at the true ones."""
         error = np.zeros_like(offset)
         for _ in range(MAX_STEPS):
-            before, error = error, _terms(offset - error, self.powers) @ self.coefficients
+            before = error
+            error = _terms(offset - error, self.powers) @ self.coefficients
             if np.array_equal(error, before):
                 break
         return error
@@ -153,7 +154,8 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
     images = model.problem.images
     if images is None:
         return None
-    problem, grid = model.problem, model.problem.system.grid
+    problem = model.problem
+    grid = model.problem.system.grid
     readings = [measurements.views[index] for index in problem.grid.index]
     image = readings[0].view.image
     if image is None or min(image.nx, image.ny) < 3:
@@ -174,7 +176,8 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
     if layout is None:
         return None
     cells, rows, errors = layout
-    error_of_cell, drawn = errors(offsets(model.fitted.parameters)), errors(drawn)
+    error_of_cell = errors(offsets(model.fitted.parameters))
+    drawn = errors(drawn)
     samples = noises.mark * drawn[:, 0] + noises.image * drawn[:, 1]
     published = np.array(
         [_place([readings[row] for row in column[column >= 0]]) for column in rows.T]
@@ -263,7 +266,8 @@ def _polynomial(
         added = (wider @ error)[len(powers) + 1 :]
         drawn = (samples @ wider.T)[:, len(powers) + 1 :]
         drawn_parts = np.concatenate([drawn.real, drawn.imag], axis=1)
-        value, (k, n) = np.concatenate([added.real, added.imag]), drawn_parts.shape
+        value = np.concatenate([added.real, added.imag])
+        k, n = drawn_parts.shape
         squares = value @ np.linalg.solve(drawn_parts.T @ drawn_parts / k, value)
         if fdtrc(n, k - n, squares * (k - n) / (n * (k - 1))) < F_LEVEL:
             powers, fit = wider_powers, wider
@@ -435,7 +439,8 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     rows_of_yaw = rows[free.rows([name])]
     if np.linalg.matrix_rank(free.undetermined(free.free)[rows], tol=TRACE) > 1:
         return None
-    noise, coefficients = model.fitted.xy, model.coefficients
+    noise = model.fitted.xy
+    coefficients = model.coefficients
     now = score(
         free,
         model.fitted.both_residuals,
@@ -449,7 +454,8 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     centred = np.eye(int(rows.sum())) - 1 / rows.sum()
     to_map = centred @ inverse[rows]
     share = images.noises(model.fitted.residuals).share
-    grid, fit = free.system.grid, free.projected
+    grid = free.system.grid
+    fit = free.projected
     sensitivities = grid.plate(
         np.tensordot(to_map, free.columns.grid, axes=1),
         (to_map @ fit.fields.T).reshape(-1, *grid.views.shape),
@@ -457,7 +463,8 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     )[1]
     covariance = to_map[:, rows] @ centred + share * images.added_covariance(sensitivities)
     covariance *= noise.sigma**2
-    yaw_rad, n = centred @ values[rows], len(centred) - 1
+    yaw_rad = centred @ values[rows]
+    n = len(centred) - 1
     statistic = yaw_rad @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw_rad
     x, y = (
         sense.sign * axis.ravel()[rows_of_yaw]  # (1.6) and its rotations

@@ -136,7 +136,8 @@ class ImageNoise:
 
     def noises(self, residual: np.ndarray) -> TwoNoises:
         """Return the noises that residuals (views, nx, ny) show."""
-        expected, sums = self.drawn.mean(axis=0), self.sums(residual)
+        expected = self.drawn.mean(axis=0)
+        sums = self.sums(residual)
         from_sums = np.linalg.inv(expected[:, :2])
         variances = from_sums @ sums
         if variances.min() < 0:  # one of the two alone

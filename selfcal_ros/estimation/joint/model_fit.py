@@ -153,8 +153,10 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
         check(state.equations)
     if not (problem.rigid or problem.terms or problem.moves):
         return state.finished()
-    before, peak = np.inf, float(np.abs(problem.grid.y).max())
-    smallest, found_at = np.inf, 0
+    before = np.inf
+    peak = float(np.abs(problem.grid.y).max())
+    smallest = np.inf
+    found_at = 0
     for number in range(MAX_STEPS):
         change = state.step()
         largest = max(float(np.abs(state.fitted.parameters).max()), problem.largest_turn_m)
@@ -247,7 +249,8 @@ class _State:
 
     def _stale(self, equations: TermEquations) -> bool:
         """Return whether the weights of angular readings differ from those in the equations."""
-        now, then = self.fitted.inverse, self.weights
+        now = self.fitted.inverse
+        then = self.weights
         if len(equations.columns.lines.at) and (
             abs(self.fitted.ratio - self.ratio) > NEGLIGIBLE * self.ratio
         ):
@@ -261,7 +264,9 @@ class _State:
         on them: all rotations together, that of a view of lines alone. What is taken off the
         readings may where the misalignments take it up; not so what places of the stage change.
         """
-        parameters, y, coefficients = self.fitted.parameters, self.y, self.coefficients
+        parameters = self.fitted.parameters
+        y = self.y
+        coefficients = self.coefficients
         if self.equations is not None:
             self._refresh(self.equations)
         self.steps += 1
@@ -431,7 +436,8 @@ def _of_lines(
     """
     if not fitted.ratio > 0:
         return 0.0, 0.0
-    system, angular = problem.system, problem.system.angular
+    system = problem.system
+    angular = problem.system.angular
     columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)
     weight = equations.line_weight * angular.weight
     rotations = fitted.ratio * fitted.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
@@ -484,7 +490,8 @@ def is_untested(problem: Problem) -> bool:
     system = placed(problem)
     if system is None or is_too_large(system):
         return system is not None
-    views, n_left = system.grid.views, equations_left(system.grid)
+    views = system.grid.views
+    n_left = equations_left(system.grid)
     if views.spline.axes[0].degree == 1 or n_left > 2 * math.prod(views.spline.refined.shape):
         return False
     fine = PlacedSystem(views.artifact, views.poses, system.grid.weight, views.spline.refined)
@@ -524,7 +531,8 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
 
     None on the lattice, or if the readings leave no noise by which to weight the terms.
     """
-    problem, system = model.problem, placed(model.problem)
+    problem = model.problem
+    system = placed(model.problem)
     if system is None:
         return None
     grid = system.grid
@@ -663,5 +671,6 @@ def _tests_of(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ..
         coefficients=model.coefficients,
     )
     right = scored.total + equations.information @ model.coefficients
-    noise, excess = model.fitted.xy, noise_excess(model.problem, model.fitted.residuals)
+    noise = model.fitted.xy
+    excess = noise_excess(model.problem, model.fitted.residuals)
     return size_tests(equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof))

@@ -27,7 +27,8 @@ def axis_contrast(model: ModelFit) -> float:
     By the repeats, or by the residuals if there are few. 0 unless the noises differ (F-test).
     """
     problem = model.problem
-    squares, dof = np.zeros(2), 0.0
+    squares = np.zeros(2)
+    dof = 0.0
     for _, visits, residuals in model.visits_about_means():
         if visits.repeated:
             residuals = residuals / visits.phase
@@ -123,7 +124,8 @@ def added_variances(
     shape, other_shape = (
         (views.plate_shape, views.shape) if plate else (views.shape, views.plate_shape)
     )
-    n, variances = shape[0] * shape[1], []
+    n = shape[0] * shape[1]
+    variances = []
     for start in range(0, n, BLOCK):
         unit = np.eye(min(BLOCK, n - start), n, start).reshape(-1, *shape)
         nothing = np.zeros((len(unit), *other_shape))
@@ -157,7 +159,8 @@ def time_correlation(model: ModelFit) -> np.ndarray:
     lags = int(PART * min((len(order) for _, _, order, _ in views), default=0))
     if lags < TESTED or not model.fitted.xy.sigma > FLOOR:
         return np.zeros(0)
-    products, number = np.zeros(lags + 1), 0
+    products = np.zeros(lags + 1)
+    number = 0
     for _, _, order, residuals in views:
         in_order = residuals[order]
         products += [

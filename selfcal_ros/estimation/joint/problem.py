@@ -295,7 +295,8 @@ class Problem:
         """
         if not self.rigid:
             return 0.0
-        grid, length = self.system.grid, self.half_width_m
+        grid = self.system.grid
+        length = self.half_width_m
         phi = parameters[: 3 * grid.n_views : 3, None, None] / length
         frame = np.expm1(-1j * self.turn_rad)[:, None, None]
         return rotation_excess(phi, grid.views.z * length, plate) + frame * stage
@@ -328,10 +329,8 @@ def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
     repeats = problem.repeats_xy
     if problem.images is not None and total > 0:  # of which residuals show only part
         n_taken = problem.images.dof_of_terms if problem.residuals_xy else 0
-        without_images, noises = (
-            sigma_of(total, grid_dof(problem) - n_taken),
-            problem.images.noises(residual),
-        )
+        without_images = sigma_of(total, grid_dof(problem) - n_taken)
+        noises = problem.images.noises(residual)
         residuals = residuals[0] * noises.sigma / without_images[0], min(noises.dof, residuals[1])
         repeats = repeats[0], repeats[1] / noises.excess(problem.images.marks)
     return noise_estimate(repeats, residuals, problem.grid.sigma_declared, floor=FLOOR)
@@ -476,7 +475,8 @@ def turned(problem: Problem) -> Problem:
     linear model would have the columns of the terms and that of the rotation apart by phi0, and
     what only phi0^2 determines, the scale of a microscope, with the wrong sign.
     """
-    grid, length = problem.system.grid, problem.half_width_m
+    grid = problem.system.grid
+    length = problem.half_width_m
     phi = own_rotations(grid, problem.grid.y) / length
     frame, bent = np.exp(-1j * phi), np.expm1(-1j * phi)
     marks = grid.views.z * length
@@ -566,11 +566,16 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     theta : AngularPart, optional
         `angular_part` of the problem, if several grid deviations are solved with it.
     """
-    system, grid, angular = problem.system, problem.system.grid, problem.system.angular
-    n, length = 3 * grid.n_views, problem.half_width_m
+    system = problem.system
+    grid = problem.system.grid
+    angular = problem.system.angular
+    n = 3 * grid.n_views
+    length = problem.half_width_m
     theta = theta or angular_part(problem)
     free, d = grid.reduced(y)
-    xy, inverse, ratio = None, system.grid_inverse, 0.0
+    xy = None
+    inverse = system.grid_inverse
+    ratio = 0.0
     parameters = inverse @ d
     field = (free - grid.response @ parameters).reshape(grid.views.shape)
     if system.angular.n_views:
@@ -590,7 +595,8 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
             across = np.vdot(scale_of_plate(system, problem.reference), plate).imag
             true = length * (1 + problem.reference.relative_error)
             grown += true - np.sqrt(max(true**2 - across**2, 0.0))
-        field, plate = field + grown * grid.views.z_sites, plate - grown * grid.views.z
+        field = field + grown * grid.views.z_sites
+        plate = plate - grown * grid.views.z
         parameters = parameters + grown * system.rigid[3]
     field, plate = grid.free_parts_small(field, plate)
     xy = xy or grid_noise(problem, residuals)
@@ -706,19 +712,23 @@ def noise_gain(problem: Problem, fitted: JointFit) -> np.ndarray:
     problem, fitted : Problem, JointFit
         A solution.
     """
-    places, grid = problem.places, problem.system.grid
+    places = problem.places
+    grid = problem.system.grid
     if places is None or not problem.moves or places.distance < FAR:
         return np.ones(grid.views.shape)
-    rng, sigma_m = np.random.default_rng(0), max(fitted.xy.sigma, np.finfo(float).tiny)
+    rng = np.random.default_rng(0)
+    sigma_m = max(fitted.xy.sigma, np.finfo(float).tiny)
     lines = angular_part(problem)
     still = replace(lines, free=0 * lines.free, d=0 * lines.d)
-    error_there, sums = places.errors(fitted.field), np.zeros((2, *grid.views.shape))
+    error_there = places.errors(fitted.field)
+    sums = np.zeros((2, *grid.views.shape))
     for _ in range(math.ceil(SAMPLES / grid.n_sites)):
         y = sigma_m * noise_of(rng, grid.weight.shape, grid.weight)
         plain = now = fit(problem, y, still).field
         for _ in range(MAX_STEPS):
             changes = places.changes(places.differences(now, error_there), problem.turn_rad)
-            before, now = now, fit(problem, y - changes, still).field
+            before = now
+            now = fit(problem, y - changes, still).field
             if np.abs(now - before).max() <= NEGLIGIBLE * np.abs(now).max():
                 break
         sums += np.stack([np.abs(now) ** 2, np.abs(plain) ** 2])

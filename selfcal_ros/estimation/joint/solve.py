@@ -183,14 +183,11 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
         for v in measurements.views
         if v.visits is not None and len(v.visits.stamp_ns)
     ]
-    views, at_visits = (
-        [],
-        {
-            row: (residuals + fitted.residuals[row].reshape(-1)[visits.mark])
-            * problem.to_stage[row]
-            for row, visits, residuals in model.visits_about_means()
-        },
-    )
+    views = []
+    at_visits = {
+        row: (residuals + fitted.residuals[row].reshape(-1)[visits.mark]) * problem.to_stage[row]
+        for row, visits, residuals in model.visits_about_means()
+    }
     for index, view in enumerate(measurements.views):
         entry: dict[str, Any] = {"view": view.view.name}
         if index in problem.grid.index:
@@ -259,7 +256,8 @@ def saved_terms(
     other_effects : dict of float array (p, ...), optional
         What a unit of each coefficient makes of other quantities, see `Factors`.
     """
-    shape, other_effects = cover.system.grid.views.shape, other_effects or {}
+    shape = cover.system.grid.views.shape
+    other_effects = other_effects or {}
     if cover.system.grid.n_sites > MAX_FULL:
         return None
     maps = cover.maps_of_terms()[0]
@@ -572,7 +570,8 @@ def weights_read(problem: Problem, index: int) -> dict[str, Any]:
     out: dict[str, Any] = {"read_grid": 0, "read_angular": 0}
     if index in problem.grid.index:
         row = problem.grid.index.index(index)
-        weight, field = problem.grid.weight[row], problem.system.grid.views.in_field[row]
+        weight = problem.grid.weight[row]
+        field = problem.system.grid.views.in_field[row]
         out["read_grid"] = _compact(weight, weight[field])
     if index in problem.angular.index:
         weight = problem.angular.weight[problem.angular.index.index(index)]
@@ -600,7 +599,8 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
     """Return the estimates of each term of the model; those not `declared` are assumed."""
     if model.equations is None:
         return ()
-    columns, covariance = model.equations.columns.columns, model.covariance
+    columns = model.equations.columns.columns
+    covariance = model.covariance
     determined = (
         np.abs(model.equations.undetermined(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
     )
@@ -650,7 +650,8 @@ def _error_map(
     problem, fitted = model.problem, model.fitted
     system, length = problem.system, problem.half_width_m
     u_x = u_y = np.full(system.grid.views.shape, np.nan)
-    u_theta, closure = np.full(system.angular.n_lines, np.nan), None
+    u_theta = np.full(system.angular.n_lines, np.nan)
+    closure = None
     kept_parts = Kept()
     if cover is not None:
         lines = LinesCovariance(cover, (fitted.xy.sigma, fitted.theta.sigma))
@@ -686,7 +687,8 @@ def _error_map(
     sense = measurements.sense
     field = turned_over(sense, field)
     u_x, u_y = (turned_over(sense, u, sign=1) for u in (u_x, u_y))
-    g_theta, u_theta = lines_turned_over(sense, g_theta), lines_turned_over(sense, u_theta, sign=1)
+    g_theta = lines_turned_over(sense, g_theta)
+    u_theta = lines_turned_over(sense, u_theta, sign=1)
     return (
         ErrorMap(
             measurements.artifact.field,
@@ -707,7 +709,8 @@ def _error_map(
 
 def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[str, np.ndarray]:
     """Return what a unit of each coefficient makes of the plate, the lines and the microscope."""
-    problem, columns = model.problem, cast(TermEquations, model.equations).columns
+    problem = model.problem
+    columns = cast(TermEquations, model.equations).columns
     system, length = problem.system, problem.half_width_m
     if system.grid.n_sites > MAX_FULL:
         return {}
@@ -745,7 +748,8 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
     plate = np.where(system.known_marks, fitted.plate, complex(np.nan, np.nan))
     unscaled = ReferenceLength(ReferenceKind.ARTIFACT, 0.0)
     scale = scale_of(system, unscaled, field=fitted.field, plate=fitted.plate, half_width_m=length)
-    u, sigma = float("nan"), fitted.xy.sigma
+    u = float("nan")
+    sigma = fitted.xy.sigma
     u_x = u_y = np.full(plate.shape, np.nan)
     u_theta = np.full(system.angular.n_lines, np.nan)
     if cover is not None:

@@ -122,10 +122,8 @@ def free_turns(
     components_read : Components
         The components of these readings.
     """
-    of_site, of_mark = (
-        np.zeros(len(components_read.of_site), dtype=int),
-        np.zeros(len(components_read.of_mark), int),
-    )
+    of_site = np.zeros(len(components_read.of_site), dtype=int)
+    of_mark = np.zeros(len(components_read.of_mark), int)
     free = components_read.balanced[components_read.of_site[site]]
     if not free.any():
         return of_site, of_mark
@@ -205,7 +203,8 @@ class Gauge:
 
     def remove(self, field: np.ndarray, modes: np.ndarray) -> np.ndarray:
         """Return `field` minus the modes with coefficients `modes`."""
-        shift, slope = complex(modes[0], modes[1]), complex(0.0, modes[2])
+        shift = complex(modes[0], modes[1])
+        slope = complex(0.0, modes[2])
         if self.scale:
             slope += modes[3]
         return field - shift - slope * self.z

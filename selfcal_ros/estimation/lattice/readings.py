@@ -29,7 +29,8 @@ def pose_of(view: View, artifact: Artifact) -> AnyPose:
 
 def in_field(view: View, artifact: Artifact) -> np.ndarray:
     """Return the marks of a view that lie in the field, bool (nx, ny)."""
-    pose, places = pose_of(view, artifact), artifact.places(artifact.m, artifact.n)
+    pose = pose_of(view, artifact)
+    places = artifact.places(artifact.m, artifact.n)
     return ~pose.beyond_field(np.stack(pose.site_of(*places)), artifact)
 
 

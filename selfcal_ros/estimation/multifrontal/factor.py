@@ -93,14 +93,16 @@ def fold(
     pins : int array
         Sites whose diagonal is raised by the mean weight, because they are otherwise undetermined.
     """
-    n_sites, read = weight[0].size, (weight > 0).reshape(len(weight), -1)
+    n_sites = weight[0].size
+    read = (weight > 0).reshape(len(weight), -1)
     quadrant = _quadrants(views.shape)
     index = views.site_index.reshape(len(weight), -1)
     turns = np.array([pose.q for pose in views.poses])[:, None]
     gain = (quadrant[index] - quadrant - turns) % 4
     is_cut = np.zeros(n_sites, dtype=bool)
     is_cut[index[read & (gain != 0)]] = True
-    free, cut = np.flatnonzero(~is_cut), np.flatnonzero(is_cut)
+    free = np.flatnonzero(~is_cut)
+    cut = np.flatnonzero(is_cut)
     cut = cut[np.argsort(np.abs(views.z.ravel()[cut]), kind="stable")]
     place = np.empty(n_sites, dtype=np.int64)
     place[free], place[cut] = np.arange(len(free)), np.arange(len(cut))
@@ -149,7 +151,8 @@ def _entries(
     variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray, relative_weight: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and values of one triangle of R."""
-    rows, values = [np.arange(len(diagonal))], [diagonal]
+    rows = [np.arange(len(diagonal))]
+    values = [diagonal]
     columns = rows.copy()
     for i, j in combinations(range(len(weight)), 2):
         in_both = np.flatnonzero((weight[i] > 0) & (weight[j] > 0))
@@ -197,7 +200,8 @@ class Front:
 
     def blocks(self, storage: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return views of the blocks (own, own) and (b, own), by columns."""
-        n_own, middle = self.stop - self.start, self.offset + (self.stop - self.start) ** 2
+        n_own = self.stop - self.start
+        middle = self.offset + (self.stop - self.start) ** 2
         return (
             storage[self.offset : middle].reshape(n_own, n_own).T,
             storage[middle : self.offset + self.size].reshape(n_own, -1).T,
@@ -262,7 +266,8 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
     top = _cut(rows, np.stack([far, near]), max(reach, 1), pieces)
     order = np.concatenate([np.zeros(0, dtype=int), *(piece for piece, _ in pieces)])
 
-    n, size = len(order), folded.size
+    n = len(order)
+    size = folded.size
     position = np.arange(size)
     position[order] = np.arange(n)
     a, b = position[folded.rows], position[folded.columns]
@@ -295,7 +300,8 @@ def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> t
             later = np.concatenate([boundary, *(fronts[c].boundary for c in children)])
             boundary = np.unique(later[later >= stop])
         fronts.append(Front(start, stop, boundary, children, offset))
-        start, offset = stop, offset + fronts[-1].size
+        start = stop
+        offset = offset + fronts[-1].size
     return tuple(fronts)
 
 
@@ -333,7 +339,8 @@ def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tup
         axis = int(np.argmax(spans))
         if spans[axis] > 2 * reach:
             low = _best_cut(at[axis], reach)
-            left, right = at[axis] < low, at[axis] >= low + reach
+            left = at[axis] < low
+            right = at[axis] >= low + reach
             below = (
                 *_cut(sites[left], folded, reach, pieces),
                 *_cut(sites[right], folded, reach, pieces),
@@ -352,7 +359,8 @@ def _best_cut(at: np.ndarray, reach: int) -> int:
     counts = np.bincount(at - at.min())
     before = np.concatenate([[0], np.cumsum(counts)])
     starts = np.arange(1, len(counts) - reach)
-    left, right = before[starts], before[-1] - before[starts + reach]
+    left = before[starts]
+    right = before[-1] - before[starts + reach]
     return int(starts[np.argmin(np.maximum(left, right))] + at.min())
 
 
@@ -395,7 +403,8 @@ class Factor:
 
     def _close(self, updates: dict[int, np.ndarray]) -> np.ndarray:
         """Join the copies of the cut sites and invert the remainder, complex (cut, cut)."""
-        folded, remainder = self.folded, self.dissection.rest
+        folded = self.folded
+        remainder = self.dissection.rest
         for number in self.dissection.top:
             places = self.dissection.fronts[number].boundary - self._n_free
             _extend((remainder,), places, updates.pop(number))
@@ -470,11 +479,14 @@ class Factor:
         The sites of a mark are joined: all of them are in the front in which the first is
         eliminated.
         """
-        folded, fronts, n = self.folded, self.dissection.fronts, self._n_free
+        folded = self.folded
+        fronts = self.dissection.fronts
+        n = self._n_free
         sites = folded.free[self.dissection.order]
         place = np.arange(folded.size)
         place[self.dissection.order] = np.arange(n)
-        place, shares = place[folded.of_reading], folded.shares
+        place = place[folded.of_reading]
+        shares = folded.shares
         first = np.where(shares > 0, place, folded.size).min(axis=0)
         place = np.where(shares > 0, place, first)
         marks = np.argsort(first, kind="stable")
@@ -483,7 +495,8 @@ class Factor:
         def of_means(z: np.ndarray, mine: np.ndarray, at: np.ndarray) -> np.ndarray:
             return np.einsum("vk,wk,vwk->k", shares[:, mine], shares[:, mine], z[at[:, None], at])
 
-        of_sites, means = np.empty(len(folded.phase)), np.zeros(len(marks))
+        of_sites = np.empty(len(folded.phase))
+        means = np.zeros(len(marks))
         of_sites[folded.cut] = self._cut_inverse.diagonal().real
         copies = self._cut_inverse[folded.copy_of[:, None], folded.copy_of]
         copies = (folded.copy_phase[:, None] * copies * folded.copy_phase.conj()).real
@@ -507,7 +520,8 @@ class Factor:
     def _selected(self, number: int, z22: np.ndarray) -> np.ndarray:
         """Return the inverse over one front, given the inverse over its boundary."""
         lower, below = self._blocks[number]
-        inverse, weight = lower.T @ lower, lower.T @ below.T
+        inverse = lower.T @ lower
+        weight = lower.T @ below.T
         n_own = len(inverse)
         z = np.empty((n_own + len(z22),) * 2, order="F")
         z12 = weight @ z22
@@ -537,7 +551,8 @@ def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarr
     """
     n_own = len(blocks[0])
     inner = int(np.searchsorted(places, n_own))
-    first, last = slice(inner), slice(inner, len(places))
+    first = slice(inner)
+    last = slice(inner, len(places))
     to = {first: places[first], last: places[last] - n_own}
     for block, (rows, columns) in zip(
         blocks, ((first, first), (last, first), (last, last)), strict=False

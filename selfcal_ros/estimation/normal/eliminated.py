@@ -147,7 +147,8 @@ class PlateEliminated(ABC):
     def _coupling(self) -> tuple[np.ndarray, np.ndarray]:
         """Coupling of sites, (sites, p), and misalignments, (p, p), to the misalignments."""
         p = self.of_view * self.n_views
-        sites, block = np.zeros((self.n_sites, 0)), np.zeros((p, 0))
+        sites = np.zeros((self.n_sites, 0))
+        block = np.zeros((p, 0))
         for unit in np.eye(p).reshape(self.n_views, self.of_view, p):
             of_sites, of_views = self.adjoint(self.weight * self.centred(self.misaligned(unit)))
             sites, block = np.hstack([sites, of_sites]), np.hstack([block, of_views])

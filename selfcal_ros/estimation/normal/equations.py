@@ -272,7 +272,8 @@ class NormalEquations:
     def known_views(self) -> np.ndarray:
         """Misalignments determined up to the datum, bool (size,)."""
         is_known = np.ones(self.size, dtype=bool)
-        n, nothing = 3 * self.grid.n_views, np.zeros(self.grid.weight.shape)
+        n = 3 * self.grid.n_views
+        nothing = np.zeros(self.grid.weight.shape)
         for column in self.unseen.T:
             # an unseen mode may contain rigid parts: take it in the datum
             field = -(self.grid.response @ column[:n]).reshape(self.grid.views.shape)
@@ -528,7 +529,8 @@ class PlacedSystem(GridSystem):
     @cached_property
     def variance_of_means(self) -> np.ndarray:
         """Variance of the mean stage error at the sites of each mark, (marks,), likewise."""
-        views, rows = self.views, self._over_coefficients[1].tocsr()
+        views = self.views
+        rows = self._over_coefficients[1].tocsr()
         inverse = self.factor.inverse.reshape(self.n_sites, *views.shape)
         half = views.spline.coefficients(inverse).reshape(self.n_sites, -1)
         cover = views.spline.coefficients(half.conj().T.reshape(-1, *views.shape)).reshape(
@@ -591,8 +593,11 @@ class PlacedEquations(NormalEquations):
 
         `inverse` is the covariance of the misalignments, (size, size).
         """
-        n, rigid = 3 * self.grid.n_views, datum.orthonormal
-        factor, response, misalignments = self.grid.factor, self.grid.response, inverse[:n, :n]
+        n = 3 * self.grid.n_views
+        rigid = datum.orthonormal
+        factor = self.grid.factor
+        response = self.grid.response
+        misalignments = inverse[:n, :n]
         spread = factor.inverse @ rigid + response @ (
             misalignments @ np.real(response.conj().T @ rigid)
         )
@@ -614,7 +619,8 @@ class PlacedEquations(NormalEquations):
         views, n = self.grid.views, self.grid.n_sites
         if 2 * n > MAX_FULL:
             return super().loose_modes
-        inverse, response = self.grid.factor.inverse, self.grid.response
+        inverse = self.grid.factor.inverse
+        response = self.grid.response
         cover = np.block([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
         answer = np.concatenate([response.real, response.imag])
         cover += answer @ self.grid_inverse @ answer.T

@@ -121,7 +121,8 @@ class GridSystem(PlateEliminated):
 
     def covariance(self, matrix: np.ndarray, first: int, second: int) -> np.ndarray:
         """Return the covariances of the map at marks of one and another view, (nx, ny)."""
-        site, phase = np.maximum(self.views.site_index, 0), self.views.phases
+        site = np.maximum(self.views.site_index, 0)
+        phase = self.views.phases
         return phase[first].conj() * matrix[site[first], site[second]] * phase[second]
 
     def adjoint(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +139,8 @@ class GridSystem(PlateEliminated):
     def misaligned(self, parameters: np.ndarray) -> np.ndarray:
         """Return phi i z + tau at every mark, complex (..., views, nx, ny), from (..., 3 views)."""
         of_views = parameters.reshape(*parameters.shape[:-1], self.n_views, 3)
-        phi, tau = of_views[..., 0], of_views[..., 1] + 1j * of_views[..., 2]
+        phi = of_views[..., 0]
+        tau = of_views[..., 1] + 1j * of_views[..., 2]
         return phi[..., None, None] * self.shapes[0] + tau[..., None, None]
 
     def free_parts_small(
@@ -157,10 +159,12 @@ class GridSystem(PlateEliminated):
         components = self.components
         if not components.balanced.any():
             return field, plate
-        (at_site, at_mark), n = self.free_turns, len(components.balanced)
+        at_site, at_mark = self.free_turns
+        n = len(components.balanced)
         sites = np.flatnonzero((components.of_site >= 0) & components.balanced[components.of_site])
         marks = np.flatnonzero((components.of_mark >= 0) & components.balanced[components.of_mark])
-        component, unit = components.of_mark[marks], PHASES[at_mark[marks]]
+        component = components.of_mark[marks]
+        unit = PHASES[at_mark[marks]]
         back = unit.conj() * plate.ravel()[marks]
         mean = np.bincount(component, back.real, n) + 1j * np.bincount(component, back.imag, n)
         mean /= np.maximum(np.bincount(component, minlength=n), 1)

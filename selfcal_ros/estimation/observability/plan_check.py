@@ -383,5 +383,6 @@ def unused_name(name: str, views: Iterable[View]) -> str:
     tail = 2
     out = name
     while out in names:
-        out, tail = f"{name}_{tail}", tail + 1
+        out = f"{name}_{tail}"
+        tail = tail + 1
     return out

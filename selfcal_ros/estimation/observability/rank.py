@@ -238,7 +238,8 @@ def _nodes_known(system: NormalEquations) -> bool:
 def _placed_observability(
     system: NormalEquations, artifact: Artifact, views: tuple[View, ...]
 ) -> Observability:
-    n_known, grid = int(system.known_sites.sum()), system.grid
+    n_known = int(system.known_sites.sum())
+    grid = system.grid
     if _nodes_known(system):
         n_determined = 2 * (n_known + int(system.known_marks.sum())) + grid.n_misalignments
         return Observability(n_determined, n_determined, 0, True)
@@ -297,7 +298,8 @@ def add_views(artifact: Artifact, *views: View, name: str = "add_views") -> Find
 
 def _usual_views(artifact: Artifact) -> tuple[View, View, View]:
     """Return a quarter turn, on the lattice, and a shift by one pitch along X and along Y."""
-    pitch, quarter_shift_m = artifact.grid_pitch_m, artifact.quarter_shift * artifact.grid_pitch_m
+    pitch = artifact.grid_pitch_m
+    quarter_shift_m = artifact.quarter_shift * artifact.grid_pitch_m
     lines = artifact.angular_count > 0
     turned = lines and artifact.angular_count % 4 == 0
     return (
@@ -332,7 +334,8 @@ def _missing_lines(artifact: Artifact, turns: list[float]) -> list[View]:
 
 def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
     """Return the turn, in whole degrees, of the further view that adds most to a Fourier map."""
-    of_turns, number = np.exp(1j * np.outer(turns_rad, np.arange(1, harmonics + 1))), len(turns_rad)
+    of_turns = np.exp(1j * np.outer(turns_rad, np.arange(1, harmonics + 1)))
+    number = len(turns_rad)
     turns_deg = np.arange(1, 180)
     more = of_turns.sum(axis=0) + np.exp(
         1j * np.outer(np.radians(turns_deg), np.arange(1, harmonics + 1))
@@ -474,7 +477,8 @@ def _angular_families(angular: AngularSystem) -> Iterator[Finding]:
             )
         return
     components = angular.components
-    n, lines = len(components.balanced), np.arange(len(components.of_site))
+    n = len(components.balanced)
+    lines = np.arange(len(components.of_site))
     if n > 1 and np.array_equal(components.of_site, components.of_site[lines % n]):
         yield Finding("periodic_lines", details={"period": n, "of": len(lines)})
     elif n > 1:
@@ -497,7 +501,8 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
     views : iterable of View
         Views of grid marks.
     """
-    square, listed = artifact.shape[0] == artifact.shape[1], artifact.marks is not None
+    square = artifact.shape[0] == artifact.shape[1]
+    listed = artifact.marks is not None
     forms_of_views = []
     for view in views:
         turn = round(view.pose.turn_rad / (math.pi / 2), 9) % 4

@@ -200,7 +200,8 @@ class PlannedTerms:
 
     def _effect(self, name: str, size: float) -> tuple[float, float]:
         """Return rms and largest effect of the term on the map."""
-        all_terms, term = self.all_terms, self.all_terms.rows([name])
+        all_terms = self.all_terms
+        term = self.all_terms.rows([name])
         model, explained, _ = self._remainder(name, self._other_terms(name), self.assumed.sigma_m)
         fields = all_terms.maps[:, term] - all_terms.maps[:, model] @ explained
         known_sites = all_terms.system.known_sites.ravel()
@@ -224,7 +225,8 @@ class PlannedTerms:
         )
         if rank == 0 or dof <= 0:
             return 0.0
-        rng, ratio = np.random.default_rng(1), (size / self.assumed.sigma_m) ** 2
+        rng = np.random.default_rng(1)
+        ratio = (size / self.assumed.sigma_m) ** 2
         explained = rng.chisquare(1, (DRAWS, rank)) @ (1 + ratio * values)
         noise = rng.chisquare(dof, DRAWS) / dof
         return float(np.mean(explained / rank / noise > fdtri(rank, dof, 1 - level)))
@@ -236,18 +238,18 @@ class PlannedTerms:
 
         The latter (o, t), and the information that is left on the term, (t, t).
         """
-        all_terms, term = self.all_terms, self.all_terms.rows([name])
-        of_others, columns = (
-            with_terms(all_terms, other_terms),
-            rows_of(all_terms.columns, other_terms),
-        )
+        all_terms = self.all_terms
+        term = self.all_terms.rows([name])
+        of_others = with_terms(all_terms, other_terms)
+        columns = rows_of(all_terms.columns, other_terms)
         cross = all_terms.information[np.ix_(columns, term)]
         explained = of_others.inverse(sigma_m) @ of_others.unbiased_sums(cross)
         return columns, explained, all_terms.information[np.ix_(term, term)] - cross.T @ explained
 
     def _information(self, name: str, other_terms: Sequence[ModelTerm]) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term given others, and its rank."""
-        all_terms, term = self.all_terms, self.all_terms.rows([name])
+        all_terms = self.all_terms
+        term = self.all_terms.rows([name])
         information = self._remainder(name, other_terms, 0.0)[2]
         norm = all_terms.norm[term]
         scaled = np.linalg.eigvalsh(information / np.outer(norm, norm))

@@ -370,7 +370,8 @@ def best_plan(
     finalists = finalists[: max(FINALISTS, min(ties, MAX_TIES) if angular else 0)]
     scores = [score_plan(with_lines(chosen), datum, against=against) for chosen in finalists]
     best = min(range(len(scores)), key=lambda at: scores[at].key(criterion))
-    plan, least = with_lines(finalists[best]), scores[best]
+    plan = with_lines(finalists[best])
+    least = scores[best]
     if artifact.map_grid:
         views = _moved_off_the_lattice(
             plan.views,
@@ -388,7 +389,8 @@ def _anywhere(
     plan: Plan, steps: list[Step], key: Callable[[tuple[View, ...]], tuple[float, ...]]
 ) -> list[Step]:
     """Return the best further view at any pose, unless it is one of `steps` on the lattice."""
-    pitch_m, added = plan.artifact.grid_pitch_m, steps[0].views[-1]
+    pitch_m = plan.artifact.grid_pitch_m
+    added = steps[0].views[-1]
 
     def views(pose: Pose) -> tuple[View, ...]:
         view = view_at(added, pose, pitch_m)
@@ -409,7 +411,9 @@ def _moved_off_the_lattice(
 
     The first view remains: it is the frame of the others.
     """
-    now, before, pitch_m = views, None, artifact.grid_pitch_m
+    now = views
+    before = None
+    pitch_m = artifact.grid_pitch_m
 
     def instead(views: tuple[View, ...], at: int, pose: Pose) -> tuple[View, ...]:
         return *views[:at], view_at(views[at], pose, pitch_m), *views[at + 1 :]
@@ -491,7 +495,8 @@ def _exchange(
             others_kept = now[:place] + now[place + 1 :]
             best = min(((*others_kept, i) for i in range(n_pool)), key=value)
             if value(best) < value(now):
-                now, improved = best, True
+                now = best
+                improved = True
     return {chosen: key_of_plan for chosen, key_of_plan in tried.items() if len(chosen) == free}
 
 

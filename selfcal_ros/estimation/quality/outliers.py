@@ -112,7 +112,8 @@ def view_noise(residuals: Residuals) -> np.ndarray:
     """
     from scipy.optimize import nnls  # a tenth of a second, for this alone
 
-    system, grid = residuals.problem.system, residuals.problem.system.grid
+    system = residuals.problem.system
+    grid = residuals.problem.system.grid
     mixing = _mixing(system)
     sums = (abs(residuals.marks.residual) ** 2 * grid.weight).sum(axis=(1, 2))
     out = np.empty((grid.n_views, 3))
@@ -127,7 +128,8 @@ def view_noise(residuals: Residuals) -> np.ndarray:
 
 def _mixing(system: NormalEquations) -> np.ndarray:
     """Return the sum of squares that unit noise of each view leaves in each, (views, views)."""
-    grid, rng = system.grid, np.random.default_rng(0)
+    grid = system.grid
+    rng = np.random.default_rng(0)
     mixing = np.zeros((grid.n_views, grid.n_views))
     for u in range(grid.n_views):
         for _ in range(FEW_DRAWS):

@@ -81,7 +81,8 @@ class HeldReadings:
 
 def held_readings(model: ModelFit, fitted: Measurements, held_out: Measurements) -> HeldReadings:
     """Return the grid readings `held_out` with the columns of the terms of the fit of `fitted`."""
-    problem, grid = model.problem, grid_data(held_out)
+    problem = model.problem
+    grid = grid_data(held_out)
     rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1 for i in grid.index)
     inputs = term_inputs(held_out, grid, problem.half_width_m)
     places = places_of(held_out, grid, inputs, problem.system.known_sites)
@@ -149,10 +150,12 @@ def prediction_errors(solved: Solved, held_out: HeldReadings) -> np.ndarray:
     solution does not know is that which fits the errors best.
     """
     model, result = solved.joint, solved.result
-    problem, system = model.problem, model.problem.system
+    problem = model.problem
+    system = model.problem.system
     views = maps_of(held_out.grid)
     predictable = (held_out.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
-    plate, marks = model.fitted.plate, views.z * problem.half_width_m
+    plate = model.fitted.plate
+    marks = views.z * problem.half_width_m
     error = (
         held_out.grid.y
         - held_out.place_change
@@ -163,7 +166,8 @@ def prediction_errors(solved: Solved, held_out: HeldReadings) -> np.ndarray:
         error, predictable, held_out.grid.index, held_out.grid.poses, strict=True
     ):
         view = result.views[index]
-        phi, tau = view.phi, complex(view.tx, view.ty) * pose.phase.conjugate()
+        phi = view.phi
+        tau = complex(view.tx, view.ty) * pose.phase.conjugate()
         if not np.isfinite([phi, view.tx, view.ty]).all():
             phi, tau = _fitted_placing(
                 error_of_view[predictable_marks],
@@ -186,7 +190,8 @@ def _fitted_placing(
     excess: np.ndarray | float = 0.0
     for _ in range(MAX_STEPS):  # each gains a factor of the rotation
         phi, tau = fitted_misalignment(marks, errors - excess)
-        before, excess = excess, rotation_excess(phi, marks, plate) * rigid
+        before = excess
+        excess = rotation_excess(phi, marks, plate) * rigid
         if np.abs(excess - before).max() <= FLOOR:
             break
     return phi, tau
@@ -198,7 +203,9 @@ def line_errors(solved: Solved, held_out: AngularData) -> np.ndarray:
     As of `prediction_errors`; of terms of the lines where any line of their view was fitted.
     """
     model = solved.joint
-    system, joint_fit, fitted = model.problem.system, model.fitted, model.problem.angular.index
+    system = model.problem.system
+    joint_fit = model.fitted
+    fitted = model.problem.angular.index
     field = np.where(system.known_lines, joint_fit.g_theta, np.nan)
     plate = np.where((held_out.weight > 0) & system.known_plate_lines, joint_fit.a_theta, np.nan)
     lines = lines_of(held_out)
@@ -255,7 +262,8 @@ def prediction_limit(
     own_terms = rng.standard_normal((len(held_out.own_columns), n)) / max(
         model.fitted.xy.sigma, FLOOR
     )
-    views, columns = maps_of(held_out.grid), np.zeros((0, *grid.weight.shape))
+    views = maps_of(held_out.grid)
+    columns = np.zeros((0, *grid.weight.shape))
     if model.equations is not None:
         columns = model.equations.columns.grid
     squares = np.zeros(n)
@@ -287,7 +295,8 @@ def _fitted(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit k draws of unit noise: maps (sites, k), misalignments (3 views, k), terms (p, k)."""
     problem = model.problem
-    grid, n = problem.system.grid, 3 * problem.system.grid.n_views
+    grid = problem.system.grid
+    n = 3 * problem.system.grid.n_views
     joint_fit = model.fitted
     drawn = [grid.fitted(draw, joint_fit.inverse[:n, :n]) for draw in noise]
     fields, parameters = (
@@ -435,10 +444,8 @@ def _held_out(
     except NotSettledError:
         return HeldOut(why=Finding("rest_not_converged"))
     predicted = held_readings(solved.joint, fitted, held_out)
-    error, angles = (
-        prediction_errors(solved, predicted),
-        line_errors(solved, angular_data(held_out)),
-    )
+    error = prediction_errors(solved, predicted)
+    angles = line_errors(solved, angular_data(held_out))
     predictable = np.isfinite(error)
     coordinates = np.stack([error[predictable].real, error[predictable].imag])
     lines_off = angles[np.isfinite(angles)]
@@ -463,7 +470,8 @@ def _ratio_and_limit(
     solved: Solved, held_out: HeldReadings, *, predictable: np.ndarray, error: np.ndarray
 ) -> tuple[float, float, Finding | None]:
     """Return error over noise, its limit, and why there is no limit."""
-    noise, model = solved.result.noise, solved.joint
+    noise = solved.result.noise
+    model = solved.joint
     if not predictable.any():
         return NOTHING, NOTHING, None
     weight = held_out.grid.weight

@@ -105,7 +105,8 @@ class ChangeTests(ReducedNoise):
 
         A change beyond all draws has the bound, which is close there, if that is smaller.
         """
-        of_change, (drawn, least) = statistics(self.normalised(values[:, None]))[:, 0], self._ranked
+        of_change = statistics(self.normalised(values[:, None]))[:, 0]
+        drawn, least = self._ranked
         rank = min(
             DRAWS - int(np.searchsorted(row, statistic)) + 1
             for row, statistic in zip(drawn, of_change, strict=True)
@@ -130,9 +131,12 @@ class ChangeTests(ReducedNoise):
         drawn, least = self._ranked
         rank = int(least[max(int(level * DRAWS) - 1, 0)])
         limits = drawn[:, -rank][:, None]
-        rng, noise = np.random.default_rng(1), self._noise[:, ::2]
-        n, number = len(self.places), np.arange(noise.shape[1])
-        nodes, turn = rng.integers(n, size=len(number)), 2 * np.pi * rng.random(len(number))
+        rng = np.random.default_rng(1)
+        noise = self._noise[:, ::2]
+        n = len(self.places)
+        number = np.arange(noise.shape[1])
+        nodes = rng.integers(n, size=len(number))
+        turn = 2 * np.pi * rng.random(len(number))
         at_one_node = np.zeros(noise.shape)
         at_one_node[nodes, number], at_one_node[nodes + n, number] = np.cos(turn), np.sin(turn)
         smooth = self._smooth @ rng.standard_normal((self._smooth.shape[1], len(number)))
@@ -143,7 +147,8 @@ class ChangeTests(ReducedNoise):
 
     def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
         """Return the size of a change of given shape of which POWER are found, by bisection."""
-        low, high = 0.0, 20 * rms(self.u)
+        low = 0.0
+        high = 20 * rms(self.u)
         unchanged, unit = self.normalised(noise), self.normalised(shape)
         for _ in range(10):
             size = (low + high) / 2
@@ -214,7 +219,8 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     in_datum = tests.without(values)
     test = significance(in_datum, tests)
     row = scale_row(modes)
-    scale, u_scale = float(row @ values), float(np.sqrt(row @ covariance @ row))
+    scale = float(row @ values)
+    u_scale = float(np.sqrt(row @ covariance @ row))
 
     out = np.full((2, len(common)), np.nan)
     out[:, common] = in_datum, np.sqrt(np.maximum(tests.variance, 0.0))
@@ -335,8 +341,10 @@ def _difference(
     dof : float
         Degrees of freedom of the calibration.
     """
-    in_both, rows = common[new.known], rows[common]
-    by_calibration, longer = -np.hstack([rows, new.from_plate[in_both]]), new.from_length[in_both]
+    in_both = common[new.known]
+    rows = rows[common]
+    by_calibration = -np.hstack([rows, new.from_plate[in_both]])
+    longer = new.from_length[in_both]
     of_new = new.covariances(0.0)
     of_noise = (of_new[NOISE] + of_new[TERMS])[np.ix_(in_both, in_both)]
     of_old = by_calibration @ new.effects.before @ by_calibration.T
@@ -350,7 +358,8 @@ def _difference(
 
 def line_change(new: NewMap, plate: KnownPlate) -> Change:
     """Return the change of the angular map since the calibration of the plate."""
-    old, count = plate.result.error_map.g_theta, len(new.known)
+    old = plate.result.error_map.g_theta
+    count = len(new.known)
     common = plate.together.lines()[0][0] & new.known
     out = np.full((2, count), np.nan)
     if common.sum() < 2:
@@ -381,7 +390,8 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
 
     Rows (n, s), and nodes of the other map, bool (n,).
     """
-    known_sites, old = plate.together.sites.ravel(), plate.result.artifact
+    known_sites = plate.together.sites.ravel()
+    old = plate.result.artifact
     if artifact.shape == old.shape and abs(artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP:
         return np.eye(len(known_sites))[:, known_sites], known_sites
     return rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)

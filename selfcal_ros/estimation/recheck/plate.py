@@ -83,7 +83,8 @@ class KnownPlate:
     @property
     def _lengths(self) -> tuple[ReferenceLength, ReferenceLength] | None:
         """Reference lengths now and at the calibration; None if one is not known."""
-        now, then = self.reference, self.result.reference
+        now = self.reference
+        then = self.result.reference
         return None if now is None or then is None else (now, then)
 
     @property
@@ -162,7 +163,8 @@ def reference_now(result: CalibrationResult, where: str, at: str) -> ReferenceLe
         before, relative_error=certified.relative_error, u_relative=certified.u_relative
     ).at_temperature(at)
     for name in ("expansion_per_k", "u_expansion_per_k", "certified_at_c"):
-        value_now, certified_value = getattr(now.certified, name), getattr(certified, name)
+        value_now = getattr(now.certified, name)
+        certified_value = getattr(certified, name)
         if not np.isclose(value_now, certified_value, rtol=1e-9, atol=0.0):
             raise InputError(
                 "--reference-at",
@@ -217,7 +219,8 @@ def on_plate(measurements: Measurements, plate: KnownPlate) -> Measurements:
     InputError
         If they are of another plate.
     """
-    artifact, of_calibration = measurements.artifact, plate.result.plate
+    artifact = measurements.artifact
+    of_calibration = plate.result.plate
     if (artifact.shape, artifact.angular_count, artifact.marks) != (
         of_calibration.shape,
         of_calibration.angular_count,
@@ -250,16 +253,12 @@ def rows_at(places: np.ndarray, plate: KnownPlate) -> tuple[np.ndarray, np.ndarr
 
     Rows (P, s), and the places where it is known, bool (P,).
     """
-    known_sites, old, grid = (
-        plate.together.sites,
-        plate.result.artifact,
-        plate.result.plate.map_grid,
-    )
+    known_sites = plate.together.sites
+    old = plate.result.artifact
+    grid = plate.result.plate.map_grid
     how = Interpolation.BICUBIC if grid is None else grid.interpolation
-    spline, n = (
-        MapSpline.of(old, how if known_sites.all() else Interpolation.BILINEAR),
-        known_sites.size,
-    )
+    spline = MapSpline.of(old, how if known_sites.all() else Interpolation.BILINEAR)
+    n = known_sites.size
     unit = spline.coefficients(np.eye(n).reshape(n, *known_sites.shape)).reshape(n, n).T
     rows = spline.rows(places) @ unit
     inside = np.abs(rows[:, ~known_sites.ravel()]).sum(axis=1) < EDGE
@@ -312,7 +311,8 @@ class _ReadMarks:
             return None
         z = self.marks[readable]
         free = np.stack([np.ones(len(z)), z, z.conj()], axis=1)
-        remaining, weight = differences[readable], np.ones((len(z), 1))
+        remaining = differences[readable]
+        weight = np.ones((len(z), 1))
         for _ in range(STEPS):  # least sum of lengths: single marks may be far off
             remaining = (
                 differences[readable]
@@ -379,10 +379,12 @@ def _read(
     view: ViewReadings, measurements: Measurements, plate: KnownPlate, sigma: float
 ) -> _ReadMarks | None:
     """Return the readings of a view less the stage as it was, where it was known."""
-    artifact, pitch = measurements.artifact, measurements.artifact.grid_pitch_m
+    artifact = measurements.artifact
+    pitch = measurements.artifact.grid_pitch_m
     if not len(view.m):
         return None
-    places, old = view.view.pose.places(artifact, view.m, view.n), plate.result.error_map
+    places = view.view.pose.places(artifact, view.m, view.n)
+    old = plate.result.error_map
     sign = measurements.sense.sign
     rows, stage_known = rows_at(sign * places, plate)
     stage = sign * (rows @ (old.gx + 1j * old.gy)[plate.together.sites])
@@ -438,7 +440,8 @@ def _misplaced(
     view: ViewReadings, read_marks: _ReadMarks, pose: tuple[complex, complex]
 ) -> Misplaced:
     """Return how the plate lies, turns in degrees, shifts in pitches along the stage's axes."""
-    deg, shift = np.degrees(view.view.rotation_rad), read_marks.shift + read_marks.turn * pose[1]
+    deg = np.degrees(view.view.rotation_rad)
+    shift = read_marks.shift + read_marks.turn * pose[1]
     planned, lies_at = (
         tuple(float(np.round(coordinate, 6)) for coordinate in (place.real, place.imag))
         for place in (read_marks.shift, shift)

@@ -208,7 +208,9 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
         (`PlacingError`).
     """
     solved = recheck_of(measurements, options, plate)
-    readings, solution, problem = solved.readings, solved.solution, solved.readings.problem
+    readings = solved.readings
+    solution = solved.solution
+    problem = solved.readings.problem
     covers = {"xy": np.sum(list(solved.covariances.values()), axis=0), "theta": solved.of_lines}
     change = map_change(solved.new, solved.artifact, plate)
     outcome = recheck_found(
@@ -270,7 +272,9 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
 
 def _findings(outcome: Recheck) -> tuple[Finding, ...]:
     """Return what has changed: the map, and the scale that is not part of it."""
-    largest, scale, of = outcome.largest, outcome.scale, {"of": outcome.of}
+    largest = outcome.largest
+    scale = outcome.scale
+    of = {"of": outcome.of}
     where = {"x": largest.x, "y": largest.y, **of}
     out: tuple[Finding, ...] = ()
     if outcome.changed:
@@ -326,7 +330,8 @@ def _by_microscope(solved: Rechecked, outcome: Recheck, changed: Finding) -> tup
     tells them: then nothing of the change of XY is left beyond its uncertainty, and they differ
     from what was assumed. Lines have not changed.
     """
-    readings, block = solved.readings, block_of_offsets()
+    readings = solved.readings
+    block = block_of_offsets()
     columns = readings.columns.columns
     rows = [
         row
@@ -339,10 +344,8 @@ def _by_microscope(solved: Rechecked, outcome: Recheck, changed: Finding) -> tup
     explained_by = change_by_effects(solved.new, solved.artifact, solved.plate, rows)
     if min(explained_by.p_left, 1.0) < USUAL_LEVEL or explained_by.p_none >= USUAL_LEVEL:
         return ()
-    (scale, turn), (u_scale, u_turn) = (
-        readings.effects.mean[rows] + explained_by.values,
-        explained_by.u,
-    )
+    scale, turn = readings.effects.mean[rows] + explained_by.values
+    u_scale, u_turn = explained_by.u
     return (
         replace(
             changed,
@@ -390,18 +393,21 @@ def _readings(
     weighted.
     """
     _require_noise(sigma)
-    variance, stop = sigma**2, _stops(measurements, problem)
+    variance = sigma**2
+    stop = _stops(measurements, problem)
     if measurements.has_images:
         variance = (1 - share_of(plate.result)) * plate.result.noise.sigma_xy**2
         variance = float(np.clip(variance, TRACE * sigma**2, sigma**2))
-    read, sites = problem.system.grid.read, plate.together.sites
+    read = problem.system.grid.read
+    sites = plate.together.sites
     marks = read.any(axis=0)
     of_mark = np.eye(marks.size)[marks.ravel()].reshape(-1, 1, *marks.shape) * read
     of_stop = (stop == np.arange(stop.max() + 1)[:, None, None, None]) * np.sqrt(
         (sigma**2 - variance) / np.where(read, problem.grid.weight, 1.0)
     )
     columns = _columns(problem, of_mark, of_stop)
-    offsets, declared = plate.of_offsets, any(term.block.of_microscope for term in options.terms)
+    offsets = plate.of_offsets
+    declared = any(term.block.of_microscope for term in options.terms)
     of_microscope = columns.having(lambda block: block.of_microscope)
     known_offsets = of_microscope & (
         np.isfinite(offsets).all() and not declared and microscope is None
@@ -416,12 +422,11 @@ def _readings(
     source = np.where(
         columns.rows([PLATE]) | known_offsets, PLATE, np.where(columns.rows([NOISE]), NOISE, TERMS)
     )
-    start, end = 2 * int(sites.sum()), 2 * int(sites.sum() + marks.sum())
+    start = 2 * int(sites.sum())
+    end = 2 * int(sites.sum() + marks.sum())
     of_plate_and_offsets = np.append(np.arange(end), end + components)
-    before, now = (
-        plate.together.cover(sites, marks)[np.ix_(of_plate_and_offsets, of_plate_and_offsets)],
-        plate.field[marks],
-    )
+    before = plate.together.cover(sites, marks)[np.ix_(of_plate_and_offsets, of_plate_and_offsets)]
+    now = plate.field[marks]
     effects = Effects.of(
         source,
         columns.size,
@@ -494,13 +499,15 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
     builder = ColumnBuilder(without_noise(problem.inputs, np.zeros(problem.grid.y.shape)))
     builder.add_terms(problem.terms)
     columns = builder.build()
-    of_offsets, within = columns.having(lambda block: block.of_microscope), columns.within
+    of_offsets = columns.having(lambda block: block.of_microscope)
+    within = columns.within
     if not of_offsets.any() or not within.dof:
         return None
     free = np.array([column.component in SIMILAR for column in columns.columns]) & of_offsets
     size = np.where(free, ANY, columns.size)
 
-    fitted_values, covariance = np.zeros(len(size)), np.diag(size**2)
+    fitted_values = np.zeros(len(size))
+    covariance = np.diag(size**2)
     variance = within.total / within.dof
     for _ in range(MAX_STEPS):  # the scatter that is left weighs the visits against the sizes
         if not variance > FLOOR**2:
@@ -512,7 +519,8 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
             - 2 * fitted_values @ within.right
             + fitted_values @ within.gram @ fitted_values
         )
-        before, variance = variance, float(remaining) / within.dof
+        before = variance
+        variance = float(remaining) / within.dof
         if abs(variance - before) <= SAME_VARIANCE * before:
             break
     slope = complex(*fitted_values[free])  # E / (1 + E)
@@ -587,12 +595,16 @@ def _noise(
 
     What detections of images declare is the noise of a mark, without that of its image.
     """
-    before, nan = plate.result.noise, float("nan")
-    of_marks, of_mark, out = problem.repeats_xy, problem.grid.sigma_declared, []
+    before = plate.result.noise
+    nan = float("nan")
+    of_marks = problem.repeats_xy
+    of_mark = problem.grid.sigma_declared
+    out = []
     if measurements.has_images:
         stop = _stops(measurements, problem)
         fewer = 1 + (marks_of_image(stop[stop >= 0]) - 1) * share_of(plate.result)
-        of_marks, of_mark = (of_marks[0], of_marks[1] / fewer), nan
+        of_marks = (of_marks[0], of_marks[1] / fewer)
+        of_mark = nan
     for kind, repeats, declared in (
         ("xy", of_marks, of_mark),
         ("theta", problem.repeats_theta, problem.angular.sigma_declared),
@@ -673,7 +685,9 @@ def _budget(
     result: CalibrationResult, variances: dict[str, np.ndarray], plate: KnownPlate
 ) -> Iterator[BudgetLine]:
     """Yield the lines of the budget: noise, known plate, its temperature, terms; interpolation."""
-    noise, of_plate, inf = result.noise, plate.result.artifact_map, float("inf")
+    noise = result.noise
+    of_plate = plate.result.artifact_map
+    inf = float("inf")
     by = next(
         (
             way
@@ -697,7 +711,8 @@ def _budget(
     for name, variance in variances.items():
         if name == TEMPERATURE and plate.reference is None:
             continue
-        (kind, u, unit, dof, source), u_map = rows[name], np.sqrt(variance)
+        kind, u, unit, dof, source = rows[name]
+        u_map = np.sqrt(variance)
         details: dict[str, object] = {"plate": plate.where}
         if name == NOISE:
             details = {"by": by, "contradicted": False}

@@ -64,15 +64,18 @@ class Effects:
         length: np.ndarray,
     ) -> "Effects":
         """Return effects with sizes (p,), of which the calibration knows values `plate` (k,)."""
-        of_plate, n_of_stage = source == PLATE, len(before) - len(plate)
-        mean, covariance = np.zeros(len(size)), np.diag(size**2)
+        of_plate = source == PLATE
+        n_of_stage = len(before) - len(plate)
+        mean = np.zeros(len(size))
+        covariance = np.diag(size**2)
         mean[of_plate] = plate
         covariance[np.ix_(of_plate, of_plate)] = before[n_of_stage:, n_of_stage:]
         return cls(source, mean, covariance, before, length)
 
     def known_as(self, rows: np.ndarray, covariance: np.ndarray) -> "Effects":
         """Return the effects with those `rows`, bool (p,), known to be 0 by themselves."""
-        mean, all_known = np.where(rows, 0.0, self.mean), self.covariance.copy()
+        mean = np.where(rows, 0.0, self.mean)
+        all_known = self.covariance.copy()
         all_known[rows], all_known[:, rows] = 0.0, 0.0
         all_known[np.ix_(rows, rows)] = covariance
         return replace(self, mean=mean, covariance=all_known)
@@ -216,7 +219,8 @@ class PlateReadings:
             If less than half of the nodes near the readings are.
         """
         system = self.problem.system
-        known_sites, n = system.known_sites, system.grid.n_sites
+        known_sites = system.known_sites
+        n = system.grid.n_sites
         read = np.count_nonzero(system.grid.components.of_site >= 0)
         if known_sites.sum() >= max(3, read / 2):
             return known_sites
@@ -231,7 +235,8 @@ class PlateReadings:
     @property
     def dof(self) -> int:
         """Degrees of freedom of the residuals, the effects known."""
-        system, on_map = self.problem.system, placed(self.problem)
+        system = self.problem.system
+        on_map = placed(self.problem)
         rank = (
             system.rank_grid
             if on_map is None
@@ -278,8 +283,12 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
     NotSettledError
         If the rotations of the plate do not converge.
     """
-    problem, shapes, effects = readings.problem, readings.columns.shapes, readings.effects
-    system, grid, gauge = problem.system, problem.system.grid, problem.system.gauge
+    problem = readings.problem
+    shapes = readings.columns.shapes
+    effects = readings.effects
+    system = problem.system
+    grid = problem.system.grid
+    gauge = problem.system.gauge
     reduced = reduce_columns(grid, shapes)
     fields, misalignments, remaining = effects.projected(
         (reduced.free, reduced.right, reduced.gram),
@@ -290,9 +299,11 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
     gain = remaining @ effects.covariance / readings.variance
     linear = problem.grid.y - shapes.combined(effects.mean)
     plate = shapes.combined(effects.mean, readings.columns.rows([PLATE]))
-    moving, lacking = Moving(problem), np.zeros(grid.read.shape, dtype=complex)
+    moving = Moving(problem)
+    lacking = np.zeros(grid.read.shape, dtype=complex)
     for _ in range(MAX_STEPS):
-        y, before = np.where(grid.read, linear - lacking, 0.0), lacking
+        y = np.where(grid.read, linear - lacking, 0.0)
+        before = lacking
         field, parameters = system.grid_fit(y)
         residuals = grid.plate(y, field, parameters)[1]
         right = shapes.against(shapes.sums(grid.weight * residuals))
@@ -390,7 +401,9 @@ def map_of_lines(
     noise : NoiseEstimate
         Of a line.
     """
-    scale, spectrum, variance = lines.weight.sum(), np.linalg.eigh(lines.schur), noise.sigma**2
+    scale = lines.weight.sum()
+    spectrum = np.linalg.eigh(lines.schur)
+    variance = noise.sigma**2
     determined = np.count_nonzero(spectrum[0] > GAP * scale) == lines.n_views - 1
     known_lines = lines_turned_over(sense, (lines.components.of_site >= 0) & determined, sign=1)
     if not known_lines.any():

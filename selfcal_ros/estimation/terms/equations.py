@@ -186,7 +186,8 @@ def project(
     ratio, half_width_m : float
         Weight of a line, and the unit of the misalignments, m.
     """
-    angular, n = system.angular, 3 * system.grid.n_views
+    angular = system.angular
+    n = 3 * system.grid.n_views
     right = np.zeros((system.size, reduced.right.shape[1]))
     right[:n] = reduced.right
     free, of_lines, gram_of_lines = lines_eliminated(angular, lines)
@@ -481,7 +482,8 @@ class TermEquations:
     def inverse_without(self, known_rows: np.ndarray) -> np.ndarray:
         """Return the covariance of free coefficients (p, p) if those in `known_rows` are."""
         free = ~known_rows
-        undetermined, norm = self.undetermined(free)[free], self.norm[free]
+        undetermined = self.undetermined(free)[free]
+        norm = self.norm[free]
         scaled = self.information[np.ix_(free, free)] / np.outer(norm, norm)
         out = np.zeros((self.n, self.n))
         out[np.ix_(free, free)] = (
@@ -590,7 +592,8 @@ def score(
     coefficients : float array (p,), optional
         Coefficients already subtracted.
     """
-    columns, weight = equations.columns, equations.system.grid.weight
+    columns = equations.columns
+    weight = equations.system.grid.weight
     shapes = columns.shapes
     within = columns.within
     subtracted = np.zeros(equations.n) if coefficients is None else coefficients
@@ -610,7 +613,8 @@ def residual_sums(equations: TermEquations, scored: Score) -> Sums:
     """
     inverse = equations.free_inverse
     more = inverse @ scored.total
-    gram, within = equations.projected.gram, equations.columns.within.gram
+    gram = equations.projected.gram
+    within = equations.columns.within.gram
     between = scored.sums.between - 2 * more @ scored.between + more @ gram @ more
     inner = scored.sums.within - 2 * more @ scored.within + more @ within @ more
     return Sums(
@@ -665,7 +669,8 @@ def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[st
     A part is the reduction of the covariance if that term, and those before it, are
     known: the parts add up to the covariance.
     """
-    remaining, out = covariance.copy(), []
+    remaining = covariance.copy()
+    out = []
     sized = dict.fromkeys(c.term for c in columns.columns if np.isfinite(c.size))
     for name in sized:
         root = root_of(remaining, columns.rows([name]))
@@ -812,13 +817,15 @@ def _coefficients_test(
     beyond = np.sqrt((squares / of_unit).sum())  # the statistic is below its square / size^2
 
     def size_at(level: float) -> float:
-        low, high = term.size, float(beyond / np.sqrt(level))
+        low = term.size
+        high = float(beyond / np.sqrt(level))
         while low < (middle := float(np.sqrt(low * high))) < high:
             low, high = (middle, high) if statistic(middle) > level else (low, middle)
         return high
 
     tail = TAIL if test.contradicted else DOUBT_LEVEL
-    size_shown, allowed = size_at(rank), size_at(float(chdtri(rank, 1 - tail)))
+    size_shown = size_at(rank)
+    allowed = size_at(float(chdtri(rank, 1 - tail)))
     # the limit of few coefficients is far above what they show
     allowed = min(allowed, max(term.size, term.block.plausible, size_shown))
     wider = float(np.log(variances(size_shown) / variances(term.size)).sum())
@@ -851,14 +858,13 @@ def _estimates_if_free(
         )
         - hidden @ hidden.T
     )
-    couple, scores = (
-        scaled[np.ix_(rows, other_columns)] @ of_others,
-        equations.unbiased_sums(right) / norm,
-    )
+    couple = scaled[np.ix_(rows, other_columns)] @ of_others
+    scores = equations.unbiased_sums(right) / norm
     information = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(other_columns, rows)]
     size, vectors = np.linalg.eigh((information + information.T) / 2)
     determined = size > equations.limit(rows)
-    vectors, size = vectors[:, determined], size[determined]
+    vectors = vectors[:, determined]
+    size = size[determined]
     values = vectors.T @ (scores[rows] - couple @ scores[other_columns]) / size
     sizes = equations.columns.size[rows]
     turned = vectors * (norm[rows] * sizes / sizes.max())[:, None]

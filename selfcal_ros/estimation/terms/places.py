@@ -122,7 +122,8 @@ class StagePlaces:
 
         By the slopes of the stage error where the stage stood; arguments as in `moved`, `changes`.
         """
-        cells, (s, t) = self._cells(_filled(field, self.known)), self._place(near)
+        cells = self._cells(_filled(field, self.known))
+        s, t = self._place(near)
         slopes = np.zeros((2, len(self.about_m), *self.views.plate_shape), dtype=complex)
         for slope, (a, b) in zip(slopes, ((AT_SITES, 0.0), (0.0, AT_SITES)), strict=True):
             x, y = (cells.beyond(s + a, t + b) - cells.beyond(s - a, t - b)) / (2 * AT_SITES)
@@ -158,10 +159,8 @@ def _filled(field: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
     """Return a field with unknown sites on straight lines through known ones of row and column."""
     if known_sites.all():
         return field
-    rows_first, columns_first = (
-        _along_both(field, known_sites),
-        _along_both(field.T, known_sites.T).T,
-    )
+    rows_first = _along_both(field, known_sites)
+    columns_first = _along_both(field.T, known_sites.T).T
     return (rows_first + columns_first) / 2
 
 
@@ -170,16 +169,15 @@ def _along_both(field: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
     for least in (2, 2, 1, 1):
         field, known_sites = field.copy(), known_sites.copy()
         for row in np.flatnonzero((known_sites.sum(axis=1) >= least) & ~known_sites.all(axis=1)):
-            places_known, unknown = (
-                np.flatnonzero(known_sites[row]),
-                np.flatnonzero(~known_sites[row]),
-            )
+            places_known = np.flatnonzero(known_sites[row])
+            unknown = np.flatnonzero(~known_sites[row])
             above = np.clip(
                 np.searchsorted(places_known, unknown),
                 min(1, len(places_known) - 1),
                 len(places_known) - 1,
             )
-            a, b = places_known[above - 1], places_known[above]
+            a = places_known[above - 1]
+            b = places_known[above]
             slope = (field[row, b] - field[row, a]) / np.maximum(b - a, 1)
             field[row, unknown] = field[row, a] + (unknown - a) * slope
             known_sites[row] = True

@@ -151,7 +151,8 @@ def _visits(
     Given rotation, rad, and position, m, of the plate, and the errors of stage and plate,
     (2, nx, ny), m.
     """
-    view, (turn, away) = readings.view, lies
+    view = readings.view
+    turn, away = lies
     order = assumed.order or view.visit_order or DEFAULT_ORDER
     sequence = (
         visit_sequence(artifact, view, order=order, rng=rng)
@@ -176,7 +177,8 @@ def _visits(
             )
         )
     )
-    stage, plate = errors[0].ravel()[near], errors[1].ravel()[mark] * phase
+    stage = errors[0].ravel()[near]
+    plate = errors[1].ravel()[mark] * phase
     u, v = artifact.places(sequence.m, sequence.n)
     arm = (u + 1j * v) * artifact.grid_pitch_m * phase
     offset = np.exp(-1j * turn) * (np.expm1(1j * turn) * arm + away + plate - stage - stops - aside)
@@ -211,8 +213,10 @@ def planned_equations(
     """
     inputs = planned_inputs(plan.artifact, plan.views, assumed)
     columns = term_columns(inputs, terms)
-    n, length = 3 * system.grid.n_views, inputs.half_width_m
-    inverse, ratio = np.zeros((system.size, system.size)), 0.0
+    n = 3 * system.grid.n_views
+    length = inputs.half_width_m
+    inverse = np.zeros((system.size, system.size))
+    ratio = 0.0
     inverse[:n, :n] = system.grid_inverse
     if len(columns.lines.at):
         ratio = (assumed.sigma_m / (assumed.sigma_rad * length)) ** 2  # method eq. 4.2
@@ -242,7 +246,8 @@ def with_terms(equations: TermEquations, terms: Iterable[ModelTerm]) -> TermEqua
     )
     inner = all_columns.within
     within = WithinMarks(inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof)
-    projected, of_lines = equations.projected, rows[all_columns.lines.at]
+    projected = equations.projected
+    of_lines = rows[all_columns.lines.at]
     lines = LineColumns(
         np.cumsum(rows)[all_columns.lines.at[of_lines]] - 1, all_columns.lines.values[of_lines]
     )

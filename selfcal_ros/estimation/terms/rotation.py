@@ -21,7 +21,8 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
 
 def located(explanation: Any, names: tuple[str, ...]) -> Located:
     """Yield the view that differs most from all others: a common rotation belongs to the datum."""
-    n, unit = len(explanation.values), np.eye(len(explanation.values))
+    n = len(explanation.values)
+    unit = np.eye(len(explanation.values))
     apart = []
     for at in range(n):
         differences = [unit[at] - unit[another] for another in range(n) if another != at]

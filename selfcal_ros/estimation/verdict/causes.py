@@ -207,7 +207,8 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     error_map : ErrorMap
         Its map.
     """
-    problem, places = model.problem, model.problem.places
+    problem = model.problem
+    places = model.problem.places
     if places is None:
         return None
     u = np.maximum(_uncertainty(model, error_map), LEAST_U_M)
@@ -218,7 +219,8 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     )
     if not rms(_coordinates(reading_change)) > SMALL * rms(u):
         return None
-    before, corrected = model.fitted.xy.residuals, fit(problem, model.y - reading_change)
+    before = model.fitted.xy.residuals
+    corrected = fit(problem, model.y - reading_change)
     if corrected.xy.residuals < before:  # part of the residual noise is this effect
         u = u * (corrected.xy.residuals / before)
     map_change = np.where(known_sites, model.fitted.field - corrected.field, 0.0)
@@ -280,8 +282,10 @@ def _noise(
 
     Both (2, nx, ny).
     """
-    rng, sites = np.random.default_rng(0), places.site
-    total, n_sites = np.zeros((2, u[0].size)), u[0].size
+    rng = np.random.default_rng(0)
+    sites = places.site
+    total = np.zeros((2, u[0].size))
+    n_sites = u[0].size
     for _ in range(FEW_DRAWS):
         drawn = rng.normal(0, u)
         missed = _missed(problem, places, drawn[0] + 1j * drawn[1], error_there)
@@ -300,7 +304,8 @@ def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
 
     If it was not computed, that of a mean reading, which a map from three views comes close to.
     """
-    u, grid = error_map.u_xy, model.problem.system.grid
+    u = error_map.u_xy
+    grid = model.problem.system.grid
     if not np.isfinite(u).any():
         return np.full_like(u, model.fitted.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
     u = np.nan_to_num(u, nan=rms(u))
@@ -361,13 +366,15 @@ class Candidates:
 
     def explain(self, rows: np.ndarray) -> Explained:
         """Fit the columns of `rows`, bool (p,), together."""
-        sums, chosen = self.right.sums, np.flatnonzero(rows)
+        sums = self.right.sums
+        chosen = np.flatnonzero(rows)
         square = np.ix_(chosen, chosen)
         size, vectors = np.linalg.eigh(self._scaled[square])
         determined = size > self.equations.limit(rows & (self.prior == 0))
         vectors = vectors[:, determined] / self._norm[chosen, None]
         inverse = (vectors / size[determined]) @ vectors.T
-        right, gram = self._total[chosen], self.equations.projected.gram[square]
+        right = self._total[chosen]
+        gram = self.equations.projected.gram[square]
         values = inverse @ right
         between = sums.between + values @ (gram @ values - 2 * self.right.between[chosen])
         return Explained(
@@ -406,7 +413,9 @@ class Candidates:
         If a cause is missing, visits of one mark agree better than marks do: the larger variance
         counts. NaN and 0 if the columns use up all degrees of freedom.
         """
-        sums, between, dof = self.right.sums, fitted.between, fitted.dof_between
+        sums = self.right.sums
+        between = fitted.between
+        dof = fitted.dof_between
         dof_of_both = sums.dof - fitted.rank
         if sums.dof_within >= 1 and dof_of_both > 0:
             total = (sums.total - fitted.explained) / dof_of_both
@@ -515,10 +524,12 @@ def find_explanations(
         for block in blocks().values()
         if block.name not in own_terms and (visits_known or not block.needs_visits)
     ]
-    builder, views = ColumnBuilder(inputs), problem.system.grid.views
+    builder = ColumnBuilder(inputs)
+    views = problem.system.grid.views
     builder.add_terms((*problem.terms, *further_terms))
     groups = list(_groups(builder.columns, [term.name for term in further_terms]))
-    phases, n_readings = views.phases.conj(), int(np.count_nonzero(inputs.weight))
+    phases = views.phases.conj()
+    n_readings = int(np.count_nonzero(inputs.weight))
     if slips:
         steps = list(slip_columns(builder))
         groups += [
@@ -531,7 +542,8 @@ def find_explanations(
             for rows, view, place in reading_columns(builder, model.fitted.residuals, phases)
         ]
     if placed is not None:
-        shift, rotation = placed.after * phases[placed.view], placed.after * inputs.z
+        shift = placed.after * phases[placed.view]
+        rotation = placed.after * inputs.z
         rows = add_slip(builder, placed.view, (shift.reshape(-1), rotation.reshape(-1)))
         groups.append(Group(SLIP, np.array(rows), placed.view, places=placed.places))
     columns = builder.build()
@@ -646,7 +658,8 @@ def _test(
 
     `before` is the fit without the group, `after` the one with it.
     """
-    gained, n_gained = max(after.explained - before.explained, 0.0), after.rank - before.rank
+    gained = max(after.explained - before.explained, 0.0)
+    n_gained = after.rank - before.rank
     variance, dof = pool.noise(after)
     if n_gained <= 0 or not variance > FLOOR**2:  # NaN where nothing is left to test against
         return None
@@ -758,7 +771,8 @@ def scatter_of_views(
     )
     scatter = []
     for index, view in enumerate(measurements.views):
-        sigma, dof = view.sigma_xy, float(view.dof_xy)
+        sigma = view.sigma_xy
+        dof = float(view.dof_xy)
         if index in revisited:
             visits, residuals = revisited[index]
             dof = 2.0 * (len(visits.mark) - len(np.unique(visits.mark)))
@@ -843,11 +857,10 @@ def turned_too_far(
     first = len(model.problem.inputs.with_lines) - len(
         rotations.values
     )  # fewer if the term is free
-    values, covariance = (
-        np.pad(rotations.values, (first, 0)),
-        np.pad(rotations.covariance, (first, 0)),
-    )
-    apart, variance = abs(values[:, None] - values), np.diag(covariance)
+    values = np.pad(rotations.values, (first, 0))
+    covariance = np.pad(rotations.covariance, (first, 0))
+    apart = abs(values[:, None] - values)
+    variance = np.diag(covariance)
     spread = variance[:, None] + variance - 2 * covariance
     of_u = apart / np.sqrt(np.maximum(spread, np.finfo(float).tiny))
     phi = [

@@ -86,7 +86,8 @@ def judged(
     """
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
-    is_same, failed = checked is solved, []
+    is_same = checked is solved
+    failed = []
     if not is_same and checked.model is not None and checked.model.problem.rigid:
         failed.append(
             Finding(
@@ -179,7 +180,9 @@ def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
     """
     if solved.model is None:
         return
-    emap, fitted, system = solved.result.error_map, solved.model.fitted, solved.model.problem.system
+    emap = solved.result.error_map
+    fitted = solved.model.fitted
+    system = solved.model.problem.system
     shape = emap.gx.shape
     size_m = _lack_of_fit(solved.xy, system.grid.weight, abs(fitted.residuals))
     if size_m:
@@ -357,7 +360,8 @@ def _lines_sign_findings(
     ):
         return []
     problem = replace(model.problem, terms=(), residuals_xy=None)
-    angular, squared = problem.angular, []
+    angular = problem.angular
+    squared = []
     if not problem.system.angular.n_views:
         return []
     turns = dict(zip(problem.grid.index, problem.turn_rad, strict=True))
@@ -460,7 +464,8 @@ def views_findings(measurements: Measurements) -> Iterator[Finding]:
         n_used[name] += view.used
         rejected.setdefault(name, Counter()).update(view.rejected)
     for name, counts in rejected.items():
-        n_lost, total = counts[REPEAT_OUTLIER], counts[REPEAT_OUTLIER] + n_used[name]
+        n_lost = counts[REPEAT_OUTLIER]
+        total = counts[REPEAT_OUTLIER] + n_used[name]
         if n_lost > max(FEW_OUTLIERS, MAX_REMOVED * total):
             yield Finding(
                 "repeats_contradict", view=name, details={"rejected": n_lost, "of": total}
@@ -474,7 +479,8 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
     A kind of mark that no view has is not missed in a view that has the other. The parts of a view
     in which the plate slipped are one view.
     """
-    artifact, readings_of_view = measurements.artifact, dict[str, list[ViewReadings]]()
+    artifact = measurements.artifact
+    readings_of_view = dict[str, list[ViewReadings]]()
     for readings in measurements.views:
         view_of_part = replace(readings.view, name=readings.view.name.split(AFTER_SLIP)[0])
         readings_of_view.setdefault(view_of_part.plan_view, []).append(readings)

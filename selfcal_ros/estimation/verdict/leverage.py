@@ -97,7 +97,8 @@ class FitOfKind:
 
         F-test of the reading's contribution to the sum of squares against the remainder.
         """
-        n, noise = self.coordinates, self.noise_without(at, least)
+        n = self.coordinates
+        noise = self.noise_without(at, least)
         return float(fdtrc(n, self.dof - n, self.squares[at] / n / noise**2))
 
 
@@ -137,7 +138,8 @@ def exact_leverage(
 
     `misaligned` is the covariance of the misalignments for unit noise of these readings alone.
     """
-    weight, total = system.weight, system.weight.sum(axis=0)
+    weight = system.weight
+    total = system.weight.sum(axis=0)
     inverse = system.solve(np.eye(system.n_sites))
     variance = np.zeros(weight.shape)
     for v in range(system.n_views):

@@ -122,7 +122,8 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     system = placed(model.problem)
     if system is None or is_too_large(system):
         return None
-    grid, coarse = system.grid, _of_marks(model)
+    grid = system.grid
+    coarse = _of_marks(model)
     refit = with_map(model, grid.views.spline.refined)
     if refit is None:
         return None
@@ -130,8 +131,11 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     n = [determined_coefficients(equations) for equations in (fine, coarse)]
     squares_coarse, squares_refit = _squares(coarse, model.y), _squares(fine, refit.y)
     readings = equations_left(grid)
-    n_further, dof, p = n[0] - n[1], readings - n[0], 1.0
-    power, bilinear = np.zeros(2 * len(known_places(coarse))), grid.views.spline.axes[0].degree == 1
+    n_further = n[0] - n[1]
+    dof = readings - n[0]
+    p = 1.0
+    power = np.zeros(2 * len(known_places(coarse)))
+    bilinear = grid.views.spline.axes[0].degree == 1
     if dof < 1 and not bilinear:
         return None
     if dof >= 1 and n_further >= 1:
@@ -174,7 +178,8 @@ def _of_terms(model: ModelFit, of_other_map: ModelFit) -> float:
 
 def maps_to_try(measurements: Measurements) -> Iterator[tuple[str, Measurements]]:
     """Yield the readings with smoother or closer nodes over the same field, and their --map."""
-    artifact, grid = measurements.artifact, measurements.artifact.map_grid
+    artifact = measurements.artifact
+    grid = measurements.artifact.map_grid
     if grid is None or grid.size_y not in (0, grid.size):
         return
     first = grid.size + 2 * (grid.interpolation is Interpolation.BICUBIC)
@@ -233,7 +238,8 @@ def _fitted_lines(lines: HarmonicSystem, y: np.ndarray) -> tuple[float, np.ndarr
 
 def known_places(system: PlacedEquations) -> np.ndarray:
     """Return the known nodes and the middles between known nodes, complex (P,), m."""
-    (s, t), views = _halves(system), system.grid.views
+    s, t = _halves(system)
+    views = system.grid.views
     x, y = s / 2 - views.half[0], t / 2 - views.half[1]
     return (x + 1j * y) * views.spline.pitch_m
 
@@ -242,7 +248,8 @@ def _halves(system: PlacedEquations) -> tuple[np.ndarray, np.ndarray]:
     """Return the same places in half pitches of the map from its first node, int (P,) each."""
     known_sites = system.known_sites
     s, t = np.indices([2 * size - 1 for size in system.grid.views.shape]).reshape(2, -1)
-    low, high = (s // 2, t // 2), ((s + 1) // 2, (t + 1) // 2)
+    low = (s // 2, t // 2)
+    high = ((s + 1) // 2, (t + 1) // 2)
     inside = (
         known_sites[low]
         & known_sites[high]
@@ -300,8 +307,10 @@ class _Further:
     @classmethod
     def of(cls, fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray) -> "_Further":
         """Return it for refined and coarse equations of the same readings y."""
-        places_m, grid = known_places(coarse), fine.grid
-        spline, nodes = grid.views.spline, coarse.grid.views.spline
+        places_m = known_places(coarse)
+        grid = fine.grid
+        spline = grid.views.spline
+        nodes = coarse.grid.views.spline
         matrix, couple = grid.matrix, grid.coupling
         b, d = grid.right_side(y)
         within = np.linalg.pinv(grid.block, hermitian=True, rcond=GAP)

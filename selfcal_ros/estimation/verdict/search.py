@@ -111,7 +111,8 @@ def search_causes(
     sites = solved.model.problem.system.grid.n_sites
     if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
         _search(search, measurements, options, failed=failed)
-    solved, tests = search.solved, search.solved.joint.sizes
+    solved = search.solved
+    tests = search.solved.joint.sizes
     raised = {
         str(test.name): _raised_cause(solved, test)
         for test in tests
@@ -210,7 +211,8 @@ def _best_model(searched: SearchResult, measurements: Measurements, options: Opt
     contradicts them, the one with the smaller uncertainty.
     """
     terms_used = {term.name: term for term in searched.solved.joint.problem.terms}
-    best, least = None, np.inf
+    best = None
+    least = np.inf
     for free in (True, False):
         terms = [
             ModelTerm(name) if free else terms_used[name].rounded_up for name in searched.terms
@@ -220,7 +222,8 @@ def _best_model(searched: SearchResult, measurements: Measurements, options: Opt
             emap = solved.result.error_map
             u = rms(emap.u_xy) + np.nan_to_num(rms(emap.u_g_theta))
             if u < least:
-                best, least = ",".join(map(str, tried.terms)), u
+                best = ",".join(map(str, tried.terms))
+                least = u
     return best
 
 
@@ -486,7 +489,8 @@ def _noisy_views(search: SearchResult, measurements: Measurements) -> None:
     A node may depend on one view alone: a view noisier than assumed enlarges the uncertainty.
     """
     views = scatter_of_views(measurements, search.solved.joint)
-    emap, noisy = search.solved.result.error_map, noisier_views(views)
+    emap = search.solved.result.error_map
+    noisy = noisier_views(views)
     largest = max((sigma for name, sigma, _ in views if name in [c.view for c in noisy]), default=0)
     if (ratio := largest / search.solved.xy.sigma) > 1:
         more = np.nan_to_num(emap.u_xy) * np.sqrt(ratio**2 - 1)

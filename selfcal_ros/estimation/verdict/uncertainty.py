@@ -93,7 +93,8 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     )
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
     if emap.gx.size <= MAX_FULL and result.noise.sigma_xy > 0:
-        before, sigma = factors_of(result), result.noise.sigma_xy
+        before = factors_of(result)
+        sigma = result.noise.sigma_xy
         kept_parts = replace(
             kept_parts,
             factors=replace(
@@ -192,7 +193,8 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
         ("xy", emap.u_xy**2, known_beforehand(result)),
         ("theta", emap.u_g_theta**2, of_lines),
     ):
-        dof, at = getattr(noise, f"dof_{kind}"), np.isfinite(power)
+        dof = getattr(noise, f"dof_{kind}")
+        at = np.isfinite(power)
         if dof > 0 and known_variance[at].any():
             total = float(power[at].mean())
             of_readings = max(total - float(known_variance[at].mean()), 0.0)
@@ -284,7 +286,8 @@ def budgets(result: CalibrationResult) -> list[Budget]:
     Two of each: at the nodes of the map, and anywhere between them, where interpolation adds its
     error. None without an uncertainty map.
     """
-    lines, all_budgets = result.budget or tuple(budget_lines(result)), []
+    lines = result.budget or tuple(budget_lines(result))
+    all_budgets = []
     emap = result.error_map
     for quantity, u in (("xy", emap.u_xy), ("theta", emap.u_g_theta)):
         dof = _or_infinite(result.noise.dof_of(quantity))

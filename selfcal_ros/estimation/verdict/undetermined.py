@@ -35,7 +35,8 @@ def undetermined_effects(solved: Solved, options: Options) -> Iterator[Effect]:
     options : Options
         How it was solved; nothing is added where nothing is assumed.
     """
-    model, emap = solved.model, solved.result.error_map
+    model = solved.model
+    emap = solved.result.error_map
     if model is None or not (options.assumed and options.finite_rotations):
         return
     if not solved.result.has_uncertainty or not np.isfinite(model.fitted.xy.sigma):

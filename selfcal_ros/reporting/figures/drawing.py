@@ -400,7 +400,8 @@ def round_down(value: float) -> float:
 def round_ticks(low: float, high: float, count: int) -> list[float]:
     """Return about `count` round values from `low` to `high`."""
     step = round_step(high - low, count)
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    first = math.ceil(low / step - 1e-9)
+    last = math.floor(high / step + 1e-9)
     return [index * step + 0.0 for index in range(first, last + 1)]
 
 

@@ -180,7 +180,9 @@ def error_map(
     A known truth is drawn beneath. `of` is a key of `ERRORS`; the scales have room for an error
     of `largest_m`.
     """
-    emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
+    emap = result.error_map
+    artifact = result.artifact
+    k = result.noise.k_xy
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
     step = sites[0].step or 1
     length = np.hypot(emap.gx, emap.gy)
@@ -259,7 +261,9 @@ def _ellipses(frame: draw.Frame, tips_mm: np.ndarray, u_mm: np.ndarray) -> bool:
 
 def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
     """Add tooltips with the values of each site, unless the field is too large."""
-    emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
+    emap = result.error_map
+    artifact = result.artifact
+    k = result.noise.k_xy
     if artifact.m.size > MAX_SPOTS**2:
         return
     radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
@@ -284,7 +288,9 @@ def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
 
 def uncertainty_map(result: CalibrationResult) -> draw.Drawing | None:
     """Return the larger expanded uncertainty of x and y at every node; None if none is known."""
-    emap, artifact, k = result.error_map, result.artifact, result.noise.k_xy
+    emap = result.error_map
+    artifact = result.artifact
+    k = result.noise.k_xy
     U_um = np.where(emap.valid, np.fmax(emap.u_gx, emap.u_gy), np.nan) * k * UM_PER_M
     if not np.isfinite(U_um).any():
         return None
@@ -312,10 +318,15 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
 
     `of` is a key of `ERRORS`: of a plate they are Ax and Ay.
     """
-    emap, k = result.error_map, result.noise.k_xy
+    emap = result.error_map
+    k = result.noise.k_xy
     errors = np.stack([emap.gx, emap.gy]) * UM_PER_M
     u = np.where(emap.valid, emap.u_xy, np.nan) * k * UM_PER_M
-    end, side, gap, left, top = parts.round_end(errors), 158.0, 44.0, 44.0, 50.0
+    end = parts.round_end(errors)
+    side = 158.0
+    gap = 44.0
+    left = 44.0
+    top = 50.0
     drawing = parts.titled(
         "components" if of == "stage" else f"{of}-components",
         f"Components of the error, and their U with k = {k:.3g}",
@@ -356,8 +367,10 @@ def angular_map(
     of: str = "stage",
 ) -> draw.Drawing:
     """Return the angular error around the circle, with its expanded uncertainty as a band."""
-    emap, k = result.error_map, result.noise.k_theta
-    error, u = emap.g_theta * ARCSEC_PER_RAD, emap.u_g_theta * k * ARCSEC_PER_RAD
+    emap = result.error_map
+    k = result.noise.k_theta
+    error = emap.g_theta * ARCSEC_PER_RAD
+    u = emap.u_g_theta * k * ARCSEC_PER_RAD
     true = (
         None
         if truth is None or truth.get("g_theta") is None

@@ -58,7 +58,8 @@ def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
             "not a picture format by its suffix",
             "name a file that ends in .png, .svg or .pdf",
         )
-    page, data = figure(drawing), io.BytesIO()
+    page = figure(drawing)
+    data = io.BytesIO()
     with rc_context(RC):
         page.savefig(data, format=kind.lstrip("."), dpi=DPI, metadata=KINDS[kind])
     write_bytes(path, data.getvalue())
@@ -110,7 +111,8 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
             vertices.append(line[0])
             codes.append(Outline.CLOSEPOLY)
     dash = (0, tuple(length * points for length in item.dash)) if item.dash else "solid"
-    fill, stroke = to_rgba(_light(item.fill), item.opacity), to_rgba(_light(item.stroke))
+    fill = to_rgba(_light(item.fill), item.opacity)
+    stroke = to_rgba(_light(item.stroke))
     axes.add_artist(
         PathPatch(
             Outline(vertices, codes),
@@ -126,7 +128,8 @@ def _path(item: Path, axes: Axes, points: float, order: int) -> None:
 
 def _discs(item: Discs, axes: Axes, points: float, order: int) -> None:
     wide, high = zip(*item.radii, strict=True)
-    fill, stroke = to_rgba(_light(item.fill), item.opacity), to_rgba(_light(item.stroke))
+    fill = to_rgba(_light(item.fill), item.opacity)
+    stroke = to_rgba(_light(item.stroke))
     axes.add_collection(
         EllipseCollection(
             [2 * r for r in wide],

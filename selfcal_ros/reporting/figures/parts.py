@@ -74,11 +74,10 @@ def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scal
     for i in range(level.shape[0]):
         for _, run in groupby(range(level.shape[1]), level[i].__getitem__):
             alike = list(run)
-            first, last = alike[0], alike[-1]
-            low, high = (
-                frame.at(x[i, first] - half, y[i, first] - half),
-                frame.at(x[i, last] + half, y[i, last] + half),
-            )
+            first = alike[0]
+            last = alike[-1]
+            low = frame.at(x[i, first] - half, y[i, first] - half)
+            high = frame.at(x[i, last] + half, y[i, last] + half)
             low, high = _clipped(frame, low), _clipped(frame, high)
             outlines.setdefault(int(level[i, first]), []).append(
                 (low, (high[0], low[1]), high, (low[0], high[1]))
@@ -99,7 +98,8 @@ def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
     """
     top = 2 * draw.SIDES if scale.ramp == "d" else draw.LEVELS - 1
     with np.errstate(invalid="ignore", over="ignore"):
-        offset, span = np.asarray(values) - scale.low, scale.high - scale.low
+        offset = np.asarray(values) - scale.low
+        span = scale.high - scale.low
         fraction = np.clip(offset / span if span else 0.4 + 0 * offset, 0, 1)
         step = np.rint(fraction * top) if scale.ramp == "d" else np.floor(fraction * draw.LEVELS)
     return np.where(np.isfinite(fraction), np.minimum(step, top), -1).astype(int)

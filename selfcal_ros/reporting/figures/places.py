@@ -87,7 +87,8 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     drawing, pitch = frame.drawing, artifact.grid_pitch_m
     half = np.array(artifact.reach)[:, None]
     field = [(reach + 0.3 * pitch) * MM_PER_M for reach in artifact.field_half_m]
-    low, high = frame.at(-field[0], -field[1]), frame.at(*field)
+    low = frame.at(-field[0], -field[1])
+    high = frame.at(*field)
     drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
     drawing.line(_at(frame, _places_mm(view, *_corners(artifact))), stroke="truth", width=1.6)
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
@@ -191,7 +192,8 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
     }
     drawing = parts.titled("rejected", "Positions of rejected grid readings")
     for title, frame in zip(names, parts.panels(drawing, names, reach), strict=True):
-        low, high = frame.at(-field[0], -field[1]), frame.at(*field)
+        low = frame.at(-field[0], -field[1])
+        high = frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
         for reason, colour in colours.items():
             at = [(x, y) for view, why, x, y in places if (view, why) == (title, reason)]
@@ -212,12 +214,14 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
 
 def _legend(drawing: Drawing, entries: dict[str, tuple[str, int]]) -> None:
     """Write the reasons below, as many per row as fit."""
-    x, y = 46.0, drawing.height + 14
+    x = 46.0
+    y = drawing.height + 14
     for reason, (colour, count) in entries.items():
         words = f"{printable(reason).replace('_', ' ')} ({count})"
         width = 26 + parts.text_width(words, 12)
         if x + width > parts.WIDTH and x > 46:
-            x, y = 46.0, y + 18
+            x = 46.0
+            y = y + 18
         parts.legend(drawing, [(colour, words)], (x, y))
         x += width
     drawing.height = y + 10
@@ -231,7 +235,9 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
     if result.camera is None:
         return None
     cells = result.camera.known_cells
-    place, error, u = cells[:2] * MM_PER_M, cells[2:4], cells[4:6] * result.noise.k_xy
+    place = cells[:2] * MM_PER_M
+    error = cells[2:4]
+    u = cells[4:6] * result.noise.k_xy
     apart = abs(place[0] + 1j * place[1] - (place[0] + 1j * place[1])[:, None])
     spacing = float(apart[apart > 0].min(initial=np.inf)) if len(apart) > 1 else 1.0
     factor = parts.enlargement(np.hypot(*error), spacing / MM_PER_M)

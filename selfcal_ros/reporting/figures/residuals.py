@@ -66,7 +66,8 @@ def residuals_in(result: CalibrationResult) -> list[ViewResiduals]:
     rows = stored.get("views") if isinstance(stored, dict) else None
     if not isinstance(rows, list) or len(rows) != len(result.views):
         return []
-    shape, lines = result.plate.shape, (result.plate.angular_count,)
+    shape = result.plate.shape
+    lines = (result.plate.angular_count,)
     residuals = []
     for view, row in zip(result.views, rows, strict=True):
         entry = row if isinstance(row, dict) else {}

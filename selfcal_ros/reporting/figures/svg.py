@@ -87,7 +87,8 @@ def _item(item: draw.Item, paint: Paint) -> str:
             f'<circle class="spot" cx="{_n(item.at[0])}" cy="{_n(item.at[1])}" '
             f'r="{_n(item.radius)}"><title>{escape(printable(item.title))}</title></circle>'
         )
-    colours, more = paint(item.fill, item.stroke), _look(item)
+    colours = paint(item.fill, item.stroke)
+    more = _look(item)
     if isinstance(item, draw.Discs):
         return "".join(
             f'<ellipse{colours} cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" ry="{_n(ry)}"{more}/>'

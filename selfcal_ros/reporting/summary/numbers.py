@@ -294,7 +294,8 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
     InputError
         If an array is missing or of another shape.
     """
-    artifact, true = emap.artifact, truth_arrays(emap, truth) or {}
+    artifact = emap.artifact
+    true = truth_arrays(emap, truth) or {}
     difference = np.stack([emap.gx - true["gx"], emap.gy - true["gy"]])
     if np.isfinite(difference).all(axis=0).any():
         difference = remove_modes(difference, datum_modes(artifact, scale=True))
@@ -376,7 +377,8 @@ TURNS = 1e-3
 
 def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
     """Return the camera's error shown by images, published minus true; empty without images."""
-    camera, yaw = result.camera, yaw_facts(result)
+    camera = result.camera
+    yaw = yaw_facts(result)
     if camera is None:
         return yaw
     cells = camera.known_cells
@@ -386,7 +388,8 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
 
     worst = int(np.argmax(np.hypot(*cells[2:4])))
     x, y = cells[:2, worst] * MM_PER_M
-    size, u = math.hypot(*cells[2:4, worst]), math.hypot(*cells[4:6, worst]) / math.sqrt(2)
+    size = math.hypot(*cells[2:4, worst])
+    u = math.hypot(*cells[4:6, worst]) / math.sqrt(2)
     distortions = [
         name
         for name, power in (("quadratic", (2, 0)), ("radial (cubic)", (2, 1)))

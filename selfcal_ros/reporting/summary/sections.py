@@ -145,7 +145,8 @@ def _nodes(grid: MapGrid, shape: tuple[int, int]) -> str:
 def measurement_section(result: CalibrationResult) -> Section:
     """Return plan, plate, method and input."""
     artifact = result.plate
-    (nx, ny), pitch = artifact.shape, artifact.grid_pitch_m * MM_PER_M
+    nx, ny = artifact.shape
+    pitch = artifact.grid_pitch_m * MM_PER_M
     marks = (
         f"list of {nx} marks, neighbours {pitch:.6g} mm apart (median)"
         if artifact.marks
@@ -242,7 +243,8 @@ def position_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
     """Return the position of a site as ``at x 40 mm, y -20 mm``; empty for None."""
     if site is None:
         return ""
-    pitch, at = emap.artifact.grid_pitch_m, emap.artifact.places(*map(np.array, site))
+    pitch = emap.artifact.grid_pitch_m
+    at = emap.artifact.places(*map(np.array, site))
     x, y = (f"{float(coordinate) * pitch * MM_PER_M:.6g}" for coordinate in at)
     return f"at x {x} mm, y {y} mm"
 
@@ -448,7 +450,8 @@ def _in_u(in_u: float, largest_in_u: float, within: float) -> list[tuple[str, st
 def rejected_section(result: CalibrationResult) -> Section:
     """Return rejected detections by reason, most frequent first."""
     counts = sorted(result.rejected.items(), key=lambda item: (-item[1], item[0]))
-    total, used = sum(result.rejected.values()), sum(v.used for v in result.views)
+    total = sum(result.rejected.values())
+    used = sum(v.used for v in result.views)
     facts = [
         ("detections", f"{used} used, {total} rejected"),
         *((printable(reason).replace("_", " "), str(count)) for reason, count in counts),
@@ -467,7 +470,8 @@ def attention_section(result: CalibrationResult) -> Section:
 
 def state_sentence(result: CalibrationResult) -> str:
     """Return the state of a calibration in one sentence."""
-    observability, figures = result.observability, map_figures(result.error_map)
+    observability = result.observability
+    figures = map_figures(result.error_map)
     if not observability.identifiable:
         advice = f"; {printable(observability.advice[0].text)}" if observability.advice else ""
         return (
@@ -492,7 +496,8 @@ def state_line(result: CalibrationResult) -> str:
 
     It shows 128 characters. What U owes to assumptions and the reason of a grade below good follow.
     """
-    figures, verdict = map_figures(result.error_map), result.verdict
+    figures = map_figures(result.error_map)
+    verdict = result.verdict
     if result.verification is not None:
         return result.verification.sentence
     if not result.observability.identifiable or not (figures.n_known or figures.n_lines_known):
@@ -531,7 +536,8 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
         return text
     k = result.noise.k_xy
     sites = "each" if share else "every site"
-    uncertainty, between = "uncertainty not known", anywhere_m(result)[2]
+    uncertainty = "uncertainty not known"
+    between = anywhere_m(result)[2]
     if math.isfinite(figures.max_u_m):
         also = f", any place to ±{um(between)}" if math.isfinite(between) else ""
         uncertainty = f"{sites} known to ±{um(k * figures.max_u_m)}{also} or better (k={k:.3g})"

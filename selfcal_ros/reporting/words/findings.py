@@ -38,7 +38,8 @@ class DisplayUnit(NamedTuple):
 
 
 UM, RATIO = DisplayUnit(UM_PER_M, "µm"), DisplayUnit(PPM_PER_ONE, "µm/m")
-MRAD, PERCENT = DisplayUnit(MRAD_PER_RAD, "mrad"), DisplayUnit(100.0, "%")
+MRAD = DisplayUnit(MRAD_PER_RAD, "mrad")
+PERCENT = DisplayUnit(100.0, "%")
 ARCSEC, URAD = DisplayUnit(ARCSEC_PER_RAD, "arcsec"), DisplayUnit(URAD_PER_RAD, "µrad")
 
 

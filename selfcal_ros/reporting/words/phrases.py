@@ -167,7 +167,9 @@ ONE_PASS = (
 
 def recheck_sentence(recheck: Recheck) -> str:
     """Return the verdict of a recheck in one sentence."""
-    since, scale, clearest = _since(recheck.of), recheck.scale, _clearest(recheck.largest)
+    since = _since(recheck.of)
+    scale = recheck.scale
+    clearest = _clearest(recheck.largest)
     if recheck.changed:
         return _changed(since, clearest, recheck.p)
     if scale.changed:

@@ -61,7 +61,8 @@ def validation_text(held_out: list[HeldOut], artifact: Artifact) -> list[str]:
     """Return one line for each held-out set, µm and arcsec."""
     lines = []
     for item in held_out:
-        name, why = held_out_text(item.view, item.tenth), why_text(item.why, artifact)
+        name = held_out_text(item.view, item.tenth)
+        why = why_text(item.why, artifact)
         if not item.n_grid and not item.n_angular:
             lines.append(f"{name}: {why}")
             continue
