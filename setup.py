@@ -24,9 +24,14 @@ VERBS = runpy.run_path(str(Path(NAME, "cli", "verbs.py")))
 
 def share(folder: str) -> list[tuple[str, list[str]]]:
     """Return the data files below a folder, one entry a folder, under share/selfcal_ros."""
-    folders = sorted({path.parent for path in Path(folder).rglob("*") if path.is_file()})
+    folders = sorted(
+        {path.parent for path in Path(folder).rglob("*") if path.is_file()}
+    )
     return [
-        (f"share/{NAME}/{place}", sorted(str(p) for p in place.iterdir() if p.is_file()))
+        (
+            f"share/{NAME}/{place}",
+            sorted(str(p) for p in place.iterdir() if p.is_file()),
+        )
         for place in folders
     ]
 
@@ -87,7 +92,14 @@ setup(
         "Source": f"{HOME}/source",
         "Changelog": f"{HOME}/changelog",
     },
-    keywords=["calibration", "self-calibration", "metrology", "uncertainty", "ROS 2", "stage"],
+    keywords=[
+        "calibration",
+        "self-calibration",
+        "metrology",
+        "uncertainty",
+        "ROS 2",
+        "stage",
+    ],
     classifiers=[
         "Development Status :: 4 - Beta",
         "Environment :: Console",
@@ -106,6 +118,8 @@ setup(
             "selfcal = selfcal_ros.start:selfcal",
             *(f"{node} = {NAME}.start:{node}" for node in NODES),
         ],
-        VERBS["ENTRY_POINTS"]: [f"{verb} = {VERBS['module_of'](verb)}" for verb in VERBS["VERBS"]],
+        VERBS["ENTRY_POINTS"]: [
+            f"{verb} = {VERBS['module_of'](verb)}" for verb in VERBS["VERBS"]
+        ],
     },
 )

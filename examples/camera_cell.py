@@ -22,7 +22,9 @@ def picture(x: float, y: float, rng: np.random.Generator) -> np.ndarray:
     right = column - (WIDTH - 1) / 2 - x / PIXEL_M
     up = (HEIGHT - 1) / 2 - row - y / PIXEL_M
     inside = 1 / (1 + np.exp(np.minimum(1.7 * (np.hypot(right, up) - RADIUS_PX), 50)))
-    return np.clip(200 - 150 * inside + rng.normal(0, 1, row.shape), 0, 255).astype(np.uint8)
+    return np.clip(200 - 150 * inside + rng.normal(0, 1, row.shape), 0, 255).astype(
+        np.uint8
+    )
 
 
 class CameraStage(Stage):
@@ -34,5 +36,7 @@ class CameraStage(Stage):
 
     def image(self) -> Image:
         """Expose now."""
-        nearest = min(map(self.seen, self._marks.values()), key=lambda at: np.hypot(*at))
+        nearest = min(
+            map(self.seen, self._marks.values()), key=lambda at: np.hypot(*at)
+        )
         return Image(picture(*nearest, self._rng))

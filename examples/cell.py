@@ -30,7 +30,8 @@ class Stage:
         self._random = random.Random(1)
         self._at: tuple[float, ...] = (0.0, 0.0, 0.0)
         rows = range(-(marks // 2), marks - marks // 2)
-        middle = 0.5 * (marks % 2 == 0)  # of an even number the centre is between the rows
+        # of an even number the centre is between the rows
+        middle = 0.5 * (marks % 2 == 0)
         self._marks = {
             (m, n): (
                 (m + middle) * pitch + self._random.gauss(0, 3e-7),
@@ -39,7 +40,9 @@ class Stage:
             for m in rows
             for n in rows
         }
-        self._lines = [math.tau * k / lines + self._random.gauss(0, 2e-5) for k in range(lines)]
+        self._lines = [
+            math.tau * k / lines + self._random.gauss(0, 2e-5) for k in range(lines)
+        ]
         self.place(Placing("", 0.0, 0.0, 0.0))
 
     def place(self, placing: Placing) -> None:
@@ -52,7 +55,10 @@ class Stage:
 
     def error(self, x: float, y: float) -> Pair:
         """Return what the encoders say too much at (x, y), m: what the calibration shall find."""
-        return (3e-7 * math.sin(120 * x) * math.cos(80 * y), 2e-7 * math.cos(90 * x + 60 * y))
+        return (
+            3e-7 * math.sin(120 * x) * math.cos(80 * y),
+            2e-7 * math.cos(90 * x + 60 * y),
+        )
 
     def position(self) -> tuple[float, ...]:
         """Return what the encoders say: x and y in m, theta in rad."""
@@ -73,10 +79,16 @@ class Stage:
             key=lambda item: math.hypot(*item[1]),
         )
         theta = self._at[2] - 2e-5 * math.sin(self._at[2])  # its encoder is eccentric
-        turns = [math.remainder(line + self._turn - theta, math.tau) for line in self._lines]
+        turns = [
+            math.remainder(line + self._turn - theta, math.tau) for line in self._lines
+        ]
         k = min(range(len(turns)), key=lambda line: abs(turns[line]))
         return [
-            Offset(x + self._random.gauss(0, 5e-9), y + self._random.gauss(0, 5e-9), mark=(m, n)),
+            Offset(
+                x + self._random.gauss(0, 5e-9),
+                y + self._random.gauss(0, 5e-9),
+                mark=(m, n),
+            ),
             Offset(theta=turns[k] + self._random.gauss(0, 1e-7), line=k),
         ]
 

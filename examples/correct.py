@@ -21,19 +21,25 @@ def main(path: str) -> None:
     x_command, y_command = stage.command(x, y)
     u_x, u_y = stage.uncertainty(x, y)
     for row in zip(x, y, x_command, y_command, u_x, u_y, strict=True):
-        print("be at {:+.6f} {:+.6f} m: command {:+.9f} {:+.9f} m, u {:.1e} {:.1e} m".format(*row))
+        print(
+            "be at {:+.6f} {:+.6f} m: command {:+.9f} {:+.9f} m, u {:.1e} {:.1e} m".format(
+                *row
+            )
+        )
 
     x_true, y_true = stage.correct(x_command, y_command)
     print(f"and back: off by at most {np.hypot(x_true - x, y_true - y).max():.0e} m")
 
-    error, u = stage.length_error((x[0], y[0]), (x[2], y[2]))  # the first point to the last
+    # the first point to the last
+    error, u = stage.length_error((x[0], y[0]), (x[2], y[2]))
     k = stage.result.noise.k_xy
     print(
         f"distance {np.hypot(x[2] - x[0], y[2] - y[0]):.6f} m is indicated {error[0]:+.1e} m "
         f"too long, U {k * u[0]:.1e} m (k = {k:.2f}, 95.45 %)"
     )
 
-    gradient = np.array([1 / 3, 1 / 3, 1 / 3, 0, 0, 0])  # the mean of Gx at the three points
+    # the mean of Gx at the three points
+    gradient = np.array([1 / 3, 1 / 3, 1 / 3, 0, 0, 0])
     u_mean = np.sqrt(gradient @ stage.covariance(x, y) @ gradient)
     print(f"mean error in x {(x_command - x).mean():+.1e} m, U {k * u_mean:.1e} m")
 

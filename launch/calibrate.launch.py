@@ -7,7 +7,14 @@ from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.parameter_descriptions import ParameterValue
 
-from selfcal_ros.nodes.launching import OfCell, arguments, foxglove, journal_argument, node, text
+from selfcal_ros.nodes.launching import (
+    OfCell,
+    arguments,
+    foxglove,
+    journal_argument,
+    node,
+    text,
+)
 
 HAS_CELL = PythonExpression(["'", LaunchConfiguration("cell"), "' != ''"])
 JOURNAL, PLAN = {"journal": text("journal")}, {"plan": text("plan")}
@@ -45,13 +52,19 @@ def generate_launch_description() -> LaunchDescription:
                 description="CELL.yaml of the machine that "
                 "cell_driver drives; empty = a cell of your own",
             ),
-            node("cell_driver", {"cell": text("cell")}, condition=IfCondition(HAS_CELL)),
-            node("measurement_collector", JOURNAL, SENSE, condition=IfCondition(HAS_CELL)),
+            node(
+                "cell_driver", {"cell": text("cell")}, condition=IfCondition(HAS_CELL)
+            ),
+            node(
+                "measurement_collector", JOURNAL, SENSE, condition=IfCondition(HAS_CELL)
+            ),
             node("measurement_collector", JOURNAL, condition=UnlessCondition(HAS_CELL)),
             node("solver"),
             node("pose_sequencer", PLAN, PLACING, condition=IfCondition(HAS_CELL)),
             node("pose_sequencer", PLAN, condition=UnlessCondition(HAS_CELL)),
-            node("compensator", condition=IfCondition(LaunchConfiguration("compensate"))),
+            node(
+                "compensator", condition=IfCondition(LaunchConfiguration("compensate"))
+            ),
             foxglove(),
         ]
     )

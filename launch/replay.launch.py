@@ -24,7 +24,9 @@ def generate_launch_description() -> LaunchDescription:
                 description="speed; 0 = as fast as the nodes can follow",
             ),
             IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
+                PythonLaunchDescriptionSource(
+                    str(share() / "launch/calibrate.launch.py")
+                ),
                 launch_arguments={
                     **{name: LaunchConfiguration(name) for name in SHARED},
                     "journal": "none",
@@ -34,7 +36,9 @@ def generate_launch_description() -> LaunchDescription:
                 "bag_player",
                 {
                     "bag": text("bag"),
-                    "rate": ParameterValue(LaunchConfiguration("rate"), value_type=float),
+                    "rate": ParameterValue(
+                        LaunchConfiguration("rate"), value_type=float
+                    ),
                 },
             ),
         ]

@@ -10,7 +10,14 @@ from launch.conditions import IfCondition
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
 
-from selfcal_ros.nodes.launching import SHARED, arguments, journal_argument, node, share, text
+from selfcal_ros.nodes.launching import (
+    SHARED,
+    arguments,
+    journal_argument,
+    node,
+    share,
+    text,
+)
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -20,12 +27,16 @@ def generate_launch_description() -> LaunchDescription:
             # separate from real runs: a simulated run must never continue with real readings
             journal_argument("selfcal_journals_simulated"),
             DeclareLaunchArgument(
-                "bag", default_value="", description="folder to record to; empty = do not record"
+                "bag",
+                default_value="",
+                description="folder to record to; empty = do not record",
             ),
             node(
                 "bag_recorder",
                 {"bag": text("bag")},
-                condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration("bag"), "")),
+                condition=IfCondition(
+                    NotEqualsSubstitution(LaunchConfiguration("bag"), "")
+                ),
             ),
             DeclareLaunchArgument(
                 "camera",
@@ -36,9 +47,13 @@ def generate_launch_description() -> LaunchDescription:
             ),
             node("stage_simulator", {"camera": text("camera")}),
             IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(str(share() / "launch/calibrate.launch.py")),
+                PythonLaunchDescriptionSource(
+                    str(share() / "launch/calibrate.launch.py")
+                ),
                 launch_arguments={
-                    **{name: LaunchConfiguration(name) for name in (*SHARED, "journal")},
+                    **{
+                        name: LaunchConfiguration(name) for name in (*SHARED, "journal")
+                    },
                     "detect": NotEqualsSubstitution(LaunchConfiguration("camera"), ""),
                 }.items(),
             ),

@@ -64,26 +64,37 @@ class StageMap(Compensator):
         fitted: Interpolation | None = grid.interpolation.value if grid else None
         default_method: Interpolation = fitted if fitted and all_known else "bilinear"
         super().__init__(
-            result.error_map, method=method or default_method, outside=outside, fitted=fitted
+            result.error_map,
+            method=method or default_method,
+            outside=outside,
+            fitted=fitted,
         )
         self.result = result
 
     def __repr__(self) -> str:
-        from selfcal_ros.reporting.summary.sections import state_line  # words, where they are read
+        from selfcal_ros.reporting.summary.sections import (
+            state_line,
+        )  # words, where they are read
 
         return f"<StageMap {self.result.plan_id}: {state_line(self.result)}>"
 
     def _repr_html_(self) -> str:
         """Return the picture of `plot` for a notebook."""
-        from selfcal_ros.reporting.figures.maps import map_picture  # figures, where they are seen
+        from selfcal_ros.reporting.figures.maps import (
+            map_picture,
+        )  # figures, where they are seen
         from selfcal_ros.reporting.figures.svg import printed_svg  # likewise
 
         return f'<div style="background: white">{printed_svg(map_picture(self.result))}</div>'
 
     def plot(self) -> Any:
         """Return the maps as a figure of matplotlib: verdict, vectors with U, angular error."""
-        from selfcal_ros.reporting.figures.maps import map_picture  # figures, where they are seen
-        from selfcal_ros.reporting.figures.paper import figure  # matplotlib, for this alone
+        from selfcal_ros.reporting.figures.maps import (
+            map_picture,
+        )  # figures, where they are seen
+        from selfcal_ros.reporting.figures.paper import (
+            figure,
+        )  # matplotlib, for this alone
 
         return figure(map_picture(self.result))
 
@@ -138,7 +149,9 @@ class StageMap(Compensator):
             for name in ("gx", "gy", "u_gx", "u_gy")
         }
         if self.has_theta:
-            coordinates["theta"] = 2 * np.pi * np.arange(len(emap.g_theta)) / len(emap.g_theta)
+            coordinates["theta"] = (
+                2 * np.pi * np.arange(len(emap.g_theta)) / len(emap.g_theta)
+            )
             maps |= {
                 name: (("theta",), getattr(emap, name), {"units": "rad"})
                 for name in ("g_theta", "u_g_theta")
@@ -170,10 +183,14 @@ class StageMap(Compensator):
         """
         x, y = (
             np.ravel(p)
-            for p in np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
+            for p in np.broadcast_arrays(
+                np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
+            )
         )
         if len(x) > MAX_POINTS:
-            raise InputError("covariance", f"{len(x)} points", f"give at most {MAX_POINTS}")
+            raise InputError(
+                "covariance", f"{len(x)} points", f"give at most {MAX_POINTS}"
+            )
         if np.isnan(x + y).any():
             raise InputError("covariance", "a position is not a number", "give numbers")
         if not self.inside(x, y).all():
@@ -190,7 +207,9 @@ class StageMap(Compensator):
                 "a point lies next to an unknown site",
                 "leave the point out, or measure the site",
             )
-        sites = covariance_of(self.result, "xy", used_sites.reshape(self.error_map.artifact.shape))
+        sites = covariance_of(
+            self.result, "xy", used_sites.reshape(self.error_map.artifact.shape)
+        )
         if sites.ndim == 1:
             raise InputError(
                 "covariance",
@@ -232,7 +251,9 @@ class StageMap(Compensator):
         InputError
             If two ends coincide, or as `covariance`.
         """
-        ends = np.broadcast_arrays(*(np.asarray(p, dtype=float) for p in (*first, *second)))
+        ends = np.broadcast_arrays(
+            *(np.asarray(p, dtype=float) for p in (*first, *second))
+        )
         x1, y1, x2, y2 = (np.ravel(p) for p in ends)
         dx, dy = x2 - x1, y2 - y1
         length = np.hypot(dx, dy)
@@ -246,7 +267,9 @@ class StageMap(Compensator):
             cover = self.covariance(
                 np.append(x1[chunk], x2[chunk]), np.append(y1[chunk], y2[chunk])
             )
-            u[chunk] = _along(cover, dx[chunk] / length[chunk], dy[chunk] / length[chunk])
+            u[chunk] = _along(
+                cover, dx[chunk] / length[chunk], dy[chunk] / length[chunk]
+            )
         return np.hypot(dx + bx - ax, dy + by - ay) - length, u
 
     def length_uncertainty(self, *, anywhere: bool = True) -> tuple[float, float]:
@@ -272,7 +295,9 @@ class StageMap(Compensator):
         x, y = self._places(between=anywhere and self.method == "bicubic")
         i, j = np.triu_indices(len(x), 1)
         if not len(i):
-            raise InputError("distance", "fewer than two sites are known", "measure more")
+            raise InputError(
+                "distance", "fewer than two sites are known", "measure more"
+            )
         cover = self.covariance(x, y)
         dx = x[j] - x[i]
         dy = y[j] - y[i]
@@ -284,7 +309,10 @@ class StageMap(Compensator):
             for weight, at, to in ((ex**2, i, j), (ey**2, i + n, j + n))
         )
         square += (
-            2 * ex * ey * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n] - cover[j, i + n])
+            2
+            * ex
+            * ey
+            * (cover[i, i + n] + cover[j, j + n] - cover[i, j + n] - cover[j, i + n])
         )
         if anywhere:
             worst = (self.halfway**2).sum(axis=1)
@@ -313,7 +341,8 @@ class StageMap(Compensator):
         sides = []
         for count in plate.shape:
             last = 2 * count - 2  # in half pitches
-            step = -(-last // MOST_NODES) | 1  # odd: nodes and points between them in turn
+            # odd: nodes and points between them in turn
+            step = -(-last // MOST_NODES) | 1
             halves = np.unique([*range(0, last, step), 1, last - 1, last])
             sides.append((halves - last / 2) * self._pitch / 2)
         x, y = np.meshgrid(*sides, indexing="ij")
@@ -333,7 +362,8 @@ class StageMap(Compensator):
         at = np.where(np.abs(at - np.round(at)) < SNAP, np.round(at), at)
         below = np.minimum(at.astype(int), count - 2)
         inside = (at - below)[:, None]
-        if self.method == "bicubic":  # the splines that are 1 at one node and 0 at the others
+        # the splines that are 1 at one node and 0 at the others
+        if self.method == "bicubic":
             c = cubic_pieces(np.eye(count))[:, below]
             return ((c[3] * inside + c[2]) * inside + c[1]) * inside + c[0]
         unit = np.eye(count)
@@ -344,13 +374,17 @@ def _library(name: str) -> ModuleType:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        raise InputError(error.name or name, "not installed", f"pip install {name}") from error
+        raise InputError(
+            error.name or name, "not installed", f"pip install {name}"
+        ) from error
 
 
 def _along(cover: np.ndarray, ex: np.ndarray, ey: np.ndarray) -> np.ndarray:
     """Return u of e . (G2 - G1) for pairs, from the covariance of Gx1, Gx2, Gy1, Gy2."""
     pairs = len(ex)
-    covariances = cover.reshape(4, pairs, 4, pairs)[:, np.arange(pairs), :, np.arange(pairs)]
+    covariances = cover.reshape(4, pairs, 4, pairs)[
+        :, np.arange(pairs), :, np.arange(pairs)
+    ]
     row = np.stack([-ex, ex, -ey, ey], axis=1)
     return np.sqrt(np.maximum(np.einsum("pa,pab,pb->p", row, covariances, row), 0.0))
 
@@ -361,7 +395,10 @@ def _of_difference(cover: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarra
 
 
 def load(
-    path: str | os.PathLike, *, method: Interpolation | None = None, outside: Outside = "clamp"
+    path: str | os.PathLike,
+    *,
+    method: Interpolation | None = None,
+    outside: Outside = "clamp",
 ) -> StageMap:
     """Return the calibrated stage of a RESULT.json.
 

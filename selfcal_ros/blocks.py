@@ -81,7 +81,9 @@ def by_coefficient(explanation: Any, names: tuple[str, ...]) -> Located:
     names : tuple of str
         Names of the views that the columns count.
     """
-    for column, weights in zip(explanation.columns, np.eye(len(explanation.columns)), strict=True):
+    for column, weights in zip(
+        explanation.columns, np.eye(len(explanation.columns)), strict=True
+    ):
         yield (
             {
                 "view": names[column.view] if column.view != SHARED else "",
@@ -206,7 +208,8 @@ def blocks() -> dict[str, Block]:
     from importlib.metadata import entry_points  # slow, and only this needs it
 
     block_by_name = {
-        name: import_module(f"selfcal_ros.estimation.terms.{name}").BLOCK for name in BUILT_IN
+        name: import_module(f"selfcal_ros.estimation.terms.{name}").BLOCK
+        for name in BUILT_IN
     }
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
         where = f"block '{point.name}' ({point.value})"
@@ -218,7 +221,11 @@ def blocks() -> dict[str, Block]:
                 f"it cannot be loaded: {error}",
                 "repair or remove the package that registers it",
             ) from error
-        if not isinstance(block, Block) or block.name != point.name or block.name in block_by_name:
+        if (
+            not isinstance(block, Block)
+            or block.name != point.name
+            or block.name in block_by_name
+        ):
             raise InputError(
                 where,
                 "it is not a selfcal_ros.blocks.Block of this name, or another block has the name",
@@ -238,5 +245,7 @@ def block_of(name: str) -> Block:
     """
     known_blocks = blocks()
     if name not in known_blocks:
-        raise InputError("model", f"the term '{name}' is unknown", known_are(name, known_blocks))
+        raise InputError(
+            "model", f"the term '{name}' is unknown", known_are(name, known_blocks)
+        )
     return known_blocks[name]

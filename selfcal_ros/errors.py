@@ -49,7 +49,9 @@ class InputError(SelfcalError):
 
     def __init__(self, where: str, what: str, remedy: str = "") -> None:
         self.where, self.what, self.remedy = where, what, remedy
-        super().__init__(printable(f"{where}: {what}" + (f"; {remedy}" if remedy else "")))
+        super().__init__(
+            printable(f"{where}: {what}" + (f"; {remedy}" if remedy else ""))
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how another process makes it again, without the parameters of its class."""
@@ -91,10 +93,14 @@ def did_you_mean(word: str, known_names: Iterable[str]) -> str:
     """
     names = {str(name).lower(): str(name) for name in known_names}
     words = sorted(re.split("[-_/]+", word.lower()))
-    similar = [name for name in names if sorted(re.split("[-_/]+", name)) == words][:2] or (
-        get_close_matches(word.lower(), names, n=2, cutoff=0.7)
+    similar = [name for name in names if sorted(re.split("[-_/]+", name)) == words][
+        :2
+    ] or (get_close_matches(word.lower(), names, n=2, cutoff=0.7))
+    return (
+        f"did you mean {' or '.join(repr(names[name]) for name in similar)}?"
+        if similar
+        else ""
     )
-    return f"did you mean {' or '.join(repr(names[name]) for name in similar)}?" if similar else ""
 
 
 def known_are(word: str, known_names: Iterable[str]) -> str:
@@ -131,7 +137,9 @@ def printable(text: object) -> str:
     """Return `text` as `visible`; one that is too long as its beginning, length and end."""
     text = str(text)
     if len(text) > sum(SHOWN):
-        text = f"{text[: SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1] :]}"
+        text = (
+            f"{text[: SHOWN[0]]} ... ({len(text)} characters) ... {text[-SHOWN[1] :]}"
+        )
     return visible(text)
 
 
@@ -144,7 +152,8 @@ def visible(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(
-        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text
+        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
+        for c in text
     )
 
 

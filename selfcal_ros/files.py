@@ -55,7 +55,10 @@ class _Strict(Composer, SafeConstructor, Resolver):
         self._n_nodes += 1
         if self._n_nodes > MAX_YAML_NODES:
             raise yaml.composer.ComposerError(
-                None, None, f"more than {MAX_YAML_NODES} values", self.peek_event().start_mark
+                None,
+                None,
+                f"more than {MAX_YAML_NODES} values",
+                self.peek_event().start_mark,
             )
         return super().compose_node(parent, index)
 
@@ -87,17 +90,25 @@ class _Strict(Composer, SafeConstructor, Resolver):
         """Return the mapping of a node; refuse duplicate keys."""
         keys = set()
         for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+            if (
+                isinstance(key, yaml.ScalarNode)
+                and key.tag != "tag:yaml.org,2002:merge"
+            ):
                 if (key.tag, key.value) in keys:
                     raise yaml.constructor.ConstructorError(
-                        None, None, f"the key '{key.value}' is given twice", key.start_mark
+                        None,
+                        None,
+                        f"the key '{key.value}' is given twice",
+                        key.start_mark,
                     )
                 keys.add((key.tag, key.value))
         return super().construct_mapping(node, deep)
 
     def whole_number(self, node: yaml.ScalarNode) -> int:
         """Return a whole number that fits into 64 bits."""
-        return _whole_number(self.construct_yaml_int(node) if len(node.value) < 70 else node.value)
+        return _whole_number(
+            self.construct_yaml_int(node) if len(node.value) < 70 else node.value
+        )
 
     yaml_constructors: ClassVar = SafeConstructor.yaml_constructors | {
         "tag:yaml.org,2002:int": whole_number
@@ -140,7 +151,9 @@ def _yaml_size(node: yaml.Node, size_of_node: dict[int, int]) -> int:
             if isinstance(node, yaml.SequenceNode)
             else ()
         )
-        size_of_node[id(node)] = 1 + sum(_yaml_size(child, size_of_node) for child in children)
+        size_of_node[id(node)] = 1 + sum(
+            _yaml_size(child, size_of_node) for child in children
+        )
     return size_of_node[id(node)]
 
 
@@ -157,11 +170,15 @@ class YamlDumper(yaml.SafeDumper):
     """Dumper for `read_yaml`: a string that looks like such a float is quoted."""
 
 
-FLOATS = re.compile(r"^[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)[eE][-+]?[0-9]+|\.[0-9]+)$")
+FLOATS = re.compile(
+    r"^[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)[eE][-+]?[0-9]+|\.[0-9]+)$"
+)
 """Floats that YAML 1.1 reads as strings, lacking a dot or the sign of the exponent."""
 
 for _class in (*LOADERS, YamlDumper):
-    _class.add_implicit_resolver("tag:yaml.org,2002:float", FLOATS, list("-+.0123456789"))
+    _class.add_implicit_resolver(
+        "tag:yaml.org,2002:float", FLOATS, list("-+.0123456789")
+    )
 
 
 class AsWritten(YamlLoader):
@@ -211,7 +228,9 @@ def _regular(path: str | os.PathLike, limit: int) -> bytes:
     if stat.S_ISDIR(os.stat(path).st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if stat.S_ISREG(os.stat(path).st_mode):  # opening a device may have side effects
-        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | AT_ONCE)) as file:
+        with open(
+            path, "rb", opener=lambda name, flags: os.open(name, flags | AT_ONCE)
+        ) as file:
             status = os.fstat(file.fileno())
             if stat.S_ISREG(status.st_mode) and status.st_size <= limit:
                 return file.read(status.st_size)
@@ -256,7 +275,9 @@ def csv_cells(line: str, where: str) -> list[str]:
     try:
         cells = [cell.strip() for cell in next(csv.reader([line]))]
     except csv.Error as error:
-        raise InputError(where, f"not a line of a table ({error})", "correct the line") from error
+        raise InputError(
+            where, f"not a line of a table ({error})", "correct the line"
+        ) from error
     remedy = "save the table with commas between columns and points in numbers"
     for sign, name in ((";", "semicolons"), ("\t", "tabs")):
         if len(cells) == 1 and sign in cells[0]:
@@ -283,7 +304,9 @@ def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) ->
     """Return the JSON value in the content of `path`, as `read_json`."""
     text = _decoded(raw, path)
     if limit is not None and text.count(",") >= MAX_JSON_VALUES:
-        raise InputError(str(path), f"more than {MAX_JSON_VALUES} values", "name a smaller file")
+        raise InputError(
+            str(path), f"more than {MAX_JSON_VALUES} values", "name a smaller file"
+        )
     try:
         return json.loads(text, parse_int=_whole_number)
     except json.JSONDecodeError as error:
@@ -292,9 +315,14 @@ def parse_json(raw: bytes, path: str | os.PathLike, limit: int | None = None) ->
             f"not JSON ({error.msg})",
             "give a file that `selfcal` wrote",
         ) from error
-    except (ValueError, RecursionError) as error:  # a number too long, brackets too deep
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # a number too long, brackets too deep
         raise InputError(
-            str(path), f"not usable JSON ({first_line(error)})", "give a file that `selfcal` wrote"
+            str(path),
+            f"not usable JSON ({first_line(error)})",
+            "give a file that `selfcal` wrote",
         ) from error
 
 
@@ -305,7 +333,11 @@ def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
     scalars but null as their text. The file is a regular one of at most `MAX_YAML_BYTES`.
     """
     text = read_text(path, MAX_YAML_BYTES)
-    loaders = [AsWritten] if as_written else (LOADERS if len(text) < EXPLAINED else LOADERS[:1])
+    loaders = (
+        [AsWritten]
+        if as_written
+        else (LOADERS if len(text) < EXPLAINED else LOADERS[:1])
+    )
     try:
         for loader in loaders[:-1]:  # several times as fast
             with contextlib.suppress(yaml.YAMLError):
@@ -314,7 +346,9 @@ def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         place = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
-        raise InputError(place, f"not YAML ({error.problem})", "correct the line") from error
+        raise InputError(
+            place, f"not YAML ({error.problem})", "correct the line"
+        ) from error
     except yaml.YAMLError as error:
         raise InputError(str(path), "not YAML", "give a YAML text file") from error
     except (ValueError, RecursionError) as error:  # an invalid date, brackets too deep
@@ -333,7 +367,9 @@ def sha256_of(path: str | os.PathLike) -> str:
     """
     root = Path(path)
     digest = hashlib.sha256()
-    files = sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root]
+    files = (
+        sorted(p for p in root.rglob("*") if p.is_file()) if root.is_dir() else [root]
+    )
     for file in files:
         add_file(digest, file)
     return digest.hexdigest()
@@ -351,7 +387,9 @@ def add_file(digest: Any, path: Path) -> None:
         ) from error
 
 
-def checked_fields(data: object, where: str, required: dict, optional: dict | None = None) -> dict:
+def checked_fields(
+    data: object, where: str, required: dict, optional: dict | None = None
+) -> dict:
     """Return the fields of a mapping with their types checked and defaults filled in.
 
     Parameters
@@ -369,12 +407,16 @@ def checked_fields(data: object, where: str, required: dict, optional: dict | No
         For a missing or unknown key, or a value of another type.
     """
     if not isinstance(data, dict):
-        raise InputError(where, "not a mapping of keys to values", "see the examples in config")
+        raise InputError(
+            where, "not a mapping of keys to values", "see the examples in config"
+        )
     optional = optional or {}
     for key in data:
         if key not in required and key not in optional:
             raise InputError(
-                f"{where}: {key}", "unknown key", known_are(str(key), [*required, *optional])
+                f"{where}: {key}",
+                "unknown key",
+                known_are(str(key), [*required, *optional]),
             )
     out = {key: default for key, (_, default) in optional.items()}
     for key in required:
@@ -386,7 +428,9 @@ def checked_fields(data: object, where: str, required: dict, optional: dict | No
             value = float(value)
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise InputError(
-                f"{where}: {key}", f"{value!r} is not of type {kind.__name__}", mend_of(value, kind)
+                f"{where}: {key}",
+                f"{value!r} is not of type {kind.__name__}",
+                mend_of(value, kind),
             )
         out[key] = value
     return out
@@ -411,7 +455,8 @@ def read(kind: Any, value: Any) -> Any:
         needed = [
             item.name
             for item in fields(kind)
-            if item.name in data or (item.default is MISSING and item.default_factory is MISSING)
+            if item.name in data
+            or (item.default is MISSING and item.default_factory is MISSING)
         ]
         return make(**{name: read(_hints(make)[name], data[name]) for name in needed})
     if get_origin(kind) is tuple:
@@ -423,7 +468,9 @@ def read(kind: Any, value: Any) -> Any:
     if kind is np.ndarray:  # null is NaN here as well
         return np.array(read(list, value), dtype=float)
     if kind is float:
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+        if value is not None and (
+            isinstance(value, bool) or not isinstance(value, int | float)
+        ):
             raise ValueError(f"{value!r} is not a number")
         return math.nan if value is None else float(value)
     kind = str if get_origin(kind) is Literal else get_origin(kind) or kind

@@ -89,7 +89,9 @@ def _replacement(target: Path) -> Iterator[BinaryIO]:
 def temporary_folder(parent: Path) -> Iterator[Path]:
     """Yield a hidden folder in `parent` that is removed when the block ends."""
     if not portable.LOCKS:  # then a folder cannot be opened, either
-        with TemporaryDirectory(dir=parent, prefix=".selfcal.", ignore_cleanup_errors=True) as name:
+        with TemporaryDirectory(
+            dir=parent, prefix=".selfcal.", ignore_cleanup_errors=True
+        ) as name:
             yield Path(name)
         return
     temporary, fd = _temporary(parent, folder=True)
@@ -160,7 +162,8 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_outputs(
-    inputs: Iterable[str | os.PathLike | None], outputs: Iterable[str | os.PathLike | None]
+    inputs: Iterable[str | os.PathLike | None],
+    outputs: Iterable[str | os.PathLike | None],
 ) -> None:
     """Refuse outputs that cannot all be written, before writing the first.
 
@@ -186,7 +189,9 @@ def check_outputs(
         if target.is_dir():
             raise InputError(str(name), "it is a folder", "name a file")
         if str(target) in occupied:
-            raise InputError(str(name), "would be overwritten", "name another output file")
+            raise InputError(
+                str(name), "would be overwritten", "name another output file"
+            )
         if not target.parent.is_dir():
             raise InputError(
                 str(name),
@@ -228,7 +233,8 @@ def write_together(contents: Mapping[str | os.PathLike, bytes]) -> None:
             file.write(data)
             file.flush()
             if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                os.fsync(file.fileno())  # a full disk is met before the first of them is replaced
+                # a full disk is met before the first of them is replaced
+                os.fsync(file.fileno())
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
@@ -243,7 +249,8 @@ def json_text(value: Any, depth: int = 0) -> str:
     if isinstance(value, dict):
         ends = "{}"
         inner = [
-            f"{json.dumps(str(key))}: {json_text(item, depth + 1)}" for key, item in value.items()
+            f"{json.dumps(str(key))}: {json_text(item, depth + 1)}"
+            for key, item in value.items()
         ]
     elif isinstance(value, list | tuple) and any(
         isinstance(item, dict | list | tuple) for item in value

@@ -55,7 +55,9 @@ class WorkerDied(Exception):
 def cores() -> int:
     """Return the number of cores available to this process."""
     return (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else (os.cpu_count() or 1)
     )
 
 
@@ -64,7 +66,9 @@ def check_workers(number: int | None, option: str = "--workers") -> int:
     if number is None:
         return cores()
     if not 1 <= number <= 1024:
-        raise InputError(option, f"{number} is not a number of workers", "give 1 to 1024")
+        raise InputError(
+            option, f"{number} is not a number of workers", "give 1 to 1024"
+        )
     return number
 
 
@@ -89,7 +93,9 @@ def _start_server(module: str) -> None:
     BLAS has one thread in all of them from the start: others would spin for 0.03 s in each
     library.
     """
-    multiprocessing.get_context("forkserver").set_forkserver_preload([module, __name__, FORKED])
+    multiprocessing.get_context("forkserver").set_forkserver_preload(
+        [module, __name__, FORKED]
+    )
     resource_tracker.ensure_running()  # which lets the signal through
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     threads = os.environ.get(BLAS_THREADS)
@@ -105,7 +111,11 @@ def _start_server(module: str) -> None:
 
 
 def outcomes(
-    function: Callable[[Any], Any], items: Sequence[Any], *, workers: int = 1, dask: str = ""
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    *,
+    workers: int = 1,
+    dask: str = "",
 ) -> Iterator[Outcome]:
     """Yield the outcome of `function` for each item, as it becomes ready.
 
@@ -211,29 +221,44 @@ def _with_processes(
             yield _in_own_process(function, items, index)
 
 
-def _in_own_process(function: Callable[[Any], Any], items: Sequence[Any], index: int) -> Outcome:
+def _in_own_process(
+    function: Callable[[Any], Any], items: Sequence[Any], index: int
+) -> Outcome:
     """Return the outcome of an item in a separate process."""
     with _pool(1, function) as pool:
         future = pool.submit(function, items[index])
         wait([future])
         if isinstance(future.exception(), BrokenProcessPool):
             return Outcome(
-                index, error=WorkerDied("the process that worked on it was killed (out of memory?)")
+                index,
+                error=WorkerDied(
+                    "the process that worked on it was killed (out of memory?)"
+                ),
             )
         return _outcome(index, future)
 
 
 def _outcome(index: int, future: Any) -> Outcome:
     error = future.exception()
-    return Outcome(index, error=error) if error is not None else Outcome(index, future.result())
+    return (
+        Outcome(index, error=error)
+        if error is not None
+        else Outcome(index, future.result())
+    )
 
 
 def _method() -> str:
-    return "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    return (
+        "forkserver"
+        if "forkserver" in multiprocessing.get_all_start_methods()
+        else "spawn"
+    )
 
 
 @contextlib.contextmanager
-def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolExecutor]:
+def _pool(
+    workers: int, function: Callable[[Any], Any]
+) -> Iterator[ProcessPoolExecutor]:
     """Yield a pool whose processes have ended when the block ends, however it ends.
 
     The modules of `function` are imported once, before the workers are forked.
@@ -241,7 +266,8 @@ def _pool(workers: int, function: Callable[[Any], Any]) -> Iterator[ProcessPoolE
     context = multiprocessing.get_context(_method())
     if _method() == "forkserver":
         _start_server(
-            getattr(getattr(function, "func", function), "__module__", None) or "builtins"
+            getattr(getattr(function, "func", function), "__module__", None)
+            or "builtins"
         )
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker)

@@ -40,7 +40,9 @@ def lock(descriptor: int, *, wait: bool = False) -> None:
 def hold_interrupts(*, held: bool) -> None:
     """Block Ctrl-C in this thread, or let it through, at once if it came meanwhile."""
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(
+            signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT}
+        )
 
 
 class Ended(SystemExit):
@@ -57,7 +59,9 @@ def ended_by_signals() -> Iterator[None]:
     def end(number: int, _: object) -> None:
         raise Ended(128 + number)
 
-    ends = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    ends = [
+        getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)
+    ]
     before = {
         number: signal.signal(number, end)
         for number in ends

@@ -8,7 +8,11 @@ from pathlib import Path
 
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import parse_json, read_bytes, read_text
-from selfcal_ros.model.result import CalibrationResult, require_unchanged, result_from_dict
+from selfcal_ros.model.result import (
+    CalibrationResult,
+    require_unchanged,
+    result_from_dict,
+)
 from selfcal_ros.model.verdict import Grade
 
 UNCHECKED = "the file has no digests, so whether it was edited cannot be checked"

@@ -49,7 +49,9 @@ def missing_ros() -> str:
 
 def fields_of(text: str) -> list[str]:
     """Return the names of the fields of a .msg file, without its constants."""
-    lines = [line.partition("#")[0].split() for line in text.splitlines() if line.strip()]
+    lines = [
+        line.partition("#")[0].split() for line in text.splitlines() if line.strip()
+    ]
     return [words[1] for words in lines if len(words) > 1 and "=" not in "".join(words)]
 
 

@@ -7,7 +7,10 @@ Names are relative: a namespace is put in front.
 from pathlib import Path
 
 IMAGE_TOPICS = {"raw": "stage/image", "compressed": "stage/image/compressed"}
-IMAGE_TYPES = {"raw": "sensor_msgs/msg/Image", "compressed": "sensor_msgs/msg/CompressedImage"}
+IMAGE_TYPES = {
+    "raw": "sensor_msgs/msg/Image",
+    "compressed": "sensor_msgs/msg/CompressedImage",
+}
 ENCODER_TOPIC = "stage/joint_states"
 DETECTION_TOPIC = "stage/mark_detections"
 CORRECTED_TOPIC = "stage/corrected_joint_states"

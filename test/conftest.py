@@ -16,9 +16,12 @@ from hypothesis import given, settings, strategies
 for _libraries in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_libraries, "1")
 
-settings.register_profile("repeatable", deadline=None, derandomize=True, max_examples=50)
+settings.register_profile(
+    "repeatable", deadline=None, derandomize=True, max_examples=50
+)
 settings.load_profile("repeatable")
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell: children too
+# in the background of a shell: children too
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # under nohup
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -45,7 +48,9 @@ def pytest_collection(session):
     folders = [Path(arg) for arg in session.config.args if Path(arg).is_dir()]
     if len(folders) < len(session.config.args) or not (turn := worker(session.config)):
         return
-    modules = sorted(str(path) for folder in folders for path in folder.rglob("test_*.py"))
+    modules = sorted(
+        str(path) for folder in folders for path in folder.rglob("test_*.py")
+    )
     first = len(modules) * turn[0] // turn[1]
     session.config.args[:] = modules[first:] + modules[:first]
 

@@ -44,7 +44,9 @@ def test_the_command_is_plus_the_error_and_correct_is_its_inverse(file, result):
     x, y = stage.command(pitch, -2 * pitch)
     assert float(x) == pitch + result.error_map.gx[3, 0] and abs(x - pitch) > 1e-9
     assert float(y) == -2 * pitch + result.error_map.gy[3, 0]
-    np.testing.assert_allclose(stage.correct(x, y), (pitch, -2 * pitch), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        stage.correct(x, y), (pitch, -2 * pitch), rtol=0, atol=1e-15
+    )
 
 
 def test_at_the_nodes_the_covariance_has_the_variances_of_the_map(file, result):
@@ -65,12 +67,16 @@ def test_between_the_nodes_it_is_that_of_the_interpolated_error(file, result):
     rng = np.random.default_rng(1)
     draws = rng.multivariate_normal(np.zeros(len(full)), full, 20_000, method="eigh")
     pitch = plate.grid_pitch_m
-    x, y = np.array([0.3, -1.9, 2.0, 0.0]) * pitch, np.array([0.8, 1.2, -0.5, 2.0]) * pitch
+    x, y = (
+        np.array([0.3, -1.9, 2.0, 0.0]) * pitch,
+        np.array([0.8, 1.2, -0.5, 2.0]) * pitch,
+    )
     basis = []
     for unit in np.eye(len(full)):  # the compensator is linear in the sites
         gx, gy = unit.reshape(2, *plate.shape) * 1e-9
         basis.append(
-            np.concatenate(StageMap(result_of(replace(emap, gx=gx, gy=gy))).error(x, y)) / 1e-9
+            np.concatenate(StageMap(result_of(replace(emap, gx=gx, gy=gy))).error(x, y))
+            / 1e-9
         )
     wanted = np.cov((draws @ np.array(basis)).T)
     stage = load(file)
@@ -94,10 +100,14 @@ def test_interpolation_adds_its_error_between_the_nodes(file, result):
     stage.halfway = np.array([[3e-8, 3e-8], [0.0, 5e-8]])
     both = np.sqrt(2)
     added = (
-        np.array([[0, 3, 3 * both, 3 * np.hypot(0.75, 1), 3 * both, 3], [0, 0, 5, 5, 5, 5]]) * 1e-8
+        np.array(
+            [[0, 3, 3 * both, 3 * np.hypot(0.75, 1), 3 * both, 3], [0, 0, 5, 5, 5, 5]]
+        )
+        * 1e-8
     )
     np.testing.assert_allclose(stage.uncertainty(x, y), np.hypot(before, added))
-    cells = [[a == b for a in "ABCBDE"] for b in "ABCBDE"]  # (0.5, 1) is in the cell of y = 1..2
+    # (0.5, 1) is in the cell of y = 1..2
+    cells = [[a == b for a in "ABCBDE"] for b in "ABCBDE"]
     wanted = (
         plain
         + np.kron([[1, 0], [0, 0]], np.outer(added[0], added[0]) * cells)
@@ -120,8 +130,14 @@ def test_the_error_of_a_distance_is_that_of_its_ends(file, result):
     error, u = load(file).length_error((x1, y1), (x2, y2))
     d = np.array([x2 - x1, y2 - y1])
     g = np.array([field[4, 2] - field[1, 1] for field in (emap.gx, emap.gy)])
-    assert error == pytest.approx([d @ g / np.hypot(*d)], abs=1e-11) and abs(error[0]) > 1e-8
-    full, known = covariance_of(result, "xy", emap.valid), np.zeros((2, 2, *plate.shape))
+    assert (
+        error == pytest.approx([d @ g / np.hypot(*d)], abs=1e-11)
+        and abs(error[0]) > 1e-8
+    )
+    full, known = (
+        covariance_of(result, "xy", emap.valid),
+        np.zeros((2, 2, *plate.shape)),
+    )
     for axis in (0, 1):
         known[axis, axis, 4, 2], known[axis, axis, 1, 1] = 1, -1
     row = (d / np.hypot(*d)) @ known.reshape(2, -1)
@@ -143,11 +159,15 @@ def test_what_residuals_have_beyond_repeats_is_met_at_both_ends_of_a_distance():
             replace(view, count=view.count * 5, sigma_xy=20e-9, dof_xy=8 * len(view.m))
             for view in measurements.views
         ]
-        stage = StageMap(calibrate(replace(measurements, views=tuple(repeated)), Options()))
+        stage = StageMap(
+            calibrate(replace(measurements, views=tuple(repeated)), Options())
+        )
         lack = max(part.u_max for part in stage.result.verdict.enlarged_by)
         ends = rng.uniform(-0.03, 0.03, (2, 2, 400))
         error, u = stage.length_error(*ends)
-        true = encoder(ends[1, 0] + 1j * ends[1, 1]) - encoder(ends[0, 0] + 1j * ends[0, 1])
+        true = encoder(ends[1, 0] + 1j * ends[1, 1]) - encoder(
+            ends[0, 0] + 1j * ends[0, 1]
+        )
         along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
         left = error - along[0] * true.real - along[1] * true.imag
         inside.append((abs(left) < stage.result.noise.k_xy * u).mean())
@@ -168,22 +188,29 @@ def test_a_line_over_the_length_covers_every_distance_of_the_field(file, result)
     assert a > 0 <= b and a + b * length.max() < 2 * U.max()
 
 
-def test_the_line_is_that_of_the_diagonals_if_x_and_y_err_alike(file, result, monkeypatch):
+def test_the_line_is_that_of_the_diagonals_if_x_and_y_err_alike(
+    file, result, monkeypatch
+):
     """Of sites with one error of sigma along both axes, diagonal distances have u = 2 sigma."""
     monkeypatch.setattr(
-        StageMap, "covariance", lambda self, x, y: 1e-16 * np.kron(np.ones((2, 2)), np.eye(len(x)))
+        StageMap,
+        "covariance",
+        lambda self, x, y: 1e-16 * np.kron(np.ones((2, 2)), np.eye(len(x))),
     )
     a, b = load(file).length_uncertainty(anywhere=False)
     assert a == pytest.approx(2e-8 * result.noise.k_xy, rel=1e-6) and abs(b) < 1e-12
 
 
-def test_no_other_line_over_all_distances_is_lower_on_average(file, result, monkeypatch):
+def test_no_other_line_over_all_distances_is_lower_on_average(
+    file, result, monkeypatch
+):
     """With an error of the scale, U grows with the distance."""
     monkeypatch.setattr(
         StageMap,
         "covariance",
         lambda self, x, y: (
-            1e-16 * np.eye(2 * len(x)) + 1e-12 * np.outer(np.append(x, y), np.append(x, y))
+            1e-16 * np.eye(2 * len(x))
+            + 1e-12 * np.outer(np.append(x, y), np.append(x, y))
         ),
     )
     stage, plate = load(file), result.artifact
@@ -201,7 +228,9 @@ def test_no_other_line_over_all_distances_is_lower_on_average(file, result, monk
 def test_between_nodes_the_line_covers_the_interpolation_too(file, result):
     stage, plate, rng = load(file), result.artifact, np.random.default_rng(4)
     ends = rng.uniform(-2, 2, (4, 400)) * plate.grid_pitch_m
-    ends[:, :50] = (np.floor(ends[:, :50] / plate.grid_pitch_m) + 0.5) * plate.grid_pitch_m
+    ends[:, :50] = (
+        np.floor(ends[:, :50] / plate.grid_pitch_m) + 0.5
+    ) * plate.grid_pitch_m
     ends = ends[:, np.hypot(*(ends[:2] - ends[2:])) > 0]
     a, b = stage.length_uncertainty()
     U = result.noise.k_xy * stage.length_error(ends[:2], ends[2:])[1]
@@ -215,7 +244,9 @@ def test_many_distances_are_evaluated_in_parts(file, monkeypatch):
     ends = rng.uniform(-0.02, 0.02, (4, 40))
     whole = load(file).length_error(ends[:2], ends[2:])
     monkeypatch.setattr(apply, "MAX_POINTS", 14)
-    np.testing.assert_allclose(load(file).length_error(ends[:2], ends[2:]), whole, rtol=1e-9)
+    np.testing.assert_allclose(
+        load(file).length_error(ends[:2], ends[2:]), whole, rtol=1e-9
+    )
     with pytest.raises(InputError, match="its ends coincide"):
         load(file).length_error((0.0, 0.0), (0.0, 0.0))
 
@@ -237,7 +268,9 @@ def test_what_has_no_covariance_is_refused(file, monkeypatch):
 
 
 def test_a_map_that_is_not_identified_is_no_stage(result):
-    unseen = replace(result, observability=replace(result.observability, identifiable=False))
+    unseen = replace(
+        result, observability=replace(result.observability, identifiable=False)
+    )
     with pytest.raises(NotIdentifiableError) as raised:
         StageMap(unseen)
     assert raised.value.exit_code is ExitCode.NOT_IDENTIFIABLE
@@ -248,7 +281,8 @@ def test_the_example_runs(file, capsys, monkeypatch):
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 6 and lines[3] in [
-        f"and back: off by at most {e} m" for e in ("0e+00", "2e-18", "3e-18", "4e-18", "5e-18")
+        f"and back: off by at most {e} m"
+        for e in ("0e+00", "2e-18", "3e-18", "4e-18", "5e-18")
     ]
     assert lines[4].startswith("distance 0.025000 m is indicated ")
     assert lines[5].startswith("mean error in x ")
@@ -265,7 +299,10 @@ def test_a_map_with_nodes_of_its_own_is_applied_by_its_interpolation(nodes, meth
     assert stage.method == method and result.error_map.valid.all() == (nodes == 7)
     if nodes == 7:
         place = np.array([0.0123 - 0.031j])
-        wanted = rows(artifact, place) @ (result.error_map.gx + 1j * result.error_map.gy).ravel()
+        wanted = (
+            rows(artifact, place)
+            @ (result.error_map.gx + 1j * result.error_map.gy).ravel()
+        )
         x, y = stage.command(place.real, place.imag)
         assert complex(x[0], y[0]) - place[0] == pytest.approx(wanted[0], abs=1e-15)
 
@@ -301,9 +338,14 @@ def test_a_distance_anywhere_has_the_interpolation_of_its_own_direction(monkeypa
     for row in (0, 1):
         halfway = np.zeros((2, 2))
         halfway[row, 0] = 8e-9
-        stage = stage_of(plate, np.diag(np.repeat([1e-18, 9e-18], 9)), monkeypatch, halfway)
+        stage = stage_of(
+            plate, np.diag(np.repeat([1e-18, 9e-18], 9)), monkeypatch, halfway
+        )
         a, b = stage.length_uncertainty()
-        worst = max(np.sqrt(2 * (1 + 64 * (row == 0))), np.sqrt(2 * (9 + 64 * (row == 1)))) * 1e-9
+        worst = (
+            max(np.sqrt(2 * (1 + 64 * (row == 0))), np.sqrt(2 * (9 + 64 * (row == 1))))
+            * 1e-9
+        )
         assert a + b * 0.01 == pytest.approx(stage.result.noise.k_xy * worst, rel=1e-6)
 
 
@@ -320,7 +362,8 @@ def test_inside_an_oblong_field(plate):
     stage = StageMap(result_of(random_map(plate, 1)))
     hx, hy = (half * 0.01 for half in plate.half)
     np.testing.assert_array_equal(
-        stage.inside([hx, 0, hx + 1e-4, 0], [0, hy, 0, hy + 1e-4]), [True, True, False, False]
+        stage.inside([hx, 0, hx + 1e-4, 0], [0, hy, 0, hy + 1e-4]),
+        [True, True, False, False],
     )
 
 
@@ -371,7 +414,9 @@ def test_two_maps_differ_as_diff_says(result):
 def test_without_the_library_one_line_says_so(result, name, monkeypatch):
     library = {"dataframe": "pandas", "xarray": "xarray"}[name]
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(InputError, match=f"^{library}: not installed; pip install {library}$"):
+    with pytest.raises(
+        InputError, match=f"^{library}: not installed; pip install {library}$"
+    ):
         getattr(StageMap(result), f"to_{name}")()
 
 
@@ -380,7 +425,9 @@ def test_a_data_frame_has_each_node_at_its_place(result):
     table = StageMap(result).to_dataframe().set_index(["x", "y"])
     plate, emap = result.artifact, result.error_map
     row = table.loc[(plate.x_m[3, 0], plate.y_m[3, 0])]
-    assert (row.gx, row.u_gy) == (emap.gx[3, 0], emap.u_gy[3, 0]) and len(table) == emap.gx.size
+    assert (row.gx, row.u_gy) == (emap.gx[3, 0], emap.u_gy[3, 0]) and len(
+        table
+    ) == emap.gx.size
 
 
 def test_a_data_set_has_the_maps_over_their_places(result):

@@ -16,7 +16,10 @@ from selfcal_ros.machine.interface import MachineError
         ("a\n\x1b[2J\u202e", r"a\n\x1b[2J\u202e"),
         ("\ud800", r"\ud800"),
         ("x" * 4000, "x" * 4000),
-        ("a" * 3000 + "b" + "c" * 1000, f"{'a' * 3000} ... (4001 characters) ... {'c' * 1000}"),
+        (
+            "a" * 3000 + "b" + "c" * 1000,
+            f"{'a' * 3000} ... (4001 characters) ... {'c' * 1000}",
+        ),
     ],
 )
 def test_a_text_is_one_line_of_bearable_length(text, shown):
@@ -31,9 +34,17 @@ def test_a_name_of_a_megabyte_leaves_the_remedy_readable():
 
 @pytest.mark.parametrize(
     "error",
-    [InputError("a", "b", "c"), NoDataError("a", "b"), MachineError("it stands", "axis x", "go")],
+    [
+        InputError("a", "b", "c"),
+        NoDataError("a", "b"),
+        MachineError("it stands", "axis x", "go"),
+    ],
 )
 def test_an_error_of_a_worker_reaches_its_parent(error):
     seen = pickle.loads(pickle.dumps(error))
     assert type(seen) is type(error) and str(seen) == str(error)
-    assert (seen.where, seen.what, seen.remedy) == (error.where, error.what, error.remedy)
+    assert (seen.where, seen.what, seen.remedy) == (
+        error.where,
+        error.what,
+        error.remedy,
+    )

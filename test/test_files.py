@@ -19,7 +19,14 @@ from hypothesis import strategies as st
 
 from selfcal_ros import files
 from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_bytes, read_json, read_text, read_yaml, sha256_of, write_yaml
+from selfcal_ros.files import (
+    read_bytes,
+    read_json,
+    read_text,
+    read_yaml,
+    sha256_of,
+    write_yaml,
+)
 from selfcal_ros.outputs import (
     atomic_file,
     check_outputs,
@@ -92,7 +99,9 @@ def test_a_full_disk_is_one_line_and_keeps_the_old_file(tmp_path, monkeypatch, s
                 monkeypatch.setattr(files.os, step, fail)
                 file.write(b"new")
 
-    with pytest.raises(InputError, match=r"a\.json: cannot be written \(No space left on device\)"):
+    with pytest.raises(
+        InputError, match=r"a\.json: cannot be written \(No space left on device\)"
+    ):
         write()
     assert path.read_bytes() == b"old"
     assert names(tmp_path) == ["a.json"]
@@ -111,11 +120,17 @@ with temporary_folder(folder) as beside, atomic_file(folder / "a.json") as file:
 
 
 def test_the_next_write_removes_what_killed_processes_left(tmp_path):
-    kept = [".selfcal.settings", ".selfcal.0123456789abcdef.json", ".selfcal.0123456789abcdeg"]
+    kept = [
+        ".selfcal.settings",
+        ".selfcal.0123456789abcdef.json",
+        ".selfcal.0123456789abcdeg",
+    ]
     for name in kept:
         (tmp_path / name).write_text("not ours")
     (tmp_path / ".selfcal.00000000000000aa").symlink_to(tmp_path / kept[0])
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False, cwd=ROOT)
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path)], check=False, cwd=ROOT
+    )
     assert killed.returncode == -signal.SIGKILL
     assert len(names(tmp_path)) == len(kept) + 3
     write_bytes(tmp_path / "b", b"whole")
@@ -224,7 +239,9 @@ def test_what_cannot_be_read(tmp_path, source, message):
     for read in (read_bytes, read_text, read_json, read_yaml):
         with pytest.raises(InputError) as caught:
             read(tmp_path / source)
-        assert str(caught.value) == f"{tmp_path / source}: {message}".replace("\0", "\\x00")
+        assert str(caught.value) == f"{tmp_path / source}: {message}".replace(
+            "\0", "\\x00"
+        )
 
 
 @pytest.mark.parametrize("path", ["pipe", "/dev/zero", "/dev/tty", "socket"])
@@ -234,15 +251,21 @@ def test_with_a_limit_only_regular_files_are_read(tmp_path, monkeypatch, path):
     with socket.socket(socket.AF_UNIX) as ear:
         ear.bind(str(tmp_path / "socket"))
         monkeypatch.setattr(files.os, "open", lambda *_: pytest.fail("opened"))
-        with pytest.raises(InputError, match=r": is not a regular file; name a file on a disk$"):
+        with pytest.raises(
+            InputError, match=r": is not a regular file; name a file on a disk$"
+        ):
             read_bytes(tmp_path / path, 100)
 
 
-def test_a_file_that_becomes_a_pipe_while_it_is_opened_is_not_waited_for(tmp_path, monkeypatch):
+def test_a_file_that_becomes_a_pipe_while_it_is_opened_is_not_waited_for(
+    tmp_path, monkeypatch
+):
     (tmp_path / "a").write_bytes(b"x")
     os.mkfifo(tmp_path / "pipe")
     opened = os.open
-    monkeypatch.setattr(files.os, "open", lambda _, flags: opened(tmp_path / "pipe", flags))
+    monkeypatch.setattr(
+        files.os, "open", lambda _, flags: opened(tmp_path / "pipe", flags)
+    )
     with pytest.raises(InputError, match="is not a regular file"):
         read_bytes(tmp_path / "a", 100)
 
@@ -252,8 +275,12 @@ def test_with_a_limit_a_file_has_that_many_bytes_or_is_refused(tmp_path):
     assert read_bytes(tmp_path / "a", 5) == b"12345"
     with pytest.raises(InputError) as caught:
         read_bytes(tmp_path / "a", 4)
-    assert str(caught.value) == (f"{tmp_path / 'a'}: has 5 bytes, more than 4; name a smaller file")
-    assert read_bytes("/proc/self/pagemap", 5) == b"", "the kernel makes it up, without end"
+    assert str(caught.value) == (
+        f"{tmp_path / 'a'}: has 5 bytes, more than 4; name a smaller file"
+    )
+    assert read_bytes("/proc/self/pagemap", 5) == b"", (
+        "the kernel makes it up, without end"
+    )
 
 
 def test_json_of_too_many_values_is_refused_where_somebody_waits(tmp_path, monkeypatch):
@@ -269,7 +296,9 @@ def test_json_of_too_many_values_is_refused_where_somebody_waits(tmp_path, monke
 def test_text_that_is_not_utf8(tmp_path):
     (tmp_path / "a").write_bytes(b"abc\xff")
     for read in (read_text, read_json, read_yaml):
-        with pytest.raises(InputError, match="a: byte 3: not UTF-8 text; save the file as UTF-8"):
+        with pytest.raises(
+            InputError, match="a: byte 3: not UTF-8 text; save the file as UTF-8"
+        ):
             read(tmp_path / "a")
 
 
@@ -293,9 +322,15 @@ def test_faults_in_json(tmp_path, text, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a: 1\nb: [", ":2:5: not YAML (expected the node content, but found '<stream end>')"),
+        (
+            "a: 1\nb: [",
+            ":2:5: not YAML (expected the node content, but found '<stream end>')",
+        ),
         ("a: &x 1\nb: *y", ":2:4: not YAML (found undefined alias 'y')"),
-        ("a: !!python/name:os.system ''", ":1:4: not YAML (could not determine a constructor"),
+        (
+            "a: !!python/name:os.system ''",
+            ":1:4: not YAML (could not determine a constructor",
+        ),
         ("a: \x01", ": not YAML; give a YAML text file"),
         (
             "a: {b: 1,\n    c: !!int ''}",
@@ -303,7 +338,10 @@ def test_faults_in_json(tmp_path, text, message):
         ),
         ("!!bool perhaps", ":1:1: not YAML (not a value of the type bool)"),
         ("- !!timestamp x", ":1:3: not YAML (not a value of the type timestamp)"),
-        ("a: 2001-13-40", ": not usable YAML (month must be in 1..12); correct the value"),
+        (
+            "a: 2001-13-40",
+            ": not usable YAML (month must be in 1..12); correct the value",
+        ),
         ("[" * 2_000, ": not usable YAML (maximum recursion depth"),
     ],
 )
@@ -484,14 +522,20 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
             r"f\.yaml:3:1: not YAML \(the key 'a' is given twice\); correct the line",
         ),
         ("a: {b: 1, b: 1}\n", r"f\.yaml:1:11: not YAML \(the key 'b' is given twice\)"),
-        ("a: " + "9" * 400, r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct"),
+        (
+            "a: " + "9" * 400,
+            r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct",
+        ),
         ("a: 9223372036854775808", "a whole number beyond 64 bits"),
         ("a: -9223372036854775809", "a whole number beyond 64 bits"),
         ("a: &a [*a]", "its aliases expand to more than 50000 values"),
         (
             "\n".join(
                 ["a0: &a0 [0, 0]"]
-                + [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 12)]
+                + [
+                    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]"
+                    for i in range(1, 12)
+                ]
             ),
             r"f\.yaml:1:1: not YAML \(its aliases expand to more than 50000 values\)",
         ),
@@ -513,10 +557,14 @@ def test_yaml_is_bounded_while_it_is_parsed(tmp_path, monkeypatch):
     path.write_text("[1, 2, 3, 4]")
     assert files.read_yaml(path) == [1, 2, 3, 4]
     path.write_text("- 1\n- 2\n- 3\n- 4\n- 5\n]")
-    with pytest.raises(InputError, match=r"f\.yaml:5:3: not YAML \(more than 5 values\)"):
+    with pytest.raises(
+        InputError, match=r"f\.yaml:5:3: not YAML \(more than 5 values\)"
+    ):
         files.read_yaml(path)
     monkeypatch.setattr(files, "MAX_YAML_BYTES", 8)
-    with pytest.raises(InputError, match="has 21 bytes, more than 8; name a smaller file"):
+    with pytest.raises(
+        InputError, match="has 21 bytes, more than 8; name a smaller file"
+    ):
         files.read_yaml(path)
 
 
@@ -550,7 +598,9 @@ def test_honest_yaml_is_read(tmp_path, text, value):
 
 
 @pytest.mark.parametrize("digits", [20, 400, 5000])
-def test_json_with_a_whole_number_beyond_64_bits_is_refused_without_its_digits(tmp_path, digits):
+def test_json_with_a_whole_number_beyond_64_bits_is_refused_without_its_digits(
+    tmp_path, digits
+):
     path = tmp_path / "f.json"
     path.write_text('{"a": ' + "9" * digits + "}")
     with pytest.raises(InputError) as caught:

@@ -53,7 +53,9 @@ def documented() -> dict[str, set[str]]:
     """Return package -> packages that it imports, from the top to the bottom of the table."""
     page = (ROOT / "docs/theory/architecture.md").read_text()
     section = page.partition("## Layers")[2].partition("Inside `estimation`")[0]
-    return {name: set(re.findall(r"`(\w+)`", cell)) for name, cell in ROW.findall(section)}
+    return {
+        name: set(re.findall(r"`(\w+)`", cell)) for name, cell in ROW.findall(section)
+    }
 
 
 def layer_of(path: Path) -> str:
@@ -80,7 +82,9 @@ def test_packages_import_what_the_table_states(layer):
         if name.startswith("selfcal_ros.")
     } & {*table, *BASE}
     if layer in BASE:
-        assert found - {layer} == BASE[layer], f"correct BASE['{layer}'] above, or the import"
+        assert found - {layer} == BASE[layer], (
+            f"correct BASE['{layer}'] above, or the import"
+        )
     else:
         places = list(table)
         others = found - {layer, "model", *BASE}
@@ -88,7 +92,11 @@ def test_packages_import_what_the_table_states(layer):
             f"the row `{layer}` of docs/theory/architecture.md and its imports differ in "
             f"{sorted(others ^ table[layer])}: correct the row, or move what is imported"
         )
-        above = [other for other in table[layer] if places.index(other) <= places.index(layer)]
+        above = [
+            other
+            for other in table[layer]
+            if places.index(other) <= places.index(layer)
+        ]
         assert not above, f"`{layer}` imports what is above it: move it out of {above}"
         assert "start" not in found or layer in ("cli", "nodes")
 

@@ -15,7 +15,14 @@ from threadpoolctl import threadpool_info
 
 from selfcal_ros import parallel
 from selfcal_ros.errors import InputError
-from selfcal_ros.parallel import WorkerDied, check_workers, cores, mapped, mapped_in_parts, outcomes
+from selfcal_ros.parallel import (
+    WorkerDied,
+    check_workers,
+    cores,
+    mapped,
+    mapped_in_parts,
+    outcomes,
+)
 from test.support.waiting import wait_until
 
 ROOT = Path(__file__).parents[1]
@@ -34,7 +41,11 @@ def test_values_come_back_in_their_places(workers):
 def test_parts_are_joined_in_their_order(workers):
     seen = []
     assert mapped_in_parts(
-        sorted, [3, 1, 5, 4, 2], workers=workers, size=2, progress=lambda *at: seen.append(at)
+        sorted,
+        [3, 1, 5, 4, 2],
+        workers=workers,
+        size=2,
+        progress=lambda *at: seen.append(at),
     ) == [1, 3, 4, 5, 2]
     assert seen == [(2, 5), (4, 5), (5, 5)]
 
@@ -73,9 +84,18 @@ def test_a_worker_that_dies_costs_its_own_item():
     jobs = [partial(int, n) for n in range(6)]
     jobs[2] = partial(os._exit, 9)
     found = {o.index: o for o in outcomes(operator.call, jobs, workers=2)}
-    assert {i: o.value for i, o in found.items() if i != 2} == {0: 0, 1: 1, 3: 3, 4: 4, 5: 5}
+    assert {i: o.value for i, o in found.items() if i != 2} == {
+        0: 0,
+        1: 1,
+        3: 3,
+        4: 4,
+        5: 5,
+    }
     assert isinstance(found[2].error, WorkerDied)
-    assert str(found[2].error) == "the process that worked on it was killed (out of memory?)"
+    assert (
+        str(found[2].error)
+        == "the process that worked on it was killed (out of memory?)"
+    )
 
 
 def test_a_worker_that_dies_early_leaves_all_other_items():
@@ -91,7 +111,9 @@ def test_work_is_done_by_other_processes_with_one_blas_thread_each():
     pids = [o.value for o in outcomes(operator.call, jobs[1:], workers=2)]
     assert os.getpid() not in pids
     for info in mapped(operator.call, [threadpool_info] * 4, workers=2):
-        assert all(pool["num_threads"] == 1 for pool in info if pool["user_api"] == "blas")
+        assert all(
+            pool["num_threads"] == 1 for pool in info if pool["user_api"] == "blas"
+        )
 
 
 def test_a_consumer_that_stops_takes_the_workers_along():
@@ -118,7 +140,10 @@ def test_workers_end_with_a_process_that_is_killed():
         "print(next(found).value, flush=True)\nsys.stdin.read()"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", code],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as running:
         worker = Path("/proc", running.stdout.readline().strip(), "stat")
         assert is_alive(worker)
@@ -133,7 +158,9 @@ def test_what_is_begun_is_imported_where_workers_are_forked(workers, known):
         f"begin('colorsys', {workers})\n"
         "print(mapped(eval, [\"'colorsys' in __import__('sys').modules\"] * 4, workers=2))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.split("\n")[0] == str([known] * 4)
 
 
@@ -154,7 +181,9 @@ print(min(frozen) > 10_000 > gc.get_freeze_count())
 
 
 @pytest.mark.parametrize("others", ["", "2"])
-def test_workers_start_without_threads_of_blas_and_leave_what_is_loaded_out_of_garbage(others):
+def test_workers_start_without_threads_of_blas_and_leave_what_is_loaded_out_of_garbage(
+    others,
+):
     """One thread works, one waits for the end of the parent; the parent itself is as it was."""
     done = subprocess.run(
         [sys.executable, "-c", f"OTHERS = {others!r}" + LOADED],
@@ -188,7 +217,10 @@ def test_without_dask_it_is_said_how_to_get_it(monkeypatch):
 
 def test_dask_gives_the_same(monkeypatch):
     pytest.importorskip("distributed")
-    found = {o.index: o for o in outcomes(math.sqrt, [4.0, -1.0, 9.0], workers=2, dask="local")}
+    found = {
+        o.index: o
+        for o in outcomes(math.sqrt, [4.0, -1.0, 9.0], workers=2, dask="local")
+    }
     assert (found[0].value, found[2].value) == (2.0, 3.0)
     assert isinstance(found[1].error, ValueError)
 
@@ -228,7 +260,10 @@ def test_a_server_that_is_ended_has_ended_and_is_left_to_be_found_so():
         parallel._start_server("builtins")
         server = forkserver._forkserver._forkserver_pid
         parallel._end_server()
-        assert os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT | os.WNOHANG) is not None
+        assert (
+            os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT | os.WNOHANG)
+            is not None
+        )
     parallel._end_server()  # once more: there is none
     assert mapped(abs, [-1, -2], workers=2) == [1, 2]
 

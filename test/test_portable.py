@@ -38,7 +38,9 @@ def run(folder, *lines):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return [line for line in done.stderr.splitlines() if line.startswith("code ")], done.stderr
+    return [
+        line for line in done.stderr.splitlines() if line.startswith("code ")
+    ], done.stderr
 
 
 def test_from_bag_to_map_report_and_tables(tmp_path):

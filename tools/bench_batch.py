@@ -47,7 +47,12 @@ def simulate(folder: Path, plan: Path, seed: int) -> None:
         return
     sim = folder / f".{seed:03}.yaml"
     write_yaml(
-        sim, {"plan": str(plan), "seed": seed, "noise": {"sigma_xy": 2e-8, "sigma_theta": 1.7e-5}}
+        sim,
+        {
+            "plan": str(plan),
+            "seed": seed,
+            "noise": {"sigma_xy": 2e-8, "sigma_theta": 1.7e-5},
+        },
     )
     write_simulation(read_simulation(sim), bag)
 
@@ -78,7 +83,9 @@ def timed(bags: Path, out: Path, workers: int) -> tuple[float, float]:
             os.waitpid(child, 0)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if done.returncode not in (0, 5):
-        raise InputError("selfcal batch", f"ended with exit code {done.returncode}", "see above")
+        raise InputError(
+            "selfcal batch", f"ended with exit code {done.returncode}", "see above"
+        )
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
@@ -143,7 +150,9 @@ def main() -> int:
     parser.add_argument("--bags", type=int, default=100)
     parser.add_argument("--plan", type=Path, default=ROOT / "config/plans/hu.yaml")
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
-    parser.add_argument("--rounds", type=int, default=1, help="times that both ways are run")
+    parser.add_argument(
+        "--rounds", type=int, default=1, help="times that both ways are run"
+    )
     parser.add_argument("--folder", default=str(ROOT / "build" / "bench_batch"))
     parser.add_argument("-o", "--output", help="write the figures to this file")
     args = parser.parse_args()
@@ -151,9 +160,14 @@ def main() -> int:
     folder, workers = Path(args.folder), check_workers(args.workers)
     bags = folder / args.plan.stem
     bags.mkdir(parents=True, exist_ok=True)
-    mapped(partial(simulate, bags, args.plan.resolve()), list(range(args.bags)), workers=workers)
+    mapped(
+        partial(simulate, bags, args.plan.resolve()),
+        list(range(args.bags)),
+        workers=workers,
+    )
     own = [own_ratio(bags / "000", workers)]
-    compileall.compile_dir(ROOT / "selfcal_ros", quiet=1)  # not all programs may write bytecode
+    # not all programs may write bytecode
+    compileall.compile_dir(ROOT / "selfcal_ros", quiet=1)
     times = [
         (*timed(bags, folder / "alone", 1), *timed(bags, folder / "together", workers))
         for _ in range(max(args.rounds, 1))
@@ -161,7 +175,9 @@ def main() -> int:
     alone, alone_cpu, together, together_cpu = np.mean(times, axis=0).tolist()
     own.append(own_ratio(bags / "000", workers))
     one, other = maps_of(folder / "alone"), maps_of(folder / "together")
-    same = one.keys() == other.keys() and all(np.array_equal(one[k], other[k]) for k in one)
+    same = one.keys() == other.keys() and all(
+        np.array_equal(one[k], other[k]) for k in one
+    )
     figures = {
         "bags": args.bags,
         "plan": args.plan.stem,
@@ -175,8 +191,12 @@ def main() -> int:
         "own_ratio": own,
         "same_maps": same,
     }
-    print(f"{args.bags} bags, one after the other: {alone:.1f} s ({alone_cpu:.1f} s of CPU)")
-    print(f"{args.bags} bags, {workers} workers: {together:.1f} s ({together_cpu:.1f} s of CPU)")
+    print(
+        f"{args.bags} bags, one after the other: {alone:.1f} s ({alone_cpu:.1f} s of CPU)"
+    )
+    print(
+        f"{args.bags} bags, {workers} workers: {together:.1f} s ({together_cpu:.1f} s of CPU)"
+    )
     print(
         f"ratio {together / alone:.2f}; CPU shared by {workers}: "
         f"{together_cpu / workers / alone_cpu:.2f}; maps equal: {same}"

@@ -18,7 +18,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from selfcal_ros.cli.processes import domain
-from test.support.chaos import attacked, clock_ahead, full_disk, killed_sequencers, one_round
+from test.support.chaos import (
+    attacked,
+    clock_ahead,
+    full_disk,
+    killed_sequencers,
+    one_round,
+)
 
 
 def main() -> int:

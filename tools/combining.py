@@ -79,7 +79,9 @@ def part_between(case: Case, rng: np.random.Generator) -> np.ndarray:
             np.zeros((2, *ARTIFACT.shape)),
         )
     else:
-        field = rng.normal(0, case.size_m) * np.stack([y, x]) * float(case.kind == "square")
+        field = (
+            rng.normal(0, case.size_m) * np.stack([y, x]) * float(case.kind == "square")
+        )
     return remove_modes(field, datum_modes(ARTIFACT, scale=True))
 
 
@@ -92,14 +94,20 @@ def combined(case: Case, seed: int) -> tuple[Combination, np.ndarray, np.ndarray
         moved = replace(truth, g=truth.g + part_between(case, rng))
         result = calibrate(
             simulate_measurements(
-                moved, hu_plan(ARTIFACT, 2), rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD
+                moved,
+                hu_plan(ARTIFACT, 2),
+                rng,
+                sigma_m=SIGMA_M,
+                sigma_theta_rad=SIGMA_RAD,
             ),
             OPTIONS,
         )
         parts.append(Member(f"{run}.json", result.error_map, result))
     found = combine(parts)
     emap = found.result.error_map
-    off = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g, datum_modes(ARTIFACT, scale=True))
+    off = remove_modes(
+        np.stack([emap.gx, emap.gy]) - truth.g, datum_modes(ARTIFACT, scale=True)
+    )
     theta = emap.g_theta - truth.g_theta
     return found, off, theta - theta.mean()
 
@@ -123,7 +131,9 @@ def judged(item: tuple[Case, int]) -> Found:
 def main() -> int:
     """Print a row for each case."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sets", type=int, default=300, help="sets of each case (default: 300)")
+    parser.add_argument(
+        "--sets", type=int, default=300, help="sets of each case (default: 300)"
+    )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     args = parser.parse_args()
     print(
@@ -134,7 +144,9 @@ def main() -> int:
     for case in CASES:
         sets = []
         for outcome in outcomes(
-            judged, [(case, seed) for seed in range(args.sets)], workers=check_workers(args.workers)
+            judged,
+            [(case, seed) for seed in range(args.sets)],
+            workers=check_workers(args.workers),
         ):
             if outcome.error is not None:
                 raise outcome.error
@@ -150,7 +162,10 @@ def main() -> int:
                 "between",
             )
         ]
-        print(f"| {case} | " + " | ".join(f"{share:.1f} %" for share in shares) + " |", flush=True)
+        print(
+            f"| {case} | " + " | ".join(f"{share:.1f} %" for share in shares) + " |",
+            flush=True,
+        )
     return 0
 
 

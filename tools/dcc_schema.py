@@ -40,7 +40,9 @@ def digest(text: bytes) -> tuple[str, str]:
             parent.remove(note)
         parent.attrib.pop("schemaLocation", None)
     declared = ElementTree.canonicalize(ElementTree.tostring(root), strip_text=True)
-    return root.get("targetNamespace", ""), hashlib.sha256(declared.encode()).hexdigest()
+    return root.get("targetNamespace", ""), hashlib.sha256(
+        declared.encode()
+    ).hexdigest()
 
 
 def fetch(url: str, folder: Path) -> None:
@@ -55,12 +57,16 @@ def fetch(url: str, folder: Path) -> None:
     """
     names, texts = {url: "dcc.xsd"}, {}
     while waiting := [one for one in names if one not in texts]:
-        request = urllib.request.Request(waiting[0], headers={"User-Agent": "selfcal_ros"})
+        request = urllib.request.Request(
+            waiting[0], headers={"User-Agent": "selfcal_ros"}
+        )
         with urllib.request.urlopen(request, timeout=5) as answer:
             text = answer.read()
         namespace, found = digest(text)
         if PINNED.get(namespace) != found:
-            raise ValueError(f"{waiting[0]}: not the pinned schema, but {namespace} {found}")
+            raise ValueError(
+                f"{waiting[0]}: not the pinned schema, but {namespace} {found}"
+            )
 
         def local(match: re.Match[str], base: str = waiting[0]) -> str:
             place = urljoin(base, match[2])

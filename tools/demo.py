@@ -89,8 +89,12 @@ def shades(emap: "ErrorMap") -> list[str]:
     part = np.where(known, length, 0.0) / (most or 1.0)
     level = np.minimum((part * len(SHADES)).astype(int), len(SHADES) - 1)
     rows = [
-        " ".join(SHADES[k] if good else "?" for k, good in zip(levels, goods, strict=True))
-        for levels, goods in zip(level.T[::-1].tolist(), known.T[::-1].tolist(), strict=True)
+        " ".join(
+            SHADES[k] if good else "?" for k, good in zip(levels, goods, strict=True)
+        )
+        for levels, goods in zip(
+            level.T[::-1].tolist(), known.T[::-1].tolist(), strict=True
+        )
     ]
     return [f"  {row}" for row in rows] + [
         f"  length of the error: from ' ' = 0 to '{SHADES[-1]}' = {most:.3g} µm; x to the right, "

@@ -36,7 +36,9 @@ class Walk:
         if path.is_relative_to(self.root):
             if code.co_name == "<module>":
                 self.loaded.append(path)
-            elif code.co_flags & inspect.CO_OPTIMIZED and not code.co_name.startswith("<"):
+            elif code.co_flags & inspect.CO_OPTIMIZED and not code.co_name.startswith(
+                "<"
+            ):
                 self.functions.append((path, code.co_firstlineno, code.co_qualname))
         return sys.monitoring.DISABLE
 
@@ -78,7 +80,9 @@ def table(found: Walk) -> str:
     """Return functions, files entered, loaded and there, a line for each package, and returns."""
 
     def by_package(paths: Iterable[Path]) -> Counter:
-        return Counter(path.relative_to(found.root).parts[0].removesuffix(".py") for path in paths)
+        return Counter(
+            path.relative_to(found.root).parts[0].removesuffix(".py") for path in paths
+        )
 
     there = [path for path in found.root.rglob("*.py") if path.name != "__init__.py"]
     columns = [
@@ -87,7 +91,9 @@ def table(found: Walk) -> str:
         by_package(path for path in found.loaded if path.name != "__init__.py"),
         by_package(there),
     ]
-    rows = [(name, *(column[name] for column in columns)) for name in sorted(columns[3])]
+    rows = [
+        (name, *(column[name] for column in columns)) for name in sorted(columns[3])
+    ]
     rows.append(("all", *(column.total() for column in columns)))
     lines = ["package       functions  files  loaded  there"]
     lines += [
@@ -100,7 +106,9 @@ def table(found: Walk) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("bag", nargs="?", default=str(BAG))
-    parser.add_argument("--files", action="store_true", help="list the files and their functions")
+    parser.add_argument(
+        "--files", action="store_true", help="list the files and their functions"
+    )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
 

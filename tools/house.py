@@ -117,7 +117,10 @@ def branches(tree: ast.Module) -> int:
     return len(calls) + sum(
         any(
             part not in inside
-            and (getattr(part, "id", None) in KINDS or getattr(part, "attr", None) in KINDS)
+            and (
+                getattr(part, "id", None) in KINDS
+                or getattr(part, "attr", None) in KINDS
+            )
             for part in ast.walk(test)
         )
         for test in tests
@@ -133,7 +136,11 @@ def measured(folder: Path) -> dict[str, int]:
         tokens = tokens_of(text, docstrings(tree))
         total["files"] += bool(tokens)
         total["lines"] += len(
-            {line for token in tokens for line in range(token.start[0], token.end[0] + 1)}
+            {
+                line
+                for token in tokens
+                for line in range(token.start[0], token.end[0] + 1)
+            }
         )
         total["tokens"] += len(tokens)
         total["constants"] += constants(tree)
@@ -181,7 +188,9 @@ def main() -> int:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER")
-    parser.add_argument("--terms", default="microscope,yaw", help="names of terms (%(default)s)")
+    parser.add_argument(
+        "--terms", default="microscope,yaw", help="names of terms (%(default)s)"
+    )
     args = parser.parse_args()
     beside = [folder for name in BESIDE if (folder := folder_of(name)) is not None]
     print(

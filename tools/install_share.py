@@ -14,7 +14,13 @@ from pathlib import Path
 def main(prefix: Path) -> None:
     shutil.rmtree(prefix / "share" / "selfcal_ros", ignore_errors=True)
     subprocess.run(
-        [sys.executable, "setup.py", "--quiet", "install_data", f"--install-dir={prefix}"],
+        [
+            sys.executable,
+            "setup.py",
+            "--quiet",
+            "install_data",
+            f"--install-dir={prefix}",
+        ],
         check=True,
     )
     scripts = prefix / "lib" / "selfcal_ros"

@@ -55,7 +55,9 @@ def record(bag: Path) -> None:
 
         def start(node: str, *more: str, **kwargs):
             return stack.enter_context(
-                process(f"selfcal_ros.nodes.{node}", [*params, *more], environment, **kwargs)
+                process(
+                    f"selfcal_ros.nodes.{node}", [*params, *more], environment, **kwargs
+                )
             )
 
         start("bag_recorder", "-p", f"bag:={bag}", "-p", "all_topics:=false")
@@ -89,13 +91,18 @@ def of_images(name: str) -> dict:
 
 def of_detections(bag: Path) -> dict:
     """Return what a bag must give with the defaults of collector and solver."""
-    measurements, _, lost, _ = collect_bag(bag, CollectorSettings.checked({}, "defaults"))
+    measurements, _, lost, _ = collect_bag(
+        bag, CollectorSettings.checked({}, "defaults")
+    )
     expected: dict = {"rejected": measurements.all_rejected(), "lost": lost}
     settings = SolverSettings.checked({}, "defaults")
     try:
         result = calibrate(measurements, solver_options(settings, measurements))
     except NotIdentifiableError as error:
-        return expected | {"identifiable": False, "deficiency": error.observability.deficiency}
+        return expected | {
+            "identifiable": False,
+            "deficiency": error.observability.deficiency,
+        }
     numbers, emap = summary_numbers(result), result.error_map
     return expected | {
         "identifiable": True,
@@ -127,7 +134,8 @@ def main() -> None:
             record(BAGS / name)
         else:
             write_simulation(
-                read_simulation(ROOT / "config" / "simulations" / WRITTEN[name]), BAGS / name
+                read_simulation(ROOT / "config" / "simulations" / WRITTEN[name]),
+                BAGS / name,
             )
     manifest = {
         RECORDED: entry(

@@ -16,7 +16,10 @@ BUILD_MACHINE = re.compile(
 
 
 def main() -> None:
-    own = {"include": sysconfig.get_path("include"), "lib": sysconfig.get_path("purelib")}
+    own = {
+        "include": sysconfig.get_path("include"),
+        "lib": sysconfig.get_path("purelib"),
+    }
     mended = 0
     for path in Path(sys.prefix, "share").rglob("*.cmake"):
         text = path.read_text()

@@ -89,7 +89,11 @@ MISTAKES = [
         ("slove bags/demo", 2, "did you mean 'solve'"),
         ("calibrate bags/demo", 2, "'calibrate' is unknown; "),
         ("solve", 2, "BAG is missing; see selfcal solve --help"),
-        ("solve bags/demo bags/hu_exact", 2, "'bags/hu_exact' is one argument too many"),
+        (
+            "solve bags/demo bags/hu_exact",
+            2,
+            "'bags/hu_exact' is one argument too many",
+        ),
         ("solve bags/demo --ouput r.json", 2, "did you mean '--output'"),
         (
             "solve bags/demo --method least_squares",
@@ -109,28 +113,64 @@ MISTAKES = [
         ("report", 2, "RESULT.json is missing"),
         ("plan check config/plans/hu.yaml --sigma 20furlong", 2, "20furlong"),
         ("plan check config/plans/hu.yaml --sigma -5nm", 2, "sigma"),
-        ("plan check config/plans/hu.yaml --sigma 20", 2, "'20' is 20 m, .* one of m, mm, um, nm"),
-        ("plan check config/plans/hu.yaml --placing 90", 2, "'90' is 90 rad, .* one of rad, .*deg"),
-        ("detect bags/camera -o marks --pixel-size 6um", 2, "'6um' is not a number; .* a unit"),
-        ("plan check config/plans/hu.yaml --repeats 0", 2, "--repeats: 0 is not positive"),
+        (
+            "plan check config/plans/hu.yaml --sigma 20",
+            2,
+            "'20' is 20 m, .* one of m, mm, um, nm",
+        ),
+        (
+            "plan check config/plans/hu.yaml --placing 90",
+            2,
+            "'90' is 90 rad, .* one of rad, .*deg",
+        ),
+        (
+            "detect bags/camera -o marks --pixel-size 6um",
+            2,
+            "'6um' is not a number; .* a unit",
+        ),
+        (
+            "plan check config/plans/hu.yaml --repeats 0",
+            2,
+            "--repeats: 0 is not positive",
+        ),
         ("plan check config/plans/hu.yaml --repeats many", 2, "'many'"),
         # files that are not there, or of another kind
         ("solve no_such_bag", 2, "no_such_bag: no such file or folder; check the path"),
         ("solve bags", 2, r"bags: no \.mcap file in this folder"),
-        ("solve R.json", 2, "is a result, and a bag is needed here; `selfcal report R.json`"),
+        (
+            "solve R.json",
+            2,
+            "is a result, and a bag is needed here; `selfcal report R.json`",
+        ),
         ("solve config/plans/hu.yaml", 2, "is a plan, and a bag is needed here"),
         ("solve points.csv", 2, "is a table of numbers, and a bag is needed here"),
         ("solve cut.mcap", 2, "cut.mcap"),
         ("solve bags/demo -o no/where/r.json", 2, "name an existing, writable folder"),
-        ("solve bags/demo -o R.json", 2, "the file exists; name another file, or .* --force"),
-        ("solve bags/demo -o result.csv", 2, "RESULT.json is written .* end the name in .json"),
+        (
+            "solve bags/demo -o R.json",
+            2,
+            "the file exists; name another file, or .* --force",
+        ),
+        (
+            "solve bags/demo -o result.csv",
+            2,
+            "RESULT.json is written .* end the name in .json",
+        ),
         ("report newer.json", 2, "not a result of schema selfcal.result/1"),
         ("gcode none.nc R.json -o o.nc --dialect grbl", 2, "the file is empty"),
         ("solve bags/demo -o bags", 2, "bags: it is a folder; name a file"),
         ("report no.json", 2, "no.json: no such file; check the path"),
-        ("report bags/demo", 2, "a map is computed from it with `selfcal solve bags/demo"),
+        (
+            "report bags/demo",
+            2,
+            "a map is computed from it with `selfcal solve bags/demo",
+        ),
         ("report config/plans/hu.yaml", 2, "is a plan, and a result is needed here"),
-        ("report bags/demo/truth.json", 2, "not a result.*RESULT.json that `selfcal solve` wrote"),
+        (
+            "report bags/demo/truth.json",
+            2,
+            "not a result.*RESULT.json that `selfcal solve` wrote",
+        ),
         ("report cut.json", 2, "cut.json:"),
         ("report R.json -o report.docx", 2, "report.docx: .*html"),
         ("plot R.json -o map.gif", 2, "name a file that ends in .png, .svg or .pdf"),
@@ -148,31 +188,67 @@ MISTAKES = [
         ),
         ("plan check config/params/cell.yaml", 2, "give it with --params"),
         ("plan check bags/demo", 2, "is a bag, and a plan is needed here"),
-        ("simulate config/plans/hu.yaml -o b", 2, "is a plan, and a simulation is needed here"),
-        ("simulate config/simulations/demo.yaml -o bags/demo", 2, "bags/demo: exists already"),
+        (
+            "simulate config/plans/hu.yaml -o b",
+            2,
+            "is a plan, and a simulation is needed here",
+        ),
+        (
+            "simulate config/simulations/demo.yaml -o bags/demo",
+            2,
+            "bags/demo: exists already",
+        ),
         ("simulate config/simulations/demo.yaml", 2, "-o or --output is missing"),
-        ("solve bags/demo --params config/plans/hu.yaml", 2, "a parameter file of nodes is needed"),
+        (
+            "solve bags/demo --params config/plans/hu.yaml",
+            2,
+            "a parameter file of nodes is needed",
+        ),
         ("solve bags/demo --params no.yaml", 2, "no.yaml: no such file"),
         # arguments that are swapped
-        ("apply points.csv R.json -o o.csv", 2, "swapped; write `selfcal apply R.json points.csv"),
-        ("recheck bags/demo R.json", 2, "swapped; write `selfcal recheck R.json bags/demo`"),
+        (
+            "apply points.csv R.json -o o.csv",
+            2,
+            "swapped; write `selfcal apply R.json points.csv",
+        ),
+        (
+            "recheck bags/demo R.json",
+            2,
+            "swapped; write `selfcal recheck R.json bags/demo`",
+        ),
         (
             "gcode R.json part.nc -o o.nc --dialect linuxcnc",
             2,
             "swapped; write `selfcal gcode part",
         ),
-        ("cal verify stage.cal R.json", 2, "swapped; write `selfcal cal verify R.json stage.cal`"),
+        (
+            "cal verify stage.cal R.json",
+            2,
+            "swapped; write `selfcal cal verify R.json stage.cal`",
+        ),
         (
             "measure config/cells/simulated.yaml mine.yaml -o m",
             2,
             "swapped; write `selfcal measure mine.yaml config/cells/simulated.yaml -o m`",
         ),
         ("cell try mine.yaml", 2, "is a plan, and a cell is needed here"),
-        ("measure mine.yaml machine.cell.yaml -o m --yes", 2, "did you mean 'simulated'"),
-        ("measure mine.yaml limits_mm.cell.yaml -o m --yes", 2, "limits: x: .* is it in mm"),
+        (
+            "measure mine.yaml machine.cell.yaml -o m --yes",
+            2,
+            "did you mean 'simulated'",
+        ),
+        (
+            "measure mine.yaml limits_mm.cell.yaml -o m --yes",
+            2,
+            "limits: x: .* is it in mm",
+        ),
         ("measure mine.yaml falling.cell.yaml -o m --yes", 2, "two rising numbers"),
         ("export R.json siemens -o t.ini --unit mm", 2, "'R.json' is a file, and "),
-        ("certificate config/certificates/details.yaml R.json -o c.xml", 2, "details.yaml"),
+        (
+            "certificate config/certificates/details.yaml R.json -o c.xml",
+            2,
+            "details.yaml",
+        ),
         # plans
         *(
             (f"plan check {name}.yaml", code, says)
@@ -183,7 +259,11 @@ MISTAKES = [
                 ("even", 2, "grid_size.*'five'"),
                 ("two_a", 2, "two_a.yaml: .*'a'"),
                 ("no_views", 2, "no_views.yaml: .*views"),
-                ("misspelt", 2, "rotation_degrees: unknown key; did you mean 'rotation_deg'"),
+                (
+                    "misspelt",
+                    2,
+                    "rotation_degrees: unknown key; did you mean 'rotation_deg'",
+                ),
                 ("radians", 2, "rotation_rad: .*rotation_deg"),
                 ("turn_rad", 2, "is it in rad.*give 90"),
                 ("comma", 2, "comma.yaml"),
@@ -207,7 +287,11 @@ MISTAKES = [
         ("solve bags/camera", 4, "selfcal detect"),
         ("solve bags/demo --model plate", 2, "plate"),
         ("solve bags/demo --model drift:fast", 2, "drift:fast|'fast'"),
-        ("solve bags/demo --reference artifact", 2, "is not KIND:ERROR:U; write e.g. artifact:"),
+        (
+            "solve bags/demo --reference artifact",
+            2,
+            "is not KIND:ERROR:U; write e.g. artifact:",
+        ),
         ("solve bags/demo --certificate PTB", 2, "name the length with --reference"),
         ("solve bags/demo --microscope 1:2:3:4", 2, "--microscope"),
         ("solve bags/demo --map big", 2, "--map"),
@@ -230,22 +314,38 @@ MISTAKES = [
         ),
         ("apply R.json no.csv -o o.csv", 2, "no.csv: no such file"),
         # controllers
-        ("export heidenhain R.json -o t.txt --unit mm", 2, "'heidenhain' is unknown; known are "),
+        (
+            "export heidenhain R.json -o t.txt --unit mm",
+            2,
+            "'heidenhain' is unknown; known are ",
+        ),
         ("export siemens R.json --unit mm", 2, "-o or --output is missing"),
         ("export siemens R.json -o t.ini --unit inch", 2, "'inch' is unknown; "),
         ("cal export R.json -o s.cal --x-axis 1 --y-axis 1", 2, "axis"),
         ("cal export R.json -o s.cal --x-axis X", 2, "--x-axis: .*'X'"),
         ("cal eval stage.cal --position 1", 2, "--position"),
         ("cal eval stage.cal --position 1=ten", 2, "'ten'"),
-        ("cal eval stage.cal --position 1=10,5", 2, "'10,5' is not a number; .* 1=10.5"),
+        (
+            "cal eval stage.cal --position 1=10,5",
+            2,
+            "'10,5' is not a number; .* 1=10.5",
+        ),
         ("cal check R.json", 2, "is a result, and a calibration file is needed here"),
         ("cal check no.cal", 2, "no.cal: no such file"),
         ("gcode part.nc R.json -o o.nc", 2, "dialect"),
         ("certificate R.json no.yaml -o c.xml", 2, "no.yaml: no such file"),
         ("detect bags/camera -o marks", 2, "pixel_size and mark_size"),
         ("detect bags/demo -o marks --pixel-size 6e-6 --mark-size 72e-6", 4, "image"),
-        ("detect bags/camera -o marks --pixel-size 6 --mark-size 72", 2, "pixel_size|mark_size"),
-        ("camera init bags/demo -o n.yaml --mark-size 72e-6 --mark-pixels 12", 4, "image"),
+        (
+            "detect bags/camera -o marks --pixel-size 6 --mark-size 72",
+            2,
+            "pixel_size|mark_size",
+        ),
+        (
+            "camera init bags/demo -o n.yaml --mark-size 72e-6 --mark-pixels 12",
+            4,
+            "image",
+        ),
         ("step-diagonal points.csv --method new", 2, "the column 'block' is missing"),
         ("batch no_folder -o out", 2, "no_folder: no such file or folder"),
         ("batch config -o out", 4, "no bag in it"),
@@ -285,7 +385,9 @@ def _furnish(folder: Path) -> None:
     (folder / "part.nc").write_text("G21 G90\nG0 X0 Y0\n")
     (folder / "cut.json").write_text((folder / "R.json").read_text()[:LEFT_OF_FILE])
     (folder / "newer.json").write_text(
-        (folder / "R.json").read_text().replace("selfcal.result/1", "selfcal.result/2", 1)
+        (folder / "R.json")
+        .read_text()
+        .replace("selfcal.result/1", "selfcal.result/2", 1)
     )
     bag = next((ROOT / "bags/demo").glob("*.mcap")).read_bytes()
     (folder / "cut.mcap").write_bytes(bag[:6])
@@ -313,7 +415,9 @@ def wrong() -> list[str]:
         for mistake in MISTAKES:
             code, said = _run(shlex.split(mistake.command))
             lines = said.splitlines()
-            if (code, len(lines)) != (mistake.code, 1) or not re.search(mistake.says, lines[0]):
+            if (code, len(lines)) != (mistake.code, 1) or not re.search(
+                mistake.says, lines[0]
+            ):
                 found.append(
                     f"selfcal {mistake.command}: code {code}, not {mistake.code}; "
                     f"{len(lines)} lines: {said.strip()!r}"

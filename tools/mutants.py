@@ -61,7 +61,12 @@ COMPARE = {
     ast.Eq: ("==", "!="),
     ast.NotEq: ("!=", "=="),
 }
-ARITHMETIC = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
+ARITHMETIC = {
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+}
 NAMES = {
     "sin": "cos",
     "cos": "sin",
@@ -119,9 +124,17 @@ class Source:
 
 
 def _operator(node: ast.AST, source: Source) -> tuple | None:
-    if isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC and not _is_text(node):
+    if (
+        isinstance(node, ast.BinOp)
+        and type(node.op) in ARITHMETIC
+        and not _is_text(node)
+    ):
         return source.sign(node.left, node.right, *ARITHMETIC[type(node.op)])
-    if isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in COMPARE:
+    if (
+        isinstance(node, ast.Compare)
+        and len(node.ops) == 1
+        and type(node.ops[0]) in COMPARE
+    ):
         return source.sign(node.left, node.comparators[0], *COMPARE[type(node.ops[0])])
     if isinstance(node, ast.BoolOp):
         words = ("and", "or") if isinstance(node.op, ast.And) else ("or", "and")
@@ -138,7 +151,10 @@ def _name_or_number(node: ast.AST, source: Source) -> tuple | None:
         stop = source.place(node)[1]
         return (stop - len(node.attr), stop, NAMES[node.attr])
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        return (*source.place(node), {0: "1", 1: "0"}.get(node.value, f"({node.value} * 2)"))
+        return (
+            *source.place(node),
+            {0: "1", 1: "0"}.get(node.value, f"({node.value} * 2)"),
+        )
     return None
 
 
@@ -165,9 +181,14 @@ def _is_text(node: ast.BinOp) -> bool:
 def _code(tree: ast.AST) -> Iterator[ast.AST]:
     """Yield the nodes that decide what is computed: no messages, types, defaults of decorators."""
     for child in ast.iter_child_nodes(tree):
-        if isinstance(child, ast.Raise | ast.JoinedStr | ast.arg | ast.Import | ast.ImportFrom):
+        if isinstance(
+            child, ast.Raise | ast.JoinedStr | ast.arg | ast.Import | ast.ImportFrom
+        ):
             continue
-        if isinstance(tree, ast.FunctionDef) and child in (tree.returns, *tree.decorator_list):
+        if isinstance(tree, ast.FunctionDef) and child in (
+            tree.returns,
+            *tree.decorator_list,
+        ):
             continue
         if isinstance(tree, ast.ClassDef) and child in tree.decorator_list:
             continue
@@ -177,7 +198,9 @@ def _code(tree: ast.AST) -> Iterator[ast.AST]:
         yield from _code(child)
 
 
-def sample(number: int, seed: int, only: list[str], *, root: Path = ROOT) -> list[Mutant]:
+def sample(
+    number: int, seed: int, only: list[str], *, root: Path = ROOT
+) -> list[Mutant]:
     """Return a seeded sample, as many from a long module as its length asks for."""
     found: list[tuple[str, Mutant]] = []
     package = root / PACKAGE.name
@@ -217,7 +240,8 @@ def _in_a_fork(run: Callable[[], int], cwd: Path) -> int | None:
     if child == 0:
         os.setsid()
         os.chdir(cwd)
-        os.environ.pop("PYTEST_ADDOPTS", None)  # of those who run this by pytest, as colcon does
+        # of those who run this by pytest, as colcon does
+        os.environ.pop("PYTEST_ADDOPTS", None)
         # bytecode of the same second and size as a change would be taken for that of the change
         os.environ["PYTHONDONTWRITEBYTECODE"], sys.dont_write_bytecode = "1", True
         status = 1
@@ -295,7 +319,9 @@ class Tree:
         first = self.folder.with_name("first_failed")
         first.unlink(missing_ok=True)
         status = _in_a_fork(
-            lambda: pytest.main([*options, *files], plugins=[FirstFailed(tests, first)]),
+            lambda: pytest.main(
+                [*options, *files], plugins=[FirstFailed(tests, first)]
+            ),
             self.folder,
         )
         if status in (None, -signal.SIGXCPU):
@@ -318,7 +344,9 @@ class Tree:
                 if failed is None:
                     break
                 if failed == "start" and self.failing(group) == "start":
-                    raise SystemExit(f"the tests do not start, also without a change: {group}")
+                    raise SystemExit(
+                        f"the tests do not start, also without a change: {group}"
+                    )
                 if failed in ("time", "start") or self._is_sound(failed):
                     return False
         return True
@@ -333,7 +361,9 @@ class Tree:
 def main() -> int:
     """Run the sample and print the survivors."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--number", type=int, default=40, help="changes to try (default: 40)")
+    parser.add_argument(
+        "--number", type=int, default=40, help="changes to try (default: 40)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument(
         "--only",
@@ -342,7 +372,9 @@ def main() -> int:
         metavar="PATH",
         help="file or folder, e.g. selfcal_ros/estimation; may be repeated",
     )
-    parser.add_argument("--skip", type=int, default=0, help="leave out the first of the sample")
+    parser.add_argument(
+        "--skip", type=int, default=0, help="leave out the first of the sample"
+    )
     parser.add_argument(
         "--seconds",
         type=float,
@@ -350,12 +382,17 @@ def main() -> int:
         help="time of the tests of one change, as in the suite (default: 600)",
     )
     parser.add_argument(
-        "--watch", action="store_true", help="note anew which functions each test enters"
+        "--watch",
+        action="store_true",
+        help="note anew which functions each test enters",
     )
     args = parser.parse_args()
     if args.watch or not list(KEPT.glob("*.json")):
         shutil.rmtree(KEPT, ignore_errors=True)
-        print("noting which functions each test enters: in the time of the whole suite", flush=True)
+        print(
+            "noting which functions each test enters: in the time of the whole suite",
+            flush=True,
+        )
         subprocess.run(
             [
                 sys.executable,
@@ -377,10 +414,19 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="mutants") as folder:
         tree = Tree(Path(folder) / "tree")
         watched = Watched(KEPT, tree.folder)
-        chosen = sample(args.number, args.seed, args.only, root=tree.folder)[args.skip :]
+        chosen = sample(args.number, args.seed, args.only, root=tree.folder)[
+            args.skip :
+        ]
         for number, mutant in enumerate(chosen, args.skip + 1):
-            line = (tree.folder / mutant.path).read_text().splitlines()[mutant.line - 1].strip()
-            alive = tree.survives(mutant, watched.groups(mutant.path, mutant.line, args.seconds))
+            line = (
+                (tree.folder / mutant.path)
+                .read_text()
+                .splitlines()[mutant.line - 1]
+                .strip()
+            )
+            alive = tree.survives(
+                mutant, watched.groups(mutant.path, mutant.line, args.seconds)
+            )
             survivors += alive
             print(
                 f"{number}/{args.number} {'SURVIVED' if alive else 'seen'}: {mutant.path}:"

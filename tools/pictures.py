@@ -39,7 +39,9 @@ FIGURES = ("error-map", "residual-maps")
 
 def calibrated() -> tuple[CalibrationResult, Measurements]:
     """Return the calibration of the demo's bag, and the readings in it."""
-    measurements, _, lost, _ = collect_bag(BAG, CollectorSettings.checked({}, "pictures"))
+    measurements, _, lost, _ = collect_bag(
+        BAG, CollectorSettings.checked({}, "pictures")
+    )
     options = solver_options(SolverSettings.checked({}, "pictures"), measurements)
     result = with_input(worded(calibrate(measurements, options)), bag_input(BAG), lost)
     return result, measurements
@@ -60,7 +62,8 @@ def camera_image() -> str:
     Image.fromarray(values).save(file, "PNG")
     data = base64.b64encode(file.getvalue()).decode()
     rings = "".join(
-        f'<circle cx="{mark.u + 0.5:.1f}" cy="{mark.v + 0.5:.1f}" r="8"/>' for mark in marks
+        f'<circle cx="{mark.u + 0.5:.1f}" cy="{mark.v + 0.5:.1f}" r="8"/>'
+        for mark in marks
     )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {camera.width} {camera.height}" '

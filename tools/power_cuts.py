@@ -19,7 +19,14 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from selfcal_ros.units import NM_PER_M
-from test.support.power_cuts import cuts, detections, measured, outcome, passages, prepare
+from test.support.power_cuts import (
+    cuts,
+    detections,
+    measured,
+    outcome,
+    passages,
+    prepare,
+)
 
 SIGMAS = 4.0
 
@@ -58,7 +65,10 @@ def main() -> int:
                 continue
             found = outcome(place, whole, kept)
             is_right = (
-                not found.lost and not found.doubled and found.qualified and (found.away <= SIGMAS)
+                not found.lost
+                and not found.doubled
+                and found.qualified
+                and (found.away <= SIGMAS)
             )
             wrong += not is_right
             print(
@@ -66,7 +76,9 @@ def main() -> int:
                 f"{found.away:5.2f}{'' if is_right else '  WRONG'}",
                 flush=True,
             )
-    print(f"{args.cuts - wrong} of {args.cuts} resumed to the map of the undisturbed run")
+    print(
+        f"{args.cuts - wrong} of {args.cuts} resumed to the map of the undisturbed run"
+    )
     return 1 if wrong else 0
 
 

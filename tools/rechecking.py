@@ -65,7 +65,9 @@ class Case:
     nodes: int = 3
 
 
-def complex_normal(rng: np.random.Generator, shape: tuple[int, ...], size: float) -> np.ndarray:
+def complex_normal(
+    rng: np.random.Generator, shape: tuple[int, ...], size: float
+) -> np.ndarray:
     return size * (rng.normal(size=shape) + 1j * rng.normal(size=shape))
 
 
@@ -87,35 +89,49 @@ class Machine:
             return out
         k, (stage, plate) = np.arange(artifact.angular_count), self.lines
         turn = round(view.rotation_rad / (2 * np.pi) * len(k))
-        theta = stage[(k + turn) % len(k)] + plate + phi + rng.normal(0, SIGMA_RAD, len(k))
+        theta = (
+            stage[(k + turn) % len(k)] + plate + phi + rng.normal(0, SIGMA_RAD, len(k))
+        )
         return replace(out, k=k, dtheta=theta, count_theta=np.ones(len(k), dtype=int))
 
-    def _marks(self, out: ViewReadings, phi: float, rng: np.random.Generator) -> ViewReadings:
+    def _marks(
+        self, out: ViewReadings, phi: float, rng: np.random.Generator
+    ) -> ViewReadings:
         artifact, view = self.artifact, out.view
         inside = view.pose.in_field(artifact)
         m, n = artifact.m[inside], artifact.n[inside]
         mark, phase = (m + 1j * n) * PITCH_M, view.pose.phase
         spline = MapSpline.of(
-            artifact.field, Interpolation.BICUBIC if artifact.map_grid else Interpolation.BILINEAR
+            artifact.field,
+            Interpolation.BICUBIC if artifact.map_grid else Interpolation.BILINEAR,
         )
         z = mark / np.abs(mark.real).max()
         bent = np.stack([z**2, abs(z) ** 2, z.conj() ** 2], axis=-1) @ complex_normal(
             rng, (3,), BEND_M
         )
-        seen = phase * np.exp(1j * phi) * (mark + self.plate[inside] + bent) - phase * mark
+        seen = (
+            phase * np.exp(1j * phi) * (mark + self.plate[inside] + bent) - phase * mark
+        )
         seen += (
-            spline.rows(view.pose.places(artifact, m, n)) @ spline.coefficients(self.field).ravel()
+            spline.rows(view.pose.places(artifact, m, n))
+            @ spline.coefficients(self.field).ravel()
         )
         seen += complex_normal(rng, (), 3e-6) + complex_normal(rng, m.shape, SIGMA_M)
-        return replace(out, m=m, n=n, dx=seen.real, dy=seen.imag, count=np.ones(len(m), dtype=int))
+        return replace(
+            out, m=m, n=n, dx=seen.real, dy=seen.imag, count=np.ones(len(m), dtype=int)
+        )
 
 
 def smooth(field: Artifact, rng: np.random.Generator) -> np.ndarray:
     """Return a smooth random map without motion and scale, rms 1 of each coordinate."""
     z = (field.x_m + 1j * field.y_m).ravel()
-    near = np.exp(-(np.abs(z[:, None] - z) ** 2) / (2 * (LENGTH * np.ptp(field.x_m)) ** 2))
+    near = np.exp(
+        -(np.abs(z[:, None] - z) ** 2) / (2 * (LENGTH * np.ptp(field.x_m)) ** 2)
+    )
     values, vectors = np.linalg.eigh(near)
-    drawn = (vectors * np.sqrt(np.maximum(values, 0))) @ complex_normal(rng, z.shape, 1.0)
+    drawn = (vectors * np.sqrt(np.maximum(values, 0))) @ complex_normal(
+        rng, z.shape, 1.0
+    )
     xy = np.stack([drawn.real, drawn.imag]).reshape(2, *field.shape)
     xy = remove_modes(xy, datum_modes(field, scale=True))
     return (xy[0] + 1j * xy[1]) / rms(xy)
@@ -126,7 +142,10 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
 
     And of the new map the part in U, and error / u, rms.
     """
-    artifact, rng = MAPS[case.plan], np.random.default_rng([case.seed, int(case.size > 0)])
+    artifact, rng = (
+        MAPS[case.plan],
+        np.random.default_rng([case.seed, int(case.size > 0)]),
+    )
     lines = artifact.angular_count > 0
     machine = Machine(
         artifact,
@@ -139,9 +158,14 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
         for i, (turn, (a, b)) in enumerate(PLANS[case.plan])
     )
     if lines:
-        views = (*views, View("line", 2 * np.pi / artifact.angular_count, (0.0, 0.0), False, True))
+        views = (
+            *views,
+            View("line", 2 * np.pi / artifact.angular_count, (0.0, 0.0), False, True),
+        )
     before = calibrate(
-        Measurements(case.plan, artifact, tuple(machine.read(view, rng) for view in views)),
+        Measurements(
+            case.plan, artifact, tuple(machine.read(view, rng) for view in views)
+        ),
         Options(),
     )
     field = machine.field.copy()
@@ -164,7 +188,8 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
     inside = float(np.mean(np.abs(error[good]) < result.noise.k_xy * u[good]))
     failed = {found.name for found in result.verdict.failed}
     return (
-        before.verdict.qualified and failed <= {"changed_or_drifted"},  # read in one pass
+        before.verdict.qualified
+        and failed <= {"changed_or_drifted"},  # read in one pass
         bool(result.recheck.changed),
         inside,
         float(np.sqrt(np.mean((error[good] / u[good]) ** 2))),
@@ -173,10 +198,18 @@ def run(case: Case) -> tuple[bool, bool, float, float]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--machines", type=int, default=200, help="of each plan (default: 200)")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first (default: 0)")
-    parser.add_argument("--size", type=float, default=3.0, help="of a change, over u (default: 3)")
-    parser.add_argument("--nodes", type=int, default=3, help="changed; 0 = all (default: 3)")
+    parser.add_argument(
+        "--machines", type=int, default=200, help="of each plan (default: 200)"
+    )
+    parser.add_argument(
+        "--first", type=int, default=0, help="seed of the first (default: 0)"
+    )
+    parser.add_argument(
+        "--size", type=float, default=3.0, help="of a change, over u (default: 3)"
+    )
+    parser.add_argument(
+        "--nodes", type=int, default=3, help="changed; 0 = all (default: 3)"
+    )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     args = parser.parse_args()
     print(
@@ -194,7 +227,11 @@ def main() -> int:
                 raise outcome.error
             found[outcome.index] = outcome.value
         same, other = (
-            [one[1] for one, case in zip(found, cases, strict=True) if bool(case.size) is changes]
+            [
+                one[1]
+                for one, case in zip(found, cases, strict=True)
+                if bool(case.size) is changes
+            ]
             for changes in (False, True)
         )
         print(

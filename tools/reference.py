@@ -159,7 +159,10 @@ def table(head: tuple[str, ...], rows: Iterator[tuple[str, ...]] | list) -> list
     return [
         "| " + " | ".join(head) + " |",
         "|" + "---|" * len(head),
-        *("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows),
+        *(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+            for row in rows
+        ),
     ]
 
 
@@ -190,14 +193,21 @@ def plan_keys() -> list[str]:
             f"artifact.{key}"
             for key in known_keys(whole | {"artifact": whole["artifact"] | strange})
         ),
-        *(f"views[].{key}" for key in known_keys(whole | {"views": [{"name": "a"} | strange]})),
+        *(
+            f"views[].{key}"
+            for key in known_keys(whole | {"views": [{"name": "a"} | strange]})
+        ),
     ]
 
 
-def described(keys: list[str], words: dict[str, str], what: str) -> list[tuple[str, str]]:
+def described(
+    keys: list[str], words: dict[str, str], what: str
+) -> list[tuple[str, str]]:
     missing = sorted(set(keys) ^ set(words))
     if missing:
-        raise SystemExit(f"{what}: {', '.join(missing)}: described and not there, or the reverse")
+        raise SystemExit(
+            f"{what}: {', '.join(missing)}: described and not there, or the reverse"
+        )
     return [(f"`{key}`", words[key]) for key in keys]
 
 
@@ -216,9 +226,13 @@ def parameters_text() -> str:
             facts = "; ".join(filter(None, (p.unit, bounds(p))))
             about = f"{p.description} [{facts}]" if facts else p.description
             lines += [f"    # {line}" for line in wrap(about, 90)]
-            number = isinstance(p.default, int | float) and not isinstance(p.default, bool)
+            number = isinstance(p.default, int | float) and not isinstance(
+                p.default, bool
+            )
             # ROS takes a bare y as true; 1e-09 is a number with a point alone
-            default = safe_dump(p.default).split()[0] if number else json.dumps(p.default)
+            default = (
+                safe_dump(p.default).split()[0] if number else json.dumps(p.default)
+            )
             lines.append(f"    {p.name}: {default}")
     return "\n".join(lines) + "\n"
 
@@ -227,7 +241,9 @@ def message_rows() -> Iterator[tuple[str, ...]]:
     """Yield each message, service and action with the first sentence of its definition."""
     for kind in ("msg", "srv", "action"):
         for path in sorted((ROOT / "msg_defs" / kind).iterdir()):
-            about = takewhile(lambda line: line.startswith("#"), path.read_text().splitlines())
+            about = takewhile(
+                lambda line: line.startswith("#"), path.read_text().splitlines()
+            )
             words = " ".join(line.lstrip("# ") for line in about)
             first = words.partition(". ")[0].rstrip(".") + "."
             yield f"[{path.name}](../../{path.relative_to(ROOT)})", first
@@ -237,7 +253,9 @@ def text(result: dict[str, Any]) -> str:
     """Return the page; `result` is the JSON form of a result."""
     unknown = set(result) - set(RESULT)
     if unknown or set(RESULT) - set(result):
-        raise SystemExit(f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}")
+        raise SystemExit(
+            f"RESULT.json: {sorted(unknown ^ (set(RESULT) - set(result)))}"
+        )
     lines = [
         HEAD,
         "## PLAN.yaml",
@@ -284,7 +302,9 @@ def example() -> dict[str, Any]:
     rng = np.random.default_rng(1)
     plan = hu_plan(Artifact(5, 0.01, 8), 2)
     truth = random_truth(plan.artifact, len(plan.views), rng)
-    readings = simulate_measurements(truth, plan, rng, sigma_m=1e-8, sigma_theta_rad=1e-6)
+    readings = simulate_measurements(
+        truth, plan, rng, sigma_m=1e-8, sigma_theta_rad=1e-6
+    )
     return result_to_dict(worded(calibrate(readings)))
 
 

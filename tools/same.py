@@ -109,7 +109,10 @@ def session(number: int) -> tuple[dict[str, object], list[str]]:
         for name, size in EFFECTS.items()
         if draw.random() < 0.15
     }
-    noise = {"sigma_xy": 2e-8 * 10 ** draw.uniform(-1, 1), "sigma_theta": 1.7e-5 * draw.random()}
+    noise = {
+        "sigma_xy": 2e-8 * 10 ** draw.uniform(-1, 1),
+        "sigma_theta": 1.7e-5 * draw.random(),
+    }
     if draw.random() < 0.2:
         noise["noise_ratio"] = 10 ** draw.uniform(-0.5, 0.5)
     if draw.random() < 0.1:
@@ -121,7 +124,11 @@ def session(number: int) -> tuple[dict[str, object], list[str]]:
         cell["stop_sigma"] = 2e-5
     if draw.random() < 0.2:
         cell["sense"] = "plate_moves"
-    faults = {name: part * draw.random() for name, part in FAULTS.items() if draw.random() < 0.1}
+    faults = {
+        name: part * draw.random()
+        for name, part in FAULTS.items()
+        if draw.random() < 0.1
+    }
     simulation = {
         "plan": str(ROOT / f"config/plans/{draw.choice(PLANS)}.yaml"),
         "seed": number,
@@ -181,7 +188,9 @@ def case(name: str) -> tuple[str, dict[str, object]]:
             return name, solved(ROOT / "bags" / bag, options, scratch)
         simulation, options = session(int(rest))
         (scratch / "sim.yaml").write_text(json.dumps(simulation))  # JSON is YAML
-        code, shown = _run("simulate", str(scratch / "sim.yaml"), "-o", str(scratch / "bag"))
+        code, shown = _run(
+            "simulate", str(scratch / "sim.yaml"), "-o", str(scratch / "bag")
+        )
         if code:
             return name, {"/simulate": code, "/fault": shown[-300:]}
         return name, solved(scratch / "bag", options, scratch)
@@ -202,7 +211,8 @@ def differ(old: object, new: object, allowed: float, part: float) -> bool:
     """Return whether two values differ: numbers by more than `allowed` and a part of themselves."""
     if isinstance(old, list) and isinstance(new, list):
         return len(old) != len(new) or any(
-            differ(one, other, allowed, part) for one, other in zip(old, new, strict=True)
+            differ(one, other, allowed, part)
+            for one, other in zip(old, new, strict=True)
         )
     if allowed and isinstance(old, int | float) and isinstance(new, int | float):
         return not abs(old - new) <= allowed + part * max(abs(old), abs(new))
@@ -232,30 +242,41 @@ def factors_of(case: dict[str, object]) -> list[np.ndarray]:
     parts = [of_map]
     for name in ("plate", "lines", "microscope"):
         beside = rows(f"beside/{name}")
-        if len(beside):  # the first belong to factors of the map, the others leave it as it is
+        # the first belong to factors of the map, the others leave it as it is
+        if len(beside):
             other = np.zeros((len(of_map) - shared, beside.shape[1]))
             parts.append(np.concatenate([beside[:shared], other, beside[shared:]]))
     most = max(map(len, parts))
     return [np.pad(part, ((0, most - len(part)), (0, 0))) for part in parts]
 
 
-def same_covariance(old: dict[str, object], new: dict[str, object], part: float) -> bool:
+def same_covariance(
+    old: dict[str, object], new: dict[str, object], part: float
+) -> bool:
     """Return whether L L' agrees, to a part of the largest variance of map, plate and lines."""
     before, after = factors_of(old), factors_of(new)
-    if [columns.shape[1] for columns in before] != [columns.shape[1] for columns in after]:
+    if [columns.shape[1] for columns in before] != [
+        columns.shape[1] for columns in after
+    ]:
         return False
     size = np.concatenate(
         [
-            np.full(columns.shape[1], np.sqrt((columns**2).sum(axis=0)).max(initial=0.0))
+            np.full(
+                columns.shape[1], np.sqrt((columns**2).sum(axis=0)).max(initial=0.0)
+            )
             for columns in before
         ]
     )
     one, other = (np.hstack(columns) for columns in (before, after))
-    return bool((abs(one.T @ one - other.T @ other) <= part * np.outer(size, size)).all())
+    return bool(
+        (abs(one.T @ one - other.T @ other) <= part * np.outer(size, size)).all()
+    )
 
 
 def compare(
-    before: dict[str, dict[str, object]], after: dict[str, dict[str, object]], part: float = 0.0
+    before: dict[str, dict[str, object]],
+    after: dict[str, dict[str, object]],
+    part: float = 0.0,
 ) -> int:
     """Print which values differ, and return how many cases have any."""
     different = 0
@@ -290,9 +311,13 @@ def main() -> int:
     """Record or compare."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("record", type=Path, metavar="RECORD.json.gz")
-    parser.add_argument("--against", action="store_true", help="compare with RECORD.json.gz")
+    parser.add_argument(
+        "--against", action="store_true", help="compare with RECORD.json.gz"
+    )
     parser.add_argument("--sessions", type=int, default=200, metavar="N")
-    parser.add_argument("--only", default="", metavar="TEXT", help="cases with TEXT in their name")
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="cases with TEXT in their name"
+    )
     parser.add_argument(
         "--within",
         type=float,
@@ -306,7 +331,9 @@ def main() -> int:
         names = [name for name in before if args.only in name]
         return 1 if compare(before, record(names), args.within) else 0
     bags = sorted(bag.name for bag in (ROOT / "bags").iterdir() if bag.is_dir())
-    names = [" ".join(("bag", bag, *options)) for bag in bags for options in BAG_OPTIONS]
+    names = [
+        " ".join(("bag", bag, *options)) for bag in bags for options in BAG_OPTIONS
+    ]
     names += [f"session {number}" for number in range(args.sessions)]
     done = record([name for name in names if args.only in name])
     args.record.write_bytes(gzip.compress(json.dumps(done).encode()))

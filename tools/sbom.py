@@ -54,7 +54,9 @@ def pins() -> dict[str, tuple[str, list[str]]]:
 
 def required() -> set[str]:
     """Return the names that `pip install .` brings, with what they need."""
-    text = re.search(r"install_requires=(\[.*?\])", (ROOT / "setup.py").read_text(), re.S)
+    text = re.search(
+        r"install_requires=(\[.*?\])", (ROOT / "setup.py").read_text(), re.S
+    )
     assert text is not None
     found: set[str] = set()
     waiting = tomllib.loads(f"names = {text[1]}")["names"]

@@ -15,7 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal_ros.laser import simulation as measure
-from selfcal_ros.laser.data import DIAGONALS, Closure, Method, StepDiagonal, StepDiagonalResult
+from selfcal_ros.laser.data import (
+    DIAGONALS,
+    Closure,
+    Method,
+    StepDiagonal,
+    StepDiagonalResult,
+)
 from selfcal_ros.laser.identify import Choice, identify
 from selfcal_ros.laser.profiles import squareness, straightness
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing
@@ -79,7 +85,9 @@ class Effect:
     straightness_m: float
 
 
-def _setup_fault(name: str, make: Callable[[float], tuple[measure.SetUp, measure.SetUp]]) -> Fault:
+def _setup_fault(
+    name: str, make: Callable[[float], tuple[measure.SetUp, measure.SetUp]]
+) -> Fault:
     def apply(machine: measure.StepMachine, size: float) -> Broken:
         pp, other = make(size)
         return machine, measure.Measurement({PP: pp, NP: other})
@@ -87,12 +95,16 @@ def _setup_fault(name: str, make: Callable[[float], tuple[measure.SetUp, measure
     return Fault(name, 1e-3, "rad", apply)
 
 
-def _yaw(axis: int, *, wavy: bool = False, abbe_m: float = 0.0, stacked: bool = False) -> Callable:
+def _yaw(
+    axis: int, *, wavy: bool = False, abbe_m: float = 0.0, stacked: bool = False
+) -> Callable:
     """Return a fault of an axis that turns by `size` in every block, or back and forth."""
 
     def apply(machine: measure.StepMachine, size: float) -> Broken:
         turns = np.zeros((machine.dim, machine.n_blocks, 3))
-        turns[axis, :, 2] = size * ((-1.0) ** np.arange(machine.n_blocks) if wavy else 1.0)
+        turns[axis, :, 2] = size * (
+            (-1.0) ** np.arange(machine.n_blocks) if wavy else 1.0
+        )
         spot = measure.SetUp(abbe_m=(-abbe_m / np.sqrt(2), abbe_m / np.sqrt(2), 0.0))
         return (
             replace(machine, turns_rad=turns, stacked=stacked),
@@ -119,13 +131,23 @@ FAULTS = (
         "",
         lambda machine, _: (
             machine,
-            measure.Measurement(dict.fromkeys((PP, NP), measure.SetUp(to_machine=False))),
+            measure.Measurement(
+                dict.fromkeys((PP, NP), measure.SetUp(to_machine=False))
+            ),
         ),
     ),
-    _setup_fault("mirror off, pp", lambda s: (measure.SetUp(mirror_rad=(s,)), measure.SetUp())),
-    _setup_fault("mirror off, pp and np equally", lambda s: (measure.SetUp(mirror_rad=(s,)),) * 2),
-    _setup_fault("laser off, pp", lambda s: (measure.SetUp(laser_rad=(s,)), measure.SetUp())),
-    _setup_fault("laser off, pp and np equally", lambda s: (measure.SetUp(laser_rad=(s,)),) * 2),
+    _setup_fault(
+        "mirror off, pp", lambda s: (measure.SetUp(mirror_rad=(s,)), measure.SetUp())
+    ),
+    _setup_fault(
+        "mirror off, pp and np equally", lambda s: (measure.SetUp(mirror_rad=(s,)),) * 2
+    ),
+    _setup_fault(
+        "laser off, pp", lambda s: (measure.SetUp(laser_rad=(s,)), measure.SetUp())
+    ),
+    _setup_fault(
+        "laser off, pp and np equally", lambda s: (measure.SetUp(laser_rad=(s,)),) * 2
+    ),
     _setup_fault(
         "laser and mirror off, pp",
         lambda s: (measure.SetUp(laser_rad=(s,), mirror_rad=(s,)), measure.SetUp()),
@@ -138,12 +160,17 @@ FAULTS = (
     Fault("X turns back and forth, per block", 1e-6, "rad", _yaw(0, wavy=True)),
     Fault("Y turns steadily, per block", 1e-6, "rad", _yaw(1)),
     Fault("X turns and carries Y, per block", 1e-6, "rad", _yaw(0, stacked=True)),
-    Fault("X turns steadily, beam 10 mm off the point", 1e-6, "rad", _yaw(0, abbe_m=0.01)),
+    Fault(
+        "X turns steadily, beam 10 mm off the point", 1e-6, "rad", _yaw(0, abbe_m=0.01)
+    ),
     Fault(
         "unit of length of the laser, pp",
         1e-7,
         "relative",
-        lambda machine, size: (machine, measure.Measurement({PP: measure.SetUp(scale=size)})),
+        lambda machine, size: (
+            machine,
+            measure.Measurement({PP: measure.SetUp(scale=size)}),
+        ),
     ),
     Fault(
         "noise of a laser distance, 3 repeats",
@@ -165,10 +192,15 @@ FAULTS = (
 def effect(machine: measure.StepMachine, data: StepDiagonal, method: Method) -> Effect:
     """Return the errors of one identification relative to the truth."""
     found = identify(data, Choice(method, allow_equal=True))
-    truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
+    truth = StepDiagonalResult(
+        machine.steps_m, machine.truth_m(), None, "", "", {}, Closure()
+    )
     wrong = np.abs(found.errors_m - truth.errors_m)
     straight = [
-        abs(straightness(found, axis, 1 - axis).value - straightness(truth, axis, 1 - axis).value)
+        abs(
+            straightness(found, axis, 1 - axis).value
+            - straightness(truth, axis, 1 - axis).value
+        )
         for axis in (0, 1)
     ]
     return Effect(
@@ -234,13 +266,17 @@ def _both(
     """Return the effect on each formulation, from the same draws."""
     seed = int(rng.integers(2**63))
     return {
-        str(method): effect_of(fault, size, machine, method=method, rng=np.random.default_rng(seed))
+        str(method): effect_of(
+            fault, size, machine, method=method, rng=np.random.default_rng(seed)
+        )
         for method in Method
     }
 
 
 def _columns(effects: list[dict[str, Effect]]) -> dict[str, list[dict]]:
-    return {str(method): [vars(each[str(method)]) for each in effects] for method in Method}
+    return {
+        str(method): [vars(each[str(method)]) for each in effects] for method in Method
+    }
 
 
 def sensitivity_text(rows: list[dict]) -> str:
@@ -255,9 +291,14 @@ def sensitivity_text(rows: list[dict]) -> str:
     ]
     for row in rows:
         size = f"{row['size']:g} {row['unit']}" if row["unit"] else "-"
-        values = [row[str(method)][column] * UM_PER_M for method in Method for column in columns]
+        values = [
+            row[str(method)][column] * UM_PER_M
+            for method in Method
+            for column in columns
+        ]
         lines.append(
-            f"{row['fault']:{width}s} {size:>14s} " + " ".join(f"{value:12.4f}" for value in values)
+            f"{row['fault']:{width}s} {size:>14s} "
+            + " ".join(f"{value:12.4f}" for value in values)
         )
     return "\n".join(lines)
 
@@ -267,7 +308,9 @@ def sensitivity_figure(curves: list[dict]) -> Drawing:
 
     `curves` is what `sweep` gives.
     """
-    drawing = titled("sensitivity", "Errors in µm over the angle by which laser or mirror are off")
+    drawing = titled(
+        "sensitivity", "Errors in µm over the angle by which laser or mirror are off"
+    )
     drawing.width = 900.0
     panels = (
         ("linear_m", "linear error of a block"),
@@ -282,7 +325,8 @@ def sensitivity_figure(curves: list[dict]) -> Drawing:
                 Curve(
                     np.array(curve["size"]),
                     np.maximum(
-                        np.array([effect[column] for effect in curve[method]]) * UM_PER_M,
+                        np.array([effect[column] for effect in curve[method]])
+                        * UM_PER_M,
                         NOTHING_UM,
                     ),
                     f"c{place % SERIES}",
@@ -316,7 +360,9 @@ def sensitivity_figure(curves: list[dict]) -> Drawing:
 def main() -> int:
     """Print the table, and draw the curves if asked to."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--plot", metavar="FILE", help="draw the curves (png, svg or pdf)")
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the curves (png, svg or pdf)"
+    )
     args = parser.parse_args()
     machine, rng = measure.case_study_machine(), np.random.default_rng(SEED)
     print(sensitivity_text(sensitivity(machine, rng)))

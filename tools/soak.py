@@ -79,7 +79,9 @@ def shift(hours: float, size: int) -> Recording:
     measurements = simulate_measurements(truth, plan, rng)
     marks = sum(len(view.m) for view in measurements.views)
     repeats = max(1, round(3600 * hours / marks))
-    plan = replace(plan, views=tuple(replace(view, repeats=repeats) for view in plan.views))
+    plan = replace(
+        plan, views=tuple(replace(view, repeats=repeats) for view in plan.views)
+    )
     part = recording(
         plan,
         measurements,
@@ -91,7 +93,8 @@ def shift(hours: float, size: int) -> Recording:
     for axis in ("x", "y"):
         part.detections[axis] += rng.normal(0, SIGMA_M, len(part.detections[axis]))
     first, last = part.commands[0].stamp_ns, part.commands[-1].stamp_ns
-    return replace(part, stamps_ns=np.arange(first, last, ENCODER_NS))  # between views as well
+    # between views as well
+    return replace(part, stamps_ns=np.arange(first, last, ENCODER_NS))
 
 
 def payloads(rows: np.ndarray) -> list[bytes]:
@@ -108,29 +111,41 @@ def batches(part: Recording) -> Iterator[tuple[object, list[tuple[str, bytes]]]]
     edges = [command.stamp_ns for command in part.commands] + [np.iinfo(np.int64).max]
     for command, end in zip(part.commands, edges[1:], strict=True):
         message = build(
-            typestore(), "selfcal_msgs/msg/ViewCommand", from_model.command(command, "stage")
+            typestore(),
+            "selfcal_msgs/msg/ViewCommand",
+            from_model.command(command, "stage"),
         )
         yield (
             command,
             [
                 (
                     "command",
-                    bytes(typestore().serialize_cdr(message, "selfcal_msgs/msg/ViewCommand")),
+                    bytes(
+                        typestore().serialize_cdr(
+                            message, "selfcal_msgs/msg/ViewCommand"
+                        )
+                    ),
                 )
             ],
         )
         first, last = np.searchsorted(part.stamps_ns, (command.stamp_ns, end))
         for start in range(int(first), int(last), BATCH):
             stamps = part.stamps_ns[start : min(start + BATCH, last)]
-            chosen = slice(*np.searchsorted(marks, (stamps[0], stamps[-1] + ENCODER_NS)).tolist())
+            chosen = slice(
+                *np.searchsorted(marks, (stamps[0], stamps[-1] + ENCODER_NS)).tolist()
+            )
             found = [
                 (int(t), "encoder", data)
-                for t, data in zip(stamps, payloads(encoder_rows(part, stamps, 1)), strict=True)
+                for t, data in zip(
+                    stamps, payloads(encoder_rows(part, stamps, 1)), strict=True
+                )
             ]
             found += [
                 (int(t), "detection", data)
                 for t, data in zip(
-                    marks[chosen], payloads(detection_rows(part, chosen, 2)), strict=True
+                    marks[chosen],
+                    payloads(detection_rows(part, chosen, 2)),
+                    strict=True,
                 )
             ]
             yield None, [item[1:] for item in sorted(found, key=lambda item: item[0])]
@@ -176,7 +191,9 @@ class Cell:
         if float(self.health.get("status_ms", 0)) > 0:
             self.status_ms.append(float(self.health["status_ms"]))
             self.worst_ms = max(self.worst_ms, float(self.health["status_ms_max"]))
-            self.worst_cpu_ms = max(self.worst_cpu_ms, float(self.health["status_cpu_ms_max"]))
+            self.worst_cpu_ms = max(
+                self.worst_cpu_ms, float(self.health["status_cpu_ms_max"])
+            )
 
     def _on_summary(self, message: object) -> None:
         if message.views_done > self.views_solved:
@@ -251,16 +268,23 @@ def paced(cell: Cell, batch: list[tuple[str, bytes]]) -> Iterator[str]:
             cell.executor.spin_once(timeout_sec=max(due - time.monotonic(), 0))
 
 
-def run_shift(cell: Cell, part: Recording, pid: int, realtime_s: float) -> dict[str, object]:
+def run_shift(
+    cell: Cell, part: Recording, pid: int, realtime_s: float
+) -> dict[str, object]:
     """Feed the shift; return what was measured on the way."""
     stream, last = (
         batches(part),
-        [int(part.detections["stamp"].searchsorted(c.stamp_ns)) for c in part.commands[2:]],
+        [
+            int(part.detections["stamp"].searchsorted(c.stamp_ns))
+            for c in part.commands[2:]
+        ],
     )
     ends = set(last)
     shares, latencies = [], []
     end_ns = part.detections["stamp"][max(last) - 1]
-    late = int(part.stamps_ns.searchsorted(end_ns - round((realtime_s + MARGIN_S) * 1e9)))
+    late = int(
+        part.stamps_ns.searchsorted(end_ns - round((realtime_s + MARGIN_S) * 1e9))
+    )
     in_time_s, began = 0.0, time.monotonic()
     for command, batch in stream:
         closing = any(
@@ -271,7 +295,11 @@ def run_shift(cell: Cell, part: Recording, pid: int, realtime_s: float) -> dict[
             latencies.append(closing_view(cell, batch, stream, ends))
         else:
             cell.publish(batch)
-        if command is not None and command.phase == Phase.MEASURE and command.view_index == 0:
+        if (
+            command is not None
+            and command.phase == Phase.MEASURE
+            and command.view_index == 0
+        ):
             shares.append(in_time(cell, stream, realtime_s, pid))
             began = time.monotonic()
         elif len(shares) == 1 and cell.sent["encoder"] >= late:
@@ -317,7 +345,9 @@ def same_maps(live: Path, journal: Path) -> bool:
     Stamps that run faster than the clock, and at last in real time, would look like steps of it.
     """
     out, params = FOLDER / "offline.json", FOLDER / "params.yaml"
-    params.write_text("measurement_collector: {ros__parameters: {clock_limit: 3600.0}}\n")
+    params.write_text(
+        "measurement_collector: {ros__parameters: {clock_limit: 3600.0}}\n"
+    )
     done = subprocess.run(
         [
             sys.executable,
@@ -335,7 +365,9 @@ def same_maps(live: Path, journal: Path) -> bool:
         check=False,
     )
     if done.returncode not in (0, 5):
-        raise SystemExit(f"soak: selfcal solve {journal} ends with code {done.returncode}")
+        raise SystemExit(
+            f"soak: selfcal solve {journal} ends with code {done.returncode}"
+        )
     return read_json(live)["error_map"] == read_json(out)["error_map"]
 
 
@@ -344,7 +376,10 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
     part = shift(args.hours, args.size)
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir(parents=True)
-    more = {"measurement_collector": [f"journal:={FOLDER}"], "solver": [f"result_folder:={FOLDER}"]}
+    more = {
+        "measurement_collector": [f"journal:={FOLDER}"],
+        "solver": [f"result_folder:={FOLDER}"],
+    }
     with contextlib.ExitStack() as stack:
         running = {
             node: stack.enter_context(
@@ -387,8 +422,13 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
         f"hours {args.hours:g}  plate {args.size} x {args.size}  encoder {cell.sent['encoder']}  "
         f"detections {cell.sent['detection']}"
     )
-    print(f"speed           {total / found['seconds'] / 1e3:.1f} k messages/s, lost {lost}")
-    print("memory          " + ", ".join(f"{node} {mb:.0f} MB" for node, mb in memory.items()))
+    print(
+        f"speed           {total / found['seconds'] / 1e3:.1f} k messages/s, lost {lost}"
+    )
+    print(
+        "memory          "
+        + ", ".join(f"{node} {mb:.0f} MB" for node, mb in memory.items())
+    )
     print(
         f"status          median {statistics.median(cell.status_ms):.1f} ms, "
         f"max {cell.worst_ms:.1f} ms, {cell.worst_cpu_ms:.1f} ms of CPU"
@@ -403,7 +443,9 @@ def soak(args: argparse.Namespace, environment: dict) -> int:
         print(
             f"latency         last reading to published {what}, ms: "
             + ", ".join(
-                f"{1e3 * latency:.0f}" for told, latency in found["latencies"] if told is has_map
+                f"{1e3 * latency:.0f}"
+                for told, latency in found["latencies"]
+                if told is has_map
             )
         )
     print(
@@ -420,8 +462,12 @@ def main() -> int:
     """Read the arguments and run in a ROS domain of its own."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hours", type=float, default=1.0, help="length by the stamps")
-    parser.add_argument("--size", type=int, default=21, help="marks a side of the plate")
-    parser.add_argument("--realtime", type=float, default=30.0, help="seconds in real time, s")
+    parser.add_argument(
+        "--size", type=int, default=21, help="marks a side of the plate"
+    )
+    parser.add_argument(
+        "--realtime", type=float, default=30.0, help="seconds in real time, s"
+    )
     args = parser.parse_args()
     with domain() as environment:
         os.environ.update(environment)

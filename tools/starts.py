@@ -85,7 +85,9 @@ def _ends(log: Path, result: Path) -> bool:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--starts", type=int, default=20)
-    parser.add_argument("--busy", type=int, default=2, help="busy processes beside the nodes")
+    parser.add_argument(
+        "--busy", type=int, default=2, help="busy processes beside the nodes"
+    )
     args = parser.parse_args()
     failed = 0
     with contextlib.ExitStack() as stack, ended_by_signals():

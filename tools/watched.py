@@ -68,7 +68,8 @@ def functions_at(name: str, line: int, root: Path) -> set[str]:
     names = {
         target.id
         for node in ast.walk(ast.parse(text))
-        if isinstance(node, ast.Assign | ast.AnnAssign) and node.lineno <= line <= node.end_lineno
+        if isinstance(node, ast.Assign | ast.AnnAssign)
+        and node.lineno <= line <= node.end_lineno
         for target in getattr(node, "targets", [getattr(node, "target", None)])
         if isinstance(target, ast.Name)
     }
@@ -108,7 +109,9 @@ class Watched:
         for test in self.seconds:
             by_file[test.split("::")[0]].append(test)
         for function, files in of_files.items():
-            self.tests[function].update(test for file in files for test in by_file[file])
+            self.tests[function].update(
+                test for file in files for test in by_file[file]
+            )
 
     def groups(self, name: str, line: int, seconds: float) -> list[list[str]]:
         """Return the tests that watch a line of a file, the likeliest first, in up to 3 groups.
@@ -120,7 +123,9 @@ class Watched:
         parts = Path(name).with_suffix("").parts[1:]
         mirror = "/".join(("test", *parts[:-1], f"test_{parts[-1]}"))
         files: dict[str, list[str]] = defaultdict(list)
-        for test in set().union(*(self.tests[one] for one in functions_at(name, line, self.root))):
+        for test in set().union(
+            *(self.tests[one] for one in functions_at(name, line, self.root))
+        ):
             files[test.split("::")[0]].append(test)
         if parts[0] in WITH_PROCESSES:
             for test in self.seconds:
@@ -197,7 +202,9 @@ class Watch:
             json.dumps(
                 {
                     "seconds": self.seconds,
-                    "entered": {name: sorted(names) for name, names in self.entered.items()},
+                    "entered": {
+                        name: sorted(names) for name, names in self.entered.items()
+                    },
                 }
             )
         )
@@ -205,5 +212,7 @@ class Watch:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Watch where tests run: not in the process that only hands them out."""
-    if getattr(config.option, "numprocesses", None) is None or hasattr(config, "workerinput"):
+    if getattr(config.option, "numprocesses", None) is None or hasattr(
+        config, "workerinput"
+    ):
         config.pluginmanager.register(Watch())

@@ -117,9 +117,17 @@ class AxisSamples:
 
     def covers_zero(self) -> bool:
         """Return whether position 0 is between the first and the last entry."""
-        zero = 0.0 if self.rollover is None else self.first + np.mod(-self.first, self.rollover)
+        zero = (
+            0.0
+            if self.rollover is None
+            else self.first + np.mod(-self.first, self.rollover)
+        )
         edge = EDGE * self.step
-        return self.first - edge <= zero <= self.first + (self.count - 1) * self.step + edge
+        return (
+            self.first - edge
+            <= zero
+            <= self.first + (self.count - 1) * self.step + edge
+        )
 
 
 def _track(
@@ -131,7 +139,9 @@ def _track(
 ) -> tuple[AxisSamples, bool]:
     """Return the track and whether the entries have to be reversed."""
     if distance < 0:
-        return AxisSamples(axis, start + (count - 1) * distance, -distance, count, rollover), True
+        return AxisSamples(
+            axis, start + (count - 1) * distance, -distance, count, rollover
+        ), True
     return AxisSamples(axis, start, distance, count, rollover), False
 
 
@@ -144,7 +154,9 @@ class BoundTable1D:
     values: np.ndarray
     expansion: float = 0.0
 
-    def add_to(self, out: dict[int, np.ndarray], positions: Mapping[int, np.ndarray]) -> None:
+    def add_to(
+        self, out: dict[int, np.ndarray], positions: Mapping[int, np.ndarray]
+    ) -> None:
         """Add this table's correction at `positions` to `out`."""
         position = positions[self.track.axis]
         out[self.axis] += _linear(self.values, *self.track.locate(position))
@@ -176,7 +188,9 @@ class BoundTable2D:
             (1 - v) * c[:, i1, j] + v * c[:, i1, j1]
         )
 
-    def add_to(self, out: dict[int, np.ndarray], positions: Mapping[int, np.ndarray]) -> None:
+    def add_to(
+        self, out: dict[int, np.ndarray], positions: Mapping[int, np.ndarray]
+    ) -> None:
         """Add this table's corrections at `positions` to `out`."""
         values = self.at(positions[self.rows.axis], positions[self.columns.axis])
         for axis, value in zip(self.outputs, values, strict=True):
@@ -215,11 +229,15 @@ def _home_shift(table: Table1D, setup: MachineSetup) -> float:
     now_offset = then_offset if now.home_offset is None else now.home_offset
     travel = {"CW": table.full_travel or 0.0, "CCW": 0.0}
     direction = now.home_direction or table.home_direction
-    home_moved = now_offset - then_offset + travel[direction] - travel[table.home_direction]
+    home_moved = (
+        now_offset - then_offset + travel[direction] - travel[table.home_direction]
+    )
     return -home_moved
 
 
-def _feedback_shift(axis_then: tuple[int, float | None], setup: MachineSetup, place: str) -> float:
+def _feedback_shift(
+    axis_then: tuple[int, float | None], setup: MachineSetup, place: str
+) -> float:
     axis, then = axis_then
     now = setup.of(axis).absolute_feedback_offset
     if then is None or now is None or now == then:
@@ -229,7 +247,11 @@ def _feedback_shift(axis_then: tuple[int, float | None], setup: MachineSetup, pl
 
 def _expansion(table: Table1D, setup: MachineSetup) -> float:
     """Return alpha * (T - MATERIALTEMP), by which the expanded scale indicates too little."""
-    if table.expand_coeff is None or table.material_temp is None or setup.temperature_c is None:
+    if (
+        table.expand_coeff is None
+        or table.material_temp is None
+        or setup.temperature_c is None
+    ):
         return 0.0
     return table.expand_coeff * (setup.temperature_c - table.material_temp)
 
@@ -239,7 +261,9 @@ def bound_2d(table: Table2D, setup: MachineSetup) -> BoundTable2D:
     place = f"the table of line {table.line}" if table.line else "the table"
     tracks = []
     values = np.moveaxis(table.values, 2, 0)
-    for dim, (end, axis) in enumerate((("row", table.row_axis), ("col", table.column_axis))):
+    for dim, (end, axis) in enumerate(
+        (("row", table.row_axis), ("col", table.column_axis))
+    ):
         unit = setup.unit(axis, table.position_unit, f"POSUNIT of {place}")
         distance = getattr(table, f"sample_{end}") * unit
         count = table.values.shape[dim]
@@ -258,14 +282,17 @@ def bound_2d(table: Table2D, setup: MachineSetup) -> BoundTable2D:
         tracks.append(track)
         values = np.flip(values, 1 + dim) if reverse else values
     scale = [
-        setup.unit(axis, table.correction_unit, f"CORUNIT of {place}") for axis in table.outputs
+        setup.unit(axis, table.correction_unit, f"CORUNIT of {place}")
+        for axis in table.outputs
     ]
     sign = -1.0 if table.negcor else 1.0
     values = values * (sign * np.array(scale))[:, None, None]
     ready = BoundTable2D(table.outputs, tracks[0], tracks[1], values)
     if tracks[0].covers_zero() and tracks[1].covers_zero():
         bias = ready.at(np.zeros(()), np.zeros(()))
-        ready = BoundTable2D(table.outputs, tracks[0], tracks[1], values - bias[:, None, None])
+        ready = BoundTable2D(
+            table.outputs, tracks[0], tracks[1], values - bias[:, None, None]
+        )
     return ready
 
 
@@ -285,10 +312,13 @@ class CalEvaluator:
         If a table uses counts or secondary units of unknown size.
     """
 
-    def __init__(self, tables: Sequence[Table], setup: MachineSetup | None = None) -> None:
+    def __init__(
+        self, tables: Sequence[Table], setup: MachineSetup | None = None
+    ) -> None:
         setup = setup or MachineSetup()
         self._bound = [
-            bound_1d(t, setup) if isinstance(t, Table1D) else bound_2d(t, setup) for t in tables
+            bound_1d(t, setup) if isinstance(t, Table1D) else bound_2d(t, setup)
+            for t in tables
         ]
         self.inputs = sorted({axis for t in tables for axis in t.inputs})
         self.outputs = sorted({axis for t in tables for axis in t.outputs})
@@ -317,7 +347,8 @@ class CalEvaluator:
         for start in range(0, flat[0].size, BLOCK):
             block = slice(start, start + BLOCK)
             block_positions = {
-                axis: array[block] for axis, array in zip(self.inputs, flat, strict=True)
+                axis: array[block]
+                for axis, array in zip(self.inputs, flat, strict=True)
             }
             out = {axis: array[block] for axis, array in total.items()}
             for bound in self._bound:

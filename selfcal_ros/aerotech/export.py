@@ -53,7 +53,9 @@ def table_xy(error_map: ErrorMap, frame: MachineFrame) -> Table2D:
     artifact, unit_m = error_map.artifact, frame.unit_m
     hx, hy = (half * artifact.grid_pitch_m for half in artifact.half)
     pitch = artifact.grid_pitch_m / unit_m
-    corrections = np.stack([frame.sign_x * error_map.gx.T, frame.sign_y * error_map.gy.T], axis=-1)
+    corrections = np.stack(
+        [frame.sign_x * error_map.gx.T, frame.sign_y * error_map.gy.T], axis=-1
+    )
     return Table2D(
         frame.y_axis,
         frame.x_axis,
@@ -72,7 +74,9 @@ def theta_decimals(error_map: ErrorMap) -> int:
     """Return the digits of an angular correction in arcsec required by the field's size."""
     artifact = error_map.artifact
     radius = np.hypot(*artifact.half) * artifact.grid_pitch_m
-    digits = int(np.ceil(np.log10(0.5 * RAD_PER_ARCSEC * radius / MAX_THETA_ROUNDING_M)))
+    digits = int(
+        np.ceil(np.log10(0.5 * RAD_PER_ARCSEC * radius / MAX_THETA_ROUNDING_M))
+    )
     return max(DECIMALS, digits + 1)
 
 
@@ -92,7 +96,9 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
     if frame.theta_axis is None:
         raise InputError("theta axis", "it is not named", "give its index")
     if not count:
-        raise InputError("error map", "it has no angular lines", "leave out --theta-axis")
+        raise InputError(
+            "error map", "it has no angular lines", "leave out --theta-axis"
+        )
     if not np.isfinite(g).all():
         raise InputError(
             "error map",
@@ -106,7 +112,10 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
     return Table1D(
         frame.theta_axis,
         tidy(sign * 360 / count),
-        np.round(sign * np.rad2deg(g[lines % count]) * ARCSEC_PER_DEG, theta_decimals(error_map)),
+        np.round(
+            sign * np.rad2deg(g[lines % count]) * ARCSEC_PER_DEG,
+            theta_decimals(error_map),
+        ),
         pos_unit=PRIMARY,
         cor_unit=Unit(UnitWord.PRIMARY, ARCSEC_PER_DEG),
         offset=tidy(sign * (np.rad2deg(frame.home_theta_rad) - first)),
@@ -116,7 +125,9 @@ def table_theta(error_map: ErrorMap, frame: MachineFrame) -> Table1D:
 
 UNIFORM = 1e-6
 """Largest deviation of measured positions from equal distances, in distances."""
-_LENGTH = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)", re.ASCII)
+_LENGTH = re.compile(
+    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(m|mm|um|µm|μm|nm)", re.ASCII
+)
 _LENGTH_UNITS_M = {**UNITS_M, "µm": M_PER_UM, "μm": M_PER_UM, "nm": M_PER_NM}
 
 Home = Literal["end", "middle", "middle-balanced"]
@@ -134,7 +145,9 @@ def length_m(text: str, where: str) -> float:
     """Return a length such as 5um or 200mm in m; InputError without number or unit."""
     match = _LENGTH.fullmatch(text.strip())
     if match is None or not np.isfinite(float(match[1])):
-        raise InputError(where, f"'{text}' is not a length", "write a number with m, mm, um or nm")
+        raise InputError(
+            where, f"'{text}' is not a length", "write a number with m, mm, um or nm"
+        )
     return float(match[1]) * _LENGTH_UNITS_M[match[2]]
 
 
@@ -161,11 +174,15 @@ def orthogonality(
     """
     for name, value in (("--over", over_m), ("--travel", travel_m)):
         if not value > 0:
-            raise InputError(name, f"{value:g} m is not a positive length", "give its amount")
+            raise InputError(
+                name, f"{value:g} m is not a positive length", "give its amount"
+            )
     full = -measured_m / over_m * travel_m
     begin = 0.0 if home == "end" else -travel_m / 2
     first = -full / 2 if home == "middle-balanced" else 0.0
-    return AxisCorrection(np.array([begin, begin + travel_m]), np.array([first, first + full]))
+    return AxisCorrection(
+        np.array([begin, begin + travel_m]), np.array([first, first + full])
+    )
 
 
 def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
@@ -188,7 +205,9 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
     """
     lines = enumerate(text.splitlines(), 1)
     rows = [
-        (number, csv_cells(line, f"{where}:{number}")) for number, line in lines if line.strip(", ")
+        (number, csv_cells(line, f"{where}:{number}"))
+        for number, line in lines
+        if line.strip(", ")
     ]
     if not rows or [cell.lower() for cell in rows[0][1]] != ["position", "error"]:
         raise InputError(
@@ -206,11 +225,16 @@ def measured_line(text: str, where: str, unit_m: float) -> AxisCorrection:
             ) from None
         values.append((position * unit_m, -error * M_PER_UM))
     if len(values) < 2:
-        raise InputError(where, f"{len(values)} measured positions", "give at least two")
+        raise InputError(
+            where, f"{len(values)} measured positions", "give at least two"
+        )
     order = sorted(values)
     positions, corrections = np.array(order).T
     steps = np.diff(positions)
-    if np.any(np.abs(steps - steps.mean()) > UNIFORM * steps.mean()) or steps.mean() <= 0:
+    if (
+        np.any(np.abs(steps - steps.mean()) > UNIFORM * steps.mean())
+        or steps.mean() <= 0
+    ):
         worst = int(np.argmax(np.abs(steps - steps.mean())))
         raise InputError(
             where,
@@ -235,7 +259,9 @@ def map_line(
         If a site on the line is unknown.
     """
     artifact = error_map.artifact
-    across, positions = (1, artifact.x_m[:, 0]) if along == "x" else (0, artifact.y_m[0])
+    across, positions = (
+        (1, artifact.x_m[:, 0]) if along == "x" else (0, artifact.y_m[0])
+    )
     field = error_map.gx if corrected == "x" else error_map.gy
     size = artifact.shape[across]
     values = (field.take((size - 1) // 2, across) + field.take(size // 2, across)) / 2

@@ -44,7 +44,11 @@ def number(text: str) -> float:
         If it is not a plain decimal number, or beyond `LIMIT`.
     """
     if len(text) > 400 or not _NUMBER.fullmatch(text):
-        remedy = "use a point as decimal mark" if "," in text else "write a plain decimal number"
+        remedy = (
+            "use a point as decimal mark"
+            if "," in text
+            else "write a plain decimal number"
+        )
         raise ArgumentFault(f"{short(text)} is not a number", remedy)
     value = float(text)
     if abs(value) > LIMIT:
@@ -68,7 +72,8 @@ def unit(text: str) -> Unit:
         name = UnitWord(OLD_UNITS.get(word.upper(), word.upper()))
     except ValueError:
         raise ArgumentFault(
-            f"{short(word)} is not a unit", "take PRIMARY, SECONDARY or COUNTS, with /divisor"
+            f"{short(word)} is not a unit",
+            "take PRIMARY, SECONDARY or COUNTS, with /divisor",
         ) from None
     if not slash:
         return Unit(name)
@@ -80,7 +85,8 @@ def unit(text: str) -> Unit:
     value = number(divisor)
     if value < SMALLEST:
         raise ArgumentFault(
-            f"the divisor {short(divisor)} is not positive", "write it as in PRIMARY/1000"
+            f"the divisor {short(divisor)} is not positive",
+            "write it as in PRIMARY/1000",
         )
     return Unit(name, value)
 
@@ -96,7 +102,9 @@ def serial(text: str) -> str:
     """Return a serial number without its quotes; ArgumentFault for a stray quote."""
     bare = text[1:-1] if len(text) >= 2 and text[0] == text[-1] == '"' else text
     if '"' in bare:
-        raise ArgumentFault("a stray quote in the serial number", 'write SERIALNUMBER="..."')
+        raise ArgumentFault(
+            "a stray quote in the serial number", 'write SERIALNUMBER="..."'
+        )
     return bare
 
 
@@ -182,7 +190,9 @@ class Header:
     broken: bool = False
 
 
-def read_header(kind: TableKind, heads: list[tuple[int, str]], findings: CalFindings) -> Header:
+def read_header(
+    kind: TableKind, heads: list[tuple[int, str]], findings: CalFindings
+) -> Header:
     """Return the arguments on the start lines `heads` (line number, text after the token)."""
     header = Header(kind, heads[0][0])
     for index, (line, text) in enumerate(heads):
@@ -198,7 +208,9 @@ def read_header(kind: TableKind, heads: list[tuple[int, str]], findings: CalFind
             named |= not positional
             if match["key"]:
                 if match["blank"] or match["blank2"]:
-                    findings.tolerated(line, "blanks around =", "write KEYWORD=argument")
+                    findings.tolerated(
+                        line, "blanks around =", "write KEYWORD=argument"
+                    )
                 _argument(header, (line, match["key"]), match["value"], findings)
             elif positional:
                 words.append(match["word"])
@@ -218,15 +230,21 @@ def _keyword(header: Header, line: int, name: str, findings: CalFindings) -> str
     """Return the strict spelling of a keyword of this kind of table, or None with an error."""
     strict = name.upper()
     if strict in ALIASES:
-        findings.tolerated(line, f"the keyword {short(strict)}", f"write {ALIASES[strict]}")
+        findings.tolerated(
+            line, f"the keyword {short(strict)}", f"write {ALIASES[strict]}"
+        )
         strict = ALIASES[strict]
     if strict in KEYWORDS[header.kind]:
         if strict != name and name.upper() == strict:
-            findings.tolerated(line, "a keyword in lower case", "write keywords in upper case")
+            findings.tolerated(
+                line, "a keyword in lower case", "write keywords in upper case"
+            )
         return strict
     header.broken = True
     if strict in ALL_KEYWORDS:
-        findings.error(line, f"a {header.kind} table must not have {strict}", "remove the keyword")
+        findings.error(
+            line, f"a {header.kind} table must not have {strict}", "remove the keyword"
+        )
     else:
         findings.error(
             line,
@@ -236,7 +254,9 @@ def _keyword(header: Header, line: int, name: str, findings: CalFindings) -> str
     return None
 
 
-def _argument(header: Header, place: tuple[int, str], text: str, findings: CalFindings) -> None:
+def _argument(
+    header: Header, place: tuple[int, str], text: str, findings: CalFindings
+) -> None:
     line, name = place
     strict = _keyword(header, line, name, findings)
     if strict is None:
@@ -260,7 +280,9 @@ def _argument(header: Header, place: tuple[int, str], text: str, findings: CalFi
     _set(header, (line, strict), (keyword.field, value), findings)
 
 
-def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: CalFindings) -> None:
+def _tolerances(
+    line: int, strict: str, argument: tuple[str, Any], findings: CalFindings
+) -> None:
     text, value = argument
     if isinstance(value, Unit):
         word = text.partition("/")[0]
@@ -271,18 +293,26 @@ def _tolerances(line: int, strict: str, argument: tuple[str, Any], findings: Cal
                 f"write {value.word}",
             )
         if word != word.upper():
-            findings.tolerated(line, "a unit in lower case", "write units in upper case")
+            findings.tolerated(
+                line, "a unit in lower case", "write units in upper case"
+            )
     elif strict == "HOMEDIRECTION" and text != value:
         findings.tolerated(line, "a home direction in lower case", "write CW or CCW")
-    elif strict == "SERIALNUMBER" and not (len(text) >= 2 and text[0] == text[-1] == '"'):
-        findings.tolerated(line, "a serial number without quotes", 'write SERIALNUMBER="..."')
+    elif strict == "SERIALNUMBER" and not (
+        len(text) >= 2 and text[0] == text[-1] == '"'
+    ):
+        findings.tolerated(
+            line, "a serial number without quotes", 'write SERIALNUMBER="..."'
+        )
 
 
 def _flag(header: Header, line: int, word: str, findings: CalFindings) -> None:
     if word.startswith("/"):
         header.broken = True
         findings.error(
-            line, "white space before the / of a unit", "write it without, such as PRIMARY/1000"
+            line,
+            "white space before the / of a unit",
+            "write it without, such as PRIMARY/1000",
         )
         return
     strict = _keyword(header, line, word, findings)

@@ -333,11 +333,15 @@ def decode(data: bytes, findings: CalFindings) -> tuple[list[str], set[int]]:
         findings.error(1, "the file is UTF-16", "save it as UTF-8")
         return _split(data.decode("utf-16", errors="replace"), findings), set()
     if data.startswith(codecs.BOM_UTF8):
-        findings.tolerated(1, "a byte order mark before the first line", "save as plain UTF-8")
+        findings.tolerated(
+            1, "a byte order mark before the first line", "save as plain UTF-8"
+        )
         data = data[len(codecs.BOM_UTF8) :]
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
-        findings.stop(line, "a zero byte: this is not a text file", "give a text file in UTF-8")
+        findings.stop(
+            line, "a zero byte: this is not a text file", "give a text file in UTF-8"
+        )
     try:
         return _split(data.decode(), findings), set()
     except UnicodeDecodeError:
@@ -357,11 +361,15 @@ def decode(data: bytes, findings: CalFindings) -> tuple[list[str], set[int]]:
 def _split(text: str, findings: CalFindings) -> list[str]:
     if "\r" in text:
         line = text.count("\n", 0, text.index("\r")) + 1
-        findings.tolerated(line, "lines end with CR or CRLF", "the strict form ends lines with LF")
+        findings.tolerated(
+            line, "lines end with CR or CRLF", "the strict form ends lines with LF"
+        )
         text = text.replace("\r\n", "\n").replace("\r", "\n")
     lines = text.split("\n")
     if lines[-1]:
-        findings.tolerated(len(lines), "the last line has no end", "end it with a newline")
+        findings.tolerated(
+            len(lines), "the last line has no end", "end it with a newline"
+        )
     else:
         lines.pop()
     return lines

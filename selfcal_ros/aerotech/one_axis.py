@@ -15,7 +15,12 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from selfcal_ros.aerotech.evaluate import BoundTable1D, CalEvaluator, MachineSetup, bound_1d
+from selfcal_ros.aerotech.evaluate import (
+    BoundTable1D,
+    CalEvaluator,
+    MachineSetup,
+    bound_1d,
+)
 from selfcal_ros.aerotech.export import map_line
 from selfcal_ros.aerotech.model import Table1D
 from selfcal_ros.compensation.export import fill_unknown
@@ -38,7 +43,11 @@ Pair = tuple[Axis, Axis]
 
 
 def leaves_too_much(
-    residual: tuple[float, float], before: tuple[float, float], u: float, *, rounding: float = 0.0
+    residual: tuple[float, float],
+    before: tuple[float, float],
+    u: float,
+    *,
+    rounding: float = 0.0,
 ) -> bool:
     """Tell whether more is left of an error than U, or 5 % of it.
 
@@ -91,7 +100,10 @@ class OneAxisPart:
     def unfit(self) -> bool:
         """Whether more is left than U (k = 2, rms; twice U at one node) and 5 % of the part."""
         return leaves_too_much(
-            (self.rms_left, self.largest_left), (self.rms, self.largest), self.u, rounding=ROUNDED_M
+            (self.rms_left, self.largest_left),
+            (self.rms, self.largest),
+            self.u,
+            rounding=ROUNDED_M,
         )
 
 
@@ -115,7 +127,10 @@ class OneAxisFit:
 
 
 def one_axis_fit(
-    error_map: ErrorMap, tables: Sequence[Table1D], frame: MachineFrame, setup: MachineSetup
+    error_map: ErrorMap,
+    tables: Sequence[Table1D],
+    frame: MachineFrame,
+    setup: MachineSetup,
 ) -> OneAxisFit:
     """Return what 1D tables of x and y leave of a map.
 
@@ -143,7 +158,8 @@ def one_axis_fit(
         (along_own if pair[0] == pair[1] else across).append(pair_tables)
 
     parts = [
-        pair_tables.judged(pair_tables.targets, pair_tables.correction) for pair_tables in along_own
+        pair_tables.judged(pair_tables.targets, pair_tables.correction)
+        for pair_tables in along_own
     ]
     parts += [
         pair_tables.judged(pair_tables.shapes, pair_tables.shape, ", without its slope")
@@ -188,7 +204,11 @@ class _PairOfAxes:
         slopes, shapes = zip(*(_makes(table) for table in bound), strict=True)
         self.has_slope, self.has_shape = any(slopes), any(shapes)
 
-        self.nodes = filled_map.artifact.x_m[:, 0] if pair[0] == "x" else filled_map.artifact.y_m[0]
+        self.nodes = (
+            filled_map.artifact.x_m[:, 0]
+            if pair[0] == "x"
+            else filled_map.artifact.y_m[0]
+        )
         places = [_stage_positions(table, pair[0], frame) for table in bound]
         inside = [p[(p > self.nodes[0]) & (p < self.nodes[-1])] for p in places]
         self.places = np.unique(np.concatenate([self.nodes, *inside]))
@@ -197,20 +217,33 @@ class _PairOfAxes:
         machine = frame.to_machine(self.places, self.places)["xy".index(pair[0])]
         axes = {"x": frame.x_axis, "y": frame.y_axis}
         sign = {"x": frame.sign_x, "y": frame.sign_y}[pair[1]]
-        added = CalEvaluator(tables, setup).corrections({axes[pair[0]]: machine})[axes[pair[1]]]
+        added = CalEvaluator(tables, setup).corrections({axes[pair[0]]: machine})[
+            axes[pair[1]]
+        ]
         self.correction = sign * frame.unit_m * added
-        self.targets = [_mean_line(filled_map, pair), map_line(filled_map, *pair).corrections_m]
+        self.targets = [
+            _mean_line(filled_map, pair),
+            map_line(filled_map, *pair).corrections_m,
+        ]
 
     @property
     def shape(self) -> np.ndarray:
         """The correction without its slope over the nodes, m."""
-        return self.correction - self.slope(self.correction[self.at_nodes]) * self.places
+        return (
+            self.correction - self.slope(self.correction[self.at_nodes]) * self.places
+        )
 
     @property
     def shapes(self) -> list[np.ndarray]:
         """What it may be at the nodes, m: of tables of squareness alone, nothing."""
-        target_shapes = [target - self.slope(target) * self.nodes for target in self.targets]
-        return target_shapes if self.has_shape else [*target_shapes, np.zeros(len(self.nodes))]
+        target_shapes = [
+            target - self.slope(target) * self.nodes for target in self.targets
+        ]
+        return (
+            target_shapes
+            if self.has_shape
+            else [*target_shapes, np.zeros(len(self.nodes))]
+        )
 
     def slope(self, values: np.ndarray) -> float:
         """Return the least-squares slope of values at the nodes."""
@@ -229,7 +262,9 @@ class _PairOfAxes:
             line = np.interp(self.places, self.nodes, target)
             residual_m = correction - line
             residual_m = residual_m - residual_m[self.at_nodes].mean()
-            residual_m = np.maximum(np.abs(residual_m) - np.abs(self._spline(target) - line), 0.0)
+            residual_m = np.maximum(
+                np.abs(residual_m) - np.abs(self._spline(target) - line), 0.0
+            )
             candidates.append((rms(residual_m[self.at_nodes]), float(residual_m.max())))
         rms_left, largest_left = min(candidates)
         centred = targets[0] - targets[0].mean()
@@ -259,7 +294,9 @@ def _makes(table: BoundTable1D) -> tuple[bool, bool]:
     return rms(slope) > NONE_OF_IT * rms(shape), rms(shape) > NONE_OF_IT * rms(slope)
 
 
-def _stage_positions(table: BoundTable1D, axis: Axis, frame: MachineFrame) -> np.ndarray:
+def _stage_positions(
+    table: BoundTable1D, axis: Axis, frame: MachineFrame
+) -> np.ndarray:
     """Return the positions of a table's entries in the stage frame, m."""
     positions = table.track.first + table.track.step * np.arange(table.track.count)
     return frame.from_machine(positions, positions)["xy".index(axis)]
@@ -274,7 +311,8 @@ def _squareness(
     frame of the map each slope may be that of the map, too.
     """
     added = [
-        pair_tables.slope(pair_tables.correction[pair_tables.at_nodes]) for pair_tables in across
+        pair_tables.slope(pair_tables.correction[pair_tables.at_nodes])
+        for pair_tables in across
     ]
     map_slope = _squareness_of(filled_map)
     slope_misfits = [
@@ -303,7 +341,9 @@ def _beyond(filled_map: ErrorMap, pairs: Sequence[Pair]) -> float:
     residual_m = np.stack([filled_map.gx, filled_map.gy])
     for along, corrected in pairs:
         line = _mean_line(filled_map, (along, corrected))
-        residual_m["xy".index(corrected)] -= line[:, None] if along == "x" else line[None, :]
+        residual_m["xy".index(corrected)] -= (
+            line[:, None] if along == "x" else line[None, :]
+        )
     if any(along != corrected for along, corrected in pairs):  # square, and in any turn
         x, y = filled_map.artifact.x_m, filled_map.artifact.y_m
         residual_m -= np.stack(

@@ -11,7 +11,14 @@ from itertools import combinations
 import numpy as np
 
 from selfcal_ros.aerotech import model, rules
-from selfcal_ros.aerotech.header import LIMIT, ArgumentFault, Header, number, read_header, short
+from selfcal_ros.aerotech.header import (
+    LIMIT,
+    ArgumentFault,
+    Header,
+    number,
+    read_header,
+    short,
+)
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
 
@@ -53,7 +60,11 @@ class _Reader:
         index = 0
         while index < len(lines):
             end = index
-            while self.open is not None and end < len(lines) and _NUMERIC.fullmatch(lines[end]):
+            while (
+                self.open is not None
+                and end < len(lines)
+                and _NUMERIC.fullmatch(lines[end])
+            ):
                 end += 1
             if not lines[index]:
                 index += 1
@@ -101,12 +112,16 @@ class _Reader:
             )
         elif text:
             self.findings.tolerated(
-                number_, "text outside of a table is ignored", "start it with a semicolon"
+                number_,
+                "text outside of a table is ignored",
+                "start it with a semicolon",
             )
 
     def _odd(self, line: int, text: str) -> None:
         if text.isascii() or not (text.startswith(":") or self.open is not None):
-            self.findings.tolerated(line, "Windows-1252 characters in a comment", "save as UTF-8")
+            self.findings.tolerated(
+                line, "Windows-1252 characters in a comment", "save as UTF-8"
+            )
         else:
             self.findings.error(line, "the line is not UTF-8", "save the file as UTF-8")
 
@@ -122,7 +137,9 @@ class _Reader:
             self._close()
         elif not self.first_start:
             self.findings.error(
-                0, "no table in the file", "a table starts with :START, :START2D or :GALVO2D"
+                0,
+                "no table in the file",
+                "a table starts with :START, :START2D or :GALVO2D",
             )
 
     def _directive(self, line: int, text: str) -> None:
@@ -135,7 +152,9 @@ class _Reader:
         elif word.upper() in _STARTS:
             if word != word.upper():
                 self.findings.tolerated(
-                    line, "a token in mixed case", "write :START, :START2D, :GALVO2D, :END"
+                    line,
+                    "a token in mixed case",
+                    "write :START, :START2D, :GALVO2D, :END",
                 )
             self._start(line, _STARTS[word.upper()], arguments)
         else:
@@ -187,9 +206,13 @@ class _Reader:
                 line, "a token in mixed case", "write :START, :START2D, :GALVO2D, :END"
             )
         if trailing.strip():
-            self.findings.tolerated(line, "text after :END is ignored", "start it with a semicolon")
+            self.findings.tolerated(
+                line, "text after :END is ignored", "start it with a semicolon"
+            )
         if self.open is None:
-            self.findings.error(line, ":END without a start", "remove it or start the table")
+            self.findings.error(
+                line, ":END without a start", "remove it or start the table"
+            )
             return
         self._close()
 
@@ -202,7 +225,9 @@ class _Reader:
                 break
         else:
             self.findings.error(
-                line, "odd characters between the numbers", "separate numbers by blanks or tabs"
+                line,
+                "odd characters between the numbers",
+                "separate numbers by blanks or tabs",
             )
         if self.open is not None:
             self.open.broken = True
@@ -291,7 +316,9 @@ def _table_2d(
     third = header.values.pop("outaxis3", None)
     outputs = (first, second) if third is None else (first, second, third)
     if columns < 1:
-        findings.error(header.line, f"NumCols is {columns}", "give the number of columns")
+        findings.error(
+            header.line, f"NumCols is {columns}", "give the number of columns"
+        )
         return None
     if values is None or not _rows_are_whole(columns, len(outputs), layout, findings):
         return None
@@ -310,7 +337,10 @@ def _table_2d(
 
 
 def _rows_are_whole(
-    columns: int, outputs: int, layout: tuple[list[int], list[int]], findings: model.CalFindings
+    columns: int,
+    outputs: int,
+    layout: tuple[list[int], list[int]],
+    findings: model.CalFindings,
 ) -> bool:
     """Return whether the lines form whole rows; a finding names a line that does not."""
     width = columns * outputs
@@ -345,7 +375,9 @@ def _rows_are_whole(
     return False
 
 
-def parse_cal(data: bytes, where: str, *, gi4: rules.Gi4 | None = None) -> model.CalFile:
+def parse_cal(
+    data: bytes, where: str, *, gi4: rules.Gi4 | None = None
+) -> model.CalFile:
     """Return the content of a calibration file from its bytes, with all findings.
 
     Parameters
@@ -409,7 +441,9 @@ def load_cals(paths: Sequence[str]) -> model.CalFile:
             map(model.same_table, cal.tables, other.tables)
         ):
             raise InputError(
-                again, f"is the same as {first}, and would be added twice", "name it once"
+                again,
+                f"is the same as {first}, and would be added twice",
+                "name it once",
             )
     return model.CalFile(
         ", ".join(paths),

@@ -8,7 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from selfcal_ros.aerotech.header import LIMIT, SMALLEST
-from selfcal_ros.aerotech.model import CalFindings, Table, Table1D, Table2D, TableKind, UnitWord
+from selfcal_ros.aerotech.model import (
+    CalFindings,
+    Table,
+    Table1D,
+    Table2D,
+    TableKind,
+    UnitWord,
+)
 
 MAX_AXIS = 32
 MAX_1D_TABLES = 100
@@ -32,7 +39,9 @@ class Gi4:
         return 2.0**self.bits / 64
 
 
-def check_tables(tables: Sequence[Table], findings: CalFindings, *, gi4: Gi4 | None = None) -> None:
+def check_tables(
+    tables: Sequence[Table], findings: CalFindings, *, gi4: Gi4 | None = None
+) -> None:
     """Add a finding for every rule broken by the tables of one file."""
     for table in tables:
         check_table(table, findings, gi4=gi4)
@@ -45,10 +54,14 @@ def check_table(table: Table, findings: CalFindings, *, gi4: Gi4 | None = None) 
     """Add a finding for every rule broken by one table."""
     if not np.all(np.abs(table.values) <= LIMIT):
         findings.error(
-            table.line, "values that are not finite, or too large", f"stay within +-{LIMIT:g}"
+            table.line,
+            "values that are not finite, or too large",
+            f"stay within +-{LIMIT:g}",
         )
     if not table.values.size:
-        findings.error(table.line, "the table has no correction values", "give at least one")
+        findings.error(
+            table.line, "the table has no correction values", "give at least one"
+        )
     _axes(table, findings)
     if isinstance(table, Table1D):
         _table_1d(table, findings)
@@ -62,7 +75,9 @@ def _axes(table: Table, findings: CalFindings) -> None:
     for axis in {*table.inputs, *table.outputs}:
         if not 1 <= axis <= MAX_AXIS:
             remedy = (
-                "indices in calibration files count from 1" if axis == 0 else "correct the index"
+                "indices in calibration files count from 1"
+                if axis == 0
+                else "correct the index"
             )
             findings.error(table.line, f"axis {axis} is not in 1..{MAX_AXIS}", remedy)
 
@@ -139,7 +154,9 @@ def _table_2d(table: Table2D, findings: CalFindings) -> None:
             continue
         offset = getattr(table, f"offset_{end}") or 0.0
         first, last = _span(
-            getattr(table, f"sample_{end}"), offset, table.values.shape[0 if end == "row" else 1]
+            getattr(table, f"sample_{end}"),
+            offset,
+            table.values.shape[0 if end == "row" else 1],
         )
         if not (first <= 0 <= last or getattr(table, f"rollover_{end}")):
             findings.warning(
@@ -155,7 +172,9 @@ def _table_2d(table: Table2D, findings: CalFindings) -> None:
             "a 2D table needs two input axes",
         )
     if len(set(table.outputs)) < len(table.outputs):
-        findings.error(table.line, "an output axis is named twice", "name each output axis once")
+        findings.error(
+            table.line, "an output axis is named twice", "name each output axis once"
+        )
     if (
         table.cor_unit is None
         and table.pos_unit is not None
@@ -183,15 +202,24 @@ def _galvo(table: Table2D, findings: CalFindings, gi4: Gi4 | None) -> None:
             f"RowAxis is {table.row_axis}, OutputAxis2 {table.outputs[1]}",
             "both must be the second axis of the galvo drive",
         )
-    for name, value in (("SampDistRow", table.sample_row), ("SampDistCol", table.sample_col)):
+    for name, value in (
+        ("SampDistRow", table.sample_row),
+        ("SampDistCol", table.sample_col),
+    ):
         if value < 0:
-            findings.error(line, f"{name} is negative in a galvo table", "make it positive")
+            findings.error(
+                line, f"{name} is negative in a galvo table", "make it positive"
+            )
     for name, count in (("rows", rows), ("columns", columns)):
         if count % 2 == 0:
-            findings.error(line, f"a galvo table of {count} {name}", "the number must be odd")
+            findings.error(
+                line, f"a galvo table of {count} {name}", "the number must be odd"
+            )
     if rows * columns > MAX_GALVO_POINTS:
         findings.error(
-            line, f"{rows * columns} points in a galvo table", f"it may have {MAX_GALVO_POINTS}"
+            line,
+            f"{rows * columns} points in a galvo table",
+            f"it may have {MAX_GALVO_POINTS}",
         )
     if gi4 is not None:
         _gi4(table, findings, gi4)
@@ -214,7 +242,10 @@ def _gi4(table: Table2D, findings: CalFindings, gi4: Gi4) -> None:
             "give them in counts",
         )
         return
-    for name, value in (("SampDistRow", table.sample_row), ("SampDistCol", table.sample_col)):
+    for name, value in (
+        ("SampDistRow", table.sample_row),
+        ("SampDistCol", table.sample_col),
+    ):
         if not np.isclose(value / unit.divisor, want, rtol=1e-9, atol=0):
             findings.error(
                 table.line,
@@ -223,7 +254,9 @@ def _gi4(table: Table2D, findings: CalFindings, gi4: Gi4) -> None:
             )
 
 
-def mixed_kinds(line: int, kinds: tuple[TableKind, TableKind], findings: CalFindings) -> None:
+def mixed_kinds(
+    line: int, kinds: tuple[TableKind, TableKind], findings: CalFindings
+) -> None:
     """Record a table of another kind than the first one of its file."""
     findings.error(
         line,
@@ -264,4 +297,6 @@ def check_counts(tables: Sequence[Table], findings: CalFindings) -> None:
                         "keep one table for each scanner",
                     )
                     break
-            scanners |= {axis: table.line for axis in table.inputs if axis not in scanners}
+            scanners |= {
+                axis: table.line for axis in table.inputs if axis not in scanners
+            }

@@ -7,10 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup, bound_2d
+from selfcal_ros.aerotech.evaluate import (
+    AxisSetup,
+    CalEvaluator,
+    MachineSetup,
+    bound_2d,
+)
 from selfcal_ros.aerotech.export import UNIFORM
 from selfcal_ros.aerotech.model import CalFile, Table, Table1D, Table2D
-from selfcal_ros.aerotech.one_axis import OneAxisFit, known_rms, leaves_too_much, one_axis_fit
+from selfcal_ros.aerotech.one_axis import (
+    OneAxisFit,
+    known_rms,
+    leaves_too_much,
+    one_axis_fit,
+)
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.compensation.export import fill_unknown
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
@@ -188,7 +198,10 @@ def verify_tables(
 
 
 def _at_entries(
-    error_map: ErrorMap, tables: Sequence[Table], frame: MachineFrame, evaluator: CalEvaluator
+    error_map: ErrorMap,
+    tables: Sequence[Table],
+    frame: MachineFrame,
+    evaluator: CalEvaluator,
 ) -> Residual | None:
     """Return what tables leave at the entries of 2D ones between the sites; None if none are there.
 
@@ -214,7 +227,8 @@ def _at_entries(
             }
             entries = frame.from_machine(along[frame.x_axis], along[frame.y_axis])
             inside = [
-                p[(p > side[0]) & (p < side[-1])] for p, side in zip(entries, nodes, strict=True)
+                p[(p > side[0]) & (p < side[-1])]
+                for p, side in zip(entries, nodes, strict=True)
             ]
             places.append(np.stack(np.meshgrid(*inside)).reshape(2, -1))
     sites = plate.x_m.size
@@ -228,7 +242,9 @@ def _at_entries(
     cx, cy = plane_correction(evaluator, frame)(px, py)
     added = np.stack([frame.sign_x * cx, frame.sign_y * cy]) * frame.unit_m
     error = np.stack(Compensator(plane).error(*position))
-    doubt = np.abs(np.stack(Compensator(plane, method="bicubic").error(*position)) - error)
+    doubt = np.abs(
+        np.stack(Compensator(plane, method="bicubic").error(*position)) - error
+    )
     residual_m = error - added
     residual_m = residual_m - residual_m[:, :sites].mean(axis=1, keepdims=True)
     residual_m = np.sign(residual_m) * np.maximum(np.abs(residual_m) - doubt, 0.0)
@@ -243,10 +259,14 @@ def _at_entries(
     )
 
 
-def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator) -> Residual:
+def _at_lines(
+    error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator
+) -> Residual:
     angles = error_map.artifact.theta_rad[np.isfinite(error_map.g_theta)]
     if not len(angles):
-        raise InputError("error map", "it knows no angular line", "leave out the theta axis")
+        raise InputError(
+            "error map", "it knows no angular line", "leave out the theta axis"
+        )
     stage = Compensator(error_map)
     return residual_of(
         "lines",
@@ -256,7 +276,11 @@ def _at_lines(error_map: ErrorMap, frame: MachineFrame, evaluator: CalEvaluator)
 
 
 TITLE = "Exported table: before and after"
-PLACES = {"sites": "at the nodes", "between": "between the nodes", "lines": "at the lines"}
+PLACES = {
+    "sites": "at the nodes",
+    "between": "between the nodes",
+    "lines": "at the lines",
+}
 BEFORE_AND_AFTER = ("before", "after")
 
 
@@ -282,10 +306,16 @@ def table_chapter(result: CalibrationResult, cal: CalFile) -> Chapter:
     InputError
         If a table corrects or needs an axis outside the frame of the file.
     """
-    verification = verify_tables(result.error_map, cal.tables, frame_of_file(cal) or MachineFrame())
+    verification = verify_tables(
+        result.error_map, cal.tables, frame_of_file(cal) or MachineFrame()
+    )
     rows = []
     for residual in verification.residuals:
-        unit, scale = ("arcsec", ARCSEC_PER_RAD) if residual.place == "lines" else ("µm", UM_PER_M)
+        unit, scale = (
+            ("arcsec", ARCSEC_PER_RAD)
+            if residual.place == "lines"
+            else ("µm", UM_PER_M)
+        )
         sizes = [
             size(state) * scale
             for size in (residual.rms, residual.largest)
@@ -312,7 +342,9 @@ def controller_figure(verification: TableVerification) -> Drawing:
     drawing = parts.titled(
         "before-after", "Controller: true − commanded, without its constant shift"
     )
-    fields = [residual for residual in verification.residuals if residual.place != "lines"]
+    fields = [
+        residual for residual in verification.residuals if residual.place != "lines"
+    ]
     selections = [_thinned(residual) for residual in fields]
     if fields:
         reach = (np.abs(fields[0].position).max(axis=1) * 1.2 * MM_PER_M).tolist()
@@ -364,7 +396,9 @@ def _thinned(residual: Residual) -> tuple[np.ndarray, float]:
     sides = [np.unique(side, return_inverse=True) for side in residual.position]
     step = max(1, -(-max(len(values) for values, _ in sides) // parts.MAX_ARROWS))
     take = np.all([number.ravel() % step == 0 for _, number in sides], axis=0)
-    spacing = min(float(np.ptp(values)) / max(len(values) - 1, 1) for values, _ in sides)
+    spacing = min(
+        float(np.ptp(values)) / max(len(values) - 1, 1) for values, _ in sides
+    )
     return take, step * (spacing or 1.0)
 
 
@@ -383,13 +417,19 @@ def _draw_lines(drawing: Drawing, residual: Residual) -> None:
         drawing,
         (62, top, 410, 150),
         [
-            parts.Curve(angle, getattr(residual, state)[0] * ARCSEC_PER_RAD, colour, dots=2.0)
+            parts.Curve(
+                angle, getattr(residual, state)[0] * ARCSEC_PER_RAD, colour, dots=2.0
+            )
             for state, colour in zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)
         ],
         title=PLACES["lines"],
         labels=("θ in °", "arcsec"),
     )
-    for number, (state, colour) in enumerate(zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)):
+    for number, (state, colour) in enumerate(
+        zip(BEFORE_AND_AFTER, ("c5", "c1"), strict=True)
+    ):
         sizes = _sizes(residual, state, "arcsec", ARCSEC_PER_RAD)
-        parts.legend(drawing, [(colour, f"{state}: {sizes}")], (62, top + 206 + 18 * number))
+        parts.legend(
+            drawing, [(colour, f"{state}: {sizes}")], (62, top + 206 + 18 * number)
+        )
     drawing.height = top + 236

@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.aerotech.header import KEYWORDS
-from selfcal_ros.aerotech.model import CalFile, CalFindings, Table, Table1D, Unit, same_table
+from selfcal_ros.aerotech.model import (
+    CalFile,
+    CalFindings,
+    Table,
+    Table1D,
+    Unit,
+    same_table,
+)
 from selfcal_ros.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.aerotech.rules import check_tables
 from selfcal_ros.errors import InputError
@@ -21,11 +28,18 @@ from selfcal_ros.outputs import write_together
 def decimal(value: float) -> str:
     """Return the shortest decimal number that reads back as `value`, without exponent."""
     text = repr(float(value))
-    return np.format_float_positional(value, trim="-") if "e" in text else text.removesuffix(".0")
+    return (
+        np.format_float_positional(value, trim="-")
+        if "e" in text
+        else text.removesuffix(".0")
+    )
 
 
 def cal_text(
-    tables: Sequence[Table], *, comments: Sequence[str] = (), decimals: int | None = None
+    tables: Sequence[Table],
+    *,
+    comments: Sequence[str] = (),
+    decimals: int | None = None,
 ) -> str:
     """Return a calibration file in the strict form.
 
@@ -57,14 +71,19 @@ def cal_text(
             lines += [" ".join(map(decimal, row)) for row in values.tolist()]
         else:
             row_format = " ".join([f"%.{decimals}f"] * values.shape[1])
-            lines += [row_format % tuple(row) for row in _no_minus_zero(values, decimals).tolist()]
+            lines += [
+                row_format % tuple(row)
+                for row in _no_minus_zero(values, decimals).tolist()
+            ]
         lines.append(":END")
     text = "\n".join(lines) + "\n"
     _refuse_what_reads_differently(text, tables, exact=decimals is None)
     return text
 
 
-def _refuse_what_reads_differently(text: str, tables: Sequence[Table], *, exact: bool) -> None:
+def _refuse_what_reads_differently(
+    text: str, tables: Sequence[Table], *, exact: bool
+) -> None:
     """Raise InputError if a file does not reproduce the tables it was written from.
 
     The fields of a table may be invalid: a quote in a serial number, an offset
@@ -73,7 +92,9 @@ def _refuse_what_reads_differently(text: str, tables: Sequence[Table], *, exact:
     back = refuse_errors(parse_cal(text.encode(), "calibration file")).tables
     for number, (table, read) in enumerate(zip(tables, back, strict=True), 1):
         rounded = table.values.shape == read.values.shape and not exact
-        if not same_table(read, replace(table, values=read.values) if rounded else table):
+        if not same_table(
+            read, replace(table, values=read.values) if rounded else table
+        ):
             raise InputError(
                 "calibration file",
                 f"table {number} holds what the format cannot say",
@@ -118,7 +139,11 @@ def _head(table: Table) -> list[str]:
 
 def _argument(value: float | int | str | Unit) -> str:
     if isinstance(value, Unit):
-        return value.word if value.divisor == 1 else f"{value.word}/{decimal(value.divisor)}"
+        return (
+            value.word
+            if value.divisor == 1
+            else f"{value.word}/{decimal(value.divisor)}"
+        )
     return decimal(value) if isinstance(value, float) else str(value)
 
 
@@ -156,8 +181,13 @@ def write_cals(
     """
     refuse_existing(list(texts), force=force)
     stamp = (now or datetime.now(UTC)).strftime("%Y-%m-%dT%H%M%SZ")
-    backups = {path: _backup(Path(path), stamp) if Path(path).exists() else None for path in texts}
-    contents: dict[str | os.PathLike, bytes] = {path: text.encode() for path, text in texts.items()}
+    backups = {
+        path: _backup(Path(path), stamp) if Path(path).exists() else None
+        for path in texts
+    }
+    contents: dict[str | os.PathLike, bytes] = {
+        path: text.encode() for path, text in texts.items()
+    }
     contents |= {backup: read_bytes(path) for path, backup in backups.items() if backup}
     write_together(contents)
     return backups

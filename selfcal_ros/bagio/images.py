@@ -89,10 +89,14 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
     for column in columns:
         if column not in heading:
             raise InputError(
-                str(path), f"no column '{column}'", f"begin with the line {','.join(columns)}"
+                str(path),
+                f"no column '{column}'",
+                f"begin with the line {','.join(columns)}",
             )
     if len(lines) == 1:
-        raise NoDataError(str(path), "no row below the heading", "give one for each image")
+        raise NoDataError(
+            str(path), "no row below the heading", "give one for each image"
+        )
     names = [view.name for view in plan.views] if plan else [""]
     rows: list[Position] = []
     first: dict[str, str] = {}
@@ -102,7 +106,9 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
             raise InputError(where, "an empty cell", f"give {', '.join(columns)}")
         view = cells["view"] if plan else ""
         if view not in names:
-            raise InputError(where, f"the plan has no view '{view}'", known_are(view, names))
+            raise InputError(
+                where, f"the plan has no view '{view}'", known_are(view, names)
+            )
         if first.setdefault(cells["file"], where) != where:
             raise InputError(
                 where,
@@ -123,7 +129,10 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
         _check_unit(str(path), rows, plan)
     rows.sort(key=lambda row: row.view)
     for before, row in pairwise(rows):
-        if row.stamp_ns is not None and row.stamp_ns - (before.stamp_ns or 0) < STEP_NS / 10:
+        if (
+            row.stamp_ns is not None
+            and row.stamp_ns - (before.stamp_ns or 0) < STEP_NS / 10
+        ):
             raise InputError(
                 row.where,
                 f"not exposed 0.1 s or more after {before.file}",
@@ -137,9 +146,15 @@ def _stamp_ns(text: str, where: str) -> int:
     """Return a time as ns since 1970."""
     with suppress(ValueError):
         if (date := datetime.fromisoformat(text)).tzinfo is not None:
-            return (date - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+            return (
+                (date - datetime(1970, 1, 1, tzinfo=UTC))
+                // timedelta(microseconds=1)
+                * 1000
+            )
     raise InputError(
-        where, f"'{text}' is not a time with its zone", "write it as 2026-11-21T09:30:00.25+01:00"
+        where,
+        f"'{text}' is not a time with its zone",
+        "write it as 2026-11-21T09:30:00.25+01:00",
     )
 
 
@@ -209,7 +224,11 @@ def write_pictures(
     """
     missing = [row for row in rows if not (folder / row.file).is_file()]
     if missing:
-        number = f" ({len(missing)} of {len(rows)} files are not)" if len(missing) > 1 else ""
+        number = (
+            f" ({len(missing)} of {len(rows)} files are not)"
+            if len(missing) > 1
+            else ""
+        )
         raise NoDataError(
             missing[0].where,
             f"{missing[0].file} is not in {folder}{number}",
@@ -219,7 +238,11 @@ def write_pictures(
     latched = qos_profile(reliable=True, transient_local=True, depth=64)
     volatile = qos_profile(reliable=True, transient_local=False, depth=5000)
     view = -1
-    now = rows[0].stamp_ns - STEP_NS if rows and rows[0].stamp_ns is not None else START_NS
+    now = (
+        rows[0].stamp_ns - STEP_NS
+        if rows and rows[0].stamp_ns is not None
+        else START_NS
+    )
     run_id = str(now)
 
     def command(phase: Phase, index: int) -> None:
@@ -252,13 +275,21 @@ def write_pictures(
             if row.view != view:
                 view = row.view
                 for phase, before_ns in BEFORE_NS.items():
-                    now = now + STEP_NS if row.stamp_ns is None else row.stamp_ns - before_ns
+                    now = (
+                        now + STEP_NS
+                        if row.stamp_ns is None
+                        else row.stamp_ns - before_ns
+                    )
                     command(phase, view)
             now = now + STEP_NS if row.stamp_ns is None else row.stamp_ns
             for step in BESIDE_NS:
-                sample = EncoderSample(now + step, ("x", "y", "theta"), (row.x_m, row.y_m, 0.0))
+                sample = EncoderSample(
+                    now + step, ("x", "y", "theta"), (row.x_m, row.y_m, 0.0)
+                )
                 writer.write(
-                    f"/{ENCODER_TOPIC}", from_model.joint_state(sample, frame_id), now + step
+                    f"/{ENCODER_TOPIC}",
+                    from_model.joint_state(sample, frame_id),
+                    now + step,
                 )
             try:
                 detections = detect(read_bytes(folder / row.file), row.file, now)
@@ -266,7 +297,11 @@ def write_pictures(
                 problems[str(error)] += 1
                 detections = ()
             for detection in detections:
-                writer.write(f"/{DETECTION_TOPIC}", from_model.detection(detection, frame_id), now)
+                writer.write(
+                    f"/{DETECTION_TOPIC}",
+                    from_model.detection(detection, frame_id),
+                    now,
+                )
         now += STEP_NS
         command(Phase.DONE, len(plan.views))
         check()
@@ -332,7 +367,11 @@ class ImageBag:
                 for channel in stream.channels.values()
                 if (transport := self._transport(channel.topic))
             }
-        raw = [topic for topic, transport in transport_of_topic.items() if transport == "raw"]
+        raw = [
+            topic
+            for topic, transport in transport_of_topic.items()
+            if transport == "raw"
+        ]
         names = raw or list(transport_of_topic)
         if not names:
             raise NoDataError(
@@ -352,7 +391,9 @@ class ImageBag:
         """Return the transport of a topic of images, else ""."""
         for transport, role in IMAGE_TOPICS.items():
             space = topic.removesuffix(role)
-            if (topic.endswith(role) and space in ("", "/")) or topic.endswith(f"/{role}"):
+            if (topic.endswith(role) and space in ("", "/")) or topic.endswith(
+                f"/{role}"
+            ):
                 namespace = self.namespace
                 return (
                     transport
@@ -382,7 +423,9 @@ class ImageBag:
             before_ns = latest_ns
             for channel, message in stream.messages():
                 schema = stream.schemas.get(channel.schema_id)
-                item = Item(channel, schema, message, bool(self._transport(channel.topic)))
+                item = Item(
+                    channel, schema, message, bool(self._transport(channel.topic))
+                )
                 if channel.topic == self.topic:
                     by_ns = before_ns - message.log_time
                     if by_ns > CLOCK_LIMIT_S * NS_PER_S:
@@ -406,7 +449,9 @@ class ImageBag:
             if item.image is not None:
                 yield role, item.message.log_time, item.message.data
 
-    def _decoded(self, channel: Channel, schema: Schema | None, message: Message) -> Any:
+    def _decoded(
+        self, channel: Channel, schema: Schema | None, message: Message
+    ) -> Any:
         name = schema.name if schema else self._kind
         if name != self._kind:
             raise InputError(
@@ -462,7 +507,9 @@ class ImageBag:
             )
             for item in self.items():
                 if not item.is_image:
-                    writer.copy(_number(writer, item, numbers), item.channel.topic, item.message)
+                    writer.copy(
+                        _number(writer, item, numbers), item.channel.topic, item.message
+                    )
                     continue
                 try:
                     detections = detect(item.image) if item.image is not None else ()
@@ -471,7 +518,9 @@ class ImageBag:
                     continue
                 for detection in detections:
                     writer.write(
-                        topic, from_model.detection(detection, frame_id), item.message.log_time
+                        topic,
+                        from_model.detection(detection, frame_id),
+                        item.message.log_time,
                     )
             check()
         return problems + self.lost
@@ -496,7 +545,9 @@ def encoder_track(path: str | Path) -> tuple[np.ndarray, np.ndarray]:
     for _, block in BagReader(Path(path)).columns():
         if isinstance(block, EncoderBlock) and {"x", "y"} <= set(block.names):
             stamps.append(block.stamps_ns)
-            places.append(block.positions[:, [block.names.index(name) for name in "xy"]])
+            places.append(
+                block.positions[:, [block.names.index(name) for name in "xy"]]
+            )
     stamp, place = np.concatenate(stamps), np.concatenate(places)
     order = np.argsort(stamp, kind="stable")
     return stamp[order], place[order]

@@ -252,9 +252,15 @@ class Journal(Closing):
             self._declare(topic, bag_topic)
         metadata.write(path)
         self._stop = threading.Event()
-        self._unsynced_s: float | None = None  # time since which there is something to synchronise
-        self._syncing_s: float | None = None  # the same for the synchronisation in progress
-        self._syncer = threading.Thread(target=self._sync_on, name="journal", daemon=True)
+        self._unsynced_s: float | None = (
+            None  # time since which there is something to synchronise
+        )
+        self._syncing_s: float | None = (
+            None  # the same for the synchronisation in progress
+        )
+        self._syncer = threading.Thread(
+            target=self._sync_on, name="journal", daemon=True
+        )
         self._syncer.start()
 
     def add_topic(
@@ -327,10 +333,14 @@ class Journal(Closing):
 
     def _append(self, waiting: list[tuple[str, bytes, int]]) -> None:
         records: list[bytes] = []
-        times: dict[str, list[int]] = {topic: [] for topic in {item[0] for item in waiting}}
+        times: dict[str, list[int]] = {
+            topic: [] for topic in {item[0] for item in waiting}
+        }
         for topic, data, log_time_ns in waiting:
             records.append(
-                message_record(self._channels[topic], self._sequence[topic], log_time_ns, data)
+                message_record(
+                    self._channels[topic], self._sequence[topic], log_time_ns, data
+                )
             )
             self._sequence[topic] += 1
             times[topic].append(log_time_ns)
@@ -351,7 +361,9 @@ class Journal(Closing):
                 self._syncing_s, self._unsynced_s = since, None
                 try:
                     self._file.sync()
-                except OSError as error:  # it may be dropped, and later syncs do not report it
+                except (
+                    OSError
+                ) as error:  # it may be dropped, and later syncs do not report it
                     self._failed, self._unsynced_s = error, since
                     self._n_unsynced += n_appended - self._n_synced
                 self._n_synced = n_appended
@@ -365,7 +377,9 @@ class Journal(Closing):
     @property
     def lag_s(self) -> float:
         """Age of the oldest flushed message that is not on the disk, s; 0 = none."""
-        since = [when for when in (self._syncing_s, self._unsynced_s) if when is not None]
+        since = [
+            when for when in (self._syncing_s, self._unsynced_s) if when is not None
+        ]
         return time.monotonic() - min(since) if since else 0.0
 
     def close(self) -> None:
@@ -400,10 +414,15 @@ def _taken_up(bag: Path) -> tuple[Metadata, list[tuple[int, Phase]]]:
         for channel in content.channels.values():
             schema = content.schemas.get(channel.schema_id)
             if schema is not None:
-                qos = yaml.safe_load(channel.metadata.get("offered_qos_profiles", "")) or []
+                qos = (
+                    yaml.safe_load(channel.metadata.get("offered_qos_profiles", ""))
+                    or []
+                )
                 topic = metadata.topics.setdefault(
                     channel.topic,
-                    BagTopic(schema.name, qos, heard_on=channel.metadata.get("heard_on", "")),
+                    BagTopic(
+                        schema.name, qos, heard_on=channel.metadata.get("heard_on", "")
+                    ),
                 )
                 topic.count += content.counts.get(channel.id, 0)
         commands += _commands(content, str(file))
@@ -435,7 +454,9 @@ def _locked(path: Path) -> int:
     except BlockingIOError as error:
         os.close(lock)
         raise InputError(
-            str(path), "another process writes this journal", "end it or name another folder"
+            str(path),
+            "another process writes this journal",
+            "end it or name another folder",
         ) from error
     return lock
 
@@ -469,8 +490,12 @@ def _commands(content: Content, where: str) -> list[tuple[int, Phase]]:
         if schema is None:
             continue
         with suppress(SelfcalError, ValueError):
-            store = store_of_schema(schema.name, schema.encoding, schema.data.decode(), where)
-            message = ChannelDecoder(COMMAND_TOPIC, schema.name, (store,), bad, told=True).one(data)
+            store = store_of_schema(
+                schema.name, schema.encoding, schema.data.decode(), where
+            )
+            message = ChannelDecoder(
+                COMMAND_TOPIC, schema.name, (store,), bad, told=True
+            ).one(data)
             if message is not None:
                 phases.append((stamp_ns(message), Phase(int(message.phase))))
     return phases

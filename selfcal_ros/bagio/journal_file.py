@@ -17,7 +17,13 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, Footer, Header, McapRecord, Schema, Statistics
 
-from selfcal_ros.bagio.mcap_chunk import FOOTER_SIZE, MAGIC, MessageBlock, message_block, stretch
+from selfcal_ros.bagio.mcap_chunk import (
+    FOOTER_SIZE,
+    MAGIC,
+    MessageBlock,
+    message_block,
+    stretch,
+)
 from selfcal_ros.bagio.mcap_salvage import HEAD, MESSAGE_FRONT, parsed
 from selfcal_ros.bagio.writer import FileEntry
 from selfcal_ros.outputs import sync_folder
@@ -108,7 +114,9 @@ def is_of_another_recorder(path: Path) -> bool:
     own = front()
     with path.open("rb") as file:
         beginning = file.read(len(own))
-    return not beginning or (beginning.startswith(MAGIC) and not own.startswith(beginning))
+    return not beginning or (
+        beginning.startswith(MAGIC) and not own.startswith(beginning)
+    )
 
 
 def ending(content: Content) -> bytes:
@@ -134,7 +142,9 @@ def ending(content: Content) -> bytes:
     crc = zlib.crc32(
         struct.pack("<BQQQ", Opcode.FOOTER, FOOTER_SIZE, start, 0), zlib.crc32(summary)
     )
-    footer = records(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc))
+    footer = records(
+        Footer(summary_start=start, summary_offset_start=0, summary_crc=crc)
+    )
     return data_end + summary + footer + MAGIC
 
 
@@ -148,9 +158,12 @@ class JournalFile:
     def __init__(self, path: Path) -> None:
         self.content = Content(FileEntry(path.name), end=0)
         self._torn = False  # whether there is data after the last complete record
-        part = path.with_suffix(UNFINISHED)  # so that a file of a journal is never empty
+        # so that a file of a journal is never empty
+        part = path.with_suffix(UNFINISHED)
         self._fd = os.open(
-            part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC, 0o666
+            part,
+            os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND | os.O_CLOEXEC,
+            0o666,
         )
         try:
             self.append(front())
@@ -245,7 +258,8 @@ def _scan(file: BinaryIO, name: str, keep: str) -> Content:
             if end > size or opcode == Opcode.DATA_END:
                 return content
             body = file.read(length)
-            if opcode == Opcode.MESSAGE and length >= MESSAGE_FRONT:  # longer than a block
+            # longer than a block
+            if opcode == Opcode.MESSAGE and length >= MESSAGE_FRONT:
                 block, _ = message_block(HEAD.pack(opcode, length) + body, 0)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 record, _ = parsed(opcode, body)

@@ -97,7 +97,10 @@ class MessageBlock:
         if not len(long):
             return long
         first = np.ndarray(
-            (len(payloads.data) - len(mcap_salvage.ZSTD) + 1,), "V4", payloads.data, strides=(1,)
+            (len(payloads.data) - len(mcap_salvage.ZSTD) + 1,),
+            "V4",
+            payloads.data,
+            strides=(1,),
         )[payloads.start[long]].view("<u4")
         return long[first == int.from_bytes(mcap_salvage.ZSTD, "little")]
 
@@ -138,10 +141,12 @@ def message_block(data: bytes, first: int) -> tuple[MessageBlock, int]:
     end = places.find(first)
     start = np.concatenate([*places.parts, np.array(places.single, dtype=np.int64)])
     if not len(start):
-        return MessageBlock(np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)), end
-    fronts = np.ndarray((len(data) - FRONT + 1,), f"V{FRONT}", data, strides=(1,))[start].view(
-        FRONT_TYPE
-    )
+        return MessageBlock(
+            np.zeros(0, dtype=FRONT_TYPE), Payloads(data, start, start)
+        ), end
+    fronts = np.ndarray((len(data) - FRONT + 1,), f"V{FRONT}", data, strides=(1,))[
+        start
+    ].view(FRONT_TYPE)
     length = fronts["length"].astype(np.int64) - mcap_salvage.MESSAGE_FRONT
     return MessageBlock(fronts, Payloads(data, start + FRONT, length)), end
 
@@ -179,7 +184,11 @@ class _Places:
         while offset + FRONT <= size:
             opcode, length = mcap_salvage.HEAD.unpack_from(data, offset)
             end = offset + mcap_salvage.HEAD.size + length
-            if opcode != Opcode.MESSAGE or length < mcap_salvage.MESSAGE_FRONT or end > size:
+            if (
+                opcode != Opcode.MESSAGE
+                or length < mcap_salvage.MESSAGE_FRONT
+                or end > size
+            ):
                 break
             single.append(offset)
             offset = end
@@ -188,9 +197,13 @@ class _Places:
                 sizes = _period(np.diff([*single[-waited:], offset]))
                 taken_messages = self._run(offset, sizes) if len(sizes) else 0
                 patience = (
-                    PATIENCE if taken_messages >= FIRST_LOOK else min(2 * patience, MAX_PATIENCE)
+                    PATIENCE
+                    if taken_messages >= FIRST_LOOK
+                    else min(2 * patience, MAX_PATIENCE)
                 )
-                offset = offset + taken_messages // max(len(sizes), 1) * int(sizes.sum())
+                offset = offset + taken_messages // max(len(sizes), 1) * int(
+                    sizes.sum()
+                )
                 waited = 0
         return offset
 
@@ -206,7 +219,11 @@ class _Places:
             good = np.ones(count, dtype=bool)
             for offset, size in zip(offsets.tolist(), sizes.tolist(), strict=True):
                 heads = np.ndarray(
-                    (count,), HEAD_TYPE, self.data, start + taken_runs * stride + offset, (stride,)
+                    (count,),
+                    HEAD_TYPE,
+                    self.data,
+                    start + taken_runs * stride + offset,
+                    (stride,),
                 )
                 good &= (heads["opcode"] == Opcode.MESSAGE) & (
                     heads["length"] == size - mcap_salvage.HEAD.size
@@ -309,7 +326,9 @@ class Summary:
     @property
     def complete(self) -> bool:
         """Whether everything used in the chunks is declared here."""
-        used = {number for chunk in self.chunks for number in chunk.message_index_offsets}
+        used = {
+            number for chunk in self.chunks for number in chunk.message_index_offsets
+        }
         declared = {0, *self.schemas}
         return used <= self.channels.keys() and all(
             channel.schema_id in declared for channel in self.channels.values()
@@ -322,7 +341,8 @@ class Summary:
             for chunk in self.chunks
             if chunk.message_index_offsets
             and not any(
-                wanted(self.channels[number].topic) for number in chunk.message_index_offsets
+                wanted(self.channels[number].topic)
+                for number in chunk.message_index_offsets
             )
         }
 
@@ -337,7 +357,9 @@ def read_summary(file: BinaryIO) -> Summary:
     """
     try:
         summary = _parsed(_content(file))
-    except Exception:  # a damaged summary may fail anywhere in its parser: read everything
+    except (
+        Exception
+    ):  # a damaged summary may fail anywhere in its parser: read everything
         return Summary()
     return summary if summary.complete else Summary()
 
@@ -348,7 +370,11 @@ def _content(file: BinaryIO) -> bytes:
     file.seek(size - END.size)
     tail = file.read(END.size)
     opcode, length, start, _, crc, magic = END.unpack(tail)
-    if (opcode, length, magic) != (Opcode.FOOTER, FOOTER_SIZE, MAGIC) or not crc or not start:
+    if (
+        (opcode, length, magic) != (Opcode.FOOTER, FOOTER_SIZE, MAGIC)
+        or not crc
+        or not start
+    ):
         raise ValueError("no summary with a checksum")
     if not 0 < size - END.size - start <= mcap_salvage.FREE:
         raise ValueError("no summary of a sensible size")

@@ -189,7 +189,9 @@ def plain_file(path: Path, lost: list[str]) -> Iterator[BinaryIO]:
                 )
             if not plain.tell():
                 raise InputError(
-                    str(path), "no part of the compressed file can be read", "record the bag again"
+                    str(path),
+                    "no part of the compressed file can be read",
+                    "record the bag again",
                 )
             plain.seek(0)
             yield plain
@@ -198,7 +200,9 @@ def plain_file(path: Path, lost: list[str]) -> Iterator[BinaryIO]:
 def _copy(file: BinaryIO, plain: BinaryIO) -> None:
     """Decompress `file` into `plain`, up to its limit."""
     size = os.fstat(file.fileno()).st_size
-    limit = max(FREE, min(RATIO * size, shutil.disk_usage(tempfile.gettempdir()).free // 2))
+    limit = max(
+        FREE, min(RATIO * size, shutil.disk_usage(tempfile.gettempdir()).free // 2)
+    )
     inside = zstandard.frame_content_size(file.read(ZSTD_HEAD))
     refuse_beyond(limit, inside)
     file.seek(0)
@@ -233,7 +237,9 @@ def chunk_length(data: bytes | mmap, start: int) -> int:
     More than available if `data` ends before them.
     """
     name_length = int.from_bytes(data[start + 28 : start + 32], "little")
-    inside = int.from_bytes(data[start + 32 + name_length : start + 40 + name_length], "little")
+    inside = int.from_bytes(
+        data[start + 32 + name_length : start + 40 + name_length], "little"
+    )
     return CHUNK_FRONT - HEAD.size + name_length + inside
 
 
@@ -281,9 +287,9 @@ def next_record(data: mmap, start: int, channels: Collection[int] | None) -> int
         if opcode == Opcode.CHUNK:
             fits = length == chunk_length(data, offset + HEAD.size)
         else:
-            fits = struct.unpack_from("<H", data, offset + HEAD.size)[0] in (channels or ()) and (
-                end == len(data) or data[end] in (Opcode.MESSAGE, Opcode.DATA_END)
-            )
+            fits = struct.unpack_from("<H", data, offset + HEAD.size)[0] in (
+                channels or ()
+            ) and (end == len(data) or data[end] in (Opcode.MESSAGE, Opcode.DATA_END))
         if fits:
             return offset
     return len(data)
@@ -311,7 +317,9 @@ def front_of_chunk(data: bytes) -> Iterator[McapRecord]:
             return
         try:
             record, _ = parsed(opcode, body[offset : offset + length])
-        except Exception:  # a damaged chunk, not only truncated: the rest cannot be trusted
+        except (
+            Exception
+        ):  # a damaged chunk, not only truncated: the rest cannot be trusted
             return
         if record is not None:
             yield record

@@ -129,7 +129,9 @@ class McapStream:
                     self._pass_strange(file)
         except OSError as error:
             raise InputError(
-                str(self.path), f"cannot be read ({error.strerror})", "name a readable file"
+                str(self.path),
+                f"cannot be read ({error.strerror})",
+                "name a readable file",
             ) from error
         self.lost += [
             f"{count} messages of the undeclared channel {number} cannot be read"
@@ -160,7 +162,9 @@ class McapStream:
     def _refusal(self, head: bytes) -> InputError:
         """Return the problem of a file that is not MCAP, by its first bytes."""
         if not head:
-            return InputError(str(self.path), "the file is empty", "record the bag again")
+            return InputError(
+                str(self.path), "the file is empty", "record the bag again"
+            )
         if head.startswith(SQLITE):
             return InputError(str(self.path), "a bag with sqlite3 storage", CONVERT)
         return InputError(
@@ -169,7 +173,8 @@ class McapStream:
 
     def _look_ahead(self, file: BinaryIO) -> None:
         """Determine the chunks that can be skipped; their declarations are also in the summary."""
-        if self.wanted is None or self.begin:  # places in a summary count from the begin
+        # places in a summary count from the begin
+        if self.wanted is None or self.begin:
             return
         summary = mcap_chunk.read_summary(file)
         self._needless = summary.needless(self.wanted)
@@ -196,11 +201,12 @@ class McapStream:
                 continue
             try:
                 opcode, record, end = _record(file, offset, size)
-            except Exception as error:  # a damaged record may fail anywhere in its parser
+            except (
+                Exception
+            ) as error:  # a damaged record may fail anywhere in its parser
                 size = self._end_at_joint(file, last, size)
-                offset, sure = (
-                    (offset, sure) if offset <= size else (last, last)
-                )  # the one before is cut off
+                # the one before is cut off
+                offset, sure = (offset, sure) if offset <= size else (last, last)
                 if data_ended or offset == size == clean:
                     self._say_end(file, data_ended)
                     return
@@ -220,7 +226,9 @@ class McapStream:
                 sure = offset if opcode == Opcode.MESSAGE else end
                 clean = end
             if passed and opcode == Opcode.MESSAGE_INDEX:
-                self._n_read += (end - offset - mcap_salvage.HEAD.size - INDEX.size) // INDEX_ENTRY
+                self._n_read += (
+                    end - offset - mcap_salvage.HEAD.size - INDEX.size
+                ) // INDEX_ENTRY
             offset = end
             if isinstance(record, Chunk):
                 self._chunked, passed = True, False
@@ -254,7 +262,9 @@ class McapStream:
         try:
             items = mcap_chunk.chunk_items(chunk)
         except mcap_salvage.TooLargeError as error:
-            self.lost.append(f"the chunk that ends at byte {position} was not read: {error}")
+            self.lost.append(
+                f"the chunk that ends at byte {position} was not read: {error}"
+            )
             self._declare(file)
             return
         except Exception as error:
@@ -305,7 +315,8 @@ class McapStream:
         packed = [
             number
             for number in block.compressed().tolist()
-            if self.channels[int(block.fronts["channel"][number])].message_encoding == "cdr"
+            if self.channels[int(block.fronts["channel"][number])].message_encoding
+            == "cdr"
         ]
         if not packed:
             return block
@@ -345,7 +356,9 @@ class McapStream:
     def _next_record(self, file: BinaryIO, start: int) -> int:
         """Return where reading can continue after `start`."""
         with mmap(file.fileno(), self._size, access=ACCESS_READ) as data:
-            return mcap_salvage.next_record(data, start, None if self._chunked else self.channels)
+            return mcap_salvage.next_record(
+                data, start, None if self._chunked else self.channels
+            )
 
     def _declare(self, file: BinaryIO) -> None:
         """Take declarations of the lost part from the summary."""
@@ -364,7 +377,9 @@ class McapStream:
         size = self._size
         file.seek(start)
         count = 0
-        for item in mcap_chunk.gathered(list(mcap_salvage.front_of_chunk(file.read(stop - start)))):
+        for item in mcap_chunk.gathered(
+            list(mcap_salvage.front_of_chunk(file.read(stop - start)))
+        ):
             self._chunked = True
             for block in self._take(item):
                 count += len(block)
@@ -380,7 +395,9 @@ class McapStream:
         if grown:
             self.lost.append(grown)
             return
-        reason = "truncated" if isinstance(error, _Cut) else f"damaged ({first_line(error)})"
+        reason = (
+            "truncated" if isinstance(error, _Cut) else f"damaged ({first_line(error)})"
+        )
         self.lost.append(
             f"the file is {reason} after byte {start} of {size}: {count} messages "
             "of the last chunk were recovered, the rest is lost"
@@ -396,21 +413,26 @@ def _is_chunk(file: BinaryIO, offset: int, end: int | None) -> bool:
     return file.read(head.size) == head.pack(Opcode.CHUNK, end - offset - head.size)
 
 
-def _record(file: BinaryIO, offset: int, size: int) -> tuple[int, McapRecord | None, int]:
+def _record(
+    file: BinaryIO, offset: int, size: int
+) -> tuple[int, McapRecord | None, int]:
     """Return opcode, content (None if not needed) and end of the record at `offset`."""
     file.seek(offset)
     head = file.read(mcap_salvage.HEAD.size)
     if len(head) < mcap_salvage.HEAD.size:
         raise _Cut
     opcode, length = mcap_salvage.HEAD.unpack(head)
-    if not (0 < opcode <= max(Opcode) or opcode >= 0x80):  # the range of private records
+    # the range of private records
+    if not (0 < opcode <= max(Opcode) or opcode >= 0x80):
         raise ValueError(f"no record has the opcode {opcode}")
     if offset + mcap_salvage.HEAD.size + length > size:
         raise _Cut
     if opcode >= 0x80 or opcode == Opcode.ATTACHMENT:
         return opcode, None, offset + mcap_salvage.HEAD.size + length
     body = file.read(length)
-    if opcode != Opcode.CHUNK and mcap_chunk.JOINT in body + file.read(len(mcap_chunk.JOINT) - 1):
+    if opcode != Opcode.CHUNK and mcap_chunk.JOINT in body + file.read(
+        len(mcap_chunk.JOINT) - 1
+    ):
         raise _Cut
     if opcode == Opcode.MESSAGE_INDEX:
         if INDEX.unpack_from(body)[1] != length - INDEX.size:

@@ -103,7 +103,9 @@ def collect_bag(
             f"no topics of the cell '/{cell}'",
             "choose one of " + ", ".join(f"/{name}" for name in sorted(reader.cells)),
         )
-    tail = f" ({'; '.join(dict.fromkeys(reader.lost[-MAX_SAID:]))})" if reader.lost else ""
+    tail = (
+        f" ({'; '.join(dict.fromkeys(reader.lost[-MAX_SAID:]))})" if reader.lost else ""
+    )
     for kind, topic in (
         ("command", COMMAND_TOPIC),
         ("detection", DETECTION_TOPIC),
@@ -112,7 +114,8 @@ def collect_bag(
         if not received[kind]:
             remedy = f"{topics_like(topic, reader.topics)}record this topic too, see the README"
             if kind == "detection" and any(
-                name.endswith(("/Image", "/CompressedImage")) for name in reader.topics.values()
+                name.endswith(("/Image", "/CompressedImage"))
+                for name in reader.topics.values()
             ):
                 remedy = (
                     f"it has images: find the marks in them with `selfcal detect {path} -o "
@@ -123,22 +126,27 @@ def collect_bag(
         raise NoDataError(
             str(path),
             "no MEASURE command"
-            + (f" that can be used{tail}" if collector.unusable.get(Reason.COMMAND_BAD) else ""),
+            + (
+                f" that can be used{tail}"
+                if collector.unusable.get(Reason.COMMAND_BAD)
+                else ""
+            ),
             "readings cannot be assigned to views without one",
         )
     measurements, views = collector.collect()
     clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
     findings = [
-        (f"view '{views[index].view.name}': " if index is not None else "") + str(finding)
+        (f"view '{views[index].view.name}': " if index is not None else "")
+        + str(finding)
         for index, finding in collector.findings(measurements, views).items()
     ]
     findings = [*collector.missing_commands(), *findings]
     if not any(view.used for view in measurements.views):
         reasons = ", ".join(
             f"{reason} {count}"
-            for reason, count in sorted(measurements.all_rejected().items(), key=lambda i: -i[1])[
-                :4
-            ]
+            for reason, count in sorted(
+                measurements.all_rejected().items(), key=lambda i: -i[1]
+            )[:4]
         )
         raise NoDataError(
             str(path),
@@ -163,7 +171,9 @@ def _fed(
             take[topic](item)
         progress(sum(collector.received.values()))
     if reader.mixes_clocks and not reader.leave_ahead:
-        honest = BagReader(reader.path, reader.namespace, reader.clock_limit_s, leave_ahead=True)
+        honest = BagReader(
+            reader.path, reader.namespace, reader.clock_limit_s, leave_ahead=True
+        )
         return _fed(honest, settings, roles, progress)
     for topic, count in reader.ahead.items() if reader.leave_ahead else ():
         collector.refuse(*FROM_THE_FUTURE[topic], count)
@@ -203,7 +213,9 @@ def bag_lines(
     reader = BagReader(Path(path), namespace, settings.clock_limit)
     reader, collector = _fed(reader, settings, [COMMAND_TOPIC, DETECTION_TOPIC])
     clock = [*step_lines(reader.steps, collector.timeline), *reader.future_lines()]
-    return BagLines(reader.lost, clock, collector.missing_commands(), collector.unusable)
+    return BagLines(
+        reader.lost, clock, collector.missing_commands(), collector.unusable
+    )
 
 
 def topics_like(topic: str, topics: dict[str, str]) -> str:
@@ -216,14 +228,18 @@ def topics_like(topic: str, topics: dict[str, str]) -> str:
         for name, kind in topics.items()
         if not any(f"/{name}".endswith(f"/{role}") for role in INPUT_TOPICS)
     }
-    same = sorted(name for name, kind in type_of_topic.items() if kind == INPUT_TOPICS[topic])
+    same = sorted(
+        name for name, kind in type_of_topic.items() if kind == INPUT_TOPICS[topic]
+    )
     if same:
         return f"is it {' or '.join(same[:MAX_SAID])}? then remap it to {topic}, or "
     hint = did_you_mean(f"/{topic}", type_of_topic)
     return f"{hint} then remap it, or " if hint else ""
 
 
-def block_handlers(collector: Collector, complaints: list[str]) -> dict[str, Callable[[Any], None]]:
+def block_handlers(
+    collector: Collector, complaints: list[str]
+) -> dict[str, Callable[[Any], None]]:
     """Return topic -> handler that passes the output of `BagReader.columns` to the collector.
 
     An unusable command is not fatal: it is counted, and reported in `complaints`.
@@ -237,7 +253,9 @@ def block_handlers(collector: Collector, complaints: list[str]) -> dict[str, Cal
             complaints.append(f"a view command was not used: {error}")
 
     def take_encoder(block: EncoderBlock) -> None:
-        collector.add_encoder_block(block.stamps_ns, block.names, block.positions, block.velocities)
+        collector.add_encoder_block(
+            block.stamps_ns, block.names, block.positions, block.velocities
+        )
 
     return {
         ENCODER_TOPIC: take_encoder,
@@ -299,12 +317,17 @@ class Playlist:
             images = ImageBag(bag, namespace)
             times, topics = _times_and_topics(self._messages(images))
             self.lost += [
-                f"{count} {line}" for line, count in images.lost.items() if line not in reader.lost
+                f"{count} {line}"
+                for line, count in images.lost.items()
+                if line not in reader.lost
             ]
         self._times = np.array(times, dtype=np.uint64)
-        numbers, counts = np.unique(np.array(topics, dtype=np.uint8), return_counts=True)
+        numbers, counts = np.unique(
+            np.array(topics, dtype=np.uint8), return_counts=True
+        )
         self.counts = {
-            TOPICS[number]: int(count) for number, count in zip(numbers, counts, strict=True)
+            TOPICS[number]: int(count)
+            for number, count in zip(numbers, counts, strict=True)
         }
         sorted_already = bool((self._times[1:] >= self._times[:-1]).all())
         order = None if sorted_already else np.argsort(self._times, kind="stable")
@@ -318,7 +341,12 @@ class Playlist:
     def transport(self) -> str:
         """The transport of the images that take the place of detections, "" without."""
         return next(
-            (transport for transport, topic in IMAGE_TOPICS.items() if topic in self.counts), ""
+            (
+                transport
+                for transport, topic in IMAGE_TOPICS.items()
+                if topic in self.counts
+            ),
+            "",
         )
 
     def _shows_images(self, reader: BagReader, has_detections: bool) -> bool:
@@ -336,7 +364,9 @@ class Playlist:
         )
         return False
 
-    def _messages(self, images: ImageBag | None = None) -> Iterable[tuple[str, int, bytes]]:
+    def _messages(
+        self, images: ImageBag | None = None
+    ) -> Iterable[tuple[str, int, bytes]]:
         """Return all messages, in the order of their times if the bag is."""
         messages = self._reader().cdr_messages()
         if not self._has_images:
@@ -358,12 +388,16 @@ class Playlist:
             yield from messages
             return
         of_topics = [(topic, data) for topic, _, data in messages]
-        for number, stamp in zip(self._order.tolist(), self._times.tolist(), strict=True):
+        for number, stamp in zip(
+            self._order.tolist(), self._times.tolist(), strict=True
+        ):
             topic, data = of_topics[number]
             yield topic, stamp, data
 
 
-def _times_and_topics(messages: Iterable[tuple[str, int, bytes]]) -> tuple[array, array]:
+def _times_and_topics(
+    messages: Iterable[tuple[str, int, bytes]],
+) -> tuple[array, array]:
     """Return the log time of each message, and the index of its topic."""
     times, topics = array("Q"), array("B")
     for topic, stamp, _ in messages:

@@ -26,10 +26,19 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.messages.to_model import first_stamps_ns
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+)
 from selfcal_ros.units import NS_PER_S
 
-LAST_FIELDS = {ENCODER_TOPIC: "position", DETECTION_TOPIC: "score", COMMAND_TOPIC: "angular_count"}
+LAST_FIELDS = {
+    ENCODER_TOPIC: "position",
+    DETECTION_TOPIC: "score",
+    COMMAND_TOPIC: "angular_count",
+}
 """Last field required by the contract; later ones may be missing."""
 SUFFIXES = (".mcap", ".mcap.zstd")
 CLOCK_LIMIT_S = CollectorSettings().clock_limit
@@ -86,7 +95,9 @@ class BagReader:
             self.path.stat()
             self.files = self._files()
         except (FileNotFoundError, NotADirectoryError) as error:
-            raise InputError(str(self.path), "no such file or folder", "check the path") from error
+            raise InputError(
+                str(self.path), "no such file or folder", "check the path"
+            ) from error
         except OSError as error:
             raise InputError(
                 str(self.path),
@@ -103,15 +114,22 @@ class BagReader:
                 "neither a file nor a folder",
                 "give an MCAP file or a rosbag2 folder",
             )
-        present = {p.name for p in self.path.iterdir() if p.name.endswith(SUFFIXES) and p.is_file()}
+        present = {
+            p.name
+            for p in self.path.iterdir()
+            if p.name.endswith(SUFFIXES) and p.is_file()
+        }
         recordings = sorted(
-            (name for name in present if name.removesuffix(".zstd") not in present - {name}),
+            (
+                name
+                for name in present
+                if name.removesuffix(".zstd") not in present - {name}
+            ),
             key=_natural,
         )
         listed = self._files_of_metadata()
-        names = (
-            listed if present.intersection(listed) else recordings
-        )  # the files may have been renamed
+        # the files may have been renamed
+        names = listed if present.intersection(listed) else recordings
         instead = ", ".join(name for name in names if name not in listed)
         for name in listed:
             if name not in present:
@@ -147,10 +165,14 @@ class BagReader:
         except (InputError, KeyError, TypeError, ValueError):
             self.lost.append("metadata.yaml is damaged and was not used")
             return []
-        others = [path for path in info["relative_file_paths"] if not path.endswith(SUFFIXES)]
+        others = [
+            path for path in info["relative_file_paths"] if not path.endswith(SUFFIXES)
+        ]
         if others:
             shown = ", ".join(map(repr, others))[:200]
-            self.lost.append(f"metadata.yaml lists {shown}, not an .mcap file: it was not read")
+            self.lost.append(
+                f"metadata.yaml lists {shown}, not an .mcap file: it was not read"
+            )
         elif not names:
             self.lost.append("metadata.yaml lists no file and was not used")
         return [name for name in dict.fromkeys(names) if name.endswith(SUFFIXES)]
@@ -265,20 +287,30 @@ class BagReader:
             if used:
                 logged_ns = block.fronts["log_time"][np.concatenate(used)]
                 by_ns = latest_ns - int(logged_ns.min())
-                if (stream.path, stream.begin) != part and by_ns > self.clock_limit_s * NS_PER_S:
-                    self.lost.append(f"{overlap(stream, by_ns)}; each reading counts once")
+                if (
+                    stream.path,
+                    stream.begin,
+                ) != part and by_ns > self.clock_limit_s * NS_PER_S:
+                    self.lost.append(
+                        f"{overlap(stream, by_ns)}; each reading counts once"
+                    )
                     watches = self._watches()
                 part = (stream.path, stream.begin)
                 latest_ns = max(latest_ns, int(logged_ns.max()))
             for decoder, index in parts:
                 if decoder.role in watches:
                     self._note_steps(
-                        watches[decoder.role], decoder.role, block[index[:: _stride(index)]]
+                        watches[decoder.role],
+                        decoder.role,
+                        block[index[:: _stride(index)]],
                     )
             yield block, parts
 
     def _watches(self) -> dict[str, StepWatch]:
-        return {role: StepWatch(self.clock_limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
+        return {
+            role: StepWatch(self.clock_limit_s)
+            for role in (ENCODER_TOPIC, DETECTION_TOPIC)
+        }
 
     def _in_time(self, role: str, block: MessageBlock, index: np.ndarray) -> np.ndarray:
         """Count messages stamped ahead of their log time; return the indices to be read."""
@@ -302,7 +334,9 @@ class BagReader:
             for (role, why), count in bad.items()
         ]
 
-    def _decoder(self, stream: McapStream, channel: Channel, bad: Counter) -> ChannelDecoder | None:
+    def _decoder(
+        self, stream: McapStream, channel: Channel, bad: Counter
+    ) -> ChannelDecoder | None:
         """Return the decoder of a channel, None for another topic."""
         role = self._role(channel.topic)
         if role is None:
@@ -323,10 +357,16 @@ class BagReader:
                 "remap the topic or record the right one",
             )
         text = schema.data.decode(errors="replace") if schema else ""
-        store = store_of_schema(name, schema.encoding if schema else "ros2msg", text, where)
+        store = store_of_schema(
+            name, schema.encoding if schema else "ros2msg", text, where
+        )
         if not text.strip():
             return ChannelDecoder(
-                role, name, (store, *shorter_stores(name, LAST_FIELDS[role])), bad, told=False
+                role,
+                name,
+                (store, *shorter_stores(name, LAST_FIELDS[role])),
+                bad,
+                told=False,
             )
         difference = other_field(store, name, LAST_FIELDS[role])
         if difference:
@@ -373,14 +413,18 @@ def _ahead(block: MessageBlock, index: np.ndarray) -> np.ndarray:
     """Return which messages are stamped ahead of their log time."""
     stamps, has_header = first_stamps_ns(block.payloads[index])
     ahead = np.zeros(len(index), dtype=bool)
-    logged = np.minimum(block.fronts["log_time"][index[has_header]], NEVER_NS).astype(np.int64)
+    logged = np.minimum(block.fronts["log_time"][index[has_header]], NEVER_NS).astype(
+        np.int64
+    )
     ahead[has_header] = (stamps - logged > MAX_AHEAD_NS) & (logged > 0)  # 0: unknown
     return ahead
 
 
 def _roles(topic: str) -> list[str]:
     """Return the input topics matching a topic after its namespace."""
-    return [role for role in INPUT_TOPICS if topic == role or topic.endswith("/" + role)]
+    return [
+        role for role in INPUT_TOPICS if topic == role or topic.endswith("/" + role)
+    ]
 
 
 def _natural(name: str) -> list:

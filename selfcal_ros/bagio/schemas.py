@@ -14,7 +14,12 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import (
+    Stores,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
 from rosbags.typesys.store import Typestore
 
 from selfcal_ros.errors import InputError, first_line
@@ -30,7 +35,12 @@ from selfcal_ros.messages.cdr import (
     Payloads,
     layout_of,
 )
-from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS, message_texts
+from selfcal_ros.topics import (
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+    message_texts,
+)
 
 OWN = "selfcal_msgs"
 
@@ -106,7 +116,9 @@ def definition_of(topic: str, typename: str) -> str:
     store = store_with(typename)
     if typename not in store.fielddefs:
         raise InputError(
-            f"topic {topic}", f"no definition of {typename}", "record only topics of known types"
+            f"topic {topic}",
+            f"no definition of {typename}",
+            "record only topics of known types",
         )
     return store.generate_msgdef(typename, ros_version=2)[0]
 
@@ -134,7 +146,9 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
         store = store_with(name)
         if name not in store.fielddefs:
             raise InputError(
-                where, f"the bag has no definition of {name}", "record it with message definitions"
+                where,
+                f"the bag has no definition of {name}",
+                "record it with message definitions",
             )
         return store
     try:
@@ -150,7 +164,11 @@ def store_of_schema(name: str, encoding: str, text: str, where: str) -> Typestor
 @lru_cache(maxsize=KEPT)
 def _store_of_text(name: str, encoding: str, text: str) -> Typestore:
     """Return the cached typestore of a schema: rosbags generates code for each."""
-    types = get_types_from_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, name)
+    types = (
+        get_types_from_idl(text)
+        if encoding == "ros2idl"
+        else get_types_from_msg(text, name)
+    )
     for type_name in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"):
         types.setdefault(type_name, typestore().fielddefs[type_name])
     return _store(types)
@@ -178,7 +196,9 @@ def shorter_stores(name: str, last: str) -> tuple[Typestore, ...]:
 def fields_of(store: Typestore, name: str) -> tuple[Field, ...] | None:
     """Return the fields of a type for `messages.cdr`; None if unsupported."""
     try:
-        return tuple(_field(store, field, kind) for field, kind in store.fielddefs[name][1])
+        return tuple(
+            _field(store, field, kind) for field, kind in store.fielddefs[name][1]
+        )
     except KeyError:
         return None
 
@@ -193,7 +213,9 @@ def _field(store: Typestore, name: str, kind: Any) -> Field:
     elif node == Nodetype.ARRAY:
         (node, inner), count = inner
     if node == Nodetype.NAME:
-        members = tuple(_field(store, field, kind) for field, kind in store.fielddefs[inner][1])
+        members = tuple(
+            _field(store, field, kind) for field, kind in store.fielddefs[inner][1]
+        )
         return Field(name, members, count)
     return Field(name, TEXT if inner[0] == "string" else NUMBERS[inner[0]], count)
 
@@ -216,7 +238,13 @@ def own_message(message: Any, name: str) -> object:
         if isinstance(inner, str):  # a type of its own
             values[part] = own_message(getattr(message, part), inner)
         else:
-            missing = np.zeros(0) if kind != Nodetype.BASE else "" if inner[0] == "string" else 0
+            missing = (
+                np.zeros(0)
+                if kind != Nodetype.BASE
+                else ""
+                if inner[0] == "string"
+                else 0
+            )
             values[part] = getattr(message, part, missing)
     return typestore().types[name](**values)
 
@@ -232,13 +260,15 @@ def other_field(store: Typestore, name: str, last: str) -> str:
     for part, wanted in typestore().fielddefs[name][1]:
         if part not in type_of_field and required:
             return f"no field '{part}'"
-        if part in type_of_field and _free_of_bounds(type_of_field[part]) != _free_of_bounds(
-            wanted
-        ):
+        if part in type_of_field and _free_of_bounds(
+            type_of_field[part]
+        ) != _free_of_bounds(wanted):
             return f"the field '{part}' has another type"
         inner = wanted[1]
         if isinstance(inner, str) and part in type_of_field:  # a type of its own
-            difference = other_field(store, inner, typestore().fielddefs[inner][1][-1][0])
+            difference = other_field(
+                store, inner, typestore().fielddefs[inner][1][-1][0]
+            )
             if difference:
                 return f"in '{part}', {difference}"
         required = required and part != last
@@ -355,7 +385,9 @@ class ChannelDecoder:
             if message is not None:
                 yield _block(self.role, message)
 
-    def own_bytes(self, messages: Payloads, index: np.ndarray) -> Iterator[tuple[int, bytes]]:
+    def own_bytes(
+        self, messages: Payloads, index: np.ndarray
+    ) -> Iterator[tuple[int, bytes]]:
         """Yield the CDR bytes of the messages in the type known here, with their `index`.
 
         Failures are omitted and counted.
@@ -378,7 +410,9 @@ class ChannelDecoder:
                     number,
                     data
                     if self._own and little
-                    else bytes(typestore().serialize_cdr(own_message(message, name), name)),
+                    else bytes(
+                        typestore().serialize_cdr(own_message(message, name), name)
+                    ),
                 )
 
 
@@ -410,7 +444,9 @@ def _block(role: str, message: Any) -> Input:
     """Return a single decoded message as a block of one; a command unchanged."""
     if role == ENCODER_TOPIC:
         sample = to_model.encoder_sample(message)
-        velocities = np.array([sample.velocities], dtype=float) if sample.velocities else None
+        velocities = (
+            np.array([sample.velocities], dtype=float) if sample.velocities else None
+        )
         return to_model.EncoderBlock(
             np.array([sample.stamp_ns]),
             sample.names,

@@ -41,7 +41,9 @@ def new_bag(path: str | Path) -> Iterator[Path]:
     """
     target = Path(path)
     if target.exists():
-        raise InputError(str(target), "exists already", "remove it or name another folder")
+        raise InputError(
+            str(target), "exists already", "remove it or name another folder"
+        )
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as unfinished:
@@ -50,12 +52,15 @@ def new_bag(path: str | Path) -> Iterator[Path]:
             except InputError as error:
                 if str(unfinished) not in error.where:
                     raise
-                where = error.where.replace(str(unfinished), str(target.parent))  # as asked for
+                # as asked for
+                where = error.where.replace(str(unfinished), str(target.parent))
                 raise InputError(where, error.what, error.remedy) from error
             Path(unfinished, target.name).rename(target)
     except OSError as error:
         raise InputError(
-            str(target), f"cannot be created ({error.strerror})", "name a writable folder"
+            str(target),
+            f"cannot be created ({error.strerror})",
+            "name a writable folder",
         ) from error
 
 
@@ -75,7 +80,9 @@ def writing(path: Path, what: str = "cannot be written") -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(
-            str(path), f"{what} ({error.strerror})", "free some space or name another folder"
+            str(path),
+            f"{what} ({error.strerror})",
+            "free some space or name another folder",
         ) from error
 
 
@@ -121,7 +128,9 @@ class BagTopic:
     def channel_metadata(self) -> dict[str, str]:
         """Return the metadata of its channel in rosbag2's format, with `heard_on`."""
         about = {
-            "offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False) if self.qos else "",
+            "offered_qos_profiles": yaml.safe_dump(self.qos, sort_keys=False)
+            if self.qos
+            else "",
             "topic_type_hash": self.hash,
         }
         return about | ({"heard_on": self.heard_on} if self.heard_on else {})
@@ -139,7 +148,9 @@ class FileEntry:
     def add(self, log_time_ns: int) -> None:
         """Count one message."""
         self.count += 1
-        self.first_ns = log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
+        self.first_ns = (
+            log_time_ns if self.first_ns is None else min(self.first_ns, log_time_ns)
+        )
         self.last_ns = max(self.last_ns, log_time_ns)
 
     def about(self) -> dict[str, Any]:
@@ -163,7 +174,9 @@ class Metadata:
         """Write metadata.yaml into the bag's folder, atomically."""
         write_text(
             folder / "metadata.yaml",
-            yaml.safe_dump({"rosbag2_bagfile_information": self._information()}, sort_keys=False),
+            yaml.safe_dump(
+                {"rosbag2_bagfile_information": self._information()}, sort_keys=False
+            ),
         )
 
     def _information(self) -> dict[str, Any]:
@@ -245,7 +258,9 @@ class BagWriter(Closing):
             ) from error
         except OSError as error:
             raise InputError(
-                str(self.path), f"cannot be created ({error.strerror})", "name a writable folder"
+                str(self.path),
+                f"cannot be created ({error.strerror})",
+                "name a writable folder",
             ) from error
         self._entry = FileEntry(f"{self.path.name}_0.mcap")
         self._metadata = Metadata(files=[self._entry])
@@ -258,7 +273,9 @@ class BagWriter(Closing):
             )
             self._mcap.start(profile="ros2", library="selfcal_ros")
 
-    def add_topic(self, topic: str, typename: str, qos: list[dict], heard_on: str = "") -> None:
+    def add_topic(
+        self, topic: str, typename: str, qos: list[dict], heard_on: str = ""
+    ) -> None:
         """Declare a topic of a known type, before its first message.
 
         Parameters
@@ -280,7 +297,9 @@ class BagWriter(Closing):
             self._schemas[typename] = self._mcap.register_schema(
                 typename, "ros2msg", definition.encode()
             )
-        self._metadata.topics[topic] = declared = BagTopic(typename, qos, heard_on=heard_on)
+        self._metadata.topics[topic] = declared = BagTopic(
+            typename, qos, heard_on=heard_on
+        )
         self._channels[topic] = self._mcap.register_channel(
             topic, "cdr", self._schemas[typename], declared.channel_metadata()
         )
@@ -288,13 +307,21 @@ class BagWriter(Closing):
     def add_copy(self, channel: Channel, schema: Schema | None) -> int:
         """Declare a channel of another bag, of any type, as it is; return its number here."""
         name = schema.name if schema else ""
-        number = self._mcap.register_schema(name, schema.encoding, schema.data) if schema else 0
+        number = (
+            self._mcap.register_schema(name, schema.encoding, schema.data)
+            if schema
+            else 0
+        )
         about = dict(channel.metadata)
         self._metadata.topics.setdefault(
             channel.topic,
-            BagTopic(name, _profiles(about), hash=about.get("topic_type_hash", UNKNOWN_HASH)),
+            BagTopic(
+                name, _profiles(about), hash=about.get("topic_type_hash", UNKNOWN_HASH)
+            ),
         )
-        return self._mcap.register_channel(channel.topic, channel.message_encoding, number, about)
+        return self._mcap.register_channel(
+            channel.topic, channel.message_encoding, number, about
+        )
 
     def copy(self, number: int, topic: str, message: Message) -> None:
         """Write a message of another bag on channel `number`."""
@@ -302,7 +329,11 @@ class BagWriter(Closing):
         self._entry.add(message.log_time)
         with writing(self.path):
             self._mcap.add_message(
-                number, message.log_time, message.data, message.publish_time, message.sequence
+                number,
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
             )
 
     def write(self, topic: str, fields: Fields, log_time_ns: int) -> None:
@@ -315,7 +346,9 @@ class BagWriter(Closing):
         self._metadata.topics[topic].count += 1
         self._entry.add(log_time_ns)
         with writing(self.path):
-            self._mcap.add_message(self._channels[topic], log_time_ns, data, log_time_ns)
+            self._mcap.add_message(
+                self._channels[topic], log_time_ns, data, log_time_ns
+            )
 
     @property
     def counts(self) -> dict[str, int]:

@@ -76,13 +76,19 @@ class Course:
 
 
 def course_of(
-    days: np.ndarray, values: np.ndarray, rng: np.random.Generator, *, orders: int = ORDERS
+    days: np.ndarray,
+    values: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    orders: int = ORDERS,
 ) -> Course:
     """Return the course of `values` (n,) at the times `days` (n,), which rise.
 
     Without a decision, which `courses` makes for all quantities together.
     """
-    nothing = Course(len(values), (0.0, 0.0, 0.0), 1.0, 1.0, 0, float(values[0]), float(values[0]))
+    nothing = Course(
+        len(values), (0.0, 0.0, 0.0), 1.0, 1.0, 0, float(values[0]), float(values[0])
+    )
     if len(values) < FEWEST or np.ptp(values) == 0 or np.ptp(days) == 0:
         return nothing
     from scipy import stats  # a second, for a series alone
@@ -101,7 +107,9 @@ def course_of(
     )
 
 
-def pettitt(values: np.ndarray, rng: np.random.Generator, *, orders: int = ORDERS) -> float:
+def pettitt(
+    values: np.ndarray, rng: np.random.Generator, *, orders: int = ORDERS
+) -> float:
     """Return the probability of as large a change in a random order of `values` (n,).
 
     Pettitt's statistic is the largest |2 sum of the first t ranks - t (n + 1)| over t.
@@ -135,7 +143,11 @@ def _imbalance(ranks: np.ndarray) -> np.ndarray:
 
 
 def courses(
-    days: np.ndarray, table: Mapping[str, np.ndarray], *, seed: int = SEED, orders: int = ORDERS
+    days: np.ndarray,
+    table: Mapping[str, np.ndarray],
+    *,
+    seed: int = SEED,
+    orders: int = ORDERS,
 ) -> dict[str, Course]:
     """Return the course of every quantity, with a common decision.
 
@@ -155,15 +167,23 @@ def courses(
         if has_value.sum() >= FEWEST:
             course = course_of(days[has_value], values[has_value], rng, orders=orders)
             if course.change:
-                last, first = np.flatnonzero(has_value)[course.change - 1 : course.change + 1]
+                last, first = np.flatnonzero(has_value)[
+                    course.change - 1 : course.change + 1
+                ]
                 course = replace(course, last_before=int(last), change=int(first))
             course_of_quantity[name] = course
     adjusted = _adjusted(
-        [p for course in course_of_quantity.values() for p in (course.p_trend, course.p_change)]
+        [
+            p
+            for course in course_of_quantity.values()
+            for p in (course.p_trend, course.p_change)
+        ]
     ).reshape(-1, 2)
     return {
         name: _with_finding(course, pair, days, table[name])
-        for (name, course), pair in zip(course_of_quantity.items(), adjusted, strict=True)
+        for (name, course), pair in zip(
+            course_of_quantity.items(), adjusted, strict=True
+        )
     }
 
 
@@ -184,10 +204,14 @@ def _with_finding(
         finding = (
             _of_both(course, days, values)
             if adjusted.max() <= COURSE_LEVEL
-            else (CourseKind.TREND if adjusted[0] <= COURSE_LEVEL else CourseKind.CHANGE)
+            else (
+                CourseKind.TREND if adjusted[0] <= COURSE_LEVEL else CourseKind.CHANGE
+            )
         )
     counted = {CourseKind.TREND: adjusted[0], CourseKind.CHANGE: adjusted[1]}
-    return replace(course, adjusted_p=float(counted.get(finding, adjusted.min())), finding=finding)
+    return replace(
+        course, adjusted_p=float(counted.get(finding, adjusted.min())), finding=finding
+    )
 
 
 def _of_both(course: Course, days: np.ndarray, values: np.ndarray) -> CourseKind:
@@ -242,7 +266,9 @@ def compared(
         if isinstance(difference, MapDifference)
     }
     records = [
-        record | {"not_compared": tried[number]} if isinstance(tried.get(number), str) else record
+        record | {"not_compared": tried[number]}
+        if isinstance(tried.get(number), str)
+        else record
         for number, record in enumerate(records)
     ]
     p = {
@@ -293,7 +319,8 @@ def _quantities(difference: MapDifference) -> dict[str, float | None]:
     values = {
         "difference_from_baseline_rms_um": difference.rms_m * UM_PER_M,
         "difference_from_baseline_largest_um": difference.max_m * UM_PER_M,
-        "theta_difference_from_baseline_rms_arcsec": difference.rms_theta_rad * ARCSEC_PER_RAD,
+        "theta_difference_from_baseline_rms_arcsec": difference.rms_theta_rad
+        * ARCSEC_PER_RAD,
     }
     return {name: value for name, value in values.items() if np.isfinite(value)}
 
@@ -303,11 +330,16 @@ def sentence(records: Sequence[Record], where: str) -> str:
     tested = [record for record in records if record.get("baseline")]
     changed = [record for record in tested if record["baseline"]["changed"]]
     named = ", ".join(
-        f"{record['bag']} (p = {record['baseline']['adjusted_p']:.2g})" for record in changed
+        f"{record['bag']} (p = {record['baseline']['adjusted_p']:.2g})"
+        for record in changed
     )
-    reasons = Counter(record["not_compared"] for record in records if "not_compared" in record)
+    reasons = Counter(
+        record["not_compared"] for record in records if "not_compared" in record
+    )
     return (
         f"{len(changed)} of {len(tested)} maps differ from {where}"
         + (f": {named}" if changed else "")
-        + "".join(f"; not compared: {count} ({reason})" for reason, count in reasons.items())
+        + "".join(
+            f"; not compared: {count} ({reason})" for reason, count in reasons.items()
+        )
     )

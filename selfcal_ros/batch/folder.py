@@ -79,7 +79,9 @@ def _below(top: Path) -> list[Path]:
 
 def _refuse(error: OSError) -> NoReturn:
     raise InputError(
-        str(error.filename), f"cannot be read ({error.strerror})", "name a readable folder"
+        str(error.filename),
+        f"cannot be read ({error.strerror})",
+        "name a readable folder",
     ) from error
 
 
@@ -122,7 +124,9 @@ class BatchSettings:
         """Return a digest of everything that affects a result, other than the bag."""
         values = asdict(self) | {"schema": SCHEMA, "version": __version__}
         for node in ("collector", "solver"):
-            values[node] = {k: v for k, v in values[node].items() if k not in NO_INFLUENCE}
+            values[node] = {
+                k: v for k, v in values[node].items() if k not in NO_INFLUENCE
+            }
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
@@ -179,7 +183,9 @@ def opened(folder: Path) -> Iterator[None]:
         lock = (folder / LOCK).open("w")
     except OSError as error:
         raise InputError(
-            str(folder), f"cannot be created ({error.strerror})", "name a writable folder"
+            str(folder),
+            f"cannot be created ({error.strerror})",
+            "name a writable folder",
         ) from error
     with lock:
         try:
@@ -202,7 +208,9 @@ def kept_records(folder: Path, settings: BatchSettings) -> list[Record]:
     return [
         record
         for record in records
-        if record is not None and record["settings"] == digest and is_whole(folder, record)
+        if record is not None
+        and record["settings"] == digest
+        and is_whole(folder, record)
     ]
 
 

@@ -99,7 +99,9 @@ def history(folder: Path) -> list[Entry]:
         If it has no result with a map.
     """
     if not folder.is_dir():
-        raise InputError(str(folder), "is not a folder", "name the folder of the calibrations")
+        raise InputError(
+            str(folder), "is not a folder", "name the folder of the calibrations"
+        )
     entries = []
     for path in sorted(folder.rglob("*.json")):
         if _is_result(path):
@@ -114,7 +116,12 @@ def history(folder: Path) -> list[Entry]:
         )
     entries.sort(key=lambda entry: (entry.measured, entry.result.provenance.created))
     return [
-        Entry(entry.path, entry.result, entry.measured, _change(entries[max(number - 1, 0)], entry))
+        Entry(
+            entry.path,
+            entry.result,
+            entry.measured,
+            _change(entries[max(number - 1, 0)], entry),
+        )
         for number, entry in enumerate(entries)
     ]
 
@@ -145,7 +152,9 @@ def _change(before: Entry, entry: Entry) -> MapDifference | str:
     if before is entry:
         return ""
     try:
-        return compare(before.result, entry.result, names=(str(before.path), str(entry.path)))
+        return compare(
+            before.result, entry.result, names=(str(before.path), str(entry.path))
+        )
     except InputError as error:  # another lattice, or nothing that both know
         return error.what
 

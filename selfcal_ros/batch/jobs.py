@@ -47,7 +47,9 @@ def run_job(job: folder.BatchJob) -> folder.Record:
         record["files"] = folder.stat_of(job.bag)
     except SelfcalError as error:
         return record | _without_result(error)
-    key = hashlib.sha256(f"{source['sha256']} {record['settings']}".encode()).hexdigest()[:24]
+    key = hashlib.sha256(
+        f"{source['sha256']} {record['settings']}".encode()
+    ).hexdigest()[:24]
     path = job.folder / folder.RECORDS / f"{key}.json"
     existing = None if job.redo else folder.read_record(path)
     if existing is not None and folder.is_whole(job.folder, existing):
@@ -84,7 +86,9 @@ def solved(
     except NotIdentifiableError as error:
         if not isinstance(error.observability, results.Observability):
             raise
-        result = worded(results.unidentified_result(session.measurements, error.observability))
+        result = worded(
+            results.unidentified_result(session.measurements, error.observability)
+        )
         problem = with_advice(error)
     return results.with_input(result, source, session.lost), problem
 
@@ -127,7 +131,9 @@ def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
         **summary_numbers(result),
         "sigma_xy_um": noise.sigma_xy * UM_PER_M,
         "sigma_theta_arcsec": noise.sigma_theta * ARCSEC_PER_RAD,
-        "rejected_percent": 100 * rejected / (used + rejected) if used + rejected else math.nan,
+        "rejected_percent": 100 * rejected / (used + rejected)
+        if used + rejected
+        else math.nan,
     }
     for term in result.model.terms:
         for estimate in term.estimates:
@@ -136,4 +142,6 @@ def quantities(result: results.CalibrationResult) -> dict[str, float | None]:
                 values[f"{term.name}_{estimate.component}_{unit}".replace(" ", "_")] = (
                     estimate.value
                 )
-    return {name: value if math.isfinite(value) else None for name, value in values.items()}
+    return {
+        name: value if math.isfinite(value) else None for name, value in values.items()
+    }

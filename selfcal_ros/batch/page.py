@@ -11,7 +11,13 @@ from selfcal_ros.batch.course import Course, CourseKind
 from selfcal_ros.batch.folder import Record
 from selfcal_ros.batch.table import PlanHistory, described, in_time
 from selfcal_ros.errors import printable
-from selfcal_ros.reporting.figures.drawing import TICK, Drawing, Frame, round_ticks, tick_text
+from selfcal_ros.reporting.figures.drawing import (
+    TICK,
+    Drawing,
+    Frame,
+    round_ticks,
+    tick_text,
+)
 from selfcal_ros.reporting.figures.svg import inline_svg
 from selfcal_ros.reporting.report import page
 from selfcal_ros.reporting.summary.numbers import decimals_for, fixed
@@ -103,7 +109,9 @@ def _values(series: PlanHistory, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a quantity of each bag, NaN if unknown, and its standard uncertainty, 0 if unknown."""
 
     def column(key: str) -> np.ndarray:
-        return np.array([record["quantities"].get(key) for record in series.records], dtype=float)
+        return np.array(
+            [record["quantities"].get(key) for record in series.records], dtype=float
+        )
 
     return column(name), np.nan_to_num(column(U_OF_ONE_PLACE.get(name, f"u_{name}")))
 
@@ -128,7 +136,11 @@ def _common_spans(series: PlanHistory) -> dict[str, Span]:
         for name in names:
             values, u = _values(series, name)
             has_value = np.isfinite(values)
-            ends += [*_limits(values), *(values - 2 * u)[has_value], *(values + 2 * u)[has_value]]
+            ends += [
+                *_limits(values),
+                *(values - 2 * u)[has_value],
+                *(values + 2 * u)[has_value],
+            ]
         low, high = min(ends), max(ends)
         margin = (high - low) * 0.08 or abs(high) * 0.01 or 1.0
         spans |= dict.fromkeys(names, (low - margin, high + margin))
@@ -140,10 +152,19 @@ def _figure(series: PlanHistory, name: str, span: Span) -> str:
     text, unit = described(name)
     values, u = _values(series, name)
     drawing = Drawing(name, f"{text} over time", 560, 170)
-    frame = Frame(drawing, (64, 14, 482, 126), (0.0, float(series.days[-1]) or 1.0), span)
+    frame = Frame(
+        drawing, (64, 14, 482, 126), (0.0, float(series.days[-1]) or 1.0), span
+    )
     low, high = _limits(values)
-    corners = [(frame.x[0], low), (frame.x[1], low), (frame.x[1], high), (frame.x[0], high)]
-    drawing.shapes([[frame.at(*corner) for corner in corners]], fill="band", opacity=0.25)
+    corners = [
+        (frame.x[0], low),
+        (frame.x[1], low),
+        (frame.x[1], high),
+        (frame.x[0], high),
+    ]
+    drawing.shapes(
+        [[frame.at(*corner) for corner in corners]], fill="band", opacity=0.25
+    )
     frame.border()
     for value in round_ticks(*span, 4):
         drawing.label(
@@ -155,35 +176,54 @@ def _figure(series: PlanHistory, name: str, span: Span) -> str:
             colour="soft",
         )
     for number, (x, anchor) in enumerate(((64.0, "start"), (546.0, "end"))):
-        drawing.label(x, 160, series.date(-number)[:10], size=TICK, anchor=anchor, colour="soft")
-    for day, value, spread, record in zip(series.days, values, u, series.records, strict=True):
+        drawing.label(
+            x, 160, series.date(-number)[:10], size=TICK, anchor=anchor, colour="soft"
+        )
+    for day, value, spread, record in zip(
+        series.days, values, u, series.records, strict=True
+    ):
         if not np.isfinite(value):
             continue
         if spread > 0:
             drawing.line(
-                [frame.at(day, value + end) for end in (-2 * spread, 2 * spread)], stroke="soft"
+                [frame.at(day, value + end) for end in (-2 * spread, 2 * spread)],
+                stroke="soft",
             )
-        drawing.discs([frame.at(day, value)], 3.0, fill="bad" if record["exit_code"] else "good")
-        label = f"{record['bag']}: {value:.6g} {unit}" + f" ± {2 * spread:.2g}" * bool(spread > 0)
+        drawing.discs(
+            [frame.at(day, value)], 3.0, fill="bad" if record["exit_code"] else "good"
+        )
+        label = f"{record['bag']}: {value:.6g} {unit}" + f" ± {2 * spread:.2g}" * bool(
+            spread > 0
+        )
         drawing.spot(*frame.at(day, value), 6, label)
     _finding(frame, series, values, series.courses[name])
-    caption = f"{text}{', ' * bool(unit)}{unit}" + ("" if u.any() else " (u is not known)")
+    caption = f"{text}{', ' * bool(unit)}{unit}" + (
+        "" if u.any() else " (u is not known)"
+    )
     return f"<figure>{inline_svg(drawing)}<figcaption>{_text(caption)}</figcaption></figure>"
 
 
-def _finding(frame: Frame, series: PlanHistory, values: np.ndarray, course: Course) -> None:
+def _finding(
+    frame: Frame, series: PlanHistory, values: np.ndarray, course: Course
+) -> None:
     """Draw a trend as a line, or a change as a step between the medians on both sides."""
     days = series.days
     if course.finding is CourseKind.TREND:
         slope = course.slope_per_day[0]
         offset = float(np.nanmedian(values - slope * days))
         frame.drawing.line(
-            [frame.at(day, offset + slope * day) for day in (days[0], days[-1])], width=1.5
+            [frame.at(day, offset + slope * day) for day in (days[0], days[-1])],
+            width=1.5,
         )
     elif course.finding is CourseKind.CHANGE:
         middle = (days[course.last_before] + days[course.change]) / 2
-        frame.drawing.line([frame.at(middle, end) for end in frame.y], stroke="bad", dash=(4, 3))
-        for ends, mean in (((days[0], middle), course.before), ((middle, days[-1]), course.after)):
+        frame.drawing.line(
+            [frame.at(middle, end) for end in frame.y], stroke="bad", dash=(4, 3)
+        )
+        for ends, mean in (
+            ((days[0], middle), course.before),
+            ((middle, days[-1]), course.after),
+        ):
             frame.drawing.line([frame.at(day, mean) for day in ends], width=1.5)
 
 
@@ -213,7 +253,8 @@ def _table(records: Sequence[Record]) -> str:
         ]
         rows.append(f"<tr>{''.join(cells)}</tr>")
     head = "".join(
-        f'<th class="{"t" if cell == "verdict" else "n"}">{_text(cell)}</th>' for cell in heads
+        f'<th class="{"t" if cell == "verdict" else "n"}">{_text(cell)}</th>'
+        for cell in heads
     )
     return (
         '<div class="scroll"><table class="list"><thead><tr>'
@@ -233,5 +274,6 @@ def _quantity(record: Record, name: str) -> str:
         return ""
     if not u:
         return f"{value:.4g}"
-    decimals = decimals_for([2 * u], 2)  # two figures of U, and the value to the same place
+    # two figures of U, and the value to the same place
+    decimals = decimals_for([2 * u], 2)
     return f"{fixed(value, decimals)} ± {fixed(2 * u, decimals)}"

@@ -81,7 +81,11 @@ def in_time(records: Sequence[Record]) -> list[Record]:
     """Return the records in the order of their first exposure; those without one last."""
     return sorted(
         records,
-        key=lambda r: (r.get("first_exposure") is None, str(r.get("first_exposure")), r["bag"]),
+        key=lambda r: (
+            r.get("first_exposure") is None,
+            str(r.get("first_exposure")),
+            r["bag"],
+        ),
     )
 
 
@@ -93,7 +97,8 @@ def series_of(records: Sequence[Record]) -> list[PlanHistory]:
             group = (record["plan_id"], tuple(record["plate"]))
             groups.setdefault(group, {}).setdefault(record["sha256"], record)
     return [
-        _series(group[0], list(records_of_bag.values())) for group, records_of_bag in groups.items()
+        _series(group[0], list(records_of_bag.values()))
+        for group, records_of_bag in groups.items()
     ]
 
 
@@ -102,7 +107,9 @@ def _series(plan_id: str, records: list[Record]) -> PlanHistory:
     days = (times - times[0]) / S_PER_DAY
     names = dict.fromkeys(name for record in records for name in record["quantities"])
     table = {
-        name: np.array([record["quantities"].get(name) for record in records], dtype=float)
+        name: np.array(
+            [record["quantities"].get(name) for record in records], dtype=float
+        )
         for name in names
         if not _is_u(name, names)
     }
@@ -124,7 +131,9 @@ def _time_s(record: Record) -> float | None:
 def csv_text(records: Sequence[Record]) -> str:
     """Return the table as CSV: one line per bag, unknown values are empty."""
     ordered = in_time(records)
-    names = dict.fromkeys(name for record in ordered for name in record.get("quantities", {}))
+    names = dict.fromkeys(
+        name for record in ordered for name in record.get("quantities", {})
+    )
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     compared = ["baseline_p", "changed", "not_compared"] * any(
@@ -149,7 +158,13 @@ def csv_text(records: Sequence[Record]) -> str:
 
 
 def _field(value: Any) -> Any:
-    return "" if value is None else str(value).lower() if isinstance(value, bool) else value
+    return (
+        ""
+        if value is None
+        else str(value).lower()
+        if isinstance(value, bool)
+        else value
+    )
 
 
 def batch_json(
@@ -176,7 +191,8 @@ def batch_json(
                 "bags": [r["bag"] for r in series.records],
                 "findings": series.sentences(),
                 "courses": {
-                    name: _course_json(series, course) for name, course in series.courses.items()
+                    name: _course_json(series, course)
+                    for name, course in series.courses.items()
                 },
             }
             for series in histories
@@ -186,7 +202,10 @@ def batch_json(
 
 def _course_json(series: PlanHistory, course: Course) -> dict:
     changed = (
-        [series.records[i]["first_exposure"] for i in (course.last_before, course.change)]
+        [
+            series.records[i]["first_exposure"]
+            for i in (course.last_before, course.change)
+        ]
         if course.change
         else None
     )
@@ -220,7 +239,11 @@ def summary_lines(
             f"{series.date(-1)}:"
         )
         few = f"too few bags for a trend (fewer than {FEWEST})"
-        nothing = few if len(series.records) < FEWEST else "no quantity has a trend or a change"
+        nothing = (
+            few
+            if len(series.records) < FEWEST
+            else "no quantity has a trend or a change"
+        )
         lines += [f"  {line}" for line in sentences or [nothing]]
     return lines
 
@@ -228,4 +251,6 @@ def summary_lines(
 def described(name: str) -> tuple[str, str]:
     """Return a quantity's name as words, and its unit."""
     text, _, unit = name.replace(f"m{PER}m", "m/m").rpartition("_")
-    return text.replace("_", " "), {"percent": "%", "um": "µm", "ppm": "µm/m"}.get(unit, unit)
+    return text.replace("_", " "), {"percent": "%", "um": "µm", "ppm": "µm/m"}.get(
+        unit, unit
+    )

@@ -25,7 +25,9 @@ ENDS = ("x1", "y1", "x2", "y2")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    parser.add_argument(
+        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
+    )
     parser.add_argument(
         "points",
         metavar="POINTS.csv",
@@ -70,7 +72,9 @@ def run(args: argparse.Namespace) -> int:
     """
     check_outputs([args.result, args.points], [file_of(args)])
     stage = load(
-        args.result, method=args.method, outside="refuse" if args.outside == "refuse" else "clamp"
+        args.result,
+        method=args.method,
+        outside="refuse" if args.outside == "refuse" else "clamp",
     )
     points = read_points(read_text(args.points), args.points)
     edge = args.outside == "edge"
@@ -136,7 +140,11 @@ def _say_better(stage: StageMap, points: np.ndarray) -> None:
     used = rms(stage.halfway)
     x, y = points[:, :2].T
     plain = np.array(stage.uncertainty(x, y)) if used else np.zeros(1)
-    if stage.method == "bicubic" or not emap.valid.all() or not rms(plain) > 2 * rms(emap.u_xy):
+    if (
+        stage.method == "bicubic"
+        or not emap.valid.all()
+        or not rms(plain) > 2 * rms(emap.u_xy)
+    ):
         return
     cubic = rms(Compensator(emap, method="bicubic").halfway)
     if cubic < used / 2:
@@ -170,7 +178,9 @@ def read_points(text: str, where: str) -> np.ndarray:
     points = np.empty((len(rows) - 1, len(head)))
     for index, (number, cells) in enumerate(rows[1:]):
         try:
-            points[index] = list(map(number_of, cells)) if len(cells) == len(head) else np.nan
+            points[index] = (
+                list(map(number_of, cells)) if len(cells) == len(head) else np.nan
+            )
         except ValueError:
             points[index] = np.nan
         if not np.abs(points[index]).max() < 1e12:
@@ -206,13 +216,25 @@ def corrected(
     if inverse:
         outside &= ~stage.inside(corrected_axes[0], corrected_axes[1])
     if theta:
-        corrected_axes.append((stage.correct_theta if inverse else stage.command_theta)(theta[0]))
+        corrected_axes.append(
+            (stage.correct_theta if inverse else stage.command_theta)(theta[0])
+        )
         u.append(stage.uncertainty_theta(corrected_axes[2] if inverse else theta[0]))
     unknown = int((np.isnan(corrected_axes).any(axis=0) & ~outside).sum())
     if not edge:
-        corrected_axes[:2] = (np.where(outside, np.nan, axis) for axis in corrected_axes[:2])
-    head = [*names, *(f"{name}_{what}" for name in names), *(f"u_{name}" for name in names)]
-    return _csv(head, np.column_stack([points, *corrected_axes, *u])), unknown, int(outside.sum())
+        corrected_axes[:2] = (
+            np.where(outside, np.nan, axis) for axis in corrected_axes[:2]
+        )
+    head = [
+        *names,
+        *(f"{name}_{what}" for name in names),
+        *(f"u_{name}" for name in names),
+    ]
+    return (
+        _csv(head, np.column_stack([points, *corrected_axes, *u])),
+        unknown,
+        int(outside.sum()),
+    )
 
 
 def distances(
@@ -220,7 +242,9 @@ def distances(
 ) -> tuple[str, int, int]:
     """Return the table of distances with their errors, as `corrected`; and a line over length."""
     if inverse:
-        raise InputError("--inverse", "the ends of distances are true positions", "leave it out")
+        raise InputError(
+            "--inverse", "the ends of distances are true positions", "leave it out"
+        )
     x1, y1, x2, y2 = points.T
     error, u = stage.length_error((x1, y1), (x2, y2))
     outside = ~(stage.inside(x1, y1) & stage.inside(x2, y2))
@@ -239,5 +263,8 @@ def distances(
 
 def _csv(head: list[str], rows: np.ndarray) -> str:
     """Return a table; what is not known is empty."""
-    lines = [",".join("" if cell != cell else repr(cell) for cell in row) for row in rows.tolist()]
+    lines = [
+        ",".join("" if cell != cell else repr(cell) for cell in row)
+        for row in rows.tolist()
+    ]
     return "\n".join([",".join(head), *lines]) + "\n"

@@ -19,7 +19,18 @@ FOLDERS = ("BAG", "FOLDER", "DIR")
 """Names of outputs that are folders: they are never replaced."""
 FORMATS = {".json": (), ".yaml": (".yml",)}
 """Ending of a file to write, as in the name of its argument -> others that it may have."""
-OTHERS = (".csv", ".html", ".pdf", ".png", ".svg", ".txt", ".mcap", ".xml", ".cal", *FORMATS)
+OTHERS = (
+    ".csv",
+    ".html",
+    ".pdf",
+    ".png",
+    ".svg",
+    ".txt",
+    ".mcap",
+    ".xml",
+    ".cal",
+    *FORMATS,
+)
 """Endings that say of a file that it is of another kind."""
 SEEN = 1 << 14
 """Bytes at the beginning of a file by which its kind is recognised."""
@@ -87,13 +98,18 @@ class File(NamedTuple):
 def add_force(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--force`` to a verb that writes files and has none yet."""
     if "--force" not in parser._option_string_actions and any(_outputs(parser)):
-        parser.add_argument("--force", action="store_true", help="replace files that exist")
+        parser.add_argument(
+            "--force", action="store_true", help="replace files that exist"
+        )
 
 
 def _outputs(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
     """Yield the arguments that name files to write."""
     for action in parser._actions:
-        if OUTPUTS.intersection(action.option_strings) and action.metavar not in FOLDERS:
+        if (
+            OUTPUTS.intersection(action.option_strings)
+            and action.metavar not in FOLDERS
+        ):
             yield action
 
 
@@ -120,9 +136,15 @@ def check_existing(args: argparse.Namespace) -> None:
 def _refuse_ending(path: str, metavar: str) -> None:
     """Raise InputError if the name of an output ends as that of a file of another kind."""
     wanted, ending = (os.path.splitext(name)[1].lower() for name in (metavar, path))
-    if wanted in FORMATS and ending in OTHERS and ending not in (wanted, *FORMATS[wanted]):
+    if (
+        wanted in FORMATS
+        and ending in OTHERS
+        and ending not in (wanted, *FORMATS[wanted])
+    ):
         raise InputError(
-            path, f"{metavar} is written here, which is not {ending}", f"end the name in {wanted}"
+            path,
+            f"{metavar} is written here, which is not {ending}",
+            f"end the name in {wanted}",
         )
 
 
@@ -130,7 +152,9 @@ def refuse_existing(path: str | os.PathLike, *, force: bool) -> None:
     """Raise InputError if `path` is a file with content, and ``--force`` is not given."""
     if not force and os.path.isfile(path) and os.path.getsize(path):
         raise InputError(
-            str(path), "the file exists", "name another file, or replace it with --force"
+            str(path),
+            "the file exists",
+            "name another file, or replace it with --force",
         )
 
 
@@ -162,7 +186,9 @@ def misplaced(args: argparse.Namespace) -> InputError | None:
 def _files(args: argparse.Namespace) -> Iterator[File]:
     """Yield the inputs among the arguments that are files or folders."""
     for action in args.leaf._actions:
-        wanted = tuple(WANTED[name] for name in str(action.metavar).split("|") if name in WANTED)
+        wanted = tuple(
+            WANTED[name] for name in str(action.metavar).split("|") if name in WANTED
+        )
         values = getattr(args, action.dest, None)
         for value in values if isinstance(values, list) else [values]:
             if (
@@ -180,7 +206,9 @@ def kind_of(path: str) -> str:
             names = os.listdir(path)
             return (
                 BAG
-                if any(name == "metadata.yaml" or name.endswith(".mcap") for name in names)
+                if any(
+                    name == "metadata.yaml" or name.endswith(".mcap") for name in names
+                )
                 else ""
             )
         if not os.path.isfile(path):
@@ -190,4 +218,6 @@ def kind_of(path: str) -> str:
     except (OSError, ValueError):
         return ""  # whoever reads it says why not
     ending = ENDINGS.get(os.path.splitext(path)[1].lower(), "")
-    return next((kind for kind, pattern in BEGINNINGS if pattern.match(beginning)), ending)
+    return next(
+        (kind for kind, pattern in BEGINNINGS if pattern.match(beginning)), ending
+    )

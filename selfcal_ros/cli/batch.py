@@ -53,7 +53,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "already there are kept",
     )
     how = parser.add_mutually_exclusive_group()
-    how.add_argument("--workers", type=int, metavar="N", help="processes (default: one per core)")
+    how.add_argument(
+        "--workers", type=int, metavar="N", help="processes (default: one per core)"
+    )
     how.add_argument(
         "--dask",
         metavar="ADDRESS",
@@ -88,7 +90,9 @@ def run(args: argparse.Namespace) -> int:
     bags, folder = find_bags(args.bags), Path(args.output)
     for bag in bags:
         if Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(bag)):
-            raise InputError(str(folder), f"it is in the bag {bag}", "name another folder")
+            raise InputError(
+                str(folder), f"it is in the bag {bag}", "name another folder"
+            )
     with opened(folder):
         earlier_records = [] if args.redo else kept_records(folder, settings)
         record_of, places = done_and_to_do(earlier_records, bags)
@@ -97,9 +101,8 @@ def run(args: argparse.Namespace) -> int:
         record_of |= _worked(args, bags, settings, places)
 
         records = [record_of[index] for index in sorted(record_of)]
-        keys = {
-            record.get("key") for record in earlier_records
-        }  # copies and moved bags have one, too
+        # copies and moved bags have one, too
+        keys = {record.get("key") for record in earlier_records}
         before = sum("key" in record and record["key"] in keys for record in records)
         if baseline is not None:
             records = compared(records, folder, baseline, args.baseline)
@@ -114,7 +117,10 @@ def run(args: argparse.Namespace) -> int:
     say(
         args,
         "\n".join(
-            [*map(printable, lines), f"written: {folder / 'table.csv'}, index.html, batch.json"]
+            [
+                *map(printable, lines),
+                f"written: {folder / 'table.csv'}, index.html, batch.json",
+            ]
         ),
         content,
     )
@@ -122,7 +128,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _worked(
-    args: argparse.Namespace, bags: Sequence[Path], settings: "BatchSettings", places: Sequence[int]
+    args: argparse.Namespace,
+    bags: Sequence[Path],
+    settings: "BatchSettings",
+    places: Sequence[int],
 ) -> dict[int, "Record"]:
     """Return the records of the bags at `places`; print a line for each unqualified result."""
     records: dict[int, Record] = {}

@@ -14,7 +14,13 @@ from selfcal_ros.aerotech import export
 from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
 from selfcal_ros.aerotech.one_axis import OneAxisFit
-from selfcal_ros.aerotech.read import load_cal, load_cals, parse_cal, read_cal, refuse_errors
+from selfcal_ros.aerotech.read import (
+    load_cal,
+    load_cals,
+    parse_cal,
+    read_cal,
+    refuse_errors,
+)
 from selfcal_ros.aerotech.rules import Gi4
 from selfcal_ros.aerotech.verify import (
     controller_figure,
@@ -30,7 +36,12 @@ from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.plausible import require_plausible
-from selfcal_ros.compensation.residual import Correction, Residual, bends_between, combined
+from selfcal_ros.compensation.residual import (
+    Correction,
+    Residual,
+    bends_between,
+    combined,
+)
 from selfcal_ros.controllers.export import place_to_look
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check_celsius
 from selfcal_ros.model.result import CalibrationResult
@@ -63,7 +74,9 @@ def run(args: argparse.Namespace) -> int:
 
 def add_files(group: argparse._SubParsersAction) -> None:
     """Add the sub-verbs."""
-    check = group.add_parser("check", help="check a file against every rule of the format")
+    check = group.add_parser(
+        "check", help="check a file against every rule of the format"
+    )
     check.add_argument("file", metavar="FILE.cal")
     check.add_argument(
         "--gi4",
@@ -77,12 +90,15 @@ def add_files(group: argparse._SubParsersAction) -> None:
         help=f"bits of the scanner protocol behind --gi4 (default {SCANNER_BITS})",
     )
     check.add_argument(
-        "--strict", action="store_true", help="also refuse tolerated and doubtful content"
+        "--strict",
+        action="store_true",
+        help="also refuse tolerated and doubtful content",
     )
     check.add_argument("--json", action="store_true", help="print the findings as JSON")
     check.set_defaults(run_sub_verb=_check)
     evaluate = group.add_parser(
-        "eval", help="print the corrections at a position as JSON, in primary units by axis"
+        "eval",
+        help="print the corrections at a position as JSON, in primary units by axis",
     )
     evaluate.add_argument(
         "files",
@@ -115,7 +131,9 @@ def add_files(group: argparse._SubParsersAction) -> None:
         metavar="AXIS=C",
         help="encoder counts per secondary unit",
     )
-    add("--temperature", type=float, metavar="T", help="temperature of the scales, degC")
+    add(
+        "--temperature", type=float, metavar="T", help="temperature of the scales, degC"
+    )
     add(
         "--home-direction",
         action="append",
@@ -159,7 +177,12 @@ def _check(args: argparse.Namespace) -> int:
                         for severity, number in counts.items()
                     },
                     "findings": [
-                        {"line": f.line, "severity": f.severity, "what": f.what, "mend": f.remedy}
+                        {
+                            "line": f.line,
+                            "severity": f.severity,
+                            "what": f.what,
+                            "mend": f.remedy,
+                        }
                         for f in cal.findings
                     ],
                 },
@@ -202,7 +225,10 @@ def _evaluate(args: argparse.Namespace) -> int:
     frame = frame_from_comments(cal.comments)
     unit = args.unit or (frame.unit if frame else "mm")
     rotary = {
-        axis for table in cal.tables if getattr(table, "rollover", None) for axis in table.inputs
+        axis
+        for table in cal.tables
+        if getattr(table, "rollover", None)
+        for axis in table.inputs
     }
     if frame is not None and frame.theta_axis is not None:
         rotary.add(frame.theta_axis)
@@ -228,7 +254,9 @@ def _setup(args: argparse.Namespace) -> "MachineSetup":
             )
     values_of: dict[str, dict[int, Any]] = {
         name: cal_lines.numbers(
-            getattr(args, name), f"--{name.replace('_', '-')}", positive=name.startswith("counts")
+            getattr(args, name),
+            f"--{name.replace('_', '-')}",
+            positive=name.startswith("counts"),
         )
         for name in (
             "counts_per_unit",
@@ -241,7 +269,9 @@ def _setup(args: argparse.Namespace) -> "MachineSetup":
     axes: set[int] = set().union(*values_of.values())
     return MachineSetup(
         {
-            axis: AxisSetup(**{name: values.get(axis) for name, values in values_of.items()})
+            axis: AxisSetup(
+                **{name: values.get(axis) for name, values in values_of.items()}
+            )
             for axis in axes
         },
         args.temperature,
@@ -262,7 +292,9 @@ def add_maps(group: argparse._SubParsersAction) -> None:
         "(default: FILE_theta.cal)",
     )
     export.add_argument(
-        "--fill", action="store_true", help="set unknown sites to the mean of their neighbours"
+        "--fill",
+        action="store_true",
+        help="set unknown sites to the mean of their neighbours",
     )
     export.add_argument(
         "--onto",
@@ -283,10 +315,15 @@ def add_maps(group: argparse._SubParsersAction) -> None:
     )
     verify.add_argument("result", metavar="RESULT.json")
     verify.add_argument(
-        "files", metavar="FILE.cal", nargs="+", help="file, or several that are loaded together"
+        "files",
+        metavar="FILE.cal",
+        nargs="+",
+        help="file, or several that are loaded together",
     )
     verify.add_argument(
-        "--onto", metavar="ACTIVE.cal", help="table that was loaded during the calibration"
+        "--onto",
+        metavar="ACTIVE.cal",
+        help="table that was loaded during the calibration",
     )
     verify.add_argument("--plot", metavar="F.png", help="draw it (png, svg or pdf)")
     verify.add_argument("--json", action="store_true", help="print as JSON, m and rad")
@@ -297,7 +334,9 @@ def add_maps(group: argparse._SubParsersAction) -> None:
 def _export(args: argparse.Namespace) -> int:
     frame = cal_lines.frame_of(args)
     if args.theta_output and frame.theta_axis is None:
-        raise InputError("--theta-output", "no theta table is written", "name --theta-axis")
+        raise InputError(
+            "--theta-output", "no theta table is written", "name --theta-axis"
+        )
     result, filled = ready(args)
     comments = [
         *provenance(result, frame, filled=filled, command=command(args)),
@@ -311,7 +350,9 @@ def _export(args: argparse.Namespace) -> int:
         comments.append("replaces the table that was loaded during the calibration")
     texts = {
         args.output: cal_text(
-            [export.table_xy(error_map, frame)], comments=comments, decimals=export.DECIMALS
+            [export.table_xy(error_map, frame)],
+            comments=comments,
+            decimals=export.DECIMALS,
         )
     }
     if frame.theta_axis is not None:
@@ -321,7 +362,9 @@ def _export(args: argparse.Namespace) -> int:
         )
         if os.path.realpath(theta_path) == os.path.realpath(target):
             raise InputError(
-                theta_path, "a 1D and a 2D table cannot share a file", "name another file"
+                theta_path,
+                "a 1D and a 2D table cannot share a file",
+                "name another file",
             )
         table = export.table_theta(result.error_map, frame)
         texts[theta_path] = cal_text(
@@ -351,7 +394,10 @@ def _export(args: argparse.Namespace) -> int:
 
 def numbered(steps: Sequence[str]) -> list[str]:
     """Return the lines of a checklist."""
-    return ["to put it into use:", *(f"  {number}. {step}" for number, step in enumerate(steps, 1))]
+    return [
+        "to put it into use:",
+        *(f"  {number}. {step}" for number, step in enumerate(steps, 1)),
+    ]
 
 
 def ready(args: argparse.Namespace) -> tuple["CalibrationResult", int]:
@@ -414,9 +460,14 @@ def _verify(args: argparse.Namespace) -> int:
     result, cal = read_result(args.result), load_cals(args.files)
     frame = cal_lines.frame_of(args, frame_of_file(cal))
     with busy("simulating the controller"):
-        verification = verify_tables(result.error_map, cal.tables, frame, _active(args, frame))
+        verification = verify_tables(
+            result.error_map, cal.tables, frame, _active(args, frame)
+        )
     one_axis = verification.one_axis
-    text, figures = residual_text(verification.residuals), figures_of(verification.residuals)
+    text, figures = (
+        residual_text(verification.residuals),
+        figures_of(verification.residuals),
+    )
     if one_axis is not None:
         text = f"{text}\n{one_axis_text(one_axis)}"
         figures |= {"one_axis": plain(asdict(one_axis))}
@@ -425,7 +476,9 @@ def _verify(args: argparse.Namespace) -> int:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
         save_picture(controller_figure(verification), args.plot)
-    unfit_parts = [part for part in one_axis.parts if part.unfit] if one_axis is not None else []
+    unfit_parts = (
+        [part for part in one_axis.parts if part.unfit] if one_axis is not None else []
+    )
     if verification.worse and one_axis is not None and not unfit_parts:
         raise InputError(
             cal.where,
@@ -471,7 +524,9 @@ def one_axis_text(fit: OneAxisFit) -> str:
         f"{part.name:<48}{part.rms / M_PER_UM:>16.6f}{part.rms_left / M_PER_UM:>15.6f}"
         for part in fit.parts
     ]
-    lines.append(f"{'no 1D table of these axes corrects':<64}{fit.beyond / M_PER_UM:>15.6f}")
+    lines.append(
+        f"{'no 1D table of these axes corrects':<64}{fit.beyond / M_PER_UM:>15.6f}"
+    )
     if fit.squareness_left:
         lines.append(
             "  straightness leaves the squareness, "
@@ -497,15 +552,25 @@ def figures_of(residuals: "list[Residual]") -> dict:
 
 def residual_text(residuals: "list[Residual]") -> str:
     """Return the residuals as a small table: µm, and arcsec for angular lines."""
-    lines = ["residual true - commanded, without its constant shift         before          after"]
-    names = {"sites": "sites", "between": "cell centres (cubic stage)", "lines": "angular lines"}
+    lines = [
+        "residual true - commanded, without its constant shift         before          after"
+    ]
+    names = {
+        "sites": "sites",
+        "between": "cell centres (cubic stage)",
+        "lines": "angular lines",
+    }
     for r in residuals:
-        unit, scale = ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("µm", M_PER_UM)
+        unit, scale = (
+            ("arcsec", RAD_PER_ARCSEC) if r.place == "lines" else ("µm", M_PER_UM)
+        )
         for what, value in (("rms", r.rms), ("max", r.largest)):
             name = f"{r.position.shape[1]} {names[r.place]}, {what}, {unit}"
             lines.append(
                 f"{name:<48}{value('before') / scale:>16.6f}{value('after') / scale:>15.6f}"
             )
         shift = ", ".join(f"{s / scale:.6f}" for s in r.shift_after)
-        lines.append(f"  constant shift after: {shift} {unit} (the controller is zero at home)")
+        lines.append(
+            f"  constant shift after: {shift} {unit} (the controller is zero at home)"
+        )
     return "\n".join(lines)

@@ -44,19 +44,25 @@ def pairs(texts: list[str] | None, option: str) -> dict[int, str]:
     values: dict[int, str] = {}
     for text in texts or []:
         axis, equals, value = text.partition("=")
-        if not (equals and axis.isascii() and axis.isdigit() and 1 <= int(axis[:9]) <= 32):
+        if not (
+            equals and axis.isascii() and axis.isdigit() and 1 <= int(axis[:9]) <= 32
+        ):
             raise InputError(
                 option,
                 f"'{text}' is not AXIS=VALUE with an axis from 1 to 32",
                 f"write {option} 1=10.5",
             )
         if int(axis) in values:
-            raise InputError(option, f"axis {int(axis)} is given twice", "keep one of them")
+            raise InputError(
+                option, f"axis {int(axis)} is given twice", "keep one of them"
+            )
         values[int(axis)] = value
     return values
 
 
-def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> dict[int, float]:
+def numbers(
+    texts: list[str] | None, option: str, *, positive: bool = False
+) -> dict[int, float]:
     """Return axis -> number of options AXIS=NUMBER; InputError for anything else."""
     numbers_of = {}
     for axis, text in pairs(texts, option).items():
@@ -74,7 +80,9 @@ def numbers(texts: list[str] | None, option: str, *, positive: bool = False) -> 
     return numbers_of
 
 
-def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) -> list[str]:
+def in_unit(
+    texts: list[str] | None, unit: str, *, rotary: Container[int] = ()
+) -> list[str]:
     """Return options AXIS=LENGTH with the length as a number in `unit`; others unchanged.
 
     Raises
@@ -84,7 +92,9 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
     """
     converted = []
     for text in texts or []:
-        match = re.fullmatch(r"(\d+)=([-+]?[\d.]+(?:[eE][-+]?\d{1,3})?) ?(m|mm|um|µm|nm)", text)
+        match = re.fullmatch(
+            r"(\d+)=([-+]?[\d.]+(?:[eE][-+]?\d{1,3})?) ?(m|mm|um|µm|nm)", text
+        )
         if match is None:
             converted.append(text)
             continue
@@ -94,7 +104,9 @@ def in_unit(texts: list[str] | None, unit: str, *, rotary: Container[int] = ()) 
                 f"'{text}' is a length, and axis {match[1]} is rotary",
                 f"write {match[1]}=10.5, in its primary unit (deg)",
             )
-        factor = Fraction(str(M_PER[match[3].replace("µ", "u")])) / Fraction(str(M_PER[unit]))
+        factor = Fraction(str(M_PER[match[3].replace("µ", "u")])) / Fraction(
+            str(M_PER[unit])
+        )
         try:
             converted.append(f"{match[1]}={float(Fraction(match[2]) * factor)!r}")
         except (ValueError, OverflowError):
@@ -161,7 +173,9 @@ def add_frame(
             help=f"the encoder counts opposite to the stage frame's {axis}",
         )
     if theta:
-        group.add_argument("--theta-axis", type=int, metavar="N", help="index of the theta axis")
+        group.add_argument(
+            "--theta-axis", type=int, metavar="N", help="index of the theta axis"
+        )
         group.add_argument(
             "--counts-per-unit",
             action="append",
@@ -170,7 +184,9 @@ def add_frame(
         )
 
 
-def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "MachineFrame":
+def frame_of(
+    args: argparse.Namespace, base: "MachineFrame | None" = None
+) -> "MachineFrame":
     """Return the frame described by the options, with `base` as default."""
     base = base or MachineFrame()
     changes: dict[str, Any] = {
@@ -182,7 +198,9 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
     for name in ("x", "y", "theta"):
         home = getattr(args, f"home_{name}", None)
         if home is not None and not math.isfinite(home):
-            raise InputError(f"--home-{name}", f"{home} is not a position", "give a number")
+            raise InputError(
+                f"--home-{name}", f"{home} is not a position", "give a number"
+            )
         if home is not None and name == "theta":
             changes["home_theta_rad"] = math.radians(home)
         elif home is not None:
@@ -196,7 +214,9 @@ def frame_of(args: argparse.Namespace, base: "MachineFrame | None" = None) -> "M
                 f"{changes[name]} is not in 1..32",
                 "indices in calibration files count from 1",
             )
-    counts = numbers(getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True)
+    counts = numbers(
+        getattr(args, "counts_per_unit", None), "--counts-per-unit", positive=True
+    )
     theta_axis = changes.get("theta_axis", base.theta_axis)
     for name in ("home_theta_rad", "reverse_theta"):
         if name in changes and theta_axis is None:
@@ -227,9 +247,13 @@ def add_line_tables(group: argparse._SubParsersAction) -> None:
         "them.",
     )
     square.add_argument("source", nargs="?", metavar="RESULT.json")
-    square.add_argument("--measured", metavar="LENGTH", help="error shown by the indicator")
+    square.add_argument(
+        "--measured", metavar="LENGTH", help="error shown by the indicator"
+    )
     square.add_argument("--over", metavar="LENGTH", help="length of the square")
-    square.add_argument("--travel", metavar="LENGTH", help="full travel of the reference axis")
+    square.add_argument(
+        "--travel", metavar="LENGTH", help="full travel of the reference axis"
+    )
     square.add_argument(
         "--home",
         choices=tuple(_HOMES),
@@ -255,7 +279,9 @@ def _common(parser: argparse.ArgumentParser, run: object) -> None:
     parser.add_argument(
         "--along", choices=("x", "y"), default="x", help="reference axis (default x)"
     )
-    parser.add_argument("-o", "--output", metavar="FILE.cal", help="write a calibration file")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE.cal", help="write a calibration file"
+    )
     parser.add_argument(
         "--force",
         action="store_true",
@@ -270,7 +296,9 @@ def _frame(args: argparse.Namespace) -> "MachineFrame":
     """Return the frame of the machine; refuse options without effect."""
     if args.force and not args.output:
         raise InputError(
-            "--force", "it replaces a file, and none is named", "name one with -o, or omit it"
+            "--force",
+            "it replaces a file, and none is named",
+            "name one with -o, or omit it",
         )
     return frame_of(args)
 
@@ -300,17 +328,24 @@ def _orthogonality(args: argparse.Namespace) -> int:
     _refuse_frame(args, "a measured square", "use --home")
     measured_m, over_m, travel_m = (
         cal_lines.length_m(text, name)
-        for text, name in zip(measured, ("--measured", "--over", "--travel"), strict=True)
+        for text, name in zip(
+            measured, ("--measured", "--over", "--travel"), strict=True
+        )
     )
     if args.output:
         if args.home is None:
             raise InputError(
-                "--home", "the home position is missing", "give end, middle or middle-balanced"
+                "--home",
+                "the home position is missing",
+                "give end, middle or middle-balanced",
             )
         line = cal_lines.orthogonality(measured_m, over_m, travel_m, args.home)
         return _deliver(args, line, frame, (args.along, across))
     homes = [args.home] if args.home else list(_HOMES)
-    line_of = {home: cal_lines.orthogonality(measured_m, over_m, travel_m, home) for home in homes}
+    line_of = {
+        home: cal_lines.orthogonality(measured_m, over_m, travel_m, home)
+        for home in homes
+    }
     unit_m = UNITS_M[args.unit]
     tables = {
         home: [
@@ -320,7 +355,11 @@ def _orthogonality(args: argparse.Namespace) -> int:
         for home, line in line_of.items()
     }
     if args.json:
-        print(json.dumps({"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1))
+        print(
+            json.dumps(
+                {"unit": args.unit, "correction_unit": "um", "tables": tables}, indent=1
+            )
+        )
         return int(ExitCode.DONE)
     tell(
         f"correction of {across} over the full travel of {args.along}: "
@@ -328,7 +367,11 @@ def _orthogonality(args: argparse.Namespace) -> int:
     )
     for home, rows in tables.items():
         tell(f"{_HOMES[home]} (--home {home})\n  position {args.unit:<5} correction µm")
-        print("\n".join(f"  {position:<14.9g} {correction:.9g}" for position, correction in rows))
+        print(
+            "\n".join(
+                f"  {position:<14.9g} {correction:.9g}" for position, correction in rows
+            )
+        )
     return int(ExitCode.DONE)
 
 
@@ -339,8 +382,12 @@ def _line(args: argparse.Namespace) -> int:
     if args.sub_verb == "straightness":
         corrected = "y" if args.along == "x" else "x"
     if Path(args.source).suffix.lower() == ".csv":
-        _refuse_frame(args, "measured errors, whose positions are the controller's own", "omit it")
-        line = cal_lines.measured_line(read_text(args.source), args.source, frame.unit_m)
+        _refuse_frame(
+            args, "measured errors, whose positions are the controller's own", "omit it"
+        )
+        line = cal_lines.measured_line(
+            read_text(args.source), args.source, frame.unit_m
+        )
     else:
         result = read_result(args.source)
         if not args.steep:
@@ -376,12 +423,22 @@ def _deliver(
     comments = [
         f"written by selfcal {__version__} on {datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
         f"{args.sub_verb} of {axes[1]} along {axes[0]}, from {source}",
-        *([] if result is None else [*origin_lines(result, command(args)), *verdict_lines(result)]),
+        *(
+            []
+            if result is None
+            else [*origin_lines(result, command(args)), *verdict_lines(result)]
+        ),
         frame.comment(),
     ]
     table = line_table(line, frame, along=axes[0], corrected=axes[1])
     text = cal_text([table], comments=comments, decimals=DECIMALS)
-    written = {"table": text, "corrects": axes[1], "along": axes[0], "file": None, "old_file": None}
+    written = {
+        "table": text,
+        "corrects": axes[1],
+        "along": axes[0],
+        "file": None,
+        "old_file": None,
+    }
     if args.output:
         backup = replace_files(args, {args.output: text}, [args.source])[args.output]
         say(

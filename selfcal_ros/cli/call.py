@@ -21,7 +21,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "plate is in place; redo: measure the view again; skip: continue "
         "without it; abort: end the plan",
     )
-    parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
+    parser.add_argument(
+        "--namespace", metavar="NS", default="", help="namespace of the cell"
+    )
     add_json(parser)
 
 

@@ -21,7 +21,9 @@ from selfcal_ros.vision.exposures import ImageDetector
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    init = parser.add_subparsers(dest="camera_verb", metavar="init", required=True).add_parser(
+    init = parser.add_subparsers(
+        dest="camera_verb", metavar="init", required=True
+    ).add_parser(
         "init",
         help="from a few moves of the stage",
         description="Follows marks in images taken "
@@ -39,7 +41,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="table of the image files and indicated positions: file, x, y (m)",
     )
     init.add_argument(
-        "-o", "--output", metavar="NODES.yaml", required=True, help="ROS parameter file to write"
+        "-o",
+        "--output",
+        metavar="NODES.yaml",
+        required=True,
+        help="ROS parameter file to write",
     )
     init.add_argument(
         "--mark",
@@ -154,7 +160,9 @@ def _of_bag(
             marks = detector.take(item.image)
             if marks:
                 exposed.append(marks[0].stamp_ns)
-                images.append(np.array([(mark.offset_x, mark.offset_y) for mark in marks]))
+                images.append(
+                    np.array([(mark.offset_x, mark.offset_y) for mark in marks])
+                )
     for line, count in bag.lost.items():
         print(f"selfcal camera: {args.bag}: {count} x {line}", file=sys.stderr)
     if not exposed or not len(stamps):
@@ -169,7 +177,9 @@ def _of_bag(
             "an image was taken before the first or after the last sample of the encoders",
             "record the joint states around all images",
         )
-    return np.stack([np.interp(exposed, stamps, axis) for axis in track.T], axis=1), images
+    return np.stack(
+        [np.interp(exposed, stamps, axis) for axis in track.T], axis=1
+    ), images
 
 
 def _of_files(
@@ -179,7 +189,9 @@ def _of_files(
     """Return stage positions and marks of each image of a folder."""
     positions, images = [], []
     for number, row in enumerate(read_positions(args.positions, None)):
-        marks = detector.take_file(read_bytes(Path(args.bag) / row.file), row.file, number)
+        marks = detector.take_file(
+            read_bytes(Path(args.bag) / row.file), row.file, number
+        )
         if marks:
             positions.append((row.x_m, row.y_m))
             images.append(np.array([(mark.offset_x, mark.offset_y) for mark in marks]))

@@ -59,13 +59,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "turned by some 1 mrad, and reports joints, rates, clocks, commands, rest, ids, loss, "
         "check stops, signs. Exit code 0 if all checks pass, else 5.",
     )
-    check.add_argument("--plan", metavar="PLAN.yaml", required=True, help="plan with the plate")
+    check.add_argument(
+        "--plan", metavar="PLAN.yaml", required=True, help="plan with the plate"
+    )
     check.add_argument(
         "--params",
         metavar="NODES.yaml",
         help="ROS parameter file; the section of measurement_collector is used",
     )
-    check.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
+    check.add_argument(
+        "--namespace", metavar="NS", default="", help="namespace of the cell"
+    )
     check.add_argument(
         "--settle",
         metavar="S",
@@ -92,14 +96,19 @@ def _try(args: argparse.Namespace) -> int:
     """Look, move after a yes, write what was found into CELL.yaml."""
     cell = read_cell(args.cell)
     output = args.output or f"{Path(args.cell).with_suffix('')}.seen.png"
-    with ended_by_signals(), connected(cell, lambda line: print(line, file=aside(args))) as machine:
+    with (
+        ended_by_signals(),
+        connected(cell, lambda line: print(line, file=aside(args))) as machine,
+    ):
         trial = Trial(cell, machine, mark_pixels=args.mark_pixels)
         pixels, marks = trial.look()
         print(
             "position: "
             + ", ".join(
                 f"{axis} {value + 0.0:.6g}"
-                for axis, value in zip(trial.position.names, trial.position.positions, strict=True)
+                for axis, value in zip(
+                    trial.position.names, trial.position.positions, strict=True
+                )
             ),
             file=aside(args),
         )
@@ -118,11 +127,16 @@ def _try(args: argparse.Namespace) -> int:
     if values:
         with_values(cell.path, "detector", values, notes)
     if outcome.settling_s > cell.settle.time:
-        with_values(cell.path, "settle", {"time": float(f"{outcome.settling_s:.2g}")}, {})
+        with_values(
+            cell.path, "settle", {"time": float(f"{outcome.settling_s:.2g}")}, {}
+        )
     with_values(
         cell.path,
         "found",
-        {f"backlash_{axis}": asdict(reversal) for axis, reversal in outcome.reversal.items()}
+        {
+            f"backlash_{axis}": asdict(reversal)
+            for axis, reversal in outcome.reversal.items()
+        }
         | {"settling_time": outcome.settling_s, "noise": outcome.noise_m},
         {},
     )
@@ -144,7 +158,9 @@ def _try(args: argparse.Namespace) -> int:
             "seen": output if pixels is not None else "",
             "marks": len(marks),
             **values,
-            "backlash": {axis: asdict(reversal) for axis, reversal in outcome.reversal.items()},
+            "backlash": {
+                axis: asdict(reversal) for axis, reversal in outcome.reversal.items()
+            },
             "settling_time": outcome.settling_s,
             "noise": outcome.noise_m,
             "notes": list(outcome.notes),
@@ -156,7 +172,9 @@ def _try(args: argparse.Namespace) -> int:
 def _agrees(args: argparse.Namespace, step_m: float) -> bool:
     """Ask whether the stage may move."""
     if not sys.stdin.isatty():
-        raise InputError("stdin", "there is nobody to ask: it is not a terminal", "give --yes")
+        raise InputError(
+            "stdin", "there is nobody to ask: it is not a terminal", "give --yes"
+        )
     print(
         f"the stage moves by up to {step_m / M_PER_UM:.4g} um in x and y: may it? [y/N] ",
         end="",

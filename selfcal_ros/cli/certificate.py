@@ -15,7 +15,9 @@ from selfcal_ros.standards.statements import is_traceable
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument(
-        "result", metavar="RESULT.json", help="result of `selfcal solve` or `selfcal combine`"
+        "result",
+        metavar="RESULT.json",
+        help="result of `selfcal solve` or `selfcal combine`",
     )
     parser.add_argument(
         "details",
@@ -23,7 +25,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="laboratory, customer, item, persons, conditions (docs/guides/certificate.md)",
     )
     parser.add_argument(
-        "-o", "--output", metavar="DCC.xml", required=True, help="certificate to write; - = stdout"
+        "-o",
+        "--output",
+        metavar="DCC.xml",
+        required=True,
+        help="certificate to write; - = stdout",
     )
     parser.add_argument(
         "--covariance",
@@ -43,7 +49,9 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.result, args.details], [file_of(args)])
     result = read_result(args.result)
     details = read_details(args.details)
-    xml = certificate(result, details, covariance=args.covariance, not_qualified=args.not_qualified)
+    xml = certificate(
+        result, details, covariance=args.covariance, not_qualified=args.not_qualified
+    )
     traceable = is_traceable(result)
     return deliver(
         args,

@@ -12,7 +12,11 @@ from pathlib import Path
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_settings, say
-from selfcal_ros.collection.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
+from selfcal_ros.collection.settings.detector import (
+    ANY_NUMBER,
+    OPTIONS,
+    DetectorSettings,
+)
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
@@ -41,7 +45,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="table of the image files and indicated positions: file, view, x, y (m)",
     )
     parser.add_argument(
-        "--plan", metavar="PLAN.yaml", help="plan with plate and views, needed with --positions"
+        "--plan",
+        metavar="PLAN.yaml",
+        help="plan with plate and views, needed with --positions",
     )
     parser.add_argument(
         "-o",
@@ -73,7 +79,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Detect, write the bag and print what was found."""
     settings = replace(
-        node_settings(args.params, DetectorSettings, **given(args, WITH_IDS)), max_marks=ANY_NUMBER
+        node_settings(args.params, DetectorSettings, **given(args, WITH_IDS)),
+        max_marks=ANY_NUMBER,
     )
     draw = partial(_drawn, Path(args.draw), settings) if args.draw else None
     detector = ImageDetector(settings, args.params or "options", draw)
@@ -103,7 +110,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str) -> "Counter[str]":
+def _from_files(
+    args: argparse.Namespace, detector: "ImageDetector", frame: str
+) -> "Counter[str]":
     """Write a bag from image files and a table of positions; return problems."""
     if not args.plan:
         raise InputError("--positions", "the plan is missing", "give --plan PLAN.yaml")
@@ -120,16 +129,25 @@ def _from_files(args: argparse.Namespace, detector: "ImageDetector", frame: str)
 
 
 def _drawn(
-    folder: Path, settings: DetectorSettings, name: str, picture: Picture, judged: Sequence[Judged]
+    folder: Path,
+    settings: DetectorSettings,
+    name: str,
+    picture: Picture,
+    judged: Sequence[Judged],
 ) -> None:
     """Write an image with what was found and what was rejected in it."""
     marks = [(each.u, each.v) for each in judged if isinstance(each.found, Mark)]
     rejected = [
-        (each.u, each.v, str(each.found)) for each in judged if not isinstance(each.found, Mark)
+        (each.u, each.v, str(each.found))
+        for each in judged
+        if not isinstance(each.found, Mark)
     ]
     size = settings.mark_size / settings.pixel_size
     folder.mkdir(parents=True, exist_ok=True)
-    write_bytes(folder / f"{Path(name).stem}.png", circled(picture.values, marks, size, rejected))
+    write_bytes(
+        folder / f"{Path(name).stem}.png",
+        circled(picture.values, marks, size, rejected),
+    )
 
 
 def text_of(output: str, counts: dict[str, int]) -> str:
@@ -144,7 +162,10 @@ def text_of(output: str, counts: dict[str, int]) -> str:
         for name, text in (
             ("images_without_marks", "images without marks"),
             ("images_refused", "images refused"),
-            ("images_with_more_pages", "images with further pages, which were not used"),
+            (
+                "images_with_more_pages",
+                "images with further pages, which were not used",
+            ),
         )
         if counts.get(name)
     ]

@@ -68,7 +68,9 @@ def run(args: argparse.Namespace) -> int:
             )
         for option in ("plot", "artifact"):
             if getattr(args, option):
-                raise InputError(f"--{option}", f"{args.b} has no map", "name two RESULT.json")
+                raise InputError(
+                    f"--{option}", f"{args.b} has no map", "name two RESULT.json"
+                )
         rows = compare_with_laser(a, second, args.b)
         say(
             args,
@@ -88,7 +90,11 @@ def run(args: argparse.Namespace) -> int:
                 )
     with busy("comparing"):
         difference = compare(
-            a, b, keep_scale=args.keep_scale, plates=args.artifact, names=(args.a, args.b)
+            a,
+            b,
+            keep_scale=args.keep_scale,
+            plates=args.artifact,
+            names=(args.a, args.b),
         )
     if args.plot:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
@@ -98,7 +104,11 @@ def run(args: argparse.Namespace) -> int:
             difference_picture(
                 map_a,
                 map_b,
-                {"gx": difference.dx, "gy": difference.dy, "g_theta": difference.d_theta},
+                {
+                    "gx": difference.dx,
+                    "gy": difference.dy,
+                    "g_theta": difference.d_theta,
+                },
                 _verdict_text(difference),
             ),
             args.plot,
@@ -109,7 +119,11 @@ def run(args: argparse.Namespace) -> int:
         {**_json(difference), **_grades([a, b])},
     )
     datums = [result.error_map.datum_theta for result in (a, b)]
-    if datums[0] != datums[1] and not (args.json or args.artifact) and difference.theta is not None:
+    if (
+        datums[0] != datums[1]
+        and not (args.json or args.artifact)
+        and difference.theta is not None
+    ):
         print(
             f"       theta datums differ: {datums[0]} and {datums[1]}; xy_axes also ties four "
             "lines to the XY axes"
@@ -137,7 +151,10 @@ def _grades_text(results: Sequence[CalibrationResult]) -> list[str]:
     return [
         f"{name}      grade: "
         + "; ".join(
-            [str(result.verdict.grade).replace("_", " "), *enlargement_texts(result.verdict)]
+            [
+                str(result.verdict.grade).replace("_", " "),
+                *enlargement_texts(result.verdict),
+            ]
         )
         for name, result in zip("AB", results, strict=False)
     ]
@@ -161,7 +178,9 @@ def _json(difference: MapDifference) -> dict[str, Any]:
             "nonorthogonality": difference.nonorthogonality,
             "scale_difference": difference.scale_difference,
             "significance_xy": None if difference.xy is None else asdict(difference.xy),
-            "significance_theta": None if difference.theta is None else asdict(difference.theta),
+            "significance_theta": None
+            if difference.theta is None
+            else asdict(difference.theta),
             "dx": difference.dx,
             "dy": difference.dy,
             "d_theta": difference.d_theta,
@@ -217,7 +236,9 @@ def _verdict_text(difference: MapDifference) -> str:
     tests = {"XY": difference.xy, "theta": difference.theta}
     if difference.significant is None:
         return "verdict: none, no uncertainties to test against"
-    differ = [name for name, test in tests.items() if test is not None and test.significant]
+    differ = [
+        name for name, test in tests.items() if test is not None and test.significant
+    ]
     if differ:
         return f"verdict: significant, the maps differ in {' and '.join(differ)}"
     return "verdict: not significant, the maps agree within their uncertainties"
@@ -242,7 +263,9 @@ def _laser_text(rows: Sequence[LaserDifference]) -> str:
     lines = ["first-order terms, map and laser:"]
     for row in rows:
         unit = "µrad" if row.name == "nonorthogonality" else "µm/m"
-        test = "" if math.isnan(row.u) else f"  u {row.u * UM_PER_M:.4g}, p = {row.p:.2g}"
+        test = (
+            "" if math.isnan(row.u) else f"  u {row.u * UM_PER_M:.4g}, p = {row.p:.2g}"
+        )
         lines.append(
             f"  {row.name.replace('_', ' ')}: {row.of_map * UM_PER_M:+.4g} and "
             f"{row.of_laser * UM_PER_M:+.4g} {unit}, difference "

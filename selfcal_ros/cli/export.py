@@ -45,7 +45,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="the controller subtracts the table (beckhoff, siemens: not documented)",
     )
     add("--integers", action="store_true", help="beckhoff before V3.1.3132 / V4.29")
-    add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
+    add(
+        "--fill",
+        action="store_true",
+        help="set unknown sites to the mean of their neighbours",
+    )
     add(
         "--force",
         action="store_true",
@@ -67,7 +71,9 @@ def run(args: argparse.Namespace) -> int:
     result, filled = ready(args)
     active = None
     if args.onto:
-        active = loaded(args.format, [Source(read_text(path), path) for path in args.onto], wiring)
+        active = loaded(
+            args.format, [Source(read_text(path), path) for path in args.onto], wiring
+        )
     exported = export(
         args.format,
         result,
@@ -92,7 +98,9 @@ def run(args: argparse.Namespace) -> int:
         args,
         "\n".join(lines),
         {
-            "files": [{"file": path, "old_file": backup} for path, backup in backups.items()],
+            "files": [
+                {"file": path, "old_file": backup} for path, backup in backups.items()
+            ],
             "filled": filled,
             "residuals": figures_of(exported.residuals),
             "checklist": list(exported.checklist),
@@ -115,5 +123,8 @@ def _wiring(args: argparse.Namespace) -> "Wiring":
             f"give it for {axes[0]} and {axes[1]}",
         )
     return Wiring(
-        frame, (counts[axes[0]], counts[axes[1]]) if counts else None, args.negate, args.integers
+        frame,
+        (counts[axes[0]], counts[axes[1]]) if counts else None,
+        args.negate,
+        args.integers,
     )

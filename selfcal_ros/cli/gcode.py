@@ -13,7 +13,12 @@ from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.deliver import command, deliver
 from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.compensation.export import origin_lines
-from selfcal_ros.controllers.gcode import OF_SAMPLES, Rewriter, commented, corrected_program
+from selfcal_ros.controllers.gcode import (
+    OF_SAMPLES,
+    Rewriter,
+    commented,
+    corrected_program,
+)
 from selfcal_ros.controllers.gcode_codes import DIALECTS
 from selfcal_ros.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
 from selfcal_ros.errors import InputError
@@ -28,8 +33,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("program", metavar="IN", help="G-code")
     add("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
-    add("-o", "--output", metavar="OUT", required=True, help="program to write; - = stdout")
-    add("--dialect", required=True, choices=DIALECTS, help="whose list of codes the program keeps")
+    add(
+        "-o",
+        "--output",
+        metavar="OUT",
+        required=True,
+        help="program to write; - = stdout",
+    )
+    add(
+        "--dialect",
+        required=True,
+        choices=DIALECTS,
+        help="whose list of codes the program keeps",
+    )
     add(
         "--tolerance",
         type=float,
@@ -44,7 +60,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="decimals of coordinates in mm, one more in inches (default 5)",
     )
-    add("--fill", action="store_true", help="set unknown sites to the mean of their neighbours")
+    add(
+        "--fill",
+        action="store_true",
+        help="set unknown sites to the mean of their neighbours",
+    )
     add_json(parser)
     add_frame(parser, theta=False, units=("mm", "in"))
 
@@ -97,7 +117,9 @@ def run(args: argparse.Namespace) -> int:
     program = corrected_program(text, args.program, rewriter)
     (x0, *_, x1), (y0, *_, y1) = nodes(result.error_map, frame)
     lowest, highest = rewriter.reach_m
-    warnings = ["moves leave the field, beyond which the correction at its edge is used, without U"]
+    warnings = [
+        "moves leave the field, beyond which the correction at its edge is used, without U"
+    ]
     if np.all(lowest >= (x0 - ROUNDING_M, y0 - ROUNDING_M)) and np.all(
         highest <= (x1 + ROUNDING_M, y1 + ROUNDING_M)
     ):

@@ -27,7 +27,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("folder", metavar="FOLDER", help="calibrations of one stage")
     parser.add_argument(
-        "--activate", metavar="RESULT.json", help="make this result of the folder the active map"
+        "--activate",
+        metavar="RESULT.json",
+        help="make this result of the folder the active map",
     )
     add_json(parser)
 
@@ -40,7 +42,9 @@ def run(args: argparse.Namespace) -> int:
     with busy("comparing"):
         entries = history(folder)
         active, since = active_map(folder) if (folder / ACTIVE).exists() else (None, "")
-        used = next((entry for entry in entries if active and entry.path.samefile(active)), None)
+        used = next(
+            (entry for entry in entries if active and entry.path.samefile(active)), None
+        )
         drift = drift_from(used, entries) if used else None
     say(
         args,
@@ -71,14 +75,21 @@ def _activate(folder: Path, path: Path) -> None:
         raise InputError(str(path), f"is not in {folder}", "copy it there first")
     if not read_result(path).verdict.qualified:
         raise InputError(
-            str(path), "is not qualified, so it is not a map to correct with", "calibrate again"
+            str(path),
+            "is not qualified, so it is not a map to correct with",
+            "calibrate again",
         )
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    write_text(folder / ACTIVE, f"{path.resolve().relative_to(folder.resolve())}\n{now}\n")
+    write_text(
+        folder / ACTIVE, f"{path.resolve().relative_to(folder.resolve())}\n{now}\n"
+    )
 
 
 def _text(
-    folder: Path, entries: list[Entry], active: tuple[Entry | None, str], drift: Drift | None
+    folder: Path,
+    entries: list[Entry],
+    active: tuple[Entry | None, str],
+    drift: Drift | None,
 ) -> Iterator[str]:
     used, since = active
     yield (
@@ -106,7 +117,10 @@ def _change_text(change: MapDifference | str) -> str:
     u = (
         ("", "")
         if change.xy is None
-        else (f" ± {change.xy.u_largest * NM_PER_M:.2g}", f" ± {change.xy.u_rms * NM_PER_M:.2g}")
+        else (
+            f" ± {change.xy.u_largest * NM_PER_M:.2g}",
+            f" ± {change.xy.u_rms * NM_PER_M:.2g}",
+        )
     )
     clear = {True: "changed", False: "within u", None: "u unknown"}[change.significant]
     return (

@@ -62,7 +62,9 @@ def run(args: argparse.Namespace) -> int:
         in_model = any(term.name == "approach" for term in stage.result.model.terms)
         try:
             axes.append(
-                iso230.axis_figures(stage, axis, args.line, repeats, approach_in_model=in_model)
+                iso230.axis_figures(
+                    stage, axis, args.line, repeats, approach_in_model=in_model
+                )
             )
         except InputError as error:
             if measurements is None:
@@ -107,22 +109,31 @@ def _read(args: argparse.Namespace) -> tuple[StageMap, Measurements | None]:
     if stage is None:
         with busy("solving"):
             stage = StageMap(
-                worded(calibrate(measurements, solver_options(SolverSettings(), measurements)))
+                worded(
+                    calibrate(
+                        measurements, solver_options(SolverSettings(), measurements)
+                    )
+                )
             )
     elif stage.error_map.artifact != measurements.artifact.field:
         raise InputError(
-            f"{args.source} and {args.result}", "the plates differ", "name the result of this bag"
+            f"{args.source} and {args.result}",
+            "the plates differ",
+            "name the result of this bag",
         )
     return stage, measurements
 
 
 def _figures(evaluated: AxisFigures | PathFigures) -> dict[str, Any]:
     return {
-        name: {"value": figure.value, "u": figure.u} for name, figure in evaluated.figures.items()
+        name: {"value": figure.value, "u": figure.u}
+        for name, figure in evaluated.figures.items()
     }
 
 
-def _json(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) -> dict[str, Any]:
+def _json(
+    stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]
+) -> dict[str, Any]:
     return plain(
         {
             "axes": [
@@ -172,7 +183,9 @@ def _text(stage: StageMap, axes: list[AxisFigures], paths: list[PathFigures]) ->
         lines += _rows(item)
     for path in paths:
         lines += [f"{path.name}:", *_rows(path)]
-    lines.append("deviations: actual minus commanded, ISO 230-1; u: standard uncertainty (k=1)")
+    lines.append(
+        "deviations: actual minus commanded, ISO 230-1; u: standard uncertainty (k=1)"
+    )
     if not stage.result.reference:
         lines.append(
             "scale: a convention, no reference length: a linear deviation common to both "

@@ -63,9 +63,13 @@ def build_parser(only: str | None = None) -> "Parser":
         "internal error",
     )
     parser.add_argument("--version", action="version", version=f"selfcal {__version__}")
-    group = parser.add_subparsers(dest="verb", metavar="VERB", required=True, parser_class=Parser)
+    group = parser.add_subparsers(
+        dest="verb", metavar="VERB", required=True, parser_class=Parser
+    )
     for name in [only] if only in VERBS else VERBS:
-        sub = group.add_parser(name, help=VERBS[name].what, description=VERBS[name].what)
+        sub = group.add_parser(
+            name, help=VERBS[name].what, description=VERBS[name].what
+        )
         if only in (None, name):
             _configure(sub, importlib.import_module(module_of(name)))
             for words, leaf in _leaves(sub, name):
@@ -73,7 +77,9 @@ def build_parser(only: str | None = None) -> "Parser":
                 add_force(leaf)
     if only not in VERBS:
         for name, point in verbs_of_others().items():
-            sub = group.add_parser(name, help=summary_of(point), description=summary_of(point))
+            sub = group.add_parser(
+                name, help=summary_of(point), description=summary_of(point)
+            )
             if only == name:
                 _configure(sub, point.load())
     return parser
@@ -88,7 +94,9 @@ def _configure(parser: argparse.ArgumentParser, module: Any) -> None:
 def _leaves(parser: "Parser", words: str) -> Iterator[tuple[str, "Parser"]]:
     """Yield the words and the parser of a verb, or of each of its second words."""
     groups = [
-        action for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+        action
+        for action in parser._actions
+        if isinstance(action, argparse._SubParsersAction)
     ]
     if not groups:
         yield words, parser
@@ -106,7 +114,8 @@ def _complete() -> None:
     """Answer a shell's request for completions and end; see README."""
     import argcomplete  # for completion only
 
-    words = os.environ.get("COMP_LINE", "").split(" ")[1:-1]  # without the word at the cursor
+    # without the word at the cursor
+    words = os.environ.get("COMP_LINE", "").split(" ")[1:-1]
     argcomplete.autocomplete(build_parser(_verb_in(word for word in words if word)))
 
 
@@ -142,7 +151,9 @@ def _run(words: list[str]) -> int:
     except SelfcalError as error:
         fault = (misplaced(args) if args is not None else None) or error
         if isinstance(fault, NotIdentifiableError):
-            from selfcal_ros.reporting.words.observability import with_advice  # slow: numpy
+            from selfcal_ros.reporting.words.observability import (
+                with_advice,
+            )  # slow: numpy
 
             fault = with_advice(fault)
         return _refused(f"{prefix}: {fault}", fault.exit_code)
@@ -159,7 +170,9 @@ def _run(words: list[str]) -> int:
         if error.errno is None:
             raise
         fault = InputError(
-            str(error.filename or "system"), str(error.strerror), "check path, disk and permissions"
+            str(error.filename or "system"),
+            str(error.strerror),
+            "check path, disk and permissions",
         )
         return _refused(f"{prefix}: {fault}", fault.exit_code)
 
@@ -195,7 +208,8 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.set_defaults(leaf=self)
-        self.register("type", float, number_of)  # float() reads 1_0 as 10, and other digits
+        # float() reads 1_0 as 10, and other digits
+        self.register("type", float, number_of)
         self.register("type", int, whole_number_of)
 
     def _print_message(self, message: str, file: Any = None) -> None:
@@ -212,7 +226,9 @@ class Parser(argparse.ArgumentParser):
         return f"{text}\nexample:\n  {self.example}\n" if self.example else text
 
     def parse_args(  # type: ignore[override]
-        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+        self,
+        args: Sequence[str] | None = None,
+        namespace: argparse.Namespace | None = None,
     ) -> argparse.Namespace:
         """Return the arguments; an unknown option ends with a line that names it."""
         parsed, unknown = self.parse_known_args(args, namespace)
@@ -262,8 +278,13 @@ class Parser(argparse.ArgumentParser):
             )
         choices: Iterable[str] = map(str, action.choices)
         choice_names = list(choices)
-        hint = did_you_mean(str(value), choice_names) or f"known are {', '.join(choice_names)}"
-        raise argparse.ArgumentError(None, f"{_name_of(action)} '{value}' is unknown; {hint}")
+        hint = (
+            did_you_mean(str(value), choice_names)
+            or f"known are {', '.join(choice_names)}"
+        )
+        raise argparse.ArgumentError(
+            None, f"{_name_of(action)} '{value}' is unknown; {hint}"
+        )
 
 
 class AllVerbs(Parser):
@@ -278,7 +299,10 @@ class AllVerbs(Parser):
             *textwrap.wrap(str(self.description), width),
             "",
             "start here",
-            *_columns({f"selfcal {command}": what for command, what in START_HERE.items()}, width),
+            *_columns(
+                {f"selfcal {command}": what for command, what in START_HERE.items()},
+                width,
+            ),
         ]
         offered = {action.dest: str(action.help) for action in self._verbs()}
         longest = max(map(len, offered))

@@ -31,7 +31,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("plan", metavar="PLAN.yaml", help="plan with plate and views")
     parser.add_argument(
-        "cell", metavar="CELL.yaml", help="machine, limits, detector (docs/start/machines.md)"
+        "cell",
+        metavar="CELL.yaml",
+        help="machine, limits, detector (docs/start/machines.md)",
     )
     parser.add_argument(
         "-o",
@@ -46,7 +48,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="ask nothing: the plate is placed by a robot or a simulation, and the stage may move",
     )
     parser.add_argument(
-        "--resume", action="store_true", help="continue the bag of a run that was interrupted"
+        "--resume",
+        action="store_true",
+        help="continue the bag of a run that was interrupted",
     )
     add_json(parser, "RESULT.json, and all else on stderr")
 
@@ -89,13 +93,23 @@ def run(args: argparse.Namespace) -> int:
     if plan.verify:
         parser = argparse.ArgumentParser()
         verify.configure(parser)
-        verifying = parser.parse_args([plan.verify, str(bag), "--sense", str(cell.sense)])
+        verifying = parser.parse_args(
+            [plan.verify, str(bag), "--sense", str(cell.sense)]
+        )
         verifying.json = args.json
         return verify.run(verifying)
     parser = argparse.ArgumentParser()
     solve.configure(parser)
     solving = parser.parse_args(
-        [str(bag), "-o", f"{bag}.json", "--sense", str(cell.sense), "--report", f"{bag}.html"]
+        [
+            str(bag),
+            "-o",
+            f"{bag}.json",
+            "--sense",
+            str(cell.sense),
+            "--report",
+            f"{bag}.html",
+        ]
     )
     solving.verb = "measure"
     solving.json = args.json
@@ -121,8 +135,12 @@ class Terminal:
 
     def place(self, command: Command) -> None:
         """Say how the plate is to lie, with a picture, and wait."""
-        from selfcal_ros.reporting.figures.paper import save_picture  # matplotlib, a second
-        from selfcal_ros.reporting.figures.places import plan_figure  # with numbers of results
+        from selfcal_ros.reporting.figures.paper import (
+            save_picture,
+        )  # matplotlib, a second
+        from selfcal_ros.reporting.figures.places import (
+            plan_figure,
+        )  # with numbers of results
 
         view = command.placed()
         x, y = (value * MM_PER_M for value in view.translation_m)
@@ -199,7 +217,9 @@ def progress_line(progress: ViewProgress) -> str:
     rejected = sum(readings.rejected.values())
     if rejected:
         reasons = sorted(readings.rejected.items(), key=lambda item: -item[1])
-        parts.append(f"{rejected} rejected ({', '.join(f'{name} {n}' for name, n in reasons)})")
+        parts.append(
+            f"{rejected} rejected ({', '.join(f'{name} {n}' for name, n in reasons)})"
+        )
     if math.isfinite(readings.sigma_xy):
         parts.append(f"noise {readings.sigma_xy * NM_PER_M:.3g} nm")
     return f"  {100 * progress.coverage:3.0f} %  " + ", ".join(parts)

@@ -24,8 +24,12 @@ from selfcal_ros.portable import ended_by_signals
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
-    add_json(parser, "one JSON object per line: pictures as they change, answers to requests")
+    parser.add_argument(
+        "--namespace", metavar="NS", default="", help="namespace of the cell"
+    )
+    add_json(
+        parser, "one JSON object per line: pictures as they change, answers to requests"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -84,7 +88,10 @@ def _live(log: list[str]) -> Iterator[Callable[[Any], None]]:
     console = Console()
     drawn: list[Any] = []  # size and log shown on the screen
     with Live(
-        Text("Looking for the nodes ..."), console=console, screen=True, auto_refresh=False
+        Text("Looking for the nodes ..."),
+        console=console,
+        screen=True,
+        auto_refresh=False,
     ) as live:
 
         def draw(picture: Any) -> None:
@@ -167,7 +174,9 @@ def _keys() -> Iterator[Callable[[], list[str]]]:
             commands = []
             while select.select([sys.stdin], [], [], 0)[0]:
                 keys = _read_keys(sys.stdin.fileno())
-                commands += [KEYS.get(key, "quit") for key in keys if key in KEYS or key == "q"]
+                commands += [
+                    KEYS.get(key, "quit") for key in keys if key in KEYS or key == "q"
+                ]
                 if not keys:  # the terminal is gone
                     return [*commands, "quit"]
             return commands

@@ -16,7 +16,11 @@ from selfcal_ros.cli.terminal import busy, late_progress, tell
 from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.normal.equations import KNOWN
-from selfcal_ros.estimation.observability.plan_check import Prediction, check_plan, predict_plan
+from selfcal_ros.estimation.observability.plan_check import (
+    Prediction,
+    check_plan,
+    predict_plan,
+)
 from selfcal_ros.estimation.observability.resistance import (
     PlanBudget,
     PlannedTerms,
@@ -56,17 +60,22 @@ NODES_ONLY = (
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the sub-verbs ``new``, ``check`` and ``suggest``."""
-    verbs = parser.add_subparsers(dest="plan_verb", metavar="new|check|suggest", required=True)
+    verbs = parser.add_subparsers(
+        dest="plan_verb", metavar="new|check|suggest", required=True
+    )
     plan_new.configure(
         verbs.add_parser(
-            "new", help="write a plan and a CELL.yaml from what you know of stage, plate and time"
+            "new",
+            help="write a plan and a CELL.yaml from what you know of stage, plate and time",
         )
     )
     check = verbs.add_parser(
-        "check", help="rank, undetermined modes, predicted uncertainty; exit 3 if deficient"
+        "check",
+        help="rank, undetermined modes, predicted uncertainty; exit 3 if deficient",
     )
     suggest = verbs.add_parser(
-        "suggest", help="rank the next views, or find the best plan for a number of views"
+        "suggest",
+        help="rank the next views, or find the best plan for a number of views",
     )
     for sub in (check, suggest):
         sub.add_argument("plan", metavar="PLAN.yaml")
@@ -79,7 +88,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         sub.add_argument("--json", action="store_true", help="print JSON")
         plan_terms.add_term_options(sub)
     check.add_argument(
-        "--map", action="store_true", help="also print the predicted uncertainty at every site"
+        "--map",
+        action="store_true",
+        help="also print the predicted uncertainty at every site",
     )
     check.add_argument(
         "--model",
@@ -97,7 +108,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="judge the plan as if every mark were measured N times per view",
     )
     suggest.add_argument(
-        "--views", type=int, metavar="N", help="find the best plan of N views for the plan's plate"
+        "--views",
+        type=int,
+        metavar="N",
+        help="find the best plan of N views for the plan's plate",
     )
     suggest.add_argument(
         "--criterion",
@@ -106,10 +120,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="which XY uncertainty to minimise (default rms)",
     )
     suggest.add_argument(
-        "--top", type=int, metavar="N", help=f"number of suggestions to show (default {SHOWN})"
+        "--top",
+        type=int,
+        metavar="N",
+        help=f"number of suggestions to show (default {SHOWN})",
     )
     suggest.add_argument(
-        "-o", "--output", metavar="PLAN.yaml", help="write the plan with the best suggestion"
+        "-o",
+        "--output",
+        metavar="PLAN.yaml",
+        help="write the plan with the best suggestion",
     )
 
 
@@ -121,7 +141,9 @@ def run(args: argparse.Namespace) -> int:
     if plan.verify and len(plan.views) == 1:  # of the plate of the map
         plan = replace(plan, artifact_from=plan.artifact_from or plan.verify)
     if plan.artifact_from:
-        return planned(args, _repeated(plan, args.repeats if args.plan_verb == "check" else None))
+        return planned(
+            args, _repeated(plan, args.repeats if args.plan_verb == "check" else None)
+        )
     return _check(args, plan) if args.plan_verb == "check" else _suggest(args, plan)
 
 
@@ -149,7 +171,9 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             )
     observability = worded_observability(observability)
     if args.json:
-        summary = _check_json(plan, (observability, checked.unknown_sites), alone, maps=args.map)
+        summary = _check_json(
+            plan, (observability, checked.unknown_sites), alone, maps=args.map
+        )
         unit = _averaged_m(plan, assumed) * UM_PER_M
         if alone is not None and args.sigma is not None:
             summary["predicted"] |= {
@@ -174,13 +198,23 @@ def _check(args: argparse.Namespace, plan: Plan) -> int:
             lines.append(_in_um("XY    ", alone, plan, assumed))
         if model and joint is not None:
             what = f"XY with {', '.join(map(str, model))}:"
-            lines.append(f"  {what} rms {joint.rms_xy:.4f}   largest {joint.max_xy:.4f}")
-            lines += [_in_um(what, joint, plan, assumed)] if args.sigma is not None else []
+            lines.append(
+                f"  {what} rms {joint.rms_xy:.4f}   largest {joint.max_xy:.4f}"
+            )
+            lines += (
+                [_in_um(what, joint, plan, assumed)] if args.sigma is not None else []
+            )
         lines += plan_budget_text(budget, plan) if budget else []
         lines += plan_terms.terms_text(plan, checks, assumed) if checks else []
-        lines += _map_text(alone) if args.map and alone and observability.identifiable else []
+        lines += (
+            _map_text(alone)
+            if args.map and alone and observability.identifiable
+            else []
+        )
         tell("\n".join(lines))
-    return int(ExitCode.DONE if observability.identifiable else ExitCode.NOT_IDENTIFIABLE)
+    return int(
+        ExitCode.DONE if observability.identifiable else ExitCode.NOT_IDENTIFIABLE
+    )
 
 
 def _repeated(plan: Plan, repeats: int | None) -> Plan:
@@ -189,7 +223,9 @@ def _repeated(plan: Plan, repeats: int | None) -> Plan:
         return plan
     if repeats < 1:
         raise InputError("--repeats", f"{repeats} is not positive", "give 1 or more")
-    return replace(plan, views=tuple(replace(view, repeats=repeats) for view in plan.views))
+    return replace(
+        plan, views=tuple(replace(view, repeats=repeats) for view in plan.views)
+    )
 
 
 def _judge(
@@ -218,7 +254,11 @@ def _judge(
 
 
 def _check_json(
-    plan: Plan, checked: tuple[Observability, int], predicted: Prediction | None, *, maps: bool
+    plan: Plan,
+    checked: tuple[Observability, int],
+    predicted: Prediction | None,
+    *,
+    maps: bool,
 ) -> dict[str, Any]:
     observability, unknown = checked
     out = {
@@ -245,7 +285,11 @@ def _check_json(
         )
         if maps:
             out["predicted"] |= plain(
-                {"u_gx": predicted.ux, "u_gy": predicted.uy, "u_g_theta": predicted.u_theta}
+                {
+                    "u_gx": predicted.ux,
+                    "u_gy": predicted.uy,
+                    "u_g_theta": predicted.u_theta,
+                }
             )
     return out
 
@@ -300,8 +344,9 @@ def _rank_text(observability: Observability) -> str:
         if observability.deficiency
         else "no undetermined modes"
     )
-    return f"rank {observability.rank} of {observability.unknowns} unknowns, {modes}" + (
-        f", {lines} of them in the angular map" if lines else ""
+    return (
+        f"rank {observability.rank} of {observability.unknowns} unknowns, {modes}"
+        + (f", {lines} of them in the angular map" if lines else "")
     )
 
 
@@ -343,7 +388,9 @@ def _image_text(plan: Plan) -> list[str]:
 def _check_stops_text(plan: Plan) -> str:
     marks, offset_m = plan.check_stops
     if not marks and plan_terms.tells_camera(plan):
-        return "no check stops: images show scale, turn, distortion and sign of the camera"
+        return (
+            "no check stops: images show scale, turn, distortion and sign of the camera"
+        )
     if not marks:
         return (
             "no check stops: scale, turn and sign of the microscope show only if the stage "
@@ -356,7 +403,10 @@ def _check_stops_text(plan: Plan) -> str:
 
 
 def _unchecked_text(observability: Observability) -> list[str]:
-    counts = ((observability.unchecked_sites, "sites"), (observability.unchecked_lines, "lines"))
+    counts = (
+        (observability.unchecked_sites, "sites"),
+        (observability.unchecked_lines, "lines"),
+    )
     groups = " and ".join(f"{count} {what}" for count, what in counts if count)
     return (
         [
@@ -407,7 +457,9 @@ def _map_text(predicted: Prediction) -> list[str]:
 def _suggest(args: argparse.Namespace, plan: Plan) -> int:
 
     if args.top is not None and args.views is not None:
-        raise InputError("--top", "with --views one plan is found, not a list", "omit it")
+        raise InputError(
+            "--top", "with --views one plan is found, not a list", "omit it"
+        )
     n_shown = SHOWN if args.top is None else args.top
     if n_shown < 1:
         raise InputError("--top", f"{n_shown} is not positive", "give 1 or more")
@@ -417,7 +469,10 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     datum = ThetaDatum(args.theta_datum)
     with late_progress("judging plans") as progress:
         if args.views is not None:
-            angular = any(view.angular for view in plan.views) and plan.artifact.angular_count > 0
+            angular = (
+                any(view.angular for view in plan.views)
+                and plan.artifact.angular_count > 0
+            )
             like = [view for view in plan.views if view.grid] or list(plan.views)
             best, score, search = best_plan(
                 plan.artifact,
@@ -431,7 +486,11 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
             )
         else:
             now, ranked = rank_next(
-                plan, criterion=args.criterion, datum=datum, against=against, progress=progress
+                plan,
+                criterion=args.criterion,
+                datum=datum,
+                against=against,
+                progress=progress,
             )
     # without terms (--against none) and --sigma the figures are gains
     in_um = against is not None or args.sigma is not None
@@ -439,7 +498,9 @@ def _suggest(args: argparse.Namespace, plan: Plan) -> int:
     unit = _averaged_m(judged, plan_terms.assumed_of(args)) if in_um else None
     if args.views is not None:
         best = replace(
-            best, plan_id=f"{plan.plan_id}_best{args.views}", model_terms=plan.model_terms
+            best,
+            plan_id=f"{plan.plan_id}_best{args.views}",
+            model_terms=plan.model_terms,
         )
         _show_best(args, best, (score, unit), search_text(search))
     else:
@@ -457,17 +518,26 @@ def _in_order(plan: Plan, order: str) -> Plan:
     order = str(parse_order(order, "--order"))
     return replace(
         plan,
-        views=tuple(replace(view, visit_order=order) if view.grid else view for view in plan.views),
+        views=tuple(
+            replace(view, visit_order=order) if view.grid else view
+            for view in plan.views
+        ),
     )
 
 
 def _against(args: argparse.Namespace, plan: Plan) -> Against | None:
     """Return the terms included in the uncertainty: the plan's, --against's, default ones."""
     term_of = {term.name: term for term in parse_terms(plan.model_terms, "model_terms")}
-    term_of |= {name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()}
+    term_of |= {
+        name: ModelTerm(name, size) for name, size in plan_terms.sizes_of(args).items()
+    }
     named = in_order(term_of.values())
     by_default = plan_terms.assumed_terms(args.against, named, plan)
-    return Against(named, plan_terms.assumed_of(args), by_default) if named or by_default else None
+    return (
+        Against(named, plan_terms.assumed_of(args), by_default)
+        if named or by_default
+        else None
+    )
 
 
 def _show_ranked(
@@ -488,7 +558,8 @@ def _show_ranked(
                     "suggestions": [
                         {
                             "text": step_text(item, plan),
-                            "view": item.view and view_to_dict(item.view, plan.artifact),
+                            "view": item.view
+                            and view_to_dict(item.view, plan.artifact),
                             "repeat_of": item.repeat_of,
                             "visit_order": item.order or None,
                             **_score_json(item.score, unit),
@@ -515,7 +586,10 @@ def _show_ranked(
 
 
 def _show_best(
-    args: argparse.Namespace, best: Plan, score: tuple[PlanScore, float | None], how: str
+    args: argparse.Namespace,
+    best: Plan,
+    score: tuple[PlanScore, float | None],
+    how: str,
 ) -> None:
     views = [view_to_dict(view, best.artifact) for view in best.views]
     if args.json:
@@ -532,11 +606,15 @@ def _show_best(
             )
         )
         return
-    tell(f"best plan of {len(views)} views ({args.criterion} uncertainty of XY; {how}):")
+    tell(
+        f"best plan of {len(views)} views ({args.criterion} uncertainty of XY; {how}):"
+    )
     for view in views:
         a, b = view["translation_pitch"]
         kind = "" if view["grid"] else ", lines only"
-        tell(f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a:g}, {b:g}]{kind}")
+        tell(
+            f"  {view['name']}: turn {view['rotation_deg']:g} deg, shift [{a:g}, {b:g}]{kind}"
+        )
     tell(_score_text(*score))
 
 

@@ -43,7 +43,10 @@ from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
 from selfcal_ros.outputs import check_outputs, utf8, write_together
 from selfcal_ros.plain_numbers import number_of
-from selfcal_ros.reporting.words.observability import describe_view, worded_observability
+from selfcal_ros.reporting.words.observability import (
+    describe_view,
+    worded_observability,
+)
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 REPEATS = {1: "", 2: "there_and_back@plate", 4: "x_back_y_back@plate"}
@@ -103,7 +106,9 @@ def _lengths(text: str, option: str) -> tuple[float, float]:
     """Return one or two lengths such as 100x80mm, m."""
     x, _, y = text.partition("x")
     unit = re.sub(r"[^a-zµ]", "", y)
-    return _length(x if x.strip()[-1:] == "m" else x + unit, option), _length(y or x, option)
+    return _length(x if x.strip()[-1:] == "m" else x + unit, option), _length(
+        y or x, option
+    )
 
 
 def _field(text: str, option: str) -> tuple[float, float]:
@@ -118,7 +123,9 @@ def _counts(text: str, option: str) -> tuple[int, int]:
 
 def _count(text: str, option: str) -> int:
     if not (text.isascii() and text.strip().isdecimal()):
-        raise InputError(option, f"'{text}' is not a whole number", "give for example 11")
+        raise InputError(
+            option, f"'{text}' is not a whole number", "give for example 11"
+        )
     return int(text)
 
 
@@ -128,14 +135,18 @@ def _positive(text: str, option: str) -> float:
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise InputError(option, f"'{text}' is not a positive number", "give for example 60")
+        raise InputError(
+            option, f"'{text}' is not a positive number", "give for example 60"
+        )
     return value
 
 
 def _one_of(*words: str) -> Callable[[str, str], str]:
     def read(text: str, option: str) -> str:
         if text not in words:
-            raise InputError(option, f"'{text}' is not one of {', '.join(words)}", "name one")
+            raise InputError(
+                option, f"'{text}' is not one of {', '.join(words)}", "name one"
+            )
         return text
 
     return read
@@ -146,15 +157,30 @@ QUESTIONS = (
     Question("marks", "marks along a side of the plate, as in 11 or 11x9", _counts),
     Question("pitch", "distance between neighbouring marks, as in 10mm", _length),
     Question(
-        "lines", "angular lines of the plate; 0 = none, or the stage does not turn", _count, "0"
+        "lines",
+        "angular lines of the plate; 0 = none, or the stage does not turn",
+        _count,
+        "0",
     ),
     Question(
-        "field", "what the camera sees at once, as in 25x20mm; none = one mark", _field, "none"
+        "field",
+        "what the camera sees at once, as in 25x20mm; none = one mark",
+        _field,
+        "none",
     ),
-    Question("placing", "who places the plate: person or robot", _one_of(*PLACERS), "person"),
+    Question(
+        "placing", "who places the plate: person or robot", _one_of(*PLACERS), "person"
+    ),
     Question("minutes", "minutes that the measurement may take", _positive, "60"),
-    Question("seconds", "seconds for a mark: move, come to rest, expose", _positive, "2"),
-    Question("machine", f"what is driven: {', '.join(SHIPPED)}", _one_of(*SHIPPED), "simulated"),
+    Question(
+        "seconds", "seconds for a mark: move, come to rest, expose", _positive, "2"
+    ),
+    Question(
+        "machine",
+        f"what is driven: {', '.join(SHIPPED)}",
+        _one_of(*SHIPPED),
+        "simulated",
+    ),
 )
 
 
@@ -168,7 +194,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     for question in QUESTIONS:
         default = f" (default: {question.default})" if question.default else ""
         parser.add_argument(
-            f"--{question.name}", metavar=question.name.upper(), help=question.text + default
+            f"--{question.name}",
+            metavar=question.name.upper(),
+            help=question.text + default,
         )
     parser.add_argument(
         "-o",
@@ -178,7 +206,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="plan to write; its name is that of the plan",
     )
     parser.add_argument(
-        "--cell", metavar="CELL.yaml", help="cell to write (default: cell.yaml beside the plan)"
+        "--cell",
+        metavar="CELL.yaml",
+        help="cell to write (default: cell.yaml beside the plan)",
     )
     add_json(parser)
 
@@ -199,10 +229,15 @@ def run(args: argparse.Namespace) -> int:
     with late_progress("judging plans") as progress:
         plan = _best(answers, artifact, path.stem, lambda: progress(0, None))
         prediction = _budget(plan), _next(plan)
-    texts = {path: yaml_text(plan_to_dict(plan)), cell_path: _cell_text(answers, simulation.name)}
+    texts = {
+        path: yaml_text(plan_to_dict(plan)),
+        cell_path: _cell_text(answers, simulation.name),
+    }
     if simulated:
         folder = path.resolve().parent
-        named = path.name if folder == simulation.resolve().parent else str(path.resolve())
+        named = (
+            path.name if folder == simulation.resolve().parent else str(path.resolve())
+        )
         texts[simulation] = yaml_text(_simulation(answers, named))
     write_together({name: utf8(text) for name, text in texts.items()})
     say(
@@ -219,13 +254,19 @@ def _require_new(paths: list[Path], *, force: bool) -> None:
     for path in paths:
         if path.exists() and not force:
             raise InputError(
-                str(path), "exists already", "name another file, or replace it with --force"
+                str(path),
+                "exists already",
+                "name another file, or replace it with --force",
             )
 
 
 def _answers(args: argparse.Namespace) -> Known:
     """Return the answers from the options, and from a person where some are missing."""
-    missing = [item for item in QUESTIONS if not item.default and getattr(args, item.name) is None]
+    missing = [
+        item
+        for item in QUESTIONS
+        if not item.default and getattr(args, item.name) is None
+    ]
     asks = bool(missing) and sys.stdin.isatty()
     if missing and not asks:
         raise InputError(
@@ -298,18 +339,22 @@ def _image(answers: Known) -> ImageCells | None:
     """Return the cells that the camera sees; None for a single mark."""
     counts = []
     for side, marks in zip(answers.field, answers.marks, strict=True):
-        n_seen = min(
-            int(side / answers.pitch * (1 + 1e-9)), marks
-        )  # 0.6 mm are 3 pitches of 0.2 mm
+        # 0.6 mm are 3 pitches of 0.2 mm
+        n_seen = min(int(side / answers.pitch * (1 + 1e-9)), marks)
         counts.append(max(1, n_seen - 1 + n_seen % 2))
     nx, ny = counts
     return ImageCells(nx, ny, answers.pitch) if nx * ny > 1 else None
 
 
-def _best(answers: Known, artifact: Artifact, name: str, tick: Callable[[], None]) -> Plan:
+def _best(
+    answers: Known, artifact: Artifact, name: str, tick: Callable[[], None]
+) -> Plan:
     """Return the plan of the smallest uncertainty that the time allows."""
     like = View(
-        "", check_marks=CHECK_MARKS, check_offset_m=_check_offset_m(artifact), image=_image(answers)
+        "",
+        check_marks=CHECK_MARKS,
+        check_offset_m=_check_offset_m(artifact),
+        image=_image(answers),
     )
     fewest = _fewest_exposures(artifact, like)
     plans: list[Plan] = []
@@ -361,7 +406,9 @@ def _repeated(plan: Plan) -> Iterator[Plan]:
 
 def _u_of_reading(plan: Plan) -> float:
     """Return the predicted uncertainty, rms, in units of the noise of one reading."""
-    return score_plan(plan, against=_against()).rms_xy / math.sqrt(plan.views[0].repeats)
+    return score_plan(plan, against=_against()).rms_xy / math.sqrt(
+        plan.views[0].repeats
+    )
 
 
 def _against() -> Against:
@@ -399,9 +446,13 @@ def _budget(plan: Plan) -> PlanBudget:
         raise InputError(
             "--marks",
             "no plan of these marks identifies the stage",
-            "; ".join(advice.text for advice in worded_observability(observability).advice),
+            "; ".join(
+                advice.text for advice in worded_observability(observability).advice
+            ),
         )
-    return plan_budget(plan, default_terms(), Assumed(), predict_plan(plan, ThetaDatum.ZERO_MEAN))
+    return plan_budget(
+        plan, default_terms(), Assumed(), predict_plan(plan, ThetaDatum.ZERO_MEAN)
+    )
 
 
 def _next(plan: Plan) -> tuple[View, float]:
@@ -431,13 +482,17 @@ def _cell_text(answers: Known, simulation: str) -> str:
     if any(answers.field) or answers.machine != "simulated":
         size = _mark_size_m(answers)
         pixel = (
-            f", pixel_size: {size / PIXELS_A_MARK:.6g}" if answers.machine == "simulated" else ""
+            f", pixel_size: {size / PIXELS_A_MARK:.6g}"
+            if answers.machine == "simulated"
+            else ""
         )
         lines.append(
             f"detector: {{mark: disc, mark_size: {size:.6g}{pixel}}}  # as the artwork; "
             "`selfcal cell try` finds pixel size, turn and mirror"
         )
-    placing = "robot  # the simulation" if answers.machine == "simulated" else answers.placing
+    placing = (
+        "robot  # the simulation" if answers.machine == "simulated" else answers.placing
+    )
     return "\n".join([*lines, "settle: {time: 0.0}  # s", f"placing: {placing}", ""])
 
 
@@ -477,7 +532,9 @@ def _text(
     budget, (further, factor) = prediction
     artifact = plan.artifact
     nx, ny = artifact.shape
-    span = " x ".join(f"{(count - 1) * answers.pitch * MM_PER_M:g}" for count in artifact.shape)
+    span = " x ".join(
+        f"{(count - 1) * answers.pitch * MM_PER_M:g}" for count in artifact.shape
+    )
     travel = " x ".join(f"{side * MM_PER_M:g}" for side in answers.travel)
     yield (
         f"plan {plan.plan_id}: {nx} x {ny} marks, {answers.lines or 'no'} angular lines; the map "

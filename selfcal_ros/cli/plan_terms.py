@@ -105,7 +105,9 @@ def length_m(text: str, option: str, most: float = math.inf) -> float:
     return _quantity(text, option, M_PER, "length", most)
 
 
-def _quantity(text: str, option: str, units: Mapping[str, float], what: str, most: float) -> float:
+def _quantity(
+    text: str, option: str, units: Mapping[str, float], what: str, most: float
+) -> float:
     """Return a positive number with one of the units, the first if none is given."""
     match = re.fullmatch(r"\s*([-+.\deE]*[\d.])\s*([a-zµ]*)\s*", text)
     plain = next(iter(units))
@@ -150,7 +152,9 @@ def assumed_of(args: argparse.Namespace) -> Assumed:
         stop_error_m=length_m(args.stop_error, "--stop-error", MOST_M),
         drift_degree=degree,
         order=order,
-        sigma_rad=_quantity(args.sigma_theta, "--sigma-theta", RAD_PER, "angle", MOST_RAD),
+        sigma_rad=_quantity(
+            args.sigma_theta, "--sigma-theta", RAD_PER, "angle", MOST_RAD
+        ),
         turn_rad=_quantity(args.placing, "--placing", RAD_PER, "angle", MOST_RAD),
         error_m=length_m(args.stage_error, "--stage-error", MOST_M),
     )
@@ -214,17 +218,25 @@ def assumed_terms(
         The plan: its images may tell the microscope better than it is known.
     """
     names = {term.name for term in named} | (
-        {block.name for block in blocks().values() if block.of_microscope and tells_camera(plan)}
+        {
+            block.name
+            for block in blocks().values()
+            if block.of_microscope and tells_camera(plan)
+        }
     )
     return (
-        () if _is_none(given) else tuple(term for term in default_terms() if term.name not in names)
+        ()
+        if _is_none(given)
+        else tuple(term for term in default_terms() if term.name not in names)
     )
 
 
 def tells_camera(plan: Plan) -> bool:
     """Return whether the images of a plan tell the camera's scale, turn and distortion."""
     images = [view.image for view in plan.views if view.grid]
-    return bool(images) and all(image and min(image.nx, image.ny) >= 3 for image in images)
+    return bool(images) and all(
+        image and min(image.nx, image.ny) >= 3 for image in images
+    )
 
 
 def budget_json(budget: PlanBudget, plan: Plan, assumed: Assumed) -> dict[str, Any]:
@@ -322,7 +334,8 @@ def size_text(check: TermCheck) -> str:
 def _assumptions(plan: Plan, assumed: Assumed) -> list[str]:
     views = [view for view in plan.views if view.grid]
     orders = {
-        view.name: parse_order(assumed.order or view.visit_order or DEFAULT_ORDER) for view in views
+        view.name: parse_order(assumed.order or view.visit_order or DEFAULT_ORDER)
+        for view in views
     }
     cut = [view for view in views if view.repeats < orders[view.name].passes]
     lines = [

@@ -54,7 +54,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "which `selfcal detect --aruco` knows the marks (needs OpenCV)",
     )
     parser.add_argument(
-        "--paper", choices=tuple(PAPERS_MM), help="sheet of paper to print it on, for trying"
+        "--paper",
+        choices=tuple(PAPERS_MM),
+        help="sheet of paper to print it on, for trying",
     )
     add_json(parser)
 
@@ -64,7 +66,9 @@ def run(args: argparse.Namespace) -> int:
     check_outputs([args.plan], [args.output])
     plan = read_plan(args.plan)
     size = plan.artifact.grid_pitch_m / 5 if args.mark_size is None else args.mark_size
-    art = artwork_of(plan, mark=args.mark, size_m=size, width_m=args.mark_width, aruco=args.aruco)
+    art = artwork_of(
+        plan, mark=args.mark, size_m=size, width_m=args.mark_width, aruco=args.aruco
+    )
     save_artwork(art, args.output, args.paper or "")
     left, low, right, high = art.box
     lines = [

@@ -15,7 +15,9 @@ from selfcal_ros.results import read_result
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    parser.add_argument(
+        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
+    )
     parser.add_argument(
         "-o",
         "--output",

@@ -137,13 +137,17 @@ def domain(chosen: int | None = None) -> Iterator[dict]:
 
     The domain of the environment may be that of a real cell.
     """
-    environment = {name: value for name, value in os.environ.items() if name not in REACHES_OTHERS}
+    environment = {
+        name: value for name, value in os.environ.items() if name not in REACHES_OTHERS
+    }
     environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     if chosen is not None:
         yield environment | {"ROS_DOMAIN_ID": str(chosen)}
         return
     for number in range(50, 100):
-        with Path(tempfile.gettempdir(), f"selfcal_domain_{number}.lock").open("w") as lock:
+        with Path(tempfile.gettempdir(), f"selfcal_domain_{number}.lock").open(
+            "w"
+        ) as lock:
             try:
                 portable.lock(lock.fileno())
             except OSError:
@@ -219,7 +223,9 @@ class Supervisor:
                 continue
             del self._running[node]
             how = f"signal {-code}" if code < 0 else f"code {code}"
-            recent = [when for when in self._restarts[node] if self._now_s() - when < WINDOW_S]
+            recent = [
+                when for when in self._restarts[node] if self._now_s() - when < WINDOW_S
+            ]
             if code in NEVER_AGAIN or node in ONCE:
                 self._say(f"{node} ended with {how} and is not restarted")
             elif len(recent) >= MOST_RESTARTS:
@@ -246,7 +252,9 @@ class Supervisor:
             )
         )
         self._running[node] = child
-        threading.Thread(target=self._read, args=(child,), name=node, daemon=True).start()
+        threading.Thread(
+            target=self._read, args=(child,), name=node, daemon=True
+        ).start()
 
     def _read(self, child: subprocess.Popen) -> None:
         with contextlib.suppress(ValueError):  # closed during reading

@@ -19,8 +19,12 @@ from selfcal_ros.results import read_result
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("plate_from", metavar="RESULT.json", help="calibration of the plate")
-    solve.add_arguments(parser, {"theta_datum": "theta_datum", "reference_at": "reference_at"})
+    parser.add_argument(
+        "plate_from", metavar="RESULT.json", help="calibration of the plate"
+    )
+    solve.add_arguments(
+        parser, {"theta_datum": "theta_datum", "reference_at": "reference_at"}
+    )
 
 
 def run(args: argparse.Namespace) -> int:

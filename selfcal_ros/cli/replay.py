@@ -35,7 +35,11 @@ from selfcal_ros.cli.terminal import (
     show,
 )
 from selfcal_ros.collection.inputs import rejections
-from selfcal_ros.collection.settings.detector import ANY_NUMBER, OPTIONS, DetectorSettings
+from selfcal_ros.collection.settings.detector import (
+    ANY_NUMBER,
+    OPTIONS,
+    DetectorSettings,
+)
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_json, write_yaml
@@ -60,10 +64,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "images and no detections mark_detector finds the marks",
     )
     speed = parser.add_mutually_exclusive_group()
-    speed.add_argument("--rate", type=float, default=1.0, metavar="R", help="speed (default: 1)")
-    speed.add_argument("--fast", action="store_true", help="as fast as the nodes can follow")
+    speed.add_argument(
+        "--rate", type=float, default=1.0, metavar="R", help="speed (default: 1)"
+    )
+    speed.add_argument(
+        "--fast", action="store_true", help="as fast as the nodes can follow"
+    )
     parser.add_argument(
-        "--shuffle", type=int, metavar="SEED", help="deliver the messages in shuffled order"
+        "--shuffle",
+        type=int,
+        metavar="SEED",
+        help="deliver the messages in shuffled order",
     )
     parser.add_argument(
         "-o",
@@ -72,7 +83,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="file for the result; - is stdout, and other output goes to stderr",
     )
     add_json(parser, "RESULT.json, and the summary on stderr")
-    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
+    parser.add_argument(
+        "--params", metavar="NODES.yaml", help="ROS parameter file for the nodes"
+    )
     parser.add_argument(
         "--namespace",
         metavar="NAME",
@@ -98,10 +111,14 @@ def run(args: argparse.Namespace) -> int:
     """Start the nodes, play the bag, collect the result, stop the nodes."""
     need_ros(", or use `selfcal solve`")
     if not args.fast and not args.rate > 0:
-        raise InputError("--rate", f"{args.rate:g} is not a speed", "give a number above 0")
+        raise InputError(
+            "--rate", f"{args.rate:g} is not a speed", "give a number above 0"
+        )
     if args.shuffle is not None and not 0 <= args.shuffle <= LARGEST_SEED:
         raise InputError(
-            "--shuffle", f"{args.shuffle} is not a seed", f"give a number from 0 to {LARGEST_SEED}"
+            "--shuffle",
+            f"{args.shuffle} is not a seed",
+            f"give a number from 0 to {LARGEST_SEED}",
         )
     if args.domain is not None and not 0 <= args.domain <= MOST_DOMAIN:
         raise InputError(
@@ -114,7 +131,9 @@ def run(args: argparse.Namespace) -> int:
     detector = detector_of(args)
     settings = node_settings(args.params, CollectorSettings)
     bag = bag_lines(args.bag, settings, args.namespace)
-    for line in bag.faults:  # first: what the nodes say of the readings follows from them
+    for (
+        line
+    ) in bag.faults:  # first: what the nodes say of the readings follows from them
         print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
     with (
         ended_by_signals(),
@@ -122,7 +141,9 @@ def run(args: argparse.Namespace) -> int:
         domain(args.domain) as environment,
     ):
         saved = folder / "result.json"
-        code, unplayed = _play(args, saved, environment, detector, printed_faults=bag.faults)
+        code, unplayed = _play(
+            args, saved, environment, detector, printed_faults=bag.faults
+        )
         if saved.exists():
             data = with_bag(read_json(saved), bag, unplayed, source)
             if file_of(args):
@@ -144,7 +165,9 @@ def run(args: argparse.Namespace) -> int:
 
 def offline(args: argparse.Namespace, bag: str | Path) -> BagSession:
     """Return what `selfcal solve` collects from a bag."""
-    return collect_bag(bag, node_settings(args.params, CollectorSettings), namespace=args.namespace)
+    return collect_bag(
+        bag, node_settings(args.params, CollectorSettings), namespace=args.namespace
+    )
 
 
 def _refuse_fault(
@@ -182,9 +205,13 @@ def _refuse_fault(
                 )
 
 
-def _detected(args: argparse.Namespace, settings: DetectorSettings, folder: Path) -> Path:
+def _detected(
+    args: argparse.Namespace, settings: DetectorSettings, folder: Path
+) -> Path:
     """Return the bag of marks that `selfcal detect` finds in the images of a bag."""
-    from selfcal_ros.vision.exposures import ImageDetector  # with scipy, for images only
+    from selfcal_ros.vision.exposures import (
+        ImageDetector,
+    )  # with scipy, for images only
 
     detector = ImageDetector(settings, args.bag)
     marks_bag = folder / "detected"
@@ -223,8 +250,11 @@ def detector_of(args: argparse.Namespace) -> DetectorSettings | None:
     from selfcal_ros.vision.detector import MarkDetector  # with scipy, for images only
 
     settings = node_settings(args.params, DetectorSettings, **options)
-    MarkDetector(settings, f"{args.bag} has images and no detections: {args.params or 'options'}")
-    way = DetectorSettings(transport=transport)  # how images reach it is not the user's here
+    MarkDetector(
+        settings, f"{args.bag} has images and no detections: {args.params or 'options'}"
+    )
+    # how images reach it is not the user's here
+    way = DetectorSettings(transport=transport)
     return replace(
         settings,
         transport=transport,
@@ -258,7 +288,8 @@ def with_bag(
     of_nodes = [line for line in data["warnings"] if line not in bag_warnings]
     refused = dict(sorted((data["rejected"] | bag.refused).items()))
     return with_digests(
-        data | {"warnings": [*of_nodes, *bag_warnings], "rejected": refused, "input": source}
+        data
+        | {"warnings": [*of_nodes, *bag_warnings], "rejected": refused, "input": source}
     )
 
 
@@ -274,12 +305,16 @@ def _play(
 
     Lines that are in `printed_faults` are not printed again.
     """
-    parameter_arguments = ["--ros-args", "--params-file", args.params] if args.params else []
+    parameter_arguments = (
+        ["--ros-args", "--params-file", args.params] if args.params else []
+    )
     quiet = ["--ros-args", "--log-level", "warn"]
     rate = 0.0 if args.fast else args.rate
     cell = "" if args.namespace is None else f"/{args.namespace.strip('/')}"
     with contextlib.ExitStack() as stack:
-        node_arguments = {"solver": ["--ros-args", "-p", f"result_folder:={saved.parent}"]}
+        node_arguments = {
+            "solver": ["--ros-args", "-p", f"result_folder:={saved.parent}"]
+        }
         if detector is not None:
             file = saved.with_name("mark_detector.yaml")
             write_yaml(file, {detector.NODE: {"ros__parameters": asdict(detector)}})

@@ -24,14 +24,18 @@ from selfcal_ros.standards.details import read_details
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    parser.add_argument(
+        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
+    )
     parser.add_argument(
         "-o",
         "--output",
         metavar="REPORT.html|.pdf",
         help="file to write (default: next to the result, ending in .html)",
     )
-    parser.add_argument("--plot", metavar="MAP.png", help="also write the map as a picture")
+    parser.add_argument(
+        "--plot", metavar="MAP.png", help="also write the map as a picture"
+    )
     parser.add_argument(
         "--truth",
         metavar="TRUTH.json",
@@ -56,7 +60,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         ("operator", "who calibrated it"),
     ):
         parser.add_argument(
-            f"--{name}", metavar="TEXT", default="", help=f"{what}, for the heading of the report"
+            f"--{name}",
+            metavar="TEXT",
+            default="",
+            help=f"{what}, for the heading of the report",
         )
     add_json(parser)
     parser.add_argument("--text", action="store_true", help="also print the summary")
@@ -65,7 +72,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read the result, write the report, print its path."""
     output = Path(args.output or f"{os.path.splitext(args.result)[0]}.html")
-    check_outputs([args.result, args.truth, args.table, args.details], [output, args.plot])
+    check_outputs(
+        [args.result, args.truth, args.table, args.details], [output, args.plot]
+    )
     check_name(output)
     refuse_existing(output, force=args.force)
     result = read_result(args.result)
@@ -76,13 +85,21 @@ def run(args: argparse.Namespace) -> int:
         chapters.append(certificate_chapter(result, details))
     with busy("drawing"):
         if args.plot:
-            from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
+            from selfcal_ros.reporting.figures.paper import (
+                save_picture,
+            )  # loads matplotlib
 
             save_picture(map_picture(result, truth), args.plot)
-        write_report(result, output, truth=truth, more=chapters, about=_about(args, details))
+        write_report(
+            result, output, truth=truth, more=chapters, about=_about(args, details)
+        )
     written = [str(name) for name in (output, args.plot) if name]
     text = (
-        [summary_text(result, truth=truth, ascii_only=not can_print_symbols(sys.stdout))]
+        [
+            summary_text(
+                result, truth=truth, ascii_only=not can_print_symbols(sys.stdout)
+            )
+        ]
         if args.text
         else []
     )

@@ -23,10 +23,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
     parser.add_argument("paper", choices=tuple(PAPERS))
     parser.add_argument(
-        "--draws", type=int, default=200, metavar="N", help="draws of noise (default 200)"
+        "--draws",
+        type=int,
+        default=200,
+        metavar="N",
+        help="draws of noise (default 200)",
     )
     parser.add_argument(
-        "--seed", type=int, default=1, metavar="S", help="seed of all random numbers (default 1)"
+        "--seed",
+        type=int,
+        default=1,
+        metavar="S",
+        help="seed of all random numbers (default 1)",
     )
     parser.add_argument(
         "--workers",
@@ -36,7 +44,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"{MANY} draws on one per core)",
     )
     add_json(parser, "the numbers")
-    parser.add_argument("--out", metavar="DIR", help="folder for the plots and the text")
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder for the plots and the text"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -48,10 +58,16 @@ def run(args: argparse.Namespace) -> int:
     folder = Path(args.out) if args.out else None
     if folder is not None:
         _make(folder)
-    workers = check_workers(1 if args.workers is None and args.draws < MANY else args.workers)
+    workers = check_workers(
+        1 if args.workers is None and args.draws < MANY else args.workers
+    )
     with late_progress("solving draws") as progress:
         text, figures, numbers = PAPERS[args.paper](args, workers, progress)
-    say(args, text, {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers})
+    say(
+        args,
+        text,
+        {"paper": args.paper, "draws": args.draws, "seed": args.seed, **numbers},
+    )
     if folder is not None:
         from selfcal_ros.reporting.figures.paper import save_picture  # loads matplotlib
 
@@ -68,12 +84,16 @@ def _make(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            str(folder), f"cannot be created ({error.strerror})", "name a writable folder"
+            str(folder),
+            f"cannot be created ({error.strerror})",
+            "name a writable folder",
         ) from error
 
 
 def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    reproduction = reproduce_hu(args.draws, args.seed, workers=workers, progress=progress)
+    reproduction = reproduce_hu(
+        args.draws, args.seed, workers=workers, progress=progress
+    )
 
     def figures() -> list[Drawing]:
         return hu_figures(reproduction)
@@ -103,13 +123,19 @@ def _hu(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
 
 
 def _qiao(args: argparse.Namespace, workers: int, progress: "Progress") -> tuple:
-    reproduction = reproduce_qiao(args.draws, args.seed, workers=workers, progress=progress)
+    reproduction = reproduce_qiao(
+        args.draws, args.seed, workers=workers, progress=progress
+    )
 
     def figures() -> list[Drawing]:
         return qiao_figures(reproduction)
 
     programs = [
-        {"views": program.views, "rms_um": program.rms_um, "deficiency": program.deficiency}
+        {
+            "views": program.views,
+            "rms_um": program.rms_um,
+            "deficiency": program.deficiency,
+        }
         for program in reproduction.programs
     ]
     return (
@@ -138,7 +164,8 @@ def _ibaraki(args: argparse.Namespace, workers: int, progress: "Progress") -> tu
         figures,
         {
             "table_1_mm": {
-                case: values.tolist() for case, values in reproduction.table_1_mm.items()
+                case: values.tolist()
+                for case, values in reproduction.table_1_mm.items()
             },
             "published_um": CASE_STUDY_UM,
             "new_um": reproduction.new_um.tolist(),

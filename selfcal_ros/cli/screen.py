@@ -31,7 +31,9 @@ PREFIX = re.compile(r"^\[(\w+)\] \[[\d.]+\] \[([^\]]+)\]: ")
 
 def wrapped(texts: Sequence[Text], width: int) -> list[Text]:
     """Return texts as rows of at most `width` columns."""
-    return [row for text in texts for row in text.wrap(_CONSOLE, width, overflow="fold")]
+    return [
+        row for text in texts for row in text.wrap(_CONSOLE, width, overflow="fold")
+    ]
 
 
 def fitted(rows: list[Text], most: int) -> list[Text]:
@@ -80,7 +82,13 @@ def coarser[T](
     step = max(1, ceil(len(cells) / height), ceil(across / ((width + 1) // 2)))
     return [
         [
-            worst([cell for row in cells[top : top + step] for cell in row[left : left + step]])
+            worst(
+                [
+                    cell
+                    for row in cells[top : top + step]
+                    for cell in row[left : left + step]
+                ]
+            )
             for left in range(0, across, step)
         ]
         for top in range(0, len(cells), step)
@@ -99,13 +107,21 @@ def screen(
         overflow="ellipsis",
     )
     if width < LEAST[0] or height < LEAST[1]:
-        small = Text(f"Make this terminal larger: {LEAST[0]} x {LEAST[1]}.", style="yellow")
-        return Group(*fitted(wrapped([*_task(picture), small], width), max(height - 1, 0)), keys)
+        small = Text(
+            f"Make this terminal larger: {LEAST[0]} x {LEAST[1]}.", style="yellow"
+        )
+        return Group(
+            *fitted(wrapped([*_task(picture), small], width), max(height - 1, 0)), keys
+        )
     now = headed("now", fitted(wrapped(_task(picture), width), height // 4), width)
-    nodes = headed("nodes", fitted(wrapped(_health(picture), width), height // 8), width)
+    nodes = headed(
+        "nodes", fitted(wrapped(_health(picture), width), height // 8), width
+    )
     log_rows = headed(
         "log",
-        last_fitted([_log_line(line) for line in log] or [Text("-")], width, height // 8),
+        last_fitted(
+            [_log_line(line) for line in log] or [Text("-")], width, height // 8
+        ),
         width,
     )
     rows = height - len(now) - len(nodes) - len(log_rows) - 1
@@ -137,7 +153,11 @@ def what_now(picture: dict[str, Any]) -> str:
         return "pose_sequencer is not running: start it, or wait for it."
     command = picture["command"] or {}
     state = _state(health["values"], command)
-    if health["message"].startswith("waiting for ") and state in ("IDLE", "DONE", "ABORTED"):
+    if health["message"].startswith("waiting for ") and state in (
+        "IDLE",
+        "DONE",
+        "ABORTED",
+    ):
         return f"Nothing: {printable(health['message'])}."
     look = f"Look: {printable(health['message'])}." if health["level"] else ""
     if state == "PLACING":
@@ -146,7 +166,9 @@ def what_now(picture: dict[str, Any]) -> str:
         pose = (
             ""
             if None in (x, y, turn)
-            else (f" turned by {turn:g} deg{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm")
+            else (
+                f" turned by {turn:g} deg{_sense_of(turn)}, at x {x:g} mm, y {y:g} mm"
+            )
         )
         name = command.get("view_name") or health["values"].get("view_name", "")
         return f"Place the plate for view '{printable(name)}'{pose}; then press c. {look}".rstrip()
@@ -164,7 +186,13 @@ def _sense_of(turn_deg: Any) -> str:
     """Return the direction of a turn, and the resulting position of the first corner."""
     quarters = round(turn_deg / 90)
     if not quarters % 4 or abs(turn_deg - 90 * quarters) > 1:
-        return " counter-clockwise" if turn_deg > 0 else " clockwise" if turn_deg < 0 else ""
+        return (
+            " counter-clockwise"
+            if turn_deg > 0
+            else " clockwise"
+            if turn_deg < 0
+            else ""
+        )
     corner = ("", "top left", "bottom left", "bottom right")[quarters % 4]
     way = "↺ counter-clockwise" if turn_deg > 0 else "↻ clockwise"
     return f" {way} (the corner at the top right goes to the {corner})"
@@ -179,11 +207,16 @@ def saved_as(picture: dict[str, Any]) -> str:
 def _state(values: dict[str, str], command: dict[str, Any]) -> str:
     """Return the sequencer's state; its newest command is earlier than its health."""
     state = values.get("state", "")
-    if state not in ("PLACING", "MEASURING") or command.get("plan_id") != values.get("plan_id"):
+    if state not in ("PLACING", "MEASURING") or command.get("plan_id") != values.get(
+        "plan_id"
+    ):
         return state
-    return {"PLACE": "PLACING", "MEASURE": "MEASURING", "DONE": "DONE", "ABORT": "ABORTED"}.get(
-        command.get("phase", ""), state
-    )
+    return {
+        "PLACE": "PLACING",
+        "MEASURE": "MEASURING",
+        "DONE": "DONE",
+        "ABORT": "ABORTED",
+    }.get(command.get("phase", ""), state)
 
 
 def _task(picture: dict[str, Any]) -> list[Text]:
@@ -191,8 +224,13 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     command = picture["command"]
     health = picture["health"].get("pose_sequencer")
     values = health["values"] if health else {}
-    views = _whole_number(values.get("views")) or (command or {}).get("views_planned", 0)
-    name, index = (command or {}).get("view_name", ""), (command or {}).get("view_index", 0)
+    views = _whole_number(values.get("views")) or (command or {}).get(
+        "views_planned", 0
+    )
+    name, index = (
+        (command or {}).get("view_name", ""),
+        (command or {}).get("view_index", 0),
+    )
     heading = "no view yet"
     if command and views:
         heading = (
@@ -237,7 +275,12 @@ def _measured(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
     room = rows - 1 - len(text) - len(rejected)
     plate = _plate(view, width, room) if view["plate"] else []
     return fitted(
-        [*headed(f"coverage of {printable(view['view_name'])}", [*text, *plate], width), *rejected],
+        [
+            *headed(
+                f"coverage of {printable(view['view_name'])}", [*text, *plate], width
+            ),
+            *rejected,
+        ],
         rows,
     )
 
@@ -250,7 +293,9 @@ def _coverage(view: dict[str, Any], width: int) -> list[Text]:
         ("check stops of marks", *view["checks"]),
     ]
     share = min(
-        1.0, sum(done for _, done, _ in counted) / max(1, sum(wanted for *_, wanted in counted))
+        1.0,
+        sum(done for _, done, _ in counted)
+        / max(1, sum(wanted for *_, wanted in counted)),
     )
     wide = width - 6
     counts = [f"{what} {done} of {wanted}" for what, done, wanted in counted if wanted]
@@ -262,13 +307,17 @@ def _coverage(view: dict[str, Any], width: int) -> list[Text]:
         ),
         Text(", ".join([*counts, *["complete"] * view["complete"]])),
     ]
-    noise = [_with_unit(view[f"repeatability_{unit}"], unit) for unit in ("um", "arcsec")]
+    noise = [
+        _with_unit(view[f"repeatability_{unit}"], unit) for unit in ("um", "arcsec")
+    ]
     if noise != ["-", "-"]:
         texts.append(Text(f"repeatability {', '.join(noise)}"))
     if view["missing_lines"]:
         missing = view["missing_lines"]
         omission = f" and {len(missing) - 10} more" if len(missing) > 10 else ""
-        texts.append(Text(f"missing lines {', '.join(map(str, missing[:10]))}{omission}"))
+        texts.append(
+            Text(f"missing lines {', '.join(map(str, missing[:10]))}{omission}")
+        )
     return texts
 
 
@@ -294,7 +343,9 @@ def _verdict_and_map(picture: dict[str, Any], width: int, rows: int) -> list[Tex
     um = solved_map["um"] if solved_map else []
     room = min(len(um), max(4, rows // 2 - 1))
     verdict = headed(
-        "map and verdict", fitted(wrapped(_verdict(picture), width), rows - 2 - room), width
+        "map and verdict",
+        fitted(wrapped(_verdict(picture), width), rows - 2 - room),
+        width,
     )
     return [
         *verdict,
@@ -348,12 +399,19 @@ def _map(
     """Return the size of the error at each site as a picture."""
     cells, step = coarser(um, width, max(rows - 1, 1), _worst_error)
     step *= solved_map.get("step", 1)
-    most = max((value for row in cells for value in row if value is not None), default=0.0)
+    most = max(
+        (value for row in cells for value in row if value is not None), default=0.0
+    )
     signs = [
-        ["?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))] for value in row]
+        [
+            "?" if value is None else SHADES[min(9, int(value / (most or 1.0) * 10))]
+            for value in row
+        ]
         for row in cells
     ]
-    title = f"error, '@' = {most:.3g} µm" + (f", cell {step} x {step}" if step > 1 else "")
+    title = f"error, '@' = {most:.3g} µm" + (
+        f", cell {step} x {step}" if step > 1 else ""
+    )
     return headed(title, [Text(" ".join(row), style="magenta") for row in signs], width)
 
 
@@ -370,11 +428,16 @@ def _health(picture: dict[str, Any]) -> list[Text]:
             well.append(node)
             continue
         word, colour = (
-            ("no sign of life", "red") if health is None else LEVELS.get(health["level"], LEVELS[2])
+            ("no sign of life", "red")
+            if health is None
+            else LEVELS.get(health["level"], LEVELS[2])
         )
         message = "" if health is None else f" {printable(health['message'])}"
         texts.append(Text.assemble((f"{node}: ", "bold"), (word, colour), message))
-    return [*texts, *([Text.assemble(("ok: ", "green"), ", ".join(well))] if well else [])]
+    return [
+        *texts,
+        *([Text.assemble(("ok: ", "green"), ", ".join(well))] if well else []),
+    ]
 
 
 def _log_line(line: str) -> Text:

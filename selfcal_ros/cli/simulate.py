@@ -37,7 +37,8 @@ def run(args: argparse.Namespace) -> int:
         counts = write(simulation, args.output, progress=bar)
     say(
         args,
-        f"{args.output}: " + ", ".join(f"{count} x {topic}" for topic, count in counts.items()),
+        f"{args.output}: "
+        + ", ".join(f"{count} x {topic}" for topic, count in counts.items()),
         {"bag": args.output, "messages": dict(counts)},
     )
     return 0

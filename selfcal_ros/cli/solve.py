@@ -50,7 +50,11 @@ from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.reporting.words.phrases import recheck_lines
-from selfcal_ros.reporting.words.tables import budget_text, validation_json, validation_text
+from selfcal_ros.reporting.words.tables import (
+    budget_text,
+    validation_json,
+    validation_text,
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -85,7 +89,9 @@ def add_arguments(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> 
     )
     parser.set_defaults(validate=False)
     parser.add_argument(
-        "--budget", action="store_true", help="print the uncertainty budget of the map (GUM)"
+        "--budget",
+        action="store_true",
+        help="print the uncertainty budget of the map (GUM)",
     )
     parser.add_argument(
         "--report",
@@ -129,7 +135,9 @@ def add_options(parser: argparse.ArgumentParser, names: Mapping[str, str]) -> No
     parser.set_defaults(reference=None, **dict.fromkeys(SOLVER.keys() - names))
     add_parameters(parser, CollectorSettings, SENSE)
     parser.add_argument(
-        "--params", metavar="NODES.yaml", help="ROS parameter file, the same as for the nodes"
+        "--params",
+        metavar="NODES.yaml",
+        help="ROS parameter file, the same as for the nodes",
     )
     parser.add_argument(
         "--model",
@@ -173,7 +181,9 @@ def parameters(args: argparse.Namespace) -> "tuple[CollectorSettings, SolverSett
             )
     if args.misalignment == "rigid" and solver.method == "law":
         raise InputError(
-            "--misalignment", "Hu's law is linear, not rigid", "omit it, or use --method joint"
+            "--misalignment",
+            "Hu's law is linear, not rigid",
+            "omit it, or use --method joint",
         )
     return collector, solver
 
@@ -234,7 +244,10 @@ def run(args: argparse.Namespace) -> int:
         )
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
-            args.bag, collector, namespace=args.namespace, progress=lambda count: bar(count, None)
+            args.bag,
+            collector,
+            namespace=args.namespace,
+            progress=lambda count: bar(count, None),
         )
     used = sum(view.used for view in measurements.views)
     warnings = [
@@ -242,10 +255,13 @@ def run(args: argparse.Namespace) -> int:
         *lost,
         *(() if findings else rejections(measurements.all_rejected(), used)),
     ]
-    for line in dict.fromkeys(warnings):  # a clock step is a finding, and noted in the result
+    # a clock step is a finding, and noted in the result
+    for line in dict.fromkeys(warnings):
         print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
     measurements = _with_map(args, measurements)
-    options = solver_options(solver, measurements, plate_from=getattr(args, "plate_from", ""))
+    options = solver_options(
+        solver, measurements, plate_from=getattr(args, "plate_from", "")
+    )
     if options.plate is not None and args.validate:
         raise InputError(
             "--validate",
@@ -261,12 +277,21 @@ def run(args: argparse.Namespace) -> int:
         if (args.output or args.json) and error.observability is not None:
             result = unidentified_result(measurements, error.observability)
             result = worded(with_places(result, measurements.views))
-            _write(args, result_to_dict(created_now(with_input(result, bag_input(args.bag), lost))))
-        if set(findings) - set(lost):  # a fault of the cell: a plate placed otherwise, a wrong sign
-            raise InputError(args.bag, "correct this first", f"as it is, {error}") from refused
+            _write(
+                args,
+                result_to_dict(
+                    created_now(with_input(result, bag_input(args.bag), lost))
+                ),
+            )
+        # a fault of the cell: a plate placed otherwise, a wrong sign
+        if set(findings) - set(lost):
+            raise InputError(
+                args.bag, "correct this first", f"as it is, {error}"
+            ) from refused
         if findings:  # missing readings look like a deficient plan
             raise NotIdentifiableError(
-                f"{args.bag}: correct this first; as it is, {error}", error.observability
+                f"{args.bag}: correct this first; as it is, {error}",
+                error.observability,
             ) from refused
         raise
     if (
@@ -299,15 +324,21 @@ def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
     """Return the readings with the nodes of --map, if it is given."""
     if not args.map:
         return measurements
-    return replace(measurements, artifact=with_nodes(measurements.artifact, args.map, "--map"))
+    return replace(
+        measurements, artifact=with_nodes(measurements.artifact, args.map, "--map")
+    )
 
 
-def _calibrated(args: argparse.Namespace, measurements: Any, options: Any, *, method: str) -> Any:
+def _calibrated(
+    args: argparse.Namespace, measurements: Any, options: Any, *, method: str
+) -> Any:
     """Return the result without sentences; errors of offsets or plate name the bag."""
     try:
         return calibrate_by(method, measurements, options)
     except (WiringError, PlacingError) as error:
-        raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
+        raise InputError(
+            f"{args.bag}: {error.where}", error.what, error.remedy
+        ) from error
 
 
 def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
@@ -325,11 +356,19 @@ def _validated(
     lines: list[str] = []
     result = with_places(result, measurements.views)
     if args.validate:
-        used = clean(measurements, options).measurements if options.robust else measurements
+        used = (
+            clean(measurements, options).measurements
+            if options.robust
+            else measurements
+        )
         validation = validate(used, options)
         result = judged_by(result, validation)
         result = replace(
-            result, extra={**result.extra, "validation": validation_json(validation, result.plate)}
+            result,
+            extra={
+                **result.extra,
+                "validation": validation_json(validation, result.plate),
+            },
         )
         lines += [
             "",
@@ -345,12 +384,19 @@ def _since(result: Any) -> list[str]:
     return (
         []
         if recheck is None
-        else ["", f"change since {recheck.of}:", *(f"  {line}" for line in recheck_lines(recheck))]
+        else [
+            "",
+            f"change since {recheck.of}:",
+            *(f"  {line}" for line in recheck_lines(recheck)),
+        ]
     )
 
 
 def _budget(result: Any) -> list[str]:
     """Return the text of the budget."""
     if not result.has_uncertainty:
-        return ["", "no budget: the uncertainty map was not computed (--uncertainty always)"]
+        return [
+            "",
+            "no budget: the uncertainty map was not computed (--uncertainty always)",
+        ]
     return ["", *budget_text(budgets(result))]

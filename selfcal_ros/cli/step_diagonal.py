@@ -17,8 +17,19 @@ from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_yaml, sha256_of
 from selfcal_ros.laser.bag import SeriesTopics, read_series
-from selfcal_ros.laser.data import DIAGONALS, Form, Method, StepDiagonal, StepDiagonalResult
-from selfcal_ros.laser.identify import EQUAL_READINGS, Choice, identify, readings_are_equal
+from selfcal_ros.laser.data import (
+    DIAGONALS,
+    Form,
+    Method,
+    StepDiagonal,
+    StepDiagonalResult,
+)
+from selfcal_ros.laser.identify import (
+    EQUAL_READINGS,
+    Choice,
+    identify,
+    readings_are_equal,
+)
 from selfcal_ros.laser.profiles import ReferenceLine, axis_corrections
 from selfcal_ros.laser.report import outcome, profiles_figure, summary, truth_of
 from selfcal_ros.laser.simulation import simulate_step_diagonal, simulation_from_dict
@@ -76,14 +87,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="reference line: least squares (default) or through the end points",
     )
     parser.add_argument(
-        "--diagonals", metavar="LIST", help="diagonals to use, separated by commas (default: all)"
+        "--diagonals",
+        metavar="LIST",
+        help="diagonals to use, separated by commas (default: all)",
     )
     parser.add_argument(
         "--allow-equal",
         action="store_true",
         help="accept X and Y readings that are equal in every block",
     )
-    parser.add_argument("--plot", metavar="FILE", help="draw the profiles (png, svg or pdf)")
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the profiles (png, svg or pdf)"
+    )
     parser.add_argument(
         "--simulate",
         metavar="SIM.yaml",
@@ -91,7 +106,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "-o (or print them); see config/step_diagonal/case_study.yaml",
     )
     parser.add_argument(
-        "--truth", metavar="TRUTH.json", help="with --simulate: write the errors of the machine"
+        "--truth",
+        metavar="TRUTH.json",
+        help="with --simulate: write the errors of the machine",
     )
     parser.add_argument(
         "--cal",
@@ -122,7 +139,9 @@ def run(args: argparse.Namespace) -> int:
         return _simulate(args)
     if args.data is None or args.method is None:
         raise InputError(
-            "arguments", "DATA.csv and --method are required", "give both, or --simulate alone"
+            "arguments",
+            "DATA.csv and --method are required",
+            "give both, or --simulate alone",
         )
     data, warnings, source = _measurement(args)
     choice = Choice(Method(args.method), Form(args.form), args.allow_equal)
@@ -166,7 +185,8 @@ def _check_outputs(args: argparse.Namespace) -> None:
         if path and not installed:
             raise InputError(option, "nothing would be written", remedy)
     check_outputs(
-        [args.data, args.simulate], [args.output, args.plot, args.cal, args.truth, args.save_csv]
+        [args.data, args.simulate],
+        [args.output, args.plot, args.cal, args.truth, args.save_csv],
     )
     if args.cal:
         refuse_existing([args.cal], force=args.force)
@@ -178,7 +198,16 @@ def _refuse_machine(args: argparse.Namespace) -> None:
     """Refuse options of a calibration file if none is written."""
     refuse_given(
         args,
-        ("x_axis", "y_axis", "unit", "home_x", "home_y", "reverse_x", "reverse_y", "force"),
+        (
+            "x_axis",
+            "y_axis",
+            "unit",
+            "home_x",
+            "home_y",
+            "reverse_x",
+            "reverse_y",
+            "force",
+        ),
         "it belongs to a calibration file",
         "name one with --cal, or omit it",
     )
@@ -193,20 +222,26 @@ def _write_cal(args: argparse.Namespace, identified: "StepDiagonalResult") -> No
         "positions count from the start of the first block; the x axis is the reference",
         frame.comment(),
     ]
-    text = cal_text(correction_tables(identified, frame), comments=comments, decimals=DECIMALS)
+    text = cal_text(
+        correction_tables(identified, frame), comments=comments, decimals=DECIMALS
+    )
     backup = write_cals({args.cal: text}, force=args.force)[args.cal]
     if backup:
         print(f"selfcal step-diagonal: the old {args.cal} is {backup}", file=sys.stderr)
 
 
-def correction_tables(identified: "StepDiagonalResult", frame: "MachineFrame") -> list["Table1D"]:
+def correction_tables(
+    identified: "StepDiagonalResult", frame: "MachineFrame"
+) -> list["Table1D"]:
     """Return the 1D tables of all corrections, in the controller's coordinates.
 
     The machine's home is counted from the start of the first block.
     """
     lines = axis_corrections(identified)
     return [
-        line_table(AxisCorrection(*lines[pair]), frame, along=pair[0], corrected=pair[1])
+        line_table(
+            AxisCorrection(*lines[pair]), frame, along=pair[0], corrected=pair[1]
+        )
         for pair in sorted(lines)
     ]
 
@@ -214,9 +249,13 @@ def correction_tables(identified: "StepDiagonalResult", frame: "MachineFrame") -
 def _simulate(args: argparse.Namespace) -> int:
     """Write the readings of a simulated measurement as a table."""
     if args.data is not None:
-        raise InputError("arguments", "--simulate writes data and reads none", "omit DATA.csv")
+        raise InputError(
+            "arguments", "--simulate writes data and reads none", "omit DATA.csv"
+        )
     simulation = simulation_from_dict(read_yaml(args.simulate), args.simulate)
-    data = simulate_step_diagonal(simulation.machine, simulation.measurement, simulation.rng)
+    data = simulate_step_diagonal(
+        simulation.machine, simulation.measurement, simulation.rng
+    )
     text = table_text(
         data,
         [
@@ -260,7 +299,9 @@ def _measurement(args: argparse.Namespace) -> tuple:
             "omit it",
         )
         dim = dimension_of(args.data)
-        columns = RequiredColumns(_steps(args, dim), _diagonals(args, dim), args.method == "new")
+        columns = RequiredColumns(
+            _steps(args, dim), _diagonals(args, dim), args.method == "new"
+        )
         data, warnings = read_table(args.data, columns)
     return data, warnings, {"file": args.data, "sha256": sha256_of(args.data)}
 
@@ -312,7 +353,10 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         help="field of the distance, or its joint in a JointState",
     )
     group.add_argument(
-        "--laser-unit", choices=tuple(M_PER), default="m", help="unit of the distance (default m)"
+        "--laser-unit",
+        choices=tuple(M_PER),
+        default="m",
+        help="unit of the distance (default m)",
     )
     group.add_argument(
         "--laser-sign",
@@ -340,7 +384,11 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         help="largest motion of an axis at rest, um (default 2)",
     )
     group.add_argument(
-        "--min-rest", type=float, default=0.5, metavar="S", help="shortest rest, s (default 0.5)"
+        "--min-rest",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="shortest rest, s (default 0.5)",
     )
     group.add_argument(
         "--settle",
@@ -349,10 +397,14 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="time ignored at both ends of a rest, s (default 0.1)",
     )
-    group.add_argument("--save-csv", metavar="FILE", help="write the blocks as a CSV table")
+    group.add_argument(
+        "--save-csv", metavar="FILE", help="write the blocks as a CSV table"
+    )
 
 
-def refuse_given(args: argparse.Namespace, names: Sequence[str], why: str, remedy: str) -> None:
+def refuse_given(
+    args: argparse.Namespace, names: Sequence[str], why: str, remedy: str
+) -> None:
     """Refuse options that differ from their defaults, with the reason."""
     for name in names:
         if getattr(args, name) != args.leaf.get_default(name):
@@ -369,7 +421,9 @@ def joints_of(args: argparse.Namespace) -> tuple[str, ...]:
     joints = tuple(name.strip() for name in args.joints.split(","))
     if len(joints) not in (2, 3) or len(set(joints)) < len(joints) or "" in joints:
         raise InputError(
-            "--joints", f"'{args.joints}' is not two or three names", "write --joints x,y"
+            "--joints",
+            f"'{args.joints}' is not two or three names",
+            "write --joints x,y",
         )
     return joints
 

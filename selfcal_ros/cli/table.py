@@ -34,7 +34,9 @@ KINDS = (".csv", ".npz")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("result", metavar="RESULT.json", help="result that `selfcal solve` wrote")
+    parser.add_argument(
+        "result", metavar="RESULT.json", help="result that `selfcal solve` wrote"
+    )
     parser.add_argument(
         "-o",
         "--output",
@@ -76,17 +78,31 @@ def csv_bytes(result: "CalibrationResult") -> bytes:
         cells = [
             m,
             n,
-            *(float(part[i, j]) for part in (x_m, y_m, emap.gx, emap.gy, emap.u_gx, emap.u_gy)),
+            *(
+                float(part[i, j])
+                for part in (x_m, y_m, emap.gx, emap.gy, emap.u_gx, emap.u_gy)
+            ),
         ]
         rows.append(",".join([*map(_cell, cells), "", "", "", ""]))
     for k in range(plate.angular_count):
-        cells = [k, 2 * math.pi * k / plate.angular_count, emap.g_theta[k], emap.u_g_theta[k]]
+        cells = [
+            k,
+            2 * math.pi * k / plate.angular_count,
+            emap.g_theta[k],
+            emap.u_g_theta[k],
+        ]
         rows.append("," * 8 + ",".join(map(_cell, cells)))
     return ("\n".join(rows) + "\n").encode()
 
 
 def _cell(value: float) -> str:
-    return str(value) if isinstance(value, int) else "" if value != value else repr(float(value))
+    return (
+        str(value)
+        if isinstance(value, int)
+        else ""
+        if value != value
+        else repr(float(value))
+    )
 
 
 def npz_bytes(result: "CalibrationResult") -> bytes:

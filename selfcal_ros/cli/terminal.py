@@ -53,7 +53,9 @@ def add_parameters(
             else {
                 "type": type(default),
                 "choices": parameter.choices or None,
-                "metavar": None if parameter.choices else (parameter.unit or "value").upper(),
+                "metavar": None
+                if parameter.choices
+                else (parameter.unit or "value").upper(),
             }
         )
         parser.add_argument(
@@ -109,13 +111,21 @@ def aside(args: argparse.Namespace) -> TextIO:
     return sys.stderr if on_stdout(args) else sys.stdout
 
 
-def show(result: CalibrationResult, bag: str, output: str | None, stream: TextIO) -> None:
+def show(
+    result: CalibrationResult, bag: str, output: str | None, stream: TextIO
+) -> None:
     """Print the summary, compared with the truth if the bag folder has one."""
-    from selfcal_ros.bagio.offline import read_truth  # with mcap, which not every verb needs
-    from selfcal_ros.reporting.summary.sections import summary_text  # with scipy, likewise
+    from selfcal_ros.bagio.offline import (
+        read_truth,
+    )  # with mcap, which not every verb needs
+    from selfcal_ros.reporting.summary.sections import (
+        summary_text,
+    )  # with scipy, likewise
 
     print(
-        summary_text(result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)),
+        summary_text(
+            result, truth=read_truth(bag), ascii_only=not can_print_symbols(stream)
+        ),
         file=stream,
     )
     if output:
@@ -165,7 +175,9 @@ def _nothing(done: int, total: int | None = None) -> None:
 
 
 @contextlib.contextmanager
-def late_progress(label: str, after_s: float = 2.0) -> Iterator[Callable[[int, int | None], None]]:
+def late_progress(
+    label: str, after_s: float = 2.0
+) -> Iterator[Callable[[int, int | None], None]]:
     """Yield the function of `progress_bar`; its bar appears only after `after_s`."""
     began = time.monotonic()
     draw: Callable[[int, int | None], None] | None = None

@@ -21,10 +21,18 @@ MOST_OF_A_NAME = 200
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("--plan", metavar="PLAN.yaml", required=True, help="plate and views")
-    parser.add_argument("--params", metavar="NODES.yaml", help="ROS parameter file for the nodes")
-    parser.add_argument("--namespace", metavar="NS", default="", help="namespace of the cell")
-    parser.add_argument("--bag", metavar="FOLDER", help="record the session to this new folder")
+    parser.add_argument(
+        "--plan", metavar="PLAN.yaml", required=True, help="plate and views"
+    )
+    parser.add_argument(
+        "--params", metavar="NODES.yaml", help="ROS parameter file for the nodes"
+    )
+    parser.add_argument(
+        "--namespace", metavar="NS", default="", help="namespace of the cell"
+    )
+    parser.add_argument(
+        "--bag", metavar="FOLDER", help="record the session to this new folder"
+    )
     parser.add_argument(
         "--results",
         metavar="FOLDER",
@@ -32,7 +40,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="folder for the map of each run, PLAN_RUN.json, and for those of "
         "save_map (default: the working directory)",
     )
-    add_json(parser, "one JSON object per line: pictures as they change, answers to requests")
+    add_json(
+        parser, "one JSON object per line: pictures as they change, answers to requests"
+    )
     parser.add_argument(
         "--journal",
         metavar="FOLDER",
@@ -41,7 +51,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "in selfcal of the user's folder for states, ~/.local/state)",
     )
     parser.add_argument(
-        "--compensate", action="store_true", help="publish corrected joint states as well"
+        "--compensate",
+        action="store_true",
+        help="publish corrected joint states as well",
     )
     parser.add_argument(
         "--detect",
@@ -54,7 +66,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="machine to be driven by cell_driver (docs/start/machines.md)",
     )
     parser.add_argument(
-        "--simulate", action="store_true", help="also run a simulated cell, to try it out"
+        "--simulate",
+        action="store_true",
+        help="also run a simulated cell, to try it out",
     )
 
 
@@ -84,10 +98,14 @@ def state_folder(results: str) -> Path:
     state, home = os.environ.get("XDG_STATE_HOME"), os.environ.get("HOME")
     if not state and not home:
         raise InputError(
-            "HOME", "is not set, and journals are kept there", "set it, or give --journal FOLDER"
+            "HOME",
+            "is not set, and journals are kept there",
+            "set it, or give --journal FOLDER",
         )
     name = re.sub(r"[^\w.-]", "_", str(Path(results).absolute()).strip("/")) or "root"
-    return Path(state or Path(home or "", ".local/state"), "selfcal", name[-MOST_OF_A_NAME:])
+    return Path(
+        state or Path(home or "", ".local/state"), "selfcal", name[-MOST_OF_A_NAME:]
+    )
 
 
 def commands(args: argparse.Namespace) -> dict[str, list[str]]:
@@ -96,7 +114,9 @@ def commands(args: argparse.Namespace) -> dict[str, list[str]]:
 
     def with_parameters(**values: str) -> list[str]:
         return common + [
-            word for name, value in values.items() for word in ("-p", f"{name}:={value}")
+            word
+            for name, value in values.items()
+            for word in ("-p", f"{name}:={value}")
         ]
 
     # separate: an interrupted simulated run must never continue with real readings

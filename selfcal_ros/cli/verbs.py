@@ -43,31 +43,49 @@ class Verb(NamedTuple):
 
 VERBS = {
     "up": Verb(MEASURE, "start the nodes of a cell, and calibrate on one screen"),
-    "monitor": Verb(MEASURE, "show a running cell on one screen, and operate it by keys"),
+    "monitor": Verb(
+        MEASURE, "show a running cell on one screen, and operate it by keys"
+    ),
     "call": Verb(MEASURE, "ask a running cell to start, confirm, redo, skip or abort"),
     "measure": Verb(MEASURE, "measure a plan with a machine, without ROS, and solve"),
-    "cell": Verb(MEASURE, "try a machine, or check a cell before its first calibration"),
+    "cell": Verb(
+        MEASURE, "try a machine, or check a cell before its first calibration"
+    ),
     "camera": Verb(MEASURE, "find the pixel size, rotation and mirroring of a camera"),
     "detect": Verb(MEASURE, "find the marks in the images of a bag"),
     "solve": Verb(MEASURE, "calibrate from a bag: MCAP file or rosbag2 folder"),
-    "replay": Verb(MEASURE, "play a bag into the live nodes and take the map from them"),
+    "replay": Verb(
+        MEASURE, "play a bag into the live nodes and take the map from them"
+    ),
     "batch": Verb(MEASURE, "calibrate from many bags: one table, trends and changes"),
     "report": Verb(LOOK, "write a calibration report: one HTML or PDF file"),
     "plot": Verb(LOOK, "draw the maps of a result: png, svg or pdf"),
     "table": Verb(LOOK, "write the maps of a result as a table: csv or npz"),
     "diff": Verb(LOOK, "compare two results after removing the datum difference"),
-    "recheck": Verb(LOOK, "has a calibrated stage changed? from one view of the same plate"),
-    "verify": Verb(LOOK, "is the machine better with the correction on, and if not, why not?"),
-    "history": Verb(LOOK, "the calibrations of a stage: active map, changes, when the next is due"),
+    "recheck": Verb(
+        LOOK, "has a calibrated stage changed? from one view of the same plate"
+    ),
+    "verify": Verb(
+        LOOK, "is the machine better with the correction on, and if not, why not?"
+    ),
+    "history": Verb(
+        LOOK, "the calibrations of a stage: active map, changes, when the next is due"
+    ),
     "combine": Verb(LOOK, "combine several calibrations of a stage into one map"),
     "apply": Verb(USE, "correct a table of positions: true to commands, or back"),
     "export": Verb(USE, "write the map of a result as a table for a controller"),
     "cal": Verb(USE, "write, check and verify files for Aerotech controllers"),
     "gcode": Verb(USE, "correct a G-code program: for controllers without tables"),
-    "certificate": Verb(CERTIFY, "write a digital calibration certificate: DCC 3.3.0 (XML)"),
+    "certificate": Verb(
+        CERTIFY, "write a digital calibration certificate: DCC 3.3.0 (XML)"
+    ),
     "iso230": Verb(CERTIFY, "figures of ISO 230: accuracy, circularity, diagonals"),
-    "plan": Verb(CHECK, "make a plan, check it before it is measured, or suggest views"),
-    "plate": Verb(CHECK, "draw the plate of a plan, true to size: svg, pdf, dxf or gds"),
+    "plan": Verb(
+        CHECK, "make a plan, check it before it is measured, or suggest views"
+    ),
+    "plate": Verb(
+        CHECK, "draw the plate of a plan, true to size: svg, pdf, dxf or gds"
+    ),
     "simulate": Verb(CHECK, "write a bag of a simulated cell, with its known truth"),
     "step-diagonal": Verb(MORE, "axis errors from a laser step-diagonal measurement"),
     "reproduce": Verb(MORE, "repeat the published simulations of Hu, Qiao or Ibaraki"),
@@ -140,4 +158,6 @@ def summary_of(point: "EntryPoint") -> str:
     """Return what the help says of another package's verb, without importing it."""
     if point.dist is None:
         return point.value
-    return f"{point.dist.metadata['Summary'] or point.value} (package {point.dist.name})"
+    return (
+        f"{point.dist.metadata['Summary'] or point.value} (package {point.dist.name})"
+    )

@@ -13,18 +13,26 @@ from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.api import calibrate_corrected
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.estimation.comparison.verification import is_believed, require_correctable
+from selfcal_ros.estimation.comparison.verification import (
+    is_believed,
+    require_correctable,
+)
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult, with_input
 from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.reporting.words.verification import verification_text, with_verification
+from selfcal_ros.reporting.words.verification import (
+    verification_text,
+    with_verification,
+)
 from selfcal_ros.results import read_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the verb."""
-    parser.add_argument("map", metavar="MAP.json", help="RESULT.json whose map is corrected")
+    parser.add_argument(
+        "map", metavar="MAP.json", help="RESULT.json whose map is corrected"
+    )
     parser.add_argument(
         "bag",
         metavar="BAG",
@@ -37,7 +45,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="FILE.png|.svg|.pdf",
         help="draw the error without and with the correction side by side",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON (docs/guides/verify.md)")
+    parser.add_argument(
+        "--json", action="store_true", help="print JSON (docs/guides/verify.md)"
+    )
     solve.add_options(parser, {})
 
 
@@ -48,21 +58,32 @@ def run(args: argparse.Namespace) -> int:
     require_correctable(before, args.map)
     after = _after(args, before)
     with busy("comparing"):
-        after, verification = with_verification(before, after, names=(args.map, args.bag))
+        after, verification = with_verification(
+            before, after, names=(args.map, args.bag)
+        )
     verified = after.verification
     assert verified is not None
     if args.plot:
-        from selfcal_ros.reporting.figures.maps import verification_picture  # loads matplotlib
+        from selfcal_ros.reporting.figures.maps import (
+            verification_picture,
+        )  # loads matplotlib
         from selfcal_ros.reporting.figures.paper import save_picture  # likewise
 
         save_picture(
-            verification_picture(before, after, verification, verified.sentence), args.plot
+            verification_picture(before, after, verification, verified.sentence),
+            args.plot,
         )
     say(
         args,
         verification_text(verification),
         plain(verified)
-        | plain({"gx": verification.gx, "gy": verification.gy, "g_theta": verification.g_theta}),
+        | plain(
+            {
+                "gx": verification.gx,
+                "gy": verification.gy,
+                "g_theta": verification.g_theta,
+            }
+        ),
     )
     if not is_believed(after, verification):
         say_unless_qualified(after, f"selfcal verify: {args.bag}")
@@ -74,7 +95,10 @@ def _after(args: argparse.Namespace, before: CalibrationResult) -> CalibrationRe
     collector, solver = solve.parameters(args)
     with progress_bar("reading") as bar:
         measurements, _, lost, findings = collect_bag(
-            args.bag, collector, namespace=args.namespace, progress=lambda count: bar(count, None)
+            args.bag,
+            collector,
+            namespace=args.namespace,
+            progress=lambda count: bar(count, None),
         )
     for line in dict.fromkeys([*findings, *lost]):
         print(f"selfcal verify: {args.bag}: {line}", file=sys.stderr)
@@ -97,4 +121,6 @@ def _solved(
     try:
         return calibrate_corrected(measurements, options)
     except (WiringError, PlacingError) as error:
-        raise InputError(f"{args.bag}: {error.where}", error.what, error.remedy) from error
+        raise InputError(
+            f"{args.bag}: {error.where}", error.what, error.remedy
+        ) from error

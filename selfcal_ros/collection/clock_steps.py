@@ -19,7 +19,8 @@ GROUP, BESIDE = 5, 3
 SLEW = 2000
 """Largest drift of a disciplined clock: one part in this many."""
 REMEDY = (
-    "let clocks slew, not step, while a run is measured (chrony, ptp4l: no step after the start)"
+    "let clocks slew, not step, while a run is measured "
+    "(chrony, ptp4l: no step after the start)"
 )
 Span = tuple[np.ndarray, np.ndarray]
 """Lowest and highest of offset, stamp and reception, each (3, n)."""
@@ -71,7 +72,9 @@ class StepWatch:
         stamps_ns, received_ns : int64 array (n,)
             Stamps, and instants of reception.
         """
-        messages = np.concatenate([self._rest, np.stack([stamps_ns, received_ns])], axis=1)
+        messages = np.concatenate(
+            [self._rest, np.stack([stamps_ns, received_ns])], axis=1
+        )
         n_grouped = messages.shape[1] // GROUP * GROUP
         self._rest = messages[:, n_grouped:]
         if not n_grouped:
@@ -100,9 +103,9 @@ class StepWatch:
         count = self._groups.shape[1] - 2 * BESIDE
         if count <= 0:
             return []
-        low = np.stack([self._groups[0::2, k : k + count + BESIDE + 1] for k in range(BESIDE)]).min(
-            0
-        )
+        low = np.stack(
+            [self._groups[0::2, k : k + count + BESIDE + 1] for k in range(BESIDE)]
+        ).min(0)
         high = np.stack(
             [self._groups[1::2, k : k + count + BESIDE + 1] for k in range(BESIDE)]
         ).max(0)
@@ -167,7 +170,9 @@ def _parted(before: Span, after: Span, limit_ns: int) -> np.ndarray:
     return np.where(ahead | back, by, np.where(together, stamps, 0))
 
 
-def step_lines(steps: Mapping[str, Iterable[ClockStep]], timeline: Timeline) -> list[str]:
+def step_lines(
+    steps: Mapping[str, Iterable[ClockStep]], timeline: Timeline
+) -> list[str]:
     """Return one line for each step: clock, amount, location, consequence.
 
     Parameters
@@ -213,7 +218,9 @@ def _alike(step: ClockStep, other: ClockStep) -> bool:
 def _line(topics: str, step: ClockStep, timeline: Timeline) -> str:
     index = int(timeline.assign(np.array([step.before_ns]))[0])
     view = timeline.intervals[index].view_index if index >= 0 else None
-    where = "between views" if view is None else f"in view '{timeline.views[view].name}'"
+    where = (
+        "between views" if view is None else f"in view '{timeline.views[view].name}'"
+    )
     way, wrong = ("back", "an earlier") if step.by_ns < 0 else ("ahead", "a later")
     return (
         f"the clock that stamps {topics} stepped {way} by {abs(step.by_ns) * S_PER_NS:.3g} s "

@@ -21,7 +21,12 @@ from selfcal_ros.collection.marks.stops import count_stops
 from selfcal_ros.collection.reduce import Rules
 from selfcal_ros.collection.samples import Limits
 from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.collection.timeline import Timeline, ViewCache, build_timeline, without_strays
+from selfcal_ros.collection.timeline import (
+    Timeline,
+    ViewCache,
+    build_timeline,
+    without_strays,
+)
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import plan_keys
@@ -54,12 +59,20 @@ class Collector:
         If two joints have the same name.
     """
 
-    def __init__(self, settings: CollectorSettings, store: Limits | None = None) -> None:
+    def __init__(
+        self, settings: CollectorSettings, store: Limits | None = None
+    ) -> None:
         gap_ns = round(settings.max_encoder_gap * NS_PER_S)
         linear = TrackLimits(gap_ns, settings.max_speed, settings.encoder_agreement)
-        turn = TrackLimits(gap_ns, settings.max_angular_speed, settings.encoder_agreement, True)
+        turn = TrackLimits(
+            gap_ns, settings.max_angular_speed, settings.encoder_agreement, True
+        )
         self.sense = Sense(settings.measurement_sense)
-        self._joints = {settings.joint_x: "x", settings.joint_y: "y", settings.joint_theta: "theta"}
+        self._joints = {
+            settings.joint_x: "x",
+            settings.joint_y: "y",
+            settings.joint_theta: "theta",
+        }
         if len(self._joints) < 3:
             raise InputError(
                 "measurement_collector: joint_x, joint_y, joint_theta",
@@ -67,7 +80,9 @@ class Collector:
                 "give each its own name",
             )
         self.tracks = Tracks(
-            JointTrack(linear, store), JointTrack(linear, store), JointTrack(turn, store)
+            JointTrack(linear, store),
+            JointTrack(linear, store),
+            JointTrack(turn, store),
         )
         self._rules = Rules(
             self.sense,
@@ -81,7 +96,9 @@ class Collector:
             settings.outlier_limit,
         )
         self._min_repeats = settings.min_repeats
-        self._exposures = Exposures(self.tracks, approach_threshold_m=settings.approach_threshold)
+        self._exposures = Exposures(
+            self.tracks, approach_threshold_m=settings.approach_threshold
+        )
         self._views = ViewCache(self._rules)
         self._unsettled = 0
         self._commands: dict[inputs.Command, None] = {}
@@ -144,7 +161,9 @@ class Collector:
                 None if speeds is None else speeds[good, column],
             )
         if not finite.all():
-            self._rejected_input[inputs.Reason.ENCODER_NOT_FINITE] += int((~finite).sum())
+            self._rejected_input[inputs.Reason.ENCODER_NOT_FINITE] += int(
+                (~finite).sum()
+            )
         if not joint_known and count:
             self._rejected_input[inputs.Reason.ENCODER_UNKNOWN_JOINT] += count
         self._grow(count)
@@ -200,24 +219,32 @@ class Collector:
         if self._newest is None and self._commands:
             regular = set(without_strays(self._commands))
             self._newest = max(
-                (c for c in reversed(self._commands) if c in regular), key=lambda c: c.stamp_ns
+                (c for c in reversed(self._commands) if c in regular),
+                key=lambda c: c.stamp_ns,
             )
         return self._newest
 
     @property
     def encoder_until_ns(self) -> int:
         """Stamp up to which all joints with samples have been received, as far as known."""
-        return min((track.store.newest_ns for track in self.tracks if len(track)), default=NEVER)
+        return min(
+            (track.store.newest_ns for track in self.tracks if len(track)),
+            default=NEVER,
+        )
 
     @property
     def storage_problem(self) -> str:
         """Why more encoder samples are in memory than intended; empty if all is well."""
-        return next((track.store.problem for track in self.tracks if track.store.problem), "")
+        return next(
+            (track.store.problem for track in self.tracks if track.store.problem), ""
+        )
 
     @property
     def unusable(self) -> dict[str, int]:
         """Messages unusable as encoder samples or commands, by reason."""
-        return {str(reason): count for reason, count in sorted(self._rejected_input.items())}
+        return {
+            str(reason): count for reason, count in sorted(self._rejected_input.items())
+        }
 
     @property
     def timeline(self) -> Timeline:
@@ -243,7 +270,9 @@ class Collector:
             )
         self._settle()
         readings, loose = self._views.readings(timeline, self._exposures)
-        loose.update({str(reason): count for reason, count in self._rejected_input.items()})
+        loose.update(
+            {str(reason): count for reason, count in self._rejected_input.items()}
+        )
         stamps = [command.stamp_ns for command in self._commands]
         self._seen = DetectionsSeen(
             self._views.table,
@@ -282,7 +311,8 @@ class Collector:
         if self._seen is None:
             return {}
         return self._seen.findings(
-            {index: view.readings for index, view in progress.items()}, measurements.rejected
+            {index: view.readings for index, view in progress.items()},
+            measurements.rejected,
         )
 
     def missing_commands(self) -> list[str]:
@@ -305,7 +335,10 @@ class Collector:
         return lines
 
     def finding_of_last(
-        self, progress: Mapping[int, ViewProgress], index: int, rejected: Mapping[str, int]
+        self,
+        progress: Mapping[int, ViewProgress],
+        index: int,
+        rejected: Mapping[str, int],
     ) -> RejectionFinding | None:
         """Return why the last detections of a view were rejected, none of which was used."""
         if self._seen is None:
@@ -333,7 +366,9 @@ def view_progress(
     artifact, view = timeline.planned_view(index)
     grid, angular = expected_marks(artifact, view)
     grid_done, angular_done = n_read_enough(artifact, view, readings, min_repeats)
-    checked = min(max(count_stops(view, cell)[1] for cell in readings.parts), view.check_marks)
+    checked = min(
+        max(count_stops(view, cell)[1] for cell in readings.parts), view.check_marks
+    )
     return ViewProgress(
         index,
         view,

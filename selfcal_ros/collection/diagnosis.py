@@ -115,7 +115,8 @@ class RejectionFinding:
         if not self.count:
             return self.text
         return (
-            f"{self.count} of {self.total} detections were rejected as {self.reason}: {self.text}"
+            f"{self.count} of {self.total} detections were rejected as "
+            f"{self.reason}: {self.text}"
         )
 
 
@@ -307,13 +308,17 @@ def wrong_joints(e: Evidence) -> str | None:
 
 def _away(e: Evidence, changed: Callable[[np.ndarray], np.ndarray]) -> float:
     """Return the largest median distance of a view's marks from their sites, m; 0 if unknown."""
-    sites = np.concatenate([view.sites for view in e.marks] or [np.zeros(0, dtype=complex)])
+    sites = np.concatenate(
+        [view.sites for view in e.marks] or [np.zeros(0, dtype=complex)]
+    )
     if len(sites) < AT_LEAST or min(np.ptp(sites.real), np.ptp(sites.imag)) < 1:
         return 0.0
     return max(view.away(changed(view.stage)) for view in e.marks) * e.pitch_m
 
 
-def fault_text(scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense) -> str:
+def fault_text(
+    scale: float, *, swapped: bool, signs: tuple[int, int], sense: Sense
+) -> str:
     """Return the fault and the remedy for a combination that fits."""
     faults, remedy = [], []
     if SCALES[scale]:

@@ -30,7 +30,9 @@ LOOK_BACK_NS = 60_000_000_000
 NEVER, EVER = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 GOOD, NO_ENCODER, MOVING, CONTRADICTION = range(4)
 """Codes of the result for an exposure, with an eighth of the memory of reasons."""
-REASONS = np.array([None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object)
+REASONS = np.array(
+    [None, Reason.NO_ENCODER, Reason.MOVING, Reason.CONTRADICTION], dtype=object
+)
 """The reasons for the codes; None if the position is good."""
 AS_BEFORE = 2
 """Code for a direction of approach as at the previous exposure: no motion in between."""
@@ -92,17 +94,26 @@ class JointSamples:
         self.limits = limits
         stamps, positions, speeds = samples
         if (stamps[1:] > stamps[:-1]).all():  # usual case: nothing to compare
-            self.t, self.p, self.speed, self.v = stamps, positions, speeds, np.abs(speeds)
+            self.t, self.p, self.speed, self.v = (
+                stamps,
+                positions,
+                speeds,
+                np.abs(speeds),
+            )
             self.bad = np.zeros(len(stamps), dtype=bool)
             return
         order = np.lexsort((positions, stamps))
         stamps, positions, speeds = stamps[order], positions[order], speeds[order]
         first = np.flatnonzero(np.diff(stamps, prepend=NEVER))
         # from the first of each stamp to all of them: on a circle the last may be nearer
-        first_positions = np.repeat(positions[first], np.diff(first, append=len(stamps)))
+        first_positions = np.repeat(
+            positions[first], np.diff(first, append=len(stamps))
+        )
         spread = np.abs(self._difference(positions - first_positions))
         self.t, self.p = stamps[first], positions[first]
-        self.bad = (np.maximum.reduceat(spread, first) if len(first) else spread) > limits.agreement
+        self.bad = (
+            np.maximum.reduceat(spread, first) if len(first) else spread
+        ) > limits.agreement
         self.speed = _fastest(speeds, first)  # with its sign
         self.v = np.abs(self.speed)
 
@@ -190,7 +201,9 @@ class JointSamples:
             noise = self._noise_near(stamps_ns)
             speed_noise = self._speed_noise_near(stamps_ns)
             excess = np.where(
-                np.isfinite(v[before]) & np.isfinite(v[after]), np.fmax(v[before], v[after]), 0.0
+                np.isfinite(v[before]) & np.isfinite(v[after]),
+                np.fmax(v[before], v[after]),
+                0.0,
             )
             excess = np.where(excess > BEYOND_NOISE * speed_noise, excess, 0.0)
             excess *= (t[right] - t[left]) / NS_PER_S
@@ -224,13 +237,15 @@ class JointSamples:
         if not len(self) or not len(stamps_ns):
             return np.zeros_like(out)
         t, p = self.t, self.p
-        owner = np.searchsorted(stamps_ns, t, "left")  # the first exposure at or after a sample
+        # the first exposure at or after a sample
+        owner = np.searchsorted(stamps_ns, t, "left")
         sample = np.flatnonzero(owner < len(stamps_ns))
         owner = owner[sample]
         away = np.abs(p[sample] - positions[owner])
         displaced = (away > threshold) & (stamps_ns[owner] - t[sample] <= LOOK_BACK_NS)
         limit = np.full(len(stamps_ns), threshold)
-        doubtful = np.unique(owner[displaced])  # the noise is computed only where it matters
+        # the noise is computed only where it matters
+        doubtful = np.unique(owner[displaced])
         limit[doubtful] = np.fmax(
             threshold, BEYOND_NOISE * np.sqrt(2) * self._noise_near(stamps_ns[doubtful])
         )
@@ -259,9 +274,9 @@ class JointSamples:
         def off(t: np.ndarray, p: np.ndarray) -> np.ndarray:
             step = self._difference(np.diff(p))
             dt = np.diff(t)
-            return np.abs(step[..., :-1] * dt[..., 1:] - step[..., 1:] * dt[..., :-1]) / (
-                dt[..., :-1] + dt[..., 1:]
-            )
+            return np.abs(
+                step[..., :-1] * dt[..., 1:] - step[..., 1:] * dt[..., :-1]
+            ) / (dt[..., :-1] + dt[..., 1:])
 
         return self._median_near(off, (self.t, self.p), stamps_ns) / np.sqrt(1.5)
 
@@ -277,7 +292,10 @@ class JointSamples:
         return self._median_near(off, (self.speed,), stamps_ns) / np.sqrt(6)
 
     def _median_near(
-        self, off: Callable[..., np.ndarray], columns: tuple[np.ndarray, ...], stamps_ns: np.ndarray
+        self,
+        off: Callable[..., np.ndarray],
+        columns: tuple[np.ndarray, ...],
+        stamps_ns: np.ndarray,
     ) -> np.ndarray:
         """Return the robust standard deviation about 0 of values near each exposure.
 
@@ -288,7 +306,9 @@ class JointSamples:
             return np.zeros(len(stamps_ns))
         width = min(2 * NEAR, len(self) - 2)
         start = np.clip(
-            np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR, 0, len(self) - 2 - width
+            np.searchsorted(self.t, stamps_ns, "left") - 1 - NEAR,
+            0,
+            len(self) - 2 - width,
         )
         windows = np.lib.stride_tricks.sliding_window_view
         if len(start) * width < len(self):  # usual case: few exposures, far apart
@@ -335,9 +355,14 @@ class JointSamples:
         reversing = (
             fast
             & ~exact
-            & ((fast_left & (move_left * middle < 0)) | (fast_right & (move_right * middle < 0)))
+            & (
+                (fast_left & (move_left * middle < 0))
+                | (fast_right & (move_right * middle < 0))
+            )
         )
-        reversing |= exact & fast_left & fast_right & (move_left * move_right < 0) & ~reported
+        reversing |= (
+            exact & fast_left & fast_right & (move_left * move_right < 0) & ~reported
+        )
         return moving, reversing
 
     def _step_to(self, number: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

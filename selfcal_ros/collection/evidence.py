@@ -104,7 +104,9 @@ class DetectionsSeen:
     ) -> RejectionFinding | None:
         """Return why the last detections of a view were rejected, none of which was used."""
         marks = self._named({index: readings}) if rejected.keys() & set(PLACED) else {}
-        return diagnose(self._evidence(rejected, 0, marks, joints=False, lies="", view=index))
+        return diagnose(
+            self._evidence(rejected, 0, marks, joints=False, lies="", view=index)
+        )
 
     def findings(
         self,
@@ -136,9 +138,13 @@ class DetectionsSeen:
         joints = not any(pose.planned for pose in poses.values())
         faults = texts(poses)
         alike = (
-            faults.get(next(iter(views)), "") if len(views) == 1 else mirrored_alike(poses.values())
+            faults.get(next(iter(views)), "")
+            if len(views) == 1
+            else mirrored_alike(poses.values())
         )
-        session_evidence = self._evidence(rejected, used, marks, joints=joints, lies=alike)
+        session_evidence = self._evidence(
+            rejected, used, marks, joints=joints, lies=alike
+        )
         finding = diagnose(session_evidence)
         finding_of_view: dict[int | None, RejectionFinding | None] = {
             index: diagnose(
@@ -161,7 +167,9 @@ class DetectionsSeen:
         if finding is None or (
             not alike
             and faults.keys() & named.keys()
-            and not (finding.reason in PLACED and joints and wrong_joints(session_evidence))
+            and not (
+                finding.reason in PLACED and joints and wrong_joints(session_evidence)
+            )
         ):
             return named
         return {None: finding}
@@ -174,15 +182,23 @@ class DetectionsSeen:
         bad = sum(count for reason, count in rejected.items() if reason in REMEDY)
         plate = self.artifact
         outside = unknown >= AT_LEAST and unknown > MOST * bad
-        asked = _planned_marks(plate, [view.view for view in views.values() if view.view.grid])
+        asked = _planned_marks(
+            plate, [view.view for view in views.values() if view.view.grid]
+        )
         cells = [cell for view in views.values() for cell in view.parts]
         unread = [
-            asked_rows.difference(*(np.unique(getattr(cell, axis)).tolist() for cell in cells))
+            asked_rows.difference(
+                *(np.unique(getattr(cell, axis)).tolist() for cell in cells)
+            )
             for axis, asked_rows in zip("mn", asked, strict=True)
         ]
         if plate.marks is not None or not (outside or any(unread)):
             return None
-        named = (self.table["kind"] == Kind.GRID) & self.table["has_id"] & (self.view_of >= 0)
+        named = (
+            (self.table["kind"] == Kind.GRID)
+            & self.table["has_id"]
+            & (self.view_of >= 0)
+        )
         view_of = self.view_of[named]
         seen_rows = [
             _rows(self.table[axis][named], view_of, limits)
@@ -190,9 +206,12 @@ class DetectionsSeen:
         ]
         if len(np.unique(view_of)) < 2:  # rows that are missing may follow
             seen_rows = [
-                rows | asked_rows for rows, asked_rows in zip(seen_rows, asked, strict=True)
+                rows | asked_rows
+                for rows, asked_rows in zip(seen_rows, asked, strict=True)
             ]
-        if not all(seen_rows) or any(max(rows) - min(rows) + 1 != len(rows) for rows in seen_rows):
+        if not all(seen_rows) or any(
+            max(rows) - min(rows) + 1 != len(rows) for rows in seen_rows
+        ):
             return None
         sides, planned = (tuple(map(len, rows)) for rows in (seen_rows, asked))
         on_plate = all(
@@ -223,7 +242,11 @@ class DetectionsSeen:
         view: int | None = None,
     ) -> Evidence:
         """Return the facts on a view, or on all."""
-        of_view = np.ones(len(self.table), dtype=bool) if view is None else self.view_of == view
+        of_view = (
+            np.ones(len(self.table), dtype=bool)
+            if view is None
+            else self.view_of == view
+        )
         table = self.table[of_view]
         encoder = self.encoder()
         kinds = {"x": Kind.GRID, "y": Kind.GRID, "theta": Kind.ANGULAR}
@@ -262,7 +285,9 @@ class DetectionsSeen:
             table = self.table[np.flatnonzero(self.view_of == index)[-LOOKED_AT:]]
             stage = self.exposures.at(table["stamp"])
             where = stage.x.position + 1j * stage.y.position
-            good = (table["kind"] == Kind.GRID) & table["has_id"] & (np.abs(where) < FAR_M)
+            good = (
+                (table["kind"] == Kind.GRID) & table["has_id"] & (np.abs(where) < FAR_M)
+            )
             good &= np.hypot(table["ox"], table["oy"]) < FAR_M
             good &= self.artifact.has(table["m"], table["n"])
             if not (good.any() and readings.view.grid):
@@ -299,14 +324,18 @@ def _rows(ids: np.ndarray, view_of: np.ndarray, limits: tuple[int, int]) -> set[
     }
 
 
-def _planned_marks(artifact: Artifact, views: Iterable[View]) -> tuple[set[int], set[int]]:
+def _planned_marks(
+    artifact: Artifact, views: Iterable[View]
+) -> tuple[set[int], set[int]]:
     """Return the m, and the n, of the marks that views ask for."""
     m, n = set(), set()
     for view in views:
         first, count = mark_rows(artifact, view)
         some = count > 0
         m |= set((np.flatnonzero(some) - artifact.middle[0]).tolist())
-        n |= set(range(first[some].min(), (first + count)[some].max()) if some.any() else ())
+        n |= set(
+            range(first[some].min(), (first + count)[some].max()) if some.any() else ()
+        )
     return m, n
 
 

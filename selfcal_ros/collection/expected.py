@@ -76,7 +76,9 @@ def _missing_stops(
     """Return the marks (m, n) at which an image has to be taken again: not all of it was read."""
     stops = np.zeros(artifact.shape, dtype=bool)
     for marks, cell in zip(marks_shown(artifact, view), readings.cells, strict=True):
-        stops |= beside(marks & ~_read(artifact, cell, min_repeats), artifact, cell.view, -1)
+        stops |= beside(
+            marks & ~_read(artifact, cell, min_repeats), artifact, cell.view, -1
+        )
     i, j = np.nonzero(stops)
     return artifact.marks_at(i[:NAMED_AT_MOST], j[:NAMED_AT_MOST])
 
@@ -138,7 +140,9 @@ def missing_marks(
 def first_missing(read_numbers: np.ndarray, total: int) -> np.ndarray:
     """Return the first of the numbers 0..total-1 not in `read_numbers` (rising, each once)."""
     rank = np.arange(min(total - len(read_numbers), NAMED_AT_MOST))
-    return rank + np.searchsorted(read_numbers - np.arange(len(read_numbers)), rank, "right")
+    return rank + np.searchsorted(
+        read_numbers - np.arange(len(read_numbers)), rank, "right"
+    )
 
 
 @dataclass(frozen=True)
@@ -174,11 +178,15 @@ class ViewProgress:
         """Smallest number of detections needed to complete the view."""
         repeats = self.view.repeats
         have = 0
-        tried = [pair for cell in self.readings.parts for pair in _tried(cell.view, cell)]
+        tried = [
+            pair for cell in self.readings.parts for pair in _tried(cell.view, cell)
+        ]
         for count, tries in tried:
             more = repeats - count
             if self.min_repeats:
-                more = np.minimum(more, np.maximum(repeats - tries, self.min_repeats - count))
+                more = np.minimum(
+                    more, np.maximum(repeats - tries, self.min_repeats - count)
+                )
             have += int((repeats - np.maximum(more, 0)).sum())
         return (
             repeats * (self.grid_expected + self.angular_expected)
@@ -203,6 +211,7 @@ class ViewProgress:
         Marks that are complete would be none until the last pass over the plate.
         """
         planned = (
-            self.view.repeats * (self.grid_expected + self.angular_expected) + self.check_expected
+            self.view.repeats * (self.grid_expected + self.angular_expected)
+            + self.check_expected
         )
         return 1 - self.needed / planned if planned else 1.0

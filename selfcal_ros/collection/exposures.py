@@ -82,7 +82,8 @@ class Exposures:
         self._tracks, self._threshold_m = tracks, approach_threshold_m
         self._stamps = GrowingTable(np.dtype(np.int64))
         self._joints = [
-            GrowingColumns(COLUMNS | (APPROACH if linear else {})) for linear in (True, True, False)
+            GrowingColumns(COLUMNS | (APPROACH if linear else {}))
+            for linear in (True, True, False)
         ]
 
     def __len__(self) -> int:
@@ -93,11 +94,16 @@ class Exposures:
         """Return the stage at some of the instants, in the given order."""
         index = self._index(stamps_ns)
         x, y, theta = (
-            JointAt(joint["position"][index], joint["reason"][index], joint["moving"][index])
+            JointAt(
+                joint["position"][index], joint["reason"][index], joint["moving"][index]
+            )
             for joint in self._joints
         )
         return StageAt(
-            x, y, theta, np.stack([joint["approach"][index] for joint in self._joints[:2]])
+            x,
+            y,
+            theta,
+            np.stack([joint["approach"][index] for joint in self._joints[:2]]),
         )
 
     def _index(self, stamps_ns: np.ndarray) -> np.ndarray | slice:
@@ -143,9 +149,9 @@ class Exposures:
             first, last = joint["first"], joint["last"]
             if len(new) and len(due):
                 near = np.flatnonzero((last >= new[0]) & (first <= new[-1]))
-                due[near] |= np.searchsorted(new, first[near], "left") < np.searchsorted(
-                    new, last[near], "right"
-                )
+                due[near] |= np.searchsorted(
+                    new, first[near], "left"
+                ) < np.searchsorted(new, last[near], "right")
         return due
 
     def _insert(self, stamps_ns: np.ndarray, due: np.ndarray) -> np.ndarray:
@@ -160,7 +166,9 @@ class Exposures:
         due[behind] = True  # the time since the previous exposure has changed
         self._stamps.insert(at, stamps_ns)
         for joint in self._joints:
-            joint.insert(at, {"first": encoder.NEVER, "last": encoder.EVER, "approach": NEW})
+            joint.insert(
+                at, {"first": encoder.NEVER, "last": encoder.EVER, "approach": NEW}
+            )
         if not len(behind):  # usual case, faster
             return np.append(due, np.ones(len(at), dtype=bool))
         return np.insert(due, at, True)
@@ -210,7 +218,9 @@ class Exposures:
         rows = slice(group[0], group[-1] + 1)
         stamps = self._stamps.rows[rows]
         since = self._since(index)
-        for number, (joint, track) in enumerate(zip(self._joints, self._tracks, strict=True)):
+        for number, (joint, track) in enumerate(
+            zip(self._joints, self._tracks, strict=True)
+        ):
             series = track.between(start, end)
             position, codes = series.query(stamps)
             joint["position"][rows], joint["reason"][rows] = position, codes
@@ -232,7 +242,9 @@ class Exposures:
         # after the previous exposure, whose own samples may be incomplete here
         with_previous = np.concatenate([stamps[first - 1 : first], stamps[index]])
         return series.approach(
-            with_previous, np.concatenate([[np.nan], position]), threshold=self._threshold_m
+            with_previous,
+            np.concatenate([[np.nan], position]),
+            threshold=self._threshold_m,
         )[1:]
 
     def _fill(self, due: np.ndarray, changed: np.ndarray) -> np.ndarray:
@@ -244,8 +256,14 @@ class Exposures:
         looked_up = np.zeros(0, dtype=bool)
         for joint in self._joints[:N_LINEAR]:
             old = joint["approach"][start:]
-            before = joint["approach"][start - 1 : start] if start else np.zeros(1, dtype=np.int8)
-            approach = encoder.filled(np.concatenate([before, joint["motion"][start:]]))[1:]
+            before = (
+                joint["approach"][start - 1 : start]
+                if start
+                else np.zeros(1, dtype=np.int8)
+            )
+            approach = encoder.filled(
+                np.concatenate([before, joint["motion"][start:]])
+            )[1:]
             looked_up = old != NEW
             changed |= approach != old
             joint["approach"][start:] = approach

@@ -153,7 +153,11 @@ class Command:
 
 def begun_ns(run_id: str) -> int | None:
     """Return the beginning of a run from its name; None if the name is not a stamp."""
-    return int(run_id) if run_id.isascii() and run_id.isdecimal() and len(run_id) <= 20 else None
+    return (
+        int(run_id)
+        if run_id.isascii() and run_id.isdecimal() and len(run_id) <= 20
+        else None
+    )
 
 
 def check_command(command: Command) -> None:
@@ -162,8 +166,13 @@ def check_command(command: Command) -> None:
     It has an impossible pose, asks for no marks, or contains an absurd number.
     """
     where = f"view command {command.view_index}"
-    if not 0 <= command.view_index <= MAX_VIEWS or not 0 <= command.views_planned <= MAX_VIEWS:
-        raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
+    if (
+        not 0 <= command.view_index <= MAX_VIEWS
+        or not 0 <= command.views_planned <= MAX_VIEWS
+    ):
+        raise InputError(
+            where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index"
+        )
     if len(command.plan_id) + len(command.run_id) > MAX_TEXT:
         raise InputError(
             where,
@@ -179,12 +188,18 @@ def check_command(command: Command) -> None:
         )
     if command.view is None or command.artifact is None:
         if command.phase in (Phase.PLACE, Phase.MEASURE):
-            raise InputError(where, "it describes no view", "fill in its pose and its plate")
+            raise InputError(
+                where, "it describes no view", "fill in its pose and its plate"
+            )
         return
     if not (command.view.grid or command.view.angular):
-        raise InputError(where, "neither grid nor angular marks are requested", "set one to true")
+        raise InputError(
+            where, "neither grid nor angular marks are requested", "set one to true"
+        )
     if not 1 <= command.view.repeats <= MAX_REPEATS:
-        raise InputError(where, f"{command.view.repeats} repeats", f"ask for 1 to {MAX_REPEATS}")
+        raise InputError(
+            where, f"{command.view.repeats} repeats", f"ask for 1 to {MAX_REPEATS}"
+        )
     command.view.on_stage(command.artifact)
     command.view.require_check_stops(command.artifact)
 
@@ -193,7 +208,9 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
     """Raise InputError for invalid readings of a view, or of marks that do not exist."""
     where = f"{MEASUREMENT_TOPIC} of '{readings.view.name}'"
     if not 0 <= view_index <= MAX_VIEWS:
-        raise InputError(where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index")
+        raise InputError(
+            where, f"a plan has at most {MAX_VIEWS} views", "correct the view_index"
+        )
     readings.view.on_stage(artifact)
     limits = [("k", readings.k, 0, artifact.angular_count - 1)]
     if artifact.marks is None:
@@ -204,14 +221,19 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
             )
         ]
     elif not artifact.has(readings.m, readings.n).all():
-        raise InputError(where, "an id that is not in the list of marks", "correct the publisher")
+        raise InputError(
+            where, "an id that is not in the list of marks", "correct the publisher"
+        )
     for name, index, least, most in limits:
         if len(index) and not least <= np.min(index) <= np.max(index) <= most:
             raise InputError(
                 where, f"{name} goes beyond {least} to {most}", "correct the publisher"
             )
     _check_values(
-        where, readings, ("dx", "dy", "dtheta"), ("u", "u_theta", "sigma_xy", "sigma_theta")
+        where,
+        readings,
+        ("dx", "dy", "dtheta"),
+        ("u", "u_theta", "sigma_xy", "sigma_theta"),
     )
     if not abs(readings.axis_theta) <= np.pi:
         raise InputError(where, "axis_theta is not an angle", "give rad")
@@ -223,7 +245,9 @@ def check_view(readings: ViewReadings, artifact: Artifact, view_index: int) -> N
             ("u", "sigma_m"),
         )
         if np.min(readings.visits.count) < 1:
-            raise InputError(f"{where}, visits", "a count below 1", "correct the publisher")
+            raise InputError(
+                f"{where}, visits", "a count below 1", "correct the publisher"
+            )
 
 
 def good_sigmas(sigma: np.ndarray) -> np.ndarray:
@@ -237,13 +261,18 @@ def good_sigmas(sigma: np.ndarray) -> np.ndarray:
 
 
 def _check_values(
-    where: str, table: ViewReadings | GridVisits, required: Iterable[str], perhaps: Iterable[str]
+    where: str,
+    table: ViewReadings | GridVisits,
+    required: Iterable[str],
+    perhaps: Iterable[str],
 ) -> None:
     """Raise InputError for values that are too large, or NaN where required."""
     for name in (*required, *perhaps):
         size = np.abs(getattr(table, name))
         if np.any(size > LARGEST) or (name in required and np.isnan(size).any()):
-            raise InputError(where, f"{name} is not a number up to {LARGEST:g}", "give m and rad")
+            raise InputError(
+                where, f"{name} is not a number up to {LARGEST:g}", "give m and rad"
+            )
         if name in ("u", "u_theta") and np.any((size > 0) & (size < SMALLEST_U)):
             raise InputError(where, f"{name} is below {SMALLEST_U:g}", "give m and rad")
 

@@ -15,7 +15,12 @@ from selfcal_ros.collection.encoder import GOOD, MOVING, REASONS
 from selfcal_ros.collection.exposures import Exposures, JointAt
 from selfcal_ros.collection.inputs import LARGEST_OFFSET, Kind, Reason, good_sigmas
 from selfcal_ros.collection.marks import identify, stops
-from selfcal_ros.collection.marks.repeats import Means, grid_visits, reduce_repeats, repeat_motion
+from selfcal_ros.collection.marks.repeats import (
+    Means,
+    grid_visits,
+    reduce_repeats,
+    repeat_motion,
+)
 from selfcal_ros.collection.marks.rigid import Rigid
 from selfcal_ros.collection.marks.stops import without_aside
 from selfcal_ros.model.artifact import Artifact
@@ -52,7 +57,9 @@ class PlaceList:
         reason = np.concatenate(self._reason)
         at = np.concatenate(self._at, axis=1)
         if len(reason) > RejectedPlaces.MOST:
-            chosen = np.linspace(0, len(reason) - 1, RejectedPlaces.MOST).round().astype(int)
+            chosen = (
+                np.linspace(0, len(reason) - 1, RejectedPlaces.MOST).round().astype(int)
+            )
             reason = reason[chosen]
             at = at[:, chosen]
         return RejectedPlaces(tuple(map(str, reason)), *at)
@@ -94,7 +101,9 @@ def clean(
         Whether scores are reported (any detection of the session has one above 0).
     """
     rejected: Counter = Counter()
-    known_kind = (detections["kind"] == Kind.GRID) | (detections["kind"] == Kind.ANGULAR)
+    known_kind = (detections["kind"] == Kind.GRID) | (
+        detections["kind"] == Kind.ANGULAR
+    )
     rejected[Reason.UNKNOWN_KIND] = int((~known_kind).sum())
     d = _where(known_kind, detections)
     finite = d["sigma"] >= 0
@@ -122,7 +131,9 @@ def clean(
     return unique, low, +rejected
 
 
-def with_low_scores(readings: ViewReadings, low: np.ndarray, exposures: Exposures) -> ViewReadings:
+def with_low_scores(
+    readings: ViewReadings, low: np.ndarray, exposures: Exposures
+) -> ViewReadings:
     """Return `readings` with the positions of grid detections rejected for a low score."""
     low = low[low["kind"] == Kind.GRID]
     if not len(low):
@@ -151,7 +162,12 @@ def _canonical(d: np.ndarray) -> np.ndarray:
 
 
 def reduce_view(
-    artifact: Artifact, view: View, detections: np.ndarray, *, exposures: Exposures, rules: Rules
+    artifact: Artifact,
+    view: View,
+    detections: np.ndarray,
+    *,
+    exposures: Exposures,
+    rules: Rules,
 ) -> ViewReadings:
     """Return the readings of one view from its cleaned detections (see `clean`).
 
@@ -162,12 +178,22 @@ def reduce_view(
     grid = _where(detections["kind"] == Kind.GRID, detections)
     angular = _where(detections["kind"] == Kind.ANGULAR, detections)
     marks = _grid_marks(
-        artifact, view, grid, exposures=exposures, rules=rules, rejected=rejected, places=places
+        artifact,
+        view,
+        grid,
+        exposures=exposures,
+        rules=rules,
+        rejected=rejected,
+        places=places,
     )
-    lines = _reduce_angular(artifact, view, angular, exposures, rules, rejected, marks.phi_rad)
+    lines = _reduce_angular(
+        artifact, view, angular, exposures, rules, rejected, marks.phi_rad
+    )
     cells = []
     for number, sub in enumerate(view.sub_views):
-        grid_fields = _reduce_grid(artifact, sub, marks.of_cell(number), rules, rejected, places)
+        grid_fields = _reduce_grid(
+            artifact, sub, marks.of_cell(number), rules, rejected, places
+        )
         with_lines = lines if sub.cell in (None, (0, 0)) else {}
         cells.append(
             replace(
@@ -175,13 +201,16 @@ def reduce_view(
                 **grid_fields,
                 **with_lines,
                 used=int(
-                    grid_fields["count"].sum() + (lines["count_theta"].sum() if with_lines else 0)
+                    grid_fields["count"].sum()
+                    + (lines["count_theta"].sum() if with_lines else 0)
                 ),
             )
         )
     readings = cells[0] if cells[0].view is view else _of_image(view, cells, lines)
     return replace(
-        with_rejections(readings, dict(sorted((str(r), c) for r, c in rejected.items()))),
+        with_rejections(
+            readings, dict(sorted((str(r), c) for r, c in rejected.items()))
+        ),
         places=places.places(),
     )
 
@@ -235,7 +264,13 @@ class _GridMarks:
             return self
         index, deviation, residual, position, approach = (
             np.compress(in_cell, values, axis=-1)
-            for values in (self.index, self.deviation, self.residual, self.position, self.approach)
+            for values in (
+                self.index,
+                self.deviation,
+                self.residual,
+                self.position,
+                self.approach,
+            )
         )
         return _GridMarks(
             self.detections[in_cell],
@@ -263,7 +298,9 @@ def _grid_marks(
     stage = exposures.at(d["stamp"])
     position = np.stack([stage.x.position, stage.y.position])
     why = _reasons((stage.x, stage.y), (stage.theta,))
-    d, (position, approach) = _keep(d, why, rejected, position, stage.approach, places=places)
+    d, (position, approach) = _keep(
+        d, why, rejected, position, stage.approach, places=places
+    )
     assignment, number = _identified(artifact, view, d, position, rules)
     d, (position, index, deviation, residual, approach, number) = _keep(
         d,
@@ -309,16 +346,29 @@ def _identified(
     plate = (
         0j
         if named.any()
-        else displacement(artifact, view, assignment.rigid, _reading(rules.sense, position, offset))
+        else displacement(
+            artifact, view, assignment.rigid, _reading(rules.sense, position, offset)
+        )
     )
     tried = _identified_at(
-        artifact, view, d, position, rules, plate=plate, shift=stops.shift_of(view, offset, away)
+        artifact,
+        view,
+        d,
+        position,
+        rules,
+        plate=plate,
+        shift=stops.shift_of(view, offset, away),
     )
     scaled = _identified_at(artifact, view, d, position, rules, of_cell=True)
     return (
         tried
         if plate
-        else max((assignment, number), scaled, tried, key=lambda attempt: _n_identified(attempt[0]))
+        else max(
+            (assignment, number),
+            scaled,
+            tried,
+            key=lambda attempt: _n_identified(attempt[0]),
+        )
     )
 
 
@@ -336,14 +386,17 @@ def _n_identified(marks: identify.MarkAssignment) -> int:
     return int((marks.reasons == None).sum())  # noqa: E711
 
 
-def displacement(artifact: Artifact, view: View, rigid: Rigid, reading_m: np.ndarray) -> complex:
+def displacement(
+    artifact: Artifact, view: View, rigid: Rigid, reading_m: np.ndarray
+) -> complex:
     """Return by how many whole pitches marks without ids lie beside the plate, stage frame."""
     pose = view.on_stage(artifact)
     pitch = artifact.grid_pitch_m
     centred = reading_m - np.array(pose.shift)[:, None] * pitch
     on_plate = artifact.nearest(*pose.turned_back(*(rigid.undo(centred) / pitch)))
     pitches_off = (
-        stops.middle_of(row, side) for row, side in zip(on_plate, artifact.shape, strict=True)
+        stops.middle_of(row, side)
+        for row, side in zip(on_plate, artifact.shape, strict=True)
     )
     x, y = pose.turned(*(np.array([float(number)]) for number in pitches_off))
     return complex(x[0], y[0])
@@ -467,13 +520,24 @@ def _reduce_angular(
         phi_rad=phi,
     )
     d, (k, v, residual) = _keep(
-        d, assignment.reasons, rejected, assignment.index, assignment.deviation, assignment.residual
+        d,
+        assignment.reasons,
+        rejected,
+        assignment.index,
+        assignment.deviation,
+        assignment.residual,
     )
     means = reduce_repeats(
-        k, v[None], d["sigma"], limit=rules.outlier_limit, extent=4 * np.pi, residual=residual[None]
+        k,
+        v[None],
+        d["sigma"],
+        limit=rules.outlier_limit,
+        extent=4 * np.pi,
+        residual=residual[None],
     )
     _count(rejected, Reason.OUTLIER, means.outlier)
-    place = identify.wrap(v - d["ot"])  # of the axis relative to the line, without full turns
+    # of the axis relative to the line, without full turns
+    place = identify.wrap(v - d["ot"])
     motion = repeat_motion(k, place[None], d["ot"][None], means.outlier)
     about = place[~means.outlier].mean() if len(means.key) else 0.0
     return {
@@ -497,7 +561,9 @@ def _outliers_of(means: Means, key: np.ndarray) -> np.ndarray:
     return np.bincount(place, minlength=len(means.key))
 
 
-def _reading(sense: Sense, position: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
+def _reading(
+    sense: Sense, position: np.ndarray, offset: np.ndarray | float
+) -> np.ndarray:
     """Return the position of the mark, for a moving microscope or a moving plate (method 1)."""
     return offset - position if sense is Sense.PLATE_MOVES else position + offset
 
@@ -545,10 +611,16 @@ def _count(rejected: Counter, reason: Reason, mask: np.ndarray) -> None:
         rejected[str(reason)] += int(mask.sum())
 
 
-def with_places(result: CalibrationResult, views: Iterable[ViewReadings]) -> CalibrationResult:
+def with_places(
+    result: CalibrationResult, views: Iterable[ViewReadings]
+) -> CalibrationResult:
     """Return the result with the positions of rejected detections, if any."""
     places = places_json(views)
-    return replace(result, extra={**result.extra, "rejected_at": places}) if places else result
+    return (
+        replace(result, extra={**result.extra, "rejected_at": places})
+        if places
+        else result
+    )
 
 
 def places_json(views: Iterable[ViewReadings]) -> list[dict[str, Any]]:

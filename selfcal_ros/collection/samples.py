@@ -72,7 +72,9 @@ class GrowingColumns:
     """
 
     def __init__(self, kinds: Mapping[str, str]) -> None:
-        self._columns = {name: GrowingTable(np.dtype(kind)) for name, kind in kinds.items()}
+        self._columns = {
+            name: GrowingTable(np.dtype(kind)) for name, kind in kinds.items()
+        }
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Return a column, as a writable view; valid until rows are added."""
@@ -81,7 +83,9 @@ class GrowingColumns:
     def insert(self, at: np.ndarray, values: Mapping[str, float]) -> None:
         """Insert rows with the same values before the rows `at` (rising); unnamed columns are 0."""
         for name, column in self._columns.items():
-            column.insert(at, np.full(len(at), values.get(name, 0), dtype=column.rows.dtype))
+            column.insert(
+                at, np.full(len(at), values.get(name, 0), dtype=column.rows.dtype)
+            )
 
 
 @dataclass(frozen=True)
@@ -124,7 +128,9 @@ class SampleStore:
         self._unseen: list[np.ndarray] = []
         self._count, self._end = 0, 0
         self._file: io.FileIO | None = None
-        self._read: tuple[_Block, tuple[np.ndarray, ...]] | None = None  # the last block read
+        self._read: tuple[_Block, tuple[np.ndarray, ...]] | None = (
+            None  # the last block read
+        )
         self.newest_ns, self.problem = int(np.iinfo(np.int64).min), ""
 
     def __len__(self) -> int:
@@ -137,7 +143,10 @@ class SampleStore:
         return np.empty(size, dtype=np.int64), np.empty(size), np.empty(size)
 
     def add_block(
-        self, stamps: np.ndarray, positions: np.ndarray, speeds: np.ndarray | None = None
+        self,
+        stamps: np.ndarray,
+        positions: np.ndarray,
+        speeds: np.ndarray | None = None,
     ) -> None:
         """Add samples in any order; `speeds` None or NaN if unknown."""
         start = 0
@@ -213,7 +222,11 @@ class SampleStore:
             )
             return
         self._blocks[number] = _Block(
-            block.first_ns, block.last_ns, block.count, block.has_speeds, place=self._end
+            block.first_ns,
+            block.last_ns,
+            block.count,
+            block.has_speeds,
+            place=self._end,
         )
         self._end += sum(column.nbytes for column in block.columns)
 
@@ -257,7 +270,9 @@ class SampleStore:
     def count_between(self, start_ns: int, end_ns: int) -> int:
         """Return an upper estimate of the number of samples between two stamps."""
         stamps = self._open()[0]
-        inside = int(np.searchsorted(stamps, end_ns, "right") - np.searchsorted(stamps, start_ns))
+        inside = int(
+            np.searchsorted(stamps, end_ns, "right") - np.searchsorted(stamps, start_ns)
+        )
         return inside + int(self._counts[self._touched(start_ns, end_ns)].sum())
 
     def _touched(self, start_ns: int, end_ns: int) -> np.ndarray:
@@ -278,7 +293,9 @@ class SampleStore:
             else []
         )
         pieces += [
-            _samples_between(self._columns(self._blocks[number]), start_ns, end_ns, neighbours)
+            _samples_between(
+                self._columns(self._blocks[number]), start_ns, end_ns, neighbours
+            )
             for number in np.flatnonzero(self._touched(start_ns, end_ns))
         ]
         before = np.flatnonzero(self._lasts < start_ns)
@@ -292,7 +309,10 @@ class SampleStore:
                     break
                 pieces.append(
                     _samples_between(
-                        self._columns(self._blocks[side[at]]), start_ns, end_ns, neighbours
+                        self._columns(self._blocks[side[at]]),
+                        start_ns,
+                        end_ns,
+                        neighbours,
                     )
                 )
         pieces = [piece for piece in pieces if len(piece[0])]
@@ -302,7 +322,9 @@ class SampleStore:
 def _joined(pieces: list[Samples]) -> Samples:
     if len(pieces) < 2:
         return pieces[0] if pieces else (NO_STAMPS, np.zeros(0), np.zeros(0))
-    stamps, positions, speeds = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    stamps, positions, speeds = (
+        np.concatenate(column) for column in zip(*pieces, strict=True)
+    )
     return stamps, positions, speeds
 
 
@@ -315,7 +337,9 @@ def _with_speeds(columns: tuple[np.ndarray, ...]) -> Samples:
 def _nth(pieces: list[Samples], edge: int, sign: int, n: int) -> float:
     """Return sign times the n-th stamp before or after an edge, infinity if there are fewer."""
     beyond = [
-        t[: np.searchsorted(t, edge)] if sign < 0 else t[np.searchsorted(t, edge, "right") :]
+        t[: np.searchsorted(t, edge)]
+        if sign < 0
+        else t[np.searchsorted(t, edge, "right") :]
         for t, _, _ in pieces
     ]
     stamps = np.unique(sign * np.concatenate([NO_STAMPS, *beyond]))

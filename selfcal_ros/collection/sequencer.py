@@ -54,7 +54,9 @@ class Sequencer:
         """Begin the plan with its first view."""
         if self.state not in ENDED:
             raise InputError(
-                "pose_sequencer", f"cannot start while {self.state}", "abort the plan first"
+                "pose_sequencer",
+                f"cannot start while {self.state}",
+                "abort the plan first",
             )
         self.need_plan()
         self.skipped, self.index = [], 0
@@ -64,7 +66,9 @@ class Sequencer:
         """Resume a run at the view and the command (PLACE or MEASURE) that it had reached."""
         if self.state not in ENDED:
             raise InputError(
-                "pose_sequencer", f"cannot resume while {self.state}", "abort the plan first"
+                "pose_sequencer",
+                f"cannot resume while {self.state}",
+                "abort the plan first",
             )
         self.need_plan()
         self.skipped, self.index = [], index
@@ -74,7 +78,9 @@ class Sequencer:
     def need_plan(self) -> Plan:
         """Return the plan to run; raise InputError if there is none."""
         if self.plan is None:
-            raise InputError("pose_sequencer", "there is no plan", "set the parameter 'plan'")
+            raise InputError(
+                "pose_sequencer", "there is no plan", "set the parameter 'plan'"
+            )
         return self.plan
 
     def confirm(self) -> list[Command]:
@@ -104,7 +110,9 @@ class Sequencer:
         """Place the current view again, superseding its readings."""
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError(
-                "pose_sequencer", f"nothing to redo while {self.state}", "start a plan first"
+                "pose_sequencer",
+                f"nothing to redo while {self.state}",
+                "start a plan first",
             )
         return self._place()
 
@@ -112,7 +120,9 @@ class Sequencer:
         """Keep the current view as it is and continue with the next."""
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError(
-                "pose_sequencer", f"nothing to skip while {self.state}", "start a plan first"
+                "pose_sequencer",
+                f"nothing to skip while {self.state}",
+                "start a plan first",
             )
         self.skipped.append(self.need_plan().views[self.index].name)
         return self._advance()
@@ -128,7 +138,9 @@ class Sequencer:
             return []
         if self.state not in (State.PLACING, State.MEASURING):
             raise InputError(
-                "pose_sequencer", f"nothing to abort while {self.state}", "start a plan first"
+                "pose_sequencer",
+                f"nothing to abort while {self.state}",
+                "start a plan first",
             )
         self.state = State.ABORTED
         return [self._command(Phase.ABORT)]

@@ -106,7 +106,9 @@ class Timeline:
 
     def assign(self, stamps_ns: np.ndarray) -> np.ndarray:
         """Return the index of the interval of each stamp, int array; -1 before the first."""
-        starts = np.array([interval.start_ns for interval in self.intervals], dtype=np.int64)
+        starts = np.array(
+            [interval.start_ns for interval in self.intervals], dtype=np.int64
+        )
         return np.searchsorted(starts, stamps_ns, "right") - 1
 
     def planned_view(self, view_index: int) -> tuple[Artifact, View]:
@@ -129,7 +131,9 @@ class Timeline:
 
 def begins_run(command: Command) -> bool:
     """Return whether a command is the first of a run that names itself."""
-    return command.phase in (Phase.PLACE, Phase.MEASURE) and command.run_id == str(command.stamp_ns)
+    return command.phase in (Phase.PLACE, Phase.MEASURE) and command.run_id == str(
+        command.stamp_ns
+    )
 
 
 def without_strays(commands: Iterable[Command]) -> list[Command]:
@@ -173,7 +177,10 @@ def build_timeline(commands: Iterable[Command]) -> Timeline:
     if not measures:
         last = ordered[-1].stamp_ns if ordered else 0
         return Timeline(
-            intervals=tuple(_unused(ordered)), views={}, last_stamp_ns=last, strays=strays
+            intervals=tuple(_unused(ordered)),
+            views={},
+            last_stamp_ns=last,
+            strays=strays,
         )
     newest = ordered[measures[-1]]
     plan_id, artifact = newest.plan_id, newest.artifact
@@ -240,7 +247,9 @@ def _runs(ordered: list[Command], plan_id: str) -> list[str | None]:
             continue
         over = command.phase in (Phase.DONE, Phase.ABORT)
         anew = (
-            not over and command.view_index == 0 and (ended or (later and command.phase == first))
+            not over
+            and command.view_index == 0
+            and (ended or (later and command.phase == first))
         )
         fresh = command.run_id or (str(command.stamp_ns) if anew or not run else run)
         if fresh != run:
@@ -277,9 +286,13 @@ def _unused(ordered: list[Command]) -> list[Interval]:
     ]
 
 
-def _intervals(ordered: list[Command], runs: list[str | None], run_id: str) -> list[Interval]:
+def _intervals(
+    ordered: list[Command], runs: list[str | None], run_id: str
+) -> list[Interval]:
     began: dict[int, int] = {}  # view_index -> stamp from which its MEASUREs are used
-    placed: dict[int, int] = {}  # view_index -> stamp of a PLACE not yet followed by a MEASURE
+    placed: dict[
+        int, int
+    ] = {}  # view_index -> stamp of a PLACE not yet followed by a MEASURE
     poses: dict[int, tuple] = {}
     for command, run in zip(ordered, runs, strict=True):
         view = command.view_index
@@ -296,7 +309,10 @@ def _intervals(ordered: list[Command], runs: list[str | None], run_id: str) -> l
         reason: Reason | None = interval.reason
         if command.phase == Phase.MEASURE and run != run_id:
             reason = Reason.OTHER_PLAN if run is None else Reason.OTHER_RUN
-        elif command.phase == Phase.MEASURE and command.stamp_ns < began[command.view_index]:
+        elif (
+            command.phase == Phase.MEASURE
+            and command.stamp_ns < began[command.view_index]
+        ):
             reason = Reason.SUPERSEDED
         elif command.phase == Phase.MEASURE:
             index = command.view_index
@@ -365,12 +381,16 @@ class ViewCache:
             cached = self._readings.get(index)
             if cached is None or cached.view != view:
                 self._readings[index] = self._reduce(timeline, index, exposures)
-        return {index: self._readings[index] for index in timeline.views}, self._loose(timeline)
+        return {index: self._readings[index] for index in timeline.views}, self._loose(
+            timeline
+        )
 
     def _assign(self, timeline: Timeline) -> set[int]:
         """Find the view of each detection; return the views whose detections have changed."""
         n_assigned = len(self.view_of)
-        old = self.view_of[:n_assigned].copy() if timeline is not self._timeline else None
+        old = (
+            self.view_of[:n_assigned].copy() if timeline is not self._timeline else None
+        )
         if self._timeline is None or timeline.artifact != self._timeline.artifact:
             self._readings = {}
         start = 0 if old is not None else n_assigned
@@ -385,7 +405,10 @@ class ViewCache:
         for begin in range(start, len(self._table), TOGETHER):
             rows = slice(begin, begin + TOGETHER)
             interval = timeline.assign(self.table["stamp"][rows])
-            self._place["interval"][rows], self._place["view"][rows] = interval, view_of[interval]
+            self._place["interval"][rows], self._place["view"][rows] = (
+                interval,
+                view_of[interval],
+            )
         touched = _different(self.view_of[n_assigned:])
         if old is not None:
             reassigned = old != self.view_of[:n_assigned]
@@ -407,7 +430,9 @@ class ViewCache:
                 loose[str(interval.reason)] += count
         return +loose
 
-    def _reduce(self, timeline: Timeline, index: int, exposures: Exposures) -> ViewReadings:
+    def _reduce(
+        self, timeline: Timeline, index: int, exposures: Exposures
+    ) -> ViewReadings:
         rows = np.flatnonzero(self.view_of == index)
         detections = self.table[_as_slice(rows)]
         good, low, reasons = clean(detections, self._rules, scored=self._scored)

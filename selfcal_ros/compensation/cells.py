@@ -26,7 +26,9 @@ SNAP = 1e-9
 """Distance to a node, in pitches, below which a position is taken to be on it."""
 
 
-def cubic_pieces(values: np.ndarray, *, periodic: bool = False, local: bool = False) -> np.ndarray:
+def cubic_pieces(
+    values: np.ndarray, *, periodic: bool = False, local: bool = False
+) -> np.ndarray:
     """Return the cubic spline through `values` (n, ...) one apart, (4, intervals, ...).
 
     Coefficients of 1, u, u^2, u^3 with u from 0 to 1 in each interval. Not-a-knot ends; a parabola
@@ -56,7 +58,8 @@ def _slopes(values: np.ndarray) -> np.ndarray:
         slope[end] = inward * (4 * f1 - 5 * f0 + f2) / 2
     before, diagonal = [0.0, *[1.0] * (n - 2), 2.0], [1.0, *[4.0] * (n - 2), 1.0]
     after = [2.0, *[1.0] * (n - 2), 0.0]
-    if n == 3:  # both ends give the same condition: the parabola has no third derivative
+    # both ends give the same condition: the parabola has no third derivative
+    if n == 3:
         before[2] = 0.0
         slope[2] = (values[0] - 4 * values[1] + 3 * values[2]) / 2
     for i in range(1, n):  # each row minus the previous one
@@ -70,7 +73,9 @@ def _slopes(values: np.ndarray) -> np.ndarray:
 
 def _slopes_of_circle(values: np.ndarray) -> np.ndarray:
     """Return the slopes of the periodic spline through `values` (n, ...)."""
-    turn = 2 * np.pi * np.fft.rfftfreq(len(values)).reshape(-1, *[1] * (values.ndim - 1))
+    turn = (
+        2 * np.pi * np.fft.rfftfreq(len(values)).reshape(-1, *[1] * (values.ndim - 1))
+    )
     spectrum = np.fft.rfft(values, axis=0) * (3j * np.sin(turn) / (2 + np.cos(turn)))
     return np.fft.irfft(spectrum, len(values), axis=0)
 
@@ -108,7 +113,9 @@ class Cells:
     def largest_step(self) -> float:
         """Largest difference between neighbouring known nodes."""
         steps = [np.abs(np.diff(self.nodes, axis=axis)) for axis in (1, 2)]
-        return max(float(step.max(initial=0.0, where=np.isfinite(step))) for step in steps)
+        return max(
+            float(step.max(initial=0.0, where=np.isfinite(step))) for step in steps
+        )
 
     def steepest(self) -> float:
         """Return the largest |df/du| + |df/dv| of either field at 5 x 5 points of every cell.
@@ -154,7 +161,9 @@ class Cells:
                 np.clip(np.floor(w[block]), 0, size - 2).astype(np.int64)
                 for w, size in zip((s, t), self.shape, strict=True)
             )
-            out[:, block] = self._polynomials(self._rows(i, j), s[block] - i, t[block] - j)
+            out[:, block] = self._polynomials(
+                self._rows(i, j), s[block] - i, t[block] - j
+            )
         return out
 
     def solve_in_cell(
@@ -182,7 +191,14 @@ class Cells:
             if not change * shrink > REST:
                 break
         with np.errstate(invalid="ignore"):
-            stayed = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (i + us == s) & (j + vt == t)
+            stayed = (
+                (u >= 0)
+                & (u <= 1)
+                & (v >= 0)
+                & (v <= 1)
+                & (i + us == s)
+                & (j + vt == t)
+            )
         return np.where(stayed, i + u, np.nan), np.where(stayed, j + v, np.nan)
 
     def solve_point(self, s: float, t: float, scale: float) -> tuple[float, float]:
@@ -222,7 +238,9 @@ class Cells:
                 break
         return a, b
 
-    def solve_point_anywhere(self, s: float, t: float, scale: float) -> tuple[float, float]:
+    def solve_point_anywhere(
+        self, s: float, t: float, scale: float
+    ) -> tuple[float, float]:
         """Return `solve` of one finite position, bit for bit, faster; NaN next to unknown nodes."""
         nx, ny = self.shape
         side = self.degree + 1
@@ -258,7 +276,9 @@ class Cells:
         cell = i * (self.shape[1] - 1) + j
         if self.by_power is not None:
             return self.by_power.take(cell, axis=1)
-        rows = self.coefficients.reshape(len(self.coefficients), -1).take(cell, axis=0).T
+        rows = (
+            self.coefficients.reshape(len(self.coefficients), -1).take(cell, axis=0).T
+        )
         return np.ascontiguousarray(rows) if often else rows
 
     def _polynomials(
@@ -268,14 +288,19 @@ class Cells:
         v: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         side = self.degree + 1
-        return (_horner(rows[: side * side], u, v, side), _horner(rows[side * side :], u, v, side))
+        return (
+            _horner(rows[: side * side], u, v, side),
+            _horner(rows[side * side :], u, v, side),
+        )
 
 
 def _largest(step: np.ndarray) -> float:
     """Return the largest magnitude in `step`, ignoring NaN (unknown nodes, NaN positions)."""
     size = np.abs(step)
     largest = size.max(initial=0.0)
-    return size.max(initial=0.0, where=~np.isnan(size)) if np.isnan(largest) else largest
+    return (
+        size.max(initial=0.0, where=~np.isnan(size)) if np.isnan(largest) else largest
+    )
 
 
 def _horner(rows: np.ndarray, u: np.ndarray, v: np.ndarray, side: int) -> np.ndarray:
@@ -308,7 +333,9 @@ def _horner_point(rows: list[list[float]], u: float, v: float, side: int) -> flo
 
 
 def _known_corners(
-    field: np.ndarray, cell: tuple[np.ndarray, np.ndarray], inside: tuple[np.ndarray, np.ndarray]
+    field: np.ndarray,
+    cell: tuple[np.ndarray, np.ndarray],
+    inside: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Return bilinear values that ignore corners of zero weight, (P,)."""
     (i, j), (u, v) = cell, inside
@@ -337,14 +364,17 @@ def bicubic_cells(fields: np.ndarray, *, local: bool = False) -> Cells:
     See `cubic_pieces`.
     """
     along_x = cubic_pieces(fields.swapaxes(0, 1), local=local)  # p, i, field, j
-    along_xy = cubic_pieces(along_x.transpose(3, 0, 1, 2), local=local)  # q, j, p, i, field
+    # q, j, p, i, field
+    along_xy = cubic_pieces(along_x.transpose(3, 0, 1, 2), local=local)
     return _cells(along_xy.transpose(4, 3, 1, 2, 0), 4, fields)
 
 
 def _cells(c: np.ndarray, side: int, fields: np.ndarray) -> Cells:
     """Return cells from coefficients (field, i, j, p, q)."""
     count = c.shape[1] * c.shape[2]
-    by_cell = np.ascontiguousarray(c.reshape(2, count, side, side).transpose(1, 0, 2, 3))
+    by_cell = np.ascontiguousarray(
+        c.reshape(2, count, side, side).transpose(1, 0, 2, 3)
+    )
     by_power = None
     if by_cell.nbytes <= SMALL:
         by_power = np.ascontiguousarray(by_cell.reshape(count, -1).T)

@@ -69,7 +69,8 @@ class Circle:
         self._series = None
         if harmonics:
             of = fourier_coefficients(values, harmonics)
-            self._series = np.append(of[:1], of[1::2] - 1j * of[2::2])  # Re of powers of e^(it)
+            # Re of powers of e^(it)
+            self._series = np.append(of[:1], of[1::2] - 1j * of[2::2])
         cubic &= self._count > 0 and not harmonics
         self._pieces = cubic_pieces(values, periodic=True) if cubic else None
         self._piece_points = None if self._pieces is None else self._pieces.T.tolist()

@@ -80,7 +80,9 @@ class Compensator:
     ) -> None:
         if method not in get_args(Interpolation):
             raise InputError(
-                "compensator method", f"'{method}' is unknown", "use bilinear or bicubic"
+                "compensator method",
+                f"'{method}' is unknown",
+                "use bilinear or bicubic",
             )
         if outside not in get_args(Outside):
             raise InputError(
@@ -97,7 +99,9 @@ class Compensator:
                 f"{missing} sites are unknown",
                 "bicubic needs all of them: use bilinear or measure them",
             )
-        self._cells = bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
+        self._cells = (
+            bilinear_cells(fields) if method == "bilinear" else bicubic_cells(fields)
+        )
         if self._cells.largest_step > MAX_SLOPE * self._pitch:
             raise steep("sites")
         if (
@@ -108,7 +112,9 @@ class Compensator:
             raise _steep_spline()
         self._u_cells = bilinear_cells(error_map.u_xy)
         self._theta = Circle(
-            error_map.g_theta, cubic=method == "bicubic", harmonics=error_map.artifact.harmonics
+            error_map.g_theta,
+            cubic=method == "bicubic",
+            harmonics=error_map.artifact.harmonics,
         )
         self._u_theta = Circle(error_map.u_g_theta, cubic=False, harmonics=0)
 
@@ -126,7 +132,8 @@ class Compensator:
         """Return `inside` of one position, fifty times as fast."""
         half_x, half_y = self.error_map.artifact.half
         return bool(
-            abs(x_m) <= (half_x + SNAP) * self._pitch and abs(y_m) <= (half_y + SNAP) * self._pitch
+            abs(x_m) <= (half_x + SNAP) * self._pitch
+            and abs(y_m) <= (half_y + SNAP) * self._pitch
         )
 
     def error(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +145,9 @@ class Compensator:
             With ``outside="refuse"``, if a position is outside the field.
         """
         self._refuse_outside(x_m, y_m)
-        return self._blocks(lambda x, y: self._at(self._cells, x, y), (x_m, y_m), self._cells.block)
+        return self._blocks(
+            lambda x, y: self._at(self._cells, x, y), (x_m, y_m), self._cells.block
+        )
 
     def command(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Return the indicated position to command so that the true one is `x_m`, `y_m`.
@@ -159,12 +168,18 @@ class Compensator:
         InputError
             With ``outside="refuse"``, if a true position is outside the field.
         """
-        x, y = np.broadcast_arrays(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float))
-        out = self._blocks(self._invert(self._cells.solve_in_cell), (x, y), self._cells.block)
+        x, y = np.broadcast_arrays(
+            np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
+        )
+        out = self._blocks(
+            self._invert(self._cells.solve_in_cell), (x, y), self._cells.block
+        )
         unsolved = np.isnan(out[0])
         if unsolved.any():
             solutions = self._blocks(
-                self._invert(self._cells.solve), (x[unsolved], y[unsolved]), self._cells.block
+                self._invert(self._cells.solve),
+                (x[unsolved], y[unsolved]),
+                self._cells.block,
             )
             for axis, values in zip(out, solutions, strict=True):
                 axis[unsolved] = values
@@ -193,7 +208,9 @@ class Compensator:
             x, y = map(float, self.correct(x_m, y_m))
         return x, y
 
-    def uncertainty(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def uncertainty(
+        self, x_m: ArrayLike, y_m: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return standard uncertainties of G, m, at true positions `x_m`, `y_m`.
 
         NaN outside the field: no reading says anything about G there.
@@ -237,7 +254,9 @@ class Compensator:
         """
         indicated_inside = self.inside(x_m, y_m)
         places = []
-        for true, half in zip(self.correct(x_m, y_m), self.error_map.artifact.half, strict=True):
+        for true, half in zip(
+            self.correct(x_m, y_m), self.error_map.artifact.half, strict=True
+        ):
             edge = half * self._pitch
             places.append(np.where(indicated_inside, np.clip(true, -edge, edge), true))
         return self.uncertainty(places[0], places[1])
@@ -252,7 +271,9 @@ class Compensator:
         return np.array(
             [
                 [
-                    error_halfway(np.moveaxis(g, axis, 0), np.moveaxis(u, axis, 0), cubic=cubic)[0]
+                    error_halfway(
+                        np.moveaxis(g, axis, 0), np.moveaxis(u, axis, 0), cubic=cubic
+                    )[0]
                     for axis in (0, 1)
                 ]
                 for g, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))
@@ -266,7 +287,9 @@ class Compensator:
             np.broadcast_arrays(x_m, y_m), self.error_map.artifact.half, strict=True
         ):
             at = np.clip(np.asarray(p, dtype=float) / self._pitch + half, 0, 2 * half)
-            shares.append(share_between(np.where(abs(at - np.round(at)) < SNAP, np.round(at), at)))
+            shares.append(
+                share_between(np.where(abs(at - np.round(at)) < SNAP, np.round(at), at))
+            )
         return np.sqrt(np.tensordot(self.halfway**2, np.stack(shares) ** 2, axes=1))
 
     def error_theta(self, theta_rad: ArrayLike) -> np.ndarray:
@@ -367,7 +390,9 @@ class Compensator:
         )
         return grids, self._theta.at(np.arange(count) * (2 * np.pi / max(count, 1)))
 
-    def _at(self, cells: Cells, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _at(
+        self, cells: Cells, x: np.ndarray, y: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         hx, hy = self.error_map.artifact.half
         return cells.at(x / self._pitch + hx, y / self._pitch + hy)
 
@@ -415,7 +440,9 @@ class Compensator:
     def _refuse_no_theta(self) -> None:
         if not self.has_theta:
             raise InputError(
-                "error map", "it has no angular lines", "calibrate with a plate that has them"
+                "error map",
+                "it has no angular lines",
+                "calibrate with a plate that has them",
             )
 
 

@@ -49,8 +49,12 @@ def fill_unknown(error_map: ErrorMap) -> tuple[ErrorMap, int]:
     gx, gy = error_map.gx.copy(), error_map.gy.copy()
     if unknown.any():
         place = np.concatenate(rows), np.concatenate(columns)
-        matrix = coo_array((np.concatenate(weights), place), shape=(right.shape[1],) * 2).tocsc()
-        gx[unknown], gy[unknown] = (np.atleast_1d(spsolve(matrix, side)) for side in right)
+        matrix = coo_array(
+            (np.concatenate(weights), place), shape=(right.shape[1],) * 2
+        ).tocsc()
+        gx[unknown], gy[unknown] = (
+            np.atleast_1d(spsolve(matrix, side)) for side in right
+        )
     return replace(error_map, gx=gx, gy=gy), int(unknown.sum())
 
 
@@ -114,7 +118,10 @@ def origin_lines(result: CalibrationResult, command: str = "") -> list[str]:
     return [
         *([f"command: {command}"] if command else []),
         *(
-            [f"result: {result.read_from[0]}", f"sha256 of the result: {result.read_from[1]}"]
+            [
+                f"result: {result.read_from[0]}",
+                f"sha256 of the result: {result.read_from[1]}",
+            ]
             if result.read_from
             else []
         ),

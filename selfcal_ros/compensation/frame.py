@@ -52,16 +52,25 @@ class MachineFrame:
     def __post_init__(self) -> None:
         """Refuse an unknown unit, axes that are not distinct, and values that are not numbers."""
         if self.unit not in LENGTHS_M:
-            raise InputError("unit", f"'{self.unit}' is not a primary unit", "use m, mm, um or in")
+            raise InputError(
+                "unit", f"'{self.unit}' is not a primary unit", "use m, mm, um or in"
+            )
         axes = [a for a in (self.x_axis, self.y_axis, self.theta_axis) if a is not None]
         if len(set(axes)) < len(axes):
             raise InputError(
-                "axes", f"the indices {axes} are not distinct", "give each axis its own index"
+                "axes",
+                f"the indices {axes} are not distinct",
+                "give each axis its own index",
             )
         for value in (self.home_x_m, self.home_y_m, self.home_theta_rad):
             if not math.isfinite(value):
-                raise InputError("home position", f"{value} is not a position", "give a number")
-        if self.theta_counts_per_unit is not None and not 0 < self.theta_counts_per_unit < math.inf:
+                raise InputError(
+                    "home position", f"{value} is not a position", "give a number"
+                )
+        if (
+            self.theta_counts_per_unit is not None
+            and not 0 < self.theta_counts_per_unit < math.inf
+        ):
             raise InputError(
                 "counts per degree",
                 f"{self.theta_counts_per_unit} is not a positive number",
@@ -88,14 +97,18 @@ class MachineFrame:
         """+1 or -1: encoder direction of theta in the stage frame."""
         return -1.0 if self.reverse_theta else 1.0
 
-    def to_machine(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def to_machine(
+        self, x_m: ArrayLike, y_m: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return controller positions, primary units, of stage positions in m."""
         return (
             self.sign_x * (np.asarray(x_m) - self.home_x_m) / self.unit_m,
             self.sign_y * (np.asarray(y_m) - self.home_y_m) / self.unit_m,
         )
 
-    def from_machine(self, px: ArrayLike, py: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def from_machine(
+        self, px: ArrayLike, py: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return stage positions in m of controller positions in primary units."""
         return (
             self.sign_x * np.asarray(px) * self.unit_m + self.home_x_m,
@@ -120,7 +133,9 @@ class MachineFrame:
             f"home-y={self.home_y_m / self.unit_m:.15g}",
         ]
         words += [
-            f"reverse-{name}" for name in ("x", "y", "theta") if getattr(self, f"reverse_{name}")
+            f"reverse-{name}"
+            for name in ("x", "y", "theta")
+            if getattr(self, f"reverse_{name}")
         ]
         if self.theta_axis is not None:
             words += [
@@ -140,8 +155,14 @@ def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
     InputError
         If they state different frames; one may be without theta.
     """
-    stated = [frame for line in comments if line.startswith(_MARK) and (frame := _stated(line))]
-    full_frame = max(stated, key=lambda frame: frame.theta_axis is not None, default=None)
+    stated = [
+        frame
+        for line in comments
+        if line.startswith(_MARK) and (frame := _stated(line))
+    ]
+    full_frame = max(
+        stated, key=lambda frame: frame.theta_axis is not None, default=None
+    )
     for frame in stated:
         if full_frame is not None and frame not in (full_frame, _plane(full_frame)):
             raise InputError(
@@ -156,7 +177,11 @@ def frame_from_comments(comments: Sequence[str]) -> MachineFrame | None:
 def _plane(frame: MachineFrame) -> MachineFrame:
     """Return a frame without its theta axis."""
     return replace(
-        frame, theta_axis=None, home_theta_rad=0.0, reverse_theta=False, theta_counts_per_unit=None
+        frame,
+        theta_axis=None,
+        home_theta_rad=0.0,
+        reverse_theta=False,
+        theta_counts_per_unit=None,
     )
 
 

@@ -12,7 +12,9 @@ PLAUSIBLE, PLAUSIBLE_M = 0.01, 1e-6
 it is asked about."""
 
 
-def require_plausible(error_map: ErrorMap, where: str, accept: str = "add --steep") -> None:
+def require_plausible(
+    error_map: ErrorMap, where: str, accept: str = "add --steep"
+) -> None:
     """Ask whether a step between neighbouring nodes is real that is larger than `PLAUSIBLE`.
 
     Raises

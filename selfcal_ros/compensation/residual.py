@@ -35,7 +35,9 @@ class Covering:
         First and last node along x and y, in the unit of the frame.
     """
 
-    def __init__(self, add: Correction, x: tuple[float, float], y: tuple[float, float]) -> None:
+    def __init__(
+        self, add: Correction, x: tuple[float, float], y: tuple[float, float]
+    ) -> None:
         self._add, self.field = add, tuple((min(ends), max(ends)) for ends in (x, y))
 
     def __call__(self, px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +91,9 @@ class Residual:
         return float(np.sqrt(np.max(np.sum(np.square(getattr(self, state)), axis=0))))
 
 
-def residual_of(place: str, position: np.ndarray, reached: list[np.ndarray]) -> Residual:
+def residual_of(
+    place: str, position: np.ndarray, reached: list[np.ndarray]
+) -> Residual:
     """Return the residuals from the positions reached before and after, (axes, P) each."""
     residuals = [true - position for true in reached]
     # A known site next to an unknown one cannot be inverted exactly: omit it.
@@ -129,7 +133,8 @@ def reached(
     if correct is not None:
         cx, cy = correct(px, py)
         px, py = px + cx, py + cy
-        if active is not None:  # what the controller showed with the former table at this place
+        # what the controller showed with the former table at this place
+        if active is not None:
             ex, ey = px, py
             for _ in range(SETTLED):
                 cx, cy = active(px, py)
@@ -138,7 +143,10 @@ def reached(
 
 
 def plane_residuals(
-    error_map: ErrorMap, frame: MachineFrame, correct: Correction, active: Correction | None = None
+    error_map: ErrorMap,
+    frame: MachineFrame,
+    correct: Correction,
+    active: Correction | None = None,
 ) -> list[Residual]:
     """Return the residuals at the sites and, if all are known, between them.
 
@@ -153,10 +161,15 @@ def plane_residuals(
         g_theta=np.zeros(0),
         u_g_theta=np.zeros(0),
     )
-    places = [("sites", np.stack([plate.x_m[valid], plate.y_m[valid]]), Compensator(plane))]
+    places = [
+        ("sites", np.stack([plate.x_m[valid], plate.y_m[valid]]), Compensator(plane))
+    ]
     if valid.all():
         centres = np.stack(
-            [along[:-1, :-1].ravel() + plate.grid_pitch_m / 2 for along in (plate.x_m, plate.y_m)]
+            [
+                along[:-1, :-1].ravel() + plate.grid_pitch_m / 2
+                for along in (plate.x_m, plate.y_m)
+            ]
         )
         places.append(("between", centres, Compensator(plane, method="bicubic")))
     return [
@@ -165,7 +178,13 @@ def plane_residuals(
             points,
             [
                 np.stack(
-                    reached(stage, frame, (points[0], points[1]), correct=table, active=active)
+                    reached(
+                        stage,
+                        frame,
+                        (points[0], points[1]),
+                        correct=table,
+                        active=active,
+                    )
                 )
                 for table in (None, correct)
             ],
@@ -192,7 +211,9 @@ def combined(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> Er
     map_error = np.stack([error_map.gx, error_map.gy])
     limit_m = plate.grid_pitch_m / 4
     step_m = _steepest(added)
-    if step_m > limit_m or _steepest(map_error + added) > limit_m >= _steepest(map_error):
+    if step_m > limit_m or _steepest(map_error + added) > limit_m >= _steepest(
+        map_error
+    ):
         raise _misfit(
             active,
             (px, py),
@@ -233,7 +254,9 @@ def _misfit(
     )
 
 
-def bends_between(error_map: ErrorMap, frame: MachineFrame, active: Correction) -> float:
+def bends_between(
+    error_map: ErrorMap, frame: MachineFrame, active: Correction
+) -> float:
     """Return how far an active table bends between the nodes of a map, m.
 
     That is the largest difference to its linear interpolation, at every quarter of the cells. The
@@ -249,4 +272,6 @@ def bends_between(error_map: ErrorMap, frame: MachineFrame, active: Correction) 
         for p in (x, y)
     )
     fields = active(*frame.to_machine(*np.meshgrid(x, y, indexing="ij")))
-    return frame.unit_m * max(float(abs(c - left @ c[::4, ::4] @ right.T).max()) for c in fields)
+    return frame.unit_m * max(
+        float(abs(c - left @ c[::4, ::4] @ right.T).max()) for c in fields
+    )

@@ -107,7 +107,9 @@ def write_siemens(error_map: ErrorMap, wiring: Wiring) -> Texts:
     lines = ["%_N_NC_CEC_INI", "CHANDATA(1)"]
     table = 0
     for output, (of_x, of_y, mean) in zip(axes, means, strict=True):
-        for source, positions, values in zip(axes, at, (of_x, of_y - mean), strict=True):
+        for source, positions, values in zip(
+            axes, at, (of_x, of_y - mean), strict=True
+        ):
             lines += [
                 f"$AN_CEC[{table},{n}]={fixed(value, frame.unit_m)}"
                 for n, value in enumerate(values)
@@ -143,7 +145,9 @@ def read_siemens(sources: Sequence[Source], wiring: Wiring) -> Correction:
         if re.fullmatch(r"%_N_NC_CEC_INI|CHANDATA\(1\)|M17", line.text):
             continue
         match = re.fullmatch(
-            r"\$AN_CEC(?:_(\w+))?\[(\d{1,3})(?:,(\d{1,5}))?\]\s*=\s*(\S+)", line.text, re.ASCII
+            r"\$AN_CEC(?:_(\w+))?\[(\d{1,3})(?:,(\d{1,5}))?\]\s*=\s*(\S+)",
+            line.text,
+            re.ASCII,
         )
         if (
             match is None
@@ -163,7 +167,8 @@ def read_siemens(sources: Sequence[Source], wiring: Wiring) -> Correction:
         is_axis = match[1] in CEC_KEYS[:2]
         stated[place] = match[4] if is_axis else numbers(match[4], line.where, "N")[0]
     grids = [
-        _cec_grid(table, values, settings, axes, source.where) for table, values in entries.items()
+        _cec_grid(table, values, settings, axes, source.where)
+        for table, values in entries.items()
     ]
     if not grids:
         raise InputError(source.where, "it has no CEC table", "export it again")
@@ -195,7 +200,11 @@ def _cec_grid(
             f"the axes are {' and '.join(axes)} (--x-axis, --y-axis)",
         )
     step, first, last, *other_settings = table_settings[2:]
-    if any(other_settings) or not step > 0 or abs((last - first) / step - (len(values) - 1)) > 1e-6:
+    if (
+        any(other_settings)
+        or not step > 0
+        or abs((last - first) / step - (len(values) - 1)) > 1e-6
+    ):
         raise InputError(
             place,
             f"{len(values)} values from {first} to {last} in steps of {step}",

@@ -105,7 +105,9 @@ FORMATS = {
         write_pmac,
         read_pmac,
         "; ",
-        notes=("motors are counted from their zero; beyond the field the tables roll over",),
+        notes=(
+            "motors are counted from their zero; beyond the field the tables roll over",
+        ),
         steps=(
             "delete the buffers that stand before it (DELETE LOOKAHEAD, DELETE GATHER, DELETE "
             "ROTARY; old tables: DELETE COMP from the lower motor to the higher)",
@@ -238,7 +240,8 @@ def export(
     texts = form.write(table, wiring)
     names = {part: _name(output, part) for part in texts}
     correct = form.read(
-        [Source("\n".join(lines) + "\n", names[part]) for part, lines in texts.items()], wiring
+        [Source("\n".join(lines) + "\n", names[part]) for part, lines in texts.items()],
+        wiring,
     )
     residuals = plane_residuals(emap, frame, correct, active)
     comments = [
@@ -256,7 +259,9 @@ def export(
         )
     head = [form.comment + _plain(line) for line in comments]
     files = {
-        names[part]: "\n".join([*lines, "", *head] if form.comments_last else [*head, *lines])
+        names[part]: "\n".join(
+            [*lines, "", *head] if form.comments_last else [*head, *lines]
+        )
         + "\n"
         for part, lines in texts.items()
     }
@@ -266,7 +271,11 @@ def export(
         else (_remaining_text(residuals[0]))
     )
     return Exported(
-        files, residuals, bent, checklist(form, wiring, list(files), correct, table), remains
+        files,
+        residuals,
+        bent,
+        checklist(form, wiring, list(files), correct, table),
+        remains,
     )
 
 
@@ -280,7 +289,11 @@ def _plain(text: str) -> str:
 
 
 def checklist(
-    form: Format, wiring: Wiring, files: Sequence[str], correct: Correction, table: ErrorMap
+    form: Format,
+    wiring: Wiring,
+    files: Sequence[str],
+    correct: Correction,
+    table: ErrorMap,
 ) -> tuple[str, ...]:
     """Return the steps that put files into use; the last names the place to look at.
 

@@ -96,7 +96,10 @@ def commented(program: str, comments: Sequence[str]) -> str:
     newline = "\r\n" if "\r\n" in program else "\n"
     begins = re.match(r"\s*%[^\n]*\n", program)
     head = begins[0] if begins else ""
-    lines = ["; " + re.sub("[^ -~]|[!?~]", "_", text[:MAX_COMMENT]) + newline for text in comments]
+    lines = [
+        "; " + re.sub("[^ -~]|[!?~]", "_", text[:MAX_COMMENT]) + newline
+        for text in comments
+    ]
     return head + "".join(lines) + program[len(head) :]
 
 
@@ -149,7 +152,9 @@ class Rewriter:
         self._where = where
         acting = re.search(FORBIDDEN.get(self.dialect, CONTROL), text)
         if acting:
-            self._refuse(f"{acting[0]!r} acts on {self.dialect} even in a comment", "remove it")
+            self._refuse(
+                f"{acting[0]!r} acts on {self.dialect} even in a comment", "remove it"
+            )
         content = text.strip()
         if content == "%" and not self._printer:
             self._ended |= self._begun
@@ -214,7 +219,9 @@ class Rewriter:
                 remedy(name),
             )
         if self._printer and name != letter + value:
-            self._refuse(f"{letter}{value} is not understood by all firmware", f"write {name}")
+            self._refuse(
+                f"{letter}{value} is not understood by all firmware", f"write {name}"
+            )
         return self._codes[name]
 
     def _check(self, line: ProgramLine) -> None:
@@ -222,26 +229,40 @@ class Rewriter:
         names = " ".join(code.name for code in line.codes)
         acts = [code for code in line.codes if code.does in ACTS]
         modes = [code.does for code in line.codes if code.does in MODES]
-        crowded = len(line.codes) > 1 and (self._printer or bool(acts and "path" in modes))
+        crowded = len(line.codes) > 1 and (
+            self._printer or bool(acts and "path" in modes)
+        )
         if crowded or len(acts) > 1 or len(modes) > len(set(modes)):
             self._refuse(f"{names} in one line", "write a line for each")
-        letters = "".join(code.words for code in line.codes) + ALWAYS * (not self._printer)
+        letters = "".join(code.words for code in line.codes) + ALWAYS * (
+            not self._printer
+        )
         for letter, value in line.values.items():
             if letters.count(letter) != 1:
-                self._refuse(f"{letter} is not a word of {names or self.dialect}", remedy(letter))
+                self._refuse(
+                    f"{letter} is not a word of {names or self.dialect}", remedy(letter)
+                )
             if not value and not line.code("home", "unknown"):
                 self._refuse(f"{letter} has no number", "give one")
 
         if self._ended and (line.codes or line.values):
             self._refuse("the line follows the end of the program", "remove it")
         if line.code(*MOVES) and line.code("stop", "end"):
-            self._refuse("the program stops in the line of a move", "stop in the next line")
-        if line.code("machine") and (line.named("XY") or not line.code("rapid", "line")):
-            self._refuse("G53 leaves the frame of the map", "write G0 or G1, and Z alone")
+            self._refuse(
+                "the program stops in the line of a move", "stop in the next line"
+            )
+        if line.code("machine") and (
+            line.named("XY") or not line.code("rapid", "line")
+        ):
+            self._refuse(
+                "G53 leaves the frame of the map", "write G0 or G1, and Z alone"
+            )
         if line.code("home") and not self._printer and line.named("XY"):
             self._check_way_home(line)
         if line.code("path") and float(line.values.get("Q", line.number("P"))):
-            self._refuse("G64 P merges the pieces of corrected lines", "write Q0 behind it")
+            self._refuse(
+                "G64 P merges the pieces of corrected lines", "write Q0 behind it"
+            )
         if line.code("set E") and not line.values:
             self._refuse("G92 moves the frame", remedy("G92"))
 
@@ -251,12 +272,15 @@ class Rewriter:
         mode = distance.name if distance else self._modes.get("distance")
         if mode != "G91" or line.number("X") or line.number("Y"):
             self._refuse(
-                "the way home passes a point that is not corrected", "write G91 with it, and X0, Y0"
+                "the way home passes a point that is not corrected",
+                "write G91 with it, and X0, Y0",
             )
 
     def _set_mode(self, code: Code) -> None:
         """Follow a mode."""
-        if code.does in FRAMES and (self._modes.get(code.does) != code.name or code.words):
+        if code.does in FRAMES and (
+            self._modes.get(code.does) != code.name or code.words
+        ):
             if self._drawn:
                 self._refuse(f"{code.name} follows a move in X or Y", remedy(code.name))
             self._at = dict.fromkeys("XYZE", math.nan)
@@ -281,9 +305,13 @@ class Rewriter:
                     "write it before the first move",
                 )
         if line.named("E") and not relative and "extruder" not in self._modes:
-            self._refuse("the program has not said M82 or M83", "write it after the last G90")
+            self._refuse(
+                "the program has not said M82 or M83", "write it after the last G90"
+            )
         if relative and act.does in IN_PLANE:
-            self._refuse(f"{act.name} by increments", "write G90 before arcs and cycles")
+            self._refuse(
+                f"{act.name} by increments", "write G90 before arcs and cycles"
+            )
         if act.does == "hole" and not line.named("XYZ"):
             self._refuse(f"{act.name} names no axis", "give the hole's X and Y")
         if act.does == "arc" and self.dialect == "grbl" and not line.named("XY"):
@@ -291,7 +319,9 @@ class Rewriter:
 
         ends = dict(self._at)
         for axis in line.named("XYZE"):
-            ends[axis] = line.number(axis) + (self._at[axis] if self._relative(axis) else 0.0)
+            ends[axis] = line.number(axis) + (
+                self._at[axis] if self._relative(axis) else 0.0
+            )
         lines = [_text(act, line, {})]
         if line.named("XY") or act.does in IN_PLANE:
             lines = self._corrected(act, line, ends)
@@ -299,14 +329,18 @@ class Rewriter:
         for text in lines:
             read = re.sub(r"\(.*?\)|;.*|\s", "", text)
             if len(read) > MAX_WORDS or len(text) > MAX_LINE:
-                self._refuse("the corrected line is too long", "shorten its words or comments")
+                self._refuse(
+                    "the corrected line is too long", "shorten its words or comments"
+                )
         return lines
 
     def _relative(self, axis: str) -> bool:
         by_m83 = axis == "E" and self._modes.get("extruder") == "M83"
         return by_m83 or self._modes["distance"] == "G91"
 
-    def _corrected(self, act: Code, line: ProgramLine, ends: Mapping[str, float]) -> list[str]:
+    def _corrected(
+        self, act: Code, line: ProgramLine, ends: Mapping[str, float]
+    ) -> list[str]:
         """Return the lines of a move in XY."""
         unit_m = M_PER_INCH if self._modes["unit"] == "G20" else M_PER_MM
         start_m, end_m = (complex(at["X"], at["Y"]) * unit_m for at in (self._at, ends))
@@ -318,15 +352,20 @@ class Rewriter:
         if not cmath.isfinite(end_m if travels else start_m + end_m):
             self._refuse(
                 "the position before this line is not known",
-                "write an absolute move of X and Y before it" + " with G0" * (not self.prints),
+                "write an absolute move of X and Y before it"
+                + " with G0" * (not self.prints),
             )
         limit_m = (1 - OF_SAMPLES) * self._tolerance_m
         if act.does == "arc":
             centre_m = start_m + complex(line.number("I"), line.number("J")) * unit_m
-            path_m = self._arc(start_m, end_m, centre_m, sense=-1 if act.name == "G2" else 1)
+            path_m = self._arc(
+                start_m, end_m, centre_m, sense=-1 if act.name == "G2" else 1
+            )
             limit_m -= abs(abs(end_m - centre_m) - abs(start_m - centre_m))
         elif act.does == "line" and cmath.isfinite(start_m):
-            path_m = np.linspace(start_m, end_m, self._count(abs(end_m - start_m), self._step_m))
+            path_m = np.linspace(
+                start_m, end_m, self._count(abs(end_m - start_m), self._step_m)
+            )
         else:
             path_m = np.array([end_m, end_m])
 
@@ -335,12 +374,19 @@ class Rewriter:
         lines: list[str] = []
         shared = self._shared(line) if len(vertices) > 1 else {}
         for i in vertices:
-            place = {"X": commanded_m[i].real / unit_m, "Y": commanded_m[i].imag / unit_m}
+            place = {
+                "X": commanded_m[i].real / unit_m,
+                "Y": commanded_m[i].imag / unit_m,
+            }
             for axis, start in shared.items():
                 way = line.number(axis) - start
                 place[axis] = start + way * i / (len(path_m) - 1)
-            texts = {axis: self._coordinate(axis, value) for axis, value in place.items()}
-            lines.append(_text(act, line if not lines else ProgramLine([], {}, []), texts))
+            texts = {
+                axis: self._coordinate(axis, value) for axis, value in place.items()
+            }
+            lines.append(
+                _text(act, line if not lines else ProgramLine([], {}, []), texts)
+            )
 
         corners_m = np.stack([path_m.real, path_m.imag], axis=1)
         self.reach_m[0] = np.minimum(self.reach_m[0], corners_m.min(axis=0))
@@ -367,7 +413,9 @@ class Rewriter:
         """Return points of an arc, m."""
         from_m, to_m = start_m - centre_m, end_m - centre_m
         if not from_m or not to_m:
-            self._refuse("the arc has no centre", "give I and J, or begin the line with G1")
+            self._refuse(
+                "the arc has no centre", "give I and J, or begin the line with G1"
+            )
         sweep = sense * cmath.phase(to_m / from_m) % (2 * math.pi)
         unsure = not NO_TURN_RAD < sweep < 2 * math.pi - NO_TURN_RAD
         if start_m == end_m:

@@ -164,7 +164,9 @@ def numbers(text: str, where: str, pattern: str) -> list[float]:
     form = pattern.replace("N", f"({NUMBER})").replace("I", r"([-+]?\d{1,15})")
     match = re.fullmatch(form, text, re.ASCII | re.I)
     if match is None:
-        form_text = re.sub(r"\\(.)", r"\1", pattern.replace(r"\s*", " ").replace(r"\s+", " "))
+        form_text = re.sub(
+            r"\\(.)", r"\1", pattern.replace(r"\s*", " ").replace(r"\s+", " ")
+        )
         raise InputError(
             where,
             f"'{text[:60]}' is not of the form {form_text}",
@@ -176,7 +178,9 @@ def numbers(text: str, where: str, pattern: str) -> list[float]:
     return values
 
 
-def filled(entries: dict[tuple[int, int], float], shape: Sequence[int], where: str) -> np.ndarray:
+def filled(
+    entries: dict[tuple[int, int], float], shape: Sequence[int], where: str
+) -> np.ndarray:
     """Return entries as an array; InputError if one is missing or outside."""
     if len(entries) != shape[0] * shape[1] or not all(
         i < shape[0] and j < shape[1] for i, j in entries

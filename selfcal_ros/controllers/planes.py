@@ -108,7 +108,9 @@ def read_kmotion(sources: Sequence[Source], wiring: Wiring) -> Correction:
         for start, by, count in zip(first, step, (columns, rows), strict=True)
     )
     return Covering(
-        lambda px, py: (grids[0].at(px, py) - px, grids[1].at(px, py) - py), along_x, along_y
+        lambda px, py: (grids[0].at(px, py) - px, grids[1].at(px, py) - py),
+        along_x,
+        along_y,
     )
 
 
@@ -124,7 +126,10 @@ def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
     spans, shape, at = [], [], []
     for positions, per in zip(nodes(error_map, frame), counts, strict=True):
         cell = positions[0] / spacing(positions)
-        split = next((k for k in range(1, 11) if abs(cell * k - round(cell * k)) < 1e-6), COARSEST)
+        split = next(
+            (k for k in range(1, 11) if abs(cell * k - round(cell * k)) < 1e-6),
+            COARSEST,
+        )
         entries = split * (len(positions) + 1)
         span = round(entries / split * spacing(positions) * per)
         entry = np.arange(entries + 1) * span / entries
@@ -138,7 +143,9 @@ def write_pmac(error_map: ErrorMap, wiring: Wiring) -> Texts:
     for motor, values, per in zip(
         (frame.x_axis, frame.y_axis), correct(px, py), counts, strict=True
     ):
-        integers = np.rint(PER_COUNT * per * (values - values[0, 0])).astype(int).T.ravel()[1:]
+        integers = (
+            np.rint(PER_COUNT * per * (values - values[0, 0])).astype(int).T.ravel()[1:]
+        )
         tables[motor] = [
             f"#{motor}",
             f"DEFINE COMP {shape[1]}.{shape[0]},#{frame.x_axis}D,#{frame.y_axis}D,"
@@ -170,13 +177,19 @@ def read_pmac(sources: Sequence[Source], wiring: Wiring) -> Correction:
         if re.fullmatch(r"#\d{1,2}|I51\s*=\s*1", line.text, re.I):
             continue
         if re.match("define", line.text, re.I):
-            head = numbers(*line, r"define\s+comp\s+I\.I,\s*#ID?,\s*#ID?,\s*#I,\s*I,\s*I")
+            head = numbers(
+                *line, r"define\s+comp\s+I\.I,\s*#ID?,\s*#ID?,\s*#I,\s*I,\s*I"
+            )
             tables.append((line, [int(value) for value in head], []))
-        elif tables and re.fullmatch(r"[-+]?\d{1,9}(\s+[-+]?\d{1,9})*", line.text, re.ASCII):
+        elif tables and re.fullmatch(
+            r"[-+]?\d{1,9}(\s+[-+]?\d{1,9})*", line.text, re.ASCII
+        ):
             tables[-1][2].extend(map(int, line.text.split()))
         else:
             raise InputError(
-                line.where, f"'{line.text[:60]}' is not part of a table", "export the tables again"
+                line.where,
+                f"'{line.text[:60]}' is not part of a table",
+                "export the tables again",
             )
     grids = [_pmac_grid(*table) for table in tables]
     counts = _counts(wiring)
@@ -192,7 +205,10 @@ def read_pmac(sources: Sequence[Source], wiring: Wiring) -> Correction:
         raise InputError(source.where, "it has no table", "export it again")
 
     def correct(px: np.ndarray, py: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        at = {motor: p * per for motor, p, per in zip(motors, (px, py), counts, strict=True)}
+        at = {
+            motor: p * per
+            for motor, p, per in zip(motors, (px, py), counts, strict=True)
+        }
         out = {motor: np.zeros(np.shape(px)) for motor in motors}
         for (row, column, target), grid in grids:
             out[target] = out[target] + grid.at(at[row], at[column]) / PER_COUNT
@@ -219,7 +235,9 @@ def _pmac_grid(line: Line, head: list[int], entries: list[int]) -> tuple[tuple, 
             f"{number} belong to it, and positive spans",
         )
     values = np.array([0, *entries], dtype=float).reshape(rows + 1, columns + 1).T
-    return tuple(axes), Grid((0.0, 0.0), (row_span / columns, column_span / rows), values, "roll")
+    return tuple(axes), Grid(
+        (0.0, 0.0), (row_span / columns, column_span / rows), values, "roll"
+    )
 
 
 def write_beckhoff(error_map: ErrorMap, wiring: Wiring) -> Texts:
@@ -233,11 +251,18 @@ def write_beckhoff(error_map: ErrorMap, wiring: Wiring) -> Texts:
         int(np.ceil((positions[-1] - start) / step - 1e-6))
         for positions, start in zip((x, y), first, strict=True)
     ]
-    at = [start + step * np.arange(end + 1) for start, end in zip(first, last, strict=True)]
-    values = wanted(error_map, wiring)(*(p / per for p in np.meshgrid(*at, indexing="ij")))
+    at = [
+        start + step * np.arange(end + 1)
+        for start, end in zip(first, last, strict=True)
+    ]
+    values = wanted(error_map, wiring)(
+        *(p / per for p in np.meshgrid(*at, indexing="ij"))
+    )
     number = (last[0] + 1) * (last[1] + 1)
     files = {}
-    for name, axis, field in zip("xy", (frame.x_axis, frame.y_axis), values, strict=True):
+    for name, axis, field in zip(
+        "xy", (frame.x_axis, frame.y_axis), values, strict=True
+    ):
         lines = [f"kopf.achs_nr {axis}", f"kopf.log_achs_name {name.upper()}"]
         keys = {"max_points": number} if number > MAX_POINTS else {}
         keys |= {
@@ -255,7 +280,11 @@ def write_beckhoff(error_map: ErrorMap, wiring: Wiring) -> Texts:
         scaled = field * per
         lines += [
             f"kw.crosscomp2.table[{j}][{i}].correction "
-            + (str(round(scaled[i, j])) if wiring.integers else fixed(scaled[i, j], TENTH_UM))
+            + (
+                str(round(scaled[i, j]))
+                if wiring.integers
+                else fixed(scaled[i, j], TENTH_UM)
+            )
             for j in range(last[1] + 1)
             for i in range(last[0] + 1)
         ]
@@ -293,7 +322,9 @@ def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]
     where = source.where
     settings: dict[str, Any] = {}
     entries: dict[tuple[int, int], float] = {}
-    text = re.sub(r"/\*.*?\*/", lambda match: "\n" * match[0].count("\n"), source.text, flags=re.S)
+    text = re.sub(
+        r"/\*.*?\*/", lambda match: "\n" * match[0].count("\n"), source.text, flags=re.S
+    )
     for line in lines_of(Source(text, where), "#.*"):
         match = re.fullmatch(
             r"([\w.]+)(?:\[\s*(\d{1,4})\]\s*\[\s*(\d{1,4})\]\.correction)?"
@@ -301,7 +332,9 @@ def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]
             line.text,
             re.ASCII,
         )
-        if match is None or (match[2] is not None) != (match[1] == "kw.crosscomp2.table"):
+        if match is None or (match[2] is not None) != (
+            match[1] == "kw.crosscomp2.table"
+        ):
             raise InputError(
                 line.where,
                 f"'{line.text[:60]}' is not a key and its value",
@@ -310,9 +343,13 @@ def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]
         place = (int(match[3]), int(match[2])) if match[2] else match[1]
         stated: dict[Any, Any] = entries if match[2] else settings
         if place in stated:
-            raise InputError(line.where, f"{match[1]} is given twice", "keep one of them")
+            raise InputError(
+                line.where, f"{match[1]} is given twice", "keep one of them"
+            )
         stated[place] = (
-            match[4] if match[1] == "kopf.log_achs_name" else numbers(match[4], line.where, "N")[0]
+            match[4]
+            if match[1] == "kopf.log_achs_name"
+            else numbers(match[4], line.where, "N")[0]
         )
     keys = [
         "interval",
@@ -328,7 +365,9 @@ def _beckhoff_grid(source: Source, masters: tuple[int, int]) -> tuple[int, Grid]
     missing = [name for name in names if name not in settings]
     if missing:
         raise InputError(where, f"{missing[0]} is missing", "export the list again")
-    slave, step, last1, last2, first1, first2, unit, *axes = (int(settings[name]) for name in names)
+    slave, step, last1, last2, first1, first2, unit, *axes = (
+        int(settings[name]) for name in names
+    )
     if (
         step < 1
         or unit != 1

@@ -18,7 +18,10 @@ from selfcal_ros.estimation.checks.wiring import (
     turned_error,
     turned_readings,
 )
-from selfcal_ros.estimation.comparison.verification import corrected, require_correctable
+from selfcal_ros.estimation.comparison.verification import (
+    corrected,
+    require_correctable,
+)
 from selfcal_ros.estimation.joint.camera import (
     FittedCamera,
     camera_of,
@@ -43,7 +46,9 @@ CAMERA_STEPS = 3
 
 
 @one_thread()
-def calibrate(measurements: Measurements, options: Options | None = None) -> CalibrationResult:
+def calibrate(
+    measurements: Measurements, options: Options | None = None
+) -> CalibrationResult:
     """Estimate stage error, plate error and misalignments from readings.
 
     Parameters
@@ -82,13 +87,15 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
         plate = known_plate(options.plate, options.plate_from, options.plate_at)
         return recheck(_as_calibrated(measurements, plate), options, plate)
     camera, measurements = _camera(measurements, options)
-    if camera is not None:  # the microscope that images show, in place of the assumed one
+    # the microscope that images show, in place of the assumed one
+    if camera is not None:
         (scale, turn), others_u = camera.u_coefficients[1:3]
         microscope = microscope_term(float(scale), float(turn), float(others_u.max()))
         options = replace(
             options,
             assumed=tuple(
-                microscope if term.block.of_microscope else term for term in options.assumed
+                microscope if term.block.of_microscope else term
+                for term in options.assumed
             ),
         )
     solved = solve_joint(measurements, options)
@@ -112,11 +119,16 @@ def calibrate(measurements: Measurements, options: Options | None = None) -> Cal
 
 def require_placed(result: CalibrationResult, measurements: Measurements) -> None:
     """Raise PlacingError if a result is not good because the plate is not placed as planned."""
-    if not (result.verdict.qualified and any(view.dof_xy for view in measurements.views)):
-        check_placing(measurements)  # without repeats residuals are the noise: no contradiction
+    if not (
+        result.verdict.qualified and any(view.dof_xy for view in measurements.views)
+    ):
+        # without repeats residuals are the noise: no contradiction
+        check_placing(measurements)
 
 
-def calibrate_corrected(measurements: Measurements, options: Options) -> CalibrationResult:
+def calibrate_corrected(
+    measurements: Measurements, options: Options
+) -> CalibrationResult:
     """Return the map of a stage while its correction is on: by itself, or by the known plate.
 
     Parameters
@@ -140,7 +152,9 @@ def calibrate_corrected(measurements: Measurements, options: Options) -> Calibra
     readings = replace(measurements, verify="")
     if not measurements.artifact_from:
         try:
-            return calibrate(readings, replace(options, plate=None, plate_from="", plate_at=""))
+            return calibrate(
+                readings, replace(options, plate=None, plate_from="", plate_at="")
+            )
         except NotIdentifiableError:
             pass
     return calibrate(readings, replace(options, plate=corrected(before)))
@@ -169,15 +183,20 @@ def _fits(result: CalibrationResult) -> bool:
     plausible does, such as a microscope whose scale of -1 undoes it.
     """
     causes_of_blocks = [
-        (cause, block_of(cause.name)) for cause in result.verdict.causes if cause.name in blocks()
+        (cause, block_of(cause.name))
+        for cause in result.verdict.causes
+        if cause.name in blocks()
     ]
     failed = {causes_of_blocks.name for causes_of_blocks in result.verdict.failed}
     return failed <= {BY_LINES} and not any(
-        block.between or abs(cause.size) > block.plausible for cause, block in causes_of_blocks
+        block.between or abs(cause.size) > block.plausible
+        for cause, block in causes_of_blocks
     )
 
 
-def _check_turned(measurements: Measurements, options: Options, *, contradicted: bool) -> None:
+def _check_turned(
+    measurements: Measurements, options: Options, *, contradicted: bool
+) -> None:
     """Raise WiringError if the readings agree with another wiring of the offsets.
 
     `contradicted`: whether the readings contradict the wiring as it is.
@@ -197,16 +216,21 @@ def _check_turned(measurements: Measurements, options: Options, *, contradicted:
         if (turned_solution := solution(wiring)) is None:
             return False
         result = judged(*turned_solution, options, advise=False).result
-        return _agree(result) or (contradicted and options.finite_rotations and _fits(result))
+        return _agree(result) or (
+            contradicted and options.finite_rotations and _fits(result)
+        )
 
-    if not options.finite_rotations:  # a linear model mistakes rotations for a wrong wiring
+    # a linear model mistakes rotations for a wrong wiring
+    if not options.finite_rotations:
         options = replace(options, misalignment_model="rigid")
         if agree(AS_IS, options):
             return
     plain = replace(options, causes=False)
     sign_known = sign_is_shown(measurements)  # repeats beside the marks
     fitting = (
-        [] if sign_known else [pair for pair in PAIRS if any(agree(sign, plain) for sign in pair)]
+        []
+        if sign_known
+        else [pair for pair in PAIRS if any(agree(sign, plain) for sign in pair)]
     )
     candidates = fitting[0] if len(fitting) == 1 else () if fitting else (OTHER_LINES,)
     agreeing = [wiring for wiring in candidates if agree(wiring, options)]
@@ -241,7 +265,11 @@ def robust_calibrate(
     NotIdentifiableError
         As `calibrate`.
     """
-    from selfcal_ros.estimation.quality.outliers import LEFT, clean, listed  # rarely wanted
+    from selfcal_ros.estimation.quality.outliers import (
+        LEFT,
+        clean,
+        listed,
+    )  # rarely wanted
 
     options = replace(options or Options(), robust=True)
     check_wiring(measurements)
@@ -254,7 +282,9 @@ def robust_calibrate(
     )
     verdict = result.verdict
     if spoiling:
-        verdict = replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *spoiling))
+        verdict = replace(
+            verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *spoiling)
+        )
     return replace(
         result,
         findings=(*result.findings, *cleaned.findings),
@@ -289,7 +319,9 @@ def _camera(
     plain = replace(
         options,
         terms=(),
-        assumed=tuple(term for term in options.model_terms(visits=True) if term.block.of_images),
+        assumed=tuple(
+            term for term in options.model_terms(visits=True) if term.block.of_images
+        ),
     )
     for _ in range(CAMERA_STEPS):
         camera = camera_of(measurements, fit_joint(straight, plain))

@@ -106,7 +106,9 @@ class Options:
         """Whether the plate turns by finite angles in the model."""
         return self.misalignment_model == "rigid"
 
-    def model_terms(self, *, visits: bool, assumed: bool = True) -> tuple[ModelTerm, ...]:
+    def model_terms(
+        self, *, visits: bool, assumed: bool = True
+    ) -> tuple[ModelTerm, ...]:
         """Return all terms of the model, requested terms before assumed ones.
 
         Parameters
@@ -120,6 +122,8 @@ class Options:
         more = [
             term
             for term in self.assumed
-            if assumed and term.name not in named and (visits or not term.block.needs_visits)
+            if assumed
+            and term.name not in named
+            and (visits or not term.block.needs_visits)
         ]
         return tuple(term for term in (*self.terms, *more) if term.size > 0)

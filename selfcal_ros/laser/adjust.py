@@ -99,26 +99,35 @@ class Geometry:
         slip = np.einsum("kc,kc->k", unit, t)[:, None]
         w = unit + t - slip * unit
         # unit changes by P dD / |D|; w = unit + t - (unit . t) unit follows it.
-        chain = (1.0 - slip)[:, :, None] * np.eye(self.dim) - unit[:, :, None] * t[:, None, :]
+        chain = (1.0 - slip)[:, :, None] * np.eye(self.dim) - unit[:, :, None] * t[
+            :, None, :
+        ]
         by_along = chain @ project / length[:, :, None]
         by_tilt = np.einsum("kce,kme->kcm", project, self.sideways)
         return w, by_along, by_tilt
 
-    def derivatives(self, errors_m: np.ndarray, tilt: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(
+        self, errors_m: np.ndarray, tilt: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return dR/dE (K*D*n, D*n*D) and dR/dtilt (K*D*n, K*(D-1))."""
         vectors = step_vectors(self.steps, errors_m)
         w, by_along, by_tilt = self._directions(vectors, tilt)
         n_k, dim, n = self.shape
         sign = self.signs
         by_errors = np.einsum(
-            "kj,kJ,jikc->kjiJc", sign, sign, np.tensordot(vectors, by_along, axes=(2, 1))
+            "kj,kJ,jikc->kjiJc",
+            sign,
+            sign,
+            np.tensordot(vectors, by_along, axes=(2, 1)),
         )[:, :, :, :, None].repeat(n, axis=4)
         j, i = np.ogrid[:dim, :n]
         by_errors[:, j, i, j, i] += np.moveaxis(sign.T[:, None, :, None] * w, 2, 0)
         by_tilts = np.zeros((n_k, dim, n, n_k, dim - 1))
         k = np.arange(n_k)
         readings_by_tilt = np.tensordot(vectors, by_tilt, axes=(2, 1))  # (j, i, k, m)
-        by_tilts[k, :, :, k] = sign[:, :, None, None] * np.moveaxis(readings_by_tilt, 2, 0)
+        by_tilts[k, :, :, k] = sign[:, :, None, None] * np.moveaxis(
+            readings_by_tilt, 2, 0
+        )
         rows = n_k * dim * n
         return by_errors.reshape(rows, -1), by_tilts.reshape(rows, -1)
 
@@ -145,7 +154,9 @@ def adjust(data: StepDiagonal) -> Adjusted:
     for _ in range(MAX_ITERATIONS):
         misfit = data.readings_m - geometry.readings(errors, tilt)
         by_errors, by_tilt = geometry.derivatives(errors, tilt)
-        pinv = _solver(np.hstack([by_errors[:, free], by_tilt]) * weights[:, None], data)
+        pinv = _solver(
+            np.hstack([by_errors[:, free], by_tilt]) * weights[:, None], data
+        )
         change = pinv @ (weights * misfit.ravel())
         errors[geometry.free] += change[: free.sum()]
         tilt += change[free.sum() :].reshape(tilt.shape)
@@ -174,7 +185,9 @@ def _solver(matrix: np.ndarray, data: StepDiagonal) -> np.ndarray:
 
 
 def _solution(
-    data: StepDiagonal, geometry: Geometry, estimate: tuple[np.ndarray, np.ndarray, np.ndarray]
+    data: StepDiagonal,
+    geometry: Geometry,
+    estimate: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> Adjusted:
     errors, tilt, gain = estimate
     by_errors, _ = geometry.derivatives(errors, tilt)
@@ -189,5 +202,9 @@ def _solution(
     by_linear[is_linear] = np.eye(int(is_linear.sum()))
     by_linear[free] = -gain @ by_errors[:, is_linear]
     return Adjusted(
-        errors, tilt, by_readings, by_linear, data.readings_m - geometry.readings(errors, tilt)
+        errors,
+        tilt,
+        by_readings,
+        by_linear,
+        data.readings_m - geometry.readings(errors, tilt),
     )

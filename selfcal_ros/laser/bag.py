@@ -70,10 +70,17 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
         If a topic is missing or empty.
     """
     reader = BagReader(Path(path))
-    value_of_topic = {topics.laser: _laser_value(topics), topics.position: _position_value(topics)}
+    value_of_topic = {
+        topics.laser: _laser_value(topics),
+        topics.position: _position_value(topics),
+    }
     if len(value_of_topic) < 2:
-        raise InputError("--position-topic", "it is the laser's topic", "name two topics")
-    samples_of_topic: dict[str, list[tuple[int, Any]]] = {topic: [] for topic in value_of_topic}
+        raise InputError(
+            "--position-topic", "it is the laser's topic", "name two topics"
+        )
+    samples_of_topic: dict[str, list[tuple[int, Any]]] = {
+        topic: [] for topic in value_of_topic
+    }
     other_topics: set[str] = set()
     unstamped: set[str] = set()
     for stream in streams(reader.files, reader.lost):
@@ -84,11 +91,15 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
                 other_topics.add(channel.topic)
                 continue
             if channel.id not in decoders:
-                decoders[channel.id] = _decoder(stream, channel, f"{path}: topic {topic}")
+                decoders[channel.id] = _decoder(
+                    stream, channel, f"{path}: topic {topic}"
+                )
             name, decoded = decoders[channel.id](message.data)
             if not hasattr(decoded, "header"):
                 unstamped.add(topic)
-            stamp = stamp_ns(decoded) if hasattr(decoded, "header") else message.log_time
+            stamp = (
+                stamp_ns(decoded) if hasattr(decoded, "header") else message.log_time
+            )
             if stamp > np.iinfo(np.int64).max:
                 raise InputError(
                     f"{path}: topic {topic}",
@@ -113,11 +124,15 @@ def read_series(path: Path, topics: SeriesTopics) -> tuple[Recording, list[str]]
         )
     laser_ns, laser = _sorted(samples_of_topic[topics.laser])
     position_ns, positions = _sorted(samples_of_topic[topics.position])
-    return Recording(laser_ns, laser * topics.laser_unit_m, position_ns, positions), notes
+    return Recording(
+        laser_ns, laser * topics.laser_unit_m, position_ns, positions
+    ), notes
 
 
 def _match(topic: str, value_of_topic: dict[str, Callable]) -> str | None:
-    return next((name for name in value_of_topic if name.strip("/") == topic.strip("/")), None)
+    return next(
+        (name for name in value_of_topic if name.strip("/") == topic.strip("/")), None
+    )
 
 
 def _decoder(stream: McapStream, channel: Any, where: str) -> Callable:

@@ -48,7 +48,9 @@ class Form(StrEnum):
 
 def signs_of(diagonals: Sequence[str]) -> np.ndarray:
     """Return the running sense of every axis on every diagonal, +-1, (diagonals, axes)."""
-    return np.array([[-1.0 if letter == "n" else 1.0 for letter in name] for name in diagonals])
+    return np.array(
+        [[-1.0 if letter == "n" else 1.0 for letter in name] for name in diagonals]
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +82,16 @@ class StepDiagonal:
     def __post_init__(self) -> None:
         """Refuse blocks without readings."""
         if not np.isfinite(self.samples_m).any(axis=0).all():
-            raise InputError("readings", "a block has no reading", "measure every block")
-        if self.linear_m is not None and not np.isfinite(self.linear_m).any(axis=0).all():
-            raise InputError("linear errors", "a block has no value", "measure every block")
+            raise InputError(
+                "readings", "a block has no reading", "measure every block"
+            )
+        if (
+            self.linear_m is not None
+            and not np.isfinite(self.linear_m).any(axis=0).all()
+        ):
+            raise InputError(
+                "linear errors", "a block has no value", "measure every block"
+            )
 
     @property
     def dim(self) -> int:
@@ -142,7 +151,9 @@ class StepDiagonal:
                     "choose one of these",
                 )
         index = [self.diagonals.index(name) for name in diagonals]
-        return StepDiagonal(self.steps_m, tuple(diagonals), self.samples_m[:, index], self.linear_m)
+        return StepDiagonal(
+            self.steps_m, tuple(diagonals), self.samples_m[:, index], self.linear_m
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +228,9 @@ class StepDiagonalResult:
         return np.sqrt(variance).reshape(self.errors_m.shape)
 
 
-def step_vectors(steps_m: Sequence[float] | np.ndarray, errors_m: np.ndarray) -> np.ndarray:
+def step_vectors(
+    steps_m: Sequence[float] | np.ndarray, errors_m: np.ndarray
+) -> np.ndarray:
     """Return the displacement vectors d = step e + E, (D, n, D), m."""
     return errors_m + np.diag(steps_m)[:, None, :]
 
@@ -275,7 +288,9 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
             where, "not a finite number", "measure the block again or correct the cell"
         )
     ratio = value_m / nominal_m
-    values_text = f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
+    values_text = (
+        f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
+    )
     if _is_near(ratio):
         return
     if _is_near(-ratio):
@@ -286,7 +301,9 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
         )
     for factor, unit in _UNITS.items():
         if _is_near(ratio / factor):
-            raise InputError(where, f"{values_text}: it looks like {unit}", "give millimetres")
+            raise InputError(
+                where, f"{values_text}: it looks like {unit}", "give millimetres"
+            )
     raise InputError(where, values_text, "check the unit and --step-x, --step-y")
 
 

@@ -76,7 +76,9 @@ def eq5_printed(delta: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarr
     return -(sin_alpha / np.sin(alpha_2)) * (delta - delta[0])
 
 
-def eq5_exact(r_x: np.ndarray, u: np.ndarray, sin_alpha: float, alpha_2: float) -> np.ndarray:
+def eq5_exact(
+    r_x: np.ndarray, u: np.ndarray, sin_alpha: float, alpha_2: float
+) -> np.ndarray:
     """Return Ey(x) of every block from R_x and the linear error (exact form of eq. 5)."""
     return (r_x * sin_alpha - u * np.cos(alpha_2)) / np.sin(alpha_2)
 
@@ -156,7 +158,9 @@ def readings_are_equal(data: StepDiagonal) -> bool:
     """
     r = data.readings_m
     block_is_equal = np.ptp(r, axis=1) <= EQUAL_RELATIVE * np.abs(r).max()
-    return bool(data.n_blocks > 1 and np.ptp(data.steps_m) == 0 and block_is_equal.all())
+    return bool(
+        data.n_blocks > 1 and np.ptp(data.steps_m) == 0 and block_is_equal.all()
+    )
 
 
 def block_gain(data: StepDiagonal) -> np.ndarray:
@@ -171,11 +175,15 @@ def block_gain(data: StepDiagonal) -> np.ndarray:
     return np.linalg.pinv(weighted) * weights[:, :, None, :]
 
 
-def solve_blocks(data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray) -> np.ndarray:
+def solve_blocks(
+    data: StepDiagonal, readings_m: np.ndarray, gain: np.ndarray
+) -> np.ndarray:
     """Return the errors (D, n, D) from eq. 1 block by block, rotated to the first X step."""
     # The printed matrix has the rows of R_y,pp and R_y,np exchanged.
     vectors = np.einsum("jick,kji->jic", gain, readings_m)
-    return turn_to_first_step(vectors) - step_vectors(data.steps_m, np.zeros_like(vectors))
+    return turn_to_first_step(vectors) - step_vectors(
+        data.steps_m, np.zeros_like(vectors)
+    )
 
 
 @one_thread()
@@ -228,7 +236,8 @@ def _residual(data: StepDiagonal, readings_m: np.ndarray) -> float | None:
     directions = data.signs[:, :, None] * laser_directions(data)[:, None, :]
     misfit = [
         readings_m[:, j]
-        - directions[:, j] @ np.linalg.lstsq(directions[:, j], readings_m[:, j], rcond=None)[0]
+        - directions[:, j]
+        @ np.linalg.lstsq(directions[:, j], readings_m[:, j], rcond=None)[0]
         for j in range(data.dim)
     ]
     return rms(np.array(misfit))
@@ -253,7 +262,9 @@ def jacobian(
 
 
 @one_thread()
-def identify_ibaraki(data: StepDiagonal, *, form: Form = Form.EXACT) -> StepDiagonalResult:
+def identify_ibaraki(
+    data: StepDiagonal, *, form: Form = Form.EXACT
+) -> StepDiagonalResult:
     """Identify the transverse errors from the readings and the measured linear errors.
 
     Parameters

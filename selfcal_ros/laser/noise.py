@@ -56,7 +56,10 @@ def reading_noise(data: StepDiagonal) -> ReadingNoise:
     deviation = data.samples_m - data.readings_m
     order = [time_order(signs, data.n_blocks) for signs in data.signs]
     runs = np.stack(
-        [deviation[:, k].reshape(len(deviation), -1)[:, order[k]] for k in range(len(order))],
+        [
+            deviation[:, k].reshape(len(deviation), -1)[:, order[k]]
+            for k in range(len(order))
+        ],
         axis=1,
     )
     return _pooled(runs.reshape(len(deviation), len(order), -1))
@@ -79,9 +82,15 @@ def _pooled(runs: np.ndarray) -> ReadingNoise:
     # Neighbours in time can be paired only if every repeat is a complete run; the series may
     # have different numbers of repeats.
     complete = np.isfinite(runs).all(axis=2)
-    if variance == 0 or np.any(np.isfinite(runs).any(axis=2) & ~complete) or runs.shape[2] < 2:
+    if (
+        variance == 0
+        or np.any(np.isfinite(runs).any(axis=2) & ~complete)
+        or runs.shape[2] < 2
+    ):
         return ReadingNoise(float(np.sqrt(variance)), 0.0, dof)
-    correlation, variance = _likeliest(np.nan_to_num(runs), int((complete.sum(axis=0) - 1).sum()))
+    correlation, variance = _likeliest(
+        np.nan_to_num(runs), int((complete.sum(axis=0) - 1).sum())
+    )
     return ReadingNoise(float(np.sqrt(variance)), correlation, dof)
 
 
@@ -110,7 +119,9 @@ def reading_covariance(data: StepDiagonal, noise: ReadingNoise) -> np.ndarray:
     out = np.zeros((len(data.diagonals) * size,) * 2)
     for k, signs in enumerate(data.signs):
         index = k * size + time_order(signs, data.n_blocks)
-        out[np.ix_(index, index)] = _band(data.counts[k].ravel()[index - k * size], noise)
+        out[np.ix_(index, index)] = _band(
+            data.counts[k].ravel()[index - k * size], noise
+        )
     return out
 
 
@@ -170,7 +181,9 @@ def length_closure(data: StepDiagonal) -> tuple[float, float | None] | None:
     sides = data.linear_mean_m.sum(axis=1) + data.n_blocks * np.array(data.steps_m)
     mean = rms(diagonals)
     side = float(np.linalg.norm(sides))
-    by_readings = np.repeat(diagonals / (len(diagonals) * mean), data.dim * data.n_blocks)
+    by_readings = np.repeat(
+        diagonals / (len(diagonals) * mean), data.dim * data.n_blocks
+    )
     by_linear = -np.repeat(sides / side, data.n_blocks)
     variance = propagated(data, by_readings[None], by_linear[None])
     return mean - side, None if variance is None else float(np.sqrt(variance[0, 0]))
@@ -194,7 +207,9 @@ def between_diagonals(
     covariance = propagated(data, by_readings, first.by_linear - second.by_linear)
     if covariance is None:
         return difference, None
-    return difference, np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(difference.shape)
+    return difference, np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(
+        difference.shape
+    )
 
 
 def check_lengths(data: StepDiagonal) -> None:

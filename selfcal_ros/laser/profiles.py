@@ -50,7 +50,9 @@ def profile_m(result: StepDiagonalResult, axis: int, direction: int) -> np.ndarr
     return np.concatenate([[0.0], np.cumsum(result.errors_m[axis, :, direction])])
 
 
-def u_profile_m(result: StepDiagonalResult, axis: int, direction: int) -> np.ndarray | None:
+def u_profile_m(
+    result: StepDiagonalResult, axis: int, direction: int
+) -> np.ndarray | None:
     """Return the standard uncertainty of the profile, (n+1,), m; None if unknown."""
     if result.covariance is None:
         return None
@@ -118,7 +120,8 @@ def squareness(
     of_first = row * result.steps_m[second] / result.steps_m[first] * result.n_blocks
     of_second = row * result.n_blocks
     value = float(
-        of_second @ result.errors_m[second, :, first] + of_first @ result.errors_m[first, :, second]
+        of_second @ result.errors_m[second, :, first]
+        + of_first @ result.errors_m[first, :, second]
     )
     if result.covariance is None:
         return Value(value)
@@ -168,7 +171,9 @@ def _block(
     result: StepDiagonalResult, row_kind: tuple[int, int], column_kind: tuple[int, int]
 ) -> np.ndarray:
     """Return the covariance between two kinds (axis, direction) of errors, (n, n)."""
-    assert result.covariance is not None, "asked for where nothing is known of the noise"
+    assert result.covariance is not None, (
+        "asked for where nothing is known of the noise"
+    )
     dim, n = result.dim, result.n_blocks
     shaped = result.covariance.reshape(dim, n, dim, dim, n, dim)
     return shaped[row_kind[0], :, row_kind[1], column_kind[0], :, column_kind[1]]

@@ -8,7 +8,13 @@ import numpy as np
 
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.laser import profiles
-from selfcal_ros.laser.data import AXES, Closure, Method, StepDiagonal, StepDiagonalResult
+from selfcal_ros.laser.data import (
+    AXES,
+    Closure,
+    Method,
+    StepDiagonal,
+    StepDiagonalResult,
+)
 from selfcal_ros.laser.noise import linear_noise, reading_noise
 from selfcal_ros.laser.simulation import StepMachine
 from selfcal_ros.outputs import plain
@@ -70,7 +76,9 @@ def outcome(
         }
         for j, c in kinds
     }
-    out["scale"] = {AXES[j]: profiles.slope(result, j, j, line) for j in range(result.dim)}
+    out["scale"] = {
+        AXES[j]: profiles.slope(result, j, j, line) for j in range(result.dim)
+    }
     if result.dim == 2:
         out["error_map_equivalent"] = vars(profiles.map_equivalent(result))
     out["mirror_rad"] = result.mirror_rad
@@ -103,18 +111,23 @@ def _value(prefix: str, value: profiles.Value) -> dict[str, float | None]:
     }
 
 
-def geometry(result: StepDiagonalResult, line: profiles.ReferenceLine) -> dict[str, Any]:
+def geometry(
+    result: StepDiagonalResult, line: profiles.ReferenceLine
+) -> dict[str, Any]:
     """Return squareness and straightness, mm: in 3D one name per pair, and the short names."""
     out: dict[str, Any] = _value("squareness", profiles.squareness(result, line=line))
     out["squareness_rad"] = profiles.squareness_rad(result, line=line)
     for axis in range(2):
         out |= _value(
-            f"straightness_{AXES[axis]}", profiles.straightness(result, axis, 1 - axis, line)
+            f"straightness_{AXES[axis]}",
+            profiles.straightness(result, axis, 1 - axis, line),
         )
     if result.dim == 2:
         return out
     for j, c in profiles.axis_pairs(result.dim):
-        out |= _value(f"squareness_{AXES[j]}{AXES[c]}", profiles.squareness(result, j, c, line))
+        out |= _value(
+            f"squareness_{AXES[j]}{AXES[c]}", profiles.squareness(result, j, c, line)
+        )
     for j in range(result.dim):
         for c in range(result.dim):
             if c != j:
@@ -177,13 +190,17 @@ def summary(result: dict[str, Any]) -> str:
     ]
     if "squareness_xy" in names:
         names = [
-            key for key in names if key not in ("squareness", "straightness_x", "straightness_y")
+            key
+            for key in names
+            if key not in ("squareness", "straightness_x", "straightness_y")
         ]
     lines = [
         f"{result['method']} formulation, {result['n_blocks']} blocks, "
         f"{len(result['diagonals'])} diagonals, {result['n_repeats']} repeat(s)"
     ]
-    lines += [f"  {key:22s} {in_um(result[key], result.get(f'u_{key}'))}" for key in names]
+    lines += [
+        f"  {key:22s} {in_um(result[key], result.get(f'u_{key}'))}" for key in names
+    ]
     lengths, u = result["closure"]["lengths"], result["closure"]["u_lengths"]
     if lengths is not None:
         lines.append(f"  {'closure of lengths':22s} {in_um(lengths, u)}")
@@ -192,7 +209,9 @@ def summary(result: dict[str, Any]) -> str:
 
 def coverage(data: StepDiagonal) -> float:
     """Return k for 95.45 % at the fewer degrees of freedom: of readings or of linear errors."""
-    dofs = [noise.dof for noise in (reading_noise(data), linear_noise(data)) if noise.dof]
+    dofs = [
+        noise.dof for noise in (reading_noise(data), linear_noise(data)) if noise.dof
+    ]
     return coverage_factor(min(dofs)) if dofs else float("nan")
 
 
@@ -226,7 +245,9 @@ def profiles_figure(result: StepDiagonalResult, data: StepDiagonal) -> Drawing:
 
 def truth_of(machine: StepMachine) -> dict[str, Any]:
     """Return the result of a perfect identification of a machine, mm, in the datum of results."""
-    truth = StepDiagonalResult(machine.steps_m, machine.truth_m(), None, "", "", {}, Closure())
+    truth = StepDiagonalResult(
+        machine.steps_m, machine.truth_m(), None, "", "", {}, Closure()
+    )
     errors = {
         profiles.name_of(j, c): (truth.errors_m[j, :, c] / M_PER_MM).tolist()
         for j in range(machine.dim)
@@ -236,5 +257,9 @@ def truth_of(machine: StepMachine) -> dict[str, Any]:
     return {
         "unit": "mm",
         **errors,
-        **{key: value for key, value in truth_geometry.items() if not key.startswith("u_")},
+        **{
+            key: value
+            for key, value in truth_geometry.items()
+            if not key.startswith("u_")
+        },
     }

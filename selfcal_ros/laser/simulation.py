@@ -23,7 +23,14 @@ from selfcal_ros.laser.data import (
     turn_to_first_step,
 )
 from selfcal_ros.laser.profiles import name_of
-from selfcal_ros.units import M_PER_MM, M_PER_NM, M_PER_UM, ONE_PER_PPM, RAD_PER_MRAD, RAD_PER_URAD
+from selfcal_ros.units import (
+    M_PER_MM,
+    M_PER_NM,
+    M_PER_UM,
+    ONE_PER_PPM,
+    RAD_PER_MRAD,
+    RAD_PER_URAD,
+)
 
 _Z = np.array([0.0, 0.0, 1.0])
 
@@ -150,7 +157,9 @@ def simulate_step_diagonal(
     return StepDiagonal(machine.steps_m, names, samples, linear)
 
 
-def trace(machine: StepMachine, name: str, setup: SetUp) -> tuple[np.ndarray, np.ndarray]:
+def trace(
+    machine: StepMachine, name: str, setup: SetUp
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the order of the steps in time and the laser distances, noise-free.
 
     Returns
@@ -204,7 +213,9 @@ def _directions(
 
 
 def _tilted(
-    direction: np.ndarray, sideways: tuple[np.ndarray, np.ndarray], angles_rad: tuple[float, ...]
+    direction: np.ndarray,
+    sideways: tuple[np.ndarray, np.ndarray],
+    angles_rad: tuple[float, ...],
 ) -> np.ndarray:
     for side, angle in zip(sideways, angles_rad, strict=False):
         direction = rotation(angle * np.cross(direction, side)) @ direction
@@ -222,10 +233,16 @@ def rotation(vector_rad: np.ndarray) -> np.ndarray:
 
 
 def random_machine(
-    steps_m: tuple[float, ...], n_blocks: int, rng: np.random.Generator, *, sigma_m: float = 1e-7
+    steps_m: tuple[float, ...],
+    n_blocks: int,
+    rng: np.random.Generator,
+    *,
+    sigma_m: float = 1e-7,
 ) -> StepMachine:
     """Return a machine with normally distributed step errors, in the datum of the results."""
-    machine = StepMachine(steps_m, rng.normal(0, sigma_m, (len(steps_m), n_blocks, len(steps_m))))
+    machine = StepMachine(
+        steps_m, rng.normal(0, sigma_m, (len(steps_m), n_blocks, len(steps_m)))
+    )
     return StepMachine(steps_m, machine.truth_m())
 
 
@@ -300,11 +317,16 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
         },
     )
     if top["seed"] < 0:
-        raise InputError(f"{where}: seed", f"{top['seed']} is negative", "give 0 or more")
+        raise InputError(
+            f"{where}: seed", f"{top['seed']} is negative", "give 0 or more"
+        )
     rng = np.random.default_rng(top["seed"])
     machine = _machine(top["machine"], f"{where}: machine", rng)
     setups = checked_fields(
-        top["setups"], f"{where}: setups", {}, dict.fromkeys(DIAGONALS[machine.dim], (dict, None))
+        top["setups"],
+        f"{where}: setups",
+        {},
+        dict.fromkeys(DIAGONALS[machine.dim], (dict, None)),
     )
     lengths = ("distance_nm", "reading_nm", "linear_nm")
     noise = checked_fields(
@@ -315,7 +337,8 @@ def simulation_from_dict(data: object, where: str) -> LaserSimulation:
     )
     repeats = _count(noise["repeats"], f"{where}: noise: repeats", MAX_REPEATS)
     distance_m, reading_m, linear_m = (
-        _number(noise[key], f"{where}: noise: {key}", positive=True) * M_PER_NM for key in lengths
+        _number(noise[key], f"{where}: noise: {key}", positive=True) * M_PER_NM
+        for key in lengths
     )
     return LaserSimulation(
         machine,
@@ -347,9 +370,13 @@ def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
             **dict.fromkeys(kinds, (list, None)),
         },
     )
-    steps = tuple(np.array(_numbers(fields["steps_mm"], f"{where}: steps_mm", (2, 3))) * M_PER_MM)
+    steps = tuple(
+        np.array(_numbers(fields["steps_mm"], f"{where}: steps_mm", (2, 3))) * M_PER_MM
+    )
     if min(steps) <= 0:
-        raise InputError(f"{where}: steps_mm", "a step is not positive", "give lengths in mm")
+        raise InputError(
+            f"{where}: steps_mm", "a step is not positive", "give lengths in mm"
+        )
     dim = len(steps)
     listed = {kind: fields[kind] for kind in kinds if fields[kind] is not None}
     if listed and {"blocks", "sigma_um"} & cast(dict, raw).keys():
@@ -358,7 +385,9 @@ def _machine(raw: object, where: str, rng: np.random.Generator) -> StepMachine:
         errors = _errors(listed, where, dim)
     else:
         blocks = _count(fields["blocks"], f"{where}: blocks", MAX_BLOCKS)
-        sigma = _number(fields["sigma_um"], f"{where}: sigma_um", positive=True) * M_PER_UM
+        sigma = (
+            _number(fields["sigma_um"], f"{where}: sigma_um", positive=True) * M_PER_UM
+        )
         errors = random_machine(steps, blocks, rng, sigma_m=sigma).errors_m
     turns = _turns(fields["turns_urad"], f"{where}: turns_urad", errors.shape)
     return StepMachine(steps, errors, turns, fields["stacked"])
@@ -402,7 +431,9 @@ def _turns(raw: object, where: str, shape: tuple[int, int, int]) -> np.ndarray |
                 f"not {shape[1]} rotation vectors",
                 "give [rx, ry, rz] for every block",
             )
-        turns[axes.index(axis)] = [_numbers(row, f"{where}: {axis}", (3,)) for row in rows]
+        turns[axes.index(axis)] = [
+            _numbers(row, f"{where}: {axis}", (3,)) for row in rows
+        ]
     return turns * RAD_PER_URAD
 
 
@@ -421,10 +452,15 @@ def _setup(raw: object, where: str, dim: int) -> SetUp:
         },
     )
     laser_rad, mirror_rad = (
-        tuple(np.array(_numbers(fields[key], f"{where}: {key}", (dim - 1,))) * RAD_PER_MRAD)
+        tuple(
+            np.array(_numbers(fields[key], f"{where}: {key}", (dim - 1,)))
+            * RAD_PER_MRAD
+        )
         for key in ("laser_mrad", "mirror_mrad")
     )
-    x, y, z = np.array(_numbers(fields["abbe_mm"], f"{where}: abbe_mm", (3,))) * M_PER_MM
+    x, y, z = (
+        np.array(_numbers(fields["abbe_mm"], f"{where}: abbe_mm", (3,))) * M_PER_MM
+    )
     scale = _number(fields["scale_ppm"], f"{where}: scale_ppm") * ONE_PER_PPM
     return SetUp(laser_rad, mirror_rad, fields["to_machine"], (x, y, z), scale)
 
@@ -446,12 +482,20 @@ def _number(value: object, where: str, *, positive: bool = False) -> float:
 
 def _numbers(value: list, where: str, lengths: tuple[int, ...] | range) -> list[float]:
     if len(value) not in lengths:
-        length_text = " or ".join(map(str, lengths)) if len(lengths) < 4 else f"1 to {lengths[-1]}"
-        raise InputError(where, f"{value!r} is not a list of {length_text} numbers", "give one")
+        length_text = (
+            " or ".join(map(str, lengths))
+            if len(lengths) < 4
+            else f"1 to {lengths[-1]}"
+        )
+        raise InputError(
+            where, f"{value!r} is not a list of {length_text} numbers", "give one"
+        )
     return [_number(item, where) for item in value]
 
 
 def _count(value: int, where: str, most: int) -> int:
     if not 1 <= value <= most:
-        raise InputError(where, f"{value!r} is not a whole number from 1 to {most}", "give one")
+        raise InputError(
+            where, f"{value!r} is not a whole number from 1 to {most}", "give one"
+        )
     return value

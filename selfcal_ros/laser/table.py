@@ -116,10 +116,16 @@ def _rows(path: str | os.PathLike) -> list[tuple[int, list[str]]]:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not filled_lines:
-        raise NoDataError(str(path), "the table is empty", "give a header and one row per block")
-    rows = [(number, csv_cells(line, f"{path}:{number}")) for number, line in filled_lines]
+        raise NoDataError(
+            str(path), "the table is empty", "give a header and one row per block"
+        )
+    rows = [
+        (number, csv_cells(line, f"{path}:{number}")) for number, line in filled_lines
+    ]
     if len(rows) == 1:
-        raise NoDataError(str(path), "the table has a header only", "give one row per block")
+        raise NoDataError(
+            str(path), "the table has a header only", "give one row per block"
+        )
     return rows
 
 
@@ -139,7 +145,11 @@ def _header(path: str | os.PathLike, rows: list, columns: RequiredColumns) -> li
     absent = [
         name
         for name in columns.diagonals
-        if all(column in missing for column in columns.readings if column.endswith(f"_{name}"))
+        if all(
+            column in missing
+            for column in columns.readings
+            if column.endswith(f"_{name}")
+        )
     ]
     if absent and len(absent) < len(columns.diagonals):
         raise InputError(
@@ -172,7 +182,9 @@ def _names_text(names: Sequence[str]) -> str:
 def _block(text: str, where: str) -> int:
     number = _number(text, where)
     if number != round(number) or not 0 <= number <= laser_data.MAX_BLOCKS:
-        raise InputError(where, f"'{text}' is not a block number", "number the blocks 1, 2, 3, ...")
+        raise InputError(
+            where, f"'{text}' is not a block number", "number the blocks 1, 2, 3, ..."
+        )
     return int(number)
 
 

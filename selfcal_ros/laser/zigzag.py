@@ -16,7 +16,13 @@ from itertools import pairwise
 import numpy as np
 
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.laser.data import AXES, DIAGONALS, MAX_BLOCKS, StepDiagonal, check_reading
+from selfcal_ros.laser.data import (
+    AXES,
+    DIAGONALS,
+    MAX_BLOCKS,
+    StepDiagonal,
+    check_reading,
+)
 from selfcal_ros.units import NS_PER_S
 
 OUTLIER = 10.0
@@ -137,7 +143,9 @@ def cut_zigzag(series: Recording, rule: CutRule) -> Cut:
     for chain in chains:
         name = _name_of_run(chain, dim)
         if name is None:
-            notes.append(f"{len(chain)} move(s) that are not a run along a diagonal or an axis")
+            notes.append(
+                f"{len(chain)} move(s) that are not a run along a diagonal or an axis"
+            )
         else:
             named.setdefault(name, []).append(chain)
     _same_length(named, dim)
@@ -175,7 +183,9 @@ def _check(series: Recording) -> None:
         bad = ~np.isfinite(values).reshape(len(values), -1).all(axis=1)
         if bad.any():
             raise InputError(
-                name, f"sample {int(np.argmax(bad))} is not finite", "leave lost samples out"
+                name,
+                f"sample {int(np.argmax(bad))} is not finite",
+                "leave lost samples out",
             )
 
 
@@ -197,7 +207,12 @@ def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
             laser = _mean_laser(series, (first, last), rule)
             if laser is not None:
                 rests.append(
-                    Rest(positions[start:end].mean(axis=0), laser[0], int(first), laser[1])
+                    Rest(
+                        positions[start:end].mean(axis=0),
+                        laser[0],
+                        int(first),
+                        laser[1],
+                    )
                 )
             start = end
             end = end + 1
@@ -205,13 +220,18 @@ def find_rests(series: Recording, rule: CutRule) -> list[Rest]:
             break
         else:
             # No rest contains both the sample at `end` and the last one too far from it.
-            far = np.abs(positions[start:end] - positions[end]).max(axis=1) > rule.rest_tolerance_m
+            far = (
+                np.abs(positions[start:end] - positions[end]).max(axis=1)
+                > rule.rest_tolerance_m
+            )
             start += int(np.flatnonzero(far)[-1]) + 1
             end += 1
     return rests
 
 
-def _end_of_rest(positions: np.ndarray, interval: tuple[int, int], tolerance_m: float) -> int:
+def _end_of_rest(
+    positions: np.ndarray, interval: tuple[int, int], tolerance_m: float
+) -> int:
     """Return the end of the interval from interval[0] within the tolerance."""
     start, end = interval
     low, high = positions[start:end].min(axis=0), positions[start:end].max(axis=0)
@@ -296,7 +316,8 @@ def _continues(chain: list[Move], move: Move) -> bool:
     if same_axis and same_axis[-1].sense != move.sense:
         return False
     period = next(
-        (index for index in range(1, len(chain)) if chain[index].axis == chain[0].axis), None
+        (index for index in range(1, len(chain)) if chain[index].axis == chain[0].axis),
+        None,
     )
     if period is None:
         # The first cycle is not closed: X may follow X (a run of one axis) or close the cycle.
@@ -324,20 +345,27 @@ def _origin(named: dict[str, list[list[Move]]]) -> dict[int, float]:
     """Return the lowest position of a move on every axis, m."""
     origin: dict[int, float] = {}
     for move in (
-        move for chains_of_run in named.values() for chain in chains_of_run for move in chain
+        move
+        for chains_of_run in named.values()
+        for chain in chains_of_run
+        for move in chain
     ):
         origin[move.axis] = min(origin.get(move.axis, np.inf), move.low_m)
     return origin
 
 
-def _readings(chain: list[Move], name: str, origin: dict[int, float], rule: CutRule) -> np.ndarray:
+def _readings(
+    chain: list[Move], name: str, origin: dict[int, float], rule: CutRule
+) -> np.ndarray:
     """Return the readings of a run, (D, n), or (n,) for a run of one axis; by position."""
     dim = len(rule.steps_m)
     steps = np.array(rule.steps_m)
     single_axis = len(name) == 1
     n = _blocks_of(chain, name, dim)
     if n > MAX_BLOCKS:
-        raise InputError("recording", f"{n} blocks", f"at most {MAX_BLOCKS} are handled")
+        raise InputError(
+            "recording", f"{n} blocks", f"at most {MAX_BLOCKS} are handled"
+        )
     out = np.full((dim, n), np.nan)
     for move in chain:
         block = round((move.low_m - origin[move.axis]) / steps[move.axis])
@@ -348,7 +376,11 @@ def _readings(chain: list[Move], name: str, origin: dict[int, float], rule: CutR
                 f"the run has {n} blocks only and starts elsewhere on the axis",
                 "run all diagonals and axes over the same range",
             )
-        nominal = steps[move.axis] if single_axis else (steps**2 / np.linalg.norm(steps))[move.axis]
+        nominal = (
+            steps[move.axis]
+            if single_axis
+            else (steps**2 / np.linalg.norm(steps))[move.axis]
+        )
         check_reading(move.reading_m, nominal, where)
         out[move.axis, block] = move.reading_m
     return out[chain[0].axis] if single_axis else out
@@ -356,10 +388,13 @@ def _readings(chain: list[Move], name: str, origin: dict[int, float], rule: CutR
 
 def _same_length(named: dict[str, list[list[Move]]], dim: int) -> None:
     lengths = {
-        name: {_blocks_of(chain, name, dim) for chain in chains} for name, chains in named.items()
+        name: {_blocks_of(chain, name, dim) for chain in chains}
+        for name, chains in named.items()
     }
     if len({length for of_run in lengths.values() for length in of_run}) > 1:
-        counts = ", ".join(f"{name} {sorted(of_run)}" for name, of_run in sorted(lengths.items()))
+        counts = ", ".join(
+            f"{name} {sorted(of_run)}" for name, of_run in sorted(lengths.items())
+        )
         raise InputError(
             "recording",
             f"runs of different numbers of blocks: {counts}",

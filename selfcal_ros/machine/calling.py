@@ -45,11 +45,12 @@ def called(
     except (SelfcalError, ModuleNotFoundError, Ended):
         raise
     except (Exception, SystemExit) as error:
+        # none if a library in C raised it
         frames = [
             frame
             for frame in traceback.extract_tb(error.__traceback__)
             if frame.filename != __file__
-        ]  # none if a library in C raised it
+        ]
         of_user = [
             frame
             for frame in frames

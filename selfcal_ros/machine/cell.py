@@ -136,7 +136,9 @@ class Cell:
         From a `start` beyond the limits a move back towards them is allowed.
         """
         if not math.isfinite(value):
-            raise MachineError(f"{motion}: {axis} = {value} is not a position", str(self.path))
+            raise MachineError(
+                f"{motion}: {axis} = {value} is not a position", str(self.path)
+            )
         if axis not in self.limits:
             raise MachineError(
                 f"{motion} moves {axis}, which has no limits",
@@ -173,7 +175,11 @@ def read_cell(path: str | Path) -> Cell:
         )
     machine = data["machine"]
     machine_key = machine.rpartition(":")[2]
-    if ":" not in machine and machine not in SHIPPED and machine not in known_machines():
+    if (
+        ":" not in machine
+        and machine not in SHIPPED
+        and machine not in known_machines()
+    ):
         raise InputError(
             f"{where}: machine",
             f"there is no machine '{machine}'",
@@ -207,7 +213,9 @@ def read_cell(path: str | Path) -> Cell:
                 f"the travel of {axis} is not limited",
                 f"give {axis}: [low, high] in m, as the machine indicates them",
             )
-    sense = Parameter("sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense)))
+    sense = Parameter(
+        "sense", str(Sense.MICROSCOPE_MOVES), "", choices=tuple(map(str, Sense))
+    )
     placing_keys = _mapping(
         data.get("placing") if isinstance(data.get("placing"), dict) else {}, where
     )
@@ -224,7 +232,9 @@ def read_cell(path: str | Path) -> Cell:
         machine,
         _mapping(data.get(machine_key, {}), f"{where}: {machine_key}"),
         limits,
-        origin=_numbers(data.get("origin", {}), f"{where}: origin", dict.fromkeys(AXES, 0.0)),
+        origin=_numbers(
+            data.get("origin", {}), f"{where}: origin", dict.fromkeys(AXES, 0.0)
+        ),
         sense=Sense(sense.check(data.get("sense", sense.default), where)),
         settle=Settle(
             **_numbers(
@@ -242,7 +252,11 @@ def read_cell(path: str | Path) -> Cell:
 
 def _detector(data: Any, where: str) -> DetectorSettings:
     section = _mapping(data, f"{where}: detector")
-    names = [item.name for item in DetectorSettings.parameters() if item.name not in NOT_OF_A_CELL]
+    names = [
+        item.name
+        for item in DetectorSettings.parameters()
+        if item.name not in NOT_OF_A_CELL
+    ]
     _only(section, names, f"{where}: detector")
     return DetectorSettings.checked(section, f"{where}: detector")
 
@@ -258,7 +272,9 @@ def _mapping(data: Any, where: str) -> dict[str, Any]:
 def _only(data: Mapping[str, Any], known_keys: Any, where: str) -> None:
     for key in data:
         if key not in known_keys:
-            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known_keys))
+            raise InputError(
+                f"{where}: {key}", "unknown key", known_are(str(key), known_keys)
+            )
 
 
 def _numbers(
@@ -277,10 +293,14 @@ def _numbers(
 
 def _pair(value: Any, where: str) -> tuple[float, float]:
     numbers = (
-        [item for item in value if isinstance(item, int | float)] if isinstance(value, list) else []
+        [item for item in value if isinstance(item, int | float)]
+        if isinstance(value, list)
+        else []
     )
     if len(numbers) != 2 or not numbers[0] < numbers[1]:
-        raise InputError(where, f"{value!r} is not [low, high]", "give two rising numbers, SI")
+        raise InputError(
+            where, f"{value!r} is not [low, high]", "give two rising numbers, SI"
+        )
     return float(numbers[0]), float(numbers[1])
 
 
@@ -401,7 +421,9 @@ def check_keys(kind: Any, cell: Cell) -> None:
     ]
     if missing:
         raise InputError(
-            where, f"the key '{missing[0]}' is missing", f"give {cell.name}: {{{missing[0]}: ...}}"
+            where,
+            f"the key '{missing[0]}' is missing",
+            f"give {cell.name}: {{{missing[0]}: ...}}",
         )
 
 
@@ -439,7 +461,11 @@ def _as_yaml(value: Any) -> str:
         text = repr(value)
         return text if "." in text or "e" not in text else text.replace("e", ".0e")
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {_as_yaml(item)}" for key, item in value.items()) + "}"
+        return (
+            "{"
+            + ", ".join(f"{key}: {_as_yaml(item)}" for key, item in value.items())
+            + "}"
+        )
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_as_yaml, value)) + "]"
     return str(value)

@@ -59,7 +59,9 @@ def _fitted(cause: np.ndarray, deviations_m: np.ndarray) -> tuple[np.ndarray, fl
     return slope, float((slope * product).sum() / total) if total else 0.0
 
 
-def _reversal(visits: GridVisits, deviations_m: np.ndarray, mark: np.ndarray) -> Contradiction:
+def _reversal(
+    visits: GridVisits, deviations_m: np.ndarray, mark: np.ndarray
+) -> Contradiction:
     signs = np.stack([visits.approach_x, visits.approach_y]).astype(float)
     slope, explained = _fitted(_about_means(signs, mark), deviations_m)
     x, y = np.abs(2 * slope) * UM_PER_M
@@ -71,13 +73,17 @@ def _reversal(visits: GridVisits, deviations_m: np.ndarray, mark: np.ndarray) ->
     )
 
 
-def _jump(order: np.ndarray, deviations_m: np.ndarray, mark: np.ndarray) -> Contradiction:
+def _jump(
+    order: np.ndarray, deviations_m: np.ndarray, mark: np.ndarray
+) -> Contradiction:
     """Return the best single jump between two visits."""
     best = Contradiction(0.0, "", "")
     later = np.ones(len(order))
     for number, row in enumerate(order[:-1]):
         later[row] = 0.0
-        slope, explained = _fitted(np.tile(_about_means(later, mark), (2, 1)), deviations_m)
+        slope, explained = _fitted(
+            np.tile(_about_means(later, mark), (2, 1)), deviations_m
+        )
         if explained > best.explained:
             x, y = slope * UM_PER_M
             best = Contradiction(
@@ -90,7 +96,9 @@ def _jump(order: np.ndarray, deviations_m: np.ndarray, mark: np.ndarray) -> Cont
     return best
 
 
-def _running(visits: GridVisits, deviations_m: np.ndarray, mark: np.ndarray) -> Contradiction:
+def _running(
+    visits: GridVisits, deviations_m: np.ndarray, mark: np.ndarray
+) -> Contradiction:
     time_ns = visits.stamp_ns - visits.stamp_ns.min()
     time = time_ns / max(int(time_ns.max()), 1)
     slope, explained = _fitted(np.tile(_about_means(time, mark), (2, 1)), deviations_m)

@@ -42,7 +42,11 @@ class Driver:
     """
 
     def __init__(
-        self, cell: Cell, machine: Machine, say: Callable[[str], None], clock: Clock | None = None
+        self,
+        cell: Cell,
+        machine: Machine,
+        say: Callable[[str], None],
+        clock: Clock | None = None,
     ) -> None:
         self._cell, self._machine, self._say = cell, machine, say
         self._clock = clock or Clock()
@@ -149,7 +153,9 @@ class Driver:
         x, y = view.translation_m
         self._unplaced = True
         place_by_robot(
-            self._machine, self._cell, Placing(view.name, x, y, view.rotation_rad, command)
+            self._machine,
+            self._cell,
+            Placing(view.name, x, y, view.rotation_rad, command),
         )
         self._unplaced = False
 

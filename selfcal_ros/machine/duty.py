@@ -61,4 +61,6 @@ class Duty:
         ):
             return Again()
         marks = {*zip(status.missing_m, status.missing_n, strict=False)}
-        return Again(marks, {*status.missing_k}, status.check_done < status.check_expected)
+        return Again(
+            marks, {*status.missing_k}, status.check_done < status.check_expected
+        )

@@ -87,13 +87,17 @@ class GcodeMachine:
                 f"choose one of {', '.join(DIALECTS)}",
             )
         if not (math.isfinite(feed) and feed > 0):
-            raise MachineError(f"a feed of {feed} mm/min", "gcode: feed", "give mm/min above 0")
+            raise MachineError(
+                f"a feed of {feed} mm/min", "gcode: feed", "give mm/min above 0"
+            )
         self.axes = tuple(axes)
         self._feed, self._dialect = float(feed), dialect
         self._camera = None
         self._lines = Lines(port, baud, PATIENCE_S)
         try:
-            self._talk = _TALKS[dialect](self._lines, self.axes, (password, enable_password))
+            self._talk = _TALKS[dialect](
+                self._lines, self.axes, (password, enable_password)
+            )
             if camera is not None:
                 from selfcal_ros.machine.video import VideoCamera  # extra camera
 
@@ -105,15 +109,21 @@ class GcodeMachine:
     def position(self) -> tuple[float, ...]:
         """Return the indicated position, m and rad."""
         native = self._talk.position()
-        return tuple(_to_si(axis, value) for axis, value in zip(self.axes, native, strict=True))
+        return tuple(
+            _to_si(axis, value) for axis, value in zip(self.axes, native, strict=True)
+        )
 
     def move_to(self, position: tuple[float, ...]) -> None:
         """Move, and wait for the end of the motion."""
         start = self._talk.position()
-        native = [_from_si(axis, value) for axis, value in zip(self.axes, position, strict=True)]
+        native = [
+            _from_si(axis, value)
+            for axis, value in zip(self.axes, position, strict=True)
+        ]
         way = math.hypot(*(to - at for to, at in zip(native, start, strict=True)))
         words = " ".join(
-            f"{LETTERS[axis]}{value:.6f}" for axis, value in zip(self.axes, native, strict=True)
+            f"{LETTERS[axis]}{value:.6f}"
+            for axis, value in zip(self.axes, native, strict=True)
         )
         longest_s = ALLOWANCE * way / self._feed * 60 + PATIENCE_S
         try:
@@ -158,7 +168,9 @@ class _Talk:
     GREETING = ""
     """How the first line after a reset begins."""
 
-    def __init__(self, lines: Lines, axes: tuple[str, ...], passwords: tuple[str, str]) -> None:
+    def __init__(
+        self, lines: Lines, axes: tuple[str, ...], passwords: tuple[str, str]
+    ) -> None:
         self._lines, self._axes, self._passwords = lines, axes, passwords
         self._may_greet = True  # it is being reset, or may have been before
         self._begin()
@@ -186,7 +198,9 @@ class _Talk:
             )
         elif "\N{REPLACEMENT CHARACTER}" in answer:
             raise MachineError(
-                f"'{answer:.40}' is not an answer", "controller", "check baud, cable and its shield"
+                f"'{answer:.40}' is not an answer",
+                "controller",
+                "check baud, cable and its shield",
             )
         return answer
 
@@ -208,7 +222,11 @@ class _Talk:
     def _refuse(self, answer: str, line: str) -> None:
         """Raise if an answer is an error."""
         low = answer.lower()
-        if low.startswith(("error", "alarm", "!!")) or "kill()" in low or "halted" in low:
+        if (
+            low.startswith(("error", "alarm", "!!"))
+            or "kill()" in low
+            or "halted" in low
+        ):
             raise MachineError(
                 f"'{line}' was answered by '{answer}'",
                 "controller",
@@ -264,7 +282,9 @@ class _Grbl(_Talk):
         if "WPos" in report and hasattr(self, "_offset"):
             at = [
                 value + off
-                for value, off in zip(_numbers(report["WPos"]), self._offset, strict=True)
+                for value, off in zip(
+                    _numbers(report["WPos"]), self._offset, strict=True
+                )
             ]
             return state, self._chosen(at)
         raise MachineError(
@@ -273,10 +293,12 @@ class _Grbl(_Talk):
 
     def _chosen(self, values: list[float]) -> list[float]:
         if len(values) < len(self._axes):
-            raise MachineError(f"it reports {len(values)} axes", "controller", "correct axes")
-        return [values[index] for index in ([0, 1, 3] if len(values) > 3 else [0, 1, 2])][
-            : len(self._axes)
-        ]
+            raise MachineError(
+                f"it reports {len(values)} axes", "controller", "correct axes"
+            )
+        return [
+            values[index] for index in ([0, 1, 3] if len(values) > 3 else [0, 1, 2])
+        ][: len(self._axes)]
 
     def position(self) -> list[float]:
         return self._status()[1]
@@ -323,7 +345,9 @@ class _Marlin(_Talk):
     def position(self) -> list[float]:
         for answer in self._ok(self.QUERY):
             logical, _, counted = answer.partition("Count")
-            position_of_letter = {letter: float(value) for letter, value in NUMBER.findall(logical)}
+            position_of_letter = {
+                letter: float(value) for letter, value in NUMBER.findall(logical)
+            }
             position_of_letter |= {
                 letter: float(value) / self._per_mm[letter]
                 for letter, value in NUMBER.findall(counted)
@@ -331,7 +355,9 @@ class _Marlin(_Talk):
             }
             if {LETTERS[axis] for axis in self._axes} <= position_of_letter.keys():
                 return [position_of_letter[LETTERS[axis]] for axis in self._axes]
-        raise MachineError("M114 tells no position of all axes", "controller", "correct axes")
+        raise MachineError(
+            "M114 tells no position of all axes", "controller", "correct axes"
+        )
 
     def move(self, travel: _Travel) -> None:
         self._ok(f"G1 {travel.words}", travel.longest_s)
@@ -362,9 +388,17 @@ class _LinuxCnc(_Talk):
         if answer.startswith("hello"):  # its echo
             answer = self._lines.receive()
         if not answer.upper().startswith("HELLO ACK"):
-            raise MachineError(f"linuxcncrsh answered '{answer}'", "controller", "check password")
+            raise MachineError(
+                f"linuxcncrsh answered '{answer}'", "controller", "check password"
+            )
         self._lines.send("set echo off")
-        for words in ("verbose on", f"enable {enable}", "mode mdi", "set_wait done", "mdi G21 G90"):
+        for words in (
+            "verbose on",
+            f"enable {enable}",
+            "mode mdi",
+            "set_wait done",
+            "mdi G21 G90",
+        ):
             self._set(words)
 
     def _set(self, words: str, timeout_s: float = PATIENCE_S) -> None:
@@ -390,7 +424,9 @@ class _LinuxCnc(_Talk):
         values = [float(word) for word in answer.split()[1:]]
         places = [self.ORDER.index(LETTERS[axis]) for axis in self._axes]
         if max(places) >= len(values):
-            raise MachineError(f"its position is '{answer}'", "controller", "correct axes")
+            raise MachineError(
+                f"its position is '{answer}'", "controller", "correct axes"
+            )
         return [values[place] for place in places]
 
     def move(self, travel: _Travel) -> None:
@@ -408,7 +444,9 @@ def _numbers(text: str) -> list[float]:
         return [float(number) for number in text.split(",")]
     except ValueError:
         raise MachineError(
-            f"'{text}' is not a position", "controller", "check baud, cable and its shield"
+            f"'{text}' is not a position",
+            "controller",
+            "check baud, cable and its shield",
         ) from None
 
 

@@ -75,7 +75,9 @@ class Lines:
             if not data.strip():
                 data = b""
         raise MachineError(
-            f"no answer in {wait_s:g} s", self._port, "check baud, dialect and the emergency stop"
+            f"no answer in {wait_s:g} s",
+            self._port,
+            "check baud, dialect and the emergency stop",
         )
 
     def forget(self) -> None:

@@ -128,7 +128,9 @@ class Run:
         """
         for view in self.plan.views:
             route = stops(
-                self.plan.artifact, replace(view, repeats=1, visit_order=""), self.cell.sense
+                self.plan.artifact,
+                replace(view, repeats=1, visit_order=""),
+                self.cell.sense,
             )
             try:
                 self.visitor.require(route)
@@ -205,7 +207,9 @@ class Run:
         where = str(self.bag)
         if not any(self.bag.glob("*.mcap")):
             raise InputError(
-                where, "not a bag of an interrupted run", "remove it, or name another folder"
+                where,
+                "not a bag of an interrupted run",
+                "remove it, or name another folder",
             )
         self._journal = Claim(self.bag).resume()
         if self._journal is None:
@@ -255,7 +259,11 @@ class Run:
         view = command.placed()
         if self.cell.placing == "robot":
             placing = Placing(
-                view.name, view.translation_m[0], view.translation_m[1], view.rotation_rad, command
+                view.name,
+                view.translation_m[0],
+                view.translation_m[1],
+                view.rotation_rad,
+                command,
             )
             place_by_robot(self.machine, self.cell, placing)
         else:
@@ -284,7 +292,9 @@ class Run:
         """Save a message, then use it."""
         assert self._journal is not None
         topic, fields = message_of(event)
-        self._journal.write(f"/{topic}", cdr_bytes(INPUT_TOPICS[topic], fields), event.stamp_ns)
+        self._journal.write(
+            f"/{topic}", cdr_bytes(INPUT_TOPICS[topic], fields), event.stamp_ns
+        )
         self._journal.flush()
         _feed(self.collector, event)
 
@@ -310,7 +320,9 @@ class Run:
 
     def _all_visits(self, index: int) -> GridVisits | None:
         """Return the visits of a view from the bag, outliers included."""
-        everything = Collector(replace(collector_settings(self.cell), outlier_limit=0.0))
+        everything = Collector(
+            replace(collector_settings(self.cell), outlier_limit=0.0)
+        )
         feed = block_handlers(everything, [])
         for topic, item in BagReader(self.bag).columns():
             feed[topic](item)
@@ -327,9 +339,13 @@ class Run:
         resumed = self._resumed
         self._resumed = False
         self.desk.say(f"view {index + 1} of {number} '{view.name}'")
-        if not self.desk.may_move("the stage makes a small move, then goes to its marks"):
+        if not self.desk.may_move(
+            "the stage makes a small move, then goes to its marks"
+        ):
             raise InputError(
-                f"view '{view.name}'", "the stage may not move", "continue with --resume"
+                f"view '{view.name}'",
+                "the stage may not move",
+                "continue with --resume",
             )
         self.visitor.approach(self.plan.artifact, view)
         if resumed and self._has_shifted():
@@ -405,7 +421,9 @@ class Run:
         readings, view = progress.readings, progress.view
         if not len(readings.m):
             return False
-        some = np.linspace(0, len(readings.m) - 1, min(SHIFT_MARKS, len(readings.m))).astype(int)
+        some = np.linspace(
+            0, len(readings.m) - 1, min(SHIFT_MARKS, len(readings.m))
+        ).astype(int)
         marks = [(int(readings.m[row]), int(readings.n[row])) for row in some]
         before = {
             mark: (readings.dx[row], readings.dy[row])
@@ -452,7 +470,9 @@ class Run:
 
 def collector_settings(cell: Cell) -> CollectorSettings:
     """Return the parameters with which the readings of a cell are collected."""
-    return CollectorSettings.checked({"measurement_sense": str(cell.sense)}, str(cell.path))
+    return CollectorSettings.checked(
+        {"measurement_sense": str(cell.sense)}, str(cell.path)
+    )
 
 
 def _feed(collector: Collector, event: Command | Event) -> None:
@@ -476,13 +496,18 @@ def place_by_robot(machine: Machine, cell: Cell, placing: Placing) -> None:
         place: Callable[[Placing], None] | None = getattr(machine, "place", None)
         if place is None:
             raise MachineError(
-                "the machine has no method 'place'", f"{cell.path}: placing", "name a command"
+                "the machine has no method 'place'",
+                f"{cell.path}: placing",
+                "name a command",
             )
         called("machine.place", place, placing)
         return
     words = [
         word.format(
-            view=placing.view, x=repr(placing.x), y=repr(placing.y), rotation=repr(placing.rotation)
+            view=placing.view,
+            x=repr(placing.x),
+            y=repr(placing.y),
+            rotation=repr(placing.rotation),
         )
         for word in shlex.split(cell.place_command)
     ]
@@ -514,7 +539,9 @@ def _named(progress: ViewProgress) -> str:
 
 
 def _rejected(progress: ViewProgress) -> str:
-    commonest = sorted(progress.readings.rejected.items(), key=lambda item: -item[1])[:3]
+    commonest = sorted(progress.readings.rejected.items(), key=lambda item: -item[1])[
+        :3
+    ]
     return (
         f" (rejected: {', '.join(f'{name} {count}' for name, count in commonest)})"
         if commonest

@@ -87,7 +87,9 @@ class MicroManagerMachine:
     def _load(self, adapters: str, config: str, folder: str) -> None:
         path = Path(folder, config)
         if not path.is_file():
-            raise MachineError("there is no such file", str(path), "name the .cfg of the device")
+            raise MachineError(
+                "there is no such file", str(path), "name the .cfg of the device"
+            )
         try:
             if adapters:
                 self._core.setDeviceAdapterSearchPaths([adapters])
@@ -120,7 +122,10 @@ class MicroManagerMachine:
     def _call(self, action: str, function: Any, *values: Any) -> Any:
         """Call the core; its errors become those of a machine."""
         return called(
-            f"{self._where}: {action}", function, *values, remedy="check the device and its cables"
+            f"{self._where}: {action}",
+            function,
+            *values,
+            remedy="check the device and its cables",
         )
 
     def position(self) -> tuple[float, ...]:
@@ -138,9 +143,18 @@ class MicroManagerMachine:
             )
         x, y = position
         start = self.position()
-        longest_s = ALLOWANCE * math.hypot(x - start[0], y - start[1]) / self._speed + PATIENCE_S
+        longest_s = (
+            ALLOWANCE * math.hypot(x - start[0], y - start[1]) / self._speed
+            + PATIENCE_S
+        )
         self._call("the time-out", self._core.setTimeoutMs, round(longest_s * MS_PER_S))
-        self._call("the move", self._core.setXYPosition, self._stage, x * UM_PER_M, y * UM_PER_M)
+        self._call(
+            "the move",
+            self._core.setXYPosition,
+            self._stage,
+            x * UM_PER_M,
+            y * UM_PER_M,
+        )
         try:
             self._call("the move", self._core.waitForDevice, self._stage)
         except MachineError:

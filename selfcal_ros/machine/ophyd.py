@@ -56,7 +56,9 @@ class OphydMachine:
     ) -> None:
         if unit not in M_PER:
             raise MachineError(
-                f"the unit '{unit}' is unknown", "ophyd: unit", f"use {', '.join(M_PER)}"
+                f"the unit '{unit}' is unknown",
+                "ophyd: unit",
+                f"use {', '.join(M_PER)}",
             )
         if angle_unit not in RAD_PER:
             raise MachineError(
@@ -67,7 +69,8 @@ class OphydMachine:
         names = {"x": x, "y": y} | ({"theta": theta} if theta else {})
         self.axes = tuple(names)
         self._per_unit = {
-            axis: RAD_PER[angle_unit] if axis == "theta" else M_PER[unit] for axis in names
+            axis: RAD_PER[angle_unit] if axis == "theta" else M_PER[unit]
+            for axis in names
         }
         self._timeout_s, self._image = timeout, image
         self._motors = {axis: _object(name, timeout) for axis, name in names.items()}
@@ -79,7 +82,9 @@ class OphydMachine:
         for axis, motor in self._motors.items():
             value = _called(f"position of {axis}", lambda at=motor: at.position)
             if value is None or not math.isfinite(float(value)):
-                raise MachineError(f"its position is {value}", axis, "check its connection")
+                raise MachineError(
+                    f"its position is {value}", axis, "check its connection"
+                )
             values.append(float(value) * self._per_unit[axis])
         return tuple(values)
 
@@ -87,7 +92,10 @@ class OphydMachine:
         """Start all axes, and wait for all."""
         try:
             waiting = [
-                (axis, _called(axis, self._motors[axis].set, value / self._per_unit[axis]))
+                (
+                    axis,
+                    _called(axis, self._motors[axis].set, value / self._per_unit[axis]),
+                )
                 for axis, value in zip(self.axes, position, strict=True)
             ]
             for axis, status in waiting:
@@ -103,7 +111,9 @@ class OphydMachine:
         status = _called("trigger", self._detector.trigger)
         _called("trigger", status.wait, timeout=self._timeout_s)
         signal = reduce(getattr, self._image.split("."), self._detector)
-        pixels = np.asarray(_called("image", signal.get) if hasattr(signal, "get") else signal)
+        pixels = np.asarray(
+            _called("image", signal.get) if hasattr(signal, "get") else signal
+        )
         return Image(grey(pixels))
 
     def offsets(self) -> list[Offset]:

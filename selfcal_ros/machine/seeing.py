@@ -48,12 +48,17 @@ class Eye:
             return ""
         return (
             " (rejected: "
-            + ", ".join(f"{reason} {count}" for reason, count in counts.rejected.most_common(3))
+            + ", ".join(
+                f"{reason} {count}" for reason, count in counts.rejected.most_common(3)
+            )
             + ")"
         )
 
     def detections(
-        self, image_or_offsets: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
+        self,
+        image_or_offsets: Image | list[Offset],
+        stamp_ns: int,
+        position: tuple[float, ...],
     ) -> list[Detection]:
         """Return the detections in an image or of offsets.
 
@@ -75,7 +80,9 @@ class Eye:
         """
         if isinstance(image_or_offsets, Image):
             picture = self.trusted(image_or_offsets, position)
-            return self._of_images().take_picture(picture, image_or_offsets.stamp_ns or stamp_ns)
+            return self._of_images().take_picture(
+                picture, image_or_offsets.stamp_ns or stamp_ns
+            )
         return [_detection(offset, stamp_ns) for offset in image_or_offsets]
 
     def _of_images(self) -> "ImageDetector":
@@ -86,7 +93,9 @@ class Eye:
                     "the machine returns images, and how marks are found in them is not stated",
                     "give detector: {mark: disc, mark_size: ...}, in m",
                 )
-            from selfcal_ros.vision.exposures import ImageDetector  # scipy: for images alone
+            from selfcal_ros.vision.exposures import (
+                ImageDetector,
+            )  # scipy: for images alone
 
             self._detector = ImageDetector(self._settings, f"{self._where}: detector")
         return self._detector
@@ -94,7 +103,11 @@ class Eye:
     def trusted(self, image: Image, position: tuple[float, ...]) -> Picture:
         """Return the grey values of an image, after checks; raises MachineError."""
         pixels = np.asarray(image.pixels)
-        if pixels.ndim != 2 or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
+        if (
+            pixels.ndim != 2
+            or not pixels.size
+            or pixels.dtype not in (np.uint8, np.uint16)
+        ):
             raise MachineError(
                 f"an image is {pixels.dtype} {pixels.shape}",
                 "machine.image",

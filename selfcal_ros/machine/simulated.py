@@ -14,7 +14,13 @@ from selfcal_ros.machine.clock import SimulatedClock
 from selfcal_ros.machine.interface import Image, MachineError, Offset, Placing
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.simulation import physics
-from selfcal_ros.simulation.cell import DWELL, flicker_noise, normal, quantised, white_noise
+from selfcal_ros.simulation.cell import (
+    DWELL,
+    flicker_noise,
+    normal,
+    quantised,
+    white_noise,
+)
 from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.simulation.spec import Simulation, read_simulation
 from selfcal_ros.units import NS_PER_S
@@ -49,14 +55,22 @@ class SimulatedMachine:
         self._begin(read_simulation(Path(folder) / simulation))
 
     @classmethod
-    def of(cls, simulation: Simulation, clock: SimulatedClock | None = None) -> "SimulatedMachine":
+    def of(
+        cls, simulation: Simulation, clock: SimulatedClock | None = None
+    ) -> "SimulatedMachine":
         """Return the machine of a simulation that has been read."""
         machine = cls.__new__(cls)
         machine._begin(simulation, clock)
         return machine
 
-    def _begin(self, simulation: Simulation, clock: SimulatedClock | None = None) -> None:
-        self._given, self._settings, self._clock = simulation, simulation.settings, clock
+    def _begin(
+        self, simulation: Simulation, clock: SimulatedClock | None = None
+    ) -> None:
+        self._given, self._settings, self._clock = (
+            simulation,
+            simulation.settings,
+            clock,
+        )
         self._camera, self._plan = simulation.camera, simulation.plan
         self.truth: Truth = simulation.draw(max(LEAST_VIEWS, len(self._plan.views)))[0]
         self._position, self._servo, self._encoder = np.zeros((3, 3))
@@ -77,7 +91,9 @@ class SimulatedMachine:
     def place(self, placing: Placing) -> None:
         """Lay the plate as a view commands, with the errors of a hand."""
         if not isinstance(placing.command, Command):
-            raise MachineError("a simulation needs the command of the view", "simulated")
+            raise MachineError(
+                "a simulation needs the command of the view", "simulated"
+            )
         if placing.command.plate() != self._plan.artifact:
             raise MachineError(
                 "the plan has another plate than the simulation",
@@ -97,7 +113,9 @@ class SimulatedMachine:
         self._angle = float(pose.rotation_rad + self.truth.phi_rad[index])
         self._places = self._sites = np.zeros((2, 0))
         if view.grid:  # else it may lie at any turn
-            self._places, self._sites = physics.mark_places(self.truth, index, pose, (m, n))
+            self._places, self._sites = physics.mark_places(
+                self.truth, index, pose, (m, n)
+            )
         self._lines = physics.line_directions(self.truth, index, view)
         self._cells = [sub.cell_m for sub in view.sub_views]
         n_in_field = view.on_stage(artifact).n_in_field(artifact) if view.grid else 0
@@ -128,7 +146,9 @@ class SimulatedMachine:
         stays = np.abs(target - self.position()) <= SAME
         before = stop = self._position - self._servo
         if not (stays | (np.abs(target - self._commanded) <= SAME)).all():
-            error = self._scattered(settings.stop_sigma_m, settings.stop_sigma_theta_rad)
+            error = self._scattered(
+                settings.stop_sigma_m, settings.stop_sigma_theta_rad
+            )
             stop = np.where(stays, before, self._followed(target) + error)
             self._commanded = np.where(stays, self._commanded, target)
             self._sign = physics.motion_sign((stop - before)[:2])
@@ -161,7 +181,8 @@ class SimulatedMachine:
             away = np.hypot(*(sign * self._sites - target[:2, None]))
             nearest = slice(np.argmin(away), np.argmin(away) + 1)
             place = sign * (
-                self._places[:, nearest] + physics.drift(truth, self._index, self._tau())
+                self._places[:, nearest]
+                + physics.drift(truth, self._index, self._tau())
             )
             at = place + physics.stage_error(truth, place, self._index)
             goal[:2] += (at - sign * self._sites[:, nearest])[:, 0]
@@ -178,7 +199,9 @@ class SimulatedMachine:
             return None
         offsets = self._measured_offsets()
         near = np.hypot(*offsets) < self._camera.reach_m
-        return Image(self._camera.image(offsets[:, near], self._rng, angles=self._angle))
+        return Image(
+            self._camera.image(offsets[:, near], self._rng, angles=self._angle)
+        )
 
     def offsets(self) -> list[Offset]:
         """Return the line nearest to the optical axis, and without a camera the marks in sight.
@@ -193,16 +216,24 @@ class SimulatedMachine:
             away = np.hypot(offsets[0] - cell.real, offsets[1] - cell.imag)
             nearest = int(np.argmin(away))
             x, y = quantised(offsets[:, nearest], settings.resolution_xy_m).tolist()
-            mark = tuple(self._marks[:, nearest].tolist()) if settings.with_ids else None
+            mark = (
+                tuple(self._marks[:, nearest].tolist()) if settings.with_ids else None
+            )
             if away[nearest] < self.truth.artifact.grid_pitch_m / 2:
                 seen_offsets.append(
                     Offset(
-                        x, y, mark=mark, score=0.95, sigma=settings.sigma_xy_m if declared else 0.0
+                        x,
+                        y,
+                        mark=mark,
+                        score=0.95,
+                        sigma=settings.sigma_xy_m if declared else 0.0,
                     )
                 )
         direction, _, line = self._lines
         if len(direction):
-            away = physics.line_offset(self.truth, settings.sense, direction, self._position[2:])
+            away = physics.line_offset(
+                self.truth, settings.sense, direction, self._position[2:]
+            )
             away = np.remainder(away + np.pi, 2 * np.pi) - np.pi
             nearest = int(np.argmin(np.abs(away)))
             indicated_rad = (

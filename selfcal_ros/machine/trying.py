@@ -20,7 +20,18 @@ from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
 from selfcal_ros.vision.detector import LARGEST_SIZE, SMALLEST_SIZE, MarkDetector
 from selfcal_ros.vision.images import Picture
 
-PATTERN = ((0, 0), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (0, 0))
+PATTERN = (
+    (0, 0),
+    (1, 0),
+    (1, 1),
+    (0, 1),
+    (-1, 1),
+    (-1, 0),
+    (-1, -1),
+    (0, -1),
+    (1, -1),
+    (0, 0),
+)
 """Places of the stage for the camera, in steps."""
 SIZE_STEP = 1.3
 """Ratio of the sizes in pixels that are tried for a mark of unknown size."""
@@ -104,9 +115,13 @@ class Trial:
         image_or_offsets = visitor.show()
         if not isinstance(image_or_offsets, Image):
             self._visitor = visitor
-            offsets = [(item.x, item.y) for item in image_or_offsets if item.theta is None]
+            offsets = [
+                (item.x, item.y) for item in image_or_offsets if item.theta is None
+            ]
             if not offsets:
-                raise NoDataError("machine.offsets", "no mark is seen", "move to a mark first")
+                raise NoDataError(
+                    "machine.offsets", "no mark is seen", "move to a mark first"
+                )
             return None, offsets
         settings = self.cell.detector
         if settings is None or not settings.mark_size:
@@ -134,7 +149,9 @@ class Trial:
             mark_width=settings.mark_width * size / settings.mark_size,
         )
         # offsets are pixels in it: those that matter here are those of the stage
-        self._visitor = Visitor(self.machine, replace(self.cell, detector=in_pixels), self.clock)
+        self._visitor = Visitor(
+            self.machine, replace(self.cell, detector=in_pixels), self.clock
+        )
         return picture.values, marks
 
     def _sized(
@@ -157,7 +174,11 @@ class Trial:
             score = sum(mark.score for mark in marks) * size
             if score > best[0]:
                 fitted = [mark.fit.shape.get("size", size) for mark in marks]
-                best = score, float(np.median(fitted)), [(mark.u, mark.v) for mark in marks]
+                best = (
+                    score,
+                    float(np.median(fitted)),
+                    [(mark.u, mark.v) for mark in marks],
+                )
         return best[1], best[2]
 
     @property
@@ -216,7 +237,8 @@ class Trial:
         images: list[np.ndarray] = []
         again: list[np.ndarray] = []
         for across, up in PATTERN:
-            self._go((across - 0.5) * self.step_m, (up - 0.5) * self.step_m)  # no backlash in it
+            # no backlash in it
+            self._go((across - 0.5) * self.step_m, (up - 0.5) * self.step_m)
             at = self._go(across * self.step_m, up * self.step_m)
             positions.append(at.positions[:2])
             images.append(self._marks())
@@ -245,7 +267,11 @@ class Trial:
         number = 0 if axis == "x" else 1
         offset = self._per_pixel(_nearest(self._marks()))[number]
         position = at.positions[number]
-        return offset - position if self.cell.sense is Sense.PLATE_MOVES else offset + position
+        return (
+            offset - position
+            if self.cell.sense is Sense.PLATE_MOVES
+            else offset + position
+        )
 
     def _reversal(self, axis: str) -> FoundValue:
         """Return how much an approach in + direction differs from one in - direction, m."""
@@ -279,7 +305,9 @@ class Trial:
         moving = np.flatnonzero(away > max(2 * SIGMAS * noise, 1e-9))
         if not len(moving):
             return 0.0, noise
-        return times[min(int(moving[-1]) + 1, SETTLING - 1)] + self.cell.settle.time, noise
+        return times[
+            min(int(moving[-1]) + 1, SETTLING - 1)
+        ] + self.cell.settle.time, noise
 
     def _notes_of_sense(self) -> Iterator[str]:
         moving = (
@@ -344,5 +372,8 @@ def values_of(findings: Findings) -> tuple[dict[str, object], dict[str, str]]:
     u_turn = math.degrees(camera.u_turn_rad)
     return (
         {"pixel_size": camera.pixel_size_m, "turn": turn, "mirror": camera.mirror},
-        {"pixel_size": f"u {camera.u_pixel_size_m:.2g} m", "turn": f"u {u_turn:.2g} degrees"},
+        {
+            "pixel_size": f"u {camera.u_pixel_size_m:.2g} m",
+            "turn": f"u {u_turn:.2g} degrees",
+        },
     )

@@ -113,7 +113,9 @@ class VideoCamera:
                 )
         good, frame = self._capture.retrieve()
         if not good:
-            raise MachineError("an image cannot be decoded", self._where, "check the cable")
+            raise MachineError(
+                "an image cannot be decoded", self._where, "check the cable"
+            )
         return Image(grey(frame))
 
     def close(self) -> None:

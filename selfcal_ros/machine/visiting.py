@@ -127,10 +127,14 @@ def stops(
     targets_m = stage_targets(artifact, view, visits, sense) + visits.aside_m
     aside = visits.aside_m.any(axis=0)
     stops_in_order = []
-    for number, (m, n) in enumerate(zip(visits.m.tolist(), visits.n.tolist(), strict=True)):
+    for number, (m, n) in enumerate(
+        zip(visits.m.tolist(), visits.n.tolist(), strict=True)
+    ):
         if again is None or aside[number] or (m, n) in again.marks:
             x, y = targets_m[:, number].tolist()
-            stops_in_order.append(Stop({"x": x, "y": y}, Kind.GRID, int(visits.count[number])))
+            stops_in_order.append(
+                Stop({"x": x, "y": y}, Kind.GRID, int(visits.count[number]))
+            )
     if view.angular:
         lines, theta = line_targets(artifact, view, sense, consecutive=consecutive)
         for k, angle in zip(lines.tolist(), theta.tolist(), strict=True):
@@ -177,7 +181,9 @@ class Visitor:
         self._untold: list[EncoderSample] = []  # of moves
         self._has_moved = False
         self._told_ns = 0  # newest stamp of a position
-        self._asked: tuple[str, int] | None = None  # what the machine has to answer, and since when
+        self._asked: tuple[str, int] | None = (
+            None  # what the machine has to answer, and since when
+        )
         self.stopped = False
 
     def stop(self) -> None:
@@ -215,7 +221,10 @@ class Visitor:
     def silence(self) -> MachineError | None:
         """What has not been answered for too long; only in the main thread is it given up."""
         pending = self._asked
-        if pending is None or (self.clock.now_ns() - pending[1]) / NS_PER_S <= self._longest_s:
+        if (
+            pending is None
+            or (self.clock.now_ns() - pending[1]) / NS_PER_S <= self._longest_s
+        ):
             return None
         return self._silent(pending[0])
 
@@ -257,7 +266,9 @@ class Visitor:
             )
         if kind == Kind.GRID and self.eye.newest is not None:
             raise MachineError(
-                "it returns no image any more", "machine.image", "check the camera and its cable"
+                "it returns no image any more",
+                "machine.image",
+                "check the camera and its cable",
             )
         offsets = self._ask("offsets")
         if not isinstance(offsets, list) or not all(
@@ -335,7 +346,8 @@ class Visitor:
         )
         if self.cell.detector and self.eye.newest is None:
             remedy = (
-                "the machine returns no images: check the camera, or take detector out of CELL.yaml"
+                "the machine returns no images: check the camera, "
+                "or take detector out of CELL.yaml"
             )
         return NoDataError(
             f"view '{view.name}'",
@@ -353,7 +365,9 @@ class Visitor:
                         str(self.cell.path),
                         "set angular: false in the plan",
                     )
-                self.cell.require_limits(axis, self.cell.to_machine(axis, value), "a stop")
+                self.cell.require_limits(
+                    axis, self.cell.to_machine(axis, value), "a stop"
+                )
 
     def sample(self) -> EncoderSample:
         """Return the position now, in the stage frame.
@@ -401,7 +415,9 @@ class Visitor:
         start = dict(zip(self.axes, departure.positions, strict=True))
         if "theta" in self.axes and "theta" in target:
             turns = round((target["theta"] - start["theta"]) / math.tau)
-            target = target | {"theta": self._within_limits(target["theta"] + turns * math.tau)}
+            target = target | {
+                "theta": self._within_limits(target["theta"] + turns * math.tau)
+            }
         goal = start | target
         for axis in target:
             self.cell.require_limits(
@@ -412,12 +428,16 @@ class Visitor:
             )
         if self.stopped:
             raise MachineError("stopped", "a move")
-        self._ask("move_to", tuple(self.cell.to_machine(axis, goal[axis]) for axis in self.axes))
+        self._ask(
+            "move_to",
+            tuple(self.cell.to_machine(axis, goal[axis]) for axis in self.axes),
+        )
         if self.cell.settle.time:
             self.clock.sleep(self.cell.settle.time)
         arrival = self._rest(start, goal, target)
         if last is None or departure.stamp_ns - last.stamp_ns > self.step_ns:
-            self._untold.append(departure)  # what was read at rest meanwhile may have been told
+            # what was read at rest meanwhile may have been told
+            self._untold.append(departure)
         self._untold += self._track(departure, arrival)
         return arrival
 
@@ -441,12 +461,18 @@ class Visitor:
 
     def _rests(self, motion: Position) -> bool:
         """Return whether two readings agree."""
-        return all(abs(motion[axis]) <= self.cell.settle.of(axis, "within") for axis in self.axes)
+        return all(
+            abs(motion[axis]) <= self.cell.settle.of(axis, "within")
+            for axis in self.axes
+        )
 
     def _farthest(self, away: Position) -> str:
         """Return the axis that is farthest off, in units of its tolerance of arrival."""
         return max(
-            away, key=lambda axis: abs(away[axis]) / max(self.cell.settle.of(axis, "arrival"), TINY)
+            away,
+            key=lambda axis: (
+                abs(away[axis]) / max(self.cell.settle.of(axis, "arrival"), TINY)
+            ),
         )
 
     def _within_limits(self, theta: float) -> float:
@@ -460,7 +486,9 @@ class Visitor:
         )
         return theta + turns * math.tau
 
-    def _rest(self, start: Position, goal: Position, commanded: Position) -> EncoderSample:
+    def _rest(
+        self, start: Position, goal: Position, commanded: Position
+    ) -> EncoderSample:
         """Wait until two successive readings agree with each other and with the target."""
         settle = self.cell.settle
         deadline_ns = self.clock.now_ns() + round(settle.patience * NS_PER_S)
@@ -475,7 +503,9 @@ class Visitor:
             }
             self._check_limits(start, goal, now)
             rests = self._rests(motion)
-            arrived = all(abs(away[axis]) <= settle.of(axis, "arrival") for axis in commanded)
+            arrived = all(
+                abs(away[axis]) <= settle.of(axis, "arrival") for axis in commanded
+            )
             if rests and arrived:
                 self._last = now
                 return now
@@ -498,23 +528,30 @@ class Visitor:
                 )
             before = now
 
-    def _check_limits(self, start: Position, goal: Position, now: EncoderSample) -> None:
+    def _check_limits(
+        self, start: Position, goal: Position, now: EncoderSample
+    ) -> None:
         """Raise if an axis leaves its limits, beyond where it was and where it is to go."""
         for axis, value in zip(self.axes, now.positions, strict=True):
             low, high = self.cell.limits.get(axis, (-math.inf, math.inf))
             indicated, *ends = (
-                self.cell.to_machine(axis, place) for place in (value, start[axis], goal[axis])
+                self.cell.to_machine(axis, place)
+                for place in (value, start[axis], goal[axis])
             )
             near = self.cell.settle.of(axis, "arrival")
             if not min(low, *ends) - near <= indicated <= max(high, *ends) + near:
-                raise self._astray(start, goal, {axis: value - goal[axis]}, "beyond its limits")
+                raise self._astray(
+                    start, goal, {axis: value - goal[axis]}, "beyond its limits"
+                )
 
     def _not_at_rest(self, before: EncoderSample, now: EncoderSample) -> MachineError:
         self._check_axes(before, now)
         motion = _difference(before, now)
         axis = max(
             self.axes,
-            key=lambda name: abs(motion[name]) / max(self.cell.settle.of(name, "within"), TINY),
+            key=lambda name: (
+                abs(motion[name]) / max(self.cell.settle.of(name, "within"), TINY)
+            ),
         )
         return MachineError(
             f"{axis} does not come to rest in {self.cell.settle.patience:g} s: two readings differ "
@@ -533,11 +570,14 @@ class Visitor:
                 "wait for each answer before the next question; drop what is left of old answers",
             )
 
-    def _astray(self, start: Position, goal: Position, away: Position, when: str) -> MachineError:
+    def _astray(
+        self, start: Position, goal: Position, away: Position, when: str
+    ) -> MachineError:
         moving = {
             axis: value
             for axis, value in away.items()
-            if goal[axis] != start[axis] and (abs(value) > self.cell.settle.of(axis, "arrival"))
+            if goal[axis] != start[axis]
+            and (abs(value) > self.cell.settle.of(axis, "arrival"))
         }
         axis = self._farthest(moving or away)
         cross_axis = {"x": "y", "y": "x"}.get(axis, "")
@@ -592,16 +632,25 @@ class Visitor:
         )
 
     def _detections(
-        self, image_or_offsets: Image | list[Offset], stamp_ns: int, position: tuple[float, ...]
+        self,
+        image_or_offsets: Image | list[Offset],
+        stamp_ns: int,
+        position: tuple[float, ...],
     ) -> list[Detection | Photo]:
         if isinstance(image_or_offsets, Image) and not self.detects:
             return [
-                Photo(image_or_offsets.stamp_ns or stamp_ns, np.asarray(image_or_offsets.pixels))
+                Photo(
+                    image_or_offsets.stamp_ns or stamp_ns,
+                    np.asarray(image_or_offsets.pixels),
+                )
             ]
         return [*self.eye.detections(image_or_offsets, stamp_ns, position)]
 
     def _check_stamps(
-        self, detections: list[Detection | Photo], before: EncoderSample, after: EncoderSample
+        self,
+        detections: list[Detection | Photo],
+        before: EncoderSample,
+        after: EncoderSample,
     ) -> None:
         for item in detections:
             if not before.stamp_ns <= item.stamp_ns <= after.stamp_ns:
@@ -620,7 +669,9 @@ class Visitor:
         yield from untold
         before, detections, after = self.expose(stop.kind)
         detections = [
-            item for item in detections if isinstance(item, Photo) or item.kind == stop.kind
+            item
+            for item in detections
+            if isinstance(item, Photo) or item.kind == stop.kind
         ]
         if only_nearest and stop.kind == Kind.GRID:
             detections = sorted(detections, key=_from_axis)[:1]
@@ -628,7 +679,9 @@ class Visitor:
         events = [*self._track(before, after), *detections]
         yield from sorted(events, key=lambda event: event.stamp_ns)
 
-    def _track(self, before: EncoderSample, after: EncoderSample) -> Iterator[EncoderSample]:
+    def _track(
+        self, before: EncoderSample, after: EncoderSample
+    ) -> Iterator[EncoderSample]:
         """Yield the second of two positions, and before it others on the line between them.
 
         The encoder of a machine that is asked for its position has no gap, and the direction of
@@ -637,19 +690,25 @@ class Visitor:
         count = (after.stamp_ns - before.stamp_ns - 1) // self.step_ns
         for number in range(1, count + 1):
             fraction = number / (count + 1)
-            stamp = before.stamp_ns + round(fraction * (after.stamp_ns - before.stamp_ns))
+            stamp = before.stamp_ns + round(
+                fraction * (after.stamp_ns - before.stamp_ns)
+            )
             yield EncoderSample(
                 stamp,
                 after.names,
                 tuple(
                     early + fraction * (late - early)
-                    for early, late in zip(before.positions, after.positions, strict=True)
+                    for early, late in zip(
+                        before.positions, after.positions, strict=True
+                    )
                 ),
             )
         if before.stamp_ns < after.stamp_ns:
             yield after
 
-    def first_move(self, *, marks: bool, turns: bool = False, step_m: float = 0.0) -> None:
+    def first_move(
+        self, *, marks: bool, turns: bool = False, step_m: float = 0.0
+    ) -> None:
         """Make a small move along each axis and back; check that position and marks follow.
 
         From beyond the limits it is a move towards them, and not back.
@@ -681,8 +740,13 @@ class Visitor:
             marks_before = self.marks() if sees else []
             arrival = self.go({axis: home[axis] + inward})
             if sees:
-                step_done = dict(zip(self.axes, arrival.positions, strict=True))[axis] - home[axis]
-                self._check_marks(axis, step_done, marks_before, self.marks(), self.marks())
+                step_done = (
+                    dict(zip(self.axes, arrival.positions, strict=True))[axis]
+                    - home[axis]
+                )
+                self._check_marks(
+                    axis, step_done, marks_before, self.marks(), self.marks()
+                )
             if low <= at_home <= high:
                 self.go({axis: home[axis]})
 
@@ -712,7 +776,9 @@ class Visitor:
         follows = math.hypot(along - expected, across) <= FOLLOWS * abs(step)
         if follows:
             return
-        if abs(along) <= FOLLOWS * abs(step) and abs(along_again - expected) <= FOLLOWS * abs(step):
+        if abs(along) <= FOLLOWS * abs(step) and abs(
+            along_again - expected
+        ) <= FOLLOWS * abs(step):
             reason = "the image is late by one frame"
             remedy = "let the camera expose when it is asked (software trigger), or drop a frame"
         elif abs(along) <= FOLLOWS * abs(step) and abs(across) <= FOLLOWS * abs(step):
@@ -762,8 +828,12 @@ def _change(
     """
     mark = min(first, key=lambda item: math.hypot(item.offset_x, item.offset_y))
     from_x, from_y = mark.offset_x, mark.offset_y
-    to_x, to_y = (from_x + expected, from_y) if axis == "x" else (from_x, from_y + expected)
-    nearest = min(later, key=lambda item: math.hypot(item.offset_x - to_x, item.offset_y - to_y))
+    to_x, to_y = (
+        (from_x + expected, from_y) if axis == "x" else (from_x, from_y + expected)
+    )
+    nearest = min(
+        later, key=lambda item: math.hypot(item.offset_x - to_x, item.offset_y - to_y)
+    )
     x, y = nearest.offset_x - from_x, nearest.offset_y - from_y
     return (x, y) if axis == "x" else (y, x)
 
@@ -775,7 +845,9 @@ def _length_text(axis: str, value: float) -> str:
 def _difference(before: EncoderSample, after: EncoderSample) -> Position:
     return {
         axis: late - early
-        for axis, early, late in zip(before.names, before.positions, after.positions, strict=True)
+        for axis, early, late in zip(
+            before.names, before.positions, after.positions, strict=True
+        )
     }
 
 
@@ -783,7 +855,9 @@ def _from_axis(item: Detection | Photo) -> float:
     return 0.0 if isinstance(item, Photo) else math.hypot(item.offset_x, item.offset_y)
 
 
-def message_of(event: Command | Event, frame_id: str = "stage") -> tuple[str, from_model.Fields]:
+def message_of(
+    event: Command | Event, frame_id: str = "stage"
+) -> tuple[str, from_model.Fields]:
     """Return topic and fields of a message of a cell."""
     if isinstance(event, Photo):
         encoding = f"mono{8 * event.pixels.itemsize}"

@@ -91,7 +91,9 @@ class Layout:
             mask = int.from_bytes(self.fixed[place : place + WORD], "little")
             value = int.from_bytes(self.example[place : place + WORD], "little") & mask
             if mask:
-                words.append((f"word {place}", place, np.uint64(mask), np.uint64(value)))
+                words.append(
+                    (f"word {place}", place, np.uint64(mask), np.uint64(value))
+                )
         return words
 
     @cached_property
@@ -104,7 +106,12 @@ class Layout:
         fields += [(name, "<u8", offset) for name, offset, _, _ in self._words]
         names, formats, offsets = zip(*fields, strict=True)
         return np.dtype(
-            {"names": names, "formats": formats, "offsets": offsets, "itemsize": self.length}
+            {
+                "names": names,
+                "formats": formats,
+                "offsets": offsets,
+                "itemsize": self.length,
+            }
         )
 
     def matches(self, rows: np.ndarray) -> np.ndarray:
@@ -153,7 +160,9 @@ class _Walk:
             name = None if prefix is None else prefix + field.name
             count = self._length() if field.count == SEQUENCE else field.count
             if field.kind == TEXT:
-                texts = tuple(self._text() for _ in range(1 if count is None else count))
+                texts = tuple(
+                    self._text() for _ in range(1 if count is None else count)
+                )
                 if name is not None:
                     self.texts[name] = texts
             elif isinstance(field.kind, str):
@@ -235,7 +244,9 @@ class Payloads:
 
     def __iter__(self) -> Iterator[bytes]:
         """Yield the bytes of each message."""
-        for start, length in zip(self.start.tolist(), self.length.tolist(), strict=True):
+        for start, length in zip(
+            self.start.tolist(), self.length.tolist(), strict=True
+        ):
             yield self.data[start : start + length]
 
 
@@ -315,7 +326,10 @@ class ColumnDecoder:
         if not HEAD + WORD <= length <= min(len(messages.data), MAX_LENGTH):
             return tries, index
         bytes_at = np.ndarray(
-            (len(messages.data) - length + 1,), f"V{length}", messages.data, strides=(1,)
+            (len(messages.data) - length + 1,),
+            f"V{length}",
+            messages.data,
+            strides=(1,),
         )
         rows = bytes_at[messages.start[index]]
         for known_layout in tuple(self._known.get(length, ())):

@@ -38,7 +38,9 @@ def header(stamp_ns: int, frame_id: str) -> Fields:
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 
-def event_fields(event: Command | Detection | EncoderSample, frame_id: str) -> tuple[str, Fields]:
+def event_fields(
+    event: Command | Detection | EncoderSample, frame_id: str
+) -> tuple[str, Fields]:
     """Return topic and fields of a message of a cell."""
     if isinstance(event, Command):
         return COMMAND_TOPIC, command(event, frame_id)
@@ -68,7 +70,9 @@ def image(values: np.ndarray, encoding: str, stamp_ns: int, frame_id: str) -> Fi
         "encoding": encoding,
         "is_bigendian": 0,
         "step": width * values.itemsize,
-        "data": np.frombuffer(values.astype(values.dtype.newbyteorder("<")).tobytes(), np.uint8),
+        "data": np.frombuffer(
+            values.astype(values.dtype.newbyteorder("<")).tobytes(), np.uint8
+        ),
     }
 
 
@@ -86,7 +90,10 @@ def detection(d: Detection, frame_id: str) -> Fields:
         "sigma",
         "score",
     )
-    return {"header": header(d.stamp_ns, frame_id), **{name: getattr(d, name) for name in names}}
+    return {
+        "header": header(d.stamp_ns, frame_id),
+        **{name: getattr(d, name) for name in names},
+    }
 
 
 def _artifact(artifact: Artifact) -> Fields:
@@ -310,7 +317,10 @@ def _motion(name: str, motion: RepeatMotion | None) -> Fields:
 
 
 def _rejected(rejected: dict[str, int], prefix: str) -> Fields:
-    return {f"{prefix}_reasons": list(rejected), f"{prefix}_counts": list(rejected.values())}
+    return {
+        f"{prefix}_reasons": list(rejected),
+        f"{prefix}_counts": list(rejected.values()),
+    }
 
 
 def error_map(result: CalibrationResult, stamp_ns: int, frame_id: str) -> Fields:
@@ -341,7 +351,9 @@ def grade_number(result: CalibrationResult) -> int:
     """Return the grade of a result for ErrorMap and CalibrationSummary."""
     if not result.observability.identifiable:
         return 0
-    return {Grade.NOT_QUALIFIED: 0, Grade.ENLARGED: 1, Grade.GOOD: 2}[result.verdict.grade]
+    return {Grade.NOT_QUALIFIED: 0, Grade.ENLARGED: 1, Grade.GOOD: 2}[
+        result.verdict.grade
+    ]
 
 
 def session_stamp_ns(timeline: Timeline, progress: ViewProgress) -> int:

@@ -14,7 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample, Phase
+from selfcal_ros.collection.inputs import (
+    DETECTION,
+    Command,
+    Detection,
+    EncoderSample,
+    Phase,
+)
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.messages import cdr
 from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid
@@ -41,7 +47,10 @@ HEADER = (cdr.Field("stamp", TIME), cdr.Field("frame_id", cdr.TEXT))
 JOINT_STATE = (
     cdr.Field("header", HEADER),
     cdr.Field("name", cdr.TEXT, cdr.SEQUENCE),
-    *(cdr.Field(name, "f8", cdr.SEQUENCE) for name in ("position", "velocity", "effort")),
+    *(
+        cdr.Field(name, "f8", cdr.SEQUENCE)
+        for name in ("position", "velocity", "effort")
+    ),
 )
 """Fields of sensor_msgs/msg/JointState."""
 STAMP_END = 12
@@ -101,7 +110,9 @@ def command(message: Any) -> Command:
         phase = Phase(int(message.phase))
     except ValueError as error:
         raise InputError(
-            COMMAND_TOPIC, f"unknown phase {message.phase}", "use PLACE, MEASURE, DONE or ABORT"
+            COMMAND_TOPIC,
+            f"unknown phase {message.phase}",
+            "use PLACE, MEASURE, DONE or ABORT",
         ) from error
     placed = phase in (Phase.PLACE, Phase.MEASURE)
     return Command(
@@ -151,20 +162,26 @@ def plate_from(message: Any) -> str:
 
 def plan_keys_of(message: Any) -> dict[str, str]:
     """Return the `PLAN_KEYS` of a ViewCommand or ViewMeasurement, "" for those not there."""
-    texts = reversed([str(text).partition(": ") for text in getattr(message, "plan_keys", ())])
+    texts = reversed(
+        [str(text).partition(": ") for text in getattr(message, "plan_keys", ())]
+    )
     text_of_key = {key: value for key, _, value in texts}  # the first of a key counts
     return {key: text_of_key.get(key, "") for key in PLAN_KEYS}
 
 
 def notes_of(message: Any) -> tuple[str, ...]:
     """Return the lines on the session in a ViewMeasurement, at most `MOST_NOTES`."""
-    return tuple(map(printable, islice(getattr(message, "session_notes", ()), MOST_NOTES)))
+    return tuple(
+        map(printable, islice(getattr(message, "session_notes", ()), MOST_NOTES))
+    )
 
 
 def artifact_of(message: Any) -> Artifact:
     """Return the plate of a ViewCommand, ViewMeasurement or ErrorMap."""
     ids = [int(number) for number in getattr(message, "mark_id", ())]
-    marks = marks_of(ids, _floats(message.mark_x), _floats(message.mark_y)) if ids else None
+    marks = (
+        marks_of(ids, _floats(message.mark_x), _floats(message.mark_y)) if ids else None
+    )
     return Artifact(
         int(message.grid_size),
         float(message.grid_pitch),
@@ -184,7 +201,9 @@ def _map_grid_of(message: Any) -> MapGrid | None:
     name = str(getattr(message, "map_interpolation", "")) or Interpolation.BICUBIC
     if name not in list(Interpolation):
         raise InputError(
-            "map_interpolation", f"{name!r} is not known", f"use one of {', '.join(Interpolation)}"
+            "map_interpolation",
+            f"{name!r} is not known",
+            f"use one of {', '.join(Interpolation)}",
         )
     return MapGrid(
         size,
@@ -294,7 +313,9 @@ def _motion_of(message: Any, name: str, size: int) -> RepeatMotion | None:
             f"{name} has {len(products)} values, not {size**2}",
             "correct the publisher",
         )
-    return RepeatMotion(products.reshape(size, size), int(getattr(message, f"dof_{name}")))
+    return RepeatMotion(
+        products.reshape(size, size), int(getattr(message, f"dof_{name}"))
+    )
 
 
 def _visits_of(message: Any) -> GridVisits | None:
@@ -302,17 +323,27 @@ def _visits_of(message: Any) -> GridVisits | None:
     if not len(getattr(message, "visit_mark", ())):
         return None
     table = {
-        name: np.array(getattr(message, f"visit_{name.removesuffix('_ns')}"), dtype=kind)
+        name: np.array(
+            getattr(message, f"visit_{name.removesuffix('_ns')}"), dtype=kind
+        )
         for name, kind in VISIT_COLUMNS
     }
-    lengths = {len(column) for name, column in table.items() if name != "u" or len(column)}
-    if len(lengths) > 1 or table["mark"].min() < 0 or table["mark"].max() >= len(message.m):
+    lengths = {
+        len(column) for name, column in table.items() if name != "u" or len(column)
+    }
+    if (
+        len(lengths) > 1
+        or table["mark"].min() < 0
+        or table["mark"].max() >= len(message.m)
+    ):
         raise InputError(
             f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
             "the visits differ in length or name marks that were not read",
             "correct the publisher",
         )
-    return GridVisits(**table, sigma_m=float(message.sigma_visit), dof=int(message.dof_visit))
+    return GridVisits(
+        **table, sigma_m=float(message.sigma_visit), dof=int(message.dof_visit)
+    )
 
 
 def _places_of(message: Any) -> RejectedPlaces:
@@ -333,14 +364,19 @@ def _places_of(message: Any) -> RejectedPlaces:
 
 def counts(message: Any, prefix: str) -> dict[str, int]:
     """Return reason -> count from a pair of arrays; InputError if they differ in length."""
-    reasons, numbers = (getattr(message, f"{prefix}_{name}") for name in ("reasons", "counts"))
+    reasons, numbers = (
+        getattr(message, f"{prefix}_{name}") for name in ("reasons", "counts")
+    )
     if len(reasons) != len(numbers):
         raise InputError(
             f"{MEASUREMENT_TOPIC} of '{message.view_name}'",
             f"{prefix}_reasons and {prefix}_counts differ in length",
             "correct the publisher",
         )
-    return {str(reason): int(number) for reason, number in zip(reasons, numbers, strict=True)}
+    return {
+        str(reason): int(number)
+        for reason, number in zip(reasons, numbers, strict=True)
+    }
 
 
 def sense_of(message: Any) -> Sense:
@@ -394,7 +430,8 @@ def error_map(message: Any) -> ErrorMap:
     }
     valid = np.array(message.valid, dtype=bool).reshape(artifact.shape)
     g_theta, u_g_theta = (
-        np.array(getattr(message, name), dtype=float) for name in ("g_theta", "u_g_theta")
+        np.array(getattr(message, name), dtype=float)
+        for name in ("g_theta", "u_g_theta")
     )
     _refuse_not_finite(grids, valid, g_theta)
     for values in grids.values():
@@ -424,9 +461,13 @@ def _refuse_not_finite(
             )
     for name in ("u_gx", "u_gy"):
         if (grids[name] < 0).any():
-            raise InputError(ERROR_MAP_TOPIC, f"{name} is negative", "correct the publisher")
+            raise InputError(
+                ERROR_MAP_TOPIC, f"{name} is negative", "correct the publisher"
+            )
     if np.isinf(g_theta).any():
-        raise InputError(ERROR_MAP_TOPIC, "g_theta is infinite", "correct the publisher")
+        raise InputError(
+            ERROR_MAP_TOPIC, "g_theta is infinite", "correct the publisher"
+        )
     if not valid.any() or (len(g_theta) and np.isnan(g_theta).all()):
         raise InputError(
             ERROR_MAP_TOPIC,
@@ -497,7 +538,9 @@ class PositionEditor:
             ):
                 self._known.rotate(-number)
                 return True
-        layout = cdr.layout_of(JOINT_STATE, data) if len(data) <= cdr.MAX_LENGTH else None
+        layout = (
+            cdr.layout_of(JOINT_STATE, data) if len(data) <= cdr.MAX_LENGTH else None
+        )
         if layout is None:
             return False
         code, offset, count = layout.values["position"]
@@ -555,7 +598,9 @@ def first_stamps_ns(messages: cdr.Payloads) -> tuple[np.ndarray, np.ndarray]:
     )
     is_little = octets[:, 1] & 1 == 1
     second = np.where(is_little, little["sec"], big["sec"]).astype(np.int64)
-    return second * NS_PER_S + np.where(is_little, little["nanosec"], big["nanosec"]), has_header
+    return second * NS_PER_S + np.where(
+        is_little, little["nanosec"], big["nanosec"]
+    ), has_header
 
 
 def encoder_block(group: cdr.Columns) -> EncoderBlock:

@@ -143,11 +143,15 @@ class Artifact:
             raise InputError(
                 "map harmonics",
                 f"{self.harmonics} harmonics cannot be told with {self.angular_count} lines",
-                f"give 1 to {most}" if most > 0 else "leave them out for a plate without lines",
+                f"give 1 to {most}"
+                if most > 0
+                else "leave them out for a plate without lines",
             )
         if self.map_grid is not None:
             try:
-                Artifact(self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y)
+                Artifact(
+                    self.map_grid.size, self.map_grid.pitch_m, 0, self.map_grid.size_y
+                )
             except InputError as error:
                 raise InputError(
                     error.where.replace("artifact", "map"),
@@ -169,7 +173,11 @@ class Artifact:
             self
             if grid is None
             else Artifact(
-                grid.size, grid.pitch_m, self.angular_count, grid.size_y, harmonics=self.harmonics
+                grid.size,
+                grid.pitch_m,
+                self.angular_count,
+                grid.size_y,
+                harmonics=self.harmonics,
             )
         )
 
@@ -233,7 +241,9 @@ class Artifact:
         number of marks: without it rows would lie between rows. Else 0.
         """
         nx, ny = self.shape
-        return 0.5 if (nx - ny) % 2 and self.marks is None and self.map_grid is None else 0
+        return (
+            0.5 if (nx - ny) % 2 and self.marks is None and self.map_grid is None else 0
+        )
 
     @cached_property
     def reach(self) -> tuple[float, float]:
@@ -248,14 +258,18 @@ class Artifact:
         """Index m of every site, int array (nx, ny)."""
         if self.marks is not None:
             return self.marks.id_array[:, None]
-        return np.repeat(np.arange(self.shape[0])[:, None] - self.middle[0], self.shape[1], axis=1)
+        return np.repeat(
+            np.arange(self.shape[0])[:, None] - self.middle[0], self.shape[1], axis=1
+        )
 
     @cached_property
     def n(self) -> np.ndarray:
         """Index n of every site, int array (nx, ny)."""
         if self.marks is not None:
             return np.zeros(self.shape, dtype=int)
-        return np.repeat(np.arange(self.shape[1])[None, :] - self.middle[1], self.shape[0], axis=0)
+        return np.repeat(
+            np.arange(self.shape[1])[None, :] - self.middle[1], self.shape[0], axis=0
+        )
 
     def has(self, m: np.ndarray, n: np.ndarray) -> np.ndarray:
         """Return which of the marks (m, n) are on the plate, bool."""
@@ -338,10 +352,18 @@ def default_map_grid(artifact: Artifact) -> MapGrid:
                 "give them in the plan, e.g. map: {grid_size: 3}, or use a plate with more marks",
             )
     else:
-        cells = max(int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, int(2 * longer) // 2 * 2))
+        cells = max(
+            int(0.75 * (2 * longer + 1) - 1) // 2 * 2, min(4, int(2 * longer) // 2 * 2)
+        )
     cells = min(cells, DEFAULT_NODES - 1)
     pitch_m = 2 * longer * artifact.grid_pitch_m / cells
-    sides = [max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3) for half in artifact.reach]
+    sides = [
+        max(2 * ceil(cells * half / (2 * longer) - 1e-9) + 1, 3)
+        for half in artifact.reach
+    ]
     return MapGrid(
-        sides[0], pitch_m, Interpolation.BICUBIC, sides[1] if sides[1] != sides[0] else 0
+        sides[0],
+        pitch_m,
+        Interpolation.BICUBIC,
+        sides[1] if sides[1] != sides[0] else 0,
     )

@@ -104,7 +104,9 @@ def shown_by_images(data: Any) -> tuple[CameraErrors | None, StageYawMap | None]
     return (read(CameraErrors, fields) if fields else None), yaw
 
 
-def camera_to_dict(camera: CameraErrors | None, yaw: StageYawMap | None) -> dict[str, Any]:
+def camera_to_dict(
+    camera: CameraErrors | None, yaw: StageYawMap | None
+) -> dict[str, Any]:
     """Return ``camera`` of RESULT.json; empty without images."""
     return {
         **({} if camera is None else plain(camera)),

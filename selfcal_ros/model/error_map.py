@@ -130,7 +130,9 @@ def remove_modes(field_m: np.ndarray, modes: np.ndarray) -> np.ndarray:
     known_sites = np.isfinite(field_m).all(axis=0)
     basis = modes[:, :, known_sites].reshape(len(modes), -1).T
     basis = basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny)
-    coefficients = np.linalg.lstsq(basis, field_m[:, known_sites].ravel(), rcond=None)[0]
+    coefficients = np.linalg.lstsq(basis, field_m[:, known_sites].ravel(), rcond=None)[
+        0
+    ]
     out = field_m.copy()
     out[:, known_sites] -= (basis @ coefficients).reshape(2, -1)
     return out
@@ -168,7 +170,12 @@ def half_axis_slopes(artifact: Artifact, g_m: np.ndarray) -> np.ndarray:
     if not all(size % 2 for size in artifact.shape):
         return np.full((4, *g_m.shape[3:]), np.nan)
     hx, hy = artifact.middle
-    along = (g_m[1, hx + 1 :, hy], -g_m[0, hx, hy + 1 :], g_m[1, :hx, hy], -g_m[0, hx, :hy])
+    along = (
+        g_m[1, hx + 1 :, hy],
+        -g_m[0, hx, hy + 1 :],
+        g_m[1, :hx, hy],
+        -g_m[0, hx, :hy],
+    )
     return np.stack([_slope(line, artifact.grid_pitch_m) for line in along])
 
 
@@ -238,11 +245,15 @@ def error_halfway(
     ring : bool
         Whether the first node follows the last one, as the lines of an angular map.
     """
-    over_two, over_four = (_squares(values, u, _LINEAR, pitches, ring) for pitches in (1, 2))
+    over_two, over_four = (
+        _squares(values, u, _LINEAR, pitches, ring) for pitches in (1, 2)
+    )
     if not len(over_two):
         return 0.0, 0.0
     coarse = float(over_four.mean()) if len(over_four) else 0.0
-    shrunk = np.clip(over_two.mean() / coarse, _SMOOTH**2, 1.0) if coarse > 0 else _SMOOTH**2
+    shrunk = (
+        np.clip(over_two.mean() / coarse, _SMOOTH**2, 1.0) if coarse > 0 else _SMOOTH**2
+    )
     if cubic and (ring or len(values) > 2 * max(_CUBIC)):
         over_two = _squares(values, u, _CUBIC, 1, ring)
         shrunk = shrunk**2
@@ -253,7 +264,11 @@ def error_halfway(
 
 
 def _squares(
-    values: np.ndarray, u: np.ndarray, weights: dict[int, float], pitches: int, ring: bool
+    values: np.ndarray,
+    u: np.ndarray,
+    weights: dict[int, float],
+    pitches: int,
+    ring: bool,
 ) -> np.ndarray:
     """Return the squared errors of known nodes predicted from neighbours, less noise, (k,)."""
     reach = pitches * max(weights)

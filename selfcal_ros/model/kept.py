@@ -175,15 +175,25 @@ class Kept:
             COVARIANCE: {
                 key: value
                 for kind, covariance in self.covariances.items()
-                for key, value in ((kind, covariance.lower), (f"scale_{kind}", covariance.scale))
+                for key, value in (
+                    (kind, covariance.lower),
+                    (f"scale_{kind}", covariance.scale),
+                )
             }
             or None,
         }
-        return {key: plain(section) for key, section in sections.items() if section is not None}
+        return {
+            key: plain(section)
+            for key, section in sections.items()
+            if section is not None
+        }
 
 
 def kept_from_dict(
-    data: Mapping[str, Any], of_map: tuple[int, ...], of_plate: tuple[int, ...], lines: int
+    data: Mapping[str, Any],
+    of_map: tuple[int, ...],
+    of_plate: tuple[int, ...],
+    lines: int,
 ) -> Kept:
     """Return what a result keeps from its JSON form.
 
@@ -213,10 +223,14 @@ def kept_from_dict(
     return Kept(
         _factors(data[FACTORS], of_map, of_plate, lines) if FACTORS in data else None,
         {
-            name: _numbers(u, (lines,), ANGULAR, "no contributions to these lines", finite=False)
+            name: _numbers(
+                u, (lines,), ANGULAR, "no contributions to these lines", finite=False
+            )
             for name, u in read(dict, data.get(ANGULAR, {})).items()
         },
-        _numbers(data[ADDED], (2,), ADDED, "not two variances") if ADDED in data else None,
+        _numbers(data[ADDED], (2,), ADDED, "not two variances")
+        if ADDED in data
+        else None,
         images,
         {
             kind: Covariance(
@@ -230,11 +244,16 @@ def kept_from_dict(
     )
 
 
-def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...], lines: int) -> Factors:
+def _factors(
+    data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...], lines: int
+) -> Factors:
     fields = read(dict, data)
     terms = read(tuple[str, ...], fields["terms"])
     factors = _numbers(
-        fields["factors"], (len(terms), 2, *of_map), FACTORS, "no factors of this lattice"
+        fields["factors"],
+        (len(terms), 2, *of_map),
+        FACTORS,
+        "no factors of this lattice",
     )
     shapes = {"plate": (2, *of_plate), "lines": (2, lines)}
     quantities = dict(read(dict, fields.get("beside", {})))
@@ -248,7 +267,9 @@ def _factors(data: Any, of_map: tuple[int, ...], of_plate: tuple[int, ...], line
             f"no {name} of this plate",
         )
     numbers = {len(values) for values in quantity_values.values()}
-    if quantity_values and (len(numbers) > 1 or not 0 <= with_map <= min(*numbers, len(terms))):
+    if quantity_values and (
+        len(numbers) > 1 or not 0 <= with_map <= min(*numbers, len(terms))
+    ):
         raise ValueError(f"{FACTORS}: quantities beside the map of other factors")
     on_plate = fields.get("effects_on_plate")
     return Factors(

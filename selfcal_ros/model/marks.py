@@ -71,7 +71,9 @@ class MarkList:
 
     def innermost(self, number: int) -> "MarkList":
         """Return the marks nearest to the plate's centre."""
-        near = sorted(np.argsort(np.hypot(*self.places_m), kind="stable")[:number].tolist())
+        near = sorted(
+            np.argsort(np.hypot(*self.places_m), kind="stable")[:number].tolist()
+        )
         return MarkList(
             tuple(self.ids[i] for i in near),
             tuple(self.x_m[i] for i in near),
@@ -87,7 +89,10 @@ class MarkList:
 
 
 def marks_of(
-    ids: Sequence[int], x_m: Sequence[float], y_m: Sequence[float], where: Sequence[str] = ()
+    ids: Sequence[int],
+    x_m: Sequence[float],
+    y_m: Sequence[float],
+    where: Sequence[str] = (),
 ) -> MarkList:
     """Return a list of marks, checked.
 
@@ -111,7 +116,9 @@ def marks_of(
             "give each mark an id, x and y",
         )
     where = where or [f"artifact marks[{i}]" for i in range(len(ids))]
-    where_of_list = where[0].rpartition(":")[0] if where and ":" in where[0] else "artifact marks"
+    where_of_list = (
+        where[0].rpartition(":")[0] if where and ":" in where[0] else "artifact marks"
+    )
     if not MARKS_RANGE[0] <= len(ids) <= MARKS_RANGE[1]:
         raise InputError(
             where_of_list,
@@ -121,7 +128,9 @@ def marks_of(
     where_of_id: dict[int, str] = {}
     for number, x, y, place in zip(ids, x_m, y_m, where, strict=True):
         if not -(2**31) <= number < 2**31:
-            raise InputError(place, f"id {number} is no 32 bit integer", "number the marks anew")
+            raise InputError(
+                place, f"id {number} is no 32 bit integer", "number the marks anew"
+            )
         if not (isfinite(x) and isfinite(y)):
             raise InputError(
                 place,
@@ -151,7 +160,9 @@ def marks_of(
     return marks
 
 
-def _check_places(marks: MarkList, where_of_list: str, where_of_id: dict[int, str]) -> None:
+def _check_places(
+    marks: MarkList, where_of_list: str, where_of_id: dict[int, str]
+) -> None:
     """Raise InputError for marks at one place, on one line, or off the plate's centre."""
     nearest = int(marks.neighbours[0].argmin())
     if marks.neighbours[0][nearest] < LEAST_DISTANCE_M:
@@ -161,10 +172,14 @@ def _check_places(marks: MarkList, where_of_list: str, where_of_id: dict[int, st
             f"marks {marks.ids[first]} and {marks.ids[second]} lie at one place",
             "delete one of them",
         )
-    length, width = np.linalg.svd(marks.places_m - marks.places_m.mean(axis=1)[:, None])[1]
+    length, width = np.linalg.svd(
+        marks.places_m - marks.places_m.mean(axis=1)[:, None]
+    )[1]
     if width < THINNEST * length:
         raise InputError(
-            where_of_list, "all marks lie on one line", "use a plate with marks in two directions"
+            where_of_list,
+            "all marks lie on one line",
+            "use a plate with marks in two directions",
         )
     low, high = marks.places_m.min(axis=1), marks.places_m.max(axis=1)
     middle = (low + high) / 2

@@ -97,7 +97,10 @@ def plan_from_dict(data: object, where: str) -> Plan:
     artifact = replace(artifact, map_grid=grid)
     image = image_of(fields["image"], artifact, f"{where}: image")
     views = tuple(
-        replace(_with_checks(view, *checks, artifact, where), image=image if view.grid else None)
+        replace(
+            _with_checks(view, *checks, artifact, where),
+            image=image if view.grid else None,
+        )
         for view in views
     )
     if len(with_sub_views(views)) > MAX_VIEWS:
@@ -131,14 +134,17 @@ def _checks(data: dict, where: str) -> tuple[int, float]:
     """Return the number of marks checked and their distance, m; (0, 0) if none."""
     if not data:
         return 0, 0.0
-    if isinstance(data.get("offset"), str):  # YAML reads 20e-6, without a point, as a string
+    # YAML reads 20e-6, without a point, as a string
+    if isinstance(data.get("offset"), str):
         with suppress(ValueError):  # refused below
             data = data | {"offset": float(data["offset"])}
     raw = checked_fields(data, where, {"marks": int, "offset": float})
     return raw["marks"], raw["offset"]
 
 
-def _with_checks(view: View, marks: int, offset_m: float, artifact: Artifact, where: str) -> View:
+def _with_checks(
+    view: View, marks: int, offset_m: float, artifact: Artifact, where: str
+) -> View:
     """Return the view with check stops if it has grid marks; InputError for an impossible pose."""
     view.on_stage(artifact)
     if not view.grid:
@@ -161,7 +167,9 @@ def _name(text: str, where: str) -> str:
         )
     if len(text) > MOST_CHARACTERS:
         raise InputError(
-            where, f"a name of {len(text)} characters", f"give one of at most {MOST_CHARACTERS}"
+            where,
+            f"a name of {len(text)} characters",
+            f"give one of at most {MOST_CHARACTERS}",
         )
     return text
 
@@ -187,7 +195,9 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
     )
     a, b = _translation_m(raw, where, artifact)
     if raw["repeats"] < 1:
-        raise InputError(f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more")
+        raise InputError(
+            f"{where}: repeats", f"{raw['repeats']} is not positive", "give 1 or more"
+        )
     if raw["angular"] and not artifact.angular_count:
         raise InputError(
             where,
@@ -196,12 +206,17 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
         )
     _check_degrees(raw["rotation_deg"], where)
     turn = math.radians(raw["rotation_deg"])
-    if raw["angular"] is None:  # without harmonics only grid marks can be read between two lines
+    # without harmonics only grid marks can be read between two lines
+    if raw["angular"] is None:
         raw["angular"] = artifact.angular_count > 0 and (
-            not raw["grid"] or not math.isfinite(turn) or turn_in_lines(turn, artifact) is not None
+            not raw["grid"]
+            or not math.isfinite(turn)
+            or turn_in_lines(turn, artifact) is not None
         )
     if not (raw["grid"] or raw["angular"]):
-        raise InputError(where, "neither grid nor angular marks are wanted", "set one to true")
+        raise InputError(
+            where, "neither grid nor angular marks are wanted", "set one to true"
+        )
     return View(
         _name(raw["name"], f"{where}: name"),
         turn,
@@ -216,7 +231,9 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
 def _check_degrees(rotation_deg: float, where: str) -> None:
     """Raise InputError for a rotation that is a whole number of quarter turns in rad."""
     quarters = rotation_deg / (math.pi / 2) if math.isfinite(rotation_deg) else 0.0
-    if 1 <= abs(round(quarters)) <= 4 and math.isclose(quarters, round(quarters), rel_tol=ROUNDED):
+    if 1 <= abs(round(quarters)) <= 4 and math.isclose(
+        quarters, round(quarters), rel_tol=ROUNDED
+    ):
         raise InputError(
             f"{where}: rotation_deg",
             f"{rotation_deg:g} degrees: is it in rad?",
@@ -226,9 +243,13 @@ def _check_degrees(rotation_deg: float, where: str) -> None:
 
 def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, float]:
     """Return the translation of a view in PLAN.yaml, m; (0, 0) if it has none."""
-    keys = [key for key in ("translation_pitch", "translation_mm") if raw[key] is not None]
+    keys = [
+        key for key in ("translation_pitch", "translation_mm") if raw[key] is not None
+    ]
     if len(keys) > 1:
-        raise InputError(where, f"{' and '.join(keys)} are given", "leave one of them out")
+        raise InputError(
+            where, f"{' and '.join(keys)} are given", "leave one of them out"
+        )
     if keys == ["translation_pitch"] and artifact.marks is not None:
         raise InputError(
             f"{where}: translation_pitch",

@@ -21,7 +21,9 @@ def map_to_dict(artifact: Artifact) -> dict[str, Any]:
             "interpolation": str(grid.interpolation),
             **({"grid_size_y": grid.size_y} if grid.size_y else {}),
         }
-    return map_fields | ({"harmonics": artifact.harmonics} if artifact.harmonics else {})
+    return map_fields | (
+        {"harmonics": artifact.harmonics} if artifact.harmonics else {}
+    )
 
 
 def map_grid_from_dict(data: dict[str, Any]) -> MapGrid | None:
@@ -71,7 +73,8 @@ def map_grid_of(data: dict, artifact: Artifact, where: str) -> MapGrid | None:
         )
     sizes = raw["grid_size"], raw["grid_size_y"] or raw["grid_size"]
     spans = max(
-        2 * half / max(size - 1, 1) for half, size in zip(artifact.reach, sizes, strict=True)
+        2 * half / max(size - 1, 1)
+        for half, size in zip(artifact.reach, sizes, strict=True)
     )
     return MapGrid(
         sizes[0],
@@ -114,7 +117,10 @@ def artifact_of(data: dict, where: str) -> Artifact:
                 "give each mark a whole id, x and y in m",
             )
         return Artifact(
-            0, 0.0, raw["angular_count"], marks=marks_of(lists["id"], lists["x"], lists["y"])
+            0,
+            0.0,
+            raw["angular_count"],
+            marks=marks_of(lists["id"], lists["x"], lists["y"]),
         )
     raw = checked_fields(
         _with_sides(data, where),
@@ -122,7 +128,9 @@ def artifact_of(data: dict, where: str) -> Artifact:
         {"grid_size": int, "grid_pitch": float},
         {"angular_count": (int, 0), "grid_size_y": (int, 0)},
     )
-    return Artifact(raw["grid_size"], raw["grid_pitch"], raw["angular_count"], raw["grid_size_y"])
+    return Artifact(
+        raw["grid_size"], raw["grid_pitch"], raw["angular_count"], raw["grid_size_y"]
+    )
 
 
 def _with_sides(data: dict, where: str) -> dict:
@@ -130,13 +138,20 @@ def _with_sides(data: dict, where: str) -> dict:
     sides = data.get("grid_size") if isinstance(data, dict) else None
     if not isinstance(sides, list):
         return data
-    if len(sides) != 2 or "grid_size_y" in data or not all(type(size) is int for size in sides):
+    if (
+        len(sides) != 2
+        or "grid_size_y" in data
+        or not all(type(size) is int for size in sides)
+    ):
         raise InputError(
             f"{where}: grid_size",
             f"{sides!r} is not a number of marks along x and y",
             "give [8, 6], or grid_size and grid_size_y",
         )
-    return data | {"grid_size": sides[0], "grid_size_y": sides[1] if sides[1] != sides[0] else 0}
+    return data | {
+        "grid_size": sides[0],
+        "grid_size_y": sides[1] if sides[1] != sides[0] else 0,
+    }
 
 
 def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
@@ -145,7 +160,11 @@ def artifact_to_dict(artifact: Artifact) -> dict[str, Any]:
     if artifact.marks is not None:
         marks = artifact.marks
         return {
-            "marks": {"id": list(marks.ids), "x": list(marks.x_m), "y": list(marks.y_m)},
+            "marks": {
+                "id": list(marks.ids),
+                "x": list(marks.x_m),
+                "y": list(marks.y_m),
+            },
             **count,
         }
     return {
@@ -165,7 +184,10 @@ def with_nodes(artifact: Artifact, text: str, where: str) -> Artifact:
             f"'{text}' is not NODES[:INTERPOLATION]",
             "give a number of nodes a side from 3 on, e.g. 9:bicubic",
         )
-    fields = {"grid_size": int(size), "interpolation": interpolation or str(Interpolation.BICUBIC)}
+    fields = {
+        "grid_size": int(size),
+        "interpolation": interpolation or str(Interpolation.BICUBIC),
+    }
     field = artifact.field
     if field.half[0] == field.half[1]:
         fields["grid_pitch"] = 2 * field.half[0] * field.grid_pitch_m / (int(size) - 1)

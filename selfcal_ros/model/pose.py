@@ -52,7 +52,9 @@ class StagePose(ABC):
         """Return a vector of the plate frame in the stage frame."""
 
     @abstractmethod
-    def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def turned_back(
+        self, x: np.ndarray, y: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the stage frame in the plate frame."""
 
     @abstractmethod
@@ -73,7 +75,9 @@ class StagePose(ABC):
             If the plate has none.
         """
         if self.turn_lines is None:
-            raise ValueError("the turn is counted in lines only on a plate with angular lines")
+            raise ValueError(
+                "the turn is counted in lines only on a plate with angular lines"
+            )
         return self.turn_lines
 
     def site_of(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -133,7 +137,9 @@ class LatticePose(StagePose):
             If the turn is not a whole quarter.
         """
         if self.quarter_turns is None:
-            raise ValueError("a grid mark lies on a site only after whole quarter turns")
+            raise ValueError(
+                "a grid mark lies on a site only after whole quarter turns"
+            )
         return self.quarter_turns
 
     @property
@@ -160,7 +166,9 @@ class LatticePose(StagePose):
         """Return a vector of the plate frame in the stage frame: R^q (u, v)."""
         return ((u, v), (-v, u), (-u, -v), (v, -u))[self.q]
 
-    def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def turned_back(
+        self, x: np.ndarray, y: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the stage frame in the plate frame: R^-q (x, y)."""
         return ((x, y), (y, -x), (-x, -y), (-y, x))[self.q]
 
@@ -209,14 +217,18 @@ class PlacedPose(StagePose):
         cosine, sine = self.phase.real, self.phase.imag
         return cosine * u - sine * v, sine * u + cosine * v
 
-    def turned_back(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def turned_back(
+        self, x: np.ndarray, y: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return a vector of the stage frame in the plate frame."""
         cosine, sine = self.phase.real, self.phase.imag
         return cosine * x + sine * y, cosine * y - sine * x
 
     def beyond_field(self, site: np.ndarray, artifact: Artifact) -> np.ndarray:
         """Return which sites (2, ...) lie beyond the nodes of the map, bool (...)."""
-        reach_x, reach_y = (half / artifact.grid_pitch_m + EDGE for half in artifact.field_half_m)
+        reach_x, reach_y = (
+            half / artifact.grid_pitch_m + EDGE for half in artifact.field_half_m
+        )
         x, y = np.abs(site)
         return (x > reach_x) | (y > reach_y)
 
@@ -274,14 +286,18 @@ class Pose:
     def places(self, artifact: Artifact, m: np.ndarray, n: np.ndarray) -> np.ndarray:
         """Return the nominal places of marks on the stage, x + iy, complex, m."""
         x, y = artifact.places(m, n)
-        return self.phase * (x + 1j * y) * artifact.grid_pitch_m + complex(*self.shift_m)
+        return self.phase * (x + 1j * y) * artifact.grid_pitch_m + complex(
+            *self.shift_m
+        )
 
     def in_field(self, artifact: Artifact) -> np.ndarray:
         """Return the marks of the plate that lie in the stage's field, bool (nx, ny)."""
         places = self.places(artifact, artifact.m, artifact.n)
         hx, hy = artifact.field_half_m
         rounding = EDGE * artifact.grid_pitch_m
-        return (np.abs(places.real) <= hx + rounding) & (np.abs(places.imag) <= hy + rounding)
+        return (np.abs(places.real) <= hx + rounding) & (
+            np.abs(places.imag) <= hy + rounding
+        )
 
 
 MOST_CELLS = 15
@@ -335,7 +351,9 @@ class ImageCells:
         self, cell: tuple[int, int], pose: "Pose", artifact: Artifact
     ) -> tuple[int, int]:
         """Return the steps (m, n) on a plate from the mark on the axis to that of a cell."""
-        step = (1, -1j, -1, 1j)[pose.quarters % 4] * complex(*cell) * self.steps(artifact)
+        step = (
+            (1, -1j, -1, 1j)[pose.quarters % 4] * complex(*cell) * self.steps(artifact)
+        )
         return round(step.real), round(step.imag)
 
     def steps(self, artifact: Artifact) -> int:
@@ -374,7 +392,9 @@ def whole_steps(value: float, where: str, unit: str, remedy: str) -> int:
     """Return the whole number that a value is meant to be; InputError if it is not near one."""
     steps = nearest_step(value)
     if steps is None:
-        raise InputError(where, f"{value:.6g} is not a whole number of {unit} steps", remedy)
+        raise InputError(
+            where, f"{value:.6g} is not a whole number of {unit} steps", remedy
+        )
     return steps
 
 

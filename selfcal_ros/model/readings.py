@@ -146,9 +146,13 @@ class GridVisits:
         """Return the visits of the marks where `keep` (P,) is true, renumbered."""
         stay = keep[self.mark]
         columns = {
-            name: column[stay] for name, _ in VISIT_COLUMNS if len(column := getattr(self, name))
+            name: column[stay]
+            for name, _ in VISIT_COLUMNS
+            if len(column := getattr(self, name))
         }
-        return replace(self, **columns | {"mark": (np.cumsum(keep) - 1)[self.mark[stay]]})
+        return replace(
+            self, **columns | {"mark": (np.cumsum(keep) - 1)[self.mark[stay]]}
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,8 +335,14 @@ def left_out(measurements: Measurements, index: int) -> Measurements:
     """Return the measurement without the readings of one view, counted as rejected."""
     view = measurements.views[index]
     lost = int(view.count.sum() + view.count_theta.sum())
-    empty = subset(view, np.zeros(len(view.m), dtype=bool), np.zeros(len(view.k), dtype=bool))
-    views = (*measurements.views[:index], _rejecting(empty, lost), *measurements.views[index + 1 :])
+    empty = subset(
+        view, np.zeros(len(view.m), dtype=bool), np.zeros(len(view.k), dtype=bool)
+    )
+    views = (
+        *measurements.views[:index],
+        _rejecting(empty, lost),
+        *measurements.views[index + 1 :],
+    )
     return replace(measurements, views=views)
 
 
@@ -345,7 +355,9 @@ def without(
     for index, view in enumerate(measurements.views):
         marks = {key[2] for key in keys if key[0] == index and key[1] == "grid"}
         lines = {key[2][0] for key in keys if key[0] == index and key[1] == "angular"}
-        views.append(_thinned(view, marks, lines, mark=mark) if marks or lines else view)
+        views.append(
+            _thinned(view, marks, lines, mark=mark) if marks or lines else view
+        )
     return replace(measurements, views=tuple(views))
 
 
@@ -353,7 +365,8 @@ def _thinned(
     view: ViewReadings, marks: set[tuple[int, ...]], lines: set[int], *, mark: bool
 ) -> ViewReadings:
     keep = np.array(
-        [(int(m), int(n)) not in marks for m, n in zip(view.m, view.n, strict=True)], dtype=bool
+        [(int(m), int(n)) not in marks for m, n in zip(view.m, view.n, strict=True)],
+        dtype=bool,
     )
     stay = np.array([int(k) not in lines for k in view.k], dtype=bool)
     lost = int(view.count[~keep].sum() + view.count_theta[~stay].sum())
@@ -370,7 +383,9 @@ def readings_digest(readings: ViewReadings, rejected: dict[str, int]) -> str:
     """Return the SHA-256 of one view's readings, visits, and the rejections outside views."""
     if readings not in _KNOWN:
         _KNOWN[readings] = _digest(readings)
-    return hashlib.sha256(repr((_KNOWN[readings], sorted(rejected.items()))).encode()).hexdigest()
+    return hashlib.sha256(
+        repr((_KNOWN[readings], sorted(rejected.items()))).encode()
+    ).hexdigest()
 
 
 def view_digest(cells: Sequence[ViewReadings], rejected: dict[str, int]) -> str:
@@ -388,9 +403,14 @@ _KNOWN: WeakKeyDictionary[ViewReadings, str] = WeakKeyDictionary()
 def _digest(readings: ViewReadings) -> str:
     digest = hashlib.sha256()
     visits = readings.visits
-    for table, columns in ((readings, COLUMNS), *(((visits, VISIT_COLUMNS),) if visits else ())):
+    for table, columns in (
+        (readings, COLUMNS),
+        *(((visits, VISIT_COLUMNS),) if visits else ()),
+    ):
         for name, kind in columns:
-            digest.update(np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes())
+            digest.update(
+                np.ascontiguousarray(getattr(table, name), dtype=kind).tobytes()
+            )
     if visits:
         digest.update(repr((visits.sigma_m, visits.dof)).encode())
     for motion in (readings.motion, readings.motion_theta):
@@ -433,7 +453,9 @@ def placing_digest(artifact: Artifact, view: View) -> str:
     )
     text = ",".join(float(number).hex() for number in numbers)
     text += "".join(
-        repr(item) for item in (artifact.map_grid, view.image, artifact.marks) if item is not None
+        repr(item)
+        for item in (artifact.map_grid, view.image, artifact.marks)
+        if item is not None
     )
     text += f",{artifact.harmonics}" if artifact.harmonics else ""
     return hashlib.sha256(text.encode()).hexdigest()[:16]

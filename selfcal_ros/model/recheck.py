@@ -168,5 +168,6 @@ def _filled_fields(record: Any) -> dict[str, Any]:
     return {
         field.name: plain(value)
         for field in fields(record)
-        if (value := getattr(record, field.name)) is not None or field.default is MISSING
+        if (value := getattr(record, field.name)) is not None
+        or field.default is MISSING
     }

@@ -113,7 +113,9 @@ class ReferenceLength:
         return self.runs or (self,)
 
     @classmethod
-    def between(cls, text: str, artifact: Artifact, certificate: str = "") -> "ReferenceLength":
+    def between(
+        cls, text: str, artifact: Artifact, certificate: str = ""
+    ) -> "ReferenceLength":
         """Return the distance of two marks of a plate as a reference.
 
         Parameters
@@ -133,19 +135,24 @@ class ReferenceLength:
         """
         where = "reference length"
         form = "ID:ID" if artifact.marks else "M,N:M,N"
-        example = f"write e.g. {'17:42' if artifact.marks else '-5,0:5,0'}:0.1000002:5e-9 (m)"
+        example = (
+            f"write e.g. {'17:42' if artifact.marks else '-5,0:5,0'}:0.1000002:5e-9 (m)"
+        )
         try:
             first, second, *numbers = text.split(":")
             more = ",0" * (artifact.marks is not None)
             marks = tuple(
                 (whole_number_of(m), whole_number_of(n))
                 for m, n in (
-                    (name + more * ("," not in name)).split(",") for name in (first, second)
+                    (name + more * ("," not in name)).split(",")
+                    for name in (first, second)
                 )
             )
             length, u = map(number_of, numbers)
         except ValueError as error:
-            raise InputError(where, f"'{text}' is not {form}:LENGTH:U", example) from error
+            raise InputError(
+                where, f"'{text}' is not {form}:LENGTH:U", example
+            ) from error
         for mark in marks:
             if not artifact.has(*map(np.array, mark)):
                 remedy = (
@@ -153,23 +160,36 @@ class ReferenceLength:
                     if artifact.marks
                     else (
                         "its marks go from ({}, {}) to ({}, {})".format(
-                            *(end for ends in zip(*artifact.limits, strict=True) for end in ends)
+                            *(
+                                end
+                                for ends in zip(*artifact.limits, strict=True)
+                                for end in ends
+                            )
                         )
                     )
                 )
                 raise InputError(where, f"the plate has no mark {mark}", remedy)
         nominal = artifact.grid_pitch_m * math.dist(
-            *(tuple(map(float, artifact.places(*map(np.array, mark)))) for mark in marks)
+            *(
+                tuple(map(float, artifact.places(*map(np.array, mark))))
+                for mark in marks
+            )
         )
         if nominal == 0:
             raise InputError(where, f"'{text}' names one mark twice", "name two marks")
         return cls(
-            ReferenceKind.MARKS, (length - nominal) / nominal, u / nominal, certificate, marks=marks
+            ReferenceKind.MARKS,
+            (length - nominal) / nominal,
+            u / nominal,
+            certificate,
+            marks=marks,
         )
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be relative errors, and marks that are not two."""
-        two = len(set(self.marks or ())) == 2 and all(len(mark) == 2 for mark in self.marks or ())
+        two = len(set(self.marks or ())) == 2 and all(
+            len(mark) == 2 for mark in self.marks or ()
+        )
         if (self.kind == ReferenceKind.MARKS) != two:
             raise InputError(
                 "reference length",
@@ -221,7 +241,11 @@ class ReferenceLength:
             len(numbers) not in (4, 5)
             or not all(map(math.isfinite, numbers))
             or min(values["u_temperature_k"], values["u_expansion_per_k"]) < 0
-            or not (LEAST_EXPANSION_PER_K <= values["expansion_per_k"] <= MAX_EXPANSION_PER_K)
+            or not (
+                LEAST_EXPANSION_PER_K
+                <= values["expansion_per_k"]
+                <= MAX_EXPANSION_PER_K
+            )
         ):
             raise InputError(
                 "reference length",
@@ -234,7 +258,8 @@ class ReferenceLength:
         sign = 1 if self.kind.of_plate else -1  # a longer scale indicates less
         return replace(
             self,
-            relative_error=self.relative_error + sign * values["expansion_per_k"] * warmer,
+            relative_error=self.relative_error
+            + sign * values["expansion_per_k"] * warmer,
             u_relative=math.hypot(
                 self.u_relative,
                 values["expansion_per_k"] * values["u_temperature_k"],

@@ -32,7 +32,11 @@ from selfcal_ros.model.plate_form import (
 )
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.model.recheck import Recheck
-from selfcal_ros.model.reference import ReferenceLength, reference_from_dict, reference_to_dict
+from selfcal_ros.model.reference import (
+    ReferenceLength,
+    reference_from_dict,
+    reference_to_dict,
+)
 from selfcal_ros.model.verdict import (
     BudgetLine,
     Finding,
@@ -319,7 +323,10 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
         "measurement_sense": result.sense,
         "artifact": {
             **artifact_to_dict(artifact),
-            **{key: plain(getattr(amap, key)) for key in ("magnification", "u_magnification")},
+            **{
+                key: plain(getattr(amap, key))
+                for key in ("magnification", "u_magnification")
+            },
         },
         **({"map": map_fields} if (map_fields := map_to_dict(artifact)) else {}),
         "run_id": result.run_id,
@@ -344,7 +351,9 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
                 "rotation": v.rotation,
                 "translation_x": v.translation_x,
                 "translation_y": v.translation_y,
-                "misalignment": {key: plain(getattr(v, key)) for key in ("phi", "tx", "ty")},
+                "misalignment": {
+                    key: plain(getattr(v, key)) for key in ("phi", "tx", "ty")
+                },
                 "used": v.used,
                 "rejected": v.rejected,
                 "read": {"grid": plain(v.read_grid), "angular": plain(v.read_angular)},
@@ -372,7 +381,11 @@ def result_to_dict(result: CalibrationResult) -> dict[str, Any]:
             else {}
         ),
         **result.kept.to_dict(),
-        **({} if result.verification is None else {VERIFICATION: plain(result.verification)}),
+        **(
+            {}
+            if result.verification is None
+            else {VERIFICATION: plain(result.verification)}
+        ),
         **{key: plain(value) for key, value in result.extra.items()},
     }
     return with_digests(data)
@@ -419,10 +432,14 @@ def require_unchanged(data: dict[str, Any], where: str) -> bool:
         return False
     remedy = "write it again with the verb that made it, such as `selfcal solve`"
     if not isinstance(written, dict):
-        raise InputError(where, f"its {DIGEST!r} was removed after the file was written", remedy)
+        raise InputError(
+            where, f"its {DIGEST!r} was removed after the file was written", remedy
+        )
     for key in (*now, *written):
         if now.get(key) != written.get(key):
-            raise InputError(where, f"its {key!r} was changed after the file was written", remedy)
+            raise InputError(
+                where, f"its {key!r} was changed after the file was written", remedy
+            )
     return True
 
 
@@ -478,7 +495,9 @@ def result_from_dict(data: object, where: str) -> CalibrationResult:
     try:
         return _parse(data)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        reason = f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
+        reason = (
+            f"the key {error} is missing" if isinstance(error, KeyError) else str(error)
+        )
         raise InputError(
             where, f"damaged result ({reason})", "write it again with `selfcal solve`"
         ) from error
@@ -496,11 +515,15 @@ def _parse(data: dict) -> CalibrationResult:
             raw.get("grid_size_y", 0),
         )
         if "marks" not in raw
-        else artifact_of({key: raw[key] for key in ("marks", "angular_count")}, "artifact")
+        else artifact_of(
+            {key: raw[key] for key in ("marks", "angular_count")}, "artifact"
+        )
     )
     artifact = replace(artifact, map_grid=map_grid_from_dict(grid), harmonics=harmonics)
     emap, amap = data["error_map"], data["artifact_map"]
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_MAP_ARRAYS[:4], artifact.field.shape)
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(
+        _MAP_ARRAYS[:4], artifact.field.shape
+    )
     shapes |= dict.fromkeys(_MAP_ARRAYS[4:], (artifact.angular_count,))
     error_map = ErrorMap(
         artifact.field,
@@ -524,8 +547,12 @@ def _parse(data: dict) -> CalibrationResult:
         method=read(str, data.get("method", "joint")),
         sense=str(read(Sense, data.get("measurement_sense", "microscope_moves"))),
         extra={key: value for key, value in data.items() if key not in _KNOWN},
-        kept=kept_from_dict(data, artifact.field.shape, artifact.shape, artifact.angular_count),
-        verdict=verdict_from_dict(data.get("verdict"), identifiable=observability.identifiable),
+        kept=kept_from_dict(
+            data, artifact.field.shape, artifact.shape, artifact.angular_count
+        ),
+        verdict=verdict_from_dict(
+            data.get("verdict"), identifiable=observability.identifiable
+        ),
         model=read(ModelResult, data.get("model") or {}),
         reference=reference_from_dict(data.get("reference")),
         provenance=provenance_from_dict(data.get("provenance")),
@@ -541,9 +568,9 @@ def _parse(data: dict) -> CalibrationResult:
 
 
 def _plate(amap: dict, artifact: Artifact, raw: dict) -> ArtifactMap:
-    shapes = dict.fromkeys(("ax", "ay", "u_ax", "u_ay"), artifact.shape) | dict.fromkeys(
-        ("a_theta", "u_a_theta"), (artifact.angular_count,)
-    )
+    shapes = dict.fromkeys(
+        ("ax", "ay", "u_ax", "u_ay"), artifact.shape
+    ) | dict.fromkeys(("a_theta", "u_a_theta"), (artifact.angular_count,))
     return ArtifactMap(
         **{
             key: _array(amap[key], shape, key)
@@ -556,7 +583,9 @@ def _plate(amap: dict, artifact: Artifact, raw: dict) -> ArtifactMap:
 
 
 def _view(v: dict) -> ViewResult:
-    turn, x, y = (read(float, v[key]) for key in ("rotation", "translation_x", "translation_y"))
+    turn, x, y = (
+        read(float, v[key]) for key in ("rotation", "translation_x", "translation_y")
+    )
     if not np.isfinite([turn, x, y]).all():
         raise ValueError(f"the pose of view {v['name']!r} is not finite")
     phi, tx, ty = (read(float, v["misalignment"][key]) for key in ("phi", "tx", "ty"))
@@ -587,7 +616,8 @@ def _seen_to_dict(observability: Observability) -> dict[str, Any]:
 def _seen_from_dict(data: dict[str, Any]) -> Observability:
     words = {
         name: tuple(
-            Finding("in_words", text=text) for text in read(tuple[str, ...], data.get(name, []))
+            Finding("in_words", text=text)
+            for text in read(tuple[str, ...], data.get(name, []))
         )
         for name in ("modes", "advice")
     }

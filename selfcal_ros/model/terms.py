@@ -77,13 +77,17 @@ class ModelTerm:
 
     def scaled(self, factor: float) -> "ModelTerm":
         """Return the term with all its sizes multiplied by `factor`."""
-        return ModelTerm(self.name, self.size * factor, tuple(factor * p for p in self.parts))
+        return ModelTerm(
+            self.name, self.size * factor, tuple(factor * p for p in self.parts)
+        )
 
     @property
     def rounded_up(self) -> "ModelTerm":
         """The term with its size rounded up to two figures."""
         power = 10.0 ** (math.floor(math.log10(self.size)) - 1)
-        return ModelTerm(self.name, float(f"{math.ceil(self.size / power) * power:.1e}"))
+        return ModelTerm(
+            self.name, float(f"{math.ceil(self.size / power) * power:.1e}")
+        )
 
     def __str__(self) -> str:
         """Return the term as written in an option."""
@@ -160,7 +164,9 @@ def parse_terms(texts: Iterable[str], where: str) -> tuple[ModelTerm, ...]:
             continue
         name, colon, size = text.partition(":")
         if name not in blocks():
-            raise InputError(where, f"the term '{name}' is unknown", known_are(name, blocks()))
+            raise InputError(
+                where, f"the term '{name}' is unknown", known_are(name, blocks())
+            )
         term = _term(name, size.split(":") if colon else [], f"{where}: {name}")
         if term.name in terms:
             raise InputError(where, f"the term '{name}' is given twice", "remove one")
@@ -223,11 +229,19 @@ def with_microscope(terms: tuple[str, ...], raw: dict, where: str) -> tuple[str,
         raw,
         where,
         {},
-        {"scale_u": (float, 0.01), "rotation_u": (float, 0.01), "shear_u": (float, 0.002)},
+        {
+            "scale_u": (float, 0.01),
+            "rotation_u": (float, 0.01),
+            "shear_u": (float, 0.002),
+        },
     )
-    declared = microscope_term(*(parse_size(f"{size:g}", where) for size in fields.values()))
+    declared = microscope_term(
+        *(parse_size(f"{size:g}", where) for size in fields.values())
+    )
     if any(term.partition(":")[0] == declared.name for term in terms):
-        raise InputError(where, "model_terms has a microscope as well", "leave one of them out")
+        raise InputError(
+            where, "model_terms has a microscope as well", "leave one of them out"
+        )
     return tuple(map(str, parse_terms([*terms, str(declared)], where)))
 
 
@@ -236,11 +250,15 @@ def terms_of(texts: list, where: str) -> tuple[str, ...]:
     where = f"{where}: model_terms"
     for text in texts:
         if not isinstance(text, str):
-            raise InputError(where, f"{text!r} is not a text", "write TERM or TERM:SIZE")
+            raise InputError(
+                where, f"{text!r} is not a text", "write TERM or TERM:SIZE"
+            )
     return tuple(str(term) for term in parse_terms(texts, where))
 
 
-def merged(terms: Iterable[ModelTerm], more: Collection[ModelTerm]) -> tuple[ModelTerm, ...]:
+def merged(
+    terms: Iterable[ModelTerm], more: Collection[ModelTerm]
+) -> tuple[ModelTerm, ...]:
     """Return `terms` with `more`, which replace those of the same name."""
     named = {term.name for term in more}
     return (*(term for term in terms if term.name not in named), *more)

@@ -246,7 +246,10 @@ class Provenance:
     @property
     def facts(self) -> dict[str, Any]:
         """What reports list of it by name: `extra`, and the times of the exposures if known."""
-        times = {"first_exposure": self.first_exposure, "last_exposure": self.last_exposure}
+        times = {
+            "first_exposure": self.first_exposure,
+            "last_exposure": self.last_exposure,
+        }
         return {**self.extra, **{name: time for name, time in times.items() if time}}
 
 
@@ -301,7 +304,9 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
     """Return the verdict of a result; without one, whether it is identified decides."""
     if data is None:
         grade = Grade.GOOD if identifiable else Grade.NOT_QUALIFIED
-        return Verdict(grade, sentence="Not judged: written by a version without verdicts")
+        return Verdict(
+            grade, sentence="Not judged: written by a version without verdicts"
+        )
     qualified = read(bool, data["qualified"])
     grade = Grade(data.get("grade", "good" if qualified else "not_qualified"))
     if qualified is (grade is Grade.NOT_QUALIFIED):
@@ -318,7 +323,9 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
 
 def line_to_dict(line: BudgetLine) -> dict[str, Any]:
     """Return the JSON form of a line of the budget."""
-    return {"type" if name == "kind" else name: value for name, value in vars(line).items()}
+    return {
+        "type" if name == "kind" else name: value for name, value in vars(line).items()
+    }
 
 
 def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
@@ -326,7 +333,11 @@ def budget_from_list(rows: Any) -> tuple[BudgetLine, ...]:
     return tuple(
         read(
             BudgetLine,
-            row | {"dof": math.inf if row["dof"] is None else row["dof"], "kind": row["type"]},
+            row
+            | {
+                "dof": math.inf if row["dof"] is None else row["dof"],
+                "kind": row["type"],
+            },
         )
         for row in (read(dict, line) for line in read(list, rows))
     )
@@ -340,6 +351,11 @@ def provenance_from_dict(data: dict | None) -> Provenance:
         if data is None
         else read(
             Provenance,
-            data | {"extra": {key: value for key, value in data.items() if key not in own_fields}},
+            data
+            | {
+                "extra": {
+                    key: value for key, value in data.items() if key not in own_fields
+                }
+            },
         )
     )

@@ -21,7 +21,14 @@ from selfcal_ros.model.pose import (
     whole_steps,
 )
 
-ORDERS = ("raster", "serpentine", "there_and_back", "x_then_y", "x_back_y_back", "random")
+ORDERS = (
+    "raster",
+    "serpentine",
+    "there_and_back",
+    "x_then_y",
+    "x_back_y_back",
+    "random",
+)
 """raster: line by line along x, each line along y from its first mark to its last. serpentine:
 the same, every other line backwards. there_and_back: a raster pass, then the same pass
 backwards. x_then_y: a raster pass, then one that goes line by line along y. x_back_y_back: line by
@@ -133,12 +140,20 @@ class View:
     def step_on_plate(self, artifact: Artifact) -> tuple[int, int]:
         """Return the steps (m, n) on the plate from the mark on the optical axis to the cell's."""
         cell = self.cell or (0, 0)
-        return self.image.step_on_plate(cell, self.pose, artifact) if self.image else (0, 0)
+        return (
+            self.image.step_on_plate(cell, self.pose, artifact)
+            if self.image
+            else (0, 0)
+        )
 
     @property
     def plan_view(self) -> str:
         """Name of the view in the plan: of a sub-view without its cell."""
-        return self.name if self.cell is None else self.name.removesuffix(cell_label(self.cell))
+        return (
+            self.name
+            if self.cell is None
+            else self.name.removesuffix(cell_label(self.cell))
+        )
 
     @property
     def sub_views(self) -> tuple["View", ...]:
@@ -154,7 +169,11 @@ class View:
                 angular=self.angular and cell == (0, 0),
             )
             x, y = self.translation_m
-            out.append(replace(view, translation_m=(x - view.cell_m.real, y - view.cell_m.imag)))
+            out.append(
+                replace(
+                    view, translation_m=(x - view.cell_m.real, y - view.cell_m.imag)
+                )
+            )
         return tuple(out)
 
     def require_check_stops(self, artifact: Artifact) -> None:
@@ -204,7 +223,9 @@ class View:
         if artifact.map_grid is None and artifact.marks is None:
             return self.lattice_pose(artifact)
         shift = self._pitches(artifact)
-        lines = self._lines(artifact) if self.angular and artifact.angular_count else None
+        lines = (
+            self._lines(artifact) if self.angular and artifact.angular_count else None
+        )
         return PlacedPose(self.pose.phase, shift, lines)
 
     def lattice_pose(self, artifact: Artifact) -> LatticePose:
@@ -221,7 +242,9 @@ class View:
         a, b = (
             self._half_steps(step, artifact)
             if quarter_shift
-            else whole_steps(step, f"{where} translation", "pitch", f"place the plate on the {OFF}")
+            else whole_steps(
+                step, f"{where} translation", "pitch", f"place the plate on the {OFF}"
+            )
             for step in self._pitches(artifact)
         )
         quarter = nearest_step(self.rotation_rad / (math.pi / 2))
@@ -233,7 +256,11 @@ class View:
                 f"turn by 90 deg, set grid to false, or place it on the {OFF}",
             )
         lines = turn_in_lines(self.rotation_rad, artifact)
-        if lines is None and artifact.angular_count and (self.angular or quarter is None):
+        if (
+            lines is None
+            and artifact.angular_count
+            and (self.angular or quarter is None)
+        ):
             lines = self._lines(artifact)
         if lines is None and quarter is None:
             raise InputError(
@@ -255,7 +282,11 @@ class View:
     def _quarter_shift(self, artifact: Artifact) -> float:
         """Return by how much more than whole pitches the plate is shifted on its lattice."""
         quarter = nearest_step(self.rotation_rad / (math.pi / 2))
-        return artifact.quarter_shift if self.grid and quarter is not None and quarter % 2 else 0
+        return (
+            artifact.quarter_shift
+            if self.grid and quarter is not None and quarter % 2
+            else 0
+        )
 
     def _half_steps(self, step: float, artifact: Artifact) -> float:
         """Return the odd multiple of 1/2 that a translation in pitches is meant to be."""
@@ -281,7 +312,9 @@ class View:
             )
         if not math.isfinite(self.rotation_rad):
             raise InputError(
-                f"{where} rotation", f"{self.rotation_rad} is not an angle", "give a finite turn"
+                f"{where} rotation",
+                f"{self.rotation_rad} is not an angle",
+                "give a finite turn",
             )
         a, b = (value / artifact.grid_pitch_m for value in self.translation_m)
         if max(abs(a), abs(b)) > MAX_SHIFT + 0.5:
@@ -326,7 +359,9 @@ def rotations_of(views: Sequence[View]) -> tuple[int, ...]:
     return shared_rotations(placings_of(views), [view.cell or (0, 0) for view in views])
 
 
-def shared_rotations(placings: Sequence[int], cells: Sequence[tuple[int, int]]) -> tuple[int, ...]:
+def shared_rotations(
+    placings: Sequence[int], cells: Sequence[tuple[int, int]]
+) -> tuple[int, ...]:
     """Return the same for views with the placings `placings`, and their cells in the image.
 
     A turned plate moves the marks in the image, and the camera's error there differs from that at
@@ -343,7 +378,10 @@ def shared_rotations(placings: Sequence[int], cells: Sequence[tuple[int, int]]) 
     }
     return tuple(
         placing
-        if all(len(set(along)) > 1 for along in zip(*cells_of_placing[placing], strict=True))
+        if all(
+            len(set(along)) > 1
+            for along in zip(*cells_of_placing[placing], strict=True)
+        )
         else row
         for row, placing in enumerate(placings)
     )
@@ -395,5 +433,7 @@ class Plan:
     @property
     def check_stops(self) -> tuple[int, float]:
         """Marks checked in each view of grid marks, and their distance, m."""
-        checks = ((view.check_marks, view.check_offset_m) for view in self.views if view.grid)
+        checks = (
+            (view.check_marks, view.check_offset_m) for view in self.views if view.grid
+        )
         return next(checks, (0, 0.0))

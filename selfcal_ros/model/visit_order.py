@@ -91,11 +91,14 @@ def visit_sequence(
         return VisitSequence(m, n, i, j, count, index, np.zeros(0), np.zeros((2, 0)))
     marks, sites = view.on_stage(artifact).marks_in_field(artifact)
     n_passes = 1 if consecutive else view.repeats
-    of_plate = chosen.of_plate or artifact.map_grid is not None  # no lines of sites off the lattice
+    # no lines of sites off the lattice
+    of_plate = chosen.of_plate or artifact.map_grid is not None
     places = np.stack(artifact.places(*marks)) if of_plate else sites
     lines = np.rint(places) if artifact.marks else places  # of a list: one pitch wide
     passes = _passes(chosen, places, lines, n_passes=n_passes, rng=rng)
-    return _visits(marks, sites, passes, together=view.repeats if consecutive else 1, view=view)
+    return _visits(
+        marks, sites, passes, together=view.repeats if consecutive else 1, view=view
+    )
 
 
 def stage_targets(
@@ -172,7 +175,12 @@ def _passes(
 
 
 def _visits(
-    marks: np.ndarray, sites: np.ndarray, passes: np.ndarray, *, together: int, view: View
+    marks: np.ndarray,
+    sites: np.ndarray,
+    passes: np.ndarray,
+    *,
+    together: int,
+    view: View,
 ) -> VisitSequence:
     """Return the visits of passes (P, n) in which each mark is exposed `together` times.
 
@@ -182,13 +190,19 @@ def _visits(
     """
     half = (len(passes) + 1) // 2
     stops = SIDES if view.check_marks else ()
-    rows = [*passes[:half], *[check_marks(sites, view.check_marks)] * len(stops), *passes[half:]]
+    rows = [
+        *passes[:half],
+        *[check_marks(sites, view.check_marks)] * len(stops),
+        *passes[half:],
+    ]
     sides = [(0, 0)] * half + list(stops) + [(0, 0)] * (len(passes) - half)
     index = np.concatenate(rows)
     number = np.repeat(np.arange(len(rows)), [*map(len, rows)])
     aside = view.check_offset_m * np.array(sides).T[:, number]
     exposures = np.where(aside.any(axis=0), 1, together)
-    new_stop = (np.diff(index, prepend=-1) != 0) | np.diff(aside, prepend=0.0).any(axis=0)
+    new_stop = (np.diff(index, prepend=-1) != 0) | np.diff(aside, prepend=0.0).any(
+        axis=0
+    )
     first = np.flatnonzero(new_stop)
     count = np.add.reduceat(exposures, first)
     time = np.cumsum(count) - (count + 1) / 2
@@ -205,7 +219,8 @@ def check_marks(sites: np.ndarray, number: int) -> np.ndarray:
     number = min(number, sites.shape[1])
     middle = (sites.min(axis=1) + sites.max(axis=1)) / 2
     angle = np.pi / 4 + 2 * np.pi * np.arange(number - 1) / max(number - 1, 1)
-    out = np.sqrt(0.5) * np.stack([np.cos(angle), np.sin(angle)])  # half way to the corners
+    # half way to the corners
+    out = np.sqrt(0.5) * np.stack([np.cos(angle), np.sin(angle)])
     targets = middle[:, None] + np.ptp(sites, axis=1)[:, None] / 2 * np.hstack(
         [np.zeros((2, 1)), out]
     )

@@ -5,5 +5,6 @@ import sys
 
 from selfcal_ros.start import begin_node
 
-if sys.argv[:1] == ["-m"]:  # python -m selfcal_ros.nodes.NODE, before the node itself is imported
+# python -m selfcal_ros.nodes.NODE, before the node itself is imported
+if sys.argv[:1] == ["-m"]:
     begin_node()

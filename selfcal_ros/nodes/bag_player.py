@@ -27,7 +27,10 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
             raise InputError("bag_player", "no bag is named", "set the parameter 'bag'")
         self.finished = Future()
         self.exit_code = ExitCode.DONE
-        listener, patience_s = self.settings.listener, self.settings.wait_for_subscribers
+        listener, patience_s = (
+            self.settings.listener,
+            self.settings.wait_for_subscribers,
+        )
         self.player = Player(
             self,
             self.settings.bag,
@@ -51,7 +54,9 @@ class BagPlayer(SelfcalNode[PlayerSettings]):
         elif self.player.stalled_s > STALLED_S:
             level = Level.WARN
             line = f"{self.player.listener} takes no more messages"
-        return Diagnosis(level, line, {"played": self.player.played, "total": self.player.total})
+        return Diagnosis(
+            level, line, {"played": self.player.played, "total": self.player.total}
+        )
 
     def _waits_for(self) -> str:
         if self._waits and self.player.unheard():

@@ -22,12 +22,16 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(RecorderSettings, **kwargs)
         if not self.settings.bag:
-            raise InputError("bag_recorder", "no bag is named", "set the parameter 'bag'")
+            raise InputError(
+                "bag_recorder", "no bag is named", "set the parameter 'bag'"
+            )
         self._writer = BagWriter(Path(self.settings.bag))
         topics = [*names.INPUTS, *(names.RESULTS if self.settings.all_topics else ())]
         for topic in topics:
             name, heard = kept_names(self, topic)
-            typename = f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
+            typename = (
+                f"{topic.type.__module__.split('.')[0]}/msg/{topic.type.__name__}"
+            )
             self._writer.add_topic(name, typename, [offered(topic)], heard)
             if topic is not names.ENCODER:
                 self.subscribe(topic, partial(self._record, name), raw=True)
@@ -46,7 +50,9 @@ class BagRecorder(SelfcalNode[RecorderSettings]):
             self._unrecorded += 1
             return
         try:
-            self._writer.write_raw(topic, bytes(data), self.get_clock().now().nanoseconds)
+            self._writer.write_raw(
+                topic, bytes(data), self.get_clock().now().nanoseconds
+            )
         except InputError as error:
             self._fail(error)
 

@@ -21,10 +21,23 @@ from selfcal_ros.collection.settings.parameter import BARE_Y, Parameter, Setting
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.nodes.callbacks import WithInfo
 from selfcal_ros.nodes.filling import fill, status_of
-from selfcal_ros.nodes.names import HEALTH, Topic, mismatched, others_publishing, private
+from selfcal_ros.nodes.names import (
+    HEALTH,
+    Topic,
+    mismatched,
+    others_publishing,
+    private,
+)
 from selfcal_ros.nodes.services import Answering
 from selfcal_ros.sessions.clocks import RosTime
-from selfcal_ros.sessions.health import Diagnosis, Level, Losses, Ports, Refusals, merged
+from selfcal_ros.sessions.health import (
+    Diagnosis,
+    Level,
+    Losses,
+    Ports,
+    Refusals,
+    merged,
+)
 
 BEAT_S = 1.0  # between two health messages
 
@@ -66,7 +79,9 @@ class NodeBase[S: Settings](Answering):
         self._beat = self.every(BEAT_S, self.report)
 
     def _take_parameters(self, kind: type[S]) -> None:
-        overrides = {key: value.value for key, value in self._parameter_overrides.items()}
+        overrides = {
+            key: value.value for key, value in self._parameter_overrides.items()
+        }
         self.settings = kind.checked(overrides, f"parameters of {kind.NODE}")
         for parameter in kind.parameters():  # the checked value: 2 is accepted as 2.0
             self.declare_parameter(
@@ -77,12 +92,15 @@ class NodeBase[S: Settings](Answering):
             )
         for key in (key for key, value in overrides.items() if value is True):
             if getattr(self.settings, key, "") == BARE_Y:
-                self.say(Level.OK, f"{key}: true is a bare y as ROS reads it; taken as 'y'")
+                self.say(
+                    Level.OK, f"{key}: true is a bare y as ROS reads it; taken as 'y'"
+                )
 
     def publisher(self, topic: Topic) -> Publisher:
         """Return a publisher of `topic`."""
         return self.own(
-            self.create_publisher(topic.type, topic.name, topic.qos), self.destroy_publisher
+            self.create_publisher(topic.type, topic.name, topic.qos),
+            self.destroy_publisher,
         )
 
     def output(self, topic: Topic) -> Callable[[dict[str, Any]], None]:
@@ -90,22 +108,32 @@ class NodeBase[S: Settings](Answering):
         publisher = self.publisher(topic)
         return lambda fields: publisher.publish(fill(topic.type(), fields))
 
-    def subscribe(self, topic: Topic, callback: Callable[..., None], **kwargs: Any) -> Any:
+    def subscribe(
+        self, topic: Topic, callback: Callable[..., None], **kwargs: Any
+    ) -> Any:
         """Subscribe `callback` to `topic`; its exceptions are counted and do not end the node."""
         name = self.resolve_topic_name(topic.name)
         guarded = (
-            callback if hasattr(callback, "__signature__") else self.guarded(callback, topic.name)
+            callback
+            if hasattr(callback, "__signature__")
+            else self.guarded(callback, topic.name)
         )
         self._heard_on[name] = topic
 
         def lost(event: Any) -> None:
-            if topic.qos.depth > 1:  # otherwise only the newest is used: the others are not lost
+            # otherwise only the newest is used: the others are not lost
+            if topic.qos.depth > 1:
                 self.losses.add(topic.name, event.total_count_change)
 
         events = SubscriptionEventCallbacks(message_lost=lost)
         return self.own(
             self.create_subscription(
-                topic.type, topic.name, guarded, topic.qos, event_callbacks=events, **kwargs
+                topic.type,
+                topic.name,
+                guarded,
+                topic.qos,
+                event_callbacks=events,
+                **kwargs,
             ),
             self.destroy_subscription,
         )
@@ -134,7 +162,9 @@ class NodeBase[S: Settings](Answering):
         the health of a node that starts slowly would be published three times, then not for 3 s.
         """
         timer = self.create_timer(
-            seconds, self.guarded(callback), clock=Clock(clock_type=ClockType.STEADY_TIME)
+            seconds,
+            self.guarded(callback),
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         return self.own(timer, self.destroy_timer)
 
@@ -144,13 +174,19 @@ class NodeBase[S: Settings](Answering):
 
     def ports(self, publish: Callable[[str, dict[str, Any]], None]) -> Ports:
         """Return the ports of this node for a session; `publish` takes its outputs."""
-        return Ports(publish, self.say, time.monotonic, lambda: self.get_clock().now().nanoseconds)
+        return Ports(
+            publish,
+            self.say,
+            time.monotonic,
+            lambda: self.get_clock().now().nanoseconds,
+        )
 
     def say(self, level: Level, line: str) -> None:
         """Write one line to the log."""
         logger = self.get_logger()
         line = printable(line)
-        if level == Level.OK:  # a line each: rclpy distinguishes call sites by their location
+        # a line each: rclpy distinguishes call sites by their location
+        if level == Level.OK:
             logger.info(line)
         elif level == Level.WARN:
             logger.warning(line)
@@ -163,7 +199,10 @@ class NodeBase[S: Settings](Answering):
 
     def report(self) -> None:
         """Publish the health of this node."""
-        graph = [mismatched(self, self._heard_on), others_publishing(self, self.alone_on)]
+        graph = [
+            mismatched(self, self._heard_on),
+            others_publishing(self, self.alone_on),
+        ]
         clock = self._ros_time.look(
             simulated=self.get_parameter("use_sim_time").value,
             now_ns=self.get_clock().now().nanoseconds,
@@ -178,7 +217,9 @@ class NodeBase[S: Settings](Answering):
     def diagnose(self, diagnosis: Diagnosis) -> None:
         """Publish a diagnostic status of this node, on /diagnostics and on its health topic."""
         stage = self.settings.hardware_id or self.get_namespace().strip("/") or "stage"
-        status = status_of(diagnosis, self.get_fully_qualified_name().lstrip("/"), stage)
+        status = status_of(
+            diagnosis, self.get_fully_qualified_name().lstrip("/"), stage
+        )
         array_message = DiagnosticArray(status=[status])
         array_message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array_message)
@@ -204,7 +245,9 @@ class SelfcalNode[S: Settings](NodeBase[S]):
 def descriptor(parameter: Parameter) -> ParameterDescriptor:
     """Return the descriptor of a parameter, read-only while the node runs."""
     unit = f" [{parameter.unit}]" if parameter.unit else ""
-    described = ParameterDescriptor(description=parameter.description + unit, read_only=True)
+    described = ParameterDescriptor(
+        description=parameter.description + unit, read_only=True
+    )
     if parameter.choices:
         described.additional_constraints = "one of " + ", ".join(parameter.choices)
     low, high = parameter.low, parameter.high
@@ -215,5 +258,7 @@ def descriptor(parameter: Parameter) -> ParameterDescriptor:
             FloatingPointRange(from_value=float(low), to_value=float(high))
         ]
     else:
-        described.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
+        described.integer_range = [
+            IntegerRange(from_value=int(low), to_value=int(high), step=1)
+        ]
     return described

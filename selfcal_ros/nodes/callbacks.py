@@ -49,7 +49,9 @@ class Guarded(Node):
 
     refusals: Refusals
 
-    def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
+    def guarded(
+        self, callback: Callable[..., Any], place: str = ""
+    ) -> Callable[..., Any]:
         """Return `callback` with exceptions counted and logged instead of raised."""
         place = place or getattr(callback, "__name__", "callback").strip("_")
         if inspect.iscoroutinefunction(callback):
@@ -86,7 +88,10 @@ class Guarded(Node):
     def subscriptions(self) -> Iterator[Subscription]:
         """The subscriptions, with those of rclpy guarded."""
         for item in super().subscriptions:
-            if not any(hasattr(item.callback, name) for name in ("__wrapped__", "__signature__")):
+            if not any(
+                hasattr(item.callback, name)
+                for name in ("__wrapped__", "__signature__")
+            ):
                 item.callback = self.guarded(item.callback, item.topic)
             yield item
 

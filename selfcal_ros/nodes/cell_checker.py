@@ -32,7 +32,9 @@ OF_A_CELL = ("cell_driver", "mark_detector")
 class CellChecker(SelfcalNode[CollectorSettings]):
     """Command a cell like a sequencer and check its messages."""
 
-    def __init__(self, plan: Plan, *, settle_s: float, patience_s: float, **kwargs: Any) -> None:
+    def __init__(
+        self, plan: Plan, *, settle_s: float, patience_s: float, **kwargs: Any
+    ) -> None:
         super().__init__(CollectorSettings, **kwargs)
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._said = 0
@@ -50,7 +52,9 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         MatchedInput(self, names.ENCODER_EITHER, self.session.take_encoder)
         self.subscribe(names.DETECTIONS, self.session.take_detection)
         for node in OF_A_CELL:
-            self.subscribe(names.of_node(node, names.HEALTH), partial(self._take_health, node))
+            self.subscribe(
+                names.of_node(node, names.HEALTH), partial(self._take_health, node)
+            )
         self.subscribe(names.DIAGNOSTICS, self._take_diagnostics)
         self.every(0.02, self._tick)
 
@@ -61,7 +65,9 @@ class CellChecker(SelfcalNode[CollectorSettings]):
         own_name = self.get_fully_qualified_name().lstrip("/")
         for status in message.status:
             if status.name != own_name:
-                self.session.take_diagnosis(status.name, status.level[0], status.message)
+                self.session.take_diagnosis(
+                    status.name, status.level[0], status.message
+                )
 
     def _tick(self) -> None:
         if self.finished.done():
@@ -70,13 +76,17 @@ class CellChecker(SelfcalNode[CollectorSettings]):
             self.resolve_topic_name(names.COMMAND.name)
         )
         if len(command_publishers) > 1:
-            self.say(Level.ERROR, "another node sends view commands: end the sequencer first")
+            self.say(
+                Level.ERROR, "another node sends view commands: end the sequencer first"
+            )
             self._end(ExitCode.BAD_INPUT)
             return
         for topic in (names.ENCODER.name, names.DETECTIONS.name):
             nodes = [
                 offer.node_name
-                for offer in self.get_publishers_info_by_topic(self.resolve_topic_name(topic))
+                for offer in self.get_publishers_info_by_topic(
+                    self.resolve_topic_name(topic)
+                )
             ]
             self.session.publishers[topic] = sorted(nodes)
         self.session.tick()
@@ -99,7 +109,9 @@ def main() -> None:
     except InputError as error:
         print(f"selfcal: {error}", file=sys.stderr)
         sys.exit(int(error.exit_code))
-    make = partial(CellChecker, plan, settle_s=float(sys.argv[2]), patience_s=float(sys.argv[3]))
+    make = partial(
+        CellChecker, plan, settle_s=float(sys.argv[2]), patience_s=float(sys.argv[3])
+    )
     sys.exit(run(make, sys.argv[4:]))
 
 

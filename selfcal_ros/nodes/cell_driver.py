@@ -26,10 +26,13 @@ class CellDriver(CellNode[DriverSettings]):
         if not self.settings.cell:
             raise InputError("cell_driver: cell", "is not set", "name a CELL.yaml")
         cell = read_cell(self.settings.cell)
-        self._driver = Driver(cell, open_machine(cell), lambda line: self.say(Level.ERROR, line))
+        self._driver = Driver(
+            cell, open_machine(cell), lambda line: self.say(Level.ERROR, line)
+        )
         self.publish(images=False)
         self.subscribe(
-            names.COMMAND, lambda message: self._driver.take_command(to_model.command(message))
+            names.COMMAND,
+            lambda message: self._driver.take_command(to_model.command(message)),
         )
         self.subscribe(names.STATUS_AS_IT_COMES, self._driver.take_status)
         self.every(TICK_S, self._tell)
@@ -42,7 +45,9 @@ class CellDriver(CellNode[DriverSettings]):
         """Return what the machine does, or why it stands still."""
         if self._driver.trouble:
             return Diagnosis(Level.ERROR, self._driver.trouble, self.sent)
-        return Diagnosis(Level.OK, "measuring" if self._driver.busy else "at rest", self.sent)
+        return Diagnosis(
+            Level.OK, "measuring" if self._driver.busy else "at rest", self.sent
+        )
 
     def close(self) -> None:
         """Stop the machine and release it."""

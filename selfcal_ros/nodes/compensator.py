@@ -45,10 +45,14 @@ class MapsOfOneNode:
     """
 
     def __init__(
-        self, node: "CompensatorNode", inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]]
+        self,
+        node: "CompensatorNode",
+        inputs: Sequence[tuple[names.Topic, Callable[[Any], None]]],
     ) -> None:
         self._node = node
-        self._inputs = [(topic, node.guarded(take, topic.name)) for topic, take in inputs]
+        self._inputs = [
+            (topic, node.guarded(take, topic.name)) for topic, take in inputs
+        ]
         self._waiting: deque[tuple[float, str, Callable[[], None]]] = deque()
         self._rivals, self._rivals_s = "", 0.0  # last seen
         self._subscriptions: list[Any] = []
@@ -86,7 +90,9 @@ class MapsOfOneNode:
 
     def _of_several(self, topic: str) -> InputError:
         return InputError(
-            topic, f"a message is not used: {self._rivals}", "end all publishers but one"
+            topic,
+            f"a message is not used: {self._rivals}",
+            "end all publishers but one",
         )
 
     def _has_rivals(self) -> bool:
@@ -108,7 +114,9 @@ class MapsOfOneNode:
             return
         if self._rivals:
             self._rivals = ""
-            self._node.say(Level.OK, "one node alone publishes maps again: they are used")
+            self._node.say(
+                Level.OK, "one node alone publishes maps again: they are used"
+            )
             self.close()
             self._subscribe()
         while self._waiting and now_s - self._waiting[0][0] >= ALONE_S:
@@ -146,7 +154,10 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
         """Subscribe to the maps and to the encoder."""
         self._maps = MapsOfOneNode(
             self,
-            [(names.SUMMARY, self.session.take_summary), (names.ERROR_MAP, self.session.take_map)],
+            [
+                (names.SUMMARY, self.session.take_summary),
+                (names.ERROR_MAP, self.session.take_map),
+            ],
         )
         self._input = ByTheClock(
             names.ENCODER.name,
@@ -173,7 +184,9 @@ class CompensatorNode(ManagedNode[CompensatorSettings]):
             self._commands.publish(corrected)
 
     def _correct(self, request: Any, response: Any) -> str:
-        answer = self.session.answer(request.x, request.y, request.theta, inverse=request.inverse)
+        answer = self.session.answer(
+            request.x, request.y, request.theta, inverse=request.inverse
+        )
         fill(response, answer)
         return self.session.remark(answer)
 

@@ -63,12 +63,16 @@ def map_geometry(error_map: ErrorMap) -> MapGeometry:
     spacing = step * artifact.grid_pitch_m
     m = artifact.m[:, 0]
     n = artifact.n[0]
-    shown_sites = error_map.valid & ((m % step == 0)[:, None] & (n % step == 0)[None, :])
+    shown_sites = error_map.valid & (
+        (m % step == 0)[:, None] & (n % step == 0)[None, :]
+    )
     x = artifact.x_m[shown_sites]
     y = artifact.y_m[shown_sites]
     zero = np.zeros(np.count_nonzero(shown_sites))
     sites = np.column_stack((x, y, zero))
-    errors = np.column_stack((error_map.gx[shown_sites], error_map.gy[shown_sites], zero))
+    errors = np.column_stack(
+        (error_map.gx[shown_sites], error_map.gy[shown_sites], zero)
+    )
     longest = float(np.linalg.norm(errors, axis=1).max(initial=0.0))
     factor = enlargement(spacing, longest)
     ends = np.stack((sites, sites + factor * errors), axis=1).reshape(-1, 3)
@@ -107,8 +111,11 @@ def fill(message: Any, fields: dict[str, Any]) -> Any:
             current = getattr(message, name)
             if isinstance(current, array.array):
                 code = current.typecode
-                fits = np.can_cast(value.dtype, code)  # otherwise `array` checks each number
-                value = array.array(code, value.astype(code).tobytes() if fits else value.tolist())
+                # otherwise `array` checks each number
+                fits = np.can_cast(value.dtype, code)
+                value = array.array(
+                    code, value.astype(code).tobytes() if fits else value.tolist()
+                )
             setattr(message, name, value)
         else:
             setattr(message, name, value)
@@ -167,14 +174,20 @@ def map_markers(error_map: ErrorMap, stamp_ns: int, frame_id: str) -> MarkerArra
     return MarkerArray(
         markers=[
             marker(
-                0, Marker.LINE_LIST, "error", scale={"x": wide / 20}, points=_points(shape.ends)
+                0,
+                Marker.LINE_LIST,
+                "error",
+                scale={"x": wide / 20},
+                points=_points(shape.ends),
             ),
             marker(
                 1,
                 Marker.CUBE_LIST,
                 "uncertainty",
                 scale={"x": 0.9 * wide, "y": 0.9 * wide, "z": wide / 100},
-                points=_points(shape.sites - (0.0, 0.0, wide / 20)),  # below the vectors
+                points=_points(
+                    shape.sites - (0.0, 0.0, wide / 20)
+                ),  # below the vectors
                 colors=[_colour(rgb) for rgb in shape.colours.tolist()],
             ),
             marker(

@@ -26,7 +26,8 @@ def not_heard(node: Node, publishers: Mapping[str, Publisher], by: str) -> list[
         Name of the listening node with its namespace.
     """
     reliabilities = {
-        topic: _reliabilities(node, publisher, by) for topic, publisher in publishers.items()
+        topic: _reliabilities(node, publisher, by)
+        for topic, publisher in publishers.items()
     }
     return [
         topic + (" reliably (another publisher offers best effort)" if heard else "")
@@ -49,15 +50,20 @@ def hears(node: Node, topic: str, by: str, *, matched: int) -> bool:
     matched : int
         Number of subscriptions to which the publisher is connected.
     """
+    # others never match
     readers = [
         reader
-        for reader in node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
+        for reader in node.get_subscriptions_info_by_topic(
+            node.resolve_topic_name(topic)
+        )
         if reader.qos_profile.durability == DurabilityPolicy.VOLATILE
-    ]  # others never match
+    ]
     return matched >= len(readers) and by in [_name(reader) for reader in readers]
 
 
-def others_on(node: Node, topics: Iterable[str], own_nodes: Iterable[str]) -> dict[str, list[str]]:
+def others_on(
+    node: Node, topics: Iterable[str], own_nodes: Iterable[str]
+) -> dict[str, list[str]]:
     """Return the nodes that publish on topics, with these topics, but not `own`.
 
     Parameters
@@ -82,7 +88,9 @@ def _name(reader: TopicEndpointInfo) -> str:
     return f"{reader.node_namespace.rstrip('/')}/{reader.node_name}"
 
 
-def _reliabilities(node: Node, publisher: Publisher, by: str) -> list[ReliabilityPolicy]:
+def _reliabilities(
+    node: Node, publisher: Publisher, by: str
+) -> list[ReliabilityPolicy]:
     """Return the reliabilities requested by the subscriptions of a node to a publisher."""
     if not publisher.get_subscription_count():
         return []

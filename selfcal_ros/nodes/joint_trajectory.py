@@ -78,13 +78,19 @@ class JointTrajectoryMachine:
         self._node = Node("selfcal_machine", context=self._context)
         self._topic = f"{controller}/joint_trajectory"
         self._trajectory = self._node.create_publisher(JointTrajectory, self._topic, 10)
-        self._node.create_subscription(JointState, joint_states, self._on_states, BEST_EFFORT)
+        self._node.create_subscription(
+            JointState, joint_states, self._on_states, BEST_EFFORT
+        )
         self._states_topic, self._image_topic = joint_states, image
         if image:
-            self._node.create_subscription(ImageMessage, image, self._on_image, BEST_EFFORT)
+            self._node.create_subscription(
+                ImageMessage, image, self._on_image, BEST_EFFORT
+            )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
-        self._thread = threading.Thread(target=self._spin, name="joint_trajectory", daemon=True)
+        self._thread = threading.Thread(
+            target=self._spin, name="joint_trajectory", daemon=True
+        )
         self._thread.start()
         try:
             self._need_controller()
@@ -157,9 +163,15 @@ class JointTrajectoryMachine:
 
     def _send(self, position: Sequence[float], duration_s: float) -> None:
         self._need_controller()
-        point = JointTrajectoryPoint(positions=list(position), velocities=[0.0] * len(self._joints))
-        point.time_from_start = Duration(nanoseconds=math.ceil(duration_s * 1e9)).to_msg()
-        self._trajectory.publish(JointTrajectory(joint_names=self._joints, points=[point]))
+        point = JointTrajectoryPoint(
+            positions=list(position), velocities=[0.0] * len(self._joints)
+        )
+        point.time_from_start = Duration(
+            nanoseconds=math.ceil(duration_s * 1e9)
+        ).to_msg()
+        self._trajectory.publish(
+            JointTrajectory(joint_names=self._joints, points=[point])
+        )
 
     def image(self) -> Image | None:
         """Return the first image exposed after the call, by its stamp; None without a topic."""

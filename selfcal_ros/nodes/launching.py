@@ -6,7 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
+from ament_index_python.packages import (
+    get_package_share_directory,
+    get_packages_with_prefixes,
+)
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.conditions import IfCondition
 from launch.launch_context import LaunchContext
@@ -97,7 +100,9 @@ def refuse_wrong(context: LaunchContext) -> None:
             "give the speed; 0 = as fast as the nodes can follow",
         ) from None
     if not Path(configurations["params"]).is_file():
-        raise InputError(f"params:={configurations['params']}", "no such file", "check the path")
+        raise InputError(
+            f"params:={configurations['params']}", "no such file", "check the path"
+        )
     if (
         configurations["foxglove"] == "true"
         and "foxglove_bridge" not in get_packages_with_prefixes()
@@ -141,7 +146,11 @@ def node(name: str, *parameters: Any, **kwargs: Any) -> Node:
         name=name,
         output="screen",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params"), *parameters, {"use_sim_time": simulated}],
+        parameters=[
+            LaunchConfiguration("params"),
+            *parameters,
+            {"use_sim_time": simulated},
+        ],
         ros_arguments=["--log-level", LaunchConfiguration("log_level")],
         on_exit=end_if_it_cannot_start,
         **kwargs,
@@ -171,4 +180,6 @@ def end_if_it_cannot_start(event: Any, _context: Any) -> None:
         Not needed.
     """
     if event.returncode == int(ExitCode.BAD_INPUT):
-        raise InputError(event.process_name, "cannot start", "its last line above says why")
+        raise InputError(
+            event.process_name, "cannot start", "its last line above says why"
+        )

@@ -59,7 +59,10 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
 
     def __init__(self, kind: type[S], **kwargs: Any) -> None:
         self.problem: Exception | None = None
-        self._made: dict[str, list[Callable[[], Any]]] = {"configure": [], "activate": []}
+        self._made: dict[str, list[Callable[[], Any]]] = {
+            "configure": [],
+            "activate": [],
+        }
         self._making, self._is_gone = "", False
         self.held: dict[str, Any] = {}
         super().__init__(kind.NODE, **kwargs)
@@ -96,7 +99,9 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
             self._made[self._making].append(partial(destroy, entity))
         return entity
 
-    def guarded(self, callback: Callable[..., Any], place: str = "") -> Callable[..., Any]:
+    def guarded(
+        self, callback: Callable[..., Any], place: str = ""
+    ) -> Callable[..., Any]:
         """Return a guarded callback that does nothing once the step that created it is undone.
 
         An executor may still call callbacks that were due when they were removed.
@@ -106,7 +111,9 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         if not step:
             return inner
         mine = self._made[step]
-        return wraps(callback)(lambda *args: inner(*args) if self._made[step] is mine else None)
+        return wraps(callback)(
+            lambda *args: inner(*args) if self._made[step] is mine else None
+        )
 
     def diagnosis(self) -> Diagnosis:
         """Return the state of the node if not active, else the diagnosis of the session."""
@@ -119,7 +126,9 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
             )
         if self.problem is not None:
             return Diagnosis(Level.ERROR, f"{self.state}: {first_line(self.problem)}")
-        return Diagnosis(Level.WARN, f"{self.state}: a managed node that waits to be activated")
+        return Diagnosis(
+            Level.WARN, f"{self.state}: a managed node that waits to be activated"
+        )
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Run `configure`."""
@@ -190,12 +199,17 @@ class ManagedNode[S: ManagedSettings](NodeBase[S], LifecycleNode):
         self.report()
         return TransitionCallbackReturn.ERROR
 
-    def _change_state(self, change: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+    def _change_state(
+        self, change: Callable[[Any, Any], Any], request: Any, response: Any
+    ) -> Any:
         """Answer an invalid transition with False; rclpy would raise."""
         try:
             response = change(request, response)
         except RCLError as error:
-            self.say(Level.WARN, f"no such transition while {self.state}: {first_line(error)}")
+            self.say(
+                Level.WARN,
+                f"no such transition while {self.state}: {first_line(error)}",
+            )
             response.success = False
         self.report()
         return response

@@ -48,7 +48,9 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
         self.own(None, lambda _: self._deliver())
         topics = names.image_topics(self.settings.transport, self.settings.max_waiting)
         self._kind = topics[0].type
-        images = ByTheClock(topics[0].name, self.guarded(self._take, topics[0].name), lambda: None)
+        images = ByTheClock(
+            topics[0].name, self.guarded(self._take, topics[0].name), lambda: None
+        )
         self._input = MatchedInput(self, topics, images, raw=True)
         self.every(TICK_S, self._look)
         self.every(BEAT_S, self._tell_taken)
@@ -67,7 +69,9 @@ class MarkDetectorNode(PollingNode[DetectorSettings]):
 
     def _tell_taken(self) -> None:
         self._matched = self._detections.get_subscription_count()
-        self._received.publish(names.RECEIVED.type(data=[self._taken, self._found, self._matched]))
+        self._received.publish(
+            names.RECEIVED.type(data=[self._taken, self._found, self._matched])
+        )
 
     def _look(self) -> None:
         """Take a few waiting images, and count the lost ones by their numbers."""

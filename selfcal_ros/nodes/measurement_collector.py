@@ -78,7 +78,9 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         self._inputs = {
             names.ENCODER.name: ByTheClock(names.ENCODER.name, self._reception.encoder),
             names.DETECTIONS.name: ByTheClock(
-                names.DETECTIONS.name, self._reception.detection, self.guarded(self._on_detection)
+                names.DETECTIONS.name,
+                self._reception.detection,
+                self.guarded(self._on_detection),
             ),
         }
         self.alone_on += [names.STATUS.name, names.ENCODER.name]
@@ -99,7 +101,9 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
         # undone last: remaining messages of the subscriptions go to the journal and the session
         self.own(None, lambda _: self.guarded(self._drain)())
         inputs = self._inputs
-        self._detections = self.subscribe(names.DETECTIONS, inputs[names.DETECTIONS.name], raw=True)
+        self._detections = self.subscribe(
+            names.DETECTIONS, inputs[names.DETECTIONS.name], raw=True
+        )
         self.subscribe_with_age(names.COMMAND, self._reception.command, raw=True)
         MatchedInput(self, names.ENCODER_EITHER, inputs[names.ENCODER.name], raw=True)
         self.every(TICK_S, self._on_timer)
@@ -151,13 +155,17 @@ class MeasurementCollector(PollingNode[CollectorSettings]):
     def _finish(self) -> str:
         self._drain()
         if self._reception.restoring:
-            raise InputError("measurement_collector", "a journal is being read", "ask again later")
+            raise InputError(
+                "measurement_collector", "a journal is being read", "ask again later"
+            )
         return self.session.finish()
 
     def diagnose_session(self) -> Diagnosis:
         """Return the diagnosis of the session."""
         return merged(
-            self.session.diagnosis(detections_matched=self._detections.get_publisher_count() > 0),
+            self.session.diagnosis(
+                detections_matched=self._detections.get_publisher_count() > 0
+            ),
             [self._reception.diagnosis()],
         )
 

@@ -59,7 +59,9 @@ class MonitorSession(Guarded):
         super().__init__(f"monitor_{os.getpid()}", namespace=namespace, **kwargs)
         self.finished = Future()
         self.refusals = Refusals(self._say, time.monotonic)
-        self._watch = Watch(Ports(lambda *_: None, self._say, time.monotonic, time.time_ns))
+        self._watch = Watch(
+            Ports(lambda *_: None, self._say, time.monotonic, time.time_ns)
+        )
         for topic, take in (
             (names.COMMAND, self._watch.take_command),
             (names.STATUS, self._watch.take_status),
@@ -68,7 +70,9 @@ class MonitorSession(Guarded):
         ):
             self._hear(topic, take)
         for node in WATCHED:
-            self._hear(names.of_node(node, names.HEALTH), partial(self._on_health, node))
+            self._hear(
+                names.of_node(node, names.HEALTH), partial(self._on_health, node)
+            )
         self._askers = {
             word: self.create_client(Trigger, f"pose_sequencer/{service}")
             for word, service in REQUESTS.items()
@@ -77,12 +81,16 @@ class MonitorSession(Guarded):
         self._asked: list[tuple[str, float, Any]] = []
         self._shown = ""
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(PERIOD_S, self.guarded(self._show, "the picture"), clock=steady)
+        self.create_timer(
+            PERIOD_S, self.guarded(self._show, "the picture"), clock=steady
+        )
         self.create_timer(0.05, self.guarded(self._serve, "requests"), clock=steady)
         threading.Thread(target=self._listen, name="stdin", daemon=True).start()
 
     def _hear(self, topic: names.Topic, take: Callable[[Any], None]) -> None:
-        self.create_subscription(topic.type, topic.name, self.guarded(take, topic.name), topic.qos)
+        self.create_subscription(
+            topic.type, topic.name, self.guarded(take, topic.name), topic.qos
+        )
 
     def _say(self, level: Level, line: str) -> None:
         self._write(json.dumps({"said": printable(line)}))
@@ -117,7 +125,10 @@ class MonitorSession(Guarded):
             if future is None and client.service_is_ready():
                 future = client.call_async(Trigger.Request())
             if future is not None and future.done():
-                self._answer(f"{word}: {future.result().message}", success=future.result().success)
+                self._answer(
+                    f"{word}: {future.result().message}",
+                    success=future.result().success,
+                )
             elif time.monotonic() > until:
                 self._answer(
                     f"{word}: pose_sequencer does not answer; is it running in this "

@@ -40,8 +40,12 @@ class Topic:
 def _qos(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
     return QoSProfile(
         depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        reliability=ReliabilityPolicy.RELIABLE
+        if reliable
+        else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if latched
+        else DurabilityPolicy.VOLATILE,
     )
 
 
@@ -50,7 +54,10 @@ PARTICIPANT = 12
 
 # encoder at 1 kHz: a pause of a second must not overwrite a sample
 ENCODER = Topic(topics.ENCODER_TOPIC, JointState, _qos(5000))
-ENCODER_EITHER = (ENCODER, Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False)))
+ENCODER_EITHER = (
+    ENCODER,
+    Topic(topics.ENCODER_TOPIC, JointState, _qos(5000, reliable=False)),
+)
 # corrected positions of earlier, displaced samples are useless
 ENCODER_NEWEST = Topic(topics.ENCODER_TOPIC, JointState, _qos(100, reliable=False))
 DETECTIONS = Topic(topics.DETECTION_TOPIC, msg.MarkDetection, _qos(5000))
@@ -103,7 +110,9 @@ def image_topics(transport: str, depth: int) -> tuple[Topic, Topic]:
     """Return the topic of images, reliable and with best effort."""
     name = topics.IMAGE_TOPICS[transport]
     kind = IMAGE_TYPES[transport]
-    return Topic(name, kind, _qos(depth)), Topic(name, kind, _qos(depth, reliable=False))
+    return Topic(name, kind, _qos(depth)), Topic(
+        name, kind, _qos(depth, reliable=False)
+    )
 
 
 INPUTS = (ENCODER, DETECTIONS, COMMAND)
@@ -136,7 +145,9 @@ def others_publishing(node: Node, topics: Iterable[str]) -> Diagnosis:
                 f"{topic} has {len(offers)} publishers: "
                 f"{', '.join(sorted(map(_name, offers)))}; only one is allowed"
             )
-    return Diagnosis(Level.WARN if shared_topics else Level.OK, "; ".join(shared_topics))
+    return Diagnosis(
+        Level.WARN if shared_topics else Level.OK, "; ".join(shared_topics)
+    )
 
 
 def rivals(node: Node, topics: Iterable[str]) -> str:
@@ -147,7 +158,15 @@ def rivals(node: Node, topics: Iterable[str]) -> str:
     shared_topics = []
     for topic in topics:
         offers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-        if len({(_name(offer), bytes(offer.endpoint_gid[:PARTICIPANT])) for offer in offers}) > 1:
+        if (
+            len(
+                {
+                    (_name(offer), bytes(offer.endpoint_gid[:PARTICIPANT]))
+                    for offer in offers
+                }
+            )
+            > 1
+        ):
             shared_topics.append(
                 f"{topic} has {len(offers)} publishers: {', '.join(sorted(map(_name, offers)))}"
             )
@@ -210,7 +229,9 @@ class MatchedInput:
         offers = self._node.get_publishers_info_by_topic(self._name)
         if not offers:
             return
-        reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        reliable = all(
+            o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offers
+        )
         topic = self._topics[0 if reliable else 1]
         if topic is self._topic:
             return

@@ -20,10 +20,19 @@ from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.hearing import hears, not_heard, others_on
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, IMAGE_TOPICS
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    IMAGE_TOPICS,
+)
 from selfcal_ros.units import S_PER_NS
 
-KINDS = {ENCODER_TOPIC: "encoder", DETECTION_TOPIC: "detection", COMMAND_TOPIC: "command"}
+KINDS = {
+    ENCODER_TOPIC: "encoder",
+    DETECTION_TOPIC: "detection",
+    COMMAND_TOPIC: "command",
+}
 IMAGES = "image"
 KINDS_OF_ALL = KINDS | dict.fromkeys(IMAGE_TOPICS.values(), IMAGES)
 WINDOW = 1500
@@ -67,19 +76,29 @@ class Player:
     ) -> None:
         self.node, self.rate, self._bag = node, rate, bag
         own_namespace = node.get_namespace().rstrip("/")
-        self.listener = listener if listener.startswith("/") else f"{own_namespace}/{listener}"
+        self.listener = (
+            listener if listener.startswith("/") else f"{own_namespace}/{listener}"
+        )
         self.detector = f"{own_namespace}/{DetectorSettings.NODE}"
         self.playlist = Playlist(Path(bag), namespace, seed)
         if not len(self.playlist):
-            raise NoDataError(bag, "no message on the topics of the contract", "see the README")
+            raise NoDataError(
+                bag, "no message on the topics of the contract", "see the README"
+            )
         self._messages = iter(self.playlist)
         self._next: tuple[str, int, bytes] | None = (first := next(self._messages))
         self._first_ns = first[1]
         transport = self.playlist.transport
         images = names.image_topics(transport, IMAGE_DEPTH)[:1] if transport else []
         # detections of images are the detector's
-        played = [topic for topic in names.INPUTS if not images or topic.name != DETECTION_TOPIC]
-        self._publishers = {topic.name: node.publisher(topic) for topic in (*played, *images)}
+        played = [
+            topic
+            for topic in names.INPUTS
+            if not images or topic.name != DETECTION_TOPIC
+        ]
+        self._publishers = {
+            topic.name: node.publisher(topic) for topic in (*played, *images)
+        }
         self.sent = dict.fromkeys([KINDS_OF_ALL[name] for name in self._publishers], 0)
         self.heard: dict[str, int] | None = None
         self._at = 0
@@ -87,13 +106,19 @@ class Player:
         self._published_s = 0.0  # last time that a message was sent, or none was due
         self._before = 0  # messages received by the listener before the first of these
         self.alone_on = (
-            [] if beside_others else [*self._publishers, *([DETECTION_TOPIC] if images else [])]
+            []
+            if beside_others
+            else [*self._publishers, *([DETECTION_TOPIC] if images else [])]
         )
         self._own = [
             node.get_fully_qualified_name(),
             *(
                 f"{own_namespace}/{name}"
-                for name in (SequencerSettings.NODE, CollectorSettings.NODE, SolverSettings.NODE)
+                for name in (
+                    SequencerSettings.NODE,
+                    CollectorSettings.NODE,
+                    SolverSettings.NODE,
+                )
             ),
         ]
         self._own += [self.detector] if images else []
@@ -108,7 +133,9 @@ class Player:
 
     taken: int | None = None
     """Images that the detector has taken."""
-    found = matched = 0  # detections that it has published, and subscribers matched to them
+    found = matched = (
+        0  # detections that it has published, and subscribers matched to them
+    )
     _taken_before = 0
 
     @property
@@ -137,7 +164,9 @@ class Player:
         if (
             played
             and self.taken is not None
-            and not hears(self.node, DETECTION_TOPIC, self.listener, matched=self.matched)
+            and not hears(
+                self.node, DETECTION_TOPIC, self.listener, matched=self.matched
+            )
         ):
             return [DETECTION_TOPIC]  # it would lose those of the first images
         return played if waits else self._not_heard(played, self.listener)
@@ -149,7 +178,9 @@ class Player:
         return played if waits else self._not_heard(played, self.detector)
 
     def _not_heard(self, topics: list[str], by: str) -> list[str]:
-        return not_heard(self.node, {topic: self._publishers[topic] for topic in topics}, by)
+        return not_heard(
+            self.node, {topic: self._publishers[topic] for topic in topics}, by
+        )
 
     @property
     def arrived(self) -> bool:
@@ -157,7 +188,9 @@ class Player:
         if IMAGES not in self.sent:
             return self.heard == self.sent
         return self.taken == self.sent[IMAGES] and self.heard == {
-            KINDS[topic]: self.found if topic == DETECTION_TOPIC else self.sent[KINDS[topic]]
+            KINDS[topic]: self.found
+            if topic == DETECTION_TOPIC
+            else self.sent[KINDS[topic]]
             for topic in KINDS
         }
 
@@ -272,7 +305,9 @@ class Player:
     @property
     def _received(self) -> int:
         """Number of messages of the kinds played here that the listener has received."""
-        return sum(count for kind, count in (self.heard or {}).items() if kind in self.sent)
+        return sum(
+            count for kind, count in (self.heard or {}).items() if kind in self.sent
+        )
 
     def _on_received(self, message: Any) -> None:
         if len(message.data) != len(KINDS):

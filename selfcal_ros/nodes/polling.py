@@ -48,12 +48,19 @@ class ByTheClock:
     __signature__ = inspect.signature(lambda message, info: None)  # rclpy counts them
 
     def __init__(
-        self, topic: str, take: Callable[[bytes, int], None], wake: Callable[[], None] | None = None
+        self,
+        topic: str,
+        take: Callable[[bytes, int], None],
+        wake: Callable[[], None] | None = None,
     ) -> None:
         self.topic, self.take, self.wake = topic, take, wake
-        self._numbers: list[int | None] = []  # of messages taken since the last check for gaps
+        self._numbers: list[
+            int | None
+        ] = []  # of messages taken since the last check for gaps
         self._last: int | None = None
-        self._before: int | None = None  # the last number of the subscription before this one
+        self._before: int | None = (
+            None  # the last number of the subscription before this one
+        )
         self._n_publishers = 0
 
     def __call__(self, *received: Any) -> None:
@@ -67,7 +74,9 @@ class ByTheClock:
         """Take waiting messages, up to `most`; return the number of skipped sequence numbers."""
         is_empty = False
         for _ in range(most):
-            message_and_info = subscription.handle.take_message(subscription.msg_type, True)
+            message_and_info = subscription.handle.take_message(
+                subscription.msg_type, True
+            )
             if message_and_info is None:
                 is_empty = True
                 break
@@ -140,7 +149,9 @@ class PollingNode[S: ManagedSettings](ManagedNode[S]):
         They have been acknowledged to their publishers and would not be sent again.
         """
         callback = subscription.callback
-        if isinstance(callback, ByTheClock) and subscription in [*super().subscriptions]:
+        if isinstance(callback, ByTheClock) and subscription in [
+            *super().subscriptions
+        ]:
             self.guarded(self._empty, callback.topic)(
                 subscription, callback, subscription.qos_profile.depth
             )

@@ -41,7 +41,9 @@ class CalibrationAction:
         self._node = node
         self._session: SequencingSession | None = None
         self._saver: Any = None
-        self._taken = False  # from the acceptance of a goal, before it is executed, to its end
+        self._taken = (
+            False  # from the acceptance of a goal, before it is executed, to its end
+        )
         self._goal: Any = None
         self._feedback: Any = None  # of this goal, the last
         self._ended: Future | None = None
@@ -63,7 +65,8 @@ class CalibrationAction:
         self._session = session
         session.on_end = lambda: _complete(self._ended)
         self._saver = self._node.own(
-            self._node.create_client(SaveMap, "solver/save_map"), self._node.destroy_client
+            self._node.create_client(SaveMap, "solver/save_map"),
+            self._node.destroy_client,
         )
         self._node.own(None, lambda _: self._leave())
 
@@ -110,7 +113,9 @@ class CalibrationAction:
         self._taken = True
         try:
             goal.execute()
-        except Exception:  # counted where it is caught; the next goal is not rejected for it
+        except (
+            Exception
+        ):  # counted where it is caught; the next goal is not rejected for it
             self._taken = False
             raise
 
@@ -145,7 +150,9 @@ class CalibrationAction:
                 else "activate it again: its service start resumes the plan",
             )
 
-    async def _conclude(self, goal: Any, result: Any, session: SequencingSession) -> None:
+    async def _conclude(
+        self, goal: Any, result: Any, session: SequencingSession
+    ) -> None:
         machine = session.machine
         if machine.state is not State.DONE:
             result.error_code = int(ExitCode.NO_DATA)
@@ -153,7 +160,9 @@ class CalibrationAction:
             goal.canceled() if goal.is_cancel_requested else goal.abort()
             return
         answer = await self._save(
-            session, self._node.settings.result_path or plan_file_name(machine.need_plan().plan_id)
+            session,
+            self._node.settings.result_path
+            or plan_file_name(machine.need_plan().plan_id),
         )
         result.message, result.map_path = answer.message, answer.path
         if answer.success:
@@ -166,7 +175,9 @@ class CalibrationAction:
     async def _save(self, session: SequencingSession, path: str) -> Any:
         """Return the solver's answer; NoDataError after a time-out."""
         if not self._saver.service_is_ready():
-            raise NoDataError("run_calibration", "no solver is running", "start one, then save_map")
+            raise NoDataError(
+                "run_calibration", "no solver is running", "start one, then save_map"
+            )
         patience = self._node.settings.save_timeout
         self._saved, self._save_until = Future(), time.monotonic() + patience
         answer = self._saver.call_async(SaveMap.Request(path=path))

@@ -31,12 +31,16 @@ PATIENCE_S = 60.0
 class ReplaySession(SelfcalNode[PlayerSettings]):
     """Wait for subscribers, play, check for losses, have the map saved."""
 
-    def __init__(self, player: Callable[[SelfcalNode], Player], output: str, **kwargs: Any) -> None:
+    def __init__(
+        self, player: Callable[[SelfcalNode], Player], output: str, **kwargs: Any
+    ) -> None:
         super().__init__(PlayerSettings, parameter_overrides=[], **kwargs)
         self.finished, self.exit_code = Future(), ExitCode.INTERNAL
         self._output = output
         self.player = player(self)
-        self.player.alone_on += [topic.name for topic in (*names.RESULTS, *names.COMMANDED)]
+        self.player.alone_on += [
+            topic.name for topic in (*names.RESULTS, *names.COMMANDED)
+        ]
         self._finish = self.create_client(Trigger, "measurement_collector/finish")
         self._save = self.create_client(SaveMap, "solver/save_map")
         self._act: Callable[[], None] = self._wait_for_nodes
@@ -76,7 +80,8 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
             self._go(self._play)
         elif self._late():
             self._end(
-                " and ".join(unheard) or "no services of collector and solver", ExitCode.INTERNAL
+                " and ".join(unheard) or "no services of collector and solver",
+                ExitCode.INTERNAL,
             )
 
     def _play(self) -> None:
@@ -88,7 +93,9 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
         if self.player.done:
             self._go(self._wait_until_received)
         elif self.player.stalled_s > PATIENCE_S:
-            self._end(f"the nodes take no more messages: {self._counts()}", ExitCode.INTERNAL)
+            self._end(
+                f"the nodes take no more messages: {self._counts()}", ExitCode.INTERNAL
+            )
 
     def _wait_until_received(self) -> None:
         if self.player.arrived:
@@ -134,11 +141,15 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
                 self._save,
                 SaveMap.Request(path=self._output),
                 lambda response: self._end(
-                    "" if response.success else response.message, ExitCode(response.error_code)
+                    "" if response.success else response.message,
+                    ExitCode(response.error_code),
                 ),
             )
         elif self._late():
-            self._end("the solver did not receive the readings of all views", ExitCode.INTERNAL)
+            self._end(
+                "the solver did not receive the readings of all views",
+                ExitCode.INTERNAL,
+            )
 
     def _on_solved(self, message: Any) -> None:
         self._solved = message.data
@@ -156,7 +167,9 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
 def main() -> None:
     """Run the session: BAG RATE SEED RESULT.json NAMESPACE."""
     bag, rate, seed, output, cell = sys.argv[1:6]
-    player = partial(Player, bag=bag, rate=float(rate), seed=int(seed), namespace=cell or None)
+    player = partial(
+        Player, bag=bag, rate=float(rate), seed=int(seed), namespace=cell or None
+    )
     sys.exit(run(lambda: ReplaySession(player, output), sys.argv[6:]))
 
 

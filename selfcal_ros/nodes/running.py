@@ -64,7 +64,9 @@ def _init(argv: list[str] | None) -> None:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
     except (RCLError, UnknownROSArgsError) as error:
         reason = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
-        raise InputError("arguments after --ros-args", reason, "correct them") from error
+        raise InputError(
+            "arguments after --ros-args", reason, "correct them"
+        ) from error
 
 
 def _keep_what_is_loaded() -> None:
@@ -100,7 +102,8 @@ def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
     finally:
         if node is not None:
             getattr(node, "close", lambda: None)()
-            code = code or int(getattr(node, "exit_code", ExitCode.DONE))  # `close` may set it
+            # `close` may set it
+            code = code or int(getattr(node, "exit_code", ExitCode.DONE))
             node.destroy_node()
         rclpy.try_shutdown()
         ignore_signals()
@@ -131,11 +134,13 @@ def complete_on_signal(stop: Future) -> None:
             faulthandler.dump_traceback_later(ENDS_S, exit=True)
         finally:  # also without stderr
             stop.set_result(None)
-        while True:  # keep the descriptor open: later signals would otherwise find a broken pipe
+        # keep the descriptor open: later signals would otherwise find a broken pipe
+        while True:
             reader.recv(4096)
 
     threading.Thread(target=wait, name="stop signals", daemon=True).start()
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)  # blocked while modules are imported
+    # blocked while modules are imported
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
 
 
 def ignore_signals() -> None:

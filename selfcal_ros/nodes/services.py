@@ -83,11 +83,15 @@ class Answering(Guarded):
         `answer` may take the response as well, for fields other than success and message.
         """
         parameters = inspect.signature(answer).parameters.values()
-        arguments = sum(parameter.default is parameter.empty for parameter in parameters)
+        arguments = sum(
+            parameter.default is parameter.empty for parameter in parameters
+        )
 
         def call(request: Any, response: Any) -> Any:
             return answered(
-                response, lambda: answer(*(request, response)[:arguments]), self.refusals.add
+                response,
+                lambda: answer(*(request, response)[:arguments]),
+                self.refusals.add,
             )
 
         return self.own(self.create_service(kind, name, call), self.destroy_service)
@@ -110,7 +114,11 @@ class Answering(Guarded):
             when(
                 self.guarded(
                     lambda: later.give(
-                        answered(response, lambda: answer(request, response), self.refusals.add)
+                        answered(
+                            response,
+                            lambda: answer(request, response),
+                            self.refusals.add,
+                        )
                     ),
                     name,
                 )

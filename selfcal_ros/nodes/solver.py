@@ -37,17 +37,24 @@ class Solver(ManagedNode[SolverSettings]):
 
     def __init__(self, **kwargs: Any) -> None:
         self._begun = 0  # jobs, including the running one
-        self._waiting: list[tuple[int, Callable[[], None]]] = []  # for a job, by its number
+        self._waiting: list[
+            tuple[int, Callable[[], None]]
+        ] = []  # for a job, by its number
         super().__init__(SolverSettings, **kwargs)
 
     def configure(self) -> None:
         """Create the session, the worker and the publishers."""
         self.session = SolvingSession(self.settings, self.ports(self._publish))
-        self._worker = self.own(ThreadPoolExecutor(1, thread_name_prefix="solver"), stop)
+        self._worker = self.own(
+            ThreadPoolExecutor(1, thread_name_prefix="solver"), stop
+        )
         self._running = None
         warm_up()
         self._worker.submit(warm_up, READY_FOR)
-        self._outputs = {"map": self.output(names.ERROR_MAP), "summary": self.output(names.SUMMARY)}
+        self._outputs = {
+            "map": self.output(names.ERROR_MAP),
+            "summary": self.output(names.SUMMARY),
+        }
         self._markers = self.publisher(names.MAP_MARKERS)
         self._rejected: dict[int, Marker] = {}  # by view
         self._rejected_in = ("", "")  # plan and run
@@ -60,7 +67,9 @@ class Solver(ManagedNode[SolverSettings]):
         self.subscribe(names.MEASUREMENT, self._on_measurement)
         self.subscribe(names.COMMAND, self._on_command)
         self.every(SWEEP_S, self._sweep)
-        self.service(LoadMap, "~/load_map", lambda request: self.session.load(request.path))
+        self.service(
+            LoadMap, "~/load_map", lambda request: self.session.load(request.path)
+        )
         self._waiting.clear()
         self.service_later(SaveMap, "~/save_map", self._save, self._once_solved)
 

@@ -53,11 +53,16 @@ class StageSimulator(CellNode[SimulatorSettings]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(SimulatorSettings, **kwargs)
         settings = self.settings
-        self._settings = settings_of(asdict(settings) | {"sense": settings.measurement_sense})
+        self._settings = settings_of(
+            asdict(settings) | {"sense": settings.measurement_sense}
+        )
         camera, spread = camera_of(settings.camera) if settings.camera else (None, None)
         self._camera, self._spread = camera, spread_of(asdict(settings), spread)
         self.publish(images=camera is not None)
-        self._time, self._step_ns = SimulatedClock(), round(NS_PER_S / settings.encoder_rate)
+        self._time, self._step_ns = (
+            SimulatedClock(),
+            round(NS_PER_S / settings.encoder_rate),
+        )
         self.machine: SimulatedMachine | None = None
         self._visitor: Visitor | None = None
         self._events: Iterator[Event] = iter(())
@@ -74,7 +79,9 @@ class StageSimulator(CellNode[SimulatorSettings]):
         """Draw a machine with the plate of a plan, and a placing for each of its views."""
         settings = self.settings
         self.machine = SimulatedMachine.of(
-            Simulation(plan, settings.seed, self._spread, self._settings, camera=self._camera),
+            Simulation(
+                plan, settings.seed, self._spread, self._settings, camera=self._camera
+            ),
             self._time,
         )
         cell = Cell(
@@ -98,7 +105,9 @@ class StageSimulator(CellNode[SimulatorSettings]):
             truth = self.machine.truth
             self.machine.truth = replace(
                 truth,
-                phi_rad=np.copysign(np.maximum(abs(truth.phi_rad), CHECK_TURN_RAD), truth.phi_rad),
+                phi_rad=np.copysign(
+                    np.maximum(abs(truth.phi_rad), CHECK_TURN_RAD), truth.phi_rad
+                ),
             )
         if settings.truth_path:
             write_truth(
@@ -110,7 +119,9 @@ class StageSimulator(CellNode[SimulatorSettings]):
 
     def diagnosis(self) -> Diagnosis:
         """Return its activity and the number of messages sent."""
-        return Diagnosis(Level.OK, "at rest" if self._next is None else "measuring", self.sent)
+        return Diagnosis(
+            Level.OK, "at rest" if self._next is None else "measuring", self.sent
+        )
 
     def _on_command(self, message: Any) -> None:
         command = to_model.command(message)
@@ -144,17 +155,25 @@ class StageSimulator(CellNode[SimulatorSettings]):
             self._prepare(Plan(command.plan_id, plate, (view,) * n_views))
         assert self.machine is not None and self._visitor is not None
         if again is None:
-            self.machine.place(Placing(view.name, *view.translation_m, view.rotation_rad, command))
+            self.machine.place(
+                Placing(view.name, *view.translation_m, view.rotation_rad, command)
+            )
         start_ns = max(command.stamp_ns, self.get_clock().now().nanoseconds) + LEAD_NS
         self._time.ns = max(self._time.ns, start_ns)
         order = view.visit_order or self.settings.visit_order
-        self._events = self._visitor.view(plate, replace(view, visit_order=order), again)
+        self._events = self._visitor.view(
+            plate, replace(view, visit_order=order), again
+        )
         self._next = next(self._events, None)
 
     def _on_timer(self) -> None:
         now_ns = self.get_clock().now().nanoseconds
         while self._next is not None and self._next.stamp_ns <= now_ns:
-            event, self._next = self._next, None  # whatever is raised now, it is told once
+            # whatever is raised now, it is told once
+            event, self._next = (
+                self._next,
+                None,
+            )
             self.tell(event)
             self._next, self._free_ns = next(self._events, None), now_ns
         if self._next is None and now_ns - self._time.ns >= IDLE_STEPS * self._step_ns:

@@ -15,12 +15,16 @@ class CellNode[S: (DriverSettings, SimulatorSettings)](SelfcalNode[S]):
 
     def publish(self, *, images: bool) -> None:
         """Create the publishers, also one of images if there are some."""
-        topic_of_count = {"encoder_sent": names.ENCODER, "detection_sent": names.DETECTIONS}
+        topic_of_count = {
+            "encoder_sent": names.ENCODER,
+            "detection_sent": names.DETECTIONS,
+        }
         if images:
             topic_of_count["image_sent"] = names.image_topics("raw", IMAGES_KEPT)[0]
         self.sent = dict.fromkeys(topic_of_count, 0)
         self._outputs = {
-            topic.name: (count, self.output(topic)) for count, topic in topic_of_count.items()
+            topic.name: (count, self.output(topic))
+            for count, topic in topic_of_count.items()
         }
 
     def tell(self, event: Event) -> None:

@@ -33,7 +33,10 @@ def hu_figures(reproduction: HuReproduction) -> list[Drawing]:
         (66, 40, 400, 170),
         [
             parts.Curve(
-                np.rad2deg(truth.artifact.theta_rad), np.rad2deg(truth.g_theta), "c0", dots=2.5
+                np.rad2deg(truth.artifact.theta_rad),
+                np.rad2deg(truth.g_theta),
+                "c0",
+                dots=2.5,
             )
         ],
         labels=("θ in °", ""),
@@ -52,10 +55,14 @@ def hu_figures(reproduction: HuReproduction) -> list[Drawing]:
 def qiao_figures(reproduction: QiaoReproduction) -> list[Drawing]:
     """Return Figures 3 and 4 of Qiao."""
     artifact = Artifact(reproduction.error_um.shape[1], QIAO_PITCH_M, 0)
-    programs = parts.titled("qiao_figure_3", "Qiao, Figure 3: truth and least-squares answer")
+    programs = parts.titled(
+        "qiao_figure_3", "Qiao, Figure 3: truth and least-squares answer"
+    )
     for frame, program in zip(
         parts.panels(
-            programs, [", ".join(p.views) for p in reproduction.programs], _reach(artifact)
+            programs,
+            [", ".join(p.views) for p in reproduction.programs],
+            _reach(artifact),
         ),
         reproduction.programs,
         strict=True,
@@ -63,11 +70,18 @@ def qiao_figures(reproduction: QiaoReproduction) -> list[Drawing]:
         _vectors(
             frame,
             artifact,
-            [(program.found_um * M_PER_UM, "c0", 2.6), (program.truth_um * M_PER_UM, "truth", 1.0)],
+            [
+                (program.found_um * M_PER_UM, "c0", 2.6),
+                (program.truth_um * M_PER_UM, "truth", 1.0),
+            ],
         )
         left, top, _, height = frame.box
-        programs.label(left + 80, top + height + 36, f"rms error {program.rms_um:.2g} µm")
-    parts.legend(programs, [("truth", "truth"), ("c0", "answer")], (46, programs.height + 44))
+        programs.label(
+            left + 80, top + height + 36, f"rms error {program.rms_um:.2g} µm"
+        )
+    parts.legend(
+        programs, [("truth", "truth"), ("c0", "answer")], (46, programs.height + 44)
+    )
     programs.height += 54
     noise = parts.titled("qiao_figure_4", "Qiao, Figure 4: noise of 0.1 µm")
     frame = parts.panels(noise, ["error of one draw"], _reach(artifact))[0]
@@ -80,7 +94,11 @@ def qiao_figures(reproduction: QiaoReproduction) -> list[Drawing]:
         [
             *(
                 parts.Curve(
-                    np.arange(1, n + 1), np.sqrt((values**2).mean(axis=1)), colour, 0.0, dots=1.8
+                    np.arange(1, n + 1),
+                    np.sqrt((values**2).mean(axis=1)),
+                    colour,
+                    0.0,
+                    dots=1.8,
                 )
                 for values, colour in (
                     (reproduction.rms_um, "c0"),
@@ -113,10 +131,13 @@ def _vectors(frame: Frame, artifact: Artifact, fields: Sequence[Field]) -> None:
     """Draw fields over each other at the same enlargement, with a key below."""
     places_mm = np.stack([artifact.x_m.ravel(), artifact.y_m.ravel()]) * MM_PER_M
     factor = parts.enlargement(
-        np.concatenate([np.hypot(*field).ravel() for field, _, _ in fields]), artifact.grid_pitch_m
+        np.concatenate([np.hypot(*field).ravel() for field, _, _ in fields]),
+        artifact.grid_pitch_m,
     )
     for field, colour, width in fields:
-        parts.arrows(frame, places_mm, field.reshape(2, -1), factor, colour=colour, width=width)
+        parts.arrows(
+            frame, places_mm, field.reshape(2, -1), factor, colour=colour, width=width
+        )
     frame.axes(ticks=(4, 4))
     left, top, _, height = frame.box
     parts.arrow_key(frame, factor, (left, top + height + 32))
@@ -135,7 +156,9 @@ def _draws(run: HuRun, name: str, columns: tuple[int, ...]) -> Drawing:
         f"Hu, {name}: std of the error, noise {published.sigma_um:g} µm, {published.sigma_deg:g}°",
         300,
     )
-    end = 1.1 * max(float(errors.std[:n, list(columns)].max()) for errors in (run.law, run.joint))
+    end = 1.1 * max(
+        float(errors.std[:n, list(columns)].max()) for errors in (run.law, run.joint)
+    )
     width = 410 / len(columns)
     for number, column in enumerate(columns):
         parts.chart(
@@ -143,7 +166,9 @@ def _draws(run: HuRun, name: str, columns: tuple[int, ...]) -> Drawing:
             (62 + number * width, 50, width - 50 * (len(columns) - 1), 170),
             [
                 *(
-                    parts.Curve(np.arange(1, n + 1), errors.std[:n, column], colour, dots=2.2)
+                    parts.Curve(
+                        np.arange(1, n + 1), errors.std[:n, column], colour, dots=2.2
+                    )
                     for errors, colour in ((run.law, "c0"), (run.joint, "c1"))
                 ),
                 _level(n, published.table[column][2], "ink", (5, 3)),
@@ -155,7 +180,12 @@ def _draws(run: HuRun, name: str, columns: tuple[int, ...]) -> Drawing:
         )
     parts.legend(
         drawing,
-        [("c0", "law"), ("c1", "joint least squares"), ("ink", "published"), ("c2", "bound")],
+        [
+            ("c0", "law"),
+            ("c1", "joint least squares"),
+            ("ink", "published"),
+            ("c2", "bound"),
+        ],
         (46, 280),
     )
     return drawing

@@ -48,7 +48,8 @@ class Published:
     def least_std(self, row: int) -> float:
         """Return the smallest std of as many values with the extremes of a row."""
         high, low, _ = self.table[row]
-        count = ARTIFACT.m.size if row < 2 else ARTIFACT.angular_count  # rows: x, y, theta
+        # rows: x, y, theta
+        count = ARTIFACT.m.size if row < 2 else ARTIFACT.angular_count
         return (high - low) / math.sqrt(2 * (count - 1))
 
 
@@ -59,7 +60,11 @@ TABLES = (
         (20, 20),
         0.02,
         0.001,
-        ((0.0541, -0.0490, 0.0195), (0.0511, -0.0506, 0.0196), (1.5877e-3, -1.2065e-3, 7.1184e-4)),
+        (
+            (0.0541, -0.0490, 0.0195),
+            (0.0511, -0.0506, 0.0196),
+            (1.5877e-3, -1.2065e-3, 7.1184e-4),
+        ),
     ),
     Published(
         "Table 2",
@@ -67,7 +72,11 @@ TABLES = (
         (10, 20),
         0.002,
         0.0001,
-        ((0.0051, -0.0051, 0.0020), (0.0051, -0.0053, 0.0020), (2.9963e-4, -6.9733e-4, 7.6657e-5)),
+        (
+            (0.0051, -0.0051, 0.0020),
+            (0.0051, -0.0053, 0.0020),
+            (2.9963e-4, -6.9733e-4, 7.6657e-5),
+        ),
     ),
 )
 
@@ -139,7 +148,11 @@ def _later(progress: Progress, number: int, done: int, total: int) -> None:
 
 
 def _run(
-    truth: Truth, table: Published, rng: np.random.Generator, n_draws: int, spread: Callable
+    truth: Truth,
+    table: Published,
+    rng: np.random.Generator,
+    n_draws: int,
+    spread: Callable,
 ) -> HuRun:
     plan = hu_plan(ARTIFACT)
     draws = [
@@ -154,16 +167,22 @@ def _run(
     ]
     gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES)
     bound = gain.rms_xy * table.sigma_um, gain.rms_theta * table.sigma_deg
-    return HuRun(table, _law_errors(truth, draws), _joint_errors(truth, draws, spread), bound)
+    return HuRun(
+        table, _law_errors(truth, draws), _joint_errors(truth, draws, spread), bound
+    )
 
 
 def _law_errors(truth: Truth, draws: list[Measurements]) -> Errors:
     law = law_for(ARTIFACT, ThetaDatum.XY_AXES, Sense.MICROSCOPE_MOVES)
-    readings_of_draws = [hu_readings(ARTIFACT, hu_views(readings)) for readings in draws]
+    readings_of_draws = [
+        hu_readings(ARTIFACT, hu_views(readings)) for readings in draws
+    ]
     solution = law.solve(
         HuReadings(
             *(
-                np.concatenate([getattr(of_draw, name) for of_draw in readings_of_draws], axis=-1)
+                np.concatenate(
+                    [getattr(of_draw, name) for of_draw in readings_of_draws], axis=-1
+                )
                 for name in ("v0", "v1", "v3", "vt")
             )
         )
@@ -181,7 +200,10 @@ def _joint_errors(truth: Truth, draws: list[Measurements], spread: Callable) -> 
 
 def _joint_maps(draws: list[Measurements]) -> list[ErrorMap]:
     options = Options(
-        datum_theta=ThetaDatum.XY_AXES, misalignment_model="linear", uncertainty=False, causes=False
+        datum_theta=ThetaDatum.XY_AXES,
+        misalignment_model="linear",
+        uncertainty=False,
+        causes=False,
     )
     return [calibrate(readings, options).error_map for readings in draws]
 
@@ -243,7 +265,9 @@ def _series_text(run: HuRun) -> list[str]:
     for figure, n, columns in zip(
         run.published.figures, run.published.n_draws, ((0, 1), (2,)), strict=True
     ):
-        lines.append(f"{figure}: std of the law's error in {min(n, len(run.law.xy))} draws")
+        lines.append(
+            f"{figure}: std of the law's error in {min(n, len(run.law.xy))} draws"
+        )
         for column in columns:
             name = ("x, um", "y, um", "theta, deg")[column]
             values = " ".join(

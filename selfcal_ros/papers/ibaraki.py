@@ -22,7 +22,11 @@ from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M, URAD_PER_RAD
 STEPS_M = (0.01, 0.01)
 ERRORS = ("Ex(x)", "Ey(x)", "Ex(y)", "Ey(y)")
 GIVEN_MM = {"a": (0, 0, 0, 0.1), "b": (0.1, 0, 0, 0.1), "c": (0, 0, 0.1, 0)}
-ESTIMATED_MM = {"a": (-0.05, 0, 0, 0.15), "b": (0.1, 0, 0, 0.1), "c": (-0.0002, 0, 0.1, 0.0002)}
+ESTIMATED_MM = {
+    "a": (-0.05, 0, 0, 0.15),
+    "b": (0.1, 0, 0, 0.1),
+    "c": (-0.0002, 0, 0.1, 0.0002),
+}
 """Table 1: errors of one block, and what the conventional formulation makes of them."""
 CASE_STUDY_UM = {
     "straightness X": (0.05, 0.07, 0.06),
@@ -73,7 +77,10 @@ def reproduce_ibaraki(
 
 
 def _case_study(rng: np.random.Generator) -> StepDiagonal:
-    setups = {"pp": SetUp(mirror_rad=(MIRROR_RAD,)), "np": SetUp(mirror_rad=(-MIRROR_RAD,))}
+    setups = {
+        "pp": SetUp(mirror_rad=(MIRROR_RAD,)),
+        "np": SetUp(mirror_rad=(-MIRROR_RAD,)),
+    }
     return simulate_step_diagonal(case_study_machine(), Measurement(setups, NOISE), rng)
 
 
@@ -97,7 +104,9 @@ def ibaraki_text(reproduction: IbarakiReproduction) -> str:
         "Ibaraki, Goto, Matsubara: issues in laser step diagonal measurement",
         "Table 1: conventional formulation, lasers along the machine's own diagonals, mm",
         f"{'':8}"
-        + "".join(f"{f'({case}) given':>14}{'published':>11}{'ours':>9}" for case in GIVEN_MM),
+        + "".join(
+            f"{f'({case}) given':>14}{'published':>11}{'ours':>9}" for case in GIVEN_MM
+        ),
     ]
     for row, name in enumerate(ERRORS):
         lines.append(

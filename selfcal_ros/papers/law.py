@@ -84,7 +84,11 @@ class HuLaw:
     """
 
     def __init__(
-        self, artifact: Artifact, datum: ThetaDatum, axis_lines: np.ndarray, axis_sign: int
+        self,
+        artifact: Artifact,
+        datum: ThetaDatum,
+        axis_lines: np.ndarray,
+        axis_sign: int,
     ) -> None:
         self.artifact, self.datum, self.axis_sign = artifact, datum, axis_sign
         self.x, self.y = artifact.x_m[..., None], artifact.y_m[..., None]
@@ -107,10 +111,17 @@ class HuLaw:
         u0x, u0y = v0[0] - t0[0] + phi0 * y, v0[1] - t0[1] - phi0 * x  # eq. 18
         u1x, u1y = v1[0] - t1[0] + phi1 * x, v1[1] - t1[1] + phi1 * y  # eq. 19
         u3x, u3y = v3[0] + phi3 * y[:-1], v3[1] - phi3 * x[:-1]  # eq. 21
-        o = ((u0x * y + u0y * x) + (u1x * x - u1y * y)).sum(axis=(0, 1)) / (2 * d)  # eq. 22
-        r = ((u0x * x - u0y * y) - (u1x * y + u1y * x)).sum(axis=(0, 1)) / (2 * d)  # eq. 22
-        quarter = (u0x - u1y - 2 * o * y - 2 * r * x, u0y + u1x - 2 * o * x + 2 * r * y)  # eq. 23
+        # eq. 22
+        o = ((u0x * y + u0y * x) + (u1x * x - u1y * y)).sum(axis=(0, 1)) / (2 * d)
+        # eq. 22
+        r = ((u0x * x - u0y * y) - (u1x * y + u1y * x)).sum(axis=(0, 1)) / (2 * d)
+        # eq. 23
+        quarter = (
+            u0x - u1y - 2 * o * y - 2 * r * x,
+            u0y + u1x - 2 * o * x + 2 * r * y,
+        )
         step = (u3x - u0x[:-1], u3y - u0y[:-1])  # eq. 24
+        # eq. 25
         right = np.concatenate(
             [
                 _columns(part)
@@ -119,7 +130,7 @@ class HuLaw:
                     *(np.diff(part, axis=axis) for part in step for axis in (0, 1)),
                 )
             ]
-        )  # eq. 25
+        )
         f, rest_xy = self.solve_xy(right, np.zeros((6, right.shape[1])))  # eq. 26
         rest_xy -= self.phi3_rest[:, None] * (self.phi3_rest @ rest_xy)
         f = f.reshape(v0.shape)
@@ -156,7 +167,14 @@ class HuLaw:
         )[:, :-1]
         quarter = np.zeros((2 * self.x.size, 1))
         right = np.concatenate(
-            [quarter, *(_columns(np.diff(part, axis=axis)) for part in step for axis in (0, 1))]
+            [
+                quarter,
+                *(
+                    _columns(np.diff(part, axis=axis))
+                    for part in step
+                    for axis in (0, 1)
+                ),
+            ]
         )
         residual = self.solve_xy(right, np.zeros((6, 1)))[1][:, 0]
         return residual / np.linalg.norm(residual)
@@ -227,7 +245,10 @@ def _rows_theta(
     k = np.arange(count)
     rows = sparse.csr_array(
         sparse.vstack(
-            [identity[(k + count // 4) % count] - identity, identity[(k + 1) % count] - identity]
+            [
+                identity[(k + count // 4) % count] - identity,
+                identity[(k + 1) % count] - identity,
+            ]
         )
     )
     if datum is ThetaDatum.ZERO_MEAN:
@@ -264,7 +285,11 @@ def _bordered(
         solution = factor.solve(np.concatenate([rows.T @ right, tied]))[:unknowns]
         residual, slack = right - rows @ solution, tied - ties @ solution
         refinement = factor.solve(np.concatenate([rows.T @ residual, slack]))[:unknowns]
-        return solution + refinement, residual - rows @ refinement  # one refinement: to rounding
+        # one refinement: to rounding
+        return (
+            solution + refinement,
+            residual - rows @ refinement,
+        )
 
     return solve
 
@@ -309,8 +334,12 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
         If a view is missing, surplus or incomplete, or the datum does not exist.
     """
     views = hu_views(measurements)
-    order = [next(i for i, v in enumerate(measurements.views) if v is view) for view in views]
-    law = law_for(measurements.artifact, ThetaDatum(options.datum_theta), measurements.sense)
+    order = [
+        next(i for i, v in enumerate(measurements.views) if v is view) for view in views
+    ]
+    law = law_for(
+        measurements.artifact, ThetaDatum(options.datum_theta), measurements.sense
+    )
     solution = law.solve(hu_readings(measurements.artifact, views))
     spread = _propagate(law, views)
     xy, theta = _noise(solution, spread, measurements.views)
@@ -337,7 +366,9 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
             scale_difference=float(solution.r[0]),
             datum_theta=law.datum,
         ),
-        ArtifactMap(solution.a[0, ..., 0], solution.a[1, ..., 0], solution.a_theta[:, 0]),
+        ArtifactMap(
+            solution.a[0, ..., 0], solution.a[1, ..., 0], solution.a_theta[:, 0]
+        ),
         tuple(
             ViewResult(
                 view.view.name,
@@ -352,7 +383,9 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
             for i, view in enumerate(measurements.views)
         ),
         # complete views: each site and each line has two readings or more
-        Observability(4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0),
+        Observability(
+            4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0
+        ),
         noise,
         measurements.all_rejected(),
         findings=_findings(artifact, options),
@@ -422,7 +455,11 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
     for view in measurements.views:
         pose = view.view.lattice_pose(artifact)
         grid, lines = len(view.m) > 0, len(view.k) > 0
-        index = wanted.get((pose.quarter_turns, pose.shift, pose.turn_lines)) if grid else None
+        index = (
+            wanted.get((pose.quarter_turns, pose.shift, pose.turn_lines))
+            if grid
+            else None
+        )
         if not grid and lines and (pose.shift, pose.turn_lines) == ((0, 0), 1):
             index = 2
         if index is None or index in view_of_index:
@@ -434,7 +471,9 @@ def hu_views(measurements: Measurements) -> list[ViewReadings]:
         view_of_index[index] = view
     for index, name in enumerate(_NAMES):
         if index not in view_of_index:
-            raise InputError("method law", f"Hu's view {index} ({name}) is missing", _REMEDY)
+            raise InputError(
+                "method law", f"Hu's view {index} ({name}) is missing", _REMEDY
+            )
         _require_complete(view_of_index[index], index, artifact)
     return [view_of_index[index] for index in range(4)]
 
@@ -497,10 +536,14 @@ def _propagate(law: HuLaw, views: list[ViewReadings]) -> _Spread:
     """Propagate the noise of each reading: exactly up to EXACT_SIZE, else by draws."""
     exact = law.artifact.grid_size <= EXACT_SIZE
     grid, lines = (
-        law.solve(_unit_noise(law.artifact, views, kind=kind, exact=exact)) for kind in range(2)
+        law.solve(_unit_noise(law.artifact, views, kind=kind, exact=exact))
+        for kind in range(2)
     )
     expected_squares, dof = np.transpose(
-        [_quadratic_form(of_kind, exact=exact) for of_kind in (grid.rest_xy, lines.rest_theta)]
+        [
+            _quadratic_form(of_kind, exact=exact)
+            for of_kind in (grid.rest_xy, lines.rest_theta)
+        ]
     )
     columns = 1 if exact else N_DRAWS
     var_g, var_theta = (
@@ -535,7 +578,10 @@ def _unit_noise(
     ]
     weights.append(np.array([1 / np.sqrt(view.count_theta) for view in views]))
     slots = np.concatenate(
-        [w.ravel() if (i == 3) == bool(kind) else np.zeros(w.size) for i, w in enumerate(weights)]
+        [
+            w.ravel() if (i == 3) == bool(kind) else np.zeros(w.size)
+            for i, w in enumerate(weights)
+        ]
     )
     active = np.flatnonzero(slots)
     if exact:
@@ -553,7 +599,9 @@ def _unit_noise(
     )
 
 
-def _per_mean(view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]) -> np.ndarray:
+def _per_mean(
+    view: ViewReadings, artifact: Artifact, shape: tuple[int, ...]
+) -> np.ndarray:
     counts = np.full(artifact.shape, np.nan)
     counts[artifact.index(view.m, view.n)] = view.count
     return np.broadcast_to(1 / np.sqrt(counts[: shape[1]]), shape)

@@ -17,7 +17,9 @@ LAW = "law"
 """Name of Hu's law among the methods."""
 
 
-def calibrate_by(method: str, measurements: Measurements, options: Options) -> CalibrationResult:
+def calibrate_by(
+    method: str, measurements: Measurements, options: Options
+) -> CalibrationResult:
     """Calibrate by the method of this name; ``joint`` is `selfcal_ros.estimation.api.calibrate`."""
     return (calibrate_by_law if method == LAW else calibrate)(measurements, options)
 
@@ -56,7 +58,11 @@ def calibrate_by_law(measurements: Measurements, options: Options) -> Calibratio
 def require_plain(measurements: Measurements, options: Options) -> None:
     """Raise InputError if readings or options have what the law cannot use."""
     for name, is_given, why in (
-        ("robust", options.robust, "Hu's law needs every reading and cannot leave any out"),
+        (
+            "robust",
+            options.robust,
+            "Hu's law needs every reading and cannot leave any out",
+        ),
         ("method law", options.plate, "Hu's law cannot use a known plate"),
         (
             "method law",

@@ -148,13 +148,16 @@ def reproduce_qiao(
     The noise runs are solved by `workers` processes, with the same results for any number.
     """
     observability = [
-        [plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES] for row in ROWS
+        [plan_observability(plan_of(row.views, Artifact(n, 0.01))) for n in SIZES]
+        for row in ROWS
     ]
     rng = np.random.default_rng(seed)
     truth = random_truth(ARTIFACT, 3, rng, SPREAD)
     first, second = (_program(truth, views) for views in PROGRAMS)
     plan = plan_of(PROGRAMS[0])
-    draws = [simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M) for _ in range(n_draws)]
+    draws = [
+        simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M) for _ in range(n_draws)
+    ]
     exact = simulate_measurements(truth, plan, rng)
     draws += [_with_uniform_noise(exact, rng) for _ in range(n_draws)]
     errors = mapped_in_parts(
@@ -162,7 +165,9 @@ def reproduce_qiao(
     )
     normal = errors[:n_draws]
     uniform = errors[n_draws:]
-    gain = predict(planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES).rms_xy
+    gain = predict(
+        planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES
+    ).rms_xy
     return QiaoReproduction(
         np.array([[s.rank for s in row] for row in observability]),
         np.array([[s.unknowns for s in row] for row in observability]),
@@ -188,12 +193,16 @@ def _errors_um(truth: Truth, readings: Measurements) -> np.ndarray:
     return (np.stack([error_map.gx, error_map.gy]) - truth.g) * UM_PER_M
 
 
-def _with_uniform_noise(readings: Measurements, rng: np.random.Generator) -> Measurements:
+def _with_uniform_noise(
+    readings: Measurements, rng: np.random.Generator
+) -> Measurements:
     """Add uniform noise within +-SIGMA_M."""
 
     def shaken(view: ViewReadings) -> ViewReadings:
         dx, dy = rng.uniform(-SIGMA_M, SIGMA_M, (2, len(view.dx)))
-        return ViewReadings(view.view, view.m, view.n, view.dx + dx, view.dy + dy, view.count)
+        return ViewReadings(
+            view.view, view.m, view.n, view.dx + dx, view.dy + dy, view.count
+        )
 
     return Measurements(
         readings.plan_id,
@@ -257,7 +266,9 @@ def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> Truth:
 
 
 def _observe(truth: Truth, plan: Plan) -> np.ndarray:
-    parts = [grid_deviation(truth, i, view).ravel() for i, view in enumerate(plan.views)]
+    parts = [
+        grid_deviation(truth, i, view).ravel() for i, view in enumerate(plan.views)
+    ]
     values = np.concatenate(parts)
     return values[np.isfinite(values)]
 
@@ -314,7 +325,9 @@ def qiao_text(reproduction: QiaoReproduction) -> str:
 def _noise_text(reproduction: QiaoReproduction) -> list[str]:
     n = len(reproduction.rms_um)
     x, y = reproduction.rms_um[0]
-    over_draws, uniform = (rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um))
+    over_draws, uniform = (
+        rms(r) for r in (reproduction.rms_um, reproduction.rms_uniform_um)
+    )
     return [
         f"Figure 4: noise of standard deviation 0.1 um, program 1, {n} draws",
         f"  rms error of one draw: x {x:.4f} um, y {y:.4f} um; published "

@@ -32,7 +32,9 @@ def grid_deviation(
     out = np.full_like(site, np.nan)
     stop = sign * site[:, inside]
     if artifact.map_grid is None:  # at a node, without the rounding of `stage_error`
-        i, j = np.rint(stop / artifact.grid_pitch_m + np.array(artifact.half)[:, None]).astype(int)
+        i, j = np.rint(
+            stop / artifact.grid_pitch_m + np.array(artifact.half)[:, None]
+        ).astype(int)
         error = truth.g[:, i, j] + physics.stage_bending(truth, stop, index)
     else:
         error = physics.stage_error(truth, stop, index)

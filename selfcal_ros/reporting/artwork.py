@@ -95,8 +95,12 @@ def artwork_of(
     marker_reach_mm = (AWAY + SIDE / 2 if markers else 0) * step
     edge = float(np.hypot(*places.T).max()) + 1.5 * step + marker_reach_mm
     for angle in plate.theta_rad:
-        turn = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
-        outlines.append((_box(step, step / 20) + np.array([edge + step / 2, 0.0])) @ turn)
+        turn = np.array(
+            [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]
+        )
+        outlines.append(
+            (_box(step, step / 20) + np.array([edge + step / 2, 0.0])) @ turn
+        )
     bottom = -(edge + step) if plate.angular_count else float(low[1]) - marker_reach_mm
     length = round_down(float(high[0] - low[0]) / 2)
     below = bottom - 1.5 * step
@@ -126,7 +130,12 @@ def _numbers(
         middle = at - 0.3 * letters * len(str(m))
         yield str(m), middle, float(y[0]) - marker_reach_mm - 0.8 * step, letters
     for n, at in zip(plate.n[0].tolist(), y.tolist(), strict=True):
-        yield str(n), float(x[0]) - marker_reach_mm - 0.9 * step, at - 0.35 * letters, letters
+        yield (
+            str(n),
+            float(x[0]) - marker_reach_mm - 0.9 * step,
+            at - 0.35 * letters,
+            letters,
+        )
 
 
 def _markers(plate: Artifact, step: float) -> list[np.ndarray]:
@@ -153,7 +162,9 @@ def _markers(plate: Artifact, step: float) -> list[np.ndarray]:
         black = cv2.aruco.generateImageMarker(patterns, number, cells) == 0
         for row, column, length in _runs(black):
             middle = (column + length / 2 - cells / 2, cells / 2 - row - 0.5)
-            outlines.append(_box(length * side, side) + centre + np.array(middle) * side)
+            outlines.append(
+                _box(length * side, side) + centre + np.array(middle) * side
+            )
     return outlines
 
 
@@ -283,7 +294,9 @@ def _pdf(art: Artwork, box: tuple[float, float, float, float]) -> bytes:
     axes = page.add_axes((0, 0, 1, 1))
     axes.set(xlim=(left, right), ylim=(low, high))
     axes.set_axis_off()
-    axes.add_collection(PolyCollection(art.outlines, facecolor="black", linewidth=0), autolim=False)
+    axes.add_collection(
+        PolyCollection(art.outlines, facecolor="black", linewidth=0), autolim=False
+    )
     for text, x, y, size in art.labels:
         axes.text(x, y, text, fontsize=size / 25.4 * 72, parse_math=False)
     data = io.BytesIO()

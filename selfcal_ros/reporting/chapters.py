@@ -88,7 +88,10 @@ def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
     Lengths named ``*_m`` are shown in µm and angles named ``*_rad`` in arcsec. Plain arrays
     and deeper structures are only in the result file.
     """
-    names = [*(n for n in TITLES if n in extra), *sorted(n for n in extra if n not in TITLES)]
+    names = [
+        *(n for n in TITLES if n in extra),
+        *sorted(n for n in extra if n not in TITLES),
+    ]
     names = [name for name in names if name not in DRAWN]
     sections = [
         _extra_section(name, TITLES.get(name, _words(name).capitalize()), extra[name])
@@ -100,7 +103,9 @@ def extra_sections(extra: Mapping[str, Any]) -> list[Section]:
 def _extra_section(name: str, title: str, value: Any) -> Section | None:
     if isinstance(value, Mapping):
         facts = tuple(
-            (_heading(key), _cell(key, item)) for key, item in value.items() if _is_plain(item)
+            (_heading(key), _cell(key, item))
+            for key, item in value.items()
+            if _is_plain(item)
         )
         tables = [item for item in value.values() if _is_table(item)]
         if not facts and not tables:
@@ -118,7 +123,9 @@ def _is_plain(value: Any) -> bool:
         value is None
         or isinstance(value, str | int | float)
         or (  # or a mark (m, n)
-            isinstance(value, list) and len(value) in (1, 2) and all(type(i) is int for i in value)
+            isinstance(value, list)
+            and len(value) in (1, 2)
+            and all(type(i) is int for i in value)
         )
     )
 
@@ -154,13 +161,19 @@ def _column(key: str, values: list[Any]) -> list[str]:
     ):
         return [_cell(key, v) for v in values]
     scale = _unit(key)[2]
-    numbers = [float("nan") if v is None or isinstance(v, bool) else v * scale for v in values]
+    numbers = [
+        float("nan") if v is None or isinstance(v, bool) else v * scale for v in values
+    ]
     return aligned_numbers(numbers)
 
 
 def _unit(key: str) -> tuple[str, str, float]:
     return next(
-        ((suffix, unit, scale) for suffix, unit, scale in _UNITS if str(key).endswith(suffix)),
+        (
+            (suffix, unit, scale)
+            for suffix, unit, scale in _UNITS
+            if str(key).endswith(suffix)
+        ),
         ("", "", 1.0),
     )
 
@@ -202,7 +215,10 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
     first.
     """
     provenance = result.provenance
-    facts = {**provenance.facts, **{key: value for key, value in about.items() if value}}
+    facts = {
+        **provenance.facts,
+        **{key: value for key, value in about.items() if value},
+    }
     first, last = (
         str(facts.get(key, "")).replace("T", " ")[:16]
         for key in ("first_exposure", "last_exposure")
@@ -211,9 +227,16 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
     return Section(
         "Calibration",
         (
-            *((_words(key), printable(value)) for key, value in about.items() if key not in ABOUT),
             *(
-                (_words(key), printable(facts.get(key) or f"{UNKNOWN} (not given: {hint})"))
+                (_words(key), printable(value))
+                for key, value in about.items()
+                if key not in ABOUT
+            ),
+            *(
+                (
+                    _words(key),
+                    printable(facts.get(key) or f"{UNKNOWN} (not given: {hint})"),
+                )
                 for key, hint in ABOUT.items()
             ),
             ("measured", measured if first else UNKNOWN),
@@ -230,7 +253,10 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
 def convention_section(result: CalibrationResult) -> Section:
     """Return the conventions behind the numbers: signs, datum, sense of measurement, coverage."""
     facts = [
-        ("error", "G = indicated − true, stage frame; add +G to a command to reach its position"),
+        (
+            "error",
+            "G = indicated − true, stage frame; add +G to a command to reach its position",
+        ),
         (
             "XY datum",
             "no translation or rotation over the field; a reference length sets the scale"
@@ -261,7 +287,9 @@ def convention_section(result: CalibrationResult) -> Section:
 def text_of(value: Any) -> str:
     """Return a value as text; the entries of a mapping are listed."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{_words(key)}: {text_of(item)}" for key, item in value.items())
+        return ", ".join(
+            f"{_words(key)}: {text_of(item)}" for key, item in value.items()
+        )
     return f"{value:.6g}" if isinstance(value, float) else printable(str(value))
 
 
@@ -294,7 +322,10 @@ def provenance_section(result: CalibrationResult) -> Section:
     ]
     if math.isfinite(provenance.duration_s):
         facts.append(
-            ("duration", f"{provenance.duration_s:.0f} s from the first exposure to the last")
+            (
+                "duration",
+                f"{provenance.duration_s:.0f} s from the first exposure to the last",
+            )
         )
     if length := reference_to_dict(result.reference):
         facts += [
@@ -337,7 +368,9 @@ class Chapter:
 
 
 def chapters(
-    result: CalibrationResult, truth: Mapping[str, np.ndarray] | None, more: Sequence[Chapter] = ()
+    result: CalibrationResult,
+    truth: Mapping[str, np.ndarray] | None,
+    more: Sequence[Chapter] = (),
 ) -> list[Chapter]:
     """Return the chapters of a report without empty ones.
 
@@ -351,7 +384,9 @@ def chapters(
         Chapters of others; they follow the uncertainty.
     """
     drafts = [
-        Chapter("Attention", sections=(sections.attention_section(result),), alert=True),
+        Chapter(
+            "Attention", sections=(sections.attention_section(result),), alert=True
+        ),
         _maps(result, truth),
         _causes(result),
         _uncertainty(result),
@@ -379,7 +414,9 @@ def chapters(
             "Measurement",
             _figures(
                 (
-                    plan_figure(result.plate, views_in(result)) if result.views else None,
+                    plan_figure(result.plate, views_in(result))
+                    if result.views
+                    else None,
                     "The plate as the plan places it; the arrow shows how far "
                     "its marked corner has "
                     "turned.",
@@ -407,7 +444,9 @@ def chapters(
 
 def _figures(*pairs: tuple[Drawing | None, str]) -> tuple[CaptionedFigure, ...]:
     return tuple(
-        CaptionedFigure(drawing, caption) for drawing, caption in pairs if drawing is not None
+        CaptionedFigure(drawing, caption)
+        for drawing, caption in pairs
+        if drawing is not None
     )
 
 
@@ -416,7 +455,9 @@ def _causes(result: CalibrationResult) -> Chapter:
     verdict = result.verdict
     rows = []
     for cause in verdict.causes:
-        scale, unit = (1.0, "times") if cause.name == "noise" else unit_of(cause.name, cause.unit)
+        scale, unit = (
+            (1.0, "times") if cause.name == "noise" else unit_of(cause.name, cause.unit)
+        )
         rows.append(
             (
                 cause.name.replace("_", " "),
@@ -441,9 +482,14 @@ def _causes(result: CalibrationResult) -> Chapter:
             Section(
                 "Verdict",
                 (("verdict", printable(verdict.sentence)),) if verdict.sentence else (),
-                notes=tuple(f"failed: {printable(reason)}" for reason in verdict.reasons),
+                notes=tuple(
+                    f"failed: {printable(reason)}" for reason in verdict.reasons
+                ),
             ),
-            Section("Likely causes, the most likely first", table=(header, *rows) if rows else ()),
+            Section(
+                "Likely causes, the most likely first",
+                table=(header, *rows) if rows else (),
+            ),
             sections.terms_section(result),
             sections.noise_section(result.noise),
         ),
@@ -456,9 +502,13 @@ MAP = "Map"
 
 def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> Chapter:
     """Return the error and its uncertainty, first together, then by component."""
-    caption = "Each vector points from the true position of the stage to the indicated one."
+    caption = (
+        "Each vector points from the true position of the stage to the indicated one."
+    )
     vectors = CaptionedFigure(
-        error_map(result, truth), caption, on_screen="Point at a site to read its numbers."
+        error_map(result, truth),
+        caption,
+        on_screen="Point at a site to read its numbers.",
     )
     figures = [
         vectors,
@@ -468,7 +518,10 @@ def _maps(result: CalibrationResult, truth: Mapping[str, np.ndarray] | None) -> 
                 "How well each node is known: the larger U of x and y. Edges and "
                 "corners are covered by fewer views. Unknown nodes are grey.",
             ),
-            (component_maps(result), "Gx and Gy at one scale, and below them their uncertainties."),
+            (
+                component_maps(result),
+                "Gx and Gy at one scale, and below them their uncertainties.",
+            ),
         ),
     ]
     if result.artifact.angular_count:
@@ -503,7 +556,9 @@ def _plate(result: CalibrationResult) -> Chapter:
             )
         )
     if np.isfinite(plate.error_map.g_theta).any():
-        pairs.append((angular_map(plate, of="plate"), "Error of the angle of every line."))
+        pairs.append(
+            (angular_map(plate, of="plate"), "Error of the angle of every line.")
+        )
     return Chapter("Plate", _figures(*pairs))
 
 
@@ -511,7 +566,9 @@ def _uncertainty(result: CalibrationResult) -> Chapter:
     """Return both kinds of U and their uses."""
     rows, tables = [], []
     for budget in budgets(result):
-        unit, scale = ("µm", UM_PER_M) if budget.unit == "m" else ("arcsec", ARCSEC_PER_RAD)
+        unit, scale = (
+            ("µm", UM_PER_M) if budget.unit == "m" else ("arcsec", ARCSEC_PER_RAD)
+        )
         numbers = [budget.u_rms, budget.u_max, budget.U_rms, budget.U_max]
         rows.append(
             (
@@ -540,7 +597,9 @@ def _uncertainty(result: CalibrationResult) -> Chapter:
         "Uncertainty",
         sections=(
             Section(
-                "Two kinds of U, for 95.45 %", table=(header, *rows), notes=(AT_NODES, ANYWHERE)
+                "Two kinds of U, for 95.45 %",
+                table=(header, *rows),
+                notes=(AT_NODES, ANYWHERE),
             ),
             *tables,
         ),

@@ -14,7 +14,13 @@ from selfcal_ros.errors import InputError, first_line, printable
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import write_bytes, write_text
-from selfcal_ros.reporting.chapters import MAP, CaptionedFigure, Chapter, chapters, heading
+from selfcal_ros.reporting.chapters import (
+    MAP,
+    CaptionedFigure,
+    Chapter,
+    chapters,
+    heading,
+)
 from selfcal_ros.reporting.figures.svg import css, inline_svg, printed_svg
 from selfcal_ros.reporting.summary.numbers import numeric_columns, truth_arrays
 from selfcal_ros.reporting.summary.sections import Section, state_sentence
@@ -53,7 +59,9 @@ def write_report(
     check_name(path)
     printed = is_pdf(path)
     report_chapters = chapters(result, truth_arrays(result.error_map, truth), more)
-    text = report_html(result, report_chapters, heading(result, about or {}), printed=printed)
+    text = report_html(
+        result, report_chapters, heading(result, about or {}), printed=printed
+    )
     if printed:
         write_bytes(path, printed_page(text, path))
     else:
@@ -69,7 +77,9 @@ def check_name(path: str | os.PathLike) -> None:
         If it ends in neither .html nor .pdf, or in .pdf where WeasyPrint is not installed.
     """
     if Path(path).suffix.lower() not in (".html", ".htm", ".pdf"):
-        raise InputError(str(path), "a report is HTML or PDF", "end the name in .html or .pdf")
+        raise InputError(
+            str(path), "a report is HTML or PDF", "end the name in .html or .pdf"
+        )
     if is_pdf(path) and importlib.util.find_spec("weasyprint") is None:
         raise _no_printer(path, "is not installed")
 
@@ -189,7 +199,9 @@ def page(title: str, body: str, *, style: str = "", turns: bool = False) -> str:
     """
     policy = f"{POLICY}; script-src {script_source()}" if turns else POLICY
     last = f"<script>{script()}</script>\n" if turns else ""
-    return _PAGE.format(policy=policy, title=title, css=CSS + style, body=body, script=last)
+    return _PAGE.format(
+        policy=policy, title=title, css=CSS + style, body=body, script=last
+    )
 
 
 WIDE = 40
@@ -225,18 +237,26 @@ def report_html(
         _section(head, titled=False),
         "" if printed else _contents(report_chapters),
         *(
-            _chapter(chapter, printed=printed, more=turning if chapter.title == MAP else "")
+            _chapter(
+                chapter, printed=printed, more=turning if chapter.title == MAP else ""
+            )
             for chapter in report_chapters
         ),
     ]
     return page(
-        _text(f"Stage calibration: plan {result.plan_id}"), "\n".join(blocks), turns=bool(turning)
+        _text(f"Stage calibration: plan {result.plan_id}"),
+        "\n".join(blocks),
+        turns=bool(turning),
     )
 
 
 def _grade(result: CalibrationResult) -> str:
     """Return the grade behind the colour of the banner; none is given without a map."""
-    grade = result.verdict.grade if result.observability.identifiable else Grade.NOT_QUALIFIED
+    grade = (
+        result.verdict.grade
+        if result.observability.identifiable
+        else Grade.NOT_QUALIFIED
+    )
     return str(grade)
 
 
@@ -249,7 +269,9 @@ def _anchor(title: str) -> str:
 
 
 def _contents(report_chapters: Sequence[Chapter]) -> str:
-    links = "".join(f'<a href="#{_anchor(c.title)}">{_text(c.title)}</a>' for c in report_chapters)
+    links = "".join(
+        f'<a href="#{_anchor(c.title)}">{_text(c.title)}</a>' for c in report_chapters
+    )
     return f"<nav>{links}</nav>"
 
 
@@ -274,7 +296,9 @@ def _chapter(chapter: Chapter, *, printed: bool, more: str) -> str:
 
 def _figure(figure: CaptionedFigure, *, printed: bool) -> str:
     drawing = printed_svg(figure.drawing) if printed else inline_svg(figure.drawing)
-    caption = figure.caption if printed else f"{figure.caption} {figure.on_screen}".rstrip()
+    caption = (
+        figure.caption if printed else f"{figure.caption} {figure.on_screen}".rstrip()
+    )
     return f"<figure>{drawing}<figcaption>{_text(caption)}</figcaption></figure>"
 
 
@@ -298,11 +322,22 @@ def _section(section: Section, *, titled: bool) -> str:
 def _table(table: tuple[tuple[str, ...], ...]) -> str:
     """Return a table; columns of numbers are flush right, long text wraps."""
     kinds = []
-    for number, column in zip(numeric_columns(table), zip(*table, strict=True), strict=True):
+    for number, column in zip(
+        numeric_columns(table), zip(*table, strict=True), strict=True
+    ):
         longest = max(map(len, column))
-        kinds.append("n" if number else "w" if longest > WIDE else "s" if longest < SHORT else "t")
+        kinds.append(
+            "n"
+            if number
+            else "w"
+            if longest > WIDE
+            else "s"
+            if longest < SHORT
+            else "t"
+        )
     head = "".join(
-        f'<th class="{kind}">{_text(name)}</th>' for name, kind in zip(table[0], kinds, strict=True)
+        f'<th class="{kind}">{_text(name)}</th>'
+        for name, kind in zip(table[0], kinds, strict=True)
     )
     rows = "".join(f"<tr>{_row(row, table[0], kinds)}</tr>" for row in table[1:])
     return (

@@ -106,8 +106,13 @@ def grouped(items: list[CheckItem], fault: str) -> list[CheckItem]:
     )
     while failed:
         first, *later_faults = failed
-        covered = [item for item in later_faults if item.name in COVERED.get(first.name, ())]
-        ordered += [first, *(replace(item, remedy="", follows=first.name) for item in covered)]
+        covered = [
+            item for item in later_faults if item.name in COVERED.get(first.name, ())
+        ]
+        ordered += [
+            first,
+            *(replace(item, remedy="", follows=first.name) for item in covered),
+        ]
         failed = [item for item in later_faults if item not in covered]
     return ordered
 
@@ -120,13 +125,20 @@ def checked_view(plan: Plan) -> tuple[Artifact, View]:
     plate = (
         replace(plate, marks=listed.innermost(MARKS**2))
         if listed
-        else Artifact(nx, plate.grid_pitch_m, plate.angular_count, 0 if nx == ny else ny)
+        else Artifact(
+            nx, plate.grid_pitch_m, plate.angular_count, 0 if nx == ny else ny
+        )
     )
     marks = next((view for view in plan.views if view.check_marks), View(""))
     offset = marks.check_offset_m or min(OFFSET_M, plate.grid_pitch_m / 4)
     angular = plate.angular_count > 0 and any(view.angular for view in plan.views)
     return plate, View(
-        "check", grid=True, angular=angular, repeats=REPEATS, check_marks=5, check_offset_m=offset
+        "check",
+        grid=True,
+        angular=angular,
+        repeats=REPEATS,
+        check_marks=5,
+        check_offset_m=offset,
     )
 
 
@@ -161,11 +173,17 @@ class CellCheck:
         self._settle_s, self._patience_s = settle_s, patience_s
         self._collector = Collector(settings)
         self._samples: list[tuple[int, int]] = []  # stamp, and age at its reception, ns
-        self._seen: list[tuple[float, int, bool]] = []  # received, s; age, ns; whether with an id
+        self._seen: list[
+            tuple[float, int, bool]
+        ] = []  # received, s; age, ns; whether with an id
         self._joints: set[str] = set()
         self._errors: dict[str, str] = {}  # of nodes of the cell, by their names
-        self._foreign: dict[str, str] = {}  # ERRORs on /diagnostics, by the names of their statuses
-        self._has_unread = False  # whether there were more of them at a time than are kept
+        self._foreign: dict[
+            str, str
+        ] = {}  # ERRORs on /diagnostics, by the names of their statuses
+        self._has_unread = (
+            False  # whether there were more of them at a time than are kept
+        )
         self._command = Command(0, Phase.ABORT, PLAN_ID)
         self._pause_s = WATCH_S  # after which a detection in transit has arrived
         self._script = self._run_and_diagnosed()
@@ -199,7 +217,11 @@ class CellCheck:
         """Take a detection."""
         detection = to_model.detection(message)
         self._seen.append(
-            (self._ports.now_s(), self._ports.now_ns() - detection.stamp_ns, detection.has_id)
+            (
+                self._ports.now_s(),
+                self._ports.now_ns() - detection.stamp_ns,
+                detection.has_id,
+            )
         )
         self._collector.add_detection(detection)
         self._events.append(detection)
@@ -285,7 +307,11 @@ class CellCheck:
                 "revisits",
                 revisited,
                 "a mark named as missing was "
-                + ("seen again" if revisited else f"not measured again within {REVISIT_S:g} s"),
+                + (
+                    "seen again"
+                    if revisited
+                    else f"not measured again within {REVISIT_S:g} s"
+                ),
                 "read missing_m, missing_n, missing_k of selfcal/view_status and visit these "
                 "marks until the next command; if it cannot, set min_repeats",
             )
@@ -293,9 +319,15 @@ class CellCheck:
 
     def _aborted(self) -> Steps[Command | None]:
         """Begin a view and abort it; return its MEASURE, None without detections."""
-        command = yield from self._place_and_measure(replace(self.view, repeats=ENDLESS))
+        command = yield from self._place_and_measure(
+            replace(self.view, repeats=ENDLESS)
+        )
         first = len(self._seen)
-        if not (yield from self._until(lambda: len(self._seen) >= first + 3, self._patience_s)):
+        if not (
+            yield from self._until(
+                lambda: len(self._seen) >= first + 3, self._patience_s
+            )
+        ):
             figure = f"{len(self._seen) - first} detections in {self._patience_s:g} s after MEASURE"
             remedy = (
                 "subscribe selfcal/view_command reliable and transient local, act on "
@@ -400,13 +432,22 @@ class CellCheck:
         begins = phase is Phase.PLACE or not self._command.run_id
         run_id = str(stamp) if begins else self._command.run_id
         self._command = Command(
-            stamp, phase, PLAN_ID, 0, view, None if view is None else self.plate, 1, run_id
+            stamp,
+            phase,
+            PLAN_ID,
+            0,
+            view,
+            None if view is None else self.plate,
+            1,
+            run_id,
         )
         self._publish(self._command)
         return self._command
 
     def _publish(self, command: Command) -> None:
-        self._ports.publish("command", from_model.command(command, self._settings.frame_id))
+        self._ports.publish(
+            "command", from_model.command(command, self._settings.frame_id)
+        )
 
     def _status(self, progress: ViewProgress, changes: dict[str, Any]) -> None:
         fields = from_model.view_status(
@@ -433,7 +474,11 @@ class CellCheck:
     def _longest_pause_s(self) -> float:
         """Return the time in which a detection in transit arrives: twice the longest interval."""
         received = [received_s for received_s, _, _ in self._seen]
-        return max(WATCH_S, 2 * float(np.diff(received).max())) if len(received) > 1 else WATCH_S
+        return (
+            max(WATCH_S, 2 * float(np.diff(received).max()))
+            if len(received) > 1
+            else WATCH_S
+        )
 
     def _collected(self) -> tuple[Measurements, ViewProgress]:
         measurements, progress = self._collector.collect()
@@ -444,7 +489,9 @@ class CellCheck:
 
     def _judge_publishers(self) -> bool:
         """Tell whether one node publishes each of the cell's topics; return whether it is so."""
-        several = {topic: nodes for topic, nodes in self.publishers.items() if len(nodes) > 1}
+        several = {
+            topic: nodes for topic, nodes in self.publishers.items() if len(nodes) > 1
+        }
         self._tell(
             "publishers",
             not several,
@@ -472,7 +519,9 @@ class CellCheck:
         steps = np.diff(np.sort(stamps)) * S_PER_NS
         gap = float(steps.max()) if len(steps) else float("inf")
         rate = len(steps) / float(steps.sum()) if steps.sum() > 0 else 0.0
-        jitter = float(np.ptp(np.quantile(steps, [0.025, 0.975]))) / 2 if len(steps) else 0.0
+        jitter = (
+            float(np.ptp(np.quantile(steps, [0.025, 0.975]))) / 2 if len(steps) else 0.0
+        )
         self._tell(
             "encoder rate",
             gap <= settings.max_encoder_gap and rate >= settings.encoder_rate_min,
@@ -492,12 +541,16 @@ class CellCheck:
         )
         return not missing
 
-    def _judge_readings(self, measurements: Measurements, progress: ViewProgress) -> None:
+    def _judge_readings(
+        self, measurements: Measurements, progress: ViewProgress
+    ) -> None:
         rejected = measurements.all_rejected()
         total = len(self._seen)
         first = len(self.items)
         ages = [age for _, age, _ in self._seen] or [0]
-        age, earliest = (float(value) * S_PER_NS for value in (np.median(ages), min(ages)))
+        age, earliest = (
+            float(value) * S_PER_NS for value in (np.median(ages), min(ages))
+        )
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
         # whether the stage stood at the marks at these stamps
         good = progress.readings.used > (total - outside) / 2
@@ -516,14 +569,17 @@ class CellCheck:
             f"{moving} of {total} exposures while the stage moved, or without samples around them",
             REMEDY[Reason.MOVING],
         )
+        # offsets in any unit contradict each other less
         bad = sum(
             count
             for reason, count in rejected.items()
             if reason in REMEDY and reason != Reason.OUTLIER
-        )  # offsets in any unit contradict each other less
+        )
         fault = explaining(self._command, self._events, self._settings) if bad else None
         named = sum(has_id for *_, has_id in self._seen)
-        mistaken = {reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)}
+        mistaken = {
+            reason: rejected[reason] for reason in MISTAKEN if rejected.get(reason)
+        }
         figure = f"{named} of {len(self._seen)} detections name their mark"
         figure += "" if named else ": marks are identified by their positions"
         figure += "".join(f", {count} {reason}" for reason, count in mistaken.items())
@@ -536,11 +592,17 @@ class CellCheck:
         follows, signs_told = self._judge_wiring(measurements, progress.check_done)
         if follows and self.view.angular and not mistaken and fault is None:
             self._judge_theta(measurements)
-        self.items[first:] = grouped(self.items[first:], "ids" if fault else "signs" * signs_told)
+        self.items[first:] = grouped(
+            self.items[first:], "ids" if fault else "signs" * signs_told
+        )
 
-    def _judge_loss(self, progress: ViewProgress, rejected: Mapping[str, int], total: int) -> None:
+    def _judge_loss(
+        self, progress: ViewProgress, rejected: Mapping[str, int], total: int
+    ) -> None:
         not_mistaken = {
-            reason: count for reason, count in rejected.items() if reason not in MISTAKEN
+            reason: count
+            for reason, count in rejected.items()
+            if reason not in MISTAKEN
         }
         grid, angular = expected_marks(self.plate, self.view)
         self._tell(
@@ -575,9 +637,12 @@ class CellCheck:
         by_lines = float(view.dtheta.mean()) if len(view.dtheta) else 0.0
         turned = abs(by_marks) > LEAST_TURN_RAD
         same, reversed_ = (
-            turned and abs(by_lines - sign * by_marks) < CLEARLY * abs(by_marks) for sign in (1, -1)
+            turned and abs(by_lines - sign * by_marks) < CLEARLY * abs(by_marks)
+            for sign in (1, -1)
         )
-        scatters = view.motion_theta is not None and view.motion_theta.products[1, 1] > 0
+        scatters = (
+            view.motion_theta is not None and view.motion_theta.products[1, 1] > 0
+        )
         sign_is_shown = scatters and sign_of_lines_is_shown(measurements)
         figure = (
             f"turn of the plate by the marks {by_marks * MRAD_PER_RAD:+.3f} mrad, by the "
@@ -595,10 +660,16 @@ class CellCheck:
                 "lay the plate straight, set theta to 0 where line 0 is read, turn the plate "
                 f"by 1 mrad and check again; or turn it by {enough:.2g} mrad"
             )
-            figure += "" if same or sign_is_shown else ": neither the same nor the opposite turn"
+            figure += (
+                ""
+                if same or sign_is_shown
+                else ": neither the same nor the opposite turn"
+            )
         self._tell("theta", same or (sign_is_shown and not reversed_), figure, remedy)
 
-    def _judge_wiring(self, measurements: Measurements, stops: int) -> tuple[bool, bool]:
+    def _judge_wiring(
+        self, measurements: Measurements, stops: int
+    ) -> tuple[bool, bool]:
         """Tell whether the offsets follow the stage; the angle only with check stops.
 
         Returns
@@ -614,7 +685,9 @@ class CellCheck:
             "theta": _slope(view.motion_theta, 0),
         }
         figure = ", ".join(
-            f"{axis} {slope:+.3f}" for axis, slope in slopes.items() if slope is not None
+            f"{axis} {slope:+.3f}"
+            for axis, slope in slopes.items()
+            if slope is not None
         )
         offsets_follow = slopes["x"] is not None and slopes["y"] is not None
         what = "; ".join(error.what for error in faults)
@@ -631,7 +704,9 @@ class CellCheck:
                 "publish offsets along the stage's axes: turn the camera back by this angle, "
                 "or state it (detector: turn)"
             )
-        factor = max((abs(slopes[axis] or 1.0) for axis in "xy"), key=lambda size: abs(size - 1))
+        factor = max(
+            (abs(slopes[axis] or 1.0) for axis in "xy"), key=lambda size: abs(size - 1)
+        )
         if (
             offsets_follow
             and stops
@@ -694,7 +769,11 @@ def _turned_deg(motion: RepeatMotion | None) -> float | None:
         return None
     place, cross, offset = (
         motion.products[block]
-        for block in ((slice(2), slice(2)), (slice(2, 4), slice(2)), (slice(2, 4), slice(2, 4)))
+        for block in (
+            (slice(2), slice(2)),
+            (slice(2, 4), slice(2)),
+            (slice(2, 4), slice(2, 4)),
+        )
     )
     if not np.linalg.det(place) > 0:
         return None
@@ -703,5 +782,7 @@ def _turned_deg(motion: RepeatMotion | None) -> float | None:
     if np.linalg.det(response) <= 0 or explained < FOLLOWS * np.trace(offset):
         return None
     return float(
-        np.degrees(np.arctan2(response[1, 0] - response[0, 1], response[0, 0] + response[1, 1]))
+        np.degrees(
+            np.arctan2(response[1, 0] - response[0, 1], response[0, 0] + response[1, 1])
+        )
     )

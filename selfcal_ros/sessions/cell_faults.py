@@ -86,10 +86,18 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int]:
     collector.add_command(fault.command)
     samples = [event for event in fault.events if isinstance(event, EncoderSample)]
     for (names, _, _), alike in groupby(
-        samples, key=lambda sample: (sample.names, len(sample.positions), len(sample.velocities))
+        samples,
+        key=lambda sample: (
+            sample.names,
+            len(sample.positions),
+            len(sample.velocities),
+        ),
     ):
         stamps, positions, velocities = zip(
-            *((sample.stamp_ns, sample.positions, sample.velocities) for sample in alike),
+            *(
+                (sample.stamp_ns, sample.positions, sample.velocities)
+                for sample in alike
+            ),
             strict=True,
         )
         collector.add_encoder_block(
@@ -129,9 +137,15 @@ def _standing(
             "move the stage to each mark, and name the joints that move in joint_x and joint_y",
             command,
         )
-    lines = {event.k for event in events if isinstance(event, Detection) and _is_line(event)}
+    lines = {
+        event.k for event in events if isinstance(event, Detection) and _is_line(event)
+    }
     _, turns = _turns(samples, settings)
-    if len(lines) > 1 and len(turns) and np.ptp(turns) <= STILL * 2 * pi / plate.angular_count:
+    if (
+        len(lines) > 1
+        and len(turns)
+        and np.ptp(turns) <= STILL * 2 * pi / plate.angular_count
+    ):
         return Fault(
             f"theta does not move: it is indicated at {np.median(turns):.6g} rad during "
             "the whole view",
@@ -141,7 +155,9 @@ def _standing(
     return None
 
 
-def _place(sample: EncoderSample, settings: CollectorSettings) -> tuple[float, float] | None:
+def _place(
+    sample: EncoderSample, settings: CollectorSettings
+) -> tuple[float, float] | None:
     """Return the indicated x and y of a sample that has both."""
     where = dict(zip(sample.names, sample.positions, strict=False))
     if settings.joint_x not in where or settings.joint_y not in where:
@@ -171,7 +187,9 @@ def _faults(
             "publish offset_x and offset_y in m",
             [
                 replace(
-                    reading, offset_x=reading.offset_x / scale, offset_y=reading.offset_y / scale
+                    reading,
+                    offset_x=reading.offset_x / scale,
+                    offset_y=reading.offset_y / scale,
                 )
                 for reading in readings
             ],
@@ -195,7 +213,11 @@ def _faults(
             ],
         )
     turns = list(product((1.0,), (False, True), ((1, 1), (-1, -1), (-1, 1), (1, -1))))
-    for scale, swapped, signs in (*turns[1:], (1e3, False, (1, 1)), (1e6, False, (1, 1))):
+    for scale, swapped, signs in (
+        *turns[1:],
+        (1e3, False, (1, 1)),
+        (1e6, False, (1, 1)),
+    ):
         what, _, remedy = fault_text(
             scale, swapped=swapped, signs=signs, sense=Sense(settings.measurement_sense)
         ).partition("; ")
@@ -205,7 +227,9 @@ def _faults(
             command,
             (
                 *(
-                    _sample_at(sample, settings, scale=scale, swapped=swapped, signs=signs)
+                    _sample_at(
+                        sample, settings, scale=scale, swapped=swapped, signs=signs
+                    )
                     for sample in samples
                 ),
                 *readings,
@@ -219,7 +243,10 @@ def _faults(
             what,
             remedy,
             command,
-            (*(_turned(sample, settings, factor=factor) for sample in samples), *readings),
+            (
+                *(_turned(sample, settings, factor=factor) for sample in samples),
+                *readings,
+            ),
         )
     yield from _placings(command, events)
 
@@ -240,7 +267,10 @@ def _counts(
         ((1, -1), "n is counted against plate y"),
         ((-1, -1), "m and n are counted against plate x and y"),
     ):
-        even = [sign < 0 and size % 2 == 0 for sign, size in zip(signs, plate.shape, strict=True)]
+        even = [
+            sign < 0 and size % 2 == 0
+            for sign, size in zip(signs, plate.shape, strict=True)
+        ]
         yield fault(
             what,
             "m counts the marks along plate x, n along plate y",
@@ -259,14 +289,20 @@ def _counts(
     yield fault(
         "the lines are counted clockwise",
         "count k counter-clockwise",
-        [replace(detection, k=-detection.k % plate.angular_count) for detection in detections],
+        [
+            replace(detection, k=-detection.k % plate.angular_count)
+            for detection in detections
+        ],
     )
     zero = _other_zero(view.rotation_rad, plate.angular_count, samples, lines, settings)
     yield Fault(
         f"theta is indicated {degrees(zero):+.4g}° from where the lines are",
         "count k from the line along plate x, and set theta to 0 where that line is read",
         command,
-        (*(_turned(sample, settings, zero_rad=zero) for sample in samples), *detections),
+        (
+            *(_turned(sample, settings, zero_rad=zero) for sample in samples),
+            *detections,
+        ),
     )
 
 
@@ -284,7 +320,11 @@ def _other_zero(
     theta_rad = np.interp([line.stamp_ns for line in lines], stamps, turns)
     sites = rotation_rad + 2 * pi * np.array([line.k for line in lines]) / count
     return float(
-        np.angle(np.exp(1j * (theta_rad - Sense(settings.measurement_sense).sign * sites)).mean())
+        np.angle(
+            np.exp(
+                1j * (theta_rad - Sense(settings.measurement_sense).sign * sites)
+            ).mean()
+        )
     )
 
 
@@ -373,7 +413,9 @@ def _placings(command: Command, events: Sequence[Event]) -> Iterator[Fault]:
             remedy,
             replace(
                 command,
-                view=replace(view, translation_m=(a * plate.grid_pitch_m, b * plate.grid_pitch_m)),
+                view=replace(
+                    view, translation_m=(a * plate.grid_pitch_m, b * plate.grid_pitch_m)
+                ),
             ),
             tuple(events),
         )

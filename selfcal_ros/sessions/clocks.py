@@ -48,7 +48,9 @@ class ClockWatch:
         self._watches: dict[str, StepWatch] = {}
         self.steps: dict[str, list[ClockStep]] = {}
 
-    def command(self, stamp_ns: int, now_ns: int, *, is_older: bool, run_id: str = "") -> None:
+    def command(
+        self, stamp_ns: int, now_ns: int, *, is_older: bool, run_id: str = ""
+    ) -> None:
         """Determine from a command whether the session is live; a latched one is ignored.
 
         A live run remains live: after a clock step its stamps look like recorded
@@ -67,7 +69,11 @@ class ClockWatch:
         self.steps = {topic: list(mine) for topic, mine in steps.items()}
 
     def data(
-        self, topic: str, stamps_ns: np.ndarray, now_ns: np.ndarray, steady_ns: np.ndarray
+        self,
+        topic: str,
+        stamps_ns: np.ndarray,
+        now_ns: np.ndarray,
+        steady_ns: np.ndarray,
     ) -> None:
         """Take the stamps and the reception, by both clocks, of messages of the cell; n > 0."""
         if self._live:
@@ -88,7 +94,11 @@ class ClockWatch:
     @property
     def offset_ns(self) -> int | None:
         """Lead of the cell's clock, ns; None without live messages."""
-        return max(offset for _, offset in self._bins) if self._live and self._bins else None
+        return (
+            max(offset for _, offset in self._bins)
+            if self._live and self._bins
+            else None
+        )
 
     @property
     def ahead(self) -> bool:
@@ -151,7 +161,10 @@ class RosTime:
         if state == "not heard":
             return Level.WARN, self.NOTHING
         if state == "moves":
-            return Level.OK, "stamps follow /clock (use_sim_time); work and health do not"
+            return (
+                Level.OK,
+                "stamps follow /clock (use_sim_time); work and health do not",
+            )
         return Level.OK, (
             f"/clock has stopped at {self._last_ns * S_PER_NS:.3f} s; work and "
             "health continue, stamps do not"

@@ -20,9 +20,21 @@ from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.messages.to_model import EncoderBlock
-from selfcal_ros.model.readings import Measurements, placing_digest, session_digest, view_digest
+from selfcal_ros.model.readings import (
+    Measurements,
+    placing_digest,
+    session_digest,
+    view_digest,
+)
 from selfcal_ros.sessions.clocks import ClockWatch, RunWatch
-from selfcal_ros.sessions.health import CellChecks, Diagnosis, Level, Ports, Rate, merged
+from selfcal_ros.sessions.health import (
+    CellChecks,
+    Diagnosis,
+    Level,
+    Ports,
+    Rate,
+    merged,
+)
 from selfcal_ros.sessions.progress import progress_line
 from selfcal_ros.sessions.rejections import RejectionWatch
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
@@ -57,9 +69,12 @@ class CollectingSession:
         self._moved = (-1, 0, 0.0)  # the open view, its readings needed, and since when
         self._named = False  # as stuck, since then
         self._line, self._told_line, self._told_s = "", "", float("-inf")
-        self._unseen: list[np.ndarray] = []  # its detections since the last status, by their stamps
+        self._unseen: list[
+            np.ndarray
+        ] = []  # its detections since the last status, by their stamps
         self._since_ns = 0  # its beginning
-        self._costs: deque[tuple[float, float]] = deque(maxlen=1000)  # time, and CPU time
+        # time, and CPU time
+        self._costs: deque[tuple[float, float]] = deque(maxlen=1000)
         self._published: dict[int, str] = {}
         self._run = ("", "")
         self._rejections = RejectionWatch(ports.say, ports.now_s)
@@ -71,7 +86,9 @@ class CollectingSession:
         self._encoder_rate = Rate(ports.now_s)
         self._encoder_s = float("-inf")
         self._noise: tuple[float, float] = (math.nan, math.nan)
-        self.missed: dict[tuple[str, int], str] = {}  # views that began before this node
+        self.missed: dict[
+            tuple[str, int], str
+        ] = {}  # views that began before this node
         self._placed: set[tuple[str, int]] = set()
         self._gap, self._gap_stamp_ns = "", 0  # reported until the next command
         self._problem = ""
@@ -87,7 +104,9 @@ class CollectingSession:
         """Take encoder samples, received `age_ns` ago: each of them, or the newest."""
         if not len(block):
             return
-        self._encoder_s = self._ports.now_s() - int(np.atleast_1d(age_ns)[-1]) * S_PER_NS
+        self._encoder_s = (
+            self._ports.now_s() - int(np.atleast_1d(age_ns)[-1]) * S_PER_NS
+        )
         self.collector.add_encoder_block(
             block.stamps_ns, block.names, block.positions, block.velocities
         )
@@ -107,7 +126,8 @@ class CollectingSession:
     def _note_clock(self, topic: str, stamps_ns: np.ndarray, age_ns: Age) -> None:
         """Compare stamps with their reception."""
         ages = np.atleast_1d(age_ns)
-        if len(ages) != len(stamps_ns):  # for another number of messages: that of the newest
+        # for another number of messages: that of the newest
+        if len(ages) != len(stamps_ns):
             ages = ages[-1:]
             stamps_ns = stamps_ns.max(keepdims=True)
         self._clock.data(
@@ -153,7 +173,9 @@ class CollectingSession:
                 "the cell or with redo_view"
             )
         messages = sum(collector.received.values())
-        self._ports.say(Level.OK, f"resumed {journal} with {messages} messages, {where}")
+        self._ports.say(
+            Level.OK, f"resumed {journal} with {messages} messages, {where}"
+        )
 
     def take_command(self, message: Any, is_older: bool) -> None:
         """Take a selfcal_msgs/ViewCommand; `is_older`: published before this node listened."""
@@ -162,7 +184,10 @@ class CollectingSession:
             repeated = self.collector.knows(command)
             self.collector.add_command(command)
             self._clock.command(
-                command.stamp_ns, self._ports.now_ns(), is_older=is_older, run_id=command.run_id
+                command.stamp_ns,
+                self._ports.now_ns(),
+                is_older=is_older,
+                run_id=command.run_id,
             )
             if not repeated:
                 self._runs.command(command, self.collector.newest_command, self.now_ns)
@@ -226,7 +251,9 @@ class CollectingSession:
         command = self.collector.newest_command
         if command is None:
             return
-        view = progress.get(command.view_index) if command.phase == Phase.MEASURE else None
+        view = (
+            progress.get(command.view_index) if command.phase == Phase.MEASURE else None
+        )
         state = (command.view_index, 0 if view is None else view.needed)
         if state != self._moved[:2]:
             self._moved, self._named = (*state, now_s), False
@@ -266,7 +293,11 @@ class CollectingSession:
         return session_digest(self._published)
 
     def _publish(
-        self, measurements: Measurements, progress: dict[int, ViewProgress], *, final: bool
+        self,
+        measurements: Measurements,
+        progress: dict[int, ViewProgress],
+        *,
+        final: bool,
     ) -> None:
         timeline, frame_id = self.collector.timeline, self.settings.frame_id
         stuck = self._is_stuck(self._ports.now_s())
@@ -335,7 +366,11 @@ class CollectingSession:
         lines = [
             *step_lines(self._clock.steps, self.collector.timeline),
             *future_lines(
-                [topic for topic, (_, reason) in FROM_THE_FUTURE.items() if refused.get(reason)]
+                [
+                    topic
+                    for topic, (_, reason) in FROM_THE_FUTURE.items()
+                    if refused.get(reason)
+                ]
             ),
         ]
         for line in lines:
@@ -353,7 +388,9 @@ class CollectingSession:
                 self._ports.say(Level.WARN, line)
         self._run_lines = lines
 
-    def _describe(self, measurements: Measurements, progress: dict[int, ViewProgress]) -> None:
+    def _describe(
+        self, measurements: Measurements, progress: dict[int, ViewProgress]
+    ) -> None:
         """Keep progress and rejections of the view for the diagnostics."""
         self._rejected = Counter(measurements.rejected)
         for view in progress.values():
@@ -388,14 +425,20 @@ class CollectingSession:
         detections_matched : bool
             Whether a publisher of detections has been found.
         """
-        received = {f"{kind}_received": n for kind, n in self.collector.received.items()}
+        received = {
+            f"{kind}_received": n for kind, n in self.collector.received.items()
+        }
         missed = ", ".join(self.missed.values())
         state = self._problem or self._state
         state += f"; began before this node: {missed}" if missed else ""
         stored = self.collector.storage_problem
         state += f"; {stored}" if stored else ""
         last = self.collector.newest_command
-        gap = self._gap if last is not None and last.stamp_ns == self._gap_stamp_ns else ""
+        gap = (
+            self._gap
+            if last is not None and last.stamp_ns == self._gap_stamp_ns
+            else ""
+        )
         state += f"; {gap}" if gap else ""
         bad = missed or self._problem or self.collector.unusable or stored or gap
         main = Diagnosis(
@@ -407,15 +450,21 @@ class CollectingSession:
                 **self._newest(),
                 **self._cost(),
                 "detections_matched": "yes" if detections_matched else "no",
-                **{f"rejected {reason}": n for reason, n in sorted(self._rejected.items())},
+                **{
+                    f"rejected {reason}": n
+                    for reason, n in sorted(self._rejected.items())
+                },
             },
         )
         lines = self._rejections.findings or advice(self._rejected)
         diagnosis = Diagnosis(Level.WARN if lines else Level.OK, "; ".join(lines))
         runs = Diagnosis(
-            Level.WARN if self._run_lines else Level.OK, "; ".join(self._run_lines.values())
+            Level.WARN if self._run_lines else Level.OK,
+            "; ".join(self._run_lines.values()),
         )
-        stepped = Diagnosis(Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped))
+        stepped = Diagnosis(
+            Level.WARN if self._stepped else Level.OK, "; ".join(self._stepped)
+        )
         return merged(
             main,
             [
@@ -450,7 +499,9 @@ class CollectingSession:
             "view": command.view_index,
             "view_name": command.view.name if command.view else "",
             "command_stamp": command.stamp_ns,
-            "placing": placing_digest(command.plate(), command.view) if command.view else "",
+            "placing": placing_digest(command.plate(), command.view)
+            if command.view
+            else "",
         }
 
     def _encoder(self) -> Diagnosis:
@@ -477,13 +528,17 @@ class CollectingSession:
                 f"a gap of {gap:.3g} s between encoder samples: exposures in it are rejected"
             )
         elif measuring and rate < least:
-            problems.append(f"{rate:.0f} encoder samples per second, {least:g} are wanted")
+            problems.append(
+                f"{rate:.0f} encoder samples per second, {least:g} are wanted"
+            )
         elif measuring and 0 < limit < jitter:
             problems.append(
                 f"the intervals between encoder samples vary by {jitter:.3g} s, the "
                 f"limit is {limit:g} s"
             )
-        return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)
+        return Diagnosis(
+            Level.WARN if problems else Level.OK, "; ".join(problems), values
+        )
 
     def _repeatability(self) -> Diagnosis:
         """Return the repeatability of the newest view, WARN beyond the limits."""
@@ -512,4 +567,6 @@ class CollectingSession:
                     f"{name.replace('_', ' ')} is {value * scale:.3g} {unit}, the "
                     f"limit {limit * scale:.3g} {unit}"
                 )
-        return Diagnosis(Level.WARN if problems else Level.OK, "; ".join(problems), values)
+        return Diagnosis(
+            Level.WARN if problems else Level.OK, "; ".join(problems), values
+        )

@@ -67,8 +67,12 @@ class CompensatingSession:
         self._editor = PositionEditor()
         self._ages_s: list[float] = []  # of samples corrected since the last diagnosis
         self._skipped = self._commands_refused = self._outside = 0  # since then
-        self._strange: tuple[str, ...] = ()  # joints of the last sample without one of the stage
-        self._other_frame = ""  # of the last command that names another than the stage's
+        self._strange: tuple[
+            str, ...
+        ] = ()  # joints of the last sample without one of the stage
+        self._other_frame = (
+            ""  # of the last command that names another than the stage's
+        )
         self._map: Any = None  # newest message of each, until evaluated together
         self._summary: Any = None
         self._waits = self._contradicted = ""
@@ -86,10 +90,17 @@ class CompensatingSession:
             )
         if self._settings.require_qualified and not is_qualified(result):
             raise InputError(
-                path, "the map is not qualified", "measure again, or set require_qualified to false"
+                path,
+                "the map is not qualified",
+                "measure again, or set require_qualified to false",
             )
         read_from = Path(result.read_from[0] if result.read_from else path).resolve()
-        self._use(result.error_map, f"{read_from}, plan {result.plan_id}", 0, result.interpolation)
+        self._use(
+            result.error_map,
+            f"{read_from}, plan {result.plan_id}",
+            0,
+            result.interpolation,
+        )
 
     def take_map(self, message: Any) -> None:
         """Take a selfcal_msgs/ErrorMap: use it, now or once its summary confirms it."""
@@ -109,7 +120,8 @@ class CompensatingSession:
         waits = contradicted or doubt
         if waits != self._waits and waits:
             self._ports.say(
-                Level.WARN if contradicted else Level.OK, f"the newest map is not used: {waits}"
+                Level.WARN if contradicted else Level.OK,
+                f"the newest map is not used: {waits}",
             )
         self._waits = waits
         if not waits:
@@ -120,7 +132,9 @@ class CompensatingSession:
                 error_map = to_model.error_map(message)
                 _refuse_other_axes(error_map, _source(message))
                 require_plausible(
-                    error_map, f"the map of {_source(message)}", "load its file with ~/load_map"
+                    error_map,
+                    f"the map of {_source(message)}",
+                    "load its file with ~/load_map",
                 )
                 self._use(
                     error_map,
@@ -157,7 +171,8 @@ class CompensatingSession:
             return f"{_source(message)} is not qualified: {summary.state}"
         if summary.views_done < summary.views_planned:
             return (
-                f"{_source(message)} contains {summary.views_done} of {summary.views_planned} views"
+                f"{_source(message)} contains {summary.views_done} of "
+                f"{summary.views_planned} views"
             )
         return ""
 
@@ -194,12 +209,16 @@ class CompensatingSession:
                 )
         return ""
 
-    def _use(self, error_map: ErrorMap, source: str, stamp_ns: int, interpolation: str) -> None:
+    def _use(
+        self, error_map: ErrorMap, source: str, stamp_ns: int, interpolation: str
+    ) -> None:
         """Use a map with the interpolation stated with it, or that of the parameter.
 
         With unknown nodes there is no spline: such a map is interpolated bilinearly.
         """
-        self._refuse_large(error_map, [error_map.gx, error_map.gy], error_map.g_theta, source)
+        self._refuse_large(
+            error_map, [error_map.gx, error_map.gy], error_map.g_theta, source
+        )
         method = self._settings.interpolation
         fitted = None
         if interpolation and interpolation not in get_args(Interpolation):
@@ -211,7 +230,9 @@ class CompensatingSession:
         if interpolation:
             fitted = cast(Interpolation, interpolation)
             method = fitted if error_map.valid.all() else "bilinear"
-        use = Compensator(error_map, method=method, fitted=fitted, outside=self._settings.outside)
+        use = Compensator(
+            error_map, method=method, fitted=fitted, outside=self._settings.outside
+        )
         self._refuse_large(error_map, *use.between(), source)
         if stamp_ns < self._map_ns:
             self._ports.say(
@@ -236,7 +257,9 @@ class CompensatingSession:
         """
         artifact = error_map.artifact
         limit_m = self._settings.max_correction
-        radius_m = max(math.hypot(*artifact.half) * artifact.grid_pitch_m, LEAST_RADIUS_M)
+        radius_m = max(
+            math.hypot(*artifact.half) * artifact.grid_pitch_m, LEAST_RADIUS_M
+        )
         largest_m = max(
             np.abs(part[~np.isnan(part)]).max(initial=0.0)
             for part in (*errors, errors_theta * radius_m)
@@ -278,7 +301,9 @@ class CompensatingSession:
                 publish(self._editor.replaced(data, corrected))
                 self._ages_s.append((self._ports.wall_ns() - received_ns) * S_PER_NS)
 
-    def correct(self, names: Sequence[str], positions: Sequence[float]) -> list[float] | None:
+    def correct(
+        self, names: Sequence[str], positions: Sequence[float]
+    ) -> list[float] | None:
         """Return the positions of all joints, stage joints corrected; None if unknown.
 
         Parameters
@@ -292,7 +317,9 @@ class CompensatingSession:
             self.counts["without_map"] += 1
             return None
         use = self.compensator
-        corrected = self._corrected(names, positions, (use.correct_point, use.correct_angle))
+        corrected = self._corrected(
+            names, positions, (use.correct_point, use.correct_angle)
+        )
         if corrected is None:
             self.counts["refused"] += 1
             return None
@@ -340,21 +367,28 @@ class CompensatingSession:
         place = {name: index for index, name in enumerate(names)}
         if not len(positions) == len(names) == len(place):
             return None
-        joints = (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
+        joints = (
+            self._settings.joint_x,
+            self._settings.joint_y,
+            self._settings.joint_theta,
+        )
         x, y, theta = map(place.get, joints)
         stage = [index for index in (x, y, theta) if index is not None]
         if not stage:
             self._strange = tuple(names)
         if not stage or (x is None) != (y is None):
             return None
+        # nor NaN
         if self.compensator is None or not all(
             abs(positions[index]) <= FARTHEST for index in stage
-        ):  # nor NaN
+        ):
             return None
         corrected = list(positions)
         try:
             if x is not None and y is not None:
-                corrected[x], corrected[y] = map(float, corrections[0](positions[x], positions[y]))
+                corrected[x], corrected[y] = map(
+                    float, corrections[0](positions[x], positions[y])
+                )
                 if not self.compensator.is_inside(positions[x], positions[y]):
                     self.counts["outside"] += 1
                     self._outside += 1
@@ -362,10 +396,19 @@ class CompensatingSession:
                 corrected[theta] = float(corrections[1](positions[theta]))
         except InputError:
             return None
-        return corrected if all(math.isfinite(corrected[index]) for index in stage) else None
+        return (
+            corrected
+            if all(math.isfinite(corrected[index]) for index in stage)
+            else None
+        )
 
     def answer(
-        self, x: Sequence[float], y: Sequence[float], theta: Sequence[float], *, inverse: bool
+        self,
+        x: Sequence[float],
+        y: Sequence[float],
+        theta: Sequence[float],
+        *,
+        inverse: bool,
     ) -> dict[str, np.ndarray]:
         """Return the fields of the answer to a selfcal_msgs/Correct request.
 
@@ -383,7 +426,10 @@ class CompensatingSession:
                 "calibrate, or name one with the parameter map",
             )
         points = [np.asarray(axis, dtype=float) for axis in (x, y, theta)]
-        if len(points[0]) != len(points[1]) or len(points[2]) not in (0, len(points[0])):
+        if len(points[0]) != len(points[1]) or len(points[2]) not in (
+            0,
+            len(points[0]),
+        ):
             raise InputError(
                 "request",
                 f"{len(x)} x, {len(y)} y and {len(theta)} theta",
@@ -392,9 +438,14 @@ class CompensatingSession:
         if not all((np.abs(axis) <= FARTHEST).all() for axis in points):
             raise InputError("request", "a position is not a number", "give m and rad")
         corrected = [*(use.correct if inverse else use.command)(*points[:2]), points[2]]
-        u = [*(use.uncertainty_indicated if inverse else use.uncertainty)(*points[:2]), points[2]]
+        u = [
+            *(use.uncertainty_indicated if inverse else use.uncertainty)(*points[:2]),
+            points[2],
+        ]
         if len(theta):
-            corrected[2] = (use.correct_theta if inverse else use.command_theta)(points[2])
+            corrected[2] = (use.correct_theta if inverse else use.command_theta)(
+                points[2]
+            )
             u[2] = use.uncertainty_theta(corrected[2] if inverse else points[2])
         if not all(np.isfinite(axis).all() for axis in corrected):
             raise InputError(
@@ -403,7 +454,11 @@ class CompensatingSession:
                 "leave it out, or measure the site",
             )
         return dict(
-            zip(("x", "y", "theta", "u_x", "u_y", "u_theta"), [*corrected, *u], strict=True)
+            zip(
+                ("x", "y", "theta", "u_x", "u_y", "u_theta"),
+                [*corrected, *u],
+                strict=True,
+            )
         )
 
     def remark(self, answer: dict[str, np.ndarray]) -> str:
@@ -444,9 +499,14 @@ class CompensatingSession:
             )
         strange = self._strange
         self._strange = ()
-        if strange and (refused or not ages_s):  # beside samples of the stage they may be others
+        # beside samples of the stage they may be others
+        if strange and (refused or not ages_s):
             stage_joints = ", ".join(
-                (self._settings.joint_x, self._settings.joint_y, self._settings.joint_theta)
+                (
+                    self._settings.joint_x,
+                    self._settings.joint_y,
+                    self._settings.joint_theta,
+                )
             )
             lines.append(
                 f"joints {printable(', '.join(strange))} are not of the stage ({stage_joints}): "
@@ -473,7 +533,10 @@ class CompensatingSession:
                 f"published, max_age is {limit * MS_PER_S:g} ms"
             )
         values = (
-            {"age_ms": f"{median(ages_s) * MS_PER_S:.2f}", "age_ms_max": f"{oldest * MS_PER_S:.2f}"}
+            {
+                "age_ms": f"{median(ages_s) * MS_PER_S:.2f}",
+                "age_ms_max": f"{oldest * MS_PER_S:.2f}",
+            }
             if ages_s
             else {}
         )
@@ -483,14 +546,20 @@ class CompensatingSession:
         waits = f"; not used: {self._waits}" if self._waits else ""
         if self.compensator is None:
             return Diagnosis(Level.WARN, f"no error map yet{waits}", self.counts)
-        age = (self._ports.now_ns() - self._map_ns) * S_PER_NS if self._map_ns else math.nan
+        age = (
+            (self._ports.now_ns() - self._map_ns) * S_PER_NS
+            if self._map_ns
+            else math.nan
+        )
         values = self.counts | {
             "map": self._used,
             "since_s": f"{self._ports.now_s() - self._since_s:.0f}",
             **({"map_age_s": f"{age:.0f}"} if math.isfinite(age) else {}),
         }
         if 0 < self._settings.max_map_age < age:
-            return Diagnosis(Level.WARN, f"the map is {age:.0f} s old: calibrate again", values)
+            return Diagnosis(
+                Level.WARN, f"the map is {age:.0f} s old: calibrate again", values
+            )
         return Diagnosis(
             Level.WARN if self._contradicted else Level.OK,
             f"correcting by the map of {self._used}{waits}",
@@ -524,7 +593,9 @@ def _refuse_other_axes(error_map: ErrorMap, source: str) -> None:
 
 def _source(message: Any) -> str:
     """Return plan and run of a map as text."""
-    return f"plan {message.plan_id}" + (f", run {message.run_id}" if message.run_id else "")
+    return f"plan {message.plan_id}" + (
+        f", run {message.run_id}" if message.run_id else ""
+    )
 
 
 LARGEST_FILE = 32 << 20
@@ -547,7 +618,9 @@ def result_file(path: str, folder: str) -> Path:
         If `path` is empty, outside the folder, or exists and is not a regular file.
     """
     if not path or "\0" in path:
-        raise InputError("path", "is not a file name" if path else "is empty", "name a file")
+        raise InputError(
+            "path", "is not a file name" if path else "is empty", "name a file"
+        )
     root = Path(os.path.realpath(folder or os.curdir))
     target = Path(os.path.realpath(root / path))
     if not target.is_relative_to(root):

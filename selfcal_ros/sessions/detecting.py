@@ -57,11 +57,17 @@ class DetectingSession:
         if not counts.images:
             return Diagnosis(Level.WARN, "no image yet", values)
         if self._empty >= MANY_EMPTY:
-            most = max(counts.rejected, key=lambda name: counts.rejected[name], default="")
+            most = max(
+                counts.rejected, key=lambda name: counts.rejected[name], default=""
+            )
             why = (
                 f", most rejected as {most}"
                 if most
                 else ", nothing looks like one: check mark, mark_size, pixel_size and polarity"
             )
-            return Diagnosis(Level.WARN, f"no mark in the last {self._empty} images{why}", values)
-        return Diagnosis(Level.OK, f"{counts.marks} marks in {counts.images} images", values)
+            return Diagnosis(
+                Level.WARN, f"no mark in the last {self._empty} images{why}", values
+            )
+        return Diagnosis(
+            Level.OK, f"{counts.marks} marks in {counts.images} images", values
+        )

@@ -111,7 +111,9 @@ class Tally:
     word = ""
     """Prefix of a place in the diagnostics."""
 
-    def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
+    def __init__(
+        self, say: Callable[[Level, str], None], now_s: Callable[[], float]
+    ) -> None:
         self._say, self._now_s = say, now_s
         self.counts: Counter = Counter()
         self._last: dict[str, tuple[float, str]] = {}
@@ -121,7 +123,9 @@ class Tally:
 
     def diagnosis(self) -> Diagnosis:
         """Return WARN and the newest lines for some time after a fault."""
-        recent = [line for place, (_, line) in self._last.items() if self._is_recent(place)]
+        recent = [
+            line for place, (_, line) in self._last.items() if self._is_recent(place)
+        ]
         return Diagnosis(
             Level.WARN if recent else Level.OK,
             "; ".join(recent),
@@ -147,7 +151,9 @@ class Refusals(Tally):
         self._last[place] = (self._now_s(), line)
         count = self.counts[place]
         if count <= FIRST_LINES or str(count).rstrip("0") == "1":
-            self._say(Level.ERROR, line + (f" (refused {count} times)" if count > 1 else ""))
+            self._say(
+                Level.ERROR, line + (f" (refused {count} times)" if count > 1 else "")
+            )
 
 
 class Losses(Tally):
@@ -159,7 +165,9 @@ class Losses(Tally):
 
     word = "lost"
 
-    def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
+    def __init__(
+        self, say: Callable[[Level, str], None], now_s: Callable[[], float]
+    ) -> None:
         super().__init__(say, now_s)
         self._told: dict[str, Counter] = {}
 
@@ -236,9 +244,12 @@ class Rate:
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
-        self._bins: deque[tuple[float, int, int]] = deque()  # begin, messages, newest stamp
+        # begin, messages, newest stamp
+        self._bins: deque[tuple[float, int, int]] = deque()
         self.longest_gap_ns = 0
-        self._steps: list[np.ndarray] = []  # between stamps, since the last query of the jitter
+        self._steps: list[
+            np.ndarray
+        ] = []  # between stamps, since the last query of the jitter
         self._n_steps = 0
 
     def add(self, stamps_ns: np.ndarray) -> None:
@@ -300,7 +311,9 @@ class CellChecks:
 
     def __init__(self, say: Callable[[Level, str], None]) -> None:
         self._say = say
-        self._miswired: dict[str, str] = {}  # view and kind of marks -> fault of the offsets
+        self._miswired: dict[
+            str, str
+        ] = {}  # view and kind of marks -> fault of the offsets
         self._misplaced = ""
         self._marks = 0  # marks read at the last check of the pose
 
@@ -374,7 +387,9 @@ class StallWatch:
 
 def missing_marks(status: Any) -> str:
     """Return the missing marks, lines and check stops of a ViewStatus as text, "" if none."""
-    marks = [f"({m}, {n})" for m, n in zip(status.missing_m, status.missing_n, strict=False)]
+    marks = [
+        f"({m}, {n})" for m, n in zip(status.missing_m, status.missing_n, strict=False)
+    ]
     grid = status.grid_expected - status.grid_done
     lines = [str(k) for k in status.missing_k]
     angular = status.angular_expected - status.angular_done
@@ -385,7 +400,10 @@ def missing_marks(status: Any) -> str:
         if count > 0
     ]
     parts += (
-        [f"check stops of {checks} mark{'s' * (checks != 1)} (see check_marks of the view command)"]
+        [
+            f"check stops of {checks} mark{'s' * (checks != 1)} "
+            "(see check_marks of the view command)"
+        ]
         if checks > 0
         else []
     )
@@ -398,4 +416,6 @@ def _named(words: list[str], count: int, what: str) -> str:
     text = f"{count} {what}{'s' * (count != 1)}"
     if not first_names:
         return text
-    return f"{text}: {first_names}" + (f" and {n_unnamed} more" if n_unnamed > 0 else "")
+    return f"{text}: {first_names}" + (
+        f" and {n_unnamed} more" if n_unnamed > 0 else ""
+    )

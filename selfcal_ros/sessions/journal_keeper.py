@@ -156,7 +156,11 @@ class JournalKeeper:
     """
 
     def __init__(
-        self, folder: str, topics: dict[str, KeptTopic], settings: CollectorSettings, ports: Ports
+        self,
+        folder: str,
+        topics: dict[str, KeptTopic],
+        settings: CollectorSettings,
+        ports: Ports,
     ) -> None:
         self._folder, self._topics, self._ports = folder, topics, ports
         self._lag_limit_s = settings.journal_lag_limit
@@ -167,8 +171,12 @@ class JournalKeeper:
         self.looked_at = ""  # being read
         self.away_s = 0.0  # since that was last written
         self._left_ago_s: float | None = None  # of a run too old to be resumed
-        self._early: list[tuple[str, bytes, int]] = []  # received while the journal is read
-        self._goes_on: list[Path] = []  # files that were read but could not be continued
+        self._early: list[
+            tuple[str, bytes, int]
+        ] = []  # received while the journal is read
+        self._goes_on: list[
+            Path
+        ] = []  # files that were read but could not be continued
         self._unwritten = 0  # while there was no journal
         self._n_taken = 0  # since the last flush
         self._problem, self._tried_s, self._failed_s = "", 0.0, 0.0
@@ -213,7 +221,9 @@ class JournalKeeper:
                 return
         except InputError as error:
             if getattr(error.__cause__, "errno", None) not in NO_ROOM:
-                self._folder = ""  # else one would be started beside it, and be the newest
+                self._folder = (
+                    ""  # else one would be started beside it, and be the newest
+                )
                 raise
             self._fail(error)
         self.looked_at = str(self._claim.path if self._claim else self._folder)
@@ -232,7 +242,11 @@ class JournalKeeper:
         self._looking = None
         try:
             looked = looking.result()
-            return self._take_up(looked) if self._left_ago_s is None else self._tell_left(looked)
+            return (
+                self._take_up(looked)
+                if self._left_ago_s is None
+                else self._tell_left(looked)
+            )
         finally:
             early = self._early
             self._early = []
@@ -276,7 +290,9 @@ class JournalKeeper:
             undo.callback(_given_up, journal)
             for topic, typename in INPUT_TOPICS.items():
                 topic_kept = self._topics[topic]
-                journal.add_topic(topic_kept.name, typename, [topic_kept.qos], topic_kept.heard_on)
+                journal.add_topic(
+                    topic_kept.name, typename, [topic_kept.qos], topic_kept.heard_on
+                )
             undo.pop_all()
         self._journal = journal
 
@@ -306,7 +322,11 @@ class JournalKeeper:
             self._fail(error)
 
     def _try_again(self) -> None:
-        if self._folder and not self.holds and self._ports.now_s() >= self._tried_s + RETRY_S:
+        if (
+            self._folder
+            and not self.holds
+            and self._ports.now_s() >= self._tried_s + RETRY_S
+        ):
             self._tried_s = self._ports.now_s()
             # an older journal gets only later messages: the session has its content
             self._open(journals.resume(self._folder) if self._goes_on else None)
@@ -375,6 +395,8 @@ def bad_input(bad: Counter) -> InputError | None:
     """Return an error with the undecodable messages, and reset their count."""
     if not bad:
         return None
-    line = "; ".join(f"{count} messages on {topic}{why}" for (topic, why), count in bad.items())
+    line = "; ".join(
+        f"{count} messages on {topic}{why}" for (topic, why), count in bad.items()
+    )
     bad.clear()
     return InputError(line, "cannot be decoded", "correct their publisher")

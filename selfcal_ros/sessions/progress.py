@@ -18,7 +18,11 @@ def progress_line(command: Command, view: ViewProgress | None) -> str:
     of_all = f" of {command.views_planned}" if command.views_planned else ""
     head = f"view {command.view_index + 1}{of_all} '{printable(command.placed().name)}'"
     if command.phase == Phase.PLACE or view is None:
-        return f"{head}: the plate is to be placed" if command.phase == Phase.PLACE else head
+        return (
+            f"{head}: the plate is to be placed"
+            if command.phase == Phase.PLACE
+            else head
+        )
     return f"{head}: {', '.join(_phrases(view))}"
 
 
@@ -29,17 +33,26 @@ def _phrases(view: ViewProgress) -> list[str]:
         for done, expected, what in (
             (view.grid_done, view.grid_expected, "marks"),
             (view.angular_done, view.angular_expected, "lines"),
-            (min(view.check_done, view.check_expected), view.check_expected, "check stops"),
+            (
+                min(view.check_done, view.check_expected),
+                view.check_expected,
+                "check stops",
+            ),
         )
         if expected
     ]
-    if view.view.repeats > 1 and not view.complete:  # no mark is complete until the last pass
-        parts.append(f"{math.floor(100 * view.coverage)} % of {view.view.repeats} repeats")
+    # no mark is complete until the last pass
+    if view.view.repeats > 1 and not view.complete:
+        parts.append(
+            f"{math.floor(100 * view.coverage)} % of {view.view.repeats} repeats"
+        )
 
     readings = view.readings
     rejected = sorted(readings.rejected.items(), key=lambda item: (-item[1], item[0]))
     if rejected:
-        reasons = ", ".join(f"{printable(reason)} {count}" for reason, count in rejected)
+        reasons = ", ".join(
+            f"{printable(reason)} {count}" for reason, count in rejected
+        )
         parts.append(f"{sum(readings.rejected.values())} rejected ({reasons})")
 
     if math.isfinite(readings.sigma_xy):

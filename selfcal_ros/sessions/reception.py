@@ -23,8 +23,18 @@ from selfcal_ros.messages.cdr import Payloads
 from selfcal_ros.messages.to_model import first_stamps_ns
 from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Diagnosis, Level
-from selfcal_ros.sessions.journal_keeper import JournalKeeper, ResumedRun, bad_input, take_up
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.sessions.journal_keeper import (
+    JournalKeeper,
+    ResumedRun,
+    bad_input,
+    take_up,
+)
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+)
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 
 REACH_NS = LOOK_BACK_NS + 10 * NS_PER_S
@@ -60,7 +70,12 @@ class Reception:
         say: Callable[[Level, str], None],
         refuse: Callable[[str, Exception], None],
     ) -> None:
-        self.session, self.journal, self._say, self._refuse = session, journal, say, refuse
+        self.session, self.journal, self._say, self._refuse = (
+            session,
+            journal,
+            say,
+            refuse,
+        )
         self._waiting: list[tuple[str, bytes, int, bool]] = []
         self._n_detections = 0  # waiting
         self._held: list[tuple[str, bytes, int, bool]] = []
@@ -85,7 +100,9 @@ class Reception:
         """Have the unfinished run read, once it is known that there is one."""
         try:
             files = self.journal.earlier()
-        except Exception as error:  # messages are used in any case, with or without journal
+        except (
+            Exception
+        ) as error:  # messages are used in any case, with or without journal
             self._refuse("journal", error)
             return
         if files and self._worker is not None:
@@ -116,7 +133,9 @@ class Reception:
         self._waiting.append((DETECTION_TOPIC, data, received_ns, False))
         self._n_detections += 1
 
-    def command(self, data: bytes, is_older: bool, received_ns: int | None = None) -> None:
+    def command(
+        self, data: bytes, is_older: bool, received_ns: int | None = None
+    ) -> None:
         """Take a selfcal_msgs/ViewCommand as received, now unless another instant is given.
 
         `is_older`: published before this node subscribed.
@@ -135,7 +154,9 @@ class Reception:
         self._write(waiting)
         try:
             self.journal.flush()
-        except Exception as error:  # messages are used in any case, with or without journal
+        except (
+            Exception
+        ) as error:  # messages are used in any case, with or without journal
             self._refuse("journal", error)
         if self.restoring:
             self._held += waiting
@@ -161,7 +182,9 @@ class Reception:
         if not waiting:
             return []
         now_ns = self.session.now_ns
-        stamps, stamped = first_stamps_ns(Payloads.joined([item[1] for item in waiting]))
+        stamps, stamped = first_stamps_ns(
+            Payloads.joined([item[1] for item in waiting])
+        )
         ahead = np.zeros(len(waiting), dtype=np.int64)
         ahead[stamped] = stamps - now_ns
         refused = (ahead > MAX_AHEAD_NS) & (now_ns > 0)
@@ -181,14 +204,20 @@ class Reception:
                     "set the clock that stamps it; correctly stamped messages are used",
                 ),
             )
-        return [item for item, left_out in zip(waiting, refused, strict=True) if not left_out]
+        return [
+            item
+            for item, left_out in zip(waiting, refused, strict=True)
+            if not left_out
+        ]
 
     def _write(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
         """Pass messages to the journal; only a few samples of an encoder at rest."""
         if not self.journal.is_wanted:
             return
         newest = self.session.collector.newest_command
-        measuring = self.restoring or (newest is not None and newest.phase == Phase.MEASURE)
+        measuring = self.restoring or (
+            newest is not None and newest.phase == Phase.MEASURE
+        )
         for topic, data, received_ns, _ in waiting:
             if topic == ENCODER_TOPIC:
                 samples = self._resting.sample(data, received_ns, measuring=measuring)
@@ -212,10 +241,14 @@ class Reception:
             self._say(Level.WARN, f"{self._source}: {line}")
 
     def _feed(self, waiting: list[tuple[str, bytes, int, bool]]) -> None:
-        for _, data, _, is_older in (item for item in waiting if item[0] == COMMAND_TOPIC):
+        for _, data, _, is_older in (
+            item for item in waiting if item[0] == COMMAND_TOPIC
+        ):
             message = self._decoders[COMMAND_TOPIC].one(data)
             if message is not None:
-                self._guarded(COMMAND_TOPIC, self.session.take_command, message, is_older)
+                self._guarded(
+                    COMMAND_TOPIC, self.session.take_command, message, is_older
+                )
         now_ns = time.time_ns()
         for topic, take in (
             (ENCODER_TOPIC, self.session.take_encoder),
@@ -224,7 +257,9 @@ class Reception:
             mine = [item for item in waiting if item[0] == topic]
             if mine:
                 ages_ns = now_ns - np.array([item[2] for item in mine])
-                for block in self._decoders[topic].many(Payloads.joined([m[1] for m in mine])):
+                for block in self._decoders[topic].many(
+                    Payloads.joined([m[1] for m in mine])
+                ):
                     self._guarded(topic, take, block, ages_ns)
         error = bad_input(self._bad)
         if error is not None:
@@ -240,7 +275,9 @@ class Reception:
         """Return the diagnosis of the journal."""
         diagnosis = self.journal.diagnosis()
         if self.restoring:
-            return Diagnosis(Level.WARN, f"reading the journal {self._source}", diagnosis.values)
+            return Diagnosis(
+                Level.WARN, f"reading the journal {self._source}", diagnosis.values
+            )
         return diagnosis
 
     def close(self) -> None:

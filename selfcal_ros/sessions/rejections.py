@@ -31,7 +31,9 @@ class RejectionWatch:
         Monotonic seconds.
     """
 
-    def __init__(self, say: Callable[[Level, str], None], now_s: Callable[[], float]) -> None:
+    def __init__(
+        self, say: Callable[[Level, str], None], now_s: Callable[[], float]
+    ) -> None:
         self._say, self._now_s = say, now_s
         self.restart()
 
@@ -40,7 +42,9 @@ class RejectionWatch:
         self._found: dict[Key, tuple[float, str]] = {}  # since when, and the line now
         self._advised: dict[Key, tuple[float, str]] = {}
         self._said: set[Key] = set()
-        self._progress: dict[int, tuple[int, Counter[str]]] = {}  # used, and rejected until then
+        self._progress: dict[
+            int, tuple[int, Counter[str]]
+        ] = {}  # used, and rejected until then
 
     def take(
         self,
@@ -67,14 +71,19 @@ class RejectionWatch:
             Whether all messages have come: nothing is waited for.
         """
         where: dict[int | None, str] = {None: ""}
-        where.update((index, f"view '{view.view.name}': ") for index, view in progress.items())
+        where.update(
+            (index, f"view '{view.view.name}': ") for index, view in progress.items()
+        )
         found: dict[Key, str] = {
             (index, finding.reason): f"{where[index]}{finding}"
             for index, finding in findings.items()
         }
         for index, rejected in self._since_used(progress, ended).items():
             finding = of_last(index, rejected)
-            if finding and not {(index, finding.reason), (None, finding.reason)} & found.keys():
+            if (
+                finding
+                and not {(index, finding.reason), (None, finding.reason)} & found.keys()
+            ):
                 found[index, finding.reason] = (
                     f"{where[index]}none of the last ones was used: {finding}"
                 )
@@ -109,7 +118,9 @@ class RejectionWatch:
 
     def tell(self) -> None:
         """Log each cause that has lasted, once."""
-        for key, line in (self._lasting(self._found) | self._lasting(self._advised)).items():
+        for key, line in (
+            self._lasting(self._found) | self._lasting(self._advised)
+        ).items():
             if key not in self._said:
                 self._said.add(key)
                 self._say(Level.WARN, line)
@@ -121,11 +132,18 @@ class RejectionWatch:
 
     def _lasting(self, lines: Mapping[Key, tuple[float, str]]) -> dict[Key, str]:
         now = self._now_s()
-        return {key: line for key, (since, line) in lines.items() if now - since >= PATIENCE_S}
+        return {
+            key: line
+            for key, (since, line) in lines.items()
+            if now - since >= PATIENCE_S
+        }
 
 
 def _since(
     now: float, before: Mapping[Key, tuple[float, str]], lines: Mapping[Key, str]
 ) -> dict[Key, tuple[float, str]]:
     """Return the lines, each with the time since which there has been one for its key."""
-    return {key: (min(now, before.get(key, (now, ""))[0]), line) for key, line in lines.items()}
+    return {
+        key: (min(now, before.get(key, (now, ""))[0]), line)
+        for key, line in lines.items()
+    }

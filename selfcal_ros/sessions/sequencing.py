@@ -20,7 +20,14 @@ from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import placing_digest
 from selfcal_ros.model.view import View
 from selfcal_ros.sessions.clocks import is_future
-from selfcal_ros.sessions.health import Diagnosis, Level, Ports, Presence, StallWatch, missing_marks
+from selfcal_ros.sessions.health import (
+    Diagnosis,
+    Level,
+    Ports,
+    Presence,
+    StallWatch,
+    missing_marks,
+)
 from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import S_PER_NS
 
@@ -58,7 +65,9 @@ class SequencingSession:
         self._stall = StallWatch(settings.stall_time, ports.now_s)
         self._status: Any = None  # newest of the current view
         self._stalled = self._set_back = self._silent = ""
-        self._strayed = False  # another publisher's command was not followed in this run
+        self._strayed = (
+            False  # another publisher's command was not followed in this run
+        )
         if self.waiting:
             self.machine.need_plan()
 
@@ -87,7 +96,9 @@ class SequencingSession:
             missing_nodes.append("measurement_collector (no sign of life)")
         else:
             if collector.values.get("encoder_heard") != "yes":
-                missing_nodes.append("the encoder (measurement_collector hears no sample)")
+                missing_nodes.append(
+                    "the encoder (measurement_collector hears no sample)"
+                )
             if collector.values.get("detections_matched") != "yes":
                 missing_nodes.append("a publisher of stage/mark_detections")
         if self.presence.of("solver") is None:
@@ -98,7 +109,9 @@ class SequencingSession:
         """Start the plan, or resume its run; wait for missing nodes and name them."""
         if self.machine.state not in ENDED:
             raise InputError(
-                "pose_sequencer", f"cannot start while {self.machine.state}", "abort the plan first"
+                "pose_sequencer",
+                f"cannot start while {self.machine.state}",
+                "abort the plan first",
             )
         self.machine.need_plan()
         missing = self.missing()
@@ -134,15 +147,19 @@ class SequencingSession:
             or is_future(stamp_ns, self._ports.now_ns())
         ):
             return ""
-        if health.get("placing") not in (None, placing_digest(plan.artifact, plan.views[index])):
+        if health.get("placing") not in (
+            None,
+            placing_digest(plan.artifact, plan.views[index]),
+        ):
             return ""  # the plan has been edited: the readings are of another one
         self.run_id = health["run_id"]
         command = self.machine.resume(index, Phase[phase])
         self._send([command], stamp_ns=stamp_ns)  # unchanged: it is latched again
         view_names = self._measured.get((plan.plan_id, self.run_id), {})
         names = ", ".join(view_names[number] for number in sorted(view_names))
-        return f"resumed run {self.run_id} in view '{plan.views[index].name}', {phase}" + (
-            f"; already measured: {names}" if names else ""
+        return (
+            f"resumed run {self.run_id} in view '{plan.views[index].name}', {phase}"
+            + (f"; already measured: {names}" if names else "")
         )
 
     def act(self, request: Callable[[], list[Command]]) -> str:
@@ -203,7 +220,9 @@ class SequencingSession:
                 )
             self._strayed = True
             return
-        warning = "another publisher sends view commands: following them; abort ends that"
+        warning = (
+            "another publisher sends view commands: following them; abort ends that"
+        )
         if self.machine.state in ENDED:
             self._ports.say(Level.OK, warning)
         elif self.machine.state is not State.FOLLOWING:  # its own plan ends here
@@ -218,13 +237,17 @@ class SequencingSession:
             return  # from before the command: a redone view would look complete
         if message.run_id != self.run_id:
             return  # of another run
-        expected = message.grid_expected + message.angular_expected + message.check_expected
+        expected = (
+            message.grid_expected + message.angular_expected + message.check_expected
+        )
         if message.view_index == self.machine.index and expected:
             n_measured = message.grid_done + message.angular_done + message.check_done
             self.coverage = n_measured / expected
             self._status = message
             self._stall.take(message.detections_used + message.detections_rejected)
-        moved_on = self.machine.status(message.plan_id, message.view_index, message.complete)
+        moved_on = self.machine.status(
+            message.plan_id, message.view_index, message.complete
+        )
         self._redos = 0 if moved_on else self._redos
         self._send(moved_on)
 
@@ -282,7 +305,9 @@ class SequencingSession:
         if status is None or not status.detections_used + status.detections_rejected:
             line = f"view '{name}' stalls: no detection has arrived since MEASURE"
         else:
-            missing = missing_marks(status) or "nothing, but it is not reported complete"
+            missing = (
+                missing_marks(status) or "nothing, but it is not reported complete"
+            )
             line = f"view '{name}' stalls at {100 * self.coverage:.1f} %: missing {missing}"
         collector = self.presence.of("measurement_collector")
         if collector is None:
@@ -331,14 +356,18 @@ class SequencingSession:
         for command in commands:
             now_ns = self._ports.now_ns()
             if not self.run_id and is_future(self._commanded_ns, now_ns):
-                self._commanded_ns = 0  # the clock was set back: a new run uses its time
+                self._commanded_ns = (
+                    0  # the clock was set back: a new run uses its time
+                )
             stamp = stamp_ns or max(now_ns, self._commanded_ns + 1)
             self._strayed &= bool(self.run_id)
             self.run_id = self.run_id or str(stamp)
             command = replace(command, stamp_ns=stamp, run_id=self.run_id)
             self._own.add(_key(command))
             self._commanded_ns, self._fresh = stamp, False
-            self._ports.publish("command", from_model.command(command, self._settings.frame_id))
+            self._ports.publish(
+                "command", from_model.command(command, self._settings.frame_id)
+            )
             name = command.view.name if command.view else command.plan_id
             self._ports.say(Level.OK, f"{command.phase.name} {name}")
             self.coverage, self._status, self._stalled = 0.0, None, ""

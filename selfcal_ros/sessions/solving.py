@@ -11,11 +11,22 @@ from typing import Any, cast
 import numpy as np
 
 from selfcal_ros.collection.collector import keep_freed_memory
-from selfcal_ros.collection.inputs import Phase, begun_ns, check_command, check_plate, check_view
+from selfcal_ros.collection.inputs import (
+    Phase,
+    begun_ns,
+    check_command,
+    check_plate,
+    check_view,
+)
 from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
-from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError, SelfcalError
+from selfcal_ros.errors import (
+    InputError,
+    NoDataError,
+    NotIdentifiableError,
+    SelfcalError,
+)
 from selfcal_ros.estimation.api import Options, calibrate, calibrate_corrected
 from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model import result as results
@@ -37,7 +48,12 @@ from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.observability import with_advice
 from selfcal_ros.reporting.words.verification import with_verification
 from selfcal_ros.sessions.clocks import PlanRun, begins_in_future, supersedes
-from selfcal_ros.sessions.compensating import is_qualified, read_result, result_file, run_file
+from selfcal_ros.sessions.compensating import (
+    is_qualified,
+    read_result,
+    result_file,
+    run_file,
+)
 from selfcal_ros.sessions.health import Diagnosis, Level, Ports
 from selfcal_ros.topics import MEASUREMENT_TOPIC
 from selfcal_ros.units import NS_PER_S
@@ -138,13 +154,23 @@ def pure_noise(marks: int) -> Measurements:
             View("shift_x", 0.0, (plate.grid_pitch_m, 0.0)),
         )
     ):
-        on_field = view.grid & (plate.m + bool(view.translation_m[0]) <= plate.limits[0][1])
+        on_field = view.grid & (
+            plate.m + bool(view.translation_m[0]) <= plate.limits[0][1]
+        )
         m, n = plate.m[on_field], plate.n[on_field]
         dx, dy, offset_x, offset_y = rng.normal(0.0, 2e-8, (4, len(m)))
         once = np.ones(len(m), dtype=int)
         mark = np.arange(len(m))
         visits = GridVisits(
-            mark, dx, dy, once, (1000 * number + mark) * NS_PER_S, offset_x, offset_y, once, once
+            mark,
+            dx,
+            dy,
+            once,
+            (1000 * number + mark) * NS_PER_S,
+            offset_x,
+            offset_y,
+            once,
+            once,
         )
         views.append(
             ViewReadings(
@@ -192,7 +218,9 @@ class SolvingSession:
 
     def __init__(self, settings: SolverSettings, ports: Ports) -> None:
         self._settings, self._ports = settings, ports
-        self._messages: dict[tuple[int, int, int], Any] = {}  # by view, and cell of the image
+        self._messages: dict[
+            tuple[int, int, int], Any
+        ] = {}  # by view, and cell of the image
         self._notes: tuple[str, ...] = ()  # on the session, from the newest message
         self._run = PlanRun()
         self._planned: dict[PlanRun, int] = {}
@@ -235,11 +263,15 @@ class SolvingSession:
         if run in (self._run, PlanRun(self._run.plan_id)) and (
             command.views_planned > n_planned or (ends and tells)
         ):
-            self._stale = True  # the summary shows the number of planned or remaining views
+            self._stale = (
+                True  # the summary shows the number of planned or remaining views
+            )
 
     def _planned_views(self, run: PlanRun) -> int:
         """Return the number of planned views; commands without a run count for all runs."""
-        return max(self._planned.get(run, 0), self._planned.get(PlanRun(run.plan_id), 0))
+        return max(
+            self._planned.get(run, 0), self._planned.get(PlanRun(run.plan_id), 0)
+        )
 
     def take_measurement(self, message: Any) -> None:
         """Take the readings of a view; those of an older run are ignored.
@@ -250,7 +282,9 @@ class SolvingSession:
             If the message is inconsistent or impossible.
         """
         check_view(
-            to_model.view_readings(message), to_model.artifact_of(message), int(message.view_index)
+            to_model.view_readings(message),
+            to_model.artifact_of(message),
+            int(message.view_index),
         )
         run = PlanRun(message.plan_id, message.run_id)
         now_ns = self._ports.now_ns()
@@ -284,14 +318,18 @@ class SolvingSession:
         """Return the readings of all views of the run so far."""
         if not self._messages:
             raise NoDataError(
-                MEASUREMENT_TOPIC, "no view has been measured", "start the collector and measure"
+                MEASUREMENT_TOPIC,
+                "no view has been measured",
+                "start the collector and measure",
             )
         ordered = [self._messages[index] for index in sorted(self._messages)]
         newest = max(ordered, key=lambda m: sum(m.session_reject_counts))
         artifacts = {to_model.artifact_of(message) for message in ordered}
         if len(artifacts) > 1:
             raise InputError(
-                MEASUREMENT_TOPIC, "views of different plates in one plan", "measure one plate"
+                MEASUREMENT_TOPIC,
+                "views of different plates in one plan",
+                "measure one plate",
             )
         artifact = artifacts.pop()
         views = tuple(to_model.view_readings(message) for message in ordered)
@@ -308,7 +346,9 @@ class SolvingSession:
             **to_model.plan_keys_of(newest),
         )
 
-    def _by_view(self, readings: Sequence[ViewReadings]) -> dict[int, list[ViewReadings]]:
+    def _by_view(
+        self, readings: Sequence[ViewReadings]
+    ) -> dict[int, list[ViewReadings]]:
         """Return the readings, in the order of the messages, by their view in the plan."""
         views: dict[int, list[ViewReadings]] = {}
         for (index, *_), part in zip(sorted(self._messages), readings, strict=True):
@@ -395,7 +435,12 @@ class SolvingSession:
             self._take_none(outcome)
             return
         self.shown = Shown(
-            outcome.result, outcome.problem, job.run, job.views_done, job.stamp_ns, job.digest
+            outcome.result,
+            outcome.problem,
+            job.run,
+            job.views_done,
+            job.stamp_ns,
+            job.digest,
         )
         self._saved = ""
         self._publish(outcome.result)
@@ -405,7 +450,9 @@ class SolvingSession:
     def _take_none(self, outcome: SolvingOutcome) -> None:
         """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
-        self.shown = Shown(None, outcome.problem, job.run, job.views_done, job.stamp_ns, job.digest)
+        self.shown = Shown(
+            None, outcome.problem, job.run, job.views_done, job.stamp_ns, job.digest
+        )
         self._publish_summary()
         if not self._unfinished():
             raise outcome.problem or ValueError("neither a result nor a problem")
@@ -415,7 +462,9 @@ class SolvingSession:
         try:
             path = run_file(self._settings.save_path, self.shown.run.run_id)
             write_json(path, results.result_to_dict(results.created_now(result)))
-        except InputError as error:  # the map itself is good, and save_map may use another path
+        except (
+            InputError
+        ) as error:  # the map itself is good, and save_map may use another path
             self._tried_s = self._ports.now_s()
             if not self._unsaved:
                 self._ports.say(Level.ERROR, f"save_path: {error}")
@@ -470,11 +519,16 @@ class SolvingSession:
                 "state": self._state(),
                 "views_done": shown.views_done,
                 "views_planned": planned,
-                "identifiable": result is not None and result.observability.identifiable,
-                "rank_deficiency": 0 if result is None else result.observability.deficiency,
+                "identifiable": result is not None
+                and result.observability.identifiable,
+                "rank_deficiency": 0
+                if result is None
+                else result.observability.deficiency,
                 **summary_numbers(result),
                 "advice": [*advice, *(result.warnings if result else ())],
-                "causes": [cause.text for cause in result.verdict.causes] if result else [],
+                "causes": [cause.text for cause in result.verdict.causes]
+                if result
+                else [],
                 **_verdict(shown),
             },
         )
@@ -530,15 +584,22 @@ class SolvingSession:
         target = result_file(path, self._settings.result_folder)
         if problem is not None and os.path.exists(target):
             raise problem
-        write_json(target, results.result_to_dict(results.created_now(self.shown.result)))
+        write_json(
+            target, results.result_to_dict(results.created_now(self.shown.result))
+        )
         if problem is not None:
             raise problem
         self._saved, self._unsaved = str(target), ""
         run = self.shown.run
         named = f"plan '{run.plan_id}'" + (f", run {run.run_id}" if run.run_id else "")
-        line = f"saved to {target}: {named}; readings {self.digest() or 'of a loaded map'}"
+        line = (
+            f"saved to {target}: {named}; readings {self.digest() or 'of a loaded map'}"
+        )
         verdict = self.shown.result.verdict
-        doubts = [self._newer(self._planned), "" if verdict.qualified else verdict.sentence]
+        doubts = [
+            self._newer(self._planned),
+            "" if verdict.qualified else verdict.sentence,
+        ]
         doubts += self.shown.result.warnings
         return "; WARNING: ".join([line, *filter(None, doubts)]), str(target)
 
@@ -580,7 +641,9 @@ class SolvingSession:
         has_outcome = shown.result is not None or shown.problem is not None
         newer = self._newer(self._ended)  # a running one may still send its readings
         fine = (shown.problem is None or self._unfinished()) and (
-            shown.problem is not None or shown.result is None or is_qualified(shown.result)
+            shown.problem is not None
+            or shown.result is None
+            or is_qualified(shown.result)
         )
         state = self._state() if has_outcome else "waiting for views"
         wrong = [line for line in (self._unsaved, newer) if line]

@@ -52,7 +52,9 @@ class Watch:
 
     def take_command(self, message: Any) -> None:
         """Take a view command; the newest by stamp is used."""
-        if self._command is None or to_model.stamp_ns(message) >= to_model.stamp_ns(self._command):
+        if self._command is None or to_model.stamp_ns(message) >= to_model.stamp_ns(
+            self._command
+        ):
             self._command = message
 
     def take_status(self, message: Any) -> None:
@@ -131,7 +133,11 @@ class Watch:
             "checks": [status.check_done, status.check_expected],
             "used": status.detections_used,
             "rejected": dict(
-                zip(_lines(status.reject_reasons), map(int, status.reject_counts), strict=False)
+                zip(
+                    _lines(status.reject_reasons),
+                    map(int, status.reject_counts),
+                    strict=False,
+                )
             ),
             "repeatability_um": _finite(status.sigma_xy * UM_PER_M),
             "repeatability_arcsec": _finite(status.sigma_theta * ARCSEC_PER_RAD),
@@ -145,7 +151,9 @@ class Watch:
         command, status = self._measured, self._status
         try:
             artifact = to_model.artifact_of(command)
-            view = to_model.view_of(command, repeats=1, grid=bool(command.grid), angular=False)
+            view = to_model.view_of(
+                command, repeats=1, grid=bool(command.grid), angular=False
+            )
             missing = list(
                 zip(
                     map(int, status.missing_m[:MOST_ENTRIES]),
@@ -154,7 +162,11 @@ class Watch:
                 )
             )
             return plate_picture(
-                artifact, view, missing, status.grid_expected - status.grid_done, MOST_SITES
+                artifact,
+                view,
+                missing,
+                status.grid_expected - status.grid_done,
+                MOST_SITES,
             )
         except Exception:  # faults of a command are not reported here
             return [], 1
@@ -166,7 +178,8 @@ class Watch:
             "views": [summary.views_done, summary.views_planned],
             "identifiable": bool(summary.identifiable),
             "qualified": bool(summary.qualified),
-            "enlarged": bool(summary.qualified) and int(getattr(summary, "grade", 2)) == 1,
+            "enlarged": bool(summary.qualified)
+            and int(getattr(summary, "grade", 2)) == 1,
             "max_error_um": _finite(summary.max_error_um),
             "rms_uncertainty_um": _finite(summary.rms_uncertainty_um),
             "advice": _lines(summary.advice),
@@ -190,7 +203,9 @@ class Watch:
             size = np.hypot(error_map.gx, error_map.gy) * UM_PER_M
         step = max(1, math.ceil(max(size.shape) / MOST_SITES))
         for axis in (0, 1):
-            size = np.maximum.reduceat(size, np.arange(0, size.shape[axis], step), axis=axis)
+            size = np.maximum.reduceat(
+                size, np.arange(0, size.shape[axis], step), axis=axis
+            )
         return {
             "run_id": printable(message.run_id),
             "qualified": bool(message.qualified),
@@ -208,7 +223,11 @@ def _finite(value: float) -> float | None:
 
 
 def plate_picture(
-    artifact: Artifact, view: View, missing: Iterable[tuple[int, int]], n_missing: int, most: int
+    artifact: Artifact,
+    view: View,
+    missing: Iterable[tuple[int, int]],
+    n_missing: int,
+    most: int,
 ) -> tuple[list[str], int]:
     """Return the plate in its own frame, top line first, and the number of marks per cell side.
 
@@ -239,7 +258,10 @@ def plate_picture(
     n = artifact.marks_at(j, j)[1]
     signs = ((n >= first[:, None]) & (n < (first + count)[:, None])).astype(np.int8)
     if n_missing > len(named):  # marks after the last named one are unknown
-        signs[(signs > 0) & ((m > named[-1][0]) | ((m == named[-1][0]) & (n > named[-1][1])))] = 2
+        signs[
+            (signs > 0)
+            & ((m > named[-1][0]) | ((m == named[-1][0]) & (n > named[-1][1])))
+        ] = 2
     for mark in named:
         has_mark = artifact.has(*map(np.array, mark))
         index = artifact.index(*map(np.array, mark))
@@ -247,17 +269,25 @@ def plate_picture(
             signs[index] = 3
     signs, step = _squares(signs, artifact, most)
     for axis in (0, 1):
-        signs = np.maximum.reduceat(signs, np.arange(0, signs.shape[axis], step), axis=axis)
+        signs = np.maximum.reduceat(
+            signs, np.arange(0, signs.shape[axis], step), axis=axis
+        )
     return ["".join(row) for row in np.array(list(" o?."))[signs].T[::-1]], step
 
 
-def _squares(signs: np.ndarray, artifact: Artifact, most: int) -> tuple[np.ndarray, int]:
+def _squares(
+    signs: np.ndarray, artifact: Artifact, most: int
+) -> tuple[np.ndarray, int]:
     """Return the signs of marks by their places, the largest in each square, and marks a side."""
     if artifact.marks is None:
         return signs, max(1, ceil(max(artifact.shape) / most))
     size = np.minimum(np.ceil(2 * np.array(artifact.reach)).astype(int) + 1, most)
-    low, high = (ends(artifact.marks.places_m, axis=1)[:, None] for ends in (np.min, np.max))
+    low, high = (
+        ends(artifact.marks.places_m, axis=1)[:, None] for ends in (np.min, np.max)
+    )
     part = (artifact.marks.places_m - low) / (high - low)
     out = np.zeros(size, dtype=np.int8)
-    np.maximum.at(out, tuple(np.rint(part * (size[:, None] - 1)).astype(int)), signs[:, 0])
+    np.maximum.at(
+        out, tuple(np.rint(part * (size[:, None] - 1)).astype(int)), signs[:, 0]
+    )
     return out, 1

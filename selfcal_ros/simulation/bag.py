@@ -21,9 +21,15 @@ from selfcal_ros.simulation.rendering import Camera, Exposure
 from selfcal_ros.simulation.spec import Simulation
 
 QOS = {
-    topics.ENCODER_TOPIC: topics.qos_profile(reliable=True, transient_local=False, depth=1000),
-    topics.DETECTION_TOPIC: topics.qos_profile(reliable=True, transient_local=False, depth=1000),
-    topics.COMMAND_TOPIC: topics.qos_profile(reliable=True, transient_local=True, depth=64),
+    topics.ENCODER_TOPIC: topics.qos_profile(
+        reliable=True, transient_local=False, depth=1000
+    ),
+    topics.DETECTION_TOPIC: topics.qos_profile(
+        reliable=True, transient_local=False, depth=1000
+    ),
+    topics.COMMAND_TOPIC: topics.qos_profile(
+        reliable=True, transient_local=True, depth=64
+    ),
 }
 IMAGE_TOPIC = topics.IMAGE_TOPICS["raw"]
 POSITIONS_FILE = "positions.csv"
@@ -60,7 +66,9 @@ def _write(
             writer.add_topic(f"/{topic}", typename, [QOS[topic]])
         if simulation.camera:
             writer.add_topic(
-                f"/{IMAGE_TOPIC}", topics.IMAGE_TYPES["raw"], [QOS[topics.DETECTION_TOPIC]]
+                f"/{IMAGE_TOPIC}",
+                topics.IMAGE_TYPES["raw"],
+                [QOS[topics.DETECTION_TOPIC]],
             )
         for number, (arrival_ns, event) in enumerate(arrivals):
             if isinstance(event, Exposure):
@@ -117,7 +125,9 @@ def write_files(
                 Image.fromarray(
                     simulation.camera.image(event.offsets, rng, angles=event.angle)
                 ).save(folder / name)
-                rows.append(f"{name},{view},{last.positions[0]!r},{last.positions[1]!r}")
+                rows.append(
+                    f"{name},{view},{last.positions[0]!r},{last.positions[1]!r}"
+                )
             if number % 1000 == 0:
                 progress(number, len(arrivals))
         write_text(folder / POSITIONS_FILE, "\n".join(rows) + "\n")
@@ -140,7 +150,9 @@ def image_fields(
 ) -> tuple[str, from_model.Fields]:
     """Return topic and fields of a rendered image."""
     values = camera.image(exposure.offsets, rng, angles=exposure.angle)
-    return IMAGE_TOPIC, from_model.image(values, camera.encoding, exposure.stamp_ns, "camera")
+    return IMAGE_TOPIC, from_model.image(
+        values, camera.encoding, exposure.stamp_ns, "camera"
+    )
 
 
 def write_truth(path: Path, truth: Truth, **provenance: object) -> None:
@@ -184,7 +196,10 @@ def write_truth(path: Path, truth: Truth, **provenance: object) -> None:
                 "placed": [
                     None
                     if view is None
-                    else {"rotation": view.rotation_rad, "translation": view.translation_m}
+                    else {
+                        "rotation": view.rotation_rad,
+                        "translation": view.translation_m,
+                    }
                     for view in truth.placed
                 ],
                 **provenance,

@@ -189,7 +189,12 @@ class AngularExposures:
 
 
 def grid_exposures(
-    truth: Truth, index: int, view: View, *, settings: CellSettings, rng: np.random.Generator
+    truth: Truth,
+    index: int,
+    view: View,
+    *,
+    settings: CellSettings,
+    rng: np.random.Generator,
 ) -> GridExposures:
     """Return the exposures of the grid marks of view `index`.
 
@@ -210,7 +215,8 @@ def grid_exposures(
     tau = np.arange(size) / max(size - 1, 1)
     drifted_m = physics.drift(truth, index, tau)
     stop = stage_targets(truth.artifact, view, visits, settings.sense)
-    if settings.follow_mark:  # the stage continues until the mark is under the microscope
+    # the stage continues until the mark is under the microscope
+    if settings.follow_mark:
         centre = place + drifted_m[:, np.cumsum(visits.count) - visits.count]
         centre = -centre if settings.sense is Sense.PLATE_MOVES else centre
         stop = centre + physics.stage_error(truth, centre, index)
@@ -241,7 +247,9 @@ def grid_exposures(
     for sub in view.sub_views:
         if sub.cell is not None and sub.cell != (0, 0):
             marks = physics.marks_beside(truth, index, view, (m, n), sub)
-            away = physics.mark_places(truth, index, truth.placed_as(index, view), marks[:2])[0]
+            away = physics.mark_places(
+                truth, index, truth.placed_as(index, view), marks[:2]
+            )[0]
             cell_offset = physics.offset_seen(*machine, away[:, visit] + drifted_m)
             other_cells.append(
                 Seen(
@@ -266,7 +274,9 @@ def grid_exposures(
     )
 
 
-def white_noise(rng: np.random.Generator, settings: CellSettings, size: int) -> np.ndarray:
+def white_noise(
+    rng: np.random.Generator, settings: CellSettings, size: int
+) -> np.ndarray:
     """Return the noise of single marks, (2, E), m."""
     white = normal(rng, settings.sigma_xy_m, (2, size))
     white *= np.array([[1.0], [settings.noise_ratio]])
@@ -279,11 +289,18 @@ def lead_in(truth: Truth, first: np.ndarray) -> np.ndarray:
 
 
 def angular_exposures(
-    truth: Truth, index: int, view: View, *, settings: CellSettings, rng: np.random.Generator
+    truth: Truth,
+    index: int,
+    view: View,
+    *,
+    settings: CellSettings,
+    rng: np.random.Generator,
 ) -> AngularExposures:
     """Return the exposures of the angular lines of view `index`, line by line."""
     direction, _, is_line = physics.line_directions(truth, index, view)
-    k, target = line_targets(truth.artifact, view, settings.sense, consecutive=settings.consecutive)
+    k, target = line_targets(
+        truth.artifact, view, settings.sense, consecutive=settings.consecutive
+    )
     n_stops = len(direction) if settings.consecutive else len(k)
     stop = normal(rng, settings.stop_sigma_theta_rad, n_stops)
     stop = np.repeat(stop, view.repeats) if settings.consecutive else stop
@@ -319,11 +336,15 @@ def flicker_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarra
     return wave[..., : shape[-1]]
 
 
-def _flicker(rng: np.random.Generator, sigma: float, shape: tuple[int, ...]) -> np.ndarray | float:
+def _flicker(
+    rng: np.random.Generator, sigma: float, shape: tuple[int, ...]
+) -> np.ndarray | float:
     return sigma * flicker_noise(rng, shape) if sigma and shape[-1] else 0.0
 
 
-def normal(rng: np.random.Generator, sigma: float, shape: tuple[int, ...] | int) -> np.ndarray:
+def normal(
+    rng: np.random.Generator, sigma: float, shape: tuple[int, ...] | int
+) -> np.ndarray:
     """Return normally distributed numbers; 0 without a draw if `sigma` is."""
     return rng.normal(0, sigma, shape) if sigma else np.zeros(shape)
 
@@ -364,7 +385,12 @@ def view_events(
 
 
 def plan_events(
-    truth: Truth, plan: Plan, *, settings: CellSettings, rng: np.random.Generator, start_ns: int
+    truth: Truth,
+    plan: Plan,
+    *,
+    settings: CellSettings,
+    rng: np.random.Generator,
+    start_ns: int,
 ) -> Iterator[Event]:
     """Yield all messages of a plan, commands included, in the order of their stamps."""
     now = start_ns
@@ -384,11 +410,15 @@ def plan_events(
                 **plan_keys(plan),
             )
             now += pause_ns
-        for event in view_events(truth, plan, index, settings=settings, rng=rng, start_ns=now):
+        for event in view_events(
+            truth, plan, index, settings=settings, rng=rng, start_ns=now
+        ):
             yield event
             now = max(now, event.stamp_ns)
         now += pause_ns
-    yield Command(now, Phase.DONE, plan.plan_id, len(plan.views), views_planned=len(plan.views))
+    yield Command(
+        now, Phase.DONE, plan.plan_id, len(plan.views), views_planned=len(plan.views)
+    )
 
 
 def _exposures(
@@ -411,9 +441,13 @@ def _exposures(
         marks_shown = [[] for _ in zero]
         for cell in (Seen((0, 0), grid.offset, grid.mark, grid.there), *grid.others):
             offsets = np.stack([*cell.offset, zero], axis=1)
-            m, n, is_mark = (row[grid.visit].tolist() for row in (*cell.mark, cell.there))
+            m, n, is_mark = (
+                row[grid.visit].tolist() for row in (*cell.mark, cell.there)
+            )
             for number in np.flatnonzero(is_mark).tolist():
-                marks_shown[number].append((offsets[number], (Kind.GRID, m[number], n[number], 0)))
+                marks_shown[number].append(
+                    (offsets[number], (Kind.GRID, m[number], n[number], 0))
+                )
     if view.angular:
         lines = angular_exposures(truth, index, view, settings=settings, rng=rng)
         zero = np.zeros(len(lines.k))
@@ -430,7 +464,9 @@ def _exposures(
     return np.concatenate([before, stops_of_exposures]), marks_shown
 
 
-def _position(stops: np.ndarray, elapsed_ns: int, settings: CellSettings) -> tuple[float, ...]:
+def _position(
+    stops: np.ndarray, elapsed_ns: int, settings: CellSettings
+) -> tuple[float, ...]:
     number, within = divmod(elapsed_ns, settings.period_ns)
     position = stops[min(number, len(stops) - 1)]
     if within > settings.dwell_ns and number + 1 < len(stops):
@@ -439,7 +475,9 @@ def _position(stops: np.ndarray, elapsed_ns: int, settings: CellSettings) -> tup
     return tuple(position.tolist())
 
 
-def _detection(stamp_ns: int, offset: np.ndarray, mark: tuple, settings: CellSettings) -> Detection:
+def _detection(
+    stamp_ns: int, offset: np.ndarray, mark: tuple, settings: CellSettings
+) -> Detection:
     kind, m, n, k = mark
     sigma = settings.sigma_xy_m if kind == Kind.GRID else settings.sigma_theta_rad
     m, n, k = (m, n, k) if settings.with_ids else (0, 0, 0)

@@ -136,12 +136,16 @@ class Spread:
         """The matrix E: true offset = (1 + E) measured offset, (2, 2)."""
         scale, stretch = self.microscope_scale, self.microscope_stretch
         turn, shear = self.microscope_rotation_rad, self.microscope_shear
-        return np.array([[scale + stretch, shear - turn], [shear + turn, scale - stretch]])
+        return np.array(
+            [[scale + stretch, shear - turn], [shear + turn, scale - stretch]]
+        )
 
     @property
     def wiring(self) -> np.ndarray:
         """The matrix from the measured to the published offset, (2, 2)."""
-        return self.microscope_pixels * np.reshape(AXES[self.microscope_axes], (2, 2)).astype(float)
+        return self.microscope_pixels * np.reshape(
+            AXES[self.microscope_axes], (2, 2)
+        ).astype(float)
 
 
 def _zeros(*shape: int) -> Any:
@@ -167,7 +171,11 @@ class Waves:
         """Return the sum of the waves at positions (d, E), (components, E)."""
         parts = np.array_split(place, 1 + place.shape[1] // MOST_PLACES, axis=1)
         return np.concatenate(
-            [np.real(self.size.T @ np.exp(1j * (self.number @ part))) for part in parts], axis=1
+            [
+                np.real(self.size.T @ np.exp(1j * (self.number @ part)))
+                for part in parts
+            ],
+            axis=1,
         )
 
 
@@ -318,7 +326,8 @@ def random_truth(
     drawn_g, waves = _stage(artifact.lattice, spread, rng)
     g = remove_modes(drawn_g, datum_modes(artifact.lattice, scale=True))
     a = remove_modes(
-        rng.normal(0, spread.a_m, (2, *artifact.shape)), datum_modes(artifact, scale=False)
+        rng.normal(0, spread.a_m, (2, *artifact.shape)),
+        datum_modes(artifact, scale=False),
     )
     a += spread.pitch_error * np.stack([artifact.x_m, artifact.y_m])
     drawn_theta, waves_theta = _circle(artifact.angular_count, spread, rng)
@@ -348,7 +357,9 @@ def random_truth(
         wiring=spread.wiring,
         line_factor=spread.line_factor,
         distortion=spread.microscope_distortion / spread.microscope_field_m**2,
-        optical_tilt_rad=np.array([spread.optical_tilt_x_rad, spread.optical_tilt_y_rad]),
+        optical_tilt_rad=np.array(
+            [spread.optical_tilt_x_rad, spread.optical_tilt_y_rad]
+        ),
         backlash_m=np.array([spread.backlash_x_m, spread.backlash_y_m]),
         backlash_growth_m=spread.backlash_growth_m,
         settling_m=spread.settling_m,
@@ -370,12 +381,16 @@ def _stage(
         return rng.normal(0, spread.g_m, (2, *artifact.shape)), NO_WAVES
     # directions and lengths with the spectrum of exp(-d^2 / 2 L^2)
     number = rng.normal(0, 1 / length, (N_WAVES, 2))
-    waves = Waves(number, _amplitudes(rng, np.full(N_WAVES, spread.g_m / np.sqrt(N_WAVES)), 2))
+    waves = Waves(
+        number, _amplitudes(rng, np.full(N_WAVES, spread.g_m / np.sqrt(N_WAVES)), 2)
+    )
     sites = np.stack(artifact.places(artifact.m.ravel(), artifact.n.ravel()))
     return waves.at(sites).reshape(2, *artifact.shape), waves
 
 
-def _circle(count: int, spread: Spread, rng: np.random.Generator) -> tuple[np.ndarray, Waves]:
+def _circle(
+    count: int, spread: Spread, rng: np.random.Generator
+) -> tuple[np.ndarray, Waves]:
     """Return the error of the rotary encoder at the lines, (K,), rad, and its waves."""
     if not (spread.correlation_pitches and count):
         return rng.normal(0, spread.g_theta_rad, count), NO_WAVES
@@ -388,13 +403,17 @@ def _circle(count: int, spread: Spread, rng: np.random.Generator) -> tuple[np.nd
     return waves.at(np.arange(count)[None])[0], waves
 
 
-def _amplitudes(rng: np.random.Generator, size: np.ndarray, components: int) -> np.ndarray:
+def _amplitudes(
+    rng: np.random.Generator, size: np.ndarray, components: int
+) -> np.ndarray:
     """Return complex amplitudes of waves of standard deviation `size` (n,), (n, components)."""
     parts = rng.normal(0, 1, (2, len(size), components))
     return (parts[0] + 1j * parts[1]) * size[:, None]
 
 
-def _encoder(artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str) -> np.ndarray:
+def _encoder(
+    artifact: Artifact, g: np.ndarray, drawn: np.ndarray, encoder: str
+) -> np.ndarray:
     """Return the error of the rotary encoder, (K,), rad."""
     if not artifact.angular_count:
         return drawn
@@ -424,11 +443,15 @@ def _of_views(spread: Spread, n_views: int, rng: np.random.Generator) -> dict[st
         drawn["plate_strain"] = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     for values in drawn.values():
         values[:1] = 0  # the plate is defined by the first view
-    sizes = np.array([spread.drift_linear_m, spread.drift_quadratic_m, spread.drift_cubic_m])
+    sizes = np.array(
+        [spread.drift_linear_m, spread.drift_quadratic_m, spread.drift_cubic_m]
+    )
     if sizes.any():
         drawn["drift_m"] = rng.normal(0, 1, (n_views, 2, 3)) * sizes
     if spread.drift_walk_m:
-        steps = rng.normal(0, spread.drift_walk_m / np.sqrt(WALK_STEPS), (n_views, 2, WALK_STEPS))
+        steps = rng.normal(
+            0, spread.drift_walk_m / np.sqrt(WALK_STEPS), (n_views, 2, WALK_STEPS)
+        )
         drawn["walk_m"] = np.insert(steps.cumsum(axis=2), 0, 0.0, axis=2)
     for name, shape in (
         ("stage_bend_m", (2, 3)),

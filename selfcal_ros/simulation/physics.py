@@ -22,7 +22,9 @@ def rotate(q: int, vector: np.ndarray) -> np.ndarray:
     return np.stack(((x, y), (-y, x), (-x, -y), (y, -x))[q % 4])
 
 
-def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -> np.ndarray:
+def plate_displacement(
+    truth: Truth, index: int, m: np.ndarray, n: np.ndarray
+) -> np.ndarray:
     """Return true minus nominal position of marks on the plate in a view, (2, V), m.
 
     Parameters
@@ -36,12 +38,18 @@ def plate_displacement(truth: Truth, index: int, m: np.ndarray, n: np.ndarray) -
     x, y = truth.artifact.places(m, n)
     displacement = truth.a[:, *truth.artifact.index(m, n)]
     if len(truth.plate_scale):
-        displacement = displacement + truth.plate_scale[index] * np.stack([x, y]) * pitch
+        displacement = (
+            displacement + truth.plate_scale[index] * np.stack([x, y]) * pitch
+        )
     if len(truth.plate_shape_m):
         u, v = x / hx, y / hy
-        displacement = displacement + truth.plate_shape_m[index] @ np.stack([u * u, u * v, v * v])
+        displacement = displacement + truth.plate_shape_m[index] @ np.stack(
+            [u * u, u * v, v * v]
+        )
     if len(truth.plate_strain):
-        displacement = displacement + truth.plate_strain[index] @ np.stack([x, y]) * pitch
+        displacement = (
+            displacement + truth.plate_strain[index] @ np.stack([x, y]) * pitch
+        )
     return displacement
 
 
@@ -67,7 +75,9 @@ def marks_below(
     x, y = view.on_stage(artifact).site_of(*artifact.places(*marks))
     place = lies.turned_back(x - lies.shift[0], y - lies.shift[1])
     if artifact.marks:
-        away, near = artifact.marks.tree.query(np.stack(place, axis=1) * artifact.grid_pitch_m)
+        away, near = artifact.marks.tree.query(
+            np.stack(place, axis=1) * artifact.grid_pitch_m
+        )
         return (
             artifact.marks.id_array[near],
             np.zeros(len(near), dtype=int),
@@ -79,7 +89,11 @@ def marks_below(
 
 
 def marks_beside(
-    truth: Truth, index: int, view: View, marks: tuple[np.ndarray, np.ndarray], sub_view: View
+    truth: Truth,
+    index: int,
+    view: View,
+    marks: tuple[np.ndarray, np.ndarray],
+    sub_view: View,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the marks that a cell of an image shows if `marks` are on the optical axis.
 
@@ -121,7 +135,9 @@ def mark_places(
         away = phi * rotate(1, arm) + error
     else:  # R(phi) (arm + error) - arm, without cancellation
         away = (
-            np.sin(phi) * rotate(1, arm + error) - 2 * np.sin(phi / 2) ** 2 * (arm + error) + error
+            np.sin(phi) * rotate(1, arm + error)
+            - 2 * np.sin(phi / 2) ** 2 * (arm + error)
+            + error
         )
     height = _bow(truth, m, n)
     if len(truth.plate_tilt_rad):
@@ -164,10 +180,14 @@ def drift(truth: Truth, index: int, tau: np.ndarray) -> np.ndarray:
     """Return the displacement of the plate at times `tau` (E,), 0..1 of a view, (2, E), m."""
     displacement = np.zeros((2, len(tau)))
     if len(truth.drift_m):
-        displacement += truth.drift_m[index] @ np.stack([tau**power for power in DRIFT_POWERS])
+        displacement += truth.drift_m[index] @ np.stack(
+            [tau**power for power in DRIFT_POWERS]
+        )
     if truth.walk_m.any():
         steps = np.linspace(0, 1, truth.walk_m.shape[2])
-        displacement += np.stack([np.interp(tau, steps, row) for row in truth.walk_m[index]])
+        displacement += np.stack(
+            [np.interp(tau, steps, row) for row in truth.walk_m[index]]
+        )
     return displacement
 
 
@@ -204,7 +224,9 @@ def true_position(
     settling: np.ndarray | float = 0.0
     if truth.settling_m:
         settling = truth.settling_m * sign * np.exp(-rested_s / truth.settling_time_s)
-    lag = (truth.backlash_m[:, None] + truth.backlash_growth_m * tau) * approach + settling
+    lag = (
+        truth.backlash_m[:, None] + truth.backlash_growth_m * tau
+    ) * approach + settling
     return position - stage_error(truth, position, index) - lag
 
 
@@ -221,11 +243,15 @@ def stage_error(truth: Truth, position: np.ndarray, index: int = 0) -> np.ndarra
     return error + truth.waves.at(place) if len(truth.waves.number) else error
 
 
-def between_sites(artifact: Artifact, values: np.ndarray, position: np.ndarray) -> np.ndarray:
+def between_sites(
+    artifact: Artifact, values: np.ndarray, position: np.ndarray
+) -> np.ndarray:
     """Return values at the sites (..., nx, ny) at positions (2, E), m, bilinear, (..., E)."""
     (hx, hy), (nx, ny) = artifact.half, artifact.shape
     u, v = position / artifact.grid_pitch_m + np.array([[hx], [hy]])
-    i, j = (np.clip(np.floor(w), 0, size - 2).astype(int) for w, size in ((u, nx), (v, ny)))
+    i, j = (
+        np.clip(np.floor(w), 0, size - 2).astype(int) for w, size in ((u, nx), (v, ny))
+    )
     u, v = u - i, v - j
     return (1 - u) * ((1 - v) * values[..., i, j] + v * values[..., i, j + 1]) + u * (
         (1 - v) * values[..., i + 1, j] + v * values[..., i + 1, j + 1]
@@ -254,7 +280,11 @@ def encoder_error(truth: Truth, position: np.ndarray) -> np.ndarray:
     k = np.floor(place).astype(int)
     u = place - k
     error = (1 - u) * g[k % count] + u * g[(k + 1) % count]
-    return error + truth.waves_theta.at(place[None])[0] if len(truth.waves_theta.number) else error
+    return (
+        error + truth.waves_theta.at(place[None])[0]
+        if len(truth.waves_theta.number)
+        else error
+    )
 
 
 def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarray:
@@ -274,7 +304,11 @@ def true_offset(sense: Sense, place: np.ndarray, stage: np.ndarray) -> np.ndarra
 
 
 def offset_seen(
-    truth: Truth, sense: Sense, position: np.ndarray, stage: np.ndarray, place: np.ndarray
+    truth: Truth,
+    sense: Sense,
+    position: np.ndarray,
+    stage: np.ndarray,
+    place: np.ndarray,
 ) -> np.ndarray:
     """Return the published offsets of marks, (2, E), m, without noise.
 
@@ -290,7 +324,9 @@ def offset_seen(
     place : float array (2, E)
         Positions of the marks with the stage at 0, m.
     """
-    return seen_offset(truth, with_yaw(truth, sense, position, true_offset(sense, place, stage)))
+    return seen_offset(
+        truth, with_yaw(truth, sense, position, true_offset(sense, place, stage))
+    )
 
 
 def line_offset(
@@ -300,14 +336,18 @@ def line_offset(
     return true_offset(sense, direction, position - encoder_error(truth, position))
 
 
-def with_yaw(truth: Truth, sense: Sense, position: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def with_yaw(
+    truth: Truth, sense: Sense, position: np.ndarray, offset: np.ndarray
+) -> np.ndarray:
     """Return offsets (2, E) as the stage's yaw at positions (2, E) turns them."""
     if not truth.yaw.size:
         return offset
     turn = between_sites(truth.artifact, truth.yaw, position)
     turn = turn if sense is Sense.PLATE_MOVES else -turn  # the microscope instead
     cosine, sine = np.cos(turn), np.sin(turn)
-    return np.stack([cosine * offset[0] - sine * offset[1], sine * offset[0] + cosine * offset[1]])
+    return np.stack(
+        [cosine * offset[0] - sine * offset[1], sine * offset[0] + cosine * offset[1]]
+    )
 
 
 def seen_offset(truth: Truth, offset: np.ndarray) -> np.ndarray:

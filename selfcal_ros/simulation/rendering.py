@@ -87,7 +87,9 @@ class Camera:
     def __post_init__(self) -> None:
         """Refuse impossible sizes."""
         if min(self.pixel_size_m, self.mark_size_m, self.mark_width_m) <= 0:
-            raise InputError("camera", "a size is 0", "give pixel_size, mark_size and mark_width")
+            raise InputError(
+                "camera", "a size is 0", "give pixel_size, mark_size and mark_width"
+            )
 
     @property
     def full_scale(self) -> int:
@@ -135,9 +137,18 @@ class Camera:
         grey = np.full((self.height, self.width), self.ground)
         size = self.mark_size_m / self.pixel_size_m
         for (u, v), angle in zip(
-            self.pixels_of(offsets).T, np.broadcast_to(angles, offsets.shape[1]), strict=True
+            self.pixels_of(offsets).T,
+            np.broadcast_to(angles, offsets.shape[1]),
+            strict=True,
         ):
-            self._add(grey, u, v, size, np.deg2rad(self.turn_deg) - angle, sign * self.contrast)
+            self._add(
+                grey,
+                u,
+                v,
+                size,
+                np.deg2rad(self.turn_deg) - angle,
+                sign * self.contrast,
+            )
         for _ in range(rng.poisson(self.dirt) if self.dirt else 0):
             u, v = rng.uniform(0, self.width), rng.uniform(0, self.height)
             self._speck(grey, u, v, 2 * size * rng.uniform(*DIRT_RADIUS))
@@ -153,16 +164,37 @@ class Camera:
         """Share of the light that reaches each pixel, (height, width)."""
         v, u = np.mgrid[0 : self.height, 0 : self.width]
         right, down = u - (self.width - 1) / 2, v - (self.height - 1) / 2
-        return 1 - self.vignetting * (right**2 + down**2) / (right[0, 0] ** 2 + down[0, 0] ** 2)
+        return 1 - self.vignetting * (right**2 + down**2) / (
+            right[0, 0] ** 2 + down[0, 0] ** 2
+        )
 
     def _add(
-        self, grey: np.ndarray, u: float, v: float, size: float, angle: float, contrast: float
+        self,
+        grey: np.ndarray,
+        u: float,
+        v: float,
+        size: float,
+        angle: float,
+        contrast: float,
     ) -> None:
         """Add a blurred mark at column `u` and row `v`."""
-        half = int(np.ceil((1.5 if self.mark == "corner" else 0.75) * size + 4 * self.blur_px)) + 2
+        half = (
+            int(
+                np.ceil(
+                    (1.5 if self.mark == "corner" else 0.75) * size + 4 * self.blur_px
+                )
+            )
+            + 2
+        )
         width = self.mark_width_m / self.pixel_size_m
         self._stamp(
-            grey, u, v, half, lambda a, b: distance(self.mark, a, b, size, width), contrast, angle
+            grey,
+            u,
+            v,
+            half,
+            lambda a, b: distance(self.mark, a, b, size, width),
+            contrast,
+            angle,
         )
 
     def _speck(self, grey: np.ndarray, u: float, v: float, size: float) -> None:
@@ -189,14 +221,18 @@ class Camera:
         column, row = round(u), round(v)
         first_row, first_column = row - half, column - half
         rows = slice(max(first_row, 0), min(first_row + 2 * half + 1, self.height))
-        columns = slice(max(first_column, 0), min(first_column + 2 * half + 1, self.width))
+        columns = slice(
+            max(first_column, 0), min(first_column + 2 * half + 1, self.width)
+        )
         if rows.start >= rows.stop or columns.start >= columns.stop:
             return
         step = (np.arange((2 * half + 1) * FINE) + 0.5) / FINE - 0.5 - half
         b, a = step - (v - row), step - (u - column)
         a = -a if self.mirror else a
         cosine, sine = np.cos(angle), np.sin(angle)  # from columns to rows
-        cover = inside(np.add.outer(sine * b, cosine * a), np.subtract.outer(cosine * b, sine * a))
+        cover = inside(
+            np.add.outer(sine * b, cosine * a), np.subtract.outer(cosine * b, sine * a)
+        )
         cover *= FINE
         cover += 0.5
         np.clip(cover, 0, 1, out=cover)
@@ -226,7 +262,11 @@ def blurred_pixels(count: int, blur_px: float) -> np.ndarray:
     weight = np.exp(-((away / max(sigma, np.finfo(float).tiny)) ** 2) / 2)
     point = np.arange(n)[:, None]
     means = np.zeros((count, n))
-    np.add.at(means, (point // FINE, np.clip(point + away, 0, n - 1)), weight / weight.sum() / FINE)
+    np.add.at(
+        means,
+        (point // FINE, np.clip(point + away, 0, n - 1)),
+        weight / weight.sum() / FINE,
+    )
     return means
 
 
@@ -238,7 +278,9 @@ def _box(a: np.ndarray, b: np.ndarray, length: float, width: float) -> np.ndarra
     return np.minimum(length / 2 - np.abs(a), width / 2 - np.abs(b))
 
 
-def distance(mark: str, a: np.ndarray, b: np.ndarray, size: float, width: float) -> np.ndarray:
+def distance(
+    mark: str, a: np.ndarray, b: np.ndarray, size: float, width: float
+) -> np.ndarray:
     """Return the distance of points to the edge of a mark, positive inside, px.
 
     A corner is where two squares of side `size` meet.
@@ -250,7 +292,8 @@ def distance(mark: str, a: np.ndarray, b: np.ndarray, size: float, width: float)
     if mark == "cross":
         return np.maximum(_box(a, b, size, width), _box(a, b, width, size))
     return np.maximum(
-        _box(a - size / 2, b - size / 2, size, size), _box(a + size / 2, b + size / 2, size, size)
+        _box(a - size / 2, b - size / 2, size, size),
+        _box(a + size / 2, b + size / 2, size, size),
     )
 
 
@@ -293,16 +336,25 @@ def exposures(
     place = np.zeros((2, 0))
     index = -1
     angle = 0.0
-    for _, group in groupby(events, key=lambda event: (event.stamp_ns, _is_grid(event))):
+    for _, group in groupby(
+        events, key=lambda event: (event.stamp_ns, _is_grid(event))
+    ):
         simultaneous = list(group)
         for event in simultaneous:
-            if isinstance(event, Command) and event.view is not None and event.view_index != index:
+            if (
+                isinstance(event, Command)
+                and event.view is not None
+                and event.view_index != index
+            ):
                 index = event.view_index
                 view = truth.placed_as(index, event.view)
                 place, _ = physics.mark_places(truth, index, view, (m, n))
                 angle = float(view.rotation_rad + truth.phi_rad[index])
         offset_of_mark = {
-            (event.m + i) * artifact.shape[1] + event.n + j: (event.offset_x, event.offset_y)
+            (event.m + i) * artifact.shape[1] + event.n + j: (
+                event.offset_x,
+                event.offset_y,
+            )
             for event in simultaneous
             if isinstance(event, Detection) and _is_grid(event)
         }
@@ -312,10 +364,14 @@ def exposures(
         first = next(iter(offset_of_mark))
         away = place - place[:, [first]]
         stage = place[:, [first]]
-        away = physics.with_yaw(truth, sense, -stage if sense is Sense.PLATE_MOVES else stage, away)
+        away = physics.with_yaw(
+            truth, sense, -stage if sense is Sense.PLATE_MOVES else stage, away
+        )
         offsets = np.array([offset_of_mark[first]]).T + physics.seen_offset(truth, away)
         offsets[:, list(offset_of_mark)] = np.array(list(offset_of_mark.values())).T
-        yield Exposure(simultaneous[0].stamp_ns, offsets[:, np.hypot(*away) < reach], angle)
+        yield Exposure(
+            simultaneous[0].stamp_ns, offsets[:, np.hypot(*away) < reach], angle
+        )
 
 
 def _is_grid(event: Event) -> bool:

@@ -154,7 +154,8 @@ def _one_fault(event: Detection, name: str, rng: np.random.Generator) -> list[Ev
         return [
             replace(
                 event,
-                offset_theta=event.offset_theta + np.sign(np.cos(angle)) * size * RAD_PER_MRAD,
+                offset_theta=event.offset_theta
+                + np.sign(np.cos(angle)) * size * RAD_PER_MRAD,
             )
         ]
     return [
@@ -174,7 +175,9 @@ LAST_START_S = 2.1e9
 Section = dict[str, Parameter]
 """Key -> its unit, limits and choices; the default is that of the field."""
 
-_NODE: Section = {parameter.name: parameter for parameter in SimulatorSettings.parameters()}
+_NODE: Section = {
+    parameter.name: parameter for parameter in SimulatorSettings.parameters()
+}
 """The keys that are parameters of stage_simulator as well."""
 
 
@@ -186,7 +189,11 @@ def field_of(key: str, kind: type) -> str:
     """Return the field of a dataclass that a key sets: the key with a unit; "" if none."""
     names = {item.name for item in fields(kind)}
     return next(
-        (key.removesuffix("_s") + unit for unit in UNITS if key.removesuffix("_s") + unit in names),
+        (
+            key.removesuffix("_s") + unit
+            for unit in UNITS
+            if key.removesuffix("_s") + unit in names
+        ),
         "",
     )
 
@@ -239,11 +246,21 @@ FAULTS: Section = _keys(*PARTS) | {
     for unit in ("", "_s")
     for name in ("delay", "clock_step", "encoder_gap")
 }
-_DETECTOR: Section = {parameter.name: parameter for parameter in DetectorSettings.parameters()}
+_DETECTOR: Section = {
+    parameter.name: parameter for parameter in DetectorSettings.parameters()
+}
 CAMERA: Section = (
     {
         name: _DETECTOR[name]
-        for name in ("pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")
+        for name in (
+            "pixel_size",
+            "mark",
+            "mark_size",
+            "mark_width",
+            "polarity",
+            "turn",
+            "mirror",
+        )
     }
     | {name: Parameter(name, 0, "", "px", 8, 10_000) for name in ("width", "height")}
     | _keys("blur", unit="px", high=100.0)
@@ -254,13 +271,19 @@ CAMERA: Section = (
         "encoding": Parameter("encoding", "mono8", "", choices=("mono8", "mono16")),
     }
 )
-CORRECTION_TIMES = Parameter("times", 1.0, "of the table that act", low=-1000.0, high=1000.0)
+CORRECTION_TIMES = Parameter(
+    "times", 1.0, "of the table that act", low=-1000.0, high=1000.0
+)
 OF_IMAGES = ("lost", "duplicated")
 """Faults that images can have."""
 TOP = (
     Parameter("seed", 0, "of truth, noise and faults", low=0, high=2**61),
     Parameter(
-        "noise_seed", 0, "of all that a new measurement of the machine changes", low=0, high=2**61
+        "noise_seed",
+        0,
+        "of all that a new measurement of the machine changes",
+        low=0,
+        high=2**61,
     ),
     Parameter("start_time", 1.7e9, "first stamp", "s", 0.0, LAST_START_S),
     Parameter("compression", "zstd", "of the bag", choices=("zstd", "lz4", "none")),
@@ -294,7 +317,9 @@ class Simulation:
         machine = rng = np.random.default_rng(self.seed)
         if self.noise_seed is not None:
             rng = np.random.default_rng(self.noise_seed)
-        truth = random_truth(self.plan.artifact, n_views, machine, self.spread, placing=rng)
+        truth = random_truth(
+            self.plan.artifact, n_views, machine, self.spread, placing=rng
+        )
         truth = replace(truth, placed=self.placed)
         if self.correction is not None:
             truth = corrected(truth, self.correction, self.correction_times)
@@ -303,7 +328,9 @@ class Simulation:
     def run(self) -> tuple[Truth, list[tuple[int, Event | Exposure]], dict[str, int]]:
         """Return the truth, the messages with their times of arrival, and the counts of faults."""
         truth, rng = self.draw(len(self.plan.views))
-        settings = replace(self.settings, with_ids=True) if self.camera else self.settings
+        settings = (
+            replace(self.settings, with_ids=True) if self.camera else self.settings
+        )
         cell_events = plan_events(
             truth, self.plan, settings=settings, rng=rng, start_ns=self.start_ns
         )
@@ -350,7 +377,9 @@ def read_simulation(path: str | Path) -> Simulation:
     if "plan" not in data:
         raise InputError(where, "the key 'plan' is missing", "name a PLAN.yaml")
     top = {
-        parameter.name: parameter.check(data.get(parameter.name, parameter.default), where)
+        parameter.name: parameter.check(
+            data.get(parameter.name, parameter.default), where
+        )
         for parameter in TOP
     }
     read = {
@@ -430,9 +459,16 @@ def spread_of(values: Mapping[str, Any], default: Spread | None = None) -> Sprea
     return replace(default, **_fields_of(values, TRUTH | PHYSICS, default))
 
 
-def _fields_of(values: Mapping[str, Any], keys: Section, defaults: Any) -> dict[str, Any]:
-    fields_by_key = {key: field_of(key, type(defaults)) for key in keys if key in values}
-    return {name: type(getattr(defaults, name))(values[key]) for key, name in fields_by_key.items()}
+def _fields_of(
+    values: Mapping[str, Any], keys: Section, defaults: Any
+) -> dict[str, Any]:
+    fields_by_key = {
+        key: field_of(key, type(defaults)) for key in keys if key in values
+    }
+    return {
+        name: type(getattr(defaults, name))(values[key])
+        for key, name in fields_by_key.items()
+    }
 
 
 def _plan(plan: Any, path: Path) -> Plan:
@@ -450,7 +486,11 @@ def _actual_poses(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]
     lies = {
         view.name: view
         for view in plan_from_dict(
-            {key: written[key] for key in ("plan_id", "artifact", "map") if key in written}
+            {
+                key: written[key]
+                for key in ("plan_id", "artifact", "map")
+                if key in written
+            }
             | {"views": views},
             where,
         ).views
@@ -458,7 +498,9 @@ def _actual_poses(views: Any, plan: Plan, where: str) -> tuple[View | None, ...]
     names = [view.name for view in plan.views]
     for name in lies:
         if name not in names:
-            raise InputError(where, f"the plan has no view '{name}'", known_are(name, names))
+            raise InputError(
+                where, f"the plan has no view '{name}'", known_are(name, names)
+            )
     placed = [
         replace(lies[view.name], grid=view.grid, angular=view.angular)
         if view.name in lies
@@ -490,7 +532,9 @@ def corrected(truth: Truth, table: ErrorMap, times: float) -> Truth:
     if not controller.has_theta or not plate.angular_count:
         return replace(truth, g=g)
     return replace(
-        truth, g=g, g_theta=truth.g_theta - times * controller.error_theta(plate.theta_rad)
+        truth,
+        g=g,
+        g_theta=truth.g_theta - times * controller.error_theta(plate.theta_rad),
     )
 
 
@@ -499,7 +543,9 @@ def _mapping(data: Any, where: str, known_keys: tuple[str, ...]) -> dict:
         raise InputError(where, "not a mapping", "see docs/guides/simulate.md")
     for key in data:
         if key not in known_keys:
-            raise InputError(f"{where}: {key}", "unknown key", known_are(str(key), known_keys))
+            raise InputError(
+                f"{where}: {key}", "unknown key", known_are(str(key), known_keys)
+            )
     return data
 
 

@@ -52,21 +52,27 @@ def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> C
         stage = StageMap(result)
         distance = distance_text(stage, *stage.length_uncertainty())
     except InputError as error:
-        distance = f"the correlations between nodes are not known ({printable(error.what)})"
+        distance = (
+            f"the correlations between nodes are not known ({printable(error.what)})"
+        )
     sections += [
         *(
             Section(name, notes=tuple(map(visible, texts)))
             for name, texts in statement_texts(result)
         ),
         Section("Uncertainty of distances", notes=(distance,)),
-        Section("Remarks", notes=tuple(visible(item["text"]) for item in details["remarks"])),
+        Section(
+            "Remarks", notes=tuple(visible(item["text"]) for item in details["remarks"])
+        ),
     ]
     return Chapter("Certificate", sections=tuple(sections))
 
 
 def certified(details: dict[str, Any]) -> dict[str, str]:
     """Return what the head of a certificate states, on its first page."""
-    laboratory, customer, item = (details[name] for name in ("laboratory", "customer", "item"))
+    laboratory, customer, item = (
+        details[name] for name in ("laboratory", "customer", "item")
+    )
     persons = (
         person["name"] + (f" ({person['role']})" if "role" in person else "")
         for person in details["persons"]
@@ -76,7 +82,9 @@ def certified(details: dict[str, Any]) -> dict[str, str]:
         "issued": details["certificate"]["issued"],
         "laboratory": _addressed(laboratory),
         "customer": _addressed(customer),
-        "stage": " ".join(item[key] for key in ("manufacturer", "name", "model") if key in item),
+        "stage": " ".join(
+            item[key] for key in ("manufacturer", "name", "model") if key in item
+        ),
         "serial_number": item["serial_number"],
         "operator": ", ".join(persons),
     }
@@ -88,7 +96,11 @@ def _addressed(party: dict[str, Any]) -> str:
 
 def _facts(title: str, facts: dict[str, Any]) -> Section:
     return Section(
-        title, tuple((key.replace("_", " "), printable(str(value))) for key, value in facts.items())
+        title,
+        tuple(
+            (key.replace("_", " "), printable(str(value)))
+            for key, value in facts.items()
+        ),
     )
 
 

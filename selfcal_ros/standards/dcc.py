@@ -139,7 +139,10 @@ def _administration(result: CalibrationResult, details: dict[str, Any]) -> ET.El
             ),
             _dcc("mandatoryLangCodeISO639_1", TEXTS_ARE_IN),
             _dcc("uniqueIdentifier", core["id"]),
-            _dcc("identifications", _identification("calibrationLaboratory", order, "order"))
+            _dcc(
+                "identifications",
+                _identification("calibrationLaboratory", order, "order"),
+            )
             if order
             else None,
             _dcc("beginPerformanceDate", core["begin"]),
@@ -170,7 +173,10 @@ def _software() -> ET.Element:
 
 def _identification(issuer: str, value: str, name: str) -> ET.Element:
     return _dcc(
-        "identification", _dcc("issuer", issuer), _dcc("value", value), _content("name", name)
+        "identification",
+        _dcc("issuer", issuer),
+        _dcc("value", value),
+        _content("name", name),
     )
 
 
@@ -179,7 +185,10 @@ def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
     yield _content("name", item["name"])
     descriptions = [
         f"{word}: {item[key]}"
-        for word, key in (("certificate", "certificate"), ("valid until", "valid_until"))
+        for word, key in (
+            ("certificate", "certificate"),
+            ("valid until", "valid_until"),
+        )
         if key in item
     ]
     if descriptions:
@@ -189,7 +198,8 @@ def _thing(item: dict[str, str], issuer: str) -> Iterator[ET.Element | None]:
     yield _dcc_if_given("model", item.get("model"))
     if "serial_number" in item:
         yield _dcc(
-            "identifications", _identification(issuer, item["serial_number"], "serial number")
+            "identifications",
+            _identification(issuer, item["serial_number"], "serial number"),
         )
 
 
@@ -207,7 +217,9 @@ def _contact(details: dict[str, str]) -> Iterator[ET.Element | None]:
     )
 
 
-def _statements(result: CalibrationResult, details: dict[str, Any]) -> Iterator[ET.Element]:
+def _statements(
+    result: CalibrationResult, details: dict[str, Any]
+) -> Iterator[ET.Element]:
     """Yield the statements on traceability, verdict, uncertainty and scope, and the remarks."""
     flags = {
         TRACEABILITY: ("traceable", is_traceable(result)),
@@ -224,18 +236,29 @@ def _statements(result: CalibrationResult, details: dict[str, Any]) -> Iterator[
             flag if key == "valid" else None,
         )
     for remark in details["remarks"]:
-        yield _dcc("statement", _content("name", "Remark"), _content("declaration", remark["text"]))
+        yield _dcc(
+            "statement",
+            _content("name", "Remark"),
+            _content("declaration", remark["text"]),
+        )
 
 
-def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> ET.Element:
+def _results(
+    stage: StageMap, details: dict[str, Any], *, covariance: bool
+) -> ET.Element:
     result = stage.result
     core = details["certificate"]
     conditions = [
-        _dcc("influenceCondition", _content("name", item["name"]), _dcc("data", _condition(item)))
+        _dcc(
+            "influenceCondition",
+            _content("name", item["name"]),
+            _dcc("data", _condition(item)),
+        )
         for item in details["conditions"]
     ]
     equipment = [
-        _dcc("measuringEquipment", *_thing(item, "manufacturer")) for item in details["equipment"]
+        _dcc("measuringEquipment", *_thing(item, "manufacturer"))
+        for item in details["equipment"]
     ]
     return _dcc(
         "measurementResults",
@@ -244,7 +267,9 @@ def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> E
             _dcc(
                 "usedMethod",
                 _content("name", method_name(result)),
-                _content("description", *known_plate_texts(result), *_model_texts(result)),
+                _content(
+                    "description", *known_plate_texts(result), *_model_texts(result)
+                ),
                 _dcc("norm", "JCGM 100:2008"),
             ),
         ),
@@ -267,7 +292,11 @@ def _results(stage: StageMap, details: dict[str, Any], *, covariance: bool) -> E
             _dcc(
                 "measurementMetaData",
                 *(
-                    _dcc("metaData", _content("name", name), _content("description", text))
+                    _dcc(
+                        "metaData",
+                        _content("name", name),
+                        _content("description", text),
+                    )
                     for name, text in _meta(result, core)
                 ),
             ),
@@ -285,10 +314,18 @@ def _model_texts(result: CalibrationResult) -> list[str]:
         block = blocks().get(term.name)
         if block is not None and block.of_lines and not result.plate.angular_count:
             continue
-        size = "free" if term.size is None else f"standard deviation {term.solved_with:.3g}"
-        of_images = block is not None and block.of_microscope and result.camera is not None
+        size = (
+            "free"
+            if term.size is None
+            else f"standard deviation {term.solved_with:.3g}"
+        )
+        of_images = (
+            block is not None and block.of_microscope and result.camera is not None
+        )
         source = (
-            "determined by the images" if of_images and term.source == "default" else (term.source)
+            "determined by the images"
+            if of_images and term.source == "default"
+            else (term.source)
         )
         texts.append(f"term {term.name}: {size}, {source}")
     return texts
@@ -326,7 +363,9 @@ def _meta(result: CalibrationResult, core: dict[str, str]) -> Iterator[tuple[str
         if np.isfinite(k := getattr(noise, f"k_{kind}")):
             yield (
                 f"coverage of {name}",
-                (f"k = {k:.3g} for 95.45 %, {dof_text(noise.dof_of(kind))} degrees of freedom"),
+                (
+                    f"k = {k:.3g} for 95.45 %, {dof_text(noise.dof_of(kind))} degrees of freedom"
+                ),
             )
     for warning in result.warnings:
         yield "warning", warning
@@ -356,7 +395,9 @@ def _condition(item: dict[str, Any]) -> ET.Element:
     )
 
 
-def _real(value: float, unit: str, u: float | None = None, k: float = 2.0) -> ET.Element:
+def _real(
+    value: float, unit: str, u: float | None = None, k: float = 2.0
+) -> ET.Element:
     """Return a number with its unit, and U = k u if u is known."""
     return _si(
         "real",
@@ -467,7 +508,13 @@ def _result(name: str, *data: ET.Element) -> ET.Element:
 
 
 def _scalar(
-    name: str, value: float, unit: str, text: str = "", *, u: float | None = None, k: float = 2.0
+    name: str,
+    value: float,
+    unit: str,
+    text: str = "",
+    *,
+    u: float | None = None,
+    k: float = 2.0,
 ) -> ET.Element:
     return _dcc(
         "quantity",
@@ -508,7 +555,9 @@ def _budgets(result: CalibrationResult) -> Iterator[ET.Element]:
                 f"k = {budget.k:.3g} for 95.45 %, largest {most}{budget.U_max:.3g}",
             )
         )
-        yield _result(f"Uncertainty budget: {quantity_text(budget)}", _dcc("list", *rows))
+        yield _result(
+            f"Uncertainty budget: {quantity_text(budget)}", _dcc("list", *rows)
+        )
 
 
 def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
@@ -523,7 +572,9 @@ def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
             raise
         yield _result(
             "Correlations",
-            _content("text", f"The correlations between nodes are not known ({error.what})."),
+            _content(
+                "text", f"The correlations between nodes are not known ({error.what})."
+            ),
         )
         return
     yield _result(
@@ -559,14 +610,19 @@ def _correlations(stage: StageMap, *, covariance: bool) -> Iterator[ET.Element]:
             _content("name", "Gx, then Gy"),
             _si(
                 "realListXMLList",
-                _si("valueXMLList", _numbers(np.concatenate([emap.gx[has_u], emap.gy[has_u]]))),
+                _si(
+                    "valueXMLList",
+                    _numbers(np.concatenate([emap.gx[has_u], emap.gy[has_u]])),
+                ),
                 _si("unitXMLList", METRE),
                 _si(
                     "measurementUncertaintyMultivariateXMLList",
                     _si(
                         "ellipsoidalRegionMUXMLList",
                         _si("covarianceMatrixXMLList", *columns),
-                        _si("coverageFactorXMLList", f"{_of_ellipsoid(stage, full):.4f}"),
+                        _si(
+                            "coverageFactorXMLList", f"{_of_ellipsoid(stage, full):.4f}"
+                        ),
                         _si("coverageProbabilityXMLList", PROBABILITY),
                     ),
                 ),
@@ -583,7 +639,9 @@ def _of_ellipsoid(stage: StageMap, covariance: np.ndarray) -> float:
     from scipy.stats import chi2, f  # half a second, for this alone
 
     rank = int(
-        np.linalg.matrix_rank(covariance, tol=1e-7 * np.abs(covariance).max(), hermitian=True)
+        np.linalg.matrix_rank(
+            covariance, tol=1e-7 * np.abs(covariance).max(), hermitian=True
+        )
     )
     dof = stage.result.noise.dof_of("xy")
     square = (

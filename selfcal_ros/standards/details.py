@@ -30,12 +30,16 @@ def _text(value: Any) -> str | None:
 
 
 def _code(pattern: str) -> Callable[[Any], str | None]:
-    return lambda value: value if isinstance(value, str) and re.fullmatch(pattern, value) else None
+    return lambda value: (
+        value if isinstance(value, str) and re.fullmatch(pattern, value) else None
+    )
 
 
 def _date(value: Any) -> str | None:
     try:
-        return str(value if isinstance(value, date) else date.fromisoformat(str(value)))[:10]
+        return str(
+            value if isinstance(value, date) else date.fromisoformat(str(value))
+        )[:10]
     except ValueError:
         return None
 
@@ -137,17 +141,23 @@ def details_from_dict(data: Any, where: str) -> dict[str, Any]:
     """
     if not isinstance(data, dict):
         raise InputError(
-            where, "not the details of a certificate", f"give the sections {', '.join(NEEDED)}"
+            where,
+            "not the details of a certificate",
+            f"give the sections {', '.join(NEEDED)}",
         )
     for name in data:
         if name not in SECTIONS:
-            raise InputError(f"{where}: {name}", "is unknown", known_are(str(name), SECTIONS))
+            raise InputError(
+                f"{where}: {name}", "is unknown", known_are(str(name), SECTIONS)
+            )
     details: dict[str, Any] = {}
     for name in SECTIONS:
         if not data.get(name):
             if name in NEEDED:
                 raise InputError(
-                    f"{where}: {name}", "is missing", "give " + ", ".join(SECTIONS[name][1])
+                    f"{where}: {name}",
+                    "is missing",
+                    "give " + ", ".join(SECTIONS[name][1]),
                 )
             details[name] = []
         elif name in LISTS:
@@ -215,5 +225,7 @@ def _section(data: Any, name: str, where: str) -> dict[str, Any]:
             continue
         section[key] = reader(data[key])
         if section[key] is None:
-            raise InputError(f"{where}.{key}", f"{data[key]!r} is not {expected}", "correct it")
+            raise InputError(
+                f"{where}.{key}", f"{data[key]!r} is not {expected}", "correct it"
+            )
     return section

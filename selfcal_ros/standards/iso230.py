@@ -320,7 +320,9 @@ def axis_figures(
     )
 
 
-def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _true_values(
+    values: np.ndarray, u: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """Return draws of the true values at positions, (DRAWS, n), given measured ones with u.
 
     The largest of measured values is larger than the largest true one.
@@ -332,7 +334,9 @@ def _true_values(values: np.ndarray, u: np.ndarray, rng: np.random.Generator) ->
     return centre + true_share * (values - centre) + drawn
 
 
-def _true_scatters(s: np.ndarray, dof: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _true_scatters(
+    s: np.ndarray, dof: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """Return draws of the true standard deviations at positions, (DRAWS, n), given measured ones.
 
     As `_true_values`, of their logarithms: the largest s is larger than the largest true one.
@@ -370,13 +374,20 @@ def _true_shares(
     mean = weight @ values / weight.sum(axis=1)
     fit = 0.5 * (np.log(weight) - weight * (values - mean[:, None]) ** 2).sum(axis=1)
     fit -= 0.5 * np.log(weight.sum(axis=1))
-    chosen = rng.choice(SHARES, DRAWS, p=np.exp(fit - fit.max()) / np.exp(fit - fit.max()).sum())
-    centre = mean[chosen] + rng.standard_normal(DRAWS) / np.sqrt(weight[chosen].sum(axis=1))
+    chosen = rng.choice(
+        SHARES, DRAWS, p=np.exp(fit - fit.max()) / np.exp(fit - fit.max()).sum()
+    )
+    centre = mean[chosen] + rng.standard_normal(DRAWS) / np.sqrt(
+        weight[chosen].sum(axis=1)
+    )
     return centre[:, None], 1 - u**2 * weight[chosen]
 
 
 def _positions(
-    stage: StageMap, axis: int, line: int, repeats: dict[tuple[int, int], Scatter] | None
+    stage: StageMap,
+    axis: int,
+    line: int,
+    repeats: dict[tuple[int, int], Scatter] | None,
 ) -> list[tuple[int, int]]:
     """Return the known sites along a line, with repeats if there are some."""
     plate, valid = stage.error_map.artifact, stage.error_map.valid
@@ -411,7 +422,9 @@ def _rms_about(values: np.ndarray, centre: float) -> float:
     return float(np.sqrt(np.mean((values - centre) ** 2)))
 
 
-def _map_draws(stage: StageMap, place: tuple[np.ndarray, np.ndarray], axis: int) -> np.ndarray:
+def _map_draws(
+    stage: StageMap, place: tuple[np.ndarray, np.ndarray], axis: int
+) -> np.ndarray:
     """Return draws of the error of the map at sites along one axis, (DRAWS, n), m."""
     emap = stage.error_map
     chosen = np.zeros(emap.artifact.shape, dtype=bool)
@@ -482,7 +495,10 @@ def circle_figures(
 
     name = f"circle of radius {radius_m * 1e3:g} mm"
     return PathFigures(
-        name, _path(stage, (x, y), figures, (name, "measure them, or choose a smaller --radius"))
+        name,
+        _path(
+            stage, (x, y), figures, (name, "measure them, or choose a smaller --radius")
+        ),
     )
 
 
@@ -550,7 +566,9 @@ def _path(
     deviation = -np.stack([gx, gy])
     measured = figures(deviation)
     try:
-        drawn = figures(deviation - _draws(stage.covariance(*points)).reshape(DRAWS, 2, -1))
+        drawn = figures(
+            deviation - _draws(stage.covariance(*points)).reshape(DRAWS, 2, -1)
+        )
     except InputError:  # without the correlations of the sites
         drawn = {name: np.full(1, np.nan) for name in measured}
     return {

@@ -62,20 +62,29 @@ def require_certifiable(result: CalibrationResult, details: dict[str, Any]) -> N
             )
 
 
-def _require_temperature(result: CalibrationResult, conditions: list[dict[str, Any]]) -> None:
+def _require_temperature(
+    result: CalibrationResult, conditions: list[dict[str, Any]]
+) -> None:
     """Refuse a temperature of the plate that contradicts the one of its reference length.
 
     It may differ between the runs of a mean.
     """
     length = result.reference
-    if length is None or length.certified is None or length.runs or not length.kind.of_plate:
+    if (
+        length is None
+        or length.certified is None
+        or length.runs
+        or not length.kind.of_plate
+    ):
         return
     used, u = length.certified.temperature_c, length.certified.u_temperature_k
     for item in conditions:
         if (
             item.get("unit") == "degC"
             and "plate" in item["name"]
-            and (abs(item["value"] - used) > 2 * math.hypot(u, item.get("u", 0.0)) + 1e-9)
+            and (
+                abs(item["value"] - used) > 2 * math.hypot(u, item.get("u", 0.0)) + 1e-9
+            )
         ):
             raise InputError(
                 "certificate",

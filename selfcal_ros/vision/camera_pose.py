@@ -84,7 +84,9 @@ def tracks(images: Sequence[np.ndarray]) -> list[np.ndarray]:
     return numbers
 
 
-def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sense) -> CameraPose:
+def camera_pose(
+    positions: np.ndarray, images: Sequence[np.ndarray], sense: Sense
+) -> CameraPose:
     """Return the camera that sees marks at these places while the stage is at `positions`.
 
     Parameters
@@ -120,19 +122,23 @@ def camera_pose(positions: np.ndarray, images: Sequence[np.ndarray], sense: Sens
         )
     stage = (
         stage
-        - (np.stack([np.bincount(number, axis) for axis in stage.T]) / np.bincount(number)).T[
-            number
-        ]
+        - (
+            np.stack([np.bincount(number, axis) for axis in stage.T])
+            / np.bincount(number)
+        ).T[number]
     )
     place = (
         place
-        - (np.stack([np.bincount(number, axis) for axis in place.T]) / np.bincount(number)).T[
-            number
-        ]
+        - (
+            np.stack([np.bincount(number, axis) for axis in place.T])
+            / np.bincount(number)
+        ).T[number]
     )
     span = np.linalg.svd(stage, compute_uv=False)
     if span[1] < LEAST_SPAN * span[0]:
-        raise InputError("images", "the stage moved along one line only", "move it in x and in y")
+        raise InputError(
+            "images", "the stage moved along one line only", "move it in x and in y"
+        )
     by_stage = np.linalg.lstsq(stage, place, rcond=None)[0].T  # px per m
     residual = place - stage @ by_stage.T
     noise = float(np.sqrt(np.square(residual).sum() / (2 * (len(number) - count - 2))))
@@ -157,7 +163,9 @@ def _similar(
             camera = camera * np.array([-1.0, 1.0])
         (a, b), (c, d) = camera
         size = np.hypot(a + d, c - b) / 2
-        return np.array([size, np.arctan2(c - b, a + d), (a - d) / 2 / size, (b + c) / 2 / size])
+        return np.array(
+            [size, np.arctan2(c - b, a + d), (a - d) / 2 / size, (b + c) / 2 / size]
+        )
 
     components = parts(by_stage)
     step = 1e-6 * np.abs(by_stage).max()
@@ -198,7 +206,9 @@ def _similar(
     )
 
 
-def require_size(pose: CameraPose, *, mark_size_m: float, mark_pixels: float, where: str) -> None:
+def require_size(
+    pose: CameraPose, *, mark_size_m: float, mark_pixels: float, where: str
+) -> None:
     """Raise InputError for a camera in which marks would have another size than stated."""
     stated_m = mark_size_m / mark_pixels
     if abs(stated_m / pose.pixel_size_m - 1) > DetectorSettings().size_tolerance:

@@ -57,7 +57,8 @@ class CodedPlate:
         parameters.minMarkerPerimeterRate = 0.01
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         self._reader: Any = cv2.aruco.ArucoDetector(
-            cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY)), parameters
+            cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, DICTIONARY)),
+            parameters,
         )
 
     def identified(
@@ -79,7 +80,9 @@ class CodedPlate:
         if places is None:
             return [None] * len(marks)
         last = values.shape[1] - 1
-        pixels = np.array([(last - mark.u if mirror else mark.u) - 1j * mark.v for mark in marks])
+        pixels = np.array(
+            [(last - mark.u if mirror else mark.u) - 1j * mark.v for mark in marks]
+        )
         place_of, markers = places
         return [self._id(place_of(pixel), markers) for pixel in pixels.tolist()]
 
@@ -88,7 +91,9 @@ class CodedPlate:
 
         Pixels are u - iv, places x + iy in pitches: a turn, a scale and a shift, by least squares.
         """
-        grey = np.ascontiguousarray(np.clip(values * (255.0 / full_scale), 0, 255), dtype=np.uint8)
+        grey = np.ascontiguousarray(
+            np.clip(values * (255.0 / full_scale), 0, 255), dtype=np.uint8
+        )
         corners, numbers, _ = self._reader.detectMarkers(grey)
         if numbers is None:
             return None
@@ -106,7 +111,9 @@ class CodedPlate:
             return None
         return lambda place_px: factor * place_px + shift, markers
 
-    def _id(self, place: complex, markers: np.ndarray) -> tuple[int, int] | MarkFault | None:
+    def _id(
+        self, place: complex, markers: np.ndarray
+    ) -> tuple[int, int] | MarkFault | None:
         point = np.array([place.real, place.imag])
         if (np.abs(markers - point).max(axis=1) < SIDE / 2 + 0.05).any():
             return MarkFault.MARKER

@@ -97,8 +97,14 @@ class MarkDetector:
         If the size of the pixels or marks is not set, or marks are too small or large in pixels.
     """
 
-    def __init__(self, settings: DetectorSettings, where: str = "mark_detector") -> None:
-        unset = [name for name in ("pixel_size", "mark_size") if not getattr(settings, name) > 0]
+    def __init__(
+        self, settings: DetectorSettings, where: str = "mark_detector"
+    ) -> None:
+        unset = [
+            name
+            for name in ("pixel_size", "mark_size")
+            if not getattr(settings, name) > 0
+        ]
         if unset:
             verb, them = ("are", "them") if len(unset) > 1 else ("is", "it")
             raise InputError(
@@ -118,9 +124,17 @@ class MarkDetector:
             )
         if 2 * self._width >= self.size and settings.mark in ("ring", "cross"):
             raise InputError(
-                f"{where}: mark_width", "at least half of mark_size", "give the width of one line"
+                f"{where}: mark_width",
+                "at least half of mark_size",
+                "give the width of one line",
             )
-        self._sign = 0 if settings.mark == "corner" else 1 if settings.polarity == "bright" else -1
+        self._sign = (
+            0
+            if settings.mark == "corner"
+            else 1
+            if settings.polarity == "bright"
+            else -1
+        )
 
     def judged(self, picture: Picture) -> list[Judged]:
         """Return the possible marks of an image, row by row.
@@ -220,7 +234,9 @@ class MarkDetector:
             yield int(index), MarkFault.SATURATED
         usable = which[inside][~saturated]
         fits = fit_marks(
-            self._model, Windows(windows.disc, windows.values[~saturated]), starts[usable]
+            self._model,
+            Windows(windows.disc, windows.values[~saturated]),
+            starts[usable],
         )
         for index, fit in zip(usable, fits, strict=True):
             yield int(index), MarkFault.NO_FIT if fit is None else fit
@@ -249,16 +265,23 @@ class MarkDetector:
         if abs(fit.shape["blur"]) > settings.max_blur * self.size:
             return MarkFault.DEFOCUSED
         if fit.bright + fit.dark + fit.inner_stains + fit.outer_stains >= STAINED:
-            if max(fit.bright, fit.dark) >= STAINED:  # these spoil the levels of the others
+            # these spoil the levels of the others
+            if max(fit.bright, fit.dark) >= STAINED:
                 return MarkFault.REFLECTION if fit.bright > fit.dark else MarkFault.DIRT
-            return MarkFault.BROKEN if fit.inner_stains > fit.outer_stains else MarkFault.DIRT
+            return (
+                MarkFault.BROKEN
+                if fit.inner_stains > fit.outer_stains
+                else MarkFault.DIRT
+            )
         if abs(size / self.size - 1) > settings.size_tolerance:
             return MarkFault.WRONG_SIZE
         if not max(fit.sigmas) <= settings.max_sigma_px:
             return MarkFault.WEAK
         return None
 
-    def nothing_found(self, picture: Picture | None, rejected: Counter[str]) -> tuple[str, str]:
+    def nothing_found(
+        self, picture: Picture | None, rejected: Counter[str]
+    ) -> tuple[str, str]:
         """Return what is wrong with images without a mark, and what to change.
 
         Parameters
@@ -302,7 +325,9 @@ class MarkDetector:
         out = []
         for mark, mark_id in zip(marks, ids or [None] * len(marks), strict=True):
             x, y = offset(mark.u, mark.v, shape, self.settings)
-            sigma = self.settings.pixel_size * float(np.sqrt((mark.u_u**2 + mark.u_v**2) / 2))
+            sigma = self.settings.pixel_size * float(
+                np.sqrt((mark.u_u**2 + mark.u_v**2) / 2)
+            )
             m, n = mark_id or (0, 0)
             out.append(
                 Detection(
@@ -334,17 +359,24 @@ def told_apart(judged: Iterable[Judged]) -> tuple[list[Mark], Counter[str]]:
     return marks, faults
 
 
-def _without_doubles(marks: list[Mark | MarkFault], near: float) -> list[Mark | MarkFault]:
+def _without_doubles(
+    marks: list[Mark | MarkFault], near: float
+) -> list[Mark | MarkFault]:
     """Return the marks; one that lies nearer than `near` to an earlier one is a double, px."""
     places = np.array(
-        [(mark.u, mark.v) if isinstance(mark, Mark) else (np.nan, np.nan) for mark in marks]
+        [
+            (mark.u, mark.v) if isinstance(mark, Mark) else (np.nan, np.nan)
+            for mark in marks
+        ]
     ).reshape(len(marks), 2)
     fitted = np.flatnonzero(np.isfinite(places[:, 0]))
     out = list(marks)
     if len(fitted) < 2:
         return out
     pairs = fitted[KDTree(places[fitted]).query_pairs(near, output_type="ndarray")]
-    for first, second in sorted(map(tuple, np.sort(pairs, axis=1)), key=lambda pair: pair[::-1]):
+    for first, second in sorted(
+        map(tuple, np.sort(pairs, axis=1)), key=lambda pair: pair[::-1]
+    ):
         if isinstance(out[first], Mark):
             out[second] = MarkFault.DOUBLE
     return out

@@ -41,10 +41,14 @@ def circled(
     line = max(1, round(size_px / 12))
     radius = RADIUS * size_px
     for u, v in marks:
-        draw.ellipse([u - radius, v - radius, u + radius, v + radius], outline=COLOUR, width=line)
+        draw.ellipse(
+            [u - radius, v - radius, u + radius, v + radius], outline=COLOUR, width=line
+        )
     for u, v, reason in rejected:
         draw.rectangle(
-            [u - radius, v - radius, u + radius, v + radius], outline=REJECTED, width=line
+            [u - radius, v - radius, u + radius, v + radius],
+            outline=REJECTED,
+            width=line,
         )
         draw.text((u - radius, v + radius + line), reason, fill=REJECTED)
     u = (pixels.shape[1] - 1) / 2

@@ -12,7 +12,13 @@ from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError, printable
 from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.vision.coded import CodedPlate
-from selfcal_ros.vision.detector import Judged, Mark, MarkDetector, MarkFault, told_apart
+from selfcal_ros.vision.detector import (
+    Judged,
+    Mark,
+    MarkDetector,
+    MarkFault,
+    told_apart,
+)
 from selfcal_ros.vision.images import Check, Picture, decoded, picture_of
 
 SETTLED = 3
@@ -59,7 +65,10 @@ class Counts:
             "images_without_marks": self.empty,
             "marks": self.marks,
             **({"images_with_more_pages": self.paged} if self.paged else {}),
-            **{f"rejected_{name}": count for name, count in sorted(self.rejected.items())},
+            **{
+                f"rejected_{name}": count
+                for name, count in sorted(self.rejected.items())
+            },
         }
 
 
@@ -84,14 +93,19 @@ class ImageDetector:
     """
 
     def __init__(
-        self, settings: DetectorSettings, where: str = "mark_detector", draw: Draw | None = None
+        self,
+        settings: DetectorSettings,
+        where: str = "mark_detector",
+        draw: Draw | None = None,
     ) -> None:
         self._detector = MarkDetector(settings, where)
         self._coded = CodedPlate(settings.aruco, where) if settings.aruco else None
         self.counts = Counts()
         self.problems: Counter[str] = Counter()
         self.draw = draw
-        self._empty: Picture | None = None  # an image without marks, until there is a mark
+        self._empty: Picture | None = (
+            None  # an image without marks, until there is a mark
+        )
         self._source = _Source()
         self._stamps: dict[int, None] = {}  # of the images used, in their order
 
@@ -144,7 +158,12 @@ class ImageDetector:
         )
 
     def _detect(
-        self, decode: Callable[[Check], Picture], stamp: int, name: str, *, camera: str = ""
+        self,
+        decode: Callable[[Check], Picture],
+        stamp: int,
+        name: str,
+        *,
+        camera: str = "",
     ) -> list[Detection]:
         try:
             if stamp in self._stamps:
@@ -185,8 +204,12 @@ class ImageDetector:
         """Return the possible marks without parts of markers, and the ids of the marks."""
         if self._coded is None:
             return judged, []
-        marks = [candidate.found for candidate in judged if isinstance(candidate.found, Mark)]
-        id_of_mark = self._coded.identified(marks, picture, mirror=self._detector.settings.mirror)
+        marks = [
+            candidate.found for candidate in judged if isinstance(candidate.found, Mark)
+        ]
+        id_of_mark = self._coded.identified(
+            marks, picture, mirror=self._detector.settings.mirror
+        )
         each_id = iter(id_of_mark)
         out = []
         for candidate in judged:
@@ -196,7 +219,9 @@ class ImageDetector:
                 if isinstance(identified, MarkFault)
                 else candidate
             )
-        return out, [mark_id for mark_id in id_of_mark if not isinstance(mark_id, MarkFault)]
+        return out, [
+            mark_id for mark_id in id_of_mark if not isinstance(mark_id, MarkFault)
+        ]
 
     def _refuse_other(self, image: tuple, name: str) -> None:
         """Refuse an image of another camera or size than the settled one, before it is decoded.

@@ -82,7 +82,9 @@ def _templates(
     angles = np.arange(ANGLES if sign else ANGLES // 2) * model.turns / ANGLES
     for angle in angles if model.turns else [0.0]:
         value = (sign or 1) * model.shape(
-            u.ravel(), v.ravel(), model.start(size, width, float(angle), TEMPLATE_BLUR * size)
+            u.ravel(),
+            v.ravel(),
+            model.start(size, width, float(angle), TEMPLATE_BLUR * size),
         )[0]
         value = value - value.mean()
         square = (value / np.sqrt(value @ value)).reshape(u.shape).astype(np.float32)
@@ -90,7 +92,9 @@ def _templates(
         padded[: 2 * half + 1, : 2 * half + 1] = square
         templates.append(
             _Template(
-                float(angle), square, np.conj(fft.rfft2(np.roll(padded, (-half, -half), (0, 1))))
+                float(angle),
+                square,
+                np.conj(fft.rfft2(np.roll(padded, (-half, -half), (0, 1)))),
             )
         )
     return templates
@@ -103,7 +107,8 @@ def _half(size: float) -> int:
 def _reflected(image: np.ndarray, half: int) -> np.ndarray:
     """Return the image with a reflected border, of a size with a fast transform."""
     pad = [
-        (half, fft.next_fast_len(side + 2 * half, real=True) - side - half) for side in image.shape
+        (half, fft.next_fast_len(side + 2 * half, real=True) - side - half)
+        for side in image.shape
     ]
     return np.pad(image, pad, mode="symmetric")
 
@@ -142,19 +147,24 @@ def candidates(
     best = _correlated(padded, templates, sign)[
         half : half + small.shape[0], half : half + small.shape[1]
     ]
-    amplitude = max(NOISES * max(_noise(small), QUANTUM / factor), FAINT * float(best.max()))
+    amplitude = max(
+        NOISES * max(_noise(small), QUANTUM / factor), FAINT * float(best.max())
+    )
     peaks = (best > amplitude) & (best == _largest(best, round(APART * size / factor)))
     if np.count_nonzero(peaks) > PEAKS * most:
         raise too_many(most)
     rows, columns = np.nonzero(peaks)
-    squares = np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1, 2 * half + 1))[
-        rows, columns
-    ].reshape(len(rows), (2 * half + 1) ** 2)
+    squares = np.lib.stride_tricks.sliding_window_view(
+        padded, (2 * half + 1, 2 * half + 1)
+    )[rows, columns].reshape(len(rows), (2 * half + 1) ** 2)
     norms = squares.shape[1] ** 0.5 * np.maximum(squares.std(axis=1, dtype=float), 1e-3)
     similar = best[rows, columns] > CORRELATION * norms
     if np.count_nonzero(similar) > most:
         raise too_many(most)
-    near = squares[similar] @ np.stack([template.square.ravel() for template in templates]).T
+    near = (
+        squares[similar]
+        @ np.stack([template.square.ravel() for template in templates]).T
+    )
     which = np.argmax(np.abs(near) if sign == 0 else near, axis=1)
     return [
         Candidate(
@@ -163,7 +173,10 @@ def candidates(
             templates[nearest].angle,
         )
         for row, column, nearest in zip(
-            rows[similar].tolist(), columns[similar].tolist(), which.tolist(), strict=True
+            rows[similar].tolist(),
+            columns[similar].tolist(),
+            which.tolist(),
+            strict=True,
         )
     ]
 
@@ -177,13 +190,19 @@ def too_many(most: int) -> InputError:
     )
 
 
-def _correlated(padded: np.ndarray, templates: list[_Template], sign: int) -> np.ndarray:
+def _correlated(
+    padded: np.ndarray, templates: list[_Template], sign: int
+) -> np.ndarray:
     """Return the largest correlation of each place with a template; without sign, absolute."""
     transform = fft.rfft2(padded)
     best = np.full(padded.shape, -np.inf, dtype=np.float32)
     for template in templates:
         correlation = fft.irfft2(transform * template.transform, padded.shape)
-        np.maximum(best, correlation if sign else np.abs(correlation, out=correlation), out=best)
+        np.maximum(
+            best,
+            correlation if sign else np.abs(correlation, out=correlation),
+            out=best,
+        )
     return best
 
 
@@ -205,7 +224,11 @@ def _vertex(row: np.ndarray, peak: int) -> float:
     if not 0 < peak < len(row) - 1:
         return 0.0
     before, top, after = row[peak - 1 : peak + 2].tolist()
-    return (before - after) / (2 * (before - 2 * top + after)) if before + after < 2 * top else 0.0
+    return (
+        (before - after) / (2 * (before - 2 * top + after))
+        if before + after < 2 * top
+        else 0.0
+    )
 
 
 def _noise(image: np.ndarray) -> float:

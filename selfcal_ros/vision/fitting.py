@@ -130,17 +130,28 @@ def lie_inside(
     """Return which windows (marks,) around pixels lie inside the image."""
     half = int(np.ceil(radius))
     height, width = image.shape
-    return (half <= columns) & (columns < width - half) & (half <= rows) & (rows < height - half)
+    return (
+        (half <= columns)
+        & (columns < width - half)
+        & (half <= rows)
+        & (rows < height - half)
+    )
 
 
-def windows_of(image: np.ndarray, columns: np.ndarray, rows: np.ndarray, radius: float) -> Windows:
+def windows_of(
+    image: np.ndarray, columns: np.ndarray, rows: np.ndarray, radius: float
+) -> Windows:
     """Return the windows around pixels; each must lie inside the image."""
     disc = _disc(radius)
     across, down = disc.u.astype(int), disc.v.astype(int)
-    return Windows(disc, image[rows[:, None] + down, columns[:, None] + across].astype(PRECISION))
+    return Windows(
+        disc, image[rows[:, None] + down, columns[:, None] + across].astype(PRECISION)
+    )
 
 
-def fit_marks(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit | None]:
+def fit_marks(
+    model: MarkModel, windows: Windows, starts: np.ndarray
+) -> list[Fit | None]:
     """Fit a mark near the centre of each window; None where there is none.
 
     Parameters
@@ -173,7 +184,9 @@ def _fitted(model: MarkModel, windows: Windows, starts: np.ndarray) -> list[Fit 
     settled &= parameters[:, 3] != 0
     which = np.flatnonzero(settled)
     some = Windows(windows.disc, windows.values[which])
-    for index, fit in zip(which, _weighted(model, some, parameters[which]), strict=True):
+    for index, fit in zip(
+        which, _weighted(model, some, parameters[which]), strict=True
+    ):
         fits[index] = fit
     return fits
 
@@ -190,15 +203,21 @@ def _image(
     illumination, shape.
     """
     columns = p.T[..., None].astype(PRECISION)
-    shape, derivatives = model.shape(u - columns[0], v - columns[1], columns[2 + LIGHTING :])
+    shape, derivatives = model.shape(
+        u - columns[0], v - columns[1], columns[2 + LIGHTING :]
+    )
     light = 1 + columns[4] * u + columns[5] * v
     level = columns[2] + columns[3] * shape
     bright = columns[3] * light
     jacobian = np.empty((len(p), p.shape[1], len(u)), dtype=PRECISION)
-    for row, derivative in zip((0, 1, *range(2 + LIGHTING, p.shape[1])), derivatives, strict=True):
+    for row, derivative in zip(
+        (0, 1, *range(2 + LIGHTING, p.shape[1])), derivatives, strict=True
+    ):
         np.multiply(derivative, bright, out=jacobian[:, row])
     jacobian[:, 2] = light
-    for row, (factor, values) in enumerate(((light, shape), (level, u), (level, v)), start=3):
+    for row, (factor, values) in enumerate(
+        ((light, shape), (level, u), (level, v)), start=3
+    ):
         np.multiply(factor, values, out=jacobian[:, row])
     return level * light, jacobian, shape
 
@@ -249,7 +268,11 @@ def _solved(
     normal, scale = _normal(jacobian)
     damped = normal + damping[:, None, None] * np.eye(normal.shape[1])
     gradient = (jacobian @ residual[..., None])[..., 0] / scale
-    return _solutions(np.linalg.solve, damped, gradient[..., None])[..., 0], normal, scale
+    return (
+        _solutions(np.linalg.solve, damped, gradient[..., None])[..., 0],
+        normal,
+        scale,
+    )
 
 
 def _diverged(p: np.ndarray, radius: float) -> np.ndarray:
@@ -272,7 +295,9 @@ def _unweighted_fits(
     v = windows.disc.v[some]
     values = windows.values[:, some]
     radius = windows.disc.inside.shape[0] / 2
-    p = _first(model.shape(u, v, starts.T[..., None].astype(PRECISION))[0], values, starts)
+    p = _first(
+        model.shape(u, v, starts.T[..., None].astype(PRECISION))[0], values, starts
+    )
     image, jacobian, _ = _image(model, u, v, p)
     residual = values - image
     cost = _dot(residual, residual)
@@ -282,7 +307,9 @@ def _unweighted_fits(
     for _ in range(ROUNDS):
         if not len(running):
             break
-        sigmas, _, scale = _solved(jacobian[running], residual[running], damping[running])
+        sigmas, _, scale = _solved(
+            jacobian[running], residual[running], damping[running]
+        )
         change = sigmas / scale
         tried = p[running] + change
         tried[:, -1] = np.maximum(tried[:, -1], SMALLEST_BLUR)
@@ -290,7 +317,9 @@ def _unweighted_fits(
         if "width" in model.names:
             possible &= (tried[:, 6:8] > 0).all(axis=1)
         lost = np.isnan(change).any(axis=1)
-        image, new_jacobian, _ = _image(model, u, v, np.where(possible[:, None], tried, p[running]))
+        image, new_jacobian, _ = _image(
+            model, u, v, np.where(possible[:, None], tried, p[running])
+        )
         new_residual = values[running] - image
         new_cost = _dot(new_residual, new_residual)
         better = possible & (new_cost <= cost[running])
@@ -311,7 +340,11 @@ def _unweighted_fits(
 
 
 def _variance(
-    residual: np.ndarray, image: np.ndarray, shape: np.ndarray, used: np.ndarray, free: int
+    residual: np.ndarray,
+    image: np.ndarray,
+    shape: np.ndarray,
+    used: np.ndarray,
+    free: int,
 ) -> np.ndarray:
     """Return the variance of each pixel, linear in its value between those of ground and mark."""
     square = np.square(residual)
@@ -325,16 +358,21 @@ def _variance(
     on_ground = used & (shape < CLEAR)
     on_mark = used & (shape > 1 - CLEAR)
     low, high = (
-        np.maximum(mean_of(square, part) * factor, mean / 10) for part in (on_ground, on_mark)
+        np.maximum(mean_of(square, part) * factor, mean / 10)
+        for part in (on_ground, on_mark)
     )
     at_low, at_high = mean_of(image, on_ground), mean_of(image, on_mark)
-    apart = (np.minimum(on_ground.sum(axis=1), on_mark.sum(axis=1)) >= ENOUGH) & (at_low != at_high)
+    apart = (np.minimum(on_ground.sum(axis=1), on_mark.sum(axis=1)) >= ENOUGH) & (
+        at_low != at_high
+    )
     low, high = np.where(apart, low, mean), np.where(apart, high, mean)
     slope = (high - low) / np.where(apart, at_high - at_low, 1.0)
     low, high, slope, at_low = (
         column[:, None].astype(PRECISION) for column in (low, high, slope, at_low)
     )
-    return np.clip(low + slope * (image - at_low), np.minimum(low, high), np.maximum(low, high))
+    return np.clip(
+        low + slope * (image - at_low), np.minimum(low, high), np.maximum(low, high)
+    )
 
 
 def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | None]:
@@ -359,7 +397,9 @@ def _weighted(model: MarkModel, windows: Windows, p: np.ndarray) -> list[Fit | N
         variance = _variance(residual, image, shape, used, p.shape[1])
         root = used / np.sqrt(variance)
         sigmas, normal, scale = _solved(
-            jacobian * root[:, None, :], residual * root, np.full(len(running), WEIGHTED_DAMPING)
+            jacobian * root[:, None, :],
+            residual * root,
+            np.full(len(running), WEIGHTED_DAMPING),
         )
         after = before + sigmas / scale
         after[:, -1] = np.maximum(after[:, -1], SMALLEST_BLUR)
@@ -392,8 +432,11 @@ def _fits(
     """Return the fits of marks that have settled; None where the uncertainty is not known."""
     shape, residual, variance, spread = modelled
     normal, scale = normal_and_scale
-    variances = np.diagonal(_solutions(np.linalg.inv, normal), axis1=1, axis2=2)[:, :2].copy()
-    variances[~(variances > 0)] = np.nan  # rounding, of a matrix that is almost singular
+    variances = np.diagonal(_solutions(np.linalg.inv, normal), axis1=1, axis2=2)[
+        :, :2
+    ].copy()
+    # rounding, of a matrix that is almost singular
+    variances[~(variances > 0)] = np.nan
     sigmas = np.sqrt(variances) / scale[:, :2]
     away = windows.values - windows.values.mean(axis=1, keepdims=True)
     explained = 1 - _dot(residual, residual) / np.maximum(_dot(away, away), TINY)
@@ -426,10 +469,15 @@ def _stains(
     shape, residual, spread = modelled
     squares = np.zeros((len(p), *disc.inside.shape), dtype=PRECISION)
     squares[:, disc.inside] = residual
-    mean = ndimage.uniform_filter(squares, (0, 3, 3), mode="constant")[:, disc.inside] / disc.near
+    mean = (
+        ndimage.uniform_filter(squares, (0, 3, 3), mode="constant")[:, disc.inside]
+        / disc.near
+    )
     noise = spread / np.sqrt(9 * disc.near)
     least = STAIN * np.abs(p[:, 3:4])
-    stained = (np.abs(mean) > np.maximum(least, STAIN_SIGMAS * noise)) & (np.abs(residual) > least)
+    stained = (np.abs(mean) > np.maximum(least, STAIN_SIGMAS * noise)) & (
+        np.abs(residual) > least
+    )
 
     counts = np.zeros((len(p), 4), dtype=int)
     some = stained.any(axis=1)  # the levels of the others are not wanted
@@ -449,12 +497,18 @@ def _stains(
     neither = stained & ~bright & ~dark
     inner = shape > 0.5
     counts[some] = np.stack(
-        [part.sum(axis=1) for part in (bright, dark, neither & inner, neither & ~inner)], axis=1
+        [
+            part.sum(axis=1)
+            for part in (bright, dark, neither & inner, neither & ~inner)
+        ],
+        axis=1,
     )
     return counts
 
 
-def _median_of_part(values: np.ndarray, part: np.ndarray, level: np.ndarray) -> np.ndarray:
+def _median_of_part(
+    values: np.ndarray, part: np.ndarray, level: np.ndarray
+) -> np.ndarray:
     """Return the median of the values in a part of each window; `level` where it is empty.
 
     It is robust, as the levels of the fit are not.
@@ -465,5 +519,7 @@ def _median_of_part(values: np.ndarray, part: np.ndarray, level: np.ndarray) -> 
     low = np.maximum(count - 1, 0) // 2
     high = count // 2
     with np.errstate(invalid="ignore"):  # inf - inf where there is none
-        middle = (ranked[rows, low] + ranked[rows, np.minimum(high, values.shape[1] - 1)]) / 2
+        middle = (
+            ranked[rows, low] + ranked[rows, np.minimum(high, values.shape[1] - 1)]
+        ) / 2
     return np.where(count > 0, middle, level)

@@ -73,7 +73,9 @@ def picture_of(message: Any, check: Check = any_size) -> Picture:
         return decoded(message.data, "image", check)
     if message.encoding not in ENCODINGS:
         raise InputError(
-            "image", f"encoding '{message.encoding[:40]}'", f"publish one of {', '.join(ENCODINGS)}"
+            "image",
+            f"encoding '{message.encoding[:40]}'",
+            f"publish one of {', '.join(ENCODINGS)}",
         )
     kind, channels = ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
@@ -111,9 +113,12 @@ def decoded(data: Buffer, where: str, check: Check = any_size) -> Picture:
     octets = memoryview(data).cast("B")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a bomb of decompression is announced by a warning
+            # a bomb of decompression is announced by a warning
+            warnings.simplefilter("error")
             with Image.open(io.BytesIO(octets), formats=FORMATS) as picture:
-                if picture.width * picture.height > min(LARGEST, EXPANSION * len(octets)):
+                if picture.width * picture.height > min(
+                    LARGEST, EXPANSION * len(octets)
+                ):
                     raise ValueError(
                         f"{picture.width} x {picture.height} pixels in {len(octets)} bytes"
                     )
@@ -122,7 +127,9 @@ def decoded(data: Buffer, where: str, check: Check = any_size) -> Picture:
     except InputError:
         raise
     except UnidentifiedImageError as error:  # its text has the address of an object
-        raise InputError(where, "not an image of a known kind, or damaged", SAVE_AS) from error
+        raise InputError(
+            where, "not an image of a known kind, or damaged", SAVE_AS
+        ) from error
     except Exception as error:  # the decoders of Pillow raise many kinds
         raise InputError(
             where, f"cannot be decoded as an image ({first_line(error)[:80]})", SAVE_AS
@@ -146,7 +153,9 @@ def _values(picture: Image.Image) -> Picture:
     if picture.mode == "F":
         raise ValueError("floating-point values, whose black and white are unknown")
     if picture.getexif().get(ORIENTATION, 1) != 1:
-        raise ValueError("its EXIF orientation is not 1: which way up the camera saw is unknown")
+        raise ValueError(
+            "its EXIF orientation is not 1: which way up the camera saw is unknown"
+        )
     if tags.get(PHOTOMETRIC) == WHITE_IS_ZERO and bits > 8:
         raise ValueError("white is 0")
     if signed and bits <= 8:
@@ -155,7 +164,10 @@ def _values(picture: Image.Image) -> Picture:
     stored_rows = sum(tags.get(STRIP_BYTES, ())) // max(row, 1)
     if tags.get(COMPRESSION) == UNCOMPRESSED and stored_rows > picture.height:
         raise ValueError(f"{stored_rows} rows of pixels instead of {picture.height}")
-    if picture.has_transparency_data and np.asarray(picture.convert("RGBA"))[:, :, 3].min() < 255:
+    if (
+        picture.has_transparency_data
+        and np.asarray(picture.convert("RGBA"))[:, :, 3].min() < 255
+    ):
         raise ValueError("transparent pixels")
     if picture.mode not in GREY_MODES:
         if ";16" in stored:

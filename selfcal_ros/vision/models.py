@@ -56,7 +56,9 @@ class MarkModel:
     turns: float
 
 
-def _edge(distance: np.ndarray, blur: Value) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _edge(
+    distance: np.ndarray, blur: Value
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a blurred step, 0 at negative distances, its slope, and its derivative by the blur.
 
     The normal distribution is Abramowitz and Stegun's 7.1.26, within 1e-7: a third of the time of
@@ -75,10 +77,16 @@ def _edge(distance: np.ndarray, blur: Value) -> tuple[np.ndarray, np.ndarray, np
         tail *= term
     tail *= bell
     bell *= 1 / (sigma * TWO_PI_ROOT)
-    return np.where(distance > 0, 1 - tail, tail), bell, bell * distance * (-blur / variance)
+    return (
+        np.where(distance > 0, 1 - tail, tail),
+        bell,
+        bell * distance * (-blur / variance),
+    )
 
 
-def _bars(along: np.ndarray, sides: tuple[Value, Value], blur: Value) -> tuple[np.ndarray, ...]:
+def _bars(
+    along: np.ndarray, sides: tuple[Value, Value], blur: Value
+) -> tuple[np.ndarray, ...]:
     """Return blurred bars of two lengths, and their derivatives by position, length and blur."""
     half = np.stack(np.broadcast_arrays(*map(np.atleast_1d, sides)))[:, None] / 2
     ends, slopes, by_blur = _edge(np.stack([along + half, along - half]), blur)
@@ -100,7 +108,9 @@ def _disc(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
 def _ring(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     """Parameters: outer diameter, width of the line, blur."""
     radius = np.hypot(u, v)
-    inside, slope, by_blur = _edge(np.stack([p[0] / 2 - radius, p[0] / 2 - p[1] - radius]), p[2])
+    inside, slope, by_blur = _edge(
+        np.stack([p[0] / 2 - radius, p[0] / 2 - p[1] - radius]), p[2]
+    )
     change = slope[0] - slope[1]
     outward = change / np.maximum(radius, 1e-9)
     return inside[0] - inside[1], np.stack(
@@ -154,7 +164,9 @@ def _cross(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
 def _corner(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
     """Parameters: angle of the first edge, blur; squares 1 and 3 between the edges are inside."""
     a, b, cosine, sine = _turned(u, v, p[0])
-    (over_a, over_b), (slope_a, slope_b), (blur_a, blur_b) = _edge(np.stack([a, b]), p[1])
+    (over_a, over_b), (slope_a, slope_b), (blur_a, blur_b) = _edge(
+        np.stack([a, b]), p[1]
+    )
     odd_a, odd_b = 2 * over_a - 1, 2 * over_b - 1
     by_a, by_b = slope_a * odd_b, odd_a * slope_b
     return (1 + odd_a * odd_b) / 2, np.stack(
@@ -169,7 +181,11 @@ def _corner(u: np.ndarray, v: np.ndarray, p: np.ndarray) -> Shaped:
 
 MODELS = {
     "disc": MarkModel(
-        ("size", "blur"), _disc, lambda size, width, angle, blur: np.array([size, blur]), 0.75, 0.0
+        ("size", "blur"),
+        _disc,
+        lambda size, width, angle, blur: np.array([size, blur]),
+        0.75,
+        0.0,
     ),
     "ring": MarkModel(
         ("size", "width", "blur"),

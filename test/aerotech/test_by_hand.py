@@ -31,14 +31,22 @@ ARCSEC = np.pi / 180 / 3600
 def test_the_middle_line_of_an_oblong_field(shape, along, corrected):
     plate = Artifact(shape[0], 0.01, 0, shape[1])
     i, j = np.indices(shape)
-    emap = replace(random_map(plate, 1), gx=1e-9 * (10 * i + j), gy=-1e-9 * (10 * i + j))
+    emap = replace(
+        random_map(plate, 1), gx=1e-9 * (10 * i + j), gy=-1e-9 * (10 * i + j)
+    )
     line = map_line(emap, along, corrected)
     middle = (shape[0] // 2, shape[1] // 2)
     count = shape[0] if along == "x" else shape[1]
-    wanted = [10 * n + middle[1] if along == "x" else 10 * middle[0] + n for n in range(count)]
-    np.testing.assert_allclose(line.positions_m, 0.01 * (np.arange(count) - count // 2), atol=1e-15)
+    wanted = [
+        10 * n + middle[1] if along == "x" else 10 * middle[0] + n for n in range(count)
+    ]
     np.testing.assert_allclose(
-        line.corrections_m, np.array(wanted) * (1e-9 if corrected == "x" else -1e-9), rtol=1e-12
+        line.positions_m, 0.01 * (np.arange(count) - count // 2), atol=1e-15
+    )
+    np.testing.assert_allclose(
+        line.corrections_m,
+        np.array(wanted) * (1e-9 if corrected == "x" else -1e-9),
+        rtol=1e-12,
     )
 
 
@@ -49,7 +57,9 @@ def test_squareness_is_over_the_length_of_its_own_axis(along):
     line = map_orthogonality(replace(emap, nonorthogonality=2e-6), along)
     half = 0.03 if along == "x" else 0.01
     np.testing.assert_allclose(line.positions_m, [-half, half])
-    np.testing.assert_allclose(line.corrections_m, [-4e-6 * half, 4e-6 * half], rtol=1e-9)
+    np.testing.assert_allclose(
+        line.corrections_m, [-4e-6 * half, 4e-6 * half], rtol=1e-9
+    )
 
 
 def test_a_slope_is_removed_about_the_middle_of_a_line_anywhere():
@@ -99,7 +109,9 @@ def test_zero_is_covered_also_after_a_turn(first, rollover, covers):
 
 def test_positions_between_the_last_entries_are_interpolated():
     """0, 10, 20 with a step of 10: 15 is half a step above entry 1; beyond, the last counts."""
-    entry, part = AxisSamples(1, 0.0, 10.0, 3).locate(np.array([15.0, 20.0, 99.0, -5.0]))
+    entry, part = AxisSamples(1, 0.0, 10.0, 3).locate(
+        np.array([15.0, 20.0, 99.0, -5.0])
+    )
     np.testing.assert_allclose(entry + part, [1.5, 2, 2, 0])
     assert entry.tolist() == [1, 1, 1, 0]
 
@@ -112,4 +124,7 @@ def test_each_home_position_is_a_number(axis, value):
 
 
 def test_a_reversed_theta_has_the_opposite_sign():
-    assert (MachineFrame().sign_theta, MachineFrame(reverse_theta=True).sign_theta) == (1, -1)
+    assert (MachineFrame().sign_theta, MachineFrame(reverse_theta=True).sign_theta) == (
+        1,
+        -1,
+    )

@@ -10,7 +10,14 @@ from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
 from selfcal_ros.aerotech.model import Table1D, Table2D, Unit, UnitWord
 from selfcal_ros.aerotech.read import parse_cal
 from selfcal_ros.errors import InputError
-from test.support.cal_tables import AXES, decimals, setups, tables_1d, tables_2d, tables_galvo
+from test.support.cal_tables import (
+    AXES,
+    decimals,
+    setups,
+    tables_1d,
+    tables_2d,
+    tables_galvo,
+)
 from test.support.slow_cal import slow_1d, slow_2d
 
 MM = Unit(UnitWord.PRIMARY)
@@ -22,7 +29,11 @@ def machine(axes, temperature=None):
     return MachineSetup(
         {
             axis: AxisSetup(
-                s["counts"], s["secondary"], s.get("direction"), s.get("offset"), s.get("feedback")
+                s["counts"],
+                s["secondary"],
+                s.get("direction"),
+                s.get("offset"),
+                s.get("feedback"),
             )
             for axis, s in axes.items()
         },
@@ -87,37 +98,55 @@ def test_arrays_give_what_single_positions_give(table, axes):
 
 
 def test_entries_lie_at_n_times_distance_minus_offset():
-    table = Table1D(1, 10.0, np.array([4.0, 0.0, 7.0]), pos_unit=MM, cor_unit=UM, offset=10.0)
+    table = Table1D(
+        1, 10.0, np.array([4.0, 0.0, 7.0]), pos_unit=MM, cor_unit=UM, offset=10.0
+    )
     got = CalEvaluator([table]).corrections({1: [-99, -10, -5, 0, 5, 10, 99]})[1]
     np.testing.assert_allclose(got * 1000, [4, 4, 2, 0, 3.5, 7, 7], atol=1e-12)
 
 
 def test_negative_distance_and_negpos_mirror_the_table():
     c = np.array([0.0, 2.0, 7.0])
-    for table in (Table1D(1, -10.0, c, pos_unit=MM), Table1D(1, 10.0, c, pos_unit=MM, negpos=True)):
+    for table in (
+        Table1D(1, -10.0, c, pos_unit=MM),
+        Table1D(1, 10.0, c, pos_unit=MM, negpos=True),
+    ):
         got = CalEvaluator([table]).corrections({1: [-20, -10, 0, 10]})[1]
         np.testing.assert_allclose(got, [7, 2, 0, 0])
     table = Table1D(1, -10.0, c, pos_unit=MM, offset=-10.0)
-    np.testing.assert_allclose(CalEvaluator([table]).corrections({1: [10, 0, -10]})[1], c - 2)
+    np.testing.assert_allclose(
+        CalEvaluator([table]).corrections({1: [10, 0, -10]})[1], c - 2
+    )
 
 
 def test_negcor_changes_the_sign_and_the_home_position_stays_zero():
     c = np.array([3.0, 5.0])
     table = Table1D(1, 10.0, c, pos_unit=MM, negcor=True)
-    np.testing.assert_allclose(CalEvaluator([table]).corrections({1: [0, 10]})[1], [0, -2])
+    np.testing.assert_allclose(
+        CalEvaluator([table]).corrections({1: [0, 10]})[1], [0, -2]
+    )
 
 
 def test_a_1d_table_is_biased_by_its_end_point_if_home_lies_outside():
     table = Table1D(1, 10.0, np.array([3.0, 5.0]), pos_unit=MM, offset=-100.0)
-    np.testing.assert_allclose(CalEvaluator([table]).corrections({1: [0, 110]})[1], [0, 2])
+    np.testing.assert_allclose(
+        CalEvaluator([table]).corrections({1: [0, 110]})[1], [0, 2]
+    )
 
 
 def test_rollover_counts_from_the_lowest_entry():
     table = Table1D(
-        1, 90.0, np.array([0.0, 1, 2, 3, 0]), pos_unit=MM, offset=180.0, rollover=36000.0
+        1,
+        90.0,
+        np.array([0.0, 1, 2, 3, 0]),
+        pos_unit=MM,
+        offset=180.0,
+        rollover=36000.0,
     )
     setup = MachineSetup({1: AxisSetup(100.0)})
-    got = CalEvaluator([table], setup).corrections({1: [0, 90, 180, 270, 360, 450, -360, 45]})[1]
+    got = CalEvaluator([table], setup).corrections(
+        {1: [0, 90, 180, 270, 360, 450, -360, 45]}
+    )[1]
     np.testing.assert_allclose(got, np.array([2, 3, 0, 1, 2, 3, 2, 2.5]) - 2)
 
 
@@ -132,10 +161,14 @@ def test_rows_run_down_and_columns_across():
 
 def test_a_2d_table_is_biased_only_if_home_lies_inside():
     values = np.array([[[1.0, 4], [2, 5]], [[3, 6], [4, 7]]])
-    inside = Table2D(2, 1, (1, 2), 10.0, 10.0, values, MM, MM, offset_row=10.0, offset_col=0.0)
+    inside = Table2D(
+        2, 1, (1, 2), 10.0, 10.0, values, MM, MM, offset_row=10.0, offset_col=0.0
+    )
     assert CalEvaluator([inside]).corrections({1: 0, 2: 0}) == {1: 0.0, 2: 0.0}
     assert CalEvaluator([inside]).corrections({1: 0, 2: -10}) == {1: -2.0, 2: -2.0}
-    outside = Table2D(2, 1, (1, 2), 10.0, 10.0, values, MM, MM, offset_row=10.1, offset_col=0.0)
+    outside = Table2D(
+        2, 1, (1, 2), 10.0, 10.0, values, MM, MM, offset_row=10.1, offset_col=0.0
+    )
     assert CalEvaluator([outside]).corrections({1: 0, 2: 0}) == {1: 3.0, 2: 6.0}
 
 
@@ -150,7 +183,11 @@ def test_three_outputs_in_their_own_units():
     values = np.array([[[0.0, 0, 0], [1, 2, 3]]])
     table = Table2D(2, 1, (1, 2, 3), 10.0, 10.0, values, MM)
     setup = MachineSetup({1: AxisSetup(1.0), 2: AxisSetup(10.0), 3: AxisSetup(100.0)})
-    assert CalEvaluator([table], setup).corrections({1: 10, 2: 0}) == {1: 1.0, 2: 0.2, 3: 0.03}
+    assert CalEvaluator([table], setup).corrections({1: 10, 2: 0}) == {
+        1: 1.0,
+        2: 0.2,
+        3: 0.03,
+    }
 
 
 @pytest.mark.parametrize(
@@ -168,7 +205,9 @@ def test_three_outputs_in_their_own_units():
 def test_default_units(pos, cor, factor):
     table = Table1D(1, 1e6, np.array([0.0, 3.0]), pos_unit=pos, cor_unit=cor)
     setup = MachineSetup({1: AxisSetup(50.0, 25.0)})
-    assert CalEvaluator([table], setup).corrections({1: 1e9})[1] == pytest.approx(3 * factor)
+    assert CalEvaluator([table], setup).corrections({1: 1e9})[1] == pytest.approx(
+        3 * factor
+    )
 
 
 def test_tables_add_up_and_cross_axis_tables_follow_the_other_axis():
@@ -195,7 +234,13 @@ def test_home_keywords_shift_the_table_with_the_home_position(now, moved):
     # the stage then has a coordinate that is FULLTRAVEL larger.
     c = np.array([0.0, 1.0, 5.0, 2.0])
     table = Table1D(
-        1, -10.0, c, pos_unit=MM, home_direction="CW", home_offset=1.0, full_travel=100.0
+        1,
+        -10.0,
+        c,
+        pos_unit=MM,
+        home_direction="CW",
+        home_offset=1.0,
+        full_travel=100.0,
     )
     got = CalEvaluator([table], MachineSetup({1: now})).corrections(
         {1: np.array([0, -10, -20, -30]) + moved}
@@ -204,21 +249,29 @@ def test_home_keywords_shift_the_table_with_the_home_position(now, moved):
 
 
 def test_home_keywords_need_homedirection():
-    table = Table1D(1, 10.0, np.array([0.0, 1.0]), pos_unit=MM, home_offset=1.0, full_travel=9.0)
+    table = Table1D(
+        1, 10.0, np.array([0.0, 1.0]), pos_unit=MM, home_offset=1.0, full_travel=9.0
+    )
     setup = MachineSetup({1: AxisSetup(home_offset=5.0, home_direction="CW")})
     assert CalEvaluator([table], setup).corrections({1: 10.0})[1] == 1.0
 
 
 def test_absolute_feedback_offset_is_added_to_the_position():
-    table = Table1D(1, 10.0, np.array([0.0, 1.0, 4.0]), pos_unit=MM, absolute_feedback_offset=50.0)
+    table = Table1D(
+        1, 10.0, np.array([0.0, 1.0, 4.0]), pos_unit=MM, absolute_feedback_offset=50.0
+    )
     setup = MachineSetup({1: AxisSetup(100.0, absolute_feedback_offset=250.0)})
     got = CalEvaluator([table], setup).corrections({1: np.array([0, 10, 20]) + 2.0})[1]
     np.testing.assert_allclose(got - got[0], [0, 1, 4])
 
 
 def test_a_warm_scale_indicates_too_little_so_the_correction_is_negative():
-    table = Table1D(1, 10.0, np.zeros(2), pos_unit=MM, expand_coeff=10e-6, material_temp=20.0)
-    warm = CalEvaluator([table], MachineSetup(temperature_c=25.0)).corrections({1: 400.0})[1]
+    table = Table1D(
+        1, 10.0, np.zeros(2), pos_unit=MM, expand_coeff=10e-6, material_temp=20.0
+    )
+    warm = CalEvaluator([table], MachineSetup(temperature_c=25.0)).corrections(
+        {1: 400.0}
+    )[1]
     assert warm == pytest.approx(-400 * 10e-6 * 5)
     assert CalEvaluator([table]).corrections({1: 400.0})[1] == 0.0
 
@@ -228,20 +281,28 @@ def test_positions_that_are_not_finite():
     got = CalEvaluator([table]).corrections({1: [np.nan, np.inf, -np.inf]})[1]
     np.testing.assert_array_equal(got, [np.nan, 3.0, 0.0])
     round_ = Table1D(1, 10.0, np.array([0.0, 2.0, 0.0]), pos_unit=MM, rollover=20.0)
-    got = CalEvaluator([round_], MachineSetup({1: AxisSetup(1.0)})).corrections({1: [np.inf, 5]})
+    got = CalEvaluator([round_], MachineSetup({1: AxisSetup(1.0)})).corrections(
+        {1: [np.inf, 5]}
+    )
     np.testing.assert_array_equal(got[1], [np.nan, 1.0])
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (":START 2 SAMPLEDIST=1 POSUNIT=PRIMARY\n0\n:END\n", "axis 2: its position is needed"),
+        (
+            ":START 2 SAMPLEDIST=1 POSUNIT=PRIMARY\n0\n:END\n",
+            "axis 2: its position is needed",
+        ),
         (
             ":START 1 SAMPLEDIST=1\n0\n:END\n",
             r"POSUNIT of the table of line 1 is in counts, .*"
             r"--counts-per-unit 1=",
         ),
-        (":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY ROLLOVER=9\n0\n:END\n", "ROLLOVER of the table"),
+        (
+            ":START 1 SAMPLEDIST=1 POSUNIT=PRIMARY ROLLOVER=9\n0\n:END\n",
+            "ROLLOVER of the table",
+        ),
         (":START 1 SAMPLEDIST=1 POSUNIT=SECONDARY\n0\n:END\n", "counts"),
     ],
 )

@@ -28,8 +28,12 @@ OBLONG = Artifact(7, 0.01, 24, 5)
 ROUNDING_M = 0.5e-11
 FRAMES = [
     MachineFrame(1, 2, 3),
-    MachineFrame(4, 3, 9, "um", home_x_m=-0.03, home_y_m=-0.03, theta_counts_per_unit=1000.0),
-    MachineFrame(1, 2, 3, "m", home_x_m=0.03, home_y_m=-0.03, reverse_x=True, reverse_theta=True),
+    MachineFrame(
+        4, 3, 9, "um", home_x_m=-0.03, home_y_m=-0.03, theta_counts_per_unit=1000.0
+    ),
+    MachineFrame(
+        1, 2, 3, "m", home_x_m=0.03, home_y_m=-0.03, reverse_x=True, reverse_theta=True
+    ),
     MachineFrame(
         2,
         1,
@@ -101,7 +105,9 @@ def test_a_flipped_sign_doubles_the_error(frame):
     ):
         found = verify_tables(emap, [flipped], frame)
         assert found.worse
-        assert found.sites.rms("after") == pytest.approx(2 * found.sites.rms("before"), rel=1e-3)
+        assert found.sites.rms("after") == pytest.approx(
+            2 * found.sites.rms("before"), rel=1e-3
+        )
     table = replace(table_theta(emap, frame), negcor=True)
     found = verify_tables(emap, [table], frame)
     assert found.worse and found.lines.rms("after") > 1.9 * found.lines.rms("before")
@@ -126,7 +132,9 @@ def test_a_wrong_frame_leaves_an_error(change):
 
 def test_exchanged_axes_leave_an_error():
     emap = random_map(ARTIFACT, 5)
-    found = verify_tables(emap, [table_xy(emap, MachineFrame(1, 2))], MachineFrame(2, 1))
+    found = verify_tables(
+        emap, [table_xy(emap, MachineFrame(1, 2))], MachineFrame(2, 1)
+    )
     assert found.sites.rms("after") > found.sites.rms("before")
 
 
@@ -137,7 +145,9 @@ def test_the_sign_against_physics_written_out_by_hand(reverse, home_m):
     artifact = Artifact(5, 0.01)
     emap = random_map(artifact, 8)
     stage = Compensator(emap)
-    frame = MachineFrame(1, 2, home_x_m=home_m[0], home_y_m=home_m[1], reverse_x=reverse < 0)
+    frame = MachineFrame(
+        1, 2, home_x_m=home_m[0], home_y_m=home_m[1], reverse_x=reverse < 0
+    )
     text = cal_text([table_xy(emap, frame)], decimals=DECIMALS)
     (table,) = parse_cal(text.encode(), "f").tables
     reached = []
@@ -177,7 +187,8 @@ def test_the_theta_table_makes_the_simulated_machine_true_at_its_lines(frame):
     # A smooth error, so that the shift of the zero bias costs little.
     angle = ARTIFACT.theta_rad
     emap = replace(
-        random_map(ARTIFACT, 5), g_theta=1e-5 * np.sin(angle + 1) + 4e-6 * np.cos(3 * angle)
+        random_map(ARTIFACT, 5),
+        g_theta=1e-5 * np.sin(angle + 1) + 4e-6 * np.cos(3 * angle),
     )
     cal = written([table_theta(emap, frame)], frame, theta_decimals(emap))
     found = verify_tables(emap, cal.tables, frame_from_comments(cal.comments))
@@ -193,7 +204,12 @@ def test_theta_rolls_over_for_ever_with_counts_and_covers_two_turns_without():
         base = turned(Compensator(emap), frame, ARTIFACT.theta_rad, tables)
         for turn in turns:
             reached = (
-                turned(Compensator(emap), frame, ARTIFACT.theta_rad + 2 * np.pi * turn, tables)
+                turned(
+                    Compensator(emap),
+                    frame,
+                    ARTIFACT.theta_rad + 2 * np.pi * turn,
+                    tables,
+                )
                 - 2 * np.pi * turn
             )
             np.testing.assert_allclose(reached, base, rtol=0, atol=1e-11)
@@ -235,16 +251,22 @@ def test_theta_digits_follow_the_size_of_the_field():
 
 def test_unknown_sites_and_lines_are_refused_or_filled():
     emap = random_map(ARTIFACT, 2, unknown=[(0, 0), (3, 3), (3, 4)])
-    with pytest.raises(InputError, match="3 sites are unknown, and a table has no holes"):
+    with pytest.raises(
+        InputError, match="3 sites are unknown, and a table has no holes"
+    ):
         table_xy(emap, MachineFrame())
     filled, count = fill_unknown(emap)
-    assert count == 3 and filled.gx[0, 0] == pytest.approx((emap.gx[0, 1] + emap.gx[1, 0]) / 2)
+    assert count == 3 and filled.gx[0, 0] == pytest.approx(
+        (emap.gx[0, 1] + emap.gx[1, 0]) / 2
+    )
     around = [emap.gy[2, 3], emap.gy[4, 3], emap.gy[3, 2], filled.gy[3, 4]]
     assert filled.gy[3, 3] == pytest.approx(np.mean(around))
     np.testing.assert_array_equal(filled.gx[emap.valid], emap.gx[emap.valid])
     pair, _ = fill_unknown(random_map(ARTIFACT, 2, unknown=[(0, 0), (0, 1), (6, 6)]))
     assert pair.gx[0, 0] == pytest.approx((pair.gx[0, 1] + pair.gx[1, 0]) / 2)
-    assert pair.gx[0, 1] == pytest.approx((pair.gx[0, 0] + pair.gx[0, 2] + pair.gx[1, 1]) / 3)
+    assert pair.gx[0, 1] == pytest.approx(
+        (pair.gx[0, 0] + pair.gx[0, 2] + pair.gx[1, 1]) / 3
+    )
     table = table_xy(filled, MachineFrame())
     found = verify_tables(emap, [table], MachineFrame())
     assert found.between is None and found.sites.largest("after") < 1e-10
@@ -304,7 +326,9 @@ def test_tables_of_other_axes_are_refused_by_the_verification():
 
 @pytest.mark.parametrize("datum", ThetaDatum)
 def test_provenance_says_bag_plan_date_and_uncertainty(datum):
-    result = result_of(replace(random_map(ARTIFACT, 1), datum_theta=datum), sense="plate_moves")
+    result = result_of(
+        replace(random_map(ARTIFACT, 1), datum_theta=datum), sense="plate_moves"
+    )
     when = datetime(2026, 1, 2, tzinfo=UTC)
     text = "\n".join(provenance(result, MachineFrame(), filled=2, now=when))
     for part in (
@@ -319,7 +343,10 @@ def test_provenance_says_bag_plan_date_and_uncertainty(datum):
         "machine: x-axis=1",
     ):
         assert part in text
-    u = np.sqrt(np.mean(np.square([result.error_map.u_gx, result.error_map.u_gy]))) * 1e6
+    u = (
+        np.sqrt(np.mean(np.square([result.error_map.u_gx, result.error_map.u_gy])))
+        * 1e6
+    )
     assert f"(k=1): {u:.3g} um rms" in text
 
 
@@ -327,11 +354,15 @@ def test_the_residual_is_true_minus_commanded():
     emap = random_map(OBLONG, 4)
     found = verify_tables(emap, [table_xy(emap, MachineFrame())], MachineFrame())
     g = np.stack([emap.gx.ravel(), emap.gy.ravel()])
-    np.testing.assert_allclose(found.sites.before, g.mean(axis=1)[:, None] - g, atol=1e-10)
+    np.testing.assert_allclose(
+        found.sites.before, g.mean(axis=1)[:, None] - g, atol=1e-10
+    )
     np.testing.assert_allclose(
         found.sites.shift_after, -np.array([emap.gx[3, 2], emap.gy[3, 2]]), atol=1e-10
     )
     lines = verify_tables(emap, [table_theta(emap, FRAMES[0])], FRAMES[0]).lines
     # Without a table the stage stands at the angle whose error it shows: slope times error off.
-    np.testing.assert_allclose(lines.before[0], emap.g_theta.mean() - emap.g_theta, atol=1e-6)
+    np.testing.assert_allclose(
+        lines.before[0], emap.g_theta.mean() - emap.g_theta, atol=1e-6
+    )
     assert np.corrcoef(lines.before[0], emap.g_theta)[0, 1] < -0.99

@@ -18,7 +18,9 @@ SEEDS = [
     b"0\n1.5\n-2\n:END\n:START 2 REFERENCEAXIS=1 SAMPLEDIST=1 ROLLOVER=360\n0\n1\n:END\n",
     b":START2D 2 1 1 2 10 -20 3 OUTAXIS3=3\n:START2D POSUNIT=METRIC CORUNIT = PRIMARY/3600 "
     b'OFFSETROW=10 SERIALNUMBER="a;b"\n1 2 3 4 5 6 7 8 9\n7 8 9 10 11 12 1 2 3\n:END\nend\n',
-    b"' \xb0C\r\n:GALVO2D 2 1 1 2 10 20 3 NEGCOR\r\n" + b"0 1 2 3 4 5\r\n" * 3 + b":END\r\n",
+    b"' \xb0C\r\n:GALVO2D 2 1 1 2 10 20 3 NEGCOR\r\n"
+    + b"0 1 2 3 4 5\r\n" * 3
+    + b":END\r\n",
 ]
 PIECES = [
     b"1e999",
@@ -56,7 +58,9 @@ PIECES = [
     b"9" * 500,
     b"SAMPLEDIST=1e-15",
 ]
-SETUP = MachineSetup({a: AxisSetup(1000.0, 10.0, "CW", 1.0, 5.0) for a in range(1, 33)}, 25.0)
+SETUP = MachineSetup(
+    {a: AxisSetup(1000.0, 10.0, "CW", 1.0, 5.0) for a in range(1, 33)}, 25.0
+)
 
 
 def survive(data, *, write=True):
@@ -119,7 +123,9 @@ def test_any_bytes(data):
 
 @given(
     st.lists(
-        st.sampled_from([*PIECES, b":START 1 SAMPLEDIST=1", b"\n", b" ", b"0", b":END"]),
+        st.sampled_from(
+            [*PIECES, b":START 1 SAMPLEDIST=1", b"\n", b" ", b"0", b":END"]
+        ),
         max_size=30,
     )
 )
@@ -132,16 +138,30 @@ HUGE = {
     + b"0 1 " * 10**6
     + b"\n:END\n",
     "a million columns, few values": b":START2D 2 1 1 2 1 1 1000000\n0 1\n:END\n",
-    "300,000 words in a head": b":START 1 SAMPLEDIST=1 " + b"A " * 300_000 + b"\n0\n:END\n",
-    "300,000 numbers in a head": b":START 1 SAMPLEDIST=1 " + b"1 " * 300_000 + b"\n0\n:END\n",
-    "one word of a million letters": b":START 1 SAMPLEDIST=1 " + b"A" * 10**6 + b"\n0\n:END\n",
-    "300,000 quotes": b":START 1 SAMPLEDIST=1 SERIALNUMBER=" + b'"' * 300_000 + b"\n0\n:END\n",
+    "300,000 words in a head": b":START 1 SAMPLEDIST=1 "
+    + b"A " * 300_000
+    + b"\n0\n:END\n",
+    "300,000 numbers in a head": b":START 1 SAMPLEDIST=1 "
+    + b"1 " * 300_000
+    + b"\n0\n:END\n",
+    "one word of a million letters": b":START 1 SAMPLEDIST=1 "
+    + b"A" * 10**6
+    + b"\n0\n:END\n",
+    "300,000 quotes": b":START 1 SAMPLEDIST=1 SERIALNUMBER="
+    + b'"' * 300_000
+    + b"\n0\n:END\n",
     "a million blanks": b":START 1 SAMPLEDIST" + b" " * 10**6 + b"x\n0\n:END\n",
-    "a number of a million digits": b":START 1 SAMPLEDIST=" + b"1" * 10**6 + b"\n0\n:END\n",
-    "a value of a million digits": b":START 1 SAMPLEDIST=1\n0." + b"1" * 10**6 + b"\n:END\n",
+    "a number of a million digits": b":START 1 SAMPLEDIST="
+    + b"1" * 10**6
+    + b"\n0\n:END\n",
+    "a value of a million digits": b":START 1 SAMPLEDIST=1\n0."
+    + b"1" * 10**6
+    + b"\n:END\n",
     "nested starts": b":START 1 SAMPLEDIST=1\n0\n" * 40_000,
     "start lines only": b":START 1 SAMPLEDIST=1\n" * 40_000,
-    "repeated keywords": b":START 1 SAMPLEDIST=1\n" + b":START NEGCOR\n" * 40_000 + b"0\n:END\n",
+    "repeated keywords": b":START 1 SAMPLEDIST=1\n"
+    + b":START NEGCOR\n" * 40_000
+    + b"0\n:END\n",
     "40,000 tables": b":START 1 SAMPLEDIST=1\n0\n:END\n" * 40_000,
     "comments only": b"; x\n" * 40_000 + b"' y\n" * 40_000,
     "words outside": b"words outside\n" * 40_000,
@@ -155,7 +175,8 @@ HUGE = {
 def test_huge_files_end(data):
     good = survive(data, write=False)
     assert good == (
-        data in (HUGE["a million columns on a line"], HUGE["a value of a million digits"])
+        data
+        in (HUGE["a million columns on a line"], HUGE["a value of a million digits"])
     )
 
 

@@ -64,7 +64,10 @@ def test_both_forms_for_a_home_in_the_middle_mean_the_same():
         CalEvaluator(
             [
                 line_table(
-                    orthogonality(5e-6, 0.2, 0.9, home), MachineFrame(), along="x", corrected="y"
+                    orthogonality(5e-6, 0.2, 0.9, home),
+                    MachineFrame(),
+                    along="x",
+                    corrected="y",
                 )
             ]
         ).corrections(at)[2]
@@ -76,11 +79,20 @@ def test_both_forms_for_a_home_in_the_middle_mean_the_same():
 def test_the_orthogonality_correction_cancels_what_the_indicator_showed():
     # The indicator showed +5 um of y over 200 mm of x: true y - commanded y = x / 40000.
     evaluator = CalEvaluator(
-        [line_table(orthogonality(5e-6, 0.2, 0.9, "end"), MachineFrame(), along="x", corrected="y")]
+        [
+            line_table(
+                orthogonality(5e-6, 0.2, 0.9, "end"),
+                MachineFrame(),
+                along="x",
+                corrected="y",
+            )
+        ]
     )
     x_mm = np.array([0.0, 200.0, 555.0, 900.0])
     error_mm = x_mm * (5e-3 / 200)
-    np.testing.assert_allclose(error_mm + evaluator.corrections({1: x_mm})[2], 0, atol=1e-15)
+    np.testing.assert_allclose(
+        error_mm + evaluator.corrections({1: x_mm})[2], 0, atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,9 +119,13 @@ def test_lengths_with_units(text, value):
     assert length_m(text, "--over") == pytest.approx(value, rel=1e-12)
 
 
-@pytest.mark.parametrize("text", ["5", "um", "5 inch", "nan m", "1e999 m", "", "5umm", "٣mm"])
+@pytest.mark.parametrize(
+    "text", ["5", "um", "5 inch", "nan m", "1e999 m", "", "5umm", "٣mm"]
+)
 def test_lengths_without_sense(text):
-    with pytest.raises(InputError, match=r"--over: .* is not a length; write a number with"):
+    with pytest.raises(
+        InputError, match=r"--over: .* is not a length; write a number with"
+    ):
         length_m(text, "--over")
 
 
@@ -122,10 +138,13 @@ def test_accuracy_and_straightness_tables_make_a_line_true(frame, along):
         return 1e-6 * np.sin(200 * p)
 
     emap = smooth_map(
-        lambda x, y: wave(x if along == "x" else y), lambda x, y: 2 * wave(x if along == "x" else y)
+        lambda x, y: wave(x if along == "x" else y),
+        lambda x, y: 2 * wave(x if along == "x" else y),
     )
     tables = [
-        line_table(map_line(emap, along, corrected), frame, along=along, corrected=corrected)
+        line_table(
+            map_line(emap, along, corrected), frame, along=along, corrected=corrected
+        )
         for corrected in (along, other)
     ]
     found = verify_tables(emap, tables, frame)
@@ -137,23 +156,33 @@ def test_accuracy_and_straightness_tables_make_a_line_true(frame, along):
 def test_straightness_has_no_slope():
     line = map_line(random_map(ARTIFACT, 3), "x", "y")
     flat = without_slope(line)
-    assert np.polyfit(flat.positions_m, flat.corrections_m, 1) == pytest.approx([0, 0], abs=1e-18)
+    assert np.polyfit(flat.positions_m, flat.corrections_m, 1) == pytest.approx(
+        [0, 0], abs=1e-18
+    )
     rest = line.corrections_m - flat.corrections_m
     np.testing.assert_allclose(np.diff(rest, 2), 0, atol=1e-20)
 
 
 def test_a_slope_is_removed_about_the_middle_of_positions_that_start_at_home():
     x = np.arange(5) * 0.1
-    flat = without_slope(AxisCorrection(x, np.array([1.0, 0, 0, 0, 1.0]) * 1e-6 + 3e-6 * x))
+    flat = without_slope(
+        AxisCorrection(x, np.array([1.0, 0, 0, 0, 1.0]) * 1e-6 + 3e-6 * x)
+    )
     np.testing.assert_allclose(
-        flat.corrections_m, np.array([0.6, -0.4, -0.4, -0.4, 0.6]) * 1e-6, rtol=0, atol=1e-18
+        flat.corrections_m,
+        np.array([0.6, -0.4, -0.4, -0.4, 0.6]) * 1e-6,
+        rtol=0,
+        atol=1e-18,
     )
 
 
 @pytest.mark.parametrize(
-    ("along", "half_m", "row"), [("x", 0.03, (slice(None), 2)), ("y", 0.02, (3, slice(None)))]
+    ("along", "half_m", "row"),
+    [("x", 0.03, (slice(None), 2)), ("y", 0.02, (3, slice(None)))],
 )
-def test_the_lines_of_an_oblong_field_are_its_middle_ones_from_edge_to_edge(along, half_m, row):
+def test_the_lines_of_an_oblong_field_are_its_middle_ones_from_edge_to_edge(
+    along, half_m, row
+):
     emap = replace(random_map(Artifact(7, 0.01, 0, 5), 2), nonorthogonality=4e-6)
     for corrected, values in (("x", emap.gx), ("y", emap.gy)):
         line = map_line(emap, along, corrected)
@@ -161,7 +190,9 @@ def test_the_lines_of_an_oblong_field_are_its_middle_ones_from_edge_to_edge(alon
         assert line.positions_m[[0, -1]] == pytest.approx([-half_m, half_m])
     square = map_orthogonality(emap, along)
     assert square.positions_m.tolist() == pytest.approx([-half_m, half_m])
-    assert square.corrections_m.tolist() == pytest.approx([-8e-6 * half_m, 8e-6 * half_m])
+    assert square.corrections_m.tolist() == pytest.approx(
+        [-8e-6 * half_m, 8e-6 * half_m]
+    )
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -170,7 +201,9 @@ def test_orthogonality_of_a_map_makes_the_axes_square(frame, along):
     o = 3e-5
     emap = smooth_map(lambda x, y: o * y, lambda x, y: o * x)
     other = "y" if along == "x" else "x"
-    table = line_table(map_orthogonality(emap, along), frame, along=along, corrected=other)
+    table = line_table(
+        map_orthogonality(emap, along), frame, along=along, corrected=other
+    )
     loaded = plane_correction(CalEvaluator([table]), frame)
 
     def angle(correct):
@@ -190,7 +223,12 @@ def test_measured_errors_are_opposed():
     np.testing.assert_allclose(line.positions_m, [-0.01, 0, 0.01])
     np.testing.assert_allclose(line.corrections_m, [-2.5e-6, 3e-6, -1e-6])
     table = line_table(line, MachineFrame(3, 4), along="x", corrected="x")
-    assert (table.axis, table.reference_axis, table.sample_dist, table.offset) == (3, None, 10, 10)
+    assert (table.axis, table.reference_axis, table.sample_dist, table.offset) == (
+        3,
+        None,
+        10,
+        10,
+    )
     np.testing.assert_array_equal(table.values, [-2.5, 3, -1])
 
 

@@ -36,7 +36,12 @@ def stage(u_m: float = 8e-9) -> ErrorMap:
     x, y = artifact.x_m, artifact.y_m
     both = (x / 0.04) * (y / 0.03)
     gx = 1e-6 * np.sin(60 * x + 1) + 0.4e-6 * np.cos(80 * y) + 3e-6 * y + 0.3e-6 * both
-    gy = 1e-6 * np.sin(60 * y + 2) + 0.5e-6 * np.sin(90 * x) + 3e-6 * x + 0.2e-6 * both * x / 0.04
+    gy = (
+        1e-6 * np.sin(60 * y + 2)
+        + 0.5e-6 * np.sin(90 * x)
+        + 3e-6 * x
+        + 0.2e-6 * both * x / 0.04
+    )
     gx, gy = gx - gx.mean(), gy - gy.mean()
     turn = (x * gy - y * gx).sum() / (x**2 + y**2).sum()
     gx, gy = gx + turn * y, gy - turn * x
@@ -73,7 +78,9 @@ def straightness(error_map, frame):
 
 
 def square(error_map, frame):
-    return [line_table(map_orthogonality(error_map, "x"), frame, along="x", corrected="y")]
+    return [
+        line_table(map_orthogonality(error_map, "x"), frame, along="x", corrected="y")
+    ]
 
 
 def means(error_map, frame):
@@ -89,7 +96,9 @@ def means(error_map, frame):
 
 def everything(error_map, frame):
     return [
-        table for write in (accuracy, straightness, square) for table in write(error_map, frame)
+        table
+        for write in (accuracy, straightness, square)
+        for table in write(error_map, frame)
     ]
 
 
@@ -101,7 +110,9 @@ def with_a_wrong_entry(table):
 
 def unfit(error_map, tables, frame):
     return [
-        part.name for part in verify_tables(error_map, tables, frame).one_axis.parts if part.unfit
+        part.name
+        for part in verify_tables(error_map, tables, frame).one_axis.parts
+        if part.unfit
     ]
 
 
@@ -148,7 +159,9 @@ def test_the_part_that_no_table_corrects_is_stated_alone():
 def test_straightness_says_that_it_leaves_the_squareness():
     error_map, frame = stage(), FRAMES[0]
     fit = verify_tables(error_map, straightness(error_map, frame), frame).one_axis
-    assert fit.squareness_left == pytest.approx(2 * error_map.nonorthogonality, rel=1e-9)
+    assert fit.squareness_left == pytest.approx(
+        2 * error_map.nonorthogonality, rel=1e-9
+    )
 
 
 def test_a_table_of_x_alone_is_not_blamed_for_y():
@@ -160,12 +173,16 @@ def test_a_wrong_entry_between_the_nodes_does_not_pass():
     error_map, frame = stage(), FRAMES[0]
     line = map_line(error_map, "x", "x")
     nodes = np.linspace(line.positions_m[0], line.positions_m[-1], 17)
-    dense = AxisCorrection(nodes, np.interp(nodes, line.positions_m, line.corrections_m))
+    dense = AxisCorrection(
+        nodes, np.interp(nodes, line.positions_m, line.corrections_m)
+    )
     table = line_table(dense, frame, along="x", corrected="x")
     assert unfit(error_map, [table], frame) == []
     values = table.values.copy()
     values[7] += 1.0
-    assert unfit(error_map, [replace(table, values=values)], frame) == ["x from the position of x"]
+    assert unfit(error_map, [replace(table, values=values)], frame) == [
+        "x from the position of x"
+    ]
 
 
 @pytest.mark.parametrize("frame", FRAMES)
@@ -178,10 +195,15 @@ def test_a_wrong_entry_of_a_fine_2d_table_does_not_pass(frame, entry):
     for axis in (0, 1):
         fine = np.arange(2 * values.shape[axis] - 1) / 2
         values = np.apply_along_axis(
-            lambda line, fine=fine: np.interp(fine, np.arange(len(line)), line), axis, values
+            lambda line, fine=fine: np.interp(fine, np.arange(len(line)), line),
+            axis,
+            values,
         )
     table = replace(
-        table, values=values, sample_row=table.sample_row / 2, sample_col=table.sample_col / 2
+        table,
+        values=values,
+        sample_row=table.sample_row / 2,
+        sample_col=table.sample_col / 2,
     )
     assert verify_tables(error_map, [table], frame).unfit(error_map) == []
     values = values.copy()
@@ -195,7 +217,10 @@ def test_what_is_within_u_of_the_map_is_not_blamed():
     assert (
         unfit(
             error_map,
-            [replace(table, values=table.values / 1000) for table in accuracy(error_map, frame)],
+            [
+                replace(table, values=table.values / 1000)
+                for table in accuracy(error_map, frame)
+            ],
             frame,
         )
         == []
@@ -217,7 +242,18 @@ def folder(tmp_path, monkeypatch):
     write_json("r.json", result_to_dict(result_of(stage())))
     for axis in "xy":
         assert (
-            main(["cal", "accuracy", "r.json", "--along", axis, "-o", f"{axis}.cal", "--steep"])
+            main(
+                [
+                    "cal",
+                    "accuracy",
+                    "r.json",
+                    "--along",
+                    axis,
+                    "-o",
+                    f"{axis}.cal",
+                    "--steep",
+                ]
+            )
             == 0
         )
     return tmp_path
@@ -242,7 +278,9 @@ def test_the_command_ends_with_5_and_names_the_part(folder, capsys):
 
 def test_tables_of_a_middle_line_unlike_the_field_are_named_as_such(folder, capsys):
     """White errors: what is right on one line is wrong on all others."""
-    write_json("white.json", result_to_dict(result_of(random_map(Artifact(9, 0.01), 4))))
+    write_json(
+        "white.json", result_to_dict(result_of(random_map(Artifact(9, 0.01), 4)))
+    )
     assert main(["cal", "accuracy", "white.json", "-o", "white.cal", "--steep"]) == 0
     capsys.readouterr()
     assert main(["cal", "verify", "white.json", "white.cal"]) == 2

@@ -25,7 +25,9 @@ STRICT_2D = """\
 
 
 def read(text, encoding="utf-8", **options):
-    return parse_cal(text if isinstance(text, bytes) else text.encode(encoding), "f.cal", **options)
+    return parse_cal(
+        text if isinstance(text, bytes) else text.encode(encoding), "f.cal", **options
+    )
 
 
 def said(cal, severity):
@@ -45,7 +47,12 @@ def test_strict_1d_file():
     cal = read(STRICT_1D)
     (table,) = cal.tables
     assert cal.findings == () and cal.comments == ("accuracy of the first axis",)
-    assert (table.axis, table.reference, table.sample_dist, table.offset) == (1, 1, 10.0, 10.0)
+    assert (table.axis, table.reference, table.sample_dist, table.offset) == (
+        1,
+        1,
+        10.0,
+        10.0,
+    )
     assert table.serial_number == "12;3'4" and table.kind is TableKind.ONE_D
     assert table.position_unit == Unit(UnitWord.PRIMARY)
     assert table.correction_unit == Unit(UnitWord.PRIMARY, 1000.0)
@@ -71,11 +78,17 @@ def test_every_1d_keyword():
         'SERIALNUMBER="A 1"'
     )
     (table,) = only_tolerated(f"{head}\n1\n2\n:END\n")
-    assert table.reference_axis == 2 and table.pos_unit == Unit(UnitWord.SECONDARY, 10.0)
+    assert table.reference_axis == 2 and table.pos_unit == Unit(
+        UnitWord.SECONDARY, 10.0
+    )
     assert table.cor_unit == Unit(UnitWord.COUNTS) and table.expand_coeff == 1.1e-5
     assert table.material_temp == 20.5 and table.negpos and table.negcor
     assert (table.sample_dist, table.offset, table.rollover) == (-5.0, -1.5, 4000.0)
-    assert (table.home_direction, table.home_offset, table.full_travel) == ("CCW", 2.0, 300.0)
+    assert (table.home_direction, table.home_offset, table.full_travel) == (
+        "CCW",
+        2.0,
+        300.0,
+    )
     assert (table.absolute_feedback_offset, table.serial_number) == (77.0, "A 1")
 
 
@@ -86,21 +99,40 @@ def test_every_2d_keyword_and_a_galvo_table():
         'ROLLOVERROW=3 ROLLOVERCOL=4 SERIALNUMBER="S"'
     )
     (table,) = only_tolerated(f"{head}\n1 2 3\n:END\n")
-    assert table.outputs == (1, 2, 4) and table.values.shape == (1, 1, 3) and table.negcor
-    assert (table.absolute_feedback_offset_row, table.absolute_feedback_offset_col) == (1.0, 2.0)
-    assert (table.rollover_row, table.rollover_col, table.serial_number) == (3.0, 4.0, "S")
-    (table,) = only_tolerated(":GALVO2D 2 1 1 2 10 10 1 NEGCOR OUTAXIS3=3\n0 0 0\n:END\n")
+    assert (
+        table.outputs == (1, 2, 4) and table.values.shape == (1, 1, 3) and table.negcor
+    )
+    assert (table.absolute_feedback_offset_row, table.absolute_feedback_offset_col) == (
+        1.0,
+        2.0,
+    )
+    assert (table.rollover_row, table.rollover_col, table.serial_number) == (
+        3.0,
+        4.0,
+        "S",
+    )
+    (table,) = only_tolerated(
+        ":GALVO2D 2 1 1 2 10 10 1 NEGCOR OUTAXIS3=3\n0 0 0\n:END\n"
+    )
     assert table.kind is TableKind.GALVO and table.galvo and table.outputs == (1, 2, 3)
 
 
 def test_several_tables_and_several_start_lines():
-    tables = only_tolerated(":START 1\n:START SAMPLEDIST=1\n:START NEGPOS\n0\n:END\n\n" + STRICT_1D)
+    tables = only_tolerated(
+        ":START 1\n:START SAMPLEDIST=1\n:START NEGPOS\n0\n:END\n\n" + STRICT_1D
+    )
     assert [t.line for t in tables] == [1, 8] and tables[0].negpos
 
 
 WILD = [
-    ("' by an older controller\n" + STRICT_1D, (1, "a comment that starts with an apostrophe")),
-    (STRICT_1D.replace("; another", "' another"), (5, "a comment that starts with an apostrophe")),
+    (
+        "' by an older controller\n" + STRICT_1D,
+        (1, "a comment that starts with an apostrophe"),
+    ),
+    (
+        STRICT_1D.replace("; another", "' another"),
+        (5, "a comment that starts with an apostrophe"),
+    ),
     (
         "*" * 60 + "\n* Factory file *\n" + "*" * 60 + "\n" + STRICT_1D,
         (1, "text outside of a table is ignored (and in 2 more lines)"),
@@ -112,13 +144,21 @@ WILD = [
         STRICT_1D.replace("POSUNIT=PRIMARY", "POSUNIT=METRIC"),
         (2, "the unit METRIC of older controllers, read as PRIMARY"),
     ),
-    (STRICT_1D.replace("CORUNIT=PRIMARY/", "CORUNIT=Primary/"), (2, "a unit in lower case")),
+    (
+        STRICT_1D.replace("CORUNIT=PRIMARY/", "CORUNIT=Primary/"),
+        (2, "a unit in lower case"),
+    ),
     (STRICT_1D.replace("OFFSET=", "Offset="), (3, "a keyword in lower case")),
-    (STRICT_1D.replace("0\n1.5", "0 1.5"), (4, "several values on a line of a 1D table")),
+    (
+        STRICT_1D.replace("0\n1.5", "0 1.5"),
+        (4, "several values on a line of a 1D table"),
+    ),
     (STRICT_2D.replace("1 2 3 4 5 6", "1\n2\n3\n4\n5\n6"), (3, "lines are not rows")),
     (STRICT_2D.replace("1 2 3 4 5 6\n", "1 2 3 4 5 6 "), (3, "lines are not rows")),
     (
-        STRICT_2D.replace("1 2 3 4 5 6\n7 8 9 10 11 12", "1 2 3 4\n5 6\n7 8 9 10\n11 12"),
+        STRICT_2D.replace(
+            "1 2 3 4 5 6\n7 8 9 10 11 12", "1 2 3 4\n5 6\n7 8 9 10\n11 12"
+        ),
         (3, "lines are not rows"),
     ),
     (STRICT_1D.replace("\n", "\r\n"), (1, "lines end with CR or CRLF")),
@@ -134,8 +174,14 @@ WILD = [
         (1, "Windows-1252 characters in a comment"),
         (1, "text outside of a table is ignored"),
     ),
-    (b"\xef\xbb\xbf" + STRICT_1D.encode(), (1, "a byte order mark before the first line")),
-    (STRICT_1D.replace('"', "").replace(";3'4", ""), (3, "a serial number without quotes")),
+    (
+        b"\xef\xbb\xbf" + STRICT_1D.encode(),
+        (1, "a byte order mark before the first line"),
+    ),
+    (
+        STRICT_1D.replace('"', "").replace(";3'4", ""),
+        (3, "a serial number without quotes"),
+    ),
     (
         ":START 1 SAMPLEDIST=1 PRIMARYABSOLUTEFEEDBACKOFFSET=5\n0\n:END\n",
         (1, "the keyword 'PRIMARYABSOLUTEFEEDBACKOFFSET'"),
@@ -186,7 +232,11 @@ BROKEN = [
     ("", 0, "no table in the file"),
     ("just text\n", 0, "no table in the file"),
     (":START 1 SAMPLEDIST=1\n0\n", 2, "the table of line 1 has no :END"),
-    (":START 1 SAMPLEDIST=1\n0\n" + ONE, 3, ":START before the :END of the table of line 1"),
+    (
+        ":START 1 SAMPLEDIST=1\n0\n" + ONE,
+        3,
+        ":START before the :END of the table of line 1",
+    ),
     (":END\n" + ONE, 1, ":END without a start"),
     ("5\n" + ONE, 1, "values outside of a table"),
     (ONE + ":STOP\n", 4, "unknown token ':STOP'"),
@@ -194,8 +244,16 @@ BROKEN = [
     (":START SAMPLEDIST=1\n0\n:END\n", 1, ":START has 0 arguments, not 1"),
     (":START 1 2 SAMPLEDIST=1\n0\n:END\n", 1, ":START has 2 arguments, not 1"),
     (":START 1\n:START 2 SAMPLEDIST=1\n0\n:END\n", 2, "'2' on a later :START line"),
-    (":START 1\n:START2D SAMPLEDIST=1\n0\n:END\n", 2, "a :START2D line in the 1D table of line 1"),
-    (":START 1.5 SAMPLEDIST=1\n0\n:END\n", 1, "axis_index: '1.5' is not a whole number"),
+    (
+        ":START 1\n:START2D SAMPLEDIST=1\n0\n:END\n",
+        2,
+        "a :START2D line in the 1D table of line 1",
+    ),
+    (
+        ":START 1.5 SAMPLEDIST=1\n0\n:END\n",
+        1,
+        "axis_index: '1.5' is not a whole number",
+    ),
     (":START 1 SAMPLEDIST=1\n:END\n", 1, "the table has no correction values"),
     (":START 1 SAMPLEDIST=1\n0\n1,5\n:END\n", 3, "'1,5' is not a number"),
     (":START 1 SAMPLEDIST=1\n0\nnan\n:END\n", 3, "'nan' is not a number"),
@@ -203,15 +261,31 @@ BROKEN = [
     (":START 1 SAMPLEDIST=1\n0\n1_0\n:END\n", 3, "'1_0' is not a number"),
     (":START 1 SAMPLEDIST=1\n0\n1e999\n:END\n", 3, "'1e999' is too large"),
     (":START 1 SAMPLEDIST=1\n0\n\n1-2\n:END\n", 4, "'1-2' is not a number"),
-    (":START 1 SAMPLEDIST=1\n0\n1\u00a02\n:END\n", 3, "odd characters between the numbers"),
+    (
+        ":START 1 SAMPLEDIST=1\n0\n1\u00a02\n:END\n",
+        3,
+        "odd characters between the numbers",
+    ),
     (":START 1 SAMPLEDIST=one\n0\n:END\n", 1, "SAMPLEDIST: 'one' is not a number"),
-    (":START 1 SAMPLEDIST=\u0663\n0\n:END\n", 1, "SAMPLEDIST: '\u0663' is not a number"),
-    (":START \u0661 SAMPLEDIST=1\n0\n:END\n", 1, "axis_index: '\u0661' is not a whole number"),
+    (
+        ":START 1 SAMPLEDIST=\u0663\n0\n:END\n",
+        1,
+        "SAMPLEDIST: '\u0663' is not a number",
+    ),
+    (
+        ":START \u0661 SAMPLEDIST=1\n0\n:END\n",
+        1,
+        "axis_index: '\u0661' is not a whole number",
+    ),
     (":START 1 SAMPLEDIST=\n0\n:END\n", 1, "SAMPLEDIST has no argument"),
     (":START 1 SAMPLEDIST\n0\n:END\n", 1, "SAMPLEDIST has no argument"),
     (":START 1 SAMPLEDIST=1 NEGCOR=1\n0\n:END\n", 1, "NEGCOR takes no argument"),
     (":START 1 SAMPLEDIST=1 INTABLE\n0\n:END\n", 1, "unknown keyword 'INTABLE'"),
-    (":START 1 SAMPLEDIST=1 OFFSETROW=1\n0\n:END\n", 1, "a 1D table must not have OFFSETROW"),
+    (
+        ":START 1 SAMPLEDIST=1 OFFSETROW=1\n0\n:END\n",
+        1,
+        "a 1D table must not have OFFSETROW",
+    ),
     (
         ":START 1 SAMPLEDIST=1\n:START SAMPLEDIST=2\n0\n:END\n",
         2,

@@ -20,7 +20,9 @@ def parabola():
     result, _ = known_result(5, 8)
     x = result.artifact.x_m
     gx = 1e-6 * (x / result.artifact.grid_pitch_m) ** 2
-    return replace(result, error_map=replace(result.error_map, gx=gx, gy=np.zeros_like(gx)))
+    return replace(
+        result, error_map=replace(result.error_map, gx=gx, gy=np.zeros_like(gx))
+    )
 
 
 def words(drawing):
@@ -56,7 +58,10 @@ def test_before_and_after_are_drawn_at_one_scale():
     assert [text for text in titles if text.startswith(("rms", "below"))][1] == (
         "below 0.0001 µm everywhere"
     )
-    assert sum(text.endswith(" µm") and not text.startswith("rms") for text in titles) == 1  # key
+    # key
+    assert (
+        sum(text.endswith(" µm") and not text.startswith("rms") for text in titles) == 1
+    )
     shafts = [
         line
         for item in drawing.items
@@ -64,13 +69,16 @@ def test_before_and_after_are_drawn_at_one_scale():
         for line in item.lines
     ]
     lengths = [abs(end[0] - start[0]) for start, end in shafts]
-    assert len(lengths) < 40 + 16 + 1  # nothing can be seen of what the table leaves at the nodes
+    # nothing can be seen of what the table leaves at the nodes
+    assert len(lengths) < 40 + 16 + 1
     assert max(lengths) > 10
 
 
 def test_the_lines_before_and_after_share_one_chart():
     result, frame = known_result(5, 8)[0], MachineFrame(theta_axis=3)
-    found = verify_tables(result.error_map, [table_theta(result.error_map, frame)], frame)
+    found = verify_tables(
+        result.error_map, [table_theta(result.error_map, frame)], frame
+    )
     drawing = controller_figure(found)
     before, after = (
         item.centres
@@ -78,16 +86,22 @@ def test_the_lines_before_and_after_share_one_chart():
         if isinstance(item, Discs) and item.radii[0][0] == 2.0
     )
     assert np.ptp([y for _, y in before]) > 100 > 0.1 > np.ptp([y for _, y in after])
-    legend = [text for text in words(drawing) if text.endswith("arcsec") and "rms" in text]
+    legend = [
+        text for text in words(drawing) if text.endswith("arcsec") and "rms" in text
+    ]
     assert legend[0].startswith("before: rms") and legend[1].startswith("after: rms")
 
 
 def test_a_table_of_the_other_sign_doubles_the_error_that_the_chapter_states():
     result = parabola()
     emap = result.error_map
-    flipped = exported(replace(result, error_map=replace(emap, gx=-emap.gx, gy=-emap.gy)))
+    flipped = exported(
+        replace(result, error_map=replace(emap, gx=-emap.gx, gy=-emap.gy))
+    )
     for cal, factor in ((exported(result), 0.0), (flipped, 2.0)):
         (section,) = table_chapter(result, cal).sections
         at_nodes = section.table[1]
         assert at_nodes[0] == "at the nodes"
-        assert float(at_nodes[2]) == pytest.approx(factor * float(at_nodes[1]), abs=2e-4)
+        assert float(at_nodes[2]) == pytest.approx(
+            factor * float(at_nodes[1]), abs=2e-4
+        )

@@ -17,20 +17,30 @@ def one_d(axis=1, more=""):
     return f":START {axis} SAMPLEDIST=1 {more}\n0\n1\n:END\n"
 
 
-def two_d(head="2 1 1 2 10 10 2", more="POSUNIT=PRIMARY CORUNIT=PRIMARY", rows=2, width=4):
-    return f":START2D {head} {more}\n" + (" ".join("0" * width) + "\n") * rows + ":END\n"
+def two_d(
+    head="2 1 1 2 10 10 2", more="POSUNIT=PRIMARY CORUNIT=PRIMARY", rows=2, width=4
+):
+    return (
+        f":START2D {head} {more}\n" + (" ".join("0" * width) + "\n") * rows + ":END\n"
+    )
 
 
 def galvo(head="2 1 1 2 10 10 3", rows=3, columns=3, outs=2, more=""):
-    return f":GALVO2D {head} {more}\n" + ("0 " * columns * outs + "\n") * rows + ":END\n"
+    return (
+        f":GALVO2D {head} {more}\n" + ("0 " * columns * outs + "\n") * rows + ":END\n"
+    )
 
 
-@pytest.mark.parametrize(("axis", "good"), [(0, False), (1, True), (32, True), (33, False)])
+@pytest.mark.parametrize(
+    ("axis", "good"), [(0, False), (1, True), (32, True), (33, False)]
+)
 def test_axes_count_from_one_to_32(axis, good):
     want = [] if good else [(1, f"axis {axis} is not in 1..32")]
     assert findings(one_d(axis)) == want
     assert findings(one_d(3, f"REFERENCEAXIS={axis}")) == want
-    assert findings(two_d(f"2 {axis} 3 4 1 1 2")) == ([] if axis != 2 and good else want)
+    assert findings(two_d(f"2 {axis} 3 4 1 1 2")) == (
+        [] if axis != 2 and good else want
+    )
     assert findings(two_d("5 6 7 8 1 1 1", f"OUTAXIS3={axis}", width=3)) == want
 
 
@@ -99,7 +109,9 @@ def test_kinds_do_not_mix(first, second, what):
 def test_keywords_that_a_galvo_table_must_not_have(keyword):
     word = keyword.partition("=")[0]
     assert findings(two_d(more=f"CORUNIT=COUNTS {keyword}")) == []
-    assert findings(galvo(more=keyword)) == [(1, f"a galvo 2D table must not have {word}")]
+    assert findings(galvo(more=keyword)) == [
+        (1, f"a galvo 2D table must not have {word}")
+    ]
 
 
 @pytest.mark.parametrize(
@@ -137,7 +149,10 @@ def test_gi4_restrictions_only_on_request():
         (1, "SampDistCol is 1024 counts for a GI4"),
     ]
     assert (
-        findings(galvo("2 1 1 2 32768 32768 65", 65, 65, more="POSUNIT=COUNTS/2"), gi4=Gi4(20))
+        findings(
+            galvo("2 1 1 2 32768 32768 65", 65, 65, more="POSUNIT=COUNTS/2"),
+            gi4=Gi4(20),
+        )
         == []
     )
     primary = galvo("2 1 1 2 1 1 65", 65, 65, more="POSUNIT=PRIMARY CORUNIT=PRIMARY")
@@ -174,13 +189,22 @@ def test_values_that_no_table_can_have(text, what):
         ("FULLTRAVEL=5", "FULLTRAVEL is ignored without HOMEDIRECTION"),
         ("EXPANDCOEFF=1e-5", "EXPANDCOEFF is ignored without MATERIALTEMP"),
         ("MATERIALTEMP=20", "MATERIALTEMP is ignored without EXPANDCOEFF"),
-        ("HOMEDIRECTION=CW", "HOMEDIRECTION without HOMEOFFSET: a home offset of 0 is assumed"),
+        (
+            "HOMEDIRECTION=CW",
+            "HOMEDIRECTION without HOMEOFFSET: a home offset of 0 is assumed",
+        ),
         (
             "REFERENCEAXIS=2 EXPANDCOEFF=1e-5 MATERIALTEMP=20",
             "thermal expansion in a table that corrects another axis",
         ),
-        ("OFFSET=1.5", "the home position lies outside of the table, which covers -1.5 to -0.5"),
-        ("OFFSET=-0.5", "the home position lies outside of the table, which covers 0.5 to 1.5"),
+        (
+            "OFFSET=1.5",
+            "the home position lies outside of the table, which covers -1.5 to -0.5",
+        ),
+        (
+            "OFFSET=-0.5",
+            "the home position lies outside of the table, which covers 0.5 to 1.5",
+        ),
     ],
 )
 def test_what_is_legal_but_hardly_meant_is_a_warning(more, what):
@@ -211,8 +235,12 @@ def test_2d_home_outside_loses_its_zero_bias():
             "no zero bias",
         )
     ]
-    longer = two_d(more="POSUNIT=PRIMARY CORUNIT=PRIMARY OFFSETROW=-1 OFFSETCOL=-1", rows=3)
-    assert [text.split("table, ")[1] for _, text in findings(longer, Severity.WARNING)] == [
+    longer = two_d(
+        more="POSUNIT=PRIMARY CORUNIT=PRIMARY OFFSETROW=-1 OFFSETCOL=-1", rows=3
+    )
+    assert [
+        text.split("table, ")[1] for _, text in findings(longer, Severity.WARNING)
+    ] == [
         "which covers 1 to 21: no zero bias",
         "which covers 1 to 11: no zero bias",
     ]

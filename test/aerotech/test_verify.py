@@ -18,9 +18,13 @@ FRAME = MachineFrame(1, 2, theta_axis=3)
 def test_tables_are_verified_at_sites_at_the_centres_of_all_cells_and_at_lines():
     """A rectangular field, 5 x 7 sites of 20 mm: 4 x 6 cells, the first centred at (-30, -50)."""
     emap = random_map(Artifact(5, 0.02, 12, 7), 3)
-    found = verify_tables(emap, [table_xy(emap, FRAME), table_theta(emap, FRAME)], FRAME)
+    found = verify_tables(
+        emap, [table_xy(emap, FRAME), table_theta(emap, FRAME)], FRAME
+    )
     centres = {(round(x * 1e3), round(y * 1e3)) for x, y in found.between.position.T}
-    assert centres == {(x, y) for x in (-30, -10, 10, 30) for y in (-50, -30, -10, 10, 30, 50)}
+    assert centres == {
+        (x, y) for x in (-30, -10, 10, 30) for y in (-50, -30, -10, 10, 30, 50)
+    }
     sites = {(round(x * 1e3), round(y * 1e3)) for x, y in found.sites.position.T}
     assert sites == {(x, y) for x in range(-40, 41, 20) for y in range(-60, 61, 20)}
     assert np.rad2deg(found.lines.position[0]) == pytest.approx(np.arange(12) * 30.0)

@@ -37,8 +37,12 @@ def test_decimals_read_back_exactly_and_have_no_exponent(value):
 
 
 def test_a_given_number_of_decimals_rounds_and_has_no_minus_zero():
-    text = cal_text([Table1D(1, 0.1, np.array([0.0, -1e-9, 1.0 / 3, -0.000005]))], decimals=5)
-    assert text == (":START 1\n:START SAMPLEDIST=0.1\n0.00000\n0.00000\n0.33333\n-0.00001\n:END\n")
+    text = cal_text(
+        [Table1D(1, 0.1, np.array([0.0, -1e-9, 1.0 / 3, -0.000005]))], decimals=5
+    )
+    assert text == (
+        ":START 1\n:START SAMPLEDIST=0.1\n0.00000\n0.00000\n0.33333\n-0.00001\n:END\n"
+    )
 
 
 def test_comments_cannot_break_out_of_their_line():
@@ -54,7 +58,10 @@ def test_comments_cannot_break_out_of_their_line():
         ([Table1D(1, 0.0, np.zeros(2))], "sample dist is zero"),
         ([Table1D(1, 1.0, np.zeros(2))] * 9, "more than 8 tables correct axis 1"),
         (
-            [Table1D(1, 1.0, np.zeros(2)), Table2D(2, 1, (1, 2), 1.0, 1.0, np.zeros((3, 3, 2)))],
+            [
+                Table1D(1, 1.0, np.zeros(2)),
+                Table2D(2, 1, (1, 2), 1.0, 1.0, np.zeros((3, 3, 2))),
+            ],
             "a 2D table in a file of 1D tables",
         ),
     ],
@@ -86,10 +93,19 @@ def test_a_serial_number_is_always_quoted(serial):
         (replace(PLAIN, serial_number="a\nb"), "a stray quote in the serial number"),
         (replace(PLAIN, offset=float("nan")), "OFFSET: 'nan' is not a number"),
         (replace(PLAIN, sample_dist=float("inf")), "SAMPLEDIST: 'inf' is not a number"),
-        (replace(PLAIN, home_direction="cw"), "table 1 holds what the format cannot say"),
-        (replace(PLAIN, values=np.zeros((2, 2))), "table 1 holds what the format cannot say"),
+        (
+            replace(PLAIN, home_direction="cw"),
+            "table 1 holds what the format cannot say",
+        ),
+        (
+            replace(PLAIN, values=np.zeros((2, 2))),
+            "table 1 holds what the format cannot say",
+        ),
         (replace(PLAIN, values=np.zeros(0)), "the table has no correction values"),
-        (replace(PLANE, galvo=True, offset_row=1.0), "table 1 holds what the format cannot say"),
+        (
+            replace(PLANE, galvo=True, offset_row=1.0),
+            "table 1 holds what the format cannot say",
+        ),
         (replace(PLANE, output_axes=(1, 2, 3)), "6 values on the line"),
     ],
 )
@@ -97,7 +113,9 @@ def test_a_serial_number_is_always_quoted(serial):
 def test_what_would_read_back_differently_is_not_written(table, what, decimals):
     with pytest.raises(InputError) as caught:
         cal_text([table], decimals=decimals)
-    assert str(caught.value).startswith("calibration file") and what in str(caught.value)
+    assert str(caught.value).startswith("calibration file") and what in str(
+        caught.value
+    )
 
 
 def write_cal(path, text, **kwargs):
@@ -107,20 +125,28 @@ def write_cal(path, text, **kwargs):
 def test_an_existing_file_stays_unless_forced_and_then_as_a_dated_backup(tmp_path):
     path = tmp_path / "f.cal"
     assert write_cal(path, "old\n") is None
-    with pytest.raises(InputError, match="the file exists; name another file, or replace it"):
+    with pytest.raises(
+        InputError, match="the file exists; name another file, or replace it"
+    ):
         write_cal(path, "new\n")
     assert path.read_text() == "old\n"
     first = write_cal(path, "new\n", force=True, now=WHEN)
     second = write_cal(path, "newer\n", force=True, now=WHEN)
     assert first.name == "f.cal.2026-01-02T030405Z.bak" and first.read_text() == "old\n"
-    assert second.name == "f.cal.2026-01-02T030405Z-2.bak" and second.read_text() == "new\n"
+    assert (
+        second.name == "f.cal.2026-01-02T030405Z-2.bak"
+        and second.read_text() == "new\n"
+    )
     assert path.read_text() == "newer\n" and len(list(tmp_path.iterdir())) == 3
 
 
 def test_of_two_files_on_a_full_disk_none_is_replaced(tmp_path):
     x, y = tmp_path / "x.cal", tmp_path / "y.cal"
     write_cals({x: "old x\n", y: "old y\n"})
-    with files_no_larger_than(1000), pytest.raises(InputError, match=r"y.cal: cannot be written"):
+    with (
+        files_no_larger_than(1000),
+        pytest.raises(InputError, match=r"y.cal: cannot be written"),
+    ):
         write_cals({x: "new x\n", y: "y" * 2000}, force=True)
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {
         "x.cal": "old x\n",

@@ -14,7 +14,12 @@ from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import JournalKeeper
 from selfcal_ros.sessions.reception import Reception
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+)
 from test.support.ports import START_NS, Hands, settings_of
 from test.support.sessions import cdr_of, events_of, small_plan
 
@@ -50,7 +55,9 @@ def recorded(folder, events, received_ns):
             writer.add_topic(f"/{topic}", typename, [])
         for number, event in enumerate(events):
             topic, fields = event_fields(event, "stage")
-            writer.write(f"/{topic}", fields, received_ns and received_ns + 1000 * number)
+            writer.write(
+                f"/{topic}", fields, received_ns and received_ns + 1000 * number
+            )
     return folder / "bag"
 
 
@@ -77,18 +84,26 @@ def live(events):
     return session, hands
 
 
-@pytest.mark.parametrize("events", [[*AHEAD, *HONEST], [*HONEST, *AHEAD]], ids=["first", "last"])
+@pytest.mark.parametrize(
+    "events", [[*AHEAD, *HONEST], [*HONEST, *AHEAD]], ids=["first", "last"]
+)
 def test_a_bag_with_a_run_ahead_is_what_the_live_collector_made_of_it(tmp_path, events):
     session, hands = live(events)
     found = collect_bag(recorded(tmp_path, events, START_NS), SETTINGS)
     measurements, _ = session.collector.collect()
     assert found.measurements.run_id == measurements.run_id == str(START_NS)
-    assert found.measurements.rejected == measurements.rejected == session.collector.unusable
+    assert (
+        found.measurements.rejected
+        == measurements.rejected
+        == session.collector.unusable
+    )
     assert Counter(found.measurements.rejected) == Counter(
         {
             "command_from_the_future": sum(isinstance(e, Command) for e in AHEAD),
             "from_the_future": sum(isinstance(e, Detection) for e in AHEAD),
-            "encoder_sample_from_the_future": sum(isinstance(e, EncoderSample) for e in AHEAD),
+            "encoder_sample_from_the_future": sum(
+                isinstance(e, EncoderSample) for e in AHEAD
+            ),
         }
     )
     for view, other in zip(found.measurements.views, measurements.views, strict=True):
@@ -98,9 +113,13 @@ def test_a_bag_with_a_run_ahead_is_what_the_live_collector_made_of_it(tmp_path, 
     assert hands.of("measurement")[-1]["session_notes"] == [LINE]
 
 
-@pytest.mark.parametrize("late_s, refused", [(-60.1, True), (-59.9, False), (5.0, False)])
+@pytest.mark.parametrize(
+    "late_s, refused", [(-60.1, True), (-59.9, False), (5.0, False)]
+)
 def test_how_far_ahead_of_its_logging_a_stamp_may_lie(tmp_path, late_s, refused):
-    stray = replace(next(e for e in HONEST if isinstance(e, Detection)), stamp_ns=START_NS + DAY_NS)
+    stray = replace(
+        next(e for e in HONEST if isinstance(e, Detection)), stamp_ns=START_NS + DAY_NS
+    )
     bag = recorded(tmp_path, HONEST, 0)
     with BagWriter(tmp_path / "other") as writer:
         writer.add_topic(f"/{DETECTION_TOPIC}", INPUT_TOPICS[DETECTION_TOPIC], [])

@@ -67,11 +67,18 @@ def by_columns(path):
     reader, out = BagReader(path), []
     for topic, item in reader.columns():
         if topic == ENCODER_TOPIC:
-            speeds = [()] * len(item) if item.velocities is None else item.velocities.tolist()
+            speeds = (
+                [()] * len(item)
+                if item.velocities is None
+                else item.velocities.tolist()
+            )
             out += [
                 EncoderSample(stamp, item.names, tuple(position), tuple(speed))
                 for stamp, position, speed in zip(
-                    item.stamps_ns.tolist(), item.positions.tolist(), speeds, strict=True
+                    item.stamps_ns.tolist(),
+                    item.positions.tolist(),
+                    speeds,
+                    strict=True,
                 )
             ]
         elif topic == DETECTION_TOPIC:
@@ -136,7 +143,9 @@ def test_what_stands_behind_the_fields_is_not_looked_at(tmp_path, events, little
     assert len(sent) == len(events) and {data[:2] for data in sent} == {b"\0\1"}
 
 
-def test_without_definitions_only_a_type_of_one_length_may_have_a_tail(tmp_path, events):
+def test_without_definitions_only_a_type_of_one_length_may_have_a_tail(
+    tmp_path, events
+):
     path = Tailed(schemas=False).write(tmp_path / "x.mcap", events)
     n_samples = sum(isinstance(event, EncoderSample) for event in events)
     found, lost = by_columns(path)
@@ -196,9 +205,13 @@ def write_topics(path, chunks, *, crcs=True, compression=CompressionType.NONE):
     """Write chunks of (topic, count) each; JointStates on ours, noise on the others."""
     sample = Foreign()._payload(EncoderSample(5, ("x",), (0.5,)))[1]
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1 << 30, enable_crcs=crcs, compression=compression)
+        writer = Writer(
+            file, chunk_size=1 << 30, enable_crcs=crcs, compression=compression
+        )
         writer.start(profile="ros2", library="by somebody else")
-        text = bags.contract_types().generate_msgdef(bags.ENCODER_TYPE, ros_version=2)[0]
+        text = bags.contract_types().generate_msgdef(bags.ENCODER_TYPE, ros_version=2)[
+            0
+        ]
         schema = writer.register_schema(bags.ENCODER_TYPE, "ros2msg", text.encode())
         ids = {}
         for chunk in chunks:
@@ -263,7 +276,9 @@ def test_a_chunk_that_is_passed_but_cut_short_is_found_out(tmp_path, opened):
         passed = mcap_chunk.read_summary(file).needless(lambda topic: "joint" in topic)
     (place, end), *_ = passed.items()
     assert len(passed) == 3 and data[place] == Opcode.CHUNK
-    path.write_bytes(data[: place + 1] + struct.pack("<Q", end - place) + data[place + 9 :])
+    path.write_bytes(
+        data[: place + 1] + struct.pack("<Q", end - place) + data[place + 9 :]
+    )
     assert sum(len(block) for _, block in reader.columns()) == 7
     assert len(opened) == 3 and len(reader.lost) <= 1
 
@@ -273,7 +288,9 @@ def record(opcode, body):
 
 
 def message(channel, payload, stamp=7):
-    return record(Opcode.MESSAGE, struct.pack("<HIQQ", channel, 3, stamp, stamp + 1) + payload)
+    return record(
+        Opcode.MESSAGE, struct.pack("<HIQQ", channel, 3, stamp, stamp + 1) + payload
+    )
 
 
 class FakeChunk:
@@ -295,8 +312,12 @@ def text(value):
     return struct.pack("<I", len(value)) + value
 
 
-CHANNEL = record(Opcode.CHANNEL, struct.pack("<HH", 4, 0) + text(b"/a") + text(b"cdr") + text(b""))
-SCHEMA = record(Opcode.SCHEMA, struct.pack("<H", 9) + text(b"n") + text(b"e") + text(b"definition"))
+CHANNEL = record(
+    Opcode.CHANNEL, struct.pack("<HH", 4, 0) + text(b"/a") + text(b"cdr") + text(b"")
+)
+SCHEMA = record(
+    Opcode.SCHEMA, struct.pack("<H", 9) + text(b"n") + text(b"e") + text(b"definition")
+)
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -319,7 +340,9 @@ def test_a_chunk_gives_what_the_library_gives(seed):
                 for i in range(int(rng.integers(60, 700)))
             ]
         else:
-            parts.append((CHANNEL, SCHEMA, record(0x99, rng.bytes(size + 1)))[rng.integers(3)])
+            parts.append(
+                (CHANNEL, SCHEMA, record(0x99, rng.bytes(size + 1)))[rng.integers(3)]
+            )
     data = b"".join(parts)
     expected = breakup_chunk(FakeChunk(data))
     assert flat(chunk_items(FakeChunk(data))) == expected
@@ -338,7 +361,9 @@ def test_records_between_messages_keep_their_place():
     data = message(1, b"a") + CHANNEL + message(4, b"b") + message(4, b"c") + SCHEMA
     kinds = [type(item) for item in chunk_items(FakeChunk(data))]
     assert kinds == [MessageBlock, Channel, MessageBlock, Schema]
-    assert [m.data for m in flat(chunk_items(FakeChunk(data))) if isinstance(m, Message)] == [
+    assert [
+        m.data for m in flat(chunk_items(FakeChunk(data))) if isinstance(m, Message)
+    ] == [
         b"a",
         b"b",
         b"c",
@@ -357,7 +382,9 @@ def test_runs_are_taken_at_once(monkeypatch):
             (),
             {
                 "size": 9,
-                "unpack_from": staticmethod(lambda d, at: singles.append(at) or unpack(d, at)),
+                "unpack_from": staticmethod(
+                    lambda d, at: singles.append(at) or unpack(d, at)
+                ),
             },
         ),
     )
@@ -371,7 +398,9 @@ def test_runs_are_taken_at_once(monkeypatch):
 @pytest.mark.parametrize("lengths", [(7,), (2, 5), (1, 1, 4, 0)])
 def test_messages_in_a_row_are_found_up_to_what_stands_behind_them(lengths, n, behind):
     payloads = [bytes([i % 251]) * lengths[i % len(lengths)] for i in range(n)]
-    front = SCHEMA + b"".join(message(i % 3, payload, i) for i, payload in enumerate(payloads))
+    front = SCHEMA + b"".join(
+        message(i % 3, payload, i) for i, payload in enumerate(payloads)
+    )
     block, end = mcap_chunk.message_block(front + behind, len(SCHEMA))
     assert end == len(front)
     assert [bytes(payload) for payload in block.payloads] == payloads
@@ -385,7 +414,9 @@ def test_messages_in_a_row_are_found_up_to_what_stands_behind_them(lengths, n, b
 def test_lengths_that_come_again_are_taken_at_once(monkeypatch, pattern):
     lengths = [pattern[i % len(pattern)] for i in range(6000)]
     lengths[3000] += 1  # one visit is another: the rest is found again
-    data = b"".join(message(1, bytes([i % 251]) * length) for i, length in enumerate(lengths))
+    data = b"".join(
+        message(1, bytes([i % 251]) * length) for i, length in enumerate(lengths)
+    )
     looked = []
     unpack = mcap_salvage.HEAD.unpack_from
     monkeypatch.setattr(
@@ -396,7 +427,9 @@ def test_lengths_that_come_again_are_taken_at_once(monkeypatch, pattern):
             (),
             {
                 "size": 9,
-                "unpack_from": staticmethod(lambda d, at: looked.append(at) or unpack(d, at)),
+                "unpack_from": staticmethod(
+                    lambda d, at: looked.append(at) or unpack(d, at)
+                ),
             },
         ),
     )

@@ -40,7 +40,9 @@ def test_a_later_cut_never_reads_less_and_every_loss_is_said(tmp_path):
         counts.append(count)
     assert counts == sorted(counts)
     assert counts[0] < TOTAL / 10 and counts[-1] == TOTAL
-    assert len(set(counts)) > 3, "the front part of a chunk that was cut off is read as well"
+    assert len(set(counts)) > 3, (
+        "the front part of a chunk that was cut off is read as well"
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -86,7 +88,9 @@ def records(data):
 
 def relength(data, at, change):
     length = struct.unpack_from("<Q", data, at + 1)[0]
-    return data[: at + 1] + struct.pack("<Q", (length + change) % 2**64) + data[at + 9 :]
+    return (
+        data[: at + 1] + struct.pack("<Q", (length + change) % 2**64) + data[at + 9 :]
+    )
 
 
 def damaged(folder, data):
@@ -98,10 +102,12 @@ def damaged(folder, data):
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
-def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, options):
-    path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}).write(
-        tmp_path / "x.mcap", events
-    )
+def test_a_wrong_length_of_a_chunk_loses_nothing(
+    tmp_path, events, compression, options
+):
+    path = Foreign(
+        {"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}
+    ).write(tmp_path / "x.mcap", events)
     data = path.read_bytes()
     whole, lost = damaged(tmp_path, data)
     assert lost == [] and len(whole) == len(events)
@@ -112,7 +118,9 @@ def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, 
             found, lost = damaged(tmp_path, relength(data, at, change))
             assert found == whole, change
             assert len(lost) <= 1 and (lost or change > 0)
-            assert not lost or lost[0].startswith(f"the file is damaged from byte {at} to ")
+            assert not lost or lost[0].startswith(
+                f"the file is damaged from byte {at} to "
+            )
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
@@ -120,13 +128,15 @@ def test_a_wrong_length_of_a_chunk_loses_nothing(tmp_path, events, compression, 
 def test_a_destroyed_chunk_costs_its_own_messages_and_no_more(
     tmp_path, events, compression, options
 ):
-    path = Foreign({"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}).write(
-        tmp_path / "x.mcap", events
-    )
+    path = Foreign(
+        {"chunk_size": 1500, "compression": COMPRESSIONS[compression], **options}
+    ).write(tmp_path / "x.mcap", events)
     data = path.read_bytes()
     whole, _ = damaged(tmp_path, data)
     for number in (3, 0) if not options else (3,):  # the first one declares the topics
-        chunks = [(at, length) for op, at, length in records(data) if op == Opcode.CHUNK]
+        chunks = [
+            (at, length) for op, at, length in records(data) if op == Opcode.CHUNK
+        ]
         (at, length), (behind, _) = chunks[number], chunks[number + 1]
         broken = data[:at] + bytes(9 + length) + data[at + 9 + length :]
         found, lost = damaged(tmp_path, broken)
@@ -134,16 +144,24 @@ def test_a_destroyed_chunk_costs_its_own_messages_and_no_more(
         assert 0 < missing < 100
         front = next(i for i, item in enumerate(whole) if found[i] != item)
         assert found == whole[:front] + whole[front + missing :]
-        assert lost[0].startswith(f"the file is damaged from byte {at} to {behind}: 0 messages")
+        assert lost[0].startswith(
+            f"the file is damaged from byte {at} to {behind}: 0 messages"
+        )
         assert lost[1:] == (
-            [] if options else [f"{missing} of {len(whole)} messages of the file are lost"]
+            []
+            if options
+            else [f"{missing} of {len(whole)} messages of the file are lost"]
         )
 
 
 @pytest.mark.parametrize("options", [{}, NO_SUMMARY], ids=["summary", "no summary"])
 @pytest.mark.parametrize("change", [1, -1, 50, 5000, 2**40])
-def test_a_wrong_length_without_chunks_costs_one_message(tmp_path, events, options, change):
-    path = Foreign({"use_chunking": False, **options}).write(tmp_path / "x.mcap", events)
+def test_a_wrong_length_without_chunks_costs_one_message(
+    tmp_path, events, options, change
+):
+    path = Foreign({"use_chunking": False, **options}).write(
+        tmp_path / "x.mcap", events
+    )
     data = path.read_bytes()
     whole, lost = damaged(tmp_path, data)
     assert lost == [] and len(whole) == len(events)
@@ -223,7 +241,10 @@ def test_an_mcap_file_beside_one_of_sqlite_is_read(tmp_path):
 
 
 def test_what_is_no_bag_is_refused(tmp_path):
-    for content, message in ((b"", "the file is empty"), (b"hello world", "not an MCAP file")):
+    for content, message in (
+        (b"", "the file is empty"),
+        (b"hello world", "not an MCAP file"),
+    ):
         file = tmp_path / "x.mcap"
         file.write_bytes(content)
         with pytest.raises(InputError, match=message):
@@ -246,5 +267,7 @@ def test_a_file_of_a_bag_that_is_no_mcap_file_costs_itself(tmp_path, how, place)
 def test_a_bag_none_of_whose_files_is_an_mcap_file_is_refused(tmp_path):
     for number, content in enumerate((bytes(100), b"")):
         (tmp_path / f"b_{number}.mcap").write_bytes(content)
-    with pytest.raises(InputError, match=r"b_0\.mcap: not an MCAP file; give an \.mcap file"):
+    with pytest.raises(
+        InputError, match=r"b_0\.mcap: not an MCAP file; give an \.mcap file"
+    ):
         read(tmp_path)

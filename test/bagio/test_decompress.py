@@ -35,7 +35,9 @@ SMALL_FREE = 4 << 20
 PACK = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 UNPACK = {"zstd": zstd_chunk, "lz4": lz4_chunk}
 LOOSE = {
-    "zstd": lambda data: zstandard.ZstdCompressor(write_content_size=False).compress(data),
+    "zstd": lambda data: zstandard.ZstdCompressor(write_content_size=False).compress(
+        data
+    ),
     "lz4": lambda data: lz4.frame.compress(data, store_size=False),
 }
 
@@ -53,7 +55,8 @@ def tight(monkeypatch):
 def test_what_is_allowed_comes_out_whole(name, pack, size):
     data = np.random.default_rng(size).integers(0, 4, size, dtype=np.uint8).tobytes()
     assert UNPACK[name](pack[name](data), max(size, 1)) == data
-    if name == "lz4" or pack is PACK:  # a length that the file has wrong takes nothing away
+    # a length that the file has wrong takes nothing away
+    if name == "lz4" or pack is PACK:
         assert UNPACK[name](pack[name](data), size // 2 + 1) == data
         assert UNPACK[name](pack[name](data), 2**62) == data
 
@@ -133,7 +136,9 @@ def bomb_chunk(name, size):
     """Return a chunk record of `size` zeros, honestly declared."""
     data = bytes(size)
     packed = PACK[name](data)
-    body = struct.pack("<QQQII", 0, 0, size, zlib.crc32(data), len(name)) + name.encode()
+    body = (
+        struct.pack("<QQQII", 0, 0, size, zlib.crc32(data), len(name)) + name.encode()
+    )
     body += struct.pack("<Q", len(packed)) + packed
     return struct.pack("<BQ", Opcode.CHUNK, len(body)) + body
 
@@ -152,7 +157,8 @@ def test_a_bomb_in_a_bag_costs_itself_and_one_line(tmp_path, events, tight, name
     assert sum(1 for _ in decoded(reader)) == len(events)
     [line] = reader.lost
     assert line.startswith("the chunk that ends at byte ")
-    limit = {"zstd": 4, "lz4": 17}[name]  # LZ4 squeezes zeros 243 times, zstd without end
+    # LZ4 squeezes zeros 243 times, zstd without end
+    limit = {"zstd": 4, "lz4": 17}[name]
     assert line.endswith(
         f" was not read: it would decompress to 21 MB, more than the {limit} MB "
         "that its size, the file and the memory allow"
@@ -161,7 +167,9 @@ def test_a_bomb_in_a_bag_costs_itself_and_one_line(tmp_path, events, tight, name
 
 @pytest.mark.parametrize("name", PACK)
 @pytest.mark.parametrize("pack", [PACK, LOOSE], ids=["told", "not told"])
-def test_a_bomb_that_is_cut_off_gives_nothing(tmp_path, events, tight, name, pack, monkeypatch):
+def test_a_bomb_that_is_cut_off_gives_nothing(
+    tmp_path, events, tight, name, pack, monkeypatch
+):
     monkeypatch.setitem(PACK, name, pack[name])
     data = (
         Foreign({"compression": COMPRESSIONS["none"]})
@@ -200,7 +208,9 @@ def test_a_compressed_message_that_is_a_bomb_is_counted(tmp_path, events, tight)
 @pytest.mark.parametrize("told", [True, False])
 def test_a_file_that_is_a_bomb_is_refused(tmp_path, tight, told):
     path = tmp_path / "x.mcap.zstd"
-    path.write_bytes(zstandard.ZstdCompressor(write_content_size=told).compress(bytes(5 * tight)))
+    path.write_bytes(
+        zstandard.ZstdCompressor(write_content_size=told).compress(bytes(5 * tight))
+    )
     with pytest.raises(
         InputError,
         match=r"x\.mcap\.zstd: it would decompress to \d+ MB, more than "

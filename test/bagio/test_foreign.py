@@ -69,7 +69,9 @@ def test_the_reference_is_a_calibration(expected):
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 @pytest.mark.parametrize("chunk_size", [1, 700, 1 << 24])
 def test_chunks_and_compression(tmp_path, events, expected, compression, chunk_size):
-    foreign = Foreign({"chunk_size": chunk_size, "compression": COMPRESSIONS[compression]})
+    foreign = Foreign(
+        {"chunk_size": chunk_size, "compression": COMPRESSIONS[compression]}
+    )
     check(foreign.write(tmp_path / "x.mcap", events), expected)
 
 
@@ -83,7 +85,14 @@ def test_chunks_and_compression(tmp_path, events, expected, compression, chunk_s
         {"enable_data_crcs": True},
         {**NO_SUMMARY, "enable_crcs": False},
     ],
-    ids=["no chunks", "no chunks, no summary", "no summary", "no crc", "data crc", "bare"],
+    ids=[
+        "no chunks",
+        "no chunks, no summary",
+        "no summary",
+        "no crc",
+        "data crc",
+        "bare",
+    ],
 )
 @pytest.mark.parametrize("footer", [True, False])
 def test_what_mcap_leaves_open(tmp_path, events, expected, options, footer):
@@ -95,7 +104,10 @@ def test_what_mcap_leaves_open(tmp_path, events, expected, options, footer):
 
 
 def test_fields_at_the_end_are_ignored(tmp_path, events, expected):
-    check(Foreign(types=bags.contract_types(EXTRA)).write(tmp_path / "x.mcap", events), expected)
+    check(
+        Foreign(types=bags.contract_types(EXTRA)).write(tmp_path / "x.mcap", events),
+        expected,
+    )
 
 
 def test_other_topics_are_ignored(tmp_path, events, expected):
@@ -120,14 +132,20 @@ def test_the_writer_of_rosbags(tmp_path, events, expected):
 
 
 @pytest.mark.parametrize("metadata", [True, False])
-def test_a_bag_in_many_files_whose_channels_differ(tmp_path, events, expected, metadata):
+def test_a_bag_in_many_files_whose_channels_differ(
+    tmp_path, events, expected, metadata
+):
     parts = bags.split(events, 12)
     for number, part in enumerate(parts):
-        Foreign(others=True).write(tmp_path / "bag" / f"part_{number}.mcap", part, order=number % 4)
+        Foreign(others=True).write(
+            tmp_path / "bag" / f"part_{number}.mcap", part, order=number % 4
+        )
     names = [f"part_{number}.mcap" for number in range(len(parts))]
     if metadata:
         (tmp_path / "bag" / "metadata.yaml").write_text(
-            yaml.safe_dump({"rosbag2_bagfile_information": {"relative_file_paths": names}})
+            yaml.safe_dump(
+                {"rosbag2_bagfile_information": {"relative_file_paths": names}}
+            )
         )
     assert [file.name for file in BagReader(tmp_path / "bag").files] == names
     check(tmp_path / "bag", expected)
@@ -138,7 +156,9 @@ def test_files_joined_to_one_are_all_read(tmp_path, events, expected, compressio
     """As by `cat A B`; the numbers of channels differ between them."""
     joined = b""
     for number, part in enumerate(bags.split(events, 3)):
-        file = Foreign(others=True).write(tmp_path / f"{number}.mcap", part, order=number)
+        file = Foreign(others=True).write(
+            tmp_path / f"{number}.mcap", part, order=number
+        )
         joined += file.read_bytes()
     if compression:
         joined = zstandard.compress(joined)
@@ -146,25 +166,41 @@ def test_files_joined_to_one_are_all_read(tmp_path, events, expected, compressio
     check(tmp_path / "bag.mcap", expected)
 
 
-def test_a_file_without_its_end_joined_to_another_loses_no_more_than_that(tmp_path, events):
+def test_a_file_without_its_end_joined_to_another_loses_no_more_than_that(
+    tmp_path, events
+):
     first, second = bags.split(events, 2)
     one = Foreign({"chunk_size": 1500}).write(tmp_path / "1.mcap", first).read_bytes()
     two = Foreign().write(tmp_path / "2.mcap", second, order=2).read_bytes()
-    for cut in (one.rindex(b"\x89MCAP0"), len(one) // 2, len(one) - 60, 1230, 2038, 9784):
+    for cut in (
+        one.rindex(b"\x89MCAP0"),
+        len(one) // 2,
+        len(one) - 60,
+        1230,
+        2038,
+        9784,
+    ):
         (tmp_path / "cut.mcap").write_bytes(one[:cut])
         (tmp_path / "bag.mcap").write_bytes(one[:cut] + two)
-        alone, reader = BagReader(tmp_path / "cut.mcap"), BagReader(tmp_path / "bag.mcap")
+        alone, reader = (
+            BagReader(tmp_path / "cut.mcap"),
+            BagReader(tmp_path / "bag.mcap"),
+        )
         count = len(list(decoded(alone)))
         assert len(list(decoded(reader))) == count + len(second)
         assert len(reader.lost) == len(alone.lost) <= 1
 
 
-def test_what_follows_the_end_of_a_file_and_is_no_other_is_said(tmp_path, events, expected):
+def test_what_follows_the_end_of_a_file_and_is_no_other_is_said(
+    tmp_path, events, expected
+):
     file = Foreign().write(tmp_path / "x.mcap", events)
     file.write_bytes(file.read_bytes() + bytes(50))
     result, lost = solved(file)
     assert result == expected
-    assert lost == ["50 bytes after the end of the recording are not MCAP and were not used"]
+    assert lost == [
+        "50 bytes after the end of the recording are not MCAP and were not used"
+    ]
 
 
 def test_a_recording_behind_strange_bytes_is_read(tmp_path, events, expected):
@@ -175,12 +211,19 @@ def test_a_recording_behind_strange_bytes_is_read(tmp_path, events, expected):
     (tmp_path / "bag.mcap").write_bytes(one + bytes(50) + two)
     result, lost = solved(tmp_path / "bag.mcap")
     assert result == expected
-    assert lost == ["50 bytes after the end of the recording are not MCAP and were not used"]
+    assert lost == [
+        "50 bytes after the end of the recording are not MCAP and were not used"
+    ]
 
 
 @pytest.mark.parametrize(
     ("order", "where"),
-    [([0, 0], "b.mcap"), ([1, 0], "b.mcap"), ([0, 1], ""), ("joined", "a.mcap from byte")],
+    [
+        ([0, 0], "b.mcap"),
+        ([1, 0], "b.mcap"),
+        ([0, 1], ""),
+        ("joined", "a.mcap from byte"),
+    ],
 )
 def test_copies_and_files_out_of_order_are_not_called_steps_of_a_clock(
     tmp_path, events, expected, order, where
@@ -199,12 +242,17 @@ def test_copies_and_files_out_of_order_are_not_called_steps_of_a_clock(
     assert calibrated(measurements)["error_map"] == expected["error_map"]
     assert len(lost) == bool(where)
     for line in lost:
-        assert line.startswith(where) and "before the end of what was read before it" in line
+        assert (
+            line.startswith(where)
+            and "before the end of what was read before it" in line
+        )
 
 
 def listing(bag, *files) -> None:
     (bag / "metadata.yaml").write_text(
-        yaml.safe_dump({"rosbag2_bagfile_information": {"relative_file_paths": list(files)}})
+        yaml.safe_dump(
+            {"rosbag2_bagfile_information": {"relative_file_paths": list(files)}}
+        )
     )
 
 
@@ -222,7 +270,9 @@ def test_files_that_were_renamed_are_read(tmp_path, events, expected):
     listing(tmp_path / "bag", "a.mcap")
     result, lost = solved(tmp_path / "bag")
     assert result == expected
-    assert lost == ["the file a.mcap, which metadata.yaml lists, is missing; renamed.mcap was read"]
+    assert lost == [
+        "the file a.mcap, which metadata.yaml lists, is missing; renamed.mcap was read"
+    ]
 
 
 def test_the_missing_files_of_a_bag_without_any_are_named(tmp_path):
@@ -243,7 +293,9 @@ def test_a_damaged_file_of_several_is_named(tmp_path, events):
     cut.write_bytes(cut.read_bytes()[:-9])
     reader = BagReader(tmp_path / "bag")
     list(decoded(reader))
-    assert len(reader.lost) == 1 and reader.lost[0].startswith("b.mcap: the end of the file is dam")
+    assert len(reader.lost) == 1 and reader.lost[0].startswith(
+        "b.mcap: the end of the file is dam"
+    )
 
 
 def test_a_file_that_metadata_lists_but_nobody_has_is_said(tmp_path, events, expected):
@@ -265,7 +317,9 @@ def test_a_file_that_metadata_lists_but_nobody_has_is_said(tmp_path, events, exp
         ([], "metadata.yaml lists no file and was not used"),
     ],
 )
-def test_what_metadata_lists_besides_recordings_is_said(tmp_path, events, expected, names, line):
+def test_what_metadata_lists_besides_recordings_is_said(
+    tmp_path, events, expected, names, line
+):
     Foreign().write(tmp_path / "bag" / "a.mcap", events)
     listing(tmp_path / "bag", *names)
     assert solved(tmp_path / "bag") == (expected, [line])
@@ -303,7 +357,8 @@ def test_two_cells_in_one_bag(tmp_path, events, expected):
     for name, content in (("cell1", events), ("cell2", other)):
         Foreign(namespace=f"/{name}").write(tmp_path / "bag" / f"{name}.mcap", content)
     with pytest.raises(
-        InputError, match="topics of two cells, '/cell1' and '/cell2'; choose one with --namespace"
+        InputError,
+        match="topics of two cells, '/cell1' and '/cell2'; choose one with --namespace",
     ):
         solved(tmp_path / "bag")
     check(tmp_path / "bag", expected, namespace="cell1")
@@ -311,7 +366,8 @@ def test_two_cells_in_one_bag(tmp_path, events, expected):
     assert result == result_to_dict(worded(calibrate(collected(other)[1], Options())))
     assert lost == []
     with pytest.raises(
-        NoDataError, match="no topics of the cell '/cell3'; choose one of /cell1, /cell2"
+        NoDataError,
+        match="no topics of the cell '/cell3'; choose one of /cell1, /cell2",
     ):
         solved(tmp_path / "bag", namespace="cell3")
 
@@ -320,18 +376,26 @@ def test_two_cells_in_one_bag(tmp_path, events, expected):
 def test_the_cell_in_the_root_can_be_chosen(tmp_path, events, expected, namespace):
     other = events_of(small_plan("0, 90, ty"), seed=8)
     for name, content in (("", events), ("/cell2", other)):
-        Foreign(namespace=name).write(tmp_path / "bag" / f"x{name.strip('/')}.mcap", content)
-    with pytest.raises(InputError, match="topics of two cells, '/' and '/cell2'; choose"):
+        Foreign(namespace=name).write(
+            tmp_path / "bag" / f"x{name.strip('/')}.mcap", content
+        )
+    with pytest.raises(
+        InputError, match="topics of two cells, '/' and '/cell2'; choose"
+    ):
         solved(tmp_path / "bag")
     check(tmp_path / "bag", expected, namespace=namespace)
-    with pytest.raises(NoDataError, match="no topics of the cell '/'; choose one of /cell2"):
+    with pytest.raises(
+        NoDataError, match="no topics of the cell '/'; choose one of /cell2"
+    ):
         solved(tmp_path / "bag" / "xcell2.mcap", namespace=namespace)
 
 
 @pytest.mark.parametrize(
     "more", ["", "uint32 grid_size_y\n", "uint32 grid_size_y\nuint32 views_planned\n"]
 )
-def test_without_definitions_messages_of_every_version_are_read(tmp_path, events, expected, more):
+def test_without_definitions_messages_of_every_version_are_read(
+    tmp_path, events, expected, more
+):
     types = bags.contract_types(command=bags.COMMAND + more)
     path = Foreign(types=types, schemas=False).write(tmp_path / "x.mcap", events)
     check(path, expected)
@@ -340,7 +404,9 @@ def test_without_definitions_messages_of_every_version_are_read(tmp_path, events
 def test_without_definitions_what_does_not_fit_is_said(tmp_path, events):
     types = bags.contract_types(EXTRA)
     path = Foreign(types=types, schemas=False).write(tmp_path / "x.mcap", events)
-    with pytest.raises(NoDataError, match=r"no message on selfcal/view_command \(.*\); record"):
+    with pytest.raises(
+        NoDataError, match=r"no message on selfcal/view_command \(.*\); record"
+    ):
         solved(path)
     reader = BagReader(path)
     assert {topic for topic, *_ in decoded(reader)} == {"stage/joint_states"}
@@ -369,7 +435,11 @@ TYPES = {
         ("detection", "float32 score", "float64[] score"),
         ("detection", "int32 m", "std_msgs/Header m"),
         ("command", "string plan_id", "uint32 plan_id"),
-        ("command", "uint32 angular_count", "uint32 angular_count\nstring views_planned"),
+        (
+            "command",
+            "uint32 angular_count",
+            "uint32 angular_count\nstring views_planned",
+        ),
         ("command", "uint32 grid_size", "uint32[3] grid_size"),
     ],
 )
@@ -398,7 +468,9 @@ def test_a_field_of_another_type_is_named(tmp_path, events, which, old, new):
 
 def test_a_header_of_another_kind_is_named(tmp_path, events):
     types = bags.contract_types(
-        detection=bags.DETECTION.replace("std_msgs/Header header", "builtin_interfaces/Time header")
+        detection=bags.DETECTION.replace(
+            "std_msgs/Header header", "builtin_interfaces/Time header"
+        )
     )
     path = Foreign(types=types).write(tmp_path / "x.mcap", events, spoil=True)
     with pytest.raises(InputError, match="the field 'header' has another type"):
@@ -406,7 +478,9 @@ def test_a_header_of_another_kind_is_named(tmp_path, events):
 
 
 def test_bounds_on_lengths_are_free(tmp_path, events, expected):
-    types = bags.contract_types(command=bags.COMMAND.replace("string plan", "string<=64 plan"))
+    types = bags.contract_types(
+        command=bags.COMMAND.replace("string plan", "string<=64 plan")
+    )
     check(Foreign(types=types).write(tmp_path / "x.mcap", events), expected)
 
 
@@ -421,7 +495,9 @@ def test_bags_that_rosbag2_compressed(tmp_path, events, expected, mode):
     check(bag, expected)
 
 
-def test_a_compressed_file_beside_its_plain_one_is_read_once(tmp_path, events, expected):
+def test_a_compressed_file_beside_its_plain_one_is_read_once(
+    tmp_path, events, expected
+):
     bag = bags.rosbags_bag(tmp_path / "bag", events, CompressionMode.FILE)
     [file] = bag.glob("*.mcap.zstd")
     file.with_suffix("").write_bytes(
@@ -434,7 +510,10 @@ def test_a_compressed_file_beside_its_plain_one_is_read_once(tmp_path, events, e
 
 @pytest.mark.parametrize(
     "spoil",
-    [lambda data: data[: len(data) * 9 // 10], lambda data: data[:-900] + bytes(50) + data[-850:]],
+    [
+        lambda data: data[: len(data) * 9 // 10],
+        lambda data: data[:-900] + bytes(50) + data[-850:],
+    ],
 )
 def test_a_compressed_file_that_is_damaged_is_read_as_far_as_it_goes(tmp_path, spoil):
     events = events_of(small_plan())
@@ -446,7 +525,9 @@ def test_a_compressed_file_that_is_damaged_is_read_as_far_as_it_goes(tmp_path, s
     assert 100 < len(list(decoded(reader))) < len(events)
     assert reader.lost
     file.write_bytes(data[:100])
-    with pytest.raises(InputError, match="no part of the compressed file can be read; record"):
+    with pytest.raises(
+        InputError, match="no part of the compressed file can be read; record"
+    ):
         solved(bag)
 
 
@@ -465,7 +546,11 @@ def test_a_file_listed_twice_is_read_once(tmp_path, events, expected):
     Foreign().write(tmp_path / "bag" / "a.mcap", events)
     (tmp_path / "bag" / "metadata.yaml").write_text(
         yaml.safe_dump(
-            {"rosbag2_bagfile_information": {"relative_file_paths": ["a.mcap", "a.mcap"]}}
+            {
+                "rosbag2_bagfile_information": {
+                    "relative_file_paths": ["a.mcap", "a.mcap"]
+                }
+            }
         )
     )
     check(tmp_path / "bag", expected)
@@ -515,7 +600,9 @@ def test_bytes_of_the_own_types_are_played_as_they_are(tmp_path, events):
     path = Foreign().write(tmp_path / "x.mcap", events)
     raw = {message.data for _, message in McapStream(path).messages()}
     sent = [(topic, data) for topic, _, data in BagReader(path).cdr_messages()]
-    assert {topic for topic, data in sent if data not in raw} == {"selfcal/view_command"}
+    assert {topic for topic, data in sent if data not in raw} == {
+        "selfcal/view_command"
+    }
 
 
 def test_bytes_of_the_other_order_are_turned(tmp_path, events, expected):

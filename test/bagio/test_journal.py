@@ -106,7 +106,9 @@ def test_a_journal_is_a_bag_like_any_other(tmp_path, events):
     assert writer.path.name == "journal_20231114T221320Z"
     with Reader(writer.path) as reader:
         assert reader.message_count == sum(1 for _ in reader.messages()) == len(events)
-        assert {c.topic for c in reader.connections} == {f"/{topic}" for topic in INPUT_TOPICS}
+        assert {c.topic for c in reader.connections} == {
+            f"/{topic}" for topic in INPUT_TOPICS
+        }
     [file] = writer.path.glob("*.mcap")
     with file.open("rb") as stream:
         whole = make_reader(stream, validate_crcs=True)
@@ -127,15 +129,21 @@ def test_metadata_counts_what_every_file_holds(tmp_path, events):
     assert about["starting_time"]["nanoseconds_since_epoch"] == NOW + 5
     assert about["duration"]["nanoseconds"] == 11
     assert [file["message_count"] for file in about["files"]] == [7, 5]
-    by_topic = {t["topic_metadata"]["name"]: t for t in about["topics_with_message_count"]}
+    by_topic = {
+        t["topic_metadata"]["name"]: t for t in about["topics_with_message_count"]
+    }
     assert {name: topic["message_count"] for name, topic in by_topic.items()} == {
         f"/{topic}": 12 * (topic == ENCODER_TOPIC) for topic in INPUT_TOPICS
     }
-    assert by_topic["/stage/joint_states"]["topic_metadata"]["offered_qos_profiles"] == [QOS]
+    assert by_topic["/stage/joint_states"]["topic_metadata"][
+        "offered_qos_profiles"
+    ] == [QOS]
 
 
 def information(path):
-    return yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    return yaml.safe_load((path / "metadata.yaml").read_text())[
+        "rosbag2_bagfile_information"
+    ]
 
 
 WRITER = """
@@ -165,7 +173,9 @@ while True:
 """
 
 
-def test_killed_at_any_instant_what_was_flushed_is_there_and_the_next_one_goes_on(tmp_path):
+def test_killed_at_any_instant_what_was_flushed_is_there_and_the_next_one_goes_on(
+    tmp_path,
+):
     first = 0
     for n_lines in (1, 40, 7):
         child = subprocess.Popen(
@@ -208,7 +218,8 @@ def test_a_file_cut_anywhere_is_finished_and_holds_what_is_whole(tmp_path):
         place
         for place in range(len(data))
         if data[place] == Opcode.MESSAGE
-        and data[place + 1 : place + 9] == struct.pack("<Q", 22 + len(raw(samples(1)[0])[1]))
+        and data[place + 1 : place + 9]
+        == struct.pack("<Q", 22 + len(raw(samples(1)[0])[1]))
     ]
     assert len(places) == 3
     ends = [*places[1:], data.index(bytes([Opcode.DATA_END]) + struct.pack("<Q", 4))]
@@ -270,7 +281,9 @@ def test_the_plan_that_is_running_is_taken_up(tmp_path, phases, goes_on, reverse
         again.close()
 
 
-@pytest.mark.parametrize(("ahead_s", "goes_on"), [(-3600, True), (30, True), (90, False)])
+@pytest.mark.parametrize(
+    ("ahead_s", "goes_on"), [(-3600, True), (30, True), (90, False)]
+)
 def test_a_run_that_would_hide_every_later_one_is_over(tmp_path, ahead_s, goes_on):
     """A collector uses commands stamped up to a minute ahead of their reception, no others."""
     with declared(start(tmp_path, NOW)) as writer:
@@ -308,7 +321,11 @@ def test_a_recording_beside_the_journals_is_left_alone(tmp_path, name):
         topic, data = raw(command(Phase.PLACE, NOW))
         recorder.write_raw(topic, data, NOW + 5)
     before = {file: file.read_bytes() for file in (tmp_path / name).iterdir()}
-    assert (resume(tmp_path), unfinished(tmp_path), journal.newest(tmp_path)) == (None, [], None)
+    assert (resume(tmp_path), unfinished(tmp_path), journal.newest(tmp_path)) == (
+        None,
+        [],
+        None,
+    )
     with declared(start(tmp_path, NOW)) as writer:
         record(writer, [command(Phase.PLACE, NOW)])
     os.utime(next((tmp_path / name).glob("*.mcap")))
@@ -328,11 +345,13 @@ def test_a_recording_with_the_name_of_a_journal_is_refused_as_it_is(tmp_path, be
     if begun != "whole":
         (folder / "metadata.yaml").unlink()
         os.truncate(
-            file, {"header": file.read_bytes().index(b"selfcal_ros") + 11, "empty": 0}[begun]
+            file,
+            {"header": file.read_bytes().index(b"selfcal_ros") + 11, "empty": 0}[begun],
         )
     before = {path: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(
-        InputError, match=f"^{file}: is not of a journal: another recorder writes it, or wrote it; "
+        InputError,
+        match=f"^{file}: is not of a journal: another recorder writes it, or wrote it; ",
     ):
         resume(tmp_path)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
@@ -375,7 +394,9 @@ def test_a_journal_may_be_read_by_whom_the_system_lets_read(tmp_path):
 
 
 @pytest.mark.parametrize("n_written", [0, 11, 200])
-def test_a_full_disk_is_said_and_leaves_no_half_message(tmp_path, monkeypatch, n_written):
+def test_a_full_disk_is_said_and_leaves_no_half_message(
+    tmp_path, monkeypatch, n_written
+):
     writer = declared(start(tmp_path, NOW))
     record(writer, samples(5))
     plain, room = os.write, [n_written]
@@ -437,10 +458,14 @@ def test_the_disk_has_it_soon_and_its_failure_is_said(tmp_path, monkeypatch):
 
 def test_what_cannot_be_a_journal(tmp_path):
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match=r"cannot be created \(Not a directory\); name a"):
+    with pytest.raises(
+        InputError, match=r"cannot be created \(Not a directory\); name a"
+    ):
         start(tmp_path / "file" / "in it", NOW)
     with start(tmp_path, NOW) as writer:
-        with pytest.raises(InputError, match="topic /a: no definition of b/msg/C; record only"):
+        with pytest.raises(
+            InputError, match="topic /a: no definition of b/msg/C; record only"
+        ):
             writer.add_topic("/a", "b/msg/C")
         declared(declared(writer))
         record(writer, samples(1))
@@ -455,19 +480,27 @@ def test_killed_while_a_file_is_made_nothing_is_left_to_stumble_over(tmp_path):
     with resume(tmp_path) as again:
         record(again, samples(1, 1))
     assert stamps(writer.path) == ([0, 1], [])
-    assert sorted(p.suffix for p in writer.path.iterdir()) == [".mcap", ".mcap", ".yaml"]
+    assert sorted(p.suffix for p in writer.path.iterdir()) == [
+        ".mcap",
+        ".mcap",
+        ".yaml",
+    ]
 
 
 def test_a_message_longer_than_a_stretch_is_passed(tmp_path):
     with declared(start(tmp_path, NOW)) as writer:
-        long = Foreign()._payload(EncoderSample(NOW, ("x",), (0.0,)))[1] + bytes(3 << 20)
+        long = Foreign()._payload(EncoderSample(NOW, ("x",), (0.0,)))[1] + bytes(
+            3 << 20
+        )
         writer.write("/stage/joint_states", long, NOW)
         record(writer, samples(2, 1))
     with resume(tmp_path):
         assert information(writer.path)["message_count"] == 3
     assert stamps(writer.path) == (
         [1, 2],
-        ["1 messages on stage/joint_states could not be decoded: they are longer than 8192 bytes"],
+        [
+            "1 messages on stage/joint_states could not be decoded: they are longer than 8192 bytes"
+        ],
     )
 
 
@@ -493,7 +526,9 @@ def test_nothing_follows_a_torn_record_that_cannot_be_taken_back(tmp_path, monke
     with pytest.raises(InputError, match=r"cannot be written \(Input/output error\)"):
         record(writer, samples(2, 100))
     room[0] = 10**6
-    with pytest.raises(InputError, match=r"cannot be written \(Read-only file system\)"):
+    with pytest.raises(
+        InputError, match=r"cannot be written \(Read-only file system\)"
+    ):
         record(writer, samples(2, 200))
     assert writer.n_lost == 4
     stuck[0] = False
@@ -512,7 +547,8 @@ def test_a_file_that_grows_as_fast_as_it_is_read_ends_where_it_was_opened(
         [file] = writer.path.glob("*.mcap")
         data = file.read_bytes()
     grows = tmp_path / "grows.mcap"
-    grows.write_bytes(data[: len(data) - torn])  # of the last record a part may be missing
+    # of the last record a part may be missing
+    grows.write_bytes(data[: len(data) - torn])
     stream, found = McapStream(grows), []
     for block in islice(stream.blocks(), 1000):
         found += block.fronts["log_time"].tolist()

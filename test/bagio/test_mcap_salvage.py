@@ -68,7 +68,11 @@ def test_the_front_of_a_chunk_at_the_end_of_the_file_is_none(missing):
 
 @pytest.mark.parametrize(
     ("name", "packed"),
-    [("", bytes), ("lz4", lz4.frame.compress), ("zstd", zstandard.ZstdCompressor().compress)],
+    [
+        ("", bytes),
+        ("lz4", lz4.frame.compress),
+        ("zstd", zstandard.ZstdCompressor().compress),
+    ],
 )
 def test_a_chunk_cut_anywhere_gives_a_front_part_of_its_records(name, packed):
     """Messages of 22 bytes and a payload, which stand in a chunk one behind the other."""
@@ -88,13 +92,19 @@ def test_a_chunk_cut_anywhere_gives_a_front_part_of_its_records(name, packed):
     counts = []
     for size in range(len(whole) + 1):
         found = list(front_of_chunk(whole[:size]))
-        assert [(m.sequence, m.data) for m in found] == list(enumerate(payloads))[: len(found)]
+        assert [(m.sequence, m.data) for m in found] == list(enumerate(payloads))[
+            : len(found)
+        ]
         counts.append(len(found))
     assert counts == sorted(counts) and counts[-1] == 4
-    assert counts[: len(whole) - len(records) + 1] == [0] * (len(whole) - len(records) + 1)
+    assert counts[: len(whole) - len(records) + 1] == [0] * (
+        len(whole) - len(records) + 1
+    )
     if not name:  # a message is read as soon as its last byte is there
         ends = [len(whole) - len(inside) + end for end in (31, 65, 107, 178)]
-        assert counts == [sum(size >= end for end in ends) for size in range(len(whole) + 1)]
+        assert counts == [
+            sum(size >= end for end in ends) for size in range(len(whole) + 1)
+        ]
 
 
 def test_a_file_too_short_for_a_summary_declares_nothing():

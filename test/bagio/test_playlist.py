@@ -36,16 +36,22 @@ def test_messages_are_played_by_their_times(tmp_path, events, shuffle):
     assert len(playlist) == len(events)
     assert sum(playlist.counts.values()) == len(events)
     assert set(playlist.counts) == set(bags.TOPICS)
-    assert (playlist._order is None) == (not shuffle), "only what is out of order is kept"
+    assert (playlist._order is None) == (not shuffle), (
+        "only what is out of order is kept"
+    )
 
 
 def test_equal_times_stay_in_the_order_of_the_file(tmp_path):
-    samples = [EncoderSample(stamp, (name,), (0.5,)) for name in "zyx" for stamp in (7, 5, 5)]
+    samples = [
+        EncoderSample(stamp, (name,), (0.5,)) for name in "zyx" for stamp in (7, 5, 5)
+    ]
     path = Foreign().write(tmp_path / "x.mcap", samples)
     names = [data[data.index(b"somewhere") + 20 :] for _, _, data in Playlist(path)]
     stamps = [stamp for _, stamp, _ in Playlist(path)]
     assert stamps == [1005] * 6 + [1007] * 3
-    assert [next(chr(c) for c in name if c in b"xyz") for name in names] == list("zzyyxxzyx")
+    assert [next(chr(c) for c in name if c in b"xyz") for name in names] == list(
+        "zzyyxxzyx"
+    )
 
 
 @pytest.mark.parametrize("shuffle", [False, True])
@@ -69,7 +75,9 @@ def test_what_cannot_be_decoded_is_not_played_and_said_once(tmp_path, events):
     playlist = Playlist(Cut().write(tmp_path / "x.mcap", events))
     n_commands = sum(hasattr(event, "phase") for event in events)
     assert len(list(playlist)) == len(playlist) == len(events) - n_commands
-    assert playlist.lost == [f"{n_commands} messages on selfcal/view_command could not be decoded"]
+    assert playlist.lost == [
+        f"{n_commands} messages on selfcal/view_command could not be decoded"
+    ]
     assert "selfcal/view_command" not in playlist.counts
 
 
@@ -86,7 +94,11 @@ def test_nothing_to_play(tmp_path):
 
 def test_of_a_bag_without_detections_images_are_played():
     playlist = Playlist(Path(__file__).parents[2] / "bags/camera")
-    assert (playlist.transport, playlist.counts["stage/image"], playlist.lost) == ("raw", 100, [])
+    assert (playlist.transport, playlist.counts["stage/image"], playlist.lost) == (
+        "raw",
+        100,
+        [],
+    )
 
 
 def test_images_beside_detections_are_said_not_to_be_played(tmp_path, events):

@@ -29,7 +29,9 @@ def store_of(joints, header="builtin_interfaces/Time stamp\nstring frame_id\n"):
         {
             **get_types_from_msg(joints, JOINTS),
             **get_types_from_msg(header, HEADER),
-            "builtin_interfaces/msg/Time": typestore().fielddefs["builtin_interfaces/msg/Time"],
+            "builtin_interfaces/msg/Time": typestore().fielddefs[
+                "builtin_interfaces/msg/Time"
+            ],
         }
     )
     return store
@@ -44,7 +46,9 @@ def store_of(joints, header="builtin_interfaces/Time stamp\nstring frame_id\n"):
         (KNOWN.replace("effort", "torque"), False),
         (KNOWN.replace("float64[] e", "float32[] e"), False),
         (
-            KNOWN.replace("string[] name\nfloat64[] position", "float64[] position\nstring[] name"),
+            KNOWN.replace(
+                "string[] name\nfloat64[] position", "float64[] position\nstring[] name"
+            ),
             False,
         ),
     ],
@@ -64,7 +68,9 @@ def test_a_schema_is_read_anew_where_any_of_it_differs_and_refused_wherever_it_s
     assert store_of_schema("pkg/msg/T", "ros2msg", text, "bag 2") is store
     for name, other in (("pkg/msg/T", text.replace("64", "32")), ("pkg/msg/U", text)):
         found = store_of_schema(name, "ros2msg", other, "bag 1")
-        assert found.fielddefs[name][1][1][1][1][0] == ("float32" if "32" in other else "float64")
+        assert found.fielddefs[name][1][1][1][1][0] == (
+            "float32" if "32" in other else "float64"
+        )
         assert (name in store.fielddefs) == (name == "pkg/msg/T")
     for where in ("bag 1", "bag 2"):
         with pytest.raises(
@@ -105,7 +111,10 @@ def test_shorter_stores_hold_as_many_fields_as_their_publisher_knew():
     name, last = "selfcal_msgs/msg/ViewCommand", "plan_id"
     every = [field for field, _ in typestore().fielddefs[name][1]]
     kept = [
-        [field for field, _ in store.fielddefs[name][1]] for store in shorter_stores(name, last)
+        [field for field, _ in store.fielddefs[name][1]]
+        for store in shorter_stores(name, last)
     ]
-    assert kept == [every[:count] for count in range(len(every) - 1, every.index(last), -1)]
+    assert kept == [
+        every[:count] for count in range(len(every) - 1, every.index(last), -1)
+    ]
     assert kept

@@ -46,7 +46,9 @@ def write(path, events, compression="zstd"):
 
 
 def metadata(path):
-    return yaml.safe_load((path / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    return yaml.safe_load((path / "metadata.yaml").read_text())[
+        "rosbag2_bagfile_information"
+    ]
 
 
 def counted(events):
@@ -69,7 +71,9 @@ def test_the_reader_of_mcap_finds_every_message(tmp_path, events, compression):
         stream.seek(0)
         chunks = [
             record.compression
-            for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records
+            for record in StreamReader(
+                stream, emit_chunks=True, validate_crcs=True
+            ).records
             if hasattr(record, "compression")
         ]
     assert found == [
@@ -101,7 +105,9 @@ def test_schemas_and_channels_are_those_of_rosbag2(tmp_path, events):
         assert set(channel.metadata) == {"offered_qos_profiles", "topic_type_hash"}
         assert channel.metadata["topic_type_hash"] == hash_of(name)
         profiles = yaml.safe_load(channel.metadata["offered_qos_profiles"] or "[]")
-        assert profiles == ([QOS[channel.topic.strip("/")]] if channel.topic != "/notes" else [])
+        assert profiles == (
+            [QOS[channel.topic.strip("/")]] if channel.topic != "/notes" else []
+        )
 
 
 def test_the_reader_of_rosbags_finds_every_message(tmp_path, events):
@@ -147,9 +153,9 @@ def test_metadata_is_what_rosbag2_writes_in_jazzy(tmp_path, events):
         "custom_data": None,
         "ros_distro": "jazzy",
     }
-    assert {entry["topic_metadata"]["name"]: entry["message_count"] for entry in topics} == (
-        counted(events)
-    )
+    assert {
+        entry["topic_metadata"]["name"]: entry["message_count"] for entry in topics
+    } == (counted(events))
     for entry in topics:
         assert set(entry) == {"topic_metadata", "message_count"}
         about = entry["topic_metadata"]
@@ -162,7 +168,10 @@ def test_metadata_is_what_rosbag2_writes_in_jazzy(tmp_path, events):
         }
         assert about["serialization_format"] == "cdr"
         assert about["type_description_hash"] == hash_of(about["type"])
-    types = {entry["topic_metadata"]["name"]: entry["topic_metadata"]["type"] for entry in topics}
+    types = {
+        entry["topic_metadata"]["name"]: entry["topic_metadata"]["type"]
+        for entry in topics
+    }
     assert types == {f"/{t}": name for t, name in INPUT_TOPICS.items()} | {
         "/notes": "std_msgs/msg/String"
     }
@@ -172,7 +181,9 @@ def test_metadata_is_what_rosbag2_writes_in_jazzy(tmp_path, events):
 @pytest.mark.parametrize("reliable", [True, False])
 @pytest.mark.parametrize("local", [True, False])
 def test_a_qos_profile_has_the_words_of_jazzy(reliable, local):
-    assert list(qos_profile(reliable=reliable, transient_local=local, depth=3).items()) == [
+    assert list(
+        qos_profile(reliable=reliable, transient_local=local, depth=3).items()
+    ) == [
         ("history", "keep_last"),
         ("depth", 3),
         ("reliability", "reliable" if reliable else "best_effort"),
@@ -213,7 +224,8 @@ def test_a_type_that_is_not_known_is_refused(tmp_path):
     with (
         BagWriter(tmp_path / "bag") as writer,
         pytest.raises(
-            InputError, match="topic /a: no definition of b/msg/C; record only topics of known"
+            InputError,
+            match="topic /a: no definition of b/msg/C; record only topics of known",
         ),
     ):
         writer.add_topic("/a", "b/msg/C", [])
@@ -227,7 +239,10 @@ def test_what_was_flushed_is_there_before_the_end_and_an_error_keeps_it(tmp_path
             writer.write(ENCODER, from_model.joint_state(sample, "stage"), 5)
             writer.flush()
             reader = BagReader(tmp_path / "bag")
-            assert len(list(decoded(reader))) == 1 and "without its footer" in reader.lost[0]
+            assert (
+                len(list(decoded(reader))) == 1
+                and "without its footer" in reader.lost[0]
+            )
             assert not (tmp_path / "bag" / "metadata.yaml").exists()
             raise RuntimeError("a fault")
 
@@ -297,6 +312,11 @@ def test_a_full_disk_is_one_line(tmp_path, act):
 
 def test_a_bag_that_fails_is_named_as_it_was_asked_for_and_leaves_nothing(tmp_path):
     with pytest.raises(InputError) as raised, new_bag(tmp_path / "bag") as unfinished:
-        raise InputError(str(unfinished / "bag_0.mcap"), "cannot be written", "free some space")
-    assert str(raised.value) == f"{tmp_path}/bag/bag_0.mcap: cannot be written; free some space"
+        raise InputError(
+            str(unfinished / "bag_0.mcap"), "cannot be written", "free some space"
+        )
+    assert (
+        str(raised.value)
+        == f"{tmp_path}/bag/bag_0.mcap: cannot be written; free some space"
+    )
     assert not list(tmp_path.iterdir())

@@ -32,7 +32,11 @@ def result_of(noise_seed, *, moved_m=0.0, artifact=PLATE):
     g[0, 1, 2] += moved_m
     rng = np.random.default_rng([2, noise_seed])
     readings = simulate_measurements(
-        replace(truth, g=g), hu_plan(artifact, 4), rng, sigma_m=20e-9, sigma_theta_rad=2e-5
+        replace(truth, g=g),
+        hu_plan(artifact, 4),
+        rng,
+        sigma_m=20e-9,
+        sigma_theta_rad=2e-5,
     )
     return solve_joint(readings, BARE).result
 
@@ -56,11 +60,20 @@ def shelf(folder, results):
 
 
 def test_maps_that_changed_are_named_and_no_others(tmp_path):
-    maps = [result_of(seed, moved_m=200e-9 if seed in (3, 8) else 0.0) for seed in range(1, 21)]
+    maps = [
+        result_of(seed, moved_m=200e-9 if seed in (3, 8) else 0.0)
+        for seed in range(1, 21)
+    ]
     records = compared(shelf(tmp_path, maps), tmp_path, result_of(0), "old.json")
-    assert [r["bag"] for r in records if r["baseline"]["changed"]] == ["bag 02", "bag 07"]
+    assert [r["bag"] for r in records if r["baseline"]["changed"]] == [
+        "bag 02",
+        "bag 07",
+    ]
     text = sentence(records, "old.json")
-    assert text.startswith("2 of 20 maps differ from old.json: bag 02 (p = ") and "bag 07" in text
+    assert (
+        text.startswith("2 of 20 maps differ from old.json: bag 02 (p = ")
+        and "bag 07" in text
+    )
     found = compare(result_of(0), maps[2])
     assert records[2]["baseline"]["p"] == probability(found)
     assert records[2]["quantities"] == pytest.approx(
@@ -68,18 +81,24 @@ def test_maps_that_changed_are_named_and_no_others(tmp_path):
             "sigma_xy_um": 0.02,
             "difference_from_baseline_rms_um": found.rms_m * 1e6,
             "difference_from_baseline_largest_um": found.max_m * 1e6,
-            "theta_difference_from_baseline_rms_arcsec": np.degrees(found.rms_theta_rad) * 3600,
+            "theta_difference_from_baseline_rms_arcsec": np.degrees(found.rms_theta_rad)
+            * 3600,
         }
     )
     rows = list(csv.DictReader(io.StringIO(csv_text(records))))
     assert rows[2]["changed"] == "true" and rows[3]["changed"] == "false"
     assert float(rows[2]["baseline_p"]) == records[2]["baseline"]["adjusted_p"]
-    assert float(rows[2]["difference_from_baseline_largest_um"]) == pytest.approx(0.2, rel=0.4)
+    assert float(rows[2]["difference_from_baseline_largest_um"]) == pytest.approx(
+        0.2, rel=0.4
+    )
 
 
 def test_a_stable_machine_is_rarely_named(tmp_path):
     """p of 40 maps against maps of their own: about 5 % below 0.05, and not more."""
-    p = [probability(compare(result_of(seed), result_of(1000 + seed))) for seed in range(40)]
+    p = [
+        probability(compare(result_of(seed), result_of(1000 + seed)))
+        for seed in range(40)
+    ]
     assert sum(value < 0.05 for value in p) <= 6
 
 
@@ -117,12 +136,18 @@ def test_without_uncertainties_nothing_is_tested(tmp_path):
 def test_the_verb_compares_with_a_result(tmp_path, capsys):
     bag, out, old = "bags/hu_noise", tmp_path / "out", tmp_path / "old.json"
     assert main(["solve", bag, "--quiet", "-o", str(old)]) == 0
-    assert main(["batch", bag, "-o", str(out), "--workers", "1", "--baseline", str(old)]) == 0
+    assert (
+        main(["batch", bag, "-o", str(out), "--workers", "1", "--baseline", str(old)])
+        == 0
+    )
     assert f"0 of 1 maps differ from {old}" in capsys.readouterr().out
     (record,) = json.loads((out / "batch.json").read_text())["records"]
     assert record["baseline"]["changed"] is False
     assert "differ from" in (out / "index.html").read_text()
-    assert main(["batch", bag, "-o", str(out), "--baseline", str(tmp_path / "none.json")]) == 2
+    assert (
+        main(["batch", bag, "-o", str(out), "--baseline", str(tmp_path / "none.json")])
+        == 2
+    )
 
 
 def test_a_batch_without_any_map_of_the_baseline_is_written(tmp_path, capsys):

@@ -44,7 +44,9 @@ def shelf(tmp_path_factory):
     """A folder with four good bags, one that lacks views, one that is not a bag."""
     folder = tmp_path_factory.mktemp("shelf")
     (folder / "deep" / "deeper").mkdir(parents=True)
-    for seed, place in enumerate(("a.mcap", "b.mcap", "deep/c.mcap", "deep/deeper/d.mcap")):
+    for seed, place in enumerate(
+        ("a.mcap", "b.mcap", "deep/c.mcap", "deep/deeper/d.mcap")
+    ):
         Foreign().write(folder / place, events_of(small_plan(), seed))
     Foreign().write(folder / "few.mcap", events_of(small_plan("0, 90")))
     (folder / "text.mcap").write_text("some words, and no bag at all")
@@ -63,7 +65,9 @@ def stamps(folder: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (folder / RESULTS).iterdir()}
 
 
-def test_good_bags_are_solved_as_solve_does_and_bad_ones_are_passed(shelf, tmp_path, capsys):
+def test_good_bags_are_solved_as_solve_does_and_bad_ones_are_passed(
+    shelf, tmp_path, capsys
+):
     out = tmp_path / "out"
     assert batch(shelf, "-o", out, "--workers", 1) == 2
     printed = capsys.readouterr()
@@ -79,10 +83,16 @@ def test_good_bags_are_solved_as_solve_does_and_bad_ones_are_passed(shelf, tmp_p
         f"selfcal batch: {shelf / 'text.mcap'}: not an MCAP file; give an .mcap "
         "file or a rosbag2 folder"
     )
-    assert main(["solve", str(shelf / "a.mcap"), "--quiet", "-o", str(tmp_path / "a.json")]) == 0
+    assert (
+        main(
+            ["solve", str(shelf / "a.mcap"), "--quiet", "-o", str(tmp_path / "a.json")]
+        )
+        == 0
+    )
     record = next(r for r in content(out)["records"] if r["bag"].endswith("a.mcap"))
     ours, theirs = (
-        json.loads(path.read_text()) for path in (out / record["result"], tmp_path / "a.json")
+        json.loads(path.read_text())
+        for path in (out / record["result"], tmp_path / "a.json")
     )
     for result in (ours, theirs):
         assert result["provenance"].pop("created")
@@ -109,7 +119,8 @@ def test_robust_bags_are_solved_as_robust_solve_does(shelf, tmp_path):
     assert batch(bag, "-o", out, "--workers", 1, "--robust") == 0
     assert main(["solve", str(bag), "--robust", "--quiet", "-o", str(alone)]) == 0
     ours, theirs = (
-        json.loads(path.read_text()) for path in (out / content(out)["records"][0]["result"], alone)
+        json.loads(path.read_text())
+        for path in (out / content(out)["records"][0]["result"], alone)
     )
     for result in (ours, theirs):
         assert result["provenance"].pop("created")
@@ -158,7 +169,9 @@ def test_a_copy_of_a_bag_counts_once_over_time(shelf, tmp_path):
     assert content(tmp_path / "out")["done_before"] == 2
 
 
-def test_redo_solves_a_bag_again_that_is_known_by_its_content_alone(shelf, tmp_path, monkeypatch):
+def test_redo_solves_a_bag_again_that_is_known_by_its_content_alone(
+    shelf, tmp_path, monkeypatch
+):
     names = [tmp_path / name for name in ("one.mcap", "two.mcap")]
     for name in names:
         shutil.copy(shelf / "a.mcap", name)
@@ -167,7 +180,10 @@ def test_redo_solves_a_bag_again_that_is_known_by_its_content_alone(shelf, tmp_p
     monkeypatch.setattr(
         jobs,
         "solved",
-        lambda job, source, right=jobs.solved: (solved.append(job.bag.name), right(job, source))[1],
+        lambda job, source, right=jobs.solved: (
+            solved.append(job.bag.name),
+            right(job, source),
+        )[1],
     )
     assert batch(*names, "-o", tmp_path / "out", "--workers", 1) == 0
     assert not solved
@@ -194,7 +210,10 @@ def test_killed_in_the_middle_it_does_only_the_rest(tmp_path):
     ]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as running:
         wait_until(
-            lambda: running.poll() is not None or len(list((out / RECORDS).glob("*.json"))) >= 3,
+            lambda: (
+                running.poll() is not None
+                or len(list((out / RECORDS).glob("*.json"))) >= 3
+            ),
             "three records",
         )
         running.send_signal(signal.SIGKILL)
@@ -202,7 +221,9 @@ def test_killed_in_the_middle_it_does_only_the_rest(tmp_path):
     assert batch(bags, "-o", out, "--workers", 2) == 0
     told = content(out)
     assert 3 <= told["done_before"] < 12 and told["qualified"] == 12
-    names = [path.name for part in (RECORDS, RESULTS) for path in (out / part).iterdir()]
+    names = [
+        path.name for part in (RECORDS, RESULTS) for path in (out / part).iterdir()
+    ]
     assert len(names) == 24 and not any(name.startswith(".selfcal") for name in names)
 
 
@@ -218,7 +239,9 @@ def test_two_batches_do_not_work_in_one_folder(shelf, tmp_path, capsys):
 def test_a_folder_that_cannot_be_written_is_one_line(shelf, tmp_path, capfd):
     """As on a full disk: it is the folder that fails, not a bag."""
     (tmp_path / RESULTS).symlink_to("/proc")
-    assert batch(shelf / "a.mcap", shelf / "b.mcap", "-o", tmp_path, "--workers", 2) == 2
+    assert (
+        batch(shelf / "a.mcap", shelf / "b.mcap", "-o", tmp_path, "--workers", 2) == 2
+    )
     [line] = capfd.readouterr().err.splitlines()
     assert f"{tmp_path / RESULTS}" in line and "cannot be written (" in line
 
@@ -250,8 +273,17 @@ def test_a_bag_is_no_folder_for_results(tmp_path, capsys):
 
 
 def test_bags_are_found_at_any_depth_once(shelf, tmp_path):
-    names = ["a.mcap", "b.mcap", "deep/c.mcap", "deep/deeper/d.mcap", "few.mcap", "text.mcap"]
-    assert find_bags([str(shelf), str(shelf / "a.mcap")]) == [shelf / name for name in names]
+    names = [
+        "a.mcap",
+        "b.mcap",
+        "deep/c.mcap",
+        "deep/deeper/d.mcap",
+        "few.mcap",
+        "text.mcap",
+    ]
+    assert find_bags([str(shelf), str(shelf / "a.mcap")]) == [
+        shelf / name for name in names
+    ]
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "metadata.yaml").touch()
     (tmp_path / "bag" / "part_0.mcap").touch()
@@ -260,10 +292,15 @@ def test_bags_are_found_at_any_depth_once(shelf, tmp_path):
     assert find_bags([str(tmp_path)]) == [tmp_path / "bag"]
     with pytest.raises(InputError) as caught:
         find_bags([str(tmp_path / "none")])
-    assert str(caught.value) == f"{tmp_path / 'none'}: no such file or folder; check the path"
+    assert (
+        str(caught.value)
+        == f"{tmp_path / 'none'}: no such file or folder; check the path"
+    )
     with pytest.raises(NoDataError) as nothing:
         find_bags([str(_empty(tmp_path))])
-    assert str(nothing.value).startswith(f"{tmp_path / 'empty'}: no bag in it; give MCAP files")
+    assert str(nothing.value).startswith(
+        f"{tmp_path / 'empty'}: no bag in it; give MCAP files"
+    )
 
 
 @pytest.fixture
@@ -317,7 +354,9 @@ def _empty(folder: Path) -> Path:
 
 def records(number: int = 30, change: int = 18, **more) -> list[dict]:
     """Return records of one plan, a day apart, whose squareness steps by 1 arcsec."""
-    values = np.random.default_rng(2).normal(0, 0.1, number) + (np.arange(number) >= change)
+    values = np.random.default_rng(2).normal(0, 0.1, number) + (
+        np.arange(number) >= change
+    )
     return [
         {
             "bag": f"/bags/{day:02}",
@@ -342,8 +381,12 @@ def test_a_change_is_named_between_bags_in_which_the_quantity_is_known():
         record["quantities"]["nonorthogonality_arcsec"] = None
     (series,) = series_of(gap)
     (line,) = series.sentences()
-    assert line.startswith("nonorthogonality: changed between 2026-03-14 12:00 and 2026-03-19 ")
-    found = batch_json(gap, [series], 0)["series"][0]["courses"]["nonorthogonality_arcsec"]
+    assert line.startswith(
+        "nonorthogonality: changed between 2026-03-14 12:00 and 2026-03-19 "
+    )
+    found = batch_json(gap, [series], 0)["series"][0]["courses"][
+        "nonorthogonality_arcsec"
+    ]
     assert [day[:10] for day in found["change_between"]] == ["2026-03-14", "2026-03-19"]
     # the dashed line: half way from day 13 to day 18 of 29
     place = 64 + (560 - 64 - 14) * 15.5 / 29
@@ -358,7 +401,9 @@ def test_a_change_is_named_between_bags_in_which_the_quantity_is_known():
 
 
 def test_a_change_is_named_with_its_date_whatever_the_order_of_the_bags():
-    shuffled = np.random.default_rng(4).permutation(np.array(records(), dtype=object)).tolist()
+    shuffled = (
+        np.random.default_rng(4).permutation(np.array(records(), dtype=object)).tolist()
+    )
     (series,) = series_of(shuffled)
     (line,) = series.sentences()
     assert line.startswith(
@@ -374,14 +419,25 @@ def test_a_change_is_named_with_its_date_whatever_the_order_of_the_bags():
 
 def test_plans_and_plates_are_not_mixed():
     other = records(plan_id="q") + records(plate=[7, 7, 0.01, 8])
-    assert [len(series.records) for series in series_of(records() + other)] == [30, 30, 30]
+    assert [len(series.records) for series in series_of(records() + other)] == [
+        30,
+        30,
+        30,
+    ]
     assert series_of([record | {"first_exposure": None} for record in records()]) == []
 
 
 def test_the_table_has_a_line_a_bag_in_the_order_of_time():
-    failed = {"bag": '/bags/bad, or "worse"', "exit_code": 2, "qualified": None, "message": "no"}
+    failed = {
+        "bag": '/bags/bad, or "worse"',
+        "exit_code": 2,
+        "qualified": None,
+        "message": "no",
+    }
     known = records()
-    known[1] |= {"causes": [{"name": "drift", "view": "run 2: shift x"}, {"name": "slip"}]}
+    known[1] |= {
+        "causes": [{"name": "drift", "view": "run 2: shift x"}, {"name": "slip"}]
+    }
     rows = list(csv.DictReader(io.StringIO(csv_text([failed, *known[::-1]]))))
     assert [(row["cause"], row["cause_view"]) for row in rows[:3]] == [
         ("", ""),
@@ -391,7 +447,11 @@ def test_the_table_has_a_line_a_bag_in_the_order_of_time():
     assert [row["bag"] for row in rows] == [f"/bags/{day:02}" for day in range(30)] + [
         failed["bag"]
     ]
-    assert (rows[0]["qualified"], rows[0]["sigma_xy_um"], rows[30]["qualified"]) == ("true", "", "")
+    assert (rows[0]["qualified"], rows[0]["sigma_xy_um"], rows[30]["qualified"]) == (
+        "true",
+        "",
+        "",
+    )
     assert float(rows[0]["nonorthogonality_arcsec"]) == pytest.approx(
         records()[0]["quantities"]["nonorthogonality_arcsec"], rel=1e-15
     )
@@ -409,7 +469,9 @@ class Page(html.parser.HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.seen[tag] = self.seen.get(tag, 0) + 1
-        assert not any(name.startswith("on") or name in ("src", "href") for name, _ in attrs)
+        assert not any(
+            name.startswith("on") or name in ("src", "href") for name, _ in attrs
+        )
         if tag not in self.VOID:
             self.open.append(tag)
 
@@ -440,7 +502,9 @@ def test_quantities_with_an_uncertainty_have_bars_and_no_course_of_it():
     found = records()
     plain = page_html(found, series_of(found), [""])
     for record in found:
-        record["quantities"] = record["quantities"] | {"u_nonorthogonality_arcsec": 0.01}
+        record["quantities"] = record["quantities"] | {
+            "u_nonorthogonality_arcsec": 0.01
+        }
     series = series_of(found)
     assert "nonorthogonality_arcsec" in series[0].courses
     assert "u_nonorthogonality_arcsec" not in series[0].courses
@@ -467,7 +531,9 @@ def test_plots_of_one_kind_share_a_scale_and_few_come_first():
     text = page_html(found, [series], [""])
     first, more = text.split("<details>")
     assert first.count("<figure>") == 2 and "2 further quantities" not in first
-    assert re.match(r"<summary>(\d) further quantities", more)[1] == str(more.count("<figure>"))
+    assert re.match(r"<summary>(\d) further quantities", more)[1] == str(
+        more.count("<figure>")
+    )
     head = re.search(r"<thead><tr>(.*?)</tr>", text)[1]
     assert re.findall(r"<th[^>]*>(.*?)</th>", head) == [
         "bag",
@@ -487,7 +553,9 @@ def test_limits_are_three_robust_standard_deviations_about_the_median():
 
 def test_the_share_of_rejected_detections_is_of_all_that_were_read():
     plan, rng = hu_plan(Artifact(5, 0.01, 0)), np.random.default_rng(1)
-    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=2e-8)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=2e-8
+    )
     result = calibrate(readings, bare(causes=False))
     used = sum(view.used for view in result.views)
     assert used == 25 + 25 + 20

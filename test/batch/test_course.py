@@ -152,7 +152,9 @@ def u_of(values) -> float:
     )
 
 
-@pytest.mark.parametrize("values", [(1, 2, 3, 6, 4, 5), (2, 2, 3, 1, 4, 4), (3, 1, 4, 2, 6, 5)])
+@pytest.mark.parametrize(
+    "values", [(1, 2, 3, 6, 4, 5), (2, 2, 3, 1, 4, 4), (3, 1, 4, 2, 6, 5)]
+)
 def test_the_probability_is_that_of_pettitts_statistic_in_all_orders(values):
     exact = np.mean([u_of(order) >= u_of(values) for order in permutations(values)])
     found = pettitt(np.array(values, dtype=float), rng(), orders=40_000)
@@ -224,7 +226,12 @@ def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
     days, noise = np.arange(40.0), rng(5).normal(0, 0.1, (3, 40))
     step = sign * np.where(days < 25, 0.0, 1.0)
     found = courses(
-        days, {"line": noise[0] + sign * 0.02 * days, "step": noise[1] + step, "rest": noise[2]}
+        days,
+        {
+            "line": noise[0] + sign * 0.02 * days,
+            "step": noise[1] + step,
+            "rest": noise[2],
+        },
     )
     assert [course.finding for course in found.values()] == [
         CourseKind.TREND,
@@ -233,10 +240,13 @@ def test_a_trend_is_a_trend_and_a_change_is_a_change(sign):
     ]
     slope, low, high = found["line"].slope_per_day
     assert low < sign * 0.02 < high and high - low < 0.02 and low <= slope <= high
-    assert found["line"].adjusted_p < 1e-6  # Mann and Kendall's, not that of 9,999 orders
+    # Mann and Kendall's, not that of 9,999 orders
+    assert found["line"].adjusted_p < 1e-6
     assert 1e-4 <= found["step"].adjusted_p < 1e-3
     assert found["step"].change == 25
-    assert found["step"].after - found["step"].before == pytest.approx(sign * 1.0, abs=0.1)
+    assert found["step"].after - found["step"].before == pytest.approx(
+        sign * 1.0, abs=0.1
+    )
 
 
 @pytest.mark.parametrize(
@@ -270,10 +280,18 @@ def test_values_that_are_not_known_are_passed_over():
     assert courses(days, {"x": values})["x"].change == 20
     values[12:20] = np.nan  # nobody knows when it changed between
     course = courses(days, {"x": values})["x"]
-    assert (course.finding, course.last_before, course.change) == (CourseKind.CHANGE, 11, 20)
+    assert (course.finding, course.last_before, course.change) == (
+        CourseKind.CHANGE,
+        11,
+        20,
+    )
     steady = np.where(np.arange(40) < 5, np.nan, 1.0)
     nothing = courses(days, {"x": steady})["x"]
-    assert (nothing.finding, nothing.last_before, nothing.change) == (CourseKind.NONE, 0, 0)
+    assert (nothing.finding, nothing.last_before, nothing.change) == (
+        CourseKind.NONE,
+        0,
+        0,
+    )
     few = np.where(np.arange(40) < FEWEST - 1, values, np.nan)
     few[3:6] = 0.1
     assert courses(days, {"x": few}) == {}

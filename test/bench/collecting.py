@@ -38,7 +38,9 @@ def site(number: int) -> np.ndarray:
     return (np.array([m, n]) - SIZE // 2) * PITCH_M
 
 
-def positions(since_s: np.ndarray, period_s: float, rng: np.random.Generator) -> np.ndarray:
+def positions(
+    since_s: np.ndarray, period_s: float, rng: np.random.Generator
+) -> np.ndarray:
     """Return indicated positions (n, 3): at rest in the middle of each period, moving between."""
     number, part = np.divmod(since_s, period_s)
     part = np.clip((part / period_s - 0.7) / 0.3, 0, 1)[:, None]
@@ -48,7 +50,9 @@ def positions(since_s: np.ndarray, period_s: float, rng: np.random.Generator) ->
     return np.column_stack([xy, np.zeros(len(xy))]) + rng.normal(0, 5e-9, (len(xy), 3))
 
 
-def detections(since_s: np.ndarray, period_s: float, rng: np.random.Generator) -> np.ndarray:
+def detections(
+    since_s: np.ndarray, period_s: float, rng: np.random.Generator
+) -> np.ndarray:
     """Return the detections of some exposures, in the middle of the time at rest."""
     table = np.zeros(len(since_s), dtype=DETECTION)
     table["stamp"] = START_NS + np.rint((since_s) * S).astype(np.int64)
@@ -86,7 +90,9 @@ def run(args: argparse.Namespace) -> dict[str, float]:
                 )
         begun = time.process_time()
         for tenth in range(blocks):
-            since = second + tenth / blocks + np.arange(round(args.rate / blocks)) * step
+            since = (
+                second + tenth / blocks + np.arange(round(args.rate / blocks)) * step
+            )
             where = positions(since, args.period, rng)
             stamps = START_NS + np.rint(since * S).astype(np.int64)
             collector.add_encoder_block(stamps, JOINTS, where)
@@ -103,7 +109,8 @@ def run(args: argparse.Namespace) -> dict[str, float]:
             cpus.append(time.process_time() - cpu)
     digest = hashlib.sha256(
         "".join(
-            readings_digest(item.readings, measurements.rejected) for item in progress.values()
+            readings_digest(item.readings, measurements.rejected)
+            for item in progress.values()
         ).encode()
     ).hexdigest()
     used = sum(view.used for view in measurements.views)
@@ -128,12 +135,22 @@ def main() -> None:
     """Print one line a figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hours", type=float, default=8.0)
-    parser.add_argument("--rate", type=float, default=1000.0, help="encoder samples a second")
-    parser.add_argument("--period", type=float, default=1.0, help="seconds between detections")
+    parser.add_argument(
+        "--rate", type=float, default=1000.0, help="encoder samples a second"
+    )
+    parser.add_argument(
+        "--period", type=float, default=1.0, help="seconds between detections"
+    )
     parser.add_argument("--views", type=int, default=4)
-    parser.add_argument("--status", type=int, default=1, help="seconds between two statuses")
+    parser.add_argument(
+        "--status", type=int, default=1, help="seconds between two statuses"
+    )
     for name, value in run(parser.parse_args()).items():
-        print(f"{name:18} {value:.4g}" if isinstance(value, float) else f"{name:18} {value}")
+        print(
+            f"{name:18} {value:.4g}"
+            if isinstance(value, float)
+            else f"{name:18} {value}"
+        )
 
 
 if __name__ == "__main__":

@@ -79,7 +79,10 @@ def rival(path: str) -> None:
     g = result_from_dict(read_json(path), path).error_map
     sites = (np.arange(SIZE) - SIZE // 2) * PITCH_M
     field = RegularGridInterpolator(
-        (sites, sites), np.stack([g.gx, g.gy], axis=-1), bounds_error=False, fill_value=None
+        (sites, sites),
+        np.stack([g.gx, g.gy], axis=-1),
+        bounds_error=False,
+        fill_value=None,
     )
     lines = np.arange(LINES + 1) * 2 * np.pi / LINES
     closed = np.append(g.g_theta, g.g_theta[:1])
@@ -143,19 +146,29 @@ def play(rate: int, seconds: float, pid: int) -> dict:
 
     rclpy.init()
     node = rclpy.create_node("driver")
-    out = node.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    out = node.create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos
+    )
     heard = node.create_subscription(
-        names.CORRECTED.type, names.CORRECTED.name, lambda _: None, names.CORRECTED.qos, raw=True
+        names.CORRECTED.type,
+        names.CORRECTED.name,
+        lambda _: None,
+        names.CORRECTED.qos,
+        raw=True,
     )
     health = names.of_node("compensator", names.HEALTH)
-    said = node.create_subscription(health.type, health.name, lambda _: None, health.qos)
+    said = node.create_subscription(
+        health.type, health.name, lambda _: None, health.qos
+    )
     found = error_map()
     true = (np.array(SITE) - SIZE // 2) * PITCH_M
     indicated = true + np.array([found.gx[SITE], found.gy[SITE]])
     data = bytearray(
         serialize_message(
             names.ENCODER.type(
-                name=["x", "y", "theta"], position=[*indicated, THETA], velocity=[0.0] * 3
+                name=["x", "y", "theta"],
+                position=[*indicated, THETA],
+                velocity=[0.0] * 3,
             )
         )
     )
@@ -191,8 +204,12 @@ def play(rate: int, seconds: float, pid: int) -> dict:
     while time.monotonic() < end:
         take()
     told = said.handle.take_message(health.type, False)
-    skipped = {item.key: item.value for item in told[0].values}["skipped"] if told else None
-    error = np.abs(np.array(deserialize_message(newest, heard.msg_type).position[:2]) - true)
+    skipped = (
+        {item.key: item.value for item in told[0].values}["skipped"] if told else None
+    )
+    error = np.abs(
+        np.array(deserialize_message(newest, heard.msg_type).position[:2]) - true
+    )
     row = {
         "n": total,
         "seconds": float(np.median(ages)),
@@ -224,12 +241,23 @@ def strangers(rate: int, seconds: float) -> dict:
             [word.format(map=path) for word in words],
             environment | {"PYTHONPATH": str(ROOT)},
         ) as node:
-            command = [sys.executable, __file__, "--seconds", str(seconds), "--stranger"]
+            command = [
+                sys.executable,
+                __file__,
+                "--seconds",
+                str(seconds),
+                "--stranger",
+            ]
             listener = subprocess.Popen(
-                [*command, "listen", str(rate)], env=environment, stdout=subprocess.PIPE, text=True
+                [*command, "listen", str(rate)],
+                env=environment,
+                stdout=subprocess.PIPE,
+                text=True,
             )
             idle = cpu_s(node.pid)
-            subprocess.run([*command, "publish", str(rate)], env=environment, check=True)
+            subprocess.run(
+                [*command, "publish", str(rate)], env=environment, check=True
+            )
             used = cpu_s(node.pid) - idle
             row = json.loads(listener.communicate()[0])
             return {
@@ -255,7 +283,10 @@ def publish_as_stranger(rate: int, seconds: float) -> None:
     while not out.get_subscription_count():
         time.sleep(0.05)
     time.sleep(1.0)
-    reach, message = 1.1 * (SIZE // 2) * PITCH_M, names.ENCODER.type(name=["x", "y", "theta"])
+    reach, message = (
+        1.1 * (SIZE // 2) * PITCH_M,
+        names.ENCODER.type(name=["x", "y", "theta"]),
+    )
     began = time.monotonic()
     for number in range(round(rate * seconds)):
         time.sleep(max(began + number / rate - time.monotonic(), 0.0))
@@ -296,7 +327,9 @@ def listen_as_stranger(rate: int, seconds: float) -> None:
     end = time.monotonic() + seconds + SETTLING_S - 0.5
     while time.monotonic() < end:
         rclpy.spin_once(node, timeout_sec=0.1)
-    skipped = {item.key: item.value for item in told[-1].values}["skipped"] if told else None
+    skipped = (
+        {item.key: item.value for item in told[-1].values}["skipped"] if told else None
+    )
     print(
         json.dumps(
             {
@@ -329,7 +362,15 @@ def peak_mb(pid: int) -> float:
 def measured(method: str, rate: int, seconds: float) -> dict:
     """Return the row of `drive` or `strangers` in a process of its own."""
     done = subprocess.run(
-        [sys.executable, __file__, "--worker", method, str(rate), "--seconds", str(seconds)],
+        [
+            sys.executable,
+            __file__,
+            "--worker",
+            method,
+            str(rate),
+            "--seconds",
+            str(seconds),
+        ],
         stdout=subprocess.PIPE,
         text=True,
         check=True,
@@ -360,7 +401,9 @@ def main() -> None:
     if args.rival:
         rival(args.rival)
     elif args.stranger:
-        act = publish_as_stranger if args.stranger[0] == "publish" else listen_as_stranger
+        act = (
+            publish_as_stranger if args.stranger[0] == "publish" else listen_as_stranger
+        )
         act(int(args.stranger[1]), args.seconds)
     elif args.worker:
         method, rate = args.worker[0], int(args.worker[1])

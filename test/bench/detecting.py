@@ -46,7 +46,9 @@ def camera(mark: str, ratio: float) -> Camera:
     )
 
 
-def drawn(mark: str, ratio: float, number: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def drawn(
+    mark: str, ratio: float, number: int
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Return images of nine marks at random phases, and the places of the marks (9, 2), px."""
     rng, cell = np.random.default_rng(int(ratio)), camera(mark, ratio)
     lattice = np.stack(np.meshgrid([-300, 0, 300], [-300, 0, 300])).reshape(2, -1)
@@ -101,7 +103,11 @@ def opencv(mark: str, images: list[np.ndarray]) -> list[np.ndarray]:
             first = ours(mark, [image])[0]  # it refines given corners
             corners = np.rint(first).astype(np.float32).reshape(-1, 1, 2)
             criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
-            found.append(cv2.cornerSubPix(grey, corners, (8, 8), (-1, -1), criteria).reshape(-1, 2))
+            found.append(
+                cv2.cornerSubPix(grey, corners, (8, 8), (-1, -1), criteria).reshape(
+                    -1, 2
+                )
+            )
     return found
 
 
@@ -138,16 +144,20 @@ def rows(number: int):
                 cpu = (time.process_time() - began) / number
                 missed = missed_px(found, places)
                 seconds, _ = median_time(
-                    lambda find=find, mark=mark, image=images[:1]: find(mark, image), once=False
+                    lambda find=find, mark=mark, image=images[:1]: find(mark, image),
+                    once=False,
                 )
                 yield {
                     **row,
                     "seconds": seconds,
                     "cpu_seconds": cpu,
-                    "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+                    "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+                    / 1024,
                     "max_error": float(np.abs(missed).max(initial=0.0)) * PIXEL_M,
                     "found": len(missed) / (9 * number),
-                    "rms_px": float(np.sqrt(np.square(missed).mean())) if len(missed) else None,
+                    "rms_px": float(np.sqrt(np.square(missed).mean()))
+                    if len(missed)
+                    else None,
                     "bound_px": bound_px(mark, ratio),
                 }
 
@@ -163,7 +173,10 @@ def drawn_many(side: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(side)
     width = MANY_PITCH_PX * (side + 1)
     cell = replace(
-        camera("disc", MANY_RATIO), width=width, height=width, mark_size_m=MANY_SIZE_PX * PIXEL_M
+        camera("disc", MANY_RATIO),
+        width=width,
+        height=width,
+        mark_size_m=MANY_SIZE_PX * PIXEL_M,
     )
     along = (np.arange(side) - (side - 1) / 2) * MANY_PITCH_PX
     lattice = np.stack(np.meshgrid(along, along)).reshape(2, -1)
@@ -175,10 +188,15 @@ def ours_many(image: np.ndarray) -> np.ndarray:
     """Return the places found by this package, px."""
     detector = MarkDetector(
         DetectorSettings(
-            pixel_size=PIXEL_M, mark="disc", mark_size=MANY_SIZE_PX * PIXEL_M, max_marks=image.size
+            pixel_size=PIXEL_M,
+            mark="disc",
+            mark_size=MANY_SIZE_PX * PIXEL_M,
+            max_marks=image.size,
         )
     )
-    return np.array([(found.u, found.v) for found in detector.marks(Picture(image, 65535))[0]])
+    return np.array(
+        [(found.u, found.v) for found in detector.marks(Picture(image, 65535))[0]]
+    )
 
 
 def opencv_many(image: np.ndarray) -> np.ndarray:
@@ -204,7 +222,11 @@ def labels_many(image: np.ndarray) -> np.ndarray:
 
 def rows_of_many():
     """Yield a row for each number of marks in an image and each method."""
-    methods = {OURS: ours_many, RIVALS["disc"]: opencv_many, "scipy labels": labels_many}
+    methods = {
+        OURS: ours_many,
+        RIVALS["disc"]: opencv_many,
+        "scipy labels": labels_many,
+    }
     for side in MANY:
         image, places = drawn_many(side)
         for method, find in methods.items():
@@ -223,7 +245,9 @@ def rows_of_many():
             found = find(image)
             cpu = time.process_time() - began
             missed = missed_px([found], [places])
-            seconds, _ = median_time(lambda find=find, image=image: find(image), once=False)
+            seconds, _ = median_time(
+                lambda find=find, image=image: find(image), once=False
+            )
             yield {
                 **row,
                 "seconds": seconds,
@@ -231,7 +255,9 @@ def rows_of_many():
                 "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
                 "max_error": float(np.abs(missed).max(initial=0.0)) * PIXEL_M,
                 "found": len(missed) / side**2,
-                "rms_px": float(np.sqrt(np.square(missed).mean())) if len(missed) else None,
+                "rms_px": float(np.sqrt(np.square(missed).mean()))
+                if len(missed)
+                else None,
                 "bound_px": None,
             }
 
@@ -242,6 +268,10 @@ def show(row: dict) -> None:
         f"{row['benchmark']:<17} {row['method']:<36} {row['n']:>7} {row['seconds']:12.6f} "
         f"{row['peak_mb']:10.0f} {row['max_error']:12.1e} {row['cpu_seconds']:10.3f}  "
         f"{row['found']:.1%} found, rms {row['rms_px']:.4f} px"
-        + (f", {row['rms_px'] / row['bound_px']:.2f} of the bound" if row["bound_px"] else ""),
+        + (
+            f", {row['rms_px'] / row['bound_px']:.2f} of the bound"
+            if row["bound_px"]
+            else ""
+        ),
         flush=True,
     )

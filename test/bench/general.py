@@ -24,7 +24,8 @@ class Equations:
     def __init__(self, data: Measurements) -> None:
         field, plate_z = data.artifact.field, data.artifact.x_m + 1j * data.artifact.y_m
         knots = [
-            make_interp_spline(nodes, nodes, k=3).t for nodes in (field.x_m[:, 0], field.y_m[0])
+            make_interp_spline(nodes, nodes, k=3).t
+            for nodes in (field.x_m[:, 0], field.y_m[0])
         ]
         self.to_nodes = kron(
             *(
@@ -34,7 +35,10 @@ class Equations:
         )
         marks, length, blocks, values = plate_z.size, np.ptp(field.x_m) / 2, [], []
         for number, view in enumerate(data.views):
-            phase, read = np.exp(1j * view.view.rotation_rad), data.artifact.flat(view.m, view.n)
+            phase, read = (
+                np.exp(1j * view.view.rotation_rad),
+                data.artifact.flat(view.m, view.n),
+            )
             z = plate_z.ravel()[read]
             at = phase * z + complex(*view.view.translation_m)
             x, y = (
@@ -42,7 +46,9 @@ class Equations:
                 for part, t in zip((at.real, at.imag), knots, strict=True)
             )
             stage = vstack([kron(one, other) for one, other in zip(x, y, strict=True)])
-            own = csr_matrix((np.ones(len(z)), (np.arange(len(z)), read)), (len(z), marks))
+            own = csr_matrix(
+                (np.ones(len(z)), (np.arange(len(z)), read)), (len(z), marks)
+            )
             turned = own * phase
             part = np.zeros((len(z), 3 * len(data.views)), dtype=complex)
             part[:, 3 * number : 3 * number + 3] = np.stack(
@@ -64,11 +70,16 @@ class Equations:
         """Return G at the nodes, (2, nx, ny), in no particular datum."""
         out, size = (
             np.zeros(self.full.shape[1]),
-            1 / np.sqrt(np.asarray(self.matrix.multiply(self.matrix).sum(axis=0)).ravel()),
+            1
+            / np.sqrt(
+                np.asarray(self.matrix.multiply(self.matrix).sum(axis=0)).ravel()
+            ),
         )
         matrix = self.matrix @ diags(size)
         if method == "scipy lsmr":
-            found = lsmr(matrix, self.right, atol=1e-13, btol=1e-13, conlim=0, maxiter=100_000)[0]
+            found = lsmr(
+                matrix, self.right, atol=1e-13, btol=1e-13, conlim=0, maxiter=100_000
+            )[0]
         else:
             found = splu(
                 (matrix.T @ matrix).tocsc(),
@@ -95,7 +106,9 @@ def solved(size: int, method: str) -> tuple[float, float]:
         plate(size, NODES.get(size, size)),
         Options(misalignment_model="linear", assumed=(), causes=False),
     )
-    exact, truth = readings(artifact, SIX, np.random.default_rng(size), sigma=0.0, linear=True)
+    exact, truth = readings(
+        artifact, SIX, np.random.default_rng(size), sigma=0.0, linear=True
+    )
 
     def field(data: Measurements, equations: Equations | None) -> np.ndarray:
         if equations is not None:
@@ -105,7 +118,11 @@ def solved(size: int, method: str) -> tuple[float, float]:
         return np.stack([found.gx, found.gy])
 
     data, _ = readings(artifact, SIX, np.random.default_rng(size), linear=True)
-    ready, sure = (Equations(one) if method.startswith("scipy") else None for one in (data, exact))
+    ready, sure = (
+        Equations(one) if method.startswith("scipy") else None for one in (data, exact)
+    )
     error = field(exact, sure) - np.stack([truth.field.real, truth.field.imag])
     error = remove_modes(error, datum_modes(artifact.field, scale=True))
-    return median_time(lambda: field(data, ready), once=size > 21)[0], float(np.abs(error).max())
+    return median_time(lambda: field(data, ready), once=size > 21)[0], float(
+        np.abs(error).max()
+    )

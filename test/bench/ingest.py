@@ -53,8 +53,12 @@ def detection_part(n_detections: int) -> tuple[Recording, Truth]:
     """Return a plate of 401 x 401 marks (21 x 21 for small numbers), each read several times."""
     size = 401 if n_detections >= 10**6 else 21 if n_detections >= 3000 else 5
     plan, truth, measurements, _ = simulated(size, 1)
-    repeats = max(1, round(n_detections / sum(len(view.m) for view in measurements.views)))
-    return recording(plan, measurements, repeats=repeats, visit_ns=50_000_000, encoder_ns=0), truth
+    repeats = max(
+        1, round(n_detections / sum(len(view.m) for view in measurements.views))
+    )
+    return recording(
+        plan, measurements, repeats=repeats, visit_ns=50_000_000, encoder_ns=0
+    ), truth
 
 
 class Taken(NamedTuple):
@@ -125,7 +129,10 @@ def by_pybag(bag: Path) -> int:
     from pybag.mcap_reader import McapFileReader
 
     with McapFileReader.from_file(next(bag.glob("*.mcap"))) as reader:
-        return sum(1 for _ in reader.messages(list(reader.get_topics()), in_log_time_order=False))
+        return sum(
+            1
+            for _ in reader.messages(list(reader.get_topics()), in_log_time_order=False)
+        )
 
 
 def by_us(bag: Path) -> int:
@@ -133,7 +140,8 @@ def by_us(bag: Path) -> int:
     from selfcal_ros.bagio.reader import BagReader
 
     return sum(
-        1 if topic.endswith("command") else len(item) for topic, item in BagReader(bag).columns()
+        1 if topic.endswith("command") else len(item)
+        for topic, item in BagReader(bag).columns()
     )
 
 
@@ -203,9 +211,12 @@ def in_parts(bag: Path, method: str) -> tuple[Taken, float | None]:
     assert not lost and not measurements.all_rejected()
     if method == READ:
         return reading, None
-    calibrate(simulated(5, 1)[2], Options(uncertainty=False))  # what is loaded once is not counted
+    # what is loaded once is not counted
+    calibrate(simulated(5, 1)[2], Options(uncertainty=False))
     solving, result = timed(lambda: calibrate(measurements, Options(uncertainty=False)))
-    return solving, error_of({"gx": result.error_map.gx, "gy": result.error_map.gy}, bag)
+    return solving, error_of(
+        {"gx": result.error_map.gx, "gy": result.error_map.gy}, bag
+    )
 
 
 def timed(run: Callable) -> tuple[Taken, object]:
@@ -219,7 +230,9 @@ def cpu_seconds() -> float:
     """Return the processor time of this process and of those it waited for, kernel included."""
     return sum(
         used.ru_utime + used.ru_stime
-        for used in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        for used in map(
+            resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        )
     )
 
 
@@ -228,7 +241,9 @@ def error_of(found: dict, bag: Path) -> float:
     truth = np.load(bag / "truth.npy")
     return float(
         np.abs(
-            np.stack([np.array(found["gx"], dtype=float), np.array(found["gy"], dtype=float)])
+            np.stack(
+                [np.array(found["gx"], dtype=float), np.array(found["gy"], dtype=float)]
+            )
             - truth
         ).max()
     )

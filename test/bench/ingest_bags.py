@@ -21,7 +21,12 @@ from selfcal_ros.bagio.writer import build
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
 from selfcal_ros.messages import from_model
 from selfcal_ros.messages.cdr import layout_of
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+)
 
 START_NS = 1_700_000_000_000_000_000
 PAUSE_NS = 1_000_000_000
@@ -62,7 +67,9 @@ class Recording:
     knots: tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def recording(plan, measurements, *, repeats: int, visit_ns: int, encoder_ns: int) -> Recording:
+def recording(
+    plan, measurements, *, repeats: int, visit_ns: int, encoder_ns: int
+) -> Recording:
     """Return the recording of simulated readings.
 
     Every mark is visited once in a view and exposed `repeats` times; a visit takes `visit_ns`.
@@ -70,9 +77,13 @@ def recording(plan, measurements, *, repeats: int, visit_ns: int, encoder_ns: in
     """
     pitch, now = plan.artifact.grid_pitch_m, START_NS
     commands, columns, knots, stamps = [], [], [], []
-    for index, (view, readings) in enumerate(zip(plan.views, measurements.views, strict=True)):
+    for index, (view, readings) in enumerate(
+        zip(plan.views, measurements.views, strict=True)
+    ):
         for phase in (Phase.PLACE, Phase.MEASURE):
-            commands.append(Command(now, phase, plan.plan_id, index, view, plan.artifact))
+            commands.append(
+                Command(now, phase, plan.plan_id, index, view, plan.artifact)
+            )
             now += PAUSE_NS
         i, j = view.lattice_pose(plan.artifact).site_of(readings.m, readings.n)
         middle = now + visit_ns * np.arange(len(i)) + visit_ns // 2
@@ -94,7 +105,9 @@ def recording(plan, measurements, *, repeats: int, visit_ns: int, encoder_ns: in
         ends = np.column_stack([middle - rest, middle + rest]).ravel()
         knots.append((ends, np.repeat(i * pitch, 2), np.repeat(j * pitch, 2)))
         stamps.append(
-            ends if not encoder_ns else np.arange(now, now + visit_ns * len(i), encoder_ns)
+            ends
+            if not encoder_ns
+            else np.arange(now, now + visit_ns * len(i), encoder_ns)
         )
         now = int(now + visit_ns * len(i) + PAUSE_NS)
     commands.append(Command(now, Phase.DONE, plan.plan_id, len(plan.views)))
@@ -111,7 +124,8 @@ def _rows(event, topic: str, channel: int, stamps: np.ndarray) -> tuple:
     make = from_model.joint_state if topic == ENCODER_TOPIC else from_model.detection
     name = INPUT_TOPICS[topic]
     values = make(event, "stage")
-    if "effort" in values:  # pybag-sdk cannot read a message that ends in an empty sequence
+    # pybag-sdk cannot read a message that ends in an empty sequence
+    if "effort" in values:
         values |= {"effort": [0.0] * len(event.names)}
     payload = bytes(typestore().serialize_cdr(build(typestore(), name, values), name))
     layout = layout_of(fields_of(typestore(), name), payload)
@@ -124,11 +138,16 @@ def _rows(event, topic: str, channel: int, stamps: np.ndarray) -> tuple:
         {
             "names": [*FRONT.names, *layout.values],
             "formats": [*(FRONT[n] for n in FRONT.names), *(f for f, _ in formats)],
-            "offsets": [*(FRONT.fields[n][1] for n in FRONT.names), *(at for _, at in formats)],
+            "offsets": [
+                *(FRONT.fields[n][1] for n in FRONT.names),
+                *(at for _, at in formats),
+            ],
             "itemsize": size,
         }
     )
-    rows = np.frombuffer(bytearray((bytes(FRONT.itemsize) + payload) * len(stamps)), dtype=dtype)
+    rows = np.frombuffer(
+        bytearray((bytes(FRONT.itemsize) + payload) * len(stamps)), dtype=dtype
+    )
     rows["opcode"], rows["length"] = Opcode.MESSAGE, size - 9
     rows["channel"], rows["log"], rows["publish"] = channel, stamps, stamps
     rows["header.stamp.sec"], rows["header.stamp.nanosec"] = np.divmod(stamps, 10**9)
@@ -138,13 +157,21 @@ def _rows(event, topic: str, channel: int, stamps: np.ndarray) -> tuple:
 def encoder_rows(part: Recording, stamps: np.ndarray, channel: int) -> np.ndarray:
     """Return the records of the encoder's samples at some stamps."""
     zero = (0.0,) * 3
-    rows = _rows(EncoderSample(0, ("x", "y", "theta"), zero, zero), ENCODER_TOPIC, channel, stamps)
+    rows = _rows(
+        EncoderSample(0, ("x", "y", "theta"), zero, zero),
+        ENCODER_TOPIC,
+        channel,
+        stamps,
+    )
     t, *axes = part.knots
     for axis, values in enumerate(axes):
         rows["position"][:, axis] = np.interp(stamps - START_NS, t - START_NS, values)
-    step = np.zeros((len(rows) + 1, 2))  # at the edges of a chunk the next sample is not known
+    # at the edges of a chunk the next sample is not known
+    step = np.zeros((len(rows) + 1, 2))
     step[1:-1] = np.abs(np.diff(rows["position"][:, :2], axis=0))
-    rows["velocity"][:, :2] = np.where(np.minimum(step[1:], step[:-1]) > 1e-9, 0.05, 0.0)
+    rows["velocity"][:, :2] = np.where(
+        np.minimum(step[1:], step[:-1]) > 1e-9, 0.05, 0.0
+    )
     return rows
 
 
@@ -177,10 +204,12 @@ def interleaved(tables: list[np.ndarray]) -> tuple[bytes, dict[int, np.ndarray]]
             continue
         at = place[which == number]
         width = rows.itemsize
-        np.ndarray((len(out) - width + 1,), f"V{width}", out, strides=(1,))[at] = rows.view(
-            f"V{width}"
+        np.ndarray((len(out) - width + 1,), f"V{width}", out, strides=(1,))[at] = (
+            rows.view(f"V{width}")
         )
-        index[int(rows["channel"][0])] = np.rec.fromarrays([rows["log"], at], dtype=ENTRY)
+        index[int(rows["channel"][0])] = np.rec.fromarrays(
+            [rows["log"], at], dtype=ENTRY
+        )
     return out.tobytes(), index
 
 
@@ -229,8 +258,12 @@ class _Mcap:
             data = self.front + data
         packed = zstandard.compress(data, 1) if self.compress else data
         name = b"zstd" if self.compress else b""
-        times = [int(t) for e in index.values() for t in (e["time"].min(), e["time"].max())]
-        body = struct.pack("<QQQII", min(times), max(times), len(data), zlib.crc32(data), len(name))
+        times = [
+            int(t) for e in index.values() for t in (e["time"].min(), e["time"].max())
+        ]
+        body = struct.pack(
+            "<QQQII", min(times), max(times), len(data), zlib.crc32(data), len(name)
+        )
         body += name + struct.pack("<Q", len(packed)) + packed
         start = self.file.tell()
         self.file.write(struct.pack("<BQ", Opcode.CHUNK, len(body)) + body)
@@ -239,7 +272,10 @@ class _Mcap:
             offsets[channel] = self.file.tell()
             raw = entries.tobytes()
             self.file.write(
-                struct.pack("<BQHI", Opcode.MESSAGE_INDEX, len(raw) + 6, channel, len(raw)) + raw
+                struct.pack(
+                    "<BQHI", Opcode.MESSAGE_INDEX, len(raw) + 6, channel, len(raw)
+                )
+                + raw
             )
             self.counts[channel] = self.counts.get(channel, 0) + len(entries)
         self.chunks.append(
@@ -281,7 +317,8 @@ class _Mcap:
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0)
         crc = zlib.crc32(footer, zlib.crc32(summary))
         self._record_end(
-            summary, Footer(summary_start=start, summary_offset_start=0, summary_crc=crc)
+            summary,
+            Footer(summary_start=start, summary_offset_start=0, summary_crc=crc),
         )
         return total
 
@@ -311,7 +348,9 @@ def write_bag(folder: Path, part: Recording, *, compress: bool = True) -> int:
         writer.chunk(*_commands(part.commands, ids[COMMAND_TOPIC]))
         for k in range(n_chunks):
             encoder, marks = (
-                slice(0 if k == 0 else cut[k - 1], None if k == n_chunks - 1 else cut[k])
+                slice(
+                    0 if k == 0 else cut[k - 1], None if k == n_chunks - 1 else cut[k]
+                )
                 for cut in cuts.values()
             )
             writer.chunk(
@@ -327,7 +366,9 @@ def write_bag(folder: Path, part: Recording, *, compress: bool = True) -> int:
     return total
 
 
-def _commands(commands: list[Command], channel: int) -> tuple[bytes, dict[int, np.ndarray]]:
+def _commands(
+    commands: list[Command], channel: int
+) -> tuple[bytes, dict[int, np.ndarray]]:
     """Return the records of all commands and their index."""
     out, entries = bytearray(), []
     name = INPUT_TOPICS[COMMAND_TOPIC]

@@ -18,7 +18,11 @@ def jacobian(grid: GridSystem) -> csr_matrix:
     view, mark = np.nonzero(grid.read.reshape(grid.n_views, -1))
     site = grid.views.site_index.reshape(grid.n_views, -1)[view, mark]
     back = PHASES[-np.array([pose.q for pose in grid.views.poses]) % 4][view]
-    z, n, one = grid.views.z.ravel()[mark], grid.n_sites, np.ones(len(mark), dtype=complex)
+    z, n, one = (
+        grid.views.z.ravel()[mark],
+        grid.n_sites,
+        np.ones(len(mark), dtype=complex),
+    )
     entries = (
         (2 * site, back),
         (2 * site + 1, 1j * back),
@@ -63,7 +67,9 @@ class Rival:
         data = grid_data(measurements)
         self.grid = GridSystem(data.poses, data.weight)
         matrix = jacobian(self.grid)
-        values = data.y.reshape(len(data.poses), -1)[self.grid.read.reshape(len(data.poses), -1)]
+        values = data.y.reshape(len(data.poses), -1)[
+            self.grid.read.reshape(len(data.poses), -1)
+        ]
         self.right = np.column_stack([values.real, values.imag]).ravel()
         self.keep = pinned(self.grid)
         self.full, self.matrix = matrix, matrix[:, self.keep].tocsc()
@@ -94,7 +100,14 @@ class Rival:
         from scipy.sparse.linalg import lsmr
 
         return self._spread(
-            lsmr(self.matrix, self.right, atol=1e-14, btol=1e-14, conlim=0, maxiter=100_000)[0]
+            lsmr(
+                self.matrix,
+                self.right,
+                atol=1e-14,
+                btol=1e-14,
+                conlim=0,
+                maxiter=100_000,
+            )[0]
         )
 
     def _splu(self) -> np.ndarray:
@@ -135,7 +148,10 @@ class Rival:
             rows = np.eye(2)[[h % 2 for h in held if h // 2 == node]]
             graph.add(
                 gtsam.JacobianFactor(
-                    node, rows, np.zeros(len(rows)), gtsam.noiseModel.Unit.Create(len(rows))
+                    node,
+                    rows,
+                    np.zeros(len(rows)),
+                    gtsam.noiseModel.Unit.Create(len(rows)),
                 )
             )
         return graph
@@ -149,7 +165,9 @@ class Rival:
 
         blocks = [np.zeros(self.matrix.shape[1])]
         problem = pyceres.Problem()
-        problem.add_residual_block(_linear_cost(pyceres, self.matrix, self.right), None, blocks)
+        problem.add_residual_block(
+            _linear_cost(pyceres, self.matrix, self.right), None, blocks
+        )
         options = pyceres.SolverOptions()
         options.max_num_iterations = 3
         options.minimizer_progress_to_stdout = False
@@ -177,4 +195,6 @@ def _linear_cost(pyceres, matrix, right):
 
 def installed(name: str) -> bool:
     """Return whether a rival's package can be imported."""
-    return name not in ("gtsam", "pyceres") or importlib.util.find_spec(name) is not None
+    return (
+        name not in ("gtsam", "pyceres") or importlib.util.find_spec(name) is not None
+    )

@@ -45,7 +45,13 @@ OURS = {
     "terms": "selfcal (all terms)",
     "general": "selfcal (six general views)",
 }
-MAX_SIZE = {"re-solve": 201, "uncertainty": 401, "five views": 101, "terms": 101, "general": 101}
+MAX_SIZE = {
+    "re-solve": 201,
+    "uncertainty": 401,
+    "five views": 101,
+    "terms": 101,
+    "general": 101,
+}
 GENERAL = ("scipy lsmr", "scipy splu")
 NOISE_M = 20e-9
 MISSING = 0.03
@@ -69,7 +75,9 @@ def readings(size: int, missing: float = 0.0, noise_m: float = NOISE_M):
     rng = np.random.default_rng(size)
     # the papers' linear plate, which the rivals' equations know, too
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(rotation="linear"))
-    return truth, simulate_measurements(truth, plan, rng, missing=missing, sigma_m=noise_m)
+    return truth, simulate_measurements(
+        truth, plan, rng, missing=missing, sigma_m=noise_m
+    )
 
 
 def error_of(field, truth) -> float:
@@ -107,11 +115,14 @@ def ours(benchmark: str, data) -> tuple:
         seconds, found = median_time(cold, once=False)
     elif benchmark == "re-solve":
         calibrate(data, quick)
-        seconds, found = median_time(lambda: calibrate(data, quick).error_map, once=False)
+        seconds, found = median_time(
+            lambda: calibrate(data, quick).error_map, once=False
+        )
     else:
         calibrate(data, quick)
         seconds, found = median_time(
-            lambda: calibrate(data, replace(quick, uncertainty=True)).error_map, once=False
+            lambda: calibrate(data, replace(quick, uncertainty=True)).error_map,
+            once=False,
         )
     return seconds, np.stack([found.gx, found.gy])
 
@@ -182,7 +193,10 @@ def measure(benchmark: str, method: str, size: int) -> dict:
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["no message"])[-1]
         if "MemoryError" in last or "llocate" in last or done.returncode < 0:
-            return {**row, "note": f"skipped: more than {MEMORY_LIMIT_MB / 1000:.0f} GB"}
+            return {
+                **row,
+                "note": f"skipped: more than {MEMORY_LIMIT_MB / 1000:.0f} GB",
+            }
         return {**row, "note": f"failed: {last}"}
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -218,7 +232,14 @@ def measure_ingest(benchmark: str, number: int):
         if ingest.missing(method):
             yield {**row, "note": "not installed"}
             continue
-        command = [sys.executable, __file__, "--ingest-worker", benchmark, method, str(bag)]
+        command = [
+            sys.executable,
+            __file__,
+            "--ingest-worker",
+            benchmark,
+            method,
+            str(bag),
+        ]
         try:
             done = subprocess.run(
                 command,
@@ -241,7 +262,9 @@ def measure_ingest(benchmark: str, number: int):
 
 def measure_compensation(seconds: float):
     """Yield a row for each compensator at each rate."""
-    rows = [(rate, method) for rate in compensate.RATES for method in compensate.METHODS]
+    rows = [
+        (rate, method) for rate in compensate.RATES for method in compensate.METHODS
+    ]
     for rate, method in [*rows, (compensate.STRANGER_RATE, compensate.STRANGERS)]:
         if find_spec("rclpy") is None:
             yield {
@@ -264,8 +287,13 @@ def show(row: dict) -> None:
     else:
         error = "" if row["max_error"] is None else f"{row['max_error']:12.1e}"
         cpu = f"{row['cpu_seconds']:10.2f}" if "cpu_seconds" in row else ""
-        figures = f"{row['seconds']:12.6f} {row['peak_mb']:10.0f} {error:>12} {cpu}".rstrip()
-    print(f"{row['benchmark']:<17} {row['method']:<36} {row['n']:>7} {figures}", flush=True)
+        figures = (
+            f"{row['seconds']:12.6f} {row['peak_mb']:10.0f} {error:>12} {cpu}".rstrip()
+        )
+    print(
+        f"{row['benchmark']:<17} {row['method']:<36} {row['n']:>7} {figures}",
+        flush=True,
+    )
 
 
 def main() -> int:
@@ -337,7 +365,10 @@ def main() -> int:
             if "skipped" in rows[-1].get("note", ""):
                 given_up.add((benchmark, method))
         show(rows[-1])
-    for benchmark, number in ((ingest.ENCODER, args.ingest), (ingest.DETECTIONS, args.detections)):
+    for benchmark, number in (
+        (ingest.ENCODER, args.ingest),
+        (ingest.DETECTIONS, args.detections),
+    ):
         for row in measure_ingest(benchmark, number) if number else ():
             rows.append(row)
             show(row)

@@ -40,7 +40,9 @@ def bench(tmp_path, monkeypatch, capsys):
     def measured(*args):
         target = tmp_path / "bench.json"
         monkeypatch.setattr(
-            sys, "argv", [str(RUN), "-o", str(target), "--compensate", "0", "--images", "0", *args]
+            sys,
+            "argv",
+            [str(RUN), "-o", str(target), "--compensate", "0", "--images", "0", *args],
         )
         assert run.main() == 0
         return capsys.readouterr().out, json.loads(target.read_text())
@@ -75,17 +77,24 @@ def test_every_method_is_measured_and_exact(bench):
         assert row.keys() >= KEYS and row["n"] == 7
         assert row["method"] in out
         if row["seconds"] is None:
-            assert row["note"] == "not installed" and row["method"] in ("gtsam", "pyceres")
+            assert row["note"] == "not installed" and row["method"] in (
+                "gtsam",
+                "pyceres",
+            )
         else:
             assert row["seconds"] > 0 and row["peak_mb"] > 10
             if row["benchmark"] in ("without noise", "general"):
-                assert row["max_error"] < (1e-9 if row["method"] == "pyceres" else 1e-12)
+                assert row["max_error"] < (
+                    1e-9 if row["method"] == "pyceres" else 1e-12
+                )
             elif row["benchmark"] == "solve":  # one minimum for all
                 assert row["max_error"] == pytest.approx(ours, rel=0.01)
 
 
 def test_unknown_methods_are_refused(bench, tmp_path):
-    with pytest.raises(InputError, match=r"^--methods: 'magic' is unknown; see --help$"):
+    with pytest.raises(
+        InputError, match=r"^--methods: 'magic' is unknown; see --help$"
+    ):
         bench("--methods", "magic")
     assert not (tmp_path / "bench.json").exists()
 
@@ -107,7 +116,10 @@ def test_every_way_to_read_meets_every_message(bench):
     for method, row in by_method.items():
         assert row.keys() >= KEYS and method in out
         if row["seconds"] is None:
-            assert row["note"] == "not installed" and method in ("mcap-ros2-support", "pybag-sdk")
+            assert row["note"] == "not installed" and method in (
+                "mcap-ros2-support",
+                "pybag-sdk",
+            )
             continue
         assert row["seconds"] > 0 and row["peak_mb"] > 10 and row["n"] > 5000
         assert row["cpu_seconds"] > 0 and f"{row['cpu_seconds']:.2f}" in out
@@ -119,13 +131,17 @@ def test_processor_time_counts_what_the_process_and_its_children_do(monkeypatch)
     monkeypatch.syspath_prepend(RUN.parent)
     ingest = importlib.import_module("ingest")
     work = "import time\nwhile time.process_time() < 0.05: pass"
-    taken, done = ingest.timed(lambda: subprocess.run([sys.executable, "-c", work], check=True))
+    taken, done = ingest.timed(
+        lambda: subprocess.run([sys.executable, "-c", work], check=True)
+    )
     assert done.returncode == 0 and taken.cpu_s >= 0.05
 
 
 def test_without_ros_compensators_are_left_out_with_a_reason(bench, monkeypatch):
     monkeypatch.setattr(sys.modules["run"], "find_spec", lambda name: None)
-    _, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--compensate", "2")
+    _, rows = bench(
+        "--sizes", "", "--ingest", "0", "--detections", "0", "--compensate", "2"
+    )
     assert [(row["benchmark"], row["n"], row["note"]) for row in rows[::2]] == [
         (f"compensate {rate} Hz", 2 * rate, "not installed")
         for rate in (500, 1000, 2000, 10000, 2000)
@@ -139,7 +155,9 @@ def test_marks_are_found_at_the_bound(bench, monkeypatch):
     detecting = importlib.import_module("detecting")
     monkeypatch.setattr(detecting, "RATIOS", (50,))
     monkeypatch.setattr(detecting, "MANY", (5,))
-    out, rows = bench("--sizes", "", "--ingest", "0", "--detections", "0", "--images", "2")
+    out, rows = bench(
+        "--sizes", "", "--ingest", "0", "--detections", "0", "--images", "2"
+    )
     assert [row["benchmark"] for row in rows if row["method"] == "selfcal"] == [
         *(f"detect {mark} 50" for mark in ("disc", "ring", "cross", "corner")),
         "detect many",

@@ -13,5 +13,9 @@ def median_time(run, once: bool) -> tuple[float, object]:
         began = time.perf_counter()
         result = run()
         times.append(time.perf_counter() - began)
-        if once or len(times) == MAX_REPEATS or time.perf_counter() - start > MIN_SECONDS:
+        if (
+            once
+            or len(times) == MAX_REPEATS
+            or time.perf_counter() - start > MIN_SECONDS
+        ):
             return sorted(times)[len(times) // 2], result

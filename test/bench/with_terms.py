@@ -50,7 +50,9 @@ def readings(size: int) -> Measurements:
 def solved(size: int, terms: bool) -> tuple[float, None]:
     """Return seconds of a cold solution; readings hold noise, so that no error is exact."""
     data = readings(size)
-    options = Options(terms=parse_terms([TERMS], "--terms") if terms else (), causes=False)
+    options = Options(
+        terms=parse_terms([TERMS], "--terms") if terms else (), causes=False
+    )
 
     def cold():
         system_of.cache_clear()

@@ -77,7 +77,9 @@ def test_each_point_is_followed_by_its_correction_and_u(desk, capsys, inverse):
     at = np.clip(wanted, -0.02, 0.02) if inverse else np.array([x, y])
     at[:, 2] = 0.05  # the point outside
     np.testing.assert_array_equal(rows[:, 6:8].T, use.uncertainty(*at))
-    np.testing.assert_array_equal(rows[:, 8], use.uncertainty_theta(turned if inverse else theta))
+    np.testing.assert_array_equal(
+        rows[:, 8], use.uncertainty_theta(turned if inverse else theta)
+    )
     out, err = capsys.readouterr()
     assert out == "written: o.csv, 4 points\n"
     assert err.splitlines() == [
@@ -133,14 +135,16 @@ def test_distances_get_their_error_and_a_line_over_the_length(desk, capsys):
     assert head == ["x1", "y1", "x2", "y2", "length", "error", "u"]
     error, u = StageMap(result).length_error(*rows[:, :4].T.reshape(2, 2, 2))
     np.testing.assert_array_equal(
-        rows[:, 4:].T, [[np.hypot(0.04, 0.01), 0.05], [error[0], np.nan], [u[0], np.nan]]
+        rows[:, 4:].T,
+        [[np.hypot(0.04, 0.01), 0.05], [error[0], np.nan], [u[0], np.nan]],
     )
     *lines, outside = capsys.readouterr().err.splitlines()
     for line, anywhere in zip(lines, (True, False), strict=True):
         a, b = StageMap(result).length_uncertainty(anywhere=anywhere)
         where = "anywhere in the field" if anywhere else "of two nodes"
         assert (
-            f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L" in line
+            f"U of a distance L {where} is at most {1e6 * a:.3g} um + {1e6 * b:.3g} um/m L"
+            in line
         )
     assert outside.startswith("selfcal apply: points outside the field, left empty (")
     assert main(["apply", "R.json", "d.csv", "-o", "x.csv", "--inverse"]) == 2
@@ -174,7 +178,10 @@ def test_beyond_the_edge_nothing_is_known(desk, capsys, inverse):
     """Neither value nor u, and code 5; theta has no edge, and the edge itself is inside."""
     (desk / "p.csv").write_text("x,y,theta\n0.02,0.02,0.5\n0.0225,0.0,1\n0.0,-0.03,1\n")
     words = ["apply", "R.json", "p.csv", "-o", "o.csv", *["--inverse"] * inverse]
-    write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3, gain=1e-6))))
+    write_json(
+        "R.json",
+        result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3, gain=1e-6))),
+    )
     assert main(words) == 5
     rows = table(desk / "o.csv")[1]
     known = np.isfinite(rows[:, 3:])
@@ -213,7 +220,9 @@ def test_a_table_of_excel_is_read_and_its_national_forms_are_named(desk, capsys)
     words = ["apply", "R.json", "p.csv", "-o", "o.csv", "--force"]
     (desk / "p.csv").write_bytes(b"\xef\xbb\xbfx,y\r\n0.01,-0.005\r\n0,0\r\n,\r\n")
     assert main(words) == 0
-    np.testing.assert_array_equal(table(desk / "o.csv")[1][:, :2], [[0.01, -0.005], [0, 0]])
+    np.testing.assert_array_equal(
+        table(desk / "o.csv")[1][:, :2], [[0.01, -0.005], [0, 0]]
+    )
     for text, message in (
         (
             "x;y\n0,01;-0,005\n",
@@ -221,7 +230,10 @@ def test_a_table_of_excel_is_read_and_its_national_forms_are_named(desk, capsys)
             "have decimal commas?); save the table with commas between columns and points in",
         ),
         ("x\ty\n0.01\t0\n", "p.csv:1: columns are separated by tabs"),
-        ('x,y\n"0,01","-0,005"\n', "p.csv:2: '0,01' has a decimal comma; save the table"),
+        (
+            'x,y\n"0,01","-0,005"\n',
+            "p.csv:2: '0,01' has a decimal comma; save the table",
+        ),
     ):
         (desk / "p.csv").write_text(text)
         assert main(words) == 2
@@ -232,7 +244,8 @@ def test_outside_refused_and_not_qualified(desk, capsys):
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "refuse"]) == 2
     assert "outside the calibrated field" in capsys.readouterr().err
     doubt = replace(
-        result_of(MAP), verdict=Verdict(Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy.")
+        result_of(MAP),
+        verdict=Verdict(Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."),
     )
     write_json("R.json", result_to_dict(doubt))
     assert main(["apply", "R.json", "p.csv", "-o", "o.csv", "--outside", "edge"]) == 5
@@ -244,11 +257,16 @@ def test_bicubic_is_advised_where_it_halves_u_between_the_nodes(desk, capsys):
     emap = random_map(Artifact(9, 0.01), 1)
     wave = 1e-6 * np.sin(emap.artifact.x_m / 0.015 + emap.artifact.y_m / 0.02)
     noise = np.random.default_rng(2).normal(0, 1e-6, wave.shape)
-    for g, at, advised in ((wave, 0.005, True), (noise, 0.005, False), (wave, 0.01, False)):
+    for g, at, advised in (
+        (wave, 0.005, True),
+        (noise, 0.005, False),
+        (wave, 0.01, False),
+    ):
         (desk / "d.csv").write_text(f"x,y\n{at},{at}\n0.02,{-at}\n")
         u = np.full(wave.shape, 1e-9)
         write_json(
-            "R.json", result_to_dict(result_of(replace(emap, gx=g, gy=g[::-1], u_gx=u, u_gy=u)))
+            "R.json",
+            result_to_dict(result_of(replace(emap, gx=g, gy=g[::-1], u_gx=u, u_gy=u))),
         )
         assert main(["apply", "R.json", "d.csv", "-o", "o.csv", "--force"]) == 0
         assert ("with --method bicubic" in capsys.readouterr().err) is advised

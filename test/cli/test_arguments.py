@@ -27,7 +27,9 @@ def desk(tmp_path, monkeypatch):
 def verb_of(words):
     """Return what an error begins with: of `cal` and `plan` the second word, too."""
     first, second, *_ = words.split()
-    return f"selfcal {first} {second}" if first in ("cal", "plan") else f"selfcal {first}"
+    return (
+        f"selfcal {first} {second}" if first in ("cal", "plan") else f"selfcal {first}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -157,6 +159,8 @@ def test_an_error_of_the_right_file_stays(desk, capsys):
 
 def test_what_is_not_kept_is_said(desk, capsys):
     assert main(["solve", "bags/hu_exact"]) == 0
-    assert capsys.readouterr().out.endswith("result: not kept; -o RESULT.json writes it\n")
+    assert capsys.readouterr().out.endswith(
+        "result: not kept; -o RESULT.json writes it\n"
+    )
     assert main(["solve", "bags/hu_exact", "--json"]) == 0
     assert "not kept" not in "".join(capsys.readouterr())

@@ -50,13 +50,22 @@ def one_line(err, *parts):
 
 
 def test_export_check_eval_verify(run):
-    code, out, err = run("export", "r.json", "-o", "f.cal", "--x-axis", "1", "--y-axis", "2")
+    code, out, err = run(
+        "export", "r.json", "-o", "f.cal", "--x-axis", "1", "--y-axis", "2"
+    )
     first, asks, *steps = out.splitlines()
-    assert (code, first, asks, err) == (0, "f.cal: 2D table for x and y", "to put it into use:", "")
+    assert (code, first, asks, err) == (
+        0,
+        "f.cal: 2D table for x and y",
+        "to put it into use:",
+        "",
+    )
     assert "CalibrationLoad()" in steps[0] and "Position Calibration All" in steps[2]
     assert "the correction is largest at x = " in steps[3]
     code, out, _ = run("check", "f.cal", "--strict")
-    assert code == 0 and out.endswith("f.cal: 1 tables, 0 errors, 0 warnings, 0 tolerated\n")
+    assert code == 0 and out.endswith(
+        "f.cal: 1 tables, 0 errors, 0 warnings, 0 tolerated\n"
+    )
     code, out, _ = run("eval", "f.cal", "--position", "1=10", "--position", "2=-30")
     bias = MAP.gx[3, 3], MAP.gy[3, 3]
     got = json.loads(out)
@@ -94,7 +103,9 @@ def test_verify_of_a_file_without_our_comments_takes_options(run):
         bare = "".join(line for line in file if not line.startswith(";"))
     with open("bare.cal", "w") as file:
         file.write(bare)
-    code, out, _ = run("verify", "r.json", "bare.cal", "--unit", "um", "--home-x", "1000", "--json")
+    code, out, _ = run(
+        "verify", "r.json", "bare.cal", "--unit", "um", "--home-x", "1000", "--json"
+    )
     assert code == 0 and json.loads(out)["sites"]["after"]["max"] < 1e-10
     wrong = json.loads(run("verify", "r.json", "bare.cal", "--unit", "um", "--json")[1])
     assert wrong["sites"]["after"]["max"] > 1e-8
@@ -104,12 +115,25 @@ def test_verify_of_a_file_without_our_comments_takes_options(run):
     ("old", "new", "message"),
     [
         ("home-x=0", "home-x=nan", "home position: nan is not a position"),
-        ("theta-counts-per-unit=1000", "theta-counts-per-unit=0", "0.0 is not a positive number"),
+        (
+            "theta-counts-per-unit=1000",
+            "theta-counts-per-unit=0",
+            "0.0 is not a positive number",
+        ),
         ("y-axis=2", "y-axis=1", "the indices [1, 1, 3] are not distinct"),
     ],
 )
 def test_a_wiring_in_the_file_without_sense_is_named(run, tmp_path, old, new, message):
-    run("export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--counts-per-unit", "3=1000")
+    run(
+        "export",
+        "r.json",
+        "-o",
+        "f.cal",
+        "--theta-axis",
+        "3",
+        "--counts-per-unit",
+        "3=1000",
+    )
     text = (tmp_path / "f.cal").read_text()
     assert text.count(old) == 1
     (tmp_path / "f.cal").write_text(text.replace(old, new))
@@ -123,14 +147,17 @@ def test_a_file_with_the_wrong_sign_is_refused_by_verify(run):
     with open("f.cal") as file:
         text = file.read()
     with open("bad.cal", "w") as file:
-        file.write(text.replace(":START2D CORUNIT", ":START2D NEGCOR\n:START2D CORUNIT"))
+        file.write(
+            text.replace(":START2D CORUNIT", ":START2D NEGCOR\n:START2D CORUNIT")
+        )
     code, out, err = run("verify", "r.json", "bad.cal")
     assert code == 2 and "49 sites" in out
     one_line(err, "bad.cal: the tables make the machine worse; check signs")
 
 
 @pytest.mark.parametrize(
-    "option, text", [("--home-x", "5_0"), ("--home-x", "٥"), ("--x-axis", "1_1"), ("--x-axis", "٣")]
+    "option, text",
+    [("--home-x", "5_0"), ("--home-x", "٥"), ("--x-axis", "1_1"), ("--x-axis", "٣")],
 )
 def test_an_option_is_a_plain_number(run, option, text):
     """Python's float() and int() read 5_0 as 50 and the digits of every script."""
@@ -213,13 +240,22 @@ def test_theta_goes_into_a_file_of_its_own(run):
     assert code == 0 and err == ""
     (table,) = load_cal("t.cal").tables
     assert table.rollover == 360_000 and len(table.values) == 25
-    code, out, _ = run("eval", "t.cal", "--position", "3=-345", "--counts-per-unit", "3=1000")
+    code, out, _ = run(
+        "eval", "t.cal", "--position", "3=-345", "--counts-per-unit", "3=1000"
+    )
     want = math.degrees(MAP.g_theta[1] - MAP.g_theta[0])
     assert code == 0 and json.loads(out) == {"3": pytest.approx(want, abs=1e-8)}
     code, out, _ = run("verify", "r.json", "t.cal")
     assert code == 0 and "24 angular lines, rms, arcsec" in out
     code, _, err = run(
-        "export", "r.json", "-o", "h.cal", "--theta-axis", "3", "--theta-output", "./h.cal"
+        "export",
+        "r.json",
+        "-o",
+        "h.cal",
+        "--theta-axis",
+        "3",
+        "--theta-output",
+        "./h.cal",
     )
     assert code == 2
     one_line(err, "a 1D and a 2D table cannot share a file")
@@ -230,9 +266,15 @@ def test_existing_files_stay_and_are_kept(run, tmp_path):
     code, _, err = run("export", "r.json", "-o", "f.cal", "--theta-axis", "3")
     assert code == 2 and not (tmp_path / "f.cal").exists()
     one_line(err, "f_theta.cal: the file exists")
-    code, out, _ = run("export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--force")
+    code, out, _ = run(
+        "export", "r.json", "-o", "f.cal", "--theta-axis", "3", "--force"
+    )
     (backup,) = tmp_path.glob("f_theta.cal.*.bak")
-    assert code == 0 and backup.read_text() == "old" and f"the old file is {backup.name}" in out
+    assert (
+        code == 0
+        and backup.read_text() == "old"
+        and f"the old file is {backup.name}" in out
+    )
 
 
 def test_results_that_cannot_be_exported(run):
@@ -250,7 +292,9 @@ def test_results_that_cannot_be_exported(run):
     code, _, err = run("export", "unseen.json", "-o", "g.cal")
     assert code == 3
     one_line(err, "does not identify the stage")
-    write_json("o.json", result_to_dict(result_of(replace(MAP, nonorthogonality=math.nan))))
+    write_json(
+        "o.json", result_to_dict(result_of(replace(MAP, nonorthogonality=math.nan)))
+    )
     code, _, err = run("orthogonality", "o.json", "--along", "x")
     assert code == 2
     one_line(err, "its non-orthogonality is not known")
@@ -263,7 +307,9 @@ def test_files_that_are_loaded_together_are_added(run, tmp_path):
         )
     code, out, _ = run("eval", "0.cal", "1.cal", "--position", "1=15")
     assert code == 0 and json.loads(out) == {"1": (2 + 5) / 2 + (-1 + 1) / 2}
-    (tmp_path / "copy.cal").write_text("; of another day\n" + (tmp_path / "0.cal").read_text())
+    (tmp_path / "copy.cal").write_text(
+        "; of another day\n" + (tmp_path / "0.cal").read_text()
+    )
     for again in ("0.cal", "./0.cal", "copy.cal"):
         code, out, err = run("eval", "0.cal", "1.cal", again, "--position", "1=15")
         assert (code, out) == (2, "")
@@ -298,16 +344,33 @@ def test_verify_loads_all_files(run):
     run("accuracy", "r.json", "--along", "x", "-o", "x.cal", *wiring[:4])
     twice = json.loads(run("verify", "r.json", "f.cal", "x.cal", "--json")[1])
     assert twice["sites"]["after"]["rms"] > 1e2 * both["sites"]["after"]["rms"]
-    run("accuracy", "r.json", "--along", "x", "-o", "other.cal", *wiring[:4], "--home-x", "5")
+    run(
+        "accuracy",
+        "r.json",
+        "--along",
+        "x",
+        "-o",
+        "other.cal",
+        *wiring[:4],
+        "--home-x",
+        "5",
+    )
     code, _, err = run("verify", "r.json", "f.cal", "other.cal")
     assert code == 2
-    one_line(err, "the tables are for different axes, 'machine: x-axis=2 y-axis=1 unit=mm home-x=5")
+    one_line(
+        err,
+        "the tables are for different axes, 'machine: x-axis=2 y-axis=1 unit=mm home-x=5",
+    )
 
 
-@pytest.mark.parametrize("verb", ["export", "orthogonality", "accuracy", "straightness"])
+@pytest.mark.parametrize(
+    "verb", ["export", "orthogonality", "accuracy", "straightness"]
+)
 def test_a_table_of_a_result_that_is_not_qualified_says_so_everywhere(run, verb):
     why = "the plate slipped: measure it again"
-    doubted = Verdict(Grade.NOT_QUALIFIED, sentence=f"Not qualified: {why}", reasons=(why,))
+    doubted = Verdict(
+        Grade.NOT_QUALIFIED, sentence=f"Not qualified: {why}", reasons=(why,)
+    )
     write_json("r.json", result_to_dict(replace(result_of(MAP), verdict=doubted)))
     along = [] if verb == "export" else ["--along", "x"]
     code, out, err = run(verb, "r.json", *along, "-o", "f.cal")
@@ -340,15 +403,30 @@ def test_a_table_names_what_its_uncertainty_assumes(run, grade):
             ["--theta-axis", "3", "--counts-per-unit", "4=1000"],
             "axis 4 is not the theta axis; write",
         ),
-        (["--counts-per-unit", "3=1000"], "axis 3 is not the theta axis; name --theta-axis"),
+        (
+            ["--counts-per-unit", "3=1000"],
+            "axis 3 is not the theta axis; name --theta-axis",
+        ),
         (
             ["--theta-output", "t.cal"],
             "--theta-output: no theta table is written; name --theta-axis",
         ),
-        (["--home-theta", "0"], "--home-theta: there is no theta axis; name --theta-axis"),
-        (["--reverse-theta"], "--reverse-theta: there is no theta axis; name --theta-axis"),
-        (["--theta-axis", "3", "--counts-per-unit", "3=0"], "'0' is not a positive number"),
-        (["--theta-axis", "3", "--counts-per-unit", "1000"], "'1000' is not AXIS=VALUE"),
+        (
+            ["--home-theta", "0"],
+            "--home-theta: there is no theta axis; name --theta-axis",
+        ),
+        (
+            ["--reverse-theta"],
+            "--reverse-theta: there is no theta axis; name --theta-axis",
+        ),
+        (
+            ["--theta-axis", "3", "--counts-per-unit", "3=0"],
+            "'0' is not a positive number",
+        ),
+        (
+            ["--theta-axis", "3", "--counts-per-unit", "1000"],
+            "'1000' is not AXIS=VALUE",
+        ),
     ],
 )
 def test_options_of_export_without_sense(run, args, message):
@@ -358,10 +436,14 @@ def test_options_of_export_without_sense(run, args, message):
 
 
 def test_check_prints_findings_and_exits_2_for_errors(run, tmp_path):
-    (tmp_path / "f.cal").write_text(CAL_1D.replace(":START 1", ":Start 0").replace("4", "4,0"))
+    (tmp_path / "f.cal").write_text(
+        CAL_1D.replace(":START 1", ":Start 0").replace("4", "4,0")
+    )
     code, out, err = run("check", "f.cal")
     assert code == 2
-    assert out.splitlines()[0].startswith("f.cal:1: tolerated: a token in mixed case; write")
+    assert out.splitlines()[0].startswith(
+        "f.cal:1: tolerated: a token in mixed case; write"
+    )
     assert "f.cal:4: error: '4,0' is not a number; use a point as decimal mark" in out
     one_line(err, "f.cal:4: '4,0' is not a number")
     code, out, _ = run("check", "f.cal", "--json")
@@ -394,11 +476,16 @@ def test_eval_refuses_a_length_of_an_axis_that_turns(run):
     )
     counts = "--counts-per-unit", "3=1000"
     assert run("eval", "t.cal", "--position", "3=10", *counts)[0] == 0
-    for text in (without_comments, str):  # told by where the table rolls over, or by its comments
+    # told by where the table rolls over, or by its comments
+    for text in (
+        without_comments,
+        str,
+    ):
         code, out, err = run("eval", text("t.cal"), "--position", "3=10mm", *counts)
         assert (code, out) == (2, "")
         one_line(
-            err, "'3=10mm' is a length, and axis 3 is rotary; write 3=10.5, in its primary unit"
+            err,
+            "'3=10mm' is a length, and axis 3 is rotary; write 3=10.5, in its primary unit",
         )
     assert run("export", "r.json", "-o", "g.cal", "--theta-axis", "3")[0] == 0
     code, _, err = run("eval", "g_theta.cal", "--position", "3=10mm")
@@ -453,7 +540,9 @@ def test_check_gi4(run, tmp_path):
 def test_eval_options(run, tmp_path, args, want):
     (tmp_path / "f.cal").write_text(CAL_1D)
     code, out, err = run("eval", "f.cal", "--position", *args)
-    assert (code, err) == (0, "") and json.loads(out) == {"1": pytest.approx(want, abs=1e-12)}
+    assert (code, err) == (0, "") and json.loads(out) == {
+        "1": pytest.approx(want, abs=1e-12)
+    }
 
 
 def test_eval_counts(run, tmp_path):
@@ -464,7 +553,9 @@ def test_eval_counts(run, tmp_path):
     assert code == 2
     one_line(err, "axis 1: POSUNIT of the table of line 1 is in counts")
     counts = ["--counts-per-unit", "1=50", "--counts-per-unit", "2=1000"]
-    assert json.loads(run("eval", "f.cal", "--position", "1=1", *counts)[1]) == {"2": 0.005}
+    assert json.loads(run("eval", "f.cal", "--position", "1=1", *counts)[1]) == {
+        "2": 0.005
+    }
     moved = [*counts, "--absolute-feedback-offset", "1=-100"]
     assert json.loads(run("eval", "f.cal", "--position", "1=-1", *moved)[1]) == {
         "2": pytest.approx(-0.005)
@@ -482,7 +573,10 @@ def test_eval_counts(run, tmp_path):
         (["--position", "1=1_0"], "'1_0' is not a number"),
         (["--position", "1=inf"], "'inf' is not a number"),
         (["--position", "1=1", "--position", "1=2"], "axis 1 is given twice"),
-        (["--position", "1=1", "--home-direction", "1=UP"], "'UP' is not a home direction"),
+        (
+            ["--position", "1=1", "--home-direction", "1=UP"],
+            "'UP' is not a home direction",
+        ),
         (["--position", "1=1", "--temperature", "nan"], "is not a temperature"),
         (["--position", "1=1", "--temperature", "296"], "is it in K?"),
     ],
@@ -495,7 +589,9 @@ def test_eval_without_sense(run, tmp_path, args, message):
 
 
 def test_the_example_of_the_source(run):
-    code, out, _ = run("orthogonality", "--measured", "5um", "--over", "200mm", "--travel", "900mm")
+    code, out, _ = run(
+        "orthogonality", "--measured", "5um", "--over", "200mm", "--travel", "900mm"
+    )
     rows = [line.split() for line in out.splitlines() if line.startswith("  ")]
     assert code == 0 and "-22.5 µm" in out
     assert [row for row in rows if row[0] != "position"] == [
@@ -520,7 +616,15 @@ def test_the_example_of_the_source(run):
         "um",
     )
     assert json.loads(out)["tables"] == {"end": [[0.0, 0.0], [900000.0, 22.5]]}
-    square = ["orthogonality", "--measured", "5um", "--over", "200mm", "--travel", "900mm"]
+    square = [
+        "orthogonality",
+        "--measured",
+        "5um",
+        "--over",
+        "200mm",
+        "--travel",
+        "900mm",
+    ]
     assert run(*square, "--home", "middle", "-o", "o.cal")[0] == 0
     (table,) = load_cal("o.cal").tables
     assert (table.axis, table.reference, table.offset) == (2, 1, 450.0)
@@ -534,12 +638,18 @@ def test_the_example_of_the_source(run):
     [
         (["--measured", "5um"], "the measurement is not complete"),
         (["--measured", "5", "--over", "1m", "--travel", "1m"], "'5' is not a length"),
-        (["--measured", "5um", "--over", "0m", "--travel", "1m"], "not a positive length"),
+        (
+            ["--measured", "5um", "--over", "0m", "--travel", "1m"],
+            "not a positive length",
+        ),
         (
             ["--measured", "5um", "--over", "1m", "--travel", "1m", "-o", "o.cal"],
             "give end, middle",
         ),
-        (["--measured", "5um", "--over", "1m", "--travel", "1m", "--home-x", "1"], "use --home"),
+        (
+            ["--measured", "5um", "--over", "1m", "--travel", "1m", "--home-x", "1"],
+            "use --home",
+        ),
         (["r.json", "--over", "1m"], "exclude each other"),
     ],
 )
@@ -552,7 +662,9 @@ def test_orthogonality_without_sense(run, args, message):
 def test_lines_from_a_result_and_from_measured_errors(run, tmp_path):
     assert run("orthogonality", "r.json", "-o", "o.cal", "--along", "y")[0] == 0
     assert load_cal("o.cal").tables[0].reference == 2
-    code, out, _ = run("accuracy", "r.json", "--along", "y", "--y-axis", "7", "--home-y", "-30")
+    code, out, _ = run(
+        "accuracy", "r.json", "--along", "y", "--y-axis", "7", "--home-y", "-30"
+    )
     assert code == 0 and ":START 7\n" in out and ":START OFFSET=0\n" in out
     values = [float(line) for line in out.splitlines() if line[0] not in ":;"]
     np.testing.assert_allclose(values, MAP.gy[3] * 1e6, atol=0.6e-5)
@@ -588,7 +700,16 @@ def test_force_without_a_file_to_replace_is_refused(run, tmp_path, args):
         ["accuracy", "d.csv", "--home-x", "-50"],
         ["accuracy", "d.csv", "--reverse-x"],
         ["straightness", "d.csv", "--along", "y", "--home-y", "5"],
-        ["orthogonality", "--measured", "5um", "--over", "1m", "--travel", "1m", "--reverse-y"],
+        [
+            "orthogonality",
+            "--measured",
+            "5um",
+            "--over",
+            "1m",
+            "--travel",
+            "1m",
+            "--reverse-y",
+        ],
     ],
 )
 def test_what_was_measured_is_in_the_controllers_own_coordinates(run, tmp_path, args):
@@ -626,7 +747,10 @@ def test_bad_paths_and_bad_plots(run, tmp_path):
         (["eval", ".", "--position", "1=0"], "cannot be read"),
         (["export", "x.json", "-o", "g.cal"], "not a result of schema"),
         (["export", "r.json", "-o", "no/g.cal"], "cannot be written"),
-        (["verify", "r.json", "f.cal", "--plot", "f.gif"], "not a picture format by its suffix"),
+        (
+            ["verify", "r.json", "f.cal", "--plot", "f.gif"],
+            "not a picture format by its suffix",
+        ),
     ):
         code, _, err = run(*args)
         assert code == 2
@@ -634,6 +758,14 @@ def test_bad_paths_and_bad_plots(run, tmp_path):
 
 
 def test_help_of_every_sub_verb(run):
-    for name in ("check", "eval", "export", "verify", "orthogonality", "accuracy", "straightness"):
+    for name in (
+        "check",
+        "eval",
+        "export",
+        "verify",
+        "orthogonality",
+        "accuracy",
+        "straightness",
+    ):
         code, out, _ = run(name, "--help")
         assert code == 0 and f"selfcal cal {name}" in out

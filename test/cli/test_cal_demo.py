@@ -57,7 +57,10 @@ def test_the_demo_makes_its_machine_true(result_path, tmp_path, capsys, wiring):
     capsys.readouterr()
     assert main(["cal", "verify", str(result_path), str(target), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["sites"]["before"]["max"] > 0.5e-6 and found["sites"]["after"]["max"] < 1e-10
+    assert (
+        found["sites"]["before"]["max"] > 0.5e-6
+        and found["sites"]["after"]["max"] < 1e-10
+    )
     assert found["between"]["after"]["rms"] < found["between"]["before"]["rms"]
 
 

@@ -31,12 +31,17 @@ def bag_of(path, camera, sign=-1):
     with BagWriter(path) as writer:
         writer.add_topic(f"/{ENCODER_TOPIC}", INPUT_TOPICS[ENCODER_TOPIC], [])
         writer.add_topic(f"/{IMAGE_TOPICS['raw']}", IMAGE_TYPES["raw"], [])
-        for number, (move, values) in enumerate(zip(MOVES, views(camera, sign), strict=True), 1):
+        for number, (move, values) in enumerate(
+            zip(MOVES, views(camera, sign), strict=True), 1
+        ):
             for stamp in (number * 10**9 - 10**7, number * 10**9 + 10**7):
                 writer.write(
                     f"/{ENCODER_TOPIC}",
                     from_model.joint_state(
-                        EncoderSample(stamp, ("theta", "y", "x"), (0.0, move[1], move[0])), "stage"
+                        EncoderSample(
+                            stamp, ("theta", "y", "x"), (0.0, move[1], move[0])
+                        ),
+                        "stage",
                     ),
                     stamp,
                 )
@@ -55,14 +60,29 @@ def init(source, output, *more):
 @pytest.mark.parametrize("sense, sign", [("microscope_moves", -1), ("plate_moves", 1)])
 @pytest.mark.parametrize(
     "turn, mirror",
-    [(0.0, False), (30.0, False), (-140.0, False), (0.0, True), (75.0, True), (180.0, True)],
+    [
+        (0.0, False),
+        (30.0, False),
+        (-140.0, False),
+        (0.0, True),
+        (75.0, True),
+        (180.0, True),
+    ],
 )
-def test_the_camera_is_found_within_its_uncertainty(tmp_path, capsys, turn, mirror, sense, sign):
-    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6, turn_deg=turn, mirror=mirror)
+def test_the_camera_is_found_within_its_uncertainty(
+    tmp_path, capsys, turn, mirror, sense, sign
+):
+    camera = Camera(
+        width=200, height=180, pixel_size_m=2.6e-6, turn_deg=turn, mirror=mirror
+    )
     bag_of(tmp_path / "bag", camera, sign)
-    assert init(tmp_path / "bag", tmp_path / "nodes.yaml", "--json", "--sense", sense) == 0
+    assert (
+        init(tmp_path / "bag", tmp_path / "nodes.yaml", "--json", "--sense", sense) == 0
+    )
     said = json.loads(capsys.readouterr().out)
-    given = overrides_in(read_yaml(tmp_path / "nodes.yaml"), "mark_detector", "nodes.yaml")
+    given = overrides_in(
+        read_yaml(tmp_path / "nodes.yaml"), "mark_detector", "nodes.yaml"
+    )
     assert given["mirror"] is mirror and given["mark_size"] == 50e-6
     assert 0 < said["u_pixel_size"] < 1e-3 * 2.6e-6 and 0 < said["u_turn"] < 0.05
     assert abs(given["pixel_size"] - 2.6e-6) < 5 * said["u_pixel_size"]
@@ -80,18 +100,24 @@ def test_a_folder_of_files_with_positions_serves_as_well(tmp_path):
         rows.append(f"{number}.png,{move[0]},{move[1]}")
     (tmp_path / "p.csv").write_text("\n".join(rows))
     assert init(tmp_path / "bag", tmp_path / "a.yaml") == 0
-    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 0
+    assert (
+        init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 0
+    )
     found = [
         read_yaml(tmp_path / name)["mark_detector"]["ros__parameters"]
         for name in ("a.yaml", "b.yaml")
     ]
-    assert found[0].pop("pixel_size") == pytest.approx(found[1].pop("pixel_size"), rel=1e-9)
+    assert found[0].pop("pixel_size") == pytest.approx(
+        found[1].pop("pixel_size"), rel=1e-9
+    )
     assert found[0].pop("turn") == pytest.approx(found[1].pop("turn"), abs=1e-9)
     assert found[0] == found[1]
 
 
 def test_the_detector_takes_the_file_that_it_writes(tmp_path):
-    camera = Camera(width=200, height=180, pixel_size_m=2.6e-6, turn_deg=30.0, mirror=True)
+    camera = Camera(
+        width=200, height=180, pixel_size_m=2.6e-6, turn_deg=30.0, mirror=True
+    )
     bag_of(tmp_path / "bag", camera)
     assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 0
     assert (
@@ -135,7 +161,10 @@ def test_moves_along_one_line_are_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(f"{__name__}.MOVES", [(0.0, 0.0), (3e-5, 0.0), (6e-5, 0.0)])
     bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
     assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 2
-    assert "the stage moved along one line only; move it in x and in y" in capsys.readouterr().err
+    assert (
+        "the stage moved along one line only; move it in x and in y"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "nodes.yaml").exists()
 
 
@@ -146,13 +175,17 @@ def test_moves_by_a_whole_pitch_are_refused(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(
         f"{__name__}.views",
         lambda camera, sign: [
-            camera.image(MARKS, np.random.default_rng(number)) for number in range(len(moves))
+            camera.image(MARKS, np.random.default_rng(number))
+            for number in range(len(moves))
         ],
     )
     bag_of(tmp_path / "bag", Camera(width=200, height=180, pixel_size_m=2.6e-6))
     assert init(tmp_path / "bag", tmp_path / "nodes.yaml") == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert "the marks do not follow the stage" in line and "less than half the distance" in line
+    assert (
+        "the marks do not follow the stage" in line
+        and "less than half the distance" in line
+    )
     assert not (tmp_path / "nodes.yaml").exists()
 
 
@@ -175,7 +208,14 @@ def test_positions_or_marks_in_other_units_are_refused(
 ):
     table_of(tmp_path, factor, factor)
     assert (
-        init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv"), *options) == 2
+        init(
+            tmp_path,
+            tmp_path / "b.yaml",
+            "--positions",
+            str(tmp_path / "p.csv"),
+            *options,
+        )
+        == 2
     )
     [line] = capsys.readouterr().err.splitlines()
     assert (
@@ -187,12 +227,15 @@ def test_positions_or_marks_in_other_units_are_refused(
 def test_exchanged_axes_with_one_of_them_short_are_refused(tmp_path, capsys):
     """The encoder of y counts half: the image of the motion is no similar one."""
     table_of(tmp_path, 1.0, 0.5)
-    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 2
+    assert (
+        init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 2
+    )
     assert "the image of the motion is sheared by 33" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    "count, problem", [(0, "no row below the heading"), (1, "move the stage in x and y")]
+    "count, problem",
+    [(0, "no row below the heading"), (1, "move the stage in x and y")],
 )
 def test_too_few_images_are_said_so(tmp_path, capsys, count, problem):
     camera = Camera(width=200, height=180, pixel_size_m=2.6e-6)
@@ -201,5 +244,7 @@ def test_too_few_images_are_said_so(tmp_path, capsys, count, problem):
         Image.fromarray(views(camera)[0]).save(tmp_path / f"{number}.png")
         rows.append(f"{number}.png,0,0")
     (tmp_path / "p.csv").write_text("\n".join(rows) + "\n")
-    assert init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 4
+    assert (
+        init(tmp_path, tmp_path / "b.yaml", "--positions", str(tmp_path / "p.csv")) == 4
+    )
     assert problem in capsys.readouterr().err

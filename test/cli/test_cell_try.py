@@ -23,11 +23,15 @@ PLATE = (
     "plan: {plan_id: c, artifact: {grid_size: 3, grid_pitch: 0.001, angular_count: 0}, "
     "views: [{name: a}]}\nseed: 3\ntruth: {g: 2.0e-7, a: 2.0e-7, t: 5.0e-6, phi: 1.0e-3}\n"
 )
-CAMERA = "camera: {width: 220, height: 200, pixel_size: 2.0e-6, mark_size: 50.0e-6, MORE}\n"
+CAMERA = (
+    "camera: {width: 220, height: 200, pixel_size: 2.0e-6, mark_size: 50.0e-6, MORE}\n"
+)
 MARKS = "detector: {mark: disc, mark_size: 50.0e-6}\n"
 
 
-def write(folder, more="turn: 3.0", *, physics="", cell=MARKS, sense="microscope_moves"):
+def write(
+    folder, more="turn: 3.0", *, physics="", cell=MARKS, sense="microscope_moves"
+):
     return write_cell(
         folder,
         cell=f"{CELL}{cell}sense: {sense}\n",
@@ -37,8 +41,12 @@ def write(folder, more="turn: 3.0", *, physics="", cell=MARKS, sense="microscope
 
 
 @pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
-@pytest.mark.parametrize(("turn", "mirror"), [(3.0, False), (-140.0, False), (75.0, True)])
-def test_camera_and_backlash_are_found_within_their_uncertainty(tmp_path, turn, mirror, sense):
+@pytest.mark.parametrize(
+    ("turn", "mirror"), [(3.0, False), (-140.0, False), (75.0, True)]
+)
+def test_camera_and_backlash_are_found_within_their_uncertainty(
+    tmp_path, turn, mirror, sense
+):
     cell, machine = write(
         tmp_path,
         f"turn: {turn}, mirror: {str(mirror).lower()}",
@@ -53,7 +61,10 @@ def test_camera_and_backlash_are_found_within_their_uncertainty(tmp_path, turn, 
     camera = found.camera
     assert camera.mirror is mirror
     local_scale = 4e-4  # of the stage: errors of 0.2 um from mark to mark, 1 mm
-    assert abs(camera.pixel_size_m / 2e-6 - 1) < local_scale + 5 * camera.u_pixel_size_m / 2e-6
+    assert (
+        abs(camera.pixel_size_m / 2e-6 - 1)
+        < local_scale + 5 * camera.u_pixel_size_m / 2e-6
+    )
     assert camera.u_pixel_size_m < 1e-9
     away = math.remainder(camera.turn_rad - math.radians(turn), math.tau)
     assert abs(away) < local_scale + 5 * camera.u_turn_rad < 0.05
@@ -75,7 +86,9 @@ def test_a_stage_that_creeps_after_a_move(tmp_path):
     assert trial.move().settling_s > 0
 
 
-def test_what_is_found_is_written_and_the_plan_is_measured_with_it(tmp_path, monkeypatch, capsys):
+def test_what_is_found_is_written_and_the_plan_is_measured_with_it(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     write(tmp_path)
     assert main(["cell", "try", "cell.yaml", "--yes", "--json"]) == 0
@@ -86,7 +99,11 @@ def test_what_is_found_is_written_and_the_plan_is_measured_with_it(tmp_path, mon
         assert picture.size == (220, 200)
         assert (np.asarray(picture) == COLOUR).all(axis=2).sum() > 50
     data = read_yaml("cell.yaml")
-    assert data["detector"]["pixel_size"] == said["pixel_size"] == pytest.approx(2e-6, rel=0.01)
+    assert (
+        data["detector"]["pixel_size"]
+        == said["pixel_size"]
+        == pytest.approx(2e-6, rel=0.01)
+    )
     assert data["found"]["backlash_x"].keys() == {"value", "u"}
     assert read_cell("cell.yaml").detector.turn == pytest.approx(3.0, abs=0.5)
 

@@ -32,7 +32,8 @@ def folder(tmp_path_factory):
             sigma_theta_rad=2e-5,
         )
         write_json(
-            folder / f"{seed}.json", result_to_dict(worded(calibrate(readings, bare(causes=False))))
+            folder / f"{seed}.json",
+            result_to_dict(worded(calibrate(readings, bare(causes=False)))),
         )
     return folder
 
@@ -46,7 +47,9 @@ def files(folder, monkeypatch):
 def test_the_mean_is_read_by_the_other_verbs(files, folder, capsys):
     assert main(["combine", *files, "-o", "mean.json", "--force"]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("mean of 3 maps: Good: the runs agree within their uncertainties")
+    assert text.startswith(
+        "mean of 3 maps: Good: the runs agree within their uncertainties"
+    )
     assert "3.json: weight 0.3" in text and "disagrees" not in text
     for command in (
         ["report", "mean.json", "-o", "mean.html"],
@@ -54,13 +57,27 @@ def test_the_mean_is_read_by_the_other_verbs(files, folder, capsys):
         ["table", "mean.json", "-o", "mean.csv"],
         ["diff", "1.json", "mean.json"],
         ["export", "kmotion", "mean.json", "-o", "mean.txt", "--unit", "mm"],
-        ["cal", "export", "mean.json", "-o", "mean.cal", "--x-axis", "1", "--y-axis", "2"],
+        [
+            "cal",
+            "export",
+            "mean.json",
+            "-o",
+            "mean.cal",
+            "--x-axis",
+            "1",
+            "--y-axis",
+            "2",
+        ],
     ):
         assert main(command) == 0, command
     page = (folder / "mean.html").read_text()
-    assert "weighted mean of several calibrations" in page and "uncertainties of 3 runs" in page
+    assert (
+        "weighted mean of several calibrations" in page
+        and "uncertainties of 3 runs" in page
+    )
     of_one, of_mean = (
-        load(name).length_error((0.0, 0.0), (0.02, 0.01))[1] for name in ("1.json", "mean.json")
+        load(name).length_error((0.0, 0.0), (0.02, 0.01))[1]
+        for name in ("1.json", "mean.json")
     )
     assert of_mean < of_one
     assert main(["combine", "mean.json", "1.json", "-o", "again.json"]) == 2
@@ -70,13 +87,19 @@ def test_the_mean_is_read_by_the_other_verbs(files, folder, capsys):
 def test_a_map_of_other_origin_is_one_of_them(files, tmp_path, capsys):
     table = str(tmp_path / "other.csv")
     assert main(["table", "2.json", "-o", table, "--force"]) == 0
-    assert main(["combine", "1.json", table, "-o", "mean.json", "--force", "--json"]) == 0
+    assert (
+        main(["combine", "1.json", table, "-o", "mean.json", "--force", "--json"]) == 0
+    )
     said = json.loads(capsys.readouterr().out.partition("\n")[2])
     assert [run["file"] for run in said["runs"]] == ["1.json", table]
-    one, other, mean = (read_json(name)["error_map"] for name in ("1.json", "2.json", "mean.json"))
+    one, other, mean = (
+        read_json(name)["error_map"] for name in ("1.json", "2.json", "mean.json")
+    )
     weight = said["runs"][0]["weight"]
     np.testing.assert_allclose(
-        mean["gx"], weight * np.array(one["gx"]) + (1 - weight) * np.array(other["gx"]), atol=1e-15
+        mean["gx"],
+        weight * np.array(one["gx"]) + (1 - weight) * np.array(other["gx"]),
+        atol=1e-15,
     )
     assert "xy" not in read_json("mean.json").get("map_covariance", {})
     plain = tmp_path / "plain.csv"
@@ -85,7 +108,10 @@ def test_a_map_of_other_origin_is_one_of_them(files, tmp_path, capsys):
         "0,0.01,0,0,1e-8,1e-8\n-0.01,0.02,0,0,1e-8,\n"
     )
     assert main(["combine", "1.json", str(plain), "-o", "mean.json", "--force"]) == 0
-    assert np.isfinite(np.array(read_json("mean.json")["error_map"]["gx"], float)).sum() == 3
+    assert (
+        np.isfinite(np.array(read_json("mean.json")["error_map"]["gx"], float)).sum()
+        == 3
+    )
     assert "unknown in the mean: 22" in capsys.readouterr().out
 
 
@@ -122,7 +148,9 @@ def negated(text, columns):
                 head,
                 *(
                     ",".join(
-                        repr(-float(cell)) if cell and name.rpartition("_")[0] in columns else cell
+                        repr(-float(cell))
+                        if cell and name.rpartition("_")[0] in columns
+                        else cell
                         for name, cell in zip(names, row.split(","), strict=True)
                     )
                     for row in rows
@@ -143,16 +171,21 @@ def negated(text, columns):
         ((), False),
     ],
 )  # an axis alone is wired otherwise: it disagrees
-def test_a_map_of_the_opposite_sign_is_refused_as_such(files, tmp_path, capsys, columns, refused):
+def test_a_map_of_the_opposite_sign_is_refused_as_such(
+    files, tmp_path, capsys, columns, refused
+):
     table, other = tmp_path / "own.csv", tmp_path / "other.csv"
     assert main(["table", "2.json", "-o", str(table), "--force"]) == 0
     other.write_text(negated(table.read_text(), columns))
     capsys.readouterr()
     for order in (["1.json", "3.json", str(other)], [str(other), "1.json"]):
-        assert main(["combine", *order, "-o", "mean.json", "--force"]) == (2 if refused else 0)
+        assert main(["combine", *order, "-o", "mean.json", "--force"]) == (
+            2 if refused else 0
+        )
         error = capsys.readouterr().err
         assert (
-            error == f"selfcal combine: {other}: of the opposite sign to 1.json: its negative "
+            error
+            == f"selfcal combine: {other}: of the opposite sign to 1.json: its negative "
             "agrees, and it does not; give G = indicated - true\n"
         ) is refused
 
@@ -173,7 +206,16 @@ def test_maps_within_their_u_have_no_sign(files, tmp_path):
         ]
         (tmp_path / "n.csv").write_text("x,y,gx,gy,u_gx,u_gy\n" + "\n".join(rows))
         assert (
-            main(["combine", "1.json", str(tmp_path / "n.csv"), "-o", "mean.json", "--force"])
+            main(
+                [
+                    "combine",
+                    "1.json",
+                    str(tmp_path / "n.csv"),
+                    "-o",
+                    "mean.json",
+                    "--force",
+                ]
+            )
             == code
         )
 
@@ -191,14 +233,22 @@ HEAD = "x,y,gx,gy,u_gx,u_gy\n"
         (HEAD + "0,0,a,0,1e-8,1e-8\n", "x.csv:2: a cell is not a number"),
         (HEAD + "0,0,1_0e-9,0,1e-8,1e-8\n", "x.csv:2: a cell is not a number"),
         (HEAD + "0,0,0,0,1e-8,0\n", "x.csv:2: u_gy 0 is not a standard uncertainty"),
-        (HEAD + "0.001,0,0,0,1e-8,1e-8\n", "(0.001, 0) m is not a site of the other maps"),
-        (HEAD + "0.03,0,0,0,1e-8,1e-8\n", "(0.03, 0) m is not a site of the other maps"),
+        (
+            HEAD + "0.001,0,0,0,1e-8,1e-8\n",
+            "(0.001, 0) m is not a site of the other maps",
+        ),
+        (
+            HEAD + "0.03,0,0,0,1e-8,1e-8\n",
+            "(0.03, 0) m is not a site of the other maps",
+        ),
         (HEAD + "0,0,0,0,1e-8,1e-8\n" * 2, "x.csv:3: its site is in the table twice"),
         (HEAD + "0,0,1e9,0,1e-8,1e-8\n", "a value beyond 1000 m or rad"),
         (HEAD + ",,0,0,1e-8,1e-8\n", "neither a site nor an angular line"),
     ],
 )
-def test_a_table_that_is_no_map_is_one_line(files, tmp_path, monkeypatch, capsys, text, message):
+def test_a_table_that_is_no_map_is_one_line(
+    files, tmp_path, monkeypatch, capsys, text, message
+):
     name = tmp_path / "x.csv"
     name.write_text(text)
     assert main(["combine", "1.json", str(name), "-o", "mean.json", "--force"]) == 2

@@ -36,7 +36,10 @@ def bag(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("solv x", "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help"),
+        (
+            "solv x",
+            "selfcal: VERB 'solv' is unknown; did you mean 'solve'?; see selfcal --help",
+        ),
         (
             "--version=3 solve",
             "selfcal: argument --version: ignored explicit argument '3'; see selfcal --help",
@@ -68,7 +71,10 @@ def bag(tmp_path_factory):
             "selfcal plan check: the option --sigmma is unknown; did you mean "
             "'--sigma'?; see selfcal plan check --help",
         ),
-        ("solve a b", "selfcal solve: 'b' is one argument too many; see selfcal solve --help"),
+        (
+            "solve a b",
+            "selfcal solve: 'b' is one argument too many; see selfcal solve --help",
+        ),
         (
             "cal evl f",
             "selfcal cal: WHAT 'evl' is unknown; did you mean 'eval'?; see selfcal cal --help",
@@ -103,7 +109,9 @@ def test_a_name_that_no_file_can_have_is_one_line(tmp_path, monkeypatch, capsys,
     assert main(words.replace("LONG", "x" * 300).split()) == 2
     out, err = capsys.readouterr()
     assert not out
-    assert re.fullmatch(r"selfcal [a-z -]+: \S+: .*(File name too long|is a folder).*\n", err)
+    assert re.fullmatch(
+        r"selfcal [a-z -]+: \S+: .*(File name too long|is a folder).*\n", err
+    )
 
 
 def test_names_like_one_another():
@@ -161,14 +169,21 @@ def test_a_bag_with_topics_of_other_names_says_which(tmp_path, capsys):
         tmp_path / "x.mcap", [e for e in events if not isinstance(e, Detection)]
     )
     assert main(["solve", str(path)]) == 4
-    assert "no message on stage/mark_detections; record this topic" in capsys.readouterr().err
+    assert (
+        "no message on stage/mark_detections; record this topic"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_result_on_stdout_and_all_else_on_stderr(bag, tmp_path, capsys):
     assert main(["solve", str(bag), "-o", str(tmp_path / "r.json")]) in (0, 5)
     summary = capsys.readouterr().out
     wanted = read_json(tmp_path / "r.json")
-    for options in (["-o", "-"], ["--json"], ["--json", "-o", str(tmp_path / "again.json")]):
+    for options in (
+        ["-o", "-"],
+        ["--json"],
+        ["--json", "-o", str(tmp_path / "again.json")],
+    ):
         assert main(["solve", str(bag), *options]) in (0, 5)
         printed = capsys.readouterr()
         found = json.loads(printed.out)
@@ -200,8 +215,12 @@ def test_a_plan_is_judged_in_um_where_the_noise_is_given(capsys, tmp_path):
         assert main(["plan", "check", str(plan), "--sigma", sigma, "--json"]) == 0
         found = json.loads(capsys.readouterr().out)["predicted"]
         # 20 nm, averaged over 4 repeats: 0.01 um
-        assert found["rms_u_xy_um"] == pytest.approx(0.01 * found["rms_gain_xy"], rel=1e-12)
-        assert found["max_u_xy_um"] == pytest.approx(0.01 * found["max_gain_xy"], rel=1e-12)
+        assert found["rms_u_xy_um"] == pytest.approx(
+            0.01 * found["rms_gain_xy"], rel=1e-12
+        )
+        assert found["max_u_xy_um"] == pytest.approx(
+            0.01 * found["max_gain_xy"], rel=1e-12
+        )
     assert main(["plan", "check", str(plan), "--sigma", "20nm"]) == 0
     assert (
         f"  XY     rms {found['rms_u_xy_um']:.4f} µm   largest {found['max_u_xy_um']:.4f} µm "
@@ -256,7 +275,9 @@ def test_a_position_with_its_unit(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_json("r.json", result_to_dict(known_result(5, 8)[0]))
     for unit, number in (("mm", "10.5"), ("um", "10500"), ("m", "0.0105")):
-        assert main(["cal", "export", "r.json", "-o", f"{unit}.cal", "--unit", unit]) == 0
+        assert (
+            main(["cal", "export", "r.json", "-o", f"{unit}.cal", "--unit", unit]) == 0
+        )
         found = []
         for text in (number, "10.5mm", "0.0105m", "10500um", "1.05e4µm"):
             capsys.readouterr()
@@ -286,7 +307,12 @@ def test_the_table_of_a_result(tmp_path, capsys):
     emap = replace(result.error_map, gx=result.error_map.gx.copy())
     emap.gx[0, 1] = np.nan
     write_json(tmp_path / "r.json", result_to_dict(replace(result, error_map=emap)))
-    assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.csv"), "--json"]) == 0
+    assert (
+        main(
+            ["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.csv"), "--json"]
+        )
+        == 0
+    )
     assert json.loads(capsys.readouterr().out) == {
         "written": str(tmp_path / "t.csv"),
         "kind": "csv",
@@ -298,10 +324,15 @@ def test_the_table_of_a_result(tmp_path, capsys):
     half, pitch = result.artifact.half, result.artifact.grid_pitch_m
     assert (int(first["m"]), int(first["n"])) == (-half[0], -half[1])
     assert float(first["x_m"]) == pytest.approx(-half[0] * pitch, rel=1e-15)
-    assert float(rows[ny]["gx_m"]) == emap.gx[1, 0] and float(rows[1]["gy_m"]) == emap.gy[0, 1]
+    assert (
+        float(rows[ny]["gx_m"]) == emap.gx[1, 0]
+        and float(rows[1]["gy_m"]) == emap.gy[0, 1]
+    )
     assert rows[1]["gx_m"] == "" and first["k"] == "" and line["gx_m"] == ""
     assert float(line["g_theta_rad"]) == emap.g_theta[1]
-    assert float(line["angle_rad"]) == pytest.approx(2 * np.pi / result.artifact.angular_count)
+    assert float(line["angle_rad"]) == pytest.approx(
+        2 * np.pi / result.artifact.angular_count
+    )
     assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.npz")]) == 0
     with np.load(tmp_path / "t.npz") as file:
         arrays = dict(file)
@@ -319,10 +350,24 @@ def test_the_table_of_a_result(tmp_path, capsys):
     assert main(["table", str(tmp_path / "r.json"), "-o", "-", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"csv": text}
     doubted = replace(
-        result, verdict=Verdict(Grade.NOT_QUALIFIED, sentence="Not qualified: the plate slipped")
+        result,
+        verdict=Verdict(
+            Grade.NOT_QUALIFIED, sentence="Not qualified: the plate slipped"
+        ),
     )
     write_json(tmp_path / "r.json", result_to_dict(doubted))
-    assert main(["table", str(tmp_path / "r.json"), "-o", str(tmp_path / "t.csv"), "--force"]) == 5
+    assert (
+        main(
+            [
+                "table",
+                str(tmp_path / "r.json"),
+                "-o",
+                str(tmp_path / "t.csv"),
+                "--force",
+            ]
+        )
+        == 5
+    )
     assert capsys.readouterr().err == "selfcal: Not qualified: the plate slipped\n"
 
 
@@ -349,12 +394,18 @@ def test_every_verb_takes_json_and_is_documented(name):
         "call add_json(parser) of cli/terminal.py in configure, and say() in run"
     )
     docs = Path(selfcal_ros.__file__).parents[1] / "docs/reference/json.md"
-    assert f"`{name}`" in docs.read_text(), f"add a row for `{name}` to docs/reference/json.md"
+    assert f"`{name}`" in docs.read_text(), (
+        f"add a row for `{name}` to docs/reference/json.md"
+    )
 
 
 @pytest.mark.parametrize("verb", ["solve", "plan", "cal", "step-diagonal"])
 def test_the_parser_of_one_verb_takes_what_that_of_all_does(verb):
-    own = {name: parser.format_help() for name, parser in LEAVES.items() if name.split()[0] == verb}
+    own = {
+        name: parser.format_help()
+        for name, parser in LEAVES.items()
+        if name.split()[0] == verb
+    }
     assert own and own == {
         name: parser.format_help() for name, parser in leaves(build_parser(verb))
     }
@@ -426,7 +477,9 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
     Path("p.csv").write_text("x,y\n0,0\n")
     Path("in.nc").write_text("G21 G90\nG0 X0 Y0\n")
     run = set(RUNS) | NEEDS_NODES | set(ELSEWHERE)
-    assert run == set(LEAVES), f"in RUNS above, add or remove {sorted(run ^ set(LEAVES))}"
+    assert run == set(LEAVES), (
+        f"in RUNS above, add or remove {sorted(run ^ set(LEAVES))}"
+    )
     for name, line in RUNS.items():
         words = [str(places.get(word, word)) for word in line.split()]
         if name == "combine":  # the map of another calibration
@@ -443,7 +496,8 @@ def test_every_verb_prints_one_json_object(bag, tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("kind", "begins", "lines"), [("png", b"\x89PNG", 0), ("svg", b"<?xml", 8), ("pdf", b"%PDF", 0)]
+    ("kind", "begins", "lines"),
+    [("png", b"\x89PNG", 0), ("svg", b"<?xml", 8), ("pdf", b"%PDF", 0)],
 )
 def test_the_picture_of_a_result_is_what_its_ending_says_and_repeatable(
     tmp_path, capsys, kind, begins, lines
@@ -453,10 +507,19 @@ def test_the_picture_of_a_result_is_what_its_ending_says_and_repeatable(
     data = []
     for name in ("a", "b"):
         path = tmp_path / f"{name}.{kind}"
-        assert main(["plot", str(tmp_path / "r.json"), "-o", str(path), "--json", "--force"]) == 0
-        assert json.loads(capsys.readouterr().out) == {"written": str(path), "kind": kind}
+        assert (
+            main(
+                ["plot", str(tmp_path / "r.json"), "-o", str(path), "--json", "--force"]
+            )
+            == 0
+        )
+        assert json.loads(capsys.readouterr().out) == {
+            "written": str(path),
+            "kind": kind,
+        }
         data.append(path.read_bytes())
-    if not hasattr(RendererSVG, "_get_clippath_id"):  # matplotlib 3.8 names them by their address
+    # matplotlib 3.8 names them by their address
+    if not hasattr(RendererSVG, "_get_clippath_id"):
         data = [re.sub(rb"\bp[0-9a-f]{10}\b", b"path", found) for found in data]
     assert data[0] == data[1] and data[0].startswith(begins) and len(data[0]) > 5000
 

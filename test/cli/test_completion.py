@@ -45,5 +45,7 @@ def test_help_loads_no_verb_and_no_numpy():
         "atexit.register(lambda: print({'numpy', 'selfcal_ros.cli.solve'} & {*sys.modules}, "
         "file=sys.stderr)); main(['--help'])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
     assert done.stderr == "set()\n" and "solve" in done.stdout

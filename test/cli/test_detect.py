@@ -82,8 +82,15 @@ def found(bag):
 def test_the_map_from_images_is_within_five_u_of_the_truth(bag, tmp_path, capsys):
     assert detect(bag, tmp_path / "found", "--json") == 0
     counts = json.loads(capsys.readouterr().out)["counts"]
-    assert counts == {"images": 140, "images_refused": 0, "images_without_marks": 0, "marks": 140}
-    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"), "--force"]) in (
+    assert counts == {
+        "images": 140,
+        "images_refused": 0,
+        "images_without_marks": 0,
+        "marks": 140,
+    }
+    assert main(
+        ["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"), "--force"]
+    ) in (
         0,
         5,
     )
@@ -98,7 +105,10 @@ def test_the_map_from_images_is_within_five_u_of_the_truth(bag, tmp_path, capsys
 @pytest.mark.parametrize("wrong", [["--turn", "210"], ["--turn", "120"]])
 def test_a_camera_that_is_turned_otherwise_is_noticed(bag, tmp_path, wrong):
     assert detect(bag, tmp_path / "found", *wrong) == 0
-    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (2, 5)
+    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json")]) in (
+        2,
+        5,
+    )
 
 
 def test_other_topics_are_unchanged_and_images_left_out(bag, found):
@@ -133,11 +143,15 @@ def unchanged(number, message):
 
 def compressed(number, message):
     file = io.BytesIO()
-    Image.fromarray(message.data.reshape(message.height, message.width)).save(file, "PNG")
+    Image.fromarray(message.data.reshape(message.height, message.width)).save(
+        file, "PNG"
+    )
     kind = store_with(IMAGE_TYPES["compressed"]).types[IMAGE_TYPES["compressed"]]
     return bytes_of(
         kind(
-            message.header, "mono8; png compressed mono8", np.frombuffer(file.getvalue(), np.uint8)
+            message.header,
+            "mono8; png compressed mono8",
+            np.frombuffer(file.getvalue(), np.uint8),
         ),
         IMAGE_TYPES["compressed"],
     )
@@ -170,7 +184,8 @@ def spoilt(number, message):
     if number == 11:
         message.header.stamp = STAMPS[number - 1]
     if number == 14:
-        message.header.stamp.sec += 10**6  # this one's own stamp is wrong, and no other's
+        # this one's own stamp is wrong, and no other's
+        message.header.stamp.sec += 10**6
     if number == 13:
         message.data = np.full_like(message.data, 200)
     return bytes_of(message)
@@ -201,11 +216,17 @@ def test_bad_images_give_one_line_each_and_lose_nothing_else(bag, tmp_path, caps
     "arguments, code, line",
     [
         (["--pixel-size", "0"], 2, "pixel_size: is not set; give it in m"),
-        (["--mark-size", "2e-6"], 2, "mark_size: 0.667 pixels; a mark has 6 to 2000 pixels"),
+        (
+            ["--mark-size", "2e-6"],
+            2,
+            "mark_size: 0.667 pixels; a mark has 6 to 2000 pixels",
+        ),
         (["--namespace", "other"], 4, "no topic stage/image or stage/image/compressed"),
     ],
 )
-def test_impossible_requests_end_with_one_line(bag, tmp_path, capsys, arguments, code, line):
+def test_impossible_requests_end_with_one_line(
+    bag, tmp_path, capsys, arguments, code, line
+):
     assert detect(bag, tmp_path / "found", *arguments) == code
     [printed] = capsys.readouterr().err.splitlines()
     assert line in printed
@@ -252,8 +273,12 @@ def test_topics_of_foreign_types_are_kept(bag, tmp_path):
         writer = mcap.writer.Writer(file)
         writer.start("ros2")
         schema = writer.register_schema("odd_msgs/msg/Odd", "ros2msg", b"float64 x")
-        odd = writer.register_channel("/odd", "cdr", schema, {"offered_qos_profiles": ": : ["})
-        text = store_with(IMAGE_TYPES["raw"]).generate_msgdef(IMAGE_TYPES["raw"], ros_version=2)[0]
+        odd = writer.register_channel(
+            "/odd", "cdr", schema, {"offered_qos_profiles": ": : ["}
+        )
+        text = store_with(IMAGE_TYPES["raw"]).generate_msgdef(
+            IMAGE_TYPES["raw"], ros_version=2
+        )[0]
         image = writer.register_channel(
             "/stage/image",
             "cdr",
@@ -287,7 +312,9 @@ def files(tmp_path_factory):
         )
         == 0
     )
-    assert main(["solve", str(folder / "found"), "-o", str(folder / "R.json"), "--force"]) in (0, 5)
+    assert main(
+        ["solve", str(folder / "found"), "-o", str(folder / "R.json"), "--force"]
+    ) in (0, 5)
     return folder
 
 
@@ -303,17 +330,24 @@ def test_a_folder_of_files_gives_the_detections_of_the_bag(found, files):
             stamp = store_with(kind).deserialize_cdr(data, kind).header.stamp
             assert stamp.sec * 10**9 + stamp.nanosec == time
     with (files / "found" / "metadata.yaml").open() as file:
-        topics = yaml.safe_load(file)["rosbag2_bagfile_information"]["topics_with_message_count"]
+        topics = yaml.safe_load(file)["rosbag2_bagfile_information"][
+            "topics_with_message_count"
+        ]
     latched = [
         one["topic_metadata"]["name"]
         for one in topics
         if "transient_local" in str(one["topic_metadata"]["offered_qos_profiles"])
     ]
     assert latched == [f"/{COMMAND_TOPIC}"]
-    result, truth = read_json(files / "R.json"), read_json(files / "pictures" / "truth.json")
+    result, truth = (
+        read_json(files / "R.json"),
+        read_json(files / "pictures" / "truth.json"),
+    )
     for axis in ("gx", "gy"):
         away = np.array(result["error_map"][axis], float) - truth[axis]
-        assert (np.abs(away) < 5 * np.array(result["error_map"][f"u_{axis}"], float)).all()
+        assert (
+            np.abs(away) < 5 * np.array(result["error_map"][f"u_{axis}"], float)
+        ).all()
 
 
 def test_the_times_of_files_are_those_of_the_table_and_unknown_without(files, tmp_path):
@@ -341,7 +375,9 @@ def test_the_times_of_files_are_those_of_the_table_and_unknown_without(files, tm
         )
         == 0
     )
-    assert main(["solve", str(tmp_path / "timed"), "-o", str(tmp_path / "R.json"), "--force"]) in (
+    assert main(
+        ["solve", str(tmp_path / "timed"), "-o", str(tmp_path / "R.json"), "--force"]
+    ) in (
         0,
         5,
     )
@@ -370,7 +406,10 @@ def own_values(data):
         ("file,view,x,y\na.png,shift,nan,0\n", ":2: 'nan' is not a position"),
         ("file,view,x,y\na.png,,0,0\n", ":2: an empty cell"),
         ("\ufefffile,view,x,y\r\na.png,,0,0\r\n", ":2: an empty cell"),
-        ("file,view,x,y\na.png,shift,0,0\n#\na.png,shift,0,0\n", ":4: a.png is in line 2 as well"),
+        (
+            "file,view,x,y\na.png,shift,0,0\n#\na.png,shift,0,0\n",
+            ":4: a.png is in line 2 as well",
+        ),
         (
             "file,view,x,y,time\na.png,shift,0,0,2026-11-21T09:30:00\n",
             ":2: '2026-11-21T09:30:00' is not a time with its zone; "
@@ -427,12 +466,18 @@ def test_a_table_without_rows_is_no_data(tmp_path, capsys):
         )
         == 4
     )
-    assert "p.csv: no row below the heading; give one for each image" in capsys.readouterr().err
+    assert (
+        "p.csv: no row below the heading; give one for each image"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "found").exists()
 
 
 def test_damaged_files_are_one_line_each(files, tmp_path, capsys):
-    folder, plan = shutil.copytree(files / "pictures", tmp_path / "p"), files / "plan.yaml"
+    folder, plan = (
+        shutil.copytree(files / "pictures", tmp_path / "p"),
+        files / "plan.yaml",
+    )
     images = sorted(folder.glob("*.png"))
     images[4].write_bytes(b"no image")
     Image.fromarray(np.zeros((50, 60), np.uint8)).save(images[6])
@@ -448,12 +493,23 @@ def test_damaged_files_are_one_line_each(files, tmp_path, capsys):
         == 0
     )
     damaged, other_size = capsys.readouterr().err.splitlines()
-    assert f"{images[4].name}: not an image of a known kind, or damaged; give PNG" in damaged
-    assert f"{images[6].name}: 60 x 50 pixels, but earlier images have 72 x 64" in other_size
+    assert (
+        f"{images[4].name}: not an image of a known kind, or damaged; give PNG"
+        in damaged
+    )
+    assert (
+        f"{images[6].name}: 60 x 50 pixels, but earlier images have 72 x 64"
+        in other_size
+    )
 
 
-def test_a_table_of_files_that_are_not_there_is_refused_with_its_line(files, tmp_path, capsys):
-    folder, plan = shutil.copytree(files / "pictures", tmp_path / "p"), files / "plan.yaml"
+def test_a_table_of_files_that_are_not_there_is_refused_with_its_line(
+    files, tmp_path, capsys
+):
+    folder, plan = (
+        shutil.copytree(files / "pictures", tmp_path / "p"),
+        files / "plan.yaml",
+    )
     images = sorted(folder.glob("*.png"))
     for image in images[2:4]:
         image.unlink()
@@ -469,18 +525,29 @@ def test_a_table_of_files_that_are_not_there_is_refused_with_its_line(files, tmp
         == 4
     )
     (line,) = capsys.readouterr().err.splitlines()
-    assert f"positions.csv:4: {images[2].name} is not in {folder} (2 of 140 files are not)" in line
+    assert (
+        f"positions.csv:4: {images[2].name} is not in {folder} (2 of 140 files are not)"
+        in line
+    )
     assert not (tmp_path / "found").exists()
 
 
 def test_positions_without_a_plan_are_refused(bag, tmp_path, capsys):
     assert detect(bag, tmp_path / "found", "--positions", "p.csv") == 2
-    assert "--positions: the plan is missing; give --plan PLAN.yaml" in capsys.readouterr().err
+    assert (
+        "--positions: the plan is missing; give --plan PLAN.yaml"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_cell_without_a_camera_has_no_png_files(tmp_path, capsys):
     (tmp_path / "sim.yaml").write_text(SIM.partition("camera:")[0])
-    assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "p"), "--png"]) == 2
+    assert (
+        main(
+            ["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "p"), "--png"]
+        )
+        == 2
+    )
     assert "the cell has no camera" in capsys.readouterr().err
 
 
@@ -501,7 +568,9 @@ camera: {width: 144, height: 144, pixel_size: 4.0e-6, mark_size: 60.0e-6, turn: 
 def test_images_of_nine_marks_give_the_map_from_two_views(tmp_path):
     """A camera turned by a quarter, with 1 % distortion in the corners."""
     (tmp_path / "sim.yaml").write_text(SEVERAL)
-    assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "bag")]) == 0
+    assert (
+        main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "bag")]) == 0
+    )
     assert (
         main(
             [
@@ -519,11 +588,16 @@ def test_images_of_nine_marks_give_the_map_from_two_views(tmp_path):
         )
         == 0
     )
-    assert main(["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"), "--force"]) in (
+    assert main(
+        ["solve", str(tmp_path / "found"), "-o", str(tmp_path / "R.json"), "--force"]
+    ) in (
         0,
         5,
     )
-    result, truth = read_json(tmp_path / "R.json"), read_json(tmp_path / "bag" / "truth.json")
+    result, truth = (
+        read_json(tmp_path / "R.json"),
+        read_json(tmp_path / "bag" / "truth.json"),
+    )
     assert result["observability"]["identifiable"] and result["rejected"] == {}
     for axis in ("gx", "gy"):
         away = np.array(result["error_map"][axis], float) - truth[axis]
@@ -538,10 +612,15 @@ def test_images_of_nine_marks_give_the_map_from_two_views(tmp_path):
             r"no dark disc of 10 px was found.*; what repeats is (19|20)[.\d]* "
             r"px, dark; try --mark-size (5\.[89]|6|6\.1)e-05$",
         ),
-        (["--polarity", "bright"], r"no bright disc of 20 px was found.*; try --polarity dark$"),
+        (
+            ["--polarity", "bright"],
+            r"no bright disc of 20 px was found.*; try --polarity dark$",
+        ),
     ],
 )
-def test_images_without_the_mark_say_what_they_show_instead(bag, tmp_path, capsys, options, said):
+def test_images_without_the_mark_say_what_they_show_instead(
+    bag, tmp_path, capsys, options, said
+):
     assert detect(bag, tmp_path / "found", *options) == 4
     (line,) = capsys.readouterr().err.splitlines()
     assert re.search(said, line), line
@@ -555,7 +634,9 @@ def test_images_with_nothing_in_them_are_refused(bag, tmp_path, capsys):
 
     rewritten(bag, tmp_path / "flat", flat)
     assert detect(tmp_path / "flat", tmp_path / "found") == 4
-    assert "nothing repeats in them; check exposure and focus" in capsys.readouterr().err
+    assert (
+        "nothing repeats in them; check exposure and focus" in capsys.readouterr().err
+    )
 
 
 def test_a_bag_none_of_whose_images_can_be_used_is_refused(bag, tmp_path, capsys):
@@ -579,7 +660,12 @@ def test_images_are_drawn_with_what_was_found_and_what_was_rejected(bag, tmp_pat
         return bytes_of(message)
 
     rewritten(bag, tmp_path / "dirty", dirty)
-    assert detect(tmp_path / "dirty", tmp_path / "found", "--draw", str(tmp_path / "drawn")) == 0
+    assert (
+        detect(
+            tmp_path / "dirty", tmp_path / "found", "--draw", str(tmp_path / "drawn")
+        )
+        == 0
+    )
     pictures = sorted((tmp_path / "drawn").glob("*.png"))
     assert len(pictures) == 20
     colours = []

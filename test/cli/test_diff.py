@@ -48,12 +48,19 @@ def files(tmp_path):
 
 def test_both_maps_and_their_difference_are_drawn(files, tmp_path, capsys, monkeypatch):
     drawn = []
-    monkeypatch.setattr(paper, "save_picture", lambda picture, path: drawn.append(picture))
+    monkeypatch.setattr(
+        paper, "save_picture", lambda picture, path: drawn.append(picture)
+    )
     assert main(["diff", *files, "--plot", str(tmp_path / "d.svg")]) == 0
     [picture] = drawn
     text = [item.text for item in picture.items if hasattr(item, "text")]
-    assert picture.says == "verdict: not significant, the maps agree within their uncertainties"
-    assert [line for line in text if line in ("A", "B, in the datum of A", "B − A")] == [
+    assert (
+        picture.says
+        == "verdict: not significant, the maps agree within their uncertainties"
+    )
+    assert [
+        line for line in text if line in ("A", "B, in the datum of A", "B − A")
+    ] == [
         "A",
         "B, in the datum of A",
         "B − A",
@@ -64,14 +71,19 @@ def test_both_maps_and_their_difference_are_drawn(files, tmp_path, capsys, monke
     difference = {"gx": found.dx, "gy": found.dy, "g_theta": found.d_theta}
     shown = []
     monkeypatch.setattr(
-        maps, "error_map", lambda result, **_: shown.append(result) or Drawing("", "", 10, 10)
+        maps,
+        "error_map",
+        lambda result, **_: shown.append(result) or Drawing("", "", 10, 10),
     )
     maps.difference_picture(a, b, difference, "")
     of_a, of_b, of_both = (result.error_map for result in shown)
     np.testing.assert_array_equal(of_a.gx, a.error_map.gx)
-    assert np.abs(of_b.gx - a.error_map.gx).max() < 1e-7  # without the micrometre of the datum
+    # without the micrometre of the datum
+    assert np.abs(of_b.gx - a.error_map.gx).max() < 1e-7
     np.testing.assert_array_equal(of_both.gy, found.dy)
-    np.testing.assert_array_equal(of_both.u_gx, np.hypot(a.error_map.u_gx, b.error_map.u_gx))
+    np.testing.assert_array_equal(
+        of_both.u_gx, np.hypot(a.error_map.u_gx, b.error_map.u_gx)
+    )
     assert main(["diff", *files, "--plot", files[0]]) == 2
     assert "would be overwritten" in capsys.readouterr().err
 
@@ -79,7 +91,11 @@ def test_both_maps_and_their_difference_are_drawn(files, tmp_path, capsys, monke
 def test_two_results_as_text_and_as_json(files, capsys):
     assert main(["diff", *files]) == 0
     text = capsys.readouterr().out
-    assert "translation (+1, " in text and "not significant" in text and "theta  rms" in text
+    assert (
+        "translation (+1, " in text
+        and "not significant" in text
+        and "theta  rms" in text
+    )
     assert main(["diff", *files, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (
@@ -93,9 +109,17 @@ def test_two_results_as_text_and_as_json(files, capsys):
     assert 0.005 < found["rms_um"] < found["max_um"] < 0.1
     assert found["significance_xy"]["correlated"] is True
     test = found["significance_xy"]
-    assert 1e-3 < test["p"] < 1 and len(found["dx"]) == 5 and found["significant"] is False
-    assert f"largest |z| {test['largest_z']:.2f}, limit {test['z_limit']:.2f}, p = " in text
-    assert f"Mahalanobis distance^2/dof {test['chi2_ratio']:.3f}, {test['dof']:.0f} dof" in text
+    assert (
+        1e-3 < test["p"] < 1 and len(found["dx"]) == 5 and found["significant"] is False
+    )
+    assert (
+        f"largest |z| {test['largest_z']:.2f}, limit {test['z_limit']:.2f}, p = "
+        in text
+    )
+    assert (
+        f"Mahalanobis distance^2/dof {test['chi2_ratio']:.3f}, {test['dof']:.0f} dof"
+        in text
+    )
     assert text.splitlines()[-1] == (
         "verdict: not significant, the maps agree within their uncertainties"
     )
@@ -104,14 +128,20 @@ def test_two_results_as_text_and_as_json(files, capsys):
 def test_plates_are_compared_as_the_stages_are(files, tmp_path, capsys):
     assert main(["diff", "--artifact", *files, "--plot", str(tmp_path / "d.svg")]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("B minus A, plates, datum difference removed: translation (+0, +0) µm")
+    assert text.startswith(
+        "B minus A, plates, datum difference removed: translation (+0, +0) µm"
+    )
     assert "the maps agree" in text and "theta  rms" in text
     assert "B − A" in (tmp_path / "d.svg").read_text()
     assert main(["diff", "--artifact", *files, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["significance_xy"]["correlated"] and found["significance_theta"]["correlated"]
+    assert (
+        found["significance_xy"]["correlated"]
+        and found["significance_theta"]["correlated"]
+    )
     a, b = (np.array(read_json(path)["artifact_map"]["ax"]) for path in files)
-    assert np.array(found["dx"]) == pytest.approx(b - a, abs=5e-8)  # less a turn and a scale
+    # less a turn and a scale
+    assert np.array(found["dx"]) == pytest.approx(b - a, abs=5e-8)
     assert main(["diff", files[0], files[1]]) == 0
     assert "translation (+1, " in capsys.readouterr().out
 
@@ -146,15 +176,22 @@ def test_the_grades_of_both_and_what_enlarged_them_are_shown(files, capsys):
     }
 
 
-def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(files, tmp_path, capsys):
+def test_maps_that_differ_and_maps_without_uncertainty_have_their_verdicts(
+    files, tmp_path, capsys
+):
     data = read_json(files[1])
     data["error_map"]["gy"][2][3] += 1e-6
     other = str(tmp_path / "other.json")
     write_json(other, with_digests(data))
     assert main(["diff", files[0], other]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == "verdict: significant, the maps differ in XY"
+    assert (
+        capsys.readouterr().out.splitlines()[-1]
+        == "verdict: significant, the maps differ in XY"
+    )
     for key in ("u_gx", "u_gy", "u_g_theta"):
-        data["error_map"][key] = plain(np.array(data["error_map"][key], dtype=float) * np.nan)
+        data["error_map"][key] = plain(
+            np.array(data["error_map"][key], dtype=float) * np.nan
+        )
     write_json(other, with_digests(data))
     assert main(["diff", files[0], other]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
@@ -184,9 +221,16 @@ def test_a_result_that_is_not_qualified_is_named(files, tmp_path, capsys):
             },
         },
     )
-    for arguments in ((files[0], bad), (bad, files[0]), (bad, laser), (files[0], bad, "--json")):
+    for arguments in (
+        (files[0], bad),
+        (bad, files[0]),
+        (bad, laser),
+        (files[0], bad, "--json"),
+    ):
         assert main(["diff", *arguments]) == 0
-        assert capsys.readouterr().err == f"selfcal diff: {bad}: Not qualified: because\n"
+        assert (
+            capsys.readouterr().err == f"selfcal diff: {bad}: Not qualified: because\n"
+        )
     assert main(["diff", *files]) == 0
     assert capsys.readouterr().err == ""
 
@@ -213,7 +257,11 @@ def test_keep_scale_is_for_maps_that_have_one(files, tmp_path, capsys):
             np.array(data["error_map"]["gy"]) + error * 0.01 * np.arange(-2, 3)
         ).tolist()
         if error:
-            data["reference"] = {"kind": "artifact", "relative_error": error, "u_relative": 1e-7}
+            data["reference"] = {
+                "kind": "artifact",
+                "relative_error": error,
+                "u_relative": 1e-7,
+            }
         write_json(files[number], with_digests(data))
     assert main(["diff", *files]) == 0
     assert "scale +50 µm/m" in capsys.readouterr().out
@@ -259,7 +307,9 @@ def test_result_against_the_laser(files, tmp_path, capsys):
     assert re.search(r"scale difference: \S+ and -2 µm/m, difference ", out)
     assert main(["diff", files[0], str(laser), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["nonorthogonality"]["laser"] == 1e-6 and found["grade"] == {"a": "good"}
+    assert found["nonorthogonality"]["laser"] == 1e-6 and found["grade"] == {
+        "a": "good"
+    }
     assert found["nonorthogonality"]["difference"] == pytest.approx(
         1e-6 - found["nonorthogonality"]["map"]
     )

@@ -30,7 +30,9 @@ X, Y = np.array([-25, -15, -5, 5, 15, 25]) * 1e-3, np.array([-15, -5, 5, 15]) * 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Two calibrations of one machine and plate, their results, and a view on another day."""
-    return two_and_a_view(tmp_path_factory.mktemp("even"), PLAN, (1, 2, 3), noise=NOISE, **MACHINE)
+    return two_and_a_view(
+        tmp_path_factory.mktemp("even"), PLAN, (1, 2, 3), noise=NOISE, **MACHINE
+    )
 
 
 def numbers(line):
@@ -40,7 +42,12 @@ def numbers(line):
 @pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
 @pytest.mark.parametrize("with_ids", [True, False])
 def test_a_bag_without_noise_gives_the_truth(tmp_path, sense, with_ids):
-    cell = {"with_ids": with_ids, "sense": sense, "servo_sigma": 0.0, "servo_sigma_theta": 0.0}
+    cell = {
+        "with_ids": with_ids,
+        "sense": sense,
+        "servo_sigma": 0.0,
+        "servo_sigma_theta": 0.0,
+    }
     simulate(tmp_path, "exact", PLAN, seed=5, cell=cell, truth={"phi": 1e-4})
     on_its_targets = 5  # where all offsets might have the other sign: not qualified
     assert (
@@ -57,7 +64,9 @@ def test_a_bag_without_noise_gives_the_truth(tmp_path, sense, with_ids):
         )
         == on_its_targets
     )
-    found, truth = (read_json(tmp_path / name) for name in ("r.json", "exact/truth.json"))
+    found, truth = (
+        read_json(tmp_path / name) for name in ("r.json", "exact/truth.json")
+    )
     for axis in ("gx", "gy"):
         difference = np.array(found["error_map"][axis]) - np.array(truth[axis])
         assert np.abs(difference).max() < 1e-12
@@ -67,14 +76,21 @@ def test_a_bag_without_noise_gives_the_truth(tmp_path, sense, with_ids):
 def test_tables_name_the_nodes_by_their_places(said):
     said("table", "one.json", "-o", "map.csv")
     rows = [line.split(",") for line in Path("map.csv").read_text().split()[1:25]]
-    assert [[int(cell) for cell in rows[at][:2]] for at in (0, -1)] == [[-3, -2], [2, 1]]
-    places = np.array([[float(cell) for cell in row[2:4]] for row in rows]).reshape(6, 4, 2)
+    assert [[int(cell) for cell in rows[at][:2]] for at in (0, -1)] == [
+        [-3, -2],
+        [2, 1],
+    ]
+    places = np.array([[float(cell) for cell in row[2:4]] for row in rows]).reshape(
+        6, 4, 2
+    )
     np.testing.assert_allclose(places[:, 0, 0], X, atol=1e-17)
     np.testing.assert_allclose(places[0, :, 1], Y, atol=1e-17)
     said("table", "one.json", "-o", "map.npz")
     gx = np.load("map.npz")["gx"]
     assert gx.shape == (6, 4)
-    assert [float(row[4]) for row in rows] == pytest.approx(gx.ravel().tolist(), rel=1e-12)
+    assert [float(row[4]) for row in rows] == pytest.approx(
+        gx.ravel().tolist(), rel=1e-12
+    )
 
 
 def test_tables_of_controllers_have_the_nodes_at_their_places(said):
@@ -84,7 +100,17 @@ def test_tables_of_controllers_have_the_nodes_at_their_places(said):
     assert {":START2D OFFSETROW=15", ":START2D OFFSETCOL=25"} <= set(lines)
     counts = ["--counts-per-unit", "1=1000", "--counts-per-unit", "2=1000"]
     for kind in ("kmotion", "pmac", "beckhoff", "linuxcnc", "siemens"):
-        said("export", kind, "one.json", "-o", f"{kind}.txt", "--unit", "mm", "--verify", *counts)
+        said(
+            "export",
+            kind,
+            "one.json",
+            "-o",
+            f"{kind}.txt",
+            "--unit",
+            "mm",
+            "--verify",
+            *counts,
+        )
     emap = read_json("one.json")["error_map"]
     gx, gy = np.array(emap["gx"]), np.array(emap["gy"])
     rows = [
@@ -126,7 +152,9 @@ def test_results_are_compared_combined_and_rechecked(said):
     found = json.loads(said("diff", "one.json", "two.json", "--json"))
     assert not found["significant"]
     said("combine", "one.json", "two.json", "-o", "mean.json")
-    assert said("recheck", "one.json", "again", "-o", "now.json").startswith("Still good: ")
+    assert said("recheck", "one.json", "again", "-o", "now.json").startswith(
+        "Still good: "
+    )
 
 
 def test_every_other_verb_takes_the_result(said):

@@ -47,11 +47,14 @@ def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
     assert out[: len(files)] == files and all(Path(file).is_file() for file in files)
     assert out[len(files)].startswith("residual true - commanded")
     assert out[len(files) + 7] == "to put it into use:" and all(
-        line.startswith(f"  {number}. ") for number, line in enumerate(out[len(files) + 8 :], 1)
+        line.startswith(f"  {number}. ")
+        for number, line in enumerate(out[len(files) + 8 :], 1)
     )
     before, after = map(float, out[len(files) + 1].split()[-2:])
     assert before > 0.1 and after < (
-        0.0001 if (len(files) == 1 and name != "siemens") or name == "beckhoff" else 0.99 * before
+        0.0001
+        if (len(files) == 1 and name != "siemens") or name == "beckhoff"
+        else 0.99 * before
     )
     assert run(line) == 2
     assert "the file exists" in capsys.readouterr().err
@@ -59,7 +62,9 @@ def test_files_are_written_tried_and_not_overwritten(capsys, name, files):
     found = json.loads(capsys.readouterr().out)
     assert [entry["file"] for entry in found["files"]] == files
     assert all(Path(entry["old_file"]).is_file() for entry in found["files"])
-    assert found["residuals"]["sites"]["after"]["rms"] == pytest.approx(1e-6 * after, abs=1e-12)
+    assert found["residuals"]["sites"]["after"]["rms"] == pytest.approx(
+        1e-6 * after, abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -94,7 +99,10 @@ def test_a_step_between_neighbours_that_is_not_plausible_is_asked_about(capsys, 
     ("name", "said"),
     [
         ("kmotion", ("Tool Setup, Trajectory Planner: enter t.txt",)),
-        ("pmac", ("send t.txt to the controller, then I51=1", "Mxx69 of motors 3 and 4")),
+        (
+            "pmac",
+            ("send t.txt to the controller, then I51=1", "Mxx69 of motors 3 and 4"),
+        ),
         (
             "beckhoff",
             (
@@ -128,7 +136,9 @@ def test_the_checklist_names_files_axes_and_the_place_to_look_at(capsys, name, s
     x, y, cx, cy = map(float, found.groups())
     if name in ("linuxcnc", "siemens"):
         return  # they hold a part of the map
-    c = 1e6 * (np.stack([MAP.gx, MAP.gy]) - np.stack([MAP.gx, MAP.gy])[:, 3, 2][:, None, None])
+    c = 1e6 * (
+        np.stack([MAP.gx, MAP.gy]) - np.stack([MAP.gx, MAP.gy])[:, 3, 2][:, None, None]
+    )
     i, j = np.unravel_index(np.hypot(*c).argmax(), MAP.gx.shape)
     assert (x, y) == (10 * (i - 2) - 10, 10 * (j - 2))
     assert (cx, cy) == pytest.approx(c[:, i, j], abs=1e-3)
@@ -145,7 +155,10 @@ def test_what_remains_is_said_before_the_table_of_linuxcnc_is_written(capsys):
         in err
         and f"of {before:.3g} um rms" in err
     )
-    rows = [list(map(float, row.split())) for row in Path("t_x.txt").read_text().splitlines()[:5]]
+    rows = [
+        list(map(float, row.split()))
+        for row in Path("t_x.txt").read_text().splitlines()[:5]
+    ]
     at, forward, _ = np.array(rows).T
     means = 1e3 * MAP.gx.mean(axis=1)
     at_zero = (means[2] + means[3]) / 2  # the zero is at x = 5 mm, between two columns
@@ -155,7 +168,11 @@ def test_what_remains_is_said_before_the_table_of_linuxcnc_is_written(capsys):
 
 
 def test_kmotion_is_in_inches_unless_told_otherwise(capsys):
-    assert run("kmotion R.json -o inch.txt") == run("kmotion R.json -o mm.txt --unit mm") == 0
+    assert (
+        run("kmotion R.json -o inch.txt")
+        == run("kmotion R.json -o mm.txt --unit mm")
+        == 0
+    )
     first = [
         float(line.split(",")[0])
         for line in (
@@ -169,7 +186,9 @@ def test_kmotion_is_in_inches_unless_told_otherwise(capsys):
 def test_onto_combines_with_the_active_table(capsys):
     assert run("kmotion R.json -o old.txt --unit mm") == 0
     assert run("kmotion R.json -o new.txt --unit mm --onto old.txt") == 0
-    old, new = (Path(name).read_text().splitlines()[3 + 12] for name in ("old.txt", "new.txt"))
+    old, new = (
+        Path(name).read_text().splitlines()[3 + 12] for name in ("old.txt", "new.txt")
+    )
     assert old.startswith("2,2,") and new.startswith("2,2,")
     g = [1e3 * MAP.gx[2, 2], 1e3 * MAP.gy[2, 2]]
     for column, value in zip((2, 3), g, strict=True):
@@ -187,11 +206,17 @@ def test_onto_combines_with_the_active_table(capsys):
             "--negate: the sense of kmotion is known; leave it out",
         ),
         ("siemens R.json -o t.txt --integers", "--integers: siemens needs none"),
-        ("pmac R.json -o t.txt --counts-per-unit 1=5", "--counts-per-unit: it is given for [1]"),
+        (
+            "pmac R.json -o t.txt --counts-per-unit 1=5",
+            "--counts-per-unit: it is given for [1]",
+        ),
         ("pmac R.json -o t.txt", "--counts-per-unit: PMAC's tables are in counts"),
         ("kmotion R.json -o R.json", "R.json: would be overwritten"),
         ("linuxcnc R.json -o t.txt --onto a", "a: no such file"),
-        ("siemens R.json -o t.txt --y-axis 1", "axes: the indices [1, 1] are not distinct"),
+        (
+            "siemens R.json -o t.txt --y-axis 1",
+            "axes: the indices [1, 1] are not distinct",
+        ),
     ],
 )
 def test_what_is_not_possible_is_one_line(capsys, line, message):
@@ -210,7 +235,8 @@ def test_integers_are_for_the_old_controller():
 
 def test_holes_are_filled_on_request_and_the_file_says_so(capsys):
     write_json(
-        "R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01), 3, unknown=((1, 1),))))
+        "R.json",
+        result_to_dict(result_of(random_map(Artifact(5, 0.01), 3, unknown=((1, 1),)))),
     )
     assert run("siemens R.json -o t.txt") == 2
     assert "1 sites are unknown" in capsys.readouterr().err
@@ -237,11 +263,16 @@ def test_not_qualified_is_code_5_and_not_identified_code_3(capsys):
         ),
     )
     assert run("kmotion R.json -o t.txt") == 5
-    assert "too noisy" in capsys.readouterr().err and "NOT QUALIFIED" in Path("t.txt").read_text()
+    assert (
+        "too noisy" in capsys.readouterr().err
+        and "NOT QUALIFIED" in Path("t.txt").read_text()
+    )
     write_json(
         "R.json",
         result_to_dict(
-            replace(found, observability=replace(found.observability, identifiable=False))
+            replace(
+                found, observability=replace(found.observability, identifiable=False)
+            )
         ),
     )
     assert run("kmotion R.json -o u.txt") == 3 and not Path("u.txt").exists()
@@ -252,10 +283,13 @@ def test_cal_export_combines_too(capsys):
     assert main(["cal", "export", "R.json", "-o", "new.cal", "--onto", "old.cal"]) == 0
     assert "replaces the table" in Path("new.cal").read_text()
     capsys.readouterr()
-    assert main(["cal", "verify", "R.json", "new.cal", "--onto", "old.cal", "--json"]) == 0
+    assert (
+        main(["cal", "verify", "R.json", "new.cal", "--onto", "old.cal", "--json"]) == 0
+    )
     sites = json.loads(capsys.readouterr().out)["sites"]
     assert sites["after"]["max"] < 1e-10 < 1e-7 < sites["before"]["max"]
-    assert main(["cal", "verify", "R.json", "new.cal", "--json"]) == 2  # twice the correction
+    # twice the correction
+    assert main(["cal", "verify", "R.json", "new.cal", "--json"]) == 2
     words = ["R.json", "-o", "n.cal", "--onto", "old.cal", "--y-axis", "3"]
     assert main(["cal", "export", *words]) == 2
     assert "it is for axes" in capsys.readouterr().err
@@ -289,5 +323,7 @@ def test_the_home_of_theta_is_in_degrees_of_the_stage(options, offset):
     write_json("T.json", result_to_dict(result_of(random_map(Artifact(5, 0.01, 8), 3))))
     words = f"cal export T.json -o t.cal --theta-axis 3 {options}".split()
     assert main(words) == 0
-    found = re.search(r"^:START\S* OFFSET=(\S+)$", Path("t_theta.cal").read_text(), re.M)
+    found = re.search(
+        r"^:START\S* OFFSET=(\S+)$", Path("t_theta.cal").read_text(), re.M
+    )
     assert float(found[1]) == offset

@@ -23,7 +23,9 @@ def test_the_help_has_five_lines_to_start_and_every_verb_in_its_group(capsys, wo
     except SystemExit as ended:
         assert ended.code == 0
     text, error = capsys.readouterr()
-    blocks = {block.splitlines()[0]: block.splitlines()[1:] for block in text.split("\n\n")}
+    blocks = {
+        block.splitlines()[0]: block.splitlines()[1:] for block in text.split("\n\n")
+    }
     assert not error and len(blocks["start here"]) == len(START_HERE) == 5
     for group in GROUPS:
         listed = {line.split()[0] for line in blocks[group] if line[2] != " "}
@@ -38,11 +40,15 @@ def test_help_of_a_verb_is_that_of_its_option(capsys):
             main(words)
         assert ended.value.code == 0
         shown.append(capsys.readouterr().out)
-    assert shown[0] == shown[1] and f"example:\n  {EXAMPLES['plan check']}\n" in shown[0]
+    assert (
+        shown[0] == shown[1] and f"example:\n  {EXAMPLES['plan check']}\n" in shown[0]
+    )
 
 
 def leaves(parser, words=()):
-    groups = [action for action in parser._actions if hasattr(action, "_name_parser_map")]
+    groups = [
+        action for action in parser._actions if hasattr(action, "_name_parser_map")
+    ]
     if not groups:
         yield " ".join(words), parser
     for group in groups:
@@ -55,7 +61,10 @@ def test_every_help_has_an_example_that_is_understood(verb):
     for words, leaf in leaves(build_parser(verb)):
         assert words in EXAMPLES, f"add '{words}' to EXAMPLES in cli/verbs.py"
         example = EXAMPLES[words]
-        assert example.startswith(f"selfcal {words} ") and f"\n  {example}\n" in leaf.format_help()
+        assert (
+            example.startswith(f"selfcal {words} ")
+            and f"\n  {example}\n" in leaf.format_help()
+        )
         build_parser(verb).parse_args(shlex.split(example)[1:])
         for word in shlex.split(example):
             assert not word.startswith(("config/", "bags/")) or (ROOT / word).exists()
@@ -63,10 +72,14 @@ def test_every_help_has_an_example_that_is_understood(verb):
 
 def test_verbs_are_registered_as_those_of_other_packages_are(tmp_path):
     subprocess.run(
-        [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", tmp_path], cwd=ROOT, check=True
+        [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", tmp_path],
+        cwd=ROOT,
+        check=True,
     )
     [folder] = tmp_path.iterdir()
-    registered = metadata.PathDistribution(folder).entry_points.select(group="selfcal.verbs")
+    registered = metadata.PathDistribution(folder).entry_points.select(
+        group="selfcal.verbs"
+    )
     assert {point.name: point.value for point in registered} == {
         name: module_of(name) for name in VERBS
     }
@@ -97,7 +110,9 @@ def test_another_package_adds_a_verb(capsys):
     assert main([]) == 0
     more = capsys.readouterr().out.partition("\nmore\n")[2]
     assert re.search(r"  hello +greet a stage \(package hello-verbs\)\n", more)
-    assert build_parser("solve").parse_args(["solve", "b"]).run.__module__ == module_of("solve")
+    assert build_parser("solve").parse_args(["solve", "b"]).run.__module__ == module_of(
+        "solve"
+    )
 
 
 def test_a_verb_of_this_package_looks_for_no_other(monkeypatch):
@@ -112,7 +127,9 @@ def test_a_narrow_terminal_breaks_lines_between_words():
 
 
 @pytest.mark.parametrize("closed", [{1}, {2}, {1, 2}, {0, 1, 2}])
-@pytest.mark.parametrize(("words", "code"), [("--version", 0), ("solve nothing.mcap", 2)])
+@pytest.mark.parametrize(
+    ("words", "code"), [("--version", 0), ("solve nothing.mcap", 2)]
+)
 def test_a_closed_stream_is_not_a_fault(tmp_path, closed, words, code):
     """The shell closes what `>&-` says; nothing else may take the place of a closed stream."""
     close = " ".join(f"{stream}{'<' if stream == 0 else '>'}&-" for stream in closed)
@@ -133,7 +150,9 @@ def test_nobody_reads_what_is_printed(words, code):
     reader, writer = os.pipe()
     os.close(reader)
     with open(writer, "wb", closefd=True) as pipe:
-        done = subprocess.run([*SELFCAL, *words.split()], stdout=pipe, stderr=pipe, check=False)
+        done = subprocess.run(
+            [*SELFCAL, *words.split()], stdout=pipe, stderr=pipe, check=False
+        )
     assert done.returncode == code
 
 
@@ -171,4 +190,6 @@ def test_a_line_that_does_not_fit_on_the_disk_leaves_the_exit_code():
 
 
 def test_every_verb_is_in_a_group():
-    assert all(isinstance(verb, Verb) and verb.group in GROUPS for verb in VERBS.values())
+    assert all(
+        isinstance(verb, Verb) and verb.group in GROUPS for verb in VERBS.values()
+    )

@@ -43,7 +43,12 @@ def test_points_are_commanded_with_the_error_added(capsys):
     )
     found = map(float, re.fullmatch(form, Path("out.nc").read_text()).groups())
     assert list(found) == pytest.approx(
-        [1e3 * MAP.gx[2, 2], 1e3 * MAP.gy[2, 2], 10 + 1e3 * MAP.gx[3, 2], 1e3 * MAP.gy[3, 2]],
+        [
+            1e3 * MAP.gx[2, 2],
+            1e3 * MAP.gy[2, 2],
+            10 + 1e3 * MAP.gx[3, 2],
+            1e3 * MAP.gy[3, 2],
+        ],
         abs=6e-7,
     )
 
@@ -61,7 +66,10 @@ def test_the_programs_zero_and_the_sense_of_the_axes(options, site, sign, capsys
 
 def test_the_json_has_the_program_and_the_unit_is_that_of_home_alone(capsys):
     Path("in.nc").write_text("G90 G21\nG0 X10 Y0\n")
-    assert run("in.nc R.json -o - --unit in --home-x 0.3937007874 --json --decimals 7") == 0
+    assert (
+        run("in.nc R.json -o - --unit in --home-x 0.3937007874 --json --decimals 7")
+        == 0
+    )
     word = json.loads(capsys.readouterr().out)["program"].splitlines()[4].split()[1]
     assert float(word[1:]) / 1e3 == pytest.approx(0.01 + MAP.gx[4, 2], abs=1e-9)
 
@@ -70,9 +78,18 @@ def test_the_json_has_the_program_and_the_unit_is_that_of_home_alone(capsys):
     ("line", "message"),
     [
         ("in.nc R.json -o in.nc", "in.nc: would be overwritten"),
-        ("in.nc R.json -o o.nc --tolerance 0", "--tolerance, --decimals: 0.0 um, 5; give"),
-        ("in.nc R.json -o o.nc --decimals 12", "--tolerance, --decimals: 1.0 um, 12; give"),
-        ("in.nc R.json -o o.nc --decimals 2", "--decimals: 2 round by more than 1 um; give more"),
+        (
+            "in.nc R.json -o o.nc --tolerance 0",
+            "--tolerance, --decimals: 0.0 um, 5; give",
+        ),
+        (
+            "in.nc R.json -o o.nc --decimals 12",
+            "--tolerance, --decimals: 1.0 um, 12; give",
+        ),
+        (
+            "in.nc R.json -o o.nc --decimals 2",
+            "--decimals: 2 round by more than 1 um; give more",
+        ),
         ("bad.nc R.json -o o.nc", "bad.nc:1: G92 is not in the list of codes"),
     ],
 )
@@ -85,13 +102,21 @@ def test_what_is_not_possible_is_one_line(capsys, line, message):
 
 
 @pytest.mark.parametrize(("gain", "um"), [(20, 0.05), (400, 1.0)])
-def test_the_path_is_within_the_tolerance_however_sharply_the_map_bends(gain, um, capsys):
+def test_the_path_is_within_the_tolerance_however_sharply_the_map_bends(
+    gain, um, capsys
+):
     """Errors of up to 0.2 mm that change from site to site, on ways across many cells."""
     bent = random_map(Artifact(11, 0.01), 4, gain=gain)
     write_json("R.json", result_to_dict(result_of(bent)))
     stage, worst = Compensator(bent), 0.0
-    for begin, end in [((-41, -33), (44, 39)), ((-45, 20), (43, 9)), ((12, -40), (-7, 44))]:
-        Path("in.nc").write_text(f"{SAID}G0 X{begin[0]} Y{begin[1]}\nG1 X{end[0]} Y{end[1]} F9\n")
+    for begin, end in [
+        ((-41, -33), (44, 39)),
+        ((-45, 20), (43, 9)),
+        ((12, -40), (-7, 44)),
+    ]:
+        Path("in.nc").write_text(
+            f"{SAID}G0 X{begin[0]} Y{begin[1]}\nG1 X{end[0]} Y{end[1]} F9\n"
+        )
         assert run(f"in.nc R.json -o - --decimals 7 --tolerance {um} --steep") == 0
         words = re.findall(r"X(\S+) Y(\S+)", capsys.readouterr().out)
         points = np.array(words, float) * 1e-3
@@ -111,7 +136,9 @@ def test_not_qualified_is_code_5(capsys):
         result_to_dict(
             replace(
                 result_of(MAP),
-                verdict=Verdict(Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."),
+                verdict=Verdict(
+                    Grade.NOT_QUALIFIED, sentence="Not qualified: too noisy."
+                ),
             )
         ),
     )
@@ -125,7 +152,9 @@ def test_a_dialect_must_be_named(capsys):
     assert left.value.code == 2 and "--dialect" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("end", "leaves"), [("20", False), ("20.001", True), ("-20.5", True)])
+@pytest.mark.parametrize(
+    ("end", "leaves"), [("20", False), ("20.001", True), ("-20.5", True)]
+)
 def test_moves_beyond_the_field_are_named(end, leaves, capsys):
     """The field is 40 mm wide."""
     Path("in.nc").write_text(f"{SAID}G0 X0 Y0\nG0 X{end}\n")

@@ -38,7 +38,9 @@ def write(path, *, day=0, bow_m=0.0, noise_m=1e-9, **changes):
     )
     result = calibrate(readings, Options())
     when = (BEGAN + timedelta(days=day)).isoformat()
-    result = replace(result, provenance=replace(result.provenance, first_exposure=when), **changes)
+    result = replace(
+        result, provenance=replace(result.provenance, first_exposure=when), **changes
+    )
     write_json(path, result_to_dict(result))
     return path
 
@@ -69,8 +71,11 @@ def test_calibrations_are_listed_in_the_order_of_their_measurement(folder, capsy
     first, second = found["entries"]
     assert first["not_compared"] is None and found["active"] is None
     assert second["changed"]
-    bow = 4e-7 * ((ARTIFACT.m / 2.0) ** 2 - 0.5)  # nothing but a shift is removed from it
-    assert second["change_rms_m"] == pytest.approx(np.sqrt(np.mean(bow**2) / 2), rel=0.02)
+    # nothing but a shift is removed from it
+    bow = 4e-7 * ((ARTIFACT.m / 2.0) ** 2 - 0.5)
+    assert second["change_rms_m"] == pytest.approx(
+        np.sqrt(np.mean(bow**2) / 2), rel=0.02
+    )
     assert second["change_max_m"] == pytest.approx(np.abs(bow).max(), rel=0.02)
     # each map has 5 nm of bending in its u; with nothing else it is 1.414 times 5 nm and more
     assert 7e-9 < second["u_change_rms_m"] < 1.4e-8
@@ -103,7 +108,9 @@ def test_without_drift_it_is_not_due_before_one_could_have_been_missed(folder, c
     drift = told(folder, capsys)["drift"]
     assert not drift["clear"]
     days = (datetime.fromisoformat(drift["due"]) - BEGAN).total_seconds() / 86400
-    assert days == pytest.approx(drift["limit_m"] / (2 * drift["u_per_day_m"]), abs=1e-3)
+    assert days == pytest.approx(
+        drift["limit_m"] / (2 * drift["u_per_day_m"]), abs=1e-3
+    )
 
 
 def test_the_folder_stands_for_its_active_map(folder, capsys, tmp_path):
@@ -113,7 +120,9 @@ def test_the_folder_stands_for_its_active_map(folder, capsys, tmp_path):
     points.write_text("x,y\n0.02,0.0\n")
     for name, source in (("a.json", "old.csv"), ("b.json", "new.csv")):
         assert main(["history", str(folder), "--activate", name]) == 0
-        assert main(["apply", str(folder), str(points), "-o", str(tmp_path / source)]) == 0
+        assert (
+            main(["apply", str(folder), str(points), "-o", str(tmp_path / source)]) == 0
+        )
         hands = Hands()
         CompensatingSession(settings_of("compensator", map=str(folder)), hands.ports)
         assert any(name in str(said) for said in hands.said)
@@ -124,7 +133,9 @@ def test_another_plate_is_not_compared(folder, capsys):
     write(folder / "a.json")
     other = read_result(folder / "a.json")
     artifact = replace(ARTIFACT, grid_pitch_m=0.02)
-    write(folder / "b.json", day=1, error_map=replace(other.error_map, artifact=artifact))
+    write(
+        folder / "b.json", day=1, error_map=replace(other.error_map, artifact=artifact)
+    )
     assert "pitches of" in told(folder, capsys)["entries"][1]["not_compared"]
 
 
@@ -141,7 +152,9 @@ def test_what_cannot_be_is_refused_in_a_line(folder, tmp_path, capsys):
     result = read_result(bad)
     write_json(
         bad,
-        result_to_dict(replace(result, verdict=replace(result.verdict, grade=Grade.NOT_QUALIFIED))),
+        result_to_dict(
+            replace(result, verdict=replace(result.verdict, grade=Grade.NOT_QUALIFIED))
+        ),
     )
     assert "is not qualified" in refused(folder, "--activate", "bad.json")
     assert "no such file" in refused(folder, "--activate", "c.json")

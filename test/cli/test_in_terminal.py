@@ -48,7 +48,9 @@ def test_examples_run_in_a_terminal():
     with desk() as folder:
         (folder / "stage.cal").unlink()
         (folder / "commands.json").write_text(json.dumps(lines))
-        code, said = in_terminal([sys.executable, "-c", ALL], columns=300, folder=folder)
+        code, said = in_terminal(
+            [sys.executable, "-c", ALL], columns=300, folder=folder
+        )
     assert code == 0, said[-3000:]
     assert "TERMINAL True True True" in said and "Traceback" not in said
     ended = re.findall(r"CODE (\d) (.*)\r\n", said)
@@ -66,7 +68,8 @@ def test_a_cell_is_brought_up_on_a_terminal_and_ends_by_its_key(tmp_path):
     plan = shlex.split(EXAMPLES["up"])[3]
     with desk():
         code, said = in_terminal(
-            [*SELFCAL, "up", "--plan", plan, "--simulate", "--results", str(tmp_path)], keys=b"q"
+            [*SELFCAL, "up", "--plan", plan, "--simulate", "--results", str(tmp_path)],
+            keys=b"q",
         )
     assert code == 0, said[-2000:]
     assert "Traceback" not in said

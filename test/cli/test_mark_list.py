@@ -53,24 +53,35 @@ def test_plates_are_compared_and_maps_combined(said):
     assert found["significance_xy"]["dof"] == 2 * 90 - 4 and not found["significant"]
     said("combine", "one.json", "two.json", "-o", "mean.json")
     both, one = (
-        np.array(read_json(f"{name}.json")["error_map"]["u_gx"]) for name in ("mean", "one")
+        np.array(read_json(f"{name}.json")["error_map"]["u_gx"])
+        for name in ("mean", "one")
     )
     assert np.nanmean(both / one) == pytest.approx(1.0, abs=0.35)
 
 
 def test_the_stage_is_rechecked_with_one_view_of_the_list(said):
-    assert said("recheck", "one.json", "again", "-o", "now.json").startswith("Still good: ")
+    assert said("recheck", "one.json", "again", "-o", "now.json").startswith(
+        "Still good: "
+    )
     found = read_json("now.json")["recheck"]
     assert found["p"] > 0.01 and found["detectable"]["smooth"] < found["u_rms"]
     assert 4 < found["detectable"]["one_node"] / found["u_rms"] < 8
 
 
 def test_two_marks_are_named_by_their_ids_as_the_reference(said):
-    pair = [MARKS.ids[np.argmin(sign * (np.array(MARKS.x_m) + MARKS.y_m))] for sign in (1, -1)]
+    pair = [
+        MARKS.ids[np.argmin(sign * (np.array(MARKS.x_m) + MARKS.y_m))]
+        for sign in (1, -1)
+    ]
     places = dict(zip(MARKS.ids, zip(MARKS.x_m, MARKS.y_m, strict=True), strict=True))
     length = math.dist(*(places[mark] for mark in pair)) * (1 + 5e-6)
     said(
-        "solve", "one", "--reference", f"marks:{pair[0]}:{pair[1]}:{length!r}:2e-8", "-o", "r.json"
+        "solve",
+        "one",
+        "--reference",
+        f"marks:{pair[0]}:{pair[1]}:{length!r}:2e-8",
+        "-o",
+        "r.json",
     )
     plate = read_json("r.json")
     ids, found = plate["artifact"]["marks"]["id"], plate["artifact_map"]
@@ -101,5 +112,7 @@ def test_its_map_is_exported_drawn_and_certified_as_any_other(said):
         said(*words)
     rows = [line.split(",") for line in Path("map.csv").read_text().split()[1:]]
     want = np.array(read_json("one.json")["error_map"]["gx"]).ravel()
-    assert [float(row[4]) for row in rows[:25]] == pytest.approx(want.tolist(), rel=1e-12)
+    assert [float(row[4]) for row in rows[:25]] == pytest.approx(
+        want.tolist(), rel=1e-12
+    )
     assert read_json("many/batch.json")["qualified"] == 2

@@ -22,17 +22,23 @@ LINES = PLAN.replace("angular_count: 0", "angular_count: 4")
 def test_from_the_plate_to_the_report_in_one_command(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     _, machine = write_cell(tmp_path, plan=LINES)
-    assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--json"]) == 0
+    assert (
+        main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--json"]) == 0
+    )
     out, err = capsys.readouterr()
     result = json.loads(out)
     assert "view 2 of 3 'rot90'" in err
     assert "9 of 9 marks, 4 of 4 lines" in err
     assert result == json.loads(Path("bag.json").read_text())
     assert Path("bag.html").is_file()
-    found = np.array([result["error_map"]["gx"], result["error_map"]["gy"]]).reshape(2, -1)
+    found = np.array([result["error_map"]["gx"], result["error_map"]["gy"]]).reshape(
+        2, -1
+    )
     true = machine.truth.g.reshape(2, -1)
     x, y = (index.ravel() for index in np.mgrid[-1:2, -1:2])
-    columns = np.array([[*(x * 0 + 1), *x * 0], [*x * 0, *(x * 0 + 1)], [*-y, *x], [*x, *y]]).T
+    columns = np.array(
+        [[*(x * 0 + 1), *x * 0], [*x * 0, *(x * 0 + 1)], [*-y, *x], [*x, *y]]
+    ).T
     away = (found - true).ravel()
     away -= columns @ np.linalg.lstsq(columns, away, rcond=None)[0]
     assert np.abs(away).max() < 2e-8 < 0.1 * np.ptp(true)
@@ -65,7 +71,11 @@ def test_a_run_that_is_killed_is_resumed_to_the_same_map(tmp_path):
 @pytest.mark.parametrize(
     ("words", "cell", "said"),
     [
-        (["--yes"], CELL.replace("robot", "person"), "--yes, but a person places the plate"),
+        (
+            ["--yes"],
+            CELL.replace("robot", "person"),
+            "--yes, but a person places the plate",
+        ),
         ([], CELL, "there is nobody to ask: it is not a terminal; give --yes"),
     ],
 )
@@ -140,7 +150,9 @@ def write_left_alone(folder, name, module):
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-def test_a_signal_stops_the_stage_and_keeps_the_bag(tmp_path, monkeypatch, capsys, name):
+def test_a_signal_stops_the_stage_and_keeps_the_bag(
+    tmp_path, monkeypatch, capsys, name
+):
     monkeypatch.chdir(tmp_path)
     write_left_alone(tmp_path, name, f"left_alone_{name}")
     with pytest.raises(SystemExit) as ended:
@@ -148,7 +160,10 @@ def test_a_signal_stops_the_stage_and_keeps_the_bag(tmp_path, monkeypatch, capsy
     assert ended.value.code == 128 + signal.Signals[name]
     assert "stopped; bag is kept, --resume continues" in capsys.readouterr().err
     assert Path("stopped.txt").exists()
-    assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"]) == 0
+    assert (
+        main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"])
+        == 0
+    )
 
 
 def test_a_stop_before_the_first_reading_names_no_bag(tmp_path, monkeypatch, capsys):

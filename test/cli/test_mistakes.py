@@ -9,7 +9,9 @@ from tools.mistakes import MISTAKES, wrong
 
 
 def test_every_mistake_is_answered():
-    assert len(MISTAKES) >= 83 and len({mistake.command for mistake in MISTAKES}) == len(MISTAKES)
+    assert len(MISTAKES) >= 83 and len(
+        {mistake.command for mistake in MISTAKES}
+    ) == len(MISTAKES)
     assert not wrong()
 
 

@@ -30,7 +30,12 @@ def folder(tmp_path_factory):
         "plan_id": "odd",
         "artifact": {"grid_size": 7, "grid_pitch": 0.01, "angular_count": 0},
         "views": [
-            {"name": name, "rotation_deg": turn, "translation_pitch": shift, "repeats": 2}
+            {
+                "name": name,
+                "rotation_deg": turn,
+                "translation_pitch": shift,
+                "repeats": 2,
+            }
             for name, (turn, shift) in VIEWS.items()
         ],
     }
@@ -83,10 +88,18 @@ def test_no_reason_is_cut(folder, monkeypatch, capsys):
         assert f">{cell}</td>" in page
     assert f"failed: {reason}" in page
     capsys.readouterr()
-    assert main(["cal", "export", "r.json", "-o", "t.cal", "--x-axis", "1", "--y-axis", "2"]) == 0
+    assert (
+        main(
+            ["cal", "export", "r.json", "-o", "t.cal", "--x-axis", "1", "--y-axis", "2"]
+        )
+        == 0
+    )
     assert f"because: {to_ascii(reason)}" in "\n".join(load_cal("t.cal").comments)
     capsys.readouterr()
     assert main(["diff", "r.json", "r.json"]) == 0
-    assert capsys.readouterr().err.splitlines() == [f"selfcal diff: r.json: {sentence}"] * 2
+    assert (
+        capsys.readouterr().err.splitlines()
+        == [f"selfcal diff: r.json: {sentence}"] * 2
+    )
     (record,) = json.loads(Path("batch/batch.json").read_text())["records"]
     assert record["message"] == sentence

@@ -50,7 +50,9 @@ def machine_of(options, **kwargs):
 
 def measured(machine, table):
     """Write what a calibration finds while a table is active, without noise."""
-    points = np.stack(np.meshgrid(*machine.nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = np.stack(np.meshgrid(*machine.nodes, indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
     gx, gy = (machine.shown(points, table) - points).T.reshape(2, *PLATE.shape)
     write_json("R.json", result_to_dict(result_of(replace(G, gx=gx, gy=gy))))
 
@@ -113,7 +115,12 @@ ACTIVE = {
 }
 
 
-PAIRS = [(w, a) for w in range(len(WIRED)) for a, _ in enumerate(ACTIVE) if (w + 2 * a) % 5 < 2]
+PAIRS = [
+    (w, a)
+    for w in range(len(WIRED))
+    for a, _ in enumerate(ACTIVE)
+    if (w + 2 * a) % 5 < 2
+]
 """Each wiring with two of the tables, each table with two of the wirings."""
 
 
@@ -132,7 +139,11 @@ def test_a_replaced_table_leaves_the_rounding_of_its_digits(
     monkeypatch.chdir(tmp_path)
     units = ["mm", "um", "m", *(["in"] if name != "cal" else [])]
     unit = units[(wired + active) % len(units)]
-    plate, *texts = [*ACTIVE.values()][active][0], WIRED[wired], [*ACTIVE.values()][active][1]
+    plate, *texts = (
+        [*ACTIVE.values()][active][0],
+        WIRED[wired],
+        [*ACTIVE.values()][active][1],
+    )
     options, moved = (options_of(text, unit) for text in texts)
     options += f" --unit {unit}"
     machine = machine_of(options, emap=sayable(name, G))
@@ -142,7 +153,9 @@ def test_a_replaced_table_leaves_the_rounding_of_its_digits(
             f" --counts-per-unit {axis}={counts[0]!r}"
             for axis in ((3, 1) if "axis" in options else (1, 2))
         )
-    subtract = {"subtract": True} if name in ("beckhoff", "siemens") and wired % 2 else {}
+    subtract = (
+        {"subtract": True} if name in ("beckhoff", "siemens") and wired % 2 else {}
+    )
     more = [*options.split(), *(["--negate"] if subtract else [])]
     verb = ["cal", "export"] if name == "cal" else ["export", name]
 
@@ -153,7 +166,10 @@ def test_a_replaced_table_leaves_the_rounding_of_its_digits(
             [path.read_text() for path in files], counts, **unit, **subtract
         )
 
-    write_json("Old.json", result_to_dict(result_of(sayable(name, random_map(plate, 5, gain=20)))))
+    write_json(
+        "Old.json",
+        result_to_dict(result_of(sayable(name, random_map(plate, 5, gain=20)))),
+    )
     assert main([*verb, "Old.json", "-o", "old.txt", *more, *moved.split()]) == 0
     files, old = machine_s("old")
     measured(machine, old)
@@ -166,23 +182,38 @@ def test_a_replaced_table_leaves_the_rounding_of_its_digits(
     assert machine.off(new, between=True) < bound
     assert machine.off(new, sense=-1) > 1e-6
     assert main([*verb, "R.json", "-o", "alone.txt", *more]) == 0
-    assert machine.off(machine_s("alone")[1]) > 1e-6  # what the old one corrected is lost
+    # what the old one corrected is lost
+    assert machine.off(machine_s("alone")[1]) > 1e-6
     capsys.readouterr()
 
 
 @pytest.mark.parametrize("verb", [["export", "kmotion"], ["cal", "export"]])
-def test_a_table_that_does_not_fit_is_refused_as_such(tmp_path, monkeypatch, capsys, verb):
+def test_a_table_that_does_not_fit_is_refused_as_such(
+    tmp_path, monkeypatch, capsys, verb
+):
     """Of KMotion beyond a field of 40 um; of .cal with a wrong unit of corrections."""
     monkeypatch.chdir(tmp_path)
     write_json("R.json", result_to_dict(result_of(random_map(Artifact(5, 0.01), 3))))
-    write_json("S.json", result_to_dict(result_of(random_map(Artifact(5, 1e-5), 4, gain=0.5))))
+    write_json(
+        "S.json", result_to_dict(result_of(random_map(Artifact(5, 1e-5), 4, gain=0.5)))
+    )
     assert (
-        main([*verb, "S.json", "-o", "small", *(["--unit", "mm"] if "kmotion" in verb else [])])
+        main(
+            [
+                *verb,
+                "S.json",
+                "-o",
+                "small",
+                *(["--unit", "mm"] if "kmotion" in verb else []),
+            ]
+        )
         == 0
     )
     if "cal" in verb:
         text = Path("small").read_text().replace("PRIMARY/1000", "PRIMARY/0.01")
-        Path("small").write_text(text.replace("2D 2 1 1 2 0.01 0.01", "2D 2 1 1 2 10 10"))
+        Path("small").write_text(
+            text.replace("2D 2 1 1 2 0.01 0.01", "2D 2 1 1 2 10 10")
+        )
     capsys.readouterr()
     assert (
         main(

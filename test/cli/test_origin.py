@@ -30,7 +30,10 @@ def shelf(tmp_path_factory):
     shutil.copytree(ROOT / "bags/hu_noise", folder / "bag")
     shutil.copy(ROOT / "config/certificates/details.yaml", folder)
     (folder / "in.nc").write_text("%\n(part)\nG21 G90\nG0 X1 Y2\n")
-    assert main(["solve", str(folder / "bag"), "--quiet", "-o", str(folder / "r.json")]) == 0
+    assert (
+        main(["solve", str(folder / "bag"), "--quiet", "-o", str(folder / "r.json")])
+        == 0
+    )
     return folder
 
 
@@ -60,5 +63,10 @@ def test_comments_of_a_program_fit_into_the_lines_of_linuxcnc(here):
     long = here / ("x" * 120) / ("y" * 120) / "é.json"
     long.parent.mkdir(parents=True)
     shutil.copy("r.json", long)
-    assert main(["gcode", "in.nc", str(long), "-o", "g.nc", "--dialect", "linuxcnc"]) == 0
-    assert all(len(line) < 256 and line.isascii() for line in Path("g.nc").read_text().splitlines())
+    assert (
+        main(["gcode", "in.nc", str(long), "-o", "g.nc", "--dialect", "linuxcnc"]) == 0
+    )
+    assert all(
+        len(line) < 256 and line.isascii()
+        for line in Path("g.nc").read_text().splitlines()
+    )

@@ -63,11 +63,20 @@ def test_every_shipped_plan_is_what_its_name_says(path, capsys):
     assert found["identifiable"] is not deficient
     assert (found["deficiency"] > 0) is deficient
     assert bool(found["modes"]) is deficient and bool(found["advice"]) is deficient
-    assert found["unchecked_sites"] == found["unchecked_lines"] == (None if deficient else 0)
+    assert (
+        found["unchecked_sites"]
+        == found["unchecked_lines"]
+        == (None if deficient else 0)
+    )
     if deficient:
         assert found["predicted"] is None
     else:
-        assert 0.2 < found["predicted"]["rms_gain_xy"] < found["predicted"]["max_gain_xy"] < 1.5
+        assert (
+            0.2
+            < found["predicted"]["rms_gain_xy"]
+            < found["predicted"]["max_gain_xy"]
+            < 1.5
+        )
 
 
 def test_check_as_json_has_the_keys_of_the_contract(capsys):
@@ -76,8 +85,14 @@ def test_check_as_json_has_the_keys_of_the_contract(capsys):
     assert (found["rank"], found["unknowns"], found["deficiency"]) == (493, 493, 0)
     assert found["predicted"]["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)
     assert found["predicted"]["rms_gain_theta"] == pytest.approx(0.677, abs=5e-4)
-    assert len(found["predicted"]["u_gx"]) == 11 and len(found["predicted"]["u_g_theta"]) == 24
-    assert main(["plan", "check", shipped("hu"), "--json", "--theta-datum", "xy_axes"]) == 0
+    assert (
+        len(found["predicted"]["u_gx"]) == 11
+        and len(found["predicted"]["u_g_theta"]) == 24
+    )
+    assert (
+        main(["plan", "check", shipped("hu"), "--json", "--theta-datum", "xy_axes"])
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)
     assert found["predicted"]["rms_gain_theta"] == pytest.approx(0.752, abs=5e-4)
     assert main(["plan", "check", shipped("qiao"), "--json"]) == 0
@@ -85,7 +100,9 @@ def test_check_as_json_has_the_keys_of_the_contract(capsys):
 
 
 def test_check_tells_what_nothing_checks(tmp_path, capsys):
-    text = Path(shipped("hu")).read_text().replace("size: 11", "size: 11, grid_size_y: 5")
+    text = (
+        Path(shipped("hu")).read_text().replace("size: 11", "size: 11, grid_size_y: 5")
+    )
     (tmp_path / "long.yaml").write_text(text)
     assert main(["plan", "check", str(tmp_path / "long.yaml")]) == 0
     assert (
@@ -98,7 +115,10 @@ def test_check_in_words(capsys):
     assert main(["plan", "check", shipped("deficient_shifts")]) == 3
     text = capsys.readouterr().out
     assert "rank 491 of 493 unknowns, 2 undetermined modes" in text
-    assert "  - non-orthogonality of the axes" in text and "  - add a view turned by 90 deg" in text
+    assert (
+        "  - non-orthogonality of the axes" in text
+        and "  - add a view turned by 90 deg" in text
+    )
     assert main(["plan", "check", shipped("hu"), "--map"]) == 0
     text = capsys.readouterr().out
     assert "XY     rms 0.8905   largest 1.2154" in text and "theta  rms 0.6766" in text
@@ -126,15 +146,23 @@ def test_nodes_that_stay_unknown_are_counted(tmp_path, capsys):
     assert (found["unknown_sites"], found["deficiency"]) == (36, 0)
     assert found["predicted"]["rms_gain_xy"] == pytest.approx(2.010, abs=1e-3)
     assert main(["plan", "check", path]) == 0
-    assert "at 45 of 81 nodes of the map: the other 36 remain unknown" in capsys.readouterr().out
+    assert (
+        "at 45 of 81 nodes of the map: the other 36 remain unknown"
+        in capsys.readouterr().out
+    )
     assert main(["simulate", str(tmp_path / "spec.yaml"), "-o", bag]) == 0
     assert main(["solve", bag, "-o", out, "--model", "none"]) == 0
     assert "Calibrated at 45 of 81 sites from 3 views" in capsys.readouterr().out
-    assert np.isnan(np.array(read_json(out)["error_map"]["gx"], dtype=float)).sum() == 36
+    assert (
+        np.isnan(np.array(read_json(out)["error_map"]["gx"], dtype=float)).sum() == 36
+    )
 
 
 def test_check_judges_every_term(capsys):
-    assert main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma", "20nm"]) == 0
+    assert (
+        main(["plan", "check", shipped("hu_repeated"), "--json", "--sigma", "20nm"])
+        == 0
+    )
     found = json.loads(capsys.readouterr().out)
     terms = {term["name"]: term for term in found["terms"]}
     assert list(terms) == [
@@ -155,10 +183,16 @@ def test_check_judges_every_term(capsys):
         "effect_max_m",
         "power",
     } < set(terms["drift"])
-    assert (terms["plate_shape"]["told"], terms["plate_shape"]["unseen_modes"]) == (False, 7)
+    assert (terms["plate_shape"]["told"], terms["plate_shape"]["unseen_modes"]) == (
+        False,
+        7,
+    )
     assert terms["drift"]["told"] is True and terms["drift"]["unit"] == "m"
     assert terms["plate_shape"]["effect_rms_m"] == pytest.approx(31.66e-9, abs=1e-11)
-    assert found["predicted"]["rms_gain_xy_with_terms"] == found["predicted"]["rms_gain_xy"]
+    assert (
+        found["predicted"]["rms_gain_xy_with_terms"]
+        == found["predicted"]["rms_gain_xy"]
+    )
     # half the noise notices more; an effect does not depend on noise, and grows with its size
     assert (
         main(
@@ -175,9 +209,13 @@ def test_check_judges_every_term(capsys):
         )
         == 0
     )
-    other = {term["name"]: term for term in json.loads(capsys.readouterr().out)["terms"]}
+    other = {
+        term["name"]: term for term in json.loads(capsys.readouterr().out)["terms"]
+    }
     assert other["approach"]["power"] > terms["approach"]["power"]
-    assert other["approach"]["effect_rms_m"] == pytest.approx(terms["approach"]["effect_rms_m"])
+    assert other["approach"]["effect_rms_m"] == pytest.approx(
+        terms["approach"]["effect_rms_m"]
+    )
     assert other["plate_shape"]["effect_rms_m"] == pytest.approx(
         2 * terms["plate_shape"]["effect_rms_m"]
     )
@@ -192,7 +230,8 @@ def test_free_terms_that_a_plan_does_not_tell_are_refused(capsys, tmp_path):
     assert "  XY with drift: rms 0.8905   largest 1.2154\n" in text
     assert "  drift        free   yes" in text
     assert (
-        "assumed: order there_and_back; drifts of degree 1; 0.02 µm noise of one reading;" in text
+        "assumed: order there_and_back; drifts of degree 1; 0.02 µm noise of one reading;"
+        in text
     )
     assert main(["plan", "check", shipped("qiao"), *asked, "--drift-degree", "2"]) == 3
     text = capsys.readouterr().out
@@ -219,9 +258,18 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     asked = ["plan", "check", shipped("qiao"), "--placing", "0.02deg"]
     assert main([*asked, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["budget"]
-    assert (found["sigma_m"], found["sigma_rad"]) == (20e-9, pytest.approx(math.radians(1e-3)))
+    assert (found["sigma_m"], found["sigma_rad"]) == (
+        20e-9,
+        pytest.approx(math.radians(1e-3)),
+    )
     lines = {line["component"]: line for line in found["lines"]}
-    assert list(lines) == ["reading noise", "microscope", "plate_shape", "plate_strain", "drift"]
+    assert list(lines) == [
+        "reading noise",
+        "microscope",
+        "plate_shape",
+        "plate_strain",
+        "drift",
+    ]
     assert lines["drift"]["removal"]["text"].startswith("visit the marks in the order ")
     assert lines["plate_shape"]["removal"]["text"].startswith(
         "add an unturned view shifted by -1 pitch along X"
@@ -240,16 +288,22 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     assert found["U_xy"] == pytest.approx(
         2 * math.hypot(*(line["effect_rms"] for line in lines.values()))
     )
-    assert found["U_xy_noise"] == pytest.approx(2 * lines["reading noise"]["effect_rms"])
+    assert found["U_xy_noise"] == pytest.approx(
+        2 * lines["reading noise"]["effect_rms"]
+    )
     assert main(asked) == 0
     text = capsys.readouterr().out
     assert "%  add check_stops: {marks: 5, offset: 20e-6}: " in text
     larger = found["U_xy_if_larger"]
     assert 2 * found["U_xy"] < larger < 3 * found["U_xy"]
-    assert f"from noise alone 35.6 nm; {larger * 1e9:.3g} nm if all that is assumed" in text
+    assert (
+        f"from noise alone 35.6 nm; {larger * 1e9:.3g} nm if all that is assumed"
+        in text
+    )
     assert main([*asked, "--model", "none", "--json"]) == 0
     assert [
-        line["component"] for line in json.loads(capsys.readouterr().out)["budget"]["lines"]
+        line["component"]
+        for line in json.loads(capsys.readouterr().out)["budget"]["lines"]
     ] == ["reading noise"]
     # what the plan declares takes the place of the default; lines have a budget of their own
     assert (
@@ -274,7 +328,9 @@ def test_check_shows_what_is_assumed_and_what_removes_it(capsys):
     strain, circle = lines["xy", "plate_strain"], lines["theta", "line_eccentricity"]
     assert (strain["source"], strain["removal"]["kind"]) == ("declared", "certificate")
     assert strain["removal"]["text"].startswith("declare a smaller plate_strain:SIZE")
-    assert (circle["source"], circle["unit"]) == ("default", "rad") and circle["share"] > 0.9
+    assert (circle["source"], circle["unit"]) == ("default", "rad") and circle[
+        "share"
+    ] > 0.9
 
 
 def test_check_stops_are_a_next_step_where_the_microscope_costs_most(capsys, tmp_path):
@@ -304,11 +360,20 @@ def test_check_stops_are_a_next_step_where_the_microscope_costs_most(capsys, tmp
     assert first["text"] == "add check_stops: {marks: 5, offset: 20e-6}"
     assert (first["view"], first["visit_order"]) == (None, None)
     plan = plan_from_dict(read_yaml(out), "next")
-    assert {(view.check_marks, view.check_offset_m) for view in plan.views} == {(5, 20e-6)}
+    assert {(view.check_marks, view.check_offset_m) for view in plan.views} == {
+        (5, 20e-6)
+    }
 
 
 def test_an_order_that_is_cut_off_is_said(capsys):
-    asked = ["plan", "check", shipped("hu_repeated"), "--order", "x_back_y_back", "--repeats"]
+    asked = [
+        "plan",
+        "check",
+        shipped("hu_repeated"),
+        "--order",
+        "x_back_y_back",
+        "--repeats",
+    ]
     assert main([*asked, "3"]) == 0
     assert (
         "  the order x_back_y_back needs 4 repeats: it is truncated in the views 'identity', "
@@ -348,13 +413,28 @@ def test_a_plan_of_a_known_plate_leaves_open_whether_it_is_identified(capsys):
             "or a number and one of rad, mrad, urad, deg, arcsec",
         ),
         (["--placing", "0"], "--placing: '0' is not a positive angle"),
-        (["--drift-degree", "10"], "--drift-degree: 10 is not a degree of a drift; give 1 to 9"),
-        (["--drift-degree", "0"], "--drift-degree: 0 is not a degree of a drift; give 1 to 9"),
+        (
+            ["--drift-degree", "10"],
+            "--drift-degree: 10 is not a degree of a drift; give 1 to 9",
+        ),
+        (
+            ["--drift-degree", "0"],
+            "--drift-degree: 0 is not a degree of a drift; give 1 to 9",
+        ),
         (["--order", "spiral"], "--order: 'spiral' is not a visiting order"),
         (["--model", "creep"], "--model: the term 'creep' is unknown"),
-        (["--model", "yaw"], "model: yaw: no reading of this plan depends on it; leave it out"),
-        (["--model", "line_scale"], "model: line_scale: no reading of this plan depends on it"),
-        (["--against", "drift"], "--against: drift: a size is missing; write drift:SIZE"),
+        (
+            ["--model", "yaw"],
+            "model: yaw: no reading of this plan depends on it; leave it out",
+        ),
+        (
+            ["--model", "line_scale"],
+            "model: line_scale: no reading of this plan depends on it",
+        ),
+        (
+            ["--against", "drift"],
+            "--against: drift: a size is missing; write drift:SIZE",
+        ),
         (["--repeats", "0"], "--repeats: 0 is not positive; give 1 or more"),
     ],
 )
@@ -364,7 +444,9 @@ def test_bad_options_of_check(arguments, message, capsys):
     assert message in error and len(error.splitlines()) == 1
 
 
-@pytest.mark.parametrize("text", ["20e-9", "20nm", "20 nm", "0.02um", "0.02µm", "2e-5mm", "2E-8 m"])
+@pytest.mark.parametrize(
+    "text", ["20e-9", "20nm", "20 nm", "0.02um", "0.02µm", "2e-5mm", "2E-8 m"]
+)
 def test_lengths_with_and_without_a_unit(text):
     assert length_m(text, "--sigma") == pytest.approx(20e-9, rel=1e-12)
 
@@ -402,10 +484,20 @@ def test_suggest_next_views(capsys, tmp_path):
 
 def test_suggest_against_terms(capsys, tmp_path):
     out = tmp_path / "next.yaml"
-    asked = ["plan", "suggest", shipped("qiao"), "--against", "drift:500e-9", "--order", "raster"]
+    asked = [
+        "plan",
+        "suggest",
+        shipped("qiao"),
+        "--against",
+        "drift:500e-9",
+        "--order",
+        "raster",
+    ]
     assert main([*asked, "--top", "1", "-o", str(out)]) == 0
     text = capsys.readouterr().out
-    assert text.startswith("plan qiao: u XY rms ") and " µm  max " in text.splitlines()[0]
+    assert (
+        text.startswith("plan qiao: u XY rms ") and " µm  max " in text.splitlines()[0]
+    )
     assert "visit the marks in the order x_back_y_back, 4 repeats for 1" in text
     plan = plan_from_dict(read_yaml(out), "next")
     assert {(v.visit_order, v.repeats) for v in plan.views} == {("x_back_y_back", 4)}
@@ -443,7 +535,10 @@ def test_the_best_plan_is_judged_as_it_is_written(capsys, tmp_path):
             }
         )
     )
-    assert main(["plan", "suggest", str(plan), "--views", "4", "--json", "-o", str(out)]) == 0
+    assert (
+        main(["plan", "suggest", str(plan), "--views", "4", "--json", "-o", str(out)])
+        == 0
+    )
     best = json.loads(capsys.readouterr().out)
     assert best["deficiency"] == 0
     assert {view["repeats"] for view in best["views"]} == {4}
@@ -453,7 +548,21 @@ def test_the_best_plan_is_judged_as_it_is_written(capsys, tmp_path):
     # by default the terms that are assumed of every measurement count, too
     of_model = found["predicted"]["rms_u_xy_um_with_terms"] * 1e-6
     assert best["u_rms_m"] > 1.0001 * of_model
-    assert main(["plan", "suggest", str(plan), "--views", "4", "--json", "--against", "none"]) == 0
+    assert (
+        main(
+            [
+                "plan",
+                "suggest",
+                str(plan),
+                "--views",
+                "4",
+                "--json",
+                "--against",
+                "none",
+            ]
+        )
+        == 0
+    )
     assert json.loads(capsys.readouterr().out)["u_rms_m"] < 1.0001 * of_model
 
 
@@ -468,14 +577,36 @@ def test_suggest_does_not_write_over_its_plan(capsys, tmp_path):
 def test_suggest_the_best_plan(capsys, tmp_path):
     out = tmp_path / "best.yaml"
     assert (
-        main(["plan", "suggest", shipped("deficient_no_line"), "--views", "4", "-o", str(out)]) == 0
+        main(
+            [
+                "plan",
+                "suggest",
+                shipped("deficient_no_line"),
+                "--views",
+                "4",
+                "-o",
+                str(out),
+            ]
+        )
+        == 0
     )
     assert "best plan of 4 views" in capsys.readouterr().out
     assert main(["plan", "check", str(out), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["predicted"]["rms_gain_xy"] == pytest.approx(0.890, abs=5e-4)
     assert (
-        main(["plan", "suggest", shipped("qiao"), "--views", "3", "--json", "--against", "none"])
+        main(
+            [
+                "plan",
+                "suggest",
+                shipped("qiao"),
+                "--views",
+                "3",
+                "--json",
+                "--against",
+                "none",
+            ]
+        )
         == 0
     )
     found = json.loads(capsys.readouterr().out)
@@ -486,7 +617,10 @@ def test_suggest_the_best_plan(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["suggest", "--views", "2"], "--views: 2 views cannot identify the stage; give 3 or more"),
+        (
+            ["suggest", "--views", "2"],
+            "--views: 2 views cannot identify the stage; give 3 or more",
+        ),
         (["suggest", "--top", "0"], "--top: 0 is not positive"),
         (
             ["suggest", "--views", "4", "--top", "2"],
@@ -503,7 +637,10 @@ def test_bad_arguments(arguments, message, capsys):
 def test_the_best_plan_off_the_lattice_identifies_the_stage(tmp_path, capsys):
     """Half a turn leaves nodes unknown, and what is known of the others looks small."""
     best = tmp_path / "best.yaml"
-    assert main(["plan", "suggest", shipped("general"), "--views", "3", "-o", str(best)]) == 0
+    assert (
+        main(["plan", "suggest", shipped("general"), "--views", "3", "-o", str(best)])
+        == 0
+    )
     capsys.readouterr()
     assert main(["plan", "check", str(best), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["unknown_sites"] == 0
@@ -575,7 +712,18 @@ def test_images_tell_the_camera_and_suffice_with_two_turns(tmp_path, capsys):
     plan["views"] = plan["views"][:1]
     (tmp_path / "p.yaml").write_text(yaml.safe_dump(plan))
     assert main(["plan", "check", str(tmp_path / "p.yaml")]) == 3
-    assert main(["plan", "suggest", str(tmp_path / "p.yaml"), "-o", str(tmp_path / "q.yaml")]) == 0
+    assert (
+        main(
+            [
+                "plan",
+                "suggest",
+                str(tmp_path / "p.yaml"),
+                "-o",
+                str(tmp_path / "q.yaml"),
+            ]
+        )
+        == 0
+    )
     better = plan_from_dict(read_yaml(tmp_path / "q.yaml"), "q")
     assert better.views[1].image == better.views[0].image
     assert better.views[1].image.nx == 3
@@ -584,8 +732,17 @@ def test_images_tell_the_camera_and_suffice_with_two_turns(tmp_path, capsys):
 def test_a_size_of_0_takes_a_default_term_out_of_the_predicted_u(capsys):
     components = {}
     for size in ("5e-9", "0"):
-        words = ["plan", "check", shipped("hu"), "--json", "--model", f"plate_shape:{size}"]
+        words = [
+            "plan",
+            "check",
+            shipped("hu"),
+            "--json",
+            "--model",
+            f"plate_shape:{size}",
+        ]
         assert main(words) == 0
         lines = json.loads(capsys.readouterr().out)["budget"]["lines"]
-        components[size] = {line["component"] for line in lines if line["quantity"] == "xy"}
+        components[size] = {
+            line["component"] for line in lines if line["quantity"] == "xy"
+        }
     assert components["5e-9"] - components["0"] == {"plate_shape"}

@@ -51,9 +51,13 @@ def test_its_plan_is_checked_drawn_and_measured(options, minutes, capsys):
     assert promised["U_xy"] == pytest.approx(checked["budget"]["U_xy"])
     assert main(["plate", "plan.yaml", "-o", "plate.svg"]) == 0
     capsys.readouterr()
-    assert main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--json"]) == 0
+    assert (
+        main(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--json"]) == 0
+    )
     result = json.loads(capsys.readouterr().out)
-    assert len(result["views"]) == len(promised["views"]) * (3 if options is CAMERA else 1)
+    assert len(result["views"]) == len(promised["views"]) * (
+        3 if options is CAMERA else 1
+    )
     assert all(view["rejected"] == 0 for view in result["views"])
 
 
@@ -84,8 +88,11 @@ def test_the_time_is_kept_and_used(capsys):
             Path(name).unlink()
     assert found["30"]["U_xy"] < 0.8 * found["20"]["U_xy"]
     views = found["20"]["views"]
-    marks = sum(view["repeats"] * (25 - 5 * any(view["translation_pitch"])) for view in views)
-    assert found["20"]["exposures"] == marks + 20 * len(views)  # 5 marks from four sides
+    marks = sum(
+        view["repeats"] * (25 - 5 * any(view["translation_pitch"])) for view in views
+    )
+    # 5 marks from four sides
+    assert found["20"]["exposures"] == marks + 20 * len(views)
     assert found["20"]["minutes"] == pytest.approx(
         5 * len(views) + found["20"]["exposures"] * 2 / 60
     )
@@ -102,7 +109,11 @@ def test_the_cell_of_every_machine_can_be_read(machine):
     assert cell.placing == ("robot" if machine == "simulated" else "person")
     assert read_plan("plan.yaml").plan_id == "plan"
     shipped = {path: read_yaml(path) for path in CELLS.glob("*.yaml")}
-    own = {path: data[machine] for path, data in shipped.items() if data["machine"] == machine}
+    own = {
+        path: data[machine]
+        for path, data in shipped.items()
+        if data["machine"] == machine
+    }
     assert own, f"add an example with `machine: {machine}` to config/cells"
     assert read_yaml("cell.yaml")[machine].keys() <= next(iter(own.values())).keys()
     pages = "".join(page.read_text() for page in PAGES.glob("machine*.md"))
@@ -119,7 +130,10 @@ def test_the_cell_of_every_machine_can_be_read(machine):
             "40 mm along x, and 5 marks with their check stops need 40.04 mm; take 4 marks",
         ),
         ([*STAGE, "--travel", "60x30mm"], "30 mm along y"),
-        ([*STAGE, "--minutes", "3"], "the shortest plan takes 20: 3 placings of 5 minutes"),
+        (
+            [*STAGE, "--minutes", "3"],
+            "the shortest plan takes 20: 3 placings of 5 minutes",
+        ),
         ([*STAGE, "--lines", "8", "--field", "30mm"], "lines are not found in images"),
         ([*STAGE, "--pitch", "10"], "'10' has no unit; write for example 10mm"),
         ([*STAGE, "--marks", "2"], "is not a number from 3"),

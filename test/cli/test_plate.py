@@ -33,12 +33,16 @@ def plan(tmp_path):
 
 def rendered(svg):
     """Return an image (rows, columns) of an SVG's outlines, 0.01 mm a pixel, by PIL."""
-    width, height = map(float, re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg).groups())
+    width, height = map(
+        float, re.search(r'viewBox="0 0 ([\d.]+) ([\d.]+)"', svg).groups()
+    )
     columns, rows = int(width / PIXEL_MM), int(height / PIXEL_MM)
     image = Image.new("L", (columns * FINE, rows * FINE), 220)
     draw = ImageDraw.Draw(image)
     for outline in re.search(r'<path d="([^"]*)"', svg)[1].split("Z")[:-1]:
-        points = np.array([point.split(",") for point in outline[1:].split("L")], dtype=float)
+        points = np.array(
+            [point.split(",") for point in outline[1:].split("L")], dtype=float
+        )
         at = points / PIXEL_MM * FINE - 0.5
         draw.polygon([tuple(point) for point in at], fill=40)
     fine = np.asarray(image, dtype=float).reshape(rows, FINE, columns, FINE)
@@ -49,18 +53,25 @@ def rendered(svg):
 def test_marks_are_found_where_they_are_drawn(plan, tmp_path, mark):
     """True to 0.01 pixel against each other, behind a lens of 0.7 pixels blur."""
     file = tmp_path / f"{mark}.svg"
-    assert main(["plate", plan, "-o", str(file), "--mark", mark, "--mark-size", "3e-4"]) == 0
+    assert (
+        main(["plate", plan, "-o", str(file), "--mark", mark, "--mark-size", "3e-4"])
+        == 0
+    )
     image, _ = rendered(file.read_text())
     image = np.round(gaussian_filter(image, 0.7) * 256).astype(np.uint16)
     detector = MarkDetector(
-        DetectorSettings.checked({"pixel_size": 1e-5, "mark": mark, "mark_size": 3e-4}, "test")
+        DetectorSettings.checked(
+            {"pixel_size": 1e-5, "mark": mark, "mark_size": 3e-4}, "test"
+        )
     )
     marks, _ = detector.marks(Picture(image, 65535))
     found = np.array(sorted((found.v, found.u) for found in marks))
     assert len(found) == 9
     rows = found.reshape(3, 3, 2)
     rows = np.array([sorted(row.tolist(), key=lambda at: at[1]) for row in rows])
-    wanted = np.stack(np.meshgrid([-100, 0, 100], [-100, 0, 100], indexing="ij"), axis=2)
+    wanted = np.stack(
+        np.meshgrid([-100, 0, 100], [-100, 0, 100], indexing="ij"), axis=2
+    )
     assert np.abs(rows - rows.mean(axis=(0, 1)) - wanted).max() < 0.01
 
 
@@ -80,14 +91,18 @@ def photographed(svg, rng, *, turn, centre, mirror):
         np.array([point.split(",") for point in outline[1:].split("L")], dtype=float)
         for outline in re.search(r'<path d="([^"]*)"', svg)[1].split("Z")[:-1]
     ]
-    marks = np.array([outline.mean(axis=0) for outline in drawn[:30]])  # the first are the marks
+    # the first are the marks
+    marks = np.array([outline.mean(axis=0) for outline in drawn[:30]])
     middle = (marks.min(axis=0) + marks.max(axis=0)) / 2
 
     def pixel(places):  # of places on the page, mm, y downwards
         away = (places - middle) * (1, -1) - centre
         rows = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         across, up = rows @ away.T * PITCH_PX
-        return np.stack([(-across if mirror else across), -up], axis=1) + (IMAGE_PX - 1) / 2
+        return (
+            np.stack([(-across if mirror else across), -up], axis=1)
+            + (IMAGE_PX - 1) / 2
+        )
 
     image = Image.new("L", (IMAGE_PX * FINE,) * 2, 210)
     draw = ImageDraw.Draw(image)
@@ -98,7 +113,10 @@ def photographed(svg, rng, *, turn, centre, mirror):
     ):
         at = pixel(np.array([[float(x), float(y)]]))[0] * FINE
         draw.text(
-            tuple(at), text, fill=30, font=ImageFont.load_default(float(size) * PITCH_PX * FINE)
+            tuple(at),
+            text,
+            fill=30,
+            font=ImageFont.load_default(float(size) * PITCH_PX * FINE),
         )
     grey = np.asarray(image, dtype=float).reshape(IMAGE_PX, FINE, IMAGE_PX, FINE)
     grey = gaussian_filter(grey.mean(axis=(1, 3)), rng.uniform(0.5, 1.5))
@@ -117,13 +135,22 @@ def identify(svg, seed):
         svg, rng, turn=rng.uniform(0, 2 * np.pi), centre=centre, mirror=mirror
     )
     settings = DetectorSettings.checked(
-        {"pixel_size": 2e-5, "mark": "disc", "mark_size": 3e-4, "mirror": mirror, "aruco": "6x5"},
+        {
+            "pixel_size": 2e-5,
+            "mark": "disc",
+            "mark_size": 3e-4,
+            "mirror": mirror,
+            "aruco": "6x5",
+        },
         "test",
     )
     found = ImageDetector(settings).take_picture(picture, 1)
     inside = np.flatnonzero(((pixels > 15) & (pixels < IMAGE_PX - 16)).all(axis=1))
     wanted = {
-        (m - 3, n - 2): pixels[m * 5 + n] for m in range(6) for n in range(5) if m * 5 + n in inside
+        (m - 3, n - 2): pixels[m * 5 + n]
+        for m in range(6)
+        for n in range(5)
+        if m * 5 + n in inside
     }
     assert all(each.has_id for each in found)
     told = {(each.m, each.n): each for each in found}
@@ -162,7 +189,9 @@ def test_markers_need_opencv_and_a_lattice(plan, tmp_path, capsys, monkeypatch):
     assert main(["plate", plan, "-o", str(tmp_path / "p.svg"), "--aruco"]) == 2
     assert "pip install 'selfcal_ros[camera]'" in capsys.readouterr().err
     settings = {"pixel_size": 1e-5, "mark_size": 3e-4, "aruco": "3x3"}
-    with pytest.raises(InputError, match="OpenCV, which reads the markers, is not installed"):
+    with pytest.raises(
+        InputError, match="OpenCV, which reads the markers, is not installed"
+    ):
         ImageDetector(DetectorSettings.checked(settings, "test"))
     with pytest.raises(InputError, match="'three' is not the marks along x and y"):
         ImageDetector(DetectorSettings.checked(settings | {"aruco": "three"}, "test"))
@@ -173,14 +202,18 @@ def test_markers_need_opencv_and_a_lattice(plan, tmp_path, capsys, monkeypatch):
 def test_rows_and_columns_are_numbered(plan, tmp_path):
     file = tmp_path / "p.svg"
     assert main(["plate", plan, "-o", str(file)]) == 0
-    texts = re.findall(r'<text x="([\d.-]+)" y="([\d.-]+)"[^>]*>(-?\d)<', file.read_text())
+    texts = re.findall(
+        r'<text x="([\d.-]+)" y="([\d.-]+)"[^>]*>(-?\d)<', file.read_text()
+    )
     columns, rows = texts[:3], texts[3:]
     assert [text for _, _, text in texts] == ["-1", "0", "1"] * 2
     assert np.allclose(np.diff([float(x) for x, _, _ in columns]), 1.0, atol=0.1)
-    assert np.allclose(np.diff([float(y) for _, y, _ in rows]), -1.0)  # n upwards, the page down
+    # n upwards, the page down
+    assert np.allclose(np.diff([float(y) for _, y, _ in rows]), -1.0)
     height = float(re.search(r'viewBox="0 0 [\d.]+ ([\d.]+)"', file.read_text())[1])
     assert all(
-        float(y) < height for y in re.findall(r'<text x="[\d.-]+" y="([\d.-]+)"', file.read_text())
+        float(y) < height
+        for y in re.findall(r'<text x="[\d.-]+" y="([\d.-]+)"', file.read_text())
     )
 
 
@@ -194,14 +227,18 @@ def test_the_file_is_true_to_size(plan, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("ending", "package"), [("dxf", "ezdxf"), ("gds", "gdstk")])
-def test_a_missing_package_is_named(plan, tmp_path, capsys, monkeypatch, ending, package):
+def test_a_missing_package_is_named(
+    plan, tmp_path, capsys, monkeypatch, ending, package
+):
     monkeypatch.setitem(sys.modules, package, None)
     assert main(["plate", plan, "-o", str(tmp_path / f"plate.{ending}")]) == 2
     assert f"pip install {package}" in capsys.readouterr().err
 
 
 def test_marks_that_touch_are_refused(plan, tmp_path, capsys):
-    assert main(["plate", plan, "-o", str(tmp_path / "p.svg"), "--mark-size", "9e-4"]) == 2
+    assert (
+        main(["plate", plan, "-o", str(tmp_path / "p.svg"), "--mark-size", "9e-4"]) == 2
+    )
     assert "the marks are 1 mm apart" in capsys.readouterr().err
 
 
@@ -209,7 +246,10 @@ def test_dxf_is_true_to_size(plan, tmp_path):
     ezdxf = pytest.importorskip("ezdxf")
     assert main(["plate", plan, "-o", str(tmp_path / "p.dxf")]) == 0
     drawing = ezdxf.readfile(tmp_path / "p.dxf")
-    lines = [np.array(line.get_points("xy")) for line in drawing.modelspace().query("LWPOLYLINE")]
+    lines = [
+        np.array(line.get_points("xy"))
+        for line in drawing.modelspace().query("LWPOLYLINE")
+    ]
     assert drawing.units == 4 and len(lines) == 9 + 2
     assert np.allclose(lines[8].mean(axis=0), (1.0, 1.0))
     assert np.ptp(lines[8], axis=0) == pytest.approx((0.2, 0.2))
@@ -219,6 +259,8 @@ def test_gds_is_true_to_size(plan, tmp_path):
     gdstk = pytest.importorskip("gdstk")
     assert main(["plate", plan, "-o", str(tmp_path / "p.gds")]) == 0
     library = gdstk.read_gds(tmp_path / "p.gds")
-    marks = [np.array(each.points) for each in library.cells[0].polygons if each.layer == 0]
+    marks = [
+        np.array(each.points) for each in library.cells[0].polygons if each.layer == 0
+    ]
     assert library.unit == 1e-6 and len(marks) == 9 + 2
     assert np.allclose(marks[8].mean(axis=0), (1000.0, 1000.0), atol=0.01)

@@ -12,7 +12,10 @@ from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.files import read_json
 
 EXACT = Path(__file__).parents[2] / "bags/hu_exact"
-PLAN = {"plan_id": "first", "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8}}
+PLAN = {
+    "plan_id": "first",
+    "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 8},
+}
 SEEDS = {
     "seed": 3,
     "truth": {"phi": 1e-4, "t": 1e-5},
@@ -33,23 +36,44 @@ def folder(tmp_path_factory):
     for name, views, more in (
         ("first", first, {"noise_seed": 1}),
         ("same", [{"name": "again"}], {"noise_seed": 2}),
-        ("bent", [{"name": "again"}], {"noise_seed": 2, "physics": {"stage_bend": 2e-7}}),
+        (
+            "bent",
+            [{"name": "again"}],
+            {"noise_seed": 2, "physics": {"stage_bend": 2e-7}},
+        ),
     ):
         spec = SEEDS | more | {"plan": PLAN | {"views": views, "plan_id": name}}
         (folder / f"{name}.yaml").write_text(json.dumps(spec))  # YAML, too
-        assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
-    assert main(["solve", str(folder / "first"), "-o", str(folder / "r.json"), "--quiet"]) == 0
+        assert (
+            main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)])
+            == 0
+        )
+    assert (
+        main(["solve", str(folder / "first"), "-o", str(folder / "r.json"), "--quiet"])
+        == 0
+    )
     return folder
 
 
 def test_a_stage_that_is_as_it_was(folder, capsys):
     out = folder / "same.json"
     assert (
-        main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", str(out), "--budget"])
+        main(
+            [
+                "recheck",
+                str(folder / "r.json"),
+                str(folder / "same"),
+                "-o",
+                str(out),
+                "--budget",
+            ]
+        )
         == 0
     )
     text = capsys.readouterr().out
-    assert text.startswith("Still good: no change since r.json beyond its uncertainty (p = ")
+    assert text.startswith(
+        "Still good: no change since r.json beyond its uncertainty (p = "
+    )
     assert "change since" in text and "against the plate (k=1)" in text
     assert "theta  clearest at line" in text
     assert f"covariance of the plate's map in {folder / 'r.json'}" in text
@@ -77,16 +101,32 @@ def test_a_stage_that_has_changed(folder, capsys):
     assert main(seen) == 5
     assert "a single pass cannot tell a change from drift" in capsys.readouterr().err
     assert (
-        main([*seen, "--force", "--model", "drift:1e-9", "--report", str(folder / "bent.html")])
+        main(
+            [
+                *seen,
+                "--force",
+                "--model",
+                "drift:1e-9",
+                "--report",
+                str(folder / "bent.html"),
+            ]
+        )
         == 0
     )
     text = capsys.readouterr().out
-    assert text.startswith("Changed since r.json: calibrate again, provided this is the same ")
-    assert "and the camera was not touched (if it was, declare it: --microscope 0.01); " in text
+    assert text.startswith(
+        "Changed since r.json: calibrate again, provided this is the same "
+    )
+    assert (
+        "and the camera was not touched (if it was, declare it: --microscope 0.01); "
+        in text
+    )
     data = read_json(out)
     assert data["recheck"]["changed"] is True and data["recheck"]["p"] < 1e-3
     assert data["warnings"][0].startswith("Changed since r.json")
-    assert abs(data["recheck"]["largest"]["change"]) > 3 * data["recheck"]["largest"]["u"]
+    assert (
+        abs(data["recheck"]["largest"]["change"]) > 3 * data["recheck"]["largest"]["u"]
+    )
     assert "Changed since r.json" in (folder / "bent.html").read_text()
 
 
@@ -97,7 +137,9 @@ def test_options_that_one_view_cannot_use_are_not_there(option, folder, capsys):
     with pytest.raises(SystemExit) as ended:
         main(["recheck", str(folder / "r.json"), str(folder / "same"), option])
     assert ended.value.code == 2
-    assert f"the option {option.partition('=')[0]} is unknown" in capsys.readouterr().err
+    assert (
+        f"the option {option.partition('=')[0]} is unknown" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(
@@ -106,25 +148,43 @@ def test_options_that_one_view_cannot_use_are_not_there(option, folder, capsys):
 def test_a_plan_of_a_known_plate_refuses_what_needs_more_than_one_view(
     option, where, folder, capsys
 ):
-    plan = {"plan_id": "m", "artifact_from": str(folder / "r.json"), "views": [{"name": "again"}]}
-    (folder / "view.yaml").write_text(json.dumps(SEEDS | {"noise_seed": 4, "plan": plan}))
+    plan = {
+        "plan_id": "m",
+        "artifact_from": str(folder / "r.json"),
+        "views": [{"name": "again"}],
+    }
+    (folder / "view.yaml").write_text(
+        json.dumps(SEEDS | {"noise_seed": 4, "plan": plan})
+    )
     if not (folder / "view").exists():
-        assert main(["simulate", str(folder / "view.yaml"), "-o", str(folder / "view")]) == 0
+        assert (
+            main(["simulate", str(folder / "view.yaml"), "-o", str(folder / "view")])
+            == 0
+        )
     capsys.readouterr()
     assert main(["solve", str(folder / "view"), option]) == 2
-    assert f"{where}: the plate is known from {folder / 'r.json'}" in capsys.readouterr().err
+    assert (
+        f"{where}: the plate is known from {folder / 'r.json'}"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_recheck_knows_no_plate(folder, capsys):
     out = str(folder / "again.json")
-    assert main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", out]) == 0
+    assert (
+        main(["recheck", str(folder / "r.json"), str(folder / "same"), "-o", out]) == 0
+    )
     assert main(["recheck", out, str(folder / "same")]) == 2
     assert "is itself a recheck" in capsys.readouterr().err
 
 
 def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
     """FitOfKind, relative to the plan: the plate is that of the result."""
-    plan = {"plan_id": "morning", "artifact_from": "r.json", "views": [{"name": "again"}]}
+    plan = {
+        "plan_id": "morning",
+        "artifact_from": "r.json",
+        "views": [{"name": "again"}],
+    }
     (folder / "plan.yaml").write_text(json.dumps(plan))
     assert main(["plan", "check", str(folder / "plan.yaml"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -133,11 +193,16 @@ def test_a_plan_names_the_calibration_of_its_plate(folder, capsys):
     assert main(["plan", "check", str(folder / "plan.yaml")]) == 0
     text = capsys.readouterr().out
     assert f"1 view of the plate calibrated in {folder / 'r.json'}" in text
-    assert f"change of XY since the calibration: rms {wanted['rms_gain_change']:.4f}" in text
+    assert (
+        f"change of XY since the calibration: rms {wanted['rms_gain_change']:.4f}"
+        in text
+    )
     assert "a single pass cannot tell a change from drift" in text
     spec = SEEDS | {"noise_seed": 2, "plan": "plan.yaml"}
     (folder / "morning.yaml").write_text(json.dumps(spec))
-    bag, one, other = (str(folder / name) for name in ("morning", "one.json", "other.json"))
+    bag, one, other = (
+        str(folder / name) for name in ("morning", "one.json", "other.json")
+    )
     assert main(["simulate", str(folder / "morning.yaml"), "-o", bag]) == 0
     bare = ["--model", "none"]
     assert main(["solve", bag, "-o", one, *bare]) == 0
@@ -188,4 +253,6 @@ def test_readings_without_noise_are_refused_in_one_line(tmp_path, capsys):
     capsys.readouterr()
     assert main(["recheck", out, str(EXACT)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "readings: they or those of the calibration have no noise against which" in line
+    assert (
+        "readings: they or those of the calibration have no noise against which" in line
+    )

@@ -29,7 +29,9 @@ def calibrated(seed, sigma_m=2e-8, sigma_rad=2e-5):
     plan = hu_plan(artifact, 3)
     truth = random_truth(artifact, len(plan.views), rng)
     result = calibrate(
-        simulate_measurements(truth, plan, rng, sigma_m=sigma_m, sigma_theta_rad=sigma_rad)
+        simulate_measurements(
+            truth, plan, rng, sigma_m=sigma_m, sigma_theta_rad=sigma_rad
+        )
     )
     return result_to_dict(result), {
         "gx": truth.g[0].tolist(),
@@ -132,7 +134,9 @@ def test_summary_on_a_terminal_without_symbols(folder, monkeypatch):
         ),
     ],
 )
-def test_unusable_input_is_one_line_and_code_2(folder, monkeypatch, capsys, arguments, message):
+def test_unusable_input_is_one_line_and_code_2(
+    folder, monkeypatch, capsys, arguments, message
+):
     monkeypatch.chdir(folder)
     (folder / "text.json").write_text("hello")
     (folder / "list.json").write_text("[]")
@@ -175,7 +179,12 @@ def test_no_damage_to_a_result_file_ends_in_a_traceback(folder):
     assert min(outcomes.values()) > 50
 
 
-REFERENCE = {"kind": "artifact", "relative_error": 1e-6, "u_relative": 1e-7, "certificate": "C 1"}
+REFERENCE = {
+    "kind": "artifact",
+    "relative_error": 1e-6,
+    "u_relative": 1e-7,
+    "certificate": "C 1",
+}
 ROW = {
     "quantity": "xy",
     "component": "reading noise",
@@ -195,10 +204,22 @@ ROW = {
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("reference", REFERENCE | {"kind": "moon"}, "'moon' is not a valid ReferenceKind"),
+        (
+            "reference",
+            REFERENCE | {"kind": "moon"},
+            "'moon' is not a valid ReferenceKind",
+        ),
         ("reference", REFERENCE | {"relative_error": "x"}, "'x' is not a number"),
-        ("reference", REFERENCE | {"u_relative": None}, "nan is not a standard uncertainty"),
-        ("reference", REFERENCE | {"u_relative": -1.0}, "-1.0 is not a standard uncertainty"),
+        (
+            "reference",
+            REFERENCE | {"u_relative": None},
+            "nan is not a standard uncertainty",
+        ),
+        (
+            "reference",
+            REFERENCE | {"u_relative": -1.0},
+            "-1.0 is not a standard uncertainty",
+        ),
         ("reference", REFERENCE | {"certificate": 3}, "3 is not of type str"),
         ("reference", {}, "the key 'kind' is missing"),
         ("reference", [], "[] is not of type dict"),
@@ -211,7 +232,9 @@ ROW = {
         ("budget", "x", "'x' is not of type list"),
     ],
 )
-def test_an_unusable_reference_or_budget_is_one_line(folder, monkeypatch, capsys, key, value, said):
+def test_an_unusable_reference_or_budget_is_one_line(
+    folder, monkeypatch, capsys, key, value, said
+):
     monkeypatch.chdir(folder)
     whole = json.loads(Path("result.json").read_text())
     for name, good in (("reference", REFERENCE), ("budget", [ROW])):
@@ -221,7 +244,10 @@ def test_an_unusable_reference_or_budget_is_one_line(folder, monkeypatch, capsys
     capsys.readouterr()
     assert main(["report", "bad.json"]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("selfcal report: bad.json: damaged result (") and err.count("\n") == 1
+    assert (
+        err.startswith("selfcal report: bad.json: damaged result (")
+        and err.count("\n") == 1
+    )
     assert said in err
 
 

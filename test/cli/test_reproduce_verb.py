@@ -22,7 +22,10 @@ def test_text_and_plots_and_the_same_bytes_for_the_same_seed(
     paper, figures, word, tmp_path, capsys
 ):
     out = tmp_path / "new" / "folder"
-    assert main(["reproduce", paper, "--draws", "3", "--seed", "5", "--out", str(out)]) == 0
+    assert (
+        main(["reproduce", paper, "--draws", "3", "--seed", "5", "--out", str(out)])
+        == 0
+    )
     printed = capsys.readouterr().out
     assert word in printed
     assert (out / f"{paper}.txt").read_text() == printed.split("wrote ")[0]
@@ -32,7 +35,19 @@ def test_text_and_plots_and_the_same_bytes_for_the_same_seed(
     if paper == "qiao":  # same seed, same bytes
         again = tmp_path / "again"
         assert (
-            main(["reproduce", paper, "--draws", "3", "--seed", "5", "--out", str(again), "--json"])
+            main(
+                [
+                    "reproduce",
+                    paper,
+                    "--draws",
+                    "3",
+                    "--seed",
+                    "5",
+                    "--out",
+                    str(again),
+                    "--json",
+                ]
+            )
             == 0
         )
         told = capsys.readouterr()

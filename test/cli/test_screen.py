@@ -31,14 +31,20 @@ COMMAND = {
 
 
 def told(state: str, message: str = "", level: int = 0, **values: str) -> dict:
-    return {"level": level, "message": message or state, "values": {"state": state} | values}
+    return {
+        "level": level,
+        "message": message or state,
+        "values": {"state": state} | values,
+    }
 
 
 TURN = "90 deg ↺ counter-clockwise (the corner at the top right goes to the top left)"
 
 
 def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> str:
-    console = Console(file=io.StringIO(), width=size[0], height=size[1], legacy_windows=False)
+    console = Console(
+        file=io.StringIO(), width=size[0], height=size[1], legacy_windows=False
+    )
     console.print(screen(picture, list(log), size), end="")
     return console.file.getvalue()
 
@@ -72,7 +78,8 @@ def shown(picture: dict, log: tuple = (), size: tuple[int, int] = (140, 40)) -> 
 )
 def test_what_a_person_has_to_do(sequencer, sentence):
     assert (
-        what_now(EMPTY | {"health": {"pose_sequencer": sequencer}, "command": COMMAND}) == sentence
+        what_now(EMPTY | {"health": {"pose_sequencer": sequencer}, "command": COMMAND})
+        == sentence
     )
 
 
@@ -92,7 +99,10 @@ def test_what_a_person_has_to_do(sequencer, sentence):
 @pytest.mark.parametrize("state", ["PLACING", "MEASURING"])
 def test_the_newest_command_is_earlier_than_the_health(state, phase, sentence):
     health = {"pose_sequencer": told(state, plan_id="hu", view_name="identity")}
-    assert what_now(EMPTY | {"health": health, "command": COMMAND | {"phase": phase}}) == sentence
+    assert (
+        what_now(EMPTY | {"health": health, "command": COMMAND | {"phase": phase}})
+        == sentence
+    )
 
 
 def test_an_empty_cell_is_shown_as_such():
@@ -112,7 +122,9 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
     text = shown(
         {
             "health": {
-                "pose_sequencer": told("MEASURING", views="4", plan_id="hu", run_id="17"),
+                "pose_sequencer": told(
+                    "MEASURING", views="4", plan_id="hu", run_id="17"
+                ),
                 "solver": told("", "readings cannot be used", 1),
             },
             "command": COMMAND,
@@ -141,7 +153,11 @@ def test_coverage_rejections_map_verdict_and_health_are_shown():
                 "causes": ["the plate slipped"],
                 "run_id": "17",
             },
-            "map": {"run_id": "17", "qualified": False, "um": [[0.0, 1.0], [None, 0.5]]},
+            "map": {
+                "run_id": "17",
+                "qualified": False,
+                "um": [[0.0, 1.0], [None, 0.5]],
+            },
         },
         ["first", "escape \x1b[2J"],
     )
@@ -227,21 +243,26 @@ BAD = {
     | {
         "qualified": False,
         "causes": [
-            f"cause {n}: the plate slipped within the view, measure it again" for n in range(9)
+            f"cause {n}: the plate slipped within the view, measure it again"
+            for n in range(9)
         ],
     },
 }
 LOG = [
-    "[WARN] [1795306660.671861903] [solver]: a long line of a node " + "that goes on " * 9,
+    "[WARN] [1795306660.671861903] [solver]: a long line of a node "
+    + "that goes on " * 9,
     "[INFO] [1795306661.000000001] [pose_sequencer]: PLACE rot90",
     "confirm: measuring",
 ]
 
 
 @pytest.mark.parametrize(
-    "size", [(80, 24), (120, 40), (60, 18), (200, 70), (81, 25), (20, 5), (80, 10), (1, 1)]
+    "size",
+    [(80, 24), (120, 40), (60, 18), (200, 70), (81, 25), (20, 5), (80, 10), (1, 1)],
 )
-@pytest.mark.parametrize("picture", [EMPTY, MEASURED, MEASURED | BAD], ids=["empty", "good", "bad"])
+@pytest.mark.parametrize(
+    "picture", [EMPTY, MEASURED, MEASURED | BAD], ids=["empty", "good", "bad"]
+)
 def test_the_screen_fits_whatever_the_size(picture, size):
     rows = shown(picture, LOG, size).splitlines()
     assert len(rows) <= size[1]
@@ -287,7 +308,12 @@ def test_what_there_is_no_room_for_is_counted(size):
     picture = MEASURED | BAD
     rows = shown(picture, LOG, size).splitlines()
     text = "\n".join(rows)
-    for title in ("coverage of vvv", "rejected by reason; 20 used", "map and verdict", "nodes"):
+    for title in (
+        "coverage of vvv",
+        "rejected by reason; 20 used",
+        "map and verdict",
+        "nodes",
+    ):
         assert title in text
     counted = [int(n) for n in re.findall(r"\.\.\. (\d+) more row", text)]
     assert len(counted) >= 3
@@ -347,9 +373,18 @@ def test_a_number_of_views_that_is_none_is_not_shown(views, sentence):
     ("turn", "said"),
     [
         (0.0, "turned by 0 deg, at"),
-        (180.0, "↺ counter-clockwise (the corner at the top right goes to the bottom left), at"),
-        (270.0, "↺ counter-clockwise (the corner at the top right goes to the bottom right), at"),
-        (-90.0, "↻ clockwise (the corner at the top right goes to the bottom right), at"),
+        (
+            180.0,
+            "↺ counter-clockwise (the corner at the top right goes to the bottom left), at",
+        ),
+        (
+            270.0,
+            "↺ counter-clockwise (the corner at the top right goes to the bottom right), at",
+        ),
+        (
+            -90.0,
+            "↻ clockwise (the corner at the top right goes to the bottom right), at",
+        ),
         (15.0, "turned by 15 deg counter-clockwise, at"),
     ],
 )

@@ -120,11 +120,17 @@ def test_the_terms_of_the_plan_travel_in_the_bag_and_options_win(tmp_path):
 
 
 def test_what_is_no_bag(tmp_path, capsys):
-    text, empty, folder = tmp_path / "a.txt", tmp_path / "empty.mcap", tmp_path / "folder"
+    text, empty, folder = (
+        tmp_path / "a.txt",
+        tmp_path / "empty.mcap",
+        tmp_path / "folder",
+    )
     text.write_text("some words, and no bag at all")
     empty.write_bytes(b"")
     folder.mkdir()
-    lines = [refused(capsys, 2, path) for path in (text, empty, folder, tmp_path / "none")]
+    lines = [
+        refused(capsys, 2, path) for path in (text, empty, folder, tmp_path / "none")
+    ]
     assert lines == [
         f"{text}: not an MCAP file; give an .mcap file or a rosbag2 folder",
         f"{empty}: the file is empty; record the bag again",
@@ -144,7 +150,9 @@ def test_what_is_no_bag(tmp_path, capsys):
 )
 def test_a_topic_without_messages(tmp_path, capsys, events, kind, topic):
     path = Foreign().write(tmp_path / "x.mcap", without(events, kind))
-    assert refused(capsys, 4, path).startswith(f"{path}: no message on {topic}; record this topic")
+    assert refused(capsys, 4, path).startswith(
+        f"{path}: no message on {topic}; record this topic"
+    )
 
 
 def test_commands_without_measure(tmp_path, capsys, events):
@@ -153,7 +161,9 @@ def test_commands_without_measure(tmp_path, capsys, events):
     assert "no MEASURE command; readings" in refused(capsys, 4, path)
 
 
-def test_commands_that_cannot_be_used_are_given_with_the_reason(tmp_path, capsys, events):
+def test_commands_that_cannot_be_used_are_given_with_the_reason(
+    tmp_path, capsys, events
+):
     off = [
         replace(e, view=replace(e.view, translation_m=(0.003, 0.0)))
         if isinstance(e, Command) and e.view
@@ -161,8 +171,13 @@ def test_commands_that_cannot_be_used_are_given_with_the_reason(tmp_path, capsys
         for e in events
     ]
     said = refused(capsys, 4, Foreign().write(tmp_path / "x.mcap", off))
-    assert "no MEASURE command that can be used (a view command was not used: view '" in said
-    assert said.count("0.3 is not a whole number of pitch steps") == said.count("view '")
+    assert (
+        "no MEASURE command that can be used (a view command was not used: view '"
+        in said
+    )
+    assert said.count("0.3 is not a whole number of pitch steps") == said.count(
+        "view '"
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,13 +191,19 @@ def test_another_version_of_a_message(tmp_path, capsys, events, names, field, ty
     text = {"detection": bags.DETECTION, "command": bags.COMMAND}[names]
     types = bags.contract_types(**{names: text.replace(field + "\n", "")})
     line = refused(capsys, 2, Foreign(types=types).write(tmp_path / "x.mcap", events))
-    assert f"another version of {typename}: no field '{field.split()[1]}'; record" in line
+    assert (
+        f"another version of {typename}: no field '{field.split()[1]}'; record" in line
+    )
 
 
-@pytest.mark.parametrize(("wanted", "other"), [("kind", "uint8 kind"), ("offset_x", "x")])
+@pytest.mark.parametrize(
+    ("wanted", "other"), [("kind", "uint8 kind"), ("offset_x", "x")]
+)
 def test_a_field_of_another_type(tmp_path, capsys, events, wanted, other):
     old = {"kind": "uint8 kind", "offset_x": "float64 offset_x"}[wanted]
-    text = bags.DETECTION.replace(old, {"uint8 kind": "string kind", "x": "string offset_x"}[other])
+    text = bags.DETECTION.replace(
+        old, {"uint8 kind": "string kind", "x": "string offset_x"}[other]
+    )
     types = bags.contract_types(detection=text)
     path = Foreign(types=types).write(tmp_path / "x.mcap", without(events, Detection))
     line = refused(capsys, 4, path)
@@ -261,11 +282,17 @@ def check_keys(found):
         values = found[part] if part else found
         for key, kind in wanted.items():
             assert key in values
-            assert isinstance(values[key], kind) or (kind is float and values[key] is None), key
+            assert isinstance(values[key], kind) or (
+                kind is float and values[key] is None
+            ), key
     size, count = found["artifact"]["grid_size"], found["artifact"]["angular_count"]
     for name in ("gx", "gy", "u_gx", "u_gy"):
         assert [len(row) for row in found["error_map"][name]] == [size] * size
-    assert len(found["error_map"]["g_theta"]) == len(found["error_map"]["u_g_theta"]) == count
+    assert (
+        len(found["error_map"]["g_theta"])
+        == len(found["error_map"]["u_g_theta"])
+        == count
+    )
     for view in found["views"]:
         assert {
             "name",
@@ -297,7 +324,9 @@ def test_the_result_has_the_keys_of_the_contract(plain):
     assert found["schema"] == "selfcal.result/1"
     assert found["input"]["file"] == "bag" and len(found["input"]["sha256"]) == 64
     assert found["rejected"]["duplicate"] > 0
-    assert sum(view["rejected"] for view in found["views"]) == sum(found["rejected"].values())
+    assert sum(view["rejected"] for view in found["views"]) == sum(
+        found["rejected"].values()
+    )
 
 
 def test_the_same_bits_every_time_and_for_file_and_folder(tmp_path, bag, plain):
@@ -313,12 +342,16 @@ def test_the_same_bits_every_time_and_for_file_and_folder(tmp_path, bag, plain):
 def params(tmp_path, **nodes):
     path = tmp_path / "nodes.yaml"
     path.write_text(
-        yaml.safe_dump({name: {"ros__parameters": values} for name, values in nodes.items()})
+        yaml.safe_dump(
+            {name: {"ros__parameters": values} for name, values in nodes.items()}
+        )
     )
     return str(path)
 
 
-def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys, bag, plain):
+def test_parameters_reach_collector_and_solver_and_options_win(
+    tmp_path, capsys, bag, plain
+):
     path = params(
         tmp_path,
         solver={"theta_datum": "xy_axes", "misalignment_model": "linear"},
@@ -328,7 +361,10 @@ def test_parameters_reach_collector_and_solver_and_options_win(tmp_path, capsys,
     by_file = capsys.readouterr().err
     assert solve(bag, "--sense", "plate_moves") == 2
     assert by_file == capsys.readouterr().err
-    assert " of 198 detections were rejected as stage_not_at_mark: the stage is ind" in by_file
+    assert (
+        " of 198 detections were rejected as stage_not_at_mark: the stage is ind"
+        in by_file
+    )
     sense = ("--sense", "microscope_moves")
     papers = ("--theta-datum", "xy_axes", "--misalignment", "linear")
     linear = {"codes": (0, 5)}  # whether the readings contradict it is another question
@@ -362,7 +398,9 @@ def test_the_uncertainty_map_on_request(tmp_path, bag, plain):
     assert all(u is None for row in bare["u_gx"] for u in row)
 
 
-def test_numbers_in_a_parameter_file_are_read_as_the_nodes_read_them(tmp_path, bag, plain):
+def test_numbers_in_a_parameter_file_are_read_as_the_nodes_read_them(
+    tmp_path, bag, plain
+):
     path = tmp_path / "nodes.yaml"
     text = "measurement_collector:\n  ros__parameters: {max_speed: 5e-4, outlier_limit: %s}\n"
     path.write_text(text % "6e0")
@@ -386,8 +424,14 @@ def test_methods(tmp_path):
     ("values", "message"),
     [
         ({"solver": {"methode": "joint"}}, "methode: solver has no such parameter"),
-        ({"solver": {"method": "best"}}, "method: 'best' is not known; choose one of joint, law"),
-        ({"measurement_collector": {"min_score": 7.0}}, "min_score: 7.0 is outside 0.0 to 1.0"),
+        (
+            {"solver": {"method": "best"}},
+            "method: 'best' is not known; choose one of joint, law",
+        ),
+        (
+            {"measurement_collector": {"min_score": 7.0}},
+            "min_score: 7.0 is outside 0.0 to 1.0",
+        ),
         (
             {"measurement_collector": {"min_score": "much"}},
             "min_score: 'much' is not of type float",
@@ -402,7 +446,9 @@ def test_bad_parameters(tmp_path, capsys, bag, values, message):
 
 
 def test_parameter_files_that_cannot_be_read(tmp_path, capsys, bag):
-    assert "no such file" in refused(capsys, 2, bag, "--params", str(tmp_path / "none.yaml"))
+    assert "no such file" in refused(
+        capsys, 2, bag, "--params", str(tmp_path / "none.yaml")
+    )
     (tmp_path / "bad.yaml").write_text("solver:\n  a: [1\n")
     assert "bad.yaml:3:1: not YAML" in refused(
         capsys, 2, bag, "--params", str(tmp_path / "bad.yaml")
@@ -410,7 +456,13 @@ def test_parameter_files_that_cannot_be_read(tmp_path, capsys, bag):
 
 
 @pytest.mark.parametrize(
-    "options", [("--method", "best"), ("--theta-datum", "up"), ("--sense", "none"), ("--nonsense",)]
+    "options",
+    [
+        ("--method", "best"),
+        ("--theta-datum", "up"),
+        ("--sense", "none"),
+        ("--nonsense",),
+    ],
 )
 def test_bad_options(capsys, bag, options):
     with pytest.raises(SystemExit) as stop:
@@ -430,7 +482,10 @@ def test_the_measurement_is_never_written_over(tmp_path, capsys):
     before = [part.read_bytes() for part in parts]
     for target in parts:
         assert solve(bag, output=target) == 2
-        assert f"{target.name}: would be overwritten; name another" in capsys.readouterr().err
+        assert (
+            f"{target.name}: would be overwritten; name another"
+            in capsys.readouterr().err
+        )
     assert solve(bag, output=tmp_path / "none" / "r.json") == 2
     assert "cannot be written (No such file or directory)" in capsys.readouterr().err
     assert [part.read_bytes() for part in parts] == before

@@ -24,10 +24,15 @@ def test_lines_that_cannot_be_told_apart_are_said_with_their_mend(tmp_path, caps
     first, *rest = capsys.readouterr().err.splitlines()
     finding = "96 of 96 detections were rejected as rotation_not_known: the view's rotation is not"
     assert first.startswith(f"selfcal solve: {path}: view 'line': {finding}")
-    assert code == 2 and len(rest) == 1  # the view of lines alone is what identifies theta
-    assert rest[0].startswith(f"selfcal solve: {path}: correct this first; as it is, the marks")
+    # the view of lines alone is what identifies theta
+    assert code == 2 and len(rest) == 1
+    assert rest[0].startswith(
+        f"selfcal solve: {path}: correct this first; as it is, the marks"
+    )
     mended = tmp_path / "p.yaml"
-    mended.write_text("measurement_collector: {ros__parameters: {max_rotation: 0.02}}\n")
+    mended.write_text(
+        "measurement_collector: {ros__parameters: {max_rotation: 0.02}}\n"
+    )
     assert main(["solve", str(path), "--quiet", "--params", str(mended)]) == 0
     assert capsys.readouterr().err == ""
 
@@ -35,7 +40,9 @@ def test_lines_that_cannot_be_told_apart_are_said_with_their_mend(tmp_path, caps
 def test_commands_that_cannot_be_followed_are_said_and_change_nothing(tmp_path, capsys):
     events = events_of(plan_of("0, 90, tx", 5, count=8, line=True))
     plain = Foreign().write(tmp_path / "plain.mcap", events)
-    measure = next(e for e in events if isinstance(e, Command) and e.phase == Phase.MEASURE)
+    measure = next(
+        e for e in events if isinstance(e, Command) and e.phase == Phase.MEASURE
+    )
     view = measure.view
     odd = [
         replace(measure, view=replace(view, translation_m=(1e17, 0.0))),
@@ -57,7 +64,9 @@ def test_commands_that_cannot_be_followed_are_said_and_change_nothing(tmp_path, 
 
 
 @pytest.mark.parametrize("placed", [{"rotation_deg": 180}, {"rotation_deg": -90}])
-def test_a_plate_placed_otherwise_is_bad_input_and_not_a_deficient_plan(tmp_path, capsys, placed):
+def test_a_plate_placed_otherwise_is_bad_input_and_not_a_deficient_plan(
+    tmp_path, capsys, placed
+):
     plan = {
         "plan_id": "p",
         "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 0},
@@ -71,7 +80,9 @@ def test_a_plate_placed_otherwise_is_bad_input_and_not_a_deficient_plan(tmp_path
     capsys.readouterr()
     assert main(["solve", str(tmp_path / "bag"), "--quiet"]) == 2
     first, last = capsys.readouterr().err.splitlines()
-    assert f"the plate lies turned by {placed['rotation_deg'] % 360}°, not by 90°" in first
+    assert (
+        f"the plate lies turned by {placed['rotation_deg'] % 360}°, not by 90°" in first
+    )
     assert "bag: correct this first; as it is, the marks" in last
 
 
@@ -79,7 +90,9 @@ def test_a_plate_placed_otherwise_is_bad_input_and_not_a_deficient_plan(tmp_path
     "step_s, code, way",
     [(37.0, 3, "back by 37 s"), (-37.0, 0, "ahead by 37 s"), (0.2, 0, "back by 0.2 s")],
 )
-def test_a_clock_that_stepped_is_named_first_and_in_the_result(tmp_path, capsys, step_s, code, way):
+def test_a_clock_that_stepped_is_named_first_and_in_the_result(
+    tmp_path, capsys, step_s, code, way
+):
     bag, out = str(stepped_bag(tmp_path, step_s)), tmp_path / "r.json"
     assert main(["solve", bag, "-o", str(out), "--quiet"]) == code
     first, *rest = capsys.readouterr().err.splitlines()
@@ -89,9 +102,11 @@ def test_a_clock_that_stepped_is_named_first_and_in_the_result(tmp_path, capsys,
     )
     assert first.startswith(f"selfcal solve: {bag}: {line}")
     *others, last = json.loads(out.read_text())["warnings"]
-    assert last.startswith(line)  # marks that the step lost may leave sites that nothing checks
+    # marks that the step lost may leave sites that nothing checks
+    assert last.startswith(line)
     assert all(
-        "that no other checks" in other or other.startswith("view '90' is only partly in the map: ")
+        "that no other checks" in other
+        or other.startswith("view '90' is only partly in the map: ")
         for other in others
     )
     assert code == 0 or rest[-1].startswith(
@@ -100,31 +115,45 @@ def test_a_clock_that_stepped_is_named_first_and_in_the_result(tmp_path, capsys,
 
 
 def test_the_same_messages_without_a_step_name_no_clock(tmp_path, capsys):
-    path = Foreign().write(tmp_path / "x.mcap", shuffled(events_of(small_plan("0, 90, tx"))))
+    path = Foreign().write(
+        tmp_path / "x.mcap", shuffled(events_of(small_plan("0, 90, tx")))
+    )
     assert main(["solve", str(path), "--quiet"]) == 0
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("kind", [Kind.GRID, Kind.ANGULAR])
 @pytest.mark.parametrize("sigma", [1e4, 1e-200])
-def test_a_sigma_that_cannot_be_is_one_line_and_costs_that_detection(tmp_path, capsys, sigma, kind):
+def test_a_sigma_that_cannot_be_is_one_line_and_costs_that_detection(
+    tmp_path, capsys, sigma, kind
+):
     events = [
-        replace(e, sigma=2e-8 if e.kind == Kind.GRID else 2e-5) if isinstance(e, Detection) else e
+        replace(e, sigma=2e-8 if e.kind == Kind.GRID else 2e-5)
+        if isinstance(e, Detection)
+        else e
         for e in events_of(small_plan("0, 90, tx"))
     ]
-    index = next(n for n, e in enumerate(events) if isinstance(e, Detection) and e.kind == kind)
+    index = next(
+        n for n, e in enumerate(events) if isinstance(e, Detection) and e.kind == kind
+    )
     events[index] = replace(events[index], sigma=sigma)
     path = Foreign().write(tmp_path / "x.mcap", events)
     assert main(["solve", str(path), "--quiet", "-o", str(tmp_path / "r.json")]) == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"selfcal solve: {path}: 1 detection rejected as sigma_out_of_range: ")
+    assert line.startswith(
+        f"selfcal solve: {path}: 1 detection rejected as sigma_out_of_range: "
+    )
     result = json.loads((tmp_path / "r.json").read_text())
     assert result["rejected"] == {"sigma_out_of_range": 1}
 
 
-def test_reversed_offsets_are_one_line_that_names_the_bag_and_no_result(tmp_path, capsys):
+def test_reversed_offsets_are_one_line_that_names_the_bag_and_no_result(
+    tmp_path, capsys
+):
     events = [
-        replace(e, offset_x=-e.offset_x, offset_y=-e.offset_y) if isinstance(e, Detection) else e
+        replace(e, offset_x=-e.offset_x, offset_y=-e.offset_y)
+        if isinstance(e, Detection)
+        else e
         for e in events_of(small_plan(repeats=9))
     ]
     path, out = Foreign().write(tmp_path / "x.mcap", events), tmp_path / "r.json"

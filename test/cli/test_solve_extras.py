@@ -28,7 +28,11 @@ def test_validation_and_budget_are_printed_and_written(solved):
     assert result["validation"][0]["n_grid"] > 20
     assert 1 < result["validation"][0]["ratio"] < 4
     assert {row["type"] for row in result["budget"]} == {"A", "B"}
-    assert {row["source"] for row in result["budget"]} <= {"readings", "declared", "default"}
+    assert {row["source"] for row in result["budget"]} <= {
+        "readings",
+        "declared",
+        "default",
+    }
 
 
 def test_the_law_cannot_hold_readings_out(capsys, tmp_path):
@@ -69,5 +73,8 @@ def test_extras_only_on_demand(solved):
 def test_deficient_bag_names_the_unseen_modes(solved):
     code, result, printed = solved("deficient")
     assert code == 3
-    assert "do not identify the stage" in printed.err and len(printed.err.splitlines()) == 1
+    assert (
+        "do not identify the stage" in printed.err
+        and len(printed.err.splitlines()) == 1
+    )
     assert result["observability"]["modes"] and result["observability"]["advice"]

@@ -69,7 +69,13 @@ CLASHES = {
     ("validate", 1),
 }
 """What Hu's law does not go together with."""
-VIEWS = [("a", 0, (0, 0)), ("b", 90, (0, 0)), ("c", 0, (1, 0)), ("d", 0, (-1, 0)), ("e", 0, (0, 1))]
+VIEWS = [
+    ("a", 0, (0, 0)),
+    ("b", 90, (0, 0)),
+    ("c", 0, (1, 0)),
+    ("d", 0, (-1, 0)),
+    ("e", 0, (0, 1)),
+]
 SIGMA_M, SIGMA_RAD = 2e-8, 1e-5
 BAGS = {
     # axes that the rotary encoder continues, stops on the marks, visits from all sides
@@ -100,7 +106,9 @@ Row = dict[str, int]
 
 def clash(row: Row) -> bool:
     """Return whether options of a row contradict each other."""
-    return bool(row.get("method")) and any(row.get(name) == level for name, level in CLASHES)
+    return bool(row.get("method")) and any(
+        row.get(name) == level for name, level in CLASHES
+    )
 
 
 def pairs_of(factors) -> set[tuple[str, int, str, int]]:
@@ -125,7 +133,11 @@ def covering(factors) -> list[Row]:
         row = {first[0]: first[1], first[2]: first[3]}
         for name in (name for name in factors if name not in row):
             row[name] = max(
-                (level for level in range(len(factors[name])) if not clash({**row, name: level})),
+                (
+                    level
+                    for level in range(len(factors[name]))
+                    if not clash({**row, name: level})
+                ),
                 key=lambda level, name=name: (
                     len(left & pairs_in({**row, name: level}, factors)),
                     -level,
@@ -137,32 +149,46 @@ def covering(factors) -> list[Row]:
 
 
 def pairs_in(row: Row, factors) -> set[tuple[str, int, str, int]]:
-    return {(a, row[a], b, row[b]) for a, b in combinations(factors, 2) if a in row and b in row}
+    return {
+        (a, row[a], b, row[b])
+        for a, b in combinations(factors, 2)
+        if a in row and b in row
+    }
 
 
 def factors_of(bag: str):
     """Return the options that a bag can be solved with: the law wants Hu's views."""
-    return FACTORS if bag == "hu" else {k: v for k, v in FACTORS.items() if k != "method"}
+    return (
+        FACTORS if bag == "hu" else {k: v for k, v in FACTORS.items() if k != "method"}
+    )
 
 
 ROWS = {bag: covering(factors_of(bag)) for bag in BAGS}
 
 
 def words_of(row: Row, **known: float) -> list[str]:
-    return [word.format(**known) for name, level in row.items() for word in FACTORS[name][level]]
+    return [
+        word.format(**known)
+        for name, level in row.items()
+        for word in FACTORS[name][level]
+    ]
 
 
 @pytest.mark.parametrize("bag", BAGS)
 def test_each_two_values_of_options_meet(bag):
     factors = factors_of(bag)
-    assert set().union(*(pairs_in(row, factors) for row in ROWS[bag])) >= pairs_of(factors)
+    assert set().union(*(pairs_in(row, factors) for row in ROWS[bag])) >= pairs_of(
+        factors
+    )
     assert not any(clash(row) for row in ROWS[bag]) and len(ROWS[bag]) <= 30
 
 
 @pytest.fixture(scope="module")
 def bags(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bags")
-    for number, (name, (views, repeats, order, truth, cell, faults)) in enumerate(BAGS.items()):
+    for number, (name, (views, repeats, order, truth, cell, faults)) in enumerate(
+        BAGS.items()
+    ):
         plan = {
             "plan_id": name,
             "visit_order": order,
@@ -187,12 +213,18 @@ def bags(tmp_path_factory):
                     "seed": 32 + number,
                     "cell": cell,
                     "faults": faults,
-                    "truth": {"rotation": "linear" if name == "hu" else "finite", **truth},
+                    "truth": {
+                        "rotation": "linear" if name == "hu" else "finite",
+                        **truth,
+                    },
                     "noise": {"sigma_xy": SIGMA_M, "sigma_theta": SIGMA_RAD},
                 }
             )
         )
-        assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
+        assert (
+            main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)])
+            == 0
+        )
     return folder
 
 
@@ -231,7 +263,8 @@ def test_options_that_contradict_each_other(bags, bag, words, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("bag", "number"), [(bag, number) for bag, rows in ROWS.items() for number in range(len(rows))]
+    ("bag", "number"),
+    [(bag, number) for bag, rows in ROWS.items() for number in range(len(rows))],
 )
 def test_options_in_pairs(bags, bag, number, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -241,16 +274,26 @@ def test_options_in_pairs(bags, bag, number, tmp_path, monkeypatch, capsys):
     row = {"method": 0, **ROWS[bag][number]}
     (tmp_path / "nodes.yaml").write_text("solver: {ros__parameters: {drift_degree: 2}}")
     known = read_json(bags / bag / "truth.json")
-    truth = {name: np.array(known[name]) for name in ("gx", "gy", "g_theta", "ax", "ay")}
-    code = main(["solve", str(bags / bag), "-o", "o.json", *words_of(row, **scales(truth))])
+    truth = {
+        name: np.array(known[name]) for name in ("gx", "gy", "g_theta", "ax", "ay")
+    }
+    code = main(
+        ["solve", str(bags / bag), "-o", "o.json", *words_of(row, **scales(truth))]
+    )
     printed = capsys.readouterr()
     data, files = read_json("o.json"), {path.name for path in tmp_path.iterdir()}
     if row["json"]:
         assert json.loads(printed.out) == data
-    if code == 3:  # a plate that was laid down so well does not tell a microscope or a drift
+    # a plate that was laid down so well does not tell a microscope or a drift
+    if code == 3:
         assert bag == "hu" and row["model"] in (1, 2, 3)
-        assert not data["observability"]["identifiable"] and files == {"nodes.yaml", "o.json"}
-        assert printed.err.startswith("selfcal solve: ") and printed.err.count("\n") == 1
+        assert not data["observability"]["identifiable"] and files == {
+            "nodes.yaml",
+            "o.json",
+        }
+        assert (
+            printed.err.startswith("selfcal solve: ") and printed.err.count("\n") == 1
+        )
         return
     # wrong by what is known: rotations that are no small ones, axes that the encoder owes nothing
     wrong = row["misalignment"] == 1 if bag == "five" else row["datum"] == 1
@@ -259,11 +302,14 @@ def test_options_in_pairs(bags, bag, number, tmp_path, monkeypatch, capsys):
     assert grade != "good" if wrong else grade == "good"
     assert files == {"nodes.yaml", "o.json"} | ({"r.html"} if row["report"] else set())
     again = result_to_dict(result_from_dict(data, "o.json"))
-    assert again | {"digest": None} == data | {"digest": None}  # 1 and 1.0 are the same number
+    # 1 and 1.0 are the same number
+    assert again | {"digest": None} == data | {"digest": None}
     told = printed.err if row["json"] else printed.out
     assert (told.count("\n") > 20) == (not row["quiet"])
     assert_as_asked(data, row)
-    assert_true(data, truth, row, wrong_xy=wrong and (bag == "five" or row["method"] == 1))
+    assert_true(
+        data, truth, row, wrong_xy=wrong and (bag == "five" or row["method"] == 1)
+    )
 
 
 def scales(truth):
@@ -278,7 +324,9 @@ def scales(truth):
 def assert_as_asked(data, row):
     """The result says what was asked for, and has what was asked for and nothing else."""
     assert data["method"] == ("law" if row["method"] else "joint")
-    assert data["error_map"]["datum_theta"] == ("xy_axes" if row["datum"] else "zero_mean")
+    assert data["error_map"]["datum_theta"] == (
+        "xy_axes" if row["datum"] else "zero_mean"
+    )
     linear = row["misalignment"] == 1 or row["method"]
     assert data["model"]["misalignment"] == ("linear" if linear else "rigid")
     given = ",".join(FACTORS["model"][row["model"]][1::2]).replace("none", "")
@@ -289,13 +337,18 @@ def assert_as_asked(data, row):
     } == names | (set() if bare else ASSUMED)
     degrees = {2 if row["params"] else 3} if "drift" in given else set()
     assert {
-        sum(item["view"] == "a" and item["component"].startswith("x") for item in term["estimates"])
+        sum(
+            item["view"] == "a" and item["component"].startswith("x")
+            for item in term["estimates"]
+        )
         for term in data["model"]["terms"]
         if term["name"] == "drift"
     } == degrees
     kind = (None, "artifact", "stage_x")[row["reference"]]
     assert (data["reference"] or {}).get("kind") == kind
-    assert (data["reference"] or {}).get("certificate", "") == "No. 7" * (row["reference"] == 2)
+    assert (data["reference"] or {}).get("certificate", "") == "No. 7" * (
+        row["reference"] == 2
+    )
     never = row["uncertainty"] == 1
     assert ("outliers" in data, "validation" in data, bool(data["budget"])) == (
         bool(row["robust"]),
@@ -307,7 +360,9 @@ def assert_as_asked(data, row):
 def assert_true(data, truth, row, *, wrong_xy):
     """All is known; and where the result is right, to within what it says."""
     emap, never = data["error_map"], row["uncertainty"] == 1
-    error = {name: np.array(emap[name], dtype=float) - truth[name] for name in ("gx", "gy")}
+    error = {
+        name: np.array(emap[name], dtype=float) - truth[name] for name in ("gx", "gy")
+    }
     theta = truth["g_theta"] - (0.0 if row["datum"] else truth["g_theta"].mean())
     error["g_theta"] = np.array(emap["g_theta"], dtype=float) - theta
     for name, values in error.items():
@@ -318,6 +373,8 @@ def assert_true(data, truth, row, *, wrong_xy):
         # axes that the encoder does not follow spoil theta alone, but for Hu's law
         if data["verdict"]["qualified"] or (not wrong_xy and name != "g_theta"):
             # what is wrong and bounded enlarges u
-            assert never or data["verdict"]["grade"] == "enlarged" or u.max() < largest, name
+            assert (
+                never or data["verdict"]["grade"] == "enlarged" or u.max() < largest
+            ), name
             of_u = values / (largest if never else u)
             assert np.sqrt((of_u**2).mean()) < 1.8 and abs(of_u).max() < 4.5, name

@@ -39,7 +39,9 @@ def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
     else:
         along = fixed["gx"] if kind == "stage_x" else fixed["gy"]
         axis = x if kind == "stage_x" else x.T
-        assert (along * axis).sum() / (axis * axis).sum() == pytest.approx(2e-6, abs=1e-9)
+        assert (along * axis).sum() / (axis * axis).sum() == pytest.approx(
+            2e-6, abs=1e-9
+        )
     assert fixed["u_gx"][0, 5] == pytest.approx(0.05 * 1e-7, rel=0.05)
 
 
@@ -59,7 +61,10 @@ def test_the_distance_of_two_marks_is_met(tmp_path):
     assert plate["u_gx"][0, 5] == pytest.approx(0.05 * 1e-7, rel=0.05)
     reference = json.loads((tmp_path / "r.json").read_text())["reference"]
     assert reference["marks"] == [[-5, 0], [5, 0]]
-    assert main(["export", "kmotion", str(tmp_path / "r.json"), "-o", str(tmp_path / "t")]) == 0
+    assert (
+        main(["export", "kmotion", str(tmp_path / "r.json"), "-o", str(tmp_path / "t")])
+        == 0
+    )
     assert (
         "reference length: distance of the marks (-5, 0) and (5, 0), relative error 2e-06, "
         "u 1e-07 (PTB 1)"

@@ -28,9 +28,16 @@ def run(capsys, *args):
 def test_table_1_case_c_through_the_command(tmp_path, capsys):
     # Laser along the machine's own diagonals, a = b = 10 mm, Ex(y) = 0.1 mm.
     r_pp, r_np = np.hypot(10.1, 10), np.hypot(9.9, 10)
-    row = (10.1 * 10 / r_pp, (10.1 * 0.1 + 100) / r_pp, 9.9 * 10 / r_np, (100 - 9.9 * 0.1) / r_np)
+    row = (
+        10.1 * 10 / r_pp,
+        (10.1 * 0.1 + 100) / r_pp,
+        9.9 * 10 / r_np,
+        (100 - 9.9 * 0.1) / r_np,
+    )
     table, out = tmp_path / "c.csv", tmp_path / "out.json"
-    table.write_text("block,rx_pp,ry_pp,rx_np,ry_np\n1," + ",".join(f"{r:.9f}" for r in row))
+    table.write_text(
+        "block,rx_pp,ry_pp,rx_np,ry_np\n1," + ",".join(f"{r:.9f}" for r in row)
+    )
     code, text, _ = run(capsys, table, "--method", "conventional", "-o", out)
     result = json.loads(out.read_text())
     assert code == 0 and text.startswith("conventional formulation, 1 blocks")
@@ -44,7 +51,16 @@ def test_the_example_gives_what_its_truth_says(method, tmp_path, capsys):
     truth = json.loads((CONFIG / "case_study_truth.json").read_text())
     out = tmp_path / "out.json"
     code, _, err = run(
-        capsys, EXAMPLE, "--method", method, "--step-x", "10", "--step-y", "10", "-o", out
+        capsys,
+        EXAMPLE,
+        "--method",
+        method,
+        "--step-x",
+        "10",
+        "--step-y",
+        "10",
+        "-o",
+        out,
     )
     result = json.loads(out.read_text())
     assert (code, err) == (0, "")
@@ -60,11 +76,15 @@ def test_the_example_gives_what_its_truth_says(method, tmp_path, capsys):
     for key in ("ex_x", "ey_x", "ex_y", "ey_y"):
         assert len(result[key]) == 6 and len(result[f"u_{key}"]) == 6
     assert result["ey_x"][0] == 0
-    assert result["input"]["file"] == str(EXAMPLE) and len(result["input"]["sha256"]) == 64
+    assert (
+        result["input"]["file"] == str(EXAMPLE) and len(result["input"]["sha256"]) == 64
+    )
 
 
 def test_without_an_output_file_the_json_is_printed(capsys):
-    code, text, _ = run(capsys, EXAMPLE, "--method", "new", "--form", "printed", "--line", "end")
+    code, text, _ = run(
+        capsys, EXAMPLE, "--method", "new", "--form", "printed", "--line", "end"
+    )
     result = json.loads(text)
     assert code == 0 and result["form"] == "printed" and result["line"] == "end"
     assert len(result["profiles"]["py_x"]["error"]) == 7
@@ -74,11 +94,24 @@ def test_body_diagonals_are_told_by_their_columns(tmp_path, capsys):
     rng = np.random.default_rng(3)
     machine = random_machine((0.01, 0.02, 0.005), 4, rng)
     setups = {"npp": SetUp(mirror_rad=(1e-3, -1e-3))}
-    data = simulate_step_diagonal(machine, Measurement(setups, LaserNoise(repeats=2)), rng)
+    data = simulate_step_diagonal(
+        machine, Measurement(setups, LaserNoise(repeats=2)), rng
+    )
     table, out = tmp_path / "d.csv", tmp_path / "out.json"
     write_table(table, data)
     code, text, err = run(
-        capsys, table, "--method", "new", "--step-x", 10, "--step-y", 20, "--step-z", 5, "-o", out
+        capsys,
+        table,
+        "--method",
+        "new",
+        "--step-x",
+        10,
+        "--step-y",
+        20,
+        "--step-z",
+        5,
+        "-o",
+        out,
     )
     result = json.loads(out.read_text())
     assert code == 0 and "squareness_xz" in text and "straightness_z_in_x" in text
@@ -86,15 +119,23 @@ def test_body_diagonals_are_told_by_their_columns(tmp_path, capsys):
     for j, axis in enumerate("xyz"):
         for c, direction in enumerate("xyz"):
             np.testing.assert_allclose(
-                result[f"e{direction}_{axis}"], machine.errors_m[j, :, c] * 1e3, atol=1e-6
+                result[f"e{direction}_{axis}"],
+                machine.errors_m[j, :, c] * 1e3,
+                atol=1e-6,
             )
 
 
 def test_one_diagonal_on_request(capsys):
     code, text, _ = run(capsys, EXAMPLE, "--method", "new", "--diagonals", "pp")
     result = json.loads(text)
-    assert code == 0 and result["diagonals"] == ["pp"] and result["closure"]["lengths"] is None
-    code, text, err = run(capsys, EXAMPLE, "--method", "conventional", "--diagonals", "np")
+    assert (
+        code == 0
+        and result["diagonals"] == ["pp"]
+        and result["closure"]["lengths"] is None
+    )
+    code, text, err = run(
+        capsys, EXAMPLE, "--method", "conventional", "--diagonals", "np"
+    )
     assert code == 2 and not text
     assert err == (
         "selfcal step-diagonal: diagonals: only np measured; the conventional "
@@ -128,23 +169,45 @@ def test_bad_arguments_are_one_line_and_exit_code_2(capsys, extra, message):
     ("args", "message"),
     [
         (("d.csv", "--method", "new", "-o", "d.csv"), "d.csv: would be overwritten"),
-        (("d.csv", "--method", "new", "-o", "a.json", "--cal", "a.json"), "a.json: would be over"),
+        (
+            ("d.csv", "--method", "new", "-o", "a.json", "--cal", "a.json"),
+            "a.json: would be over",
+        ),
         (
             ("d.csv", "--method", "new", "-o", "no/a.json", "--cal", "a.cal"),
             "no/a.json: cannot be wr",
         ),
         (
-            ("d.csv", "--method", "new", "-o", "a.json", "--plot", "a.png", "--cal", "old.cal"),
+            (
+                "d.csv",
+                "--method",
+                "new",
+                "-o",
+                "a.json",
+                "--plot",
+                "a.png",
+                "--cal",
+                "old.cal",
+            ),
             "old.cal: the file exists",
         ),
         (
             ("d.csv", "--method", "new", "--save-csv", "a.csv"),
             "--save-csv: nothing would be written",
         ),
-        (("d.csv", "--method", "new", "--truth", "a.json"), "--truth: nothing would be written"),
+        (
+            ("d.csv", "--method", "new", "--truth", "a.json"),
+            "--truth: nothing would be written",
+        ),
         (("--simulate", "s.yaml", "-o", "s.yaml"), "s.yaml: would be overwritten"),
-        (("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"), "./a.csv: would be over"),
-        (("--simulate", "s.yaml", "--plot", "a.png"), "--plot: nothing would be written"),
+        (
+            ("--simulate", "s.yaml", "-o", "a.csv", "--truth", "./a.csv"),
+            "./a.csv: would be over",
+        ),
+        (
+            ("--simulate", "s.yaml", "--plot", "a.png"),
+            "--plot: nothing would be written",
+        ),
         (("--simulate", "s.yaml", "--cal", "a.cal"), "--cal: nothing would be written"),
     ],
 )
@@ -236,7 +299,10 @@ def test_data_and_method_belong_together(capsys):
 
 def test_a_picture_has_a_known_format(tmp_path, capsys):
     code, _, err = run(capsys, EXAMPLE, "--method", "new", "--plot", tmp_path / "p.gif")
-    assert code == 2 and "by its suffix; name a file that ends in .png, .svg or .pdf" in err
+    assert (
+        code == 2
+        and "by its suffix; name a file that ends in .png, .svg or .pdf" in err
+    )
 
 
 def test_the_corrections_are_written_as_tables(tmp_path, capsys):
@@ -266,7 +332,9 @@ def test_the_corrections_are_written_as_tables(tmp_path, capsys):
     ]
     result = json.loads((tmp_path / "o.json").read_text())
     np.testing.assert_allclose(
-        tables[0].values, [-1e3 * e for e in result["profiles"]["px_x"]["error"]], atol=1e-5
+        tables[0].values,
+        [-1e3 * e for e in result["profiles"]["px_x"]["error"]],
+        atol=1e-5,
     )
     code, _, err = run(capsys, *args)
     assert code == 2 and "the file exists" in err
@@ -281,7 +349,9 @@ def recorded_bag(path, **options):
 
     setups = {"pp": SetUp(mirror_rad=(5e-4,)), "np": SetUp(mirror_rad=(-5e-4,))}
     return write_laser_bag(
-        path, recorded(case_study_machine(), setups, rng=np.random.default_rng(4)), **options
+        path,
+        recorded(case_study_machine(), setups, rng=np.random.default_rng(4)),
+        **options,
     )
 
 
@@ -305,7 +375,15 @@ def test_a_bag_gives_the_same_as_the_table_of_its_blocks(tmp_path, capsys):
     assert code == 0 and "complete runs: np 1, pp 1, x 1, y 1" in err
     assert run(capsys, table, "--method", "new", "-o", again)[0] == 0
     one, other = (json.loads(path.read_text()) for path in (out, again))
-    for key in ("ex_x", "ey_x", "ex_y", "ey_y", "squareness", "straightness_x", "straightness_y"):
+    for key in (
+        "ex_x",
+        "ey_x",
+        "ex_y",
+        "ey_y",
+        "squareness",
+        "straightness_x",
+        "straightness_y",
+    ):
         np.testing.assert_allclose(one[key], other[key], atol=1e-7)
     assert one["squareness"] == pytest.approx(-1.22e-3, abs=1e-8)
     assert one["straightness_y"] == pytest.approx(0.11e-3, abs=1e-8)
@@ -340,14 +418,25 @@ def test_a_diagonal_that_was_not_run_is_named(tmp_path, capsys):
     assert code == 0 and json.loads(text)["diagonals"] == ["np"]
     code, _, err = run(capsys, bag, "--method", "new", *topics, "--diagonals", "ppp")
     assert code == 2 and "'ppp' is unknown" in err
-    code, _, err = run(capsys, bag, "--method", "conventional", *topics, "--laser-sign", "-1")
+    code, _, err = run(
+        capsys, bag, "--method", "conventional", *topics, "--laser-sign", "-1"
+    )
     assert code == 2 and "the sign is wrong" in err
 
 
 def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
     table, truth = tmp_path / "d.csv", tmp_path / "t.json"
     assert (
-        run(capsys, "--simulate", CONFIG / "case_study.yaml", "-o", table, "--truth", truth)[0] == 0
+        run(
+            capsys,
+            "--simulate",
+            CONFIG / "case_study.yaml",
+            "-o",
+            table,
+            "--truth",
+            truth,
+        )[0]
+        == 0
     )
 
     def rows(path):
@@ -361,7 +450,15 @@ def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
         atol=2e-8,
     )
     shipped_truth = json.loads((CONFIG / "case_study_truth.json").read_text())
-    for key in ("ex_x", "ey_x", "ex_y", "ey_y", "squareness", "straightness_x", "straightness_y"):
+    for key in (
+        "ex_x",
+        "ey_x",
+        "ex_y",
+        "ey_y",
+        "squareness",
+        "straightness_x",
+        "straightness_y",
+    ):
         np.testing.assert_allclose(
             json.loads(truth.read_text())[key], shipped_truth[key], atol=1e-11
         )
@@ -373,7 +470,15 @@ def test_the_example_is_what_its_configuration_simulates(tmp_path, capsys):
 def test_the_body_diagonals_of_the_example(tmp_path, capsys):
     table, truth = tmp_path / "d.csv", tmp_path / "t.json"
     assert (
-        run(capsys, "--simulate", CONFIG / "body_diagonals.yaml", "-o", table, "--truth", truth)[0]
+        run(
+            capsys,
+            "--simulate",
+            CONFIG / "body_diagonals.yaml",
+            "-o",
+            table,
+            "--truth",
+            truth,
+        )[0]
         == 0
     )
     code, text, _ = run(

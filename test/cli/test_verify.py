@@ -40,7 +40,10 @@ def folder(tmp_path_factory):
         noise_seed=1,
         **MACHINE,
     )
-    assert main(["solve", str(folder / "first"), "-o", str(folder / "r.json"), "--quiet"]) == 0
+    assert (
+        main(["solve", str(folder / "first"), "-o", str(folder / "r.json"), "--quiet"])
+        == 0
+    )
     return folder
 
 
@@ -77,7 +80,9 @@ def test_what_acts_is_named(folder, capsys, views, times, fault, code):
     assert found["passed"] is (code == 0)
     assert found["better"] is (0 < times < 2)
     for axis in found["axes"].values():
-        assert abs(axis["factor"] - times) < max(5 * axis["u_factor"], 0.002 * abs(times))
+        assert abs(axis["factor"] - times) < max(
+            5 * axis["u_factor"], 0.002 * abs(times)
+        )
 
 
 def test_a_correction_that_acts(folder, capsys):
@@ -114,23 +119,36 @@ def test_a_map_of_another_lattice_is_refused(folder, capsys):
 
 
 @pytest.mark.parametrize(
-    ("views", "times", "passed"), [(VIEWS, 1, True), (VIEWS[:1], 1, True), (VIEWS[:1], -1, False)]
+    ("views", "times", "passed"),
+    [(VIEWS, 1, True), (VIEWS[:1], 1, True), (VIEWS[:1], -1, False)],
 )
 def test_a_plan_that_verifies_says_the_same_live(folder, capsys, views, times, passed):
     name = f"live_{times}_{len(views)}"
-    plan = {"plan_id": name, "verify": str(folder / "r.json"), "artifact": PLATE, "views": views}
+    plan = {
+        "plan_id": name,
+        "verify": str(folder / "r.json"),
+        "artifact": PLATE,
+        "views": views,
+    }
     simulate(
-        folder, name, plan, noise_seed=2, correction={"result": "r.json", "times": times}, **MACHINE
+        folder,
+        name,
+        plan,
+        noise_seed=2,
+        correction={"result": "r.json", "times": times},
+        **MACHINE,
     )
     capsys.readouterr()
-    assert main(["verify", str(folder / "r.json"), str(folder / name), "--json"]) == 5 * (
-        not passed
-    )
+    assert main(
+        ["verify", str(folder / "r.json"), str(folder / name), "--json"]
+    ) == 5 * (not passed)
     told = json.loads(capsys.readouterr().out)["sentence"]
 
     hands = Hands()
     session = SolvingSession(settings_of("solver"), hands.ports)
-    measurements, progress, *_ = collect_bag(str(folder / name), CollectorSettings.checked({}, ""))
+    measurements, progress, *_ = collect_bag(
+        str(folder / name), CollectorSettings.checked({}, "")
+    )
     first = progress[0].readings.view
     planned = Command(
         int(measurements.run_id),
@@ -156,7 +174,8 @@ def test_a_plan_that_verifies_says_the_same_live(folder, capsys, views, times, p
     summaries = [fields for output, fields in hands.published if output == "summary"]
     assert summaries[-1]["state"] == told
     assert summaries[-1]["qualified"] is passed
-    assert all(output != "map" for output, _ in hands.published)  # nobody corrects by what is left
+    # nobody corrects by what is left
+    assert all(output != "map" for output, _ in hands.published)
 
 
 def test_a_bag_of_a_verification_is_not_solved_as_a_calibration(folder, capsys):
@@ -166,7 +185,12 @@ def test_a_bag_of_a_verification_is_not_solved_as_a_calibration(folder, capsys):
     simulate(
         folder,
         "verifying",
-        {"plan_id": "v", "verify": str(folder / "r.json"), "artifact": PLATE, "views": VIEWS},
+        {
+            "plan_id": "v",
+            "verify": str(folder / "r.json"),
+            "artifact": PLATE,
+            "views": VIEWS,
+        },
         noise_seed=2,
         **MACHINE,
     )

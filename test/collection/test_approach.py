@@ -31,7 +31,9 @@ def asked(joint, *at_ms, threshold=UM):
 
 def path(*positions, dwell=5):
     """Return samples every 10 ms of a stage that rests `dwell` samples at each position."""
-    return [(10 * at, p) for at, p in enumerate(p for p in positions for _ in range(dwell))]
+    return [
+        (10 * at, p) for at, p in enumerate(p for p in positions for _ in range(dwell))
+    ]
 
 
 def test_the_sign_is_that_of_the_last_motion_and_holds_while_the_axis_rests():
@@ -41,7 +43,9 @@ def test_the_sign_is_that_of_the_last_motion_and_holds_while_the_axis_rests():
     assert asked(joint, 20, 220) == [0, 1]
 
 
-@pytest.mark.parametrize(("over", "sign"), [(5 * UM, -1), (1.1 * UM, -1), (0.9 * UM, 1)])
+@pytest.mark.parametrize(
+    ("over", "sign"), [(5 * UM, -1), (1.1 * UM, -1), (0.9 * UM, 1)]
+)
 @pytest.mark.parametrize("side", [1, -1])
 def test_an_overshoot_beyond_the_threshold_is_the_last_motion(over, sign, side):
     joint = track(path(0.0, side * (0.01 + over), side * 0.01))
@@ -49,7 +53,9 @@ def test_an_overshoot_beyond_the_threshold_is_the_last_motion(over, sign, side):
     assert asked(joint, 20, 120, threshold=10 * UM) == [0, side]
 
 
-@pytest.mark.parametrize(("step", "found"), [(0.9 * UM, 0), (1.1 * UM, 1), (-1.1 * UM, -1)])
+@pytest.mark.parametrize(
+    ("step", "found"), [(0.9 * UM, 0), (1.1 * UM, 1), (-1.1 * UM, -1)]
+)
 def test_a_displacement_counts_beyond_the_threshold(step, found):
     assert asked(track(path(0.0, step)), 20, 70) == [0, found]
 
@@ -65,7 +71,10 @@ def test_a_displacement_counts_beyond_the_noise_at_rest(step, found):
 def test_samples_of_a_stage_that_mostly_moves_tell_no_wrong_direction(step_ms, known):
     """An exposure every 200 ms, moves of 80 ms between: a slow encoder has few samples at rest."""
     stops = np.random.default_rng(2).permutation(60) * 1e-3
-    times, course = np.array([[-60.0, 60.0]]) + 200 * np.arange(60)[:, None], np.repeat(stops, 2)
+    times, course = (
+        np.array([[-60.0, 60.0]]) + 200 * np.arange(60)[:, None],
+        np.repeat(stops, 2),
+    )
     at = np.arange(-60.0, 200 * 59 + 61, step_ms)
     joint = track(zip(at, np.interp(at, times.ravel(), course), strict=True))
     true = np.sign(np.diff(stops))
@@ -119,7 +128,10 @@ def looked_for(samples, stamps, positions):
     return signs
 
 
-STEPS, PLACES = st.sampled_from([1, 10, 99, 101]), st.sampled_from([0.0] * 20 + [1e-3, -1e-3, 5e-7])
+STEPS, PLACES = (
+    st.sampled_from([1, 10, 99, 101]),
+    st.sampled_from([0.0] * 20 + [1e-3, -1e-3, 5e-7]),
+)
 
 
 @settings(max_examples=20)

@@ -25,11 +25,15 @@ def moved(cell, joint, about_ns, *, speed=None, drift=0.0):
         positions[index] += drift * (20 * MS + min(max(away, -20 * MS), 20 * MS)) / 1e9
         told[index] = (speed or 0.0) * (abs(away) <= 20 * MS)
         cell.samples[at] = replace(
-            sample, positions=tuple(positions), velocities=() if speed is None else tuple(told)
+            sample,
+            positions=tuple(positions),
+            velocities=() if speed is None else tuple(told),
         )
 
 
-@pytest.mark.parametrize(("drift", "moving"), [(0.1, True), (-0.1, True), (0.004, False)])
+@pytest.mark.parametrize(
+    ("drift", "moving"), [(0.1, True), (-0.1, True), (0.004, False)]
+)
 def test_a_grid_reading_while_theta_turns(drift, moving):
     cell = scene()
     at = cell.detections[cell.grid(12)].stamp_ns
@@ -43,20 +47,26 @@ def test_a_grid_reading_while_theta_turns(drift, moving):
 
 
 @pytest.mark.parametrize("joint", ["x", "y"])
-@pytest.mark.parametrize(("drift", "moving"), [(0.01, True), (-0.01, True), (4e-4, False)])
+@pytest.mark.parametrize(
+    ("drift", "moving"), [(0.01, True), (-0.01, True), (4e-4, False)]
+)
 def test_an_angular_reading_while_x_or_y_moves(joint, drift, moving):
     cell = scene()
     at = cell.detections[cell.angular(4)].stamp_ns
     moved(cell, joint, at, drift=drift)
     found, _ = collect(cell.events)
     near = [
-        d.k for d in cell.detections if d.kind == Kind.ANGULAR and abs(d.stamp_ns - at) <= 20 * MS
+        d.k
+        for d in cell.detections
+        if d.kind == Kind.ANGULAR and abs(d.stamp_ns - at) <= 20 * MS
     ]
     assert found.all_rejected() == ({"stage_moving": len(near)} if moving else {})
     assert set(found.views[0].k) == set(range(8)) - set(near if moving else ())
 
 
-@pytest.mark.parametrize(("speed", "moving"), [(0.004, False), (0.006, True), (-0.006, True)])
+@pytest.mark.parametrize(
+    ("speed", "moving"), [(0.004, False), (0.006, True), (-0.006, True)]
+)
 def test_a_told_turn_rate_counts_for_a_grid_reading(speed, moving):
     cell = scene()
     moved(cell, "theta", cell.detections[cell.grid(12)].stamp_ns, speed=speed)
@@ -75,7 +85,9 @@ def test_a_detection_that_two_joints_reject_counts_once():
 
 def test_a_stage_without_theta_encoder_reads_the_grid():
     cell = scene(count=0)
-    cell.samples = [EncoderSample(s.stamp_ns, ("x", "y"), s.positions[:2]) for s in cell.samples]
+    cell.samples = [
+        EncoderSample(s.stamp_ns, ("x", "y"), s.positions[:2]) for s in cell.samples
+    ]
     found, _ = collect(cell.events)
     assert found.all_rejected() == {}
     assert table(found.views[0]) == table(collect(scene(count=0).events)[0].views[0])
@@ -85,7 +97,9 @@ def test_a_theta_encoder_that_falls_silent_or_contradicts_itself_does_not_touch_
     cell = scene(count=0)
     half = cell.detections[12].stamp_ns
     silent = [
-        s if s.stamp_ns < half else EncoderSample(s.stamp_ns, ("x", "y"), s.positions[:2])
+        s
+        if s.stamp_ns < half
+        else EncoderSample(s.stamp_ns, ("x", "y"), s.positions[:2])
         for s in cell.samples
     ]
     echo = [EncoderSample(s.stamp_ns, ("theta",), (0.5,)) for s in cell.samples]
@@ -113,7 +127,9 @@ def test_noise_of_an_unneeded_joint_is_no_motion(size):
 
 def test_noise_of_a_told_speed_is_no_motion_though_the_position_stands_still():
     cell, rng = scene(count=0), np.random.default_rng(1)
-    noisy = [replace(s, velocities=(0.0, 0.0, rng.normal(0, 0.05))) for s in cell.samples]
+    noisy = [
+        replace(s, velocities=(0.0, 0.0, rng.normal(0, 0.05))) for s in cell.samples
+    ]
     found, _ = collect([*cell.commands, *noisy, *cell.detections])
     assert found.all_rejected() == {}
 
@@ -137,7 +153,9 @@ def test_three_samples_tell_noise_from_motion_and_two_do_not(n):
         joint = JointTrack(LIMITS)
         for at, position in zip(stamps_ms.tolist(), positions.tolist(), strict=True):
             joint.add(at * MS, position, math.nan)
-        assert joint.moving(np.array([MS])).tolist() == [Reason.MOVING if moves else None]
+        assert joint.moving(np.array([MS])).tolist() == [
+            Reason.MOVING if moves else None
+        ]
 
 
 def steps(rng, motion, *, sigma, speeds=False):
@@ -145,7 +163,11 @@ def steps(rng, motion, *, sigma, speeds=False):
     joint, position = JointTrack(LIMITS), 0.0
     for number in range(400):
         rate = motion(number)
-        joint.add(number * 2 * MS, position + rng.normal(0, sigma), rate if speeds else math.nan)
+        joint.add(
+            number * 2 * MS,
+            position + rng.normal(0, sigma),
+            rate if speeds else math.nan,
+        )
         position += rate * 2e-3
     return joint
 
@@ -154,7 +176,9 @@ def steps(rng, motion, *, sigma, speeds=False):
 @pytest.mark.parametrize("sigma", [0.0, 1e-4])
 def test_motion_is_found_beside_noise_and_noise_alone_is_not(sigma, speeds):
     between = np.arange(400) * 2 * MS + MS
-    still = steps(np.random.default_rng(1), lambda number: 0.0, sigma=sigma, speeds=speeds)
+    still = steps(
+        np.random.default_rng(1), lambda number: 0.0, sigma=sigma, speeds=speeds
+    )
     assert not (still.moving(between[:-1]) == Reason.MOVING).any()
     some = steps(
         np.random.default_rng(1),
@@ -165,7 +189,9 @@ def test_motion_is_found_beside_noise_and_noise_alone_is_not(sigma, speeds):
     found = some.moving(between[:-1]) == Reason.MOVING
     assert found[100:300].all()
     assert not found[:99].any() and not found[301:].any()
-    steady = steps(np.random.default_rng(1), lambda number: 5.0, sigma=sigma, speeds=speeds)
+    steady = steps(
+        np.random.default_rng(1), lambda number: 5.0, sigma=sigma, speeds=speeds
+    )
     assert (steady.moving(between[:-1]) == Reason.MOVING).all()
     at_samples = steady.moving(np.arange(1, 399) * 2 * MS)
     assert (at_samples == Reason.MOVING).all()
@@ -177,7 +203,10 @@ def test_a_joint_without_samples_near_does_not_move():
     joint.add(0, 0.0, math.nan)
     assert joint.moving(np.array([0, 5])).tolist() == [None, None]
     joint.add(200 * MS, 50.0, 9.0)
-    assert joint.moving(np.array([100 * MS, 200 * MS])).tolist() == [None, Reason.MOVING]
+    assert joint.moving(np.array([100 * MS, 200 * MS])).tolist() == [
+        None,
+        Reason.MOVING,
+    ]
     assert joint.moving(np.zeros(0, dtype=np.int64)).tolist() == []
 
 

@@ -17,7 +17,9 @@ TRUE = 1_700_000_000 * S + np.arange(3000) * 5 * MS
 
 def found(stamps, received, limit_s=0.1, pieces=1):
     watch = StepWatch(limit_s)
-    parts = zip(np.array_split(stamps, pieces), np.array_split(received, pieces), strict=True)
+    parts = zip(
+        np.array_split(stamps, pieces), np.array_split(received, pieces), strict=True
+    )
     return [step for part in parts for step in watch.add(*part)]
 
 
@@ -106,7 +108,9 @@ def late_then_dropped(late_s=0.425, start=400, stop=1000):
     lost = round(late_s * 200)
     kept = np.r_[TRUE[:stop], TRUE[stop + lost :]]
     delay = np.where(
-        (np.arange(len(kept)) >= start) & (np.arange(len(kept)) < stop), round(late_s * S), MS
+        (np.arange(len(kept)) >= start) & (np.arange(len(kept)) < stop),
+        round(late_s * S),
+        MS,
     )
     return kept, kept + delay
 
@@ -127,7 +131,17 @@ def faster():
 
 @pytest.mark.parametrize(
     "case",
-    [bundles, hole, stall, transport, shuffled, mixed, faster, late_then_dropped, late_for_long],
+    [
+        bundles,
+        hole,
+        stall,
+        transport,
+        shuffled,
+        mixed,
+        faster,
+        late_then_dropped,
+        late_for_long,
+    ],
     ids=lambda case: case.__name__,
 )
 def test_what_only_looks_like_a_step_is_none(case):

@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase, Reason
+from selfcal_ros.collection.inputs import (
+    Command,
+    Detection,
+    EncoderSample,
+    Phase,
+    Reason,
+)
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
@@ -43,20 +49,29 @@ def lost_marks(events, **parameters):
 @pytest.mark.parametrize("sense", list(Sense))
 def test_the_readings_are_the_deviations_of_the_truth(sense):
     cell = scene(
-        "0, 90, tx, 270", line=True, sense=sense, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0
+        "0, 90, tx, 270",
+        line=True,
+        sense=sense,
+        servo_sigma_m=0.0,
+        servo_sigma_theta_rad=0.0,
     )
     found, progress = collect(cell.events, measurement_sense=str(sense))
     assert found.sense is sense
     assert all(item.complete and item.coverage == 1.0 for item in progress.values())
     assert len(found.views) == 5
-    for index, (view, readings) in enumerate(zip(cell.plan.views, found.views, strict=True)):
+    for index, (view, readings) in enumerate(
+        zip(cell.plan.views, found.views, strict=True)
+    ):
         assert readings.view == view
         if view.grid:
             expected = grid_deviation(cell.truth, index, view, sense=sense)
             at = np.stack([readings.m, readings.n]) + 2
             assert len(readings.m) == np.isfinite(expected[0]).sum()
             np.testing.assert_allclose(
-                np.stack([readings.dx, readings.dy]), expected[:, *at], rtol=0, atol=ROUNDING_M
+                np.stack([readings.dx, readings.dy]),
+                expected[:, *at],
+                rtol=0,
+                atol=ROUNDING_M,
             )
         expected = angular_deviation(cell.truth, index, view, sense=sense)
         assert readings.k.tolist() == list(range(8))
@@ -116,12 +131,21 @@ def test_an_exposure_while_theta_turns():
     assert lost_marks(cell.events) == ({"stage_moving": 1}, {("line", 6)})
 
 
-@pytest.mark.parametrize(("rate", "moving"), [(4e-4, False), (6e-4, True), (-6e-4, True)])
+@pytest.mark.parametrize(
+    ("rate", "moving"), [(4e-4, False), (6e-4, True), (-6e-4, True)]
+)
 def test_an_encoder_that_tells_of_motion_in_its_velocity(rate, moving):
     cell = scene()
     d = cell.detections[cell.grid(6)]
     cell.samples = [
-        replace(s, velocities=(0.0, rate if abs(s.stamp_ns - d.stamp_ns) < 3 * MS else 0.0, 0.0))
+        replace(
+            s,
+            velocities=(
+                0.0,
+                rate if abs(s.stamp_ns - d.stamp_ns) < 3 * MS else 0.0,
+                0.0,
+            ),
+        )
         for s in cell.samples
     ]
     rejected, lost = lost_marks(cell.events)
@@ -132,12 +156,18 @@ def test_an_encoder_that_tells_of_motion_in_its_velocity(rate, moving):
 def test_samples_that_contradict_each_other_at_one_stamp():
     cell = scene()
     d = cell.detections[cell.grid(6)]
-    sample = max((s for s in cell.samples if s.stamp_ns < d.stamp_ns), key=lambda s: s.stamp_ns)
+    sample = max(
+        (s for s in cell.samples if s.stamp_ns < d.stamp_ns), key=lambda s: s.stamp_ns
+    )
     x, y, theta = sample.positions
     cell.samples.append(replace(sample, positions=(x + 1e-6, y, theta)))
     rejected, lost = lost_marks(cell.events)
     assert rejected == {"encoder_contradiction": len(lost)}
-    near = {mark_of(o) for o in cell.detections if abs(o.stamp_ns - sample.stamp_ns) <= 50 * MS}
+    near = {
+        mark_of(o)
+        for o in cell.detections
+        if abs(o.stamp_ns - sample.stamp_ns) <= 50 * MS
+    }
     assert lost == near
     cell.samples[-1] = replace(sample, positions=(x + 1e-10, y, theta))
     assert lost_marks(cell.events, encoder_agreement=1e-9)[0] == {}
@@ -225,7 +255,9 @@ def test_a_view_placed_again_but_not_measured_keeps_its_readings():
 def test_views_of_another_plan():
     cell = scene("0, 90")
     other = [
-        replace(c, plan_id="other", stamp_ns=c.stamp_ns) for c in cell.commands if c.view_index == 0
+        replace(c, plan_id="other", stamp_ns=c.stamp_ns)
+        for c in cell.commands
+        if c.view_index == 0
     ]
     cell.commands = [*other, *(c for c in cell.commands if c.view_index != 0)]
     found, progress = collect(cell.events)
@@ -237,13 +269,18 @@ def test_views_of_another_plan():
 def test_one_plan_has_one_plate():
     cell = scene("0, 90")
     wider = [
-        replace(c, artifact=Artifact(5, 0.011, 8)) if c.view_index == 0 and c.view else c
+        replace(c, artifact=Artifact(5, 0.011, 8))
+        if c.view_index == 0 and c.view
+        else c
         for c in cell.commands
     ]
     wider = [
-        replace(c, view=replace(c.view, translation_m=(0.0, 0.0))) if c.view else c for c in wider
+        replace(c, view=replace(c.view, translation_m=(0.0, 0.0))) if c.view else c
+        for c in wider
     ]
-    with pytest.raises(InputError, match="a different plate from the rest of plan '0, 90'"):
+    with pytest.raises(
+        InputError, match="a different plate from the rest of plan '0, 90'"
+    ):
         collect([*wider, *cell.samples, *cell.detections])
 
 
@@ -251,11 +288,15 @@ def test_one_plan_has_one_plate():
 def test_a_command_off_the_lattice_is_refused_and_changes_nothing(rotation):
     cell = scene()
     collector = gathered(cell.events)
-    bad = replace(cell.commands[1], view=replace(cell.commands[1].view, rotation_rad=rotation))
+    bad = replace(
+        cell.commands[1], view=replace(cell.commands[1].view, rotation_rad=rotation)
+    )
     with pytest.raises(InputError, match="view '0'"):
         collector.add_command(bad)
     assert collector.received["command"] == 3
-    assert table(collector.collect()[0].views[0]) == table(collect(cell.events)[0].views[0])
+    assert table(collector.collect()[0].views[0]) == table(
+        collect(cell.events)[0].views[0]
+    )
     collector.refuse("command", Reason.COMMAND_BAD)
     assert collector.collect()[0].all_rejected() == {"command_unusable": 1}
 
@@ -272,12 +313,21 @@ def test_no_measure_command_is_no_data():
 @pytest.mark.parametrize(
     ("sample", "reason"),
     [
-        (EncoderSample(START_NS, ("a", "b"), (0.0, 0.0)), "encoder_sample_unknown_joint"),
+        (
+            EncoderSample(START_NS, ("a", "b"), (0.0, 0.0)),
+            "encoder_sample_unknown_joint",
+        ),
         (EncoderSample(START_NS, (), ()), "encoder_sample_unknown_joint"),
-        (EncoderSample(START_NS, ("x", "y"), (0.0, math.nan)), "encoder_sample_not_finite"),
+        (
+            EncoderSample(START_NS, ("x", "y"), (0.0, math.nan)),
+            "encoder_sample_not_finite",
+        ),
         (EncoderSample(START_NS, ("x",), (-math.inf,)), "encoder_sample_not_finite"),
         (EncoderSample(START_NS, ("x", "y"), (0.0,)), "encoder_sample_malformed"),
-        (EncoderSample(START_NS, ("x",), (0.0,), (0.0, 0.0)), "encoder_sample_malformed"),
+        (
+            EncoderSample(START_NS, ("x",), (0.0,), (0.0, 0.0)),
+            "encoder_sample_malformed",
+        ),
     ],
 )
 def test_encoder_samples_that_cannot_be_used(sample, reason):
@@ -294,7 +344,10 @@ def test_one_joint_in_each_message_and_joints_of_other_machines():
     assert lost_marks([*cell.commands, *cell.detections, *apart]) == ({}, set())
     shuffled = [
         EncoderSample(
-            s.stamp_ns, ("z", *s.names[::-1]), (7.0, *s.positions[::-1]), (5.0, 0.0, 0.0, 0.0)
+            s.stamp_ns,
+            ("z", *s.names[::-1]),
+            (7.0, *s.positions[::-1]),
+            (5.0, 0.0, 0.0, 0.0),
         )
         for s in cell.samples
     ]
@@ -305,7 +358,10 @@ def test_names_of_joints_are_parameters():
     cell = scene()
     renamed = [replace(s, names=("ax1", "ax2", "c")) for s in cell.samples]
     assert lost_marks(
-        [*cell.commands, *cell.detections, *renamed], joint_x="ax1", joint_y="ax2", joint_theta="c"
+        [*cell.commands, *cell.detections, *renamed],
+        joint_x="ax1",
+        joint_y="ax2",
+        joint_theta="c",
     ) == ({}, set())
 
 
@@ -364,7 +420,9 @@ EVERYTHING = Faults(
 def spoilt_events(**settings):
     cell = scene("0, 90, tx", line=True, repeats=3, **NOISY, **settings)
     arrivals, _ = apply_faults(
-        sorted(cell.events, key=lambda e: e.stamp_ns), EVERYTHING, np.random.default_rng(8)
+        sorted(cell.events, key=lambda e: e.stamp_ns),
+        EVERYTHING,
+        np.random.default_rng(8),
     )
     return [event for _, event in arrivals]
 

@@ -23,11 +23,27 @@ ODD = [
         {},
         "view command 0: neither grid nor angular marks are requested; set one to true",
     ),
-    ({"repeats": 2**32 - 1}, {}, "view command 0: 4294967295 repeats; ask for 1 to 1000000"),
+    (
+        {"repeats": 2**32 - 1},
+        {},
+        "view command 0: 4294967295 repeats; ask for 1 to 1000000",
+    ),
     ({"repeats": 0}, {}, "view command 0: 0 repeats; ask for 1 to 1000000"),
-    ({}, {"view_index": 2**31}, "view command 2147483648: a plan has at most 1000 views; "),
-    ({}, {"views_planned": 2**32 - 1}, "view command 0: a plan has at most 1000 views; correct"),
-    ({}, {"view": None}, "view command 0: it describes no view; fill in its pose and its plate"),
+    (
+        {},
+        {"view_index": 2**31},
+        "view command 2147483648: a plan has at most 1000 views; ",
+    ),
+    (
+        {},
+        {"views_planned": 2**32 - 1},
+        "view command 0: a plan has at most 1000 views; correct",
+    ),
+    (
+        {},
+        {"view": None},
+        "view command 0: it describes no view; fill in its pose and its plate",
+    ),
 ]
 
 
@@ -36,7 +52,9 @@ def test_a_command_with_impossible_numbers_is_refused(of_view, of_command, messa
     cell = scene()
     collector = gathered(cell.events)
     measure = cell.commands[1]
-    bad = replace(measure, stamp_ns=measure.stamp_ns + 1, view=replace(measure.view, **of_view))
+    bad = replace(
+        measure, stamp_ns=measure.stamp_ns + 1, view=replace(measure.view, **of_view)
+    )
     with pytest.raises(InputError) as caught:
         collector.add_command(replace(bad, **of_command))
     assert str(caught.value).startswith(message)
@@ -59,13 +77,18 @@ def test_limits_themselves_are_kept():
         )
     )
     collector.add_command(Command(0, Phase.ABORT, "p", 1000))
-    collector.add_command(replace(measure, view=replace(measure.view, translation_m=(1000.0, 0.0))))
+    collector.add_command(
+        replace(measure, view=replace(measure.view, translation_m=(1000.0, 0.0)))
+    )
     assert collector.received["command"] == 3
 
 
 def test_a_plate_of_401_marks_a_side_of_which_25_were_read():
     cell = scene(count=0)
-    wide = [replace(c, artifact=Artifact(401, 0.01)) if c.artifact else c for c in cell.commands]
+    wide = [
+        replace(c, artifact=Artifact(401, 0.01)) if c.artifact else c
+        for c in cell.commands
+    ]
     _, progress = collect([*wide, *cell.samples, *cell.detections])
     assert (progress[0].grid_expected, progress[0].grid_done) == (401**2, 25)
     assert (progress[0].missing.m[0], progress[0].missing.n[199]) == (-200, -1)
@@ -103,5 +126,7 @@ def test_a_run_does_not_begin_after_its_own_command(run_id, good):
     if good:
         check_command(ends)
     else:
-        with pytest.raises(InputError, match="begins after its own stamp; let run_id be the stamp"):
+        with pytest.raises(
+            InputError, match="begins after its own stamp; let run_id be the stamp"
+        ):
             check_command(ends)

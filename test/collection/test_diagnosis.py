@@ -25,14 +25,16 @@ def findings(events, **parameters):
     """Return view_index (None = all) -> the line that is said."""
     collector = gathered(events, **parameters)
     return {
-        index: str(finding) for index, finding in collector.findings(*collector.collect()).items()
+        index: str(finding)
+        for index, finding in collector.findings(*collector.collect()).items()
     }
 
 
 def with_positions(cell, change):
     """Let every encoder sample indicate change(x, y)."""
     cell.samples = [
-        replace(s, positions=(*change(*s.positions[:2]), s.positions[2])) for s in cell.samples
+        replace(s, positions=(*change(*s.positions[:2]), s.positions[2]))
+        for s in cell.samples
     ]
     return cell.events
 
@@ -68,9 +70,15 @@ def test_joints_of_other_names_are_named():
         )
     }
     cell.samples = [replace(s, names=("x", "Y1", "theta")) for s in cell.samples]
-    assert "'y' arrived; joints received: 'x', 'theta', 'Y1';" in findings(cell.events)[None]
+    assert (
+        "'y' arrived; joints received: 'x', 'theta', 'Y1';"
+        in findings(cell.events)[None]
+    )
     cell.samples = []
-    assert "of the joint 'x', 'y' arrived; joints received: none;" in findings(cell.events)[None]
+    assert (
+        "of the joint 'x', 'y' arrived; joints received: none;"
+        in findings(cell.events)[None]
+    )
 
 
 def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
@@ -78,7 +86,8 @@ def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
     samples = cell.samples
     for names, came in ((("x", "y", "rz"), "'x', 'y', 'rz'"), (("x", "y"), "'x', 'y'")):
         cell.samples = [
-            replace(s, names=names, positions=s.positions[: len(names)]) for s in samples
+            replace(s, names=names, positions=s.positions[: len(names)])
+            for s in samples
         ]
         found = findings(cell.events)
         assert list(found) == [1]
@@ -91,7 +100,9 @@ def test_an_angle_that_is_not_there_is_missed_by_lines_alone():
 @pytest.mark.parametrize("sense", list(Sense))
 def test_the_other_sense(sense):
     other = next(s for s in Sense if s is not sense)
-    assert findings(scene(count=0, sense=sense).events, measurement_sense=str(other)) == {
+    assert findings(
+        scene(count=0, sense=sense).events, measurement_sense=str(other)
+    ) == {
         None: (
             "24 of 25 detections were rejected as stage_not_at_mark: the "
             "plate lies turned by 180°, "
@@ -117,14 +128,23 @@ def test_the_only_view_asks_for_the_pose_before_the_joints():
     ("change", "text"),
     [
         (lambda x, y: (y, x), "x and y are exchanged; exchange joint_x and joint_y"),
-        (lambda x, y: (-x, y), "x is indicated with the wrong sign; reverse the sign of x"),
-        (lambda x, y: (x, -y), "y is indicated with the wrong sign; reverse the sign of y"),
+        (
+            lambda x, y: (-x, y),
+            "x is indicated with the wrong sign; reverse the sign of x",
+        ),
+        (
+            lambda x, y: (x, -y),
+            "y is indicated with the wrong sign; reverse the sign of y",
+        ),
         (
             lambda x, y: (1e3 * x, 1e3 * y),
             "the indicated positions are 1000 times those of the "
             "marks: they are in mm; publish joint positions in metres",
         ),
-        (lambda x, y: (1e6 * x, 1e6 * y), "a million times those of the marks: they are in µm"),
+        (
+            lambda x, y: (1e6 * x, 1e6 * y),
+            "a million times those of the marks: they are in µm",
+        ),
         (lambda x, y: (1e-3 * x, 1e-3 * y), "a thousandth of those of the marks"),
         (
             lambda x, y: (1e3 * y, 1e3 * x),
@@ -149,14 +169,26 @@ def test_a_placed_plate_is_diagnosed_as_one_on_the_lattice():
 @pytest.mark.parametrize(
     ("deg", "shift", "text"),
     [
-        (-37, (0.013, -0.007), "the plate lies turned by 323°, not by 37° {ids}; turn it counter-"),
+        (
+            -37,
+            (0.013, -0.007),
+            "the plate lies turned by 323°, not by 37° {ids}; turn it counter-",
+        ),
         (
             127,
             (0.013, -0.007),
             "the plate lies turned by 127°, not by 37° {ids}; turn it as planned ",
         ),
-        (307.6, (0.013, -0.007), "the plate lies turned by 307°, not by 37° {ids}; turn it as "),
-        (0, (0.013, -0.007), "the plate lies turned by 0°, not by 37° {ids}; turn it as planned "),
+        (
+            307.6,
+            (0.013, -0.007),
+            "the plate lies turned by 307°, not by 37° {ids}; turn it as ",
+        ),
+        (
+            0,
+            (0.013, -0.007),
+            "the plate lies turned by 0°, not by 37° {ids}; turn it as planned ",
+        ),
         (
             37,
             (0.0, 0.0),
@@ -177,7 +209,11 @@ def test_ids_show_how_a_placed_plate_lies(deg, shift, text):
     truth = replace(random_truth(plan.artifact, 4, rng), placed=lies)
     found = findings(
         plan_events(
-            truth, plan, settings=CellSettings(follow_mark=True), rng=rng, start_ns=START_NS
+            truth,
+            plan,
+            settings=CellSettings(follow_mark=True),
+            rng=rng,
+            start_ns=START_NS,
         )
     )
     assert list(found) == [2]
@@ -191,15 +227,27 @@ def test_ids_show_how_a_placed_plate_lies(deg, shift, text):
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (lambda m, n: (n, m), "the ids have m and n exchanged, or the plate lies upside down"),
+        (
+            lambda m, n: (n, m),
+            "the ids have m and n exchanged, or the plate lies upside down",
+        ),
         (lambda m, n: (-n, -m), "the ids have m and n exchanged and both reversed, or"),
-        (lambda m, n: (-m, n), "the ids have m reversed, or the plate lies upside down"),
-        (lambda m, n: (m, -n), "the ids have n reversed, or the plate lies upside down"),
+        (
+            lambda m, n: (-m, n),
+            "the ids have m reversed, or the plate lies upside down",
+        ),
+        (
+            lambda m, n: (m, -n),
+            "the ids have n reversed, or the plate lies upside down",
+        ),
         (
             lambda m, n: (-m, -n),
             "the plate lies turned by 270°, not by 90° (or its ids are those of",
         ),
-        (lambda m, n: (m + 1, n), "the plate lies shifted by (+0, -1) pitches, not by (+0, +0)"),
+        (
+            lambda m, n: (m + 1, n),
+            "the plate lies shifted by (+0, -1) pitches, not by (+0, +0)",
+        ),
     ],
 )
 def test_ids_of_one_view_do_not_blame_the_joints(change, text):
@@ -208,7 +256,10 @@ def test_ids_of_one_view_do_not_blame_the_joints(change, text):
     found = findings(with_changed_ids(cell, change, 1))
     assert list(found) == [1]
     assert text in found[1]
-    assert "joint_x" not in found[1] and "leave the joints and the sense as they are" in found[1]
+    assert (
+        "joint_x" not in found[1]
+        and "leave the joints and the sense as they are" in found[1]
+    )
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300])
@@ -237,28 +288,41 @@ def test_exchanged_views_are_named_in_both():
     truth = replace(random_truth(plan.artifact, 4, rng), placed=lies)
     found = findings(
         plan_events(
-            truth, plan, settings=CellSettings(follow_mark=True), rng=rng, start_ns=START_NS
+            truth,
+            plan,
+            settings=CellSettings(follow_mark=True),
+            rng=rng,
+            start_ns=START_NS,
         )
     )
     assert sorted(found) == [1, 2]
     for index, other in ((1, "37"), (2, "90")):
         assert f"as planned for view '{other}'" in found[index]
-        assert "the views are exchanged; measure them in the order of the plan" in found[index]
+        assert (
+            "the views are exchanged; measure them in the order of the plan"
+            in found[index]
+        )
 
 
 def test_mm_are_named_though_the_stage_seems_to_jump():
     rng = np.random.default_rng(1)
     found = findings(
         with_positions(
-            scene(count=0), lambda x, y: tuple(1e3 * np.array([x, y]) + rng.normal(0, 2e-4, 2))
+            scene(count=0),
+            lambda x, y: tuple(1e3 * np.array([x, y]) + rng.normal(0, 2e-4, 2)),
         )
     )[None]
-    assert "rejected as encoder_contradiction: the indicated positions are 1000 times" in found
+    assert (
+        "rejected as encoder_contradiction: the indicated positions are 1000 times"
+        in found
+    )
     assert "they are in mm" in found
 
 
 def test_a_parked_stage():
-    found = findings(with_positions(scene(count=0), lambda x, y: (0.0301, -0.002)))[None]
+    found = findings(with_positions(scene(count=0), lambda x, y: (0.0301, -0.002)))[
+        None
+    ]
     assert found == (
         "25 of 25 detections were rejected as stage_not_at_mark: the stage did not move: it is "
         "indicated at x = 0.0301 m, y = -0.002 m at all of them; name the joints that move, in "
@@ -273,12 +337,18 @@ def test_an_encoder_that_stands_still_within_a_view(sense):
     last = cell.detections[30].stamp_ns
     place = next(s.positions for s in cell.samples if s.stamp_ns > last)
     cell.samples = [
-        s if s.stamp_ns < last else replace(s, positions=place, velocities=()) for s in cell.samples
+        s if s.stamp_ns < last else replace(s, positions=place, velocities=())
+        for s in cell.samples
     ]
     found = findings(cell.events, measurement_sense=str(sense))[None]
     where = f"x = {place[0]:.6g} m, y = {place[1]:.6g} m"
-    assert f"stage_not_at_mark: the stage has stopped: it is indicated at {where} at each" in found
-    assert "of the last 20 marks; check the encoder and what publishes its joints" in found
+    assert (
+        f"stage_not_at_mark: the stage has stopped: it is indicated at {where} at each"
+        in found
+    )
+    assert (
+        "of the last 20 marks; check the encoder and what publishes its joints" in found
+    )
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -296,7 +366,10 @@ def test_stamps_of_another_exposure(exposures, where, sense):
     for index, detection in enumerate(cell.detections):
         cell.spoil(index, stamp_ns=detection.stamp_ns + exposures * step)
     found = findings(cell.events, measurement_sense=str(sense))[None]
-    assert f"stage_not_at_mark: at the stamp of a mark the stage stands where {where} is " in found
+    assert (
+        f"stage_not_at_mark: at the stamp of a mark the stage stands where {where} is "
+        in found
+    )
     assert found.endswith("with the time of the exposure, by one clock")
 
 
@@ -320,12 +393,16 @@ def test_stamps_of_another_exposure(exposures, where, sense):
 )
 def test_joint_states_that_cannot_be_used(positions, said):
     cell = scene(count=0)
-    cell.samples = [replace(s, positions=positions, velocities=()) for s in cell.samples]
+    cell.samples = [
+        replace(s, positions=positions, velocities=()) for s in cell.samples
+    ]
     assert findings(cell.events) == {None: said.format(len(cell.samples))}
 
 
 def test_positions_that_nothing_explains():
-    found = findings(with_positions(scene(count=0), lambda x, y: (x + 0.05, 2 * y)))[None]
+    found = findings(with_positions(scene(count=0), lambda x, y: (x + 0.05, 2 * y)))[
+        None
+    ]
     assert "the stage stands 0.0" in found
     assert "m from the sites of the detected marks (median); check joint_x" in found
 
@@ -351,7 +428,9 @@ def test_a_clock_of_its_own(ahead_s, side):
 )
 def test_commands_by_another_clock(ahead_s, side):
     cell = scene(count=0)
-    cell.commands = [replace(c, stamp_ns=c.stamp_ns - round(ahead_s * S)) for c in cell.commands]
+    cell.commands = [
+        replace(c, stamp_ns=c.stamp_ns - round(ahead_s * S)) for c in cell.commands
+    ]
     found = findings(cell.events)[None]
     assert found.startswith(
         "25 of 25 detections were rejected as outside_every_view: all "
@@ -376,12 +455,18 @@ def test_a_view_is_named_where_the_session_as_a_whole_is_good():
         if begin < d.stamp_ns < end:
             cell.spoil(index, m=77)
     assert findings(cell.events) == {
-        1: "25 of 25 detections were rejected as unknown_mark: " + REMEDY[Reason.UNKNOWN_MARK]
+        1: "25 of 25 detections were rejected as unknown_mark: "
+        + REMEDY[Reason.UNKNOWN_MARK]
     }
 
 
 def test_what_is_no_fault_does_not_count():
-    rejected = {"superseded_by_redo": 90, "other_run": 50, "duplicate": 70, "stage_moving": 6}
+    rejected = {
+        "superseded_by_redo": 90,
+        "other_run": 50,
+        "duplicate": 70,
+        "stage_moving": 6,
+    }
     assert main_reason(rejected, 6) is None
     assert main_reason(rejected, 5) == ("stage_moving", 6, 11)
     assert main_reason({"stage_moving": 4}, 0) is None
@@ -393,7 +478,10 @@ def test_what_is_no_fault_does_not_count():
 @pytest.mark.parametrize("reason", list(REMEDY))
 def test_every_reason_has_its_remedy_without_further_evidence(reason):
     finding = diagnose(Evidence({str(reason): 9}, 1))
-    assert str(finding) == f"9 of 10 detections were rejected as {reason}: {REMEDY[reason]}"
+    assert (
+        str(finding)
+        == f"9 of 10 detections were rejected as {reason}: {REMEDY[reason]}"
+    )
     assert "\n" not in str(finding)
 
 
@@ -409,7 +497,9 @@ def test_marks_on_one_line_do_not_tell_x_from_y():
     )
     assert named.away(-marks) > 1
     told = diagnose(
-        Evidence({"stage_not_at_mark": 10}, 0, marks=(named,), pitch_m=0.01, limit_m=0.006)
+        Evidence(
+            {"stage_not_at_mark": 10}, 0, marks=(named,), pitch_m=0.01, limit_m=0.006
+        )
     )
     assert told.text == REMEDY[Reason.NOT_AT_MARK]
 
@@ -421,7 +511,10 @@ def test_the_pose_of_a_plate_is_fitted_through_marks_taken_for_others():
     at = turn * marks + (0.5 - 0.2j)
     at[(m == 4) & (n > -2)] += 4
     found, shift, left = _fitted(marks, at, False)
-    assert (found, shift) == (pytest.approx(turn, abs=1e-3), pytest.approx(0.5 - 0.2j, abs=1e-3))
+    assert (found, shift) == (
+        pytest.approx(turn, abs=1e-3),
+        pytest.approx(0.5 - 0.2j, abs=1e-3),
+    )
     assert left < 0.01
 
 
@@ -438,7 +531,10 @@ def declared(cell, *size):
     commands = [
         c
         if c.artifact is None
-        else replace(c, artifact=replace(c.artifact, grid_size=size[0], grid_size_y=(*size, 0)[1]))
+        else replace(
+            c,
+            artifact=replace(c.artifact, grid_size=size[0], grid_size_y=(*size, 0)[1]),
+        )
         for c in cell.commands
     ]
     return [*commands, *cell.samples, *cell.detections]
@@ -450,7 +546,10 @@ def test_a_mark_that_is_read_many_times_is_not_a_stage_that_has_stopped():
     seen = SimpleNamespace(marks=[marks], pitch_m=0.01, sense=Sense.MICROSCOPE_MOVES)
     assert _stopped(seen) is None
     marks.sites = places + np.linspace(0, 2, 25)
-    assert "the stage has stopped: it is indicated at x = 0.03 m, y = 0.01 m" in _stopped(seen)
+    assert (
+        "the stage has stopped: it is indicated at x = 0.03 m, y = 0.01 m"
+        in _stopped(seen)
+    )
 
 
 def test_an_encoder_that_stands_still_in_the_middle_of_a_small_plate():
@@ -469,9 +568,21 @@ def test_an_encoder_that_stands_still_in_the_middle_of_a_small_plate():
 @pytest.mark.parametrize(
     ("plate", "size", "said"),
     [
-        ((7,), (5,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 5 x 5; corr"),
-        ((7,), (9,), "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 9 x 9; corr"),
-        ((6,), (7,), "the ids are those of 6 x 6 marks (m -3 to 2, n -3 to 2), not of 7 x 7; corr"),
+        (
+            (7,),
+            (5,),
+            "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 5 x 5; corr",
+        ),
+        (
+            (7,),
+            (9,),
+            "the ids are those of 7 x 7 marks (m -3 to 3, n -3 to 3), not of 9 x 9; corr",
+        ),
+        (
+            (6,),
+            (7,),
+            "the ids are those of 6 x 6 marks (m -3 to 2, n -3 to 2), not of 7 x 7; corr",
+        ),
         (
             (7, 5),
             (5, 7),
@@ -495,14 +606,18 @@ def test_a_plate_of_the_declared_size_is_not_suspected(text):
         cell.spoil(index, m=cell.detections[index].m + 9)
     for part in (len(cell.detections), len(cell.detections) // 3):
         events = [*cell.commands, *cell.samples, *cell.detections[:part]]
-        assert not any("the ids are those" in found for found in findings(events).values())
+        assert not any(
+            "the ids are those" in found for found in findings(events).values()
+        )
 
 
 def test_few_stray_ids_among_other_rejections_are_no_other_plate():
     """All others have no ids: the strays alone would be a plate of one mark."""
     cell = scene(plan_of("0, 90, tx", 7, repeats=2), with_ids=False)
     for index in range(0, len(cell.detections) - 1, 9):
-        cell.spoil(index, **({"has_id": True, "m": 9999} if index % 2 else {"score": 1e-3}))
+        cell.spoil(
+            index, **({"has_id": True, "m": 9999} if index % 2 else {"score": 1e-3})
+        )
         cell.spoil(index + 1, score=1e-3)
     rejected = gathered(cell.events).collect()[0].all_rejected()
     assert 5 <= rejected["unknown_mark"] < rejected["low_score"]
@@ -510,7 +625,9 @@ def test_few_stray_ids_among_other_rejections_are_no_other_plate():
 
 
 def test_the_cause_of_many_rejections_is_stated_with_a_result():
-    assert rejections({"unknown_mark": 10, "duplicate": 500, "stage_moving": 99}, 90) == []
+    assert (
+        rejections({"unknown_mark": 10, "duplicate": 500, "stage_moving": 99}, 90) == []
+    )
     assert rejections({"low_score": 4, "unknown_mark": 8}, 90) == [
         f"12 of 102 detections were rejected, 8 of them as unknown_mark: "
         f"{REMEDY[Reason.UNKNOWN_MARK]}"

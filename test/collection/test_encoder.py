@@ -27,7 +27,9 @@ def track(samples, limits=SLOW):
 
 
 def ask(joint, *at):
-    positions, reasons = joint.query(np.array([T0 + round(t * MS) for t in at], dtype=np.int64))
+    positions, reasons = joint.query(
+        np.array([T0 + round(t * MS) for t in at], dtype=np.int64)
+    )
     return positions.tolist(), reasons.tolist()
 
 
@@ -50,7 +52,9 @@ def test_a_line_is_read_to_rounding_and_a_rest_to_the_bit(start, rise, at):
 
 def test_an_exact_stamp_gives_the_sample_itself():
     values = [0.1, 0.1 + 1e-5, 0.1 - 3e-6, 0.1]
-    positions, reasons = ask(track(list(zip((0, 3, 7, 9), values, strict=True))), 0, 3, 7, 9)
+    positions, reasons = ask(
+        track(list(zip((0, 3, 7, 9), values, strict=True))), 0, 3, 7, 9
+    )
     assert positions == values
     assert reasons == [None] * 4
 
@@ -67,7 +71,15 @@ def test_outside_the_samples_and_in_gaps_there_is_no_position():
         None,
         Reason.NO_ENCODER,
     ]
-    assert [math.isnan(p) for p in positions] == [True, False, True, False, False, False, True]
+    assert [math.isnan(p) for p in positions] == [
+        True,
+        False,
+        True,
+        False,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_without_samples_and_without_questions():
@@ -123,7 +135,11 @@ def test_a_contradicted_stamp_spoils_half_a_gap_around_it():
 
 def test_far_apart_samples_beside_a_contradicted_stamp_are_spoilt_too():
     joint = track([(0, 0.0), (90, 0.0), (90, 1e-6), (180, 0.0), (270, 0.0), (360, 0.0)])
-    assert ask(joint, 10, 170, 350)[1] == [Reason.CONTRADICTION, Reason.CONTRADICTION, None]
+    assert ask(joint, 10, 170, 350)[1] == [
+        Reason.CONTRADICTION,
+        Reason.CONTRADICTION,
+        None,
+    ]
 
 
 def test_equal_and_agreeing_samples_of_one_stamp_are_no_contradiction():

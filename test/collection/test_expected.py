@@ -26,7 +26,9 @@ from test.support.collecting import collect, scene
 TURNS = st.integers(0, 3).map(lambda q: q * np.pi / 2)
 
 
-@given(st.integers(1, 4), st.integers(1, 4), TURNS, st.integers(-9, 9), st.integers(-9, 9))
+@given(
+    st.integers(1, 4), st.integers(1, 4), TURNS, st.integers(-9, 9), st.integers(-9, 9)
+)
 def test_the_marks_in_the_field_are_those_whose_sites_are_sites(hx, hy, turn, a, b):
     plate = Artifact(2 * hx + 1, 0.01, 0, 2 * hy + 1)
     view = View("v", turn, (a * 0.01, b * 0.01), angular=False)
@@ -50,17 +52,23 @@ def test_missing_marks_of_a_placed_plate_are_named(turn, a, b, read):
     missing = missing_marks(
         plate,
         view,
-        ViewReadings(view, plate.m[done], plate.n[done], count=np.ones(done.sum(), dtype=int)),
+        ViewReadings(
+            view, plate.m[done], plate.n[done], count=np.ones(done.sum(), dtype=int)
+        ),
     )
     lost = inside & ~done
-    assert missing == Missing(tuple(plate.m[lost].tolist()), tuple(plate.n[lost].tolist()))
+    assert missing == Missing(
+        tuple(plate.m[lost].tolist()), tuple(plate.n[lost].tolist())
+    )
     assert expected_marks(plate, view) == (inside.sum(), 0)
 
 
 @given(st.sets(st.integers(0, 300)), st.integers(0, 600))
 def test_the_first_missing_numbers(done, total):
     done = np.array(sorted(number for number in done if number < total), dtype=int)
-    want = [number for number in range(total) if number not in set(done)][:NAMED_AT_MOST]
+    want = [number for number in range(total) if number not in set(done)][
+        :NAMED_AT_MOST
+    ]
     assert first_missing(done, total).tolist() == want
 
 
@@ -97,7 +105,9 @@ def test_a_view_of_lines_alone_lacks_no_grid_marks():
     view = View("v", np.pi / 12, grid=False)
     plate = Artifact(5, 0.01, 24)
     missing = missing_marks(
-        plate, view, ViewReadings(view, k=np.array([0, 2]), count_theta=np.array([1, 1]))
+        plate,
+        view,
+        ViewReadings(view, k=np.array([0, 2]), count_theta=np.array([1, 1])),
     )
     assert (missing.m, missing.n) == ((), ())
     assert missing.k == (1, *range(3, 24))
@@ -122,7 +132,9 @@ def with_outliers(repeats, marks, lines=(), **settings):
         ("offset_theta", Kind.ANGULAR, lines, 1e-2),
     ):
         for mark, count in enumerate(numbers):
-            named = sorted({(d.m, d.n, d.k) for d in cell.detections if d.kind == kind})[mark]
+            named = sorted(
+                {(d.m, d.n, d.k) for d in cell.detections if d.kind == kind}
+            )[mark]
             mine = [
                 i
                 for i, d in enumerate(cell.detections)
@@ -130,7 +142,8 @@ def with_outliers(repeats, marks, lines=(), **settings):
             ]
             for turn, index in enumerate(mine[:count]):
                 cell.spoil(
-                    index, **{field: getattr(cell.detections[index], field) + by * (1 + turn)}
+                    index,
+                    **{field: getattr(cell.detections[index], field) + by * (1 + turn)},
                 )
     return cell
 
@@ -160,8 +173,12 @@ def test_outliers_do_not_keep_a_mark_open_where_enough_is_left(least):
     assert found.readings.outliers.sum() == 3
 
 
-@pytest.mark.parametrize(("least", "complete"), [(0, False), (1, True), (2, True), (3, False)])
-def test_a_view_with_outliers_of_marks_and_lines_is_complete_with_min_repeats(least, complete):
+@pytest.mark.parametrize(
+    ("least", "complete"), [(0, False), (1, True), (2, True), (3, False)]
+)
+def test_a_view_with_outliers_of_marks_and_lines_is_complete_with_min_repeats(
+    least, complete
+):
     cell = with_outliers(3, (1, 1), (0, 1))
     _, progress = collect(cell.events, min_repeats=least)
     assert progress[0].complete is complete

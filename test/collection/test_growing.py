@@ -13,7 +13,9 @@ def rows_of(first, count):
     return np.array([(first + i, 0.5 * i) for i in range(count)], dtype=PAIR)
 
 
-@pytest.mark.parametrize("sizes", [(0,), (1,), (64,), (65,), (3, 61, 1), (60, 5, 500, 0, 2)])
+@pytest.mark.parametrize(
+    "sizes", [(0,), (1,), (64,), (65,), (3, 61, 1), (60, 5, 500, 0, 2)]
+)
 def test_rows_appended_stay_in_their_order(sizes):
     table, want, at = GrowingTable(PAIR), [], 0
     for size in sizes:
@@ -68,6 +70,8 @@ def test_columns_take_the_same_rows_each_with_its_own_value():
     columns["b"][:] = [1.0, 2.0, 3.0]
     columns.insert(np.array([0, 2, 2, 3]), {"a": 7, "b": np.nan, "c": True})
     assert columns["a"].tolist() == [7, 5, 5, 7, 7, 5, 7]
-    np.testing.assert_array_equal(columns["b"], [np.nan, 1, 2, np.nan, np.nan, 3, np.nan])
+    np.testing.assert_array_equal(
+        columns["b"], [np.nan, 1, 2, np.nan, np.nan, 3, np.nan]
+    )
     assert columns["c"].tolist() == [True, False, False, True, True, False, True]
     assert [columns[name].dtype for name in "abc"] == [np.int64, np.float64, np.bool_]

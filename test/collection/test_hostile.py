@@ -22,14 +22,18 @@ def stepped_between_views(count, seed):
     It steps back after that detection, so that MEASURE of view 1 is stamped 5 ms before it.
     """
     cell = scene("0, 0", count=count, seed=seed)
-    place, measure = (c for c in cell.commands if c.view is not None and c.view_index == 1)
+    place, measure = (
+        c for c in cell.commands if c.view is not None and c.view_index == 1
+    )
     last = [d for d in cell.detections if d.stamp_ns < place.stamp_ns][-1]
     step = measure.stamp_ns - last.stamp_ns + 5 * MS
     return (
         cell,
         last,
         [
-            replace(e, stamp_ns=e.stamp_ns - step) if e.stamp_ns >= place.stamp_ns else e
+            replace(e, stamp_ns=e.stamp_ns - step)
+            if e.stamp_ns >= place.stamp_ns
+            else e
             for e in cell.events
         ],
     )
@@ -37,12 +41,15 @@ def stepped_between_views(count, seed):
 
 @pytest.mark.parametrize("seed", [0, 5, 8])
 @pytest.mark.parametrize("count", [0, 24])
-def test_a_detection_that_a_stepped_clock_moves_to_the_next_view_is_an_outlier_there(count, seed):
+def test_a_detection_that_a_stepped_clock_moves_to_the_next_view_is_an_outlier_there(
+    count, seed
+):
     cell, last, events = stepped_between_views(count, seed)
     found, _ = collect(events)
     assert found.views[1].rejected == {"outlier_among_repeats": 2}
     assert found.views[0].rejected == {}
-    assert found.rejected == {"outside_every_view": 2}  # stamped while the plate was placed
+    # stamped while the plate was placed
+    assert found.rejected == {"outside_every_view": 2}
     mark = ("line", last.k) if count else ("grid", last.m, last.n)
     assert mark not in table(found.views[1])
     assert len(table(found.views[1])) == 25 + count - 1
@@ -51,7 +58,11 @@ def test_a_detection_that_a_stepped_clock_moves_to_the_next_view_is_an_outlier_t
         expected = grid_deviation(cell.truth, index, readings.view)[:, *at]
         # the servo's 20 nm and 0.1 urad off its place, the stage has the error of another place
         np.testing.assert_allclose([readings.dx, readings.dy], expected, atol=2e-11)
-        lines = angular_deviation(cell.truth, index, readings.view)[readings.k] if count else []
+        lines = (
+            angular_deviation(cell.truth, index, readings.view)[readings.k]
+            if count
+            else []
+        )
         np.testing.assert_allclose(readings.dtheta, lines, atol=1e-9)
     shuffled = list(events)
     random.Random(3).shuffle(shuffled)
@@ -65,8 +76,12 @@ def test_few_repeats_of_clean_readings_are_kept_beside_the_scatter_of_marks():
         marks = int(rng.integers(MIN_PAIRS, 60))
         key = np.append(np.arange(marks), [0, 1])
         noise = rng.normal(0, 2e-8, (components, len(key)))
-        values = noise + rng.normal(0, rng.choice([0.0, 3e-7]), (components, marks))[:, key]
-        means = reduce_repeats(key, values, np.zeros(len(key)), limit=4.0, residual=values)
+        values = (
+            noise + rng.normal(0, rng.choice([0.0, 3e-7]), (components, marks))[:, key]
+        )
+        means = reduce_repeats(
+            key, values, np.zeros(len(key)), limit=4.0, residual=values
+        )
         rejected, total = rejected + int(means.outlier.sum()), total + len(key)
     assert 30_000 < total < 40_000
     assert rejected <= 2
@@ -82,7 +97,9 @@ def test_few_repeats_are_judged_only_beside_enough_marks():
     values = np.append(np.tile([1.0, -1.0], 10), 90.0)[None] * 1e-7
     found = reduce_repeats(key, values, np.zeros(21), limit=6.0, residual=values)
     assert np.flatnonzero(found.outlier).tolist() == [0, 20]
-    assert not reduce_repeats(key, values, np.zeros(21), limit=0.0, residual=values).outlier.any()
+    assert not reduce_repeats(
+        key, values, np.zeros(21), limit=0.0, residual=values
+    ).outlier.any()
 
 
 @pytest.mark.parametrize("shift_ns", [-START_NS, -2 * START_NS, 2**62])
@@ -109,7 +126,9 @@ def test_a_view_placed_and_moved_again_begins_anew_at_any_time(shift_ns):
         replace(place, stamp_ns=at + 1),
         replace(measure, stamp_ns=at + 2),
     ]
-    found, progress = collect([replace(e, stamp_ns=e.stamp_ns + shift_ns) for e in events])
+    found, progress = collect(
+        [replace(e, stamp_ns=e.stamp_ns + shift_ns) for e in events]
+    )
     assert found.all_rejected() == {"superseded_by_redo": 10}
     assert progress[0].view == cell.commands[1].view
 
@@ -122,7 +141,9 @@ def test_absurd_sigmas_weigh_without_overflow(scale):
     scaled = reduce_repeats(key, values, sigma * scale, limit=0.0)
     np.testing.assert_allclose(scaled.mean, plain.mean, rtol=1e-14)
     np.testing.assert_allclose(scaled.u, plain.u * scale, rtol=1e-14)
-    mixed = reduce_repeats(key, values, np.array([1.0, scale, 1.0, 1.0, 1.0]), limit=6.0)
+    mixed = reduce_repeats(
+        key, values, np.array([1.0, scale, 1.0, 1.0, 1.0]), limit=6.0
+    )
     assert np.isfinite(mixed.mean).all() and np.isfinite(mixed.u).all()
 
 
@@ -149,7 +170,9 @@ def test_no_rotation_to_reckon_with_is_a_rotation_of_zero():
 
 
 def test_two_joints_of_one_name_are_refused():
-    with pytest.raises(InputError, match="two of them are the same joint; give each its own name"):
+    with pytest.raises(
+        InputError, match="two of them are the same joint; give each its own name"
+    ):
         gathered([], joint_x="a", joint_y="a")
 
 
@@ -162,6 +185,12 @@ def test_an_id_below_zero_is_no_line():
 def test_place_of_a_view_between_two_measures_of_another_changes_neither():
     cell = scene("0, 90")
     at = cell.detections[9].stamp_ns + 1
-    place = next(c for c in cell.commands if c.phase == Phase.PLACE and c.view_index == 1)
-    events = [*cell.events, replace(place, stamp_ns=at), replace(cell.commands[1], stamp_ns=at + 1)]
+    place = next(
+        c for c in cell.commands if c.phase == Phase.PLACE and c.view_index == 1
+    )
+    events = [
+        *cell.events,
+        replace(place, stamp_ns=at),
+        replace(cell.commands[1], stamp_ns=at + 1),
+    ]
     assert collect(events)[0].all_rejected() == {}

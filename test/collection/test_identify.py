@@ -15,7 +15,12 @@ from selfcal_ros.collection.marks.identify import (
     identify_grid,
     wrap,
 )
-from selfcal_ros.collection.marks.rigid import MotionEstimate, Rigid, RigidFit, fit_motion
+from selfcal_ros.collection.marks.rigid import (
+    MotionEstimate,
+    Rigid,
+    RigidFit,
+    fit_motion,
+)
 from selfcal_ros.model.artifact import Artifact, default_map_grid
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View
@@ -59,9 +64,13 @@ def test_grid_marks_without_ids_are_found(size, pitch, pose, degrees):
     view = View("v", q * pi / 2, (a * pitch, b * pitch), angular=False)
     if not view.is_on_lattice(artifact):
         artifact = replace(artifact, map_grid=default_map_grid(artifact))
-    marks, read, moved = seen(artifact, view, np.deg2rad(degrees), np.random.default_rng(1))
+    marks, read, moved = seen(
+        artifact, view, np.deg2rad(degrees), np.random.default_rng(1)
+    )
     no = np.zeros(marks.shape[1], dtype=bool)
-    found = identify_grid(artifact, view, read, ids=np.zeros_like(marks), has_id=no, rules=RULES)
+    found = identify_grid(
+        artifact, view, read, ids=np.zeros_like(marks), has_id=no, rules=RULES
+    )
     assert (found.reasons == None).all()  # noqa: E711
     np.testing.assert_array_equal(found.index, marks)
     np.testing.assert_allclose(found.deviation, moved, rtol=0, atol=1e-15)
@@ -78,10 +87,14 @@ def test_lost_marks_and_outliers_do_not_mislead_the_rest(kept):
     stray = rng.random(marks.shape[1]) < 0.05
     read[:, stray] += rng.uniform(-1, 1, (2, stray.sum())) * 2.5e-3
     no = np.zeros(marks.shape[1], dtype=bool)
-    found = identify_grid(artifact, view, read, ids=np.zeros_like(marks), has_id=no, rules=RULES)
+    found = identify_grid(
+        artifact, view, read, ids=np.zeros_like(marks), has_id=no, rules=RULES
+    )
     good = found.reasons == None  # noqa: E711
     assert good[~stray].all()
-    np.testing.assert_array_equal(found.index[:, good & ~stray], marks[:, good & ~stray])
+    np.testing.assert_array_equal(
+        found.index[:, good & ~stray], marks[:, good & ~stray]
+    )
 
 
 def test_what_lies_nearly_between_marks_tells_nothing_of_the_view():
@@ -107,7 +120,12 @@ def test_named_and_unnamed_marks_go_together():
     marks, read, _ = seen(artifact, view, np.deg2rad(0.3), rng)
     has_id = rng.random(marks.shape[1]) < 0.5
     found = identify_grid(
-        artifact, view, read, ids=np.where(has_id, marks, 77), has_id=has_id, rules=RULES
+        artifact,
+        view,
+        read,
+        ids=np.where(has_id, marks, 77),
+        has_id=has_id,
+        rules=RULES,
     )
     np.testing.assert_array_equal(found.index, marks)
     assert (found.reasons == None).all()  # noqa: E711
@@ -133,11 +151,20 @@ def test_what_stands_beside_the_plate_is_of_no_mark_from_three_quarters_of_a_pit
     artifact, pitch = Artifact(7, 0.01, 8, 5), 0.01
     read = np.stack([artifact.m.ravel(), artifact.n.ravel()]) * pitch
     marks = np.rint(read / pitch).astype(int)
-    edge = int(np.flatnonzero((marks[axis] == artifact.half[axis]) & (marks[1 - axis] == -1))[0])
+    edge = int(
+        np.flatnonzero((marks[axis] == artifact.half[axis]) & (marks[1 - axis] == -1))[
+            0
+        ]
+    )
     has_id = np.arange(marks.shape[1]) != edge
     read[axis, edge] += beyond * pitch
     found = identify_grid(
-        artifact, View("v"), read, ids=marks, has_id=has_id, rules=IdentityRules(5e-3, 0.5, 0.035)
+        artifact,
+        View("v"),
+        read,
+        ids=marks,
+        has_id=has_id,
+        rules=IdentityRules(5e-3, 0.5, 0.035),
     )
     assert found.reasons[edge] == reason
     assert (found.reasons[has_id] == None).all()  # noqa: E711
@@ -197,7 +224,13 @@ def test_a_turn_of_more_than_half_a_line_needs_the_grid_to_tell_it():
     phi, k = np.deg2rad(0.8), np.arange(360)
     read = k * 2 * pi / 360 + phi
     found = identify_angular(
-        artifact, view, read, ids=0 * k, has_id=np.zeros(360, bool), rules=RULES, phi_rad=phi
+        artifact,
+        view,
+        read,
+        ids=0 * k,
+        has_id=np.zeros(360, bool),
+        rules=RULES,
+        phi_rad=phi,
     )
     np.testing.assert_array_equal(found.index, k)
     np.testing.assert_allclose(found.deviation, phi, atol=1e-14)
@@ -206,9 +239,12 @@ def test_a_turn_of_more_than_half_a_line_needs_the_grid_to_tell_it():
 @pytest.mark.parametrize("sense", list(Sense))
 def test_a_session_without_ids_reads_what_one_with_ids_reads(sense):
     plan = {"size": 11, "count": 24, "line": True, "sense": sense, "seed": 6}
-    named, _ = collect(scene("0, 90, 270, tx", **plan).events, measurement_sense=str(sense))
+    named, _ = collect(
+        scene("0, 90, 270, tx", **plan).events, measurement_sense=str(sense)
+    )
     bare, _ = collect(
-        scene("0, 90, 270, tx", **plan, with_ids=False).events, measurement_sense=str(sense)
+        scene("0, 90, 270, tx", **plan, with_ids=False).events,
+        measurement_sense=str(sense),
     )
     assert bare.all_rejected() == named.all_rejected() == {}
     for a, b in zip(named.views, bare.views, strict=True):
@@ -225,7 +261,9 @@ def test_a_rigid_motion_is_fitted_through_outliers(phi):
     fit = fit_motion(p, deviation).rigid
     assert fit.phi_rad == pytest.approx(phi, abs=1e-9)
     assert (fit.tx_m, fit.ty_m) == pytest.approx(tuple(OFFSET_M), abs=1e-10)
-    np.testing.assert_allclose(Rigid(pi / 2).at(np.array([[1.0], [0.0]])), [[-1.0], [1.0]])
+    np.testing.assert_allclose(
+        Rigid(pi / 2).at(np.array([[1.0], [0.0]])), [[-1.0], [1.0]]
+    )
     np.testing.assert_allclose(
         Rigid(phi, 1.0, 2.0).undo(p + Rigid(phi, 1.0, 2.0).at(p)), p, atol=1e-15
     )
@@ -247,7 +285,9 @@ def test_estimate_and_fit_are_folded_by_the_same_whole_pitches():
         (folded.rigid, (1e-3, 0.0023, 0.0012)),
         (moved.rigid, (1.2e-3, 0.0024, 0.0013)),
     ):
-        assert (found.phi_rad, found.tx_m, found.ty_m) == pytest.approx(wanted, abs=1e-12)
+        assert (found.phi_rad, found.tx_m, found.ty_m) == pytest.approx(
+            wanted, abs=1e-12
+        )
     assert (folded.offset_error_m, moved.marks) == (1e-4, 9)
 
 
@@ -262,7 +302,13 @@ def test_lines_are_found_at_any_turn_of_a_fourier_map(count, told):
     read = k * step + view.rotation_rad + v + 2 * pi * rng.integers(-2, 3, count)
     for has_id in (np.zeros(count, bool), np.arange(count) % 2 > 0):
         found = identify_angular(
-            artifact, view, read, ids=k, has_id=has_id, rules=RULES, phi_rad=phi if told else None
+            artifact,
+            view,
+            read,
+            ids=k,
+            has_id=has_id,
+            rules=RULES,
+            phi_rad=phi if told else None,
         )
         assert (found.reasons == None).all()  # noqa: E711
         np.testing.assert_array_equal(found.index, k)

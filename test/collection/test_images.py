@@ -33,7 +33,9 @@ def test_a_reading_has_the_error_of_the_stage_where_it_stands(sense):
     for number, view in enumerate(measurements.views[:-1]):
         turn, (cx, cy) = number // 9, view.view.cell
         assert (cx, cy) == (number % 9 // 3 - 1, number % 3 - 1)
-        place, site = physics.mark_places(shot.truth, turn, PLAN.views[turn], (view.m, view.n))
+        place, site = physics.mark_places(
+            shot.truth, turn, PLAN.views[turn], (view.m, view.n)
+        )
         x, y = rotated(turn, view.m, view.n)
         i, j = sign * (x - cx) + 3, sign * (y - cy) + 3  # where the stage stands
         error = sign * shot.truth.g[:, i, j]
@@ -60,7 +62,9 @@ def test_marks_of_an_image_need_no_ids(sense):
 
 def test_the_order_of_arrival_changes_nothing():
     shot = scene(PLAN, sigma_xy_m=2e-8)
-    shuffled = [shot.events[i] for i in np.random.default_rng(1).permutation(len(shot.events))]
+    shuffled = [
+        shot.events[i] for i in np.random.default_rng(1).permutation(len(shot.events))
+    ]
     measurements, _ = collect(shot.events)
     again, _ = collect(shuffled)
     for one, other in zip(measurements.views, again.views, strict=True):
@@ -69,12 +73,20 @@ def test_the_order_of_arrival_changes_nothing():
 
 
 def displaced(
-    plan, t_m, *, ids, follow=False, sense=Sense.MICROSCOPE_MOVES, shown=lambda detection: True
+    plan,
+    t_m,
+    *,
+    ids,
+    follow=False,
+    sense=Sense.MICROSCOPE_MOVES,
+    shown=lambda detection: True,
 ):
     """Return truth, readings and progress of plates at `t_m`, from the detections `shown`."""
     shot = scene(plan, with_ids=ids, follow_mark=follow, sense=sense, t_m=t_m, **QUIET)
     kept = [d for d in shot.detections if shown(d)]
-    return shot, *collect([*shot.commands, *shot.samples, *kept], measurement_sense=str(sense))
+    return shot, *collect(
+        [*shot.commands, *shot.samples, *kept], measurement_sense=str(sense)
+    )
 
 
 @pytest.mark.parametrize("ids", [True, False])
@@ -88,7 +100,9 @@ def test_a_plate_off_its_place_by_more_than_half_a_pitch_loses_no_mark(sense, t_
     sign = -1 if sense is Sense.PLATE_MOVES else 1
     for number, view in enumerate(measurements.views[:-1]):
         turn, (cx, cy) = number // 9, view.view.cell
-        place, site = physics.mark_places(shot.truth, turn, PLAN.views[turn], (view.m, view.n))
+        place, site = physics.mark_places(
+            shot.truth, turn, PLAN.views[turn], (view.m, view.n)
+        )
         x, y = rotated(turn, view.m, view.n)
         error = sign * shot.truth.g[:, sign * (x - cx) + 3, sign * (y - cy) + 3]
         np.testing.assert_allclose([view.dx, view.dy], place - site + error, atol=1e-14)
@@ -101,7 +115,9 @@ def test_the_map_of_a_displaced_plate_is_that_of_the_one_in_place(ids):
         measurements = displaced(plan, t_m, ids=ids)[1]
         maps.append(calibrate(measurements, Options(causes=False)).error_map)
     for axis in "xy":
-        np.testing.assert_allclose(*(getattr(found, f"g{axis}") for found in maps), atol=2e-10)
+        np.testing.assert_allclose(
+            *(getattr(found, f"g{axis}") for found in maps), atol=2e-10
+        )
 
 
 @pytest.mark.parametrize("pixels", [0.75, 1.2])
@@ -122,13 +138,17 @@ def test_of_a_part_of_the_image_ids_tell_the_cells():
         PLAN, (0.6e-3, 0.0), ids=True, shown=lambda d: d.offset_x < 1.1e-3
     )
     assert not told.all_rejected()
-    assert {view.view.cell[0] for view in told.views if view.used and view.view.grid} == {-1, 0}
+    assert {
+        view.view.cell[0] for view in told.views if view.used and view.view.grid
+    } == {-1, 0}
     assert not any(view.complete for view in list(progress.values())[:3])
 
 
 def test_a_stage_that_follows_a_plate_a_pitch_away_is_named_and_no_mark_misnamed():
     for ids in (True, False):
-        _, measurements, _ = displaced(image_plan(7), (1.2e-3, 0.0), ids=ids, follow=True)
+        _, measurements, _ = displaced(
+            image_plan(7), (1.2e-3, 0.0), ids=ids, follow=True
+        )
         assert measurements.all_rejected() == {str(Reason.NOT_AT_MARK): 722}
 
 
@@ -165,10 +185,13 @@ def test_marks_beyond_the_image_of_the_plan_are_named():
 def test_without_an_image_in_the_plan_other_marks_are_named():
     shot = scene(image_plan(7), **QUIET)
     commands = [
-        replace(c, view=replace(c.view, image=None)) if c.view else c for c in shot.commands
+        replace(c, view=replace(c.view, image=None)) if c.view else c
+        for c in shot.commands
     ]
     measurements, _ = collect([*commands, *shot.samples, *shot.detections])
-    assert measurements.all_rejected() == {str(Reason.SEVERAL): len(shot.detections) - 2 * 49}
+    assert measurements.all_rejected() == {
+        str(Reason.SEVERAL): len(shot.detections) - 2 * 49
+    }
 
 
 def test_progress_counts_the_marks_of_images_and_names_the_stops_to_repeat():
@@ -184,13 +207,18 @@ def test_progress_counts_the_marks_of_images_and_names_the_stops_to_repeat():
     _, progress = collect([*shot.commands, *shot.samples, *kept])
     assert not progress[0].complete
     assert progress[0].needed == len(gone) - 1 == 361 - progress[0].grid_done
-    assert (progress[0].missing.m, progress[0].missing.n) == ((at_the_axis.m,), (at_the_axis.n,))
+    assert (progress[0].missing.m, progress[0].missing.n) == (
+        (at_the_axis.m,),
+        (at_the_axis.n,),
+    )
     assert 0 < progress[0].coverage < 1
 
 
 def test_check_stops_of_images_are_recognised():
     plan = image_plan(7, repeats=2)
-    views = tuple(replace(view, check_marks=5, check_offset_m=20e-6) for view in plan.views)
+    views = tuple(
+        replace(view, check_marks=5, check_offset_m=20e-6) for view in plan.views
+    )
     _, progress = collect(scene(replace(plan, views=views), sigma_xy_m=2e-8).events)
     assert [view.check_done for view in progress.values()] == [5, 5]
     assert all(view.complete for view in progress.values())
@@ -198,7 +226,10 @@ def test_check_stops_of_images_are_recognised():
 
 def test_a_stage_away_from_its_image_is_named():
     shot = scene(image_plan(7), **QUIET)
-    moved = [replace(s, positions=(s.positions[0] + 3e-3, *s.positions[1:])) for s in shot.samples]
+    moved = [
+        replace(s, positions=(s.positions[0] + 3e-3, *s.positions[1:]))
+        for s in shot.samples
+    ]
     measurements, _ = collect([*shot.commands, *moved, *shot.detections])
     assert set(measurements.all_rejected()) <= {Reason.TOO_FAR, Reason.NOT_AT_MARK}
     assert not any(view.used for view in measurements.views)

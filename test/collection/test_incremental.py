@@ -36,7 +36,9 @@ SMALL = Limits(block=32, in_memory=2)
 
 
 def a_session(repeats=2):
-    cell = scene("0, 90, tx", line=True, repeats=repeats, sigma_xy_m=2e-8, sigma_theta_rad=2e-6)
+    cell = scene(
+        "0, 90, tx", line=True, repeats=repeats, sigma_xy_m=2e-8, sigma_theta_rad=2e-6
+    )
     arrivals, _ = apply_faults(
         sorted(cell.events, key=lambda e: e.stamp_ns), FAULTS, np.random.default_rng(5)
     )
@@ -78,7 +80,8 @@ def late(seed, spread):
     return [
         event
         for _, event in sorted(
-            ((at + draw.uniform(0, spread), at), event) for at, event in enumerate(EVENTS)
+            ((at + draw.uniform(0, spread), at), event)
+            for at, event in enumerate(EVENTS)
         )
     ]
 
@@ -87,13 +90,24 @@ def test_commands_of_a_run_with_another_plate_that_come_after_its_detections():
     """What lay in the first view lies in the first view again, of another plate."""
     cell = scene("0", repeats=1)
     begin = cell.commands[0].stamp_ns
-    place, measure = (replace(command, run_id=str(begin)) for command in cell.commands[:2])
-    wide = replace(cell.plan.artifact, grid_pitch_m=1.5 * cell.plan.artifact.grid_pitch_m)
+    place, measure = (
+        replace(command, run_id=str(begin)) for command in cell.commands[:2]
+    )
+    wide = replace(
+        cell.plan.artifact, grid_pitch_m=1.5 * cell.plan.artifact.grid_pitch_m
+    )
     later = [
-        replace(command, stamp_ns=command.stamp_ns + 1, run_id=str(begin + 1), artifact=wide)
+        replace(
+            command, stamp_ns=command.stamp_ns + 1, run_id=str(begin + 1), artifact=wide
+        )
         for command in (place, measure)
     ]
-    events = [place, measure, *(e for e in cell.events if not isinstance(e, Command)), *later]
+    events = [
+        place,
+        measure,
+        *(e for e in cell.events if not isinstance(e, Command)),
+        *later,
+    ]
     collector = fresh()
     for event in events:
         if event is later[0]:
@@ -136,7 +150,9 @@ def blocks(events, size):
         samples: dict[tuple, list[EncoderSample]] = {}
         for event in part:
             if isinstance(event, EncoderSample):
-                samples.setdefault((event.names, bool(event.velocities)), []).append(event)
+                samples.setdefault((event.names, bool(event.velocities)), []).append(
+                    event
+                )
         out += [("encoder", names, group) for (names, _), group in samples.items()]
         out += [("detection", None, [e for e in part if isinstance(e, Detection)])]
         out += [("command", None, [e for e in part if isinstance(e, Command)])]
@@ -145,7 +161,9 @@ def blocks(events, size):
 
 def feed_block(collector, kind, names, group):
     if kind == "encoder":
-        speeds = np.array([e.velocities for e in group]) if group[0].velocities else None
+        speeds = (
+            np.array([e.velocities for e in group]) if group[0].velocities else None
+        )
         collector.add_encoder_block(
             np.array([e.stamp_ns for e in group]),
             names,
@@ -214,12 +232,19 @@ def test_blocks_that_cannot_be_used_are_counted(names, positions, velocities, re
     collector = fresh()
     positions = np.array(positions)
     collector.add_encoder_block(
-        np.arange(3), names, positions, None if velocities is None else np.array(velocities)
+        np.arange(3),
+        names,
+        positions,
+        None if velocities is None else np.array(velocities),
     )
     assert collector.unusable == reasons
     assert collector.received == {"encoder": 3, "detection": 0, "command": 0}
-    finite = np.isfinite(positions) if "not_finite" in str(reasons) else np.zeros((3, 2))
-    assert [len(collector.tracks.x), len(collector.tracks.y)] == finite.sum(axis=0).tolist()
+    finite = (
+        np.isfinite(positions) if "not_finite" in str(reasons) else np.zeros((3, 2))
+    )
+    assert [len(collector.tracks.x), len(collector.tracks.y)] == finite.sum(
+        axis=0
+    ).tolist()
 
 
 def looks(monkeypatch):
@@ -326,7 +351,9 @@ def test_a_sample_that_comes_after_hours_finds_its_exposure():
     assert before["no_encoder_sample_near"] >= 10
     hours = [
         EncoderSample(
-            cell.samples[-1].stamp_ns + 2_000_000 * k, ("x", "y", "theta"), (0.0, 0.0, 0.0)
+            cell.samples[-1].stamp_ns + 2_000_000 * k,
+            ("x", "y", "theta"),
+            (0.0, 0.0, 0.0),
         )
         for k in range(200, 700)
     ]
@@ -343,14 +370,20 @@ def test_a_late_sample_finds_its_exposure_beside_one_that_is_new():
     others = [event for event in cell.events if event is not nearest]
     x, y, theta = nearest.positions
     late_one = replace(nearest, positions=(x + 1e-7, y, theta))
-    new = replace(cell.samples[-1], stamp_ns=cell.samples[-1].stamp_ns + 3_600_000_000_000)
+    new = replace(
+        cell.samples[-1], stamp_ns=cell.samples[-1].stamp_ns + 3_600_000_000_000
+    )
     collector = fresh()
     for event in others:
         add(collector, event)
     collector.collect()
     add(collector, new)
     add(collector, late_one)
-    assert digest_of(collector) == digest([*others, late_one, new]) != digest([*others, new])
+    assert (
+        digest_of(collector)
+        == digest([*others, late_one, new])
+        != digest([*others, new])
+    )
 
 
 def test_scores_that_are_reported_late_count_for_all():
@@ -362,7 +395,10 @@ def test_scores_that_are_reported_late_count_for_all():
         add(collector, event)
     assert collector.collect()[0].views[0].used == 25
     add(collector, replace(cell.detections[0], stamp_ns=1, score=0.9))
-    assert collector.collect()[0].all_rejected() == {"low_score": 25, "outside_every_view": 1}
+    assert collector.collect()[0].all_rejected() == {
+        "low_score": 25,
+        "outside_every_view": 1,
+    }
 
 
 def test_a_command_that_comes_late_moves_readings_to_their_view():

@@ -44,9 +44,15 @@ def session():
     ("changes", "reason"),
     [
         ({"translation_x": 1e300}, "pitches are beyond every field; is it in mm?"),
-        ({"translation_y": float("nan")}, "(0.0, nan) are not two lengths; give a finite"),
+        (
+            {"translation_y": float("nan")},
+            "(0.0, nan) are not two lengths; give a finite",
+        ),
         ({"rotation": float("inf")}, "inf is not an angle"),
-        ({"view_index": 2**31}, "a plan has at most 1000 views; correct the view_index"),
+        (
+            {"view_index": 2**31},
+            "a plan has at most 1000 views; correct the view_index",
+        ),
         ({"grid_size": 3}, "m goes beyond -1 to 1; correct the publisher"),
         ({"angular_count": 4}, "k goes beyond 0 to 3; correct the publisher"),
         ({"grid_size": 2**31 + 1}, "rows of marks are more than 401; "),
@@ -62,7 +68,10 @@ def session():
             {"visit_offset_y": [float("nan")] * 25},
             "'0', visits: offset_y is not a number up to 1000",
         ),
-        ({"visit_count": [0] * 25}, "'0', visits: a count below 1; correct the publisher"),
+        (
+            {"visit_count": [0] * 25},
+            "'0', visits: a count below 1; correct the publisher",
+        ),
     ],
 )
 def test_a_view_that_cannot_be_is_refused_and_forgotten(session, changes, reason):
@@ -89,14 +98,17 @@ def test_uncertainties_that_are_not_known_are_no_reason_to_refuse(session):
 def test_a_plate_that_is_enormous_beside_what_was_read_is_not_solved(session):
     session.take_measurement(first_view(grid_size=401))
     tracemalloc.start()
-    with pytest.raises(InputError, match="25 readings of a plate with 160801 marks; correct "):
+    with pytest.raises(
+        InputError, match="25 readings of a plate with 160801 marks; correct "
+    ):
         session.next_job()
     assert tracemalloc.get_traced_memory()[1] < 1e6
     tracemalloc.stop()
 
 
 def test_a_thousand_sites_for_each_mark_are_still_solved(session):
-    session.take_measurement(first_view(grid_size=161))  # 25921 sites, 26 * 1000 is the limit
+    # 25921 sites, 26 * 1000 is the limit
+    session.take_measurement(first_view(grid_size=161))
     assert session.next_job() is not None
     session.take_measurement(first_view(grid_size=163))
     with pytest.raises(InputError, match="25 readings of a plate with 26569 marks"):
@@ -106,8 +118,16 @@ def test_a_thousand_sites_for_each_mark_are_still_solved(session):
 @pytest.mark.parametrize(
     ("view", "artifact", "reason"),
     [
-        (View("a", repeats=32), Artifact(401, 0.01), "5145632 exposures exceed the 5000000 of a"),
-        (View("a", repeats=2**32 - 1), SMALL, "4294967295 repeats; ask for 1 to 1000000"),
+        (
+            View("a", repeats=32),
+            Artifact(401, 0.01),
+            "5145632 exposures exceed the 5000000 of a",
+        ),
+        (
+            View("a", repeats=2**32 - 1),
+            SMALL,
+            "4294967295 repeats; ask for 1 to 1000000",
+        ),
         (View("a", repeats=200_001), SMALL, "5000025 exposures exceed"),
         (
             View("a", grid=False, angular=False),
@@ -125,7 +145,9 @@ def test_what_the_simulated_cell_cannot_hold_is_refused(view, artifact, reason):
 
 
 def test_the_limit_itself_is_simulated():
-    command = Command(5, Phase.MEASURE, "p", 0, View("a", repeats=MAX_EXPOSURES // 25), SMALL, 1)
+    command = Command(
+        5, Phase.MEASURE, "p", 0, View("a", repeats=MAX_EXPOSURES // 25), SMALL, 1
+    )
     check_simulated(command)
     with pytest.raises(InputError, match="at most 1000 views"):
         check_simulated(replace(command, view_index=2**31))
@@ -170,8 +192,12 @@ EDGES = [
 @pytest.mark.parametrize("alike", [False, True], ids=["one", "all"])
 @pytest.mark.parametrize("declared", [0.0, 2e-8])
 @pytest.mark.parametrize(("field", "value"), EDGES)
-def test_what_the_collector_takes_of_a_detection_the_solver_can_use(field, value, declared, alike):
-    cell = scene("0, 90, tx", line=True, repeats=2, sigma_xy_m=2e-8, sigma_theta_rad=2e-5)
+def test_what_the_collector_takes_of_a_detection_the_solver_can_use(
+    field, value, declared, alike
+):
+    cell = scene(
+        "0, 90, tx", line=True, repeats=2, sigma_xy_m=2e-8, sigma_theta_rad=2e-5
+    )
     for index, seen in enumerate(cell.detections):
         spoilt = alike or index in (cell.grid(3), cell.angular(3))
         cell.spoil(index, **{"sigma": declared} | ({field: value} if spoilt else {}))
@@ -179,7 +205,10 @@ def test_what_the_collector_takes_of_a_detection_the_solver_can_use(field, value
             cell.spoil(index, **{field: value + getattr(seen, field)})
     measurements, progress = collect(cell.events)
     messages = [
-        message("ViewMeasurement", from_model.view_measurement(view, measurements, 10, "stage"))
+        message(
+            "ViewMeasurement",
+            from_model.view_measurement(view, measurements, 10, "stage"),
+        )
         for view in progress.values()
     ]
     session = SolvingSession(settings_of("solver"), Hands().ports)

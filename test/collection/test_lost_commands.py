@@ -15,7 +15,8 @@ def without(*lost):
         [
             event
             for event in events_of(small_plan())
-            if not isinstance(event, Command) or (event.view_index, event.phase) not in lost
+            if not isinstance(event, Command)
+            or (event.view_index, event.phase) not in lost
         ]
     ).missing_commands()
 
@@ -32,7 +33,9 @@ def test_the_end_of_a_run_and_where_the_plate_lies_may_be_missing():
 def test_a_view_whose_measure_is_lost_is_named_with_what_was_read_in_it(view):
     plan = small_plan()
     (line,) = without((view, Phase.MEASURE))
-    read = line.removeprefix(f"view '{plan.views[view].name}' was placed, and ").split()[0]
+    read = line.removeprefix(
+        f"view '{plan.views[view].name}' was placed, and "
+    ).split()[0]
     counts = [
         int(without((other, Phase.MEASURE))[0].split("placed, and ")[1].split()[0])
         for other in range(4)

@@ -34,7 +34,9 @@ PLAN = {
 
 
 def planned(folder, text: str, **changes):
-    (folder / "marks.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+    (folder / "marks.csv").write_bytes(
+        text if isinstance(text, bytes) else text.encode()
+    )
     return plan_of(PLAN | changes, "PLAN.yaml", folder)
 
 
@@ -53,7 +55,9 @@ def test_a_plan_reads_its_marks_from_a_table(tmp_path):
     written = plan_to_dict(plan)
     assert written["artifact"]["marks"]["id"] == [-2, 3, 9, 40]
     assert plan_from_dict(written, "again") == plan
-    moved = planned(tmp_path, GOOD, views=[{"name": "a", "translation_mm": [6.5, -1.0]}])
+    moved = planned(
+        tmp_path, GOOD, views=[{"name": "a", "translation_mm": [6.5, -1.0]}]
+    )
     assert moved.views[0].translation_m == (0.0065, -0.001)
     assert plan_from_dict(plan_to_dict(moved), "again") == moved
 
@@ -61,7 +65,10 @@ def test_a_plan_reads_its_marks_from_a_table(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("id,x\n1,0\n", r"marks.csv:1: no column y; begin with the line id,x,y \(x and y in m\)"),
+        (
+            "id,x\n1,0\n",
+            r"marks.csv:1: no column y; begin with the line id,x,y \(x and y in m\)",
+        ),
         ("", r"marks.csv:1: no column id, x, y"),
         (GOOD + "6,0.01\n", r"marks.csv:7: 2 cells, not 3; correct the line"),
         (GOOD + "6,a,0\n", r"marks.csv:7: x 'a' is not a number"),
@@ -69,11 +76,17 @@ def test_a_plan_reads_its_marks_from_a_table(tmp_path):
         (GOOD + "1_0,0,0\n", r"marks.csv:7: id '1_0' is not a whole number"),
         (GOOD + "b,0,0\n", r"marks.csv:7: id 'b' is not a whole number"),
         (GOOD + "1.0,0,0\n", r"marks.csv:7: id '1.0' is not a whole number"),
-        (GOOD + "3,0.02,0\n", r"marks.csv:7: the id 3 is used already in .*marks.csv:4"),
+        (
+            GOOD + "3,0.02,0\n",
+            r"marks.csv:7: the id 3 is used already in .*marks.csv:4",
+        ),
         (GOOD + "6,0.05,0.05\n", r"marks.csv:7: marks 4 and 6 lie at one place"),
         (GOOD + "6,nan,0\n", r"marks.csv:7: mark 6 has no place \(nan, 0\)"),
         (GOOD + "6,0,inf\n", r"marks.csv:7: mark 6 has no place"),
-        (GOOD + "6,20.5,0\n", r"marks.csv:7: .*beyond every plate \(2 m\); is it in mm\?"),
+        (
+            GOOD + "6,20.5,0\n",
+            r"marks.csv:7: .*beyond every plate \(2 m\); is it in mm\?",
+        ),
         (GOOD + f"{2**31},0,0\n", r"marks.csv:7: id 2147483648 is no 32 bit integer"),
         ("id,x,y\n1,0,0\n2,0,0.1\n3,0.1,0\n", r"marks.csv: 3 marks, not 4 to 10000"),
         (
@@ -103,7 +116,10 @@ def test_bad_tables_are_refused_in_one_line(tmp_path, text, said):
             "marks and grid_size are both given",
         ),
         ({"artifact": {"marks": 5}}, "artifact: marks: 5 is not of type dict"),
-        ({"artifact": {"marks": {"id": [1], "x": [0.0], "y": []}}}, "not as many numbers each"),
+        (
+            {"artifact": {"marks": {"id": [1], "x": [0.0], "y": []}}},
+            "not as many numbers each",
+        ),
         (
             {"map": {}},
             r"artifact marks: 5 marks are too few to choose the nodes of the map; give them "
@@ -113,7 +129,10 @@ def test_bad_tables_are_refused_in_one_line(tmp_path, text, said):
             {"views": [{"name": "a", "translation_pitch": [1, 0]}]},
             r"translation_pitch: a list of marks has no pitch; give translation_mm",
         ),
-        ({"image": {"nx": 3, "ny": 3}}, "images show the cells of a lattice, the plate is a list"),
+        (
+            {"image": {"nx": 3, "ny": 3}},
+            "images show the cells of a lattice, the plate is a list",
+        ),
     ],
 )
 def test_plans_that_a_list_cannot_have_are_refused(tmp_path, changes, said):
@@ -123,7 +142,11 @@ def test_plans_that_a_list_cannot_have_are_refused(tmp_path, changes, said):
 
 def test_the_nodes_of_the_map_are_chosen_from_the_marks():
     """At most three quarters as many a side as a lattice of as many marks; over their field."""
-    for plate, size in ((scatter(225, 0), 11), (lattice(9, nodes=0), 5), (scatter(16, 0), 3)):
+    for plate, size in (
+        (scatter(225, 0), 11),
+        (lattice(9, nodes=0), 5),
+        (scatter(16, 0), 3),
+    ):
         assert plate.map_grid.size == size <= 0.75 * plate.m.size**0.5
         assert plate.field_half_m == pytest.approx((HALF_M, HALF_M))
     at = np.stack(np.meshgrid(np.linspace(-1, 1, 30), np.linspace(-0.3, 0.3, 9)))
@@ -132,21 +155,29 @@ def test_the_nodes_of_the_map_are_chosen_from_the_marks():
         {
             "plan_id": "p",
             "artifact": {
-                "marks": {"id": list(marks.ids), "x": list(marks.x_m), "y": list(marks.y_m)}
+                "marks": {
+                    "id": list(marks.ids),
+                    "x": list(marks.x_m),
+                    "y": list(marks.y_m),
+                }
             },
             "views": [{"name": "a"}],
         },
         "f",
     )
     field = plan.artifact.field
-    assert field.shape == (21, 7) and plan.artifact.field_half_m == pytest.approx((1, 0.3))
+    assert field.shape == (21, 7) and plan.artifact.field_half_m == pytest.approx(
+        (1, 0.3)
+    )
 
 
 def read(plate: Artifact, rng, *, turn=3e-4, shift=(40e-6, -25e-6)):
     """Return where the marks in the field of VIEW are read, and their ids, (2, n) each."""
     marks, sites = VIEW.on_stage(plate).marks_in_field(plate)
     about = sites * plate.grid_pitch_m - np.array(VIEW.translation_m)[:, None]
-    turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ about
+    turned = (
+        np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) @ about
+    )
     where = turned + np.array(VIEW.translation_m)[:, None] + np.array(shift)[:, None]
     return where + rng.normal(0, 1e-6, where.shape), marks
 
@@ -184,7 +215,9 @@ def test_marks_are_identified(name, with_ids):
 def test_a_plate_beside_its_place_is_identified_without_ids():
     """Scattered marks show an offset beyond half their distance, which a lattice hides."""
     plate = scatter()
-    where, marks = read(plate, np.random.default_rng(2), shift=(0.7 * plate.grid_pitch_m, 1e-3))
+    where, marks = read(
+        plate, np.random.default_rng(2), shift=(0.7 * plate.grid_pitch_m, 1e-3)
+    )
     found = identified(plate, where, marks, False)
     good = ~found.reasons.astype(bool)
     assert good.mean() > 0.9 and (found.index == marks)[:, good].all()
@@ -197,7 +230,9 @@ def test_marks_that_may_be_confused_are_rejected_and_named():
     twin = replace(
         plate,
         marks=marks_of(
-            [*marks.ids, 999], [*marks.x_m, marks.x_m[near] + 30e-6], [*marks.y_m, marks.y_m[near]]
+            [*marks.ids, 999],
+            [*marks.x_m, marks.x_m[near] + 30e-6],
+            [*marks.y_m, marks.y_m[near]],
         ),
     )
     where, ids = read(twin, np.random.default_rng(3))
@@ -212,7 +247,9 @@ def test_detections_of_no_mark_are_rejected():
     plate = lattice(7, (24,))  # the middle mark is missing
     where, marks = read(plate, np.random.default_rng(4))
     strange = np.hstack([where, np.array([VIEW.translation_m]).T])
-    reasons = identified(plate, strange, np.hstack([marks, marks[:, :1]]), False).reasons
+    reasons = identified(
+        plate, strange, np.hstack([marks, marks[:, :1]]), False
+    ).reasons
     assert reasons[-1] == Reason.TOO_FAR and not reasons[:-1].any()
     marks[0, 5] = 123456
     found = identified(plate, where, marks, True)
@@ -224,7 +261,9 @@ def test_marks_expected_and_missing_are_those_of_the_list():
     inside = VIEW.pose.in_field(plate)
     assert expected_marks(plate, VIEW) == (int(inside.sum()), 0)
     m = plate.m[inside]
-    readings = ViewReadings(VIEW, m[3:], 0 * m[3:], count=np.ones(len(m) - 3, dtype=int))
+    readings = ViewReadings(
+        VIEW, m[3:], 0 * m[3:], count=np.ones(len(m) - 3, dtype=int)
+    )
     missing = missing_marks(plate, VIEW, readings)
     assert missing.m == tuple(m[:3]) and missing.n == (0, 0, 0)
 
@@ -255,10 +294,16 @@ def test_the_plate_of_a_command_comes_back():
     plate = rings(angular_count=12)
     command = Command(5, Phase.MEASURE, "p", 0, replace(VIEW, angular=False), plate, 1)
     fields = from_model.command(command, "stage")
-    assert (fields["grid_size"], fields["grid_pitch"]) == (0, 0.0)  # old software refuses it
+    # old software refuses it
+    assert (fields["grid_size"], fields["grid_pitch"]) == (
+        0,
+        0.0,
+    )
     assert to_model.command(through_cdr("ViewCommand", fields)).artifact == plate
     for names, said in ((("mark_y",), "ids, "), (("map_grid_size",), "without nodes")):
-        damaged = fields | {name: [] if name.startswith("mark") else 0 for name in names}
+        damaged = fields | {
+            name: [] if name.startswith("mark") else 0 for name in names
+        }
         with pytest.raises(InputError, match=said):
             to_model.command(through_cdr("ViewCommand", damaged)).artifact.field.shape  # noqa: B018
 

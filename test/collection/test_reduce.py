@@ -298,7 +298,8 @@ def test_a_mark_without_id_far_off_the_plate_is_too_far():
 
 
 @pytest.mark.parametrize(
-    ("lines", "reason"), [(0.5, Reason.AMBIGUOUS), (-0.4, Reason.AMBIGUOUS), (0.3, Reason.TOO_FAR)]
+    ("lines", "reason"),
+    [(0.5, Reason.AMBIGUOUS), (-0.4, Reason.AMBIGUOUS), (0.3, Reason.TOO_FAR)],
 )
 def test_a_line_without_id_between_lines(lines, reason):
     spoilt = scene(with_ids=False)

@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from selfcal_ros.collection.marks import repeats as repeats_module
-from selfcal_ros.collection.marks.repeats import distances, median, reduce_repeats, row_medians
+from selfcal_ros.collection.marks.repeats import (
+    distances,
+    median,
+    reduce_repeats,
+    row_medians,
+)
 
 SIGMA = 2e-8
 LIMIT = 6.0
@@ -18,7 +23,11 @@ LIMIT = 6.0
 
 def readings(marks, repeats, rng, *, components=2):
     key = np.tile(np.arange(marks), repeats)
-    return key, rng.normal(0, SIGMA, (components, marks * repeats)), np.zeros(marks * repeats)
+    return (
+        key,
+        rng.normal(0, SIGMA, (components, marks * repeats)),
+        np.zeros(marks * repeats),
+    )
 
 
 def rejected_of_clean(marks, repeats, views, *, components=2, limit=LIMIT):
@@ -61,9 +70,13 @@ def test_of_clean_readings_fewer_than_one_in_100000_are_rejected():
         (24, 5, 1, 50),
     ],
 )
-def test_views_with_few_pairs_of_repeats_reject_no_more(marks, repeats, components, views):
+def test_views_with_few_pairs_of_repeats_reject_no_more(
+    marks, repeats, components, views
+):
     """The limit grows with few pairs: even one of 4.5 is then as safe as 6 is with many."""
-    bad, total = rejected_of_clean(marks, repeats, views, components=components, limit=4.5)
+    bad, total = rejected_of_clean(
+        marks, repeats, views, components=components, limit=4.5
+    )
     assert bad <= binom.ppf(0.999, total, 1e-5)
 
 
@@ -81,7 +94,9 @@ def test_where_an_outlier_begins_is_as_by_hand(marks, cut, side):
     key, values = np.repeat(np.arange(marks), 3), np.tile([-1.0, 0.0, 1.0], marks)
     for off, expected in ((cut - 1e-6, []), (cut + 1e-6, [5])):
         values[3:6] = [-side, 0.0, side * off]
-        found = reduce_repeats(key, values[None] * SIGMA, np.zeros(len(key)), limit=LIMIT)
+        found = reduce_repeats(
+            key, values[None] * SIGMA, np.zeros(len(key)), limit=LIMIT
+        )
         assert np.flatnonzero(found.outlier).tolist() == expected
 
 
@@ -93,7 +108,10 @@ def test_every_outlier_of_1_to_20_um_is_caught(repeats, marks):
     for _ in range(25):
         key, values, sigma = readings(marks, repeats, rng)
         spoilt = rng.random(len(key)) < 0.01
-        angle, size = rng.uniform(0, 2 * np.pi, len(key)), rng.uniform(1e-6, 20e-6, len(key))
+        angle, size = (
+            rng.uniform(0, 2 * np.pi, len(key)),
+            rng.uniform(1e-6, 20e-6, len(key)),
+        )
         values += spoilt * size * np.stack([np.cos(angle), np.sin(angle)])
         outlier = reduce_repeats(key, values, sigma, limit=LIMIT).outlier
         assert outlier[spoilt].all()
@@ -144,7 +162,9 @@ def test_outliers_are_told_in_units_of_the_declared_sigma():
     values[:, coarse] *= 50
     sigma = np.where(coarse, 50 * SIGMA, SIGMA)
     assert not reduce_repeats(key, values, sigma, limit=LIMIT).outlier.any()
-    assert reduce_repeats(key, values, 0 * sigma, limit=LIMIT).outlier[coarse].sum() > 10
+    assert (
+        reduce_repeats(key, values, 0 * sigma, limit=LIMIT).outlier[coarse].sum() > 10
+    )
 
 
 def test_marks_with_declared_sigmas_far_apart_are_held_to_their_own():
@@ -153,7 +173,9 @@ def test_marks_with_declared_sigmas_far_apart_are_held_to_their_own():
     values = rng.normal(0, 1, (2, 4 * marks)) * sigma
     values[0, 9] += 12 * SIGMA  # of a mark read well; nothing among those of the others
     for size in (1.0, 1e3):  # declared in whatever unit
-        means = reduce_repeats(np.repeat(np.arange(marks), 4), values, size * sigma, limit=LIMIT)
+        means = reduce_repeats(
+            np.repeat(np.arange(marks), 4), values, size * sigma, limit=LIMIT
+        )
         assert np.flatnonzero(means.outlier).tolist() == [9]
 
 
@@ -166,7 +188,9 @@ def test_mean_count_repeatability_and_degrees_of_freedom_as_by_hand():
     assert means.count.tolist() == [4, 1, 2, 5]
     assert means.dof == 2 * (3 + 0 + 1 + 4)
     groups = [values[:, key == k] for k in (3, 5, 8, 9)]
-    np.testing.assert_allclose(means.mean.T, [g.mean(axis=1) for g in groups], rtol=1e-14)
+    np.testing.assert_allclose(
+        means.mean.T, [g.mean(axis=1) for g in groups], rtol=1e-14
+    )
     squares = sum(((g - g.mean(axis=1, keepdims=True)) ** 2).sum() for g in groups)
     assert means.sigma == pytest.approx(np.sqrt(squares / means.dof), rel=1e-12)
     assert means.u.shape == (0,)
@@ -186,9 +210,13 @@ def test_declared_sigmas_weigh_the_mean_and_tell_its_uncertainty():
     sigma = np.array([1.0, 2.0, 0.5, 1.0, 0.0, 3.0])
     means = reduce_repeats(key, values, sigma, limit=0.0)
     weights = 1 / sigma[:3] ** 2
-    assert means.mean[0, 0] == pytest.approx(np.average(values[0, :3], weights=weights), rel=1e-14)
+    assert means.mean[0, 0] == pytest.approx(
+        np.average(values[0, :3], weights=weights), rel=1e-14
+    )
     assert means.mean[0, 1] == 6.0  # one of its repeats declares none: not weighted
-    np.testing.assert_allclose(means.u, [1 / np.sqrt(weights.sum()), np.nan, 3.0], rtol=1e-14)
+    np.testing.assert_allclose(
+        means.u, [1 / np.sqrt(weights.sum()), np.nan, 3.0], rtol=1e-14
+    )
 
 
 @given(st.floats(-1e-3, 1e-3), st.integers(1, 9), st.floats(1e-12, 1e-3))
@@ -211,16 +239,24 @@ def test_the_pooled_repeatability_is_unbiased():
 
 
 @pytest.mark.parametrize("step", [1e-9, 1e-7])
-def test_a_sensor_that_resolves_no_finer_than_its_step_has_no_outliers_of_one_step(step):
+def test_a_sensor_that_resolves_no_finer_than_its_step_has_no_outliers_of_one_step(
+    step,
+):
     rng = np.random.default_rng(3)
     key = np.tile(np.arange(121), 6)
-    values = step * np.rint(rng.normal(0, 0.22, (2, len(key)))) + 0.01 * np.stack([key, -key])
+    values = step * np.rint(rng.normal(0, 0.22, (2, len(key)))) + 0.01 * np.stack(
+        [key, -key]
+    )
     means = reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT, extent=1.21)
-    assert 0.02 < (np.abs(values - 0.01 * np.stack([key, -key])) > step / 2).mean() < 0.25
+    assert (
+        0.02 < (np.abs(values - 0.01 * np.stack([key, -key])) > step / 2).mean() < 0.25
+    )
     assert not means.outlier.any()
     values[0, 77] += 4.2 * step
     assert np.flatnonzero(
-        reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT, extent=1.21).outlier
+        reduce_repeats(
+            key, values, np.zeros(len(key)), limit=LIMIT, extent=1.21
+        ).outlier
     ).tolist() == [77]
 
 
@@ -259,7 +295,9 @@ def test_outliers_are_found_in_every_part_of_the_marks(monkeypatch, part):
     key = rng.permutation(np.repeat(np.arange(len(count)), count))
     values = rng.normal(0, SIGMA, (2, len(key)))
     spoilt = np.zeros(len(key), dtype=bool)
-    for mark in np.flatnonzero((np.arange(len(count)) % 9 == 0) | (np.arange(len(count)) % 9 == 8)):
+    for mark in np.flatnonzero(
+        (np.arange(len(count)) % 9 == 0) | (np.arange(len(count)) % 9 == 8)
+    ):
         spoilt[np.flatnonzero(key == mark)[-1]] = True
     values[:, spoilt] += 50 * SIGMA
     found = reduce_repeats(key, values, np.zeros(len(key)), limit=LIMIT)
@@ -280,7 +318,9 @@ def test_medians_are_those_of_numpy_to_the_bit(count, of):
         np.testing.assert_array_equal(row, before)  # untouched unless it may be
         assert median(row, overwrite=True) == np.median(before)
     rest = table[:, 1:]
-    np.testing.assert_array_equal(row_medians(rest), np.median(rest, axis=-1, keepdims=True))
+    np.testing.assert_array_equal(
+        row_medians(rest), np.median(rest, axis=-1, keepdims=True)
+    )
 
 
 def test_distances():

@@ -14,7 +14,12 @@ from selfcal_ros.collection.marks.identify import (
     identify_angular,
     identify_grid,
 )
-from selfcal_ros.collection.marks.rigid import LARGEST_TURN_RAD, MotionEstimate, Rigid, fit_motion
+from selfcal_ros.collection.marks.rigid import (
+    LARGEST_TURN_RAD,
+    MotionEstimate,
+    Rigid,
+    fit_motion,
+)
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.view import View
 from selfcal_ros.simulation.cell import CellSettings, plan_events
@@ -72,7 +77,9 @@ def test_few_named_lines_tell_the_rotation_to_all_others(degrees, named):
 def test_a_stated_largest_rotation_below_half_a_line_makes_the_nearest_line_the_one(
     stated, degrees, reason
 ):
-    k, found = lines(360, degrees, rules=replace(RULES, max_rotation_rad=np.deg2rad(stated)))
+    k, found = lines(
+        360, degrees, rules=replace(RULES, max_rotation_rad=np.deg2rad(stated))
+    )
     assert set(found.reasons) == {reason}
     if reason is None:
         np.testing.assert_array_equal(found.index, k)
@@ -178,7 +185,9 @@ def turned(
     The plan asks for a turn by `placed_deg`, over a map that reaches beyond the plate.
     """
     rng = np.random.default_rng(seed)
-    artifact = Artifact(size, pitch, 24, map_grid=MapGrid(5, size * pitch) if placed_deg else None)
+    artifact = Artifact(
+        size, pitch, 24, map_grid=MapGrid(5, size * pitch) if placed_deg else None
+    )
     view = View("v", np.deg2rad(placed_deg), angular=False)
     marks = np.stack([artifact.m.ravel(), artifact.n.ravel()])
     has_id = np.zeros(marks.shape[1], dtype=bool)
@@ -198,7 +207,8 @@ def turned(
 
 @pytest.mark.parametrize("named", [1, 2, 3, "corner"])
 @pytest.mark.parametrize(
-    ("degrees", "offset"), [(0.7, (1e-4, -5e-5)), (-2.0, (1e-4, -5e-5)), (0.7, (2.3e-3, -1.4e-3))]
+    ("degrees", "offset"),
+    [(0.7, (1e-4, -5e-5)), (-2.0, (1e-4, -5e-5)), (0.7, (2.3e-3, -1.4e-3))],
 )
 def test_few_named_marks_are_anchors_of_all_others(named, degrees, offset):
     for seed in range(3):
@@ -215,9 +225,13 @@ def test_anchors_reach_over_lost_marks(named):
 
 
 @pytest.mark.parametrize("placed_deg", [0.0, 37.0, 90.0, 211.0])
-def test_marks_without_ids_at_one_side_of_a_turned_plate_tell_its_rotation_themselves(placed_deg):
+def test_marks_without_ids_at_one_side_of_a_turned_plate_tell_its_rotation_themselves(
+    placed_deg,
+):
     """There they are by more than half a pitch beside their places."""
-    marks, found = turned(0.9, named=0, where=lambda m, n: m < -40, placed_deg=placed_deg)
+    marks, found = turned(
+        0.9, named=0, where=lambda m, n: m < -40, placed_deg=placed_deg
+    )
     assert set(found.reasons) == {None}
     np.testing.assert_array_equal(found.index, marks)
 
@@ -261,7 +275,9 @@ def test_two_named_marks_one_of_them_misread_tell_nothing():
     has_id = ((m == -3) & (n == 0)) | ((m == 3) & (n == 0))
     ids = np.where(has_id, marks, 0)
     ids[1, (m == 3) & (n == 0)] = 1
-    found = identify_grid(artifact, View("v"), marks * 0.005, ids=ids, has_id=has_id, rules=RULES)
+    found = identify_grid(
+        artifact, View("v"), marks * 0.005, ids=ids, has_id=has_id, rules=RULES
+    )
     good = (found.reasons == None) & ~has_id  # noqa: E711
     np.testing.assert_array_equal(found.index[:, good], marks[:, good])
 

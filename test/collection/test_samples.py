@@ -13,7 +13,9 @@ STAMPS = st.lists(st.integers(0, 300), max_size=30)
 
 
 def rows(columns):
-    return sorted(zip(*(np.nan_to_num(c, nan=-1.0).tolist() for c in columns), strict=True))
+    return sorted(
+        zip(*(np.nan_to_num(c, nan=-1.0).tolist() for c in columns), strict=True)
+    )
 
 
 def stored(parts, *, speeds):
@@ -26,7 +28,9 @@ def stored(parts, *, speeds):
         if number % 2:
             for at in range(len(t)):
                 store.add_block(
-                    t[at : at + 1], p[at : at + 1], None if v is None else v[at : at + 1]
+                    t[at : at + 1],
+                    p[at : at + 1],
+                    None if v is None else v[at : at + 1],
                 )
         else:
             store.add_block(t, p, v)
@@ -42,7 +46,9 @@ def stored(parts, *, speeds):
     st.integers(1, 6),
     st.booleans(),
 )
-def test_what_is_near_is_all_of_it_and_its_neighbours(parts, start, width, beside, speeds):
+def test_what_is_near_is_all_of_it_and_its_neighbours(
+    parts, start, width, beside, speeds
+):
     store, every = stored(parts, speeds=speeds)
     end = start + width
     found = rows(store.near(start, end, beside))
@@ -56,7 +62,9 @@ def test_what_is_near_is_all_of_it_and_its_neighbours(parts, start, width, besid
     assert set(found) <= set(every)
     assert len(store) == len(every)
     assert store.span() == ((stamps[0], stamps[-1]) if stamps else None)
-    assert store.count_between(start, end) >= sum(start <= row[0] <= end for row in every)
+    assert store.count_between(start, end) >= sum(
+        start <= row[0] <= end for row in every
+    )
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -90,13 +98,17 @@ def test_most_of_a_long_session_is_in_the_file():
     held = sum(block.count for block in store._blocks if block.columns)
     assert held == 200
     t, p, v = store.near(1234, 1240, 2)
-    assert p[(t >= 1232) & (t <= 1242)].tolist() == [float(k) for k in range(1232, 1243)]
+    assert p[(t >= 1232) & (t <= 1242)].tolist() == [
+        float(k) for k in range(1232, 1243)
+    ]
     assert np.isnan(v).all()
 
 
 def test_speeds_that_are_told_come_back_from_the_file():
     store = SampleStore(Limits(block=10, in_memory=1))
-    store.add_block(np.arange(40), np.zeros(40), np.where(np.arange(40) < 20, np.nan, 7.0))
+    store.add_block(
+        np.arange(40), np.zeros(40), np.where(np.arange(40) < 20, np.nan, 7.0)
+    )
     assert rows(store.near(5, 6, 1))[1] == (5, 0.0, -1.0)
     assert rows(store.near(25, 26, 1))[1] == (25, 0.0, 7.0)
 

@@ -64,11 +64,17 @@ def test_every_request_in_every_state(state, request_name):
     if (state, request_name) in FITS:
         phase, view, after = FITS[state, request_name]
         (command,) = REQUESTS[request_name](sequencer)
-        assert (command.phase, command.view_index, sequencer.state) == (phase, view, after)
+        assert (command.phase, command.view_index, sequencer.state) == (
+            phase,
+            view,
+            after,
+        )
         assert command.plan_id == PLAN.plan_id
         assert command.views_planned == 3
         assert command.view == (PLAN.views[view] if phase in (PLACE, MEASURE) else None)
-        assert command.artifact == (PLAN.artifact if phase in (PLACE, MEASURE) else None)
+        assert command.artifact == (
+            PLAN.artifact if phase in (PLACE, MEASURE) else None
+        )
         return
     if (state, request_name) in QUIET:
         assert REQUESTS[request_name](sequencer) == []
@@ -126,7 +132,9 @@ def test_skipping_the_last_view_is_done():
 
 
 def test_without_a_plan_nothing_starts():
-    with pytest.raises(InputError, match=r"^pose_sequencer: there is no plan; set the parameter"):
+    with pytest.raises(
+        InputError, match=r"^pose_sequencer: there is no plan; set the parameter"
+    ):
         Sequencer().start()
 
 
@@ -158,5 +166,7 @@ def test_the_sequencer_yields_to_recorded_commands_in_any_state():
     ],
 )
 def test_a_confirmation_out_of_place_says_what_to_do(state, remedy):
-    with pytest.raises(InputError, match=f"confirm_view does not fit while {state}; {remedy}$"):
+    with pytest.raises(
+        InputError, match=f"confirm_view does not fit while {state}; {remedy}$"
+    ):
         sequencer_in(state).confirm()

@@ -29,14 +29,21 @@ EVERY = [(node, p) for node, table in NODE_PARAMETERS.items() for p in table]
 
 
 def values_in(text, node="measurement_collector"):
-    return NODE_SETTINGS[node].checked(overrides_in(yaml.safe_load(text), node, "p.yaml"), "p.yaml")
+    return NODE_SETTINGS[node].checked(
+        overrides_in(yaml.safe_load(text), node, "p.yaml"), "p.yaml"
+    )
 
 
-@pytest.mark.parametrize(("node", "parameter"), EVERY, ids=lambda v: getattr(v, "name", v))
+@pytest.mark.parametrize(
+    ("node", "parameter"), EVERY, ids=lambda v: getattr(v, "name", v)
+)
 def test_every_default_is_in_bounds_and_said_in_words(node, parameter):
     assert parameter.check(parameter.default, "here") == parameter.default
     assert parameter.description
-    assert getattr(NODE_SETTINGS[node].checked({}, "here"), parameter.name) == parameter.default
+    assert (
+        getattr(NODE_SETTINGS[node].checked({}, "here"), parameter.name)
+        == parameter.default
+    )
 
 
 @pytest.mark.parametrize(
@@ -49,9 +56,13 @@ def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
     for bound, away in ((parameter.low, -math.inf), (parameter.high, math.inf)):
         assert parameter.check(kind(bound), "here") == bound
         beyond = (
-            math.nextafter(bound, away) if kind is float else int(bound + math.copysign(1, away))
+            math.nextafter(bound, away)
+            if kind is float
+            else int(bound + math.copysign(1, away))
         )
-        with pytest.raises(InputError, match=f"^here: {parameter.name}: .* is outside "):
+        with pytest.raises(
+            InputError, match=f"^here: {parameter.name}: .* is outside "
+        ):
             NODE_SETTINGS[node].checked({parameter.name: beyond}, "here")
 
 
@@ -59,7 +70,9 @@ def test_the_bounds_are_allowed_and_beyond_is_not(node, parameter):
 def test_the_file_of_all_parameters_states_their_units_and_bounds(node):
     text = (Path(__file__).parents[2] / "config/params/all.yaml").read_text()
     section = re.split(r"^(\w+):$", text, flags=re.M)
-    found = re.findall(r"((?:^    # .*\n)+)    (\w+): ", section[section.index(node) + 1], re.M)
+    found = re.findall(
+        r"((?:^    # .*\n)+)    (\w+): ", section[section.index(node) + 1], re.M
+    )
     about = {name: " ".join(re.findall(r"# (.*)", words)) for words, name in found}
     for parameter in NODE_PARAMETERS[node]:
         assert parameter.name in about, "run `make reference`"
@@ -80,7 +93,11 @@ def test_names_are_unique_in_a_node():
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("max_sped", 1.0, "measurement_collector has no such parameter; did you mean 'max_speed'?"),
+        (
+            "max_sped",
+            1.0,
+            "measurement_collector has no such parameter; did you mean 'max_speed'?",
+        ),
         (
             "max_speed",
             "fast",
@@ -127,7 +144,9 @@ def test_parameters_that_ros_adds_itself_are_let_pass():
         "start_type_description_service": False,
         "qos_overrides./tf.publisher.depth": 5,
     }
-    assert SolverSettings.checked(overrides, "here") == SolverSettings.checked({}, "here")
+    assert SolverSettings.checked(overrides, "here") == SolverSettings.checked(
+        {}, "here"
+    )
 
 
 @pytest.mark.parametrize(
@@ -165,7 +184,9 @@ def test_a_wild_card_section_holds_parameters_of_many_nodes_but_no_unknown_ones(
     text = "/**: {ros__parameters: {method: law, max_speed: 0.1, frame_id: base}}"
     assert values_in(text).frame_id == "base"
     assert values_in(text, "solver").method == "law"
-    with pytest.raises(InputError, match=r"p.yaml: methd: solver has no such parameter"):
+    with pytest.raises(
+        InputError, match=r"p.yaml: methd: solver has no such parameter"
+    ):
         values_in("/**: {ros__parameters: {methd: law}}", "solver")
 
 
@@ -176,8 +197,14 @@ def test_a_wild_card_section_holds_parameters_of_many_nodes_but_no_unknown_ones(
             "colector: {ros__parameters: {}}",
             "p.yaml: /colector: no node of this package; known are ",
         ),
-        ("[1, 2]", "p.yaml: not a ROS parameter file; write 'NODE: ros__parameters: ...'"),
-        ("solver: 5", "p.yaml: not a ROS parameter file; write 'NODE: ros__parameters: ...'"),
+        (
+            "[1, 2]",
+            "p.yaml: not a ROS parameter file; write 'NODE: ros__parameters: ...'",
+        ),
+        (
+            "solver: 5",
+            "p.yaml: not a ROS parameter file; write 'NODE: ros__parameters: ...'",
+        ),
         (
             "solver: {ros__parameters: [1]}",
             "p.yaml: /solver: ros__parameters is not a mapping; write",
@@ -199,14 +226,20 @@ def test_the_estimator_gets_what_the_solver_was_given():
         {"theta_datum": "xy_axes", "misalignment_model": "linear"}, "here"
     )
     options = solver_options(settings)
-    assert (options.datum_theta, options.misalignment_model) == (ThetaDatum.XY_AXES, "linear")
+    assert (options.datum_theta, options.misalignment_model) == (
+        ThetaDatum.XY_AXES,
+        "linear",
+    )
     assert options.uncertainty is None
 
 
 def test_without_being_told_plates_turn_and_the_encoder_owes_nothing_to_the_axes():
     options = solver_options(SolverSettings.checked({}, "here"))
     assert options == Options()
-    assert (options.datum_theta, options.misalignment_model) == (ThetaDatum.ZERO_MEAN, "rigid")
+    assert (options.datum_theta, options.misalignment_model) == (
+        ThetaDatum.ZERO_MEAN,
+        "rigid",
+    )
 
 
 def test_the_law_cannot_use_a_known_plate():
@@ -215,7 +248,9 @@ def test_the_law_cannot_use_a_known_plate():
         match=r"method law: the plate is known from r.json, and .*leave "
         "the method out",
     ):
-        solver_options(SolverSettings.checked({"method": "law"}, "here"), plate_from="r.json")
+        solver_options(
+            SolverSettings.checked({"method": "law"}, "here"), plate_from="r.json"
+        )
 
 
 def asked(*terms: str) -> Measurements:
@@ -227,7 +262,12 @@ def asked(*terms: str) -> Measurements:
     [
         ([""], (), [], ""),
         ([""], ("drift:1e-08",), ["drift:1e-08"], "plan"),
-        (["approach,microscope"], ("drift:1e-08",), ["microscope", "approach"], "options"),
+        (
+            ["approach,microscope"],
+            ("drift:1e-08",),
+            ["microscope", "approach"],
+            "options",
+        ),
         (["none"], ("drift:1e-08",), [], ""),
         ([" none "], (), [], ""),
         (["none,"], ("drift:1e-08",), [], ""),
@@ -238,15 +278,26 @@ def asked(*terms: str) -> Measurements:
 def test_given_terms_win_over_those_of_the_plan(given, planned, terms, origin):
     settings = SolverSettings.checked({"model_terms": given}, "here")
     options = solver_options(settings, asked(*planned))
-    assert ([str(term) for term in options.terms], options.terms_from) == (terms, origin)
+    assert ([str(term) for term in options.terms], options.terms_from) == (
+        terms,
+        origin,
+    )
 
 
 @pytest.mark.parametrize(
     ("given", "planned", "message"),
     [
-        ([""], ("creep",), "plan 'p': model_terms: the term 'creep' is unknown; known are "),
+        (
+            [""],
+            ("creep",),
+            "plan 'p': model_terms: the term 'creep' is unknown; known are ",
+        ),
         (["creep"], (), "model_terms: the term 'creep' is unknown; known are "),
-        (["none,drift"], (), "model_terms: 'none' and other terms exclude each other; leave out "),
+        (
+            ["none,drift"],
+            (),
+            "model_terms: 'none' and other terms exclude each other; leave out ",
+        ),
         (
             ["drift", "none"],
             (),
@@ -266,7 +317,9 @@ def test_terms_that_cannot_be(given, planned, message):
     assert str(caught.value).startswith(message)
 
 
-@pytest.mark.parametrize(("word", "wanted"), [("auto", None), ("always", True), ("never", False)])
+@pytest.mark.parametrize(
+    ("word", "wanted"), [("auto", None), ("always", True), ("never", False)]
+)
 def test_the_uncertainty_map_is_wanted_in_words(word, wanted):
     settings = SolverSettings.checked({"uncertainty": word}, "here")
     assert solver_options(settings).uncertainty is wanted
@@ -289,7 +342,10 @@ def test_what_is_known_of_the_microscope_is_assumed_unless_somebody_says_otherwi
         "microscope:0.1:0.02:0.003",
         *ASSUMED[1:],
     ]
-    assert model_of(model_terms=["microscope"], scale_u=0.1) == ["microscope", *ASSUMED[1:]]
+    assert model_of(model_terms=["microscope"], scale_u=0.1) == [
+        "microscope",
+        *ASSUMED[1:],
+    ]
     assert model_of(scale_u=0.0, rotation_u=0.0, shear_u=0.0) == ASSUMED[1:]
 
 

@@ -28,7 +28,9 @@ def test_clean_readings_of_small_views_are_kept():
 @pytest.mark.parametrize(
     ("marks", "repeats", "components"), [(5, 2, 2), (5, 3, 1), (4, 2, 2), (11, 2, 1)]
 )
-def test_fewer_pairs_than_tell_an_outlier_reject_nothing_at_all(marks, repeats, components):
+def test_fewer_pairs_than_tell_an_outlier_reject_nothing_at_all(
+    marks, repeats, components
+):
     """However far it is off: whatever the noise does, no clean reading is lost."""
     key, rng = np.repeat(np.arange(marks), repeats), np.random.default_rng(1)
     values = rng.normal(0, 2e-8, (components, len(key)))
@@ -36,7 +38,9 @@ def test_fewer_pairs_than_tell_an_outlier_reject_nothing_at_all(marks, repeats, 
     assert not reduce_repeats(key, values, np.zeros(len(key)), limit=6.0).outlier.any()
 
 
-@pytest.mark.parametrize(("marks", "repeats", "components"), [(6, 3, 1), (12, 2, 1), (6, 2, 2)])
+@pytest.mark.parametrize(
+    ("marks", "repeats", "components"), [(6, 3, 1), (12, 2, 1), (6, 2, 2)]
+)
 def test_twelve_pairs_tell_an_outlier(marks, repeats, components):
     key, rng = np.repeat(np.arange(marks), repeats), np.random.default_rng(1)
     values = rng.normal(0, 2e-8, (components, len(key)))

@@ -30,7 +30,8 @@ def led_astray(cell, index, shift_m):
 
 @pytest.mark.parametrize("with_ids", [True, False])
 @pytest.mark.parametrize(
-    ("shift", "kept"), [(0.55, True), (-0.55, True), (0.62, False), (-0.62, False), (2.0, False)]
+    ("shift", "kept"),
+    [(0.55, True), (-0.55, True), (0.62, False), (-0.62, False), (2.0, False)],
 )
 def test_a_stage_that_stands_beside_the_mark(with_ids, shift, kept):
     # half a pitch, and 0.035 rad times the radius of 2.83 pitches: 0.599 pitches
@@ -52,7 +53,9 @@ def test_a_stage_beside_any_of_many_marks_is_seen(monkeypatch, part):
 def test_the_limit_is_a_parameter_and_grows_with_the_rotation_reckoned_with():
     cell = led_astray(scene(count=0), 12, 0.62 * PITCH)
     assert collect(cell.events, max_stage_distance=0.0063)[0].all_rejected() == {}
-    assert collect(cell.events, max_stage_distance=0.0061)[0].all_rejected() == {REASON: 1}
+    assert collect(cell.events, max_stage_distance=0.0061)[0].all_rejected() == {
+        REASON: 1
+    }
     assert collect(cell.events, max_rotation=0.05)[0].all_rejected() == {}
 
 
@@ -66,11 +69,16 @@ def test_a_stage_that_never_moved_is_not_calibrated(sense):
     stamps = np.array(sorted(where))
     for index, d in enumerate(cell.detections):
         x, y, _ = where[stamps[np.searchsorted(stamps, d.stamp_ns) - 1]]
-        cell.spoil(index, offset_x=d.offset_x + sign * x, offset_y=d.offset_y + sign * y)
-    cell.samples = [replace(s, positions=(0.0, 0.0, s.positions[2])) for s in cell.samples]
+        cell.spoil(
+            index, offset_x=d.offset_x + sign * x, offset_y=d.offset_y + sign * y
+        )
+    cell.samples = [
+        replace(s, positions=(0.0, 0.0, s.positions[2])) for s in cell.samples
+    ]
     found, _ = collect(cell.events, measurement_sense=str(sense))
     assert found.all_rejected() == {REASON: 24}
-    assert len(found.views[0].m) == 1  # the mark at the centre, where the stage is parked
+    # the mark at the centre, where the stage is parked
+    assert len(found.views[0].m) == 1
     told, _ = collect(cell.events, measurement_sense=str(sense), max_stage_distance=1.0)
     assert len(told.views[0].m) == 25
 
@@ -93,7 +101,9 @@ def test_marks_at_whose_sites_the_stage_does_not_stand_do_not_move_the_others():
 
 @pytest.mark.parametrize("with_ids", [True, False])
 @pytest.mark.parametrize("sense", Sense)
-def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(with_ids, sense):
+def test_of_an_image_of_many_marks_the_one_at_which_the_stage_stands_is_read(
+    with_ids, sense
+):
     """At each stop the microscope sees the whole plate; the other marks are named as that."""
     cell = scene(count=0, sense=sense)
     plain, _ = collect(cell.events, measurement_sense=str(sense))

@@ -41,7 +41,9 @@ def checked(*, repeats=3, microscope=((0, 0), (0, 0)), turn=0, **settings):
     plan = plan_of("90" if turn else "0", 5, repeats=repeats)
     if turn == PLACED:  # the map reaches beyond the corners of the plate
         plate = replace(plan.artifact, map_grid=MapGrid(5, 0.02))
-        plan = replace(plan, artifact=plate, views=(View("37", np.deg2rad(37), repeats=repeats),))
+        plan = replace(
+            plan, artifact=plate, views=(View("37", np.deg2rad(37), repeats=repeats),)
+        )
     view = replace(plan.views[0], check_marks=MARKS, check_offset_m=OFFSET)
     plan, rng = replace(plan, views=(view,)), np.random.default_rng(4)
     truth = random_truth(plan.artifact, 1, rng)
@@ -82,11 +84,15 @@ def test_check_stops_are_visits_with_the_opposite_offset(sense, turn):
             for row in (visits.offset_x, visits.offset_y)
         ]
     ).reshape(MARKS, 2)
-    seen = np.stack([visits.offset_x, visits.offset_y], axis=1)[last].reshape(4, MARKS, 2)
+    seen = np.stack([visits.offset_x, visits.offset_y], axis=1)[last].reshape(
+        4, MARKS, 2
+    )
     # the microscope stops at +x of the mark and sees it at -x; the plate at +x carries it to +x
     sign = 1 if sense is Sense.PLATE_MOVES else -1
     want = sign * OFFSET * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[:, None]
-    np.testing.assert_allclose(seen - usual, np.broadcast_to(want, seen.shape), atol=3e-7)
+    np.testing.assert_allclose(
+        seen - usual, np.broadcast_to(want, seen.shape), atol=3e-7
+    )
 
 
 @pytest.mark.parametrize(
@@ -98,14 +104,23 @@ def test_check_stops_are_visits_with_the_opposite_offset(sense, turn):
         ((1, 0), (0, 1)),
         ((-1, 1), (1, -1)),
     ],
-    ids=["scale and turn", "other sign", "pixels doubled", "pixels halved", "axes exchanged"],
+    ids=[
+        "scale and turn",
+        "other sign",
+        "pixels doubled",
+        "pixels halved",
+        "axes exchanged",
+    ],
 )
 def test_no_microscope_makes_outliers_or_noise_of_check_stops(microscope):
     readings, progress = progress_of(checked(microscope=microscope, servo_sigma_m=0.0))
     assert readings.rejected == {}
     assert progress.complete
-    assert readings.sigma_xy == pytest.approx(NOISE, rel=4 / np.sqrt(2 * readings.dof_xy))
-    assert readings.dof_xy == 2 * (readings.used - ORDINARY) - 4  # two numbers an axis are fitted
+    assert readings.sigma_xy == pytest.approx(
+        NOISE, rel=4 / np.sqrt(2 * readings.dof_xy)
+    )
+    # two numbers an axis are fitted
+    assert readings.dof_xy == 2 * (readings.used - ORDINARY) - 4
 
 
 def test_an_outlier_among_check_stops_is_one_and_leaves_the_mark_unchecked():
@@ -114,7 +129,11 @@ def test_an_outlier_among_check_stops_is_one_and_leaves_the_mark_unchecked():
     scene.spoil(index, offset_x=scene.detections[index].offset_x + 2e-6)
     readings, progress = progress_of(scene)
     assert readings.rejected == {"outlier_among_repeats": 1}
-    assert (progress.complete, progress.check_done, progress.grid_done) == (False, 4, 25)
+    assert (progress.complete, progress.check_done, progress.grid_done) == (
+        False,
+        4,
+        25,
+    )
     assert progress.coverage == 79 / 80
 
 
@@ -127,7 +146,11 @@ def test_check_stops_are_no_repeats():
     readings, progress = progress_of(scene)
     at = (readings.m == mark.m) & (readings.n == mark.n)
     assert readings.count[at].tolist() == [2 + 4]
-    assert (progress.grid_done, progress.check_done, progress.complete) == (24, MARKS, False)
+    assert (progress.grid_done, progress.check_done, progress.complete) == (
+        24,
+        MARKS,
+        False,
+    )
     assert (progress.missing.m, progress.missing.n) == ((mark.m,), (mark.n,))
     assert progress.needed == 1
     assert collect([*scene.events, lost])[1][0].complete
@@ -138,7 +161,11 @@ def test_a_mark_that_lacks_one_side_is_not_checked(lost):
     scene = checked()
     scene.detections.pop(FIRST + lost * MARKS)
     _, progress = progress_of(scene)
-    assert (progress.grid_done, progress.check_done, progress.complete) == (25, 4, False)
+    assert (progress.grid_done, progress.check_done, progress.complete) == (
+        25,
+        4,
+        False,
+    )
 
 
 def test_the_order_of_arrival_changes_nothing_on_the_way():
@@ -159,11 +186,17 @@ def test_a_view_without_check_stops_asks_for_none_and_one_with_them_waits():
     scene = checked()
     del scene.detections[FIRST : FIRST + 4 * MARKS]
     readings, progress = progress_of(scene)
-    assert (progress.grid_done, progress.check_done, progress.complete) == (25, 0, False)
+    assert (progress.grid_done, progress.check_done, progress.complete) == (
+        25,
+        0,
+        False,
+    )
     assert progress.needed == MARKS
     timeline = gathered(
         [
-            replace(c, view=c.view and replace(c.view, check_marks=0, check_offset_m=0.0))
+            replace(
+                c, view=c.view and replace(c.view, check_marks=0, check_offset_m=0.0)
+            )
             for c in scene.commands
         ]
     ).timeline
@@ -181,15 +214,20 @@ def test_stops_that_scatter_like_check_stops_ask_for_none():
 def test_a_check_stop_may_be_further_off_than_the_stage_limit():
     assert progress_of(checked(), max_stage_distance=1e-5)[1].complete
     scene = checked(stop_sigma_m=2e-4)  # ordinary stops may not
-    assert "stage_not_at_mark" in progress_of(scene, max_stage_distance=1e-5)[0].rejected
+    assert (
+        "stage_not_at_mark" in progress_of(scene, max_stage_distance=1e-5)[0].rejected
+    )
 
 
 def test_which_stops_are_aside():
     key = np.array([0, 0, 0, 0, 0, 1, 1, 2])
-    place = np.array([[0, 20, -20, 0, 0, 3, 3, 20], [0, 0, 0, 20, -20, 4, 4, 20]]) * 1e-6
+    place = (
+        np.array([[0, 20, -20, 0, 0, 3, 3, 20], [0, 0, 0, 20, -20, 4, 4, 20]]) * 1e-6
+    )
     aside = stage_aside(key, place, OFFSET)
     np.testing.assert_allclose(
-        aside, np.array([[0, 20, -20, 0, 0, 0, 0, 0], [0, 0, 0, 20, -20, 0, 0, 0]]) * 1e-6
+        aside,
+        np.array([[0, 20, -20, 0, 0, 0, 0, 0], [0, 0, 0, 20, -20, 0, 0, 0]]) * 1e-6,
     )
     assert not stage_aside(key[:0], place[:, :0], OFFSET).any()
     assert not stage_aside(key, place / 2.5, OFFSET).any()  # too near
@@ -197,7 +235,10 @@ def test_which_stops_are_aside():
     both = place.copy()
     both[1, 1] = 20e-6  # along both axes: no check stop of either
     assert not stage_aside(key, both, OFFSET)[:, 1].any()
-    assert stage_aside(np.zeros(6, int), np.tile(np.arange(6) * 5e-6, (2, 1)), OFFSET) is None
+    assert (
+        stage_aside(np.zeros(6, int), np.tile(np.arange(6) * 5e-6, (2, 1)), OFFSET)
+        is None
+    )
 
 
 def test_a_stop_on_one_side_alone_is_a_repeat():
@@ -225,7 +266,11 @@ def test_a_stop_on_one_side_alone_is_a_repeat():
         )
         count = np.bincount(mark)
         readings = replace(
-            progress_of(checked())[0], m=np.arange(2), n=np.arange(2), count=count, visits=visits
+            progress_of(checked())[0],
+            m=np.arange(2),
+            n=np.arange(2),
+            count=count,
+            visits=visits,
         )
         view = View("0", check_marks=1, check_offset_m=OFFSET)
         stops, done = count_stops(view, readings)
@@ -249,7 +294,10 @@ def test_cells_are_numbered_in_their_order_and_what_lies_beyond_them_is_none():
 
 def test_the_place_of_a_cell_is_as_many_pitches_off_along_the_rows_of_the_plate():
     """A quarter turn leaves the rows along the axes, one by 10 deg does not."""
-    cells, beside_m = np.array([1 + 2j, -1j, 0]), np.array([3e-4 - 3e-4j, -2e-4 - 4e-4j, 4e-3j])
+    cells, beside_m = (
+        np.array([1 + 2j, -1j, 0]),
+        np.array([3e-4 - 3e-4j, -2e-4 - 4e-4j, 4e-3j]),
+    )
     for turn_deg, rows in ((90, 1.0), (10, np.exp(1j * np.deg2rad(10)))):
         view = replace(WIDE, rotation_rad=np.deg2rad(turn_deg))
         place = rows * 0.01 * cells
@@ -262,7 +310,8 @@ def test_the_place_of_a_cell_is_as_many_pitches_off_along_the_rows_of_the_plate(
 
 def test_displacements_are_medians_of_a_cell_less_that_on_the_axis():
     away = np.array([[1, 2, 9, 5, 5, 6, 40], [0, -1, -1, 3, 4, 9, 40]]) * 1e-6
-    number = np.array([7, 7, 7, 2, 2, 2, -1])  # on the axis, in cell 2, beyond the image
+    # on the axis, in cell 2, beyond the image
+    number = np.array([7, 7, 7, 2, 2, 2, -1])
     np.testing.assert_allclose(
         middles(WIDE, number, away) * 1e6,
         [[0, 0, 0, 3, 3, 3, 0], [0, 0, 0, 5, 5, 5, 0]],
@@ -281,7 +330,9 @@ def test_marks_that_the_cells_show_are_those_seen_from_each_stop():
         stops = [(m, n) for m in range(-3, 4) for n in range(-2, 3) if -3 <= m + 1 <= 3]
         expected = {(m + cell[0], n + cell[1]) for m, n in stops}
         expected = {(m, n) for m, n in expected if abs(m) <= 3 and abs(n) <= 2}
-        assert {(m - 3, n - 2) for m, n in np.argwhere(shown).tolist()} == expected, cell
+        assert {(m - 3, n - 2) for m, n in np.argwhere(shown).tolist()} == expected, (
+            cell
+        )
         again = np.argwhere(beside(shown, plate, sub, -1)) - (3, 2)
         assert set(map(tuple, again.tolist())) == {
             (m - cell[0], n - cell[1]) for m, n in expected

@@ -19,7 +19,11 @@ PLACE, MEASURE, DONE, ABORT = Phase
 
 
 def command(stamp, phase, index=0, **fields):
-    view = (PLAN.views[index], PLAN.artifact, 3) if phase in (PLACE, MEASURE) else (None, None, 3)
+    view = (
+        (PLAN.views[index], PLAN.artifact, 3)
+        if phase in (PLACE, MEASURE)
+        else (None, None, 3)
+    )
     return replace(Command(stamp, phase, PLAN.plan_id, index, *view), **fields)
 
 
@@ -73,7 +77,11 @@ def test_what_the_timeline_says_of_itself():
     timeline = build_timeline(WHOLE)
     assert (timeline.plan_id, timeline.artifact) == (PLAN.plan_id, PLAN.artifact)
     assert timeline.views == {0: PLAN.views[0], 1: PLAN.views[1]}
-    assert (timeline.views_planned, timeline.finished, timeline.last_stamp_ns) == (3, True, 50)
+    assert (timeline.views_planned, timeline.finished, timeline.last_stamp_ns) == (
+        3,
+        True,
+        50,
+    )
     assert [(i.start_ns, i.end_ns) for i in timeline.of_view(1)] == [(40, 50)]
     unended = build_timeline(WHOLE[:-1])
     assert not unended.finished
@@ -217,7 +225,11 @@ def test_two_runs_may_have_two_plates_and_two_numbers_of_views():
     assert (timeline.artifact, timeline.views_planned) == (other, 1)
 
 
-@given(st.permutations([*WHOLE, command(60, PLACE), command(70, MEASURE), command(80, DONE, 3)]))
+@given(
+    st.permutations(
+        [*WHOLE, command(60, PLACE), command(70, MEASURE), command(80, DONE, 3)]
+    )
+)
 def test_the_order_of_arrival_changes_no_run(commands):
     timeline = build_timeline(commands)
     assert timeline.run_id == "60"
@@ -275,7 +287,10 @@ def test_a_command_of_no_run_that_has_begun_changes_nothing_within_one_that_has(
     [
         ([*RUN_10[:2], stray(25, MEASURE, "25", index=2)], "25"),  # another one begins
         ([*RUN_10, stray(60, PLACE), stray(70, MEASURE)], "60"),  # behind the end
-        ([*of_run(WHOLE[1:-1], "10"), stray(45, MEASURE, "7")], "7"),  # no begin is there
+        (
+            [*of_run(WHOLE[1:-1], "10"), stray(45, MEASURE, "7")],
+            "7",
+        ),  # no begin is there
         ([*of_run(WHOLE[:2], "5"), stray(25, MEASURE, "7")], "7"),
         (
             [

@@ -34,7 +34,9 @@ def in_pairs(cell, *, size=1e-7):
 
 def runs(cell):
     """Return the successive detections of one mark, as lists, from a session of one view."""
-    grid = sorted((d for d in cell.detections if d.kind == Kind.GRID), key=lambda d: d.stamp_ns)
+    grid = sorted(
+        (d for d in cell.detections if d.kind == Kind.GRID), key=lambda d: d.stamp_ns
+    )
     return [list(group) for _, group in groupby(grid, key=lambda d: (d.m, d.n))]
 
 
@@ -69,22 +71,30 @@ def test_every_visit_has_its_means_instant_offset_and_approach(sense):
         for v, run in zip(rows[mark], expected, strict=True):
             assert visits.count[v] == len(run) == 2
             assert visits.stamp_ns[v] == run[0].stamp_ns + 500 * US
-            assert visits.offset_x[v] == pytest.approx((run[0].offset_x + run[1].offset_x) / 2)
-            assert visits.offset_y[v] == pytest.approx((run[0].offset_y + run[1].offset_y) / 2)
+            assert visits.offset_x[v] == pytest.approx(
+                (run[0].offset_x + run[1].offset_x) / 2
+            )
+            assert visits.offset_y[v] == pytest.approx(
+                (run[0].offset_y + run[1].offset_y) / 2
+            )
             assert visits.approach_x[v] == came[0][run[0].stamp_ns]
             assert visits.approach_y[v] == came[1][run[0].stamp_ns]
     for signs in (visits.approach_x, visits.approach_y):
         assert set(signs.tolist()) >= {-1, 1}
     for name in ("dx", "dy"):
         sums = np.bincount(visits.mark, visits.count * getattr(visits, name))
-        np.testing.assert_allclose(sums / readings.count, getattr(readings, name), atol=1e-15)
+        np.testing.assert_allclose(
+            sums / readings.count, getattr(readings, name), atol=1e-15
+        )
 
 
 def test_the_repeatability_within_visits_is_that_of_their_differences():
     cell = in_pairs(scene(repeats=3, sigma_xy_m=5e-8, servo_sigma_m=0.0), size=1e-7)
     readings = collect(cell.events)[0].views[0]
     assert readings.visits.dof == 2 * 75
-    assert readings.visits.sigma_m == pytest.approx(np.sqrt((1e-7**2 + 2e-7**2) / 4), rel=1e-6)
+    assert readings.visits.sigma_m == pytest.approx(
+        np.sqrt((1e-7**2 + 2e-7**2) / 4), rel=1e-6
+    )
     assert readings.dof_xy == 2 * 25 * 5
     passes = collect(scene(repeats=3, **NOISE).events)[0].views[0]
     assert passes.visits.dof == 0

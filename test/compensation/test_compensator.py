@@ -34,7 +34,9 @@ def test_bilinear_is_the_weighted_mean_of_four_corners(x, y):
     s, t = x / 0.01 + 5, y / 0.01 + 5
     i, j = min(int(s), 9), min(int(t), 9)
     u, v = s - i, t - j
-    for got, field in zip(OF_MAP["bilinear"].error(x, y), (MAP.gx, MAP.gy), strict=True):
+    for got, field in zip(
+        OF_MAP["bilinear"].error(x, y), (MAP.gx, MAP.gy), strict=True
+    ):
         want = (
             (1 - u) * (1 - v) * field[i, j]
             + u * (1 - v) * field[i + 1, j]
@@ -48,7 +50,9 @@ def test_bilinear_is_the_weighted_mean_of_four_corners(x, y):
 def test_bicubic_is_the_interpolating_spline(x, y):
     sites = np.arange(-5, 6) * 0.01
     for got, field in zip(OF_MAP["bicubic"].error(x, y), (MAP.gx, MAP.gy), strict=True):
-        assert got == pytest.approx(RectBivariateSpline(sites, sites, field).ev(x, y), abs=1e-17)
+        assert got == pytest.approx(
+            RectBivariateSpline(sites, sites, field).ev(x, y), abs=1e-17
+        )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -69,10 +73,16 @@ def test_correct_undoes_command_for_a_steep_map_and_at_sites():
 
 def test_the_sign_is_indicated_minus_true():
     one = np.ones(ARTIFACT.shape)
-    emap = ErrorMap(ARTIFACT, 3e-6 * one, -2e-6 * one, one, one, np.full(24, 1e-4), np.zeros(24))
+    emap = ErrorMap(
+        ARTIFACT, 3e-6 * one, -2e-6 * one, one, one, np.full(24, 1e-4), np.zeros(24)
+    )
     compensator = Compensator(emap)
-    assert compensator.command(0.01, 0.02) == pytest.approx((0.010003, 0.019998), abs=1e-16)
-    assert compensator.correct(0.01, 0.02) == pytest.approx((0.009997, 0.020002), abs=1e-16)
+    assert compensator.command(0.01, 0.02) == pytest.approx(
+        (0.010003, 0.019998), abs=1e-16
+    )
+    assert compensator.correct(0.01, 0.02) == pytest.approx(
+        (0.009997, 0.020002), abs=1e-16
+    )
     assert compensator.command_theta(1.0) == pytest.approx(1.0001, abs=1e-15)
     assert compensator.correct_theta(1.0) == pytest.approx(0.9999, abs=1e-15)
 
@@ -88,20 +98,27 @@ def test_outside_is_clamped_to_the_nearest_point_of_the_edge():
 def test_outside_is_refused_on_request(call):
     compensator = Compensator(MAP, outside="refuse")
     getattr(compensator, call)(0.0, 0.0)
-    with pytest.raises(InputError, match=r"\(0\.06.*outside the calibrated field; stay"):
+    with pytest.raises(
+        InputError, match=r"\(0\.06.*outside the calibrated field; stay"
+    ):
         getattr(compensator, call)([0.0, 0.06], [0.0, 0.01])
 
 
 def test_the_edge_belongs_to_the_field_in_both_directions():
     compensator = Compensator(MAP, outside="refuse")
     edge = compensator.command(0.05, -0.05)
-    np.testing.assert_allclose(compensator.correct(*edge), (0.05, -0.05), rtol=0, atol=1e-16)
+    np.testing.assert_allclose(
+        compensator.correct(*edge), (0.05, -0.05), rtol=0, atol=1e-16
+    )
 
 
 def test_nan_positions_give_nan_and_leave_the_others_alone():
     gx, _ = Compensator(MAP).error([np.nan, 0.012], 0.0)
     tx, ty = Compensator(MAP).correct([np.nan, 0.012], 0.0)
-    assert np.isnan([gx[0], tx[0], ty[0]]).all() and np.isfinite([gx[1], tx[1], ty[1]]).all()
+    assert (
+        np.isnan([gx[0], tx[0], ty[0]]).all()
+        and np.isfinite([gx[1], tx[1], ty[1]]).all()
+    )
 
 
 def test_what_is_not_known_is_nan_and_not_outside():
@@ -124,7 +141,9 @@ def test_nan_positions_do_not_spoil_the_precision_of_the_others(method):
     known = np.isfinite(q[0])
     got = np.array(compensator.correct(*q))
     assert np.isnan(got[:, ~known]).all()
-    np.testing.assert_allclose(got[:, known], np.stack([x, y])[:, known], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        got[:, known], np.stack([x, y])[:, known], rtol=0, atol=1e-15
+    )
 
 
 def test_unknown_sites_do_not_spoil_the_precision_of_the_others():
@@ -132,7 +151,9 @@ def test_unknown_sites_do_not_spoil_the_precision_of_the_others():
     x, y = np.random.default_rng(5).uniform(-0.05, 0.05, (2, 500))
     far = np.hypot(x, y) > 0.02
     got = np.array(compensator.correct(*compensator.command(x, y)))
-    np.testing.assert_allclose(got[:, far], np.stack([x, y])[:, far], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(
+        got[:, far], np.stack([x, y])[:, far], rtol=0, atol=1e-15
+    )
 
 
 def test_an_unknown_site_spoils_its_cells_but_not_its_neighbours():
@@ -175,7 +196,10 @@ def test_theta_gives_the_lines_themselves_and_the_mean_between_them(method):
     compensator = Compensator(MAP, method=method)
     lines = np.arange(-24, 48)
     np.testing.assert_allclose(
-        compensator.error_theta(lines * np.pi / 12), MAP.g_theta[lines % 24], rtol=0, atol=1e-16
+        compensator.error_theta(lines * np.pi / 12),
+        MAP.g_theta[lines % 24],
+        rtol=0,
+        atol=1e-16,
     )
     if method == "bilinear":
         assert compensator.error_theta(-np.pi / 24) == pytest.approx(
@@ -187,7 +211,9 @@ def test_theta_gives_the_lines_themselves_and_the_mean_between_them(method):
                 error_halfway(MAP.g_theta, MAP.u_g_theta, ring=True)[0],
             )
         )
-        assert compensator.uncertainty_theta(-np.pi / 12) == pytest.approx(MAP.u_g_theta[23])
+        assert compensator.uncertainty_theta(-np.pi / 12) == pytest.approx(
+            MAP.u_g_theta[23]
+        )
 
 
 def test_uncertainty_is_that_of_the_sites_and_a_bound_between_them():
@@ -196,7 +222,9 @@ def test_uncertainty_is_that_of_the_sites_and_a_bound_between_them():
     np.testing.assert_allclose(ux, MAP.u_gx, rtol=1e-12)
     np.testing.assert_allclose(uy, MAP.u_gy, rtol=1e-12)
     compensator.halfway = np.zeros((2, 2))
-    assert compensator.uncertainty(0.005, 0.0)[0] == pytest.approx(MAP.u_gx[5:7, 5].mean())
+    assert compensator.uncertainty(0.005, 0.0)[0] == pytest.approx(
+        MAP.u_gx[5:7, 5].mean()
+    )
 
 
 def test_bicubic_uncertainty_exceeds_that_of_the_sites_in_the_outermost_cells_only():
@@ -209,7 +237,8 @@ def test_bicubic_uncertainty_exceeds_that_of_the_sites_in_the_outermost_cells_on
         g[site] = 1e-6
         emap = ErrorMap(ARTIFACT, g, 0 * g, 0 * g, 0 * g, np.zeros(24), np.zeros(24))
         weights.append(Compensator(emap, method="bicubic").error(x, 0.0)[0] / 1e-6)
-    ratio = np.sum(np.square(weights), axis=0)  # of the variance along x, of the u over the field
+    # of the variance along x, of the u over the field
+    ratio = np.sum(np.square(weights), axis=0)
     assert ratio[np.abs(x) <= 0.04 + 1e-9].max() < 1.01
     assert 1.37 < ratio.max() < 1.38
 
@@ -260,14 +289,19 @@ def test_a_spline_that_is_too_steep_between_its_sites_is_refused():
     # fixed point did not come to rest, and the inverse erred by millimetres without a word.
     x, y = np.random.default_rng(6).uniform(-0.05, 0.05, (2, 2000))
     Compensator(checked(0.24, 0.24))
-    with pytest.raises(InputError, match="spline between the sites is steeper than one half"):
+    with pytest.raises(
+        InputError, match="spline between the sites is steeper than one half"
+    ):
         Compensator(checked(0.24), method="bicubic")
     compensator = Compensator(checked(0.05, 0.24), method="bicubic")
     back = compensator.correct(*compensator.command(x, y))
     np.testing.assert_allclose(back, (x, y), rtol=0, atol=1e-16)
     theta = np.linspace(-4, 4, 99)
     np.testing.assert_allclose(
-        compensator.correct_theta(compensator.command_theta(theta)), theta, rtol=0, atol=4e-15
+        compensator.correct_theta(compensator.command_theta(theta)),
+        theta,
+        rtol=0,
+        atol=4e-15,
     )
 
 
@@ -275,7 +309,9 @@ def test_a_spline_that_is_too_steep_between_its_sites_is_refused():
 def test_the_largest_slope_of_the_spline(seed):
     rng = np.random.default_rng(seed)
     cells = bicubic_cells(rng.normal(size=(2, 7, 5)))
-    s, t = np.meshgrid(np.linspace(1e-5, 6 - 1e-5, 301), np.linspace(1e-5, 4 - 1e-5, 201))
+    s, t = np.meshgrid(
+        np.linspace(1e-5, 6 - 1e-5, 301), np.linspace(1e-5, 4 - 1e-5, 201)
+    )
     s, t = s.ravel(), t.ravel()
     step = 1e-6
     slopes = [
@@ -292,16 +328,24 @@ def test_scalars_and_shapes_come_back_as_they_were():
     assert x.shape == y.shape == (3, 4)
 
 
-POSITIONS = st.one_of(st.floats(-0.2, 0.2), st.sampled_from([-0.05, -0.01, 0.0, 0.03, 0.05, 1e9]))
+POSITIONS = st.one_of(
+    st.floats(-0.2, 0.2), st.sampled_from([-0.05, -0.01, 0.0, 0.03, 0.05, 1e9])
+)
 HOLES = random_map(ARTIFACT, 1, unknown=[(4, 5), (0, 0)])
-OF_POINTS = {**OF_MAP, "unknown": Compensator(HOLES), "oblong": Compensator(random_map(OBLONG, 2))}
+OF_POINTS = {
+    **OF_MAP,
+    "unknown": Compensator(HOLES),
+    "oblong": Compensator(random_map(OBLONG, 2)),
+}
 
 
 @pytest.mark.parametrize("which", OF_POINTS)
 @given(x=POSITIONS, y=POSITIONS)
 def test_a_point_is_corrected_to_the_bit_as_an_array_of_one(which, x, y):
     compensator = OF_POINTS[which]
-    np.testing.assert_array_equal(compensator.correct_point(x, y), compensator.correct(x, y))
+    np.testing.assert_array_equal(
+        compensator.correct_point(x, y), compensator.correct(x, y)
+    )
 
 
 @pytest.mark.parametrize("which", OF_POINTS)
@@ -317,7 +361,9 @@ def test_points_outside_are_refused_on_request_and_angles_without_lines():
     refusing = Compensator(MAP, outside="refuse")
     with pytest.raises(InputError, match="outside the calibrated field"):
         refusing.correct_point(0.06, 0.0)
-    assert refusing.correct_point(0.049, 0.0) == OF_MAP["bilinear"].correct_point(0.049, 0.0)
+    assert refusing.correct_point(0.049, 0.0) == OF_MAP["bilinear"].correct_point(
+        0.049, 0.0
+    )
     with pytest.raises(InputError, match="has no angular lines"):
         Compensator(random_map(Artifact(5, 0.01, 0), 1)).correct_angle(0.0)
 
@@ -330,7 +376,9 @@ def test_cubic_pieces_are_those_of_scipy(count, periodic):
     want = CubicSpline(
         np.arange(len(closed)), closed, bc_type="periodic" if periodic else "not-a-knot"
     ).c[::-1]
-    np.testing.assert_allclose(cubic_pieces(values, periodic=periodic), want, atol=1e-14)
+    np.testing.assert_allclose(
+        cubic_pieces(values, periodic=periodic), want, atol=1e-14
+    )
 
 
 def test_a_fourier_series_goes_through_the_lines_in_their_order():
@@ -339,7 +387,9 @@ def test_a_fourier_series_goes_through_the_lines_in_their_order():
     wanted = lambda t: 1e-6 * (np.cos(t) - 2 * np.sin(t) + 3 * np.sin(2 * t))  # noqa: E731
     emap, zero = random_map(plate, 1), np.zeros(8)
     stage = Compensator(
-        ErrorMap(plate, emap.gx, emap.gy, emap.u_gx, emap.u_gy, wanted(plate.theta_rad), zero)
+        ErrorMap(
+            plate, emap.gx, emap.gy, emap.u_gx, emap.u_gy, wanted(plate.theta_rad), zero
+        )
     )
     angle = np.linspace(-3, 9, 25)
     np.testing.assert_allclose(stage.error_theta(angle), wanted(angle), atol=1e-18)
@@ -353,7 +403,9 @@ def test_the_error_halfway_is_that_of_its_field_along_its_axis(field, axis):
     fields = np.zeros((2, 7, 9))
     fields[field] = 1e-3 * (plate.x_m, plate.y_m)[axis] ** 2
     none = np.full((7, 9), 1e-15)
-    found = Compensator(ErrorMap(plate, *fields, none, none, np.zeros(0), np.zeros(0))).halfway
+    found = Compensator(
+        ErrorMap(plate, *fields, none, none, np.zeros(0), np.zeros(0))
+    ).halfway
     assert found[field, axis] > 1e-9
     found[field, axis] = 0
     assert found.max() < 1e-12

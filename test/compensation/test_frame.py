@@ -28,6 +28,8 @@ def test_a_reversed_encoder_counts_from_home_the_other_way(reverse, want):
         reverse_theta=reverse[2],
     )
     x, y = frame.to_machine(0.02, 0.02)
-    assert (x, y, frame.theta_to_machine(np.deg2rad(50))) == pytest.approx(want, rel=1e-12)
+    assert (x, y, frame.theta_to_machine(np.deg2rad(50))) == pytest.approx(
+        want, rel=1e-12
+    )
     back = (*frame.from_machine(want[0], want[1]), frame.theta_from_machine(want[2]))
     assert back == pytest.approx((0.02, 0.02, np.deg2rad(50)), rel=1e-12)

@@ -61,20 +61,32 @@ def test_a_map_that_can_be_said_leaves_the_rounding_of_the_digits(name, frame):
     made = export(name, result_of(emap), wiring_of(frame, name), "out.txt")
     sites, between = made.residuals
     assert sites.rms("before") > 1e-7
-    assert sorted({*between.position[0].round(6)}) == pytest.approx(np.arange(-2.5, 3) * 0.01)
+    assert sorted({*between.position[0].round(6)}) == pytest.approx(
+        np.arange(-2.5, 3) * 0.01
+    )
     assert sites.largest("after") < rounding(name, frame)
     linear = Compensator(emap).error(*between.position)
     cubic = Compensator(emap, method="bicubic").error(*between.position)
     rest = np.subtract(cubic, linear)
     rest = rest - rest.mean(axis=1, keepdims=True)
-    np.testing.assert_allclose(between.after, -rest, rtol=0, atol=rounding(name, frame) + 1e-10)
+    np.testing.assert_allclose(
+        between.after, -rest, rtol=0, atol=rounding(name, frame) + 1e-10
+    )
 
 
 WRONG = {
-    "home_x": lambda w: replace(w, frame=replace(w.frame, home_x_m=w.frame.home_x_m + 0.01)),
-    "home_y": lambda w: replace(w, frame=replace(w.frame, home_y_m=w.frame.home_y_m - 0.01)),
-    "reverse_x": lambda w: replace(w, frame=replace(w.frame, reverse_x=not w.frame.reverse_x)),
-    "reverse_y": lambda w: replace(w, frame=replace(w.frame, reverse_y=not w.frame.reverse_y)),
+    "home_x": lambda w: replace(
+        w, frame=replace(w.frame, home_x_m=w.frame.home_x_m + 0.01)
+    ),
+    "home_y": lambda w: replace(
+        w, frame=replace(w.frame, home_y_m=w.frame.home_y_m - 0.01)
+    ),
+    "reverse_x": lambda w: replace(
+        w, frame=replace(w.frame, reverse_x=not w.frame.reverse_x)
+    ),
+    "reverse_y": lambda w: replace(
+        w, frame=replace(w.frame, reverse_y=not w.frame.reverse_y)
+    ),
     "axes": lambda w: replace(
         w, frame=replace(w.frame, x_axis=w.frame.y_axis, y_axis=w.frame.x_axis)
     ),
@@ -91,7 +103,8 @@ HAS = {
 
 
 @pytest.mark.parametrize(
-    ("name", "what"), [(name, what) for what in WRONG for name in HAS.get(what, FORMATS)]
+    ("name", "what"),
+    [(name, what) for what in WRONG for name in HAS.get(what, FORMATS)],
 )
 @pytest.mark.parametrize("frame", [FRAMES[0], FRAMES[5]])
 def test_a_file_does_not_correct_a_machine_that_is_wired_otherwise(name, what, frame):
@@ -120,10 +133,14 @@ def test_a_long_axis_of_linuxcnc_has_as_many_lines_as_it_may():
     plate = Artifact(301, 1e-4, 0, 3)
     emap = random_map(plate, 2)
     gx = np.outer(np.sin(plate.x_m[:, 0] * 300) * 1e-6, np.ones(3))
-    made = export("linuxcnc", result_of(replace(emap, gx=gx, gy=0 * gx)), Wiring(FRAMES[0]), "o")
+    made = export(
+        "linuxcnc", result_of(replace(emap, gx=gx, gy=0 * gx)), Wiring(FRAMES[0]), "o"
+    )
     lines = [line.split() for line in made.files["o_x"].splitlines()[:256]]
     assert (float(lines[0][0]), float(lines[255][0])) == (-15, 15)
-    assert made.files["o_x"].splitlines()[256] == "" and all(len(line) == 3 for line in lines)
+    assert made.files["o_x"].splitlines()[256] == "" and all(
+        len(line) == 3 for line in lines
+    )
     assert made.residuals[0].largest("after") < 1e-9
 
 
@@ -132,7 +149,10 @@ def test_beckhoff_is_told_of_more_points_than_it_expects(size, said):
     emap = random_map(Artifact(size, 1e-3), 1, gain=0.01)
     texts = FORMATS["beckhoff"].write(emap, Wiring(FRAMES[0]))
     assert [
-        line.split()[1] for lines in texts.values() for line in lines if "max_points" in line
+        line.split()[1]
+        for lines in texts.values()
+        for line in lines
+        if "max_points" in line
     ] == said
 
 
@@ -154,7 +174,11 @@ def test_digits_are_those_of_the_rounding_and_zero_has_no_sign():
     [
         ("linuxcnc", "0 0 0\n1 1\n", "file:2: '1 1' is not of the form"),
         ("linuxcnc", "0 0 0\n1 1 1e20\n", "file:2: a number is too large"),
-        ("linuxcnc", "0 0 0\n0 1 1\n", "file: 2 lines, or positions that do not increase"),
+        (
+            "linuxcnc",
+            "0 0 0\n0 1 1\n",
+            "file: 2 lines, or positions that do not increase",
+        ),
         ("linuxcnc", "0 0 0\n1 1 2\n", "file: forward and reverse differ"),
         (
             "kmotion",
@@ -164,13 +188,25 @@ def test_digits_are_those_of_the_rounding_and_zero_has_no_sign():
         ("kmotion", "1,2\n1,1\n0,0", "file: 1 rows and 2 columns"),
         ("kmotion", "2,2\n1,0\n0,0", "file: 2 rows and 2 columns, spacing [1.0, 0.0]"),
         ("pmac", "#1\n5 5 5", "file:2: '5 5 5' is not part of a table"),
-        ("pmac", "DEFINE COMP 1.1,#1D,#3D,#1,9,9\n1 2 3", "file:1: motors (1, 3, 1) are not those"),
-        ("pmac", "DEFINE COMP 1.1,#1D,#2D,#1,9,9\n1 2", "file:1: 2 entries for 1.1; 3 belong"),
+        (
+            "pmac",
+            "DEFINE COMP 1.1,#1D,#3D,#1,9,9\n1 2 3",
+            "file:1: motors (1, 3, 1) are not those",
+        ),
+        (
+            "pmac",
+            "DEFINE COMP 1.1,#1D,#2D,#1,9,9\n1 2",
+            "file:1: 2 entries for 1.1; 3 belong",
+        ),
     ],
 )
 def test_a_reader_names_the_line_and_what_is_wrong(name, text, message):
     with pytest.raises(InputError) as raised:
-        loaded(name, [Source(text, "file")] * len(FORMATS[name].parts), wiring_of(FRAMES[0], name))
+        loaded(
+            name,
+            [Source(text, "file")] * len(FORMATS[name].parts),
+            wiring_of(FRAMES[0], name),
+        )
     assert str(raised.value).startswith(message)
 
 
@@ -178,10 +214,14 @@ def test_a_reader_names_the_line_and_what_is_wrong(name, text, message):
 def test_negated_values_are_for_a_machine_that_subtracts(name):
     emap = sayable(name)
     plain = export(name, result_of(emap), wiring_of(FRAMES[0], name), "out.txt")
-    made = export(name, result_of(emap), wiring_of(FRAMES[0], name, negate=True), "out.txt")
+    made = export(
+        name, result_of(emap), wiring_of(FRAMES[0], name, negate=True), "out.txt"
+    )
     assert made.residuals[0].largest("after") < 3e-11
     added, subtracted = (
-        loaded(name, sources_of(files), wiring_of(FRAMES[0], name))(np.array(3.0), np.array(-7.0))
+        loaded(name, sources_of(files), wiring_of(FRAMES[0], name))(
+            np.array(3.0), np.array(-7.0)
+        )
         for files in (plain, made)
     )
     np.testing.assert_allclose(added, np.negative(subtracted), rtol=0, atol=1e-8)
@@ -191,10 +231,13 @@ def test_negated_values_are_for_a_machine_that_subtracts(name):
 def test_what_cannot_be_said_remains_and_the_file_says_how_much(name):
     emap = random_map(PLATE, 1)
     made = export(name, result_of(emap), Wiring(FRAMES[0]), "out.txt")
-    rest = [g - g.mean(axis=axis, keepdims=True) for g, axis in ((emap.gx, 1), (emap.gy, 0))]
+    rest = [
+        g - g.mean(axis=axis, keepdims=True) for g, axis in ((emap.gx, 1), (emap.gy, 0))
+    ]
     if name == "siemens":
         rest = [
-            g - g.mean(axis=1 - axis, keepdims=True) for g, axis in zip(rest, (1, 0), strict=True)
+            g - g.mean(axis=1 - axis, keepdims=True)
+            for g, axis in zip(rest, (1, 0), strict=True)
         ]
     left = np.sqrt(sum((g - g.mean()).var() for g in rest))
     sites = made.residuals[0]
@@ -205,7 +248,9 @@ def test_what_cannot_be_said_remains_and_the_file_says_how_much(name):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_comment_tells_where_a_file_comes_from(name):
-    made = export(name, result_of(sayable(name)), wiring_of(FRAMES[0], name), "out.txt", filled=2)
+    made = export(
+        name, result_of(sayable(name)), wiring_of(FRAMES[0], name), "out.txt", filled=2
+    )
     for text in made.files.values():
         mark = FORMATS[name].comment
         said = "\n".join(line for line in text.splitlines() if line.startswith(mark))
@@ -230,7 +275,9 @@ def test_the_comment_tells_where_a_file_comes_from(name):
         assert first.startswith(mark) != FORMATS[name].comments_last
 
 
-@pytest.mark.parametrize("plan_id", ["a\nb", "/* a", "*/ a /* b", "/*/", "a; # b", "\x0b\u2028"])
+@pytest.mark.parametrize(
+    "plan_id", ["a\nb", "/* a", "*/ a /* b", "/*/", "a; # b", "\x0b\u2028"]
+)
 @pytest.mark.parametrize("name", FORMATS)
 def test_no_name_in_a_comment_changes_what_is_read(name, plan_id):
     wiring, at = wiring_of(FRAMES[0], name), np.linspace(-30.0, 30.0, 5)
@@ -244,7 +291,9 @@ def test_no_name_in_a_comment_changes_what_is_read(name, plan_id):
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_map_with_holes_is_refused(name):
-    with pytest.raises(InputError, match="1 sites are unknown, and a table has no holes"):
+    with pytest.raises(
+        InputError, match="1 sites are unknown, and a table has no holes"
+    ):
         export(
             name,
             result_of(random_map(PLATE, 1, unknown=((0, 0),))),
@@ -261,7 +310,8 @@ def test_a_table_replaces_the_one_that_was_active(name, frame):
     rough = replace(raw, gx=0.7 * raw.gx[::-1], gy=0.7 * raw.gy)
     old = export_of(name, rough, wiring)
     x, y = np.stack([PLATE.x_m, PLATE.y_m])
-    ex, ey = frame.to_machine(x + raw.gx, y + raw.gy)  # the encoder where the marks are met
+    # the encoder where the marks are met
+    ex, ey = frame.to_machine(x + raw.gx, y + raw.gy)
     px, py = ex, ey
     for _ in range(100):
         cx, cy = old(px, py)
@@ -275,12 +325,22 @@ def test_a_table_replaces_the_one_that_was_active(name, frame):
     off = np.subtract(reached, (x, y))
     off -= off.mean(axis=(1, 2), keepdims=True)
     # PMAC's zero moves everything by microns, and with it the error by its slope
-    assert np.abs(off).max() < {"pmac": 3e-8, "linuxcnc": 1e-8, "siemens": 2e-9}.get(name, 1e-10)
-    assert np.abs(made.residuals[0].after).max() < 3e-8 < 1e-7 < made.residuals[0].rms("before")
+    assert np.abs(off).max() < {"pmac": 3e-8, "linuxcnc": 1e-8, "siemens": 2e-9}.get(
+        name, 1e-10
+    )
+    assert (
+        np.abs(made.residuals[0].after).max()
+        < 3e-8
+        < 1e-7
+        < made.residuals[0].rms("before")
+    )
     assert "replaces the table" in next(iter(made.files.values()))
-    g = np.stack([seen.gx, seen.gy])  # what the machine has now, not without the old table
+    # what the machine has now, not without the old table
+    g = np.stack([seen.gx, seen.gy])
     g = g - g.mean(axis=(1, 2), keepdims=True)
-    assert made.residuals[0].rms("before") == pytest.approx(np.sqrt((g**2).sum(0).mean()), rel=0.01)
+    assert made.residuals[0].rms("before") == pytest.approx(
+        np.sqrt((g**2).sum(0).mean()), rel=0.01
+    )
 
 
 @pytest.mark.parametrize("frame", [FRAMES[0], FRAMES[5]])
@@ -290,7 +350,9 @@ def test_what_an_active_table_bends_between_the_nodes_is_said(frame):
     x, y = frame.to_machine(PLATE.x_m[:, 0], PLATE.y_m[0])
     y = np.linspace(y[0], y[-1], 2 * len(y) - 1)
     bump = np.where(np.arange(len(y)) % 2, 2e-6 / frame.unit_m, 0.0)
-    active = Grid((x[0], y[0]), (x[1] - x[0], y[1] - y[0]), np.tile(bump, (len(x), 1)), "hold")
+    active = Grid(
+        (x[0], y[0]), (x[1] - x[0], y[1] - y[0]), np.tile(bump, (len(x), 1)), "hold"
+    )
     for also, bent in ((0.0, 2e-6), (5e-6, 2e-6)):  # a slope is no bend
         made = export(
             "kmotion",
@@ -301,10 +363,17 @@ def test_what_an_active_table_bends_between_the_nodes_is_said(frame):
         )
         assert made.bent_m == pytest.approx(bent, rel=1e-6)
         assert made.residuals[0].largest("after") < rounding("kmotion", frame) * 2
-        assert "bends between the nodes of the map, up to 2 um, is lost" in made.files["out.txt"]
+        assert (
+            "bends between the nodes of the map, up to 2 um, is lost"
+            in made.files["out.txt"]
+        )
     assert (
         export(
-            "kmotion", result_of(emap), wiring, "o", active=export_of("kmotion", emap, wiring)
+            "kmotion",
+            result_of(emap),
+            wiring,
+            "o",
+            active=export_of("kmotion", emap, wiring),
         ).bent_m
         < 1e-10
     )
@@ -313,5 +382,9 @@ def test_what_an_active_table_bends_between_the_nodes_is_said(frame):
 def export_of(name, emap, wiring):
     form = FORMATS[name]
     return form.read(
-        [Source("\n".join(lines), part) for part, lines in form.write(emap, wiring).items()], wiring
+        [
+            Source("\n".join(lines), part)
+            for part, lines in form.write(emap, wiring).items()
+        ],
+        wiring,
     )

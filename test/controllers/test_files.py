@@ -34,7 +34,12 @@ GEO = (
 @pytest.mark.parametrize(
     "x, y, cx, cy",
     [
-        (-10, 5, 0.1, 0.1),  # row 0, column 0: the offset is its position, the values are absolute
+        (
+            -10,
+            5,
+            0.1,
+            0.1,
+        ),  # row 0, column 0: the offset is its position, the values are absolute
         (-10, 25, 0.0, 0.4),
         (0, 25, 0.8, 0.0),
         (10, 5, 0.0, 0.0),  # row along y, column along x
@@ -99,7 +104,10 @@ def lists(slave):
             "kw.crosscomp2.master1_ax_nr 1",
             "kw.crosscomp2.master2_ax_nr 2",
             "kw.crosscomp2.n_cycles 20",
-            *(f"kw.crosscomp2.table[  {j}][ {i}].correction {value}" for j, i, value in rows),
+            *(
+                f"kw.crosscomp2.table[  {j}][ {i}].correction {value}"
+                for j, i, value in rows
+            ),
         ]
     )
 
@@ -119,7 +127,9 @@ def lists(slave):
 )  # the edge holds
 @pytest.mark.parametrize("sense", [1, -1])
 def test_beckhoff(x, y, tenths, sense):
-    found = corrections("beckhoff", [lists(2), lists(1)], x, y, Wiring(MM, negate=sense < 0))
+    found = corrections(
+        "beckhoff", [lists(2), lists(1)], x, y, Wiring(MM, negate=sense < 0)
+    )
     assert found == pytest.approx(
         [sense * (100 + tenths) * 1e-4, sense * (200 + tenths) * 1e-4], abs=1e-12
     )
@@ -127,16 +137,26 @@ def test_beckhoff(x, y, tenths, sense):
 
 @pytest.mark.parametrize(
     "key, value",
-    [("interval", "0"), ("unit", "0"), ("last_index_master1", "-1"), ("master2_ax_nr", "3")],
+    [
+        ("interval", "0"),
+        ("unit", "0"),
+        ("last_index_master1", "-1"),
+        ("master2_ax_nr", "3"),
+    ],
 )
 def test_a_beckhoff_list_of_another_grid_is_refused(key, value):
     other = re.sub(rf"(crosscomp2\.{key}) \d+", rf"\1 {value}", lists(1))
-    with pytest.raises(InputError, match=r"unit 1, masters \[1, 2\] and a positive interval"):
+    with pytest.raises(
+        InputError, match=r"unit 1, masters \[1, 2\] and a positive interval"
+    ):
         corrections("beckhoff", [other, lists(2)], 0, 0)
 
 
 def test_numbers_are_those_that_a_double_holds_to_the_integer():
-    assert numbers("999999999999999 -9e14", "file:1", r"N\s+N") == [999999999999999, -9e14]
+    assert numbers("999999999999999 -9e14", "file:1", r"N\s+N") == [
+        999999999999999,
+        -9e14,
+    ]
     for text in ("1e15", "-1e15"):
         with pytest.raises(InputError, match="file:1: a number is too large"):
             numbers(text, "file:1", "N")
@@ -169,10 +189,17 @@ CEC = "\n".join(
         *(
             line
             for table, (source, output, values) in enumerate(
-                [(1, 2, (0.001, 0.003, 0.002)), (2, 1, (0.01, 0.02)), (2, 2, (0.1, 0.3))]
+                [
+                    (1, 2, (0.001, 0.003, 0.002)),
+                    (2, 1, (0.01, 0.02)),
+                    (2, 2, (0.1, 0.3)),
+                ]
             )
             for line in [
-                *(f"$AN_CEC[{table},{n}]={value} ; a value" for n, value in enumerate(values)),
+                *(
+                    f"$AN_CEC[{table},{n}]={value} ; a value"
+                    for n, value in enumerate(values)
+                ),
                 f"$AN_CEC_INPUT_AXIS[{table}]=(AX{source})",
                 f"$AN_CEC_OUTPUT_AXIS[{table}]=(AX{output})",
                 f"$AN_CEC_STEP[{table}]=10.0",

@@ -69,7 +69,9 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(name):
     wiring, rng = wiring_of(FRAMES[0], name), random.Random(1)
     texts = [
         "\n".join(lines)
-        for lines in FORMATS[name].write(random_map(Artifact(3, 0.01), 1), wiring).values()
+        for lines in FORMATS[name]
+        .write(random_map(Artifact(3, 0.01), 1), wiring)
+        .values()
     ]
     at, refused = np.linspace(-15.0, 15.0, 7), 0
     for _ in range(600):

@@ -20,7 +20,8 @@ from selfcal_ros.model.artifact import Artifact
 from test.support.gcode_machines import INERT, Machine, Wrong, farthest, run_both
 from test.support.maps import random_map
 
-MAP = random_map(Artifact(11, 0.01), 4, gain=20.0)  # errors of some 5 um, from site to site
+# errors of some 5 um, from site to site
+MAP = random_map(Artifact(11, 0.01), 4, gain=20.0)
 FRAME = MachineFrame(unit="m", home_x_m=-0.003, home_y_m=0.005)
 FRAMES = [
     FRAME,
@@ -136,7 +137,9 @@ def reached(points_mm: np.ndarray, frame=FRAME) -> np.ndarray:
     return np.stack(frame.to_machine(x, y), axis=1) * 1e3
 
 
-def pieces(text: str, dialect: str, *, um: float = 1.0, frame=FRAME, seen=FRAME, **kwargs) -> int:
+def pieces(
+    text: str, dialect: str, *, um: float = 1.0, frame=FRAME, seen=FRAME, **kwargs
+) -> int:
     """Run both programs as `seen` wires the stage; return the number of pieces."""
     return run_both(
         text,
@@ -179,9 +182,22 @@ ALL = [
     f"{letter}{number}{part}"
     for letter in "GM"
     for number in range(201)
-    for part in ("", *(".1", ".2", ".3", ".4", ".5")[: 5 * (f"{letter}{number}" in KNOWN)])
+    for part in (
+        "",
+        *(".1", ".2", ".3", ".4", ".5")[: 5 * (f"{letter}{number}" in KNOWN)],
+    )
 ]
-FOLLOWING = ["", " X10 Y7", " P1", " Z2", " E1", " H1", " Z-1 R2 X3", " X10 R8", " X10 I5"]
+FOLLOWING = [
+    "",
+    " X10 Y7",
+    " P1",
+    " Z2",
+    " E1",
+    " H1",
+    " Z-1 R2 X3",
+    " X10 R8",
+    " X10 I5",
+]
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
@@ -215,11 +231,14 @@ def test_no_code_of_a_dialect_leads_the_stage_elsewhere(dialect):
         "SET_GCODE_OFFSET X=2",
         "PARK",
     }
-    assert ("T1" in known) == (dialect in ("linuxcnc", "grbl"))  # it only names the next tool
+    # it only names the next tool
+    assert ("T1" in known) == (dialect in ("linuxcnc", "grbl"))
     machine, unknown = Machine(dialect), set()
     for code in known:
         try:
-            machine.run(f"{code} X1 Z1 R1 I1 E1 P1" if code in ("G2", "G3", "G81") else code)
+            machine.run(
+                f"{code} X1 Z1 R1 I1 E1 P1" if code in ("G2", "G3", "G81") else code
+            )
         except Wrong as error:
             unknown |= {code} if str(error).startswith("not known") else set()
     assert not unknown
@@ -228,7 +247,11 @@ def test_no_code_of_a_dialect_leads_the_stage_elsewhere(dialect):
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_codes_that_change_no_place_are_inert(dialect):
     """The list of what leaves positions alone against that of the machines of the tests."""
-    inert = {code.name for code in DIALECTS[dialect].values() if code.does in ("other", "stop")}
+    inert = {
+        code.name
+        for code in DIALECTS[dialect].values()
+        if code.does in ("other", "stop")
+    }
     assert inert <= {*INERT[dialect].split(), "G95"}
 
 
@@ -282,7 +305,9 @@ ANY_CODE = st.sampled_from(
     ]
 )
 LINES = st.builds(
-    lambda before, codes, words, between, after: before + between.join([*codes, *words]) + after,
+    lambda before, codes, words, between, after: (
+        before + between.join([*codes, *words]) + after
+    ),
     st.sampled_from(["", "", "", "/", "N5 "]),
     st.lists(ANY_CODE | st.sampled_from(["G0", "G1", "G2", "G3"]), max_size=2),
     st.lists(WORDS, max_size=4),
@@ -292,7 +317,11 @@ LINES = st.builds(
 
 
 @settings(max_examples=50, deadline=None, derandomize=True)
-@given(st.sampled_from(sorted(DIALECTS)), st.lists(LINES, min_size=1, max_size=8), st.booleans())
+@given(
+    st.sampled_from(sorted(DIALECTS)),
+    st.lists(LINES, min_size=1, max_size=8),
+    st.booleans(),
+)
 def test_no_random_program_leads_the_stage_elsewhere(dialect, lines, said):
     """Of a program its lines that are not refused after one another."""
     kept = (SAID[dialect] if said else "").splitlines()
@@ -300,7 +329,9 @@ def test_no_random_program_leads_the_stage_elsewhere(dialect, lines, said):
         try:
             corrected("\n".join([*kept, line]), dialect, um=20.0)
         except InputError as error:
-            assert "\n" not in str(error) and str(error).startswith(f"a.nc:{len(kept) + 1}: ")
+            assert "\n" not in str(error) and str(error).startswith(
+                f"a.nc:{len(kept) + 1}: "
+            )
         else:
             kept.append(line)
     pieces("\n".join(kept), dialect, um=20.0)
@@ -387,7 +418,10 @@ klipper | PARK | 1: the line does not begin with a command
 klipper | G1 X5 (a) | 1: '(' does
 """
 """Dialect, program (+: its modes are said; //: end of line), line and reason."""
-CASES = [tuple(part.strip() for part in row.split(" | ")) for row in REFUSED.strip().splitlines()]
+CASES = [
+    tuple(part.strip() for part in row.split(" | "))
+    for row in REFUSED.strip().splitlines()
+]
 CASES += [
     ("marlin", "\tG1 X5", "1: '\\t' does not belong to a word of marlin"),
     ("grbl", "(\u212a)", "1: '\u212a' acts on grbl even in"),
@@ -406,14 +440,20 @@ def test_what_cannot_be_corrected_is_one_line(dialect, text, message):
         text = BEFORE[dialect] + text[1:]
     with pytest.raises(InputError) as raised:
         corrected(text, dialect)
-    assert str(raised.value).startswith(f"a.nc:{message}") and "\n" not in str(raised.value)
+    assert str(raised.value).startswith(f"a.nc:{message}") and "\n" not in str(
+        raised.value
+    )
 
 
 def test_increments_do_not_add_up_their_rounding():
     steps = "".join("G1 X0.3333 Y0.1\n" for _ in range(60))
     text = f"G21 G90\nG0 X0 Y0\nG91 F9\n{steps}"
     rewriter = Rewriter(
-        wanted(MAP, Wiring(FRAME)), dialect="grbl", tolerance_m=5e-4, step_m=3e-4, decimals=3
+        wanted(MAP, Wiring(FRAME)),
+        dialect="grbl",
+        tolerance_m=5e-4,
+        step_m=3e-4,
+        decimals=3,
     )
     machine = Machine("grbl")
     for line in corrected_program(text, "a.nc", rewriter).splitlines():
@@ -433,7 +473,9 @@ def test_each_end_of_line_is_kept_and_nothing_else_ends_a_line(end):
 def test_lines_without_motion_are_kept_letter_by_letter():
     out = corrected(PRINTER, "marlin").splitlines()
     kept = [line for line in PRINTER.splitlines() if not re.match("G[0-3] ", line)]
-    assert [line for line in out if not re.match("G[0-3] ", line)] == kept and len(kept) > 15
+    assert [line for line in out if not re.match("G[0-3] ", line)] == kept and len(
+        kept
+    ) > 15
 
 
 def test_the_polygon_of_few_points_stays_within_the_tolerance():
@@ -445,7 +487,11 @@ def test_the_polygon_of_few_points_stays_within_the_tolerance():
 
 def test_the_page_lists_the_known_codes_with_their_words():
     page = (Path(__file__).parents[2] / "docs/guides/controllers.md").read_text()
-    rows = [re.split(r"\s*\|\s*", line)[1:-1] for line in page.splitlines() if line[:2] == "| "]
+    rows = [
+        re.split(r"\s*\|\s*", line)[1:-1]
+        for line in page.splitlines()
+        if line[:2] == "| "
+    ]
     head = next(row for row in rows if row[1:] == list(DIALECTS))
     listed = {
         (dialect, name, words, row[0].partition(":")[0])

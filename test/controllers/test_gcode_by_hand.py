@@ -34,7 +34,9 @@ def roof(top):
     return Looked(lambda x, y: (0 * x, 0.1 * (1 - abs(x - top) / top)))
 
 
-def rewritten(text, correct=None, *, dialect="grbl", tolerance=1e-3, step=1.0, **kwargs):
+def rewritten(
+    text, correct=None, *, dialect="grbl", tolerance=1e-3, step=1.0, **kwargs
+):
     """Return the lines of a corrected program, after those that say its modes.
 
     Tolerance and step in mm.
@@ -47,7 +49,9 @@ def rewritten(text, correct=None, *, dialect="grbl", tolerance=1e-3, step=1.0, *
         **kwargs,
     )
     said = SAID[dialect]
-    return corrected_program(said + text, "a.nc", rewriter).splitlines()[said.count("\n") :]
+    return corrected_program(said + text, "a.nc", rewriter).splitlines()[
+        said.count("\n") :
+    ]
 
 
 def values(lines, letter):
@@ -70,7 +74,9 @@ def places(lines):
 )
 def test_a_circle_with_one_word_for_its_centre(arc, centre, first):
     """From (0, 0); `first` are the signs of the way at its beginning."""
-    points = places(rewritten(f"G0 X0 Y0\n{arc}\n", tolerance=0.01, dialect="linuxcnc")[1:])
+    points = places(
+        rewritten(f"G0 X0 Y0\n{arc}\n", tolerance=0.01, dialect="linuxcnc")[1:]
+    )
     np.testing.assert_allclose(np.hypot(*(points - centre).T), 5, atol=1e-5)
     assert tuple(np.sign(points[0])) == first and tuple(points[-1]) == (0, 0)
     angle = np.unwrap(np.arctan2(*(np.vstack([[0, 0], points]) - centre).T[::-1]))
@@ -82,12 +88,16 @@ def test_the_radius_of_a_spiral_grows_with_the_angle():
     points = places(rewritten("G0 X10 Y0\nG3 X0 Y10.0004 I-10\n")[1:])
     turned = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     assert len(points) > 30 and turned[-1] == pytest.approx(90, abs=1e-9)
-    np.testing.assert_allclose(np.hypot(*points.T), 10 + 0.0004 * turned / 90, atol=2e-5)
+    np.testing.assert_allclose(
+        np.hypot(*points.T), 10 + 0.0004 * turned / 90, atol=2e-5
+    )
 
 
 def test_a_quarter_is_split_once_where_that_suffices():
     """Radius 10 mm: 90 deg have a sagitta of 2.93 mm, 45 deg of 0.76 mm, within 7/8 of 1 mm."""
-    points = places(rewritten("G0 X10 Y0\nG3 X0 Y10 J0 I-10\n", tolerance=1.0, step=0.1)[1:])
+    points = places(
+        rewritten("G0 X10 Y0\nG3 X0 Y10 J0 I-10\n", tolerance=1.0, step=0.1)[1:]
+    )
     assert len(points) == 2 and tuple(points[1]) == (0, 10)
     assert np.hypot(*points[0]) == pytest.approx(10, abs=1e-5)
     assert math.degrees(math.atan2(*points[0][::-1])) == pytest.approx(45, abs=0.3)
@@ -95,7 +105,12 @@ def test_a_quarter_is_split_once_where_that_suffices():
 
 @pytest.mark.parametrize(
     ("move", "length", "looks"),
-    [("G1 X30 Y0", 30, 2), ("G1 X18 Y24", 30, 2), ("G1 X41 Y0", 41, 3), ("G1 X19 Y0", 19, 1)],
+    [
+        ("G1 X30 Y0", 30, 2),
+        ("G1 X18 Y24", 30, 2),
+        ("G1 X41 Y0", 41, 3),
+        ("G1 X19 Y0", 19, 1),
+    ],
 )
 def test_the_correction_of_a_line_is_looked_up_at_steps(move, length, looks):
     correct = Looked()
@@ -113,7 +128,9 @@ def test_the_correction_of_a_line_is_looked_up_at_steps(move, length, looks):
         (0.1, 100.0, 32),
     ],
 )  # chords whose sagitta is 1/8 of the tolerance: 2 acos(1 - 1/800) = 0.1 rad
-def test_the_correction_of_an_arc_is_looked_up_at_steps_and_chords(tolerance, step, looks):
+def test_the_correction_of_an_arc_is_looked_up_at_steps_and_chords(
+    tolerance, step, looks
+):
     """Half a circle of radius 10 mm, and of 2 m with all lengths 200 times as large."""
     for times in (1, 200):
         correct = Looked()
@@ -127,7 +144,9 @@ def test_the_correction_of_an_arc_is_looked_up_at_steps_and_chords(tolerance, st
         assert len(points) == looks + 1
         np.testing.assert_allclose(np.hypot(*(points - [10, 0]).T), 10, rtol=1e-9)
         turned = np.degrees(np.arctan2(points[:, 1], points[:, 0] - 10))
-        np.testing.assert_allclose(turned, 180 - 180 / looks * np.arange(looks + 1), atol=1e-6)
+        np.testing.assert_allclose(
+            turned, 180 - 180 / looks * np.arange(looks + 1), atol=1e-6
+        )
 
 
 def test_what_lies_between_two_steps_is_found():
@@ -168,11 +187,15 @@ def test_an_extruder_has_its_own_kind_of_increments(dialect, before, e):
     assert values(lines[-2:], "E") == list(e)
 
 
-@pytest.mark.parametrize("before", ["M83\nG90", "G91\nM82", "M83\nG91\nM82\nG90\nG91\nM82"])
+@pytest.mark.parametrize(
+    "before", ["M83\nG90", "G91\nM82", "M83\nG91\nM82\nG90\nG91\nM82"]
+)
 def test_marlin_1_and_2_read_e_after_g90_and_m83_differently(before):
     """Version 1: relative by G91 or M83; version 2: by the last of the four."""
     with pytest.raises(InputError, match="M82"):
-        rewritten(f"G0 X0 Y0\nG92 E0\n{before}\nG1 X40 Y0 E3\n", roof(20), dialect="marlin")
+        rewritten(
+            f"G0 X0 Y0\nG92 E0\n{before}\nG1 X40 Y0 E3\n", roof(20), dialect="marlin"
+        )
 
 
 @pytest.mark.parametrize(
@@ -209,7 +232,9 @@ def test_other_words_of_a_split_move_stand_in_its_first_line():
     ]
 
 
-@pytest.mark.parametrize("line", ["G64", "G64 P0.01 Q0", "g 64 ( merge )", "G64 P0", "G61.1"])
+@pytest.mark.parametrize(
+    "line", ["G64", "G64 P0.01 Q0", "g 64 ( merge )", "G64 P0", "G61.1"]
+)
 def test_path_modes_that_do_not_merge_are_kept(line):
     assert rewritten(line, dialect="linuxcnc") == [line]
 

@@ -25,7 +25,10 @@ PROGRAMS = {
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_linuxcnc_reads_the_same_way(name, tmp_path):
     ways = []
-    for text in (PROGRAMS[name], corrected_program(PROGRAMS[name], "a", rewriter_of("linuxcnc"))):
+    for text in (
+        PROGRAMS[name],
+        corrected_program(PROGRAMS[name], "a", rewriter_of("linuxcnc")),
+    ):
         (tmp_path / "a.ngc").write_text(text)
         ways.append(ways_of(tmp_path / "a.ngc"))
     scale = 25.4 if name == "inches" else 1.0

@@ -34,7 +34,9 @@ def test_kmotion_has_a_line_for_each_row_and_column(plate):
     assert len(lines) == 3 + nx * ny
     for line in lines[3:]:
         row, column, x, y, _ = map(float, line.split(","))
-        assert x == pytest.approx(10 * (column - nx // 2) + 1e-4 * (column + 1), abs=1e-8)
+        assert x == pytest.approx(
+            10 * (column - nx // 2) + 1e-4 * (column + 1), abs=1e-8
+        )
         assert y == pytest.approx(10 * (row - ny // 2) + 1e-2 * (row + 1), abs=1e-8)
 
 
@@ -44,13 +46,17 @@ def test_beckhoff_has_the_second_master_first(plate, integers):
     files = FORMATS["beckhoff"].write(numbered(plate), Wiring(MM, integers=integers))
     for name, value in (("x", lambda i, j: i + 1), ("y", lambda i, j: 100 * (j + 1))):
         entries = [
-            re.fullmatch(r"kw\.crosscomp2\.table\[(\d+)\]\[(\d+)\]\.correction (\S+)", line)
+            re.fullmatch(
+                r"kw\.crosscomp2\.table\[(\d+)\]\[(\d+)\]\.correction (\S+)", line
+            )
             for line in files[name]
             if "table" in line
         ]
         found = {(int(m[2]), int(m[1])): float(m[3]) for m in entries}
         assert set(found) == set(np.ndindex(plate.shape))
-        assert all(v == pytest.approx(value(i, j), abs=1e-4) for (i, j), v in found.items())
+        assert all(
+            v == pytest.approx(value(i, j), abs=1e-4) for (i, j), v in found.items()
+        )
         assert all(m[3].isdigit() for m in entries) == integers
 
 
@@ -84,7 +90,10 @@ def beckhoff(last1, last2, entries=()):
                         "master2_ax_nr": 2,
                     }.items()
                 ),
-                *(f"kw.crosscomp2.table[{j}][{i}].correction {value}" for i, j, value in entries),
+                *(
+                    f"kw.crosscomp2.table[{j}][{i}].correction {value}"
+                    for i, j, value in entries
+                ),
             ]
         ),
         "file",
@@ -97,7 +106,9 @@ def beckhoff(last1, last2, entries=()):
 )
 def test_beckhoff_s_reader_has_bounds_for_both_masters(monkeypatch, last1, last2, size):
     monkeypatch.setattr(planes, "MAX_ENTRIES", 14)
-    with pytest.raises(InputError, match=f"^file: interval 10, unit 1, {size} points, masters"):
+    with pytest.raises(
+        InputError, match=f"^file: interval 10, unit 1, {size} points, masters"
+    ):
         loaded("beckhoff", [beckhoff(last1, last2)] * 2, Wiring(MM))
 
 
@@ -162,7 +173,9 @@ def test_kmotion_s_reader_has_bounds_for_rows_and_columns(rows, columns):
     )
     assert cx == 0
     for place in ((rows, 0), (0, columns)):
-        with pytest.raises(InputError, match=f"row {place[0]}, column {place[1]} is not in the"):
+        with pytest.raises(
+            InputError, match=f"row {place[0]}, column {place[1]} is not in the"
+        ):
             loaded("kmotion", [geo(rows, columns, [*places[:-1], place])], Wiring(MM))
 
 
@@ -176,24 +189,35 @@ def test_kmotion_s_reader_has_limits_of_rows_and_of_columns(rows, columns):
 def test_entries_have_the_bounds_of_their_own_axis(shape):
     entries = {place: 10.0 * place[0] + place[1] for place in np.ndindex(shape)}
     np.testing.assert_array_equal(
-        filled(entries, shape, "file"), np.add.outer(10 * np.arange(shape[0]), np.arange(shape[1]))
+        filled(entries, shape, "file"),
+        np.add.outer(10 * np.arange(shape[0]), np.arange(shape[1])),
     )
     del entries[0, 0]
     for beyond in ((shape[0], 0), (0, shape[1])):
-        with pytest.raises(InputError, match=f"6 entries, not those of {shape[0]} x {shape[1]}"):
+        with pytest.raises(
+            InputError, match=f"6 entries, not those of {shape[0]} x {shape[1]}"
+        ):
             filled(entries | {beyond: 1.0}, shape, "file")
 
 
 @pytest.mark.parametrize(
     "frame",
-    [MachineFrame(reverse_x=True), MachineFrame(reverse_y=True, home_y_m=0.004), MachineFrame()],
+    [
+        MachineFrame(reverse_x=True),
+        MachineFrame(reverse_y=True, home_y_m=0.004),
+        MachineFrame(),
+    ],
 )
 def test_a_table_is_combined_in_the_sense_of_its_own_axis(frame):
     """The active table adds 3 um to x and 5 um to y of the controller everywhere."""
     emap = numbered(WIDE)
     found = combined(emap, frame, lambda px, py: (0 * px + 3e-3, 0 * py + 5e-3))
-    np.testing.assert_allclose(found.gx - emap.gx, -3e-6 if frame.reverse_x else 3e-6, rtol=1e-9)
-    np.testing.assert_allclose(found.gy - emap.gy, -5e-6 if frame.reverse_y else 5e-6, rtol=1e-9)
+    np.testing.assert_allclose(
+        found.gx - emap.gx, -3e-6 if frame.reverse_x else 3e-6, rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        found.gy - emap.gy, -5e-6 if frame.reverse_y else 5e-6, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("plate", [WIDE, DEEP])
@@ -205,14 +229,18 @@ def test_bends_are_found_in_the_last_cells_of_both_axes(plate):
         first[axis], step[axis] = half[axis] - 10, 5.0
         values = np.moveaxis(np.outer([0, 2e-3, 0], [1, 1]), 0, axis)
         roof = Grid(tuple(first), tuple(step), values, "hold")
-        bent = bends_between(numbered(plate), MM, lambda px, py, r=roof: (r.at(px, py), 0 * px))
+        bent = bends_between(
+            numbered(plate), MM, lambda px, py, r=roof: (r.at(px, py), 0 * px)
+        )
         assert bent == pytest.approx(2e-6, rel=1e-9)
 
 
 @pytest.mark.parametrize("axes", [(1, 2), (7, 4)])
 def test_pmac_defines_the_higher_motor_first(axes):
     """The tables are stored downwards from the last motor."""
-    lines = FORMATS["pmac"].write(numbered(WIDE), Wiring(MachineFrame(*axes), (1e4, 1e4)))[""]
+    lines = FORMATS["pmac"].write(
+        numbered(WIDE), Wiring(MachineFrame(*axes), (1e4, 1e4))
+    )[""]
     assert [line for line in lines if re.fullmatch(r"#\d", line)] == [
         f"#{axis}" for axis in sorted(axes, reverse=True)
     ]

@@ -36,7 +36,10 @@ class Measured:
     def __init__(self) -> None:
         plan, rng = hu_plan(Artifact(9, 0.008), repeats=2), np.random.default_rng(27)
         truth = random_truth(
-            plan.artifact, len(plan.views), rng, Spread(g_m=4e-6, correlation_pitches=3.0)
+            plan.artifact,
+            len(plan.views),
+            rng,
+            Spread(g_m=4e-6, correlation_pitches=3.0),
         )
         self.result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=80e-9))
         nodes = plan.artifact.x_m[:, 0]
@@ -66,18 +69,27 @@ def corrected(stage: Measured, path: Path, sign: float = 1.0):
     """Yield each line of a program and those that replace it."""
     correct = wanted(stage.result.error_map, Wiring(FRAME, negate=sign < 0))
     rewriter = Rewriter(
-        correct, dialect=DIALECTS[path.suffix], tolerance_m=TOLERANCE_M, step_m=0.25e-3, decimals=6
+        correct,
+        dialect=DIALECTS[path.suffix],
+        tolerance_m=TOLERANCE_M,
+        step_m=0.25e-3,
+        decimals=6,
     )
     for number, line in enumerate(path.read_text().splitlines(), 1):
         yield line, rewriter.line(line, f"{path.name}:{number}")
 
 
-def distances(stage: Measured, path: Path, sign: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def distances(
+    stage: Measured, path: Path, sign: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the distances of the true path from the programmed one and back, and U there."""
     programmed, machine = (Machine(DIALECTS[path.suffix]) for _ in range(2))
     off, limits, known = [], [], False
     for line, out in corrected(stage, path, sign):
-        ideal, made = programmed.run(line), [move for text in out for move in machine.run(text)]
+        ideal, made = (
+            programmed.run(line),
+            [move for text in out for move in machine.run(text)],
+        )
         in_xy = any(np.ptp(move.points[:, :2], axis=0).any() for move in ideal)
         if in_xy and len(ideal[-1].points) > 1:
             if len(ideal) > 1:  # a cycle: the hole
@@ -87,7 +99,8 @@ def distances(stage: Measured, path: Path, sign: float = 1.0) -> tuple[np.ndarra
                 1e-3
                 * np.vstack(
                     [
-                        m.points[0] + np.linspace(0, 1, 8)[:, None] * (m.points[-1] - m.points[0])
+                        m.points[0]
+                        + np.linspace(0, 1, 8)[:, None] * (m.points[-1] - m.points[0])
                         for m in made
                     ]
                 )[:, :2]
@@ -96,7 +109,10 @@ def distances(stage: Measured, path: Path, sign: float = 1.0) -> tuple[np.ndarra
             if known and not ideal[0].rapid:
                 pairs += [(way[::6], whole), (whole[::40], way)]
             for some, path_of in pairs:
-                off += [farthest(point[None], np.vstack([path_of, path_of[-1:]])) for point in some]
+                off += [
+                    farthest(point[None], np.vstack([path_of, path_of[-1:]]))
+                    for point in some
+                ]
                 limits.append(stage.expanded(some))
             known = True
         known &= not ideal or len(ideal[-1].points) > 1
@@ -122,7 +138,8 @@ def kept(line: str) -> list[str]:
     return sorted(
         re.sub(r"\s", "", word)
         for word in TOKEN.findall(line)
-        if word[0] in "(;" or (word[0] not in "XYZIJR" and not re.fullmatch("G0?[0-3]", word))
+        if word[0] in "(;"
+        or (word[0] not in "XYZIJR" and not re.fullmatch("G0?[0-3]", word))
     )
 
 
@@ -130,7 +147,9 @@ def kept(line: str) -> list[str]:
 def test_words_and_comments_are_kept(stage, path):
     moves = 0
     for line, (first, *more) in corrected(stage, path):
-        assert [w for w in kept(first) if w != "G81"] == [w for w in kept(line) if w != "G81"]
+        assert [w for w in kept(first) if w != "G81"] == [
+            w for w in kept(line) if w != "G81"
+        ]
         assert all(re.fullmatch(r"G1 X\S+ Y\S+( Z\S+)?", text) for text in more)
         moves += bool(more)
     assert moves >= 8

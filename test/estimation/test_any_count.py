@@ -43,7 +43,12 @@ def measured(count, seed=1, sigma_rad=SIGMA_RAD, lines=1, sense=Sense.MICROSCOPE
     rng, views = np.random.default_rng(seed), plan(count, lines)
     truth = random_truth(views.artifact, 4, rng, Spread(phi_rad=1e-3))
     return truth, simulate_measurements(
-        truth, views, rng, sigma_m=20e-9 * bool(sigma_rad), sigma_theta_rad=sigma_rad, sense=sense
+        truth,
+        views,
+        rng,
+        sigma_m=20e-9 * bool(sigma_rad),
+        sigma_theta_rad=sigma_rad,
+        sense=sense,
     )
 
 
@@ -59,7 +64,8 @@ def test_readings_without_noise_give_the_truth(count, sense):
     result = calibrate(readings, BARE)
     assert np.abs(error_of(result, truth)).max() < 1e-12
     assert result.artifact_map.a_theta == pytest.approx(
-        truth.a_theta - truth.a_theta.mean() + result.artifact_map.a_theta.mean(), abs=1e-12
+        truth.a_theta - truth.a_theta.mean() + result.artifact_map.a_theta.mean(),
+        abs=1e-12,
     )
 
 
@@ -91,23 +97,33 @@ def test_views_off_the_lines_measure_the_grid_alone():
     assert [view.angular for view in found.views] == [True, False, True, True]
     artifact = found.artifact
     assert found.views[1].lattice_pose(artifact).turn_lines is None
-    assert found.views[1].lattice_pose(replace(artifact, angular_count=12)).turn_lines == 3
+    assert (
+        found.views[1].lattice_pose(replace(artifact, angular_count=12)).turn_lines == 3
+    )
     with pytest.raises(InputError, match=r"2\.5 is not a whole number of angular line"):
         replace(found.views[1], angular=True).lattice_pose(artifact)
     _, ranked = rank_next(found)
     turned = [
         item.view
         for item in ranked
-        if item.view and item.view.grid and round(math.degrees(item.view.rotation_rad)) % 180
+        if item.view
+        and item.view.grid
+        and round(math.degrees(item.view.rotation_rad)) % 180
     ]
     assert turned and not any(view.angular for view in turned)
 
 
 def test_what_needs_lines_on_both_axes_is_refused():
     _, readings = measured(10)
-    with pytest.raises(InputError, match="xy_axes: of 10 lines, none lies on the y axis"):
+    with pytest.raises(
+        InputError, match="xy_axes: of 10 lines, none lies on the y axis"
+    ):
         calibrate(readings, bare(datum_theta=ThetaDatum.XY_AXES))
-    with pytest.raises(InputError, match=r"Hu's law needs a square plate with 4, 8, 12"):
+    with pytest.raises(
+        InputError, match=r"Hu's law needs a square plate with 4, 8, 12"
+    ):
         calibrate_by_law(readings, Options())
     with pytest.raises(InputError, match="encoder xy_axes: of 10 lines, none"):
-        random_truth(readings.artifact, 4, np.random.default_rng(1), Spread(encoder="xy_axes"))
+        random_truth(
+            readings.artifact, 4, np.random.default_rng(1), Spread(encoder="xy_axes")
+        )

@@ -33,7 +33,10 @@ def mixed_plan(text, nx, ny, **how):
         views=tuple(
             view
             if round(view.rotation_rad / (np.pi / 2)) % 2 == 0 or not view.grid
-            else replace(view, translation_m=tuple(along + beside for along in view.translation_m))
+            else replace(
+                view,
+                translation_m=tuple(along + beside for along in view.translation_m),
+            )
             for view in plan.views
         ),
     )
@@ -52,13 +55,16 @@ def test_the_dense_solution_is_the_same(size, text, finite):
     """Map, plate, misalignments and u, in the datum of the product."""
     _, readings = measured(plan_of(text, size), size, linear=not finite)
     result = calibrate(
-        readings, Options(assumed=(), misalignment_model="rigid" if finite else "linear")
+        readings,
+        Options(assumed=(), misalignment_model="rigid" if finite else "linear"),
     )
     want, emap = solve(readings, finite=finite), result.error_map
     assert np.abs(emap.gx + 1j * emap.gy - want.field).max() < 1e-13
     plate = result.artifact_map
     assert np.abs(plate.ax + 1j * plate.ay - want.plate).max() < 1e-13
-    assert [view.phi for view in result.views] == pytest.approx(want.phi, rel=0, abs=1e-11)
+    assert [view.phi for view in result.views] == pytest.approx(
+        want.phi, rel=0, abs=1e-11
+    )
     lies = np.array([complex(view.tx, view.ty) for view in result.views])
     assert np.abs(lies - want.t).max() < 1e-13
     u = np.stack([emap.u_gx, emap.u_gy]) / result.noise.sigma_xy
@@ -97,7 +103,9 @@ def test_readings_without_noise_give_the_truth(size, sense):
     emap = result.error_map
     assert np.abs([emap.gx - truth.g[0], emap.gy - truth.g[1]]).max() < 1e-15
     assert (
-        np.abs([result.artifact_map.ax - truth.a[0], result.artifact_map.ay - truth.a[1]]).max()
+        np.abs(
+            [result.artifact_map.ax - truth.a[0], result.artifact_map.ay - truth.a[1]]
+        ).max()
         < 1e-15
     )
 
@@ -108,12 +116,18 @@ def test_readings_without_noise_give_the_truth(size, sense):
 def test_detections_give_the_truth(size, with_ids, sense):
     """With ids and without: the nearest mark to a place between marks is half a pitch away."""
     plan = mixed_plan("0, 90, 180, -tx, ty", *size)
-    shot = scene(plan, sense=sense, with_ids=with_ids, servo_sigma_m=0.0, t_m=(3e-5, -2e-5))
+    shot = scene(
+        plan, sense=sense, with_ids=with_ids, servo_sigma_m=0.0, t_m=(3e-5, -2e-5)
+    )
     readings, progress = collect(shot.events, measurement_sense=str(sense))
     assert all(view.grid_done == view.grid_expected for view in progress.values())
     found = calibrate(readings)
-    np.testing.assert_allclose([found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11)
-    assert [view.phi for view in found.views] == pytest.approx(shot.truth.phi_rad, abs=1e-8)
+    np.testing.assert_allclose(
+        [found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11
+    )
+    assert [view.phi for view in found.views] == pytest.approx(
+        shot.truth.phi_rad, abs=1e-8
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -123,7 +137,9 @@ def test_images_of_nine_marks_give_the_map(sense, with_ids):
     readings, progress = collect(shot.events, measurement_sense=str(sense))
     assert all(view.grid_done == view.grid_expected for view in progress.values())
     found = calibrate(readings)
-    np.testing.assert_allclose([found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11)
+    np.testing.assert_allclose(
+        [found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11
+    )
     np.testing.assert_allclose(
         [found.artifact_map.ax, found.artifact_map.ay], shot.truth.a, atol=2e-11
     )
@@ -134,7 +150,10 @@ def test_errors_lie_in_u():
     inside = squares = number = 0.0
     for seed in range(40):
         plan = mixed_plan(
-            "0, 90, tx, ty", *((8, 0), (6, 4), (7, 6), (4, 0))[seed % 4], count=8, line=True
+            "0, 90, tx, ty",
+            *((8, 0), (6, 4), (7, 6), (4, 0))[seed % 4],
+            count=8,
+            line=True,
         )
         truth, readings = measured(plan, seed, sigma_theta_rad=1e-6)
         result = solve_joint(readings, BARE).result
@@ -156,7 +175,10 @@ def test_no_site_lies_on_an_axis():
             calibrate_by(method, readings, Options(datum_theta=ThetaDatum.XY_AXES))
     _, linear = measured(plan, 5, sigma_m=0.0, linear=True)
     found = calibrate_by_law(linear, Options())
-    assert np.abs([found.error_map.gx - truth.g[0], found.error_map.gy - truth.g[1]]).max() < 1e-14
+    assert (
+        np.abs([found.error_map.gx - truth.g[0], found.error_map.gy - truth.g[1]]).max()
+        < 1e-14
+    )
 
 
 def test_a_quarter_turn_of_mixed_sides_is_half_a_pitch_beside():

@@ -46,7 +46,13 @@ SIGMA_RAD = 1e-6
 
 
 def measured(
-    views, seed=1, *, sigma_rad=SIGMA_RAD, lines=4.0, sense=Sense.MICROSCOPE_MOVES, missing=0.0
+    views,
+    seed=1,
+    *,
+    sigma_rad=SIGMA_RAD,
+    lines=4.0,
+    sense=Sense.MICROSCOPE_MOVES,
+    missing=0.0,
 ):
     """Return a truth with an encoder of the correlation length `lines`, and its readings."""
     rng = np.random.default_rng(seed)
@@ -88,16 +94,27 @@ def test_the_predicted_uncertainty_is_that_of_dense_equations(count, harmonics, 
             "angular map: harmonics 3, 6 and 9, as every turn between views is a whole number",
         ),
         ((120, 240), "angular map: harmonics 3, 6 and 9, as every turn"),
-        ((72,), "angular map: harmonics 5 and 10, as every turn between views is a whole number"),
-        ((45.001,), "angular map: harmonic 8, as every turn between views is a whole number"),
-        ((), "angular map: harmonics 1, 2, 3, 4, 5, 6, 7, 8, 9, 10 and 11, as no view turns the"),
+        (
+            (72,),
+            "angular map: harmonics 5 and 10, as every turn between views is a whole number",
+        ),
+        (
+            (45.001,),
+            "angular map: harmonic 8, as every turn between views is a whole number",
+        ),
+        (
+            (),
+            "angular map: harmonics 1, 2, 3, 4, 5, 6, 7, 8, 9, 10 and 11, as no view turns the",
+        ),
     ],
 )
 def test_missed_harmonics_are_named(turns, text):
     views = plan(24, 11, turns)
     found = check_plan(views)
     assert not found.observability.identifiable
-    named = next(mode for mode in in_words(found.observability.modes) if "harmonic" in mode)
+    named = next(
+        mode for mode in in_words(found.observability.modes) if "harmonic" in mode
+    )
     assert named.startswith(text)
     assert found.observability.deficiency == 2 * len(re.findall(r"\d+", text))
     cured = replace(views, views=(*views.views, *found.cures[0]))
@@ -120,14 +137,20 @@ def test_the_advised_turn_is_the_best_one():
 
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize(
-    ("count", "harmonics", "lines"), [(24, 8, 4.0), (7, 3, 2.5), (36, 17, 5.0), (10, 4, 3.0)]
+    ("count", "harmonics", "lines"),
+    [(24, 8, 4.0), (7, 3, 2.5), (36, 17, 5.0), (10, 4, 3.0)],
 )
-def test_readings_without_noise_give_the_truth_on_lines_and_between(count, harmonics, lines, sense):
-    truth, readings = measured(plan(count, harmonics), sigma_rad=0.0, lines=lines, sense=sense)
+def test_readings_without_noise_give_the_truth_on_lines_and_between(
+    count, harmonics, lines, sense
+):
+    truth, readings = measured(
+        plan(count, harmonics), sigma_rad=0.0, lines=lines, sense=sense
+    )
     result = calibrate(readings, BARE)
     assert np.abs(error_of(result, truth)).max() < 1e-10
     assert result.artifact_map.a_theta == pytest.approx(
-        truth.a_theta - truth.a_theta.mean() + result.artifact_map.a_theta.mean(), abs=1e-10
+        truth.a_theta - truth.a_theta.mean() + result.artifact_map.a_theta.mean(),
+        abs=1e-10,
     )
     angle = np.random.default_rng(0).uniform(-7, 7, 200)
     stage = StageMap(result)
@@ -137,7 +160,9 @@ def test_readings_without_noise_give_the_truth_on_lines_and_between(count, harmo
     assert stage.correct_angle(float(angle[0])) == pytest.approx(
         float(stage.correct_theta(angle[0])), abs=1e-15
     )
-    np.testing.assert_allclose(stage.command_theta(stage.correct_theta(angle)), angle, atol=1e-14)
+    np.testing.assert_allclose(
+        stage.command_theta(stage.correct_theta(angle)), angle, atol=1e-14
+    )
     assert np.isnan(stage.error_theta(np.array([np.nan, np.inf]))).all()
 
 
@@ -197,27 +222,35 @@ def test_the_solution_is_that_of_one_dense_least_squares():
         ]
     )
     root = np.sqrt(weight[view, line])
-    cover = np.linalg.pinv((columns * root[:, None]).T @ (columns * root[:, None]), rcond=1e-10)
+    cover = np.linalg.pinv(
+        (columns * root[:, None]).T @ (columns * root[:, None]), rcond=1e-10
+    )
     solved = cover @ columns.T @ (root**2 * y[view, line])
     lines = np.arange(count) * 2 * np.pi / count
     rows = np.hstack([np.cos(np.outer(lines, h)), np.sin(np.outer(lines, h))])
     free, d = system.reduced(y)
     phi = np.linalg.pinv(system.schur, rcond=1e-9) @ d
     field = free - system.response @ phi
-    np.testing.assert_allclose(field - field.mean(), rows @ solved[: 2 * harmonics], atol=1e-10)
+    np.testing.assert_allclose(
+        field - field.mean(), rows @ solved[: 2 * harmonics], atol=1e-10
+    )
     spread = (
         system.solve(np.eye(count))
         + system.response @ np.linalg.pinv(system.schur, rcond=1e-9) @ system.response.T
     )
     centre = np.eye(count) - 1 / count
     np.testing.assert_allclose(
-        centre @ spread @ centre, rows @ cover[: 2 * harmonics, : 2 * harmonics] @ rows.T, atol=1e-9
+        centre @ spread @ centre,
+        rows @ cover[: 2 * harmonics, : 2 * harmonics] @ rows.T,
+        atol=1e-9,
     )
     rest = system.plate(y, field, phi)[1]
-    np.testing.assert_allclose(rest[view, line], y[view, line] - columns @ solved, atol=1e-10)
-    assert system.rank + np.linalg.matrix_rank(system.schur, tol=1e-8) == np.linalg.matrix_rank(
-        columns * root[:, None]
+    np.testing.assert_allclose(
+        rest[view, line], y[view, line] - columns @ solved, atol=1e-10
     )
+    assert system.rank + np.linalg.matrix_rank(
+        system.schur, tol=1e-8
+    ) == np.linalg.matrix_rank(columns * root[:, None])
 
 
 def test_rows_gather_adjoint_and_covariance_are_of_one_matrix():
@@ -227,7 +260,11 @@ def test_rows_gather_adjoint_and_covariance_are_of_one_matrix():
         AngularSystem((0, 2, 7), np.ones((3, 9))),
     ):
         rows = np.stack([view @ np.eye(9) for view in system.rows])
-        field, y, matrix = rng.normal(size=9), rng.normal(size=(2, 3, 9)), rng.normal(size=(9, 9))
+        field, y, matrix = (
+            rng.normal(size=9),
+            rng.normal(size=(2, 3, 9)),
+            rng.normal(size=(9, 9)),
+        )
         np.testing.assert_allclose(system.gather(field), rows @ field, atol=1e-12)
         sums = np.einsum("vkl,cvk->lc", rows, y)
         np.testing.assert_allclose(system.adjoint(y)[0], sums, atol=1e-12)
@@ -249,7 +286,10 @@ def test_all_harmonics_of_an_odd_number_of_lines_are_the_lines_themselves(count)
     other = calibrate(replace(readings, artifact=series.artifact), Options())
     for name in ("g_theta", "u_g_theta", "gx", "u_gx"):
         np.testing.assert_allclose(
-            getattr(other.error_map, name), getattr(one.error_map, name), rtol=1e-9, atol=1e-16
+            getattr(other.error_map, name),
+            getattr(one.error_map, name),
+            rtol=1e-9,
+            atol=1e-16,
         )
     for name in ("a_theta", "u_a_theta"):
         np.testing.assert_allclose(
@@ -290,17 +330,21 @@ def test_an_encoder_rougher_than_its_harmonics_is_named_and_covered():
         found += [cause for cause in result.verdict.causes if cause.name == "roughness"]
         inside.append(
             (
-                np.abs(error_of(result, truth)) < result.noise.k_theta * result.error_map.u_g_theta
+                np.abs(error_of(result, truth))
+                < result.noise.k_theta * result.error_map.u_g_theta
             ).mean()
         )
         assert result.verdict.grade is Grade.ENLARGED
     assert len(found) == 12 and np.mean(inside) > 0.9
     cause = found[-1]
     assert (cause.unit, cause.details) == ("rad", {"harmonics": 4})
-    assert "a rotary encoder rougher than the 4 harmonics of its map can follow, by" in json.dumps(
-        result_to_dict(worded(result)), ensure_ascii=False
+    assert (
+        "a rotary encoder rougher than the 4 harmonics of its map can follow, by"
+        in json.dumps(result_to_dict(worded(result)), ensure_ascii=False)
     )
-    enough = [calibrate(measured(plan(24, 6), seed, lines=5.0)[1], BARE) for seed in range(12)]
+    enough = [
+        calibrate(measured(plan(24, 6), seed, lines=5.0)[1], BARE) for seed in range(12)
+    ]
     assert not [cause for one in enough for cause in one.verdict.causes]
 
 
@@ -308,7 +352,9 @@ def test_a_result_keeps_its_harmonics_and_is_compared_with_its_covariance():
     views = plan(24, 5)
     truth, readings = measured(views, 1, lines=6.0)
     rng = np.random.default_rng(8)
-    again = simulate_measurements(truth, views, rng, sigma_m=20e-9, sigma_theta_rad=SIGMA_RAD)
+    again = simulate_measurements(
+        truth, views, rng, sigma_m=20e-9, sigma_theta_rad=SIGMA_RAD
+    )
     one, other = (
         result_from_dict(result_to_dict(worded(calibrate(part, BARE))), "f")
         for part in (readings, again)
@@ -319,7 +365,8 @@ def test_a_result_keeps_its_harmonics_and_is_compared_with_its_covariance():
     assert not found.theta.significant
     changed = replace(
         other.error_map,
-        g_theta=other.error_map.g_theta + 10 * SIGMA_RAD * np.cos(2 * truth.artifact.theta_rad),
+        g_theta=other.error_map.g_theta
+        + 10 * SIGMA_RAD * np.cos(2 * truth.artifact.theta_rad),
     )
     assert compare(one, replace(other, error_map=changed)).theta.significant
 
@@ -335,8 +382,16 @@ def test_readings_held_out_are_predicted_between_the_lines():
 @pytest.mark.parametrize(
     ("count", "harmonics", "message"),
     [
-        (24, 12, "map harmonics: 12 harmonics cannot be told with 24 lines; give 1 to 11"),
-        (24, -1, "map harmonics: -1 harmonics cannot be told with 24 lines; give 1 to 11"),
+        (
+            24,
+            12,
+            "map harmonics: 12 harmonics cannot be told with 24 lines; give 1 to 11",
+        ),
+        (
+            24,
+            -1,
+            "map harmonics: -1 harmonics cannot be told with 24 lines; give 1 to 11",
+        ),
         (
             0,
             3,
@@ -356,9 +411,16 @@ def test_the_axes_fix_the_constant_of_a_series_too():
     readings = measured(views)[1]
     result = calibrate(readings, replace(BARE, datum_theta=ThetaDatum.XY_AXES))
     at_lines = replace(
-        result, error_map=replace(result.error_map, artifact=replace(views.artifact, harmonics=0))
+        result,
+        error_map=replace(
+            result.error_map, artifact=replace(views.artifact, harmonics=0)
+        ),
     )
-    for one, positive in ((result, False), (at_lines, True)):  # known between the lines, or not
+    # known between the lines, or not
+    for one, positive in (
+        (result, False),
+        (at_lines, True),
+    ):
         between = next(
             line
             for line in budget_lines(one)
@@ -425,6 +487,10 @@ def test_the_picture_follows_the_series_between_the_lines():
     angle = math.tau / 720
     (x, y), _ = measured_curve.lines[100]
     assert math.atan2(CENTRE[1] - y, x - CENTRE[0]) == pytest.approx(100 * angle)
-    radius = [math.hypot(x - CENTRE[0], y - CENTRE[1]) for (x, y), _ in measured_curve.lines]
+    radius = [
+        math.hypot(x - CENTRE[0], y - CENTRE[1]) for (x, y), _ in measured_curve.lines
+    ]
     error = StageMap(result).error_theta(np.arange(720) * angle)
-    np.testing.assert_allclose(radius, np.polyval(np.polyfit(error, radius, 1), error), atol=1e-6)
+    np.testing.assert_allclose(
+        radius, np.polyval(np.polyfit(error, radius, 1), error), atol=1e-6
+    )

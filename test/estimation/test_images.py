@@ -22,7 +22,9 @@ def test_two_turns_give_the_map(sense):
     shot = scene(image_plan(7), sense=sense, servo_sigma_m=0.0)
     measurements, _ = collect(shot.events, measurement_sense=str(sense))
     found = calibrate(measurements)
-    np.testing.assert_allclose([found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11)
+    np.testing.assert_allclose(
+        [found.error_map.gx, found.error_map.gy], shot.truth.g, atol=2e-11
+    )
     for view, result in zip(measurements.views, found.views, strict=True):
         assert result.phi == pytest.approx(
             shot.truth.phi_rad[int(view.view.plan_view == "90")], abs=1e-7
@@ -32,7 +34,9 @@ def test_two_turns_give_the_map(sense):
 def test_two_turns_are_predicted_to_be_enough():
     plan = image_plan(7)
     assert check_plan(plan).observability.identifiable
-    assert predict_plan(plan, ThetaDatum.ZERO_MEAN).rms_xy == pytest.approx(0.2722, abs=1e-4)
+    assert predict_plan(plan, ThetaDatum.ZERO_MEAN).rms_xy == pytest.approx(
+        0.2722, abs=1e-4
+    )
     alone = replace(plan, views=tuple(replace(view, image=None) for view in plan.views))
     assert not check_plan(alone).observability.identifiable
 

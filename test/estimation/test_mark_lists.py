@@ -51,9 +51,13 @@ def test_readings_without_noise_give_the_truth(name, how):
     assert np.nanmax(np.abs(error_in_datum(result.error_map, truth))) < 1e-11
     rest = result.artifact_map.ax + 1j * result.artifact_map.ay - truth.plate
     z = (artifact.x_m + 1j * artifact.y_m)[np.isfinite(rest)]
-    columns = np.stack([np.ones_like(z), z], axis=1)  # its place, turn and size are a convention
+    # its place, turn and size are a convention
+    columns = np.stack([np.ones_like(z), z], axis=1)
     left = rest[np.isfinite(rest)]
-    assert np.abs(left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]).max() < 1e-11
+    assert (
+        np.abs(left - columns @ np.linalg.lstsq(columns, left, rcond=None)[0]).max()
+        < 1e-11
+    )
 
 
 @pytest.mark.parametrize("name", PLATES)
@@ -63,13 +67,13 @@ def test_the_dense_solution_is_the_same(name):
     result = calibrate(found, LINEAR)
     known = result.error_map.valid
     field, u = (both[:, known] for both in dense(found, known))
-    assert np.stack([result.error_map.gx, result.error_map.gy])[:, known] == pytest.approx(
-        field, abs=1e-13
-    )
+    assert np.stack([result.error_map.gx, result.error_map.gy])[
+        :, known
+    ] == pytest.approx(field, abs=1e-13)
     lack = adequacy_of(fit_joint(found, LINEAR)).effect(result).xy[:, known]
-    assert np.stack([result.error_map.u_gx, result.error_map.u_gy])[:, known] == pytest.approx(
-        np.hypot(u * result.noise.sigma_xy, lack), rel=1e-5
-    )
+    assert np.stack([result.error_map.u_gx, result.error_map.u_gy])[
+        :, known
+    ] == pytest.approx(np.hypot(u * result.noise.sigma_xy, lack), rel=1e-5)
 
 
 def as_list(found: Measurements, artifact: Artifact) -> Measurements:
@@ -78,7 +82,9 @@ def as_list(found: Measurements, artifact: Artifact) -> Measurements:
     order = np.lexsort((artifact.y_m[:, 0].round(6), artifact.x_m[:, 0].round(6)))
     ids = artifact.m[order, 0].reshape(found.artifact.shape)
     views = tuple(
-        replace(view, m=ids[view.m + half[0], view.n + half[1]], n=np.zeros_like(view.n))
+        replace(
+            view, m=ids[view.m + half[0], view.n + half[1]], n=np.zeros_like(view.n)
+        )
         for view in found.views
     )
     return replace(found, artifact=artifact, views=views)
@@ -103,7 +109,9 @@ def test_a_lattice_as_a_list_gives_the_same_numbers():
     two = as_list(one, listed)
     a, b = calibrate(one), calibrate(two)
     for name in ("gx", "gy", "u_gx", "u_gy"):
-        assert getattr(b.error_map, name) == pytest.approx(getattr(a.error_map, name), abs=1e-15)
+        assert getattr(b.error_map, name) == pytest.approx(
+            getattr(a.error_map, name), abs=1e-15
+        )
     order = np.lexsort((listed.y_m[:, 0].round(6), listed.x_m[:, 0].round(6)))
     for name in ("ax", "ay", "u_ax", "u_ay"):
         assert getattr(b.artifact_map, name)[order, 0] == pytest.approx(
@@ -115,7 +123,9 @@ def test_a_lattice_as_a_list_gives_the_same_numbers():
         a.verdict.grade,
         [c.name for c in a.verdict.causes],
     )
-    assert b.artifact_map.magnification == pytest.approx(a.artifact_map.magnification, abs=1e-14)
+    assert b.artifact_map.magnification == pytest.approx(
+        a.artifact_map.magnification, abs=1e-14
+    )
 
 
 @pytest.mark.parametrize("name", PLATES)
@@ -147,7 +157,9 @@ def _plate_z(result, truth) -> np.ndarray:
     z = (artifact.x_m + 1j * artifact.y_m)[known]
     columns = np.stack([np.ones_like(z), z], axis=1)
     rest = rest - columns @ np.linalg.lstsq(columns, rest, rcond=None)[0]
-    return np.concatenate([rest.real / found.u_ax[known], rest.imag / found.u_ay[known]])
+    return np.concatenate(
+        [rest.real / found.u_ax[known], rest.imag / found.u_ay[known]]
+    )
 
 
 def test_a_result_keeps_its_marks():
@@ -200,7 +212,9 @@ def test_three_views_determine_a_lattice_of_even_sides(nodes, gain):
     )
     plan = Plan("even", artifact, views)
     assert check_plan(plan).observability.identifiable
-    assert predict_plan(plan, ThetaDatum.ZERO_MEAN).rms_xy == pytest.approx(gain, abs=1e-4)
+    assert predict_plan(plan, ThetaDatum.ZERO_MEAN).rms_xy == pytest.approx(
+        gain, abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("how", ["bilinear", "bicubic"])
@@ -216,11 +230,14 @@ def test_three_nodes_a_side_are_determined_as_the_dense_solution_says(how, poses
 
 
 @pytest.mark.parametrize(
-    "poses", [THREE[:1], ((0, (0, 0)), (90, (0, 0))), ((0, (0, 0)), (180, (0, 0)), (0, (1, 0)))]
+    "poses",
+    [THREE[:1], ((0, (0, 0)), (90, (0, 0))), ((0, (0, 0)), (180, (0, 0)), (0, (1, 0)))],
 )
 def test_three_nodes_a_side_are_not_determined_by_turns_or_shifts_alone(poses):
     artifact = lattice(4, nodes=3)
-    assert not check_plan(Plan("p", artifact, views_of(artifact, poses))).observability.identifiable
+    assert not check_plan(
+        Plan("p", artifact, views_of(artifact, poses))
+    ).observability.identifiable
 
 
 def test_a_plan_that_shows_too_little_is_refused():
@@ -229,7 +246,9 @@ def test_a_plan_that_shows_too_little_is_refused():
     with pytest.raises(NotIdentifiableError, match="do not identify"):
         calibrate(found, BARE)
     seen = check_plan(Plan("p", artifact, views_of(artifact, THREE[:1]))).observability
-    assert not seen.identifiable and any("mm along X" in text for text in in_words(seen.advice))
+    assert not seen.identifiable and any(
+        "mm along X" in text for text in in_words(seen.advice)
+    )
 
 
 def test_no_turn_makes_plans_of_a_list_equal():

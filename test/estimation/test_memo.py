@@ -19,7 +19,9 @@ def test_a_value_is_made_once_for_each_system_and_key():
     one, other = system_of("0,90"), system_of("0,tx")
 
     def ask(system, key):
-        return memo.get(system, key, lambda: made.append((system is one, key)) or len(made))
+        return memo.get(
+            system, key, lambda: made.append((system is one, key)) or len(made)
+        )
 
     asked = (one, "a"), (one, "a"), (one, "b"), (other, "a"), (one, "b")
     assert [ask(system, key) for system, key in asked] == [1, 1, 2, 3, 2]

@@ -41,7 +41,9 @@ def test_the_dense_solution_is_the_same():
     found, _ = readings(plate(7, 5), SIX, np.random.default_rng(2), linear=True)
     result = calibrate(found, LINEAR)
     field, u = dense(found)
-    assert np.stack([result.error_map.gx, result.error_map.gy]) == pytest.approx(field, abs=1e-15)
+    assert np.stack([result.error_map.gx, result.error_map.gy]) == pytest.approx(
+        field, abs=1e-15
+    )
     lack = adequacy_of(fit_joint(found, LINEAR)).effect(result).xy
     assert np.stack([result.error_map.u_gx, result.error_map.u_gy]) == pytest.approx(
         np.hypot(u * result.noise.sigma_xy, lack), rel=1e-6
@@ -95,7 +97,9 @@ def test_errors_lie_in_u(poses, how):
     assert 0.94 < inside / number < 0.985
 
 
-@pytest.mark.parametrize("poses", [((0, (0, 0)), (37, (0, 0))), ((0, (0, 0)), (180, (1.3, 0.4)))])
+@pytest.mark.parametrize(
+    "poses", [((0, (0, 0)), (37, (0, 0))), ((0, (0, 0)), (180, (1.3, 0.4)))]
+)
 def test_turns_alone_and_half_turns_are_refused(poses):
     found, _ = readings(plate(11, 7), poses, np.random.default_rng(5))
     with pytest.raises(NotIdentifiableError, match="do not identify"):
@@ -127,7 +131,9 @@ def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(
 ):
     """As a dense least squares has it, at nodes of the datum and at others; half of them do."""
     found, _ = readings(
-        plate(11, nodes), ((0, (0, 0)), (turn, (0, 0)), (0, shift)), np.random.default_rng(10)
+        plate(11, nodes),
+        ((0, (0, 0)), (turn, (0, 0)), (0, shift)),
+        np.random.default_rng(10),
     )
     half = (nodes - 1) / 2
     known = np.abs(np.indices((nodes, nodes)) - half).max(axis=0) < 0.7499 * half
@@ -140,10 +146,15 @@ def test_nodes_are_known_by_their_uncertainty_in_the_datum_of_the_known_ones(
 
 def test_a_map_whose_middle_is_not_read_is_known_around_it():
     """By the dense solution in their datum; u of the others is beyond the noise of 3 readings."""
-    found, _ = readings(plate(9, 7, "bilinear"), SIX, np.random.default_rng(1), linear=True)
+    found, _ = readings(
+        plate(9, 7, "bilinear"), SIX, np.random.default_rng(1), linear=True
+    )
     views = []
     for view in found.views:
-        at = view.view.pose.places(found.artifact, view.m, view.n) / found.artifact.grid_pitch_m
+        at = (
+            view.view.pose.places(found.artifact, view.m, view.n)
+            / found.artifact.grid_pitch_m
+        )
         outside = np.maximum(np.abs(at.real), np.abs(at.imag)) > 2.5
         views.append(subset(view, outside, np.zeros(0, dtype=bool)))
     found = replace(found, views=tuple(views))
@@ -168,17 +179,25 @@ def test_a_result_keeps_plate_and_map_apart():
     again = result_from_dict(data, "RESULT.json")
     assert again.plate == found.artifact and again.artifact == found.artifact.field
     assert again.plate.map_grid == MapGrid(7, 0.1 / 6, Interpolation.BICUBIC)
-    assert again.artifact_map.ax.shape == (11, 11) and again.error_map.gx.shape == (7, 7)
+    assert again.artifact_map.ax.shape == (11, 11) and again.error_map.gx.shape == (
+        7,
+        7,
+    )
 
 
 def waves(rng, length):
     """Return a stage error that varies over `length` pitches, 1 um: smooth, and no spline."""
-    k, at = rng.normal(size=(2, 150, 2)) / length / 10e-3, rng.uniform(0, 2 * np.pi, (2, 150))
+    k, at = (
+        rng.normal(size=(2, 150, 2)) / length / 10e-3,
+        rng.uniform(0, 2 * np.pi, (2, 150)),
+    )
 
     def stage(z):
         x, y = (
             np.cos(
-                np.multiply.outer(z.real, along) + np.multiply.outer(z.imag, across) + start
+                np.multiply.outer(z.real, along)
+                + np.multiply.outer(z.imag, across)
+                + start
             ).sum(axis=-1)
             for (along, across), start in zip(k.swapaxes(1, 2), at, strict=True)
         )
@@ -193,12 +212,17 @@ def test_a_map_that_does_not_suffice_is_contradicted_and_covers(length, rough):
     inside, contradicted = [], 0
     for seed in range(5):
         rng = np.random.default_rng([seed, length])
-        found, truth = readings(plate(11, 7), SIX, rng, sigma=0.1e-6, stage=waves(rng, length))
+        found, truth = readings(
+            plate(11, 7), SIX, rng, sigma=0.1e-6, stage=waves(rng, length)
+        )
         result = trusted(found, BARE)
         u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
         error = error_in_datum(result.error_map, truth)
         inside.append(np.mean(np.abs(error) < result.noise.k_xy * u))
-        assert "effect roughness" in [line.component for line in result.budget] or not rough
+        assert (
+            "effect roughness" in [line.component for line in result.budget]
+            or not rough
+        )
         named = "roughness" in [cause.name for cause in result.verdict.causes]
         assert result.verdict.grade == ("enlarged" if named else "good")
         contradicted += named
@@ -218,7 +242,9 @@ def test_a_bilinear_map_of_a_curved_stage_is_rough_and_not_a_bent_plate(bent):
         if bent:
             views = [
                 replace(
-                    v, dy=v.dy + (v.view.name == found.views[1].view.name) * 2e-6 * (v.m / 4) ** 2
+                    v,
+                    dy=v.dy
+                    + (v.view.name == found.views[1].view.name) * 2e-6 * (v.m / 4) ** 2,
                 )
                 for v in found.views
             ]
@@ -243,7 +269,12 @@ def test_terms_do_not_size_the_lack_of_fit_of_a_map_that_suffices():
             "views": [
                 {"name": "a", "repeats": 2},
                 {"name": "b", "rotation_deg": 90, "repeats": 2},
-                {"name": "c", "rotation_deg": 37, "translation_mm": [6, -4], "repeats": 2},
+                {
+                    "name": "c",
+                    "rotation_deg": 37,
+                    "translation_mm": [6, -4],
+                    "repeats": 2,
+                },
             ],
         },
         "",
@@ -252,7 +283,9 @@ def test_terms_do_not_size_the_lack_of_fit_of_a_map_that_suffices():
     for seed in range(6):
         rng = np.random.default_rng(seed)
         truth = random_truth(plan.artifact, 3, rng, spread)
-        result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=10e-9, visits=True))
+        result = calibrate(
+            simulate_measurements(truth, plan, rng, sigma_m=10e-9, visits=True)
+        )
         assert 5e-9 < np.nanmean(result.error_map.u_gx) < 11e-9
 
 
@@ -304,7 +337,9 @@ def test_readings_are_turned_back_into_the_stage_frame(turn):
     step = np.zeros(len(views[2].m))
     step[40] = 1e-6
     moved = [*views[:2], replace(views[2], dx=views[2].dx + step), *views[3:]]
-    before, after = (prepare(replace(found, views=tuple(each)), BARE)[0] for each in (views, moved))
+    before, after = (
+        prepare(replace(found, views=tuple(each)), BARE)[0] for each in (views, moved)
+    )
     change = (after.grid.y - before.grid.y)[2] * before.to_stage[2]
     at = views[2].m[40] + 5, views[2].n[40] + 5
     assert before.turn_rad == pytest.approx(turn, abs=0.01)
@@ -329,7 +364,9 @@ def test_readings_too_few_for_a_finer_map_do_not_test_the_nodes(poses, said):
     """A finer map of 15 x 15 nodes has 450 unknowns, and three views 460 equations for it."""
     measurements, _ = readings(plate(11, 9), poses, np.random.default_rng(5))
     result = calibrate(measurements, Options())
-    assert ("roughness_untested" in [finding.name for finding in result.findings]) is said
+    assert (
+        "roughness_untested" in [finding.name for finding in result.findings]
+    ) is said
     assert (adequacy_of(fit_joint(measurements, Options())) is None) is said
 
 

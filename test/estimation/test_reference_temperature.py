@@ -11,13 +11,21 @@ from selfcal_ros.model.reference import ReferenceLength
 
 @pytest.mark.parametrize(
     ("kind", "expected"),
-    [("artifact", 1e-6 + 3 * 8e-6), ("stage_x", 1e-6 - 3 * 8e-6), ("stage_y", 1e-6 - 3 * 8e-6)],
+    [
+        ("artifact", 1e-6 + 3 * 8e-6),
+        ("stage_x", 1e-6 - 3 * 8e-6),
+        ("stage_y", 1e-6 - 3 * 8e-6),
+    ],
 )
 def test_a_warm_plate_is_longer_and_a_warm_scale_indicates_less(kind, expected):
     """8 ppm/K and 3 K: on a glass scale that grew by 24 ppm a true metre is 24 µm fewer."""
-    found = ReferenceLength(kind, 1e-6, 3e-7, "PTB 1").at_temperature("23:0.1:8e-6:1e-7")
+    found = ReferenceLength(kind, 1e-6, 3e-7, "PTB 1").at_temperature(
+        "23:0.1:8e-6:1e-7"
+    )
     assert found.relative_error == pytest.approx(expected)
-    assert found.u_relative == pytest.approx((3e-7**2 + (8e-6 * 0.1) ** 2 + (3 * 1e-7) ** 2) ** 0.5)
+    assert found.u_relative == pytest.approx(
+        (3e-7**2 + (8e-6 * 0.1) ** 2 + (3 * 1e-7) ** 2) ** 0.5
+    )
     assert found.certificate == "PTB 1"
     assert vars(found.certified) == {
         "relative_error": 1e-6,
@@ -63,7 +71,9 @@ def test_glass_ceramics_and_carbon_fibre_may_shrink(per_k):
     assert found.relative_error == pytest.approx(float(per_k))
 
 
-@pytest.mark.parametrize("text", ["296:0.02:8e-6:0", "20:0.02:8e-6:0:293.15", "-51:0:0:0"])
+@pytest.mark.parametrize(
+    "text", ["296:0.02:8e-6:0", "20:0.02:8e-6:0:293.15", "-51:0:0:0"]
+)
 def test_a_temperature_in_kelvin_is_refused(text):
     with pytest.raises(InputError, match=r"-50 to 100 degC: is it in K\?"):
         ReferenceLength("artifact", 0.0).at_temperature(text)

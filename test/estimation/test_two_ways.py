@@ -66,7 +66,9 @@ def require_same(found, wanted, *, unit=1.0):
         ("artifact", "artifact", 0.1),
     ],
 )
-def test_order_turn_mirror_and_unit_change_nothing_but_the_frame(name, kind, turned_kind, missing):
+def test_order_turn_mirror_and_unit_change_nothing_but_the_frame(
+    name, kind, turned_kind, missing
+):
     _, readings = measured(CASES[name], missing=missing)
     options, of_turned = (
         bare(reference=ReferenceLength(of, 3e-6, 1e-7) if of else None)
@@ -80,19 +82,27 @@ def test_order_turn_mirror_and_unit_change_nothing_but_the_frame(name, kind, tur
     require_same(mirrored_back(solve_joint(mirrored(readings), options).result), wanted)
     for unit in (50.0, 0.001):
         require_same(
-            maps_of(solve_joint(scaled(readings, unit), options).result), wanted, unit=unit
+            maps_of(solve_joint(scaled(readings, unit), options).result),
+            wanted,
+            unit=unit,
         )
 
 
 @pytest.mark.parametrize("sense", Sense)
 def test_the_angular_datum_decides_nothing_about_outliers(sense):
     """The stage does not satisfy the axis conditions: no fault of any single reading."""
-    _, readings = measured(hu_plan(Artifact(7, 0.01, 24)), sigma_theta_rad=2e-6, sense=sense)
+    _, readings = measured(
+        hu_plan(Artifact(7, 0.01, 24)), sigma_theta_rad=2e-6, sense=sense
+    )
     views = [
         replace(
             view,
             dtheta=view.dtheta
-            + 2e-4 * (((view.k + view.view.lattice_pose(readings.artifact).turn_lines) % 24) == 0),
+            + 2e-4
+            * (
+                ((view.k + view.view.lattice_pose(readings.artifact).turn_lines) % 24)
+                == 0
+            ),
         )
         for view in readings.views
     ]
@@ -141,8 +151,14 @@ def test_validation_predicts_by_the_model_that_was_fitted(sense, few_draws):
 def test_validation_does_not_depend_on_the_order_of_readings(few_draws):
     _, readings = measured(CASES["square"])
     wanted = validate(readings, BARE, folds=2)
-    for one, two in zip(validate(permuted(readings), BARE, folds=2), wanted, strict=True):
-        assert (one.n_grid, one.n_angular, one.why) == (two.n_grid, two.n_angular, two.why)
+    for one, two in zip(
+        validate(permuted(readings), BARE, folds=2), wanted, strict=True
+    ):
+        assert (one.n_grid, one.n_angular, one.why) == (
+            two.n_grid,
+            two.n_angular,
+            two.why,
+        )
         assert one.rms_m == pytest.approx(two.rms_m, nan_ok=True)
         assert one.rms_rad == pytest.approx(two.rms_rad, nan_ok=True)
 
@@ -168,13 +184,19 @@ def test_views_with_too_few_readings_to_tell_are_not_called_noisy():
 )
 def test_one_kind_of_readings_may_be_exact(sigma_m, sigma_rad, limit_m):
     """Twenty orders of magnitude between the weights shall not lose what the lighter one tells."""
-    truth, readings = measured(CASES["square"], sigma_m=sigma_m, sigma_theta_rad=sigma_rad)
+    truth, readings = measured(
+        CASES["square"], sigma_m=sigma_m, sigma_theta_rad=sigma_rad
+    )
     for solve in (calibrate, robust_calibrate):
         emap = solve(readings).error_map
-        error = np.sqrt(np.mean(np.square([emap.gx - truth.g[0], emap.gy - truth.g[1]])))
+        error = np.sqrt(
+            np.mean(np.square([emap.gx - truth.g[0], emap.gy - truth.g[1]]))
+        )
         assert error < limit_m
         left = emap.g_theta - truth.g_theta
-        assert np.sqrt(np.mean((left - left.mean()) ** 2)) < 3 * max(sigma_rad, sigma_m * 50, 1e-15)
+        assert np.sqrt(np.mean((left - left.mean()) ** 2)) < 3 * max(
+            sigma_rad, sigma_m * 50, 1e-15
+        )
 
 
 def test_a_view_that_was_never_read_is_missed_by_name():
@@ -182,7 +204,8 @@ def test_a_view_that_was_never_read_is_missed_by_name():
     _, readings = measured(CASES["square"])
     gone = {1, 4}  # both views turned by a quarter
     views = tuple(
-        ViewReadings(view.view) if i in gone else view for i, view in enumerate(readings.views)
+        ViewReadings(view.view) if i in gone else view
+        for i, view in enumerate(readings.views)
     )
     with refused("add a view turned by 90 deg"):
         calibrate(replace(readings, views=views), BARE)
@@ -190,7 +213,9 @@ def test_a_view_that_was_never_read_is_missed_by_name():
 
 def test_readings_of_zero_alone_take_a_reference():
     still = Spread(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    _, readings = measured(CASES["square"], sigma_m=0.0, sigma_theta_rad=0.0, spread=still)
+    _, readings = measured(
+        CASES["square"], sigma_m=0.0, sigma_theta_rad=0.0, spread=still
+    )
     options = bare(reference=ReferenceLength("stage_x", 1e-6, 1e-6))
     emap = calibrate(readings, options).error_map
     assert np.allclose(emap.gx, 1e-6 * emap.artifact.x_m, rtol=1e-9, atol=0)
@@ -217,7 +242,9 @@ FOUR = plan_of("0,90,tx", Artifact(5, 0.01, 4), lines=1)
 
 
 def numbers_of(result):
-    return np.concatenate([maps_of(result)[key].ravel() for key in ("gx", "gy", "g_theta")])
+    return np.concatenate(
+        [maps_of(result)[key].ravel() for key in ("gx", "gy", "g_theta")]
+    )
 
 
 @pytest.mark.parametrize(
@@ -228,7 +255,9 @@ def numbers_of(result):
         (FOUR, Sense.PLATE_MOVES, 0.0, LINEAR),
     ],
 )
-def test_uncertainties_are_those_of_every_reading_moved_in_turn(plan, sense, missing, options):
+def test_uncertainties_are_those_of_every_reading_moved_in_turn(
+    plan, sense, missing, options
+):
     _, readings = measured(
         plan,
         sense=sense,
@@ -241,7 +270,13 @@ def test_uncertainties_are_those_of_every_reading_moved_in_turn(plan, sense, mis
     readings = replace(
         readings,
         views=tuple(
-            replace(view, sigma_xy=SIGMA_M, dof_xy=1000, sigma_theta=SIGMA_RAD, dof_theta=1000)
+            replace(
+                view,
+                sigma_xy=SIGMA_M,
+                dof_xy=1000,
+                sigma_theta=SIGMA_RAD,
+                dof_theta=1000,
+            )
             for view in readings.views
         ),
     )
@@ -255,14 +290,18 @@ def test_uncertainties_are_those_of_every_reading_moved_in_turn(plan, sense, mis
     u = np.concatenate([found["u_" + key].ravel() for key in ("gx", "gy", "g_theta")])
     known = np.isfinite(u)
     assert known.sum() > 0.8 * len(u)
-    np.testing.assert_allclose(u[known], np.sqrt((answers[:, known] ** 2).sum(axis=0)), rtol=1e-6)
+    np.testing.assert_allclose(
+        u[known], np.sqrt((answers[:, known] ** 2).sum(axis=0)), rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
     ("plan", "sense", "missing"),
     [(SHIFTS, Sense.PLATE_MOVES, 0.2), (CASES["square"], Sense.MICROSCOPE_MOVES, 0.0)],
 )
-def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(plan, sense, missing):
+def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(
+    plan, sense, missing
+):
     """Finite rotations of a plate that errs by 20 um, noise told by the residuals alone."""
     rng = np.random.default_rng(11)
     truth, clean = measured(
@@ -278,7 +317,9 @@ def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(plan, s
     options = bare(causes=False)
     wanted, squares = maps_of(calibrate(clean, options)), {"xy": [], "theta": []}
     for _ in range(30):
-        draw = rng.normal(size=len(values_of(clean))) * sizes_of(clean, SIGMA_M, SIGMA_RAD)
+        draw = rng.normal(size=len(values_of(clean))) * sizes_of(
+            clean, SIGMA_M, SIGMA_RAD
+        )
         moved = with_values(clean, values_of(clean) + draw)
         found = maps_of(solve_joint(moved, options).result)
         for key, kind in (("gx", "xy"), ("gy", "xy"), ("g_theta", "theta")):
@@ -294,12 +335,18 @@ def test_uncertainties_are_the_scatter_of_recalibrations_of_rough_plates(plan, s
 def test_finite_rotations_settle_in_any_unit(factor):
     _, readings = measured(CASES["square"], spread=ROUGH)
     wanted, found = calibrate(readings, BARE), calibrate(scaled(readings, factor), BARE)
-    assert np.allclose(found.error_map.gx / factor, wanted.error_map.gx, rtol=0, atol=1e-14)
-    assert [v.phi for v in found.views] == pytest.approx([v.phi for v in wanted.views], abs=2e-13)
+    assert np.allclose(
+        found.error_map.gx / factor, wanted.error_map.gx, rtol=0, atol=1e-14
+    )
+    assert [v.phi for v in found.views] == pytest.approx(
+        [v.phi for v in wanted.views], abs=2e-13
+    )
 
 
 def test_a_plate_laid_exactly_has_settled():
     straight = Spread(phi_rad=0.0, t_m=0.0)
-    truth, readings = measured(CASES["square"], spread=straight, sigma_m=0.0, sigma_theta_rad=0.0)
+    truth, readings = measured(
+        CASES["square"], spread=straight, sigma_m=0.0, sigma_theta_rad=0.0
+    )
     found = calibrate(readings, BARE)
     assert np.abs(found.error_map.gx - truth.g[0]).max() < 1e-15

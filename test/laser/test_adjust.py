@@ -19,7 +19,9 @@ def measurement(steps):
         name: SetUp(mirror_rad=(2e-3 * (k + 1), -1e-3 * k))
         for k, name in enumerate(DIAGONALS[len(steps)])
     }
-    return simulate_step_diagonal(machine, Measurement(setups), np.random.default_rng(2))
+    return simulate_step_diagonal(
+        machine, Measurement(setups), np.random.default_rng(2)
+    )
 
 
 @pytest.mark.parametrize("steps", [(0.01, 0.006), (0.01, 0.008, 0.006)])
@@ -28,10 +30,14 @@ def test_model_derivatives_are_those_of_the_model(steps):
     geometry, found = Geometry(data), adjust(data)
     by_errors, by_tilt = geometry.derivatives(found.errors_m, found.tilt)
     np.testing.assert_allclose(
-        by_errors, jacobian(lambda e: geometry.readings(e, found.tilt), found.errors_m), atol=1e-8
+        by_errors,
+        jacobian(lambda e: geometry.readings(e, found.tilt), found.errors_m),
+        atol=1e-8,
     )
     np.testing.assert_allclose(
-        by_tilt, jacobian(lambda t: geometry.readings(found.errors_m, t), found.tilt), atol=1e-10
+        by_tilt,
+        jacobian(lambda t: geometry.readings(found.errors_m, t), found.tilt),
+        atol=1e-10,
     )
 
 

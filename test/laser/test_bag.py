@@ -17,7 +17,8 @@ SHORT = Recording(
 
 
 @pytest.mark.parametrize(
-    "laser", ["std_msgs/msg/Float64", "sensor_msgs/msg/Range", "sensor_msgs/msg/JointState"]
+    "laser",
+    ["std_msgs/msg/Float64", "sensor_msgs/msg/Range", "sensor_msgs/msg/JointState"],
 )
 @pytest.mark.parametrize(
     "position",
@@ -28,7 +29,9 @@ SHORT = Recording(
     ],
 )
 @pytest.mark.parametrize("backwards", [False, True])
-def test_types_and_order_of_messages_make_no_difference(tmp_path, laser, position, backwards):
+def test_types_and_order_of_messages_make_no_difference(
+    tmp_path, laser, position, backwards
+):
     bag = write_laser_bag(
         tmp_path / "b", SHORT, laser=laser, position=position, backwards=backwards
     )
@@ -111,7 +114,10 @@ def test_a_missing_bag_is_named(tmp_path):
 
 def test_a_time_of_logging_beyond_all_clocks_is_named(tmp_path):
     late = Recording(
-        SHORT.laser_ns + (2**63 - EPOCH_NS), SHORT.laser_m, SHORT.position_ns, SHORT.position_m
+        SHORT.laser_ns + (2**63 - EPOCH_NS),
+        SHORT.laser_m,
+        SHORT.position_ns,
+        SHORT.position_m,
     )
     bag = write_laser_bag(tmp_path / "b", late, laser="std_msgs/msg/Float64")
     with pytest.raises(InputError, match=r"laser: \d+ ns is not a log time; record"):

@@ -27,7 +27,9 @@ def test_bars_are_as_long_as_u_with_the_k_of_the_repeats():
     bars = [
         item.lines
         for item in drawing.items
-        if isinstance(item, Line) and item.stroke == "c0" and len(item.lines) == found.n_blocks + 1
+        if isinstance(item, Line)
+        and item.stroke == "c0"
+        and len(item.lines) == found.n_blocks + 1
     ]
     assert len(dots) == len(bars) == 4
     profile, u = profile_m(found, 0, 1), u_profile_m(found, 0, 1)
@@ -36,6 +38,8 @@ def test_bars_are_as_long_as_u_with_the_k_of_the_repeats():
     assert gain > 0 and up == pytest.approx(profile * gain, abs=1e-6)
     dof = min(reading_noise(data).dof, linear_noise(data).dof)
     k = t.ppf(0.5 + 0.9545 / 2, dof)
-    assert [low[1] - high[1] for low, high in bars[1]] == pytest.approx(2 * k * u * gain, rel=1e-3)
+    assert [low[1] - high[1] for low, high in bars[1]] == pytest.approx(
+        2 * k * u * gain, rel=1e-3
+    )
     title = next(item.text for item in drawing.items if isinstance(item, Label))
     assert title == f"Step diagonal, new formulation; bars: U, k = {k:.3g}"

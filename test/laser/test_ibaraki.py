@@ -32,7 +32,9 @@ angles = st.floats(-2e-3, 2e-3)
     st.integers(1, 8),
     st.tuples(angles, angles),
 )
-def test_exact_form_recovers_the_truth_for_any_steps_and_mirrors(seed, a, b, n, mirrors):
+def test_exact_form_recovers_the_truth_for_any_steps_and_mirrors(
+    seed, a, b, n, mirrors
+):
     errors = random_errors(n, np.random.default_rng(seed))
     found = identify_ibaraki(planar((a, b), errors, mirror_rad=mirrors))
     np.testing.assert_allclose(found.errors_m, errors, atol=1e-14)
@@ -58,7 +60,9 @@ def test_unequal_misalignment_errs_by_the_cosine_that_the_docs_state():
     data = planar((0.01, 0.01), errors, laser_rad=lasers, mirror_rad=mirrors)
     shrink = -(lasers**2) / 2 - lasers * mirrors
     expected = errors[1, :, 0] + 0.01 * (shrink[0] - shrink[1])
-    np.testing.assert_allclose(identify_ibaraki(data).errors_m[1, :, 0], expected, atol=0.01 * NM)
+    np.testing.assert_allclose(
+        identify_ibaraki(data).errors_m[1, :, 0], expected, atol=0.01 * NM
+    )
 
 
 @pytest.mark.parametrize("diagonal", ["pp", "np"])
@@ -79,7 +83,9 @@ def test_eq_5_as_printed_errs_by_the_linear_errors_that_it_leaves_out():
     # Without variation of Ex(x) and of the half diagonal the printed form is right.
     same = random_errors(1, np.random.default_rng(25)).repeat(6, axis=1)
     data = planar((0.01, 0.01), same, mirror_rad=(1e-3, 1e-3))
-    assert np.abs(identify_ibaraki(data, form=Form.PRINTED).errors_m - same).max() < 1 * NM
+    assert (
+        np.abs(identify_ibaraki(data, form=Form.PRINTED).errors_m - same).max() < 1 * NM
+    )
 
 
 def test_the_closure_between_diagonals_is_zero_for_one_machine_and_the_difference_for_two():
@@ -89,9 +95,13 @@ def test_the_closure_between_diagonals_is_zero_for_one_machine_and_the_differenc
     assert np.abs(identify_ibaraki(data).closure.between_m).max() < 1e-5 * NM
     samples = data.samples_m.copy()
     samples[:, 1, 1] += 10 * NM  # every Y reading of np too long
-    other = identify_ibaraki(StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m))
+    other = identify_ibaraki(
+        StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m)
+    )
     # np alone: Ex(y) shrinks by sqrt(2) 10 nm, so pp - np grows by as much.
-    np.testing.assert_allclose(other.closure.between_m[1, :, 0], np.sqrt(2) * 10 * NM, rtol=1e-3)
+    np.testing.assert_allclose(
+        other.closure.between_m[1, :, 0], np.sqrt(2) * 10 * NM, rtol=1e-3
+    )
     np.testing.assert_allclose(
         other.errors_m[1, :, 0] - errors[1, :, 0], -10 * NM / np.sqrt(2), rtol=1e-3
     )
@@ -119,7 +129,10 @@ def test_body_diagonals_recover_all_transverse_errors_within_1_nm(steps, n):
         [setups[name].mirror_rad for name in DIAGONALS[3]],
         atol=3e-6,
     )
-    same = {name: SetUp(laser_rad=(1e-3, 1e-3), mirror_rad=(1e-3, 1e-3)) for name in DIAGONALS[3]}
+    same = {
+        name: SetUp(laser_rad=(1e-3, 1e-3), mirror_rad=(1e-3, 1e-3))
+        for name in DIAGONALS[3]
+    }
     data = simulate_step_diagonal(machine, Measurement(same), rng)
     assert np.abs(identify_ibaraki(data).errors_m - machine.errors_m).max() < 0.1 * NM
 
@@ -127,7 +140,9 @@ def test_body_diagonals_recover_all_transverse_errors_within_1_nm(steps, n):
 def test_two_body_diagonals_are_not_enough():
     machine = random_machine((0.01, 0.01, 0.01), 3, np.random.default_rng(32))
     data = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0))
-    with pytest.raises(NotIdentifiableError, match="ppp, npp: they do not determine the errors"):
+    with pytest.raises(
+        NotIdentifiableError, match="ppp, npp: they do not determine the errors"
+    ):
         identify_ibaraki(data.pick(["ppp", "npp"]))
 
 
@@ -198,7 +213,9 @@ def test_standard_uncertainties_are_the_scatter_of_measurements():
         LaserNoise(reading_m=10 * NM, repeats=400),
     ):
         found = identify_ibaraki(
-            simulate_step_diagonal(machine, Measurement({}, noise), np.random.default_rng(1))
+            simulate_step_diagonal(
+                machine, Measurement({}, noise), np.random.default_rng(1)
+            )
         )
         closure = found.closure
         # a standard deviation from 400 runs of 24 readings scatters by 0.7 %
@@ -217,7 +234,9 @@ def test_standard_uncertainties_are_the_scatter_of_measurements():
 def test_joint_use_of_both_diagonals_halves_the_variance():
     machine = case_study_machine()
     noise = LaserNoise(reading_m=10 * NM, repeats=200)
-    data = simulate_step_diagonal(machine, Measurement({}, noise), np.random.default_rng(5))
+    data = simulate_step_diagonal(
+        machine, Measurement({}, noise), np.random.default_rng(5)
+    )
     both = squareness(identify_ibaraki(data)).u
     one = squareness(identify_ibaraki(data.pick(["pp"]))).u
     assert one / both == pytest.approx(np.sqrt(2), rel=0.05)
@@ -229,7 +248,9 @@ def test_a_diagonal_with_more_repeats_counts_for_more():
     samples = data.samples_m.repeat(9, axis=0)
     samples[1:, 1] = np.nan  # pp nine times, np once
     samples[0, 1, 1] += 10 * NM
-    found = identify_ibaraki(StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m))
+    found = identify_ibaraki(
+        StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m)
+    )
     np.testing.assert_allclose(
         found.errors_m[1, :, 0] - errors[1, :, 0], -np.sqrt(2) * 10 * NM / 10, rtol=0.01
     )
@@ -237,15 +258,21 @@ def test_a_diagonal_with_more_repeats_counts_for_more():
 
 def test_missing_linear_errors_are_named():
     data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(1)))
-    with pytest.raises(InputError, match="linear errors: the new formulation needs them; measure"):
+    with pytest.raises(
+        InputError, match="linear errors: the new formulation needs them; measure"
+    ):
         identify_ibaraki(StepDiagonal(data.steps_m, data.diagonals, data.samples_m))
 
 
 def test_linear_errors_in_micrometres_are_found_out_by_the_diagonals():
     errors = random_errors(3, np.random.default_rng(1), sigma_m=2e-7)
     data = planar((0.01, 0.01), errors)
-    wrong = StepDiagonal(data.steps_m, data.diagonals, data.samples_m, data.linear_m * 1000)
-    with pytest.raises(InputError, match="the linear errors look like micrometres; give ex_x"):
+    wrong = StepDiagonal(
+        data.steps_m, data.diagonals, data.samples_m, data.linear_m * 1000
+    )
+    with pytest.raises(
+        InputError, match="the linear errors look like micrometres; give ex_x"
+    ):
         identify_ibaraki(wrong)
 
 
@@ -263,17 +290,23 @@ def test_linear_errors_count_as_micrometres_where_a_tenth_of_the_misfit_is_left(
     """
     d = (1 - misfit) / (1 / 1.00001 - misfit / 1.01)
     steps = np.array([0.03, 0.04])
-    readings = np.repeat((steps**2 / 0.05)[:, None], 3, axis=1)  # along the diagonal, in X and Y
+    # along the diagonal, in X and Y
+    readings = np.repeat((steps**2 / 0.05)[:, None], 3, axis=1)
     readings[:, 1] *= d
     linear = np.zeros((2, 3))
     linear[:, 1] = 0.01 * steps
-    data = StepDiagonal(tuple(steps), DIAGONALS[2], np.stack([readings] * 2)[None], linear[None])
+    data = StepDiagonal(
+        tuple(steps), DIAGONALS[2], np.stack([readings] * 2)[None], linear[None]
+    )
     with pytest.raises(InputError) as raised:
         check_lengths(data)
-    expected = f"block 2: diagonals and linear errors disagree by {(d / 1.01 - 1) * 50:.4g} mm" + (
-        "; the linear errors look like micrometres; give ex_x, ey_y in mm"
-        if micrometres
-        else "; check the steps, the units, and that both are of one machine"
+    expected = (
+        f"block 2: diagonals and linear errors disagree by {(d / 1.01 - 1) * 50:.4g} mm"
+        + (
+            "; the linear errors look like micrometres; give ex_x, ey_y in mm"
+            if micrometres
+            else "; check the steps, the units, and that both are of one machine"
+        )
     )
     assert str(raised.value) == expected
 
@@ -281,7 +314,9 @@ def test_linear_errors_count_as_micrometres_where_a_tenth_of_the_misfit_is_left(
 def test_paper_forms_are_planar():
     machine = random_machine((0.01, 0.01, 0.01), 3, np.random.default_rng(32))
     data = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0))
-    with pytest.raises(InputError, match="in 2D only; use the exact form for body diagonals"):
+    with pytest.raises(
+        InputError, match="in 2D only; use the exact form for body diagonals"
+    ):
         identify_ibaraki(data, form=Form.PRINTED)
 
 

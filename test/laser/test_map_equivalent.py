@@ -50,7 +50,9 @@ def test_a_corrected_machine_is_straight_square_and_true(frame):
     place = np.arange(7) * 0.01
     x, y = (grid.ravel() for grid in np.meshgrid(place, place, indexing="ij"))
     # E = Px(x) + Px(y), Py(x) + Py(y): what the steps of the machine add up to.
-    sums = np.concatenate([np.zeros((2, 1, 2)), np.cumsum(machine.errors_m, axis=1)], axis=1)
+    sums = np.concatenate(
+        [np.zeros((2, 1, 2)), np.cumsum(machine.errors_m, axis=1)], axis=1
+    )
     error = (sums[0][:, None] + sums[1][None]).reshape(-1, 2)
     px, py = frame.to_machine(x, y)
     add = tables.corrections({frame.x_axis: px, frame.y_axis: py})
@@ -73,7 +75,9 @@ def test_a_corrected_machine_is_straight_square_and_true(frame):
 
 
 def test_the_correction_of_y_along_x_has_no_slope():
-    line = axis_corrections(identify_ibaraki(measured(case_study_machine())))[("x", "y")]
+    line = axis_corrections(identify_ibaraki(measured(case_study_machine())))[
+        ("x", "y")
+    ]
     assert np.polyfit(*line, 1)[0] == pytest.approx(0, abs=1e-15)
 
 
@@ -96,22 +100,34 @@ def test_o_and_r_are_those_of_an_error_map_of_the_same_machine():
     assert equivalent.nonorthogonality == pytest.approx(o, rel=1e-9)
     assert equivalent.scale_difference == pytest.approx(r, rel=1e-9)
     assert squareness_rad(found) == pytest.approx(-2 * o, rel=1e-9)
-    assert equivalent.u_nonorthogonality is None and equivalent.u_scale_difference is None
+    assert (
+        equivalent.u_nonorthogonality is None and equivalent.u_scale_difference is None
+    )
 
 
 def test_uncertainties_follow():
-    found = identify_ibaraki(measured(case_study_machine(), LaserNoise(1e-8, 0, 1e-8, 3)))
+    found = identify_ibaraki(
+        measured(case_study_machine(), LaserNoise(1e-8, 0, 1e-8, 3))
+    )
     equivalent = map_equivalent(found)
-    assert equivalent.u_nonorthogonality == pytest.approx(squareness(found).u / 0.06 / 2)
+    assert equivalent.u_nonorthogonality == pytest.approx(
+        squareness(found).u / 0.06 / 2
+    )
     expected = np.hypot(*(u_slope(found, axis, axis) for axis in (0, 1))) / 2
     assert equivalent.u_scale_difference == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("steps_m", [(0.01, 0.016), (0.016, 0.01)])
 def test_the_uncertainty_of_o_is_the_spread_of_measurements_with_unequal_steps(steps_m):
-    machine, noise = StepMachine(steps_m, np.zeros((2, 4, 2))), LaserNoise(1e-8, 0, 1e-8, 400)
+    machine, noise = (
+        StepMachine(steps_m, np.zeros((2, 4, 2))),
+        LaserNoise(1e-8, 0, 1e-8, 400),
+    )
     spread = scatter_of(
-        machine, lambda data: np.array([map_equivalent(identify_ibaraki(data)).nonorthogonality])
+        machine,
+        lambda data: np.array(
+            [map_equivalent(identify_ibaraki(data)).nonorthogonality]
+        ),
     )(noise)
     found = map_equivalent(identify_ibaraki(measured(machine, noise)))
     assert found.u_nonorthogonality == pytest.approx(spread[0], rel=0.05)

@@ -29,8 +29,12 @@ def simulated(noise, seed=3):
 
 
 def test_time_order_of_np_starts_with_the_last_block_of_x():
-    np.testing.assert_array_equal(time_order(np.array([1.0, 1.0]), 3), [0, 3, 1, 4, 2, 5])
-    np.testing.assert_array_equal(time_order(np.array([-1.0, 1.0]), 3), [2, 3, 1, 4, 0, 5])
+    np.testing.assert_array_equal(
+        time_order(np.array([1.0, 1.0]), 3), [0, 3, 1, 4, 2, 5]
+    )
+    np.testing.assert_array_equal(
+        time_order(np.array([-1.0, 1.0]), 3), [2, 3, 1, 4, 0, 5]
+    )
 
 
 def test_noise_of_distances_shows_as_a_correlation_of_minus_one_half():
@@ -74,10 +78,14 @@ def test_diagonals_with_fewer_complete_runs_keep_their_correlation():
     assert noise.dof == 39 * 12 + 24 * 12
     # The sum of a run is the difference of two distances, however many steps it has.
     sums = [
-        np.ones(12) @ reading_covariance(fewer, noise)[k : k + 12, k : k + 12] @ np.ones(12)
+        np.ones(12)
+        @ reading_covariance(fewer, noise)[k : k + 12, k : k + 12]
+        @ np.ones(12)
         for k in (0, 12)
     ]
-    np.testing.assert_allclose(sums, [2 * (10 * NM) ** 2 / 40, 2 * (10 * NM) ** 2 / 25], rtol=0.2)
+    np.testing.assert_allclose(
+        sums, [2 * (10 * NM) ** 2 / 40, 2 * (10 * NM) ** 2 / 25], rtol=0.2
+    )
 
 
 def test_rows_that_only_others_have_filled_change_nothing():

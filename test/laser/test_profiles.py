@@ -23,7 +23,9 @@ from test.support.laser import random_errors
 
 
 def identified(steps, errors, covariance=None):
-    return StepDiagonalResult(tuple(steps), errors, covariance, "new", "exact", {}, Closure())
+    return StepDiagonalResult(
+        tuple(steps), errors, covariance, "new", "exact", {}, Closure()
+    )
 
 
 def test_profiles_start_at_zero_and_end_at_the_sum():
@@ -55,7 +57,9 @@ def test_the_case_study_machine_has_the_published_errors():
     assert squareness(found).value == pytest.approx(-1.22e-6, rel=1e-12)
     assert straightness(found, 0, 1).value == pytest.approx(0.05e-6, rel=1e-9)
     assert straightness(found, 1, 0).value == pytest.approx(0.11e-6, rel=1e-9)
-    np.testing.assert_allclose([profile_m(found, j, j)[-1] for j in (0, 1)], [1.14e-6, 0.69e-6])
+    np.testing.assert_allclose(
+        [profile_m(found, j, j)[-1] for j in (0, 1)], [1.14e-6, 0.69e-6]
+    )
     assert machine.errors_m[0, 0, 1] == 0.0
     np.testing.assert_allclose(machine.truth_m(), machine.errors_m, atol=1e-18)
 
@@ -68,16 +72,28 @@ def test_squareness_is_positive_where_the_axes_enclose_less_than_90_deg(line):
     assert squareness(found, line=line).value == pytest.approx(4e-7)
     assert squareness_rad(found, line=line) == pytest.approx(1e-7 / 0.005)
     errors = np.zeros((2, 4, 2))
-    errors[0, :, 1] = 1e-7  # X leans towards +Y: 1e-7/0.01 rad over the Y range of 20 mm
-    assert squareness(identified((0.01, 0.005), errors), line=line).value == pytest.approx(2e-7)
+    errors[0, :, 1] = (
+        1e-7  # X leans towards +Y: 1e-7/0.01 rad over the Y range of 20 mm
+    )
+    assert squareness(
+        identified((0.01, 0.005), errors), line=line
+    ).value == pytest.approx(2e-7)
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(-1e-5, 1e-5), st.sampled_from(list(ReferenceLine)))
-def test_a_turn_of_the_machine_changes_neither_straightness_nor_squareness(seed, turn, line):
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(-1e-5, 1e-5),
+    st.sampled_from(list(ReferenceLine)),
+)
+def test_a_turn_of_the_machine_changes_neither_straightness_nor_squareness(
+    seed, turn, line
+):
     errors = random_errors(6, np.random.default_rng(seed))
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    turned = step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
+    turned = (
+        step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
+    )
     one, other = identified((0.01, 0.01), errors), identified((0.01, 0.01), turned)
     assert squareness(one, line=line).value == pytest.approx(
         squareness(other, line=line).value, abs=1e-11
@@ -105,7 +121,9 @@ def test_uncertainties_against_monte_carlo():
         (straightness(found, 1, 0).u, lambda d: straightness(d, 1, 0)),
     ):
         assert value == pytest.approx(np.std([of(d).value for d in drawn]), rel=0.05)
-    assert u_slope(found, 1, 1) == pytest.approx(np.std([slope(d, 1, 1) for d in drawn]), rel=0.05)
+    assert u_slope(found, 1, 1) == pytest.approx(
+        np.std([slope(d, 1, 1) for d in drawn]), rel=0.05
+    )
     assert u_slope(drawn[0], 1, 1) is None
     profile = np.std([profile_m(d, 0, 1) for d in drawn], axis=0)
     np.testing.assert_allclose(u_profile_m(found, 0, 1), profile, rtol=0.05)

@@ -26,7 +26,9 @@ def found():
     rng = np.random.default_rng(6)
     errors = rng.normal(0, 1e-6, (2, N, 2))
     root = rng.normal(0, 1e-9, (4 * N, 4 * N))
-    return StepDiagonalResult(STEPS, errors, root @ root.T, "new", "exact", {}, Closure())
+    return StepDiagonalResult(
+        STEPS, errors, root @ root.T, "new", "exact", {}, Closure()
+    )
 
 
 def u_of(function, found):
@@ -37,7 +39,11 @@ def u_of(function, found):
         shift[index] = 1e-9
         up, down = (
             function(
-                replace(found, errors_m=found.errors_m + sign * shift.reshape(found.errors_m.shape))
+                replace(
+                    found,
+                    errors_m=found.errors_m
+                    + sign * shift.reshape(found.errors_m.shape),
+                )
             )
             for sign in (1, -1)
         )
@@ -49,7 +55,9 @@ def u_of(function, found):
 @pytest.mark.parametrize(("axis", "direction"), [(0, 1), (1, 0)])
 def test_straightness(found, axis, direction, line):
     wanted = u_of(lambda f: straightness(f, axis, direction, line).value, found)
-    assert straightness(found, axis, direction, line).u == pytest.approx(wanted, rel=1e-6)
+    assert straightness(found, axis, direction, line).u == pytest.approx(
+        wanted, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("line", ReferenceLine)
@@ -65,13 +73,20 @@ def test_squareness_and_straightness_are_reported_in_mm_with_their_u(found):
         ("straightness_x", straightness(found, 0, 1, line)),
         ("straightness_y", straightness(found, 1, 0, line)),
     ):
-        assert (out[name], out[f"u_{name}"]) == pytest.approx((1e3 * value.value, 1e3 * value.u))
+        assert (out[name], out[f"u_{name}"]) == pytest.approx(
+            (1e3 * value.value, 1e3 * value.u)
+        )
 
 
 @pytest.mark.parametrize(("axis", "direction"), [(0, 0), (0, 1), (1, 0), (1, 1)])
 def test_profiles_and_slopes(found, axis, direction):
-    wanted = [u_of(lambda f, i=i: profile_m(f, axis, direction)[i], found) for i in range(N + 1)]
-    assert u_profile_m(found, axis, direction) == pytest.approx(wanted, rel=1e-6, abs=1e-20)
+    wanted = [
+        u_of(lambda f, i=i: profile_m(f, axis, direction)[i], found)
+        for i in range(N + 1)
+    ]
+    assert u_profile_m(found, axis, direction) == pytest.approx(
+        wanted, rel=1e-6, abs=1e-20
+    )
     lone = u_slope(found, axis, direction)
     x = np.arange(N + 1) * STEPS[axis]
     slope = u_of(lambda f: np.polyfit(x, profile_m(f, axis, direction), 1)[0], found)

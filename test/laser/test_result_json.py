@@ -12,13 +12,17 @@ from test.support.laser import planar
 
 @pytest.mark.parametrize(("steps", "blocks"), [((0.03, 0.04), 4), ((0.3, 0.4), 6)])
 @pytest.mark.parametrize(
-    ("ppm", "advised"), [(-2.02, True), (-1.98, False), (0.0, False), (1.98, False), (2.02, True)]
+    ("ppm", "advised"),
+    [(-2.02, True), (-1.98, False), (0.0, False), (1.98, False), (2.02, True)],
 )
 def test_the_laser_is_doubted_beyond_2_ppm_of_the_diagonal(steps, blocks, ppm, advised):
     """A perfect machine of 0.2 m and 3 m, all of whose readings are too long by one share."""
     exact = planar(steps, np.zeros((2, blocks, 2)))
     data = StepDiagonal(
-        exact.steps_m, exact.diagonals, exact.samples_m * (1 + ppm * 1e-6), exact.linear_m
+        exact.steps_m,
+        exact.diagonals,
+        exact.samples_m * (1 + ppm * 1e-6),
+        exact.linear_m,
     )
     off_um = ppm * np.hypot(*steps) * blocks
     expected = [

@@ -64,12 +64,16 @@ def test_a_table_that_lacks_a_body_diagonal_is_one_of_three_axes_still(tmp_path)
 def test_writing_and_reading_gives_the_same_measurement(tmp_path, steps):
     rng = np.random.default_rng(2)
     data = simulate_step_diagonal(
-        random_machine(steps, 4, rng), Measurement({}, LaserNoise(1e-8, 0, 1e-8, 2)), rng
+        random_machine(steps, 4, rng),
+        Measurement({}, LaserNoise(1e-8, 0, 1e-8, 2)),
+        rng,
     )
     path = tmp_path / "out.csv"
     write_table(path, data, ["two repeats"])
     assert dimension_of(path) == len(steps)
-    back, warnings = read_table(path, RequiredColumns(steps, DIAGONALS[len(steps)], True))
+    back, warnings = read_table(
+        path, RequiredColumns(steps, DIAGONALS[len(steps)], True)
+    )
     np.testing.assert_allclose(back.samples_m, data.samples_m, atol=0.6e-11)
     np.testing.assert_allclose(back.linear_m, data.linear_m, atol=0.6e-11)
     assert not warnings
@@ -79,10 +83,17 @@ def test_a_repeat_of_some_blocks_only_is_written_as_such():
     samples = np.full((2, 2, 2, 2), 7e-3)
     samples[1, :, :, 1] = np.nan
     text = table_text(StepDiagonal((0.01, 0.01), DIAGONALS[2], samples))
-    assert [line.split(",")[0] for line in text.splitlines()] == ["block", "1", "2", "1"]
+    assert [line.split(",")[0] for line in text.splitlines()] == [
+        "block",
+        "1",
+        "2",
+        "1",
+    ]
 
 
-@pytest.mark.parametrize("repeats", [(3, 2, 1, 1), (2, 3, 2, 4), (1, 1, 1, 2), (2, 1, 3, 1)])
+@pytest.mark.parametrize(
+    "repeats", [(3, 2, 1, 1), (2, 3, 2, 4), (1, 1, 1, 2), (2, 1, 3, 1)]
+)
 def test_diagonals_and_axes_of_unequal_repeats_lose_nothing(tmp_path, repeats):
     rng = np.random.default_rng(3)
     samples = 7.07e-3 + rng.normal(0, 1e-8, (max(repeats[:2]), 2, 2, 3))
@@ -104,18 +115,42 @@ ROW = f"1,{GOOD}\n"
 HOSTILE = {
     "empty": ("", NoDataError, "the table is empty"),
     "header only": (HEAD + "\n", NoDataError, "the table has a header only"),
-    "missing block": (f"{HEAD}\n1,{GOOD}\n3,{GOOD}\n", InputError, "block 2 is missing"),
+    "missing block": (
+        f"{HEAD}\n1,{GOOD}\n3,{GOOD}\n",
+        InputError,
+        "block 2 is missing",
+    ),
     "missing block from zero": (
         f"{HEAD}\n0,{GOOD}\n2,{GOOD}\n",
         InputError,
         "block 1 is missing; measure every block from 0 to 2",
     ),
     "first block missing": (f"{HEAD}\n2,{GOOD}\n", InputError, "block 1 is missing"),
-    "nan": (HEAD + "\n1,nan,7,7,7,0,0\n", InputError, "d.csv:2: rx_pp: 'nan' is not a finite"),
-    "inf": (HEAD + "\n1,7,inf,7,7,0,0\n", InputError, "d.csv:2: ry_pp: 'inf' is not a finite"),
-    "text": (HEAD + "\n1,7,7,seven,7,0,0\n", InputError, "d.csv:2: rx_np: 'seven' is not a num"),
-    "underscore": (HEAD + "\n1,7_0,7,7,7,0,0\n", InputError, "rx_pp: '7_0' is not a number"),
-    "empty cell": (HEAD + "\n1,7,7,,7,0,0\n", InputError, "d.csv:2: rx_np: the cell is empty"),
+    "nan": (
+        HEAD + "\n1,nan,7,7,7,0,0\n",
+        InputError,
+        "d.csv:2: rx_pp: 'nan' is not a finite",
+    ),
+    "inf": (
+        HEAD + "\n1,7,inf,7,7,0,0\n",
+        InputError,
+        "d.csv:2: ry_pp: 'inf' is not a finite",
+    ),
+    "text": (
+        HEAD + "\n1,7,7,seven,7,0,0\n",
+        InputError,
+        "d.csv:2: rx_np: 'seven' is not a num",
+    ),
+    "underscore": (
+        HEAD + "\n1,7_0,7,7,7,0,0\n",
+        InputError,
+        "rx_pp: '7_0' is not a number",
+    ),
+    "empty cell": (
+        HEAD + "\n1,7,7,,7,0,0\n",
+        InputError,
+        "d.csv:2: rx_np: the cell is empty",
+    ),
     "empty cell of a repeat": (
         f"{HEAD}\n{ROW}1,7,7,,7,0,0\n",
         InputError,
@@ -136,15 +171,27 @@ HOSTILE = {
         InputError,
         "d.csv:3: ry_pp: 0.0070711 where 7.07107 mm is nominal: it looks like metres",
     ),
-    "nanometres": (HEAD + "\n1,7071100,7,7,7,0,0\n", InputError, "looks like nanometres"),
+    "nanometres": (
+        HEAD + "\n1,7071100,7,7,7,0,0\n",
+        InputError,
+        "looks like nanometres",
+    ),
     "inches": (HEAD + "\n1,0.2784,7,7,7,0,0\n", InputError, "looks like inches"),
     "sign of np": (
         HEAD + "\n1,7,7,-7,7,0,0\n",
         InputError,
         "rx_np: -7 where 7.07107 mm is nominal: the sign is wrong; readings are",
     ),
-    "zero": (HEAD + "\n1,0,7,7,7,0,0\n", InputError, "rx_pp: 0 where 7.07107 mm is nominal; check"),
-    "other step": (HEAD + "\n1,14.1,7,7,7,0,0\n", InputError, "check the unit and --step-x"),
+    "zero": (
+        HEAD + "\n1,0,7,7,7,0,0\n",
+        InputError,
+        "rx_pp: 0 where 7.07107 mm is nominal; check",
+    ),
+    "other step": (
+        HEAD + "\n1,14.1,7,7,7,0,0\n",
+        InputError,
+        "check the unit and --step-x",
+    ),
     "linear in um": (
         HEAD + "\n1,7,7,7,7,0.9,0\n",
         InputError,
@@ -155,18 +202,46 @@ HOSTILE = {
         InputError,
         "it looks like the step itself",
     ),
-    "linear nan": (HEAD + "\n1,7,7,7,7,nan,0\n", InputError, "ex_x: 'nan' is not a finite"),
+    "linear nan": (
+        HEAD + "\n1,7,7,7,7,nan,0\n",
+        InputError,
+        "ex_x: 'nan' is not a finite",
+    ),
     "linear never given": (
         HEAD + "\n1,7,7,7,7,,0\n",
         InputError,
         "linear errors: a block has no value",
     ),
-    "short line": (HEAD + "\n1,7,7,7\n", InputError, "d.csv:2: 4 cells where the header has 7"),
-    "block 1.5": (HEAD + "\n1.5,7,7,7,7,0,0\n", InputError, "'1.5' is not a block number"),
-    "negative block": (HEAD + "\n-1,7,7,7,7,0,0\n", InputError, "'-1' is not a block number"),
-    "huge block": (HEAD + "\n1000000,7,7,7,7,0,0\n", InputError, "is not a block number"),
-    "twice": ("block,rx_pp,rx_pp\n1,7,7\n", InputError, "the column 'rx_pp' appears twice"),
-    "no block": ("rx_pp,ry_pp,rx_np,ry_np\n7,7,7,7\n", InputError, "column 'block' is missing"),
+    "short line": (
+        HEAD + "\n1,7,7,7\n",
+        InputError,
+        "d.csv:2: 4 cells where the header has 7",
+    ),
+    "block 1.5": (
+        HEAD + "\n1.5,7,7,7,7,0,0\n",
+        InputError,
+        "'1.5' is not a block number",
+    ),
+    "negative block": (
+        HEAD + "\n-1,7,7,7,7,0,0\n",
+        InputError,
+        "'-1' is not a block number",
+    ),
+    "huge block": (
+        HEAD + "\n1000000,7,7,7,7,0,0\n",
+        InputError,
+        "is not a block number",
+    ),
+    "twice": (
+        "block,rx_pp,rx_pp\n1,7,7\n",
+        InputError,
+        "the column 'rx_pp' appears twice",
+    ),
+    "no block": (
+        "rx_pp,ry_pp,rx_np,ry_np\n7,7,7,7\n",
+        InputError,
+        "column 'block' is missing",
+    ),
     "one diagonal": (
         "block,rx_pp,ry_pp,ex_x,ey_y\n1,7,7,0,0\n",
         InputError,

@@ -46,7 +46,9 @@ def tilted(direction, angle_rad, rng):
     """Return `direction` turned by an angle towards a random side."""
     side = rng.normal(size=len(direction))
     side -= (side @ direction) * direction
-    return np.cos(angle_rad) * direction + np.sin(angle_rad) * side / np.linalg.norm(side)
+    return np.cos(angle_rad) * direction + np.sin(angle_rad) * side / np.linalg.norm(
+        side
+    )
 
 
 def machine(dim, n, rng):
@@ -73,7 +75,9 @@ def test_new_finds_all_errors_whatever_the_mirrors(dim, n):
         laser = along(steps, errors, name)
         readings.append(walk(steps, errors, name, (laser, tilted(laser, 5e-3, rng))))
     data = StepDiagonal(steps, NAMES[dim], np.array([readings]), linear(errors)[None])
-    np.testing.assert_allclose(identify_ibaraki(data).errors_m, errors, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        identify_ibaraki(data).errors_m, errors, rtol=0, atol=1e-14
+    )
     for name in NAMES[2] if dim == 2 else ():
         np.testing.assert_allclose(
             identify_ibaraki(data.pick([name])).errors_m, errors, rtol=0, atol=1e-14

@@ -5,8 +5,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.laser.data import DIAGONALS, Method, StepDiagonal, signs_of, step_vectors
-from selfcal_ros.laser.identify import Choice, identify, identify_wang, jacobian, readings_are_equal
+from selfcal_ros.laser.data import (
+    DIAGONALS,
+    Method,
+    StepDiagonal,
+    signs_of,
+    step_vectors,
+)
+from selfcal_ros.laser.identify import (
+    Choice,
+    identify,
+    identify_wang,
+    jacobian,
+    readings_are_equal,
+)
 from selfcal_ros.laser.profiles import squareness
 from selfcal_ros.laser.simulation import (
     Measurement,
@@ -29,7 +41,9 @@ def exact_nominal(steps, errors):
     dim = len(steps)
     signs = signs_of(DIAGONALS[dim])
     lasers = signs * np.array(steps) / np.linalg.norm(steps)
-    readings = signs[:, :, None] * np.einsum("kc,jic->kji", lasers, step_vectors(steps, errors))
+    readings = signs[:, :, None] * np.einsum(
+        "kc,jic->kji", lasers, step_vectors(steps, errors)
+    )
     return StepDiagonal(tuple(steps), DIAGONALS[dim], readings[None])
 
 
@@ -43,7 +57,12 @@ def test_table_1_of_the_source(case):
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 0.1), st.floats(1e-3, 0.1), st.integers(1, 8))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.floats(1e-3, 0.1),
+    st.floats(1e-3, 0.1),
+    st.integers(1, 8),
+)
 def test_nominal_lasers_give_the_truth_for_any_steps_and_blocks(seed, a, b, n):
     errors = random_errors(n, np.random.default_rng(seed))
     found = identify_wang(exact_nominal((a, b), errors))
@@ -69,7 +88,9 @@ def test_a_turn_of_the_whole_machine_changes_nothing():
     errors = random_errors(5, rng)
     turn = 1e-4
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    turned = step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
+    turned = (
+        step_vectors((0.01, 0.01), errors) @ rotation.T - np.diag((0.01, 0.01))[:, None]
+    )
     np.testing.assert_allclose(
         identify_wang(exact_nominal((0.01, 0.01), turned)).errors_m, errors, atol=1e-15
     )
@@ -79,7 +100,9 @@ def test_equal_readings_are_said_and_the_new_formulation_refuses_them():
     samples = np.full((1, 2, 2, 3), 7.0711e-3)
     data = StepDiagonal((0.01, 0.01), DIAGONALS[2], samples, np.zeros((1, 2, 3)))
     assert readings_are_equal(data)
-    with pytest.raises(InputError, match="readings of all axes are equal in every block"):
+    with pytest.raises(
+        InputError, match="readings of all axes are equal in every block"
+    ):
         identify(data, Choice(Method.NEW))
     for choice in (Choice(Method.NEW, allow_equal=True), Choice(Method.CONVENTIONAL)):
         assert np.isfinite(identify(data, choice).errors_m).all()
@@ -101,7 +124,9 @@ def test_readings_are_equal_where_all_axes_read_the_same_in_two_or_more_blocks(
     samples = np.full((1, 2, 2, blocks), 7.0711e-3)
     samples[0, 1, 0, -1] += spoil_m
     assert (
-        readings_are_equal(StepDiagonal(steps, DIAGONALS[2], samples, np.zeros((1, 2, blocks))))
+        readings_are_equal(
+            StepDiagonal(steps, DIAGONALS[2], samples, np.zeros((1, 2, blocks)))
+        )
         is equal
     )
 
@@ -119,7 +144,8 @@ def test_table_1_case_b_holds_in_many_blocks():
 def test_one_diagonal_is_refused():
     data = planar((0.01, 0.01), random_errors(3, np.random.default_rng(0))).pick(["pp"])
     with pytest.raises(
-        InputError, match="only pp measured; the conventional formulation needs every diagonal"
+        InputError,
+        match="only pp measured; the conventional formulation needs every diagonal",
     ):
         identify_wang(data)
 
@@ -133,7 +159,9 @@ def test_no_uncertainty_without_repeats_and_the_propagated_one_with_them():
     # v = s (Rx_pp - Rx_np) / (2b), s = sqrt(2) a, less the turn by the first block's v.
     expected = 1e-8 / np.sqrt(400)
     np.testing.assert_allclose(found.u_errors_m[0, :, 0], expected, rtol=0.05)
-    np.testing.assert_allclose(found.u_errors_m[0, 1:, 1], np.sqrt(2) * expected, rtol=0.05)
+    np.testing.assert_allclose(
+        found.u_errors_m[0, 1:, 1], np.sqrt(2) * expected, rtol=0.05
+    )
     assert found.u_errors_m[0, 0, 1] < 1e-12
 
 
@@ -146,7 +174,9 @@ def test_jacobian_of_a_product():
 
 def test_body_diagonals_are_weighted_by_their_repeats():
     machine = random_machine((0.01, 0.01, 0.01), 2, np.random.default_rng(3))
-    samples = exact_nominal(machine.steps_m, machine.errors_m).samples_m.repeat(9, axis=0)
+    samples = exact_nominal(machine.steps_m, machine.errors_m).samples_m.repeat(
+        9, axis=0
+    )
     samples[:, 0] += 1e-8  # ppp is off, and measured nine times; the others once
     heavy = samples.copy()
     heavy[1:, 1:] = np.nan
@@ -173,8 +203,12 @@ def test_body_diagonals_take_a_mirror_for_a_lean_to_first_order():
     wrong = []
     for angle in (1e-4, 2e-4):
         setups = {"npp": SetUp(mirror_rad=(angle, 0.0))}
-        data = simulate_step_diagonal(machine, Measurement(setups), np.random.default_rng(0))
+        data = simulate_step_diagonal(
+            machine, Measurement(setups), np.random.default_rng(0)
+        )
         found = identify_wang(data)
         wrong.append(squareness(found, 0, 2).value)
     off = wrong[1] - wrong[0]
-    assert abs(off) > 1e-4 * 0.04 / 10, "of the order of angle x range, not of its square"
+    assert abs(off) > 1e-4 * 0.04 / 10, (
+        "of the order of angle x range, not of its square"
+    )

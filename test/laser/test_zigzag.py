@@ -23,7 +23,9 @@ RULE = CutRule((0.01, 0.01))
 
 def recording(**options):
     setups = {"pp": SetUp(mirror_rad=(5e-4,)), "np": SetUp(mirror_rad=(-3e-4,))}
-    return recorded(case_study_machine(), setups, rng=np.random.default_rng(1), **options)
+    return recorded(
+        case_study_machine(), setups, rng=np.random.default_rng(1), **options
+    )
 
 
 @pytest.mark.parametrize("steps", [(0.01, 0.007), (0.01, 0.01, 0.005)])
@@ -31,7 +33,9 @@ def test_a_recording_gives_back_the_machine(steps):
     rng = np.random.default_rng(2)
     machine = random_machine(steps, 4, rng)
     cut = cut_zigzag(recorded(machine, {}, rng=rng), CutRule(steps))
-    np.testing.assert_allclose(identify_ibaraki(cut.data).errors_m, machine.errors_m, atol=1e-13)
+    np.testing.assert_allclose(
+        identify_ibaraki(cut.data).errors_m, machine.errors_m, atol=1e-13
+    )
     assert set(cut.runs.values()) == {1} and set("xy") < set(cut.runs)
 
 
@@ -39,8 +43,12 @@ def test_blocks_of_np_are_numbered_by_place():
     machine = case_study_machine()
     cut = cut_zigzag(recording(), RULE)
     assert cut.data.diagonals == ("pp", "np") and cut.data.n_blocks == 6
-    np.testing.assert_allclose(cut.data.linear_mean_m[0], machine.errors_m[0, :, 0], atol=1e-15)
-    measurement = Measurement({"pp": SetUp(mirror_rad=(5e-4,)), "np": SetUp(mirror_rad=(-3e-4,))})
+    np.testing.assert_allclose(
+        cut.data.linear_mean_m[0], machine.errors_m[0, :, 0], atol=1e-15
+    )
+    measurement = Measurement(
+        {"pp": SetUp(mirror_rad=(5e-4,)), "np": SetUp(mirror_rad=(-3e-4,))}
+    )
     expected = simulate_step_diagonal(machine, measurement, np.random.default_rng(0))
     np.testing.assert_allclose(cut.data.readings_m, expected.readings_m, atol=1e-14)
     backwards = np.ptp(cut.data.readings_m[1, 0] - expected.readings_m[1, 0, ::-1])
@@ -49,7 +57,9 @@ def test_blocks_of_np_are_numbered_by_place():
 
 def test_repeats_of_a_whole_recording_become_samples():
     one = recording(noise_m=10e-9)
-    other = recorded(case_study_machine(), {}, rng=np.random.default_rng(5), noise_m=10e-9)
+    other = recorded(
+        case_study_machine(), {}, rng=np.random.default_rng(5), noise_m=10e-9
+    )
     gap = int(one.laser_ns[-1]) + 10**9
     both = Recording(
         np.concatenate([one.laser_ns, other.laser_ns + gap]),
@@ -85,10 +95,14 @@ def test_runs_that_were_repeated_more_often_than_others_keep_all_samples():
 def test_a_distance_that_shrinks_along_the_diagonal_is_turned_by_the_sign():
     series = recording()
     shrinking = replace(series, laser_m=-series.laser_m)
-    with pytest.raises(InputError, match=r"run pp, x move, block 1: .*the sign is wrong"):
+    with pytest.raises(
+        InputError, match=r"run pp, x move, block 1: .*the sign is wrong"
+    ):
         cut_zigzag(shrinking, RULE)
     turned = cut_zigzag(shrinking, replace(RULE, laser_sign=-1)).data
-    np.testing.assert_allclose(turned.readings_m, cut_zigzag(series, RULE).data.readings_m)
+    np.testing.assert_allclose(
+        turned.readings_m, cut_zigzag(series, RULE).data.readings_m
+    )
 
 
 def test_the_mean_of_a_rest_leaves_the_moves_out():
@@ -135,7 +149,9 @@ def test_a_missing_rest_is_named():
     def wander(positions):
         return positions + np.linspace(0, 1e-4, len(positions))[:, None]
 
-    with pytest.raises(InputError, match=r"different numbers of blocks: np \[6\], pp \["):
+    with pytest.raises(
+        InputError, match=r"different numbers of blocks: np \[6\], pp \["
+    ):
         cut_zigzag(recording(extra={5: wander}), RULE)
 
 
@@ -186,7 +202,11 @@ def test_a_spoilt_recording_is_one_clear_line(spoil, kind, message):
 def test_both_ends_of_a_rest_are_left_out(edge):
     series = recording()
     rest, phase = np.divmod(series.laser_ns - 3_000_000, 1_200_000_000)
-    creeping = phase < 80_000_000 if edge == "start" else (phase > 900_000_000) & (phase < 10**9)
+    creeping = (
+        phase < 80_000_000
+        if edge == "start"
+        else (phase > 900_000_000) & (phase < 10**9)
+    )
     creeping &= rest % 2 == 1  # of every rest alike it would cancel in the readings
     spoilt = replace(series, laser_m=series.laser_m + 1e-6 * creeping)
     np.testing.assert_allclose(
@@ -226,7 +246,8 @@ def rests_by_trying_every_start(series, rule):
         end = start + 1
         while (
             end < len(stamps)
-            and np.ptp(series.position_m[start : end + 1], axis=0).max() <= rule.rest_tolerance_m
+            and np.ptp(series.position_m[start : end + 1], axis=0).max()
+            <= rule.rest_tolerance_m
         ):
             end += 1
         if stamps[end - 1] - stamps[start] >= rule.min_rest_s * 1e9:
@@ -246,13 +267,15 @@ def test_rests_of_creeping_axes_are_those_of_the_definition(seed, creep, jumps):
     stamps = np.arange(300) * 20_000_000
     series = Recording(stamps, np.zeros(300), stamps, walk)
     rule = CutRule((0.01, 0.01), min_rest_s=0.2, settle_s=0.0)
-    assert [rest.start_ns for rest in find_rests(series, rule)] == rests_by_trying_every_start(
-        series, rule
-    )
+    assert [
+        rest.start_ns for rest in find_rests(series, rule)
+    ] == rests_by_trying_every_start(series, rule)
 
 
 def test_a_rest_without_laser_samples_does_not_count():
     series = recording()
     lost = (series.laser_ns > 1_200_000_000) & (series.laser_ns < 2_400_000_000)
-    gap = replace(series, laser_ns=series.laser_ns[~lost], laser_m=series.laser_m[~lost])
+    gap = replace(
+        series, laser_ns=series.laser_ns[~lost], laser_m=series.laser_m[~lost]
+    )
     assert len(find_rests(gap, RULE)) == len(find_rests(series, RULE)) - 1

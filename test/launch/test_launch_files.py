@@ -58,7 +58,9 @@ def test_it_states_its_arguments(description, path):
     from launch.actions import DeclareLaunchArgument
 
     stated = [
-        entity for entity in description(path).entities if isinstance(entity, DeclareLaunchArgument)
+        entity
+        for entity in description(path).entities
+        if isinstance(entity, DeclareLaunchArgument)
     ]
     assert {argument.name for argument in stated} == ARGUMENTS[path.name]
     assert all(argument.description for argument in stated)
@@ -70,9 +72,14 @@ def test_it_starts_executables_of_this_package(description, path):
 
     from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 
-    nodes = [entity for entity in description(path).entities if isinstance(entity, Node)]
+    nodes = [
+        entity for entity in description(path).entities if isinstance(entity, Node)
+    ]
     assert {node.node_executable for node in nodes} == STARTED[path.name]
-    assert {node.node_executable for node in nodes} <= {*NODE_PARAMETERS, "foxglove_bridge"}
+    assert {node.node_executable for node in nodes} <= {
+        *NODE_PARAMETERS,
+        "foxglove_bridge",
+    }
     assert {node.node_package for node in nodes} <= {"selfcal_ros", "foxglove_bridge"}
 
 
@@ -85,7 +92,8 @@ def test_shipped_files_that_are_defaults_exist(description):
         for entity in description(path).entities:
             if isinstance(entity, DeclareLaunchArgument) and entity.default_value:
                 value = perform_substitutions(LaunchContext(), entity.default_value)
-                if entity.name == "journal":  # made when it is needed, apart for what is simulated
+                # made when it is needed, apart for what is simulated
+                if entity.name == "journal":
                     simulated = path.name == "simulated_cell.launch.py"
                     assert value.endswith("_simulated") == simulated
                     continue
@@ -98,7 +106,12 @@ def parameters_of(description, **given: str) -> list[dict]:
     from launch_ros.actions import Node
     from launch_ros.utilities import evaluate_parameters
 
-    once = {"measurement_collector", "pose_sequencer", "cell_driver"}  # other with a cell
+    # other with a cell
+    once = {
+        "measurement_collector",
+        "pose_sequencer",
+        "cell_driver",
+    }
     found = []
     for path in FILES:
         context = LaunchContext()
@@ -117,7 +130,9 @@ def parameters_of(description, **given: str) -> list[dict]:
                     and not entity.condition.evaluate(context)
                 )
             ):
-                rows = [row for row in entity._Node__parameters if isinstance(row, dict)]
+                rows = [
+                    row for row in entity._Node__parameters if isinstance(row, dict)
+                ]
                 found.append(
                     {
                         key: value
@@ -130,7 +145,11 @@ def parameters_of(description, **given: str) -> list[dict]:
 
 @pytest.mark.parametrize("name", ["bag", "plan"])
 def test_a_name_like_a_date_or_a_number_stays_text(description, name):
-    told = {row[name] for row in parameters_of(description, **{name: "2026_01_05"}) if name in row}
+    told = {
+        row[name]
+        for row in parameters_of(description, **{name: "2026_01_05"})
+        if name in row
+    }
     assert told == {"2026_01_05"}
 
 
@@ -155,8 +174,13 @@ def test_collector_and_sequencer_are_told_what_the_cell_states(
     )
     rows = parameters_of(description, cell=str(cell))
     assert [row["cell"] for row in rows if "cell" in row] == [str(cell)]
-    assert [row["measurement_sense"] for row in rows if "measurement_sense" in row] == [sense]
-    assert [row["auto_confirm"] for row in rows if "auto_confirm" in row] == [placing == "robot"]
+    assert [row["measurement_sense"] for row in rows if "measurement_sense" in row] == [
+        sense
+    ]
+    assert [row["auto_confirm"] for row in rows if "auto_confirm" in row] == [
+        placing == "robot"
+    ]
     assert not any(
-        {"measurement_sense", "auto_confirm"} & row.keys() for row in parameters_of(description)
+        {"measurement_sense", "auto_confirm"} & row.keys()
+        for row in parameters_of(description)
     )

@@ -58,7 +58,11 @@ def run(monkeypatch, tmp_path):
         home = f"ROS_HOME={tmp_path / 'ros_home'}".encode()
         wait_until(
             lambda: (
-                not [path for path in Path("/proc").glob("[0-9]*/environ") if holds(path, home)]
+                not [
+                    path
+                    for path in Path("/proc").glob("[0-9]*/environ")
+                    if holds(path, home)
+                ]
             ),
             "the end of all that was launched",
         )
@@ -67,7 +71,9 @@ def run(monkeypatch, tmp_path):
 def holds(path: Path, what: bytes) -> bool:
     """Return whether the environment of another process holds an entry."""
     with contextlib.suppress(OSError):  # it has just ended
-        return path.parent.name != str(os.getpid()) and what in path.read_bytes().split(b"\0")
+        return path.parent.name != str(os.getpid()) and what in path.read_bytes().split(
+            b"\0"
+        )
     return False
 
 
@@ -136,7 +142,9 @@ def test_a_sequencer_without_its_plan_ends_the_launch_with_the_reason(run, tmp_p
 
 @pytest.mark.parametrize("file", ["calibrate", "replay", "simulated_cell"])
 def test_a_parameter_file_that_is_not_there_starts_nothing(run, tmp_path, file):
-    done = launched(run, f"{file}.launch.py", f"params:={tmp_path / 'no.yaml'}", "bag:=x")
+    done = launched(
+        run, f"{file}.launch.py", f"params:={tmp_path / 'no.yaml'}", "bag:=x"
+    )
     said = done.stdout + done.stderr
     assert f"params:={tmp_path / 'no.yaml'}: no such file; check the path" in said
     assert "process started" not in said
@@ -166,7 +174,10 @@ def test_foxglove_bridge_is_started_where_it_is_wanted(run, tmp_path):
         pytest.skip("foxglove_bridge is installed: the launch would not end")
     done = launched(run, "calibrate.launch.py", "foxglove:=true", "journal:=none")
     said = done.stdout + done.stderr
-    assert "foxglove:=true: there is no package foxglove_bridge; sudo apt install ros-j" in said
+    assert (
+        "foxglove:=true: there is no package foxglove_bridge; sudo apt install ros-j"
+        in said
+    )
     assert "process started" not in said
     assert done.returncode == 1
 
@@ -178,6 +189,10 @@ def test_an_exit_later_ends_nothing():
     from selfcal_ros.nodes.launching import end_if_it_cannot_start
 
     for code in (0, 1, -9, -2):
-        end_if_it_cannot_start(SimpleNamespace(process_name="solver-2", returncode=code), None)
+        end_if_it_cannot_start(
+            SimpleNamespace(process_name="solver-2", returncode=code), None
+        )
     with pytest.raises(InputError, match="solver-2: cannot start"):
-        end_if_it_cannot_start(SimpleNamespace(process_name="solver-2", returncode=2), None)
+        end_if_it_cannot_start(
+            SimpleNamespace(process_name="solver-2", returncode=2), None
+        )

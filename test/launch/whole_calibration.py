@@ -31,8 +31,12 @@ def generate_test_description() -> LaunchDescription:
                 for name, value in ARGUMENTS.items()
             ),
             IncludeLaunchDescription(
-                PythonLaunchDescriptionSource(str(share / "launch/simulated_cell.launch.py")),
-                launch_arguments={name: LaunchConfiguration(name) for name in ARGUMENTS}.items(),
+                PythonLaunchDescriptionSource(
+                    str(share / "launch/simulated_cell.launch.py")
+                ),
+                launch_arguments={
+                    name: LaunchConfiguration(name) for name in ARGUMENTS
+                }.items(),
             ),
             launch_testing.actions.ReadyToTest(),
         ]
@@ -44,7 +48,9 @@ class TestCalibration(unittest.TestCase):
 
     def setUp(self):
         rclpy.init()
-        self.node = rclpy.create_node("onlooker", namespace=self.test_args.get("namespace", ""))
+        self.node = rclpy.create_node(
+            "onlooker", namespace=self.test_args.get("namespace", "")
+        )
 
     def tearDown(self):
         self.node.destroy_node()
@@ -63,7 +69,9 @@ class TestCalibration(unittest.TestCase):
             )
         deadline = time.monotonic() + PATIENCE_S
         while not self.is_done(heard.get(names.SUMMARY.name)):
-            assert time.monotonic() < deadline, f"the plan was not measured in time: {heard}"
+            assert time.monotonic() < deadline, (
+                f"the plan was not measured in time: {heard}"
+            )
             rclpy.spin_once(self.node, timeout_sec=0.1)
         summary, error_map = heard[names.SUMMARY.name], heard[names.ERROR_MAP.name]
         assert summary.identifiable, summary

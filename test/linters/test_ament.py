@@ -13,15 +13,21 @@ DOCSTRINGS = ["D213", "D401", "D402", "D403", "D413", "D417"]
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_flake8(monkeypatch):
-    linter = pytest.importorskip("ament_flake8.main", reason="needs ament_flake8 of ROS 2")
+    linter = pytest.importorskip(
+        "ament_flake8.main", reason="needs ament_flake8 of ROS 2"
+    )
     monkeypatch.chdir(ROOT)
-    code, found = linter.main_with_errors(argv=["--config", "setup.cfg", "--", *CHECKED])
+    code, found = linter.main_with_errors(
+        argv=["--config", "setup.cfg", "--", *CHECKED]
+    )
     assert code == 0, "\n".join(found)
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_pep257(monkeypatch):
-    linter = pytest.importorskip("ament_pep257.main", reason="needs ament_pep257 of ROS 2")
+    linter = pytest.importorskip(
+        "ament_pep257.main", reason="needs ament_pep257 of ROS 2"
+    )
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr("sys.argv", ["ament_pep257"])
     assert linter.main(argv=["--add-ignore", *DOCSTRINGS, "--", *CHECKED[:-1]]) == 0

@@ -8,7 +8,13 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
 from selfcal_ros.machine import MachineError
-from selfcal_ros.machine.cell import check_keys, class_of, open_machine, read_cell, with_values
+from selfcal_ros.machine.cell import (
+    check_keys,
+    class_of,
+    open_machine,
+    read_cell,
+    with_values,
+)
 from selfcal_ros.machine.simulated import SimulatedMachine
 from selfcal_ros.model.readings import Sense
 from test.support.cells import CELL, write_cell
@@ -32,10 +38,17 @@ LIMITS = "limits: {x: [-1, 1], y: [-1, 1]}\n"
 
 def test_a_cell_with_all_its_keys(tmp_path):
     (tmp_path / "cell.yaml").write_text(
-        CELL + ("sense: plate_moves\norigin: {x: 0.1}\ndetector: {mark: ring, mark_size: 4.0e-5}\n")
+        CELL
+        + (
+            "sense: plate_moves\norigin: {x: 0.1}\ndetector: {mark: ring, mark_size: 4.0e-5}\n"
+        )
     )
     cell = read_cell(tmp_path / "cell.yaml")
-    assert (cell.machine, cell.sense, cell.placing) == ("simulated", Sense.PLATE_MOVES, "robot")
+    assert (cell.machine, cell.sense, cell.placing) == (
+        "simulated",
+        Sense.PLATE_MOVES,
+        "robot",
+    )
     assert cell.limits["x"] == (-0.01, 0.01)
     assert cell.to_machine("x", 0.25) == 0.35
     assert cell.to_stage("x", 0.35) == pytest.approx(0.25)
@@ -48,16 +61,28 @@ def test_a_cell_with_all_its_keys(tmp_path):
     [
         ("machine: simulated\n", "cell.yaml: limits: the travel of x is not limited"),
         (LIMITS, "the key 'machine' is missing"),
-        (f"{LIMITS}machine: simulated\nlimit: 3\n", "limit: unknown key; did you mean 'limits'?"),
+        (
+            f"{LIMITS}machine: simulated\nlimit: 3\n",
+            "limit: unknown key; did you mean 'limits'?",
+        ),
         (
             f"{LIMITS}machine: simulated\nsettle: {{tim: 3}}\n",
             "tim: unknown key; did you mean 'time'?",
         ),
         (f"{LIMITS}machine: simulated\nsettle: {{time: -3}}\n", "-3.0 is outside"),
-        (f"{LIMITS}machine: simulated\norigin: {{x: low}}\n", "'low' is not of type float"),
+        (
+            f"{LIMITS}machine: simulated\norigin: {{x: low}}\n",
+            "'low' is not of type float",
+        ),
         (f"{LIMITS}machine: simulated\nplacing: hand\n", "choose one of person, robot"),
-        (f"{LIMITS}machine: simulated\ndetector: {{autostart: true}}\n", "autostart: unknown key"),
-        ("machine: simulated\nlimits: {x: [1, -1], y: [-1, 1]}\n", "[1, -1] is not [low, high]"),
+        (
+            f"{LIMITS}machine: simulated\ndetector: {{autostart: true}}\n",
+            "autostart: unknown key",
+        ),
+        (
+            "machine: simulated\nlimits: {x: [1, -1], y: [-1, 1]}\n",
+            "[1, -1] is not [low, high]",
+        ),
     ],
 )
 def test_a_wrong_key_is_named(tmp_path, text, said):
@@ -79,12 +104,21 @@ def test_a_class_beside_the_file_gets_the_keys_under_its_name(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("machine: simulatd\n", "there is no machine 'simulatd'; did you mean 'simulated'?"),
+        (
+            "machine: simulatd\n",
+            "there is no machine 'simulatd'; did you mean 'simulated'?",
+        ),
         ("machine: no_such_module:Mine\n", "put no_such_module.py beside cell.yaml"),
         ("machine: own_stage:Yours\n", "own_stage.py) has no 'Yours'"),
-        ("machine: own_stage:Mine\nMine: {prot: 1}\n", "prot: unknown key; did you mean 'port'?"),
+        (
+            "machine: own_stage:Mine\nMine: {prot: 1}\n",
+            "prot: unknown key; did you mean 'port'?",
+        ),
         ("machine: own_stage:Mine\n", "Mine: the key 'port' is missing"),
-        ("machine: code:Stage\n", "code.py) has no 'Stage'"),  # of Python, not beside the file
+        (
+            "machine: code:Stage\n",
+            "code.py) has no 'Stage'",
+        ),  # of Python, not beside the file
         (
             "machine: own_stage:Far\n",
             "JSONDecodeError: Expecting value: line 1 column 1 (char 0) (own_stage.py, line ",

@@ -66,7 +66,9 @@ def test_nothing_is_measured_on_a_plate_that_the_robot_did_not_place(cell):
     machine.place = place
     command(Phase.PLACE)
     command(Phase.MEASURE)
-    seen = {(event.m, event.n) for event in driver.events if isinstance(event, Detection)}
+    seen = {
+        (event.m, event.n) for event in driver.events if isinstance(event, Detection)
+    }
     assert len(seen) == 9
 
 
@@ -92,7 +94,9 @@ def test_a_machine_that_does_not_answer_is_named_until_it_does(cell):
     asked.wait()
     assert not driver.trouble
     driver._clock.sleep(75.0)
-    assert driver.trouble.startswith("machine.position: it has not answered for 61 s; check")
+    assert driver.trouble.startswith(
+        "machine.position: it has not answered for 61 s; check"
+    )
     answers.set()
     wait_until(lambda: not driver.trouble, "an answer")
 
@@ -131,7 +135,10 @@ def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
     told = len(driver.events)
     wait_until(lambda: len(driver.events) >= told + 3, "positions at rest")
     driver._clock.ns += 10 * PATIENCE_NS
-    wait_until(lambda: driver.events[-1].stamp_ns > driver._clock.ns - PATIENCE_NS, "a later one")
+    wait_until(
+        lambda: driver.events[-1].stamp_ns > driver._clock.ns - PATIENCE_NS,
+        "a later one",
+    )
     driver.take_status(
         SimpleNamespace(
             complete=False,
@@ -146,7 +153,9 @@ def test_a_mark_that_is_missing_later_is_visited_in_the_order_of_time(cell):
     )
     wait_until(lambda: not driver.busy, "the visit")
     again = list(driver.events)[told:]
-    assert [(event.m, event.n) for event in again if isinstance(event, Detection)] == [(1, 0)]
+    assert [(event.m, event.n) for event in again if isinstance(event, Detection)] == [
+        (1, 0)
+    ]
     stamps = [event.stamp_ns for event in driver.events]
     assert stamps == sorted(stamps)
 
@@ -172,7 +181,9 @@ def test_a_class_of_ones_own_tells_the_same_without_ros_and_by_the_driver(tmp_pa
             written.append(event)
 
     written = []
-    Listening(plan, cell, open_machine(cell), tmp_path / "bag", Agreeing(), Jumping()).measure()
+    Listening(
+        plan, cell, open_machine(cell), tmp_path / "bag", Agreeing(), Jumping()
+    ).measure()
     commands = [event for event in written if isinstance(event, Command)]
     alone = exposures(event for event in written if not isinstance(event, Command))
 

@@ -62,7 +62,9 @@ def measure(folder):
         return simulated.image()
 
     machine.place, machine.image = simulated.place, image
-    Run(read_plan(folder / "plan.yaml"), cell, machine, folder / "bag", Agreeing()).measure()
+    Run(
+        read_plan(folder / "plan.yaml"), cell, machine, folder / "bag", Agreeing()
+    ).measure()
     away, result = away_from(simulated.truth, folder / "bag")
     assert result.verdict.qualified
     return np.abs(away).max()

@@ -45,7 +45,9 @@ AT_THE_FIRST_MOVE = [
 
 
 @pytest.mark.parametrize(("fault", "said"), AT_THE_FIRST_MOVE)
-def test_a_wrong_stage_is_named_before_it_has_moved_farther_than_a_mark(tmp_path, fault, said):
+def test_a_wrong_stage_is_named_before_it_has_moved_farther_than_a_mark(
+    tmp_path, fault, said
+):
     cell, machine = write_cell(tmp_path, plan=LINES)
     spoilt = Spoilt(machine, fault)
     with pytest.raises(MachineError, match=said):
@@ -85,7 +87,10 @@ OF_THE_STAGE = [
     ("connection lost at a reading", "the connection was lost"),
     ("no answer to a move", "machine.move_to: TimeoutError: no answer in 5 s"),
     ("no answer for the position", "machine.position: TimeoutError: no answer in 5 s"),
-    ("driver raises an error of its own", "machine.move_to: OSError: .*faults.py, line"),
+    (
+        "driver raises an error of its own",
+        "machine.move_to: OSError: .*faults.py, line",
+    ),
     ("position is not a number", "its position is .*nan"),
     ("position is infinite", "its position is .*inf"),
     ("position is None", "its position is None"),
@@ -114,7 +119,10 @@ OF_IMAGES = [
     ("out of focus", "nothing is seen at the last 5 stops .rejected: no_fit"),
     ("colour", "an image is uint8 \\(140, 150, 3\\)"),
     ("of floats", "an image is float64"),
-    ("of half the size", "an image is 75 x 70 uint8, those before were 150 x 140 uint8"),
+    (
+        "of half the size",
+        "an image is 75 x 70 uint8, those before were 150 x 140 uint8",
+    ),
     ("of sixteen bits", "an image is 150 x 140 uint16, those before"),
     ("no image", "it returns no image any more"),
     ("stamp of the future", "the stamp of an exposure"),
@@ -124,7 +132,10 @@ OF_IMAGES = [
 
 @pytest.mark.parametrize(
     ("fault", "said", "camera"),
-    [*((*fault, False) for fault in OF_THE_STAGE), *((*fault, True) for fault in OF_IMAGES)],
+    [
+        *((*fault, False) for fault in OF_THE_STAGE),
+        *((*fault, True) for fault in OF_IMAGES),
+    ],
 )
 def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
     tmp_path, fault, said, camera
@@ -134,16 +145,24 @@ def test_a_fault_in_the_middle_of_a_view_stops_the_stage_and_keeps_the_readings(
     with pytest.raises((MachineError, NoDataError), match=said):
         run_of(tmp_path, spoilt, cell).measure()
     assert spoilt.stops
-    assert len(spoilt.moves) - spoilt.moves_before <= (6 if "last 5 stops" in said else 4)
+    assert len(spoilt.moves) - spoilt.moves_before <= (
+        6 if "last 5 stops" in said else 4
+    )
     readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
     assert sum(int(view.count.sum()) for view in readings.views) >= 8
 
 
 @pytest.mark.parametrize(
     ("fault", "camera"),
-    [("connection lost in a move", False), ("zero lost at rest", False), ("out of focus", True)],
+    [
+        ("connection lost in a move", False),
+        ("zero lost at rest", False),
+        ("out of focus", True),
+    ],
 )
-def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(tmp_path, fault, camera):
+def test_a_run_that_a_fault_has_ended_is_resumed_to_the_right_map(
+    tmp_path, fault, camera
+):
     cell, machine = write_cell(tmp_path, camera=camera)
     with pytest.raises((MachineError, NoDataError)):
         run_of(tmp_path, Spoilt(machine, fault, after=ONSET), cell).measure()
@@ -163,18 +182,26 @@ HARMLESS = {
 
 
 @pytest.mark.parametrize(("fault", "camera"), HARMLESS.items())
-def test_a_fault_that_the_readings_allow_for_leaves_the_map_right(tmp_path, fault, camera):
+def test_a_fault_that_the_readings_allow_for_leaves_the_map_right(
+    tmp_path, fault, camera
+):
     cell, machine = write_cell(tmp_path, camera=camera)
     desk = Agreeing()
     run_of(tmp_path, Spoilt(machine, fault, after=ONSET), cell, desk=desk).measure()
     away, _ = away_from(machine.truth, tmp_path / "bag")
     assert np.abs(away).max() < 5e-8
     noted = [line for line in desk.lines if line.startswith("note: view 'identity'")]
-    assert [("has slipped" in line) for line in noted] == [True] * (fault == "camera was knocked")
+    assert [("has slipped" in line) for line in noted] == [True] * (
+        fault == "camera was knocked"
+    )
 
 
 NOT_SHOWN_BY_THE_POSITION = [
-    ("backlash of 5 um", 0, r"lie (4|5)[.]?\d* um apart in x and (4|5)[.]?\d* um in y: backlash"),
+    (
+        "backlash of 5 um",
+        0,
+        r"lie (4|5)[.]?\d* um apart in x and (4|5)[.]?\d* um in y: backlash",
+    ),
     ("steps were lost once", 40, r"[+]20 um in x and .* steps were lost"),
     ("loses steps", 0, r"the marks run away by [+]\d+ um in x"),
 ]
@@ -182,7 +209,9 @@ NOT_SHOWN_BY_THE_POSITION = [
 
 @pytest.mark.parametrize(("fault", "after", "said"), NOT_SHOWN_BY_THE_POSITION)
 def test_what_no_position_shows_is_named_from_the_repeats(tmp_path, fault, after, said):
-    cell, machine = write_cell(tmp_path, plan=PLAN.replace("grid_size: 3", "grid_size: 5"))
+    cell, machine = write_cell(
+        tmp_path, plan=PLAN.replace("grid_size: 3", "grid_size: 5")
+    )
     desk = Agreeing()
     try:
         run_of(tmp_path, Spoilt(machine, fault, after), cell, desk=desk).measure()
@@ -192,7 +221,9 @@ def test_what_no_position_shows_is_named_from_the_repeats(tmp_path, fault, after
 
 
 def test_marks_of_exchanged_names_and_bad_ones_are_named_with_the_reason(tmp_path):
-    cell, machine = write_cell(tmp_path, plan=PLAN.replace("grid_size: 3", "grid_size: 5"))
+    cell, machine = write_cell(
+        tmp_path, plan=PLAN.replace("grid_size: 3", "grid_size: 5")
+    )
     for fault, said in (
         ("m and n are exchanged", "the ids have m and n exchanged"),
         ("score is low", "rejected as low_score"),
@@ -211,7 +242,9 @@ def test_a_sensor_that_turns_its_sign_is_named_at_the_end_of_the_view(tmp_path):
 def test_an_offset_that_is_no_number_stops_the_stage(tmp_path):
     cell, machine = write_cell(tmp_path)
     spoilt = Spoilt(machine, "offset is not a number", ONSET)
-    with pytest.raises(MachineError, match=r"an offset is x nan.*leave out what is not seen"):
+    with pytest.raises(
+        MachineError, match=r"an offset is x nan.*leave out what is not seen"
+    ):
         run_of(tmp_path, spoilt, cell).measure()
     assert spoilt.stops
 
@@ -251,7 +284,9 @@ def test_a_device_that_never_answers_is_stopped_and_named(tmp_path, monkeypatch,
     monkeypatch.setattr(spoilt, name, silent)
     monkeypatch.setattr(visiting, "ANSWER_S", 0.2)
     quick = replace(cell, settle=replace(cell.settle, patience=1.0))
-    with pytest.raises(MachineError, match=rf"machine.{name}: it has not answered for 1.2 s"):
+    with pytest.raises(
+        MachineError, match=rf"machine.{name}: it has not answered for 1.2 s"
+    ):
         run_of(tmp_path, spoilt, quick).measure()
     assert spoilt.stops
 
@@ -261,7 +296,9 @@ def test_a_stop_that_never_answers_is_said(tmp_path, monkeypatch):
     spoilt = Spoilt(machine, "connection lost in a move", ONSET)
     monkeypatch.setattr(spoilt, "stop", lambda: time.sleep(100))
     monkeypatch.setattr(visiting, "ANSWER_S", 0.2)
-    with pytest.raises(MachineError, match=r"cannot be stopped .no answer.; use the emergency"):
+    with pytest.raises(
+        MachineError, match=r"cannot be stopped .no answer.; use the emergency"
+    ):
         run_of(tmp_path, spoilt, cell).measure()
 
 
@@ -272,7 +309,9 @@ def test_a_driver_that_ends_the_program_is_an_error(tmp_path, monkeypatch):
         run_of(tmp_path, machine, cell).measure()
 
 
-def test_a_stage_that_runs_away_is_stopped_at_once_and_the_axis_named(tmp_path, monkeypatch):
+def test_a_stage_that_runs_away_is_stopped_at_once_and_the_axis_named(
+    tmp_path, monkeypatch
+):
     cell, machine = write_cell(tmp_path)
     spoilt = Spoilt(machine, "")
     position = spoilt.position
@@ -282,7 +321,9 @@ def test_a_stage_that_runs_away_is_stopped_at_once_and_the_axis_named(tmp_path, 
         return (0.2 if len(spoilt.moves) > ONSET else x, *others)
 
     monkeypatch.setattr(spoilt, "position", far)
-    with pytest.raises(MachineError, match=r"x was sent to \S+ and indicates 0.2 beyond its lim"):
+    with pytest.raises(
+        MachineError, match=r"x was sent to \S+ and indicates 0.2 beyond its lim"
+    ):
         run_of(tmp_path, spoilt, cell).measure()
     assert spoilt.stops and len(spoilt.moves) == ONSET + 1
 
@@ -303,7 +344,9 @@ def test_a_stage_that_cannot_be_stopped_is_said(tmp_path):
         run_of(tmp_path, spoilt, cell).measure()
 
 
-def test_a_disk_that_is_full_stops_the_stage_and_the_run_is_resumed(tmp_path, monkeypatch):
+def test_a_disk_that_is_full_stops_the_stage_and_the_run_is_resumed(
+    tmp_path, monkeypatch
+):
     cell, machine = write_cell(tmp_path)
     spoilt, written, write = Spoilt(machine), [], Journal.write
 

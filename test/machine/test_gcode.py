@@ -12,7 +12,15 @@ from selfcal_ros.machine.gcode import GcodeMachine
 from selfcal_ros.machine.measuring import Run
 from test.machine.test_measuring import away_from
 from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell
-from test.support.firmware import FaultyGrbl, Grbl, Klipper, LinuxCnc, Marlin, over_pty, over_tcp
+from test.support.firmware import (
+    FaultyGrbl,
+    Grbl,
+    Klipper,
+    LinuxCnc,
+    Marlin,
+    over_pty,
+    over_tcp,
+)
 
 pytest.importorskip("serial")
 pytestmark = pytest.mark.usefixtures("quick_controllers")
@@ -28,16 +36,25 @@ def quick_controllers(monkeypatch, jumping_clocks):
 
 @pytest.mark.parametrize(
     ("dialect", "over"),
-    [("grbl", over_pty), *((dialect, over_tcp) for dialect in KINDS if dialect != "grbl")],
+    [
+        ("grbl", over_pty),
+        *((dialect, over_tcp) for dialect in KINDS if dialect != "grbl"),
+    ],
 )
 def test_a_plan_is_measured_by_a_controller(tmp_path, dialect, over):
-    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
+    cell, simulated = write_cell(
+        tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL
+    )
     firmware = KINDS[dialect]()
     with over(firmware) as port:
         machine = WithPlate(simulated, port=port, dialect=dialect)
         try:
             Run(
-                read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+                read_plan(tmp_path / "plan.yaml"),
+                cell,
+                machine,
+                tmp_path / "bag",
+                Agreeing(),
             ).measure()
         finally:
             machine.close()
@@ -94,15 +111,23 @@ def test_an_alarm_in_the_middle_stops_and_is_named(dialect):
         ("silent", "no status report|no answer"),
     ],
 )
-def test_a_controller_that_fails_in_the_middle_of_a_view(tmp_path, monkeypatch, fault, said):
+def test_a_controller_that_fails_in_the_middle_of_a_view(
+    tmp_path, monkeypatch, fault, said
+):
     monkeypatch.setattr(gcode, "PATIENCE_S", 0.3)
-    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
+    cell, simulated = write_cell(
+        tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL
+    )
     firmware = FaultyGrbl(fault, after=150)
     with over_tcp(firmware) as port:
         machine = WithPlate(simulated, port=port, dialect="grbl")
         with pytest.raises(MachineError, match=said):
             Run(
-                read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+                read_plan(tmp_path / "plan.yaml"),
+                cell,
+                machine,
+                tmp_path / "bag",
+                Agreeing(),
             ).measure()
         machine.close()
     assert firmware.stopped >= 2 or fault == "silent"  # feed hold and reset
@@ -132,9 +157,14 @@ def test_a_lost_connection_is_named(over, monkeypatch):
 )
 def test_keys_that_cannot_be(keys, said):
     with pytest.raises(MachineError, match=said):
-        GcodeMachine(**{"port": "socket://127.0.0.1:1", "dialect": "grbl", "feed": 1.0} | keys)
+        GcodeMachine(
+            **{"port": "socket://127.0.0.1:1", "dialect": "grbl", "feed": 1.0} | keys
+        )
 
 
 def test_a_password_that_is_refused():
-    with over_tcp(LinuxCnc()) as port, pytest.raises(MachineError, match="check password"):
+    with (
+        over_tcp(LinuxCnc()) as port,
+        pytest.raises(MachineError, match="check password"),
+    ):
         GcodeMachine(port, "linuxcnc", feed=1.0, password="other")

@@ -25,13 +25,17 @@ from test.support.waiting import wait_until
 pytest.importorskip("serial")
 
 
-@pytest.mark.skipif(shutil.which("linuxcncrsh") is None, reason="LinuxCNC is not installed")
+@pytest.mark.skipif(
+    shutil.which("linuxcncrsh") is None, reason="LinuxCNC is not installed"
+)
 def test_a_real_linuxcnc_measures_a_plan_and_loads_the_tables(tmp_path):
     """Its numbers are the machine's own, in mm; what lies beyond its limits it refuses.
 
     Its motors go to the true position and the error of the map there, but for that at its zero.
     """
-    cell, simulated = write_cell(tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL)
+    cell, simulated = write_cell(
+        tmp_path, camera=True, simulation=QUIET, plan=FEW, cell=CELL
+    )
     emap = random_map(Artifact(5, 0.005, 0, 5), 1)
     emap = replace(emap, gx=emap.gx[:, :1] + 0 * emap.gx, gy=emap.gy[:1] + 0 * emap.gy)
     with tempfile.TemporaryDirectory() as folder:
@@ -43,7 +47,11 @@ def test_a_real_linuxcnc_measures_a_plan_and_loads_the_tables(tmp_path):
             machine = WithPlate(simulated, port=port, dialect="linuxcnc")
             try:
                 Run(
-                    read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+                    read_plan(tmp_path / "plan.yaml"),
+                    cell,
+                    machine,
+                    tmp_path / "bag",
+                    Agreeing(),
                 ).measure()
                 check_limits(machine)
                 check_tables(machine, emap)
@@ -56,7 +64,9 @@ def test_a_real_linuxcnc_measures_a_plan_and_loads_the_tables(tmp_path):
 def check_limits(machine):
     machine.move_to((0.0015, -0.00225))
     assert machine.position() == pytest.approx((0.0015, -0.00225), abs=1e-9)
-    with pytest.raises(MachineError, match=r"'set mdi G53 G1 X30.000000 Y0.000000 .* NAK'"):
+    with pytest.raises(
+        MachineError, match=r"'set mdi G53 G1 X30.000000 Y0.000000 .* NAK'"
+    ):
         machine.move_to((0.03, 0.0))
     assert machine.position() == pytest.approx((0.0015, -0.00225), abs=1e-9)
 

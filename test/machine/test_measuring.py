@@ -78,7 +78,9 @@ def test_nothing_moves_beyond_the_limits(tmp_path):
     cell, machine = write_cell(tmp_path, plan=PLAN.replace("0.001", "0.0101"))
     spoilt = Spoilt(machine)
     run = run_of(tmp_path, spoilt, cell)
-    with pytest.raises(MachineError, match=r"view 'identity'.*beyond the limits -0.01 to 0.01"):
+    with pytest.raises(
+        MachineError, match=r"view 'identity'.*beyond the limits -0.01 to 0.01"
+    ):
         run.require()
     assert not spoilt.moves
 
@@ -99,10 +101,14 @@ def test_a_stage_that_stands_beyond_the_limits_moves_back_towards_them(tmp_path)
 
 
 def test_a_view_of_lines_needs_a_rotary_axis(tmp_path):
-    cell, machine = write_cell(tmp_path, plan=PLAN.replace("angular_count: 0", "angular_count: 8"))
+    cell, machine = write_cell(
+        tmp_path, plan=PLAN.replace("angular_count: 0", "angular_count: 8")
+    )
     spoilt = Spoilt(machine)
     spoilt.axes = ("x", "y")
-    with pytest.raises(MachineError, match="the view moves theta, the machine has x and y"):
+    with pytest.raises(
+        MachineError, match="the view moves theta, the machine has x and y"
+    ):
         run_of(tmp_path, spoilt, cell).require()
 
 
@@ -142,7 +148,9 @@ def test_a_mark_that_is_never_seen_is_named(tmp_path):
         def offsets(self):
             return [seen for seen in super().offsets() if seen.mark != (1, -1)]
 
-    with pytest.raises(NoDataError, match=r"mark \(1, -1\) are not read after 3 more visits"):
+    with pytest.raises(
+        NoDataError, match=r"mark \(1, -1\) are not read after 3 more visits"
+    ):
         run_of(tmp_path, Dirty(machine), cell).measure()
 
 
@@ -159,7 +167,9 @@ def test_marks_that_were_missed_are_visited_again(tmp_path):
     run_of(tmp_path, Forgetful(machine), cell).measure()
     counts = [
         view.count.min()
-        for view in collect_bag(tmp_path / "bag", CollectorSettings()).measurements.views
+        for view in collect_bag(
+            tmp_path / "bag", CollectorSettings()
+        ).measurements.views
     ]
     assert min(counts) >= 2
 
@@ -167,7 +177,9 @@ def test_marks_that_were_missed_are_visited_again(tmp_path):
 def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
     cell, machine = write_cell(tmp_path)
     with pytest.raises(MachineError):
-        run_of(tmp_path, Spoilt(machine, "connection lost in a move", after=18), cell).measure()
+        run_of(
+            tmp_path, Spoilt(machine, "connection lost in a move", after=18), cell
+        ).measure()
 
     class Rehomed(Spoilt):
         """After the power cut its zero is 3 um beside the old one."""
@@ -180,10 +192,12 @@ def test_a_stage_that_lost_its_zero_has_the_view_measured_anew(tmp_path):
             super().move_to((position[0] - 3e-6, *position[1:]))
 
     desk = Agreeing()
-    run_of(tmp_path, Rehomed(machine), cell, Jumping(Jumping().ns + 10**12), desk).measure(
-        resume=True
+    run_of(
+        tmp_path, Rehomed(machine), cell, Jumping(Jumping().ns + 10**12), desk
+    ).measure(resume=True)
+    assert any(
+        "its marks lie" in line and "measured anew" in line for line in desk.lines
     )
-    assert any("its marks lie" in line and "measured anew" in line for line in desk.lines)
     readings = collect_bag(tmp_path / "bag", CollectorSettings()).measurements
     assert readings.views[0].rejected.get("superseded_by_redo", 0) > 0 or (
         readings.rejected.get("superseded_by_redo", 0) > 0
@@ -195,11 +209,17 @@ def test_a_plate_that_was_taken_away_has_the_view_measured_anew(tmp_path):
     """Another machine, as after its simulation was killed: its plate lies as for the first view."""
     cell, machine = write_cell(tmp_path)
     with pytest.raises(MachineError):
-        run_of(tmp_path, Spoilt(machine, "connection lost in a move", after=100), cell).measure()
+        run_of(
+            tmp_path, Spoilt(machine, "connection lost in a move", after=100), cell
+        ).measure()
     cell, machine = write_cell(tmp_path)
     desk = Agreeing()
-    run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12), desk).measure(resume=True)
-    assert [line for line in desk.lines if "none of its marks is seen where it was" in line]
+    run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12), desk).measure(
+        resume=True
+    )
+    assert [
+        line for line in desk.lines if "none of its marks is seen where it was" in line
+    ]
     assert calibrate(
         collect_bag(tmp_path / "bag", CollectorSettings()).measurements
     ).verdict.qualified
@@ -208,18 +228,24 @@ def test_a_plate_that_was_taken_away_has_the_view_measured_anew(tmp_path):
 def test_a_bag_is_not_overwritten_and_not_continued_by_another_plan(tmp_path):
     cell, machine = write_cell(tmp_path)
     with pytest.raises(MachineError):
-        run_of(tmp_path, Spoilt(machine, "connection lost in a move", after=12), cell).measure()
+        run_of(
+            tmp_path, Spoilt(machine, "connection lost in a move", after=12), cell
+        ).measure()
     with pytest.raises(InputError, match="exists already; continue it with --resume"):
         run_of(tmp_path, machine, cell).measure()
     (tmp_path / "plan.yaml").write_text(PLAN.replace("repeats: 2", "repeats: 3"))
     with pytest.raises(InputError, match="of another plan"):
-        run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12)).measure(resume=True)
+        run_of(tmp_path, machine, cell, Jumping(Jumping().ns + 10**12)).measure(
+            resume=True
+        )
 
 
 def test_a_clock_that_was_set_back_does_not_continue(tmp_path):
     cell, machine = write_cell(tmp_path)
     with pytest.raises(MachineError):
-        run_of(tmp_path, Spoilt(machine, "connection lost in a move", after=12), cell).measure()
+        run_of(
+            tmp_path, Spoilt(machine, "connection lost in a move", after=12), cell
+        ).measure()
     with pytest.raises(InputError, match="clock is behind the last message"):
         run_of(tmp_path, machine, cell, Jumping()).measure(resume=True)
 

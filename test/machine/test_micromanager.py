@@ -31,16 +31,24 @@ def config(tmp_path):
 
 @pytest.mark.usefixtures("jumping_clocks")
 def test_the_example_finds_the_map_within_its_uncertainty(tmp_path, config):
-    with_values(tmp_path / "cell.yaml", "detector", {"pixel_size": 1e-6, "turn": 3.0}, {})
+    with_values(
+        tmp_path / "cell.yaml", "detector", {"pixel_size": 1e-6, "turn": 3.0}, {}
+    )
     cell = read_cell(tmp_path / "cell.yaml")
     machine = open_machine(cell)
     try:
         Run(
-            read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+            read_plan(tmp_path / "plan.yaml"),
+            cell,
+            machine,
+            tmp_path / "bag",
+            Agreeing(),
         ).measure()
     finally:
         machine.close()
-    away, result = away_from(machine.plate.truth, tmp_path / "bag", collector_settings(cell))
+    away, result = away_from(
+        machine.plate.truth, tmp_path / "bag", collector_settings(cell)
+    )
     u = np.concatenate([result.error_map.u_gx.ravel(), result.error_map.u_gy.ravel()])
     assert np.abs(away).max() < 4 * u.max() < 1e-7
 

@@ -15,7 +15,8 @@ from test.machine.test_measuring import away_from
 from test.support.cells import QUIET, Agreeing, Jumping, write_cell
 
 pytest.importorskip("ophyd", exc_type=ImportError)
-pytestmark = pytest.mark.filterwarnings("ignore")  # of its own and its libraries' imports
+# of its own and its libraries' imports
+pytestmark = pytest.mark.filterwarnings("ignore")
 
 
 @pytest.fixture
@@ -46,10 +47,17 @@ def test_a_plan_is_measured_to_its_true_map(tmp_path, devices):
             return self.frame.trigger()
 
     devices.camera = Detector(name="camera")
-    machine = OphydMachine("beamline:x", "beamline:y", detector="beamline:camera", image="frame")
+    machine = OphydMachine(
+        "beamline:x", "beamline:y", detector="beamline:camera", image="frame"
+    )
     machine.place = simulated.place
     Run(
-        read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing(), Jumping()
+        read_plan(tmp_path / "plan.yaml"),
+        cell,
+        machine,
+        tmp_path / "bag",
+        Agreeing(),
+        Jumping(),
     ).measure()
     away, result = away_from(simulated.truth, tmp_path / "bag")
     assert result.verdict.qualified

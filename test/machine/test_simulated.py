@@ -68,7 +68,9 @@ def test_exposures_come_in_their_period_with_samples_at_their_rate(period_s, rat
     """The stage rests 60 % of the period; two samples before and after an exposure are alike."""
     settings = replace(EXACT, exposure_period_s=period_s, encoder_rate_hz=rate_hz)
     _, [told] = visited(
-        Plan("p", PLATE, (View("a", repeats=2),)), settings, step_ns=round(1e9 / rate_hz)
+        Plan("p", PLATE, (View("a", repeats=2),)),
+        settings,
+        step_ns=round(1e9 / rate_hz),
     )
     stamps = np.array([event.stamp_ns for event in told])
     assert (np.diff(stamps) > 0).all()
@@ -91,7 +93,9 @@ def test_all_repeats_of_a_mark_one_after_another_are_one_visit():
     seen = of_kind(Detection, told)
     marks = [(item.m, item.n) for item in seen]
     assert marks == [mark for mark in dict.fromkeys(marks) for _ in range(3)]
-    offsets = np.array([(item.offset_x, item.offset_y) for item in seen]).reshape(9, 3, 2)
+    offsets = np.array([(item.offset_x, item.offset_y) for item in seen]).reshape(
+        9, 3, 2
+    )
     assert (offsets == offsets[:, :1]).all()
     assert len(np.unique(offsets[:, 0], axis=0)) == 9
 
@@ -104,10 +108,14 @@ def test_a_stage_that_follows_its_marks_has_them_on_the_axis(sense):
     spread = Spread(t_m=1e-4, phi_rad=1e-2)
     for follows in (True, False):
         _, [told] = visited(
-            Plan("p", PLATE, (view,)), replace(settings, follow_mark=follows), spread=spread
+            Plan("p", PLATE, (view,)),
+            replace(settings, follow_mark=follows),
+            spread=spread,
         )
         seen = of_kind(Detection, told)
-        away = np.array([np.hypot(item.offset_x, item.offset_y) for item in seen if not item.kind])
+        away = np.array(
+            [np.hypot(item.offset_x, item.offset_y) for item in seen if not item.kind]
+        )
         angle = np.array([item.offset_theta for item in seen if item.kind])
         if follows:
             aside = np.repeat([0.0, 2e-5, 0.0], [9, 8, 0])
@@ -121,13 +129,17 @@ def test_a_stage_that_follows_its_marks_has_them_on_the_axis(sense):
 def test_encoder_noise_is_that_of_an_exposure_and_moves_nothing():
     settings = replace(EXACT, encoder_sigma_m=1e-7)
     view = View("a", repeats=40, angular=False)
-    machine, [told] = visited(Plan("p", PLATE, (view,)), settings, spread=Spread(t_m=0.0))
+    machine, [told] = visited(
+        Plan("p", PLATE, (view,)), settings, spread=Spread(t_m=0.0)
+    )
     seen = of_kind(Detection, told)
     marks = np.array([item.m * 10 + item.n for item in seen])
     offsets = np.array([item.offset_x for item in seen])
     assert all(np.ptp(offsets[marks == mark]) < 1e-15 for mark in marks)
     samples = of_kind(EncoderSample, told)
-    at = np.searchsorted([sample.stamp_ns for sample in samples], [item.stamp_ns for item in seen])
+    at = np.searchsorted(
+        [sample.stamp_ns for sample in samples], [item.stamp_ns for item in seen]
+    )
     read = np.array([samples[index].positions[0] for index in at]) - marks // 10 * 0.001
     assert np.std([x - round(x, 3) for x in read]) == pytest.approx(1e-7, rel=0.1)
     assert machine.position() == machine.position()
@@ -177,7 +189,9 @@ SPREAD = Spread(
 
 
 @pytest.mark.parametrize("sense", list(Sense))
-@pytest.mark.parametrize("how", [{}, {"consecutive": True}, {"follow_mark": True}], ids=str)
+@pytest.mark.parametrize(
+    "how", [{}, {"consecutive": True}, {"follow_mark": True}], ids=str
+)
 def test_a_visited_machine_reads_as_its_bag_without_noise(how, sense):
     """The stage comes to each view from below, as that of a bag does."""
     plan = plan_of("0, 90, -tx", 5, size_y=3, count=8, line=True, repeats=3)
@@ -197,7 +211,11 @@ def test_a_visited_machine_reads_as_its_bag_without_noise(how, sense):
         begin={"x": -0.5, "y": -0.5, "theta": 0.1},
     )
     bag = plan_events(
-        machine.truth, plan, settings=settings, rng=np.random.default_rng(4), start_ns=START_NS
+        machine.truth,
+        plan,
+        settings=settings,
+        rng=np.random.default_rng(4),
+        start_ns=START_NS,
     )
     offline, _ = collect(bag, measurement_sense=str(sense), outlier_limit=0.0)
     live = []

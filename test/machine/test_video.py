@@ -32,7 +32,9 @@ class Webcam:
     def frames(self) -> Iterator[bytes]:
         while not self.unplugged.wait(1 / FRAMES_A_SECOND):
             file = BytesIO()
-            Pillow.fromarray(self.picture()).save(file, "JPEG", quality=95, subsampling=0)
+            Pillow.fromarray(self.picture()).save(
+                file, "JPEG", quality=95, subsampling=0
+            )
             yield file.getvalue()
 
 
@@ -43,7 +45,9 @@ def streamed(webcam):
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
             self.send_response(200)
-            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+            self.send_header(
+                "Content-Type", "multipart/x-mixed-replace; boundary=frame"
+            )
             self.end_headers()
             with suppress(OSError):
                 for frame in webcam.frames():
@@ -90,7 +94,9 @@ def test_a_camera_that_is_unplugged_is_named():
         camera = VideoCamera(address)
         camera.image()
         webcam.unplugged.set()
-        with pytest.raises(MachineError, match=r"camera http.*no image any more; check the cable"):
+        with pytest.raises(
+            MachineError, match=r"camera http.*no image any more; check the cable"
+        ):
             camera.image()
         camera.close()
 
@@ -138,7 +144,9 @@ def test_a_plan_is_measured_with_a_webcam_that_never_waits(tmp_path):
 
 def test_a_sequence_of_files_is_read_one_by_one_to_its_end(tmp_path):
     for number in range(3):
-        Pillow.fromarray(flat(50 + 50 * number)).save(tmp_path / f"frame_{number:03}.png")
+        Pillow.fromarray(flat(50 + 50 * number)).save(
+            tmp_path / f"frame_{number:03}.png"
+        )
     camera = VideoCamera(str(tmp_path / "frame_%03d.png"))
     assert [camera.image().pixels.mean() for _ in range(3)] == [50, 100, 150]
     with pytest.raises(MachineError, match="the file has ended"):

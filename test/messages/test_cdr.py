@@ -89,7 +89,9 @@ def test_the_fields_are_those_of_the_definitions():
     assert fields_of(STORE, JOINTS) == JOINT_STATE
 
 
-texts = st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\0"), max_size=9)
+texts = st.text(
+    st.characters(blacklist_categories=["Cs"], blacklist_characters="\0"), max_size=9
+)
 numbers = st.lists(st.floats(allow_nan=False), max_size=4)
 states = st.tuples(
     st.lists(texts, max_size=4),
@@ -106,7 +108,9 @@ states = st.tuples(
 @given(st.lists(states, min_size=1, max_size=30))
 def test_any_mixture_of_layouts_gives_what_rosbags_gives(drawn):
     data, expected = [], []
-    for number, (names, position, velocity, effort, frame, little, tail) in enumerate(drawn * 3):
+    for number, (names, position, velocity, effort, frame, little, tail) in enumerate(
+        drawn * 3
+    ):
         stamp = number * 1_500_000_001
         message = joint_state(stamp, names, position, velocity, effort, frame)
         data.append(as_cdr(message, little, tail))
@@ -183,7 +187,9 @@ def test_fields_before_between_and_behind_the_known_ones():
 
 def test_a_basic_type_without_a_numpy_code_is_left_to_rosbags():
     store = get_typestore(Stores.ROS2_JAZZY)
-    store.register(get_types_from_msg("std_msgs/Header header\nfloat128 much\n", "pkg/msg/Long"))
+    store.register(
+        get_types_from_msg("std_msgs/Header header\nfloat128 much\n", "pkg/msg/Long")
+    )
     assert fields_of(store, "pkg/msg/Long") is None
 
 
@@ -191,7 +197,9 @@ def test_padding_may_hold_anything():
     data = bytearray(as_cdr(joint_state(5, effort=[1.0])))
     other = bytearray(as_cdr(joint_state(6, effort=[1.0])))
     layout = layout_of(JOINT_STATE, bytes(data))
-    inside = set(range(2, len(data))) - {i for i, fixed in enumerate(layout.fixed) if fixed}
+    inside = set(range(2, len(data))) - {
+        i for i, fixed in enumerate(layout.fixed) if fixed
+    }
     for code, at, count in layout.values.values():
         inside -= set(range(at, at + int(code[2:]) * (1 if count is None else count)))
     assert inside - {2, 3}, "this message has padding"
@@ -252,7 +260,9 @@ def test_how_much_may_stand_behind_the_last_field():
 def test_layouts_that_few_share_are_not_tried_without_end(monkeypatch):
     tried = []
     monkeypatch.setattr(
-        cdr, "layout_of", lambda fields, data: tried.append(1) or layout_of(fields, data)
+        cdr,
+        "layout_of",
+        lambda fields, data: tried.append(1) or layout_of(fields, data),
     )
     data = [as_cdr(joint_state(i, frame=f"{i:05d}")) for i in range(640)]
     blocks, rest = blocks_of(data)
@@ -273,9 +283,9 @@ def test_known_layouts_are_not_walked_again(monkeypatch):
     groups, _ = decoder.decode(Payloads.joined(data))
     assert sorted(len(group) for group in groups) == [10, 10, 10]
     monkeypatch.setattr(cdr, "layout_of", None)
-    assert samples(map(encoder_block, decoder.decode(Payloads.joined(data))[0])) == samples(
-        map(encoder_block, groups)
-    )
+    assert samples(
+        map(encoder_block, decoder.decode(Payloads.joined(data))[0])
+    ) == samples(map(encoder_block, groups))
 
 
 def test_the_memory_of_layouts_is_bounded():
@@ -368,4 +378,7 @@ def test_an_editor_refuses_what_is_cut_or_too_long():
     whole = as_cdr(joint_state(5, velocities=[1.0, 2.0, 3.0]))
     assert editor.read(whole) is not None
     assert [size for size in range(len(whole)) if editor.read(whole[:size])] == []
-    assert editor.read(as_cdr(joint_state(5, positions=np.zeros(cdr.MAX_LENGTH // 8)))) is None
+    assert (
+        editor.read(as_cdr(joint_state(5, positions=np.zeros(cdr.MAX_LENGTH // 8))))
+        is None
+    )

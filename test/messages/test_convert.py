@@ -34,7 +34,9 @@ from test.support.results import known_result
 
 STAMPS = st.integers(0, (2**31 - 1) * 10**9 + 999_999_999)
 FLOATS = st.floats(allow_nan=False)
-TEXTS = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9)
+TEXTS = st.text(
+    st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=9
+)
 U32, I32 = st.integers(0, 2**32 - 1), st.integers(-(2**31), 2**31 - 1)
 FLOATS32 = st.floats(width=32, allow_nan=False)
 DETECTIONS = st.builds(
@@ -53,7 +55,9 @@ DETECTIONS = st.builds(
 )
 SAMPLES = st.lists(st.tuples(TEXTS, FLOATS, FLOATS), max_size=4).flatmap(
     lambda rows: st.builds(
-        EncoderSample, STAMPS, *(st.just(tuple(row[i] for row in rows)) for i in range(3))
+        EncoderSample,
+        STAMPS,
+        *(st.just(tuple(row[i] for row in rows)) for i in range(3)),
     )
 )
 ARTIFACTS = st.builds(
@@ -80,7 +84,9 @@ VIEWS = st.builds(
     st.booleans(),
     st.integers(1, 2**32 - 1),
 )
-ORDER_TEXTS = st.sampled_from(["", *ORDERS]) | st.sampled_from(ORDERS).map(lambda o: o + "@plate")
+ORDER_TEXTS = st.sampled_from(["", *ORDERS]) | st.sampled_from(ORDERS).map(
+    lambda o: o + "@plate"
+)
 ASKING = st.builds(
     Command,
     STAMPS,
@@ -88,13 +94,22 @@ ASKING = st.builds(
     TEXTS,
     U32,
     st.builds(
-        replace, VIEWS, visit_order=ORDER_TEXTS, check_marks=U32, check_offset_m=st.floats(0, 1)
+        replace,
+        VIEWS,
+        visit_order=ORDER_TEXTS,
+        check_marks=U32,
+        check_offset_m=st.floats(0, 1),
     ),
     ARTIFACTS,
     U32,
 )
 ENDING = st.builds(
-    Command, STAMPS, st.sampled_from([Phase.DONE, Phase.ABORT]), TEXTS, U32, views_planned=U32
+    Command,
+    STAMPS,
+    st.sampled_from([Phase.DONE, Phase.ABORT]),
+    TEXTS,
+    U32,
+    views_planned=U32,
 )
 COUNTS = st.dictionaries(TEXTS, U32, max_size=3)
 STAMP_NS = 1_700_000_000_123_456_789
@@ -151,7 +166,10 @@ def test_a_message_of_somebody_else_is_what_it_says(event):
 def test_fields_of_a_detection_by_name():
     event = Detection(STAMP_NS, 1, True, -2, 3, 4, -5e-6, 6e-6, -7e-3, 8e-8, 0.5)
     assert from_model.detection(event, "f") == {
-        "header": {"stamp": {"sec": 1_700_000_000, "nanosec": 123_456_789}, "frame_id": "f"},
+        "header": {
+            "stamp": {"sec": 1_700_000_000, "nanosec": 123_456_789},
+            "frame_id": "f",
+        },
         "kind": 1,
         "has_id": True,
         "m": -2,
@@ -178,7 +196,9 @@ MAP_FIELDS = {
 
 
 def test_fields_of_a_command_by_name():
-    view = View("turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y", 3, 2e-5)
+    view = View(
+        "turned", math.pi / 2, (0.01, -0.02), True, False, 7, "x_then_y", 3, 2e-5
+    )
     made = from_model.command(
         Command(
             STAMP_NS,
@@ -226,15 +246,24 @@ def test_fields_of_a_command_by_name():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"phase": 4}, "selfcal/view_command: unknown phase 4; use PLACE, MEASURE, DONE or ABORT"),
+        (
+            {"phase": 4},
+            "selfcal/view_command: unknown phase 4; use PLACE, MEASURE, DONE or ABORT",
+        ),
         ({"grid_size": 2}, "artifact grid_size: 2 is not a number"),
         ({"grid_pitch": math.nan}, "artifact grid_pitch: nan m is not a length"),
-        ({"map_grid_size": 2, "map_grid_pitch": 0.1}, "map grid_size: 2 is not a number"),
+        (
+            {"map_grid_size": 2, "map_grid_pitch": 0.1},
+            "map grid_size: 2 is not a number",
+        ),
         (
             {"angular_count": 7, "map_harmonics": 4},
             "map harmonics: 4 harmonics cannot be told with 7",
         ),
-        ({"map_grid_size": 5}, "map grid_pitch: 0.0 m is not a length; give the number of nodes"),
+        (
+            {"map_grid_size": 5},
+            "map grid_pitch: 0.0 m is not a length; give the number of nodes",
+        ),
         ({"image_nx": 2}, "image"),
         ({"image_nx": 3, "image_ny": 2}, "image"),
         (
@@ -258,12 +287,17 @@ def test_commands_that_cannot_be_used(changes, message):
 
 def test_a_command_may_be_stamped_at_the_beginning_of_time():
     first = Command(0, Phase.PLACE, "p", 3, View("a"), Artifact(5, 0.01))
-    assert to_model.command(through_cdr("ViewCommand", from_model.command(first, "f"))) == first
+    assert (
+        to_model.command(through_cdr("ViewCommand", from_model.command(first, "f")))
+        == first
+    )
 
 
 @pytest.mark.parametrize("text", ["spiral", "\x1b[31m", "raster@stage"])
 def test_an_order_that_is_not_known_does_not_cost_the_command(text):
-    event = Command(STAMP_NS, Phase.MEASURE, "p", 3, View("a", repeats=2), Artifact(5, 0.01))
+    event = Command(
+        STAMP_NS, Phase.MEASURE, "p", 3, View("a", repeats=2), Artifact(5, 0.01)
+    )
     values = from_model.command(event, "f") | {"visit_order": text}
     assert to_model.command(through_cdr("ViewCommand", values)) == event
 
@@ -272,7 +306,12 @@ def test_no_repeats_are_one():
     values = from_model.command(
         Command(STAMP_NS, Phase.PLACE, "p", 3, View("a"), Artifact(5, 0.01)), "f"
     )
-    assert to_model.command(through_cdr("ViewCommand", values | {"repeats": 0})).view.repeats == 1
+    assert (
+        to_model.command(
+            through_cdr("ViewCommand", values | {"repeats": 0})
+        ).view.repeats
+        == 1
+    )
 
 
 @given(stamp=st.integers(-(2**31) * 10**9, 2**31 * 10**9 - 1))
@@ -283,7 +322,9 @@ def test_a_stamp_is_kept_to_the_nanosecond(stamp):
 
 
 def arrays(size, element, kind):
-    return st.lists(element, min_size=size, max_size=size).map(lambda v: np.array(v, dtype=kind))
+    return st.lists(element, min_size=size, max_size=size).map(
+        lambda v: np.array(v, dtype=kind)
+    )
 
 
 @st.composite
@@ -313,7 +354,9 @@ def readings(draw):
 
 
 @settings(max_examples=20)
-@given(read=readings(), artifact=ARTIFACTS, rejected=COUNTS, sense=st.sampled_from(Sense))
+@given(
+    read=readings(), artifact=ARTIFACTS, rejected=COUNTS, sense=st.sampled_from(Sense)
+)
 def test_view_measurements_come_back(read, artifact, rejected, sense):
     progress = ViewProgress(5, read.view, 0, 0, 0, 0, read, 0)
     whole = Measurements("p", artifact, (read,), sense, rejected)
@@ -327,7 +370,11 @@ def test_view_measurements_come_back(read, artifact, rejected, sense):
         assert not isinstance(wanted, np.ndarray) or got.dtype == wanted.dtype
     assert to_model.artifact_of(message) == artifact
     assert to_model.counts(message, "session_reject") == rejected
-    assert (to_model.sense_of(message), message.plan_id, message.view_index) == (sense, "p", 5)
+    assert (to_model.sense_of(message), message.plan_id, message.view_index) == (
+        sense,
+        "p",
+        5,
+    )
 
 
 VISITS = GridVisits(
@@ -363,7 +410,9 @@ READ = ViewReadings(
     15,
     {"low_score": 16, "not_at_mark": 2},
     VISITS,
-    RejectedPlaces(("not_at_mark", "low_score"), np.array([0.3, math.nan]), np.array([0.4, 0.5])),
+    RejectedPlaces(
+        ("not_at_mark", "low_score"), np.array([0.3, math.nan]), np.array([0.4, 0.5])
+    ),
     motion=RepeatMotion(1e-15 * np.arange(16.0).reshape(4, 4), 21),
     motion_theta=RepeatMotion(1e-12 * np.array([[1.0, 2.0], [3.0, 4.0]]), 22),
     axis_theta=0.01,
@@ -402,7 +451,8 @@ def test_the_cell_of_an_image_comes_back():
         progress = replace(PROGRESS, readings=replace(READ, view=cell))
         plate = replace(MEASURED, artifact=image_plan(5).artifact)
         message = through_cdr(
-            "ViewMeasurement", from_model.view_measurement(progress, plate, STAMP_NS, "f")
+            "ViewMeasurement",
+            from_model.view_measurement(progress, plate, STAMP_NS, "f"),
         )
         assert to_model.view_readings(message).view == cell
         assert to_model.cell_of(message) == cell.cell
@@ -410,7 +460,9 @@ def test_the_cell_of_an_image_comes_back():
 
 def test_the_plate_and_the_map_of_a_measurement_come_back():
     there = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
-    assert to_model.artifact_of(through_cdr("ViewMeasurement", there)) == MEASURED.artifact
+    assert (
+        to_model.artifact_of(through_cdr("ViewMeasurement", there)) == MEASURED.artifact
+    )
 
 
 def test_the_visits_of_a_view_survive_the_message():
@@ -425,11 +477,14 @@ def test_the_visits_of_a_view_survive_the_message():
 def test_rejected_detections_and_the_visiting_order_survive_the_message():
     found = to_model.view_readings(
         through_cdr(
-            "ViewMeasurement", from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+            "ViewMeasurement",
+            from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f"),
         )
     )
     assert found.places.reason == READ.places.reason
-    np.testing.assert_array_equal([found.places.x, found.places.y], [READ.places.x, READ.places.y])
+    np.testing.assert_array_equal(
+        [found.places.x, found.places.y], [READ.places.x, READ.places.y]
+    )
     assert found.view.visit_order == "x_then_y"
 
 
@@ -451,7 +506,8 @@ def test_a_key_of_a_plan_that_is_not_known_is_refused_by_name(name):
 
 def test_sums_over_repeats_come_back():
     message = through_cdr(
-        "ViewMeasurement", from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
+        "ViewMeasurement",
+        from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f"),
     )
     found = to_model.view_readings(message)
     for name in ("motion", "motion_theta"):
@@ -469,7 +525,9 @@ def test_fields_of_a_view_measurement_by_name():
     )
     np.testing.assert_array_equal(made.pop("motion"), 1e-15 * np.arange(16.0))
     np.testing.assert_array_equal(made.pop("motion_theta"), 1e-12 * np.arange(1.0, 5.0))
-    for name in [name for name in made if name.startswith("visit_") and name != "visit_order"]:
+    for name in [
+        name for name in made if name.startswith("visit_") and name != "visit_order"
+    ]:
         del made[name]
     assert made == {
         "plan_id": "p",
@@ -562,19 +620,33 @@ def test_fields_of_a_view_status_by_name():
         ({"k": []}, "k, dtheta, count_theta, u_theta differ in length"),
         ({"u_theta": [1.0, 2.0]}, "k, dtheta, count_theta, u_theta differ in length"),
         ({"reject_counts": []}, "reject_reasons and reject_counts differ in length"),
-        ({"visit_dy": [1.0]}, "the visits differ in length or name marks that were not read"),
-        ({"rejected_y": [1.0]}, "the rejected detections differ in length or name no reason"),
-        ({"rejected_reason": [0, 2]}, "the rejected detections differ in length or name no reason"),
+        (
+            {"visit_dy": [1.0]},
+            "the visits differ in length or name marks that were not read",
+        ),
+        (
+            {"rejected_y": [1.0]},
+            "the rejected detections differ in length or name no reason",
+        ),
+        (
+            {"rejected_reason": [0, 2]},
+            "the rejected detections differ in length or name no reason",
+        ),
         ({"motion": [1.0, 2.0]}, "motion has 2 values, not 16"),
         ({"motion_theta": [1.0]}, "motion_theta has 1 values, not 4"),
-        ({"visit_mark": [0, 1]}, "the visits differ in length or name marks that were not read"),
+        (
+            {"visit_mark": [0, 1]},
+            "the visits differ in length or name marks that were not read",
+        ),
     ],
 )
 def test_arrays_that_do_not_belong_together(changes, said):
     values = from_model.view_measurement(PROGRESS, MEASURED, STAMP_NS, "f")
     with pytest.raises(InputError) as caught:
         to_model.view_readings(through_cdr("ViewMeasurement", values | changes))
-    assert str(caught.value) == (f"selfcal/view_measurement of 'a': {said}; correct the publisher")
+    assert str(caught.value) == (
+        f"selfcal/view_measurement of 'a': {said}; correct the publisher"
+    )
 
 
 def test_the_sense_of_a_measurement():
@@ -585,7 +657,9 @@ def test_the_sense_of_a_measurement():
         InputError,
         match="measurement_sense 'both' is not known; use one of microscope_moves, plate_moves",
     ):
-        to_model.sense_of(through_cdr("ViewMeasurement", values | {"measurement_sense": "both"}))
+        to_model.sense_of(
+            through_cdr("ViewMeasurement", values | {"measurement_sense": "both"})
+        )
 
 
 @pytest.fixture(scope="module")
@@ -606,14 +680,21 @@ def test_an_error_map_comes_back(result):
     message = through_cdr("ErrorMap", from_model.error_map(result, STAMP_NS, "f"))
     found = to_model.error_map(message)
     assert message.interpolation == ""
-    own = replace(result, placed_plate=replace(emap.artifact, map_grid=MapGrid(3, 0.01)))
+    own = replace(
+        result, placed_plate=replace(emap.artifact, map_grid=MapGrid(3, 0.01))
+    )
     assert from_model.error_map(own, STAMP_NS, "f")["interpolation"] == "bicubic"
     for name in ("gx", "gy", "g_theta", "u_g_theta"):
         np.testing.assert_array_equal(getattr(found, name), getattr(emap, name), name)
     for name in ("u_gx", "u_gy"):
         wanted = np.where(emap.valid, getattr(emap, name), np.nan)
         np.testing.assert_array_equal(getattr(found, name), wanted, name)
-    assert (found.artifact, found.datum_theta, found.nonorthogonality, found.scale_difference) == (
+    assert (
+        found.artifact,
+        found.datum_theta,
+        found.nonorthogonality,
+        found.scale_difference,
+    ) == (
         emap.artifact,
         ThetaDatum.ZERO_MEAN,
         1.5e-6,
@@ -655,8 +736,14 @@ def test_the_grade_of_a_map_is_a_number(result, grade, identifiable, number):
     [
         ({"gx": [1.0]}, "gx has 1 values, the plate 35; correct the publisher"),
         ({"valid": []}, "valid has 0 values, the plate 35; correct the publisher"),
-        ({"u_g_theta": [1.0]}, "u_g_theta has 1 values, the plate 8; correct the publisher"),
-        ({"datum_theta": "none"}, "datum_theta 'none' is not known; use one of xy_axes, zero_mean"),
+        (
+            {"u_g_theta": [1.0]},
+            "u_g_theta has 1 values, the plate 8; correct the publisher",
+        ),
+        (
+            {"datum_theta": "none"},
+            "datum_theta 'none' is not known; use one of xy_axes, zero_mean",
+        ),
     ],
 )
 def test_error_maps_that_cannot_be(result, changes, said):

@@ -22,14 +22,22 @@ DIGESTS = {
     "srv/LoadMap": "1475f229bca1248672e8744d8dbf89532af7d1453953770658b722725854787e",
     "srv/SaveMap": "d77bfe5723fb152967572be0153525fb12568d4873e503dc7c04d05a333d9bd2",
 }
-HASHES = {f"selfcal_msgs/{name}": f"RIHS01_{digest}" for name, digest in DIGESTS.items()}
+HASHES = {
+    f"selfcal_msgs/{name}": f"RIHS01_{digest}" for name, digest in DIGESTS.items()
+}
 """RIHS01 (REP-2011) of every type, which a further key of a plan must not change: `plan_keys`."""
 ROOT = Path(__file__).parents[2] / "msg_defs"
 
 
 def test_every_definition_is_held():
-    files = [*ROOT.glob("msg/*.msg"), *ROOT.glob("srv/*.srv"), *ROOT.glob("action/*.action")]
-    assert {f"selfcal_msgs/{file.parent.name}/{file.stem}" for file in files} == set(HASHES)
+    files = [
+        *ROOT.glob("msg/*.msg"),
+        *ROOT.glob("srv/*.srv"),
+        *ROOT.glob("action/*.action"),
+    ]
+    assert {f"selfcal_msgs/{file.parent.name}/{file.stem}" for file in files} == set(
+        HASHES
+    )
     assert ElementTree.parse(ROOT / "package.xml").findtext("version") == "1.0.0"
 
 

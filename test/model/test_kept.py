@@ -36,15 +36,21 @@ def test_json_keeps_all_of_it_to_the_last_bit():
     assert found.images == FULL.images and found.factors.terms == FULL.factors.terms
     assert found.factors.with_map == 1
     np.testing.assert_array_equal(found.factors.of_map, FULL.factors.of_map)
-    np.testing.assert_array_equal(found.factors.beside["lines"], FULL.factors.beside["lines"])
+    np.testing.assert_array_equal(
+        found.factors.beside["lines"], FULL.factors.beside["lines"]
+    )
     np.testing.assert_array_equal(found.angular["drift"], FULL.angular["drift"])
     np.testing.assert_allclose(
-        found.covariances["xy"].matrix(2), np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18, rtol=1e-6
+        found.covariances["xy"].matrix(2),
+        np.array([[4.0, 1.0], [1.0, 2.0]]) * 1e-18,
+        rtol=1e-6,
     )
 
 
 def test_a_covariance_without_noise_is_kept():
-    np.testing.assert_array_equal(Covariance.of(np.zeros((2, 2))).matrix(2), np.zeros((2, 2)))
+    np.testing.assert_array_equal(
+        Covariance.of(np.zeros((2, 2))).matrix(2), np.zeros((2, 2))
+    )
 
 
 @pytest.mark.parametrize("n", [0, 1, 3])
@@ -79,17 +85,37 @@ def test_what_is_infinite_or_unknown_is_kept():
             [[[1.0, 2.0]]],
             "covariance_terms: no factors of this latt",
         ),
-        (("covariance_terms", "factors"), "no", "covariance_terms: no factors of this lattice"),
-        (("covariance_terms", "terms"), ["drift"], "covariance_terms: no factors of this lattice"),
-        (("covariance_terms", "beside", "plate"), [1.0, 2.0], "covariance_terms: no plate of this"),
+        (
+            ("covariance_terms", "factors"),
+            "no",
+            "covariance_terms: no factors of this lattice",
+        ),
+        (
+            ("covariance_terms", "terms"),
+            ["drift"],
+            "covariance_terms: no factors of this lattice",
+        ),
+        (
+            ("covariance_terms", "beside", "plate"),
+            [1.0, 2.0],
+            "covariance_terms: no plate of this",
+        ),
         (("covariance_terms", "beside", "lines"), None, "None is not of type list"),
         (
             ("covariance_terms", "beside", "microscope"),
             [[0.0] * 4],
             "beside the map of other factors",
         ),
-        (("covariance_terms", "beside", "with_map"), 3, "beside the map of other factors"),
-        (("covariance_terms", "beside", "with_map"), -1, "beside the map of other factors"),
+        (
+            ("covariance_terms", "beside", "with_map"),
+            3,
+            "beside the map of other factors",
+        ),
+        (
+            ("covariance_terms", "beside", "with_map"),
+            -1,
+            "beside the map of other factors",
+        ),
         (
             ("covariance_terms", "effects_on_plate"),
             [[None]],
@@ -100,9 +126,17 @@ def test_what_is_infinite_or_unknown_is_kept():
             [0.1] * (LINES + 1),
             "angular_terms: no contributions to these",
         ),
-        (("angular_terms", "drift"), "no", "angular_terms: no contributions to these lines"),
+        (
+            ("angular_terms", "drift"),
+            "no",
+            "angular_terms: no contributions to these lines",
+        ),
         (("first_order_added",), [0.1], "first_order_added: not two variances"),
-        (("map_covariance", "xy"), [1.0, None], "map_covariance: not a triangle of numbers"),
+        (
+            ("map_covariance", "xy"),
+            [1.0, None],
+            "map_covariance: not a triangle of numbers",
+        ),
         (("map_covariance", "scale_xy"), "1", "'1' is not a number"),
         (("images", "share"), 1.5, "images: no noise of images"),
         (("images", "share"), None, "images: no noise of images"),

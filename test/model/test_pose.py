@@ -10,7 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
+from selfcal_ros.model.artifact import (
+    Artifact,
+    Interpolation,
+    MapGrid,
+    default_map_grid,
+)
 from selfcal_ros.model.pose import LatticePose, turn_in_lines
 from selfcal_ros.model.view import MAX_SHIFT, View
 
@@ -24,7 +29,9 @@ def test_the_nearest_mark_of_a_plate_with_an_even_and_an_odd_side():
         m, n = plate.nearest(x + part, y - part)
         np.testing.assert_array_equal([m, n], [plate.m.ravel(), plate.n.ravel()])
     tall = Artifact(5, 0.01, grid_size_y=8)
-    m, n = tall.nearest((tall.x_m / 0.01).ravel() - 0.4, (tall.y_m / 0.01).ravel() + 0.4)
+    m, n = tall.nearest(
+        (tall.x_m / 0.01).ravel() - 0.4, (tall.y_m / 0.01).ravel() + 0.4
+    )
     np.testing.assert_array_equal([m, n], [tall.m.ravel(), tall.n.ravel()])
 
 
@@ -52,7 +59,10 @@ def test_places_turn_counter_clockwise_and_shift() -> None:
     pose = View("a", math.radians(37), (2e-3, -1e-3)).pose
     place = pose.places(PLATE, np.array([3]), np.array([0]))
     assert place[0] == pytest.approx(
-        complex(0.03 * math.cos(math.radians(37)) + 2e-3, 0.03 * math.sin(math.radians(37)) - 1e-3)
+        complex(
+            0.03 * math.cos(math.radians(37)) + 2e-3,
+            0.03 * math.sin(math.radians(37)) - 1e-3,
+        )
     )
 
 
@@ -62,7 +72,9 @@ def test_quarter_turns_are_exact(quarter: int) -> None:
     view = View("a", quarter * math.pi / 2, (10e-3, 0.0))
     m, n = np.array([3, -5, 0]), np.array([2, 4, -1])
     i, j = view.lattice_pose(PLATE).site_of(m, n)
-    assert np.allclose(view.pose.places(PLATE, m, n), (i + 1j * j) * 10e-3, rtol=0, atol=1e-17)
+    assert np.allclose(
+        view.pose.places(PLATE, m, n), (i + 1j * j) * 10e-3, rtol=0, atol=1e-17
+    )
 
 
 def test_marks_on_the_edge_are_in_the_field() -> None:
@@ -80,7 +92,9 @@ def test_the_field_is_that_of_the_map() -> None:
     assert small.field == Artifact(5, 15e-3) and PLATE.field is PLATE
 
 
-@pytest.mark.parametrize(("size", "nodes"), [(3, 3), (5, 5), (7, 5), (11, 7), (21, 15), (101, 51)])
+@pytest.mark.parametrize(
+    ("size", "nodes"), [(3, 3), (5, 5), (7, 5), (11, 7), (21, 15), (101, 51)]
+)
 def test_default_map_spans_the_plate(size: int, nodes: int) -> None:
     """Three quarters as many nodes as marks, over the same field."""
     grid = default_map_grid(Artifact(size, 1e-3))
@@ -143,7 +157,10 @@ def test_turning_back_undoes_a_turn(degrees):
 @pytest.mark.parametrize(
     ("view", "message"),
     [
-        (View("v", math.nan), "view 'v' rotation: nan is not an angle; give a finite turn"),
+        (
+            View("v", math.nan),
+            "view 'v' rotation: nan is not an angle; give a finite turn",
+        ),
         (
             View("v", 0.0, (math.inf, 0.0)),
             "view 'v' translation: (inf, 0.0) are not two lengths; give",
@@ -152,7 +169,10 @@ def test_turning_back_undoes_a_turn(degrees):
             View("v", 0.0, (0.0, -2e3)),
             "view 'v' translation: -200000 pitches are beyond every field",
         ),
-        (View("v", 0.1), "view 'v' rotation: 0.381972 is not a whole number of angular line steps"),
+        (
+            View("v", 0.1),
+            "view 'v' rotation: 0.381972 is not a whole number of angular line steps",
+        ),
     ],
 )
 def test_poses_that_no_map_allows(view, message):

@@ -11,7 +11,12 @@ from selfcal_ros.model.view import View
 
 def test_a_view_of_which_nothing_was_read_holds_nothing():
     nothing = ViewReadings(View("v"))
-    assert (nothing.used, nothing.dof_xy, nothing.dof_theta, nothing.rejected) == (0, 0, 0, {})
+    assert (nothing.used, nothing.dof_xy, nothing.dof_theta, nothing.rejected) == (
+        0,
+        0,
+        0,
+        {},
+    )
     assert math.isnan(nothing.sigma_xy) and math.isnan(nothing.sigma_theta)
     assert nothing.visits is None
     for values in (
@@ -44,4 +49,5 @@ def test_what_a_view_is_placed_for_depends_on_the_map():
         )
     }
     assert len(digests) == 6
-    assert "f943b89aa4fe758a" in digests  # of a plan on the lattice, as journals know it
+    # of a plan on the lattice, as journals know it
+    assert "f943b89aa4fe758a" in digests

@@ -41,14 +41,20 @@ ARRAYS = ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
 
 
 def through_json(result):
-    return result_from_dict(json.loads(json.dumps(result_to_dict(result), allow_nan=False)), "f")
+    return result_from_dict(
+        json.loads(json.dumps(result_to_dict(result), allow_nan=False)), "f"
+    )
 
 
 def assert_same(a, b):
     for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(a.error_map, name), getattr(b.error_map, name))
+        np.testing.assert_array_equal(
+            getattr(a.error_map, name), getattr(b.error_map, name)
+        )
     for name in ("ax", "ay", "a_theta", "u_ax", "u_ay", "u_a_theta"):
-        np.testing.assert_array_equal(getattr(a.artifact_map, name), getattr(b.artifact_map, name))
+        np.testing.assert_array_equal(
+            getattr(a.artifact_map, name), getattr(b.artifact_map, name)
+        )
     for name in (
         "plan_id",
         "observability",
@@ -135,18 +141,34 @@ def test_an_unidentified_plan_has_maps_of_nulls():
 
 def test_the_input_and_its_losses_are_added():
     result, _ = known_result()
-    told = with_input(replace(result, warnings=("w",)), {"file": "b", "sha256": "0"}, ["cut"])
+    told = with_input(
+        replace(result, warnings=("w",)), {"file": "b", "sha256": "0"}, ["cut"]
+    )
     assert (told.input, told.warnings) == ({"file": "b", "sha256": "0"}, ("w", "cut"))
 
 
 def test_plain_makes_json_types():
-    value = {"a": np.float64("nan"), "b": (np.int64(3), np.array([1.0, np.inf])), "c": np.True_}
+    value = {
+        "a": np.float64("nan"),
+        "b": (np.int64(3), np.array([1.0, np.inf])),
+        "c": np.True_,
+    }
     assert plain(value) == {"a": None, "b": [3, [1.0, None]], "c": True}
 
 
 AXIS = AxisError(8e-7, 3e-8, 2e-6, 9e-8, 3e-8, 3e-8, 0.98, 0.01)
 VERIFIED = plain(
-    Verified("m.json", "better", True, True, "none", "off", False, 0.9, {"x": AXIS, "y": AXIS})
+    Verified(
+        "m.json",
+        "better",
+        True,
+        True,
+        "none",
+        "off",
+        False,
+        0.9,
+        {"x": AXIS, "y": AXIS},
+    )
 )
 
 
@@ -203,7 +225,9 @@ def test_damaged_results_are_refused(path, value, message):
 
 @pytest.mark.parametrize("data", [None, [], {}, {"schema": "selfcal.result/2"}])
 def test_other_json_is_no_result(data):
-    with pytest.raises(InputError, match=r"^f: not a result of schema selfcal\.result/1; give a "):
+    with pytest.raises(
+        InputError, match=r"^f: not a result of schema selfcal\.result/1; give a "
+    ):
         result_from_dict(data, "f")
 
 
@@ -224,9 +248,13 @@ def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
     data = result_to_dict(known_result()[0])
     data["reference"] = {"kind": "stage_x", "relative_error": error, "u_relative": u}
     if is_one:
-        assert result_from_dict(data, "r").reference == ReferenceLength("stage_x", error, u)
+        assert result_from_dict(data, "r").reference == ReferenceLength(
+            "stage_x", error, u
+        )
         return
-    with pytest.raises(InputError, match=r"^r: .*reference length: .* is not a (relative|stand)"):
+    with pytest.raises(
+        InputError, match=r"^r: .*reference length: .* is not a (relative|stand)"
+    ):
         result_from_dict(data, "r")
 
 
@@ -250,7 +278,9 @@ CAUSE = Cause(
 
 @pytest.mark.parametrize("grade", Grade)
 def test_a_grade_with_its_causes_and_terms_comes_back(grade):
-    failed = Finding("noise_contradicted", 3e-8, unit="m", details={"stated": 1e-8}, text="noisy")
+    failed = Finding(
+        "noise_contradicted", 3e-8, unit="m", details={"stated": 1e-8}, text="noisy"
+    )
     verdict = Verdict(
         grade,
         (failed,),
@@ -263,7 +293,9 @@ def test_a_grade_with_its_causes_and_terms_comes_back(grade):
         TermResult("plate_strain", 7e-8, (), 2e-7, "default"),
         TermResult("drift", 5e-8, (), None, "readings"),
     )
-    result = replace(known_result()[0], verdict=verdict, model=ModelResult("rigid", terms))
+    result = replace(
+        known_result()[0], verdict=verdict, model=ModelResult("rigid", terms)
+    )
     data = result_to_dict(result)["verdict"]
     assert (data["grade"], data["qualified"]) == (str(grade), grade != "not_qualified")
     assert data["causes"][0]["remedies"] == [{"model": "drift:8e-8"}, {"view": "tx"}]
@@ -272,14 +304,20 @@ def test_a_grade_with_its_causes_and_terms_comes_back(grade):
 
 
 def test_a_verdict_of_before_has_the_grade_of_its_qualification():
-    data = result_to_dict(replace(known_result()[0], verdict=Verdict(Grade.GOOD, sentence="Good")))
+    data = result_to_dict(
+        replace(known_result()[0], verdict=Verdict(Grade.GOOD, sentence="Good"))
+    )
     for key in ("grade", "enlarged_by", "failed"):
         del data["verdict"][key]
     assert result_from_dict(data, "old").verdict == Verdict(Grade.GOOD, sentence="Good")
     data["verdict"]["qualified"] = False
-    assert result_from_dict(data, "old").verdict == Verdict(Grade.NOT_QUALIFIED, sentence="Good")
+    assert result_from_dict(data, "old").verdict == Verdict(
+        Grade.NOT_QUALIFIED, sentence="Good"
+    )
     data["verdict"]["grade"] = "enlarged"
-    with pytest.raises(InputError, match="the grade 'enlarged' contradicts qualified False"):
+    with pytest.raises(
+        InputError, match="the grade 'enlarged' contradicts qualified False"
+    ):
         result_from_dict(data, "old")
 
 
@@ -309,20 +347,26 @@ def edited(path, change):
 def test_a_file_that_was_edited_is_refused_with_the_key(key, change, tmp_path):
     path = written_file(tmp_path)
     edited(path, change)
-    with pytest.raises(InputError, match=f"r.json: its '{key}' was changed after the file was"):
+    with pytest.raises(
+        InputError, match=f"r.json: its '{key}' was changed after the file was"
+    ):
         read_result(path)
 
 
 def test_layout_and_time_of_creation_are_no_edits(tmp_path):
     path = written_file(tmp_path)
     before = read_result(path)
-    edited(path, lambda data: data["provenance"].__setitem__("created", "2026-01-02T03:04:05Z"))
+    edited(
+        path,
+        lambda data: data["provenance"].__setitem__("created", "2026-01-02T03:04:05Z"),
+    )
     assert_same(read_result(path), before)
 
 
 @pytest.mark.parametrize("version", ["0.4.0", "0.10.0", "1.0.0", "unknown"])
 @pytest.mark.parametrize(
-    "remove", [lambda data: data.pop("digest"), lambda data: data.__setitem__("digest", "none")]
+    "remove",
+    [lambda data: data.pop("digest"), lambda data: data.__setitem__("digest", "none")],
 )
 def test_a_file_whose_digests_were_removed_is_refused(version, remove, tmp_path):
     path = written_file(tmp_path)

@@ -35,12 +35,18 @@ def test_a_microscope_has_three_sizes():
         0.0004,
         0.0004,
     ]
-    assert (term.size, term.free, str(term)) == (0.02, False, "microscope:0.02:0.003:0.0004")
+    assert (term.size, term.free, str(term)) == (
+        0.02,
+        False,
+        "microscope:0.02:0.003:0.0004",
+    )
     assert parse_terms([str(term)], "here") == (term,)
     assert str(term.scaled(10)) == "microscope:0.2:0.03:0.004"
     assert microscope_term(0.001, 0.05, 0.01).size == 0.05
     (one,) = parse_terms(["microscope:0.02"], "here")
-    assert {one.size_of(part) for part in ("scale", "turn", "stretch", "shear")} == {0.02}
+    assert {one.size_of(part) for part in ("scale", "turn", "stretch", "shear")} == {
+        0.02
+    }
 
 
 @pytest.mark.parametrize(
@@ -49,8 +55,14 @@ def test_a_microscope_has_three_sizes():
         ("drift:1e-8:1e-8:1e-8", "--model: drift: 3 sizes are given; give one"),
         ("microscope:0.1:0.1", "--model: microscope: 2 sizes are given; give one, or"),
         ("drift:1_0e-9", "--model: drift: the size '1_0e-9' is not a positive number"),
-        ("microscope:0.1:x:0.1", "--model: microscope: the size 'x' is not a positive number"),
-        ("microscope:0.1:0.1:2", "--model: microscope: the size 2 is outside 1e-18 to 1"),
+        (
+            "microscope:0.1:x:0.1",
+            "--model: microscope: the size 'x' is not a positive number",
+        ),
+        (
+            "microscope:0.1:0.1:2",
+            "--model: microscope: the size 2 is outside 1e-18 to 1",
+        ),
     ],
 )
 def test_sizes_that_no_term_has(text, said):

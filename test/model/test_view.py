@@ -10,7 +10,12 @@ import pytest
 from selfcal_ros.collection.inputs import Command
 from selfcal_ros.collection.timeline import Timeline
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
+from selfcal_ros.model.artifact import (
+    Artifact,
+    Interpolation,
+    MapGrid,
+    default_map_grid,
+)
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import PLAN_KEYS, Plan, View, plan_keys, with_sub_views
@@ -24,7 +29,11 @@ PLAN = {
 
 
 def plan_with(view=None, **keys):
-    return {**PLAN, **keys, **({"views": [{"name": "a", **view}]} if view is not None else {})}
+    return {
+        **PLAN,
+        **keys,
+        **({"views": [{"name": "a", **view}]} if view is not None else {}),
+    }
 
 
 @pytest.mark.parametrize(
@@ -44,13 +53,20 @@ def plan_with(view=None, **keys):
     ],
 )
 def test_turns_in_quarters_and_lines(degrees, quarter, lines):
-    pose = View("v", math.radians(degrees), grid=quarter is not None).lattice_pose(PLATE)
+    pose = View("v", math.radians(degrees), grid=quarter is not None).lattice_pose(
+        PLATE
+    )
     assert (pose.quarter_turns, pose.turn_lines) == (quarter, lines)
 
 
 @pytest.mark.parametrize(
     ("pitches", "shift"),
-    [((0, 0), (0, 0)), ((1, -2), (1, -2)), ((0.9991, 0), (1, 0)), ((-3, 0.0009), (-3, 0))],
+    [
+        ((0, 0), (0, 0)),
+        ((1, -2), (1, -2)),
+        ((0.9991, 0), (1, 0)),
+        ((-3, 0.0009), (-3, 0)),
+    ],
 )
 def test_translations_in_pitches(pitches, shift):
     view = View("v", 0.0, (pitches[0] * 0.01, pitches[1] * 0.01))
@@ -93,7 +109,11 @@ def test_marks_have_no_sites_between_quarter_turns():
             PLATE,
             "view 'v' translation: (0.0, inf) are not two length",
         ),
-        (View("v", math.nan), PLATE, "view 'v' rotation: nan is not an angle; give a finite turn"),
+        (
+            View("v", math.nan),
+            PLATE,
+            "view 'v' rotation: nan is not an angle; give a finite turn",
+        ),
         (
             View("v", -math.inf),
             PLATE,
@@ -134,7 +154,10 @@ def test_poses_off_the_lattice_are_refused(view, plate, message):
         ),
         ((1, 0.01), "artifact grid_size: 1 is not"),
         ((-3, 0.01), "artifact grid_size: -3 is not"),
-        ((4003, 0.01), "artifact grid_size: 4003 rows of marks are more than 401; use every other"),
+        (
+            (4003, 0.01),
+            "artifact grid_size: 4003 rows of marks are more than 401; use every other",
+        ),
         ((11, 0.01, 0, 2), "artifact grid_size_y: 2 is not"),
         ((11, 0.0), "artifact grid_pitch: 0.0 m is not a length"),
         ((11, -0.01), "artifact grid_pitch: -0.01 m is not a length"),
@@ -148,7 +171,10 @@ def test_poses_off_the_lattice_are_refused(view, plate, message):
         ((11, math.inf), "artifact grid_pitch: inf m is not a length"),
         ((11, 0.01, 2), "artifact angular_count: 2 is not a number from 3 to "),
         ((11, 0.01, -4), "artifact angular_count: -4 is not a number from 3 to "),
-        ((11, 0.01, 2**31), "artifact angular_count: 2147483648 is not a number from 3 to "),
+        (
+            (11, 0.01, 2**31),
+            "artifact angular_count: 2147483648 is not a number from 3 to ",
+        ),
     ],
 )
 def test_plates_that_are_refused(arguments, message):
@@ -197,7 +223,9 @@ def test_a_plan_with_its_defaults_and_with_all_its_keys():
     )
     assert [v.visit_order for v in ordered.views] == ["x_then_y", "raster@plate", ""]
     assert plan.views[0].visit_order == ""
-    bare = plan_from_dict({**PLAN, "artifact": {**PLAN["artifact"], "angular_count": 0}}, "f")
+    bare = plan_from_dict(
+        {**PLAN, "artifact": {**PLAN["artifact"], "angular_count": 0}}, "f"
+    )
     assert not bare.views[0].angular
 
 
@@ -213,13 +241,19 @@ def test_a_plate_without_angular_count_has_no_lines():
     [
         (None, "f: not a mapping of keys to values; see the examples in config"),
         ({}, "f: the key 'plan_id' is missing; add it"),
-        (plan_with(extra=1), "f: extra: unknown key; known are plan_id, artifact, views, visit"),
+        (
+            plan_with(extra=1),
+            "f: extra: unknown key; known are plan_id, artifact, views, visit",
+        ),
         (plan_with(plan_id=3), "f: plan_id: 3 is not of type str; correct the value"),
         (
             plan_with(plan_id="a\r\x1b[31m\u202e"),
             r"f: plan_id: 'a\r\x1b[31m\u202e' has characters that cannot be printed, such as",
         ),
-        (plan_with(plan_id="n" * 201), "f: plan_id: a name of 201 characters; give one of at m"),
+        (
+            plan_with(plan_id="n" * 201),
+            "f: plan_id: a name of 201 characters; give one of at m",
+        ),
         (
             plan_with(views=[{"name": "a\nb"}]),
             r"f: views[0]: name: 'a\nb' has characters that cannot be printed, such as a line br",
@@ -230,19 +264,29 @@ def test_a_plate_without_angular_count_has_no_lines():
         ),
         (plan_with(views=[]), "f: the plan has no views; add at least one view"),
         (plan_with(views=[3]), "f: views[0]: not a mapping of keys to values"),
-        (plan_with(views=[{"name": "a"}] * 1001), "f: views: 1001 views are more than 1000; "),
-        (plan_with(views=[{"name": "a"}] * 1000), "f: views[1]: the name 'a' is used twice; give"),
+        (
+            plan_with(views=[{"name": "a"}] * 1001),
+            "f: views: 1001 views are more than 1000; ",
+        ),
+        (
+            plan_with(views=[{"name": "a"}] * 1000),
+            "f: views[1]: the name 'a' is used twice; give",
+        ),
         (
             plan_with(views=[{"name": "a"}] * 2),
             "f: views[1]: the name 'a' is used twice; give every",
         ),
         (plan_with(artifact=[]), "f: artifact: [] is not of type dict"),
         (
-            plan_with(artifact={"grid_size": 11.0, "grid_pitch": 1, "angular_count": 0}),
+            plan_with(
+                artifact={"grid_size": 11.0, "grid_pitch": 1, "angular_count": 0}
+            ),
             "f: artifact: grid_size: 11.0 is not of type int",
         ),
         (
-            plan_with(artifact={"grid_size": True, "grid_pitch": 1, "angular_count": 0}),
+            plan_with(
+                artifact={"grid_size": True, "grid_pitch": 1, "angular_count": 0}
+            ),
             "f: artifact: grid_size: True is not of type int",
         ),
         (
@@ -254,9 +298,18 @@ def test_a_plate_without_angular_count_has_no_lines():
             "f: views[0]: rotation: unknown key; did you mean "
             "'rotation_deg'? known are name, rotation_",
         ),
-        (plan_with({"rotation_deg": "90"}), "f: views[0]: rotation_deg: '90' is not of type float"),
-        (plan_with({"rotation_deg": math.nan}), "view 'a' rotation: nan is not an angle"),
-        (plan_with({"rotation_deg": math.inf}), "view 'a' rotation: inf is not an angle"),
+        (
+            plan_with({"rotation_deg": "90"}),
+            "f: views[0]: rotation_deg: '90' is not of type float",
+        ),
+        (
+            plan_with({"rotation_deg": math.nan}),
+            "view 'a' rotation: nan is not an angle",
+        ),
+        (
+            plan_with({"rotation_deg": math.inf}),
+            "view 'a' rotation: inf is not an angle",
+        ),
         (
             plan_with({"rotation_deg": 1, "angular": True}),
             "view 'a' rotation: 0.0666667 is not a whole "
@@ -291,34 +344,61 @@ def test_a_plate_without_angular_count_has_no_lines():
             plan_with({"translation_mm": [1, math.nan]}),
             "view 'a' translation: (0.001, nan) are not tw",
         ),
-        (plan_with({"translation_mm": [1]}), "f: views[0]: translation_mm: not two numbers; give"),
+        (
+            plan_with({"translation_mm": [1]}),
+            "f: views[0]: translation_mm: not two numbers; give",
+        ),
         (
             plan_with({"translation_mm": [1, 0], "translation_pitch": [1, 0]}),
             "f: views[0]: translation_pitch and translation_mm are given; leave one of them out",
         ),
-        (plan_with(map={"grid_size": 2}), "map grid_size: 2 is not a number from 3 to 401; give"),
-        (plan_with(map={"grid_size": 7, "grid_size_y": 2}), "map grid_size_y: 2 is not a number"),
+        (
+            plan_with(map={"grid_size": 2}),
+            "map grid_size: 2 is not a number from 3 to 401; give",
+        ),
+        (
+            plan_with(map={"grid_size": 7, "grid_size_y": 2}),
+            "map grid_size_y: 2 is not a number",
+        ),
         (
             plan_with(map={"grid_size": 7, "grid_pitch": -0.1}),
             "map grid_pitch: -0.1 m is not a length",
         ),
-        (plan_with(map={"grid_pitch": 0.01}), "f: map: the key 'grid_size' is missing; add it"),
+        (
+            plan_with(map={"grid_pitch": 0.01}),
+            "f: map: the key 'grid_size' is missing; add it",
+        ),
         (
             plan_with(map={"grid_size": 7, "interpolation": "cubic"}),
             "f: map: interpolation: 'cubic' is not known; use one of bilinear, bicubic",
         ),
-        (plan_with({"repeats": 0}), "f: views[0]: repeats: 0 is not positive; give 1 or more"),
-        (plan_with(visit_order="spiral"), "f: visit_order: 'spiral' is not a visiting order; use "),
+        (
+            plan_with({"repeats": 0}),
+            "f: views[0]: repeats: 0 is not positive; give 1 or more",
+        ),
+        (
+            plan_with(visit_order="spiral"),
+            "f: visit_order: 'spiral' is not a visiting order; use ",
+        ),
         (plan_with(visit_order=1), "f: visit_order: 1 is not of type str"),
-        (plan_with({"visit_order": "back"}), "f: views[0]: visit_order: 'back' is not a visiting "),
-        (plan_with({"visit_order": None}), "f: views[0]: visit_order: None is not of type str"),
+        (
+            plan_with({"visit_order": "back"}),
+            "f: views[0]: visit_order: 'back' is not a visiting ",
+        ),
+        (
+            plan_with({"visit_order": None}),
+            "f: views[0]: visit_order: None is not of type str",
+        ),
         (plan_with({"grid": 1}), "f: views[0]: grid: 1 is not of type bool"),
         (
             plan_with({"grid": False, "angular": False}),
             "f: views[0]: neither grid nor angular marks",
         ),
         (
-            {**plan_with({"angular": True}), "artifact": {**PLAN["artifact"], "angular_count": 0}},
+            {
+                **plan_with({"angular": True}),
+                "artifact": {**PLAN["artifact"], "angular_count": 0},
+            },
             "f: views[0]: angular marks are wanted but the plate has "
             "none; set angular to false, or "
             "give the plate its angular_count",
@@ -350,9 +430,9 @@ def test_views_off_the_lattice_get_a_map_of_their_own():
     pose = plan.views[2].on_stage(plan.artifact)
     assert pose.shift == pytest.approx((1.3, -0.7), abs=1e-12) and pose.s == 0
     assert plan.views[3].on_stage(plan.artifact).s == 2
-    assert plan_from_dict(plan_with({"translation_mm": [-20, 30]}), "f") == plan_from_dict(
-        plan_with({"translation_pitch": [-2, 3]}), "f"
-    )
+    assert plan_from_dict(
+        plan_with({"translation_mm": [-20, 30]}), "f"
+    ) == plan_from_dict(plan_with({"translation_pitch": [-2, 3]}), "f")
 
 
 @pytest.mark.parametrize(
@@ -371,7 +451,9 @@ def test_the_nodes_of_a_map_span_the_plate_unless_their_pitch_is_given(grid, wan
     assert plan_from_dict(plan_with(map=grid), "f").artifact.map_grid == want
 
 
-@pytest.mark.parametrize(("sides", "want"), [([7, 5], (7, 5)), ([5, 7], (5, 7)), ([7, 7], (7, 7))])
+@pytest.mark.parametrize(
+    ("sides", "want"), [([7, 5], (7, 5)), ([5, 7], (5, 7)), ([7, 7], (7, 7))]
+)
 def test_a_plate_may_give_both_its_sides(sides, want):
     """A square one is the same plate as by one number."""
     plate = plan_from_dict(
@@ -412,7 +494,9 @@ def test_check_stops_hold_for_all_views_with_grid_marks():
         assert plan_from_dict(plan_with({}, check_stops=none), "f") == plan_from_dict(
             plan_with({}), "f"
         )
-    at_most = plan_with({"translation_pitch": [10, 0]}, check_stops={"marks": 11, "offset": 0.0025})
+    at_most = plan_with(
+        {"translation_pitch": [10, 0]}, check_stops={"marks": 11, "offset": 0.0025}
+    )
     assert plan_from_dict(at_most, "f").views[0].check_marks == 11
 
 
@@ -420,9 +504,18 @@ def test_check_stops_hold_for_all_views_with_grid_marks():
     ("stops", "message"),
     [
         ({"marks": 5}, "f: check_stops: the key 'offset' is missing; add it"),
-        ({"marks": 5.0, "offset": 2e-5}, "f: check_stops: marks: 5.0 is not of type int"),
-        ({"marks": 5, "offset": "20 um"}, "f: check_stops: offset: '20 um' is not of type float"),
-        ({"marks": 5, "offset": 0.0}, "f: view 'a' check_stops: 5 marks, 0 m off; give both "),
+        (
+            {"marks": 5.0, "offset": 2e-5},
+            "f: check_stops: marks: 5.0 is not of type int",
+        ),
+        (
+            {"marks": 5, "offset": "20 um"},
+            "f: check_stops: offset: '20 um' is not of type float",
+        ),
+        (
+            {"marks": 5, "offset": 0.0},
+            "f: view 'a' check_stops: 5 marks, 0 m off; give both ",
+        ),
         (
             {"marks": 5, "offset": -2e-5},
             "f: view 'a' check_stops: 5 marks, -2e-05 m off; give both",
@@ -431,7 +524,10 @@ def test_check_stops_hold_for_all_views_with_grid_marks():
             {"marks": -1, "offset": 2e-5},
             "f: view 'a' check_stops: -1 marks, 2e-05 m off; give both",
         ),
-        ({"marks": 0, "offset": 2e-5}, "f: view 'a' check_stops: 0 marks, 2e-05 m off; give both"),
+        (
+            {"marks": 0, "offset": 2e-5},
+            "f: view 'a' check_stops: 0 marks, 2e-05 m off; give both",
+        ),
         (
             {"marks": 5, "offset": math.nan},
             "f: view 'a' check_stops: 5 marks, nan m off; give both",
@@ -450,7 +546,9 @@ def test_check_stops_hold_for_all_views_with_grid_marks():
 )
 def test_check_stops_that_are_refused(stops, message):
     with pytest.raises(InputError) as caught:
-        plan_from_dict(plan_with({"translation_pitch": [10, 0]}, check_stops=stops), "f")
+        plan_from_dict(
+            plan_with({"translation_pitch": [10, 0]}, check_stops=stops), "f"
+        )
     assert str(caught.value).startswith(message)
 
 
@@ -477,14 +575,18 @@ def test_terms_of_a_plan_are_read_and_checked():
 
 
 def test_a_plan_knows_its_microscope():
-    plan = plan_from_dict(plan_with(microscope={"rotation_u": 0.002}, model_terms=["drift"]), "p")
+    plan = plan_from_dict(
+        plan_with(microscope={"rotation_u": 0.002}, model_terms=["drift"]), "p"
+    )
     assert plan.model_terms == ("microscope:0.01:0.002:0.002", "drift")
     with pytest.raises(
         InputError,
         match=r"^p: microscope: model_terms has a microscope as well; "
         "leave one of them out$",
     ):
-        plan_from_dict(plan_with(microscope={"scale_u": 0.1}, model_terms=["microscope"]), "p")
+        plan_from_dict(
+            plan_with(microscope={"scale_u": 0.1}, model_terms=["microscope"]), "p"
+        )
     with pytest.raises(InputError, match="p: microscope: the size 2 is"):
         plan_from_dict(plan_with(microscope={"shear_u": 2.0}), "p")
 
@@ -492,7 +594,10 @@ def test_a_plan_knows_its_microscope():
 IMAGE = {
     "plan_id": "p",
     "artifact": {"grid_size": 7, "grid_pitch": 0.001, "angular_count": 8},
-    "views": [{"name": "a"}, {"name": "turned", "rotation_deg": 90, "translation_pitch": [1, 0]}],
+    "views": [
+        {"name": "a"},
+        {"name": "turned", "rotation_deg": 90, "translation_pitch": [1, 0]},
+    ],
     "image": {"nx": 3, "ny": 1},
 }
 
@@ -501,9 +606,17 @@ def test_the_cells_of_an_image_are_views_at_shifted_poses():
     plan = plan_from_dict(IMAGE, "p")
     assert plan_from_dict(plan_to_dict(plan), "p") == plan
     views = with_sub_views(plan.views)
-    assert [view.name for view in views[3:]] == ["turned[-1,+0]", "turned[+0,+0]", "turned[+1,+0]"]
+    assert [view.name for view in views[3:]] == [
+        "turned[-1,+0]",
+        "turned[+0,+0]",
+        "turned[+1,+0]",
+    ]
     assert [view.plan_view for view in views] == ["a"] * 3 + ["turned"] * 3
-    assert [view.on_stage(plan.artifact).shift for view in views[3:]] == [(2, 0), (1, 0), (0, 0)]
+    assert [view.on_stage(plan.artifact).shift for view in views[3:]] == [
+        (2, 0),
+        (1, 0),
+        (0, 0),
+    ]
     assert [view.cell_m for view in views[:3]] == [-0.001, 0, 0.001]
     assert plan.views[1].cell_m == 0  # the axis of the microscope stands at the centre
     assert [view.angular for view in views[:3]] == [False, True, False]
@@ -562,7 +675,9 @@ def test_a_plan_with_harmonics_reads_lines_at_any_turn():
     assert plan_from_dict(plan_to_dict(plan), "f") == plan
     placed = plan_from_dict(plan_with({"rotation_deg": 37}, map={"harmonics": 3}), "f")
     assert placed.views[0].angular
-    assert placed.artifact.map_grid == default_map_grid(plan_from_dict(PLAN, "f").artifact)
+    assert placed.artifact.map_grid == default_map_grid(
+        plan_from_dict(PLAN, "f").artifact
+    )
     assert placed.artifact.field.harmonics == 3
 
 
@@ -574,7 +689,10 @@ def test_a_plan_with_harmonics_reads_lines_at_any_turn():
             "map harmonics: 12 harmonics cannot be told with 24 lines; give 1 to 11",
         ),
         ({"harmonics": 1.5}, "f: map: harmonics"),
-        ({"harmonics": 3, "nodes": 5}, "f: map: nodes: unknown key; known are grid_size"),
+        (
+            {"harmonics": 3, "nodes": 5},
+            "f: map: nodes: unknown key; known are grid_size",
+        ),
     ],
 )
 def test_harmonics_that_are_refused(given, message):

@@ -18,7 +18,9 @@ ONCE = View("v")
 
 
 def sites(order, *, plate=PLATE, view=ONCE, **more):
-    found = visit_sequence(plate, view, order=order, rng=np.random.default_rng(1), **more)
+    found = visit_sequence(
+        plate, view, order=order, rng=np.random.default_rng(1), **more
+    )
     return list(zip(found.i.tolist(), found.j.tolist(), strict=True))
 
 
@@ -83,7 +85,9 @@ def test_times_passes_and_counts():
 
 
 def test_consecutive_repeats_are_one_visit_of_one_pass():
-    found = visit_sequence(PLATE, View("v", repeats=3), order="there_and_back", consecutive=True)
+    found = visit_sequence(
+        PLATE, View("v", repeats=3), order="there_and_back", consecutive=True
+    )
     assert list(zip(found.i, found.j, strict=True)) == ALONG_X
     assert found.count.tolist() == [3] * 15
     assert found.time.tolist() == [3 * visit + 1 for visit in range(15)]
@@ -95,13 +99,20 @@ def test_the_stage_goes_the_same_way_and_the_marks_turn():
     turned = View("v", math.pi / 2)
     assert sites("raster", plate=plate, view=turned) == sites("raster", plate=plate)
     # a quarter turn brings mark (m, n) to site (-n, m): the first site, (-1, -1), holds (-1, 1)
-    assert marks("raster", plate=plate, view=turned)[:4] == [(-1, 1), (0, 1), (1, 1), (-1, 0)]
+    assert marks("raster", plate=plate, view=turned)[:4] == [
+        (-1, 1),
+        (0, 1),
+        (1, 1),
+        (-1, 0),
+    ]
 
 
 def test_of_the_plate_the_same_marks_follow_each_other_in_every_view():
     plate = Artifact(3, 0.01)
     turned = View("v", math.pi / 2)
-    assert marks("raster@plate", plate=plate, view=turned) == marks("raster", plate=plate)
+    assert marks("raster@plate", plate=plate, view=turned) == marks(
+        "raster", plate=plate
+    )
     assert sites("raster@plate", plate=plate, view=turned)[:4] == [
         (1, -1),
         (0, -1),
@@ -132,7 +143,11 @@ def test_marks_off_the_field_are_not_visited():
 def test_every_mark_is_exposed_as_often_as_the_view_asks(order, suffix, consecutive):
     plate, view = Artifact(5, 0.01, 0, 7), View("v", math.pi, (0.01, -0.02), repeats=5)
     found = visit_sequence(
-        plate, view, order=order + suffix, consecutive=consecutive, rng=np.random.default_rng(2)
+        plate,
+        view,
+        order=order + suffix,
+        consecutive=consecutive,
+        rng=np.random.default_rng(2),
     )
     assert (abs(found.i) <= 2).all() and (abs(found.j) <= 3).all()
     np.testing.assert_array_equal(found.i, -found.m + 1)
@@ -142,7 +157,9 @@ def test_every_mark_is_exposed_as_often_as_the_view_asks(order, suffix, consecut
     assert len(np.unique(at)) == 4 * 5
     assert found.count.sum() == 100
     # times are the means of runs of whole numbers that follow each other
-    np.testing.assert_allclose(found.time, np.cumsum(found.count) - (found.count + 1) / 2)
+    np.testing.assert_allclose(
+        found.time, np.cumsum(found.count) - (found.count + 1) / 2
+    )
 
 
 def test_the_order_of_the_view_holds_unless_another_is_asked_for():
@@ -153,11 +170,16 @@ def test_the_order_of_the_view_holds_unless_another_is_asked_for():
 
 
 def test_lines_are_no_visits():
-    assert len(visit_sequence(Artifact(3, 0.01, 8), View("v", math.pi / 4, grid=False))) == 0
+    assert (
+        len(visit_sequence(Artifact(3, 0.01, 8), View("v", math.pi / 4, grid=False)))
+        == 0
+    )
 
 
 def test_a_random_order_needs_chance():
-    with pytest.raises(ValueError, match=r"^a random visiting order needs a source of chance$"):
+    with pytest.raises(
+        ValueError, match=r"^a random visiting order needs a source of chance$"
+    ):
         visit_sequence(PLATE, View("v"), order="random")
 
 
@@ -190,7 +212,13 @@ def test_the_side_from_which_a_place_is_reached():
         -1,
         1,
     ]
-    assert approach_signs(np.array([0.0, 0.1, 1.0, 0.9, 0.0]), 0.2).tolist() == [0, 0, 1, 1, -1]
+    assert approach_signs(np.array([0.0, 0.1, 1.0, 0.9, 0.0]), 0.2).tolist() == [
+        0,
+        0,
+        1,
+        1,
+        -1,
+    ]
     assert approach_signs(np.array([0.0, 0.2, 0.0]), 0.2).tolist() == [0, 0, 0]
     assert approach_signs(np.zeros(0)).tolist() == []
 
@@ -211,7 +239,9 @@ def test_an_order_begins_again_after_its_passes(order):
 CHECKED = replace(ONCE, check_marks=3, check_offset_m=2e-5)
 
 
-@pytest.mark.parametrize(("repeats", "before"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)])
+@pytest.mark.parametrize(
+    ("repeats", "before"), [(1, 1), (2, 1), (3, 2), (4, 2), (5, 3)]
+)
 def test_check_stops_come_half_way_side_by_side_in_the_same_order(repeats, before):
     found = visit_sequence(PLATE, replace(CHECKED, repeats=repeats), order="raster")
     where = list(zip(found.i, found.j, strict=True))
@@ -230,7 +260,20 @@ def test_check_stops_come_half_way_side_by_side_in_the_same_order(repeats, befor
     assert found.count.tolist() == len(found) * [1]
     assert found.time.tolist() == list(range(len(found)))
     assert (np.diff(found.pass_number) >= 0).all()
-    assert (found.pass_number[stops] - before).tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert (found.pass_number[stops] - before).tolist() == [
+        0,
+        0,
+        0,
+        1,
+        1,
+        1,
+        2,
+        2,
+        2,
+        3,
+        3,
+        3,
+    ]
     assert found.pass_number[-1] == repeats + 3
 
 
@@ -238,7 +281,9 @@ def test_check_stops_part_the_two_exposures_where_the_stage_turns_back():
     """Consecutive repeats are one visit, a check stop is always one exposure."""
     found = visit_sequence(PLATE, replace(CHECKED, repeats=2), order="there_and_back")
     assert found.count.tolist() == 42 * [1]
-    together = visit_sequence(PLATE, replace(CHECKED, repeats=3), order="raster", consecutive=True)
+    together = visit_sequence(
+        PLATE, replace(CHECKED, repeats=3), order="raster", consecutive=True
+    )
     assert together.count.tolist() == 15 * [3] + 12 * [1]
     assert together.time.tolist() == [*range(1, 45, 3), *range(45, 57)]
 
@@ -252,10 +297,11 @@ def test_check_stops_are_along_the_axes_of_the_stage_whatever_the_turn():
         turned.i[turned.aside_m.any(axis=0)].tolist()
         == straight.i[straight.aside_m.any(axis=0)].tolist()
     )
+    # the mark that lies there
     assert (
         turned.m[turned.aside_m.any(axis=0)].tolist()
         == straight.j[straight.aside_m.any(axis=0)].tolist()
-    )  # the mark that lies there
+    )
 
 
 def test_a_view_without_grid_marks_has_no_check_stops():
@@ -273,4 +319,5 @@ def test_marks_of_check_stops_spread_over_what_lies_in_the_field():
     assert chosen(5, field[2:], field) == [[1, 0], [2, 2], [-1, 2], [-1, -2], [2, -2]]
     every = chosen(9, np.arange(-1, 2), np.arange(-1, 2))
     assert len({tuple(site) for site in every}) == 9
-    assert chosen(20, np.arange(-1, 2), np.arange(-1, 2)) == every  # no more than there are
+    # no more than there are
+    assert chosen(20, np.arange(-1, 2), np.arange(-1, 2)) == every

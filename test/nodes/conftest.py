@@ -31,7 +31,9 @@ def pytest_collection_modifyitems(items):
         if str(item.path).startswith(HERE):
             item.add_marker("ros")
             # the parser that rclpy's type description service loads is older than Python 3.12
-            item.add_marker(pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"))
+            item.add_marker(
+                pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")
+            )
 
 
 @pytest.fixture

@@ -23,24 +23,36 @@ PLAIN = Parameter(name="no_such", value=ParameterValue(type=1))
 
 def test_a_parameter_of_an_unknown_type_is_a_failure_of_each_that_was_asked_for(graph):
     node = graph.node(Solver)
-    answer = graph.call(SetParameters, "solver/set_parameters", parameters=[PLAIN, STRANGE, PLAIN])
+    answer = graph.call(
+        SetParameters, "solver/set_parameters", parameters=[PLAIN, STRANGE, PLAIN]
+    )
     assert [result.successful for result in answer.results] == [False] * 3
     first, *others = (result.reason for result in answer.results)
     assert first.startswith("Invalid access to undeclared parameter")
     assert others == ["ValueError: 99 is not a valid Parameter.Type"] * 2
     answer = graph.call(
-        SetParametersAtomically, "solver/set_parameters_atomically", parameters=[STRANGE]
+        SetParametersAtomically,
+        "solver/set_parameters_atomically",
+        parameters=[STRANGE],
     )
     assert (answer.result.successful, answer.result.reason) == (False, others[0])
-    assert "solver" not in graph.call(ListParameters, "solver/list_parameters").result.names
+    assert (
+        "solver"
+        not in graph.call(ListParameters, "solver/list_parameters").result.names
+    )
     told = node.refusals.diagnosis()
-    assert told.values == {"refused set_parameters": 1, "refused set_parameters_atomically": 1}
+    assert told.values == {
+        "refused set_parameters": 1,
+        "refused set_parameters_atomically": 1,
+    }
     assert "99 is not a valid Parameter.Type" in told.message
 
 
 def test_an_answer_that_cannot_be_sent_is_counted(graph):
     node = graph.node(Solver)
-    service = next(s for s in node.services if s.service_name.endswith("/get_parameters"))
+    service = next(
+        s for s in node.services if s.service_name.endswith("/get_parameters")
+    )
     service.send_response("no response", None)
     assert node.refusals.counts == {"get_parameters": 1}
 
@@ -84,11 +96,16 @@ def test_a_task_of_an_action_that_fails_is_counted(graph, sequencer, sent, monke
     with monkeypatch.context() as patch:
         patch.setattr(server, "_result_futures", Lost())
         sent()
-        graph.until(lambda: sequencer.refusals.counts["ActionServer"] == 1, "the request's refusal")
+        graph.until(
+            lambda: sequencer.refusals.counts["ActionServer"] == 1,
+            "the request's refusal",
+        )
     with monkeypatch.context() as patch:
         patch.setattr(ServerGoalHandle, "abort", lambda goal: 1 / 0)
         sent()
-        graph.until(lambda: sequencer.refusals.counts["ActionServer"] == 2, "the goal's refusal")
+        graph.until(
+            lambda: sequencer.refusals.counts["ActionServer"] == 2, "the goal's refusal"
+        )
     accepted = graph.finish(sent(), "a goal")
     result = graph.finish(accepted.get_result_async(), "its result").result
     assert result.message == "no such: no such file; check the path"

@@ -66,7 +66,8 @@ class FaultyCell(StageSimulator):
         if now:
             super()._on_timer()
         elif not all(
-            self.count_subscribers(topic.name) for topic in (names.ENCODER, names.DETECTIONS)
+            self.count_subscribers(topic.name)
+            for topic in (names.ENCODER, names.DETECTIONS)
         ):
             return  # time begins when somebody listens
         second, nanosecond = divmod(now + STEP_NS if now else time.time_ns(), SECOND)
@@ -112,7 +113,8 @@ class FaultyCell(StageSimulator):
         if self.fault == "wrong ids" and is_detection and event.kind == 0:
             event = replace(event, m=event.n, n=event.m)
         if self.fault == "m reversed" and is_detection and event.kind == 0:
-            event = replace(event, m=-1 - event.m)  # an even side has m from -N/2 to N/2 - 1
+            # an even side has m from -N/2 to N/2 - 1
+            event = replace(event, m=-1 - event.m)
         if self.fault == "k shifted" and is_detection and event.kind == 1:
             event = replace(event, k=(event.k + 1) % 8)
         if self.fault == "reversed offset_theta" and is_detection and event.kind == 1:
@@ -125,7 +127,8 @@ class Checker(CellChecker):
 
     def ports(self, publish):
         return replace(
-            super().ports(publish), now_s=lambda: self.get_clock().now().nanoseconds / SECOND
+            super().ports(publish),
+            now_s=lambda: self.get_clock().now().nanoseconds / SECOND,
         )
 
 
@@ -161,8 +164,12 @@ def failed(items):
 def test_a_node_of_another_package_in_error_is_heard(graph):
     """Published again and again, as the checker may not have been found yet."""
     publisher = graph.hand.create_publisher(DiagnosticArray, "/diagnostics", 10)
-    hot = DiagnosticStatus(name="motor x", level=DiagnosticStatus.ERROR, message="too hot")
-    graph.hand.create_timer(0.1, lambda: publisher.publish(DiagnosticArray(status=[hot])))
+    hot = DiagnosticStatus(
+        name="motor x", level=DiagnosticStatus.ERROR, message="too hot"
+    )
+    graph.hand.create_timer(
+        0.1, lambda: publisher.publish(DiagnosticArray(status=[hot]))
+    )
     node, items = checked(graph)
     assert failed(items) == {"diagnostics"}, items
     assert items["diagnostics"].figure == "ERROR on /diagnostics: motor x: too hot"
@@ -172,7 +179,9 @@ def test_a_node_of_another_package_in_error_is_heard(graph):
 @pytest.mark.usefixtures("short")
 @pytest.mark.parametrize("sense", ["microscope_moves", "plate_moves"])
 def test_a_good_cell_passes_every_check(graph, sense):
-    node, items = checked(graph, measurement_sense=sense, checker={"measurement_sense": sense})
+    node, items = checked(
+        graph, measurement_sense=sense, checker={"measurement_sense": sense}
+    )
     assert failed(items) == set(), items
     assert node.exit_code == ExitCode.DONE
     assert list(items) == CHECKS
@@ -201,7 +210,9 @@ def test_a_plate_of_even_sides_is_checked_about_the_same_centre(graph):
 def test_a_cell_without_ids_passes_and_that_is_said(graph):
     _, items = checked(graph, with_ids=False)
     assert failed(items) == set(), items
-    assert items["ids"].figure.endswith("name their mark: marks are identified by their positions")
+    assert items["ids"].figure.endswith(
+        "name their mark: marks are identified by their positions"
+    )
 
 
 @pytest.mark.usefixtures("short")
@@ -209,12 +220,26 @@ def test_a_cell_without_ids_passes_and_that_is_said(graph):
     ("cell", "figure", "remedy"),
     [
         ({"microscope_axes": "-x-y"}, "offsets of the other sign", "reverse the sign"),
-        ({"microscope_axes": "-xy"}, "offsets of the other sign: offset_x", "reverse the sign"),
+        (
+            {"microscope_axes": "-xy"},
+            "offsets of the other sign: offset_x",
+            "reverse the sign",
+        ),
         ({"microscope_axes": "yx"}, "exchanged axes", "along the stage's axes"),
-        ({"microscope_pixels": 2.0}, "offsets in wrong units", "correct the pixel size"),
-        ({"microscope_pixels": 0.5}, "offsets in wrong units", "correct the pixel size"),
+        (
+            {"microscope_pixels": 2.0},
+            "offsets in wrong units",
+            "correct the pixel size",
+        ),
+        (
+            {"microscope_pixels": 0.5},
+            "offsets in wrong units",
+            "correct the pixel size",
+        ),
     ],
-    ids=lambda value: "-".join(map(str, value.values())) if isinstance(value, dict) else "",
+    ids=lambda value: (
+        "-".join(map(str, value.values())) if isinstance(value, dict) else ""
+    ),
 )
 def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
     node, items = checked(graph, **cell)
@@ -230,7 +255,11 @@ def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
     [
         ("deaf", "commands", "0 detections in 5 s after MEASURE"),
         ("goes on after ABORT", "abort", "detections later than"),
-        ("acts again", "old commands", "detections after a finished MEASURE was sent again"),
+        (
+            "acts again",
+            "old commands",
+            "detections after a finished MEASURE was sent again",
+        ),
         ("never revisits", "revisits", "not measured again within 3 s"),
         ("no check stops", "check stops", "0 of 5 marks from all four sides"),
         ("loses", "marks", "of 9 marks"),
@@ -245,7 +274,9 @@ def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
     ],
 )
 def test_a_fault_of_the_cell_is_named(graph, fault, name, figure):
-    node, items = checked(graph, fault, exposure_period=0.04 if "ABORT" in fault else 0.01)
+    node, items = checked(
+        graph, fault, exposure_period=0.04 if "ABORT" in fault else 0.01
+    )
     assert name in failed(items), items
     assert next(item.name for item in node.session.items if not item.passed) == name
     assert figure in items[name].figure
@@ -269,17 +300,26 @@ def test_a_check_that_an_error_ends_has_failed(graph, monkeypatch):
 
 @pytest.mark.usefixtures("short")
 def test_reversed_ids_of_an_even_side_are_named(graph):
-    _, items = checked(graph, "m reversed", plan=plan_of("0, 90, tx", 6, size_y=5, count=8))
+    _, items = checked(
+        graph, "m reversed", plan=plan_of("0, 90, tx", 6, size_y=5, count=8)
+    )
     assert items["ids"].figure.startswith("m is counted against plate x (")
 
 
 @pytest.mark.usefixtures("short")
-@pytest.mark.parametrize(("sense", "deg"), [("microscope_moves", "-45"), ("plate_moves", "+45")])
+@pytest.mark.parametrize(
+    ("sense", "deg"), [("microscope_moves", "-45"), ("plate_moves", "+45")]
+)
 def test_lines_that_are_counted_from_another_one_are_named(graph, sense, deg):
     _, items = checked(
-        graph, "k shifted", measurement_sense=sense, checker={"measurement_sense": sense}
+        graph,
+        "k shifted",
+        measurement_sense=sense,
+        checker={"measurement_sense": sense},
     )
-    assert items["ids"].figure.startswith(f"theta is indicated {deg}° from where the lines are (")
+    assert items["ids"].figure.startswith(
+        f"theta is indicated {deg}° from where the lines are ("
+    )
 
 
 @pytest.mark.usefixtures("short")
@@ -288,7 +328,10 @@ def test_two_publishers_of_a_topic_are_the_first_fault_and_the_only_one(graph, t
     graph.hand.create_publisher(topic.type, topic.name, topic.qos)
     _, items = checked(graph)
     assert list(items) == ["publishers"] and failed(items) == {"publishers"}
-    assert items["publishers"].figure == f"2 publishers of {topic.name}: hand, stage_simulator"
+    assert (
+        items["publishers"].figure
+        == f"2 publishers of {topic.name}: hand, stage_simulator"
+    )
 
 
 @pytest.mark.usefixtures("short")
@@ -301,7 +344,9 @@ def test_a_cell_that_says_nothing(graph):
 
 def test_a_sequencer_beside_it_is_refused(graph):
     node = graph.node(partial(CellChecker, small_plan(), settle_s=0.0, patience_s=60.0))
-    graph.hand.create_publisher(names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos)
+    graph.hand.create_publisher(
+        names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos
+    )
     graph.until(node.finished.done, "the refusal")
     assert node.exit_code == ExitCode.BAD_INPUT
     assert node.session.items == []
@@ -329,14 +374,24 @@ def test_the_verb_checks_a_simulated_cell(ros_environment, tmp_path, capfd):
 @pytest.mark.parametrize(
     ("code", "words", "said"),
     [
-        (0, [], "pass  rest: still\nall 1 checks passed: the cell is ready for a calibration\n"),
+        (
+            0,
+            [],
+            "pass  rest: still\nall 1 checks passed: the cell is ready for a calibration\n",
+        ),
         (
             0,
             ["--json"],
             {
                 "passed": True,
                 "items": [
-                    {"name": "rest", "passed": True, "figure": "still", "remedy": "", "follows": ""}
+                    {
+                        "name": "rest",
+                        "passed": True,
+                        "figure": "still",
+                        "remedy": "",
+                        "follows": "",
+                    }
                 ],
             },
         ),
@@ -373,7 +428,10 @@ def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
         yield SimpleNamespace(stdout=[json.dumps(item)], wait=lambda: code)
 
     monkeypatch.setattr(cell, "process", child)
-    assert main(["cell", "check", "--plan", plan_file(tmp_path, small_plan()), *words]) == code
+    assert (
+        main(["cell", "check", "--plan", plan_file(tmp_path, small_plan()), *words])
+        == code
+    )
     found = capfd.readouterr().out
     assert (json.loads(found) if words else found) == said
 
@@ -382,7 +440,10 @@ def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
     ("words", "said"),
     [
         (["--settle", "-1"], "--settle: -1 s is not a waiting time; give 0 or more"),
-        (["--patience", "nan"], "--patience: nan s is not a waiting time; give 0 or more"),
+        (
+            ["--patience", "nan"],
+            "--patience: nan s is not a waiting time; give 0 or more",
+        ),
         (["--params", "none.yaml"], "none.yaml"),
     ],
 )
@@ -397,6 +458,11 @@ def test_the_response_of_each_axis_is_its_own(graph):
     _, items = checked(graph, microscope_stretch=0.02)
     x, y = (
         float(part.split()[1])
-        for part in items["signs"].figure.removeprefix("offset against stage ").split(", ")[:2]
+        for part in items["signs"]
+        .figure.removeprefix("offset against stage ")
+        .split(", ")[:2]
     )
-    assert (x, y) == (pytest.approx(-1 / 1.02, abs=3e-3), pytest.approx(-1 / 0.98, abs=3e-3))
+    assert (x, y) == (
+        pytest.approx(-1 / 1.02, abs=3e-3),
+        pytest.approx(-1 / 0.98, abs=3e-3),
+    )

@@ -25,9 +25,15 @@ def test_nothing_is_lost_without_a_word_and_the_maps_are_the_right_ones(
 ):
     lines, wrong = one_round(2, ros_environment, tmp_path, kills=1, forks=forks)
     assert wrong == []
-    assert [line.partition(":")[0] for line in lines] == ["quiet_messages", "lost_messages"]
+    assert [line.partition(":")[0] for line in lines] == [
+        "quiet_messages",
+        "lost_messages",
+    ]
     assert all(" used + " in line for line in lines)
-    assert [line.rpartition("killed ")[2] for line in lines] == ["measurement_collector", "solver"]
+    assert [line.rpartition("killed ")[2] for line in lines] == [
+        "measurement_collector",
+        "solver",
+    ]
 
 
 def test_a_disk_that_is_full_for_a_while_costs_its_part_of_the_journal_alone(
@@ -85,8 +91,14 @@ def test_the_judgement_sees_a_detection_that_is_not_accounted_for_and_another_ma
     cell = Result()
     told = story(cell, HARMLESS, np.random.default_rng(1), kills=0)
     sent = sum(isinstance(event, Detection) for event in told.arriving)
-    nothing = {name: [0.0] for name in ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")}
-    cell.found = {"views": [{"used": sent - 1}], "rejected": {"duplicate": 2}, "error_map": nothing}
+    nothing = {
+        name: [0.0] for name in ("gx", "gy", "u_gx", "u_gy", "g_theta", "u_g_theta")
+    }
+    cell.found = {
+        "views": [{"used": sent - 1}],
+        "rejected": {"duplicate": 2},
+        "error_map": nothing,
+    }
     told.judge()
     assert told.faults[0] == f"{sent} detections sent, {sent - 1} used and 2 rejected"
     assert "gx is not that of these messages" in told.faults

@@ -41,9 +41,12 @@ def test_an_honest_run_after_one_a_day_ahead_is_the_map_that_is_saved(graph, tmp
     graph.node(Solver, result_folder=str(tmp_path))
     maps, received = graph.listen(names.ERROR_MAP), collector.session.collector.received
     ahead, honest = run_of(now + DAY_NS, 5), run_of(now - 3600 * 10**9, 6)
-    begin = next(e for e in honest if isinstance(e, Command) and e.phase == Phase.MEASURE)
+    begin = next(
+        e for e in honest if isinstance(e, Command) and e.phase == Phase.MEASURE
+    )
     forged = [
-        replace(begin, stamp_ns=begin.stamp_ns + 10**8, run_id=run_id) for run_id in ("", "17")
+        replace(begin, stamp_ns=begin.stamp_ns + 10**8, run_id=run_id)
+        for run_id in ("", "17")
     ]
     publish_events(graph, ahead)
     graph.until(lambda: sum(received.values()) == len(ahead), "the run that is ahead")
@@ -56,13 +59,19 @@ def test_an_honest_run_after_one_a_day_ahead_is_the_map_that_is_saved(graph, tmp
         ),
         "a map",
     )
-    graph.until(lambda: sum(received.values()) == len(ahead) + len(honest) + 2, "all of it")
+    graph.until(
+        lambda: sum(received.values()) == len(ahead) + len(honest) + 2, "all of it"
+    )
     wanted = calibrate(collected(honest)[1]).error_map
-    graph.until(lambda: list(maps[-1].gx) == wanted.gx.ravel().tolist(), "the map of the run")
+    graph.until(
+        lambda: list(maps[-1].gx) == wanted.gx.ravel().tolist(), "the map of the run"
+    )
     answer = graph.call(SaveMap, "solver/save_map", path="map.json")
     assert answer.success and f"run {now - 3600 * 10**9}; readings " in answer.message
     assert "newer" not in answer.message and answer.message.count("WARNING") == 1
-    assert "stamped more than 60 s ahead of its reception was not used" in answer.message
+    assert (
+        "stamped more than 60 s ahead of its reception was not used" in answer.message
+    )
     assert not collector.session.collector.unusable.keys() ^ {
         "command_from_the_future",
         "encoder_sample_from_the_future",

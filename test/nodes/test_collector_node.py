@@ -63,7 +63,9 @@ def test_the_encoder_is_taken_as_it_is_offered(graph, offer, policy):
 def test_an_encoder_that_becomes_best_effort_is_still_heard(graph):
     node = graph.node(MeasurementCollector)
     graph.publisher(names.ENCODER)
-    graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER_EITHER[1].qos)
+    graph.hand.create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER_EITHER[1].qos
+    )
     graph.until(
         lambda: encoder_subscriptions(graph) == [ReliabilityPolicy.BEST_EFFORT],
         "a subscription that matches both publishers",
@@ -85,7 +87,9 @@ def test_a_late_listener_receives_every_cell_of_every_view(graph):
     assert graph.call(Trigger, FINISH).success
     graph.until(lambda: len({m.view_name for m in early}) == 2 * 49, "all cells")
     late = graph.listen(names.MEASUREMENT)
-    graph.until(lambda: {m.view_name for m in late} == {m.view_name for m in early}, "all again")
+    graph.until(
+        lambda: {m.view_name for m in late} == {m.view_name for m in early}, "all again"
+    )
 
 
 def test_what_it_publishes_is_what_the_messages_hold_bit_for_bit(graph):
@@ -109,7 +113,9 @@ def test_what_it_publishes_is_what_the_messages_hold_bit_for_bit(graph):
         assert found == expected[index]
         assert message.plan_id == measurements.plan_id
         assert to_model.artifact_of(message) == measurements.artifact
-    graph.until(lambda: {m.view_index for m in status if m.complete} == set(expected), "status")
+    graph.until(
+        lambda: {m.view_index for m in status if m.complete} == set(expected), "status"
+    )
 
 
 def test_order_of_arrival_changes_nothing(graph):
@@ -129,7 +135,9 @@ def test_order_of_arrival_changes_nothing(graph):
 
 def test_the_status_counts_marks_and_rejections_while_the_view_is_open(graph):
     events = events_of(small_plan("0", repeats=1))
-    commands = [index for index, event in enumerate(events) if isinstance(event, Command)]
+    commands = [
+        index for index, event in enumerate(events) if isinstance(event, Command)
+    ]
     events = events[: commands[2]]  # the first view alone, still open
     detections = [event for event in events if isinstance(event, Detection)]
     events.remove(detections[3])
@@ -137,7 +145,9 @@ def test_the_status_counts_marks_and_rejections_while_the_view_is_open(graph):
     graph.node(MeasurementCollector, status_period=0.02)
     status = graph.listen(names.STATUS)
     publish_events(graph, events)
-    graph.until(lambda: status and status[-1].detections_rejected == 2, "the rejections")
+    graph.until(
+        lambda: status and status[-1].detections_rejected == 2, "the rejections"
+    )
     last = status[-1]
     assert (last.grid_expected, last.grid_done) == (25, 24)
     assert (last.angular_expected, last.angular_done) == (8, 8)
@@ -153,7 +163,9 @@ def test_the_last_detection_of_a_view_is_not_left_to_the_clock(graph, monkeypatc
     monkeypatch.setattr(measurement_collector, "TICK_S", 3600.0)
     monkeypatch.setattr(measurement_collector, "SOON_TICKS", 10**9)
     events = events_of(small_plan("0", repeats=1))
-    commands = [index for index, event in enumerate(events) if isinstance(event, Command)]
+    commands = [
+        index for index, event in enumerate(events) if isinstance(event, Command)
+    ]
     node = graph.node(MeasurementCollector, status_period=60.0)
     measured, status = graph.listen(names.MEASUREMENT), graph.listen(names.STATUS)
     publish_events(graph, [events[index] for index in commands[:2]])
@@ -161,7 +173,11 @@ def test_the_last_detection_of_a_view_is_not_left_to_the_clock(graph, monkeypatc
     node._on_timer()
     publish_events(
         graph,
-        [event for event in events[: commands[2]] if event.stamp_ns > events[commands[1]].stamp_ns],
+        [
+            event
+            for event in events[: commands[2]]
+            if event.stamp_ns > events[commands[1]].stamp_ns
+        ],
     )
     graph.until(lambda: measured and status and status[-1].complete, "the view")
     graph.until(lambda: node._soon.is_canceled(), "rest")
@@ -185,7 +201,9 @@ def test_timers_that_are_woken_neither_hasten_nor_put_off_the_health(graph):
 
 
 @pytest.mark.usefixtures("quick_beat")
-def test_a_node_whose_timers_are_due_when_it_is_first_spun_tells_its_health_in_time(graph):
+def test_a_node_whose_timers_are_due_when_it_is_first_spun_tells_its_health_in_time(
+    graph,
+):
     node = MeasurementCollector(context=graph.context)
     node.autostart()
     told = graph.listen(names.of_node("measurement_collector", names.HEALTH))
@@ -210,12 +228,21 @@ def test_a_command_that_cannot_be_used_is_counted_and_does_not_end_the_node(grap
     commands.publish(ViewCommand(phase=9))
     commands.publish(
         ViewCommand(
-            phase=1, grid=True, grid_size=5, grid_pitch=0.01, repeats=1, translation_x=0.0042
+            phase=1,
+            grid=True,
+            grid_size=5,
+            grid_pitch=0.01,
+            repeats=1,
+            translation_x=0.0042,
         )
     )
-    graph.until(lambda: node.session.collector.received["command"] == 2, "both commands")
+    graph.until(
+        lambda: node.session.collector.received["command"] == 2, "both commands"
+    )
     publish_events(graph, events_of(small_plan("0", repeats=1)))
-    graph.until(lambda: node.session.collector.received["command"] == 2 + 5, "the good commands")
+    graph.until(
+        lambda: node.session.collector.received["command"] == 2 + 5, "the good commands"
+    )
     measurements, _ = node.session.collector.collect()
     assert measurements.rejected["command_unusable"] == 2
 
@@ -230,7 +257,9 @@ def small_run(start_s: int) -> list:
 
 def test_a_view_measured_again_in_a_second_run_is_called_complete(graph):
     first, second = small_run(0), small_run(1000)
-    commands = [index for index, event in enumerate(second) if isinstance(event, Command)]
+    commands = [
+        index for index, event in enumerate(second) if isinstance(event, Command)
+    ]
     node = graph.node(MeasurementCollector, status_period=0.02)
     counts = publish_events(graph, first)
     graph.until(lambda: received(node, counts), "the first run")
@@ -242,7 +271,9 @@ def test_a_view_measured_again_in_a_second_run_is_called_complete(graph):
     )
 
 
-def test_the_readings_of_a_view_are_sent_before_it_is_called_complete(graph, monkeypatch):
+def test_the_readings_of_a_view_are_sent_before_it_is_called_complete(
+    graph, monkeypatch
+):
     node = graph.node(MeasurementCollector)
     counts = publish_events(graph, events_of(small_plan("0", repeats=1)))
     graph.until(lambda: received(node, counts), "all messages")
@@ -252,7 +283,9 @@ def test_the_readings_of_a_view_are_sent_before_it_is_called_complete(graph, mon
         node,
         "_outputs",
         {
-            name: lambda fields, name=name: sent.append(f"{name} {fields['view_index']}")
+            name: lambda fields, name=name: sent.append(
+                f"{name} {fields['view_index']}"
+            )
             for name in ("status", "measurement")
         },
     )
@@ -266,10 +299,14 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
         event for event in events_of(small_plan("0"))[:9] if isinstance(event, Command)
     )
     diagnostics: list = []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    graph.hand.create_subscription(
+        DiagnosticArray, "/diagnostics", diagnostics.append, 10
+    )
     commands = graph.publisher(names.COMMAND, readers=0)
     for command in (place, measure):
-        commands.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
+        commands.publish(
+            fill(names.COMMAND.type(), from_model.command(command, "stage"))
+        )
     node = graph.node(MeasurementCollector)
     line = f"began before this node: {measure.view.name}"
     graph.until(
@@ -281,11 +318,16 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
         line,
     )
     for number, command in enumerate((measure, place, measure), 1):
-        assert set(node.session.missed.values()) == {measure.view.name}  # until it is measured anew
+        # until it is measured anew
+        assert set(node.session.missed.values()) == {measure.view.name}
         command = replace(command, stamp_ns=command.stamp_ns + number * 10**9)
-        commands.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
+        commands.publish(
+            fill(names.COMMAND.type(), from_model.command(command, "stage"))
+        )
         graph.until(
-            lambda number=number: node.session.collector.received["command"] == 2 + number,
+            lambda number=number: (
+                node.session.collector.received["command"] == 2 + number
+            ),
             "the command",
         )
     graph.until(
@@ -298,12 +340,19 @@ def test_a_collector_that_starts_within_a_view_names_it_until_it_is_placed_anew(
 
 
 @pytest.mark.usefixtures("quick_beat")
-def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(graph, monkeypatch):
+def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(
+    graph, monkeypatch
+):
     node = graph.node(MeasurementCollector, status_period=0.02)
     said, diagnostics = [], []
     monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(error=said.append))
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
-    commands, detections = graph.publisher(names.COMMAND), graph.publisher(names.DETECTIONS)
+    graph.hand.create_subscription(
+        DiagnosticArray, "/diagnostics", diagnostics.append, 10
+    )
+    commands, detections = (
+        graph.publisher(names.COMMAND),
+        graph.publisher(names.DETECTIONS),
+    )
     for second, size in enumerate((5, 7)):
         plan = plan_of("0", size, count=8)
         commands.publish(
@@ -311,7 +360,13 @@ def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(g
                 names.COMMAND.type(),
                 from_model.command(
                     Command(
-                        second * 10**9, Phase.MEASURE, "one", 0, plan.views[0], plan.artifact, 1
+                        second * 10**9,
+                        Phase.MEASURE,
+                        "one",
+                        0,
+                        plan.views[0],
+                        plan.artifact,
+                        1,
                     ),
                     "stage",
                 ),
@@ -341,10 +396,15 @@ def test_another_plate_under_the_same_plan_is_said_once_and_in_the_diagnostics(g
 def test_diagnostics_count_rejections_before_any_view_and_beat_without_messages(graph):
     node = graph.node(MeasurementCollector)
     diagnostics: list = []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    graph.hand.create_subscription(
+        DiagnosticArray, "/diagnostics", diagnostics.append, 10
+    )
     graph.until(lambda: diagnostics, "a sign of life")
     (status,) = diagnostics[-1].status
-    assert (status.level, status.message) == (DiagnosticStatus.OK, "waiting for a MEASURE command")
+    assert (status.level, status.message) == (
+        DiagnosticStatus.OK,
+        "waiting for a MEASURE command",
+    )
     encoder = graph.publisher(names.ENCODER)
     encoder.publish(names.ENCODER.type(name=["spindle"], position=[0.0]))
     encoder.publish(names.ENCODER.type(name=["x"], position=[float("nan")]))
@@ -355,7 +415,8 @@ def test_diagnostics_count_rejections_before_any_view_and_beat_without_messages(
     }
     graph.until(
         lambda: any(
-            wanted <= {(v.key, v.value) for v in s.values} and s.level == DiagnosticStatus.WARN
+            wanted <= {(v.key, v.value) for v in s.values}
+            and s.level == DiagnosticStatus.WARN
             for m in diagnostics
             for s in m.status
         ),
@@ -372,14 +433,18 @@ def test_a_late_solver_hears_the_views_that_are_done(graph):
     graph.until(lambda: {m.view_index for m in late} == {0, 1}, "the latched views")
 
 
-def test_a_view_whose_lines_cannot_be_told_apart_says_once_what_to_do(graph, monkeypatch):
+def test_a_view_whose_lines_cannot_be_told_apart_says_once_what_to_do(
+    graph, monkeypatch
+):
     events = [
         replace(event, has_id=False) if isinstance(event, Detection) else event
         for event in events_of(plan_of("0", 3, count=96, line=True))
     ]
     node = graph.node(MeasurementCollector, status_period=0.02)
     said: list[str] = []
-    monkeypatch.setattr(node, "get_logger", lambda: SimpleNamespace(warning=said.append))
+    monkeypatch.setattr(
+        node, "get_logger", lambda: SimpleNamespace(warning=said.append)
+    )
     counts = publish_events(graph, events)
     graph.until(lambda: received(node, counts), "all messages")
     for _ in range(2):
@@ -407,16 +472,22 @@ def test_an_encoder_that_is_heard_late_is_no_fault_and_one_with_a_clock_of_its_o
     monkeypatch.setattr(
         node,
         "get_logger",
-        lambda: SimpleNamespace(warning=lambda line: said.append((time.monotonic(), line))),
+        lambda: SimpleNamespace(
+            warning=lambda line: said.append((time.monotonic(), line))
+        ),
     )
     status = graph.listen(names.STATUS)
     publish_events(graph, first)
-    graph.until(lambda: status and status[-1].detections_rejected == 25, "all of them rejected")
+    graph.until(
+        lambda: status and status[-1].detections_rejected == 25, "all of them rejected"
+    )
     rejected_s = time.monotonic()
     publish_events(graph, late)
     if not offset_s:
         graph.until(lambda: status[-1].detections_used == 25, "the readings")
-        graph.until(lambda: time.monotonic() > rejected_s + 1.5 * patience_s, "the time")
+        graph.until(
+            lambda: time.monotonic() > rejected_s + 1.5 * patience_s, "the time"
+        )
         assert said == []
         return
     graph.until(lambda: said, "the warning")
@@ -433,7 +504,12 @@ def test_diagnostics_count_what_was_received(graph):
     graph.publisher(names.DETECTIONS).publish(MarkDetection())
     wanted = ("detection_received", "1")
     graph.until(
-        lambda: any(wanted == (v.key, v.value) for m in heard for s in m.status for v in s.values),
+        lambda: any(
+            wanted == (v.key, v.value)
+            for m in heard
+            for s in m.status
+            for v in s.values
+        ),
         "the count",
     )
     assert heard[-1].status[0].name == "measurement_collector"
@@ -454,11 +530,15 @@ def test_simulated_time_that_ends_without_done_loses_no_view(graph):
     graph.until(lambda: clock.get_subscription_count() > 0, "the node's ear for /clock")
     stamp_s, stamp_ns = divmod(events[0].stamp_ns, 10**9)
     clock.publish(Clock(clock=Time(sec=stamp_s, nanosec=stamp_ns)))  # then it stands
-    graph.until(lambda: node.get_clock().now().nanoseconds == events[0].stamp_ns, "the time")
+    graph.until(
+        lambda: node.get_clock().now().nanoseconds == events[0].stamp_ns, "the time"
+    )
     publish_events(graph, events[:-1])
     graph.until(
         lambda: (
-            {m.view_index: len(m.m) + len(m.k) for m in heard}.get(events[measure].view_index)
+            {m.view_index: len(m.m) + len(m.k) for m in heard}.get(
+                events[measure].view_index
+            )
             == marks
         ),
         "the readings of the last view",
@@ -477,7 +557,9 @@ def test_who_comes_late_gets_the_newest_status(graph):
 
 
 @pytest.mark.usefixtures("quick_beat")
-@pytest.mark.parametrize(("given", "told"), [({}, "stage"), ({"hardware_id": "XY-7"}, "XY-7")])
+@pytest.mark.parametrize(
+    ("given", "told"), [({}, "stage"), ({"hardware_id": "XY-7"}, "XY-7")]
+)
 def test_the_health_names_the_stage(graph, given, told):
     heard = graph.listen(names.of_node("measurement_collector", names.HEALTH))
     graph.node(MeasurementCollector, **given)
@@ -508,13 +590,18 @@ def test_messages_that_were_overwritten_before_they_were_taken_are_counted(graph
     encoder = graph.publisher(names.ENCODER)
     sample = names.ENCODER.type(name=["x"], position=[0.0])
     encoder.publish(sample)
-    graph.until(lambda: graph.nodes[-1].session.collector.received["encoder"] == 1, "the first")
+    graph.until(
+        lambda: graph.nodes[-1].session.collector.received["encoder"] == 1, "the first"
+    )
     for _ in range(depth + 700):  # nobody spins meanwhile
         encoder.publish(sample)
     graph.until(lambda: told, "the loss")
     lost, level, message = told[-1]
     graph.until(
-        lambda: graph.nodes[-1].session.collector.received["encoder"] == 1 + depth + 700 - lost,
+        lambda: (
+            graph.nodes[-1].session.collector.received["encoder"]
+            == 1 + depth + 700 - lost
+        ),
         "the others",
     )
     assert lost > 0
@@ -533,7 +620,10 @@ def test_detections_that_were_overwritten_are_counted_too(graph):
         detections.publish(MarkDetection())
     graph.until(lambda: told, "the loss")
     graph.until(
-        lambda: node.session.collector.received["detection"] == 1 + depth + 700 - told[-1][0],
+        lambda: (
+            node.session.collector.received["detection"]
+            == 1 + depth + 700 - told[-1][0]
+        ),
         "the others",
     )
     assert told[-1][0] > 0
@@ -543,12 +633,16 @@ def test_detections_that_were_overwritten_are_counted_too(graph):
 def test_the_numbers_of_two_publishers_that_interleave_are_no_loss(graph):
     node = graph.node(MeasurementCollector)
     first = graph.publisher(names.ENCODER)
-    second = graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    second = graph.hand.create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos
+    )
     graph.until(lambda: second.get_subscription_count() == 1, "both")
     sample = names.ENCODER.type(name=["x"], position=[0.0])
     for number in range(12):
         (second if number == 8 else first).publish(sample)
-        graph.until(lambda n=number: node.session.collector.received["encoder"] == n + 1, "it")
+        graph.until(
+            lambda n=number: node.session.collector.received["encoder"] == n + 1, "it"
+        )
     assert not node.losses.counts
 
 
@@ -576,7 +670,11 @@ def test_what_was_acknowledged_is_used_and_written_when_the_node_is_taken_down(
         node.destroy_node()
     else:
         node.trigger_deactivate()
-        assert session.collector.received == {"encoder": 30, "detection": 30, "command": 0}
+        assert session.collector.received == {
+            "encoder": 30,
+            "detection": 30,
+            "command": 0,
+        }
         if taken_down_by == "clean up":
             node.trigger_cleanup()
     assert session.collector.received == {"encoder": 30, "detection": 30, "command": 0}
@@ -607,7 +705,9 @@ def test_losses_are_counted_over_the_life_of_the_node(graph):
     }
 
 
-def test_a_remapped_topic_is_in_the_journal_under_the_name_of_the_contract(graph, tmp_path):
+def test_a_remapped_topic_is_in_the_journal_under_the_name_of_the_contract(
+    graph, tmp_path
+):
     remapped = partial(
         MeasurementCollector,
         namespace="cell",

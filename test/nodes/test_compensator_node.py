@@ -26,7 +26,12 @@ from test.support.waiting import PATIENCE_S
 
 MAP, OTHER = (random_map(Artifact(5, 0.01, 8), seed) for seed in (3, 4))
 BENCH = Path(__file__).parents[1] / "bench" / "compensate.py"
-PLACES = [(0.0, 0.0, 0.0), (0.0123, -0.0071, 0.4), (0.02, 0.02, 3.0), (0.09, -0.09, -1.0)]
+PLACES = [
+    (0.0, 0.0, 0.0),
+    (0.0123, -0.0071, 0.4),
+    (0.02, 0.02, 3.0),
+    (0.09, -0.09, -1.0),
+]
 
 
 def summary():
@@ -46,7 +51,10 @@ def latch_map(graph, error_map=MAP) -> None:
         names.ERROR_MAP.type, names.ERROR_MAP.name, names.ERROR_MAP.qos
     )
     publisher.publish(
-        fill(names.ERROR_MAP.type(), from_model.error_map(result_of(error_map), 1, "stage"))
+        fill(
+            names.ERROR_MAP.type(),
+            from_model.error_map(result_of(error_map), 1, "stage"),
+        )
     )
     summaries = graph.hand.create_publisher(
         names.SUMMARY.type, names.SUMMARY.name, names.SUMMARY.qos
@@ -78,10 +86,14 @@ def correct(graph, messages: list) -> list:
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "bicubic"])
-def test_each_sample_comes_back_with_the_stage_error_taken_off(graph, tmp_path, interpolation):
+def test_each_sample_comes_back_with_the_stage_error_taken_off(
+    graph, tmp_path, interpolation
+):
     graph.node(CompensatorNode, map=map_file(tmp_path), interpolation=interpolation)
     reference = Compensator(MAP, method=interpolation, outside="clamp")
-    for place, answer in zip(PLACES, correct(graph, [sample(*p) for p in PLACES]), strict=True):
+    for place, answer in zip(
+        PLACES, correct(graph, [sample(*p) for p in PLACES]), strict=True
+    ):
         x, y = reference.correct(place[0], place[1])
         assert list(answer.position) == [x, y, reference.correct_theta(place[2])]
         assert list(answer.velocity) == [0.5, 0.5, 0.5]
@@ -106,15 +118,22 @@ def test_a_map_that_was_published_before_the_node_started_is_used(graph):
 
 
 def test_joints_are_found_by_name_and_others_pass_unchanged(graph, tmp_path):
-    graph.node(CompensatorNode, map=map_file(tmp_path), joint_x="stage_x", joint_y="stage_y")
-    [answer] = correct(graph, [sample(7.0, 0.01, 0.005, name=("z", "stage_y", "stage_x"))])
+    graph.node(
+        CompensatorNode, map=map_file(tmp_path), joint_x="stage_x", joint_y="stage_y"
+    )
+    [answer] = correct(
+        graph, [sample(7.0, 0.01, 0.005, name=("z", "stage_y", "stage_x"))]
+    )
     x, y = Compensator(MAP).correct(0.005, 0.01)
     assert list(answer.position) == [7.0, y, x]
 
 
 def test_every_command_comes_back_in_order_with_the_error_added(graph, tmp_path):
     graph.node(CompensatorNode, map=map_file(tmp_path))
-    heard, publisher = graph.listen(names.CORRECTED_MOTION), graph.publisher(names.MOTION)
+    heard, publisher = (
+        graph.listen(names.CORRECTED_MOTION),
+        graph.publisher(names.MOTION),
+    )
     count = 3 * KEEPS_UP  # more than the newest of the samples
     for number in range(count):
         message = sample(0.0001 * number, 0.005, 0.4)
@@ -132,7 +151,9 @@ def test_the_service_answers_with_commands_their_u_and_the_way_back(graph, tmp_p
     node = graph.node(CompensatorNode)
     none = graph.call(Correct, "compensator/correct", x=[0.01], y=[0.0])
     assert (none.success, none.error_code) == (False, 2) and not len(none.x)
-    assert none.message.startswith("compensator: no error map yet; calibrate, or name one")
+    assert none.message.startswith(
+        "compensator: no error map yet; calibrate, or name one"
+    )
     node.session._load_file(map_file(tmp_path))
     there = graph.call(Correct, "compensator/correct", x=[0.01, -0.013], y=[0.0, 0.004])
     assert there.success and there.message.endswith("map.json, plan demo")
@@ -140,7 +161,9 @@ def test_the_service_answers_with_commands_their_u_and_the_way_back(graph, tmp_p
     assert (list(there.x), list(there.y), list(there.theta)) == (list(x), list(y), [])
     u_x, u_y = Compensator(MAP).uncertainty([0.01, -0.013], [0.0, 0.004])
     assert (list(there.u_x), list(there.u_y)) == (list(u_x), list(u_y))
-    back = graph.call(Correct, "compensator/correct", x=there.x, y=there.y, inverse=True)
+    back = graph.call(
+        Correct, "compensator/correct", x=there.x, y=there.y, inverse=True
+    )
     np.testing.assert_allclose(back.x, [0.01, -0.013], rtol=0, atol=1e-15)
 
 
@@ -149,7 +172,8 @@ def test_after_a_standstill_the_newest_sample_comes_first(graph, tmp_path, count
     """Nothing runs while these are published; of the larger number most are displaced."""
     node = graph.node(CompensatorNode, map=map_file(tmp_path))
     heard, publisher = graph.listen(names.CORRECTED), graph.publisher(names.ENCODER)
-    publisher.publish(sample(0.0, 0.0, 0.0))  # with the number that the others are counted from
+    # with the number that the others are counted from
+    publisher.publish(sample(0.0, 0.0, 0.0))
     graph.until(lambda: len(heard) == 1, "the first answer")
     for number in range(1, count + 1):
         message = sample(0.01, 0.0, 0.0)
@@ -184,7 +208,9 @@ def test_what_is_not_corrected_is_counted_and_not_published(graph, tmp_path):
     wanted = {"corrected": "1", "without_map": "0", "refused": "2"}
     graph.until(
         lambda: (
-            said and wanted.items() <= {v.key: v.value for v in said[-1].status[0].values}.items()
+            said
+            and wanted.items()
+            <= {v.key: v.value for v in said[-1].status[0].values}.items()
         ),
         "the counts",
     )
@@ -198,7 +224,10 @@ def test_places_beside_unknown_sites_and_no_numbers_are_refused(graph):
     said: list = []
     graph.hand.create_subscription(DiagnosticArray, "/diagnostics", said.append, 10)
     graph.until(
-        lambda: said and said[-1].status[0].message.startswith("correcting by the map of plan "),
+        lambda: (
+            said
+            and said[-1].status[0].message.startswith("correcting by the map of plan ")
+        ),
         "the map",
     )
     heard, publisher = graph.listen(names.CORRECTED), graph.publisher(names.ENCODER)
@@ -208,7 +237,8 @@ def test_places_beside_unknown_sites_and_no_numbers_are_refused(graph):
     graph.until(lambda: heard, "the good sample")
     assert heard[0].position[0] == pytest.approx(0.015, abs=1e-5)
     graph.until(
-        lambda: {v.key: v.value for v in said[-1].status[0].values}["refused"] == "3", "the counts"
+        lambda: {v.key: v.value for v in said[-1].status[0].values}["refused"] == "3",
+        "the counts",
     )
 
 
@@ -243,7 +273,10 @@ def publish_map(graph, by, error_map, stamp_ns: int) -> None:
         "views_planned": 4,
     }
     for topic, fields in (
-        (names.ERROR_MAP, from_model.error_map(result_of(error_map), stamp_ns, "stage")),
+        (
+            names.ERROR_MAP,
+            from_model.error_map(result_of(error_map), stamp_ns, "stage"),
+        ),
         (names.SUMMARY, summary),
     ):
         publisher = by.create_publisher(topic.type, topic.name, topic.qos)
@@ -254,7 +287,9 @@ def publish_map(graph, by, error_map, stamp_ns: int) -> None:
 @pytest.mark.parametrize("leaves", ["intruder", "solver"])
 def test_a_map_of_a_second_node_is_not_used_until_one_is_left(graph, leaves):
     node = graph.node(CompensatorNode)
-    others = {name: Node(name, context=graph.context) for name in ("solver", "intruder")}
+    others = {
+        name: Node(name, context=graph.context) for name in ("solver", "intruder")
+    }
     for other in others.values():
         graph.add(other)
     heard: list = []
@@ -276,8 +311,12 @@ def test_a_map_of_a_second_node_is_not_used_until_one_is_left(graph, leaves):
     graph.until(lambda: node.refusals.counts[names.ERROR_MAP.name] > 0, "the refusal")
     graph.remove(others[leaves])
     kept = {"intruder": MAP, "solver": OTHER}[leaves]
-    graph.until(lambda: node.session.compensator is not first, "the latched map of who is left")
-    assert node.session.compensator.correct(0.01, 0.0) == Compensator(kept).correct(0.01, 0.0)
+    graph.until(
+        lambda: node.session.compensator is not first, "the latched map of who is left"
+    )
+    assert node.session.compensator.correct(0.01, 0.0) == Compensator(kept).correct(
+        0.01, 0.0
+    )
 
 
 def test_of_two_nodes_that_were_there_before_no_map_is_used(graph):
@@ -312,12 +351,15 @@ def test_many_summaries_take_no_map_away_and_the_oldest_are_counted(graph, monke
         summaries.publish(summary())
         graph.until(
             lambda number=number: (
-                node.refusals.counts[names.SUMMARY.name] + len(node._maps._waiting) == number + 2
+                node.refusals.counts[names.SUMMARY.name] + len(node._maps._waiting)
+                == number + 2
             ),
             f"summary {number}",
         )
     assert node.refusals.counts[names.SUMMARY.name] == 3
-    assert [topic for _, topic, _ in node._maps._waiting].count(names.ERROR_MAP.name) == 1
+    assert [topic for _, topic, _ in node._maps._waiting].count(
+        names.ERROR_MAP.name
+    ) == 1
     monkeypatch.setattr(compensator, "ALONE_S", 0.0)
     graph.until(lambda: node.session.compensator is not None, "the map")
 
@@ -339,6 +381,10 @@ def test_the_bench_takes_corrected_samples(ros_environment):
         timeout=PATIENCE_S,
     )
     row = json.loads(done.stdout)
-    assert (row["benchmark"], row["method"], row["n"]) == ("compensate 100 Hz", "selfcal", 20)
+    assert (row["benchmark"], row["method"], row["n"]) == (
+        "compensate 100 Hz",
+        "selfcal",
+        20,
+    )
     assert row["corrected"] > 0
     assert row["max_error"] < 1e-12

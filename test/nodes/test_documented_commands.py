@@ -15,7 +15,17 @@ from selfcal_ros.nodes.solver import Solver
 from test.support.pages import ROOT, lines_of
 from test.support.sessions import plan_file, small_plan
 
-CHECKED = {"run", "launch", "topic", "service", "action", "lifecycle", "param", "interface", "bag"}
+CHECKED = {
+    "run",
+    "launch",
+    "topic",
+    "service",
+    "action",
+    "lifecycle",
+    "param",
+    "interface",
+    "bag",
+}
 NOT_HERE = {"security", "pkg", "control"}
 """What is not of the graph: the tools of SROS2 and ros2_control, the index of packages."""
 OPTIONS = re.compile(r"^--?[a-z]")
@@ -57,9 +67,13 @@ def test_launch_files_have_the_arguments_that_are_given():
             "selfcal_ros/nodes/launching.py",
             *re.findall(r"launch/\w+\.launch\.py", text),
         ):
-            text += (ROOT / path).read_text()  # an included file's arguments may be given, too
+            text += (
+                ROOT / path
+            ).read_text()  # an included file's arguments may be given, too
         for argument in arguments:
-            assert re.search(rf'rgument\(\s*"{argument.partition(":=")[0]}"', text), argument
+            assert re.search(rf'rgument\(\s*"{argument.partition(":=")[0]}"', text), (
+                argument
+            )
 
 
 @pytest.fixture
@@ -85,12 +99,17 @@ def test_topics_services_and_actions_exist_with_their_types(cell):
     cell.until(
         lambda: (
             wanted_services
-            <= {(name, of) for name, types in hand.get_service_names_and_types() for of in types}
+            <= {
+                (name, of)
+                for name, types in hand.get_service_names_and_types()
+                for of in types
+            }
         ),
         f"{wanted_services}",
     )
     cell.until(
-        lambda: set(topics) <= {name for name, _ in hand.get_topic_names_and_types()}, f"{topics}"
+        lambda: set(topics) <= {name for name, _ in hand.get_topic_names_and_types()},
+        f"{topics}",
     )
     for _, of, *request in services:
         fields = yaml.safe_load(request[0]) if request else {}
@@ -110,9 +129,13 @@ def test_nodes_transitions_and_interfaces_exist(cell):
 def test_what_is_recorded_are_the_topics_of_a_bag():
     from selfcal_ros.topics import INPUT_TOPICS
 
-    recorded = next(words for words in lines("bag") if words[0] == "record" and len(words) > 4)
+    recorded = next(
+        words for words in lines("bag") if words[0] == "record" and len(words) > 4
+    )
     assert {
-        word[1:] for word in plain(recorded) if word.startswith("/") and word != "/tmp/session"
+        word[1:]
+        for word in plain(recorded)
+        if word.startswith("/") and word != "/tmp/session"
     } == set(INPUT_TOPICS)
     for words in lines("bag"):
         for word in words:

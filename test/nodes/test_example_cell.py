@@ -34,7 +34,9 @@ def away_from(machine, gx, gy, size: int) -> tuple[np.ndarray, float]:
     columns = np.array(
         [np.r_[x * 0 + 1, y * 0], np.r_[x * 0, y * 0 + 1], np.r_[-y, x], np.r_[x, y]]
     ).T
-    return away - columns @ np.linalg.lstsq(columns, away, rcond=None)[0], float(np.ptp(true))
+    return away - columns @ np.linalg.lstsq(columns, away, rcond=None)[0], float(
+        np.ptp(true)
+    )
 
 
 SMALL = EXAMPLES.parent / "config/plans/small.yaml"
@@ -45,13 +47,18 @@ SMALL = EXAMPLES.parent / "config/plans/small.yaml"
     ("plan", "cell", "size", "most"),
     [(SMALL, "cell", 5, 2e-8), (EXAMPLES / "camera_plan.yaml", "camera_cell", 3, 1e-7)],
 )
-def test_an_example_is_measured_without_ros(tmp_path, monkeypatch, plan, cell, size, most):
+def test_an_example_is_measured_without_ros(
+    tmp_path, monkeypatch, plan, cell, size, most
+):
     monkeypatch.chdir(tmp_path)
     path = EXAMPLES / f"{cell}.yaml"
     assert main(["measure", str(plan), str(path), "-o", "bag", "--yes"]) == 0
     result = json.loads(Path("bag.json").read_text())
     away, span = away_from(
-        open_machine(read_cell(path)), result["error_map"]["gx"], result["error_map"]["gy"], size
+        open_machine(read_cell(path)),
+        result["error_map"]["gx"],
+        result["error_map"]["gy"],
+        size,
     )
     assert np.abs(away).max() < most < 0.3 * span
 
@@ -74,7 +81,10 @@ def test_the_same_class_is_driven_under_ros(graph, tmp_path, size):
         graph.node(MeasurementCollector)
         graph.node(Solver)
         graph.node(
-            PoseSequencer, plan=str(tmp_path / "plan.yaml"), auto_confirm=True, auto_start=True
+            PoseSequencer,
+            plan=str(tmp_path / "plan.yaml"),
+            auto_confirm=True,
+            auto_start=True,
         )
         graph.until(
             lambda: (
@@ -112,7 +122,13 @@ def test_a_command_latched_anew_is_not_carried_out_again_and_abort_stops(graph):
                 names.COMMAND.type(),
                 from_model.command(
                     Command(
-                        stamp_ns, phase, "p", 0, View("a", angular=False), Artifact(5, 0.01, 8), 1
+                        stamp_ns,
+                        phase,
+                        "p",
+                        0,
+                        View("a", angular=False),
+                        Artifact(5, 0.01, 8),
+                        1,
                     ),
                     "stage",
                 ),
@@ -146,13 +162,21 @@ def test_a_machine_that_fails_is_named_in_the_health(graph, tmp_path):
                 names.COMMAND.type(),
                 from_model.command(
                     Command(
-                        7, Phase.MEASURE, "p", 0, View("a", angular=False), Artifact(5, 0.01, 8), 1
+                        7,
+                        Phase.MEASURE,
+                        "p",
+                        0,
+                        View("a", angular=False),
+                        Artifact(5, 0.01, 8),
+                        1,
                     ),
                     "stage",
                 ),
             )
         )
-        graph.until(lambda: "beyond the limits" in driver.diagnosis().message, "the reason")
+        graph.until(
+            lambda: "beyond the limits" in driver.diagnosis().message, "the reason"
+        )
         assert driver.diagnosis().level == 2
     finally:
         driver.close()

@@ -10,7 +10,11 @@ from selfcal_ros.nodes.filling import fill
 
 @pytest.mark.parametrize(
     ("message", "dtype"),
-    [(UInt64MultiArray, np.uint32), (UInt64MultiArray, np.int64), (UInt8MultiArray, np.int64)],
+    [
+        (UInt64MultiArray, np.uint32),
+        (UInt64MultiArray, np.int64),
+        (UInt8MultiArray, np.int64),
+    ],
 )
 def test_integers_of_another_type_are_kept(message, dtype):
     numbers = np.array([3, 0, 255], dtype=dtype)
@@ -18,7 +22,8 @@ def test_integers_of_another_type_are_kept(message, dtype):
 
 
 @pytest.mark.parametrize(
-    ("message", "number"), [(UInt8MultiArray, 256), (UInt8MultiArray, -1), (UInt64MultiArray, -1)]
+    ("message", "number"),
+    [(UInt8MultiArray, 256), (UInt8MultiArray, -1), (UInt64MultiArray, -1)],
 )
 def test_an_integer_that_does_not_fit_is_refused_and_not_wrapped(message, number):
     with pytest.raises(OverflowError):

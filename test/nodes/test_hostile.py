@@ -46,7 +46,14 @@ from test.support.hostile import TEXTS, torn, worst
 from test.support.maps import random_map, result_of
 from test.support.plans import plan_of
 from test.support.ports import Hands, settings_of
-from test.support.sessions import cdr_of, collected, events_of, plan_file, small_bag, small_plan
+from test.support.sessions import (
+    cdr_of,
+    collected,
+    events_of,
+    plan_file,
+    small_bag,
+    small_plan,
+)
 
 PLAN = small_plan("0, 90, tx", repeats=1)
 TEXT_FIELDS = (
@@ -98,14 +105,20 @@ def good():
         (
             names.COMMAND,
             from_model.command(
-                next(e for e in events if isinstance(e, Command) and e.phase == 1), "stage"
+                next(e for e in events if isinstance(e, Command) and e.phase == 1),
+                "stage",
             ),
         ),
         (names.STATUS, from_model.view_status(view, PLAN.plan_id, stamp, "stage")),
-        (names.MEASUREMENT, from_model.view_measurement(view, measurements, stamp, "stage")),
+        (
+            names.MEASUREMENT,
+            from_model.view_measurement(view, measurements, stamp, "stage"),
+        ),
         (
             names.ERROR_MAP,
-            from_model.error_map(result_of(random_map(PLAN.artifact, 3)), stamp, "stage"),
+            from_model.error_map(
+                result_of(random_map(PLAN.artifact, 3)), stamp, "stage"
+            ),
         ),
         (
             names.SUMMARY,
@@ -140,7 +153,9 @@ def cell(graph, refused, tmp_path, monkeypatch):
     """Yield all nodes of a cell, each with every topic that it may hear."""
     monkeypatch.setattr(monitor_session.sys, "stdin", io.StringIO())
     nodes = [
-        graph.node(MeasurementCollector, journal=str(tmp_path / "journals"), status_period=0.02),
+        graph.node(
+            MeasurementCollector, journal=str(tmp_path / "journals"), status_period=0.02
+        ),
         graph.node(PoseSequencer, plan=plan_file(tmp_path, PLAN)),
         graph.node(Solver, result_folder=str(tmp_path)),
         graph.node(CompensatorNode, require_qualified=False),
@@ -167,7 +182,9 @@ def all_kinds(graph, cell, tmp_path):
         beside_others=True,
     )
     graph.node(partial(CellDriver, namespace="driven"), cell=str(SIMULATED_CELL))
-    graph.node(partial(CellChecker, PLAN, namespace="beside", settle_s=0.0, patience_s=3600.0))
+    graph.node(
+        partial(CellChecker, PLAN, namespace="beside", settle_s=0.0, patience_s=3600.0)
+    )
     graph.add(
         ReplaySession(
             partial(Player, bag=bag, rate=1.0, seed=-1, beside_others=True),
@@ -198,7 +215,8 @@ def kinds():
 def play(graph, events) -> None:
     """Publish the messages of a run, once all nodes that are to hear them do."""
     voices = {
-        kind: graph.publisher(topic, readers=readers) for kind, (topic, readers) in HEARD_BY.items()
+        kind: graph.publisher(topic, readers=readers)
+        for kind, (topic, readers) in HEARD_BY.items()
     }
     for event in events:
         voices[type(event)].publish(cdr_of(event))
@@ -207,9 +225,13 @@ def play(graph, events) -> None:
 def send(graph, topic, messages) -> None:
     """Publish messages, or the bytes of some, to all that hear them, and wait for their arrival."""
     heard: list = []
-    ear = graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos, raw=True)
+    ear = graph.hand.create_subscription(
+        topic.type, topic.name, heard.append, topic.qos, raw=True
+    )
     name = graph.hand.resolve_topic_name(topic.name)
-    readers = sum(name in subscribed(node) for node in graph.nodes if node is not graph.hand)
+    readers = sum(
+        name in subscribed(node) for node in graph.nodes if node is not graph.hand
+    )
     voice, sent = graph.publisher(topic, readers=1 + readers), 0
     for group in batched(messages, min(AT_ONCE, topic.qos.depth)):
         for one in group:
@@ -222,7 +244,9 @@ def send(graph, topic, messages) -> None:
 
 def good_run():
     """Return the messages of a run after the hostile messages."""
-    return [replace(event, stamp_ns=event.stamp_ns + LATER_NS) for event in events_of(PLAN)]
+    return [
+        replace(event, stamp_ns=event.stamp_ns + LATER_NS) for event in events_of(PLAN)
+    ]
 
 
 def everybody_is_well(graph, cell, refused, capsys, begun=0) -> None:
@@ -232,9 +256,18 @@ def everybody_is_well(graph, cell, refused, capsys, begun=0) -> None:
     """
     solver = cell[2]
     assert [node.state for node in cell[:4]] == ["active"] * 4
-    assert [(place, error) for place, error in refused if not isinstance(error, SelfcalError)] == []
-    told = {node: graph.listen(names.of_node(node.get_name(), names.HEALTH)) for node in cell}
-    graph.until(lambda: all(len(heard) > 1 for heard in told.values()), "the health of all")
+    assert [
+        (place, error)
+        for place, error in refused
+        if not isinstance(error, SelfcalError)
+    ] == []
+    told = {
+        node: graph.listen(names.of_node(node.get_name(), names.HEALTH))
+        for node in cell
+    }
+    graph.until(
+        lambda: all(len(heard) > 1 for heard in told.values()), "the health of all"
+    )
     graph.call(Trigger, "pose_sequencer/abort")  # it followed the commands of others
     events = good_run()
     play(graph, events[begun:])
@@ -266,7 +299,9 @@ def hostile_to(topic, fields):
             yield message
 
 
-def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, good, capfd):
+def test_each_field_at_its_worst_ends_nothing(
+    graph, cell, all_kinds, refused, good, capfd
+):
     status = dict.fromkeys(("view", "command_stamp", "views", "run_id"), "1")
     private = [
         (
@@ -276,7 +311,9 @@ def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, g
                     level=b"\1",
                     name=node,
                     message="as told",
-                    values=[KeyValue(key=key, value=value) for key, value in status.items()],
+                    values=[
+                        KeyValue(key=key, value=value) for key, value in status.items()
+                    ],
                 )
             ),
         )
@@ -289,15 +326,22 @@ def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, g
     strange = [
         (names.of_node(node, topic), [message for _, message in worst(message)])
         for node, topic, message in (
-            ("measurement_collector", names.RECEIVED, names.RECEIVED.type(data=[1, 2, 3])),
+            (
+                "measurement_collector",
+                names.RECEIVED,
+                names.RECEIVED.type(data=[1, 2, 3]),
+            ),
             ("solver", names.SOLVED, names.SOLVED.type(data="digest")),
         )
     ]
     image = from_model.image(np.full((40, 40), 90), "mono8", 10**8, "camera")
-    strange.append((IMAGES, [message for _, message in worst(fill(IMAGES.type(), image))]))
+    strange.append(
+        (IMAGES, [message for _, message in worst(fill(IMAGES.type(), image))])
+    )
+    # its commands move a machine
     heard = set().union(
         *(subscribed(node) for node in all_kinds if not isinstance(node, CellDriver))
-    )  # its commands move a machine
+    )
     for space in ("/beside", "/replay"):
         for topic, messages in [
             *((topic, hostile_to(topic, fields)) for topic, fields in good),
@@ -306,7 +350,10 @@ def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, g
             if f"{space}/{topic.name}" in heard:
                 send(graph, replace(topic, name=f"{space}/{topic.name}"), messages)
     foreign = DiagnosticStatus(
-        level=b"\2", name="of others", message="as told", values=[KeyValue(key="key", value="1")]
+        level=b"\2",
+        name="of others",
+        message="as told",
+        values=[KeyValue(key="key", value="1")],
     )
     send(
         graph,
@@ -329,7 +376,9 @@ def test_each_field_at_its_worst_ends_nothing(graph, cell, all_kinds, refused, g
 
 def subscribed(node) -> set[str]:
     """Return the full names of the topics that a node hears, as the graph has them."""
-    found = node.get_subscriber_names_and_types_by_node(node.get_name(), node.get_namespace())
+    found = node.get_subscriber_names_and_types_by_node(
+        node.get_name(), node.get_namespace()
+    )
     return {name for name, _ in found}
 
 
@@ -344,7 +393,10 @@ def test_numbers_of_readings_at_their_worst_are_solved_or_refused_in_one_line():
     plan = plan_of("0, 90, tx", 3, count=4)
     _, measurements, progress = collected(events_of(plan))
     views = [
-        fill(names.MEASUREMENT.type(), from_model.view_measurement(view, measurements, 5, "stage"))
+        fill(
+            names.MEASUREMENT.type(),
+            from_model.view_measurement(view, measurements, 5, "stage"),
+        )
         for view in progress.values()
     ]
     answers, solved = Counter(), set()
@@ -359,7 +411,8 @@ def test_numbers_of_readings_at_their_worst_are_solved_or_refused_in_one_line():
             job = session.next_job()
             same = pickle.dumps(job)
             mild = any(value in MILD for value in np.ravel(getattr(spoilt, name))[:1])
-            if same not in solved and not mild and not name.endswith(ALONG_Y):  # or of other plans
+            # or of other plans
+            if same not in solved and not mild and not name.endswith(ALONG_Y):
                 session.take(solve(job))
             solved.add(same)
             answers["solved"] += 1
@@ -368,7 +421,8 @@ def test_numbers_of_readings_at_their_worst_are_solved_or_refused_in_one_line():
     assert answers["solved"] > 50
     enormous_or_none = 5  # of FLOATS
     assert answers["dtheta"] == enormous_or_none
-    assert answers["dx"] == answers["dy"] == 2 * enormous_or_none  # of means and of visits
+    # of means and of visits
+    assert answers["dx"] == answers["dy"] == 2 * enormous_or_none
 
 
 RAISED_BY_RCLPY = {"set_parameters", "set_parameters_atomically"}
@@ -376,7 +430,9 @@ RAISED_BY_RCLPY = {"set_parameters", "set_parameters_atomically"}
 ACTION = "/pose_sequencer/run_calibration/_action"
 TEXT = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="x")
 BASES = {
-    "parameters": [[Parameter(name=name, value=TEXT)] for name in ("hardware_id", "use_sim_time")],
+    "parameters": [
+        [Parameter(name=name, value=TEXT)] for name in ("hardware_id", "use_sim_time")
+    ],
     "names": [["none"]],
     "prefixes": [["none"]],
 }
@@ -410,7 +466,8 @@ def requests_of(kind, traps):
         request = kind.Request(**({} if name is None else {name: base}))
         yield request
         for place, spoilt in worst(request):
-            if not place.endswith("_array_value"):  # the value is a text: arrays are not read
+            # the value is a text: arrays are not read
+            if not place.endswith("_array_value"):
                 yield spoilt
     for path in traps if "path" in fields else ():
         yield kind.Request(path=path)
@@ -446,19 +503,28 @@ def ask(graph, client, requests):
 def goal_of(path, number):
     """Return the request of a goal."""
     request = RunCalibration.Impl.SendGoalService.Request()
-    request.goal.plan_path, request.goal_id.uuid = path, [*divmod(number, 256), *[0] * 14]
+    request.goal.plan_path, request.goal_id.uuid = (
+        path,
+        [*divmod(number, 256), *[0] * 14],
+    )
     return request
 
 
 def results_of(graph, traps):
     """Return the results of goals of which none can be reached, one after the other."""
     impl, found = RunCalibration.Impl, []
-    send = reached(graph, impl.SendGoalService, f"{ACTION}/send_goal", goal_of("no such", 0))
+    send = reached(
+        graph, impl.SendGoalService, f"{ACTION}/send_goal", goal_of("no such", 0)
+    )
     get = reached(graph, impl.GetResultService, f"{ACTION}/get_result")
     cancel = reached(graph, impl.CancelGoalService, f"{ACTION}/cancel_goal")
-    for number, path in enumerate([*filter(None, TEXTS), *traps], 1):  # "" is the plan it has
+    # "" is the plan it has
+    for number, path in enumerate([*filter(None, TEXTS), *traps], 1):
         goal = goal_of(path, number)
-        assert [answer.accepted for answer in ask(graph, send, [goal, goal])] == [True, False]
+        assert [answer.accepted for answer in ask(graph, send, [goal, goal])] == [
+            True,
+            False,
+        ]
         asked = impl.GetResultService.Request(goal_id=goal.goal_id)
         found += ask(graph, get, [asked])
         ask(graph, cancel, [impl.CancelGoalService.Request(), asked_to_end(goal)])
@@ -499,11 +565,17 @@ def test_each_request_at_its_worst_is_answered_and_ends_nothing(
             )
         }
 
-    graph.until(lambda: offered() == called, "the services that were called, and no other")
+    graph.until(
+        lambda: offered() == called, "the services that were called, and no other"
+    )
     graph.call(Trigger, "pose_sequencer/abort")  # or it rejects goals
     results = results_of(graph, traps)
     assert {result.error_code for result in results} == {2}
-    odd = [(place, error) for place, error in refused if not isinstance(error, SelfcalError)]
+    odd = [
+        (place, error)
+        for place, error in refused
+        if not isinstance(error, SelfcalError)
+    ]
     assert {place for place, _ in odd} == RAISED_BY_RCLPY, [
         (place, error) for place, error in odd if place not in RAISED_BY_RCLPY
     ] or odd

@@ -87,9 +87,13 @@ def test_images_that_are_played_give_the_map_of_detect_and_solve(graph, found):
         "all detections",
     )
     digest = collector._finish()
-    graph.until(lambda: solved and solved[-1].data == digest and maps, "the map of all readings")
+    graph.until(
+        lambda: solved and solved[-1].data == digest and maps, "the map of all readings"
+    )
     assert not detector.losses.counts
-    offline = calibrate(collect_bag(found, CollectorSettings.checked({}, "test"))[0]).error_map
+    offline = calibrate(
+        collect_bag(found, CollectorSettings.checked({}, "test"))[0]
+    ).error_map
     np.testing.assert_array_equal(
         [maps[-1].gx, maps[-1].gy], [offline.gx.ravel(), offline.gy.ravel()]
     )
@@ -120,7 +124,9 @@ def test_compressed_images_are_played_to_a_detector_alone(graph, tmp_path):
     player = graph.node(BagPlayer, bag=str(tmp_path / "bag"), rate=0.0)
     graph.until(player.finished.done, "the end of the bag")
     graph.until(lambda: len(heard) >= len(expected) > 80, "all detections")
-    assert heard == [deserialize_message(data, names.DETECTIONS.type) for data in expected]
+    assert heard == [
+        deserialize_message(data, names.DETECTIONS.type) for data in expected
+    ]
 
 
 def test_nothing_is_played_without_a_detector(graph):
@@ -129,7 +135,8 @@ def test_nothing_is_played_without_a_detector(graph):
     assert player.diagnosis().message == "waiting for /measurement_collector"
     graph.until(
         lambda: (
-            player.diagnosis().message == "waiting for /mark_detector" or player.finished.done()
+            player.diagnosis().message == "waiting for /mark_detector"
+            or player.finished.done()
         ),
         "the collector",
     )
@@ -157,7 +164,10 @@ def test_detections_are_played_rather_than_images(found, tmp_path):
     for bag, name in ((BAG, "a"), (found, "b")):
         (both / f"{name}.mcap").write_bytes(next(Path(bag).glob("*.mcap")).read_bytes())
     playlist = Playlist(both)
-    assert "stage/image" not in playlist.counts and playlist.counts["stage/mark_detections"] == 676
+    assert (
+        "stage/image" not in playlist.counts
+        and playlist.counts["stage/mark_detections"] == 676
+    )
     assert "images on /stage/image are not played" in playlist.lost[-1]
 
 
@@ -184,9 +194,14 @@ def test_processes_give_the_result_of_detect_and_solve_bit_for_bit(
     ros_environment, found, tmp_path, capfd
 ):
     """Options win over the parameter file: one pixel size in it is wrong."""
-    params, replayed, solved = (tmp_path / name for name in ("p.yaml", "replayed", "solved"))
+    params, replayed, solved = (
+        tmp_path / name for name in ("p.yaml", "replayed", "solved")
+    )
     params.write_text(PARAMS)
-    bag, common = of_two_cells(tmp_path / "bag"), ["--params", str(params), "--quiet", "-o"]
+    bag, common = (
+        of_two_cells(tmp_path / "bag"),
+        ["--params", str(params), "--quiet", "-o"],
+    )
     assert (
         main(
             [
@@ -264,7 +279,12 @@ def test_the_detector_of_a_replay_gets_all_its_parameters(monkeypatch, tmp_path)
         "autostart": True,
     }
     assert {name: values[name] for name in told} == told
-    assert list(started) == ["mark_detector", "file", *replay_verb.NODES, "replay_session"]
+    assert list(started) == [
+        "mark_detector",
+        "file",
+        *replay_verb.NODES,
+        "replay_session",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -327,7 +347,13 @@ def test_no_image_is_played_before_the_detections_are_heard(graph, monkeypatch):
     ("mark", "ends", "fault", "code", "line"),
     [
         ("5e-5", 3, "", 3, ""),
-        ("5e-5", 3, "view 'b': the plate lies otherwise", 2, "view 'b': the plate lies otherwise"),
+        (
+            "5e-5",
+            3,
+            "view 'b': the plate lies otherwise",
+            2,
+            "view 'b': the plate lies otherwise",
+        ),
         ("5e-4", 4, "", 4, "no dark disc of 250 px was found; what repeats is 25 px"),
     ],
 )
@@ -341,7 +367,10 @@ def test_the_code_of_images_is_that_of_detect_and_solve(
         {
             "plan_id": "p",
             "artifact": {"grid_size": 3, "grid_pitch": 0.01, "angular_count": 0},
-            "views": [{"name": "a", "repeats": 1}, {"name": "b", "rotation_deg": 90, "repeats": 1}],
+            "views": [
+                {"name": "a", "repeats": 1},
+                {"name": "b", "rotation_deg": 90, "repeats": 1},
+            ],
         },
         camera={},
         truth={"g": 2e-7, "a": 2e-7, "t": 1e-6, "phi": 1e-5},

@@ -67,7 +67,9 @@ class Site:
     def start_cell(self):
         self.cell = self.graph.add(
             IndependentCell(
-                context=self.graph.context, namespace=self.namespace, **self.cell_options
+                context=self.graph.context,
+                namespace=self.namespace,
+                **self.cell_options,
             )
         )
 
@@ -100,7 +102,10 @@ class Site:
         self.graph.until(lambda: self.cell.held, "the middle of a view")
         received = self.nodes[MeasurementCollector].session.collector.received
         self.graph.until(
-            lambda: received["detection"] == sum(self.marks[: self.cell.view]) + self.cell.exposed,
+            lambda: (
+                received["detection"]
+                == sum(self.marks[: self.cell.view]) + self.cell.exposed
+            ),
             "what was sent",
         )
 
@@ -109,7 +114,9 @@ class Site:
 
     def until_done(self):
         self.graph.until(
-            lambda: self.commands and self.commands[-1].phase == names.COMMAND.type.DONE,
+            lambda: (
+                self.commands and self.commands[-1].phase == names.COMMAND.type.DONE
+            ),
             "the end of the plan",
         )
         run = self.commands[-1].run_id
@@ -174,21 +181,29 @@ def test_the_wrong_sense_is_no_map(graph, tmp_path):
 
 def test_two_cells_side_by_side(graph, tmp_path):
     left = Site(graph, tmp_path / "left", "left", seed=2).begin()
-    right = Site(graph, tmp_path / "right", "right", size=-2.0, ids=False, seed=3).begin()
+    right = Site(
+        graph, tmp_path / "right", "right", size=-2.0, ids=False, seed=3
+    ).begin()
     left.check()
     right.check(-2.0)
 
 
 @pytest.mark.parametrize(
     "kind, view",
-    [(MeasurementCollector, 0), (MeasurementCollector, 3), (Solver, 3), (PoseSequencer, 3)],
+    [
+        (MeasurementCollector, 0),
+        (MeasurementCollector, 3),
+        (Solver, 3),
+        (PoseSequencer, 3),
+    ],
 )
 def test_a_node_that_is_restarted_within_a_view(graph, tmp_path, kind, view):
     site = Site(graph, tmp_path).begin(hold_at=(view, 4))
     site.until_held()
     site.restart(kind)
     if kind is PoseSequencer:
-        site.ask("start")  # takes up the run, at once or as soon as it has heard all of them
+        # takes up the run, at once or as soon as it has heard all of them
+        site.ask("start")
         graph.until(lambda: site.nodes[PoseSequencer].session.run_id, "the run")
     elif kind is MeasurementCollector:
         graph.until(
@@ -231,7 +246,9 @@ def test_a_second_run_is_that_run_alone(graph, tmp_path):
     site.check_that_all_was_used()
     site.cell.size = -1.0
     assert site.ask("start").success
-    graph.until(lambda: site.commands[-1].phase != names.COMMAND.type.DONE, "the second run")
+    graph.until(
+        lambda: site.commands[-1].phase != names.COMMAND.type.DONE, "the second run"
+    )
     site.check(-1.0)
     assert len({summary.run_id for summary in site.summaries}) == 2
 
@@ -248,7 +265,10 @@ def test_all_of_them_may_come_late(graph, tmp_path):
         site.start_cell,
     ):
         health.clear()
-        graph.until(lambda: any("waiting for" in told.message for told in health), "a sign of it")
+        graph.until(
+            lambda: any("waiting for" in told.message for told in health),
+            "a sign of it",
+        )
         assert site.commands == []
         start()
     site.check()

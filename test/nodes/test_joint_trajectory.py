@@ -31,7 +31,9 @@ class Controller(Node):
         self.at, self._way, self.goals = np.zeros(2), None, []
         self._states = self.create_publisher(JointState, "joint_states", 10)
         self._images = self.create_publisher(Image, "camera/image", 10)
-        self.create_subscription(JointTrajectory, "gantry/joint_trajectory", self._on_goal, 10)
+        self.create_subscription(
+            JointTrajectory, "gantry/joint_trajectory", self._on_goal, 10
+        )
         self.create_timer(0.01, self._tick)
         self.create_timer(0.05, self._show)
 
@@ -45,7 +47,9 @@ class Controller(Node):
     def _tick(self) -> None:
         if self._way is not None:
             start, end, began, needed = self._way
-            self.at = start + (end - start) * min(1.0, (time.monotonic() - began) / needed)
+            self.at = start + (end - start) * min(
+                1.0, (time.monotonic() - began) / needed
+            )
         message = JointState(name=["gy", "gx"], position=[self.at[1], self.at[0]])
         self._states.publish(message)
 
@@ -55,7 +59,9 @@ class Controller(Node):
         self._images.publish(
             fill(
                 Image(),
-                from_model.image(self._simulated.image().pixels, "mono8", stamp_ns, "camera"),
+                from_model.image(
+                    self._simulated.image().pixels, "mono8", stamp_ns, "camera"
+                ),
             )
         )
 
@@ -91,7 +97,12 @@ def controller(graph, tmp_path):
     context.try_shutdown()
 
 
-KEYS = {"joints": ["gx", "gy"], "controller": "gantry", "image": "camera/image", "speed": 0.1}
+KEYS = {
+    "joints": ["gx", "gy"],
+    "controller": "gantry",
+    "image": "camera/image",
+    "speed": 0.1,
+}
 
 
 def test_a_plan_is_measured_by_a_controller_to_its_true_map(controller, tmp_path):
@@ -100,7 +111,11 @@ def test_a_plan_is_measured_by_a_controller_to_its_true_map(controller, tmp_path
     machine.place = simulated.place
     try:
         Run(
-            read_plan(tmp_path / "plan.yaml"), cell, machine, tmp_path / "bag", Agreeing()
+            read_plan(tmp_path / "plan.yaml"),
+            cell,
+            machine,
+            tmp_path / "bag",
+            Agreeing(),
         ).measure()
         before = len(node.goals)
         machine.stop()

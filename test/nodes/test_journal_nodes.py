@@ -34,7 +34,9 @@ def undisturbed(events):
 
 def same(found, expected):
     for name in ("gx", "gy", "u_gx", "g_theta"):
-        np.testing.assert_array_equal(np.array(found[name], dtype=float), getattr(expected, name))
+        np.testing.assert_array_equal(
+            np.array(found[name], dtype=float), getattr(expected, name)
+        )
 
 
 @pytest.fixture(scope="module")
@@ -61,11 +63,17 @@ def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_sam
         cell.until_told(run[:cut], but=3)  # the last are still on their way
         cell.kill("measurement_collector")
         cell.start_collector()
-        done, newest = cut, [event for event in run[:cut] if isinstance(event, Command)][-1]
+        done, newest = (
+            cut,
+            [event for event in run[:cut] if isinstance(event, Command)][-1],
+        )
         heard = cell.graph.listen(names.of_node("measurement_collector", names.HEALTH))
         cell.graph.until(
             lambda newest=newest, heard=heard: any(
-                {"phase": Phase(newest.phase).name, "view": str(newest.view_index)}.items()
+                {
+                    "phase": Phase(newest.phase).name,
+                    "view": str(newest.view_index),
+                }.items()
                 <= {value.key: value.value for value in message.values}.items()
                 for message in heard
             ),
@@ -74,7 +82,9 @@ def test_a_collector_killed_again_and_again_goes_on_in_it_and_the_map_is_the_sam
     cell.send(run, first=done)
     cell.until_told(run)
     same(cell.saved()["error_map"], undisturbed(run))
-    [journal] = (path for path in cell.folder.iterdir() if path.name.startswith("journal_"))
+    [journal] = (
+        path for path in cell.folder.iterdir() if path.name.startswith("journal_")
+    )
     cell.kill("measurement_collector")
     offline = collect_bag(journal, VALUES)
     [lost] = offline.lost
@@ -89,7 +99,8 @@ def test_a_solver_killed_after_a_view_gets_all_readings_again(cell, run):
     second = next(
         n
         for n, event in enumerate(run)
-        if isinstance(event, Command) and (event.phase, event.view_index) == (Phase.PLACE, 1)
+        if isinstance(event, Command)
+        and (event.phase, event.view_index) == (Phase.PLACE, 1)
     )
     cell.inside["measurement_collector"] = None
     cell.start("solver", result_folder=cell.folder)
@@ -103,7 +114,9 @@ def test_a_solver_killed_after_a_view_gets_all_readings_again(cell, run):
     cell.until_told(run)
     solved = cell.graph.listen(names.of_node("solver", names.SOLVED))
     answer = cell.graph.call(Trigger, "measurement_collector/finish")
-    cell.graph.until(lambda: answer.message in {message.data for message in solved}, "the map")
+    cell.graph.until(
+        lambda: answer.message in {message.data for message in solved}, "the map"
+    )
     same(cell.saved()["error_map"], undisturbed(run))
 
 
@@ -122,9 +135,13 @@ def test_a_solver_that_hangs_for_a_while_solves_then_what_it_missed(cell, run):
 def test_a_second_collector_on_one_journal_is_refused(cell):
     cell.inside["measurement_collector"] = None
     cell.start_collector()
-    cell.graph.until(lambda: any(cell.folder.glob("journal_*/metadata.yaml")), "the journal")
+    cell.graph.until(
+        lambda: any(cell.folder.glob("journal_*/metadata.yaml")), "the journal"
+    )
     cell.inside.clear()
     cell.start("measurement_collector", journal=cell.folder)
     _, err = cell.running["measurement_collector"].communicate(timeout=300)
     [line] = [text for text in err.splitlines() if text.startswith("selfcal: ")]
-    assert line.endswith("another process writes this journal; end it or name another folder")
+    assert line.endswith(
+        "another process writes this journal; end it or name another folder"
+    )

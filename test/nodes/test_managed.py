@@ -41,7 +41,14 @@ def entities(node) -> dict[str, int]:
     """Return how many entities of each kind a node holds."""
     return {
         kind: len(list(getattr(node, kind)))
-        for kind in ("publishers", "subscriptions", "services", "clients", "timers", "waitables")
+        for kind in (
+            "publishers",
+            "subscriptions",
+            "services",
+            "clients",
+            "timers",
+            "waitables",
+        )
     }
 
 
@@ -59,7 +66,9 @@ def state(graph, node: str) -> str:
 def test_ten_bring_ups_and_tear_downs_leave_nothing_behind(graph, name):
     images = camera(graph)
     node = graph.node(MANAGED[name], autostart=False, **NEEDED.get(name, {}))
-    graph.until(lambda: node.get_publishers_info_by_topic(images.topic_name), "the camera")
+    graph.until(
+        lambda: node.get_publishers_info_by_topic(images.topic_name), "the camera"
+    )
     steps = (
         Transition.TRANSITION_CONFIGURE,
         Transition.TRANSITION_ACTIVATE,
@@ -105,7 +114,10 @@ def test_there_is_no_session_but_from_configuring_to_taking_down(graph, name):
 
 def test_an_active_node_works_as_one_that_starts_by_itself(graph, tmp_path):
     graph.node(
-        PoseSequencer, autostart=False, plan=plan_file(tmp_path, small_plan()), start_checks=False
+        PoseSequencer,
+        autostart=False,
+        plan=plan_file(tmp_path, small_plan()),
+        start_checks=False,
     )
     assert change(graph, "pose_sequencer", Transition.TRANSITION_CONFIGURE)
     heard = graph.listen(names.COMMAND)
@@ -127,7 +139,9 @@ def test_an_error_in_a_transition_is_told_and_can_be_mended(graph, tmp_path):
     assert state(graph, "pose_sequencer") == "unconfigured"
     line = f"unconfigured: {plan}: no such file; check the path"
     graph.until(
-        lambda: any(s.message == line and s.level == DiagnosticStatus.ERROR for s in health),
+        lambda: any(
+            s.message == line and s.level == DiagnosticStatus.ERROR for s in health
+        ),
         "the reason",
     )
     plan_file(tmp_path, small_plan())
@@ -160,13 +174,17 @@ def test_a_transition_that_does_not_exist_is_refused_and_ends_nothing(graph):
     assert change(graph, "solver", Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert state(graph, "solver") == "finalized"
     assert node.diagnosis() == Diagnosis(
-        Level.ERROR, "finalized: shut down on request; end this process and start the node again"
+        Level.ERROR,
+        "finalized: shut down on request; end this process and start the node again",
     )
 
 
 def test_an_inactive_node_says_so(graph):
     node = graph.node(Solver, autostart=False)
-    assert node.diagnosis().message == "unconfigured: a managed node that waits to be activated"
+    assert (
+        node.diagnosis().message
+        == "unconfigured: a managed node that waits to be activated"
+    )
 
 
 def test_work_goes_on_under_a_simulated_time_that_stands_still(graph, tmp_path):
@@ -213,7 +231,9 @@ def test_whatever_a_message_does_is_counted_and_told(graph):
     node = graph.node(Solver)
     publisher = graph.publisher(names.MEASUREMENT)
     publisher.publish(names.MEASUREMENT.type(grid_size=5, grid_pitch=0.01, dx=[0.0]))
-    graph.until(lambda: node.refusals.counts["selfcal/view_measurement"] == 1, "the count")
+    graph.until(
+        lambda: node.refusals.counts["selfcal/view_measurement"] == 1, "the count"
+    )
 
     def broken(_):
         raise OverflowError("int too large")
@@ -221,8 +241,14 @@ def test_whatever_a_message_does_is_counted_and_told(graph):
     guarded = node.guarded(broken, "selfcal/view_command")
     assert guarded(None) is None
     told = node.refusals.diagnosis()
-    assert told.values == {"refused selfcal/view_command": 1, "refused selfcal/view_measurement": 1}
-    assert "selfcal/view_command: cannot be used (OverflowError: int too large)" in told.message
+    assert told.values == {
+        "refused selfcal/view_command": 1,
+        "refused selfcal/view_measurement": 1,
+    }
+    assert (
+        "selfcal/view_command: cannot be used (OverflowError: int too large)"
+        in told.message
+    )
 
 
 @pytest.mark.usefixtures("quick_beat")
@@ -247,13 +273,18 @@ def test_a_publisher_that_cannot_be_heard_is_named(graph):
 @pytest.mark.usefixtures("quick_beat")
 def test_two_solvers_are_named(graph):
     first = graph.node(Solver)
-    graph.hand.create_publisher(names.ERROR_MAP.type, names.ERROR_MAP.name, names.ERROR_MAP.qos)
+    graph.hand.create_publisher(
+        names.ERROR_MAP.type, names.ERROR_MAP.name, names.ERROR_MAP.qos
+    )
     heard: list = []
     topic = names.of_node("solver", names.HEALTH)
     graph.hand.create_subscription(topic.type, topic.name, heard.append, topic.qos)
     line = "selfcal/error_map has 2 publishers: /hand, /solver; only one is allowed"
     graph.until(
-        lambda: any(line in s.message and s.level == DiagnosticStatus.WARN for s in heard), line
+        lambda: any(
+            line in s.message and s.level == DiagnosticStatus.WARN for s in heard
+        ),
+        line,
     )
     assert first.get_name() == "solver"
 
@@ -267,7 +298,9 @@ def test_diagnostics_come_once_a_second_whatever_is_received(graph):
     for _ in range(3000):
         encoder.publish(names.ENCODER.type(name=["x"], position=[0.0]))
     began, before = time.monotonic(), len(told)
-    graph.until(lambda: node.session.collector.received["encoder"] >= 3000, "the samples")
+    graph.until(
+        lambda: node.session.collector.received["encoder"] >= 3000, "the samples"
+    )
     graph.until(lambda: len(told) > before, "a report")
     assert len(told) - before <= time.monotonic() - began + 2
 
@@ -285,7 +318,9 @@ def test_what_was_due_when_a_node_was_deactivated_is_not_called(graph):
     assert node.refusals.counts == {}
 
 
-def test_what_has_come_is_in_the_journal_when_a_collector_is_taken_down(graph, tmp_path):
+def test_what_has_come_is_in_the_journal_when_a_collector_is_taken_down(
+    graph, tmp_path
+):
     node = graph.node(MeasurementCollector, journal=str(tmp_path))
     detections = graph.publisher(names.DETECTIONS)
     received = node.session.collector.received
@@ -295,7 +330,9 @@ def test_what_has_come_is_in_the_journal_when_a_collector_is_taken_down(graph, t
     graph.remove(node)  # before it looked
     assert received["detection"] == 7
     (journal,) = tmp_path.glob("journal_*")
-    assert [topic for topic, *_ in decoded(BagReader(journal))] == [names.DETECTIONS.name] * 7
+    assert [topic for topic, *_ in decoded(BagReader(journal))] == [
+        names.DETECTIONS.name
+    ] * 7
 
 
 @pytest.mark.parametrize("name", ["measurement_collector", "mark_detector"])

@@ -29,7 +29,9 @@ def bag(tmp_path_factory):
     with BagWriter(path) as writer:
         writer.add_topic("/stage/image", IMAGE_TYPES["raw"], [])
         for number in range(30):
-            marks = np.array([[-6e-5, 7e-5], [0.0, 3e-5]]) + rng.uniform(-1e-5, 1e-5, (2, 1))
+            marks = np.array([[-6e-5, 7e-5], [0.0, 3e-5]]) + rng.uniform(
+                -1e-5, 1e-5, (2, 1)
+            )
             values = CAMERA.image(marks, rng)[: 100 if number == 4 else 120]
             writer.write(
                 "/stage/image",
@@ -41,7 +43,9 @@ def bag(tmp_path_factory):
 
 def images(bag):
     kind = names.IMAGE_TYPES["raw"]
-    return [deserialize_message(item.message.data, kind) for item in ImageBag(bag).items()]
+    return [
+        deserialize_message(item.message.data, kind) for item in ImageBag(bag).items()
+    ]
 
 
 def offline(bag, output):
@@ -55,7 +59,9 @@ def offline(bag, output):
 
 
 @pytest.mark.parametrize("reliable", [True, False])
-def test_the_node_finds_what_the_command_finds_bit_for_bit(graph, bag, tmp_path, reliable):
+def test_the_node_finds_what_the_command_finds_bit_for_bit(
+    graph, bag, tmp_path, reliable
+):
     expected = offline(bag, tmp_path / "found")
     assert 40 < len(expected) < 58  # dirt costs some
     node = graph.node(MarkDetectorNode, **PARAMETERS)
@@ -101,7 +107,9 @@ def test_images_that_were_overwritten_are_counted(graph, bag):
     for image in others:
         publisher.publish(image)
     publisher.wait_for_all_acked(Duration(seconds=60))
-    graph.until(lambda: _taken(node) + node.losses.counts["stage/image"] == 30, "all images")
+    graph.until(
+        lambda: _taken(node) + node.losses.counts["stage/image"] == 30, "all images"
+    )
     assert node.losses.counts["stage/image"] >= 20
     assert "messages lost" in node.losses.diagnosis().message
 

@@ -82,16 +82,23 @@ def test_an_unknown_parameter_is_refused_with_the_known_names(graph, needed, nam
     with pytest.raises(InputError) as caught:
         graph.node(NODES[name], misspelt=1, **needed.get(name, {}))
     message = str(caught.value)
-    assert message.startswith(f"parameters of {name}: misspelt: {name} has no such parameter")
+    assert message.startswith(
+        f"parameters of {name}: misspelt: {name} has no such parameter"
+    )
     assert first in message
 
 
 @pytest.mark.parametrize(
     "value, problem",
-    [(-1.0, "-1.0 is outside 0.0 to 3600.0 s"), ("soon", "'soon' is not of type float")],
+    [
+        (-1.0, "-1.0 is outside 0.0 to 3600.0 s"),
+        ("soon", "'soon' is not of type float"),
+    ],
 )
 def test_a_value_that_cannot_be_is_refused(graph, value, problem):
-    with pytest.raises(InputError, match=f"parameters of pose_sequencer: settle_time: {problem}"):
+    with pytest.raises(
+        InputError, match=f"parameters of pose_sequencer: settle_time: {problem}"
+    ):
         graph.node(PoseSequencer, settle_time=value)
 
 
@@ -105,11 +112,17 @@ def test_a_whole_number_is_taken_where_a_number_is_wanted(graph):
 @pytest.mark.parametrize(
     "namespace, name", [*(("/", name) for name in NODES), ("/cell1", "pose_sequencer")]
 )
-@pytest.mark.parametrize("file", sorted(PARAMS.glob("*.yaml")), ids=lambda path: path.name)
-def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name, namespace):
+@pytest.mark.parametrize(
+    "file", sorted(PARAMS.glob("*.yaml")), ids=lambda path: path.name
+)
+def test_every_node_takes_the_shipped_parameter_files(
+    graph, needed, file, name, namespace
+):
     """As ROS reads them: a bare y is true, and `name:` does not hold in a namespace."""
     stated = overrides_in(yaml.safe_load(file.read_text()), name, str(file))
-    given = {key: value for key, value in needed.get(name, {}).items() if not stated.get(key)}
+    given = {
+        key: value for key, value in needed.get(name, {}).items() if not stated.get(key)
+    }
     more = [word for key, value in given.items() for word in ("-p", f"{key}:={value}")]
     node = graph.add(
         NODES[name](
@@ -127,7 +140,9 @@ def test_every_node_takes_the_shipped_parameter_files(graph, needed, file, name,
 def test_a_word_that_the_file_makes_a_bool_is_refused_with_the_mend(graph, tmp_path):
     file = tmp_path / "cell.yaml"
     file.write_text("measurement_collector: {ros__parameters: {joint_x: y}}")
-    with pytest.raises(InputError, match="joint_x: True is not of type str; put it in quotes"):
+    with pytest.raises(
+        InputError, match="joint_x: True is not of type str; put it in quotes"
+    ):
         MeasurementCollector(
             context=graph.context, cli_args=["--ros-args", "--params-file", str(file)]
         )
@@ -136,9 +151,14 @@ def test_a_word_that_the_file_makes_a_bool_is_refused_with_the_mend(graph, tmp_p
 def test_a_dump_of_all_parameters_is_a_file_that_a_node_takes(graph, tmp_path):
     """As `ros2 param dump` writes it: a joint called y comes out bare, and ROS reads it as true."""
     first = graph.node(MeasurementCollector, max_speed=0.25)
-    told = {name: parameter.value for name, parameter in first.get_parameters_by_prefix("").items()}
+    told = {
+        name: parameter.value
+        for name, parameter in first.get_parameters_by_prefix("").items()
+    }
     file = tmp_path / "dump.yaml"
-    file.write_text(yaml.dump({"/**": {"ros__parameters": told}}, default_flow_style=False))
+    file.write_text(
+        yaml.dump({"/**": {"ros__parameters": told}}, default_flow_style=False)
+    )
     assert "joint_y: y\n" in file.read_text()
     second = graph.add(
         MeasurementCollector(

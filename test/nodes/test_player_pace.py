@@ -19,7 +19,9 @@ from selfcal_ros.nodes.player import (
 T0 = 1_700_000_000_000_000_000
 
 
-def player_of(count: int, sent: list, rate: float, topic: str = next(iter(KINDS))) -> Player:
+def player_of(
+    count: int, sent: list, rate: float, topic: str = next(iter(KINDS))
+) -> Player:
     """Return a player of so many messages, a second apart; what it publishes goes to `sent`."""
     played = Player.__new__(Player)
     messages = iter([(topic, T0 + number * 10**9, number) for number in range(count)])
@@ -53,9 +55,16 @@ def tell(played: Player, received: int) -> None:
 
 @pytest.mark.parametrize(
     ("rate", "counts"),
-    [(1.0, [1, 1, 2, 3, 5]), (2.0, [1, 2, 3, 5, 5]), (0.5, [1, 1, 1, 2, 4]), (0.0, [5] * 5)],
+    [
+        (1.0, [1, 1, 2, 3, 5]),
+        (2.0, [1, 2, 3, 5, 5]),
+        (0.5, [1, 1, 1, 2, 4]),
+        (0.0, [5] * 5),
+    ],
 )
-def test_messages_are_due_at_their_own_distances_over_the_rate(monkeypatch, rate, counts):
+def test_messages_are_due_at_their_own_distances_over_the_rate(
+    monkeypatch, rate, counts
+):
     """Five messages, a second apart; looked at after 0, 0.5, 1, 2 and 6 s."""
     now, sent = [70.0], []
     monkeypatch.setattr(player.time, "monotonic", lambda: now[0])

@@ -21,7 +21,9 @@ from selfcal_ros.nodes.stage_simulator import StageSimulator
 from test.support.cameras import DETECTS, camera
 from test.support.sessions import plan_file, small_bag, small_plan
 
-POLICY = ElementTree.parse(Path(__file__).parents[2] / "config/sros2/policy.xml").getroot()
+POLICY = ElementTree.parse(
+    Path(__file__).parents[2] / "config/sros2/policy.xml"
+).getroot()
 NODES = {
     "measurement_collector": MeasurementCollector,
     "pose_sequencer": PoseSequencer,
@@ -78,7 +80,8 @@ def used(graph, node: str) -> dict[tuple[str, str], set[str]]:
         if "/_action/" in name
     }
     found = {
-        kind: {name for name in names_ if "/_action/" not in name} for kind, names_ in found.items()
+        kind: {name for name in names_ if "/_action/" not in name}
+        for kind, names_ in found.items()
     }
     found["topics", "subscribe"] |= {"/clock"}  # with use_sim_time
     if node == "mark_detector":  # with transport compressed
@@ -98,7 +101,9 @@ def test_a_node_is_granted_what_it_does_and_nothing_else(graph, tmp_path, name):
         "cell_driver": {"cell": str(SIMULATED_CELL)},
         "pose_sequencer": {"plan": plan_file(tmp_path, small_plan())},
     }
-    graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    graph.hand.create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos
+    )
     camera(graph)
     node = graph.node(NODES[name], **parameters.get(name, {}))
     wanted = granted(name)

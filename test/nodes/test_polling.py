@@ -16,7 +16,13 @@ class Queue:
 
     def take_message(self, kind, raw):
         return (
-            (b"", {"publication_sequence_number": self.waiting.pop(0), "received_timestamp": 1})
+            (
+                b"",
+                {
+                    "publication_sequence_number": self.waiting.pop(0),
+                    "received_timestamp": 1,
+                },
+            )
             if self.waiting
             else None
         )
@@ -50,11 +56,17 @@ def test_what_lies_between_two_numbers_is_lost(callback, taken):
     assert len(taken) == 8
 
 
-def test_numbers_of_several_publishers_tell_nothing_until_the_last_of_them_is_taken(callback):
+def test_numbers_of_several_publishers_tell_nothing_until_the_last_of_them_is_taken(
+    callback,
+):
     queue = Queue(2)
     assert missing(callback, queue, 100_000, 3, 100_001, 4) == (0, 0)
     queue.n_publishers = 1
-    assert missing(callback, queue, 5, 100_005) == (0, 0)  # what came before the other left
+    # what came before the other left
+    assert missing(callback, queue, 5, 100_005) == (
+        0,
+        0,
+    )
     assert missing(callback, queue, 6, 9) == (2, 0)
     queue.n_publishers = 2
     assert missing(callback, queue, 10, 1, 11) == (0, 0)
@@ -84,7 +96,9 @@ def test_what_was_published_between_two_subscriptions_is_told_apart(callback):
     assert missing(callback, queue, 14) == (0, 0)
 
 
-def test_what_a_publisher_left_behind_that_is_gone_is_not_held_against_what_was_heard(callback):
+def test_what_a_publisher_left_behind_that_is_gone_is_not_held_against_what_was_heard(
+    callback,
+):
     assert missing(callback, Queue(), 1, 2) == (0, 0)
     callback.pause()
     queue = Queue(0)

@@ -107,16 +107,29 @@ SIGNALS = {
 def test_a_signal_ends_every_node_cleanly(graph, group, tmp_path):
     bag, recorded = small_bag(tmp_path), tmp_path / "recorded"
     needed = {
-        "bag_player": ["-p", f"bag:={bag}", "-p", "rate:=0.001", "-p", "beside_others:=true"],
+        "bag_player": [
+            "-p",
+            f"bag:={bag}",
+            "-p",
+            "rate:=0.001",
+            "-p",
+            "beside_others:=true",
+        ],
         "bag_recorder": ["-p", f"bag:={recorded}"],
         "cell_driver": ["-p", f"cell:={SIMULATED_CELL}"],
         "mark_detector": ["-p", "pixel_size:=2e-6", "-p", "mark_size:=5e-5"],
         "pose_sequencer": ["-p", f"plan:={plan_file(tmp_path, small_plan())}"],
     }
     diagnostics: list = []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 100)
-    processes = {name: group.node(name, *needed.get(name, [])) for name in NODE_PARAMETERS}
-    graph.until(lambda: set(NODE_PARAMETERS) <= set(graph.hand.get_node_names()), "all nodes")
+    graph.hand.create_subscription(
+        DiagnosticArray, "/diagnostics", diagnostics.append, 100
+    )
+    processes = {
+        name: group.node(name, *needed.get(name, [])) for name in NODE_PARAMETERS
+    }
+    graph.until(
+        lambda: set(NODE_PARAMETERS) <= set(graph.hand.get_node_names()), "all nodes"
+    )
     graph.until(
         lambda: (
             {status.name for m in diagnostics for status in m.status}
@@ -167,7 +180,9 @@ def test_a_player_ends_by_itself_when_the_bag_is_played(group, tmp_path):
 
 def test_bad_input_is_one_line_and_code_2(group, tmp_path):
     file = tmp_path / "params.yaml"
-    file.write_text(yaml.safe_dump({"compensator": {"ros__parameters": {"joint_tetha": "c"}}}))
+    file.write_text(
+        yaml.safe_dump({"compensator": {"ros__parameters": {"joint_tetha": "c"}}})
+    )
     not_ros = "arguments after --ros-args: "
     cases = [
         (
@@ -176,7 +191,12 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
             "parameters of compensator: metod: compensator has no such parameter",
             "",
         ),
-        ("pose_sequencer", ["-p", "plan:=/no/plan.yaml"], "/no/plan.yaml: no such file", ""),
+        (
+            "pose_sequencer",
+            ["-p", "plan:=/no/plan.yaml"],
+            "/no/plan.yaml: no such file",
+            "",
+        ),
         ("bag_player", ["-p", "bag:=/no/bag"], "/no/bag: no such file or folder", ""),
         (
             "compensator",
@@ -184,7 +204,12 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
             "joint_tetha: compensator has no such parameter; did you mean 'joint_theta'? known are",
             "",
         ),
-        ("compensator", ["--params-file", "/no/p.yaml"], "Couldn't parse params file", not_ros),
+        (
+            "compensator",
+            ["--params-file", "/no/p.yaml"],
+            "Couldn't parse params file",
+            not_ros,
+        ),
         ("compensator", ["--bogus"], "['--bogus']", not_ros),
     ]
     processes = [group.node(node, *words) for node, words, _, _ in cases]
@@ -200,13 +225,19 @@ def test_bad_input_is_one_line_and_code_2(group, tmp_path):
 
 def test_a_recorder_whose_disk_is_full_ends_with_code_2(graph, group, tmp_path):
     bag = f"bag:={tmp_path / 'recorded'}"
-    recorder = group.start("-m", "selfcal_ros.nodes.bag_recorder", "--ros-args", "-p", bag)
+    recorder = group.start(
+        "-m", "selfcal_ros.nodes.bag_recorder", "--ros-args", "-p", bag
+    )
     diagnostics: list = []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 100)
+    graph.hand.create_subscription(
+        DiagnosticArray, "/diagnostics", diagnostics.append, 100
+    )
     graph.until(lambda: diagnostics, "the recorder")
     [file] = tmp_path.glob("recorded/*.mcap")
     resource.prlimit(
-        recorder.pid, resource.RLIMIT_FSIZE, (file.stat().st_size, resource.RLIM_INFINITY)
+        recorder.pid,
+        resource.RLIMIT_FSIZE,
+        (file.stat().st_size, resource.RLIM_INFINITY),
     )
     publisher = graph.publisher(names.ENCODER)
     publisher.publish(names.ENCODER.type(name=["x"], position=[0.25]))
@@ -222,7 +253,11 @@ def test_a_recorder_whose_disk_is_full_ends_with_code_2(graph, group, tmp_path):
 
 @pytest.mark.parametrize("whole_group", [True, False], ids=["ctrl-c", "kill -INT"])
 def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_group):
-    bag, nodes = small_bag(tmp_path), NODES[1:2]  # and the session: a first and a last child
+    # and the session: a first and a last child
+    bag, nodes = (
+        small_bag(tmp_path),
+        NODES[1:2],
+    )
     some = f"from selfcal_ros.cli import replay; replay.NODES = {nodes}; "
     replay = group.start(
         "-c",
@@ -234,7 +269,9 @@ def test_an_interrupted_replay_leaves_no_process(graph, group, tmp_path, whole_g
         "--domain",
         group.environment["ROS_DOMAIN_ID"],
     )
-    graph.until(lambda: {"bag_player", *nodes} <= set(graph.hand.get_node_names()), "the nodes")
+    graph.until(
+        lambda: {"bag_player", *nodes} <= set(graph.hand.get_node_names()), "the nodes"
+    )
     (os.killpg if whole_group else os.kill)(replay.pid, signal.SIGINT)
     code, _, err = ended(replay)
     assert code == 128 + signal.SIGINT
@@ -284,7 +321,9 @@ sys.meta_path.insert(0, Finder())
 """
 
 
-def test_a_signal_while_a_node_is_imported_by_its_module_ends_it_cleanly(group, tmp_path):
+def test_a_signal_while_a_node_is_imported_by_its_module_ends_it_cleanly(
+    group, tmp_path
+):
     group.customize(tmp_path, SITE)
     code, out, err = ended(group.start("-m", "selfcal_ros.nodes.compensator"))
     assert (code, out, err) == (0, "", "")
@@ -327,10 +366,15 @@ def test_whatever_needs_a_module_that_is_not_there_says_what_brings_it(
     group.customize(tmp_path, HIDING.format(module=module))
     code, out, err = ended(group.start(*words))
     assert (code, out) == (2, "")
-    assert err == f"{who}: environment: there is no {module} in this environment; {remedy}\n"
+    assert (
+        err
+        == f"{who}: environment: there is no {module} in this environment; {remedy}\n"
+    )
 
 
-@pytest.mark.parametrize("module", ["argparse", "selfcal_ros.cli.solve", "selfcal_ros.errors"])
+@pytest.mark.parametrize(
+    "module", ["argparse", "selfcal_ros.cli.solve", "selfcal_ros.errors"]
+)
 def test_a_signal_while_the_command_is_imported_is_one_line(group, module):
     code, out, err = ended(
         group.start(
@@ -367,7 +411,11 @@ def test_a_replay_interrupted_while_its_nodes_are_imported_is_one_line(group, tm
     group.customize(tmp_path, SITE)
     argv = ["selfcal", "replay", str(small_bag(tmp_path)), "--rate", "0.001"]
     code, out, err = ended(group.start("-c", INTERRUPTED_REPLAY.format(argv=argv)))
-    assert (code, out, err) == (128 + signal.SIGINT, "", "selfcal replay: interrupted\n")
+    assert (code, out, err) == (
+        128 + signal.SIGINT,
+        "",
+        "selfcal replay: interrupted\n",
+    )
 
 
 INTERRUPTED_DEMO = (
@@ -380,7 +428,8 @@ runpy.run_path({demo!r}, run_name="__main__")
 
 
 @pytest.mark.parametrize(
-    "module, who", [("selfcal_ros.bagio.offline", "demo"), ("selfcal_ros.cli.processes", "selfcal")]
+    "module, who",
+    [("selfcal_ros.bagio.offline", "demo"), ("selfcal_ros.cli.processes", "selfcal")],
 )
 def test_a_demo_that_is_interrupted_is_one_line(group, module, who):
     code, _, err = ended(
@@ -446,4 +495,8 @@ def test_shared_memory_of_nodes_that_are_gone_is_removed_and_no_other(tmp_path):
         remove_stale(tmp_path, 0.0)
         assert len(list(tmp_path.iterdir())) == 8
         remove_stale(tmp_path, time.time() + 60.0)
-    assert {file.name for file in tmp_path.iterdir()} == {"fastrtps_2", "fastrtps_2_el", "other_el"}
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "fastrtps_2",
+        "fastrtps_2_el",
+        "other_el",
+    }

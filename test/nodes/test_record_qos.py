@@ -16,7 +16,11 @@ from selfcal_ros.files import read_yaml
 from selfcal_ros.nodes import names
 
 FILE = Path(__file__).parents[2] / "config/rosbag2/record_qos.yaml"
-KINDS = {"history": HistoryPolicy, "reliability": ReliabilityPolicy, "durability": DurabilityPolicy}
+KINDS = {
+    "history": HistoryPolicy,
+    "reliability": ReliabilityPolicy,
+    "durability": DurabilityPolicy,
+}
 
 
 def overrides() -> dict[str, QoSProfile]:
@@ -41,6 +45,11 @@ def test_every_input_has_the_depth_of_the_own_recorder():
 
 
 def test_it_hears_whatever_the_contract_lets_a_cell_offer():
-    for offer in (names.ENCODER, names.ENCODER_EITHER[1], names.DETECTIONS, names.COMMAND):
+    for offer in (
+        names.ENCODER,
+        names.ENCODER_EITHER[1],
+        names.DETECTIONS,
+        names.COMMAND,
+    ):
         verdict, reason = qos_check_compatible(offer.qos, overrides()[offer.name])
         assert verdict != QoSCompatibility.ERROR, reason

@@ -34,7 +34,9 @@ def stamps(bag: Path) -> list[tuple[str, int]]:
 
 
 def content(bag: Path) -> Counter:
-    return Counter((topic, repr(message)) for topic, _, message in decoded(BagReader(bag)))
+    return Counter(
+        (topic, repr(message)) for topic, _, message in decoded(BagReader(bag))
+    )
 
 
 def digests(bag: Path) -> list[str]:
@@ -44,10 +46,13 @@ def digests(bag: Path) -> list[str]:
 
 def is_a_rosbag2_bag(recorded: Path) -> None:
     """Check what other readers want to know of a recording."""
-    info = yaml.safe_load((recorded / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    info = yaml.safe_load((recorded / "metadata.yaml").read_text())[
+        "rosbag2_bagfile_information"
+    ]
     assert (info["version"], info["storage_identifier"]) == (9, "mcap")
     counts = {
-        t["topic_metadata"]["name"]: t["message_count"] for t in info["topics_with_message_count"]
+        t["topic_metadata"]["name"]: t["message_count"]
+        for t in info["topics_with_message_count"]
     }
     expected = Counter(f"/{topic}" for topic, _ in stamps(recorded))
     assert {name: n for name, n in counts.items() if n} == expected
@@ -62,7 +67,9 @@ def is_a_rosbag2_bag(recorded: Path) -> None:
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
     assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
-    assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+    assert {channel.message_encoding for channel in summary.channels.values()} == {
+        "cdr"
+    }
 
 
 @pytest.fixture(scope="module")
@@ -78,11 +85,15 @@ def played(graph, tmp_path, bag):
     def play(**parameters):
         recorder = graph.node(BagRecorder, bag=str(tmp_path / "recorded"))
         player = graph.node(
-            BagPlayer, bag=str(bag), **({"rate": 0.0, "listener": "bag_recorder"} | parameters)
+            BagPlayer,
+            bag=str(bag),
+            **({"rate": 0.0, "listener": "bag_recorder"} | parameters),
         )
         graph.until(player.finished.done, "the end of the bag")
         total = player.player.total
-        graph.until(lambda: sum(recorder._writer.counts.values()) >= total, "the last message")
+        graph.until(
+            lambda: sum(recorder._writer.counts.values()) >= total, "the last message"
+        )
         recorder.close()
         return tmp_path / "recorded", player
 
@@ -117,7 +128,9 @@ def test_an_encoder_with_best_effort_is_recorded(graph, tmp_path):
     recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
     publisher = graph.publisher(names.ENCODER_EITHER[1])
     publisher.publish(names.ENCODER.type(name=["x"], position=[0.25]))
-    graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the sample")
+    graph.until(
+        lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the sample"
+    )
     recorder.close()
 
 
@@ -125,10 +138,16 @@ def test_an_encoder_that_comes_back_with_best_effort_is_recorded(graph, tmp_path
     recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
     first = graph.publisher(names.ENCODER)
     first.publish(names.ENCODER.type(name=["x"], position=[0.25]))
-    graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the first sample")
+    graph.until(
+        lambda: recorder._writer.counts["/stage/joint_states"] == 1, "the first sample"
+    )
     graph.hand.destroy_publisher(first)
-    graph.publisher(names.ENCODER_EITHER[1]).publish(names.ENCODER.type(name=["x"], position=[0.5]))
-    graph.until(lambda: recorder._writer.counts["/stage/joint_states"] == 2, "the second sample")
+    graph.publisher(names.ENCODER_EITHER[1]).publish(
+        names.ENCODER.type(name=["x"], position=[0.5])
+    )
+    graph.until(
+        lambda: recorder._writer.counts["/stage/joint_states"] == 2, "the second sample"
+    )
     recorder.close()
 
 
@@ -151,7 +170,10 @@ def endless(node, name: str, topics=names.INPUTS, **qos) -> list:
     heard: list = []
     for topic in topics:
         node.create_subscription(
-            topic.type, name + topic.name, heard.append, **({"qos_profile": topic.qos} | qos)
+            topic.type,
+            name + topic.name,
+            heard.append,
+            **({"qos_profile": topic.qos} | qos),
         )
     return heard
 
@@ -159,7 +181,11 @@ def endless(node, name: str, topics=names.INPUTS, **qos) -> list:
 def test_nothing_is_lost_beside_strangers_who_listen_before_the_collector(graph, bag):
     """As ros2 topic echo, foxglove_bridge and the compensator do."""
     heard = endless(graph.hand, "")
-    endless(graph.add(Node("echo", context=graph.context)), "", qos_profile=qos_profile_sensor_data)
+    endless(
+        graph.add(Node("echo", context=graph.context)),
+        "",
+        qos_profile=qos_profile_sensor_data,
+    )
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0)
     graph.until(
         lambda: all(
@@ -175,7 +201,9 @@ def test_nothing_is_lost_beside_strangers_who_listen_before_the_collector(graph,
     assert player.diagnosis().message == "waiting for /measurement_collector"
     collector = graph.node(MeasurementCollector)
     graph.until(player.finished.done, "the end of the bag")
-    graph.until(lambda: collector.session.collector.received == player.player.sent, "all of it")
+    graph.until(
+        lambda: collector.session.collector.received == player.player.sent, "all of it"
+    )
     measurements, _ = collector.session.collector.collect()
     assert [readings_digest(view, {}) for view in measurements.views] == digests(bag)
 
@@ -186,7 +214,11 @@ def test_a_player_whose_listener_does_not_come_ends_and_has_played_nothing(graph
     lines: list = []
     player.say = lambda level, line: lines.append((level, line))
     graph.until(player.finished.done, "its end")
-    assert (player.exit_code, player.player.played, heard) == (ExitCode.BAD_INPUT, 0, [])
+    assert (player.exit_code, player.player.played, heard) == (
+        ExitCode.BAD_INPUT,
+        0,
+        [],
+    )
     assert lines == [
         (
             Level.ERROR,
@@ -200,7 +232,9 @@ def test_a_player_whose_listener_does_not_come_ends_and_has_played_nothing(graph
     ]
 
 
-@pytest.mark.parametrize("parameters", [{"listener": ""}, {"wait_for_subscribers": 0.0}])
+@pytest.mark.parametrize(
+    "parameters", [{"listener": ""}, {"wait_for_subscribers": 0.0}]
+)
 def test_a_player_that_waits_for_nobody_plays_at_once(graph, bag, parameters):
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, **parameters)
     graph.until(player.finished.done, "the end of the bag")
@@ -208,15 +242,19 @@ def test_a_player_that_waits_for_nobody_plays_at_once(graph, bag, parameters):
 
 
 @pytest.mark.parametrize(
-    "listener, heard", [("measurement_collector", False), ("/cell2/measurement_collector", True)]
+    "listener, heard",
+    [("measurement_collector", False), ("/cell2/measurement_collector", True)],
 )
 def test_a_listener_is_one_by_name_and_namespace(graph, bag, listener, heard):
-    other = graph.add(Node("measurement_collector", namespace="cell2", context=graph.context))
+    other = graph.add(
+        Node("measurement_collector", namespace="cell2", context=graph.context)
+    )
     endless(other, "/")
     player = graph.node(BagPlayer, bag=str(bag), rate=0.001, listener=listener).player
     graph.until(
         lambda: all(
-            publisher.get_subscription_count() for publisher in player._publishers.values()
+            publisher.get_subscription_count()
+            for publisher in player._publishers.values()
         ),
         "the subscriptions",
     )
@@ -233,12 +271,18 @@ DRIVER = "/hand publishes stage/joint_states as well; 0 messages were played"
 
 def test_nothing_is_played_beside_somebody_elses_publisher(graph, bag):
     heard = endless(graph.hand, "")
-    graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
+    graph.hand.create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos
+    )
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
     lines: list = []
     player.say = lambda level, line: lines.append((level, line))
     graph.until(player.finished.done, "its end")
-    assert (player.exit_code, player.player.played, heard) == (ExitCode.BAD_INPUT, 0, [])
+    assert (player.exit_code, player.player.played, heard) == (
+        ExitCode.BAD_INPUT,
+        0,
+        [],
+    )
     [(level, line)] = lines
     assert level == Level.ERROR and DRIVER in line
 
@@ -256,8 +300,12 @@ def test_a_node_named_as_one_of_selfcal_is_a_stranger_on_what_is_played(graph, b
 
 
 def test_a_bag_is_played_beside_others_where_that_is_asked_for(graph, bag):
-    graph.hand.create_publisher(names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos)
-    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="", beside_others=True)
+    graph.hand.create_publisher(
+        names.ENCODER.type, names.ENCODER.name, names.ENCODER.qos
+    )
+    player = graph.node(
+        BagPlayer, bag=str(bag), rate=0.0, listener="", beside_others=True
+    )
     graph.until(player.finished.done, "the end of the bag")
     assert (player.exit_code, player.player.done) == (ExitCode.DONE, True)
 
@@ -266,7 +314,9 @@ def test_one_own_sequencer_is_no_stranger_and_two_are(graph, bag):
     graph.add(Node("pose_sequencer", context=graph.context)).create_publisher(
         names.COMMAND.type, names.COMMAND.name, names.COMMAND.qos
     )
-    player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="", wait_for_subscribers=0.0)
+    player = graph.node(
+        BagPlayer, bag=str(bag), rate=0.0, listener="", wait_for_subscribers=0.0
+    )
     graph.until(player.finished.done, "the end of the bag")
     assert player.player.done
     graph.add(Node("pose_sequencer", context=graph.context)).create_publisher(
@@ -281,7 +331,9 @@ def test_one_own_sequencer_is_no_stranger_and_two_are(graph, bag):
 def test_a_publisher_that_comes_while_a_bag_is_played_ends_the_player(graph, bag):
     player = graph.node(BagPlayer, bag=str(bag), rate=0.01, listener="")
     graph.until(lambda: player.player.played, "the first message")
-    graph.hand.create_publisher(names.DETECTIONS.type, names.DETECTIONS.name, names.DETECTIONS.qos)
+    graph.hand.create_publisher(
+        names.DETECTIONS.type, names.DETECTIONS.name, names.DETECTIONS.qos
+    )
     graph.until(player.finished.done, "its end")
     assert player.exit_code == ExitCode.BAD_INPUT and not player.player.done
 
@@ -294,7 +346,9 @@ def test_a_listener_of_one_topic_alone_is_not_enough(graph, bag):
     assert player.unheard() == [names.ENCODER.name, names.COMMAND.name]
 
 
-def test_a_collector_that_a_stranger_has_hear_with_best_effort_is_waited_for(graph, bag):
+def test_a_collector_that_a_stranger_has_hear_with_best_effort_is_waited_for(
+    graph, bag
+):
     driver = graph.hand.create_publisher(
         names.ENCODER.type, names.ENCODER.name, names.ENCODER_EITHER[1].qos
     )
@@ -308,7 +362,9 @@ def test_a_collector_that_a_stranger_has_hear_with_best_effort_is_waited_for(gra
     graph.until(lambda: player.done, "the end of the bag")
 
 
-def test_a_bag_that_goes_away_while_it_is_played_ends_the_player_with_a_line(graph, bag):
+def test_a_bag_that_goes_away_while_it_is_played_ends_the_player_with_a_line(
+    graph, bag
+):
     player = graph.node(BagPlayer, bag=str(bag), rate=0.0, listener="")
     player.player._messages = iter(())
     lines: list = []
@@ -328,7 +384,9 @@ def test_a_bag_that_goes_away_while_it_is_played_ends_the_player_with_a_line(gra
 def test_what_was_flushed_survives_a_crash(graph, tmp_path):
     recorder = graph.node(BagRecorder, bag=str(tmp_path / "bag"))
     graph.publisher(names.DETECTIONS).publish(names.DETECTIONS.type(m=3))
-    graph.until(lambda: recorder._writer.counts["/stage/mark_detections"] == 1, "the message")
+    graph.until(
+        lambda: recorder._writer.counts["/stage/mark_detections"] == 1, "the message"
+    )
     recorder._flush()
     reader = BagReader(tmp_path / "bag")
     assert [message.m for _, _, message in decoded(reader)] == [3]
@@ -343,7 +401,9 @@ def test_only_the_inputs_are_recorded_when_asked(graph, tmp_path):
 
 
 def test_an_existing_folder_is_never_written_into(graph, tmp_path):
-    with pytest.raises(InputError, match="exists already; remove it or name another folder"):
+    with pytest.raises(
+        InputError, match="exists already; remove it or name another folder"
+    ):
         graph.node(BagRecorder, bag=str(tmp_path))
 
 
@@ -361,7 +421,10 @@ def test_a_bag_without_our_topics_is_refused(graph, tmp_path):
 
 def test_a_remapped_topic_is_recorded_under_the_name_of_the_contract(graph, tmp_path):
     recorder = graph.node(
-        partial(BagRecorder, cli_args=["--ros-args", "-r", "stage/mark_detections:=/robot/marks"]),
+        partial(
+            BagRecorder,
+            cli_args=["--ros-args", "-r", "stage/mark_detections:=/robot/marks"],
+        ),
         bag=str(tmp_path / "bag"),
     )
     marks = graph.publisher(replace(names.DETECTIONS, name="/robot/marks"))

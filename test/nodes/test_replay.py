@@ -51,7 +51,10 @@ def ordered_plan():
     """Return a plan that states in which order its marks are visited."""
     plan = small_plan(repeats=4)
     return replace(
-        plan, views=tuple(replace(view, visit_order="x_back_y_back@plate") for view in plan.views)
+        plan,
+        views=tuple(
+            replace(view, visit_order="x_back_y_back@plate") for view in plan.views
+        ),
     )
 
 
@@ -76,7 +79,9 @@ def solved(request, tmp_path_factory):
     )
     ordered = bool(plan.views[0].visit_order)
     bag = small_bag(folder, plan, correlation=4.0, **REJECTED if ordered else {})
-    assert selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) == 0
+    assert (
+        selfcal(["solve", str(bag), "--quiet", "-o", str(folder / "solved.json")]) == 0
+    )
     assert ("rejected_at" in read_json(folder / "solved.json")) is ordered
     return bag, undated((folder / "solved.json").read_text())
 
@@ -101,7 +106,9 @@ def played(graph, bag, folder, *, rate=0.0, seed=-1, cell=None):
     ):
         graph.node(node, **parameters)
     player = partial(Player, bag=str(bag), rate=rate, seed=seed, namespace=cell)
-    session = graph.add(ReplaySession(player, str(folder / "saved.json"), context=graph.context))
+    session = graph.add(
+        ReplaySession(player, str(folder / "saved.json"), context=graph.context)
+    )
     graph.until(session.finished.done, "the end of the session")
     return session
 
@@ -110,7 +117,10 @@ def result_text(session, bag, folder, cell=None):
     """Return the text of the result that the command would write."""
     of_bag = bag_lines(bag, settings_of("measurement_collector"), cell)
     data = replay_verb.with_bag(
-        read_json(folder / "saved.json"), of_bag, session.player.playlist.lost, bag_input(str(bag))
+        read_json(folder / "saved.json"),
+        of_bag,
+        session.player.playlist.lost,
+        bag_input(str(bag)),
     )
     write_json(folder / "replayed.json", data)
     return undated((folder / "replayed.json").read_text())
@@ -121,7 +131,9 @@ def result_text(session, bag, folder, cell=None):
     [("on the lattice", {"rate": 50.0}), *((name, {"seed": 3}) for name in PLANS)],
     indirect=["solved"],
 )
-def test_a_session_gives_the_result_of_solve_bit_for_bit(graph, solved, tmp_path, options, capfd):
+def test_a_session_gives_the_result_of_solve_bit_for_bit(
+    graph, solved, tmp_path, options, capfd
+):
     bag, expected = solved
     session = played(graph, bag, tmp_path, **options)
     assert session.exit_code == 0
@@ -192,15 +204,25 @@ def test_what_a_session_is_told_and_that_its_code_is_that_of_the_command(
     assert f"result_folder:={Path(saved).parent}" in started["solver"]
 
 
-def test_a_deficient_bag_ends_with_code_3_and_the_result_of_solve(graph, tmp_path, capfd):
+def test_a_deficient_bag_ends_with_code_3_and_the_result_of_solve(
+    graph, tmp_path, capfd
+):
     """The session's code is that of the command, as another test has it."""
     bag = small_bag(tmp_path, small_plan("0, 90"), low_score=0.05)
     session = played(graph, bag, tmp_path)
     assert session.exit_code == 3
-    [line] = [text for text in capfd.readouterr().err.splitlines() if "selfcal replay: " in text]
+    [line] = [
+        text
+        for text in capfd.readouterr().err.splitlines()
+        if "selfcal replay: " in text
+    ]
     solved = tmp_path / "solved.json"
     assert selfcal(["solve", str(bag), "--quiet", "-o", str(solved)]) == 3
-    [same] = [text for text in capfd.readouterr().err.splitlines() if "selfcal solve: " in text]
+    [same] = [
+        text
+        for text in capfd.readouterr().err.splitlines()
+        if "selfcal solve: " in text
+    ]
     assert line.removeprefix("selfcal replay: ") == same.removeprefix("selfcal solve: ")
     assert result_text(session, bag, tmp_path) == undated(solved.read_text())
 
@@ -209,16 +231,24 @@ def test_a_bag_without_marks_ends_at_once_as_by_solve(monkeypatch, tmp_path, cap
     monkeypatch.setattr(replay_verb, "process", None)  # no node is started
     bag = Foreign().write(
         tmp_path / "x.mcap",
-        [event for event in events_of(small_plan()) if not isinstance(event, Detection)],
+        [
+            event
+            for event in events_of(small_plan())
+            if not isinstance(event, Detection)
+        ],
     )
     assert selfcal(["solve", str(bag)]) == 4
     said = capsys.readouterr().err
     assert "no message on stage/mark_detections; record this topic too" in said
     assert selfcal(["replay", str(bag)]) == 4
-    assert capsys.readouterr().err == said.replace("selfcal solve: ", "selfcal replay: ")
+    assert capsys.readouterr().err == said.replace(
+        "selfcal solve: ", "selfcal replay: "
+    )
 
 
-def test_detections_that_are_all_rejected_end_the_session_with_code_4(graph, tmp_path, capfd):
+def test_detections_that_are_all_rejected_end_the_session_with_code_4(
+    graph, tmp_path, capfd
+):
     bag = Foreign().write(
         tmp_path / "x.mcap",
         [
@@ -227,10 +257,15 @@ def test_detections_that_are_all_rejected_end_the_session_with_code_4(graph, tmp
         ],
     )
     assert played(graph, bag, tmp_path).exit_code == 4
-    assert "selfcal replay: plan '0, 90, tx': no grid mark was read" in capfd.readouterr().err
+    assert (
+        "selfcal replay: plan '0, 90, tx': no grid mark was read"
+        in capfd.readouterr().err
+    )
 
 
-def test_a_plate_placed_otherwise_is_bad_input_as_by_solve(monkeypatch, tmp_path, capsys):
+def test_a_plate_placed_otherwise_is_bad_input_as_by_solve(
+    monkeypatch, tmp_path, capsys
+):
     plan = {
         "plan_id": "p",
         "artifact": {"grid_size": 5, "grid_pitch": 0.01, "angular_count": 0},
@@ -254,13 +289,18 @@ def test_a_plate_placed_otherwise_is_bad_input_as_by_solve(monkeypatch, tmp_path
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", str(tmp_path / "turned"), "--fast"]) == 2
     [line] = capsys.readouterr().err.splitlines()
-    assert "the plate lies turned by 180°, not by 90°" in line and "correct this first" in line
+    assert (
+        "the plate lies turned by 180°, not by 90°" in line
+        and "correct this first" in line
+    )
     assert selfcal(["replay", str(tmp_path / "deficient"), "--fast"]) == 3
     assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("noted", [False, True], ids=["played fast", "in real time"])
-def test_a_clock_that_stepped_is_said_once_as_solve_says_it(monkeypatch, tmp_path, capsys, noted):
+def test_a_clock_that_stepped_is_said_once_as_solve_says_it(
+    monkeypatch, tmp_path, capsys, noted
+):
     """Played fast no node can see it; in real time the collector notes the same line."""
     bag, folder = str(stepped_bag(tmp_path, 0.2)), tmp_path
     assert selfcal(["solve", bag, "--quiet", "-o", str(folder / "solved.json")]) == 0
@@ -272,11 +312,18 @@ def test_a_clock_that_stepped_is_said_once_as_solve_says_it(monkeypatch, tmp_pat
     def process(module, given, *_, **__):
         if module.endswith("replay_session"):
             print("what the nodes say", file=sys.stderr)
-            write_json(given[3], solved | {"warnings": solved["warnings"] if noted else others})
+            write_json(
+                given[3], solved | {"warnings": solved["warnings"] if noted else others}
+            )
         yield SimpleNamespace(stdout=[], wait=lambda: 0)
 
     monkeypatch.setattr(replay_verb, "process", process)
-    assert selfcal(["replay", bag, "--fast", "--quiet", "-o", str(folder / "replayed.json")]) == 0
+    assert (
+        selfcal(
+            ["replay", bag, "--fast", "--quiet", "-o", str(folder / "replayed.json")]
+        )
+        == 0
+    )
     assert capsys.readouterr().err.splitlines() == [
         line.replace("selfcal solve: ", "selfcal replay: "),
         "what the nodes say",
@@ -292,7 +339,10 @@ def test_a_clock_that_stepped_is_said_once_as_solve_says_it(monkeypatch, tmp_pat
 
 def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, capsys):
     bag = small_bag(tmp_path, small_plan(repeats=4), not_finite=0.2)
-    assert selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")]) == 0
+    assert (
+        selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")])
+        == 0
+    )
     said = capsys.readouterr().err
     assert "detections were rejected" in said and "not_finite" in said
 
@@ -304,7 +354,9 @@ def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, caps
 
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", str(bag), "--fast", "--quiet"]) == 0
-    assert capsys.readouterr().err == said.replace("selfcal solve: ", "selfcal replay: ")
+    assert capsys.readouterr().err == said.replace(
+        "selfcal solve: ", "selfcal replay: "
+    )
 
 
 @pytest.mark.parametrize(("plan", "code"), [("0, 90, tx, ty", 0), ("0, 90, tx", 2)])
@@ -345,20 +397,29 @@ def test_a_lost_command_is_said_once_whether_or_not_it_spoils_the_map(
     ] * bool(code)
 
 
-def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypatch, tmp_path):
+def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(
+    monkeypatch, tmp_path
+):
     """They are not played: here a detection that is stamped a day late."""
     bag = stepped_bag(tmp_path, 0.0)
     with BagWriter(tmp_path / "more") as writer:
-        writer.add_topic(f"/{names.DETECTIONS.name}", "selfcal_msgs/msg/MarkDetection", [])
+        writer.add_topic(
+            f"/{names.DETECTIONS.name}", "selfcal_msgs/msg/MarkDetection", []
+        )
         late = next(e for e in events_of(small_plan()) if isinstance(e, Detection))
         writer.write(
             f"/{names.DETECTIONS.name}",
-            event_fields(replace(late, stamp_ns=late.stamp_ns + 86400 * 10**9), "stage")[1],
+            event_fields(
+                replace(late, stamp_ns=late.stamp_ns + 86400 * 10**9), "stage"
+            )[1],
             late.stamp_ns,
         )
     (tmp_path / "more" / "more_0.mcap").rename(bag / "bag_1.mcap")
     (bag / "metadata.yaml").unlink()
-    assert selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")]) == 0
+    assert (
+        selfcal(["solve", str(bag), "--quiet", "-o", str(tmp_path / "solved.json")])
+        == 0
+    )
     solved = read_json(tmp_path / "solved.json")
     assert solved["rejected"] == {"from_the_future": 1}
     *before, line = solved["warnings"]
@@ -373,13 +434,20 @@ def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(monkeypa
         )
 
     monkeypatch.setattr(replay_verb, "process", process)
-    assert selfcal(["replay", str(bag), "--fast", "--quiet", "-o", str(tmp_path / "r.json")]) == 0
+    assert (
+        selfcal(
+            ["replay", str(bag), "--fast", "--quiet", "-o", str(tmp_path / "r.json")]
+        )
+        == 0
+    )
     assert undated((tmp_path / "r.json").read_text()) == undated(
         (tmp_path / "solved.json").read_text()
     )
 
 
-def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_last(graph):
+def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_last(
+    graph,
+):
     told, saved, turns = [], [], []
 
     def answer(_, response):
@@ -414,9 +482,13 @@ def test_the_map_is_saved_once_the_solver_has_solved_what_the_collector_sent_las
         is_alone=lambda: True,
         playlist=SimpleNamespace(lost=[]),
     )
-    session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
+    session = graph.add(
+        ReplaySession(lambda _: player, "map.json", context=graph.context)
+    )
     graph.hand.create_timer(0.005, lambda: turns.append(session._digest))
-    graph.until(lambda: turns.count("of all views") > 20, "the session to wait for the solver")
+    graph.until(
+        lambda: turns.count("of all views") > 20, "the session to wait for the solver"
+    )
     tell("of all views")
     graph.until(session.finished.done, "the end of the session")
     assert (saved, session.exit_code) == (["of all views"], 0)
@@ -436,7 +508,9 @@ def test_a_session_plays_nothing_where_somebody_else_publishes(
     graph.hand.create_publisher(topic.type, topic.name, topic.qos)
     heard = graph.listen(names.DETECTIONS)
     player = partial(Player, bag=str(solved[0]), rate=0.0, seed=-1)
-    session = graph.add(ReplaySession(player, str(tmp_path / "r.json"), context=graph.context))
+    session = graph.add(
+        ReplaySession(player, str(tmp_path / "r.json"), context=graph.context)
+    )
     graph.until(session.finished.done, "the end of the session")
     domain = graph.context.get_domain_id()
     assert (session.exit_code, heard) == (2, [])
@@ -465,9 +539,13 @@ def test_what_was_received_beyond_what_was_sent_is_somebody_elses(graph, capfd):
         heard={"encoder": 9, "detection": 2},
         playlist=SimpleNamespace(lost=[]),
     )
-    graph.hand.create_service(Trigger, "measurement_collector/finish", lambda _, answer: answer)
+    graph.hand.create_service(
+        Trigger, "measurement_collector/finish", lambda _, answer: answer
+    )
     graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
-    session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
+    session = graph.add(
+        ReplaySession(lambda _: player, "map.json", context=graph.context)
+    )
     graph.until(session.finished.done, "the end of the session")
     assert session.exit_code == 2
     assert capfd.readouterr().err == (
@@ -496,9 +574,13 @@ def test_nothing_is_played_before_the_nodes_listen(graph):
         heard={},
         playlist=SimpleNamespace(lost=[]),
     )
-    graph.hand.create_service(Trigger, "measurement_collector/finish", lambda _, answer: answer)
+    graph.hand.create_service(
+        Trigger, "measurement_collector/finish", lambda _, answer: answer
+    )
     graph.hand.create_service(SaveMap, "solver/save_map", lambda _, answer: answer)
-    session = graph.add(ReplaySession(lambda _: player, "map.json", context=graph.context))
+    session = graph.add(
+        ReplaySession(lambda _: player, "map.json", context=graph.context)
+    )
     graph.until(lambda: len(turns) > 20, "the session to wait for the nodes")
     assert not steps
     deaf.clear()
@@ -509,10 +591,19 @@ def test_nothing_is_played_before_the_nodes_listen(graph):
 @pytest.mark.parametrize(
     "options, problem",
     [
-        (["--domain", "233"], "--domain: 233 is not a ROS domain; give a number from 0 to 232"),
+        (
+            ["--domain", "233"],
+            "--domain: 233 is not a ROS domain; give a number from 0 to 232",
+        ),
         (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0"),
-        (["--shuffle", "-1"], "--shuffle: -1 is not a seed; give a number from 0 to 2147483648"),
-        (["--shuffle", "2147483649"], "--shuffle: 2147483649 is not a seed; give a number from 0"),
+        (
+            ["--shuffle", "-1"],
+            "--shuffle: -1 is not a seed; give a number from 0 to 2147483648",
+        ),
+        (
+            ["--shuffle", "2147483649"],
+            "--shuffle: 2147483649 is not a seed; give a number from 0",
+        ),
     ],
 )
 def test_speeds_and_seeds_that_are_none(options, problem, capsys):
@@ -524,9 +615,16 @@ def test_what_follows_the_five_arguments_of_a_session_is_for_ros(monkeypatch):
     from selfcal_ros.nodes import replay_session
 
     given = []
-    monkeypatch.setattr(replay_session, "run", lambda make, args: given.append(args) or 3)
-    for more in ([], ["--ros-args", "-p", "a:=1", "-p", "b:=2", "-p", "c:=3", "-p", "d:=4"]):
-        monkeypatch.setattr("sys.argv", ["session", "bag", "2.0", "-1", "r.json", "/cell", *more])
+    monkeypatch.setattr(
+        replay_session, "run", lambda make, args: given.append(args) or 3
+    )
+    for more in (
+        [],
+        ["--ros-args", "-p", "a:=1", "-p", "b:=2", "-p", "c:=3", "-p", "d:=4"],
+    ):
+        monkeypatch.setattr(
+            "sys.argv", ["session", "bag", "2.0", "-1", "r.json", "/cell", *more]
+        )
         with pytest.raises(SystemExit) as ended:
             replay_session.main()
         assert ended.value.code == 3 and given.pop() == more

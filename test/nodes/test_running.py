@@ -26,7 +26,9 @@ def test_what_a_node_has_loaded_is_not_gone_through_while_it_works(monkeypatch, 
         monkeypatch.setattr(running, name, lambda argument: None)
     monkeypatch.setattr(running, "ignore_signals", lambda: None)
     monkeypatch.setattr(running, "rclpy", SimpleNamespace(try_shutdown=lambda: None))
-    monkeypatch.setattr(running, "spin", lambda node, until: frozen.append(gc.get_freeze_count()))
+    monkeypatch.setattr(
+        running, "spin", lambda node, until: frozen.append(gc.get_freeze_count())
+    )
     made: list[list] = []
 
     def make():
@@ -61,13 +63,17 @@ def test_a_node_that_hangs_when_it_is_to_end_is_ended_and_says_where():
     assert " in hang" in done.stderr
 
 
-def test_messages_that_were_built_before_a_field_was_added_are_one_line(monkeypatch, capsys):
+def test_messages_that_were_built_before_a_field_was_added_are_one_line(
+    monkeypatch, capsys
+):
     """Else each service call ended with an AttributeError."""
     assert start.missing_ros() == ""
     fields = selfcal_msgs.msg.ViewCommand.get_fields_and_field_types()
     older = {name: kind for name, kind in fields.items() if name != "plan_keys"}
     monkeypatch.setattr(
-        selfcal_msgs.msg, "ViewCommand", SimpleNamespace(get_fields_and_field_types=lambda: older)
+        selfcal_msgs.msg,
+        "ViewCommand",
+        SimpleNamespace(get_fields_and_field_types=lambda: older),
     )
     monkeypatch.setattr(start, "hold_interrupts", lambda held: None)
     with pytest.raises(SystemExit) as ended:

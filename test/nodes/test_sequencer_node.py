@@ -50,7 +50,12 @@ class Desk:
         assert self.commands == list(commands)
 
     def complete(
-        self, index: int, *, plan_id: str = PLAN.plan_id, complete: bool = True, age_ns: int = 0
+        self,
+        index: int,
+        *,
+        plan_id: str = PLAN.plan_id,
+        complete: bool = True,
+        age_ns: int = 0,
     ) -> None:
         stamp = to_model.stamp_ns(self.heard[-1]) - age_ns if self.heard else 0
         self.status.publish(
@@ -73,7 +78,8 @@ class Desk:
 def all_alive(graph: Graph, **values: str) -> None:
     """Let the companions tell from now on that all are there."""
     graph.health(
-        "measurement_collector", **{"encoder_heard": "yes", "detections_matched": "yes"} | values
+        "measurement_collector",
+        **{"encoder_heard": "yes", "detections_matched": "yes"} | values,
     )
     graph.health("solver")
 
@@ -141,7 +147,9 @@ def test_redo_skip_and_abort(desk):
         ("abort", "nothing to abort while idle"),
     ],
 )
-def test_a_request_that_does_not_fit_is_refused_and_changes_nothing(desk, service, problem):
+def test_a_request_that_does_not_fit_is_refused_and_changes_nothing(
+    desk, service, problem
+):
     answer = desk.ask(service)
     assert not answer.success
     assert problem in answer.message
@@ -152,7 +160,9 @@ def test_a_request_that_does_not_fit_is_refused_and_changes_nothing(desk, servic
 def test_without_a_plan_start_says_so(graph, tmp_path):
     answer = Desk(graph, tmp_path, plan="").ask("start")
     assert not answer.success
-    assert answer.message == "pose_sequencer: there is no plan; set the parameter 'plan'"
+    assert (
+        answer.message == "pose_sequencer: there is no plan; set the parameter 'plan'"
+    )
 
 
 def test_a_late_joiner_hears_the_newest_command_alone(desk):
@@ -193,7 +203,9 @@ def test_the_run_of_another_sequencer_wins_over_its_own(desk):
     ]
     publisher = desk.graph.publisher(names.COMMAND, readers=2)
     for command in foreign:
-        publisher.publish(fill(names.COMMAND.type(), from_model.command(command, "stage")))
+        publisher.publish(
+            fill(names.COMMAND.type(), from_model.command(command, "stage"))
+        )
     desk.graph.until(lambda: len(desk.heard) >= 5, "the commands of the other")
     for service in ("start", "confirm_view", "skip_view"):
         answer = desk.ask(service)
@@ -230,7 +242,10 @@ def test_a_start_waits_for_who_is_missing_and_names_them(graph, tmp_path):
     ):
         graph.health("solver")
         graph.health("measurement_collector", **values)
-        graph.until(lambda said=said: any(s.message == said for m in heard for s in m.status), said)
+        graph.until(
+            lambda said=said: any(s.message == said for m in heard for s in m.status),
+            said,
+        )
     assert desk.commands == []
     all_alive(graph)
     desk.expect((PLACE, 0))
@@ -266,10 +281,20 @@ def test_a_restarted_sequencer_takes_up_the_run_in_its_view(graph, tmp_path):
     }
     all_alive(graph, **told)
     graph.until(lambda: not desk.node.session.missing(), "all of them")
-    assert desk.ask("start").message == f"resumed run 17 in view '{PLAN.views[1].name}', MEASURE"
+    assert (
+        desk.ask("start").message
+        == f"resumed run 17 in view '{PLAN.views[1].name}', MEASURE"
+    )
     desk.expect((MEASURE, 1))
     assert to_model.command(desk.heard[0]) == Command(
-        1700, MEASURE, PLAN.plan_id, 1, PLAN.views[1], PLAN.artifact, len(PLAN.views), "17"
+        1700,
+        MEASURE,
+        PLAN.plan_id,
+        1,
+        PLAN.views[1],
+        PLAN.artifact,
+        len(PLAN.views),
+        "17",
     )
     desk.complete(1)
     desk.expect((MEASURE, 1), (PLACE, 2))
@@ -291,14 +316,25 @@ def test_following_is_a_warning_only_where_a_plan_is_given_up(desk, monkeypatch)
         message = fill(
             names.COMMAND.type(),
             from_model.command(
-                Command(stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp)),
+                Command(
+                    stamp,
+                    PLACE,
+                    "other",
+                    0,
+                    PLAN.views[0],
+                    PLAN.artifact,
+                    run_id=str(stamp),
+                ),
                 "stage",
             ),
         )
         desk.node.session.take_command(message)
         desk.node.session.take_command(message)
         assert [item for item in said if item[1].startswith("another publisher")] == [
-            (level, "another publisher sends view commands: following them; abort ends that")
+            (
+                level,
+                "another publisher sends view commands: following them; abort ends that",
+            )
         ]
         assert desk.ask("abort").success
         assert desk.ask("start").success
@@ -337,9 +373,13 @@ class Actor(Desk):
             **parameters,
         )
         self.saved, self.feedback = [], []
-        self.answer = SaveMap.Response(success=True, message="saved", path=str(folder / "map.json"))
+        self.answer = SaveMap.Response(
+            success=True, message="saved", path=str(folder / "map.json")
+        )
         graph.hand.create_service(SaveMap, "solver/save_map", self._save)
-        self.client = ActionClient(graph.hand, RunCalibration, "pose_sequencer/run_calibration")
+        self.client = ActionClient(
+            graph.hand, RunCalibration, "pose_sequencer/run_calibration"
+        )
         graph.until(self.client.server_is_ready, "the action server")
 
     def _save(self, request, response):
@@ -361,7 +401,9 @@ class Actor(Desk):
 
     def measure_all(self) -> None:
         for index in range(len(PLAN.views)):
-            self.graph.until(lambda index=index: (MEASURE, index) in self.commands, f"view {index}")
+            self.graph.until(
+                lambda index=index: (MEASURE, index) in self.commands, f"view {index}"
+            )
             self.complete(index)
 
 
@@ -375,7 +417,9 @@ def test_the_action_runs_the_plan_and_names_the_map(actor, tmp_path):
     assert handle.accepted
     actor.graph.until(lambda: (MEASURE, 0) in actor.commands, "the first view")
     actor.complete(0, complete=False)
-    actor.graph.until(lambda: any(f.coverage == 0.2 for f in actor.feedback), "coverage")
+    actor.graph.until(
+        lambda: any(f.coverage == 0.2 for f in actor.feedback), "coverage"
+    )
     actor.measure_all()
     status, result = actor.result(handle)
     assert status == GoalStatus.STATUS_SUCCEEDED
@@ -415,7 +459,10 @@ def test_a_goal_is_rejected_while_the_node_is_not_active(actor, capfd):
     actor.node.trigger_activate()
     actor.node.trigger_deactivate()
     assert not actor.send().accepted
-    assert "goal rejected while the node is inactive: activate it first" in capfd.readouterr().err
+    assert (
+        "goal rejected while the node is inactive: activate it first"
+        in capfd.readouterr().err
+    )
     actor.node.trigger_activate()
     first = actor.send()
     assert first.accepted
@@ -452,12 +499,18 @@ def test_a_plan_that_cannot_be_read_fails_with_code_2(actor, tmp_path):
 
 
 def test_a_map_that_cannot_be_saved_fails_with_the_solvers_words(actor):
-    actor.answer = SaveMap.Response(success=False, error_code=3, message="modes are unseen")
+    actor.answer = SaveMap.Response(
+        success=False, error_code=3, message="modes are unseen"
+    )
     handle = actor.send()
     actor.measure_all()
     status, result = actor.result(handle)
     assert status == GoalStatus.STATUS_ABORTED
-    assert (result.error_code, result.message, result.map_path) == (3, "modes are unseen", "")
+    assert (result.error_code, result.message, result.map_path) == (
+        3,
+        "modes are unseen",
+        "",
+    )
 
 
 def test_a_result_has_code_0_only_if_it_is_done(actor):
@@ -503,7 +556,11 @@ def test_a_solver_that_does_not_answer_is_told_in_time(graph, tmp_path):
 
 @pytest.mark.parametrize(
     "undone",
-    [["deactivate", "cleanup"], ["shutdown"], ["deactivate", "cleanup", "configure", "activate"]],
+    [
+        ["deactivate", "cleanup"],
+        ["shutdown"],
+        ["deactivate", "cleanup", "configure", "activate"],
+    ],
 )
 @pytest.mark.parametrize("saving", [False, True], ids=["measuring", "saving"])
 def test_a_goal_ends_with_a_result_when_the_node_is_cleaned_up(actor, undone, saving):

@@ -17,7 +17,9 @@ from selfcal_ros.nodes.services import answered
         (RuntimeError("a fault of our own"), ExitCode.INTERNAL, True),
     ],
 )
-def test_an_error_is_the_answer_and_only_faults_are_reported(error, code, is_fault, coded):
+def test_an_error_is_the_answer_and_only_faults_are_reported(
+    error, code, is_fault, coded
+):
     def answer():
         raise error
 
@@ -33,5 +35,7 @@ def test_an_error_is_the_answer_and_only_faults_are_reported(error, code, is_fau
 
 
 def test_an_answer_is_the_message():
-    response = answered(SimpleNamespace(), lambda: "saved", lambda *_: pytest.fail("no fault"))
+    response = answered(
+        SimpleNamespace(), lambda: "saved", lambda *_: pytest.fail("no fault")
+    )
     assert (response.success, response.message) == (True, "saved")

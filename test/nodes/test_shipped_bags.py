@@ -27,7 +27,9 @@ def republish(graph, name, taken):
             publishers[channel.topic].publish(message.data)
             sent += 1
             if sent % TOGETHER == 0:
-                graph.until(lambda due=sent: taken() >= due, "the nodes to take what came")
+                graph.until(
+                    lambda due=sent: taken() >= due, "the nodes to take what came"
+                )
     graph.until(lambda: taken() >= sent, "the nodes to take everything")
 
 
@@ -42,9 +44,12 @@ def test_the_bytes_of_a_bag_give_what_the_manifest_says(graph, name):
     received = collector.session.collector.received
     republish(graph, name, lambda: sum(received.values()))
     digest = collector._finish()
-    graph.until(lambda: solved and solved[-1].data == digest, "a solution of all readings")
     graph.until(
-        lambda: summaries and summaries[-1].identifiable == expected["identifiable"], "its summary"
+        lambda: solved and solved[-1].data == digest, "a solution of all readings"
+    )
+    graph.until(
+        lambda: summaries and summaries[-1].identifiable == expected["identifiable"],
+        "its summary",
     )
     if not expected["identifiable"]:
         assert not maps and summaries[-1].rank_deficiency == expected["deficiency"]

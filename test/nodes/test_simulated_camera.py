@@ -18,11 +18,15 @@ from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
 
 CONFIG = Path(__file__).parents[2] / "config"
-CAMERA, PLAN = (str(CONFIG / folder / "camera.yaml") for folder in ("simulations", "plans"))
+CAMERA, PLAN = (
+    str(CONFIG / folder / "camera.yaml") for folder in ("simulations", "plans")
+)
 
 
 def parameters(node: str) -> dict:
-    return read_yaml(CONFIG / "params/simulated_camera.yaml")[f"/**/{node}"]["ros__parameters"]
+    return read_yaml(CONFIG / "params/simulated_camera.yaml")[f"/**/{node}"][
+        "ros__parameters"
+    ]
 
 
 def test_the_shipped_camera_cell_is_calibrated_live_as_offline(graph, tmp_path):
@@ -53,7 +57,8 @@ def test_the_shipped_camera_cell_is_calibrated_live_as_offline(graph, tmp_path):
         "all images",
     )
     counts = detector.session.diagnosis().values
-    assert int(counts["marks"]) >= 2 * 2 * 169  # 25 stops, at the edges fewer than nine marks
+    # 25 stops, at the edges fewer than nine marks
+    assert int(counts["marks"]) >= 2 * 2 * 169
     recorder.close()
     assert not detector.losses.counts
     live = np.array([maps[-1].gx, maps[-1].gy])

@@ -65,7 +65,9 @@ def solve(graph, tmp_path):
         publisher = graph.publisher(names.MEASUREMENT)
         for message in messages:
             publisher.publish(message)
-        graph.until(lambda: summaries and summaries[-1].views_done == len(messages), "all views")
+        graph.until(
+            lambda: summaries and summaries[-1].views_done == len(messages), "all views"
+        )
         return maps, summaries, measurements
 
     return run
@@ -96,7 +98,9 @@ def test_the_map_is_that_of_the_readings_bit_for_bit(solve, graph):
 def test_topic_echo_shows_the_figures_of_the_state_whole(solve):
     _, summaries, measurements = solve()
     assert summaries[-1].state == state_line(worded(calibrate(measurements)))
-    figures, assumed, _ = summaries[-1].state.partition("; U assumes a plate that bends by ")
+    figures, assumed, _ = summaries[-1].state.partition(
+        "; U assumes a plate that bends by "
+    )
     assert assumed and len(figures) <= 128
 
 
@@ -115,7 +119,11 @@ def test_what_solving_needs_is_loaded_before_there_is_another_thread_then_its_me
         solver_module,
         "warm_up",
         lambda *marks: calls.append(
-            (marks, threading.current_thread().name, [one.name for one in threading.enumerate()])
+            (
+                marks,
+                threading.current_thread().name,
+                [one.name for one in threading.enumerate()],
+            )
         ),
     )
     graph.node(Solver)
@@ -126,9 +134,13 @@ def test_what_solving_needs_is_loaded_before_there_is_another_thread_then_its_me
     assert then == (21,) and worker.startswith("solver")
 
 
-def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(graph, monkeypatch):
+def test_a_solution_that_was_ready_while_the_node_was_not_active_is_taken_later(
+    graph, monkeypatch
+):
     gate, plain = threading.Event(), solver_module.solve
-    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(300) and plain(job))
+    monkeypatch.setattr(
+        solver_module, "solve", lambda job: gate.wait(300) and plain(job)
+    )
     monkeypatch.setattr(solver_module, "SWEEP_S", 0.02)
     node = graph.node(Solver)
     summaries = graph.listen(names.SUMMARY)
@@ -165,7 +177,8 @@ def test_save_map_waits_for_the_readings_that_came_before_while_the_node_works_o
     path = tmp_path / "map.json"
     future = client.call_async(SaveMap.Request(path=str(path)))
     graph.until(lambda: node._waiting, "the request")
-    refused = graph.call(LoadMap, "solver/load_map", path="")  # others are answered meanwhile
+    # others are answered meanwhile
+    refused = graph.call(LoadMap, "solver/load_map", path="")
     assert refused.message == "path: is empty; name a file"
     assert not future.done()
     assert not path.exists()
@@ -179,9 +192,13 @@ def test_save_map_waits_for_the_readings_that_came_before_while_the_node_works_o
     )
 
 
-def test_a_save_that_waited_is_told_what_the_readings_contradict(graph, tmp_path, monkeypatch):
+def test_a_save_that_waited_is_told_what_the_readings_contradict(
+    graph, tmp_path, monkeypatch
+):
     gate, plain = threading.Event(), solver_module.solve
-    monkeypatch.setattr(solver_module, "solve", lambda job: gate.wait(300) and plain(job))
+    monkeypatch.setattr(
+        solver_module, "solve", lambda job: gate.wait(300) and plain(job)
+    )
     node = graph.node(Solver, result_folder=str(tmp_path))
     publisher, (messages, _) = graph.publisher(names.MEASUREMENT), measured()
     publisher.publish(messages[0])
@@ -218,16 +235,22 @@ def test_what_was_solved_is_told_again_to_who_missed_it(solve, graph, monkeypatc
     assert told[-1].data == told[-2].data == solver.session.digest() != ""
 
 
-def test_save_map_before_a_solution_that_failed_is_taken_says_why(graph, monkeypatch, tmp_path):
+def test_save_map_before_a_solution_that_failed_is_taken_says_why(
+    graph, monkeypatch, tmp_path
+):
     """It takes the solution itself; what that raises ended the node."""
     monkeypatch.setattr(solver_module, "SWEEP_S", 3600.0)
     monkeypatch.setattr(Solver, "_wake", lambda node, solution: None)
     problem = NotSettledError("the readings", "did not converge", "measure anew")
-    monkeypatch.setattr(solver_module, "solve", lambda job: SolvingOutcome(job, None, problem))
+    monkeypatch.setattr(
+        solver_module, "solve", lambda job: SolvingOutcome(job, None, problem)
+    )
     node = graph.node(Solver, result_folder=str(tmp_path))
     messages, _ = measured(PLAN)
     graph.publisher(names.MEASUREMENT).publish(messages[0])
-    graph.until(lambda: node._running is not None and node._running.done(), "a solution")
+    graph.until(
+        lambda: node._running is not None and node._running.done(), "a solution"
+    )
     answer = graph.call(SaveMap, "solver/save_map", path="map.json")
     assert (answer.success, answer.error_code) == (False, ExitCode.BAD_INPUT)
     assert answer.message == str(problem)
@@ -263,13 +286,22 @@ def test_a_view_measured_anew_replaces_the_old_one(graph):
         publisher.publish(message)
     wanted = calibrate(measurements).error_map
     graph.until(
-        lambda: maps and np.array_equal(to_model.error_map(maps[-1]).gx, wanted.gx, equal_nan=True),
+        lambda: (
+            maps
+            and np.array_equal(
+                to_model.error_map(maps[-1]).gx, wanted.gx, equal_nan=True
+            )
+        ),
         "the new map",
     )
-    graph.until(lambda: summaries and summaries[-1].views_done == len(new), "a summary of all")
+    graph.until(
+        lambda: summaries and summaries[-1].views_done == len(new), "a summary of all"
+    )
 
 
-def test_a_deficient_plan_is_told_with_advice_and_publishes_no_map(solve, graph, tmp_path):
+def test_a_deficient_plan_is_told_with_advice_and_publishes_no_map(
+    solve, graph, tmp_path
+):
     maps, summaries, measurements = solve(small_plan("0, 90"))
     with pytest.raises(NotIdentifiableError) as unidentified:
         calibrate(measurements)
@@ -295,7 +327,9 @@ def test_without_readings_there_is_nothing_to_save(graph, tmp_path):
 
 def test_a_path_that_cannot_be_written_is_bad_input(solve, graph, tmp_path):
     solve()
-    answer = graph.call(SaveMap, "solver/save_map", path=str(tmp_path / "no" / "map.json"))
+    answer = graph.call(
+        SaveMap, "solver/save_map", path=str(tmp_path / "no" / "map.json")
+    )
     assert (answer.success, answer.error_code) == (False, 2)
     assert "cannot be written" in answer.message
 
@@ -347,7 +381,15 @@ def command_of(plan_id: str, views_planned: int):
     return fill(
         names.COMMAND.type(),
         from_model.command(
-            Command(1, Phase.MEASURE, plan_id, 0, PLAN.views[0], PLAN.artifact, views_planned),
+            Command(
+                1,
+                Phase.MEASURE,
+                plan_id,
+                0,
+                PLAN.views[0],
+                PLAN.artifact,
+                views_planned,
+            ),
             "stage",
         ),
     )
@@ -357,10 +399,15 @@ def command_of(plan_id: str, views_planned: int):
 def test_the_plan_is_known_whichever_topic_is_heard_first(graph):
     graph.node(Solver)
     summaries, diagnostics = graph.listen(names.SUMMARY), []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    graph.hand.create_subscription(
+        DiagnosticArray, "/diagnostics", diagnostics.append, 10
+    )
     graph.until(lambda: diagnostics, "a sign of life")
     assert diagnostics[-1].status[0].message == "waiting for views"
-    readings, commands = graph.publisher(names.MEASUREMENT), graph.publisher(names.COMMAND)
+    readings, commands = (
+        graph.publisher(names.MEASUREMENT),
+        graph.publisher(names.COMMAND),
+    )
     commands.publish(command_of("an earlier plan", 9))
     readings.publish(measured()[0][0])
     graph.until(lambda: summaries, "a summary")
@@ -385,7 +432,9 @@ def test_the_plan_is_known_whichever_topic_is_heard_first(graph):
 def test_views_of_two_plates_are_an_alarm(graph, tmp_path):
     graph.node(Solver)
     diagnostics: list = []
-    graph.hand.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+    graph.hand.create_subscription(
+        DiagnosticArray, "/diagnostics", diagnostics.append, 10
+    )
     readings = graph.publisher(names.MEASUREMENT)
     messages, _ = measured()
     messages[1].grid_pitch *= 2
@@ -418,7 +467,9 @@ def test_the_map_is_shown_as_markers_in_the_frame_of_the_map(solve, graph):
         Marker.TEXT_VIEW_FACING,
     )
     np.testing.assert_array_equal([(p.x, p.y, p.z) for p in vectors.points], shape.ends)
-    np.testing.assert_array_equal([(p.x, p.y) for p in uncertainty.points], shape.sites[:, :2])
+    np.testing.assert_array_equal(
+        [(p.x, p.y) for p in uncertainty.points], shape.sites[:, :2]
+    )
     np.testing.assert_allclose(
         [(c.r, c.g, c.b) for c in uncertainty.colors], shape.colours, rtol=1e-6
     )
@@ -427,7 +478,9 @@ def test_the_map_is_shown_as_markers_in_the_frame_of_the_map(solve, graph):
     assert legend.text == shape.legend
 
 
-def test_rejected_detections_are_shown_until_their_view_is_measured_without(graph, tmp_path):
+def test_rejected_detections_are_shown_until_their_view_is_measured_without(
+    graph, tmp_path
+):
     graph.node(Solver, frame_id="cell", result_folder=str(tmp_path))
     arrays = graph.listen(names.MAP_MARKERS)
     readings = graph.publisher(names.MEASUREMENT)
@@ -437,7 +490,9 @@ def test_rejected_detections_are_shown_until_their_view_is_measured_without(grap
     messages[1].rejected_x, messages[1].rejected_y = [0.01, np.nan], [-0.02, 0.0]
     for message in messages:
         readings.publish(message)
-    graph.until(lambda: arrays and len(arrays[-1].markers) == 4, "the rejected detection")
+    graph.until(
+        lambda: arrays and len(arrays[-1].markers) == 4, "the rejected detection"
+    )
     shown = arrays[-1].markers[-1]
     assert (shown.ns, shown.id, shown.type, shown.action) == (
         "rejected",
@@ -445,12 +500,16 @@ def test_rejected_detections_are_shown_until_their_view_is_measured_without(grap
         Marker.POINTS,
         Marker.ADD,
     )
-    assert [(p.x, p.y) for p in shown.points] == [(0.01, -0.02)] and shown.color.r > shown.color.g
+    assert [(p.x, p.y) for p in shown.points] == [
+        (0.01, -0.02)
+    ] and shown.color.r > shown.color.g
     assert shown.header.frame_id == "cell"
     again, _ = measured()
     again[1].sigma_xy *= 1.01  # another measurement
     readings.publish(again[1])
-    graph.until(lambda: arrays[-1].markers[-1].action == Marker.DELETE, "the view without")
+    graph.until(
+        lambda: arrays[-1].markers[-1].action == Marker.DELETE, "the view without"
+    )
 
 
 def test_rejected_detections_of_an_earlier_run_are_deleted(graph):
@@ -468,14 +527,18 @@ def test_rejected_detections_of_an_earlier_run_are_deleted(graph):
     messages[with_rejected].reject_counts = [1]
     for message in messages:
         readings.publish(message)
-    graph.until(lambda: arrays and arrays[-1].markers[-1].ns == "rejected", "the first run")
+    graph.until(
+        lambda: arrays and arrays[-1].markers[-1].ns == "rejected", "the first run"
+    )
     assert arrays[-1].markers[-1].action == Marker.ADD
     again, _ = measured(plan)
     for message in again:
         message.run_id = "2"
         if message.view_index != with_rejected:
             readings.publish(message)
-    graph.until(lambda: arrays[-1].markers[-1].action == Marker.DELETE, "the second run")
+    graph.until(
+        lambda: arrays[-1].markers[-1].action == Marker.DELETE, "the second run"
+    )
 
 
 def test_a_malformed_measurement_does_not_end_the_solver(graph):
@@ -491,7 +554,9 @@ def test_a_malformed_measurement_does_not_end_the_solver(graph):
         publisher.publish(message)
     graph.until(
         lambda: (
-            summaries and summaries[-1].identifiable and summaries[-1].views_done == len(messages)
+            summaries
+            and summaries[-1].identifiable
+            and summaries[-1].views_done == len(messages)
         ),
         "the good views",
     )

@@ -37,13 +37,19 @@ def stamp_ns(message) -> int:
 
 
 @pytest.mark.parametrize("late_ns", [0, 400_000_000])
-def test_nothing_is_stamped_at_a_time_that_had_passed_when_the_command_came(graph, late_ns):
+def test_nothing_is_stamped_at_a_time_that_had_passed_when_the_command_came(
+    graph, late_ns
+):
     samples, seen = graph.listen(names.ENCODER), graph.listen(names.DETECTIONS)
     graph.node(StageSimulator, **QUICK)
     sent = measure(graph, View("a"), late_ns=late_ns)
     graph.until(lambda: len(seen) == 13, "9 marks and 4 lines")
     stamps = [stamp_ns(sample) for sample in samples]
-    moved = [stamp for stamp, sample in zip(stamps, samples, strict=True) if any(sample.position)]
+    moved = [
+        stamp
+        for stamp, sample in zip(stamps, samples, strict=True)
+        if any(sample.position)
+    ]
     assert min(moved) >= sent + LEAD_NS
     assert min(map(stamp_ns, seen)) > sent + LEAD_NS
     assert stamps == sorted(stamps)
@@ -55,7 +61,9 @@ def test_the_order_that_a_command_asks_for(graph):
     view = View("a", angular=False)
     measure(graph, replace(view, visit_order="raster"))
     graph.until(lambda: len(seen) == 9, "9 marks")
-    assert [(d.m, d.n) for d in seen] == [(m, n) for m in (-1, 0, 1) for n in (-1, 0, 1)]
+    assert [(d.m, d.n) for d in seen] == [
+        (m, n) for m in (-1, 0, 1) for n in (-1, 0, 1)
+    ]
     seen.clear()
     measure(graph, view)
     graph.until(lambda: len(seen) == 9, "9 marks again")
@@ -94,10 +102,15 @@ def test_the_truth_that_its_parameters_ask_for_is_recorded(graph, tmp_path):
     assert truth["backlash"] == [0.0, -1e-8]
     assert truth["rotation"] == "finite"
     assert truth["drift"] == []
-    assert len(truth["drift_walk"]) == len(truth["plate_shape"]) == len(truth["phi"]) == 64
+    assert (
+        len(truth["drift_walk"]) == len(truth["plate_shape"]) == len(truth["phi"]) == 64
+    )
     assert truth["drift_walk"][0][0][-1] == node.machine.truth.walk_m[0, 0, -1] != 0
     assert abs(sum(truth["g_theta"])) < 1e-18
-    assert (truth["cell"]["stop_sigma_m"], truth["cell"]["sense"]) == (5e-5, "plate_moves")
+    assert (truth["cell"]["stop_sigma_m"], truth["cell"]["sense"]) == (
+        5e-5,
+        "plate_moves",
+    )
     assert truth["cell"]["exposure_period_s"] == 0.005
 
 
@@ -129,7 +142,9 @@ def test_a_command_is_acted_on_once(graph):
     seen = graph.listen(names.DETECTIONS)
     graph.node(StageSimulator, **QUICK)
     publisher = graph.publisher(names.COMMAND)
-    command = Command(now_ns(graph), Phase.MEASURE, "p", 0, View("a", angular=False), PLATE, 1)
+    command = Command(
+        now_ns(graph), Phase.MEASURE, "p", 0, View("a", angular=False), PLATE, 1
+    )
     message = fill(names.COMMAND.type(), from_model.command(command, "stage"))
     publisher.publish(message)
     graph.until(lambda: len(seen) == 9, "9 marks")

@@ -62,7 +62,9 @@ class Screen:
         for text in texts:
             if not any(text in line for line in self.lines[begin:]):
                 self.until(text)
-        return [next(line for line in self.lines[begin:] if text in line) for text in texts]
+        return [
+            next(line for line in self.lines[begin:] if text in line) for text in texts
+        ]
 
     def until(self, text: str) -> str:
         """Return the next line that holds `text`."""
@@ -97,7 +99,10 @@ def start(ros_environment):
 def processes_of(session: int) -> list[str]:
     """Return the processes of a session, each as its id and its arguments."""
     return subprocess.run(
-        ["ps", "-o", "pid=,args=", "-s", str(session)], text=True, capture_output=True, check=False
+        ["ps", "-o", "pid=,args=", "-s", str(session)],
+        text=True,
+        capture_output=True,
+        check=False,
     ).stdout.splitlines()
 
 
@@ -129,7 +134,9 @@ def no_error_in(said: str) -> bool:
     return not re.search("ERROR|FATAL|Traceback|Error:|stalls|lost", said)
 
 
-def test_two_calibrations_by_words_the_other_past_the_death_of_two_nodes(start, tmp_path):
+def test_two_calibrations_by_words_the_other_past_the_death_of_two_nodes(
+    start, tmp_path
+):
     (tmp_path / "plan.yaml").write_text(LINES_FIRST)
     up = start(
         "up",
@@ -147,7 +154,9 @@ def test_two_calibrations_by_words_the_other_past_the_death_of_two_nodes(start, 
     for view in VIEWS:
         up.until(f"PLACE {view}")  # the log is there
         up.write("confirm")
-    up.until_all("now: Done. s starts another run.", "map: Good: error up to ", "saved: ")
+    up.until_all(
+        "now: Done. s starts another run.", "map: Good: error up to ", "saved: "
+    )
     assert no_error_in("\n".join(up.lines))
     up.write("start")
     for index, view in enumerate(VIEWS):
@@ -187,7 +196,8 @@ up.commands = lambda args, commands=up.commands: {
 
 
 @pytest.mark.parametrize(
-    ("ending", "code"), [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, 128 + signal.SIGTERM)]
+    ("ending", "code"),
+    [(signal.SIGKILL, -signal.SIGKILL), (signal.SIGTERM, 128 + signal.SIGTERM)],
 )
 def test_a_command_that_is_ended_takes_its_nodes_along(start, tmp_path, ending, code):
     """Of a kill it knows nothing: each node, and the screen's eyes, end by themselves."""
@@ -266,10 +276,16 @@ def test_states_without_a_home_are_asked_for(monkeypatch):
 def test_a_parameter_file_may_name_where_the_map_goes(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "cell.yaml").touch()
-    args = build_parser().parse_args(["up", "--plan", "p.yaml", "--params", "cell.yaml"])
+    args = build_parser().parse_args(
+        ["up", "--plan", "p.yaml", "--params", "cell.yaml"]
+    )
     given = up_verb.commands(args)["solver"]
     assert given[:3] == ["--ros-args", "-p", f"save_path:={tmp_path}/p_{{run_id}}.json"]
-    assert given[3:5] == ["--params-file", str(tmp_path / "cell.yaml")]  # the later one counts
+    # the later one counts
+    assert given[3:5] == [
+        "--params-file",
+        str(tmp_path / "cell.yaml"),
+    ]
     assert given[-2:] == ["-p", f"result_folder:={tmp_path}"]
 
 
@@ -296,7 +312,10 @@ def test_a_request_without_a_cell_says_so(graph, monkeypatch, capsys):
 @pytest.mark.parametrize(
     "words, line",
     [
-        (["--plan", "/no/plan.yaml"], "selfcal up: /no/plan.yaml: no such file; check the path"),
+        (
+            ["--plan", "/no/plan.yaml"],
+            "selfcal up: /no/plan.yaml: no such file; check the path",
+        ),
         (
             ["--plan", "PLAN", "--bag", "/tmp"],
             "selfcal up: /tmp: exists already; remove it or name another folder",
@@ -349,9 +368,9 @@ def test_a_node_that_dies_again_and_again_is_given_up(dying):
     with supervisor:
         for _ in range(MOST_RESTARTS + 3):
             supervisor.step()
-        assert supervisor.log == ["solver ended with signal 9: restarted"] * (MOST_RESTARTS) + [
-            "solver ended with signal 9, 6 times within 60 s: not restarted"
-        ]
+        assert supervisor.log == ["solver ended with signal 9: restarted"] * (
+            MOST_RESTARTS
+        ) + ["solver ended with signal 9, 6 times within 60 s: not restarted"]
 
 
 @pytest.mark.parametrize("seconds, kept", [(59.9, False), (60.0, True)])
@@ -385,7 +404,16 @@ def test_marks_are_detected_on_request(tmp_path):
     params.touch()
     for more, there in (([], False), (["--detect"], True)):
         args = build_parser("up").parse_args(
-            ["up", "--plan", "p.yaml", "--params", str(params), "--results", str(tmp_path), *more]
+            [
+                "up",
+                "--plan",
+                "p.yaml",
+                "--params",
+                str(params),
+                "--results",
+                str(tmp_path),
+                *more,
+            ]
         )
         nodes = up_verb.commands(args)
         assert ("mark_detector" in nodes) is there

@@ -25,7 +25,9 @@ LAW = Options(datum_theta="xy_axes")
 AS_PUBLISHED = Spread(encoder="xy_axes", rotation="linear")
 
 
-def measured(size=5, count=8, *, seed=1, repeats=1, sense=Sense.MICROSCOPE_MOVES, **noise):
+def measured(
+    size=5, count=8, *, seed=1, repeats=1, sense=Sense.MICROSCOPE_MOVES, **noise
+):
     artifact = Artifact(size, 0.01, count)
     rng = np.random.default_rng(seed)
     truth = random_truth(artifact, 4, rng, AS_PUBLISHED)
@@ -55,7 +57,9 @@ def test_noise_free_readings_give_the_truth_back(size, count, datum, sense):
     shift = 0.0 if datum is ThetaDatum.XY_AXES else truth.g_theta.mean()
     sign = -1 if sense is Sense.PLATE_MOVES else 1
     assert np.abs(amap.a_theta - truth.a_theta - sign * shift).max() < 1e-12 * 5e-3
-    assert np.allclose([view.phi for view in result.views], truth.phi_rad, rtol=0, atol=1e-14)
+    assert np.allclose(
+        [view.phi for view in result.views], truth.phi_rad, rtol=0, atol=1e-14
+    )
     t = np.array([(view.tx, view.ty) for view in result.views])
     assert np.allclose(t[[0, 1, 3]], truth.t_m[[0, 1, 3]], rtol=0, atol=1e-16)
     assert np.isnan(t[2]).all()
@@ -68,8 +72,12 @@ def test_first_order_parts_are_reported():
     emap = calibrate_by_law(readings, LAW).error_map
     x, y = emap.artifact.x_m, emap.artifact.y_m
     d = (x**2 + y**2).sum()
-    assert emap.nonorthogonality == pytest.approx((emap.gx * y + emap.gy * x).sum() / d, rel=1e-9)
-    assert emap.scale_difference == pytest.approx((emap.gx * x - emap.gy * y).sum() / d, rel=1e-9)
+    assert emap.nonorthogonality == pytest.approx(
+        (emap.gx * y + emap.gy * x).sum() / d, rel=1e-9
+    )
+    assert emap.scale_difference == pytest.approx(
+        (emap.gx * x - emap.gy * y).sum() / d, rel=1e-9
+    )
 
 
 def published_draws(n_draws):
@@ -90,7 +98,9 @@ def published_draws(n_draws):
 
 def test_published_calibration_errors_lie_within_the_spread_of_200_draws():
     g, theta = published_draws(200)
-    std = np.concatenate([g.std(axis=(1, 2)) * 1e6, np.rad2deg(theta.std(axis=0, keepdims=True))])
+    std = np.concatenate(
+        [g.std(axis=(1, 2)) * 1e6, np.rad2deg(theta.std(axis=0, keepdims=True))]
+    )
     mean, spread = std.mean(axis=1), std.std(axis=1, ddof=1)
     published = np.array([0.0195, 0.0196, 7.1184e-4])
     assert (np.abs(published - mean) < 2 * spread).all()
@@ -107,7 +117,11 @@ def test_uncertainty_is_that_of_every_reading_moved_in_turn(sense):
         replace(
             readings,
             views=tuple(
-                replace(view, count=np.full(len(view.m), 1 + i), count_theta=np.full(8, 4 - i))
+                replace(
+                    view,
+                    count=np.full(len(view.m), 1 + i),
+                    count_theta=np.full(8, 4 - i),
+                )
                 for i, view in enumerate(readings.views)
             ),
         ),
@@ -164,7 +178,9 @@ def test_an_uncertainty_map_that_is_not_wanted_is_not_there(monkeypatch, exact_s
     for name in ("gx", "gy", "g_theta"):
         assert np.array_equal(getattr(wanted, name), getattr(plain, name))
     for name in ("u_gx", "u_gy", "u_g_theta"):
-        assert (getattr(wanted, name) > 0).all() and np.isnan(getattr(plain, name)).all()
+        assert (getattr(wanted, name) > 0).all() and np.isnan(
+            getattr(plain, name)
+        ).all()
     found = calibrate_by_law(readings, replace(LAW, uncertainty=False))
     assert not any(finding.name == "drawn_uncertainty" for finding in found.findings)
     assert not found.has_uncertainty
@@ -178,7 +194,12 @@ def test_noise_of_one_reading_from_what_is_left_over():
         )
         noise = calibrate_by_law(readings, LAW).noise
         assert noise.sigma_xy == noise.sigma_xy_repeats == pytest.approx(SIGMA_M)
-        ratios.append((noise.sigma_xy_residuals / SIGMA_M, noise.sigma_theta_residuals / SIGMA_RAD))
+        ratios.append(
+            (
+                noise.sigma_xy_residuals / SIGMA_M,
+                noise.sigma_theta_residuals / SIGMA_RAD,
+            )
+        )
     ratios = np.array(ratios)
     assert np.abs((ratios**2).mean(axis=0) - 1).max() < 0.15
     assert noise.dof_xy_residuals > 100 and noise.dof_theta_residuals > 15
@@ -187,9 +208,18 @@ def test_noise_of_one_reading_from_what_is_left_over():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda v: v[:3], "Hu's view 3 (one pitch along +X with grid and lines) is missing"),
-        (lambda v: (v[0], v[2], v[3]), "Hu's view 1 (90 deg with grid and lines) is missing"),
-        (lambda v: (*v, v[0]), "view 'identity': is not one of Hu's four views, each once"),
+        (
+            lambda v: v[:3],
+            "Hu's view 3 (one pitch along +X with grid and lines) is missing",
+        ),
+        (
+            lambda v: (v[0], v[2], v[3]),
+            "Hu's view 1 (90 deg with grid and lines) is missing",
+        ),
+        (
+            lambda v: (*v, v[0]),
+            "view 'identity': is not one of Hu's four views, each once",
+        ),
         (
             lambda v: (
                 replace(
@@ -205,7 +235,12 @@ def test_noise_of_one_reading_from_what_is_left_over():
             "view 'identity': 24 of 25 grid marks were read",
         ),
         (
-            lambda v: (v[0], v[1], replace(v[2], k=v[2].k[2:], dtheta=v[2].dtheta[2:]), v[3]),
+            lambda v: (
+                v[0],
+                v[1],
+                replace(v[2], k=v[2].k[2:], dtheta=v[2].dtheta[2:]),
+                v[3],
+            ),
             "view 'line': 6 of 8 angular lines were read",
         ),
     ],
@@ -233,7 +268,9 @@ def test_options_and_plates_that_the_law_does_not_know_are_refused():
     _, small = measured(3, 4)
     with pytest.raises(InputError, match="has no slope"):
         calibrate_by_law(small, LAW)
-    assert calibrate_by_law(small, replace(LAW, datum_theta="zero_mean")).method == "law"
+    assert (
+        calibrate_by_law(small, replace(LAW, datum_theta="zero_mean")).method == "law"
+    )
 
 
 def test_correlations_are_unknown():

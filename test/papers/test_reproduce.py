@@ -53,12 +53,17 @@ def test_figures_are_whole_and_their_keys_lie_beside_the_panels(hu, qiao):
             if isinstance(item, Discs)
             for x, _ in item.centres
         }
-        ends = {round(float(x), 6) for item in paths if item.dash for x, _ in item.lines[0]}
-        assert ends <= draws, figure.name  # levels reach from the first draw to the last
+        ends = {
+            round(float(x), 6) for item in paths if item.dash for x, _ in item.lines[0]
+        }
+        # levels reach from the first draw to the last
+        assert ends <= draws, figure.name
         keys = [item.lines[0][1] for item in paths if item.width == 1.4]
         assert bool(keys) == (figure in (figures[0], *figures[-2:]))
         assert not any(
-            low[0] < x < high[0] and low[1] < y < high[1] for x, y in keys for low, high in panels
+            low[0] < x < high[0] and low[1] < y < high[1]
+            for x, y in keys
+            for low, high in panels
         ), figure.name
 
 
@@ -66,9 +71,13 @@ def test_hus_tables_lie_within_the_spread_of_draws(hu):
     for run in hu.runs:
         std = run.law.std
         published = np.array([row[2] for row in run.published.table])
-        assert (np.abs(published - std.mean(axis=0)) < 2.5 * std.std(axis=0, ddof=1)).all()
+        assert (
+            np.abs(published - std.mean(axis=0)) < 2.5 * std.std(axis=0, ddof=1)
+        ).all()
         ends = np.abs([row[:2] for row in run.published.table[:2]])
-        found = np.abs(np.concatenate([run.law.xy.max(axis=(2, 3)), run.law.xy.min(axis=(2, 3))]))
+        found = np.abs(
+            np.concatenate([run.law.xy.max(axis=(2, 3)), run.law.xy.min(axis=(2, 3))])
+        )
         assert (ends > found.min() * 0.9).all() and (ends < found.max() * 1.1).all()
 
 
@@ -77,7 +86,9 @@ def test_joint_solution_reaches_the_bound_and_the_law_does_not(hu):
         joint, law = (float(np.sqrt(np.mean(e.xy**2))) for e in (run.joint, run.law))
         assert joint == pytest.approx(run.bound[0], rel=0.04)
         assert law > 1.08 * run.bound[0]
-        assert np.sqrt(np.mean(run.joint.theta**2)) == pytest.approx(run.bound[1], rel=0.15)
+        assert np.sqrt(np.mean(run.joint.theta**2)) == pytest.approx(
+            run.bound[1], rel=0.15
+        )
 
 
 def test_errors_scale_with_the_noise_and_vanish_without(hu):
@@ -137,7 +148,9 @@ def test_hus_text_shows_tables_and_figures(hu):
 def test_hus_text_names_the_row_that_contradicts_itself(hu):
     """Values with given extremes scatter least if all others lie in the middle."""
     said = [line for line in hu_text(hu).splitlines() if "contradicts" in line]
-    assert len(said) == 1 and said[0].startswith("the published row of EGth contradicts itself")
+    assert len(said) == 1 and said[0].startswith(
+        "the published row of EGth contradicts itself"
+    )
     assert hu_text(hu).index("Table 2") < hu_text(hu).index(said[0])
     for table in module.TABLES:
         for row, count in enumerate((121, 121, 24)):
@@ -154,8 +167,18 @@ def test_ibarakis_figures_stand_beside_ours():
     measured, _, conventional = np.array(list(CASE_STUDY_UM.values()), dtype=float).T
     assert found.new_um.mean(axis=0) == pytest.approx(measured, abs=0.01)
     assert found.conventional_um.mean(axis=0) == pytest.approx(conventional, abs=0.2)
-    rows = {line[:16].strip(): line.split()[-6:] for line in ibaraki_text(found).splitlines()}
-    assert rows["squareness"] == ["squareness", "-1.22", "-1.32", "-1.22", "-1.37", "-1.22"]
+    rows = {
+        line[:16].strip(): line.split()[-6:]
+        for line in ibaraki_text(found).splitlines()
+    }
+    assert rows["squareness"] == [
+        "squareness",
+        "-1.22",
+        "-1.32",
+        "-1.22",
+        "-1.37",
+        "-1.22",
+    ]
 
 
 def test_qiaos_ranks_programs_and_bound(qiao):

@@ -16,7 +16,12 @@ from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Remedy, Verdict
-from selfcal_ros.reporting.chapters import MAX_ROWS, convention_section, extra_sections, heading
+from selfcal_ros.reporting.chapters import (
+    MAX_ROWS,
+    convention_section,
+    extra_sections,
+    heading,
+)
 from selfcal_ros.reporting.report import report_html, write_report
 from selfcal_ros.reporting.turning import script
 from test.support.results import chapters_of, html_of, known_result, with_residuals
@@ -33,7 +38,9 @@ class Checker(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        self.addresses += [value for name, value in attrs if name in ("src", "href", "srcset")]
+        self.addresses += [
+            value for name, value in attrs if name in ("src", "href", "srcset")
+        ]
         assert not any(name.startswith("on") for name, _ in attrs)
         if tag not in VOID:
             self.open.append(tag)
@@ -80,14 +87,17 @@ def test_the_map_that_turns_has_the_numbers_of_the_result():
     gx = result.error_map.gx.copy()
     gx[1, 2] = np.nan
     (text,) = re.findall(
-        r'data-map="([^"]*)"', html_of(replace(result, error_map=replace(result.error_map, gx=gx)))
+        r'data-map="([^"]*)"',
+        html_of(replace(result, error_map=replace(result.error_map, gx=gx))),
     )
     found = json.loads(unescape(text))
     assert found["gx"][1][2] is None and found["gy"][1][2] is None
     assert found["gx"][0][3] == pytest.approx(1e6 * gx[0, 3], abs=1e-4)
     assert found["x"][0] == pytest.approx(1e3 * result.artifact.x_m[0, 0])
     assert found["u"][4][0] == pytest.approx(
-        1e6 * result.noise.k_xy * max(result.error_map.u_gx[4, 0], result.error_map.u_gy[4, 0]),
+        1e6
+        * result.noise.k_xy
+        * max(result.error_map.u_gx[4, 0], result.error_map.u_gy[4, 0]),
         abs=1e-4,
     )
 
@@ -157,7 +167,9 @@ def test_a_printer_that_lacks_a_library_is_said_so(tmp_path, monkeypatch):
 @pytest.mark.parametrize("grade", list(Grade))
 def test_the_banner_has_the_colour_of_the_verdict(grade):
     result = replace(
-        known_result(3, 0)[0], verdict=Verdict(grade, sentence="Verdict"), warnings=("torn bag",)
+        known_result(3, 0)[0],
+        verdict=Verdict(grade, sentence="Verdict"),
+        warnings=("torn bag",),
     )
     html = html_of(result)
     assert re.findall(r'<p class="verdict (\w+)">', html) == [str(grade)]
@@ -195,7 +207,9 @@ def test_every_colour_of_a_figure_is_defined_for_light_and_dark():
 
 
 def test_figures_follow_what_the_result_keeps():
-    bare, rich = (parsed(html_of(r)).text for r in (known_result(5, 24)[0], with_residuals()))
+    bare, rich = (
+        parsed(html_of(r)).text for r in (known_result(5, 24)[0], with_residuals())
+    )
     titles = (
         "Residuals of the grid readings by view",
         "Distribution of the grid residuals",
@@ -212,7 +226,12 @@ def test_both_kinds_of_uncertainty_are_told_with_what_each_is_for():
     result, _ = known_result(5, 24)
     page = parsed(html_of(result))
     text = "|".join(page.text)
-    for where in ("x or y, at the nodes", "x or y, anywhere", "θ, at the lines", "θ, anywhere"):
+    for where in (
+        "x or y, at the nodes",
+        "x or y, anywhere",
+        "θ, at the lines",
+        "θ, anywhere",
+    ):
         assert text.count(where) == 1
     assert "At the nodes: how well the map itself is known." in text
     assert "Anywhere: with the error of interpolating" in text
@@ -232,7 +251,10 @@ def test_causes_come_as_a_table_with_one_unit_each():
             1e-9,
             "run 2: shift x",
             "x",
-            remedies=(Remedy("model", "drift:8e-8"), Remedy("action", "measure there and back")),
+            remedies=(
+                Remedy("model", "drift:8e-8"),
+                Remedy("action", "measure there and back"),
+            ),
         ),
         Cause("noise", 2.0, 0.1, "m/m", 2e-4, "a"),
     )
@@ -247,7 +269,9 @@ def test_causes_come_as_a_table_with_one_unit_each():
     assert banner.startswith("Not qualified: most likely drift. Map as it is:")
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", html)
     at = cells.index("drift")
-    what = "a drift of 0.0800 ± 0.0030 µm along x during view &#x27;run 2: shift x&#x27;"
+    what = (
+        "a drift of 0.0800 ± 0.0030 µm along x during view &#x27;run 2: shift x&#x27;"
+    )
     assert cells[at : at + 7] == [
         "drift",
         what,
@@ -328,7 +352,9 @@ def test_a_deficient_plan_is_marked_and_comes_first():
     )
     html = html_of(replace(result, observability=seen))
     assert '<p class="verdict not_qualified">Not a calibration: 2 modes' in html
-    assert html.index("advice: add a view turned by 90 deg") < html.index("<h2>Map</h2>")
+    assert html.index("advice: add a view turned by 90 deg") < html.index(
+        "<h2>Map</h2>"
+    )
     assert '<p class="verdict good">Calibrated' in html_of(result)
 
 
@@ -356,7 +382,10 @@ def test_rows_and_numbers_are_tabulated_with_units():
         {"view": "b", "rms_m": 1.23e-6, "exceeds": True},
     ]
     sections = extra_sections(
-        {"left_over": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]}, "validation": rows}
+        {
+            "left_over": {"largest_rad": 1e-6, "n": 968, "map": [[1.0]]},
+            "validation": rows,
+        }
     )
     assert [s.title for s in sections] == ["Held-out validation", "Left over"]
     assert sections[0].table == (
@@ -368,14 +397,19 @@ def test_rows_and_numbers_are_tabulated_with_units():
 
 
 def test_extras_of_other_forms_are_left_to_the_file():
-    assert extra_sections({"covariance": [[1.0]], "empty": {}, "none": None, "rows": []}) == []
+    assert (
+        extra_sections({"covariance": [[1.0]], "empty": {}, "none": None, "rows": []})
+        == []
+    )
     assert extra_sections({"seed": 7})[0].facts == (("seed", "7"),)
     views = [{"view": "a", "rms_m": 2e-8}]
     nested = extra_sections({"validation": {"rms_m": 1e-8, "views": views}})
     assert nested[0].facts == (("rms in µm", "0.0100"),)
     assert nested[0].table == (("view", "rms in µm"), ("a", "0.0200"))
     long = extra_sections({"outliers": [{"m": i} for i in range(MAX_ROWS + 5)]})[0]
-    assert len(long.table) == MAX_ROWS + 1 and long.notes == ("5 more rows are in the result file",)
+    assert len(long.table) == MAX_ROWS + 1 and long.notes == (
+        "5 more rows are in the result file",
+    )
 
 
 def test_a_report_begins_with_stage_serial_number_operator_and_dates():
@@ -389,7 +423,9 @@ def test_a_report_begins_with_stage_serial_number_operator_and_dates():
         "2026-11-21T16:29:26.532+00:00",
     )
     result = replace(result, provenance=made)
-    found = heading(result, {"stage": "XY <1>", "operator": "N. N.", "serial_number": ""})
+    found = heading(
+        result, {"stage": "XY <1>", "operator": "N. N.", "serial_number": ""}
+    )
     assert found.facts == (
         ("stage", "XY <1>"),
         ("serial number", "– (not given: --serial-number TEXT)"),
@@ -399,7 +435,9 @@ def test_a_report_begins_with_stage_serial_number_operator_and_dates():
     )
     assert dict(heading(result, {}).facts)["stage"] == "bag's"
     html = report_html(result, [], found)
-    assert html.index('class="verdict') < html.index("XY &lt;1&gt;") < html.index("N. N.")
+    assert (
+        html.index('class="verdict') < html.index("XY &lt;1&gt;") < html.index("N. N.")
+    )
     late = replace(made, last_exposure="2026-11-22T00:10:00.000+00:00")
     assert dict(heading(replace(result, provenance=late), {}).facts)["measured"] == (
         "2026-11-21 15:28 to 2026-11-22 00:10 UTC"

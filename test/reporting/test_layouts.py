@@ -29,7 +29,9 @@ def fields_of(topic):
     if topic == "/stage/joint_states":
         return {"header", "name", "position", "velocity", "effort"}
     text = (ROOT / "msg_defs" / "msg" / f"{TYPES[topic]}.msg").read_text()
-    return set(re.findall(r"^[a-z]\S*\s+([a-z]\w*)\s*(?:#|$)", text, flags=re.MULTILINE))
+    return set(
+        re.findall(r"^[a-z]\S*\s+([a-z]\w*)\s*(?:#|$)", text, flags=re.MULTILINE)
+    )
 
 
 def leaves(node):
@@ -51,18 +53,27 @@ def test_every_foxglove_panel_is_placed_once(foxglove):
     placed = list(leaves(foxglove["layout"]))
     assert sorted(placed) == sorted(foxglove["configById"])
     assert all(
-        re.fullmatch(r"(3D|Plot|RawMessages|DiagnosticSummary|Image)!\w+", name) for name in placed
+        re.fullmatch(r"(3D|Plot|RawMessages|DiagnosticSummary|Image)!\w+", name)
+        for name in placed
     )
 
 
 def test_every_foxglove_path_names_a_field_of_the_contract(foxglove):
-    paths = [p["value"] for c in foxglove["configById"].values() for p in c.get("paths", [])]
+    paths = [
+        p["value"] for c in foxglove["configById"].values() for p in c.get("paths", [])
+    ]
     assert len(paths) >= 10
     for path in paths:
-        topic, field = re.fullmatch(r"(/[\w/]+)\.(\w+)(?:\[(?:\d+|:)\])?", path).groups()
+        topic, field = re.fullmatch(
+            r"(/[\w/]+)\.(\w+)(?:\[(?:\d+|:)\])?", path
+        ).groups()
         assert field in fields_of(topic), path
     raw = {c["topicPath"] for c in foxglove["configById"].values() if "topicPath" in c}
-    assert raw == {"/selfcal/summary", "/selfcal/view_command", f"/{PROGRESS_TOPIC}.data"}
+    assert raw == {
+        "/selfcal/summary",
+        "/selfcal/view_command",
+        f"/{PROGRESS_TOPIC}.data",
+    }
 
 
 def test_foxglove_shows_the_image_and_where_detections_were_rejected(foxglove):
@@ -89,7 +100,8 @@ def shown(label: str, needle: str) -> bool:
 def test_the_foxglove_panel_of_nodes_shows_each_of_them_once(foxglove, namespace):
     """Pinned statuses stand on top, the others below if their label passes the filter."""
     panel = foxglove["configById"]["DiagnosticSummary!nodes"]
-    stage = namespace.strip("/") or "stage"  # of a node whose parameter hardware_id is empty
+    # of a node whose parameter hardware_id is empty
+    stage = namespace.strip("/") or "stage"
     pinned = set()
     for node in NODE_PARAMETERS:
         if f"|{stage}|{namespace}{node}|" in panel["pinnedIds"]:
@@ -126,4 +138,6 @@ def test_rviz_layout_shows_the_stage_frame_from_above():
 def test_rviz_grid_is_larger_than_any_stage():
     layout = yaml.safe_load(RVIZ.read_text())
     grid = layout["Visualization Manager"]["Displays"][0]
-    assert grid["Cell Size"] == 0.01 and grid["Cell Size"] * grid["Plane Cell Count"] >= 1
+    assert (
+        grid["Cell Size"] == 0.01 and grid["Cell Size"] * grid["Plane Cell Count"] >= 1
+    )

@@ -24,7 +24,9 @@ def one_error(shape=(5, 5), at=(4, 1), g=(3e-7, -4e-7)):
     emap = random_map(Artifact(shape[0], PITCH, 8, shape[1]), 3)
     gx, gy = np.zeros(shape), np.zeros(shape)
     gx[at], gy[at] = g
-    return replace(emap, gx=gx, gy=gy, u_gx=np.full(shape, 3e-9), u_gy=np.full(shape, 4e-9))
+    return replace(
+        emap, gx=gx, gy=gy, u_gx=np.full(shape, 3e-9), u_gy=np.full(shape, 4e-9)
+    )
 
 
 def test_a_vector_points_from_the_nominal_site_along_the_error():
@@ -32,9 +34,12 @@ def test_a_vector_points_from_the_nominal_site_along_the_error():
     tails, heads = shape.ends[0::2], shape.ends[1::2]
     np.testing.assert_array_equal(tails, shape.sites)
     site = np.flatnonzero(np.any(heads != tails, axis=1))
-    np.testing.assert_allclose(tails[site], [[0.02, -0.01, 0.0]], atol=1e-15)  # m = 2, n = -1
+    # m = 2, n = -1
+    np.testing.assert_allclose(tails[site], [[0.02, -0.01, 0.0]], atol=1e-15)
     assert shape.factor == 20_000  # 0.5 um becomes the 10 mm of a pitch
-    np.testing.assert_allclose(heads[site] - tails[site], [[6e-3, -8e-3, 0.0]], rtol=1e-12)
+    np.testing.assert_allclose(
+        heads[site] - tails[site], [[6e-3, -8e-3, 0.0]], rtol=1e-12
+    )
     assert shape.legend == (
         "stage error (indicated - true), enlarged 20,000 x, longest 0.5 um; "
         "dark: u = 0.005 um (k=1)"
@@ -82,7 +87,9 @@ def test_unknown_sites_are_left_out():
 
 
 def test_a_map_without_any_site_is_an_empty_picture():
-    shape = map_geometry(random_map(Artifact(3, PITCH, 8), 3, unknown=tuple(np.ndindex(3, 3))))
+    shape = map_geometry(
+        random_map(Artifact(3, PITCH, 8), 3, unknown=tuple(np.ndindex(3, 3)))
+    )
     assert len(shape.sites) == len(shape.ends) == len(shape.colours) == 0
 
 

@@ -39,7 +39,9 @@ REVERSED = "reverse the sign of offset_theta"
         (1e-5, 1e-5, -1, "", ""),
     ],
 )
-def test_what_does_not_show_the_sign_of_the_lines_does_not_pass(turn, lines, stops, said, remedy):
+def test_what_does_not_show_the_sign_of_the_lines_does_not_pass(
+    turn, lines, stops, said, remedy
+):
     """`stops`: slope of the offsets of lines that scatter by 1 urad, 0 = no scatter."""
     check = CellCheck(small_plan(), settings_of("measurement_collector"), Hands().ports)
     m, n = (np.array(row).ravel() for row in np.meshgrid((-1, 0, 1), (-1, 0, 1)))

@@ -30,7 +30,9 @@ def offset_after(*delays_s: float, every_s: float, live: bool = True) -> int | N
     for number, delay in enumerate(delays_s):
         steady_ns = round((50.0 + number * every_s) * 1e9)
         now_ns = T0 + round(number * every_s * 1e9)
-        watch.data("joints", *np.array([[now_ns - round(delay * 1e9)], [now_ns], [steady_ns]]))
+        watch.data(
+            "joints", *np.array([[now_ns - round(delay * 1e9)], [now_ns], [steady_ns]])
+        )
     return watch.offset_ns
 
 
@@ -84,13 +86,17 @@ def test_a_slow_image_is_no_clock_that_is_behind(lead_s, offset_s):
     watch.data(DETECTION_TOPIC, stamps, np.array(now), np.array([50 * 10**9]))
     assert watch.offset_ns == (offset_s and round(offset_s * 1e9))
     assert bool(watch.diagnosis().message) is (offset_s is not None)
-    watch.data(ENCODER_TOPIC, np.array([T0 - 10**6]), np.array(now), np.array([50 * 10**9]))
+    watch.data(
+        ENCODER_TOPIC, np.array([T0 - 10**6]), np.array(now), np.array([50 * 10**9])
+    )
     assert watch.offset_ns == max(-(10**6), round((offset_s or -1.0) * 1e9))
 
 
 def test_the_clock_of_the_system_is_no_matter():
     found, said = looked(5_000_000_000, 5_000_000_000, simulated=False)
-    assert [(item.level, item.message, item.values) for item in found] == [(0, "", {})] * 2
+    assert [(item.level, item.message, item.values) for item in found] == [
+        (0, "", {})
+    ] * 2
     assert said == []
 
 
@@ -101,7 +107,9 @@ def test_a_clock_that_nobody_publishes_is_a_warning_and_one_line():
 
 
 def test_a_clock_that_moves_and_stands_is_told_at_each_change():
-    found, said = looked(0, 7_000_000_000, 8_500_000_000, 8_500_000_000, 8_500_000_000, 9)
+    found, said = looked(
+        0, 7_000_000_000, 8_500_000_000, 8_500_000_000, 8_500_000_000, 9
+    )
     assert [item.values["/clock"] for item in found] == [
         "not heard",
         "moves",
@@ -115,6 +123,9 @@ def test_a_clock_that_moves_and_stands_is_told_at_each_change():
     assert said == [
         (Level.WARN, NOTHING),
         moves,
-        (Level.OK, "/clock has stopped at 8.500 s; work and health continue, stamps do not"),
+        (
+            Level.OK,
+            "/clock has stopped at 8.500 s; work and health continue, stamps do not",
+        ),
         moves,
     ]

@@ -72,7 +72,10 @@ def test_a_wrong_sense_is_said_once_while_the_view_is_measured():
         "turned by 180°, not by 0° (or its ids are those of other marks); turn "
         "it as planned"
     )
-    assert "the stage is indicated at minus the marks' sites; the sense is reversed" in said
+    assert (
+        "the stage is indicated at minus the marks' sites; the sense is reversed"
+        in said
+    )
     cell.feed(e for e in events.events if e.stamp_ns >= half)
     assert len(cell.said) == 1
 
@@ -84,9 +87,14 @@ def test_a_view_of_which_all_was_rejected_is_published_as_it_is_offline():
     cell.feed(events.events).wait()
     rejected, good = cell.of("measurement")
     assert (rejected["view_index"], rejected["m"].size) == (0, 0)
-    assert (rejected["reject_reasons"], rejected["reject_counts"]) == (["unknown_mark"], [25])
+    assert (rejected["reject_reasons"], rejected["reject_counts"]) == (
+        ["unknown_mark"],
+        [25],
+    )
     assert good["detections_used"] == 25
-    assert cell.said[0][1].startswith("view '0': 25 of 25 detections were rejected as unknown_mark")
+    assert cell.said[0][1].startswith(
+        "view '0': 25 of 25 detections were rejected as unknown_mark"
+    )
 
 
 def without_first_view():
@@ -98,7 +106,9 @@ def without_first_view():
 def test_a_view_of_which_nothing_came_is_published_empty_when_it_is_over_as_offline():
     events = without_first_view()
     cell = Cell().feed(events)
-    assert [(fields["view_index"], len(fields["m"])) for fields in cell.of("measurement")] == [
+    assert [
+        (fields["view_index"], len(fields["m"])) for fields in cell.of("measurement")
+    ] == [
         (0, 0),
         (1, 25),
     ]
@@ -110,7 +120,9 @@ def test_a_view_of_which_nothing_came_is_published_empty_when_it_is_over_as_offl
 def test_a_view_that_a_collector_before_this_one_may_have_sent_is_not_published_empty():
     cell, events = Cell(), without_first_view()
     for command in [e for e in events if isinstance(e, Command)][:2]:
-        cell.session.take_command(message("ViewCommand", from_model.command(command, "s")), True)
+        cell.session.take_command(
+            message("ViewCommand", from_model.command(command, "s")), True
+        )
     cell.feed(events)
     assert [fields["view_index"] for fields in cell.of("measurement")] == [1]
 
@@ -131,22 +143,44 @@ def test_status_names_the_run_and_what_is_missing():
         ([(0, Phase.MEASURE, False)], []),
         ([(0, Phase.PLACE, True), (0, Phase.MEASURE, True)], ["0"]),
         ([(0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
-        ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False)], ["0"]),  # the redo has not begun
-        ([(0, Phase.MEASURE, True), (0, Phase.PLACE, False), (0, Phase.MEASURE, False)], []),
-        ([(0, Phase.MEASURE, True), (1, Phase.PLACE, False), (1, Phase.MEASURE, False)], ["0"]),
+        (
+            [(0, Phase.MEASURE, True), (0, Phase.PLACE, False)],
+            ["0"],
+        ),  # the redo has not begun
+        (
+            [
+                (0, Phase.MEASURE, True),
+                (0, Phase.PLACE, False),
+                (0, Phase.MEASURE, False),
+            ],
+            [],
+        ),
+        (
+            [
+                (0, Phase.MEASURE, True),
+                (1, Phase.PLACE, False),
+                (1, Phase.MEASURE, False),
+            ],
+            ["0"],
+        ),
         ([(0, Phase.MEASURE, True), (0, Phase.MEASURE, False)], ["0"]),
     ],
 )
-def test_a_view_that_began_before_the_node_is_missed_until_it_is_measured_again(heard, missed):
+def test_a_view_that_began_before_the_node_is_missed_until_it_is_measured_again(
+    heard, missed
+):
     """Commands: view, phase, and whether it was published before this node listened."""
     events, cell = scene("0, 90", count=0), Cell()
     for number, (view, phase, is_older) in enumerate(heard):
-        like = next(c for c in events.commands if (c.view_index, c.phase) == (view, phase))
+        like = next(
+            c for c in events.commands if (c.view_index, c.phase) == (view, phase)
+        )
         cell.session.take_command(
             message(
                 "ViewCommand",
                 from_model.command(
-                    replace(like, stamp_ns=events.commands[0].stamp_ns + number), "stage"
+                    replace(like, stamp_ns=events.commands[0].stamp_ns + number),
+                    "stage",
                 ),
             ),
             is_older,
@@ -172,7 +206,9 @@ def test_a_second_run_is_published_anew(run_id):
     first = cell.of("measurement")
     later = [replace(e, stamp_ns=e.stamp_ns + 10**12) for e in events.events]
     later = [replace(e, run_id=run_id) if isinstance(e, Command) else e for e in later]
-    begin = next(e.stamp_ns for e in later if isinstance(e, Command) and e.view_index == 1)
+    begin = next(
+        e.stamp_ns for e in later if isinstance(e, Command) and e.view_index == 1
+    )
     cell.feed(e for e in later if e.stamp_ns < begin)
     second = cell.of("measurement")[len(first) :]
     assert [fields["view_index"] for fields in first] == [0, 1]

@@ -71,7 +71,9 @@ class Desk:
 def first_view(plan: str = "0", **changes) -> list:
     """Return the messages of the first view alone, still open."""
     events = events_of(small_plan(plan, repeats=1))
-    commands = [index for index, event in enumerate(events) if isinstance(event, Command)]
+    commands = [
+        index for index, event in enumerate(events) if isinstance(event, Command)
+    ]
     return events[: commands[2]]
 
 
@@ -122,9 +124,14 @@ def test_which_views_a_status_is_of():
         for n, event in enumerate(events)
         if isinstance(event, Command) and event.phase == Phase.PLACE
     ]
-    views = [events[begin:end] for begin, end in zip(places, [*places[1:], None], strict=True)]
+    views = [
+        events[begin:end]
+        for begin, end in zip(places, [*places[1:], None], strict=True)
+    ]
     views[1].remove(next(event for event in views[1] if isinstance(event, Detection)))
-    views.append([replace(event, stamp_ns=event.stamp_ns + 10 * 10**9) for event in views[0]])
+    views.append(
+        [replace(event, stamp_ns=event.stamp_ns + 10 * 10**9) for event in views[0]]
+    )
     told = []
     for view in views:
         desk.feed(view, run_id="1")
@@ -137,11 +144,15 @@ def test_which_views_a_status_is_of():
 
 def test_a_step_that_is_found_behind_the_readings_is_sent_with_them_once():
     desk, events = Desk(), events_of(small_plan("0", repeats=1))
-    sample = next(event for event in reversed(events) if isinstance(event, EncoderSample))
+    sample = next(
+        event for event in reversed(events) if isinstance(event, EncoderSample)
+    )
     desk.feed(events)
     desk.session.tick()
     desk.hands.published.clear()
-    desk.session._clock.steps["stage/joint_states"] = [ClockStep(sample.stamp_ns, 10**9)]
+    desk.session._clock.steps["stage/joint_states"] = [
+        ClockStep(sample.stamp_ns, 10**9)
+    ]
     for _ in range(2):
         desk.session.take_encoder(encoder_block(sample))
         desk.hands.pass_time(1)
@@ -155,7 +166,10 @@ def test_a_step_that_is_found_behind_the_readings_is_sent_with_them_once():
     "spoilt, lines",
     [
         (1, ["view '0': 1 detection rejected as sigma_out_of_range: their sigma is"]),
-        (1000, ["74 of 74 detections were rejected as sigma_out_of_range: their sigma is"]),
+        (
+            1000,
+            ["74 of 74 detections were rejected as sigma_out_of_range: their sigma is"],
+        ),
     ],
 )
 def test_what_would_correct_rejections_is_said_once_when_a_view_is_over(spoilt, lines):
@@ -168,7 +182,9 @@ def test_what_would_correct_rejections_is_said_once_when_a_view_is_over(spoilt, 
         desk.session.tick()
         desk.hands.pass_time(PATIENCE_S)
         desk.session.tick()
-    said = [line for line in desk.hands.lines(Level.WARN) if "sigma_out_of_range" in line]
+    said = [
+        line for line in desk.hands.lines(Level.WARN) if "sigma_out_of_range" in line
+    ]
     assert [text[: len(line)] for text, line in zip(said, lines, strict=True)] == lines
 
 
@@ -177,7 +193,9 @@ def test_every_message_of_a_run_names_it():
     desk.feed(events_of(small_plan("0", repeats=1)), run_id="17")
     desk.session.tick()
     assert {
-        fields["run_id"] for output, fields in desk.hands.published if output != "progress"
+        fields["run_id"]
+        for output, fields in desk.hands.published
+        if output != "progress"
     } == {"17"}
     assert desk.told().values["run_id"] == "17"
     assert desk.told().values["phase"] == "DONE"
@@ -185,7 +203,14 @@ def test_every_message_of_a_run_names_it():
 
 @pytest.mark.parametrize(
     "ahead_s, complete",
-    [(0.0, True), (0.1, True), (0.101, False), (1.0, False), (37.0, False), (-0.0001, True)],
+    [
+        (0.0, True),
+        (0.1, True),
+        (0.101, False),
+        (1.0, False),
+        (37.0, False),
+        (-0.0001, True),
+    ],
 )
 def test_a_view_is_not_called_complete_on_stamps_from_the_future(ahead_s, complete):
     desk = Desk(clock_limit=0.1)
@@ -196,7 +221,10 @@ def test_a_view_is_not_called_complete_on_stamps_from_the_future(ahead_s, comple
     assert ("clock" in told.message) is not complete
     if not complete:
         assert told.level == Level.WARN
-        assert f"the cell's clock is {ahead_s:.3g} s ahead of this machine's" in told.message
+        assert (
+            f"the cell's clock is {ahead_s:.3g} s ahead of this machine's"
+            in told.message
+        )
 
 
 def test_a_clock_behind_is_told():
@@ -207,12 +235,19 @@ def test_a_clock_behind_is_told():
 
 @pytest.mark.parametrize(
     "by_s, words",
-    [(-1.0, "stepped back by 1 s in view '"), (37.0, "stepped ahead by 37 s in view '")],
+    [
+        (-1.0, "stepped back by 1 s in view '"),
+        (37.0, "stepped ahead by 37 s in view '"),
+    ],
 )
-def test_a_clock_that_steps_within_a_view_is_said_once_and_told_to_the_end_of_the_run(by_s, words):
+def test_a_clock_that_steps_within_a_view_is_said_once_and_told_to_the_end_of_the_run(
+    by_s, words
+):
     desk, events = Desk(), events_of(small_plan("0, 90"))
     half = next(
-        n for n, event in enumerate(events) if event.stamp_ns > events[0].stamp_ns + 4 * 10**8
+        n
+        for n, event in enumerate(events)
+        if event.stamp_ns > events[0].stamp_ns + 4 * 10**8
     )
     desk.feed(events[:half], run_id="1")
     assert desk.told().level == Level.OK
@@ -255,7 +290,9 @@ def solved_offline(folder):
 
 
 @pytest.mark.parametrize("by_s", [0.15, -0.3])
-def test_a_clock_that_stepped_is_in_the_live_result_as_in_the_offline_one(tmp_path, by_s):
+def test_a_clock_that_stepped_is_in_the_live_result_as_in_the_offline_one(
+    tmp_path, by_s
+):
     desk, events = Desk(), events_of(small_plan("0, 90, tx", repeats=4))
     half = (
         next(
@@ -279,40 +316,59 @@ def test_a_clock_that_stepped_is_in_the_live_result_as_in_the_offline_one(tmp_pa
     live = solved_live(desk)
     bag = logged(
         tmp_path / "bag",
-        [*zip([*events[:half], *later], [event.stamp_ns for event in events], strict=True)],
+        [
+            *zip(
+                [*events[:half], *later],
+                [event.stamp_ns for event in events],
+                strict=True,
+            )
+        ],
     )
     offline = solved_offline(bag)
     lines = [
-        [re.sub(r"at \d+\.\d{3} s", "at T", line) for line in result.warnings if "clock" in line]
+        [
+            re.sub(r"at \d+\.\d{3} s", "at T", line)
+            for line in result.warnings
+            if "clock" in line
+        ]
         for result in (live, offline)
     ]
     assert lines[0] == lines[1]
     assert len(lines[0]) == 1
-    assert f"{'ahead' if by_s > 0 else 'back'} by {abs(by_s)} s in view '90', at T: " in lines[0][0]
+    assert (
+        f"{'ahead' if by_s > 0 else 'back'} by {abs(by_s)} s in view '90', at T: "
+        in lines[0][0]
+    )
     assert [line for line in live.warnings if "clock" in line] == desk.session._stepped
     np.testing.assert_array_equal(live.error_map.gx, offline.error_map.gx)
     again = Desk()  # that takes up the journal
     taken = take_up([*bag.glob("*.mcap")], again.session.settings)
     again.session.adopt(taken.collector, "journal", taken.steps)
     again.session.finish()
-    assert [line for line in offline.warnings if "clock" in line] == again.hands.of("measurement")[
-        -1
-    ]["session_notes"]
+    assert [line for line in offline.warnings if "clock" in line] == again.hands.of(
+        "measurement"
+    )[-1]["session_notes"]
 
 
 def test_no_step_no_note(tmp_path):
     desk = Desk()
     desk.feed(events_of(small_plan("0, 90, tx")))
     desk.session.finish()
-    assert {len(fields["session_notes"]) for fields in desk.hands.of("measurement")} == {0}
+    assert {
+        len(fields["session_notes"]) for fields in desk.hands.of("measurement")
+    } == {0}
 
 
-def test_a_clock_that_steps_with_this_machines_is_found_by_the_steady_clock(monkeypatch):
+def test_a_clock_that_steps_with_this_machines_is_found_by_the_steady_clock(
+    monkeypatch,
+):
     desk, events = Desk(), events_of(small_plan("0, 90"))
     half = len(events) // 2
     desk.feed(events[:half], run_id="1")
     monkeypatch.setattr(
-        Hands, "now_ns", property(lambda hands: START_NS + round((hands.seconds - 137.0) * 1e9))
+        Hands,
+        "now_ns",
+        property(lambda hands: START_NS + round((hands.seconds - 137.0) * 1e9)),
     )
     desk.feed(
         [
@@ -345,7 +401,10 @@ def test_the_encoder_is_heard_for_a_second(seconds, heard):
     desk.feed(first_view())
     desk.hands.pass_time(seconds)
     told = desk.told(matched=False)
-    assert (told.values["encoder_heard"], told.values["detections_matched"]) == (heard, "no")
+    assert (told.values["encoder_heard"], told.values["detections_matched"]) == (
+        heard,
+        "no",
+    )
     assert (told.level == Level.WARN) is (heard == "no")
 
 
@@ -358,14 +417,20 @@ def test_a_gap_of_the_encoder_is_told_while_a_view_is_measured():
         [
             event
             for event in events
-            if isinstance(event, Command) or not cut < event.stamp_ns < cut + 150_000_000
+            if isinstance(event, Command)
+            or not cut < event.stamp_ns < cut + 150_000_000
         ]
     )
-    assert "s between encoder samples: exposures in it are rejected" in desk.told().message
-    assert "between encoder samples" not in desk.told().message  # of the last second only
+    assert (
+        "s between encoder samples: exposures in it are rejected" in desk.told().message
+    )
+    # of the last second only
+    assert "between encoder samples" not in desk.told().message
 
 
-@pytest.mark.parametrize("limit, level", [(1e-12, Level.WARN), (1e-3, Level.OK), (0.0, Level.OK)])
+@pytest.mark.parametrize(
+    "limit, level", [(1e-12, Level.WARN), (1e-3, Level.OK), (0.0, Level.OK)]
+)
 def test_repeatability_against_its_limit(limit, level):
     desk = Desk(repeatability_xy_limit=limit)
     desk.feed(events_of(small_plan("0", repeats=2)))
@@ -438,7 +503,10 @@ def test_a_complete_view_does_not_wait_because_the_last_status_was_dear():
 
 def test_early_looks_in_vain_take_a_sixth_of_the_time_at_most():
     desk, [detection], behind = closing()
-    wrong = [replace(detection, k=77, stamp_ns=detection.stamp_ns + number) for number in range(3)]
+    wrong = [
+        replace(detection, k=77, stamp_ns=detection.stamp_ns + number)
+        for number in range(3)
+    ]
     desk.feed([*wrong[:1], *behind])
     desk.session.tick()
     began = desk.hands.seconds - desk.hands.costs
@@ -496,7 +564,9 @@ def test_detections_that_are_not_decoded_yet_are_reckoned_with(more, expected):
 
 
 @pytest.mark.parametrize("after_ns, expected", [(-1, False), (0, True), (1, True)])
-def test_a_detection_counts_for_its_view_from_the_instant_of_its_command_on(after_ns, expected):
+def test_a_detection_counts_for_its_view_from_the_instant_of_its_command_on(
+    after_ns, expected
+):
     desk, [last], _ = closing()
     begin = desk.session.collector.timeline.intervals[-1].start_ns
     assert begin == next(
@@ -504,7 +574,9 @@ def test_a_detection_counts_for_its_view_from_the_instant_of_its_command_on(afte
         for event in first_view()
         if isinstance(event, Command) and event.phase == Phase.MEASURE
     )
-    desk.session.take_detections(detection_table(replace(last, stamp_ns=begin + after_ns)))
+    desk.session.take_detections(
+        detection_table(replace(last, stamp_ns=begin + after_ns))
+    )
     assert desk.session.expects_end() is expected
 
 
@@ -517,7 +589,9 @@ def test_the_health_tells_what_a_status_costs():
         desk.hands.costs, desk.hands.works = spent, spent / 2
         desk.hands.pass_time(1)
         desk.session.take_detections(
-            detection_table(next(event for event in first_view() if isinstance(event, Detection)))
+            detection_table(
+                next(event for event in first_view() if isinstance(event, Detection))
+            )
         )
         desk.session.tick()
     assert [desk.told().values[name] for name in names] == ["2.0", "7.0", "3.5"]
@@ -546,7 +620,9 @@ def test_the_jitter_of_the_encoder_is_told_and_held_against_its_limit(limit, lev
     told = desk.told()
     assert float(told.values["encoder_jitter_s"]) == pytest.approx(2e-4, rel=0.01)
     assert told.level == level
-    assert ("vary by 0.0002 s, the limit is 0.00019 s" in told.message) is (level == Level.WARN)
+    assert ("vary by 0.0002 s, the limit is 0.00019 s" in told.message) is (
+        level == Level.WARN
+    )
 
 
 def test_a_sigma_that_cannot_be_costs_that_detection_and_is_a_warning():
@@ -556,11 +632,19 @@ def test_a_sigma_that_cannot_be_costs_that_detection_and_is_a_warning():
     desk.feed(events)
     desk.session.tick()
     status = desk.hands.of("status")[-1]
-    assert (status["reject_reasons"], status["reject_counts"]) == (["sigma_out_of_range"], [1])
-    assert status["missing_m"] == [events[index].m] and status["missing_n"] == [events[index].n]
+    assert (status["reject_reasons"], status["reject_counts"]) == (
+        ["sigma_out_of_range"],
+        [1],
+    )
+    assert status["missing_m"] == [events[index].m] and status["missing_n"] == [
+        events[index].n
+    ]
     told = desk.told()
     assert told.level == Level.WARN
-    assert "1 detection rejected as sigma_out_of_range: their sigma is not a " in told.message
+    assert (
+        "1 detection rejected as sigma_out_of_range: their sigma is not a "
+        in told.message
+    )
     assert told.values["rejected sigma_out_of_range"] == 1
 
 
@@ -571,18 +655,29 @@ def test_reversed_offsets_are_an_error_while_the_first_view_is_measured():
     cell = CellSettings(sigma_xy_m=1e-8, servo_sigma_m=5e-8, sigma_theta_rad=1e-5)
     events = list(
         plan_events(
-            random_truth(plan.artifact, 4, rng), plan, settings=cell, rng=rng, start_ns=START_NS
+            random_truth(plan.artifact, 4, rng),
+            plan,
+            settings=cell,
+            rng=rng,
+            start_ns=START_NS,
         )
     )
-    spoilt = [replace(e, offset_y=-e.offset_y) if isinstance(e, Detection) else e for e in events]
-    end = next(i for i, e in enumerate(spoilt) if isinstance(e, Command) and e.view_index == 1)
+    spoilt = [
+        replace(e, offset_y=-e.offset_y) if isinstance(e, Detection) else e
+        for e in events
+    ]
+    end = next(
+        i for i, e in enumerate(spoilt) if isinstance(e, Command) and e.view_index == 1
+    )
     for event in spoilt[:end]:
         desk.feed([event])
         desk.session.tick()
         if desk.told().level is Level.ERROR:
             break
     (line,) = [line for level, line in desk.hands.said if level is Level.ERROR]
-    assert line.startswith("stage/mark_detections: offsets of the other sign: offset_y rises where")
+    assert line.startswith(
+        "stage/mark_detections: offsets of the other sign: offset_y rises where"
+    )
     assert desk.told().message.startswith(line)
     assert 0 < len(desk.session.collector.collect()[0].views[0].visits.mark) < 150
     desk.feed(spoilt[end:])

@@ -31,7 +31,9 @@ NAMES = ["x", "y", "theta"]
 def map_of(error_map=ONE, stamp_ns: int = START_NS, **changes) -> object:
     return message(
         "ErrorMap",
-        from_model.error_map(result_of(error_map), stamp_ns, "stage") | {"run_id": "7"} | changes,
+        from_model.error_map(result_of(error_map), stamp_ns, "stage")
+        | {"run_id": "7"}
+        | changes,
     )
 
 
@@ -123,9 +125,9 @@ def test_a_command_gets_the_error_added_and_all_else_stays(desk):
         x,
         by.command_theta(0.4),
     ]
-    assert abs(x - 0.01) > 1e-9 and desk.session.correct(NAMES, [float(x), float(y), 0.0])[0] == (
-        pytest.approx(0.01, abs=1e-15)
-    )
+    assert abs(x - 0.01) > 1e-9 and desk.session.correct(
+        NAMES, [float(x), float(y), 0.0]
+    )[0] == (pytest.approx(0.01, abs=1e-15))
     assert commanded(desk, ["theta"], [0.4]) == [by.command_theta(0.4)]
     assert desk.session.counts["commands"] == 2
 
@@ -149,7 +151,10 @@ def test_a_command_that_cannot_be_corrected_is_not_passed_on(desk, names, positi
     assert commanded(desk, names, position) is None
     assert desk.session.command(b"damaged") is None
     told = desk.session.diagnosis()
-    assert told.level == Level.WARN and "2 commands refused since the last status" in told.message
+    assert (
+        told.level == Level.WARN
+        and "2 commands refused since the last status" in told.message
+    )
     assert told.values["commands_refused"] == 2
     assert desk.session.diagnosis().level == Level.OK  # told once
 
@@ -161,13 +166,16 @@ def test_joints_that_are_not_of_the_stage_are_named(desk):
     told = desk.session.diagnosis()
     assert (
         told.level == Level.WARN
-        and ("joints gantry_x, gantry_y are not of the stage (x, y, theta)") in told.message
+        and ("joints gantry_x, gantry_y are not of the stage (x, y, theta)")
+        in told.message
     )
     assert desk.session.counts["refused"] == 2 and desk.session.counts["corrected"] == 0
     assert desk.session.diagnosis().level == Level.OK  # told once
 
 
-@pytest.mark.parametrize("frame_id, said", [("stage", False), ("", False), ("gantry", True)])
+@pytest.mark.parametrize(
+    "frame_id, said", [("stage", False), ("", False), ("gantry", True)]
+)
 def test_a_command_in_another_frame_is_named_once(desk, frame_id, said):
     use(desk)
     assert commanded(desk, NAMES, [0.0, 0.0, 0.0], frame_id) is not None
@@ -205,11 +213,15 @@ def test_a_request_is_answered_with_corrections_and_u(desk, inverse):
 def test_outside_the_field_u_is_not_known(desk, inverse):
     """Not even a quarter of a pitch beyond; the edge itself belongs to the field."""
     use(desk)
-    found = desk.session.answer([0.02, 0.0225, 0.0], [0.02, 0.0, -0.5], [], inverse=inverse)
+    found = desk.session.answer(
+        [0.02, 0.0225, 0.0], [0.02, 0.0, -0.5], [], inverse=inverse
+    )
     np.testing.assert_array_equal(np.isfinite(found["u_x"]), [True, False, False])
     np.testing.assert_array_equal(np.isfinite(found["u_y"]), [True, False, False])
     assert np.isfinite([found["x"], found["y"]]).all()
-    assert "; u is not known at 2 positions: is one outside" in desk.session.remark(found)
+    assert "; u is not known at 2 positions: is one outside" in desk.session.remark(
+        found
+    )
     inside = desk.session.answer([0.01], [0.01], [], inverse=inverse)
     assert "u is not known" not in desk.session.remark(inside)
 
@@ -221,7 +233,10 @@ def test_positions_outside_the_field_are_counted_and_told_once(desk):
     assert commanded(desk, NAMES, [0.0, -0.0225, 0.0]) is not None
     said = desk.session.diagnosis()
     assert said.level == Level.WARN and said.values["outside"] == 2
-    assert "2 positions outside the field since the last status, corrected as at" in said.message
+    assert (
+        "2 positions outside the field since the last status, corrected as at"
+        in said.message
+    )
     assert desk.session.diagnosis().level == Level.OK
 
 
@@ -296,7 +311,10 @@ def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
     )
     desk.hands.pass_time(12)
     told = desk.session.diagnosis()
-    assert (told.level, told.message) == (Level.OK, "correcting by the map of plan demo, run 7")
+    assert (told.level, told.message) == (
+        Level.OK,
+        "correcting by the map of plan demo, run 7",
+    )
     assert (told.values["since_s"], told.values["map_age_s"]) == ("12", "12")
 
 
@@ -311,7 +329,11 @@ def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
         ),
         ({}, {"qualified": False}, "plan demo, run 7 is not qualified: as it is"),
         ({}, {"views_done": 3}, "plan demo, run 7 contains 3 of 4 views"),
-        ({}, {"run_id": "6"}, "no selfcal/summary says yet whether plan demo, run 7 is complete"),
+        (
+            {},
+            {"run_id": "6"},
+            "no selfcal/summary says yet whether plan demo, run 7 is complete",
+        ),
         (
             {},
             {"stamp_ns": START_NS + 1},
@@ -319,7 +341,9 @@ def test_a_map_is_used_once_its_summary_says_that_it_is_complete(desk, order):
         ),
     ],
 )
-def test_a_map_that_must_not_be_used_leaves_the_former_one_in_use(desk, the_map, the_summary, why):
+def test_a_map_that_must_not_be_used_leaves_the_former_one_in_use(
+    desk, the_map, the_summary, why
+):
     desk.session.take_map(map_of(TWO, START_NS - 5))
     desk.session.take_summary(summary_of(START_NS - 5))
     before = desk.x_at(0.01)
@@ -340,14 +364,21 @@ def exchanged(error_map):
     """Return a map with x and y exchanged, as positions and as errors."""
     swapped = {
         name: getattr(error_map, other).T
-        for name, other in (("gx", "gy"), ("gy", "gx"), ("u_gx", "u_gy"), ("u_gy", "u_gx"))
+        for name, other in (
+            ("gx", "gy"),
+            ("gy", "gx"),
+            ("u_gx", "u_gy"),
+            ("u_gy", "u_gx"),
+        )
     }
     return replace(error_map, **swapped)
 
 
 def mirrored(error_map):
     """Return a map with x reversed, as position and as error."""
-    fields = {name: getattr(error_map, name)[::-1] for name in ("gx", "gy", "u_gx", "u_gy")}
+    fields = {
+        name: getattr(error_map, name)[::-1] for name in ("gx", "gy", "u_gx", "u_gy")
+    }
     return replace(error_map, **fields | {"gx": -fields["gx"]})
 
 
@@ -384,11 +415,15 @@ def test_a_map_with_changed_axes_leaves_the_former_one_in_use(change, qualified_
     ],
 )
 @pytest.mark.parametrize("qualified_only", [True, False])
-def test_a_map_that_its_summary_contradicts_leaves_the_former_one_in_use(name, qualified_only):
+def test_a_map_that_its_summary_contradicts_leaves_the_former_one_in_use(
+    name, qualified_only
+):
     desk = Desk(require_qualified=qualified_only)
     use(desk, TWO)
     before, figures = desk.x_at(0.01), summary_figures(ONE)
-    desk.session.take_summary(summary_of(START_NS + 1, **figures | {name: 1.01 * figures[name]}))
+    desk.session.take_summary(
+        summary_of(START_NS + 1, **figures | {name: 1.01 * figures[name]})
+    )
     desk.session.take_map(map_of(ONE, START_NS + 1))
     assert desk.x_at(0.01) == before
     line = desk.hands.lines(Level.WARN)[-1]
@@ -416,7 +451,9 @@ def test_a_sample_is_corrected_by_one_map_as_a_whole(desk):
     for error_map, stamp in ((ONE, START_NS), (TWO, START_NS + 1)):
         desk.session.take_map(map_of(error_map, stamp))
         desk.session.take_summary(summary_of(stamp))
-        x, y, _ = desk.session.correct(NAMES, [error_map.gx[2, 2], error_map.gy[2, 2], 0.0])
+        x, y, _ = desk.session.correct(
+            NAMES, [error_map.gx[2, 2], error_map.gy[2, 2], 0.0]
+        )
         assert np.hypot(x, y) < 1e-15
 
 
@@ -465,13 +502,25 @@ MILLIRADIAN_REACH = 1e-3 / np.hypot(0.02, 0.02)
     "changes, why",
     [
         ({"gx": np.zeros(3)}, "gx has 3 values, the plate 25"),
-        ({"gx": with_value(ONE.gx, math.nan)}, "gx is not finite at 1 of the 25 valid sites"),
+        (
+            {"gx": with_value(ONE.gx, math.nan)},
+            "gx is not finite at 1 of the 25 valid sites",
+        ),
         ({"u_gy": with_value(ONE.gy, -1e-9)}, "u_gy is negative"),
-        ({"gy": with_value(ONE.gy, -math.inf)}, "gy is not finite at 1 of the 25 valid sites"),
+        (
+            {"gy": with_value(ONE.gy, -math.inf)},
+            "gy is not finite at 1 of the 25 valid sites",
+        ),
         ({"g_theta": with_value(ONE.g_theta, math.inf)}, "g_theta is infinite"),
-        ({"g_theta": np.full(8, math.nan)}, "the error of no site or of no line is known"),
+        (
+            {"g_theta": np.full(8, math.nan)},
+            "the error of no site or of no line is known",
+        ),
         ({"valid": [False] * 25}, "the error of no site or of no line is known"),
-        ({"gx": with_value(ONE.gx, 2e-4)}, "mm to the next along x, 10 mm away: is it real?"),
+        (
+            {"gx": with_value(ONE.gx, 2e-4)},
+            "mm to the next along x, 10 mm away: is it real?",
+        ),
         (
             {"gy": np.full(25, -1.01e-3)},
             "it corrects by up to 0.00101 m, max_correction is 0.001 m; check its units",
@@ -494,7 +543,9 @@ def test_a_map_that_harms_leaves_the_former_one_in_use(desk, changes, why):
     assert desk.session.correct(NAMES, [0.01, -0.01, 0.3]) != before
 
 
-@pytest.mark.parametrize("frame_id, used", [("stage", True), ("", True), ("gantry", False)])
+@pytest.mark.parametrize(
+    "frame_id, used", [("stage", True), ("", True), ("gantry", False)]
+)
 def test_a_map_of_another_frame_leaves_the_former_one_in_use(desk, frame_id, used):
     use(desk, TWO)
     before = desk.x_at(0.01)
@@ -510,7 +561,9 @@ def test_a_map_of_another_frame_leaves_the_former_one_in_use(desk, frame_id, use
 @pytest.mark.parametrize("factor", [0.99, 1.01])
 def test_max_correction_is_the_largest_error_that_is_used(factor):
     largest = max(
-        np.abs(ONE.gx).max(), np.abs(ONE.gy).max(), np.abs(ONE.g_theta).max() * np.hypot(0.02, 0.02)
+        np.abs(ONE.gx).max(),
+        np.abs(ONE.gy).max(),
+        np.abs(ONE.g_theta).max() * np.hypot(0.02, 0.02),
     )
     desk = Desk(require_qualified=False, max_correction=factor * largest)
     taken = True
@@ -521,7 +574,9 @@ def test_max_correction_is_the_largest_error_that_is_used(factor):
     assert taken is (factor > 1) and (desk.session.compensator is not None) is taken
 
 
-@pytest.mark.parametrize(("interpolation", "used"), [("bilinear", True), ("bicubic", False)])
+@pytest.mark.parametrize(
+    ("interpolation", "used"), [("bilinear", True), ("bicubic", False)]
+)
 @pytest.mark.parametrize("changed", ["gx", "g_theta"])
 def test_a_spline_that_passes_beyond_the_limit_between_its_nodes_is_not_used(
     interpolation, used, changed
@@ -562,7 +617,13 @@ def test_nan_where_the_map_is_not_valid_is_no_error(desk):
 
 @pytest.mark.parametrize(
     "position, refused",
-    [(1e12, False), (-1.1e12, True), (1.7e308, True), (float("inf"), True), (float("nan"), True)],
+    [
+        (1e12, False),
+        (-1.1e12, True),
+        (1.7e308, True),
+        (float("inf"), True),
+        (float("nan"), True),
+    ],
 )
 @pytest.mark.parametrize("joint", [0, 1, 2])
 def test_a_position_that_no_stage_has_is_refused(desk, joint, position, refused):
@@ -622,7 +683,12 @@ def test_of_the_bytes_of_a_sample_the_positions_alone_change(busy):
     [message] = corrected(busy, [sample(7)])
     assert list(message.position) == busy.session.correct(NAMES, [0.01, 0.0, 0.0])
     assert message.position[0] != 0.01
-    assert (message.name, list(message.velocity), message.header.frame_id, numbers([message])) == (
+    assert (
+        message.name,
+        list(message.velocity),
+        message.header.frame_id,
+        numbers([message]),
+    ) == (
         NAMES,
         [1.0, 2.0, 3.0],
         "stage",
@@ -640,16 +706,21 @@ def test_of_the_bytes_of_a_sample_the_positions_alone_change(busy):
         (0, 4, []),
     ],
 )
-def test_few_samples_are_corrected_in_order_and_of_many_the_newest_alone(busy, waiting, lost, out):
+def test_few_samples_are_corrected_in_order_and_of_many_the_newest_alone(
+    busy, waiting, lost, out
+):
     found = corrected(busy, [sample(number) for number in range(waiting)], lost)
     assert numbers(found) == list(out)
     skipped = waiting + lost - len(out)
-    assert (busy.session.counts["corrected"], busy.session.counts["skipped"]) == (len(out), skipped)
+    assert (busy.session.counts["corrected"], busy.session.counts["skipped"]) == (
+        len(out),
+        skipped,
+    )
     told = busy.session.diagnosis()
     assert told.level == (Level.WARN if skipped else Level.OK)
-    assert told.message.startswith(f"{skipped} samples skipped since the last status: ") is (
-        skipped > 0
-    )
+    assert told.message.startswith(
+        f"{skipped} samples skipped since the last status: "
+    ) is (skipped > 0)
 
 
 def test_skipped_samples_are_a_warning_once_and_a_count_for_good(busy):
@@ -661,22 +732,30 @@ def test_skipped_samples_are_a_warning_once_and_a_count_for_good(busy):
 
 
 @pytest.mark.parametrize("age_ms, level", [(5.0, Level.OK), (5.1, Level.WARN)])
-def test_the_age_of_corrected_samples_is_told_and_beyond_max_age_a_warning(busy, age_ms, level):
+def test_the_age_of_corrected_samples_is_told_and_beyond_max_age_a_warning(
+    busy, age_ms, level
+):
     corrected(busy, [sample(1)], age_ms=1.0)
     corrected(busy, [sample(2)], age_ms=2.0)
     corrected(busy, [sample(3)], age_ms=age_ms)
     told = busy.session.diagnosis()
     assert told.level == level
-    assert (told.values["age_ms"], told.values["age_ms_max"]) == ("2.00", f"{age_ms:.2f}")
+    assert (told.values["age_ms"], told.values["age_ms_max"]) == (
+        "2.00",
+        f"{age_ms:.2f}",
+    )
     assert (
-        "a corrected position was 5.1 ms old when it was published, max_age is 5 ms" in told.message
+        "a corrected position was 5.1 ms old when it was published, max_age is 5 ms"
+        in told.message
     ) is (level == Level.WARN)
     assert busy.session.diagnosis().level == Level.OK
 
 
 def test_samples_that_cannot_be_read_are_refused_and_those_behind_them_corrected(busy):
     bad = sample(1)
-    found = corrected(busy, [bad[:40], b"", sample(2, math.nan), b"\xff" * len(bad), sample(3)])
+    found = corrected(
+        busy, [bad[:40], b"", sample(2, math.nan), b"\xff" * len(bad), sample(3)]
+    )
     assert numbers(found) == [3]
     assert (busy.session.counts["refused"], busy.session.counts["corrected"]) == (4, 1)
 

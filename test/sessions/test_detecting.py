@@ -19,7 +19,9 @@ CAMERA = Camera(width=90, height=80)
 @pytest.fixture
 def desk():
     sent = []
-    ports = SimpleNamespace(publish=lambda output, fields: sent.append((output, fields)))
+    ports = SimpleNamespace(
+        publish=lambda output, fields: sent.append((output, fields))
+    )
     session = DetectingSession(
         DetectorSettings(pixel_size=2e-6, mark_size=5e-5, frame_id="f"), ports
     )
@@ -27,7 +29,9 @@ def desk():
 
 
 def image(stamp, values, camera="eye"):
-    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp, nanosec=5), frame_id=camera)
+    header = SimpleNamespace(
+        stamp=SimpleNamespace(sec=stamp, nanosec=5), frame_id=camera
+    )
     return SimpleNamespace(
         header=header,
         height=values.shape[0],
@@ -56,19 +60,26 @@ def test_detections_have_frame_and_stamp_of_their_image(desk):
     found = desk.session.diagnosis()
     assert (found.level, found.message) == (Level.OK, "1 marks in 1 images")
     assert float(found.values["ms_per_image_max"]) > 0
-    assert "ms_per_image_max" not in desk.session.diagnosis().values  # since the last one
+    # since the last one
+    assert "ms_per_image_max" not in desk.session.diagnosis().values
 
 
 @pytest.mark.parametrize(
     "values, why",
     [
-        (drawn(0), "nothing looks like one: check mark, mark_size, pixel_size and polarity"),
+        (
+            drawn(0),
+            "nothing looks like one: check mark, mark_size, pixel_size and polarity",
+        ),
         (drawn()[25:], "most rejected as cut_off"),
     ],
 )
 def test_images_without_marks_are_a_warning_with_its_likely_reason(desk, values, why):
     for number in range(MANY_EMPTY):
-        assert desk.session.diagnosis().message != f"no mark in the last {number} images, {why}"
+        assert (
+            desk.session.diagnosis().message
+            != f"no mark in the last {number} images, {why}"
+        )
         desk.session.take(image(number + 1, values))
     found = desk.session.diagnosis()
     assert (found.level, found.message) == (
@@ -119,7 +130,9 @@ def test_another_camera_on_the_topic_is_named_and_its_images_refused(desk):
     desk.session.take(image(1, drawn()))
     for stamp in (2, 4, 6):
         desk.session.take(image(stamp, drawn()))
-        with pytest.raises(InputError, match="of the camera 'hand', earlier ones are of 'eye'"):
+        with pytest.raises(
+            InputError, match="of the camera 'hand', earlier ones are of 'eye'"
+        ):
             desk.session.take(image(stamp + 1, drawn(), "hand"))
     assert len(desk.sent) == 4
 
@@ -129,7 +142,9 @@ def test_of_a_settled_size_another_one_is_refused_before_it_is_decoded(desk):
         desk.session.take(image(stamp, drawn()))
     other = image(9, drawn()[:60])
     other.data = Unreadable(60 * 90)
-    with pytest.raises(InputError, match="90 x 60 pixels, but earlier images have 90 x 80"):
+    with pytest.raises(
+        InputError, match="90 x 60 pixels, but earlier images have 90 x 80"
+    ):
         desk.session.take(other)
 
 
@@ -156,6 +171,8 @@ def test_more_possible_marks_than_max_marks_refuse_the_image(desk):
             session.take(image(1, values))
             assert len(desk.sent) == marks
             continue
-        with pytest.raises(InputError, match="more than 5 possible marks; check mark_size"):
+        with pytest.raises(
+            InputError, match="more than 5 possible marks; check mark_size"
+        ):
             session.take(image(1, values))
         assert session.diagnosis().values["images_refused"] == 1

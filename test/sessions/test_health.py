@@ -41,7 +41,8 @@ def test_a_flood_of_refusals_is_counted_and_logged_at_powers_of_ten(hands):
     for _ in range(1234):
         refusals.add("topic", InputError("topic", "bad", "correct it"))
     assert hands.lines(Level.ERROR) == ["topic: bad; correct it"] + [
-        f"topic: bad; correct it (refused {n} times)" for n in (2, 3, 4, 5, 10, 100, 1000)
+        f"topic: bad; correct it (refused {n} times)"
+        for n in (2, 3, 4, 5, 10, 100, 1000)
     ]
     assert refusals.diagnosis() == Diagnosis(
         Level.WARN, "topic: bad; correct it", {"refused topic": 1234}
@@ -62,7 +63,9 @@ def test_a_refusal_and_a_loss_are_warnings_for_a_while(hands, seconds, level):
     hands.pass_time(seconds)
     assert refusals.diagnosis().level == losses.diagnosis().level == level
     assert losses.diagnosis().values == {"lost topic": 7}
-    assert (losses.diagnosis().message == "topic: 7 messages lost") is (level == Level.WARN)
+    assert (losses.diagnosis().message == "topic: 7 messages lost") is (
+        level == Level.WARN
+    )
 
 
 @pytest.mark.parametrize(
@@ -102,7 +105,10 @@ def test_what_was_published_while_nobody_listened_is_told_apart(hands):
     losses.add("topic", 2)
     losses.add_unheard("topic", 7)
     losses.add_unheard("topic", 4)
-    assert losses.diagnosis().values == {"lost topic": 2, "lost topic, not listening": 11}
+    assert losses.diagnosis().values == {
+        "lost topic": 2,
+        "lost topic, not listening": 11,
+    }
     assert hands.lines(Level.WARN)[1:] == [
         "topic: 7 messages were published while this node was not listening"
     ]
@@ -144,7 +150,13 @@ def test_a_stamp_of_the_future_does_not_hide_later_gaps(hands, ahead_ns):
 
 @pytest.mark.parametrize(
     "stamps, gap",
-    [([5], 0), ([5, 9, 20], 11), ([20, 5, 9], 0), ([5, 20, 9, 26], 15), ([9, 5, 12], 3)],
+    [
+        ([5], 0),
+        ([5, 9, 20], 11),
+        ([20, 5, 9], 0),
+        ([5, 20, 9, 26], 15),
+        ([9, 5, 12], 3),
+    ],
 )
 def test_a_gap_lies_between_a_stamp_and_the_newest_before(hands, stamps, gap):
     together, single = Rate(hands.ports.now_s), Rate(hands.ports.now_s)

@@ -14,7 +14,9 @@ PLATE = Artifact(7, 0.01, 0, 5)
 
 def test_marks_missing_marks_and_what_a_shift_leaves_out():
     """Shifted by a pitch along +x the marks at m = 3 lie off the field."""
-    lines, step = plate_picture(PLATE, View("v", 0.0, (0.01, 0.0)), [(-3, 2), (0, -1)], 2, 20)
+    lines, step = plate_picture(
+        PLATE, View("v", 0.0, (0.01, 0.0)), [(-3, 2), (0, -1)], 2, 20
+    )
     assert step == 1
     assert lines == [".ooooo ", "oooooo ", "oooooo ", "ooo.oo ", "oooooo "]
 
@@ -34,8 +36,12 @@ def test_nothing_is_drawn_where_nothing_is_told():
     assert plate_picture(PLATE, View("v", 0.0, (0.07, 0.0)), [], 0, 20) == ([], 1)
 
 
-@pytest.mark.parametrize(("most", "step"), [(7, 1), (6, 2), (4, 2), (3, 3), (2, 4), (1, 7)])
-@pytest.mark.parametrize("missing", [[(3, 2)], [(-3, -2)], [(0, 0), (3, -2)], [(2, 1), (1, 1)]])
+@pytest.mark.parametrize(
+    ("most", "step"), [(7, 1), (6, 2), (4, 2), (3, 3), (2, 4), (1, 7)]
+)
+@pytest.mark.parametrize(
+    "missing", [[(3, 2)], [(-3, -2)], [(0, 0), (3, -2)], [(2, 1), (1, 1)]]
+)
 def test_of_several_marks_the_worst_shows(most, step, missing):
     lines, found = plate_picture(PLATE, View("v"), missing, len(missing), most)
     assert found == step
@@ -49,7 +55,9 @@ def test_of_several_marks_the_worst_shows(most, step, missing):
             }
             for column in range(0, 7, step)
         ]
-        expected.append("".join("." if block & set(missing) else "o" for block in blocks))
+        expected.append(
+            "".join("." if block & set(missing) else "o" for block in blocks)
+        )
     assert lines == expected[::-1]
 
 
@@ -61,7 +69,8 @@ def test_a_placed_plate_shows_the_marks_over_the_map():
     inside = view.pose.in_field(plate)
     assert 9 < inside.sum() < 25
     wanted = [
-        ["o" if inside[m + 2, n + 2] else " " for m in range(-2, 3)] for n in range(2, -3, -1)
+        ["o" if inside[m + 2, n + 2] else " " for m in range(-2, 3)]
+        for n in range(2, -3, -1)
     ]
     wanted[3][2] = wanted[2][3] = "."
     assert lines == ["".join(row) for row in wanted]

@@ -22,7 +22,9 @@ from test.support.ports import message
 
 VIEW = View("rot90", np.pi / 2)
 COMMAND = Command(5, Phase.MEASURE, "hu", 1, VIEW, Artifact(11, 0.01, 24), 4)
-READ = ViewReadings(VIEW, sigma_xy=19.2e-9, rejected={"low_score": 1, "stage_moving": 2})
+READ = ViewReadings(
+    VIEW, sigma_xy=19.2e-9, rejected={"low_score": 1, "stage_moving": 2}
+)
 PROGRESS = ViewProgress(1, VIEW, 121, 83, 24, 12, READ, 9)
 
 
@@ -75,7 +77,9 @@ def test_other_states(command, view, line):
 
 def test_repeats_are_counted_while_no_mark_is_complete():
     twice = replace(VIEW, repeats=2)
-    read = ViewReadings(twice, np.array([0, 0]), np.array([0, 1]), count=np.array([1, 1]))
+    read = ViewReadings(
+        twice, np.array([0, 0]), np.array([0, 1]), count=np.array([1, 1])
+    )
     view = ViewProgress(1, twice, 4, 0, 0, 0, read, 9)
     assert progress_line(COMMAND, view).endswith(": 0 of 4 marks, 25 % of 2 repeats")
 
@@ -104,7 +108,10 @@ class Desk:
                     message("ViewCommand", from_model.command(event, "stage")), False
                 )
             else:
-                add = {Detection: collector.add_detection, EncoderSample: collector.add_encoder}
+                add = {
+                    Detection: collector.add_detection,
+                    EncoderSample: collector.add_encoder,
+                }
                 add[type(event)](event)
         self.session._dirty = True
 

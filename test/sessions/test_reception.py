@@ -23,7 +23,12 @@ from selfcal_ros.sessions.collecting import CollectingSession
 from selfcal_ros.sessions.health import Level
 from selfcal_ros.sessions.journal_keeper import JournalKeeper, KeptTopic
 from selfcal_ros.sessions.reception import Reception
-from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
+from selfcal_ros.topics import (
+    COMMAND_TOPIC,
+    DETECTION_TOPIC,
+    ENCODER_TOPIC,
+    INPUT_TOPICS,
+)
 from test.support.bags import Foreign
 from test.support.ports import START_NS, Hands, settings_of
 from test.support.sessions import cdr_of, collected, events_of, small_plan
@@ -37,9 +42,13 @@ class Desk:
 
     def __init__(self, folder="", worker=None, **parameters):
         self.hands, self.refused = Hands(), Counter()
-        settings = settings_of("measurement_collector", journal=str(folder), **parameters)
+        settings = settings_of(
+            "measurement_collector", journal=str(folder), **parameters
+        )
         self.session = CollectingSession(settings, self.hands.ports)
-        self.keeper = JournalKeeper(settings.journal, TOPICS, settings, self.hands.ports)
+        self.keeper = JournalKeeper(
+            settings.journal, TOPICS, settings, self.hands.ports
+        )
         self.reception = Reception(
             self.session,
             self.keeper,
@@ -110,7 +119,11 @@ def expected(events):
 
 def test_bytes_give_the_readings_of_the_messages(events, expected):
     desk = Desk().receive(events)
-    assert desk.session.collector.received == {"encoder": 0, "detection": 0, "command": 0}
+    assert desk.session.collector.received == {
+        "encoder": 0,
+        "detection": 0,
+        "command": 0,
+    }
     assert desk.read() == expected
     assert sum(desk.session.collector.received.values()) == len(events)
     assert not desk.refused
@@ -130,7 +143,9 @@ def test_messages_that_are_too_long_are_counted_with_the_reason(events, expected
     }
 
 
-def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events, expected):
+def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(
+    events, expected
+):
     desk = Desk()
     for _ in range(2):
         desk.reception.encoder(b"\0\1\0\0\xff\xff", 0)
@@ -144,7 +159,9 @@ def test_what_cannot_be_decoded_is_counted_by_topic_and_the_rest_is_used(events,
     }
 
 
-def test_a_command_that_cannot_be_used_is_refused_and_the_others_are_used(events, expected):
+def test_a_command_that_cannot_be_used_is_refused_and_the_others_are_used(
+    events, expected
+):
     bad = Command(events[0].stamp_ns, Phase.ABORT, "plan", view_index=10_001)
     desk = Desk().receive([bad, *events])
     desk.read()
@@ -153,7 +170,9 @@ def test_a_command_that_cannot_be_used_is_refused_and_the_others_are_used(events
     assert desk.session.collector.unusable == {"command_unusable": 1}
 
 
-def test_what_is_received_is_in_the_journal_before_it_is_used(tmp_path, events, expected):
+def test_what_is_received_is_in_the_journal_before_it_is_used(
+    tmp_path, events, expected
+):
     desk = Desk(tmp_path)
     used = []
     collector = desk.session.collector
@@ -162,7 +181,8 @@ def test_what_is_received_is_in_the_journal_before_it_is_used(tmp_path, events, 
             len(table),
             desk.keeper.path.stat()
             and sum(
-                file.read_bytes().count(cdr_of(found)) for file in desk.keeper.path.glob("*.mcap")
+                file.read_bytes().count(cdr_of(found))
+                for file in desk.keeper.path.glob("*.mcap")
             ),
         )
     )
@@ -171,7 +191,9 @@ def test_what_is_received_is_in_the_journal_before_it_is_used(tmp_path, events, 
     assert used == [(1, 1)]
 
 
-def test_the_journal_is_a_bag_that_gives_what_the_session_gave(tmp_path, events, expected):
+def test_the_journal_is_a_bag_that_gives_what_the_session_gave(
+    tmp_path, events, expected
+):
     desk = Desk(tmp_path).receive(events)
     assert desk.read() == expected
     desk.reception.close()
@@ -201,6 +223,7 @@ def test_a_session_that_takes_up_a_journal_goes_on_as_if_nothing_had_been(
     first.keeper.close()
     second = Desk(tmp_path)
     assert second.reception.restoring
+    # latched
     second.receive(
         [
             event
@@ -208,17 +231,21 @@ def test_a_session_that_takes_up_a_journal_goes_on_as_if_nothing_had_been(
             if isinstance(event, Command) and event.stamp_ns <= events[cut - 1].stamp_ns
         ],
         is_older=True,
-    )  # latched
+    )
     second.receive(events[cut:])
     assert second.read() == expected
     assert not second.session.missed
     assert second.session.diagnosis(detections_matched=True).values["phase"] == "DONE"
-    [line] = [line for line in second.hands.lines(Level.OK) if line.startswith("resumed")]
+    [line] = [
+        line for line in second.hands.lines(Level.OK) if line.startswith("resumed")
+    ]
     assert f"with {cut} messages" in line
 
 
 @pytest.mark.parametrize("away_s", [0.5, 90.0])
-def test_the_time_without_a_collector_is_told_in_the_view_that_it_tore(tmp_path, events, away_s):
+def test_the_time_without_a_collector_is_told_in_the_view_that_it_tore(
+    tmp_path, events, away_s
+):
     """Where the marks that were lost had been read often enough before, nothing else tells it."""
     commands = [event for event in events if isinstance(event, Command)]
     cut = next(number for number, event in enumerate(events) if event is commands[2])
@@ -249,7 +276,9 @@ def test_the_time_without_a_collector_is_told_in_the_view_that_it_tore(tmp_path,
     ("hours", "limit_s", "goes_on"),
     [(23, 86400.0, True), (25, 86400.0, False), (25, 1e6, True), (1, 60.0, False)],
 )
-def test_a_run_that_was_left_long_ago_is_not_taken_up(tmp_path, events, hours, limit_s, goes_on):
+def test_a_run_that_was_left_long_ago_is_not_taken_up(
+    tmp_path, events, hours, limit_s, goes_on
+):
     first = Desk(tmp_path).receive(events[:200])
     first.reception.drain()
     first.keeper.close()
@@ -280,14 +309,20 @@ def test_of_a_run_that_is_over_nothing_is_said_however_old(tmp_path, events):
     assert not second.hands.lines(Level.WARN)
 
 
-def test_what_comes_while_the_journal_is_read_is_written_and_held_back(tmp_path, events, expected):
+def test_what_comes_while_the_journal_is_read_is_written_and_held_back(
+    tmp_path, events, expected
+):
     cut = len(events) // 2
     first = Desk(tmp_path).receive(events[:cut])
     first.reception.drain()
     first.keeper.close()
     worker = Later()
     second = Desk(tmp_path, worker).receive(events[cut:-6])
-    for path in (None, first.keeper.path or first_path(tmp_path)):  # gone through, then read
+    # gone through, then read
+    for path in (
+        None,
+        first.keeper.path or first_path(tmp_path),
+    ):
         assert not second.reception.drain()
         told = second.reception.diagnosis()
         assert (told.level, told.message) == (
@@ -322,7 +357,8 @@ def test_what_comes_while_a_journal_whose_run_is_over_is_gone_through_is_in_the_
     second.reception.close()
     assert path != first_path(tmp_path)
     assert sum(
-        len(item) if hasattr(item, "__len__") else 1 for _, item in BagReader(path).columns()
+        len(item) if hasattr(item, "__len__") else 1
+        for _, item in BagReader(path).columns()
     ) == len(events)
 
 
@@ -405,7 +441,9 @@ class FullDisk:
         monkeypatch.setattr(journal_file.os, "write", guarded)
 
 
-def test_a_full_disk_is_said_counted_and_ends_nothing(tmp_path, events, expected, monkeypatch):
+def test_a_full_disk_is_said_counted_and_ends_nothing(
+    tmp_path, events, expected, monkeypatch
+):
     disk, desk = FullDisk(monkeypatch), Desk(tmp_path)
     desk.receive(events[:40]).reception.drain()
     disk.full = True
@@ -428,10 +466,15 @@ def test_a_full_disk_is_said_counted_and_ends_nothing(tmp_path, events, expected
         f"{desk.keeper.path}: the journal is written again; 30 messages are not in it",
     ]
     told = desk.reception.diagnosis()
-    assert (told.level, told.message) == (Level.WARN, "30 messages are not in the journal")
+    assert (told.level, told.message) == (
+        Level.WARN,
+        "30 messages are not in the journal",
+    )
 
 
-def test_a_disk_that_is_full_from_the_beginning_is_tried_again(tmp_path, events, monkeypatch):
+def test_a_disk_that_is_full_from_the_beginning_is_tried_again(
+    tmp_path, events, monkeypatch
+):
     disk = FullDisk(monkeypatch)
     disk.full = True
     desk = Desk(tmp_path / "journals").receive(events[:5])
@@ -446,7 +489,9 @@ def test_a_disk_that_is_full_from_the_beginning_is_tried_again(tmp_path, events,
     desk.receive(events[7:10]).reception.drain()
     assert desk.reception.diagnosis().values["journal_lost"] == 7
     assert desk.reception.diagnosis().message == "7 messages are not in the journal"
-    assert [path.name for path in (tmp_path / "journals").iterdir()] == [desk.keeper.path.name]
+    assert [path.name for path in (tmp_path / "journals").iterdir()] == [
+        desk.keeper.path.name
+    ]
     assert desk.hands.lines(Level.WARN)[1:] == [
         f"{desk.keeper.path}: the journal is written again; 7 messages are not in it"
     ]
@@ -454,7 +499,9 @@ def test_a_disk_that_is_full_from_the_beginning_is_tried_again(tmp_path, events,
 
 def test_a_folder_that_may_not_be_written_is_a_mistake_of_the_parameter(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match=r"cannot be created \(Not a directory\); name a"):
+    with pytest.raises(
+        InputError, match=r"cannot be created \(Not a directory\); name a"
+    ):
         Desk(tmp_path / "file")
 
 
@@ -464,7 +511,9 @@ def test_a_disk_that_lags_is_told(tmp_path, monkeypatch, lag_s, level):
     monkeypatch.setattr(type(desk.keeper._journal), "lag_s", lag_s)
     told = desk.reception.diagnosis()
     assert told.level == level
-    assert ("the disk is 5.1 s behind with the journal" in told.message) is (level > Level.OK)
+    assert ("the disk is 5.1 s behind with the journal" in told.message) is (
+        level > Level.OK
+    )
     assert told.values["journal_lag_s"] == f"{lag_s:.2f}"
 
 
@@ -476,7 +525,10 @@ def test_without_a_folder_there_is_no_journal(events, expected):
 
 def test_a_journal_that_is_refused_gets_no_other_beside_it(tmp_path):
     """That would be the newest one, and be continued instead at the next start."""
-    hands, settings = Hands(), settings_of("measurement_collector", journal=str(tmp_path))
+    hands, settings = (
+        Hands(),
+        settings_of("measurement_collector", journal=str(tmp_path)),
+    )
     with journal.start(tmp_path, START_NS) as other:
         keeper = JournalKeeper(settings.journal, TOPICS, settings, hands.ports)
         with pytest.raises(InputError, match="another process writes this journal"):
@@ -537,7 +589,9 @@ def test_whatever_a_later_try_meets_what_has_come_is_used(
     assert desk.read() == expected
 
 
-def test_a_full_disk_and_a_slow_encoder_do_not_fill_the_log(tmp_path, events, monkeypatch):
+def test_a_full_disk_and_a_slow_encoder_do_not_fill_the_log(
+    tmp_path, events, monkeypatch
+):
     disk, desk = FullDisk(monkeypatch), Desk(tmp_path)
     disk.full = True
     for tick in range(1000):  # 40 s, a message at every second look
@@ -574,7 +628,10 @@ def test_a_journal_is_taken_up_on_a_full_disk_and_gone_on_with_when_there_is_roo
     disk.full = False
     second.hands.pass_time(10)
     second.reception.drain()
-    assert (second.keeper.path, second.reception.restoring) == (first_path(tmp_path), False)
+    assert (second.keeper.path, second.reception.restoring) == (
+        first_path(tmp_path),
+        False,
+    )
     second.receive(events[260:])
     assert second.read() == expected
     assert second.reception.diagnosis().message == "60 messages are not in the journal"
@@ -592,7 +649,9 @@ def first_path(folder):
     return min(path for path in folder.iterdir() if path.is_dir())
 
 
-def test_a_journal_that_could_not_be_read_is_not_written_to(tmp_path, events, monkeypatch):
+def test_a_journal_that_could_not_be_read_is_not_written_to(
+    tmp_path, events, monkeypatch
+):
     first = Desk(tmp_path).receive(events[:50])
     first.reception.drain()
     first.keeper.close()
@@ -612,7 +671,10 @@ def test_a_journal_that_could_not_be_read_is_not_written_to(tmp_path, events, mo
     second.receive(events[60:70]).reception.drain()
     assert second.keeper.path not in (None, first.keeper.path)
     assert sum(second.session.collector.received.values()) == 20
-    assert [len(list(path.glob("*.mcap"))) for path in sorted(tmp_path.iterdir())] == [1, 1]
+    assert [len(list(path.glob("*.mcap"))) for path in sorted(tmp_path.iterdir())] == [
+        1,
+        1,
+    ]
 
 
 def two_files(folder, events, spoil):
@@ -675,7 +737,9 @@ def digests(measurements):
     return [readings_digest(view, {}) for view in measurements.views]
 
 
-def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_path, events):
+def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(
+    tmp_path, events
+):
     ahead, honest = run_of(events, START_NS + DAY_NS), run_of(events, START_NS)
     _, expected, _ = collected(honest)
     desk = Desk(tmp_path).receive(ahead)
@@ -688,7 +752,11 @@ def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_p
     ]
     assert desk.session.collector.unusable == dict(
         zip(
-            ("command_from_the_future", "from_the_future", "encoder_sample_from_the_future"),
+            (
+                "command_from_the_future",
+                "from_the_future",
+                "encoder_sample_from_the_future",
+            ),
             counts,
             strict=True,
         )
@@ -708,7 +776,9 @@ def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(tmp_p
     assert measurements.run_id == str(START_NS)
     assert digests(measurements) == digests(expected)
     desk.keeper.close()
-    again = collect_bag(desk_path(tmp_path), settings_of("measurement_collector")).measurements
+    again = collect_bag(
+        desk_path(tmp_path), settings_of("measurement_collector")
+    ).measurements
     assert digests(again) == digests(expected)
     assert Desk(tmp_path).receive(honest, is_older=True).reception.drain()
 
@@ -723,13 +793,17 @@ def test_a_clock_that_steps_shortly_before_the_end_is_told_live_as_of_the_journa
     step_ns = events[-1].stamp_ns - 300_000_000
     for number, event in enumerate(events):
         stepped = isinstance(event, Detection) and event.stamp_ns > step_ns
-        data = cdr_of(replace(event, stamp_ns=event.stamp_ns + round(by_s * 1e9) * stepped))
+        data = cdr_of(
+            replace(event, stamp_ns=event.stamp_ns + round(by_s * 1e9) * stepped)
+        )
         if isinstance(event, Command):
             desk.reception.command(data, False, event.stamp_ns)
         else:
-            (desk.reception.detection if isinstance(event, Detection) else desk.reception.encoder)(
-                data, event.stamp_ns
-            )
+            (
+                desk.reception.detection
+                if isinstance(event, Detection)
+                else desk.reception.encoder
+            )(data, event.stamp_ns)
         if number == len(events) // 2 or event is events[-1]:
             desk.hands.seconds = 100.0 + (event.stamp_ns - START_NS) * 1e-9
             desk.reception.drain()
@@ -746,7 +820,8 @@ def test_a_clock_that_steps_shortly_before_the_end_is_told_live_as_of_the_journa
 def test_how_far_ahead_a_stamp_may_lie(events, ahead_s, used, kind):
     event = next(event for event in events if isinstance(event, kind))
     desk = Desk().receive([replace(event, stamp_ns=START_NS + round(ahead_s * 1e9))])
-    assert desk.reception.drain()  # else the counts are not published, and a player waits for them
+    # else the counts are not published, and a player waits for them
+    assert desk.reception.drain()
     assert sum(desk.session.collector.received.values()) == 1
     assert not desk.reception.drain()
     assert (desk.session.collector.unusable == {}) is used is (not desk.refused)
@@ -819,8 +894,12 @@ def test_a_recorded_run_of_long_ago_is_no_newer_one(events):
 
 def test_a_forged_command_within_a_run_changes_nothing_and_is_a_warning(events):
     honest = run_of(events, START_NS)
-    begin = next(e for e in honest if isinstance(e, Command) and e.phase == Phase.MEASURE)
-    forged = replace(begin, stamp_ns=begin.stamp_ns + 10**8, run_id="", plan_id="forged")
+    begin = next(
+        e for e in honest if isinstance(e, Command) and e.phase == Phase.MEASURE
+    )
+    forged = replace(
+        begin, stamp_ns=begin.stamp_ns + 10**8, run_id="", plan_id="forged"
+    )
     desk = Desk().receive([*honest, forged])
     desk.reception.drain()
     desk.session.tick()
@@ -830,5 +909,6 @@ def test_a_forged_command_within_a_run_changes_nothing_and_is_a_warning(events):
     told = desk.session.diagnosis(detections_matched=True)
     assert told.level == Level.WARN
     assert (
-        "1 view command of plan 'forged' arrived during a run, belonging to no run" in told.message
+        "1 view command of plan 'forged' arrived during a run, belonging to no run"
+        in told.message
     )

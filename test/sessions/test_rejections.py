@@ -32,7 +32,9 @@ class Late:
 
     def __init__(self) -> None:
         self.hands = Hands()
-        self.session = CollectingSession(settings_of("measurement_collector"), self.hands.ports)
+        self.session = CollectingSession(
+            settings_of("measurement_collector"), self.hands.ports
+        )
 
     def give(self, events: Iterable) -> None:
         for event in events:
@@ -67,7 +69,11 @@ def arrivals(late: type, by_s: float, *, plan: str = "0, 90, 180") -> list:
     events = scene(plan, count=0).events
     first = min(event.stamp_ns for event in events)
     return [
-        ((event.stamp_ns - first) * 1e-9 + (by_s if isinstance(event, late) else 0.0), event)
+        (
+            (event.stamp_ns - first) * 1e-9
+            + (by_s if isinstance(event, late) else 0.0),
+            event,
+        )
         for event in events
     ]
 
@@ -86,7 +92,9 @@ def test_views_whose_commands_come_after_all_detections_are_no_fault(by_s):
     cell, events = Late(), scene("0, 90, 180", count=0)
     cell.give([*events.commands[:2], *events.samples, *events.detections])
     cell.session.tick()
-    assert cell.session.collector.collect()[0].views[0].rejected["stage_not_at_mark"] > 40
+    assert (
+        cell.session.collector.collect()[0].views[0].rejected["stage_not_at_mark"] > 40
+    )
     cell.hands.pass_time(by_s)
     cell.session.tick()
     cell.give(events.commands[2:])
@@ -120,7 +128,10 @@ def test_clocks_that_differ_are_told_after_a_while(by_s):
     cell.hands.pass_time(0.01 * PATIENCE_S + 1e-6)
     cell.session.tick()
     [line] = cell.hands.lines(Level.WARN)
-    assert f"the detections are stamped about {by_s:g} s after the encoder samples; {CLOCK}" in line
+    assert (
+        f"the detections are stamped about {by_s:g} s after the encoder samples; {CLOCK}"
+        in line
+    )
     assert line in cell.session.diagnosis(detections_matched=True).message
     cell.hands.pass_time(PATIENCE_S)
     cell.session.tick()
@@ -150,7 +161,9 @@ def test_the_time_is_counted_anew_when_a_fault_comes_again():
         assert cell.hands.said == []
         cell.session.tick()
     [line] = cell.hands.lines(Level.WARN)
-    assert line.startswith("15 of 25 detections were rejected as no_encoder_sample_near")
+    assert line.startswith(
+        "15 of 25 detections were rejected as no_encoder_sample_near"
+    )
 
 
 def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected():
@@ -164,7 +177,8 @@ def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected()
     cell.give(
         event
         for event in events
-        if event not in lost and not (isinstance(event, Command) and event.phase == Phase.DONE)
+        if event not in lost
+        and not (isinstance(event, Command) and event.phase == Phase.DONE)
     )
     cell.session.tick()
     for number in range(AT_LEAST):
@@ -183,20 +197,28 @@ def test_a_view_that_no_longer_advances_says_why_before_most_of_it_is_rejected()
     cell.give(lost)
     cell.hands.pass_time(STEP_S)
     cell.session.tick()
-    assert "none of the last" not in cell.session.diagnosis(detections_matched=True).message
+    assert (
+        "none of the last"
+        not in cell.session.diagnosis(detections_matched=True).message
+    )
 
 
 def test_lines_without_their_joint_are_told_although_the_marks_are_more():
     cell, events = Late(), scene("0", count=8).events
     lines = [
-        event for event in events if isinstance(event, Detection) and event.kind == Kind.ANGULAR
+        event
+        for event in events
+        if isinstance(event, Detection) and event.kind == Kind.ANGULAR
     ]
     cell.give(
-        replace(event, names=event.names[:2], positions=event.positions[:2], velocities=())
+        replace(
+            event, names=event.names[:2], positions=event.positions[:2], velocities=()
+        )
         if isinstance(event, EncoderSample)
         else event
         for event in events
-        if event not in lines[1:] and not (isinstance(event, Command) and event.phase == Phase.DONE)
+        if event not in lines[1:]
+        and not (isinstance(event, Command) and event.phase == Phase.DONE)
     )
     cell.session.tick()
     cell.give(lines[1:])

@@ -49,7 +49,10 @@ def test_all_is_kept_around_a_command_or_a_detection():
     assert times(resting.wake(1399 * STEP_NS + 1)) == [*range(1399 - NEAR, 1400)]
     assert times(resting.wake(1399 * STEP_NS + 1)) == []
     after = run(resting, 1400, 4000)
-    assert after == [*range(1400, 1400 + NEAR), *bursts(*range(1400 + NEAR, 4000 - NEAR, 600))]
+    assert after == [
+        *range(1400, 1400 + NEAR),
+        *bursts(*range(1400 + NEAR, 4000 - NEAR, 600)),
+    ]
 
 
 def test_all_is_kept_while_a_view_is_measured():
@@ -110,17 +113,22 @@ def live(desk, events, idle_s):
 
 def first_exposure(events):
     """Return the first sample behind the first exposure, and the stamp of that; None without."""
-    first = next((event.stamp_ns for event in events if isinstance(event, Detection)), None)
+    first = next(
+        (event.stamp_ns for event in events if isinstance(event, Detection)), None
+    )
     return first and (
         next(
-            event for event in events if isinstance(event, EncoderSample) and event.stamp_ns > first
+            event
+            for event in events
+            if isinstance(event, EncoderSample) and event.stamp_ns > first
         ),
         first,
     )
 
 
 def test_a_journal_with_rests_gives_what_the_session_gave(tmp_path, events):
-    gap = {"max_encoder_gap": 1.5 * STEP_NS * S_PER_NS}  # at rest the encoder is heard as well
+    # at rest the encoder is heard as well
+    gap = {"max_encoder_gap": 1.5 * STEP_NS * S_PER_NS}
     desk = Desk(tmp_path, **gap)
     live(desk, events, idle_s=300)
     measurements, progress = desk.session.collector.collect()
@@ -130,7 +138,9 @@ def test_a_journal_with_rests_gives_what_the_session_gave(tmp_path, events):
     }
     assert all(view.complete for view in progress.values())
     desk.reception.close()
-    offline = collect_bag(desk_path(tmp_path), settings_of("measurement_collector", **gap))
+    offline = collect_bag(
+        desk_path(tmp_path), settings_of("measurement_collector", **gap)
+    )
     assert {
         index: readings_digest(item.readings, offline.measurements.rejected)
         for index, item in offline.views.items()
@@ -149,12 +159,17 @@ def test_a_journal_with_rests_gives_what_the_session_gave(tmp_path, events):
 
 def count(path):
     return sum(
-        len(item) if hasattr(item, "__len__") else 1 for _, item in BagReader(path).columns()
+        len(item) if hasattr(item, "__len__") else 1
+        for _, item in BagReader(path).columns()
     )
 
 
-def test_a_run_that_is_taken_up_is_kept_whole_before_a_command_comes_again(tmp_path, events):
-    cut = next(number for number, event in enumerate(events) if isinstance(event, Detection))
+def test_a_run_that_is_taken_up_is_kept_whole_before_a_command_comes_again(
+    tmp_path, events
+):
+    cut = next(
+        number for number, event in enumerate(events) if isinstance(event, Detection)
+    )
     first = Desk(tmp_path).receive(events[:cut])
     first.reception.drain()
     first.keeper.close()

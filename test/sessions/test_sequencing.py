@@ -30,7 +30,10 @@ class Desk:
         self.session = SequencingSession(
             settings_of(
                 "pose_sequencer",
-                **({"plan": plan_file(folder, PLAN), "start_checks": False} | parameters),
+                **(
+                    {"plan": plan_file(folder, PLAN), "start_checks": False}
+                    | parameters
+                ),
             ),
             self.hands.ports,
         )
@@ -43,7 +46,13 @@ class Desk:
         self.session.presence.take(node, Diagnosis(Level.OK, "", values))
 
     def status(
-        self, index: int = 0, *, done: int = 5, complete: bool = False, age_ns: int = 0, **fields
+        self,
+        index: int = 0,
+        *,
+        done: int = 5,
+        complete: bool = False,
+        age_ns: int = 0,
+        **fields,
     ) -> None:
         stamp = self.hands.of("command")[-1]["header"]["stamp"]
         stamp_ns = stamp["sec"] * 10**9 + stamp["nanosec"] - age_ns
@@ -51,7 +60,9 @@ class Desk:
             SimpleNamespace(
                 **(
                     {
-                        "header": SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=stamp_ns)),
+                        "header": SimpleNamespace(
+                            stamp=SimpleNamespace(sec=0, nanosec=stamp_ns)
+                        ),
                         "plan_id": PLAN.plan_id,
                         "view_index": index,
                         "complete": complete,
@@ -102,7 +113,10 @@ def test_each_command_starts_the_coverage_of_its_view_anew(measuring):
     measuring.status(done=10)
     assert measuring.session.diagnosis().values["coverage"] == "0.400"
     measuring.session.act(measuring.session.machine.redo)
-    assert (measuring.session.coverage, measuring.session.diagnosis().values["coverage"]) == (
+    assert (
+        measuring.session.coverage,
+        measuring.session.diagnosis().values["coverage"],
+    ) == (
         0.0,
         "0.000",
     )
@@ -119,12 +133,16 @@ def test_stamps_grow_where_the_clock_steps_back(measuring):
 
 
 @pytest.mark.parametrize("back_s, said", [(0.099, 0), (0.2, 1), (37.0, 1)])
-def test_a_clock_that_was_set_back_is_told_until_it_has_caught_up(measuring, back_s, said):
+def test_a_clock_that_was_set_back_is_told_until_it_has_caught_up(
+    measuring, back_s, said
+):
     measuring.hands.pass_time(-back_s)
     measuring.session.tick()
     measuring.session.tick()
     words = f"this machine's clock is {back_s:.3g} s behind its own last command: it was set back"
-    assert [line[: len(words)] for line in measuring.hands.lines(Level.WARN)] == [words] * said
+    assert [line[: len(words)] for line in measuring.hands.lines(Level.WARN)] == [
+        words
+    ] * said
     assert measuring.session.diagnosis().message.startswith(words) is bool(said)
     measuring.hands.pass_time(back_s)
     measuring.session.tick()
@@ -176,7 +194,9 @@ def test_view_timeout(tmp_path, timeout, seconds, last):
 
 
 def test_redos_are_counted_by_view(tmp_path):
-    desk = Desk(tmp_path, view_timeout=1.0, max_redos=1, auto_confirm=True, settle_time=0.0)
+    desk = Desk(
+        tmp_path, view_timeout=1.0, max_redos=1, auto_confirm=True, settle_time=0.0
+    )
     desk.session.begin()
     for _ in range(10):
         desk.session.tick()  # confirms
@@ -205,8 +225,14 @@ def test_redos_are_counted_by_view(tmp_path):
     "values, missing",
     [
         (READY, []),
-        (READY | {"encoder_heard": "no"}, ["the encoder (measurement_collector hears no sample)"]),
-        (READY | {"detections_matched": "no"}, ["a publisher of stage/mark_detections"]),
+        (
+            READY | {"encoder_heard": "no"},
+            ["the encoder (measurement_collector hears no sample)"],
+        ),
+        (
+            READY | {"detections_matched": "no"},
+            ["a publisher of stage/mark_detections"],
+        ),
         (
             {},
             [
@@ -357,7 +383,9 @@ def test_a_view_that_was_aborted_is_not_measured_already(tmp_path, short, known)
         Command(0, MEASURE, PLAN.plan_id, 0, PLAN.views[0], PLAN.artifact), "stage"
     )
     desk.session.take_measurement(
-        SimpleNamespace(**(view | {"count": count, "count_theta": np.full(8, 2), "run_id": "17"}))
+        SimpleNamespace(
+            **(view | {"count": count, "count_theta": np.full(8, 2), "run_id": "17"})
+        )
     )
     desk.hear("measurement_collector", **TOLD)
     desk.hear("solver")
@@ -394,7 +422,9 @@ def test_check_stops_that_are_missing_count_and_are_named(measuring):
 
 def test_a_view_without_any_detection_stalls_too_and_the_collector_is_quoted(measuring):
     measuring.hands.pass_time(5.0)
-    measuring.session.presence.take("measurement_collector", Diagnosis(Level.WARN, "clock"))
+    measuring.session.presence.take(
+        "measurement_collector", Diagnosis(Level.WARN, "clock")
+    )
     measuring.session.tick()
     assert measuring.hands.lines(Level.WARN) == [
         "view '0' stalls: no detection has arrived since MEASURE; measurement_collector: clock"
@@ -418,15 +448,23 @@ def test_a_stall_ends_with_the_next_detection_and_a_slow_cell_gets_more_time(mea
 
 def test_a_foreign_command_ends_waiting_and_its_own_plan(desk, measuring):
     stamp = measuring.session._commanded_ns + 1
-    foreign = Command(stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp))
-    measuring.session.take_command(message("ViewCommand", from_model.command(foreign, "stage")))
+    foreign = Command(
+        stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp)
+    )
+    measuring.session.take_command(
+        message("ViewCommand", from_model.command(foreign, "stage"))
+    )
     assert measuring.session.machine.state is State.FOLLOWING
-    with pytest.raises(InputError, match="cannot start while following recorded commands"):
+    with pytest.raises(
+        InputError, match="cannot start while following recorded commands"
+    ):
         measuring.session.begin()
 
 
 def test_its_own_command_is_not_foreign(measuring):
-    measuring.session.take_command(message("ViewCommand", measuring.hands.of("command")[0]))
+    measuring.session.take_command(
+        message("ViewCommand", measuring.hands.of("command")[0])
+    )
     assert measuring.session.machine.state is State.MEASURING
 
 
@@ -439,7 +477,9 @@ def test_a_companion_that_falls_silent_within_a_run_is_named_until_it_is_back(
     for _ in range(2):
         measuring.session.tick()
     line = "no sign of life from solver for 3 s: it hangs or has ended"
-    assert [text.startswith(line) for text in measuring.hands.lines(Level.WARN)] == [True] * said
+    assert [text.startswith(line) for text in measuring.hands.lines(Level.WARN)] == [
+        True
+    ] * said
     assert measuring.session.diagnosis().message.startswith(line) is bool(said)
     measuring.hear("solver")
     measuring.session.tick()
@@ -447,7 +487,8 @@ def test_a_companion_that_falls_silent_within_a_run_is_named_until_it_is_back(
     measuring.session.give_up()
     measuring.hands.pass_time(60)
     measuring.session.tick()
-    assert len(measuring.hands.lines(Level.WARN)) == said  # no run, nobody is waited for
+    # no run, nobody is waited for
+    assert len(measuring.hands.lines(Level.WARN)) == said
 
 
 @pytest.mark.parametrize(
@@ -472,7 +513,9 @@ def test_a_forged_or_old_command_does_not_end_the_run_of_its_own_plan(
     )
     published = len(measuring.hands.published)
     for _ in range(2):
-        measuring.session.take_command(message("ViewCommand", from_model.command(foreign, "f")))
+        measuring.session.take_command(
+            message("ViewCommand", from_model.command(foreign, "f"))
+        )
     assert measuring.session.machine.state is State.MEASURING
     assert len(measuring.hands.published) == published
     assert measuring.hands.lines(Level.WARN) == [
@@ -483,9 +526,13 @@ def test_a_forged_or_old_command_does_not_end_the_run_of_its_own_plan(
 
 def test_a_command_of_the_future_is_refused_by_an_idle_sequencer_too(desk):
     stamp = START_NS + 61 * 10**9
-    foreign = Command(stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp))
+    foreign = Command(
+        stamp, PLACE, "other", 0, PLAN.views[0], PLAN.artifact, run_id=str(stamp)
+    )
     with pytest.raises(InputError, match="stamped in the future of this node's clock"):
-        desk.session.take_command(message("ViewCommand", from_model.command(foreign, "f")))
+        desk.session.take_command(
+            message("ViewCommand", from_model.command(foreign, "f"))
+        )
     assert desk.session.machine.state is State.IDLE
 
 

@@ -11,7 +11,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.inputs import MAX_TEXT, Command, Detection, Kind, Phase, begun_ns
+from selfcal_ros.collection.inputs import (
+    MAX_TEXT,
+    Command,
+    Detection,
+    Kind,
+    Phase,
+    begun_ns,
+)
 from selfcal_ros.collection.settings.estimator import solver_options
 from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError, NoDataError, NotIdentifiableError
@@ -33,11 +40,16 @@ from test.support.ports import START_NS, Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan
 
 PLAN = small_plan()
-OTHER_SIGN = (np.kron(np.ones((2, 2)), np.eye(2)) * 1e-8).ravel()  # offsets rise with x, y
-ASSUMED = [term.name for term in default_terms() if term.name != "yaw"]  # which images show
+OTHER_SIGN = (
+    np.kron(np.ones((2, 2)), np.eye(2)) * 1e-8
+).ravel()  # offsets rise with x, y
+# which images show
+ASSUMED = [term.name for term in default_terms() if term.name != "yaw"]
 
 
-def views_of(plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, **changes) -> list:
+def views_of(
+    plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, **changes
+) -> list:
     """Return the ViewMeasurement messages of a run, stamps 10, 11, ...; with marks or without."""
     _, measurements, progress = collected(
         [
@@ -58,10 +70,20 @@ def views_of(plan=PLAN, seed: int = 5, run_id: str = "", *, grid: bool = True, *
 
 
 def command(
-    views: int, run_id: str = "", plan_id: str = PLAN.plan_id, phase: Phase = Phase.MEASURE
+    views: int,
+    run_id: str = "",
+    plan_id: str = PLAN.plan_id,
+    phase: Phase = Phase.MEASURE,
 ) -> object:
     told = Command(
-        begun_ns(run_id) or 1, phase, plan_id, 0, PLAN.views[0], PLAN.artifact, views, run_id
+        begun_ns(run_id) or 1,
+        phase,
+        plan_id,
+        0,
+        PLAN.views[0],
+        PLAN.artifact,
+        views,
+        run_id,
     )
     return message("ViewCommand", from_model.command(told, "stage"))
 
@@ -69,7 +91,9 @@ def command(
 class Desk:
     def __init__(self, **parameters) -> None:
         self.hands = Hands()
-        self.session = SolvingSession(settings_of("solver", **parameters), self.hands.ports)
+        self.session = SolvingSession(
+            settings_of("solver", **parameters), self.hands.ports
+        )
 
     def take(self, messages: list) -> None:
         for item in messages:
@@ -116,12 +140,18 @@ def test_a_plan_with_a_known_plate_is_a_recheck_as_offline(desk, tmp_path):
     shown = desk.session.result
     readings = collected(events_of(plan))[1]
     assert readings.artifact_from == path
-    offline = worded(calibrate(readings, solver_options(SolverSettings.checked({}, ""), readings)))
-    assert json.dumps(result_to_dict(replace(shown, run_id=offline.run_id))) == json.dumps(
-        result_to_dict(offline)
+    offline = worded(
+        calibrate(readings, solver_options(SolverSettings.checked({}, ""), readings))
     )
+    assert json.dumps(
+        result_to_dict(replace(shown, run_id=offline.run_id))
+    ) == json.dumps(result_to_dict(offline))
     assert shown.recheck.of == path
-    (told,) = [fields["state"] for output, fields in desk.hands.published if output == "summary"]
+    (told,) = [
+        fields["state"]
+        for output, fields in desk.hands.published
+        if output == "summary"
+    ]
     assert told.startswith("Still good: no change since first.json")
     lost = Desk()
     with pytest.raises(InputError, match="no such file"):
@@ -135,7 +165,8 @@ def test_the_robust_solver_leaves_out_a_reading_that_contradicts_the_others():
         views[1].dx[3] += 5e-6
         desk.take(views)
     assert [
-        (item["view"], item["kind"]) for item in robust.session.result.extra["outliers"]["removed"]
+        (item["view"], item["kind"])
+        for item in robust.session.result.extra["outliers"]["removed"]
     ] == [(PLAN.views[1].name, "grid")]
     assert robust.session.result.verdict.qualified
     assert not plain.session.result.verdict.qualified
@@ -182,7 +213,11 @@ def test_readings_of_two_runs_are_never_mixed(desk):
     desk.take(old)
     desk.take(new[:2])
     summary = desk.hands.of("summary")[-1]
-    assert (summary["views_done"], summary["run_id"], summary["identifiable"]) == (2, "200", False)
+    assert (summary["views_done"], summary["run_id"], summary["identifiable"]) == (
+        2,
+        "200",
+        False,
+    )
     desk.take([*new[2:], old[3]])
     last = desk.hands.of("map")[-1]
     _, fresh, _ = collected(events_of(PLAN, 6))
@@ -213,7 +248,9 @@ def test_the_later_run_supersedes(new, current, later):
 
 
 @pytest.mark.parametrize("run_id", ["", "no stamp"])
-def test_readings_that_name_no_beginning_take_nothing_from_a_run_that_does(desk, run_id):
+def test_readings_that_name_no_beginning_take_nothing_from_a_run_that_does(
+    desk, run_id
+):
     views = views_of(run_id="100")
     desk.take(views[:2])
     with pytest.raises(InputError, match="readings without a run_id, while run 100"):
@@ -221,13 +258,17 @@ def test_readings_that_name_no_beginning_take_nothing_from_a_run_that_does(desk,
     desk.take(views[2:])
     last = desk.hands.of("map")[-1]
     _, measurements, _ = collected(events_of(PLAN))
-    np.testing.assert_array_equal(last["gx"], calibrate(measurements).error_map.gx.ravel())
+    np.testing.assert_array_equal(
+        last["gx"], calibrate(measurements).error_map.gx.ravel()
+    )
     assert last["run_id"] == "100"
 
 
 def test_names_of_runs_that_are_kept_are_no_longer_than_messages_to_the_collector(desk):
     desk.session.take_command(command(4, run_id="7", plan_id="x" * (MAX_TEXT - 1)))
-    with pytest.raises(InputError, match="plan_id and run_id are longer than 8192 characters"):
+    with pytest.raises(
+        InputError, match="plan_id and run_id are longer than 8192 characters"
+    ):
         desk.session.take_command(command(4, run_id="7", plan_id="x" * MAX_TEXT))
 
 
@@ -251,10 +292,15 @@ def test_what_arrives_while_a_job_runs_is_solved_next_and_a_newer_run_discards_i
 
 
 @pytest.mark.parametrize("first, second, counts", [(1, 2, 2), (2, 1, 2)])
-def test_the_session_rejections_are_those_of_the_newest_view(desk, first, second, counts):
+def test_the_session_rejections_are_those_of_the_newest_view(
+    desk, first, second, counts
+):
     messages = views_of()[:2]
     for item, number in zip(messages, (first, second), strict=True):
-        item.session_reject_reasons, item.session_reject_counts = ["outside_every_view"], [number]
+        item.session_reject_reasons, item.session_reject_counts = (
+            ["outside_every_view"],
+            [number],
+        )
     desk.take(messages)
     assert desk.session.measurements().rejected == {"outside_every_view": counts}
 
@@ -283,7 +329,10 @@ def test_a_deficient_plan_is_a_warning_once_all_its_views_are_measured(
     with pytest.raises(NotIdentifiableError):
         desk.session.save("x.json")
     saved = read_json(tmp_path / "x.json")
-    assert (saved["plan_id"], saved["observability"]["identifiable"]) == (PLAN.plan_id, False)
+    assert (saved["plan_id"], saved["observability"]["identifiable"]) == (
+        PLAN.plan_id,
+        False,
+    )
     (tmp_path / "good.json").write_text("a map")
     with pytest.raises(NotIdentifiableError):
         desk.session.save("good.json")
@@ -302,7 +351,9 @@ def test_after_done_no_view_is_to_come_and_the_missing_one_is_named(desk):
     assert (last["views_done"], last["views_planned"]) == (1, 4)
     assert "do not identify the stage" in last["state"]
     assert (
-        last["advice"] == [advice.text for advice in desk.session.result.observability.advice] != []
+        last["advice"]
+        == [advice.text for advice in desk.session.result.observability.advice]
+        != []
     )
     assert desk.session.diagnosis().level == Level.WARN
 
@@ -325,7 +376,9 @@ def test_a_view_of_lines_alone_is_no_error_while_others_are_to_come(desk):
 def test_lines_of_all_views_are_a_beginning_until_done(desk):
     """Of messages that come shuffled, lines of every view may be there before any mark is."""
     lines = views_of(grid=False)
-    assert [len(view.m) for view in lines] == [0] * 4 and all(len(view.k) for view in lines)
+    assert [len(view.m) for view in lines] == [0] * 4 and all(
+        len(view.k) for view in lines
+    )
     desk.session.take_command(command(4))
     desk.take(lines)
     state = "4 of 4 views measured, not yet enough to identify the stage."
@@ -343,7 +396,8 @@ def test_lines_of_all_views_are_a_beginning_until_done(desk):
     with pytest.raises(NoDataError, match="no grid mark was read"):
         alone.solve()
     assert alone.session.diagnosis().level == Level.WARN
-    assert alone.session.digest() == alone.session.diagnosis().values["readings"] != ""  # solved
+    # solved
+    assert alone.session.digest() == alone.session.diagnosis().values["readings"] != ""
     ended = Desk()  # where DONE came first
     ended.session.take_command(command(4, phase=Phase.DONE))
     with pytest.raises(NoDataError, match="no grid mark was read"):
@@ -392,10 +446,16 @@ def test_more_planned_views_are_told_and_fewer_change_nothing(desk):
     "field, value, problem",
     [
         ("dx", np.zeros(3), "m, n, dx, dy, count differ in length"),
-        ("reject_reasons", ["one"], "reject_reasons and reject_counts differ in length"),
+        (
+            "reject_reasons",
+            ["one"],
+            "reject_reasons and reject_counts differ in length",
+        ),
     ],
 )
-def test_readings_that_contradict_themselves_are_refused_at_once(desk, field, value, problem):
+def test_readings_that_contradict_themselves_are_refused_at_once(
+    desk, field, value, problem
+):
     bad = views_of()[0]
     setattr(bad, field, value)
     with pytest.raises(InputError, match=problem):
@@ -408,13 +468,17 @@ def test_two_plates_in_one_run_are_told(desk):
     two.grid_pitch *= 2
     desk.session.take_measurement(one)
     desk.session.take_measurement(two)
-    with pytest.raises(InputError, match="views of different plates in one plan; measure one"):
+    with pytest.raises(
+        InputError, match="views of different plates in one plan; measure one"
+    ):
         desk.session.next_job()
     assert desk.session.diagnosis().level == Level.WARN
 
 
 def test_nothing_to_save_yet(desk):
-    with pytest.raises(NoDataError, match="there is no map yet; measure the views of the plan"):
+    with pytest.raises(
+        NoDataError, match="there is no map yet; measure the views of the plan"
+    ):
         desk.session.save("map.json")
 
 
@@ -426,7 +490,9 @@ def test_maps_are_saved_in_the_folder_of_results_alone(tmp_path):
     assert line.startswith(f"saved to {path}: plan '{PLAN.plan_id}'; readings ")
     assert json.loads((tmp_path / "map.json").read_text())["plan_id"] == PLAN.plan_id
     for outside in ("../map.json", "/tmp/map.json", f"{tmp_path}/../x.json"):
-        with pytest.raises(InputError, match=r"lies outside of .*; name a file in it, or set the "):
+        with pytest.raises(
+            InputError, match=r"lies outside of .*; name a file in it, or set the "
+        ):
             desk.session.save(outside)
 
 
@@ -453,10 +519,13 @@ def test_a_plan_names_no_file_elsewhere(plan_id, name):
 
 
 @pytest.mark.parametrize(
-    "run_id, name", [("17", "map_17.json"), ("", "map_run.json"), ("../../x", "map__.._x.json")]
+    "run_id, name",
+    [("17", "map_17.json"), ("", "map_run.json"), ("../../x", "map__.._x.json")],
 )
 def test_each_run_has_a_file_of_its_own_and_the_health_names_it(tmp_path, run_id, name):
-    desk = Desk(save_path=str(tmp_path / "map_{run_id}.json"), result_folder=str(tmp_path))
+    desk = Desk(
+        save_path=str(tmp_path / "map_{run_id}.json"), result_folder=str(tmp_path)
+    )
     assert desk.session.diagnosis().values["saved"] == ""
     desk.take(views_of(run_id=run_id))
     assert [path.name for path in tmp_path.iterdir()] == [name]
@@ -469,14 +538,18 @@ def test_each_run_has_a_file_of_its_own_and_the_health_names_it(tmp_path, run_id
 
 
 def test_a_map_that_cannot_be_saved_by_itself_is_still_published(tmp_path):
-    desk = Desk(save_path=str(tmp_path / "no" / "map.json"), result_folder=str(tmp_path))
+    desk = Desk(
+        save_path=str(tmp_path / "no" / "map.json"), result_folder=str(tmp_path)
+    )
     desk.take(views_of())
     [line] = desk.hands.lines(Level.ERROR)
     problem = f"{tmp_path}/no/map.json: cannot be written"
     assert line.startswith(f"save_path: {problem}")
     assert desk.hands.of("map")
     told = desk.session.diagnosis()
-    assert told.level == Level.WARN and f"the map is not saved: {problem}" in told.message
+    assert (
+        told.level == Level.WARN and f"the map is not saved: {problem}" in told.message
+    )
     assert desk.session.save("map.json")[1] == str(tmp_path / "map.json")
 
 
@@ -523,7 +596,9 @@ def test_a_file_beyond_any_result_is_not_read(tmp_path):
     """It has no blocks: whoever reads it reads zeros, a GiB of them."""
     with (tmp_path / "huge.json").open("wb") as file:
         file.truncate(2**30)
-    with pytest.raises(InputError, match="has 1073741824 bytes, more than 33554432; name"):
+    with pytest.raises(
+        InputError, match="has 1073741824 bytes, more than 33554432; name"
+    ):
         read_result(str(tmp_path / "huge.json"))
 
 
@@ -560,7 +635,11 @@ def test_a_map_tells_run_and_verdict(desk):
     desk.take(views_of(run_id="7"))
     published, summary = desk.hands.of("map")[-1], desk.hands.of("summary")[-1]
     assert (published["qualified"], published["run_id"]) == (True, "7")
-    assert (summary["qualified"], summary["run_id"], summary["causes"]) == (True, "7", [])
+    assert (summary["qualified"], summary["run_id"], summary["causes"]) == (
+        True,
+        "7",
+        [],
+    )
     assert to_model.error_map(message("ErrorMap", published)).artifact == PLAN.artifact
 
 
@@ -568,7 +647,10 @@ def test_what_is_noted_of_the_session_is_a_warning_of_the_result(desk):
     first, *others = views_of()
     first.session_notes = ["the clock stepped \x1b[2J"] + ["more"] * 30
     desk.take([*others, first])
-    assert desk.session.result.warnings[-20:] == (r"the clock stepped \x1b[2J", *["more"] * 19)
+    assert desk.session.result.warnings[-20:] == (
+        r"the clock stepped \x1b[2J",
+        *["more"] * 19,
+    )
     first.session_notes = []
     desk.take([first])  # the newest word counts
     assert "more" not in desk.session.result.warnings
@@ -615,8 +697,10 @@ def test_a_saved_map_names_its_run_and_a_newer_one_that_is_not_in_it(tmp_path):
     line, _ = desk.session.save("map.json")
     assert f": plan '{PLAN.plan_id}', run {NOW}; readings " in line
     assert "WARNING" not in line
-    desk.session.take_command(command(4, run_id=str(NOW - 5)))  # an older one, heard late
-    desk.session.take_command(command(4, run_id=str(NOW + DAY_NS)))  # of a clock that is ahead
+    # an older one, heard late
+    desk.session.take_command(command(4, run_id=str(NOW - 5)))
+    # of a clock that is ahead
+    desk.session.take_command(command(4, run_id=str(NOW + DAY_NS)))
     assert "WARNING" not in desk.session.save("map.json")[0]
     desk.session.take_command(command(4, run_id=str(NOW + 7)))
     line, _ = desk.session.save("map.json")
@@ -627,7 +711,9 @@ def test_a_saved_map_names_its_run_and_a_newer_one_that_is_not_in_it(tmp_path):
     assert desk.session.diagnosis().level == Level.OK  # it may be measured just now
     desk.session.take_command(command(4, run_id=str(NOW + 7), phase=Phase.DONE))
     told = desk.session.diagnosis()
-    assert told.level == Level.WARN and told.message.startswith(f"the newer run {NOW + 7} of plan")
+    assert told.level == Level.WARN and told.message.startswith(
+        f"the newer run {NOW + 7} of plan"
+    )
     desk.take(views_of(run_id=str(NOW + 7)))
     assert desk.session.diagnosis().level == Level.OK
     assert "WARNING" not in desk.session.save("map.json")[0]
@@ -649,7 +735,9 @@ def test_a_saved_map_tells_that_it_is_not_qualified_and_what_it_lacks(tmp_path):
 
 def test_readings_of_a_run_of_the_future_are_refused(desk):
     desk.take(views_of(run_id=str(NOW)))
-    with pytest.raises(InputError, match="begins in the future of this node's clock; set the"):
+    with pytest.raises(
+        InputError, match="begins in the future of this node's clock; set the"
+    ):
         desk.take(views_of(run_id=str(NOW + DAY_NS)))
     assert desk.session.shown.run.run_id == str(NOW)
 
@@ -699,8 +787,12 @@ def test_the_cells_of_an_image_are_solved_together():
     desk.take(messages[:1])
     assert desk.session.shown.views_done == 3
     expected = calibrate(measurements)
-    np.testing.assert_array_equal(desk.session.result.error_map.gx, expected.error_map.gx)
-    np.testing.assert_array_equal(desk.session.result.error_map.u_gx, expected.error_map.u_gx)
+    np.testing.assert_array_equal(
+        desk.session.result.error_map.gx, expected.error_map.gx
+    )
+    np.testing.assert_array_equal(
+        desk.session.result.error_map.u_gx, expected.error_map.u_gx
+    )
     assert desk.session.digest() == session_digest(
         {
             index: view_digest(view.readings.parts, measurements.rejected)

@@ -82,7 +82,11 @@ def status(index: int, missing: list, **fields) -> object:
 def test_before_anything_is_heard(watch):
     picture = json.loads(json.dumps(watch.picture()))
     assert picture == {
-        "health": {"measurement_collector": None, "pose_sequencer": None, "solver": None},
+        "health": {
+            "measurement_collector": None,
+            "pose_sequencer": None,
+            "solver": None,
+        },
         "command": None,
         "view": None,
         "summary": None,
@@ -95,7 +99,11 @@ def test_the_plate_is_drawn_in_its_own_frame_top_line_first(watch):
     watch.take_status(status(0, [(-2, 2), (1, 0)]))
     view = watch.picture()["view"]
     assert view["plate"] == [".oooo", "ooooo", "ooo.o", "ooooo", "ooooo"]
-    assert (view["grid"], view["angular"], view["rejected"]) == ([23, 25], [7, 8], {"duplicate": 2})
+    assert (view["grid"], view["angular"], view["rejected"]) == (
+        [23, 25],
+        [7, 8],
+        {"duplicate": 2},
+    )
     assert view["repeatability_um"] == pytest.approx(0.02)
     assert view["repeatability_arcsec"] is None
     watch.take_status(status(0, [], sigma_theta=math.radians(2 / 3600)))
@@ -115,7 +123,11 @@ def test_only_the_newest_command_and_its_view_count(watch):
     watch.take_status(status(1, []))
     watch.take_status(status(0, []))
     picture = watch.picture()
-    assert picture["command"]["view_name"] == picture["view"]["view_name"] == PLAN.views[1].name
+    assert (
+        picture["command"]["view_name"]
+        == picture["view"]["view_name"]
+        == PLAN.views[1].name
+    )
     assert picture["command"]["rotation_deg"] == pytest.approx(90)
 
 
@@ -149,7 +161,16 @@ def test_a_large_plate_shows_the_worst_of_the_marks_behind_a_sign(watch):
         message(
             "ViewCommand",
             from_model.command(
-                Command(5, Phase.MEASURE, plan.plan_id, 0, plan.views[0], plan.artifact, 1, "17"),
+                Command(
+                    5,
+                    Phase.MEASURE,
+                    plan.plan_id,
+                    0,
+                    plan.views[0],
+                    plan.artifact,
+                    1,
+                    "17",
+                ),
                 "stage",
             ),
         )
@@ -168,7 +189,10 @@ def test_a_large_plate_shows_the_worst_of_the_marks_behind_a_sign(watch):
     rows = view["plate"]
     assert {len(row) for row in rows} == {34} == {len(rows)}
     missing = {
-        (x, y) for y, row in enumerate(reversed(rows)) for x, sign in enumerate(row) if sign == "."
+        (x, y)
+        for y, row in enumerate(reversed(rows))
+        for x, sign in enumerate(row)
+        if sign == "."
     }
     assert missing == {(0, 0), ((0 + 50) // 3, (1 + 50) // 3), (33, 33)}
 
@@ -176,7 +200,13 @@ def test_a_large_plate_shows_the_worst_of_the_marks_behind_a_sign(watch):
 def test_marks_behind_the_last_that_is_named_are_not_known(watch):
     watch.take_command(command(0))
     watch.take_status(status(0, [(-2, -2), (-1, 0)], grid_done=25 - 9))
-    assert watch.picture()["view"]["plate"] == ["o????", "o????", "o.???", "oo???", ".o???"]
+    assert watch.picture()["view"]["plate"] == [
+        "o????",
+        "o????",
+        "o.???",
+        "oo???",
+        ".o???",
+    ]
 
 
 def test_long_texts_and_lists_are_cut(watch):
@@ -192,25 +222,40 @@ def test_long_texts_and_lists_are_cut(watch):
         )
     )
     watch.take_health(
-        "solver", Diagnosis(Level.WARN, "y" * 10**6, {str(n): "z" * 10**6 for n in range(300)})
+        "solver",
+        Diagnosis(Level.WARN, "y" * 10**6, {str(n): "z" * 10**6 for n in range(300)}),
     )
     picture = watch.picture()
     view, health = picture["view"], picture["health"]["solver"]
-    assert view["view_name"] == f"{'x' * 3000} ... (1000000 characters) ... {'x' * 1000}"
-    assert len(view["rejected"]) == len(view["missing_lines"]) == len(health["values"]) == 200
+    assert (
+        view["view_name"] == f"{'x' * 3000} ... (1000000 characters) ... {'x' * 1000}"
+    )
+    assert (
+        len(view["rejected"])
+        == len(view["missing_lines"])
+        == len(health["values"])
+        == 200
+    )
     assert max(map(len, [health["message"], *health["values"].values()])) < 4100
 
 
 def test_the_map_is_thinned_out_and_stands_upright(watch):
     error_map = random_map(Artifact(5, 0.01, 8), 3, unknown=[(0, 4)])
-    watch.take_map(message("ErrorMap", from_model.error_map(result_of(error_map), 1, "stage")))
+    watch.take_map(
+        message("ErrorMap", from_model.error_map(result_of(error_map), 1, "stage"))
+    )
     um = watch.picture()["map"]["um"]
     assert um[0][0] is None  # x smallest, y largest: top left
-    assert um[-1][0] == pytest.approx(1e6 * np.hypot(error_map.gx[0, 0], error_map.gy[0, 0]))
+    assert um[-1][0] == pytest.approx(
+        1e6 * np.hypot(error_map.gx[0, 0], error_map.gy[0, 0])
+    )
     big = random_map(Artifact(101, 0.01, 8), 3)
-    watch.take_map(message("ErrorMap", from_model.error_map(result_of(big), 1, "stage")))
+    watch.take_map(
+        message("ErrorMap", from_model.error_map(result_of(big), 1, "stage"))
+    )
     found = watch.picture()["map"]
     size = 1e6 * np.hypot(big.gx, big.gy)
     assert (len(found["um"]), found["step"]) == (34, 3)
-    assert found["um"][0][0] == pytest.approx(size[:3, 99:].max())  # the largest of its sites
+    # the largest of its sites
+    assert found["um"][0][0] == pytest.approx(size[:3, 99:].max())
     assert found["um"][-1][1] == pytest.approx(size[3:6, :3].max())

@@ -31,7 +31,8 @@ class Cell(Bench):
         super().__init__(seed=4, **kwargs)
         self.fault, self.hands, self.check = fault, hands, None
         self.work, self.acted, self.begun_s, self.last = [], 0, 0.0, None
-        self.planned = iter(())  # a view without an end is exposed only until it is aborted
+        # a view without an end is exposed only until it is aborted
+        self.planned = iter(())
         self.view, self.position, self.late = None, self.home, []  # in transit
         self.noise = np.random.default_rng(1)
         self.came = 1.0  # sign of the last motion along x
@@ -46,7 +47,9 @@ class Cell(Bench):
         view = SimpleNamespace(**fields)
         stamp = fields["header"]["stamp"]
         stamp = stamp["sec"] * 10**9 + stamp["nanosec"]
-        if stamp <= self.acted or (self.fault == "ignores ABORT" and view.phase == ABORT):
+        if stamp <= self.acted or (
+            self.fault == "ignores ABORT" and view.phase == ABORT
+        ):
             return
         self.acted, self.work, self.planned = stamp, [], iter(())
         if view.phase == PLACE:
@@ -106,7 +109,9 @@ class Cell(Bench):
         if self.fault == "another zero of theta":
             theta += 0.4
         names = ("a", "b", "c") if self.fault == "other joints" else ("x", "y", "theta")
-        return SimpleNamespace(header=self.header(now), name=names, position=[x, y, theta])
+        return SimpleNamespace(
+            header=self.header(now), name=names, position=[x, y, theta]
+        )
 
     def show(self, seen, seconds):
         """Publish a detection of an exposure."""
@@ -147,11 +152,15 @@ class Cell(Bench):
         }.get(self.fault, {})
         seconds += {"stamped late": PERIOD_S, "old stamps": -30.0}.get(self.fault, 0.0)
         arrives = self.hands.seconds + 11.0 * (self.fault == "arrives late")
-        self.late.append((arrives, SimpleNamespace(header=self.header(seconds), **seen)))
+        self.late.append(
+            (arrives, SimpleNamespace(header=self.header(seconds), **seen))
+        )
 
     def header(self, seconds):
         stamp = self.hands.now_ns + round((seconds - self.hands.seconds) * 1e9)
-        return SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9))
+        return SimpleNamespace(
+            stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
+        )
 
 
 FIELDS = {
@@ -180,7 +189,9 @@ def checked(fault="", statuses=(), joints=(), **cell):
         check.take_diagnosis(*status)
     if joints:
         check.take_encoder(
-            SimpleNamespace(header=bench.header(0.0), name=joints, position=[0.0] * len(joints))
+            SimpleNamespace(
+                header=bench.header(0.0), name=joints, position=[0.0] * len(joints)
+            )
         )
     while not check.done:
         hands.published.clear()
@@ -197,7 +208,9 @@ def test_the_right_cell_passes(cell):
     assert [item for item in checked(**cell) if not item.passed] == []
 
 
-REVERSED_THETA = "the lines are counted clockwise, or theta is indicated with the wrong sign (54"
+REVERSED_THETA = (
+    "the lines are counted clockwise, or theta is indicated with the wrong sign (54"
+)
 WRONG = [
     ("theta reversed", "theta", "offset_theta has the other sign"),
     ("theta reversed, straight", "theta", "too little to tell the sign"),
@@ -206,8 +219,16 @@ WRONG = [
     ("camera turned 30", "signs", "the offsets are turned by +30.0°"),
     ("camera turned 90", "signs", "the offsets are turned by +90.0°"),
     ("mirrored camera", "signs", "offsets of the other sign: offset_x rises"),
-    ("pixels too large", "signs", "the offsets are 1.3 times as large as the motion of the stage"),
-    ("no offsets", "signs", "the offsets do not follow the stage: between the stops at a mark"),
+    (
+        "pixels too large",
+        "signs",
+        "the offsets are 1.3 times as large as the motion of the stage",
+    ),
+    (
+        "no offsets",
+        "signs",
+        "the offsets do not follow the stage: between the stops at a mark",
+    ),
     ("offsets 1000 times too small", "signs", "it moves by 27 um rms, they by 0.05"),
     ("backlash", "marks", "16 outlier_among_repeats"),
     ("m and n exchanged", "ids", "m and n are exchanged"),
@@ -226,15 +247,35 @@ WRONG = [
     ("reversed theta", "ids", REVERSED_THETA),
     ("k reversed", "ids", REVERSED_THETA),
     ("theta in degrees", "ids", "theta is indicated in degrees (54"),
-    ("frozen theta", "ids", "theta does not move: it is indicated at 0 rad during the whole view"),
-    ("another zero of theta", "ids", "theta is indicated +22.92° from where the lines are (54"),
+    (
+        "frozen theta",
+        "ids",
+        "theta does not move: it is indicated at 0 rad during the whole view",
+    ),
+    (
+        "another zero of theta",
+        "ids",
+        "theta is indicated +22.92° from where the lines are (54",
+    ),
     ("k shifted", "ids", "theta is indicated -45° from where the lines are (54"),
     ("other joints", "joints", "heard a, b, c"),
     ("old stamps", "detection clock", "stamps 3.008e+04 ms old when they arrive"),
     ("arrives late", "detection clock", "stamps 1.108e+04 ms old when they arrive"),
-    ("stamped late", "ids", "each detection shows the mark of 1 exposure before its stamp"),
-    ("repeats the last detection", "ids", "each detection shows the mark of 1 exposure before"),
-    ("does not move", "ids", "the stage does not move: it is indicated at x = 0 mm, y = 0 mm"),
+    (
+        "stamped late",
+        "ids",
+        "each detection shows the mark of 1 exposure before its stamp",
+    ),
+    (
+        "repeats the last detection",
+        "ids",
+        "each detection shows the mark of 1 exposure before",
+    ),
+    (
+        "does not move",
+        "ids",
+        "the stage does not move: it is indicated at x = 0 mm, y = 0 mm",
+    ),
     ("another view", "ids", "the marks are those of a plate turned by 90°"),
 ]
 
@@ -259,7 +300,9 @@ REMEDIES = {
 }
 
 
-@pytest.mark.parametrize(("fault", "name", "figure"), WRONG, ids=[fault for fault, *_ in WRONG])
+@pytest.mark.parametrize(
+    ("fault", "name", "figure"), WRONG, ids=[fault for fault, *_ in WRONG]
+)
 def test_a_wrong_cell_fails_once_and_what_follows_is_told_as_that(fault, name, figure):
     first, *others = [item for item in checked(fault) if not item.passed]
     assert (first.name, first.follows) == (name, "")
@@ -289,7 +332,9 @@ def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
     )
     check.take_health("mark_detector", Level.ERROR, "no image")
     check.take_health("mark_detector", Level.OK, "")
-    check.take_health("cell_driver", Level.ERROR, "first move: x is reversed; correct turn")
+    check.take_health(
+        "cell_driver", Level.ERROR, "first move: x is reversed; correct turn"
+    )
     while not check.done:
         check.tick()
         bench.tick()
@@ -345,7 +390,9 @@ def test_joints_without_end_do_not_hide_those_of_the_stage():
 
 
 def test_what_was_not_read_is_said_and_fails():
-    statuses = [(f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)]
+    statuses = [
+        (f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)
+    ]
     statuses += [(name, Level.OK, "on") for name, _, _ in statuses[1:]]
     (item,) = (item for item in checked(statuses=statuses) if not item.passed)
     assert item.figure == (
@@ -355,13 +402,17 @@ def test_what_was_not_read_is_said_and_fails():
 
 
 def test_a_status_that_is_known_is_read_however_many_there_are():
-    statuses = [(f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)]
+    statuses = [
+        (f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)
+    ]
     (item,) = (
         item
         for item in checked(statuses=[*statuses, ("axis 000", Level.ERROR, "hot")])
         if not item.passed
     )
-    assert item.figure.startswith("ERROR on /diagnostics: axis 000: hot; axis 001: off; ")
+    assert item.figure.startswith(
+        "ERROR on /diagnostics: axis 000: hot; axis 001: off; "
+    )
     assert item.figure.endswith(
         "; and 95 more; there were more than 100 names, and others were not read"
     )
@@ -371,7 +422,10 @@ def test_two_publishers_are_the_only_fault():
     hands = Hands()
     check = CellCheck(small_plan(), settings_of("measurement_collector"), hands.ports)
     cell = Cell("", hands)
-    cell.check, check.publishers = check, {"stage/mark_detections": ["camera", "old_camera"]}
+    cell.check, check.publishers = (
+        check,
+        {"stage/mark_detections": ["camera", "old_camera"]},
+    )
     while not check.done:
         check.tick()
         cell.tick()

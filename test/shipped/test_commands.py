@@ -64,7 +64,9 @@ def desk(tmp_path, monkeypatch, jumping_clocks):
         (tmp_path / name).symlink_to(ROOT / name)
     for name in ("hu_exact", "hu_noise"):
         copytree(ROOT / "bags" / name, tmp_path / "ARCHIVE" / name)
-    (tmp_path / "measured.csv").write_text("position,error\n-10,0.4\n0,0\n10,-0.2\n20,0.1\n")
+    (tmp_path / "measured.csv").write_text(
+        "position,error\n-10,0.4\n0,0\n10,-0.2\n20,0.1\n"
+    )
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -88,7 +90,9 @@ def test_commands_run(page, desk, solved, checked, capsys):
     text = page.read_text()
     for name, content in (found for kind in FILES for found in kind.findall(text)):
         (desk / name).write_text(content)
-    run = [(command, code) for command, code in commands(text) if not parsed_alone(command)]
+    run = [
+        (command, code) for command, code in commands(text) if not parsed_alone(command)
+    ]
     if any("RESULT.json" in command for command, _ in run):
         copyfile(solved, "RESULT.json")
     for command, code in run:
@@ -126,7 +130,10 @@ def test_the_way_to_a_corrected_machine_is_whole():
 
 
 def test_the_tutorial_is_run_from_its_beginning_to_its_end():
-    steps = [command for command, _ in commands((ROOT / "docs/start/tutorial.md").read_text())]
+    steps = [
+        command
+        for command, _ in commands((ROOT / "docs/start/tutorial.md").read_text())
+    ]
     assert sum(not parsed_alone(command) for command in steps) == 9
     assert {shlex.split(command)[1] for command in steps} == {
         "plan",
@@ -140,18 +147,25 @@ def test_the_tutorial_is_run_from_its_beginning_to_its_end():
 def headings(text: str) -> set[str]:
     """Return the names by which links reach the headings of a page, as mkdocs makes them."""
     found = re.findall(r"^#+ (.*)$", text, re.M)
-    return {re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in found}
+    return {
+        re.sub(r"\s+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower())
+        for title in found
+    }
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.name)
 def test_links_lead_to_files_and_headings(page):
-    for address, heading in re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", page.read_text()):
+    for address, heading in re.findall(
+        r"\]\(([^)#]*)(?:#([^)]*))?\)", page.read_text()
+    ):
         if address.startswith("http"):
             continue
         target = page.parent / address if address else page
         assert target.exists(), f"{page.name}: {address}"
         if heading:
-            assert heading in headings(target.read_text()), f"{page.name}: {address}#{heading}"
+            assert heading in headings(target.read_text()), (
+                f"{page.name}: {address}#{heading}"
+            )
 
 
 def test_what_faq_quotes_is_what_the_code_says():
@@ -159,7 +173,9 @@ def test_what_faq_quotes_is_what_the_code_says():
     source = re.sub(
         r'"\s*\n?\s*f?"',
         "",
-        "".join(path.read_text() for path in sorted((ROOT / "selfcal_ros").rglob("*.py"))),
+        "".join(
+            path.read_text() for path in sorted((ROOT / "selfcal_ros").rglob("*.py"))
+        ),
     )
     quoted = re.findall(r"^### `(.+)`$", (ROOT / "docs/start/faq.md").read_text(), re.M)
     assert len(quoted) >= 12

@@ -8,7 +8,11 @@ from pathlib import Path
 import pytest
 
 from selfcal_ros import __version__
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS, overrides_in
+from selfcal_ros.collection.settings.nodes import (
+    NODE_PARAMETERS,
+    NODE_SETTINGS,
+    overrides_in,
+)
 from selfcal_ros.files import read_json, read_yaml
 from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.simulation.spec import read_simulation
@@ -59,7 +63,9 @@ def test_launch_files_compile_and_start_only_our_nodes(path):
 def test_versions_agree():
     """The messages have a version of their own, see test_type_hashes."""
     found = {ElementTree.parse(ROOT / "package.xml").findtext("version")}
-    found |= set(re.findall(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M))
+    found |= set(
+        re.findall(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.M)
+    )
     found.add(read_json(ROOT / "sbom.json")["metadata"]["component"]["version"])
     assert found == {__version__}
 

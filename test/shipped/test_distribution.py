@@ -55,7 +55,9 @@ def wheel(tmp_path_factory) -> Path:
     clone = tmp_path_factory.mktemp("clone")
     for name in SOURCES:
         if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, clone / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(
+                ROOT / name, clone / name, ignore=shutil.ignore_patterns("__pycache__")
+            )
         else:
             shutil.copy(ROOT / name, clone / name)
     run(clone, "setup.py", "-q", "sdist", "-d", "dist")
@@ -101,7 +103,9 @@ def test_the_wheel_holds_every_module_message_and_configuration(wheel):
 def test_the_wheel_describes_itself(wheel):
     """One version; what it needs, and no tool of its building; README; types."""
     with zipfile.ZipFile(wheel) as file:
-        [place] = (name for name in file.namelist() if name.endswith(".dist-info/METADATA"))
+        [place] = (
+            name for name in file.namelist() if name.endswith(".dist-info/METADATA")
+        )
         about = message_from_bytes(file.read(place))
         assert "selfcal_ros/py.typed" in file.namelist()
     assert about["Version"] == __version__ == "0.4.0"
@@ -162,7 +166,9 @@ def test_every_pin_has_the_hashes_of_its_files(name):
     ]
     assert len(lines) > 20
     for line in lines:
-        assert re.fullmatch(r"[a-z0-9.-]+==\S+( --hash=sha256:[0-9a-f]{64}){1,2}", line), line
+        assert re.fullmatch(
+            r"[a-z0-9.-]+==\S+( --hash=sha256:[0-9a-f]{64}){1,2}", line
+        ), line
     assert "--require-hashes" in (ROOT / "tools/setup.sh").read_text()
 
 
@@ -172,7 +178,10 @@ def components() -> list[dict]:
 
 def test_the_bill_of_materials_lists_what_is_pinned():
     assert {
-        part["name"]: (part["version"], [digest["content"] for digest in part["hashes"]])
+        part["name"]: (
+            part["version"],
+            [digest["content"] for digest in part["hashes"]],
+        )
         for part in components()
     } == pins()
 
@@ -198,10 +207,18 @@ def test_no_library_of_the_product_is_under_the_gpl():
         for part in components()
         if part["scope"] != "excluded"
     }
-    assert {"numpy", "scipy", "rosbags", "mcap", "matplotlib", "threadpoolctl", "ros-rclpy"} <= set(
-        licences
-    )
+    assert {
+        "numpy",
+        "scipy",
+        "rosbags",
+        "mcap",
+        "matplotlib",
+        "threadpoolctl",
+        "ros-rclpy",
+    } <= set(licences)
     for name, licence in licences.items():
         assert licence, name
-        assert re.fullmatch(r"[\w.-]+( (AND|OR) [\w.-]+)*", licence), f"{name}: not SPDX's"
+        assert re.fullmatch(r"[\w.-]+( (AND|OR) [\w.-]+)*", licence), (
+            f"{name}: not SPDX's"
+        )
         assert not re.search(r"GPL|General Public", licence), f"{name}: {licence}"

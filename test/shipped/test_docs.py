@@ -30,15 +30,22 @@ def test_every_reason_is_explained():
 
 
 def test_the_simulation_of_the_documentation_runs(tmp_path, capsys):
-    text = re.search(r"```yaml\n(.*?)```", (ROOT / "docs/guides/simulate.md").read_text(), re.S)[1]
+    text = re.search(
+        r"```yaml\n(.*?)```", (ROOT / "docs/guides/simulate.md").read_text(), re.S
+    )[1]
     spec = tmp_path / "sim.yaml"
     spec.write_text(text.replace("../plans", str(ROOT / "config/plans")))
     assert main(["simulate", str(spec), "-o", str(tmp_path / "bag")]) == 0
     assert main(["solve", str(tmp_path / "bag")]) == 0
     printed = capsys.readouterr()
-    assert "Against the known truth" in printed.out and "solve with --robust" in printed.err
+    assert (
+        "Against the known truth" in printed.out
+        and "solve with --robust" in printed.err
+    )
     # a hundredth of its readings are outliers
-    assert printed.err.splitlines()[-1].startswith("selfcal: Good within an enlarged U: ")
+    assert printed.err.splitlines()[-1].startswith(
+        "selfcal: Good within an enlarged U: "
+    )
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -68,7 +75,9 @@ def test_every_equation_that_the_code_cites_exists():
 
 def test_every_page_is_in_the_menu_of_the_site():
     menu = re.findall(r"^ +- (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M)
-    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
+    pages = {
+        str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")
+    }
     assert set(menu) == pages, "list it in mkdocs.yml"
 
 
@@ -78,10 +87,14 @@ def test_the_site_reads_a_page_as_github_does(page):
     within_fence, above = False, ""
     for line in page.read_text().splitlines():
         if line.lstrip().startswith("```"):
-            assert within_fence or re.fullmatch(r' *```(\w+( title="[\w.]+")?)?', line), line
+            assert within_fence or re.fullmatch(
+                r' *```(\w+( title="[\w.]+")?)?', line
+            ), line
             within_fence = not within_fence
         begins_list = re.match(r"(-|\d\.) ", line) and not within_fence
-        assert not begins_list or re.match(r"$|(-|\d\.) | +", above), f"no line above {line}"
+        assert not begins_list or re.match(r"$|(-|\d\.) | +", above), (
+            f"no line above {line}"
+        )
         above = line
 
 

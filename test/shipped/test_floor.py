@@ -80,7 +80,12 @@ def test_every_replaced_pin_is_one_of_the_environment():
         for line in (ROOT / "tools/requirements.txt").read_text().splitlines()
         if "==" in line
     }
-    assert set(pins()) - own == {"attrs", "six", "wheel"}  # needed by the old versions alone
+    # needed by the old versions alone
+    assert set(pins()) - own == {
+        "attrs",
+        "six",
+        "wheel",
+    }
 
 
 @pytest.mark.parametrize("library", TOO_NEW)
@@ -96,7 +101,9 @@ def test_no_name_is_newer_than_the_floor(library):
                 if isinstance(node, ast.ImportFrom)
                 else set()
             )
-            assert not used & TOO_NEW[library], f"{path}:{node.lineno}: {used} came with {library}"
+            assert not used & TOO_NEW[library], (
+                f"{path}:{node.lineno}: {used} came with {library}"
+            )
 
 
 def test_least_squares_name_their_cut():

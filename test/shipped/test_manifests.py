@@ -44,12 +44,16 @@ def test_ros_packages_that_are_imported_are_declared():
     used = set()
     for path in SOURCES:
         for node in (*source(path).imports, *source(path).late):
-            names = [alias.name for alias in node.names] if hasattr(node, "names") else []
+            names = (
+                [alias.name for alias in node.names] if hasattr(node, "names") else []
+            )
             used |= {(getattr(node, "module", None) or names[0]).split(".")[0]}
     ros = {
         name
         for name in used
-        if re.fullmatch(r"\w+_(msgs|interfaces|srvs|index_python)|rclpy|launch\w*", name)
+        if re.fullmatch(
+            r"\w+_(msgs|interfaces|srvs|index_python)|rclpy|launch\w*", name
+        )
     }
     assert len(ros) > 8
     assert ros <= declared(MANIFESTS[0])
@@ -59,11 +63,16 @@ def test_ros_packages_that_are_imported_are_declared():
 def test_the_commands_install_and_build_both_packages(page):
     text = (ROOT / page).read_text().replace("\\\n", " ")
     [rosdep] = re.findall(r"PIP_BREAK_SYSTEM_PACKAGES=1 rosdep install[^\n&]*", text)
-    assert {"src/selfcal_ros", "src/selfcal_ros/msg_defs", "--ignore-src"} <= set(rosdep.split())
+    assert {"src/selfcal_ros", "src/selfcal_ros/msg_defs", "--ignore-src"} <= set(
+        rosdep.split()
+    )
     assert known()["pip"], "else nothing has to break system packages"
     assert " ".join(BUILD.split()) in " ".join(text.split())
     assert "apt install" in text or "apt-get install" in text
-    assert "python3-threadpoolctl" in text and "python3-threadpoolctl" in NEEDED["threadpoolctl"]
+    assert (
+        "python3-threadpoolctl" in text
+        and "python3-threadpoolctl" in NEEDED["threadpoolctl"]
+    )
 
 
 def test_the_container_copies_what_exists_and_all_that_is_installed():

@@ -15,7 +15,9 @@ PICTURE = re.compile(r"!\[([^\]]*)\]\(([^)]+)\)")
 @pytest.fixture(scope="module")
 def made():
     """Return what `make pictures` would write: name -> text."""
-    found = importlib.util.spec_from_file_location("pictures", ROOT / "tools/pictures.py")
+    found = importlib.util.spec_from_file_location(
+        "pictures", ROOT / "tools/pictures.py"
+    )
     tool = importlib.util.module_from_spec(found)
     found.loader.exec_module(tool)
     return tool.pictures()
@@ -37,7 +39,9 @@ def test_committed_pictures_are_current(made):
     """The last digits of a solution differ between machines: shapes and words must not."""
     for name, text in made.items():
         committed = (ROOT / "docs/pictures" / name).read_text()
-        words, tags = (re.findall(pattern, text) for pattern in (r">([^<>\n]+)</text>", r"<(\w+)"))
+        words, tags = (
+            re.findall(pattern, text) for pattern in (r">([^<>\n]+)</text>", r"<(\w+)")
+        )
         assert re.findall(r">([^<>\n]+)</text>", committed) == words, name
         assert re.findall(r"<(\w+)", committed) == tags, name
 

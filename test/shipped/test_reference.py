@@ -8,14 +8,20 @@ import pytest
 import yaml
 
 from selfcal_ros import __version__
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, NODE_SETTINGS, overrides_in
+from selfcal_ros.collection.settings.nodes import (
+    NODE_PARAMETERS,
+    NODE_SETTINGS,
+    overrides_in,
+)
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
 def tool():
-    found = importlib.util.spec_from_file_location("reference", ROOT / "tools/reference.py")
+    found = importlib.util.spec_from_file_location(
+        "reference", ROOT / "tools/reference.py"
+    )
     module = importlib.util.module_from_spec(found)
     found.loader.exec_module(module)
     return module

@@ -47,7 +47,9 @@ def test_every_page_with_python_is_run_here():
 
 def test_machines(run, tmp_path):
     """The class of the page, around a driver in mm, measures a plan to its true map."""
-    cell, simulated = write_cell(tmp_path, camera=True, cell=CELL + "origin: {x: 0.0}\n")
+    cell, simulated = write_cell(
+        tmp_path, camera=True, cell=CELL + "origin: {x: 0.0}\n"
+    )
 
     class Driver:
         def read_mm(self, letter):
@@ -69,17 +71,31 @@ def test_machines(run, tmp_path):
     machine = run("machines.md", connect=lambda port: Driver())["Stage"]("COM3")
     machine.place = simulated.place
     assert isinstance(machine, Machine)
-    measuring = Run(read_plan("plan.yaml"), cell, machine, tmp_path / "bag", Agreeing(), Jumping())
-    with pytest.raises(MachineError, match="stage: the drive reports an error; reset it"):
+    measuring = Run(
+        read_plan("plan.yaml"), cell, machine, tmp_path / "bag", Agreeing(), Jumping()
+    )
+    with pytest.raises(
+        MachineError, match="stage: the drive reports an error; reset it"
+    ):
         measuring.measure()
     assert machine._driver.stopped
-    assert collect_bag(tmp_path / "bag", CollectorSettings()).measurements.views[0].count.sum() > 5
+    assert (
+        collect_bag(tmp_path / "bag", CollectorSettings())
+        .measurements.views[0]
+        .count.sum()
+        > 5
+    )
 
 
 def test_apply(run):
-    assert main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", "RESULT.json"]) == 0
+    assert (
+        main(["solve", str(ROOT / "bags/hu_noise"), "--quiet", "-o", "RESULT.json"])
+        == 0
+    )
     found = run("apply.md")
-    np.testing.assert_allclose((found["x_true"], found["y_true"]), (0.01, -0.005), atol=1e-15)
+    np.testing.assert_allclose(
+        (found["x_true"], found["y_true"]), (0.01, -0.005), atol=1e-15
+    )
     assert found["covariance"].shape == (4, 4) and found["qualified"]
 
 
@@ -96,7 +112,8 @@ def test_make_has_the_targets_that_are_named():
         # what is said beside the target is a variable that the Makefile reads
         for word in words[2:]:
             assert re.search(
-                rf"\$[({{](or \$\()?{word.split('=')[0]}\b", (ROOT / "Makefile").read_text()
+                rf"\$[({{](or \$\()?{word.split('=')[0]}\b",
+                (ROOT / "Makefile").read_text(),
             ), line
 
 

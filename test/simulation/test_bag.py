@@ -41,7 +41,11 @@ def test_what_is_broken_off_leaves_nothing(simulation, tmp_path):
 def test_the_whole_bag_has_its_name(simulation, tmp_path):
     place = tmp_path / "made" / "bag"
     assert sum(write_simulation(simulation, place).values()) > 0
-    assert {path.name for path in place.iterdir()} == {"bag_0.mcap", "metadata.yaml", "truth.json"}
+    assert {path.name for path in place.iterdir()} == {
+        "bag_0.mcap",
+        "metadata.yaml",
+        "truth.json",
+    }
     assert list(place.parent.iterdir()) == [place]
     assert read_truth(place)["seed"] == 7
     with pytest.raises(
@@ -53,7 +57,9 @@ def test_the_whole_bag_has_its_name(simulation, tmp_path):
 def test_a_place_where_no_folder_can_be_made_is_one_line(simulation, tmp_path):
     (tmp_path / "file").write_text("")
     place = tmp_path / "file" / "bag"
-    with pytest.raises(InputError, match=f"^{re.escape(str(place))}: cannot be created "):
+    with pytest.raises(
+        InputError, match=f"^{re.escape(str(place))}: cannot be created "
+    ):
         write_simulation(simulation, place)
 
 
@@ -61,7 +67,11 @@ def test_each_part_of_the_truth_is_written_under_its_name(tmp_path):
     truth = random_truth(Artifact(5, 0.01), 2, np.random.default_rng(3))
     write_truth(tmp_path / "truth.json", truth)
     written = json.loads((tmp_path / "truth.json").read_text())
-    assert np.abs(truth.a[0] - truth.a[1]).max() > 0 < np.abs(truth.g[0] - truth.g[1]).max()
+    assert (
+        np.abs(truth.a[0] - truth.a[1]).max()
+        > 0
+        < np.abs(truth.g[0] - truth.g[1]).max()
+    )
     for name, value in (
         ("gx", truth.g[0]),
         ("gy", truth.g[1]),

@@ -69,9 +69,15 @@ def test_lines_are_told_with_another_sign(sense):
 @SENSES
 def test_a_camera_distorts_with_the_cube_of_the_offset(sense):
     # 300, 400 um: half a millimetre from the axis, 1 % too long at 0.25 mm: 4 % there
-    truth = truth_with(t_m=one_view(300 * UM, -400 * UM), distortion=0.01 / (250 * UM) ** 2)
-    assert deviation(measured(truth, sense), 0, 0) == pytest.approx([312 * UM, -416 * UM])
-    drawn = random_truth(PLATE, 1, np.random.default_rng(1), Spread(microscope_distortion=0.01))
+    truth = truth_with(
+        t_m=one_view(300 * UM, -400 * UM), distortion=0.01 / (250 * UM) ** 2
+    )
+    assert deviation(measured(truth, sense), 0, 0) == pytest.approx(
+        [312 * UM, -416 * UM]
+    )
+    drawn = random_truth(
+        PLATE, 1, np.random.default_rng(1), Spread(microscope_distortion=0.01)
+    )
     assert drawn.distortion == truth.distortion
 
 
@@ -80,10 +86,14 @@ def test_a_tilted_plate_is_shorter_across_the_axis_of_its_tilt(sense):
     tilt = 0.01  # about stage y: what lies along x is shorter by 5e-5, and +x goes down
     truth = truth_with(plate_tilt_rad=one_view(0.0, tilt))
     found = measured(truth, sense)
-    assert deviation(found, 1, 1) == pytest.approx([0.1 * (cos(tilt) - 1), 0], abs=1e-15)
+    assert deviation(found, 1, 1) == pytest.approx(
+        [0.1 * (cos(tilt) - 1), 0], abs=1e-15
+    )
     # the axis is the stage's: a plate turned by 90 deg is shorter along stage x all the same
     turned = measured(truth, sense, view=QUARTER)
-    assert deviation(turned, 0, -1) == pytest.approx([0.1 * (cos(tilt) - 1), 0], abs=1e-15)
+    assert deviation(turned, 0, -1) == pytest.approx(
+        [0.1 * (cos(tilt) - 1), 0], abs=1e-15
+    )
 
 
 @SENSES
@@ -92,7 +102,8 @@ def test_height_moves_a_mark_under_a_tilted_optical_axis(sense):
     tilted = truth_with(plate_tilt_rad=one_view(0.01, 0.0), optical_tilt_rad=lean)
     # about stage x: +y rises by 0.1 sin 0.01
     assert deviation(measured(tilted, sense), 0, 1) == pytest.approx(
-        [0.02 * 0.1 * sin(0.01), 0.1 * (cos(0.01) - 1) + 0.05 * 0.1 * sin(0.01)], rel=1e-9
+        [0.02 * 0.1 * sin(0.01), 0.1 * (cos(0.01) - 1) + 0.05 * 0.1 * sin(0.01)],
+        rel=1e-9,
     )
     bowed = truth_with(plate_bow_m=10 * UM, optical_tilt_rad=lean)
     found = measured(bowed, sense)
@@ -101,7 +112,9 @@ def test_height_moves_a_mark_under_a_tilted_optical_axis(sense):
     assert deviation(found, -1, 1) == pytest.approx([-0.2 * UM, -0.5 * UM])
     # bow and tilt together: the centre, 10 um high, goes towards +x when +x goes down
     both = truth_with(plate_bow_m=10 * UM, plate_tilt_rad=one_view(0.0, 0.01))
-    assert deviation(measured(both, sense), 0, 0) == pytest.approx([0.1 * UM, 0], rel=1e-4)
+    assert deviation(measured(both, sense), 0, 0) == pytest.approx(
+        [0.1 * UM, 0], rel=1e-4
+    )
 
 
 @SENSES
@@ -110,14 +123,22 @@ def test_a_plate_is_strained_along_its_own_axes(sense):
     found = measured(truth, sense)
     assert deviation(found, 1, 0) == pytest.approx([1 * UM, 2 * UM])
     assert deviation(found, 0, 1) == pytest.approx([2 * UM, -4 * UM])
-    assert deviation(measured(truth, sense, view=QUARTER), 1, 0) == pytest.approx([-2 * UM, 1 * UM])
+    assert deviation(measured(truth, sense, view=QUARTER), 1, 0) == pytest.approx(
+        [-2 * UM, 1 * UM]
+    )
 
 
 def test_a_stage_bends_where_it_stands_whatever_lies_on_it():
     # x: 1 u^2 + 2 uv + 4 v^2, y: 8 u^2 + 16 uv + 32 v^2, in um at the edge
     truth = truth_with(stage_bend_m=np.array([[[1, 2, 4], [8, 16, 32]]]) * UM)
-    for view, mark in ((View("v"), (1, -1)), (QUARTER, (-1, -1))):  # both on site (1, -1)
-        assert deviation(measured(truth, view=view), *mark) == pytest.approx([3 * UM, 24 * UM])
+    # both on site (1, -1)
+    for view, mark in (
+        (View("v"), (1, -1)),
+        (QUARTER, (-1, -1)),
+    ):
+        assert deviation(measured(truth, view=view), *mark) == pytest.approx(
+            [3 * UM, 24 * UM]
+        )
         carried = measured(truth, Sense.PLATE_MOVES, view=view)
         assert deviation(carried, *mark) == pytest.approx([-3 * UM, -24 * UM])
     assert deviation(measured(truth), 1, 0) == pytest.approx([1 * UM, 8 * UM])
@@ -193,7 +214,10 @@ def test_backlash_grows_while_a_view_is_measured(sense):
     sign = 1 if sense is Sense.MICROSCOPE_MOVES else -1
     view = View("v", repeats=2)
     found = measured(
-        truth_with(backlash_growth_m=17 * UM), sense, view=view, visit_order="there_and_back"
+        truth_with(backlash_growth_m=17 * UM),
+        sense,
+        view=view,
+        visit_order="there_and_back",
     ).visits
     order = np.argsort(found.stamp_ns)
     # 18 exposures, of which the two in the middle are one visit: 8.5 um, from plus along x
@@ -242,7 +266,8 @@ def test_servo_scatter_is_motion_and_noise_of_the_encoder_is_none(sense):
     truth = truth_with(t_m=one_view(30 * UM, 0.0))
     view = View("v", repeats=400)
     moves = measured(truth, sense, view=view, servo_sigma_m=1 * UM).visits
-    np.testing.assert_allclose(moves.dx, 30 * UM, rtol=1e-9)  # offset and position cancel
+    # offset and position cancel
+    np.testing.assert_allclose(moves.dx, 30 * UM, rtol=1e-9)
     assert moves.offset_x.std() == pytest.approx(1 * UM, rel=0.05)
     reads = measured(truth, sense, view=view, encoder_sigma_m=1 * UM).visits
     assert np.ptp(reads.offset_x) < 1e-15
@@ -254,7 +279,11 @@ def test_servo_scatter_is_motion_and_noise_of_the_encoder_is_none(sense):
 @SENSES
 @pytest.mark.parametrize(
     ("turn", "mark", "error", "line"),
-    [(0.0, (0, 1), (2, 5), 1), (-pi / 2, (-1, 0), (5, -2), 2), (pi, (0, -1), (-2, -5), 3)],
+    [
+        (0.0, (0, 1), (2, 5), 1),
+        (-pi / 2, (-1, 0), (5, -2), 2),
+        (pi, (0, -1), (-2, -5), 3),
+    ],
 )
 def test_a_plate_that_lies_otherwise_shows_another_mark(sense, turn, mark, error, line):
     """A quarter turn is commanded: mark (1, 0) is expected on site (0, 1), line 0 along +y."""
@@ -288,7 +317,11 @@ def test_detections_name_the_mark_that_lies_there():
     plan = Plan("p", PLATE, (QUARTER,))
     truth = truth_with(placed=(View("v"),))
     events = plan_events(
-        truth, plan, settings=CellSettings(), rng=np.random.default_rng(1), start_ns=START_NS
+        truth,
+        plan,
+        settings=CellSettings(),
+        rng=np.random.default_rng(1),
+        start_ns=START_NS,
     )
     seen = [event for event in events if isinstance(event, Detection)]
     # the stage goes along the sites line by line from (-1, -1): so do the marks that lie there
@@ -299,8 +332,13 @@ def test_detections_name_the_mark_that_lies_there():
 
 def test_views_share_what_pins_make_of_them():
     spread = Spread(phi_rad=0.0, t_m=0.0, phi_common_rad=1e-3, t_common_m=50 * UM)
-    draws = [random_truth(PLATE, 3, np.random.default_rng(seed), spread) for seed in range(400)]
-    assert all(np.ptp(one.phi_rad) == 0 and not np.ptp(one.t_m, axis=0).any() for one in draws)
+    draws = [
+        random_truth(PLATE, 3, np.random.default_rng(seed), spread)
+        for seed in range(400)
+    ]
+    assert all(
+        np.ptp(one.phi_rad) == 0 and not np.ptp(one.t_m, axis=0).any() for one in draws
+    )
     assert np.std([one.phi_rad[0] for one in draws]) == pytest.approx(1e-3, rel=0.1)
     assert np.std([one.t_m[0] for one in draws]) == pytest.approx(50 * UM, rel=0.1)
 
@@ -310,17 +348,24 @@ def test_a_wrong_pitch_is_an_error_of_the_plate():
         random_truth(PLATE, 1, np.random.default_rng(3), Spread(pitch_error=size))
         for size in (0.0, 8e-4)
     )
-    np.testing.assert_allclose(wrong.a[:, 2, 0] - plain.a[:, 2, 0], [8e-5, -8e-5], rtol=1e-9)
+    np.testing.assert_allclose(
+        wrong.a[:, 2, 0] - plain.a[:, 2, 0], [8e-5, -8e-5], rtol=1e-9
+    )
     np.testing.assert_array_equal(wrong.g, plain.g)
 
 
 def test_effects_of_views_are_drawn_with_their_sizes():
     spread = Spread(
-        plate_strain=1e-6, plate_tilt_rad=1e-3, stage_bend_m=1e-8, line_eccentricity_rad=1.5e-5
+        plate_strain=1e-6,
+        plate_tilt_rad=1e-3,
+        stage_bend_m=1e-8,
+        line_eccentricity_rad=1.5e-5,
     )
     truth = random_truth(PLATE, 4001, np.random.default_rng(5), spread)
     assert not truth.plate_strain[0].any()
-    np.testing.assert_array_equal(truth.plate_strain, truth.plate_strain.transpose(0, 2, 1))
+    np.testing.assert_array_equal(
+        truth.plate_strain, truth.plate_strain.transpose(0, 2, 1)
+    )
     for values, size in (
         (truth.plate_strain, 1e-6),
         (truth.plate_tilt_rad, 1e-3),
@@ -334,7 +379,11 @@ def test_one_machine_is_measured_twice():
     spread = Spread(drift_linear_m=1e-7, plate_scale=1e-6)
     one, other = (
         random_truth(
-            PLATE, 3, np.random.default_rng(1), spread, placing=np.random.default_rng(seed)
+            PLATE,
+            3,
+            np.random.default_rng(1),
+            spread,
+            placing=np.random.default_rng(seed),
         )
         for seed in (2, 3)
     )

@@ -13,7 +13,9 @@ NOISE = {"sigma_xy_m": 2e-8, "sigma_theta_rad": 2e-6}
 
 
 def spoilt(faults, *, seed=1, **settings):
-    cell = scene("0, 90, tx", size=11, count=24, line=True, repeats=5, **NOISE, **settings)
+    cell = scene(
+        "0, 90, tx", size=11, count=24, line=True, repeats=5, **NOISE, **settings
+    )
     events = sorted(cell.events, key=lambda e: e.stamp_ns)
     arrivals, ledger = apply_faults(events, faults, np.random.default_rng(seed))
     return cell, arrivals, ledger
@@ -24,9 +26,15 @@ def assert_close_to_truth(cell, found):
     for index, readings in enumerate(found.views):
         if readings.view.grid:
             want = grid_deviation(cell.truth, index, readings.view)
-            off = np.stack([readings.dx, readings.dy]) - want[:, readings.m + 5, readings.n + 5]
+            off = (
+                np.stack([readings.dx, readings.dy])
+                - want[:, readings.m + 5, readings.n + 5]
+            )
             assert (np.abs(off) < 6 * 2e-8 / np.sqrt(readings.count)).all()
-        off = readings.dtheta - angular_deviation(cell.truth, index, readings.view)[readings.k]
+        off = (
+            readings.dtheta
+            - angular_deviation(cell.truth, index, readings.view)[readings.k]
+        )
         assert (np.abs(off) < 6 * 2e-6 / np.sqrt(readings.count_theta)).all()
 
 
@@ -107,7 +115,9 @@ def test_a_stepped_clock_and_a_gap_are_in_the_ledger():
 def test_no_fault_changes_nothing_and_a_seed_decides_the_rest():
     cell, arrivals, ledger = spoilt(Faults())
     assert ledger == {}
-    assert [event for _, event in arrivals] == sorted(cell.events, key=lambda e: e.stamp_ns)
+    assert [event for _, event in arrivals] == sorted(
+        cell.events, key=lambda e: e.stamp_ns
+    )
     many = Faults(lost=0.1, outliers=0.1, delay_s=0.1)
     first, again, other = (spoilt(many, seed=seed) for seed in (3, 3, 4))
     assert (first[1], first[2]) == (again[1], again[2])

@@ -63,10 +63,14 @@ def test_a_corner_is_turned_counter_clockwise_with_the_plate():
     camera = replace(PLAIN, mark="corner", mark_size_m=20 * PLAIN.pixel_size_m)
     upper_right = grey(camera)[45 - 8, 50 + 8]
     assert upper_right > 0.7
-    for turned in (grey(camera, angles=np.pi / 2), grey(replace(camera, turn_deg=90.0))):
+    for turned in (
+        grey(camera, angles=np.pi / 2),
+        grey(replace(camera, turn_deg=90.0)),
+    ):
         assert turned[45 - 8, 50 + 8] < 0.3
     part = grey(camera, angles=np.deg2rad(30))
-    assert part[45 - 3, 50 + 12] < 0.3  # dark from 30 degrees below the row on, seen upwards
+    # dark from 30 degrees below the row on, seen upwards
+    assert part[45 - 3, 50 + 12] < 0.3
 
 
 def test_dirt_is_dark_and_counted_on_average():
@@ -76,7 +80,9 @@ def test_dirt_is_dark_and_counted_on_average():
 
 def test_a_mark_outside_of_the_image_does_not_show():
     for away in ((1e-3, 0.0), (-1e-3, 1e-3), (0.0, -1e-3)):
-        assert (grey(PLAIN, np.array([away]).T) == grey(replace(PLAIN, contrast=0.0))).all()
+        assert (
+            grey(PLAIN, np.array([away]).T) == grey(replace(PLAIN, contrast=0.0))
+        ).all()
 
 
 def test_a_mirrored_camera_shows_the_mirrored_image():

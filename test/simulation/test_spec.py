@@ -42,7 +42,11 @@ def simulation(folder, data):
 
 def test_a_plan_alone_is_a_simulation(tmp_path):
     made = simulation(tmp_path, {"plan": PLAN})
-    assert (made.seed, made.compression, made.start_ns) == (0, "zstd", 1_700_000_000_000_000_000)
+    assert (made.seed, made.compression, made.start_ns) == (
+        0,
+        "zstd",
+        1_700_000_000_000_000_000,
+    )
     assert made.settings.sense is Sense.MICROSCOPE_MOVES
     assert [view.name for view in made.plan.views] == ["a", "b"]
     truth, arrivals, ledger = made.run()
@@ -58,7 +62,12 @@ def test_every_key_reaches_its_place(tmp_path):
         {
             "plan": "plan.yaml",
             "seed": 5,
-            "truth": {"g": 1e-6, "phi": 0.0, "encoder": "xy_axes", "rotation": "linear"},
+            "truth": {
+                "g": 1e-6,
+                "phi": 0.0,
+                "encoder": "xy_axes",
+                "rotation": "linear",
+            },
             "physics": {
                 "microscope_scale": -0.01,
                 "microscope_stretch": 0.02,
@@ -101,23 +110,45 @@ def test_every_key_reaches_its_place(tmp_path):
         },
     )
     assert (made.seed, made.start_ns, made.compression) == (5, 12_500_000_000, "lz4")
-    assert (made.spread.g_m, made.spread.phi_rad, made.spread.a_m) == (1e-6, 0.0, 0.3e-6)
+    assert (made.spread.g_m, made.spread.phi_rad, made.spread.a_m) == (
+        1e-6,
+        0.0,
+        0.3e-6,
+    )
     cell = made.settings
-    assert (cell.sense, cell.encoder_rate_hz, cell.with_ids, cell.exposure_period_s) == (
+    assert (
+        cell.sense,
+        cell.encoder_rate_hz,
+        cell.with_ids,
+        cell.exposure_period_s,
+    ) == (
         Sense.PLATE_MOVES,
         1000,
         False,
         0.02,
     )
-    assert (cell.sigma_xy_m, cell.sigma_theta_rad, cell.declare_sigma) == (1e-8, 2e-6, True)
-    assert (cell.servo_sigma_m, cell.stop_sigma_m, cell.stop_sigma_theta_rad, cell.follow_mark) == (
+    assert (cell.sigma_xy_m, cell.sigma_theta_rad, cell.declare_sigma) == (
+        1e-8,
+        2e-6,
+        True,
+    )
+    assert (
+        cell.servo_sigma_m,
+        cell.stop_sigma_m,
+        cell.stop_sigma_theta_rad,
+        cell.follow_mark,
+    ) == (
         0.0,
         5e-5,
         1e-5,
         True,
     )
     assert (cell.visit_order, cell.consecutive) == ("random@plate", True)
-    assert (cell.visit_xy_m, cell.flicker_xy_m, cell.flicker_theta_rad) == (1e-9, 2e-9, 3e-9)
+    assert (cell.visit_xy_m, cell.flicker_xy_m, cell.flicker_theta_rad) == (
+        1e-9,
+        2e-9,
+        3e-9,
+    )
     assert (cell.resolution_xy_m, cell.resolution_theta_rad) == (4e-9, 5e-9)
     spread = made.spread
     assert (spread.encoder, spread.rotation) == ("xy_axes", "linear")
@@ -135,19 +166,34 @@ def test_every_key_reaches_its_place(tmp_path):
         spread.drift_cubic_m,
         spread.drift_walk_m,
     ) == (1e-7, 2e-7, 3e-7, 4e-7)
-    assert (made.faults.lost, made.faults.delay_s, made.faults.clock_step_s) == (0.1, 0.2, 0.3)
+    assert (made.faults.lost, made.faults.delay_s, made.faults.clock_step_s) == (
+        0.1,
+        0.2,
+        0.3,
+    )
 
 
 def test_a_seed_gives_the_same_messages(tmp_path):
-    data = {"plan": PLAN, "noise": {"sigma_xy": 1e-8}, "faults": {"lost": 0.1, "delay": 0.1}}
-    first, again, other = (simulation(tmp_path, {**data, "seed": seed}).run() for seed in (1, 1, 2))
+    data = {
+        "plan": PLAN,
+        "noise": {"sigma_xy": 1e-8},
+        "faults": {"lost": 0.1, "delay": 0.1},
+    }
+    first, again, other = (
+        simulation(tmp_path, {**data, "seed": seed}).run() for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first[0].g, again[0].g)
     assert first[1:] == again[1:]
     assert first[1] != other[1]
 
 
 def test_the_machine_stays_when_it_is_measured_again(tmp_path):
-    data = {"plan": PLAN, "seed": 4, "noise": {"sigma_xy": 1e-8}, "faults": {"lost": 0.1}}
+    data = {
+        "plan": PLAN,
+        "seed": 4,
+        "noise": {"sigma_xy": 1e-8},
+        "faults": {"lost": 0.1},
+    }
     alone, first, same, other = (
         simulation(tmp_path, {**data, **more}).run()
         for more in ({}, {"noise_seed": 1}, {"noise_seed": 1}, {"noise_seed": 2})
@@ -170,7 +216,9 @@ def test_every_effect_beside_the_model_reaches_its_field(tmp_path):
     for key, value in (values | {"microscope_axes": "y-x"}).items():
         made = simulation(tmp_path, {"plan": PLAN, "physics": {key: value}})
         changed = {
-            name: at for name, at in vars(made.spread).items() if at != getattr(Spread(), name)
+            name: at
+            for name, at in vars(made.spread).items()
+            if at != getattr(Spread(), name)
         }
         assert changed == {field_of(key, Spread): value}
     made = simulation(
@@ -192,7 +240,10 @@ def test_every_effect_beside_the_model_reaches_its_field(tmp_path):
 def test_a_plate_lies_otherwise_than_its_view_says(tmp_path):
     truth, _, _ = simulation(
         tmp_path,
-        {"plan": PLAN, "placed": [{"name": "b", "rotation_deg": -90, "translation_pitch": [0, 1]}]},
+        {
+            "plan": PLAN,
+            "placed": [{"name": "b", "rotation_deg": -90, "translation_pitch": [0, 1]}],
+        },
     ).run()
     assert truth.placed[0] is None
     pose = truth.placed[1].lattice_pose(truth.artifact)
@@ -201,11 +252,18 @@ def test_a_plate_lies_otherwise_than_its_view_says(tmp_path):
 
 
 def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tmp_path):
-    askew = {"plan": PLAN, "placed": [{"name": "b", "rotation_deg": 91, "angular": False}]}
-    with pytest.raises(InputError, match="view 'b': grid marks cannot be measured at a turn of 91"):
+    askew = {
+        "plan": PLAN,
+        "placed": [{"name": "b", "rotation_deg": 91, "angular": False}],
+    }
+    with pytest.raises(
+        InputError, match="view 'b': grid marks cannot be measured at a turn of 91"
+    ):
         simulation(tmp_path, askew)
     askew["plan"] = PLAN | {"map": {"grid_size": 3}}
-    with pytest.raises(InputError, match=r"rotation: 1[.]01111 is not a whole number of ang"):
+    with pytest.raises(
+        InputError, match=r"rotation: 1[.]01111 is not a whole number of ang"
+    ):
         simulation(tmp_path, askew)
     askew["plan"]["views"] = [{"name": "b", "angular": False}]
     truth = simulation(tmp_path, askew).run()[0]
@@ -225,10 +283,22 @@ def test_a_plate_lies_off_the_lattice_only_where_its_map_has_nodes_of_its_own(tm
             "seed, noise_seed, start_time, "
             "compression",
         ),
-        ({"plan": {**PLAN, "views": []}}, ": plan: the plan has no views; add at least one view"),
-        ({"plan": True}, ": plan: not a mapping of keys to values; see the examples in config"),
-        ({"plan": PLAN, "truth": 5}, ": truth: not a mapping; see docs/guides/simulate.md"),
-        ({"plan": PLAN, "faults": None}, ": faults: not a mapping; see docs/guides/simulate.md"),
+        (
+            {"plan": {**PLAN, "views": []}},
+            ": plan: the plan has no views; add at least one view",
+        ),
+        (
+            {"plan": True},
+            ": plan: not a mapping of keys to values; see the examples in config",
+        ),
+        (
+            {"plan": PLAN, "truth": 5},
+            ": truth: not a mapping; see docs/guides/simulate.md",
+        ),
+        (
+            {"plan": PLAN, "faults": None},
+            ": faults: not a mapping; see docs/guides/simulate.md",
+        ),
         (
             {"plan": PLAN, "noise": {"encoder_rate": 500}},
             ": noise: encoder_rate: unknown key; known "
@@ -312,7 +382,8 @@ KEYS = {
         (float, -1e-3, 1e-3),
     )
     | dict.fromkeys(
-        ("plate_scale", "plate_strain", "plate_tilt", "line_eccentricity"), (float, 0.0, 0.1)
+        ("plate_scale", "plate_strain", "plate_tilt", "line_eccentricity"),
+        (float, 0.0, 0.1),
     )
     | dict.fromkeys(("microscope_pixels", "line_factor"), (float, -100.0, 100.0))
     | {
@@ -334,7 +405,9 @@ KEYS = {
     "noise": dict.fromkeys(
         ("sigma_xy", "visit_xy", "flicker_xy", "resolution_xy"), (float, 0.0, 1e-3)
     )
-    | dict.fromkeys(("sigma_theta", "flicker_theta", "resolution_theta"), (float, 0.0, 0.1))
+    | dict.fromkeys(
+        ("sigma_theta", "flicker_theta", "resolution_theta"), (float, 0.0, 0.1)
+    )
     | {"noise_ratio": (float, 0.0, 100.0)},
     "cell": {
         "sense": str,
@@ -357,7 +430,9 @@ KEYS = {
     )
     | dict.fromkeys(("delay", "clock_step", "encoder_gap"), (float, 0.0, 3600.0)),
 }
-FIELDS = [(section, key, rule) for section, keys in KEYS.items() for key, rule in keys.items()]
+FIELDS = [
+    (section, key, rule) for section, keys in KEYS.items() for key, rule in keys.items()
+]
 
 
 def one(section, key, value):
@@ -368,7 +443,10 @@ def one(section, key, value):
 def test_every_field_has_a_type_and_bounds(tmp_path, section, key, rule):
     kind, *bounds = rule if isinstance(rule, tuple) else (rule,)
     wrong = [
-        ("many", f"'many' is not {'known' if kind is str else f'of type {kind.__name__}'}; "),
+        (
+            "many",
+            f"'many' is not {'known' if kind is str else f'of type {kind.__name__}'}; ",
+        ),
         ([1], f"[1] is not of type {kind.__name__}; "),
         (None, f"None is not of type {kind.__name__}; "),
     ]
@@ -388,7 +466,9 @@ def test_every_field_has_a_type_and_bounds(tmp_path, section, key, rule):
         with pytest.raises(InputError) as caught:
             simulation(tmp_path, one(section, key, value))
         place = f"{section}: {key}" if section else key
-        assert str(caught.value).startswith(f"{tmp_path / 'sim.yaml'}: {place}: {message}")
+        assert str(caught.value).startswith(
+            f"{tmp_path / 'sim.yaml'}: {place}: {message}"
+        )
 
 
 @pytest.mark.parametrize(
@@ -396,7 +476,8 @@ def test_every_field_has_a_type_and_bounds(tmp_path, section, key, rule):
     [
         field
         for field in FIELDS
-        if isinstance(field[2], tuple) and field[1] not in ("encoder_rate", "exposure_period")
+        if isinstance(field[2], tuple)
+        and field[1] not in ("encoder_rate", "exposure_period")
     ],
 )
 def test_the_bounds_themselves_are_accepted(tmp_path, section, key, rule):
@@ -412,13 +493,18 @@ def test_a_number_in_a_form_of_yaml_1_2_is_a_number(tmp_path):
         "noise: {sigma_xy: 2e-8}\n",
     )
     assert made.plan.artifact.grid_pitch_m == 0.01
-    assert (made.start_ns, made.settings.sigma_xy_m) == (1_700_000_000_000_000_000, 2e-8)
+    assert (made.start_ns, made.settings.sigma_xy_m) == (
+        1_700_000_000_000_000_000,
+        2e-8,
+    )
 
 
 def test_flat_keys_reach_their_fields():
     settings = settings_of({"sense": "plate_moves", "stop_sigma": 1e-5, "other": 1})
     assert settings == CellSettings(Sense.PLATE_MOVES, stop_sigma_m=1e-5)
-    spread = spread_of({"encoder": "xy_axes", "drift_cubic": 1e-7, "phi": 0.0, "stop_sigma": 1})
+    spread = spread_of(
+        {"encoder": "xy_axes", "drift_cubic": 1e-7, "phi": 0.0, "stop_sigma": 1}
+    )
     assert spread == Spread(encoder="xy_axes", drift_cubic_m=1e-7, phi_rad=0.0)
 
 
@@ -426,7 +512,8 @@ def test_a_simulated_cell_is_by_default_what_a_simulation_is_but_for_hus_noise()
     cell, spread = CellSettings(), Spread()
     fields = {key: getattr(cell, field_of(key, CellSettings)) for key in NOISE | CELL}
     fields |= {
-        key: getattr(spread, field_of(key, Spread)) for key in (*PHYSICS, "encoder", "rotation")
+        key: getattr(spread, field_of(key, Spread))
+        for key in (*PHYSICS, "encoder", "rotation")
     }
     fields |= {"sigma_xy": 20e-9, "sigma_theta": np.radians(0.001)}
     shared = {
@@ -450,7 +537,9 @@ def test_a_simulated_cell_is_by_default_what_a_simulation_is_but_for_hus_noise()
 )
 def test_numbers_are_those_of_the_documents(name, keys, defaults):
     page = (Path(__file__).parents[2] / "docs/guides/simulate.md").read_text()
-    section = page.partition(f"\n`{name}`")[2].partition("\n\n`")[0].partition("\n## ")[0]
+    section = (
+        page.partition(f"\n`{name}`")[2].partition("\n\n`")[0].partition("\n## ")[0]
+    )
     said = {}
     for line in section.splitlines():
         if not line.startswith("| `"):

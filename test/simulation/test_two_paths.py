@@ -70,15 +70,22 @@ CASES = {
         ),
         {"noise_ratio": 0.25, "encoder_sigma_m": 2e-8, "encoder_sigma_theta_rad": 1e-7},
     ),
-    "followed": (EVERYTHING, {"follow_mark": True, "visit_order": "there_and_back@plate"}),
+    "followed": (
+        EVERYTHING,
+        {"follow_mark": True, "visit_order": "there_and_back@plate"},
+    ),
 }
 
 
 PLANS = {
-    "on the lattice": plan_of("0, 90, -tx, 90tx", 7, size_y=5, count=8, line=True, repeats=3),
+    "on the lattice": plan_of(
+        "0, 90, -tx, 90tx", 7, size_y=5, count=8, line=True, repeats=3
+    ),
     "harmonics": harmonic_plan(),
     "placed": placed_plan(7, size_y=5, count=8, repeats=3),
-    "a list of marks": listed_plan(scatter(40, half_m=0.02, angular_count=8), repeats=3),
+    "a list of marks": listed_plan(
+        scatter(40, half_m=0.02, angular_count=8), repeats=3
+    ),
 }
 
 
@@ -87,9 +94,13 @@ PLANS = {
 @pytest.mark.parametrize("plan", PLANS.values(), ids=list(PLANS))
 def test_both_give_the_same_readings_visit_by_visit(plan, case, sense):
     spread, how = CASES[case]
-    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(2), spread)
+    truth = random_truth(
+        plan.artifact, len(plan.views), np.random.default_rng(2), spread
+    )
     settings = CellSettings(sense, 2e-8, 1e-6, **how)
-    direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
+    direct = simulate_measurements(
+        truth, plan, np.random.default_rng(4), settings=settings
+    )
     events = plan_events(
         truth, plan, settings=settings, rng=np.random.default_rng(4), start_ns=START_NS
     )
@@ -105,7 +116,9 @@ def test_both_give_the_same_readings_visit_by_visit(plan, case, sense):
         for name in ("m", "n", "count", "k", "count_theta"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
         for name in ("dx", "dy", "sigma_xy"):
-            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=2e-17)
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(other, name), atol=2e-17
+            )
         np.testing.assert_allclose(one.dtheta, other.dtheta, atol=4e-15)
         assert one.axis_theta == pytest.approx(other.axis_theta, abs=4e-15)
         np.testing.assert_allclose(one.sigma_theta, other.sigma_theta, rtol=1e-9)
@@ -135,7 +148,9 @@ def test_both_read_the_marks_that_lie_there_where_they_have_no_ids():
         ),
     )
     settings = CellSettings(Sense.PLATE_MOVES, 2e-8, 1e-6, with_ids=False)
-    direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
+    direct = simulate_measurements(
+        truth, plan, np.random.default_rng(4), settings=settings
+    )
     events = plan_events(
         truth, plan, settings=settings, rng=np.random.default_rng(4), start_ns=START_NS
     )
@@ -151,19 +166,29 @@ def test_both_read_the_marks_that_lie_there_where_they_have_no_ids():
 @pytest.mark.parametrize("sense", list(Sense))
 @pytest.mark.parametrize(
     "plan",
-    [placed_plan(11, count=24), listed_plan(repeats=1), listed_plan(rings(angular_count=24))],
+    [
+        placed_plan(11, count=24),
+        listed_plan(repeats=1),
+        listed_plan(rings(angular_count=24)),
+    ],
     ids=["lattice", "scattered", "circles"],
 )
 def test_placed_plates_are_read_without_ids(plan, sense):
     """Turned by 17 mrad more than commanded, and 0.3 pitches beside."""
     spread = Spread(phi_rad=0.017, t_m=2e-3, correlation_pitches=4.0)
-    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(2), spread)
+    truth = random_truth(
+        plan.artifact, len(plan.views), np.random.default_rng(2), spread
+    )
     settings = CellSettings(sense, 2e-8, 1e-6, with_ids=False)
-    direct = simulate_measurements(truth, plan, np.random.default_rng(4), settings=settings)
+    direct = simulate_measurements(
+        truth, plan, np.random.default_rng(4), settings=settings
+    )
     events = plan_events(
         truth, plan, settings=settings, rng=np.random.default_rng(4), start_ns=START_NS
     )
-    collected, progress = collect(events, measurement_sense=str(sense), outlier_limit=0.0)
+    collected, progress = collect(
+        events, measurement_sense=str(sense), outlier_limit=0.0
+    )
     assert collected.all_rejected() == {}
     assert all(found.complete for found in progress.values())
     for one, other in zip(direct.views, collected.views, strict=True):
@@ -174,7 +199,9 @@ def test_placed_plates_are_read_without_ids(plan, sense):
 
 def assert_same_visits(one, other):
     for name in ("mark", "count", "approach_x", "approach_y", "dof"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        np.testing.assert_array_equal(
+            getattr(one, name), getattr(other, name), err_msg=name
+        )
     for name in ("dx", "dy", "offset_x", "offset_y", "sigma_m"):
         np.testing.assert_allclose(
             getattr(one, name), getattr(other, name), atol=2e-17, err_msg=name
@@ -187,12 +214,16 @@ def test_marks_that_are_missing_are_missing_as_a_whole():
     plan = plan_of("0, 90, tx", 11, count=24, repeats=3)
     truth = random_truth(plan.artifact, 3, np.random.default_rng(2))
     every = simulate_measurements(truth, plan, np.random.default_rng(4), visits=True)
-    found = simulate_measurements(truth, plan, np.random.default_rng(4), visits=True, missing=0.3)
+    found = simulate_measurements(
+        truth, plan, np.random.default_rng(4), visits=True, missing=0.3
+    )
     for one, whole in zip(found.views, every.views, strict=True):
         assert 0.5 * len(whole.m) < len(one.m) < 0.9 * len(whole.m)
         assert 0.4 * len(whole.k) < len(one.k) < len(whole.k)
         assert set(one.count) == set(one.count_theta) == {3}
-        np.testing.assert_array_equal(np.bincount(one.visits.mark, one.visits.count), one.count)
+        np.testing.assert_array_equal(
+            np.bincount(one.visits.mark, one.visits.count), one.count
+        )
         at = np.searchsorted(100 * whole.m + whole.n, 100 * one.m + one.n)
         np.testing.assert_allclose(one.dx, whole.dx[at], atol=1e-17)
         assert one.used == one.count.sum() + one.count_theta.sum()
@@ -202,7 +233,11 @@ def test_means_of_visits_are_the_means_of_marks():
     plan = plan_of("0", 11, count=24, repeats=3)
     truth = random_truth(plan.artifact, 1, np.random.default_rng(2))
     (found,) = simulate_measurements(
-        truth, plan, np.random.default_rng(4), sigma_m=1e-8, settings=CellSettings(sigma_xy_m=1e-8)
+        truth,
+        plan,
+        np.random.default_rng(4),
+        sigma_m=1e-8,
+        settings=CellSettings(sigma_xy_m=1e-8),
     ).views
     visits = found.visits
     mean = np.bincount(visits.mark, visits.dx * visits.count) / found.count

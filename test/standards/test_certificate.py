@@ -41,23 +41,30 @@ DETAILS = Path(__file__).parents[2] / "config/certificates/details.yaml"
 GIVEN = yaml.safe_load(DETAILS.read_text())
 IN = {"dcc": DCC, "si": SI}
 SCHEMA = Path(
-    os.environ.get("SELFCAL_DCC_SCHEMA") or Path(__file__).parents[2] / "build/oracles/dcc/dcc.xsd"
+    os.environ.get("SELFCAL_DCC_SCHEMA")
+    or Path(__file__).parents[2] / "build/oracles/dcc/dcc.xsd"
 )
 """dcc.xsd of version 3.3.0, with the schemas beside it that it imports; `make test` fetches it."""
 CERTIFIED = ReferenceLength("artifact", 1e-6, 2e-7, "PTB 1")
-OF_MARKS = ReferenceLength.between("-2,0:2,0:0.04000004:8e-9", Artifact(5, 0.01), "PTB 1")
+OF_MARKS = ReferenceLength.between(
+    "-2,0:2,0:0.04000004:8e-9", Artifact(5, 0.01), "PTB 1"
+)
 
 
 def solved(reference=None, *, lines=8):
     rng = np.random.default_rng(1)
     plan = hu_plan(Artifact(5, 0.01, lines), 2)
     truth = random_truth(plan.artifact, len(plan.views), rng)
-    readings = simulate_measurements(truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-5)
+    readings = simulate_measurements(
+        truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-5
+    )
     return worded(calibrate(readings, Options(reference=reference, causes=False)))
 
 
 RESULT = solved()
-BAD = worded(replace(RESULT, verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_converged"),))))
+BAD = worded(
+    replace(RESULT, verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_converged"),)))
+)
 
 
 def details():
@@ -70,7 +77,11 @@ def written(result=RESULT, **options):
 
 def named(root, name):
     """Return the elements whose name is a text."""
-    return [item for item in root.iter() if item.findtext("dcc:name/dcc:content", "", IN) == name]
+    return [
+        item
+        for item in root.iter()
+        if item.findtext("dcc:name/dcc:content", "", IN) == name
+    ]
 
 
 def values(item, path="si:realListXMLList/si:valueXMLList"):
@@ -92,10 +103,14 @@ def test_the_map_of_the_certificate_is_that_of_the_result():
     k = RESULT.noise.k_xy
     np.testing.assert_allclose(values(gx, U), k * emap.u_gx.ravel(), rtol=1e-8)
     np.testing.assert_allclose(values(gy, U), k * emap.u_gy.ravel(), rtol=1e-8)
-    assert float(gx.findtext(".//si:coverageFactorXMLList", "", IN)) == pytest.approx(k, abs=1e-4)
+    assert float(gx.findtext(".//si:coverageFactorXMLList", "", IN)) == pytest.approx(
+        k, abs=1e-4
+    )
     [theta], [angle] = named(root, "Gtheta"), named(root, "angle")
     np.testing.assert_allclose(values(theta), emap.g_theta, rtol=1e-8)
-    np.testing.assert_allclose(values(theta, U), RESULT.noise.k_theta * emap.u_g_theta, rtol=1e-8)
+    np.testing.assert_allclose(
+        values(theta, U), RESULT.noise.k_theta * emap.u_g_theta, rtol=1e-8
+    )
     np.testing.assert_allclose(values(angle), np.arange(8) * np.pi / 4, rtol=1e-8)
     unknown = emap.gx.copy()
     unknown[0, 1] = np.nan
@@ -105,7 +120,9 @@ def test_the_map_of_the_certificate_is_that_of_the_result():
 
 def test_budget_and_distances_are_those_of_the_result():
     root = written()
-    [at_nodes] = named(root, "Uncertainty budget: XY, one coordinate at the nodes of the map")
+    [at_nodes] = named(
+        root, "Uncertainty budget: XY, one coordinate at the nodes of the map"
+    )
     found = {
         item.findtext("dcc:name/dcc:content", "", IN): float(
             item.findtext("si:real/si:value", "", IN)
@@ -119,7 +136,8 @@ def test_budget_and_distances_are_those_of_the_result():
     assert len(found) == len(budget.lines) + 2
     a, b = StageMap(RESULT).length_uncertainty()
     assert [
-        float(named(root, name)[0].findtext("si:real/si:value", "", IN)) for name in "ab"
+        float(named(root, name)[0].findtext("si:real/si:value", "", IN))
+        for name in "ab"
     ] == pytest.approx([a, b])
     assert not named(root, "Gx, then Gy")
 
@@ -131,7 +149,9 @@ def test_the_covariance_is_written_on_request():
         for column in item.iter(f"{{{SI}}}columnXMLList")
     ]
     known = np.ones(RESULT.artifact.shape, dtype=bool)
-    np.testing.assert_allclose(found, covariance_of(RESULT, "xy", known), rtol=1e-7, atol=1e-26)
+    np.testing.assert_allclose(
+        found, covariance_of(RESULT, "xy", known), rtol=1e-7, atol=1e-26
+    )
     apart = replace(RESULT, views=())
     text = ET.tostring(written(apart), encoding="unicode")
     assert "correlations between nodes are not known" in text and not named(
@@ -174,20 +194,33 @@ def test_the_certificate_has_the_parts_of_the_schema_in_their_order():
         "measurementMetaData",
     ]
     core = {item.tag.partition("}")[2]: item.text for item in root[0][1]}
-    assert core["uniqueIdentifier"] == "EX-2026-0042" and core["issueDate"] == "2026-11-23"
+    assert (
+        core["uniqueIdentifier"] == "EX-2026-0042" and core["issueDate"] == "2026-11-23"
+    )
     assert (core["countryCodeISO3166_1"], core["usedLangCodeISO639_1"]) == ("DE", "en")
     [stage] = named(root, "XY-theta stage")
-    assert stage.findtext("dcc:identifications/dcc:identification/dcc:value", "", IN) == "4711"
-    assert stage.findtext("dcc:manufacturer/dcc:name/dcc:content", "", IN) == "Example Stages"
+    assert (
+        stage.findtext("dcc:identifications/dcc:identification/dcc:value", "", IN)
+        == "4711"
+    )
+    assert (
+        stage.findtext("dcc:manufacturer/dcc:name/dcc:content", "", IN)
+        == "Example Stages"
+    )
     [warm] = named(root, "temperature of the plate")
     assert float(warm.findtext(".//si:valueExpandedMU", "", IN)) == pytest.approx(0.1)
-    empty = [item for item in root.iter() if len(item) == 0 and not (item.text or "").strip()]
+    empty = [
+        item for item in root.iter() if len(item) == 0 and not (item.text or "").strip()
+    ]
     assert not empty
 
 
 def test_details_are_taken_as_they_are_written(tmp_path):
     given = json.loads(json.dumps(GIVEN, default=str))
-    given["laboratory"]["post_code"], given["item"]["serial_number"] = "@post", "@serial"
+    given["laboratory"]["post_code"], given["item"]["serial_number"] = (
+        "@post",
+        "@serial",
+    )
     given["certificate"]["id"], given["certificate"]["language"] = "@id", "@no"
     given["laboratory"]["country"] = "@NO"
     text = (
@@ -201,8 +234,14 @@ def test_details_are_taken_as_they_are_written(tmp_path):
     (tmp_path / "d.yaml").write_text(text)
     found = read_details(str(tmp_path / "d.yaml"))
     assert found["laboratory"]["post_code"] == "01067"
-    assert found["item"]["serial_number"] == "00471" and found["certificate"]["id"] == "1e3"
-    assert (found["laboratory"]["country"], found["certificate"]["language"]) == ("NO", "no")
+    assert (
+        found["item"]["serial_number"] == "00471"
+        and found["certificate"]["id"] == "1e3"
+    )
+    assert (found["laboratory"]["country"], found["certificate"]["language"]) == (
+        "NO",
+        "no",
+    )
     assert found["conditions"] == details()["conditions"]
     assert found["certificate"]["begin"] == details()["certificate"]["begin"]
 
@@ -251,16 +290,24 @@ def test_only_a_certified_reference_at_its_temperature_is_traceable():
 
 
 def test_a_result_that_is_not_qualified_needs_the_option():
-    with pytest.raises(InputError, match="is not qualified: Not qualified: the estimate converged"):
+    with pytest.raises(
+        InputError, match="is not qualified: Not qualified: the estimate converged"
+    ):
         written(BAD)
-    said = statement(written(BAD, not_qualified=True), "Agreement of readings and model")
+    said = statement(
+        written(BAD, not_qualified=True), "Agreement of readings and model"
+    )
     assert said.findtext("dcc:valid", "", IN) == "false"
     assert "No statement of the uncertainty is valid" in " ".join(said.itertext())
     good = statement(written(), "Agreement of readings and model")
     assert good.findtext("dcc:valid", "", IN) == "true"
     nothing = np.full(RESULT.artifact.shape, np.nan)
     with pytest.raises(InputError, match="no uncertainties"):
-        written(replace(RESULT, error_map=replace(RESULT.error_map, u_gx=nothing, u_gy=nothing)))
+        written(
+            replace(
+                RESULT, error_map=replace(RESULT.error_map, u_gx=nothing, u_gy=nothing)
+            )
+        )
 
 
 def scalar(root, name):
@@ -284,7 +331,9 @@ def test_squareness_has_the_coverage_factor_of_the_map():
         first_order_u(RESULT),
         strict=True,
     ):
-        assert scalar(written(few), name) == pytest.approx([value, 2.87 * u, 2.87], rel=1e-6)
+        assert scalar(written(few), name) == pytest.approx(
+            [value, 2.87 * u, 2.87], rel=1e-6
+        )
 
 
 @pytest.mark.parametrize("dof", [np.inf, 5.0])
@@ -293,7 +342,9 @@ def test_the_ellipsoid_of_all_nodes_has_the_factor_of_its_dimension(dof):
     noise = replace(RESULT.noise, dof_xy=dof, dof_map_xy=dof)
     root = written(replace(RESULT, noise=noise), covariance=True)
     found = float(
-        root.findtext(".//si:ellipsoidalRegionMUXMLList/si:coverageFactorXMLList", "", IN)
+        root.findtext(
+            ".//si:ellipsoidalRegionMUXMLList/si:coverageFactorXMLList", "", IN
+        )
     )
     assert found == pytest.approx({np.inf: 7.960, 5.0: 14.636}[dof], abs=1e-3)
 
@@ -302,9 +353,13 @@ def test_all_nodes_of_a_large_field_are_written():
     large = replace(result_of(random_map(Artifact(41, 0.002), 3)), noise=RESULT.noise)
     xml = certificate(large, details())
     root = ET.fromstring(xml)
-    assert [len(values(named(root, name)[0])) for name in ("x", "Gx", "Gy")] == [41 * 41] * 3
+    assert [len(values(named(root, name)[0])) for name in ("x", "Gx", "Gy")] == [
+        41 * 41
+    ] * 3
     assert len(values(named(root, "Gy")[0], U)) == 41 * 41
-    np.testing.assert_allclose(values(named(root, "Gx")[0]), large.error_map.gx.ravel(), rtol=1e-8)
+    np.testing.assert_allclose(
+        values(named(root, "Gx")[0]), large.error_map.gx.ravel(), rtol=1e-8
+    )
     if SCHEMA.exists():
         etree = pytest.importorskip("lxml.etree")
         etree.XMLSchema(etree.parse(str(SCHEMA))).assertValid(etree.fromstring(xml))
@@ -351,7 +406,9 @@ def exposed(first, last):
 
 
 def test_times_of_readings_that_are_not_dates_are_refused():
-    with pytest.raises(InputError, match="the times of the readings are not dates: yesterdayT23"):
+    with pytest.raises(
+        InputError, match="the times of the readings are not dates: yesterdayT23"
+    ):
         certificate(exposed("yesterday", "2026-11-21"), details())
 
 
@@ -367,7 +424,10 @@ def test_times_of_readings_that_are_not_dates_are_refused():
 )
 def test_readings_of_other_days_are_refused(first, last, good):
     result, clock = exposed(first, last), {**details()}
-    clock["certificate"] = {**clock["certificate"], "clock": "was not set: 3 years behind"}
+    clock["certificate"] = {
+        **clock["certificate"],
+        "clock": "was not set: 3 years behind",
+    }
     if not good:
         for write in (certificate, certificate_chapter):
             with pytest.raises(
@@ -378,7 +438,10 @@ def test_readings_of_other_days_are_refused(first, last, good):
                 write(result, details())
     else:
         [order] = named(written(result), "visit order")
-        assert order.findtext("dcc:description/dcc:content", "", IN) == "identity: x_back_y_back"
+        assert (
+            order.findtext("dcc:description/dcc:content", "", IN)
+            == "identity: x_back_y_back"
+        )
     [said] = named(ET.fromstring(certificate(result, clock)), "clock of the readings")
     assert "3 years behind" in " ".join(said.itertext())
 
@@ -386,16 +449,32 @@ def test_readings_of_other_days_are_refused(first, last, good):
 @pytest.mark.parametrize(
     ("reference", "name", "u", "value", "good"),
     [
-        (CERTIFIED, "temperature of the plate", 0.05, 20.55, True),  # 2 u of both: 0.22 K
+        (
+            CERTIFIED,
+            "temperature of the plate",
+            0.05,
+            20.55,
+            True,
+        ),  # 2 u of both: 0.22 K
         (CERTIFIED, "temperature of the plate", 0.05, 20.7, False),
         (CERTIFIED, "temperature of the plate", None, 20.7, False),
         (CERTIFIED, "temperature of the air", 0.05, 23.0, True),
-        (replace(CERTIFIED, kind="stage_x"), "temperature of the plate", 0.05, 20.7, True),
+        (
+            replace(CERTIFIED, kind="stage_x"),
+            "temperature of the plate",
+            0.05,
+            20.7,
+            True,
+        ),
     ],
 )
-def test_a_plate_at_another_temperature_than_its_length_is_refused(reference, name, u, value, good):
+def test_a_plate_at_another_temperature_than_its_length_is_refused(
+    reference, name, u, value, good
+):
     result = solved(reference.at_temperature("20.4:.1:5e-7:5e-8"))
-    stated = {"name": name, "value": value, "unit": "degC"} | ({} if u is None else {"u": u})
+    stated = {"name": name, "value": value, "unit": "degC"} | (
+        {} if u is None else {"u": u}
+    )
     given = {**details(), "conditions": [stated]}
     if good:
         assert certificate(result, given)
@@ -411,28 +490,43 @@ def test_a_plate_at_another_temperature_than_its_length_is_refused(reference, na
 
 def test_a_date_of_issue_that_is_missing_is_today_and_not_before_the_end():
     given = without("certificate", "issued")
-    assert details_from_dict(given, "d")["certificate"]["issued"] == date.today().isoformat()
+    assert (
+        details_from_dict(given, "d")["certificate"]["issued"]
+        == date.today().isoformat()
+    )
     given["certificate"]["end"] = "2999-01-01"
-    with pytest.raises(InputError, match="is before the end of the measurement, 2999-01-01"):
+    with pytest.raises(
+        InputError, match="is before the end of the measurement, 2999-01-01"
+    ):
         details_from_dict(given, "d")
 
 
 def test_the_texts_are_english_whatever_the_language_of_names():
     given = details_from_dict(changed("de", "certificate", "language"), "d.yaml")
     core = ET.fromstring(certificate(RESULT, given))[0][1]
-    assert [item.text for item in core.findall("dcc:usedLangCodeISO639_1", IN)] == ["de", "en"]
-    assert [item.text for item in core.findall("dcc:mandatoryLangCodeISO639_1", IN)] == ["en"]
+    assert [item.text for item in core.findall("dcc:usedLangCodeISO639_1", IN)] == [
+        "de",
+        "en",
+    ]
+    assert [
+        item.text for item in core.findall("dcc:mandatoryLangCodeISO639_1", IN)
+    ] == ["en"]
 
 
 def test_scope_and_uncertainty_are_stated():
-    assert "only to the item calibrated" in " ".join(statement(written(), "Scope").itertext())
+    assert "only to the item calibrated" in " ".join(
+        statement(written(), "Scope").itertext()
+    )
     assert "JCGM 100:2008" in " ".join(statement(written(), "Uncertainty").itertext())
     assert not named(written(BAD, not_qualified=True), "Uncertainty")
     titles = {
         section.title: " ".join(section.notes)
         for section in certificate_chapter(BAD, details()).sections
     }
-    assert "No statement of the uncertainty is valid" in titles["Agreement of readings and model"]
+    assert (
+        "No statement of the uncertainty is valid"
+        in titles["Agreement of readings and model"]
+    )
     assert "Uncertainty" not in titles and "item calibrated" in titles["Scope"]
 
 
@@ -468,7 +562,9 @@ def run(seed, reference=None):
     return Member(
         f"{seed}.json",
         (
-            found := worded(calibrate(readings, Options(reference=reference, causes=False)))
+            found := worded(
+                calibrate(readings, Options(reference=reference, causes=False))
+            )
         ).error_map,
         found,
     )
@@ -481,13 +577,21 @@ def test_a_mean_is_traceable_if_all_its_runs_are():
         ((cold, cold), True),
         ((cold, CERTIFIED), False),
     ):
-        parts = [run(seed, reference) for seed, reference in zip((5, 6), references, strict=True)]
+        parts = [
+            run(seed, reference)
+            for seed, reference in zip((5, 6), references, strict=True)
+        ]
         mean = worded(combine(parts, keep_scale=True).result)
         assert is_traceable(mean) is traceable
         root = written(mean)
         text = " ".join(statement(root, "Metrological traceability").itertext())
-        assert ("used at 21 °C" in text) is (warm in references) and "used at 20.4 °C" in text
-        assert [named(root, f"readings of {part.name}") != [] for part in parts] == [True, True]
+        assert ("used at 21 °C" in text) is (
+            warm in references
+        ) and "used at 20.4 °C" in text
+        assert [named(root, f"readings of {part.name}") != [] for part in parts] == [
+            True,
+            True,
+        ]
         assert is_traceable(result_from_dict(result_to_dict(mean), "m")) is traceable
     table = Member("t.csv", run(7).error_map)
     assert not is_traceable(combine([run(5, cold), table], keep_scale=True).result)
@@ -540,9 +644,15 @@ def changed(value, *path):
     ("data", "message"),
     [
         ([], "d.yaml: not the details of a certificate"),
-        (without("laboratory"), "d.yaml: laboratory: is missing; give name, city, country"),
+        (
+            without("laboratory"),
+            "d.yaml: laboratory: is missing; give name, city, country",
+        ),
         (without("conditions"), "d.yaml: conditions: is missing; give name"),
-        (without("certificate", "id"), "d.yaml: certificate.id: is missing; give a text"),
+        (
+            without("certificate", "id"),
+            "d.yaml: certificate.id: is missing; give a text",
+        ),
         (without("customer", "city"), "d.yaml: customer.city: is missing"),
         (without("item", "serial_number"), "d.yaml: item.serial_number: is missing"),
         (without("persons", 0, "name"), r"d.yaml: persons\[0\].name: is missing"),
@@ -551,8 +661,14 @@ def changed(value, *path):
             "certificate.country: 'Germany' is not a country code of two capitals, e.g. DE",
         ),
         (changed("EN", "certificate", "language"), "'EN' is not a language code"),
-        (changed("20.11.2026", "certificate", "begin"), "'20.11.2026' is not a date YYYY-MM-DD"),
-        (changed("2026-11-19", "certificate", "end"), "2026-11-19 is before 2026-11-21"),
+        (
+            changed("20.11.2026", "certificate", "begin"),
+            "'20.11.2026' is not a date YYYY-MM-DD",
+        ),
+        (
+            changed("2026-11-19", "certificate", "end"),
+            "2026-11-19 is before 2026-11-21",
+        ),
         (
             changed("2026-11-20", "certificate", "issued"),
             "certificate.issued: 2026-11-20 is before the end of the "
@@ -571,7 +687,10 @@ def changed(value, *path):
             changed("here", "certificate", "place"),
             "place: 'here' is not one of laboratory, customer",
         ),
-        (changed("x", "certificate", "idd"), "certificate.idd: is unknown; did you mean 'id'"),
+        (
+            changed("x", "certificate", "idd"),
+            "certificate.idd: is unknown; did you mean 'id'",
+        ),
         (changed({}, "instruments"), "instruments: is unknown"),
         (
             changed("warm", "conditions", 0, "value"),
@@ -583,10 +702,16 @@ def changed(value, *path):
             r"conditions\[0\]: 293.55 is not a temperature from -50 to "
             r"100 degC: is it in K\?; give degC",
         ),
-        (without("conditions", 0, "unit"), r"conditions\[0\]: neither a value with its unit nor"),
+        (
+            without("conditions", 0, "unit"),
+            r"conditions\[0\]: neither a value with its unit nor",
+        ),
         (changed(0, "conditions", 0, "u"), r"conditions\[0\]: neither a value"),
         (changed("  ", "item", "name"), "item.name: '  ' is not a text"),
-        (changed("me", "laboratory"), "laboratory: 'me' has no keys; give name, city, country"),
+        (
+            changed("me", "laboratory"),
+            "laboratory: 'me' has no keys; give name, city, country",
+        ),
     ],
 )
 def test_details_that_lack_something_are_one_line(data, message):
@@ -596,7 +721,9 @@ def test_details_that_lack_something_are_one_line(data, message):
 
 
 def test_the_verb_writes_refuses_and_ends_with_the_code_of_the_result(tmp_path, capsys):
-    good, bad, out = (str(tmp_path / name) for name in ("good.json", "bad.json", "dcc.xml"))
+    good, bad, out = (
+        str(tmp_path / name) for name in ("good.json", "bad.json", "dcc.xml")
+    )
     write_json(good, result_to_dict(RESULT))
     write_json(bad, result_to_dict(BAD))
     assert main(["certificate", good, str(DETAILS), "-o", out]) == 0
@@ -609,13 +736,20 @@ def test_the_verb_writes_refuses_and_ends_with_the_code_of_the_result(tmp_path, 
     assert main(["certificate", bad, str(DETAILS), "-o", out, "--force"]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "--not-qualified" in error
-    assert main(["certificate", bad, str(DETAILS), "-o", out, "--not-qualified", "--force"]) == 5
+    assert (
+        main(
+            ["certificate", bad, str(DETAILS), "-o", out, "--not-qualified", "--force"]
+        )
+        == 5
+    )
     assert main(["certificate", good, str(DETAILS), "-o", good]) == 2
 
 
 def test_the_report_has_the_same_for_people(tmp_path, capsys):
     result, page = str(tmp_path / "r.json"), tmp_path / "r.html"
-    write_json(result, result_to_dict(solved(CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8"))))
+    write_json(
+        result, result_to_dict(solved(CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8")))
+    )
     assert main(["report", result, "--details", str(DETAILS), "-o", str(page)]) == 0
     text = page.read_text()
     for part in (
@@ -642,7 +776,10 @@ def test_the_report_has_the_same_for_people(tmp_path, capsys):
     assert "EX-2026-0042" not in page.read_text()
     bad = tmp_path / "d.yaml"
     bad.write_text("item: {}")
-    assert main(["report", result, "--details", str(bad), "-o", str(tmp_path / "d.html")]) == 2
+    assert (
+        main(["report", result, "--details", str(bad), "-o", str(tmp_path / "d.html")])
+        == 2
+    )
     assert "certificate: is missing" in capsys.readouterr().err
     apart = solved()
     chapter = certificate_chapter(replace(apart, views=()), details())
@@ -660,14 +797,18 @@ def rechecked():
     before = worded(
         calibrate(
             simulate_measurements(truth, plan, rng, sigma_m=2e-8),
-            Options(reference=CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8"), causes=False),
+            Options(
+                reference=CERTIFIED.at_temperature("20.4:.1:5e-7:5e-8"), causes=False
+            ),
         )
     )
     before = replace(before, input={"file": "plate.mcap", "sha256": "0123abcd"})
     view = replace(plan, plan_id="again", views=plan.views[:1])
     readings = simulate_measurements(truth, view, rng, sigma_m=2e-8)
     plate = known_plate(
-        result_from_dict(result_to_dict(before), "r"), "there/r.json", "20.4:.1:5e-7:5e-8"
+        result_from_dict(result_to_dict(before), "r"),
+        "there/r.json",
+        "20.4:.1:5e-7:5e-8",
     )
     return before, worded(recheck(readings, Options(), plate))
 
@@ -680,10 +821,16 @@ def test_the_certificate_of_a_recheck_states_its_method_and_the_calibration_behi
     assert "Comparison of a stage with a plate known from its calibration" in text
     assert "plan 0,90,tx; plate.mcap, sha256 0123abcd" in text
     assert "Self-calibration of a stage" in " ".join(first.itertext())
-    assert not named(first, "Comparison of a stage with a plate known from its calibration")
+    assert not named(
+        first, "Comparison of a stage with a plate known from its calibration"
+    )
     scale = " ".join(statement(root, "Metrological traceability").itertext())
-    assert "The scale is that of the known plate" in scale and "used at 20.4 °C" in scale
-    assert "known plate" not in " ".join(statement(first, "Metrological traceability").itertext())
+    assert (
+        "The scale is that of the known plate" in scale and "used at 20.4 °C" in scale
+    )
+    assert "known plate" not in " ".join(
+        statement(first, "Metrological traceability").itertext()
+    )
     for one in (first, root):
         assert "line_eccentricity" not in " ".join(one.itertext())  # there are no lines
     assert "line_eccentricity" in " ".join(written().itertext())
@@ -698,7 +845,9 @@ def test_the_certificate_of_a_recheck_has_u_of_squareness_and_correlations():
         ("scale difference R", u_r),
     ):
         [item] = named(root, name)
-        assert float(item.findtext(".//si:valueExpandedMU", "", IN)) == pytest.approx(k * u)
+        assert float(item.findtext(".//si:valueExpandedMU", "", IN)) == pytest.approx(
+            k * u
+        )
     cover = covariance_of(after, "xy", after.error_map.valid)
     u = np.concatenate([after.error_map.u_gx.ravel(), after.error_map.u_gy.ravel()])
     np.testing.assert_allclose(np.sqrt(np.diag(cover)), u, rtol=1e-6)

@@ -59,7 +59,8 @@ def test_the_figures_are_those_of_the_definitions():
     assert set(found) == set(expected)
     for name, value in expected.items():
         assert found[name] == pytest.approx(value), name
-    alone = bidirectional(up, up, s_up, 0.5 * s_up)  # four s beat two and two without reversal
+    # four s beat two and two without reversal
+    alone = bidirectional(up, up, s_up, 0.5 * s_up)
     assert alone["R"] == pytest.approx(1.2)
 
 
@@ -74,11 +75,16 @@ def test_the_figures_of_many_draws_are_those_of_each():
 
 def test_the_uncertainty_of_the_mean_reversal_is_that_of_its_approaches():
     """Seven sites, s of 30 and 40 nm: a reversal of four approaches each has u = s (2 / 4)^1/2."""
-    items = {(i, 0): Scatter(1e-7, np.sqrt(0.5), 30e-9, 40e-9, 3, 3, 0.0) for i in range(-3, 4)}
+    items = {
+        (i, 0): Scatter(1e-7, np.sqrt(0.5), 30e-9, 40e-9, 3, 3, 0.0)
+        for i in range(-3, 4)
+    }
     stage = StageMap(result_of(random_map(ARTIFACT, 1)))
     found = axis_figures(stage, 0, 0, items).figures["mean B"]
     assert found.value == pytest.approx(-1e-7)
-    assert found.u == pytest.approx(np.sqrt((30e-9**2 + 40e-9**2) / 2 * 0.5 / 7), rel=0.06)
+    assert found.u == pytest.approx(
+        np.sqrt((30e-9**2 + 40e-9**2) / 2 * 0.5 / 7), rel=0.06
+    )
 
 
 def test_sites_that_are_not_known_are_no_positions():
@@ -88,7 +94,9 @@ def test_sites_that_are_not_known_are_no_positions():
     assert len(axis_figures(stage, 1, 0).position_m) == 7
 
 
-def measured(*, sense=Sense.MICROSCOPE_MOVES, sigma=0.0, seed=1, repeats=4, order="x_back_y_back"):
+def measured(
+    *, sense=Sense.MICROSCOPE_MOVES, sigma=0.0, seed=1, repeats=4, order="x_back_y_back"
+):
     rng = np.random.default_rng(seed)
     spread = Spread(backlash_x_m=BACKLASH_M[0], backlash_y_m=BACKLASH_M[1])
     plan = hu_plan(ARTIFACT, repeats)
@@ -117,8 +125,12 @@ def test_the_reversal_is_that_of_the_machine(sense, axis):
     g = truth.g[0][sites, 3] if axis == 0 else truth.g[1][3, sites]
     np.testing.assert_allclose(found.up_m, -(g + BACKLASH_M[axis]), atol=1e-12)
     np.testing.assert_allclose(found.down_m, -(g - BACKLASH_M[axis]), atol=1e-12)
-    assert found.figures["B"].value == pytest.approx(2 * abs(BACKLASH_M[axis]), abs=1e-12)
-    assert found.figures["mean B"].value == pytest.approx(-2 * BACKLASH_M[axis], abs=1e-12)
+    assert found.figures["B"].value == pytest.approx(
+        2 * abs(BACKLASH_M[axis]), abs=1e-12
+    )
+    assert found.figures["mean B"].value == pytest.approx(
+        -2 * BACKLASH_M[axis], abs=1e-12
+    )
 
 
 def test_a_map_of_one_approach_more_than_the_other_is_moved_to_their_middle():
@@ -136,12 +148,17 @@ def test_the_scatter_of_approaches_is_that_of_the_machine():
     _, readings = measured(sigma=30e-9, repeats=8)
     found = scatters(readings, 0).values()
     s = np.sqrt(
-        np.average([item.s_up_m**2 for item in found], weights=[item.dof_up for item in found])
+        np.average(
+            [item.s_up_m**2 for item in found], weights=[item.dof_up for item in found]
+        )
     )
     dof = sum(item.dof_up for item in found)
     assert dof > 200 and s == pytest.approx(30e-9, rel=4 / np.sqrt(2 * dof))
     off = np.array(
-        [(item.reversal_m - 2 * BACKLASH_M[0]) / (item.u_reversal_m * 30e-9) for item in found]
+        [
+            (item.reversal_m - 2 * BACKLASH_M[0]) / (item.u_reversal_m * 30e-9)
+            for item in found
+        ]
     )
     assert np.sqrt(np.mean(off**2)) == pytest.approx(1, abs=4 / np.sqrt(2 * len(off)))
 
@@ -175,7 +192,9 @@ def test_the_reversal_of_unequal_approaches_is_that_of_one_least_squares():
             if {row[2] for row in rows if row[0] == v} == {1, -1}
         ]
         rows = [row for row in rows if row[0] in both]
-        matrix = np.array([[sign / 2, *(v == view for v in both)] for view, _, sign in rows])
+        matrix = np.array(
+            [[sign / 2, *(v == view for v in both)] for view, _, sign in rows]
+        )
         inverse = np.linalg.inv(matrix.T @ matrix)
         value = inverse @ matrix.T @ [value for _, value, _ in rows]
         assert item.reversal_m == pytest.approx(value[0], abs=1e-15), site
@@ -196,8 +215,18 @@ def solved(seed, truth=None):
 def test_uncertainties_are_the_scatter_of_repeated_calibrations():
     """20 calibrations: a standard deviation is known to 16 %, and lengths have no bias."""
     truth, _ = solved(0)
-    exact = StageMap(result_of(replace(random_map(ARTIFACT, 1), gx=truth.g[0], gy=truth.g[1])))
-    z = {"difference": [], "G": [], "Fmax": [], "Fmin": [], "M": [], "1 M": [], "2 M": []}
+    exact = StageMap(
+        result_of(replace(random_map(ARTIFACT, 1), gx=truth.g[0], gy=truth.g[1]))
+    )
+    z = {
+        "difference": [],
+        "G": [],
+        "Fmax": [],
+        "Fmin": [],
+        "M": [],
+        "1 M": [],
+        "2 M": [],
+    }
     for seed in range(20):
         stage = StageMap(solved(seed, truth)[1])
         stage.halfway = np.zeros((2, 2))  # the truth is bilinear between its nodes
@@ -219,7 +248,9 @@ def test_uncertainties_are_the_scatter_of_repeated_calibrations():
 def linear(gx, gy):
     """Return a stage with a linear error, a function of x and y."""
     x, y = ARTIFACT.x_m, ARTIFACT.y_m
-    return StageMap(result_of(replace(random_map(ARTIFACT, 1), gx=gx(x, y), gy=gy(x, y))))
+    return StageMap(
+        result_of(replace(random_map(ARTIFACT, 1), gx=gx(x, y), gy=gy(x, y)))
+    )
 
 
 def test_circles_and_diagonals_of_linear_errors():
@@ -241,7 +272,9 @@ def test_circles_and_diagonals_of_linear_errors():
     centre = np.hypot(1e-5 * 0.005 + 2e-7, -1e-5 * 0.01 - 3e-7)
     assert circle["Fmax"].value == pytest.approx(-2e-7 + centre, rel=2e-3)
     assert circle["Fmin"].value == pytest.approx(-2e-7 - centre, rel=2e-3)
-    assert diagonal_figures(larger)[2].figures["length"].value == pytest.approx(0, abs=1e-15)
+    assert diagonal_figures(larger)[2].figures["length"].value == pytest.approx(
+        0, abs=1e-15
+    )
 
 
 def test_without_repeats_the_range_of_the_mean_deviation_is_left():
@@ -271,13 +304,18 @@ def test_the_largest_of_equal_scatters_is_within_its_uncertainty(reversal_m):
     """Seven positions, 37 approaches each: of 80 machines 4 s of one sigma is in 2 u of most."""
     stage, sigma_m, dof = linear(lambda x, y: 0 * x, lambda x, y: 0 * x), 2e-8, 36
     rng, within = np.random.default_rng(5), {"R": 0, "R+": 0, "R-": 0}
-    true = {"R": max(4 * sigma_m + reversal_m, 4 * sigma_m), "R+": 4 * sigma_m, "R-": 4 * sigma_m}
+    true = {
+        "R": max(4 * sigma_m + reversal_m, 4 * sigma_m),
+        "R+": 4 * sigma_m,
+        "R-": 4 * sigma_m,
+    }
     for _ in range(80):
         s_m = sigma_m * np.sqrt(rng.chisquare(dof, (7, 2)) / dof)
         u_reversal = np.sqrt(2 / (dof + 1))
         seen_m = reversal_m + u_reversal * sigma_m * rng.standard_normal(7)
         items = {
-            (m - 3, 0): Scatter(seen_m[m], u_reversal, *s_m[m], dof, dof, 0.0) for m in range(7)
+            (m - 3, 0): Scatter(seen_m[m], u_reversal, *s_m[m], dof, dof, 0.0)
+            for m in range(7)
         }
         figures = axis_figures(stage, 0, 0, items).figures
         for name, value in true.items():
@@ -288,9 +326,15 @@ def test_the_largest_of_equal_scatters_is_within_its_uncertainty(reversal_m):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda stage: axis_figures(stage, 0, 9), "line 9 along x: 0 positions are known"),
+        (
+            lambda stage: axis_figures(stage, 0, 9),
+            "line 9 along x: 0 positions are known",
+        ),
         (lambda stage: axis_figures(stage, 1, 0, {}), "visit_order there_and_back"),
-        (lambda stage: circle_figures(stage, 0.04), "is not in the field; give one up to 0.03 m"),
+        (
+            lambda stage: circle_figures(stage, 0.04),
+            "is not in the field; give one up to 0.03 m",
+        ),
         (lambda stage: circle_figures(stage, -0.01), "is not in the field"),
         (lambda stage: circle_figures(stage, float("nan")), "is not in the field"),
     ],
@@ -306,11 +350,17 @@ def test_a_path_over_unknown_sites_is_refused():
         diagonal_figures(stage)
 
 
-def test_the_verb_leaves_out_what_crosses_unknown_sites_and_says_which(tmp_path, capsys):
+def test_the_verb_leaves_out_what_crosses_unknown_sites_and_says_which(
+    tmp_path, capsys
+):
     path = str(tmp_path / "r.json")
     write_json(
         path,
-        plain(result_to_dict(result_of(random_map(ARTIFACT, 1, unknown=((0, 0), (0, 3), (5, 3)))))),
+        plain(
+            result_to_dict(
+                result_of(random_map(ARTIFACT, 1, unknown=((0, 0), (0, 3), (5, 3))))
+            )
+        ),
     )
     assert main(["iso230", path]) == 0
     out, err = capsys.readouterr()
@@ -342,14 +392,22 @@ def test_the_verb_takes_a_bag_or_a_result(tmp_path, capsys):
     assert set(of_bag["axes"][0]["figures"]) > {"A", "R", "E", "B", "M"}
     assert set(of_result["axes"][0]["figures"]) == {"M"}
     assert of_bag["scale"] == "convention"
-    assert main(["iso230", str(tmp_path / "r.json"), "--radius", "20", "--line", "-2"]) == 0
+    assert (
+        main(["iso230", str(tmp_path / "r.json"), "--radius", "20", "--line", "-2"])
+        == 0
+    )
     text = capsys.readouterr().out
-    assert "circle of radius 20 mm" in text and "axis x at y = -20 mm, 11 positions" in text
+    assert (
+        "circle of radius 20 mm" in text
+        and "axis x at y = -20 mm, 11 positions" in text
+    )
     assert main(["iso230", str(tmp_path / "r.json"), "--result", "x.json"]) == 2
     assert "is a result itself" in capsys.readouterr().err
 
 
-def test_a_bag_without_approaches_from_both_sides_says_so(tmp_path, capsys, monkeypatch):
+def test_a_bag_without_approaches_from_both_sides_says_so(
+    tmp_path, capsys, monkeypatch
+):
     from selfcal_ros.cli import iso230 as verb
 
     _, readings = measured(order="raster", sigma=1e-8)
@@ -363,9 +421,12 @@ def test_a_bag_without_approaches_from_both_sides_says_so(tmp_path, capsys, monk
 
 
 @pytest.mark.parametrize(
-    ("reversal_m", "spread_m", "unlike"), [(0.0, 0.0, True), (1e-7, 0.0, True), (5e-8, 5e-8, False)]
+    ("reversal_m", "spread_m", "unlike"),
+    [(0.0, 0.0, True), (1e-7, 0.0, True), (5e-8, 5e-8, False)],
 )
-def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(reversal_m, spread_m, unlike):
+def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(
+    reversal_m, spread_m, unlike
+):
     """150 machines with known reversal and scatter, five approaches from each side.
 
     The largest of eleven reversals with noise is too large by more than the scatter of draws about
@@ -375,10 +436,18 @@ def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(reversal_m, spread_
     rng, ratios = np.random.default_rng(8), {}
     for _ in range(150):
         truth = rng.normal(0, 5e-7, plate.shape)
-        reversal = rng.normal(reversal_m, spread_m, 11) if spread_m else np.full(11, reversal_m)
-        scatter = 8e-8 * (rng.uniform(0.5, 1.5, (2, 11)) if unlike else np.ones((2, 11)))
+        reversal = (
+            rng.normal(reversal_m, spread_m, 11)
+            if spread_m
+            else np.full(11, reversal_m)
+        )
+        scatter = 8e-8 * (
+            rng.uniform(0.5, 1.5, (2, 11)) if unlike else np.ones((2, 11))
+        )
         u = np.full(plate.shape, 3e-8)
-        emap = ErrorMap(plate, truth + rng.normal(0, u), 0 * truth, u, u, np.zeros(0), np.zeros(0))
+        emap = ErrorMap(
+            plate, truth + rng.normal(0, u), 0 * truth, u, u, np.zeros(0), np.zeros(0)
+        )
         repeats = {}
         for i in range(11):
             s = scatter[:, i] * np.sqrt(rng.chisquare(count - 1, 2) / (count - 1))
@@ -396,6 +465,12 @@ def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(reversal_m, spread_
         true = bidirectional(mean - reversal / 2, mean + reversal / 2, *scatter)
         for name, figure in found.items():
             ratios.setdefault(name, []).append((figure.value - true[name]) / figure.u)
-    for name, least in (("B", 0.94), ("R", 0.94), ("A", 0.89), ("E", 0.89), ("M", 0.89)):
+    for name, least in (
+        ("B", 0.94),
+        ("R", 0.94),
+        ("A", 0.89),
+        ("E", 0.89),
+        ("M", 0.89),
+    ):
         assert np.mean(np.abs(ratios[name]) < 2) > least, name
     assert np.sqrt(np.mean(np.square(ratios["B"]))) < 1.4

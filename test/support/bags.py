@@ -67,7 +67,9 @@ UNKNOWN_TYPE = "somebody_msgs/msg/Thing"
 
 
 @cache
-def contract_types(more: str = "", detection: str = DETECTION, command: str = COMMAND) -> Typestore:
+def contract_types(
+    more: str = "", detection: str = DETECTION, command: str = COMMAND
+) -> Typestore:
     """Return Jazzy's types and the contract's, `more` fields at the end of our two."""
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict = {}
@@ -104,7 +106,10 @@ def contract_message(store: Typestore, event: Event) -> tuple[str, str, object]:
         }
         topic, typename = "stage/mark_detections", DETECTION_TYPE
     elif isinstance(event, Command):
-        view, plate = event.view or View("", grid=False, angular=False, repeats=0), event.artifact
+        view, plate = (
+            event.view or View("", grid=False, angular=False, repeats=0),
+            event.artifact,
+        )
         values = {
             "phase": int(event.phase),
             "plan_id": event.plan_id,
@@ -130,7 +135,12 @@ def contract_message(store: Typestore, event: Event) -> tuple[str, str, object]:
         }
         topic, typename = "stage/joint_states", ENCODER_TYPE
     names = [name for name, _ in store.fielddefs[typename][1]]
-    extra = {"temperature": 20.5, "operator": "somebody", "grid_size_y": 0, "views_planned": 3}
+    extra = {
+        "temperature": 20.5,
+        "operator": "somebody",
+        "grid_size_y": 0,
+        "views_planned": 3,
+    }
     values |= {name: extra[name] for name in names if name in extra}
     kept = {name: value for name, value in values.items() if name in names}
     return topic, typename, store.types[typename](header=header, **kept)
@@ -168,7 +178,12 @@ class Foreign:
     renamed: dict[str, str] = field(default_factory=dict)
 
     def write(
-        self, path: Path, events: Iterable[Event], *, order: int = 0, spoil: bool = False
+        self,
+        path: Path,
+        events: Iterable[Event],
+        *,
+        order: int = 0,
+        spoil: bool = False,
     ) -> Path:
         """Write one MCAP file and return its path; `order` turns the order of the channels.
 
@@ -183,7 +198,11 @@ class Foreign:
                 topic, data = _empty(event) if spoil else self._payload(event)
                 write(topic, event.stamp_ns + 1000, data)
                 if self.others and number % 7 == 0:
-                    write("/camera/thing", event.stamp_ns, b"\x00\x01\x00\x00 no CDR at all")
+                    write(
+                        "/camera/thing",
+                        event.stamp_ns,
+                        b"\x00\x01\x00\x00 no CDR at all",
+                    )
             if self.footer:
                 writer.finish()
             else:
@@ -193,7 +212,9 @@ class Foreign:
     def _payload(self, event: Event) -> tuple[str, bytes]:
         return _cdr_of(self.types, event, self.little)
 
-    def _channels(self, writer: Writer, order: int) -> Callable[[str, int, bytes], None]:
+    def _channels(
+        self, writer: Writer, order: int
+    ) -> Callable[[str, int, bytes], None]:
         topics = dict(TOPICS)
         if self.others:
             topics["/camera/thing"] = UNKNOWN_TYPE
@@ -207,7 +228,9 @@ class Foreign:
                 schema = writer.register_schema(typename, "ros2msg", text.encode())
             name = topic if topic.startswith("/") else f"{self.namespace}/{topic}"
             ids[topic] = writer.register_channel(name, self.encoding, schema)
-        return lambda topic, time_ns, data: writer.add_message(ids[topic], time_ns, data, time_ns)
+        return lambda topic, time_ns, data: writer.add_message(
+            ids[topic], time_ns, data, time_ns
+        )
 
 
 @lru_cache(maxsize=20_000)
@@ -250,7 +273,9 @@ def rosbags_bag(
         }
         for event in events:
             topic, typename, message = contract_message(store, event)
-            writer.write(links[topic], event.stamp_ns, store.serialize_cdr(message, typename))
+            writer.write(
+                links[topic], event.stamp_ns, store.serialize_cdr(message, typename)
+            )
     return path
 
 

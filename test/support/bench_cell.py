@@ -8,7 +8,12 @@ true one plus the stage's error there; an offset is mark centre less optical axi
 import numpy as np
 
 NOISE_M, NOISE_RAD = 2e-9, 1e-7
-QUARTERS = {0: ((1, 0), (0, 1)), 1: ((0, -1), (1, 0)), 2: ((-1, 0), (0, -1)), 3: ((0, 1), (-1, 0))}
+QUARTERS = {
+    0: ((1, 0), (0, 1)),
+    1: ((0, -1), (1, 0)),
+    2: ((-1, 0), (0, -1)),
+    3: ((0, 1), (-1, 0)),
+}
 SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
 GRID, ANGULAR = 0, 1
 
@@ -54,7 +59,9 @@ class Bench:
     def exposures(self, view):
         """Yield indicated position and fields of a detection, of all that the view asks for."""
         half = view.grid_size // 2
-        marks = [(m - half, n - half) for m, n in np.ndindex(view.grid_size, view.grid_size)]
+        marks = [
+            (m - half, n - half) for m, n in np.ndindex(view.grid_size, view.grid_size)
+        ]
         for _ in range(view.repeats):
             if view.grid:
                 for mark in marks:
@@ -65,12 +72,16 @@ class Bench:
         if view.grid:
             for mark in marks[: view.check_marks]:
                 for side in SIDES:
-                    yield from self.stops(view, *mark, view.check_offset * np.array(side))
+                    yield from self.stops(
+                        view, *mark, view.check_offset * np.array(side)
+                    )
 
     def stops(self, view, m, n, aside=(0.0, 0.0)):
         """Yield the sight of a mark, if it lies in the field."""
         turn = np.array(QUARTERS[round(view.rotation / (np.pi / 2)) % 4])
-        shift = np.round(np.array([view.translation_x, view.translation_y]) / view.grid_pitch)
+        shift = np.round(
+            np.array([view.translation_x, view.translation_y]) / view.grid_pitch
+        )
         site = turn @ (m, n) + shift
         if abs(site).max() <= view.grid_size // 2:
             yield self.mark(view, m, n, site * view.grid_pitch + aside)
@@ -118,7 +129,9 @@ def largest_deviation(found, size: float = 1.0) -> tuple[float, float]:
     """
     index = (np.arange(found.grid_size) - found.grid_size // 2) * found.grid_pitch
     x, y = (part.ravel() for part in np.meshgrid(index, index, indexing="ij"))
-    difference = np.concatenate([found.gx, found.gy]) - size * np.concatenate(error_m(x, y))
+    difference = np.concatenate([found.gx, found.gy]) - size * np.concatenate(
+        error_m(x, y)
+    )
     one, none = np.ones_like(x), np.zeros_like(x)
     free = np.array([np.r_[one, none], np.r_[none, one], np.r_[-y, x], np.r_[x, y]]).T
     rest = difference - free @ np.linalg.lstsq(free, difference, rcond=None)[0]

@@ -36,7 +36,11 @@ feedbacks = decimals(-2000, 2000)
 expansions, references = decimals(-1e-4, 1e-4, 7), decimals(0, 40)
 turns, lengths = decimals(-20, 20), decimals(1, 200)
 counts, secondary = decimals(1, 50), decimals(0.5, 80)
-up_to_12, up_to_6, two_or_three = st.integers(1, 12), st.integers(1, 6), st.integers(2, 3)
+up_to_12, up_to_6, two_or_three = (
+    st.integers(1, 12),
+    st.integers(1, 6),
+    st.integers(2, 3),
+)
 odd = st.sampled_from([1, 3, 5])
 booleans = st.booleans()
 
@@ -119,7 +123,11 @@ def setups(draw):
     out = {}
     for number in AXES:
         out[number] = {"counts": draw(counts), "secondary": draw(secondary)}
-        for name, strategy in (("direction", ways), ("offset", turns), ("feedback", feedbacks)):
+        for name, strategy in (
+            ("direction", ways),
+            ("offset", turns),
+            ("feedback", feedbacks),
+        ):
             chosen = draw(maybe(strategy))
             if chosen is not None:
                 out[number][name] = chosen

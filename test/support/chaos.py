@@ -142,14 +142,18 @@ class Story:
             if not reason.startswith(("command_", "encoder_sample_"))
         )
         if used + rejected != sent:
-            self.faults.append(f"{sent} detections sent, {used} used and {rejected} rejected")
+            self.faults.append(
+                f"{sent} detections sent, {used} used and {rejected} rejected"
+            )
         self._compare(found, calibrate(measurements).error_map, "these messages")
         destroyed = sum(isinstance(event, Detection) for event in self.measured) - len(
             {id(event) for event in self.arriving if isinstance(event, Detection)}
         )
         if not set(self.ledger) - {"duplicated"}:
             self._compare(
-                found, calibrate(collected(self.measured)[1]).error_map, "the undisturbed run"
+                found,
+                calibrate(collected(self.measured)[1]).error_map,
+                "the undisturbed run",
             )
         return (
             f"{sent} detections = {used} used + {rejected} rejected; {max(destroyed, 0)} lost "
@@ -191,7 +195,9 @@ def listen(cell: Cell) -> None:
 
     Before the nodes are there: who takes it for one of them loses what it sends.
     """
-    stranger = cell.graph.add(Node(f"stranger_{cell.namespace}", context=cell.graph.context))
+    stranger = cell.graph.add(
+        Node(f"stranger_{cell.namespace}", context=cell.graph.context)
+    )
     for topic in (*names.INPUTS, *names.RESULTS):
         stranger.create_subscription(
             topic.type, cell.name(topic.name), lambda _: None, topic.qos, raw=True
@@ -202,11 +208,17 @@ def listen(cell: Cell) -> None:
 def story(cell: Cell, faults: Faults, rng: np.random.Generator, kills: int) -> Story:
     """Return what happens to a cell."""
     measured = events_of(small_plan("0, 90, tx", repeats=2), int(rng.integers(2**31)))
-    arrivals, ledger = apply_faults(sorted(measured, key=lambda e: e.stamp_ns), faults, rng)
+    arrivals, ledger = apply_faults(
+        sorted(measured, key=lambda e: e.stamp_ns), faults, rng
+    )
     arriving = [event for _, event in arrivals]
     cuts = np.sort(rng.integers(len(arriving) // 20, len(arriving), kills))
     return Story(
-        cell, measured, arriving, ledger, [(int(cut), str(rng.choice(NODES))) for cut in cuts]
+        cell,
+        measured,
+        arriving,
+        ledger,
+        [(int(cut), str(rng.choice(NODES))) for cut in cuts],
     )
 
 
@@ -226,7 +238,12 @@ def cells(environment: dict, folder: Path, forks: Forks | None) -> Iterator[list
 
 
 def one_round(
-    seed: int, environment: dict, folder: Path, *, kills: int = 3, forks: Forks | None = None
+    seed: int,
+    environment: dict,
+    folder: Path,
+    *,
+    kills: int = 3,
+    forks: Forks | None = None,
 ) -> tuple[list[str], list[str]]:
     """Run a round of two cells; return a line for each, and what was wrong.
 
@@ -241,13 +258,17 @@ def one_round(
         for one in stories:
             listen(one.cell)
             if forks:
-                one.cell.inside = dict.fromkeys(set(NODES) - {node for _, node in one.kills})
+                one.cell.inside = dict.fromkeys(
+                    set(NODES) - {node for _, node in one.kills}
+                )
             one.start()
         for share in np.linspace(0, 1, 9)[1:]:
             for one in stories:
                 one.play_to(float(share))
         lines = [f"{one.cell.namespace}: {one.judge()}" for one in stories]
-        wrong = [f"{one.cell.namespace}: {text}" for one in stories for text in one.faults]
+        wrong = [
+            f"{one.cell.namespace}: {text}" for one in stories for text in one.faults
+        ]
     return lines, wrong
 
 
@@ -276,7 +297,9 @@ def full_disk(
         first, last = rng.uniform(0.2, 0.4), rng.uniform(0.6, 0.8)
         one.play_to(first)
         [file] = folder.glob("full_disk/journal_*/*.mcap")
-        cell.limit_files("measurement_collector", file.stat().st_size + int(rng.integers(3000)))
+        cell.limit_files(
+            "measurement_collector", file.stat().st_size + int(rng.integers(3000))
+        )
         one.play_to(last)
         cell.limit_files("measurement_collector", resource.RLIM_INFINITY)
         one.play_to(1.0)
@@ -290,7 +313,10 @@ def full_disk(
             for _, item in BagReader(file.parent).columns()
         )
         received = sum(cell.told)
-        if kept + lost != received or not 0 < lost < (last - first + WHILE_TRYING) * received:
+        if (
+            kept + lost != received
+            or not 0 < lost < (last - first + WHILE_TRYING) * received
+        ):
             one.faults.append(
                 f"{received} messages received, {kept} in the journal and {lost} told as not in it"
             )
@@ -301,7 +327,12 @@ def full_disk(
 
 
 def killed_sequencers(
-    seed: int, environment: dict, folder: Path, *, kills: int = 3, forks: Forks | None = None
+    seed: int,
+    environment: dict,
+    folder: Path,
+    *,
+    kills: int = 3,
+    forks: Forks | None = None,
 ) -> tuple[str, list[str]]:
     """Measure in a cell that follows commands and whose sequencers are killed within views.
 
@@ -314,18 +345,25 @@ def killed_sequencers(
         for index, view in enumerate(plan.views)
         for number in range(FEWEST_MARKS * view.grid + FEWEST_LINES * view.angular)
     ]
-    stops = [exposures[place] for place in np.sort(rng.choice(len(exposures), kills, False))]
+    stops = [
+        exposures[place] for place in np.sort(rng.choice(len(exposures), kills, False))
+    ]
     graph = Graph(int(environment["ROS_DOMAIN_ID"]))
     cell = Cell(graph, environment, folder, "killed_sequencers", forks=forks)
     cell.inside = dict.fromkeys(NODES) if forks else {}
     try:
         listen(cell)
-        maps = graph.listen(replace(names.ERROR_MAP, name=cell.name(names.ERROR_MAP.name)))
+        maps = graph.listen(
+            replace(names.ERROR_MAP, name=cell.name(names.ERROR_MAP.name))
+        )
         cell.start("solver", result_folder=cell.folder)
         cell.start_collector()
         run_id, faults = _taken_up(cell, plan, stops)
         saved = cell.saved()
-        graph.until(lambda: maps and maps[-1].run_id == run_id and maps[-1].identifiable, "the map")
+        graph.until(
+            lambda: maps and maps[-1].run_id == run_id and maps[-1].identifiable,
+            "the map",
+        )
         off_m, off_rad = largest_deviation(maps[-1])
         if off_m > NOISE_M or off_rad > NOISE_RAD:
             faults.append(f"the map is off by {off_m:.1e} m, {off_rad:.1e} rad")
@@ -354,7 +392,12 @@ def killed_sequencers(
 
 
 def clock_ahead(
-    seed: int, environment: dict, folder: Path, *, kills: int = 3, forks: Forks | None = None
+    seed: int,
+    environment: dict,
+    folder: Path,
+    *,
+    kills: int = 3,
+    forks: Forks | None = None,
 ) -> tuple[str, list[str]]:
     """Measure in a cell after a run that was stamped a day ahead, and after a restart of its nodes.
 
@@ -369,7 +412,12 @@ def clock_ahead(
         one = story(cell, HARMLESS, rng, kills)
         one.start()
         ahead_ns = time.time_ns() + DAY_NS - one.measured[0].stamp_ns
-        cell.deliver([replace(event, stamp_ns=event.stamp_ns + ahead_ns) for event in one.measured])
+        cell.deliver(
+            [
+                replace(event, stamp_ns=event.stamp_ns + ahead_ns)
+                for event in one.measured
+            ]
+        )
         for node in NODES:
             cell.kill(node)
         cell.told, cell.newest_ns = (0, 0, 0), 0
@@ -378,9 +426,13 @@ def clock_ahead(
         line = one.judge()
         cell.end("measurement_collector")
         for journal in folder.glob(f"{cell.namespace}/journal_*"):
-            stamps = [message.header.stamp.sec for *_, message in decoded(BagReader(journal))]
+            stamps = [
+                message.header.stamp.sec for *_, message in decoded(BagReader(journal))
+            ]
             if max(stamps, default=0) * NS_PER_S >= one.measured[0].stamp_ns + ahead_ns:
-                one.faults.append(f"{journal.name} has messages of the run that was ahead")
+                one.faults.append(
+                    f"{journal.name} has messages of the run that was ahead"
+                )
         return line, one.faults
     finally:
         cell.close()
@@ -461,16 +513,22 @@ def _recorded(folder: Path, events: list[Event]) -> dict[Path, bytes]:
 
 def _speak(cell: Cell, topic: names.Topic) -> Any:
     """Return a publisher of a stranger, once it is heard."""
-    publisher = cell.graph.hand.create_publisher(topic.type, cell.name(topic.name), topic.qos)
+    publisher = cell.graph.hand.create_publisher(
+        topic.type, cell.name(topic.name), topic.qos
+    )
     cell.graph.until(publisher.get_subscription_count, topic.name)
     return publisher
 
 
-def _harm(cell: Cell, compensator: CompensatorNode, events: list[Event], seed: int) -> None:
+def _harm(
+    cell: Cell, compensator: CompensatorNode, events: list[Event], seed: int
+) -> None:
     """Publish maps that would harm; each of them is refused."""
     publisher, refused = _speak(cell, names.ERROR_MAP), compensator.refusals.counts
     plate = next(event.artifact for event in events if isinstance(event, Command))
-    good = from_model.error_map(result_of(random_map(plate, seed)), events[-1].stamp_ns, "stage")
+    good = from_model.error_map(
+        result_of(random_map(plate, seed)), events[-1].stamp_ns, "stage"
+    )
     for name, values in HARMFUL_VALUES.items():
         for value in values:
             count = refused[names.ERROR_MAP.name]
@@ -488,7 +546,9 @@ def _harm(cell: Cell, compensator: CompensatorNode, events: list[Event], seed: i
 def _show_images(cell: Cell, faults: list[str]) -> None:
     """Publish images that must not be decoded; a detector refuses both, and lives."""
     detector = cell.graph.node(
-        partial(MarkDetectorNode, namespace=cell.namespace), **DETECTS, transport="compressed"
+        partial(MarkDetectorNode, namespace=cell.namespace),
+        **DETECTS,
+        transport="compressed",
     )
     topic = names.image_topics("compressed", 10)[0]
     publisher, bomb = _speak(cell, topic), io.BytesIO()
@@ -508,7 +568,9 @@ def _play(cell: Cell, folder: Path, faults: list[str]) -> None:
     """Have a player start in the cell, whose stage publishes: it plays nothing."""
     (folder / "other").mkdir()
     player = cell.graph.node(
-        partial(BagPlayer, namespace=cell.namespace), rate=0.0, bag=str(small_bag(folder / "other"))
+        partial(BagPlayer, namespace=cell.namespace),
+        rate=0.0,
+        bag=str(small_bag(folder / "other")),
     )
     cell.graph.until(player.finished.done, "the end of the player")
     if (player.exit_code, player.player.played) != (ExitCode.BAD_INPUT, 0):
@@ -516,10 +578,14 @@ def _play(cell: Cell, folder: Path, faults: list[str]) -> None:
     cell.graph.remove(player)
 
 
-def _taken_up(cell: Cell, plan: Plan, stops: list[tuple[int, int]]) -> tuple[str, list[str]]:
+def _taken_up(
+    cell: Cell, plan: Plan, stops: list[tuple[int, int]]
+) -> tuple[str, list[str]]:
     """Run a plan with kills of the sequencer; return the run and what was wrong with it."""
     graph, faults, run_ids = cell.graph, [], set()
-    machine = graph.add(IndependentCell(context=graph.context, namespace=cell.namespace))
+    machine = graph.add(
+        IndependentCell(context=graph.context, namespace=cell.namespace)
+    )
     commands = graph.listen(replace(names.COMMAND, name=cell.name(names.COMMAND.name)))
     machine.hold_at = stops[0]
     start_sequencer(cell, plan)
@@ -531,13 +597,18 @@ def _taken_up(cell: Cell, plan: Plan, stops: list[tuple[int, int]]) -> tuple[str
         commands.clear()
         start_sequencer(cell, plan)
         graph.until(lambda: commands, "the command of the view in which it was")
-        if commands[0] != last or last.view_index != stop[0]:  # PLACE before the first exposure
-            faults.append(f"killed in view {stop[0]} after {last}, taken up with {commands[0]}")
+        # PLACE before the first exposure
+        if commands[0] != last or last.view_index != stop[0]:
+            faults.append(
+                f"killed in view {stop[0]} after {last}, taken up with {commands[0]}"
+            )
         machine.hold_at = after
     graph.until(lambda: commands[-1].phase == ViewCommand.DONE, "the end of the plan")
     run_ids |= {command.run_id for command in commands}
     wanted = list(range(stops[-1][0], len(plan.views)))
-    measured = [item.view_index for item in commands if item.phase == ViewCommand.MEASURE]
+    measured = [
+        item.view_index for item in commands if item.phase == ViewCommand.MEASURE
+    ]
     if measured != wanted or len(run_ids) != 1:
         faults.append(
             f"views {measured} of runs {sorted(run_ids)} after the last kill instead of "
@@ -549,6 +620,10 @@ def _taken_up(cell: Cell, plan: Plan, stops: list[tuple[int, int]]) -> tuple[str
 def start_sequencer(cell: Cell, plan: Plan) -> None:
     """Start a sequencer and have it begin, or take up, the run of a plan."""
     cell.start(
-        "pose_sequencer", plan=plan_file(cell.folder, plan), auto_confirm=True, settle_time=0.0
+        "pose_sequencer",
+        plan=plan_file(cell.folder, plan),
+        auto_confirm=True,
+        settle_time=0.0,
     )
-    cell.answer(Trigger, "pose_sequencer/start", again_s=2.0)  # a second start changes nothing
+    # a second start changes nothing
+    cell.answer(Trigger, "pose_sequencer/start", again_s=2.0)

@@ -10,10 +10,21 @@ import numpy as np
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample, Kind
+from selfcal_ros.collection.inputs import (
+    DETECTION,
+    Command,
+    Detection,
+    EncoderSample,
+    Kind,
+)
 from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.messages.to_model import EncoderBlock
-from selfcal_ros.model.readings import Measurements, ViewReadings, readings_digest, session_digest
+from selfcal_ros.model.readings import (
+    Measurements,
+    ViewReadings,
+    readings_digest,
+    session_digest,
+)
 from selfcal_ros.model.view import Plan
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from test.support.plans import plan_of
@@ -42,7 +53,9 @@ class Scene:
 
     def angular(self, number: int) -> int:
         """Return the index of the `number`-th angular detection."""
-        return [i for i, d in enumerate(self.detections) if d.kind == Kind.ANGULAR][number]
+        return [i for i, d in enumerate(self.detections) if d.kind == Kind.ANGULAR][
+            number
+        ]
 
     def spoil(self, index: int, **fields: Any) -> None:
         self.detections[index] = replace(self.detections[index], **fields)
@@ -73,10 +86,13 @@ def scene(
     if t_m is not None:
         truth = replace(truth, t_m=np.tile(t_m, (len(truth.t_m), 1)))
     events = list(
-        plan_events(truth, plan, settings=CellSettings(**settings), rng=rng, start_ns=START_NS)
+        plan_events(
+            truth, plan, settings=CellSettings(**settings), rng=rng, start_ns=START_NS
+        )
     )
     kinds = [
-        [e for e in events if isinstance(e, kind)] for kind in (Command, EncoderSample, Detection)
+        [e for e in events if isinstance(e, kind)]
+        for kind in (Command, EncoderSample, Detection)
     ]
     return Scene(plan, truth, *kinds)
 
@@ -89,7 +105,9 @@ def gathered(events: Iterable[Event], **parameters: Any) -> Collector:
             for command in alike:
                 collector.add_command(command)
         elif kind is Detection:
-            collector.add_detection_block(np.array([*map(astuple, alike)], dtype=DETECTION))
+            collector.add_detection_block(
+                np.array([*map(astuple, alike)], dtype=DETECTION)
+            )
         else:
             samples = [*alike]
             collector.add_encoder_block(
@@ -131,7 +149,10 @@ def encoder_block(sample: EncoderSample) -> EncoderBlock:
     """Return a block of one sample."""
     velocities = np.array([sample.velocities]) if sample.velocities else None
     return EncoderBlock(
-        np.array([sample.stamp_ns]), sample.names, np.array([sample.positions]), velocities
+        np.array([sample.stamp_ns]),
+        sample.names,
+        np.array([sample.positions]),
+        velocities,
     )
 
 
@@ -151,7 +172,10 @@ def table(readings: ViewReadings) -> dict[tuple, tuple]:
         strict=True,
     )
     lines = zip(
-        readings.k.tolist(), readings.dtheta.tolist(), readings.count_theta.tolist(), strict=True
+        readings.k.tolist(),
+        readings.dtheta.tolist(),
+        readings.count_theta.tolist(),
+        strict=True,
     )
     return {("grid", m, n): (dx, dy, count) for m, n, dx, dy, count in grid} | {
         ("line", k): (value, count) for k, value, count in lines

@@ -35,7 +35,9 @@ NOTHING = 1e-8
 MARKS = {
     "plate_scale": ("scale",),
     "plate_strain": ("scale", "stretch", "shear"),
-    "plate_shape": tuple(f"{form} {axis}" for form in ("z^2", "|z|^2", "z*^2") for axis in "xy"),
+    "plate_shape": tuple(
+        f"{form} {axis}" for form in ("z^2", "|z|^2", "z*^2") for axis in "xy"
+    ),
 }
 
 
@@ -62,7 +64,12 @@ class DenseFit:
         contrast=0.0,
         correlation=(),
     ):
-        self.readings, self.sigma, self.rigid, self.shared = readings, sigma, rigid, shared
+        self.readings, self.sigma, self.rigid, self.shared = (
+            readings,
+            sigma,
+            rigid,
+            shared,
+        )
         self.contrast, self.correlation = contrast, correlation
         self.artifact = readings.artifact
         (self.hx, self.hy), self.pitch = self.artifact.half, self.artifact.grid_pitch_m
@@ -72,19 +79,35 @@ class DenseFit:
         self._visits()
         self._lines()
         ends = np.cumsum(
-            [0, 2 * self.n, 2 * self.n, self.K, self.K, 3 * len(readings.views), len(self.keys)]
+            [
+                0,
+                2 * self.n,
+                2 * self.n,
+                self.K,
+                self.K,
+                3 * len(readings.views),
+                len(self.keys),
+            ]
         )
         self.g, self.a, self.gt, self.at, self.pose, self.b = (
             slice(*pair) for pair in pairwise(ends)
         )
-        self.offset, self.line_offset = self.seen, self.line_seen - self._left_by_lines()
+        self.offset, self.line_offset = (
+            self.seen,
+            self.line_seen - self._left_by_lines(),
+        )
         self.p = np.zeros(ends[-1])
         magnified = any(term in ("microscope", "line_scale") for term, *_ in self.keys)
         self.places = places
         self.steps = PLACE_STEPS if places else STEPS if magnified or rigid else 1
         for number in range(self.steps):
             self._columns = self._of_coefficients()
-            if number in (0, 1, self.steps - 1):  # between them the slopes hardly change
+            # between them the slopes hardly change
+            if number in (
+                0,
+                1,
+                self.steps - 1,
+            ):
                 self._linearise()
             self._step()
             # the noise of a reading is in the offset that was seen as well (method, terms)
@@ -111,13 +134,19 @@ class DenseFit:
                     for axis in "xy"
                 ]
             elif term.name == "line_eccentricity":
-                mine = [(v, part) for v in lines[int(term.free) :] for part in ("cos", "sin")]
+                mine = [
+                    (v, part)
+                    for v in lines[int(term.free) :]
+                    for part in ("cos", "sin")
+                ]
             elif term.name == "rotation":
                 both = [v for v in lines if v in grid]
                 mine = [(v, "turn") for v in both[int(term.free) :] if len(both) > 1]
             else:  # a yaw has columns with images only
                 mine = [
-                    (v, part) for v in grid[int(term.free) :] for part in MARKS.get(term.name, ())
+                    (v, part)
+                    for v in grid[int(term.free) :]
+                    for part in MARKS.get(term.name, ())
                 ]
             for v, part in mine:
                 if term.size_of(part):
@@ -127,7 +156,10 @@ class DenseFit:
 
     def _visits(self):
         """Every visit of every mark, one behind another."""
-        parts = {name: [] for name in ("view", "m", "n", "y", "weight", "tau", "o", "sx", "sy")}
+        parts = {
+            name: []
+            for name in ("view", "m", "n", "y", "weight", "tau", "o", "sx", "sy")
+        }
         for v, view in enumerate(self.readings.views):
             if not len(view.m):
                 continue
@@ -149,12 +181,18 @@ class DenseFit:
         self.view, self.tau, self.seen = found["view"], found["tau"], found["o"]
         self.sx, self.sy = found["sx"], found["sy"]
         self.z = self.pitch * (found["m"] + 1j * found["n"])
-        self.mark = (found["m"] + self.hx) * self.artifact.shape[1] + found["n"] + self.hy
+        self.mark = (
+            (found["m"] + self.hx) * self.artifact.shape[1] + found["n"] + self.hy
+        )
         poses = [view.view for view in self.readings.views]
-        self.quarter = np.array([1j ** round(pose.rotation_rad / (np.pi / 2)) for pose in poses])
+        self.quarter = np.array(
+            [1j ** round(pose.rotation_rad / (np.pi / 2)) for pose in poses]
+        )
         shift = np.array([complex(*pose.translation_m) for pose in poses])
         place = self.quarter[self.view] * self.z + shift[self.view]
-        at = np.rint(self.sign * np.stack([place.real, place.imag]) / self.pitch).astype(int)
+        at = np.rint(
+            self.sign * np.stack([place.real, place.imag]) / self.pitch
+        ).astype(int)
         self.site = (at[0] + self.hx) * self.artifact.shape[1] + at[1] + self.hy
         self.y, self.visit_weight = found["y"], found["weight"].astype(float)
         # offset = mark - stage, or mark + stage where the stage carries the plate along
@@ -165,12 +203,16 @@ class DenseFit:
         views = [(v, view) for v, view in enumerate(self.readings.views) if len(view.k)]
         empty = [np.zeros(0, dtype=int)]
         self.k = np.concatenate([view.k for _, view in views] or empty)
-        self.line_view = np.concatenate([np.full(len(view.k), v) for v, view in views] or empty)
+        self.line_view = np.concatenate(
+            [np.full(len(view.k), v) for v, view in views] or empty
+        )
         self.line_y = np.concatenate([view.dtheta for _, view in views] or empty)
         self.line_seen = np.concatenate(
             [view.dtheta - view.axis_theta for _, view in views] or empty
         )
-        self.line_weight = np.concatenate([view.count_theta for _, view in views] or empty)
+        self.line_weight = np.concatenate(
+            [view.count_theta for _, view in views] or empty
+        )
         turn = np.array(
             [
                 round(view.view.rotation_rad / (2 * np.pi / self.K)) if self.K else 0
@@ -183,9 +225,13 @@ class DenseFit:
         """What lines leave if their views turn as they like."""
         every = np.eye(self.K)
         turns = np.eye(len(self.readings.views))[self.line_view]
-        columns = np.concatenate([self.sign * every[self.line_site], every[self.k], turns], axis=1)
+        columns = np.concatenate(
+            [self.sign * every[self.line_site], every[self.k], turns], axis=1
+        )
         weight = np.sqrt(self.line_weight)
-        found = np.linalg.lstsq(weight[:, None] * columns, weight * self.line_y, rcond=None)[0]
+        found = np.linalg.lstsq(
+            weight[:, None] * columns, weight * self.line_y, rcond=None
+        )[0]
         return self.line_y - columns @ found
 
     def _of_stage(self, g):
@@ -217,8 +263,16 @@ class DenseFit:
             moved = turn * (self.z + body) + t - quarter * self.z
         else:
             moved = quarter * (body + 1j * phi[self.view] * self.z) + t
-        moved = moved + added + self.sign * (g[self.site] if at_sites else self._of_stage(g))
-        lines = self.sign * p[self.gt][self.line_site] + p[self.at][self.k] + phi[self.line_view]
+        moved = (
+            moved
+            + added
+            + self.sign * (g[self.site] if at_sites else self._of_stage(g))
+        )
+        lines = (
+            self.sign * p[self.gt][self.line_site]
+            + p[self.at][self.k]
+            + phi[self.line_view]
+        )
         return np.concatenate([moved.real, moved.imag, lines + turned])
 
     def _of_coefficients(self):
@@ -243,15 +297,19 @@ class DenseFit:
             u, v = z.real / half, z.imag / half
             form, axis = part.split()
             saddle, round_ = u * u - v * v, u * u + v * v
-            return {"z^2": saddle + 2j * u * v, "|z|^2": round_, "z*^2": saddle - 2j * u * v}[
-                form
-            ] * (1 if axis == "x" else 1j)
+            return {
+                "z^2": saddle + 2j * u * v,
+                "|z|^2": round_,
+                "z*^2": saddle - 2j * u * v,
+            }[form] * (1 if axis == "x" else 1j)
         x, y = z.real, z.imag
         return {"scale": x + 1j * y, "stretch": x - 1j * y, "shear": y + 1j * x}[part]
 
     def _of_visit(self, term, part):
         if term == "drift":
-            return eval_legendre(int(part[3:]), self.tau) * (1 if part[0] == "x" else 1j)
+            return eval_legendre(int(part[3:]), self.tau) * (
+                1 if part[0] == "x" else 1j
+            )
         if term == "approach":
             return self.sign * (self.sx if part == "x" else 1j * self.sy)
         x, y = self.offset.real, self.offset.imag
@@ -275,7 +333,8 @@ class DenseFit:
         unit = STEP * np.eye(len(p))
         return np.array(
             [
-                (self._predicted(p + h, at_sites) - self._predicted(p - h, at_sites)) / (2 * STEP)
+                (self._predicted(p + h, at_sites) - self._predicted(p - h, at_sites))
+                / (2 * STEP)
                 for h in unit
             ]
         ).T
@@ -285,16 +344,25 @@ class DenseFit:
         p, sized = self.p, np.isfinite(self.size)
         self.design = self._root[:, None] * self._design(p)
         prior = np.zeros((sized.sum(), len(p)))
-        prior[np.arange(len(prior)), np.arange(len(p))[self.b][sized]] = 1 / self.size[sized]
+        prior[np.arange(len(prior)), np.arange(len(p))[self.b][sized]] = (
+            1 / self.size[sized]
+        )
         held = np.concatenate(
             [
                 self._datum(np.unique(self.site)),
-                np.roll(self._datum(np.unique(self.mark))[:3], self.a.start - self.g.start, axis=1),
+                np.roll(
+                    self._datum(np.unique(self.mark))[:3],
+                    self.a.start - self.g.start,
+                    axis=1,
+                ),
             ]
         )
         held = held / (EXACTLY * self.sigma[0])
         solve = self._solved(np.concatenate([self.design, prior, held]), held)
-        self.covariance, self._solve = solve @ self._noise(solve.shape[1]) @ solve.T, solve
+        self.covariance, self._solve = (
+            solve @ self._noise(solve.shape[1]) @ solve.T,
+            solve,
+        )
         self._known = np.concatenate([prior, held])
 
     def _step(self):
@@ -340,7 +408,9 @@ class DenseFit:
             for at, (term, _, part) in enumerate(self.keys, self.b.start)
             if term == "microscope" and part in ("scale", "stretch")
         ]
-        changes = inverse_of(np.concatenate([self.design, held]))[feigned, : len(self.design)].T
+        changes = inverse_of(np.concatenate([self.design, held]))[
+            feigned, : len(self.design)
+        ].T
         more = np.zeros((len(rows) + len(feigned), len(feigned)))
         more[: len(changes)] = changes
         more[len(rows) :] = np.eye(len(feigned)) / (2 * len(self.y) * self.shared)
@@ -368,7 +438,11 @@ class DenseFit:
         x, y = (part.ravel()[sites] for part in (self.artifact.x_m, self.artifact.y_m))
         one, zero = np.ones(len(sites)), np.zeros(len(sites))
         modes = np.stack(
-            [np.concatenate(pair) for pair in ((one, zero), (zero, one), (-y, x), (x, y))], axis=1
+            [
+                np.concatenate(pair)
+                for pair in ((one, zero), (zero, one), (-y, x), (x, y))
+            ],
+            axis=1,
         )
         rows = np.zeros((4, len(self.p)))
         rows[:, np.concatenate([sites, self.n + sites])] = np.linalg.qr(modes)[0].T
@@ -392,12 +466,16 @@ class DenseFit:
         x, y = (part.ravel()[nodes] for part in (self.artifact.x_m, self.artifact.y_m))
         one, zero = np.ones(len(nodes)), np.zeros(len(nodes))
         modes = np.stack(
-            [np.concatenate(pair) for pair in ((one, zero), (zero, one), (-y, x), (x, y))], axis=1
+            [
+                np.concatenate(pair)
+                for pair in ((one, zero), (zero, one), (-y, x), (x, y))
+            ],
+            axis=1,
         )
         row = np.zeros(len(self.p))
-        row[np.arange(len(row))[where][np.concatenate([nodes, self.n + nodes])]] = np.linalg.pinv(
-            modes
-        )[mode]
+        row[np.arange(len(row))[where][np.concatenate([nodes, self.n + nodes])]] = (
+            np.linalg.pinv(modes)[mode]
+        )
         return row
 
     def plate_theta(self, lines, sites, marks):
@@ -470,7 +548,9 @@ class DenseFit:
         u = np.sqrt(np.diag(self.covariance)[self.b])
         return {
             (str(term), names[v], part): (value, spread)
-            for (term, v, part), value, spread in zip(self.keys, self.p[self.b], u, strict=True)
+            for (term, v, part), value, spread in zip(
+                self.keys, self.p[self.b], u, strict=True
+            )
         }
 
 

@@ -54,7 +54,9 @@ def solve(measurements: Measurements, *, finite: bool) -> DenseSolution:
         view.append(np.full(len(i), number))
     mark, site, view = (np.concatenate(part) for part in (mark, site, view))
     seen = np.concatenate([part.dx + 1j * part.dy for part in measurements.views])
-    alpha = np.exp(1j * np.array([part.view.rotation_rad for part in measurements.views]))[view]
+    alpha = np.exp(
+        1j * np.array([part.view.rotation_rad for part in measurements.views])
+    )[view]
     row = np.arange(len(seen))
 
     length = np.abs(z).max() * pitch
@@ -72,7 +74,10 @@ def solve(measurements: Measurements, *, finite: bool) -> DenseSolution:
     inverse = np.linalg.pinv(np.vstack([design, ties]), rcond=1e-11)
 
     def model(x: np.ndarray) -> np.ndarray:
-        field, plate = x[:n] + 1j * x[n : 2 * n], x[2 * n : 3 * n] + 1j * x[3 * n : 4 * n]
+        field, plate = (
+            x[:n] + 1j * x[n : 2 * n],
+            x[2 * n : 3 * n] + 1j * x[3 * n : 4 * n],
+        )
         phi = x[4 * n : 4 * n + v] / length
         t = (x[4 * n + v : 4 * n + 2 * v] + 1j * x[4 * n + 2 * v :])[view]
         arm = z[mark] * pitch
@@ -85,7 +90,9 @@ def solve(measurements: Measurements, *, finite: bool) -> DenseSolution:
 
     x = np.zeros(4 * n + 3 * v)
     for _ in range(STEPS if finite else 2):
-        rest = (seen - model(x)) * np.exp(-1j * x[4 * n : 4 * n + v] / length * finite)[view]
+        rest = (seen - model(x)) * np.exp(-1j * x[4 * n : 4 * n + v] / length * finite)[
+            view
+        ]
         x = x + inverse @ np.concatenate([rest.real, rest.imag, -ties @ x])
     u = np.sqrt((inverse[: 2 * n, : 2 * len(seen)] ** 2).sum(axis=1)).reshape(2, nx, ny)
     return DenseSolution(

@@ -14,7 +14,12 @@ from selfcal_ros.model.terms import ModelTerm
 SIGMA = 20e-9
 TURNS = [
     np.array(rows)
-    for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]])
+    for rows in (
+        [[1, 0], [0, 1]],
+        [[0, -1], [1, 0]],
+        [[-1, 0], [0, -1]],
+        [[0, 1], [-1, 0]],
+    )
 ]
 
 
@@ -46,7 +51,9 @@ class Dense:
         hx, hy = self.plan.artifact.half
         exposures, last, came = 0.0, None, np.zeros(2)
         times = []
-        for mark, weight, offset in zip(visits.mark, visits.weight, visits.offset, strict=True):
+        for mark, weight, offset in zip(
+            visits.mark, visits.weight, visits.offset, strict=True
+        ):
             place = np.array([mark // self.ny - hx, mark % self.ny - hy])
             at = turn @ place + np.array(pose.shift)
             stage = at if self.sense is Sense.MICROSCOPE_MOVES else -at
@@ -67,7 +74,9 @@ class Dense:
                     came.copy(),
                 )
             )
-        self.times += list(2 * (np.array(times) - times[0]) / (times[-1] - times[0]) - 1)
+        self.times += list(
+            2 * (np.array(times) - times[0]) / (times[-1] - times[0]) - 1
+        )
 
     def _reading(self, v, mark, stage, place, turn):
         hx, hy = self.plan.artifact.half
@@ -100,7 +109,12 @@ class Dense:
         views = range(len(self.visits))
         if name == "microscope":
             one = np.array(
-                [[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[1, 0], [0, -1]], [[0, 1], [1, 0]]]
+                [
+                    [[1, 0], [0, 1]],
+                    [[0, -1], [1, 0]],
+                    [[1, 0], [0, -1]],
+                    [[0, 1], [1, 0]],
+                ]
             )
             out = [[-(e @ offset) for _, _, _, offset, _ in self.about] for e in one]
         elif name == "approach":
@@ -113,7 +127,9 @@ class Dense:
             for v in views:
                 for degree in range(1, self.assumed.drift_degree + 1):
                     course = np.polynomial.Legendre.basis(degree)(np.array(self.times))
-                    out += [np.outer(course * (of_view == v), d) for d in ((1, 0), (0, 1))]
+                    out += [
+                        np.outer(course * (of_view == v), d) for d in ((1, 0), (0, 1))
+                    ]
         else:
             of_view = np.array([about[0] for about in self.about])
             x, y = np.array([place for _, place, *_ in self.about]).T
@@ -160,7 +176,9 @@ class Dense:
     def datum(self):
         """Projection of a map on what remains without translation, rotation and scale."""
         hx, hy = self.plan.artifact.half
-        place = np.array([(i, j) for i in range(-hx, hx + 1) for j in range(-hy, hy + 1)])
+        place = np.array(
+            [(i, j) for i in range(-hx, hx + 1) for j in range(-hy, hy + 1)]
+        )
         one, none = np.ones(len(place)), np.zeros(len(place))
         modes = np.array(
             [
@@ -188,7 +206,10 @@ class Dense:
         scaled = design / np.linalg.norm(design, axis=0)
         # the triangle has the singular values and right vectors of the whole
         _, size, right = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
-        null = right[(size > 1e-9 * size[0]).sum() :].T / np.linalg.norm(design, axis=0)[:, None]
+        null = (
+            right[(size > 1e-9 * size[0]).sum() :].T
+            / np.linalg.norm(design, axis=0)[:, None]
+        )
         maps = self.to_map(null / np.linalg.norm(null, axis=0))
         return int((np.linalg.svd(maps, compute_uv=False) > 1e-7).sum())
 
@@ -247,5 +268,9 @@ class Dense:
         shift = ((left @ b.T) ** 2).sum(axis=0) / SIGMA**2
         limit = central_f.isf(level, rank, dof)
         return float(
-            np.mean(np.where(shift > 2000, 1.0, ncf.sf(limit, rank, dof, np.minimum(shift, 2000))))
+            np.mean(
+                np.where(
+                    shift > 2000, 1.0, ncf.sf(limit, rank, dof, np.minimum(shift, 2000))
+                )
+            )
         )

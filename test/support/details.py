@@ -10,6 +10,8 @@ def simulated_details(folder: Path) -> str:
     """Return the path of the example's details with a word on the clock of simulated readings."""
     path = folder / "details.yaml"
     path.write_text(
-        DETAILS.read_text().replace("certificate:\n", "certificate:\n  clock: simulated\n", 1)
+        DETAILS.read_text().replace(
+            "certificate:\n", "certificate:\n  clock: simulated\n", 1
+        )
     )
     return str(path)

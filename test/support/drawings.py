@@ -1,7 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the items of a drawing lie: what is cut off, which words lie on each other."""
 
-from selfcal_ros.reporting.figures.drawing import Discs, Drawing, Item, Label, Path, Spot
+from selfcal_ros.reporting.figures.drawing import (
+    Discs,
+    Drawing,
+    Item,
+    Label,
+    Path,
+    Spot,
+)
 from selfcal_ros.reporting.figures.parts import text_width
 
 
@@ -37,14 +44,20 @@ def cut_off(drawing: Drawing) -> list[Item]:
 
     def outside(item: Item) -> bool:
         left, right, top, bottom = extent(item)
-        return min(left, top) < -0.5 or right > drawing.width + 0.5 or bottom > drawing.height + 0.5
+        return (
+            min(left, top) < -0.5
+            or right > drawing.width + 0.5
+            or bottom > drawing.height + 0.5
+        )
 
     return [item for item in drawing.items if outside(item)]
 
 
 def words_on_words(drawing: Drawing) -> list[tuple[str, str]]:
     """Return the pairs of labels that lie on each other."""
-    boxes = [(item.text, extent(item)) for item in drawing.items if isinstance(item, Label)]
+    boxes = [
+        (item.text, extent(item)) for item in drawing.items if isinstance(item, Label)
+    ]
     return [
         (text, other)
         for number, (text, (left, right, top, bottom)) in enumerate(boxes)

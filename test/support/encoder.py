@@ -10,7 +10,9 @@ class JointTrack(encoder.JointTrack):
     """The collector's track, with the answers of the series of all its samples."""
 
     def add(self, stamp_ns: int, position: float, speed: float) -> None:
-        self.store.add_block(np.array([stamp_ns]), np.array([position]), np.array([speed]))
+        self.store.add_block(
+            np.array([stamp_ns]), np.array([position]), np.array([speed])
+        )
 
     def query(self, stamps_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         positions, codes = self._all().query(stamps_ns)
@@ -24,7 +26,9 @@ class JointTrack(encoder.JointTrack):
     def approach(
         self, stamps_ns: np.ndarray, positions: np.ndarray, *, threshold: float
     ) -> np.ndarray:
-        return encoder.filled(self._all().approach(stamps_ns, positions, threshold=threshold))
+        return encoder.filled(
+            self._all().approach(stamps_ns, positions, threshold=threshold)
+        )
 
     def _all(self) -> encoder.JointSamples:
         return self.between(encoder.NEVER, encoder.EVER)

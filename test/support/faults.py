@@ -112,7 +112,10 @@ MOVES: dict[str, Callable] = {
     "ends short": lambda _, target: (target[0] - 1e-4, *target[1:]),
     "ends a little short": lambda _, target: (target[0] - 5e-6, *target[1:]),
     "turns the other way": lambda _, target: (*target[:2], -target[2]),
-    "rotary drive is off": lambda spoilt, target: (*target[:2], spoilt.machine.position()[2]),
+    "rotary drive is off": lambda spoilt, target: (
+        *target[:2],
+        spoilt.machine.position()[2],
+    ),
     "backlash of 5 um": _backlash,
     "steps were lost once": lambda _, target: (target[0] - LOST_M, *target[1:]),
     "loses steps": _loses,
@@ -187,7 +190,9 @@ OFFSETS: dict[str, Callable] = {
     "offset is not a number": lambda item: replace(item, x=math.nan),
     "offsets are reversed": lambda item: replace(item, x=-item.x, y=-item.y),
     "offsets are exchanged": lambda item: replace(item, x=item.y, y=item.x),
-    "m and n are exchanged": lambda item: replace(item, mark=item.mark and item.mark[::-1]),
+    "m and n are exchanged": lambda item: replace(
+        item, mark=item.mark and item.mark[::-1]
+    ),
     "score is low": lambda item: replace(item, score=0.1),
     "line reversed": lambda item: replace(item, theta=item.theta and -item.theta),
 }
@@ -244,7 +249,11 @@ class Spoilt:
         self.exposures += 1
         if self.exposures == self.after:
             self.moves_before = len(self.moves)
-        return [OFFSETS[self.fault](item) for item in seen] if self._is_on(OFFSETS) else seen
+        return (
+            [OFFSETS[self.fault](item) for item in seen]
+            if self._is_on(OFFSETS)
+            else seen
+        )
 
     def stop(self) -> None:
         self.stops += 1

@@ -32,7 +32,11 @@ class Firmware:
         raise AssertionError(byte)
 
     def move(self, line: str) -> None:
-        self.at |= {letter: float(value) for letter, value in WORD.findall(line) if letter != "F"}
+        self.at |= {
+            letter: float(value)
+            for letter, value in WORD.findall(line)
+            if letter != "F"
+        }
         self._moving = 2
 
     def feed(self, data: bytes, rest: bytearray) -> bytes:
@@ -69,7 +73,9 @@ class Grbl(Firmware):
             return self.greeting if byte == b"\x18" else b""
         self._moving = max(self._moving - 1, 0)
         state = "Alarm" if self.alarm else "Run" if self._moving else "Idle"
-        return (f"<{state}|MPos:{self.at['X']:.3f},{self.at['Y']:.3f},0.000|FS:0,0>\r\n").encode()
+        return (
+            f"<{state}|MPos:{self.at['X']:.3f},{self.at['Y']:.3f},0.000|FS:0,0>\r\n"
+        ).encode()
 
 
 class FaultyGrbl(Grbl):
@@ -111,7 +117,9 @@ class Marlin(Firmware):
         if line == "M92":
             return b"echo:  M92 X80.00 Y80.00 Z400.00 E93.00\nok\n"
         if line == "M114 R":
-            steps = {letter: round(value * self.PER_MM) for letter, value in self.at.items()}
+            steps = {
+                letter: round(value * self.PER_MM) for letter, value in self.at.items()
+            }
             return (
                 f"X:{steps['X'] / 80:.2f} Y:{steps['Y'] / 80:.2f} Z:0.00 E:0.00 "
                 f"Count X:{steps['X']} Y:{steps['Y']} Z:0\nok\n"
@@ -149,7 +157,9 @@ class LinuxCnc(Firmware):
         echo = f"{line}\r\n".encode() if self._echo else b""
         word, *rest = line.split()
         if word == "hello":
-            return echo + (b"HELLO ACK EMCNETSVR 1.1\r\n" if rest[0] == "EMC" else b"HELLO NAK\r\n")
+            return echo + (
+                b"HELLO ACK EMCNETSVR 1.1\r\n" if rest[0] == "EMC" else b"HELLO NAK\r\n"
+            )
         if line == "get abs_act_pos":
             return (
                 echo
@@ -172,7 +182,9 @@ class LinuxCnc(Firmware):
             return echo + f"SET {rest[0].upper()} NAK\r\n".encode()
         elif "G1" in rest:
             self.move(line)
-        return echo + (f"SET {rest[0].upper()} ACK\r\n".encode() if self._verbose else b"")
+        return echo + (
+            f"SET {rest[0].upper()} ACK\r\n".encode() if self._verbose else b""
+        )
 
 
 @contextlib.contextmanager

@@ -134,7 +134,9 @@ class Forks:
         return Fork(read, out, err)
 
     @contextlib.contextmanager
-    def process(self, node: str, arguments: Sequence[str], environment: dict) -> Iterator[Fork]:
+    def process(
+        self, node: str, arguments: Sequence[str], environment: dict
+    ) -> Iterator[Fork]:
         """Yield the process of a node; it is stopped, at worst killed, at the end of the block."""
         child = self.start(node, arguments, environment)
         try:

@@ -20,7 +20,12 @@ FRAMES = {f"G{54 + n}": np.array([7.0 * n, 3.0 * n, n, 0]) for n in range(6)} | 
 }
 TOOLS = {0: np.zeros(4), 1: np.array([0, 0, 10.0, 0]), 2: np.array([3.0, -2, 12, 0])}
 STORED = {"G28": np.array([-31.0, 33, 40, 0]), "G30": np.array([29.0, -37, 45, 0])}
-PLACES = {"klipper": {"G28": STORED["G28"][:3], **dict.fromkeys(("M18", "M84"), (0.5, 0.5, 7))}}
+PLACES = {
+    "klipper": {
+        "G28": STORED["G28"][:3],
+        **dict.fromkeys(("M18", "M84"), (0.5, 0.5, 7)),
+    }
+}
 PLACES["marlin"] = PLACES["klipper"] | dict.fromkeys(
     ("G29", "G34", "G27", "G30", "M600", "M125"), (11.0, -7, 3)
 )
@@ -74,12 +79,24 @@ class Machine:
         Of the program's frame at the first move in X or Y, in the machine's.
     """
 
-    def __init__(self, dialect: str, *, inch: bool = False, corrected: bool = False) -> None:
+    def __init__(
+        self, dialect: str, *, inch: bool = False, corrected: bool = False
+    ) -> None:
         self.dialect, self.printer = dialect, dialect in ("marlin", "klipper")
         self.at, self.inch = np.array([-1.5, 2.5, 20.0, 0.0]), inch
         self.relative = self.e_relative = False
-        self.last_relative, self.motion, self.plane, self.frame = False, None, "G17", "G54"
-        self.shift, self.tool, self.tool_in, self.prepared = np.zeros(4), np.zeros(4), 0, 0
+        self.last_relative, self.motion, self.plane, self.frame = (
+            False,
+            None,
+            "G17",
+            "G54",
+        )
+        self.shift, self.tool, self.tool_in, self.prepared = (
+            np.zeros(4),
+            np.zeros(4),
+            0,
+            0,
+        )
         self.feed, self.inverse, self.merging, self.ended = 0.0, False, 0.005, False
         self.strict = corrected and dialect == "linuxcnc"
         self.percent, self.moves, self.zero, self.sticky = 0, [], None, {}
@@ -110,7 +127,9 @@ class Machine:
                 return  # unknown command: an echo
             name = f"{match[1]}{int(match[2]) if match[2].isdigit() else match[2]}"
             words = {}
-            for letter, value in re.findall(r"([A-Z]) *([-+]?[\d.]*)", match[3].partition("*")[0]):
+            for letter, value in re.findall(
+                r"([A-Z]) *([-+]?[\d.]*)", match[3].partition("*")[0]
+            ):
                 words.setdefault(letter, value)
         if name.split(" ")[0] in ("M117", "M118"):
             return
@@ -139,29 +158,42 @@ class Machine:
         elif name in PLACES[self.dialect]:
             self.at[:3] = PLACES[self.dialect][name]
             self._traced()
-        elif name in ("M206", "M218", "M665") or name.startswith(("SET_GCODE_OFFSET", "T")):
+        elif name in ("M206", "M218", "M665") or name.startswith(
+            ("SET_GCODE_OFFSET", "T")
+        ):
             self.shift[:2] += 4.0
         elif name not in ("G4", *INERT[self.dialect].split()):
             raise Wrong(
-                "inches, if compiled in" if marlin and name == "G20" else f"not known: {name}"
+                "inches, if compiled in"
+                if marlin and name == "G20"
+                else f"not known: {name}"
             )
 
     def _printer_move(self, name: str, words: dict) -> None:
         if None in [words.get(a, 0) for a in "XYZEFIJR"] or words.get("F", 1) <= 0:
             raise Wrong("a word without a number, or no feed")
-        if name in ("G2", "G3") and self.dialect == "klipper" and (self.relative or "R" in words):
+        if (
+            name in ("G2", "G3")
+            and self.dialect == "klipper"
+            and (self.relative or "R" in words)
+        ):
             raise Wrong("not of this firmware")
         self.feed = words.get("F", self.feed)
         end = self.at.copy()
         for axis, i in zip(AXES, range(4), strict=True):
             if axis in words:
-                end[i] = words[axis] + (self.at[i] if self._relative(axis) else self.offset[i])
+                end[i] = words[axis] + (
+                    self.at[i] if self._relative(axis) else self.offset[i]
+                )
         self._go(name, end, words)
 
     def _relative(self, axis: str) -> bool:
         if axis != "E":
             return self.relative
-        if self.dialect == "marlin" and (self.relative or self.e_relative) != self.last_relative:
+        if (
+            self.dialect == "marlin"
+            and (self.relative or self.e_relative) != self.last_relative
+        ):
             raise Wrong("old and new firmware differ")
         return self.relative or self.e_relative
 
@@ -232,9 +264,14 @@ class Machine:
             p = words.get("P", 0.0) if code == "G64" else 0.0
             self.merging = words.get("Q", p) if code == "G64" else 0.0
         else:
-            return code in ("G53", "G20", "G21", "M2", "M30", *INERT[self.dialect].split()) or (
-                code == "M6" and linuxcnc
-            )
+            return code in (
+                "G53",
+                "G20",
+                "G21",
+                "M2",
+                "M30",
+                *INERT[self.dialect].split(),
+            ) or (code == "M6" and linuxcnc)
         return True
 
     def _offset(self, code: str, words: dict, scale: float) -> bool:
@@ -257,7 +294,9 @@ class Machine:
         end = self.at.copy()
         for axis, i in zip("XYZ", range(3), strict=True):
             if axis in words:
-                base = 0.0 if machine else self.at[i] if self.relative else self.offset[i]
+                base = (
+                    0.0 if machine else self.at[i] if self.relative else self.offset[i]
+                )
                 end[i] = base + words[axis] * scale
         named = [i for i, axis in enumerate("XYZ") if axis in words]
         if act in ("G80", "G4"):
@@ -288,7 +327,9 @@ class Machine:
                 raise Wrong("G53 with an arc")
         if act != "G0" and self.inverse and "F" not in words:
             raise Wrong("no time")
-        self._go(act, end, {k: v * scale if k in "IJR" else v for k, v in words.items()})
+        self._go(
+            act, end, {k: v * scale if k in "IJR" else v for k, v in words.items()}
+        )
 
     def _arc_rules(self, words: dict) -> None:
         if self.plane != "G17" or "P" in words or "K" in words:
@@ -367,7 +408,10 @@ def run_both(text: str, rewriter, true, tolerance_mm: float, **kwargs) -> int:
     which the controller stops ends there.
     """
     dialect, pieces, known = rewriter.dialect, 0, False
-    machine, second = Machine(dialect, **kwargs), Machine(dialect, corrected=True, **kwargs)
+    machine, second = (
+        Machine(dialect, **kwargs),
+        Machine(dialect, corrected=True, **kwargs),
+    )
     program = [
         (line, rewriter.line(line.removesuffix("\r"), f"a.nc:{number}"))
         for number, line in enumerate(text.split("\n"), 1)
@@ -379,7 +423,8 @@ def run_both(text: str, rewriter, true, tolerance_mm: float, **kwargs) -> int:
             return pieces
         made = [move for one in lines for move in second.run(one)]
         pieces += len(made)
-        if not ideal or len(ideal[-1].points) == 1:  # nothing, or it goes to a place of its own
+        # nothing, or it goes to a place of its own
+        if not ideal or len(ideal[-1].points) == 1:
             assert len(made[-1:]) == len(ideal[-1:])
             for here, there in zip(made[-1:], ideal[-1:], strict=True):
                 off = np.abs(here.points[-1] - there.points[-1])
@@ -392,12 +437,16 @@ def run_both(text: str, rewriter, true, tolerance_mm: float, **kwargs) -> int:
         if len(ideal) > 1:  # a cycle: compare its bottom
             assert len(made) == len(ideal)
             ideal, made = ideal[-2:-1], made[-2:-1]
-        (whole,), zero = ideal, machine.zero if machine.zero is not None else np.zeros(4)
+        (whole,), zero = (
+            ideal,
+            machine.zero if machine.zero is not None else np.zeros(4),
+        )
         assert {move.rapid for move in made} == {whole.rapid}
         assert {move.feed for move in made} == {whole.feed}
         way = np.concatenate(
             [
-                m.points[0] + np.linspace(0, 1, 30)[:, None] * (m.points[-1] - m.points[0])
+                m.points[0]
+                + np.linspace(0, 1, 30)[:, None] * (m.points[-1] - m.points[0])
                 for m in made
             ]
         )

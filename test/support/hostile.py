@@ -23,7 +23,15 @@ TEXTS = (
     "9" * 5000,
     "x" * 100_000,
 )
-WIDTHS = {"int8": 8, "uint8": 8, "octet": 8, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64}
+WIDTHS = {
+    "int8": 8,
+    "uint8": 8,
+    "octet": 8,
+    "int32": 32,
+    "uint32": 32,
+    "int64": 64,
+    "uint64": 64,
+}
 HEAD = 12
 """Bytes of the encapsulation and the stamp behind it."""
 LONG = 11_000
@@ -63,11 +71,19 @@ def _values(kind: str, value: Any) -> list:
     if kind == "string":
         return list(TEXTS)
     if kind in ("double", "float"):
-        return [v for v in FLOATS if kind == "double" or not math.isfinite(v) or abs(v) < 1e30]
+        return [
+            v
+            for v in FLOATS
+            if kind == "double" or not math.isfinite(v) or abs(v) < 1e30
+        ]
     bits = WIDTHS[kind]
     if kind == "octet":
         return [b"\0", b"\xff"]
-    whole = [0, 2**bits - 1] if kind[0] == "u" else [0, -1, -(2 ** (bits - 1)), 2 ** (bits - 1) - 1]
+    whole = (
+        [0, 2**bits - 1]
+        if kind[0] == "u"
+        else [0, -1, -(2 ** (bits - 1)), 2 ** (bits - 1) - 1]
+    )
     return [*whole, 2, 4001] if bits > 8 else whole
 
 

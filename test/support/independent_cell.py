@@ -28,12 +28,21 @@ class IndependentCell(Bench, Node):
     """
 
     def __init__(
-        self, *, ids=True, plate_moves=False, joints=("x", "y", "theta"), size=1.0, seed=1, **kwargs
+        self,
+        *,
+        ids=True,
+        plate_moves=False,
+        joints=("x", "y", "theta"),
+        size=1.0,
+        seed=1,
+        **kwargs,
     ) -> None:
         Node.__init__(self, "independent_cell", **kwargs)
         Bench.__init__(self, ids=ids, plate_moves=plate_moves, size=size, seed=seed)
         self.joints = joints
-        self.hold_at: tuple[int, int] | None = None  # view, and exposures after which it waits
+        self.hold_at: tuple[int, int] | None = (
+            None  # view, and exposures after which it waits
+        )
         self.exposed, self.view = 0, 0
         self._work: list = []
         self._acted = self._idle = 0

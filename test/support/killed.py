@@ -26,7 +26,11 @@ from test.support.forked import Forks
 from test.support.ros import Graph
 from test.support.sessions import cdr_of
 
-ROLES = {EncoderSample: names.ENCODER, Detection: names.DETECTIONS, Command: names.COMMAND}
+ROLES = {
+    EncoderSample: names.ENCODER,
+    Detection: names.DETECTIONS,
+    Command: names.COMMAND,
+}
 KINDS = tuple(ROLES)
 """In the order in which the collector tells its counts."""
 
@@ -53,7 +57,12 @@ class Cell:
         *,
         forks: Forks | None = None,
     ) -> None:
-        self.graph, self.environment, self.folder, self.forks = graph, environment, folder, forks
+        self.graph, self.environment, self.folder, self.forks = (
+            graph,
+            environment,
+            folder,
+            forks,
+        )
         self.inside: dict[str, Any] = {}
         self.namespace, self.running = namespace, {}
         self.processes = contextlib.ExitStack()
@@ -73,7 +82,10 @@ class Cell:
         )
         self.solved: list = []
         graph.hand.create_subscription(
-            names.SOLVED.type, self.name("solver/solved"), self.solved.append, names.SOLVED.qos
+            names.SOLVED.type,
+            self.name("solver/solved"),
+            self.solved.append,
+            names.SOLVED.qos,
         )
         self.matched = dict.fromkeys(KINDS, 0)
         self.publishers = {
@@ -81,7 +93,9 @@ class Cell:
                 topic.type,
                 self.name(topic.name),
                 topic.qos,
-                event_callbacks=PublisherEventCallbacks(matched=partial(self._on_matched, kind)),
+                event_callbacks=PublisherEventCallbacks(
+                    matched=partial(self._on_matched, kind)
+                ),
             )
             for kind, topic in ROLES.items()
         }
@@ -115,7 +129,11 @@ class Cell:
             "--ros-args",
             "-r",
             f"__ns:=/{self.namespace}",
-            *(word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")),
+            *(
+                word
+                for key, value in parameters.items()
+                for word in ("-p", f"{key}:={value}")
+            ),
         ]
         self.running[node] = self.processes.enter_context(
             self.forks.process(node, arguments, self.environment)
@@ -163,7 +181,9 @@ class Cell:
     def limit_files(self, node: str, size: int) -> None:
         """Let the files of a node grow no larger than `size` bytes, as if the disk were full."""
         resource.prlimit(
-            self.running[node].pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY)
+            self.running[node].pid,
+            resource.RLIMIT_FSIZE,
+            (size, resource.RLIM_INFINITY),
         )
 
     def send(self, events: Sequence[Event], *, first: int = 0) -> None:
@@ -172,7 +192,11 @@ class Cell:
         for index, event in enumerate(events):
             kind = type(event)
             number[kind] += 1
-            new = index >= first if kind is Command else number[kind] > self.told[KINDS.index(kind)]
+            new = (
+                index >= first
+                if kind is Command
+                else number[kind] > self.told[KINDS.index(kind)]
+            )
             if kind is Command:
                 self.newest_ns = max(self.newest_ns, event.stamp_ns)
             if new:
@@ -180,7 +204,9 @@ class Cell:
 
     def until_told(self, events: Sequence[Event], but: int = 0) -> None:
         """Wait until all samples and detections but some are told as received."""
-        counts = [sum(isinstance(event, kind) for event in events) - but for kind in KINDS[:2]]
+        counts = [
+            sum(isinstance(event, kind) for event in events) - but for kind in KINDS[:2]
+        ]
         self.graph.until(lambda: all(map(ge, self.told, counts)), "what was sent")
 
     def deliver(self, events: Sequence[Event], *, first: int = 0) -> None:
@@ -203,12 +229,18 @@ class Cell:
     def saved(self) -> dict | str:
         """Return the result that the solver saves, or why there is none."""
         path = self.folder / "map.json"
-        if self.newest_ns:  # a count does not tell: a collector that starts hears commands again
-            self.graph.until(lambda: self.newest_told == str(self.newest_ns), "the last command")
+        # a count does not tell: a collector that starts hears commands again
+        if self.newest_ns:
+            self.graph.until(
+                lambda: self.newest_told == str(self.newest_ns), "the last command"
+            )
         finished = self.answer(Trigger, "measurement_collector/finish")
         assert finished.success, finished.message
-        end = time.monotonic() + 4 * IDLE_S  # where the readings are refused it says nothing
-        while time.monotonic() < end and all(m.data != finished.message for m in self.solved):
+        # where the readings are refused it says nothing
+        end = time.monotonic() + 4 * IDLE_S
+        while time.monotonic() < end and all(
+            m.data != finished.message for m in self.solved
+        ):
             self.graph.executor.spin_once(timeout_sec=0.02)
         answer = self.answer(SaveMap, "solver/save_map", path=str(path))
         return read_json(path) if answer.success else answer.message
@@ -220,7 +252,10 @@ class Cell:
         client = self.graph.hand.create_client(kind, self.name(name))
         for _ in range(round(ATTEMPTS * 2 * IDLE_S / again_s)):
             self.graph.until(client.service_is_ready, name)
-            future, end = client.call_async(kind.Request(**fields)), time.monotonic() + again_s
+            future, end = (
+                client.call_async(kind.Request(**fields)),
+                time.monotonic() + again_s,
+            )
             while not future.done() and time.monotonic() < end:
                 self.graph.executor.spin_once(timeout_sec=0.02)
             if future.done():

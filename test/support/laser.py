@@ -34,7 +34,9 @@ def planar(steps_m, errors_m, *, laser_rad=(0.0, 0.0), mirror_rad=(0.0, 0.0)):
         normal = np.array([np.cos(mirror), np.sin(mirror)])
         w = normal / (np.cos(laser) * normal[0] + np.sin(laser) * normal[1])
         readings[k] = signs[k][:, None] * np.einsum("c,jic->ji", w, vectors)
-    return StepDiagonal(tuple(steps_m), DIAGONALS[2], readings[None], linear_of(errors_m)[None])
+    return StepDiagonal(
+        tuple(steps_m), DIAGONALS[2], readings[None], linear_of(errors_m)[None]
+    )
 
 
 def one_block(ex_x, ey_x, ex_y, ey_y):
@@ -55,13 +57,19 @@ def scatter_of(machine, values_of):
     `values_of` finds them from a measurement; they follow every mean reading moved in turn. A
     reading is the difference of two distances, one after the other in time.
     """
-    exact, size = simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0)), 1e-8
+    exact, size = (
+        simulate_step_diagonal(machine, Measurement(), np.random.default_rng(0)),
+        1e-8,
+    )
     base, answers = values_of(exact), {}
     for name in ("samples_m", "linear_m"):
         whole = getattr(exact, name)
         moves = size * np.eye(whole.size).reshape(-1, *whole.shape)
         answers[name] = np.array(
-            [(values_of(replace(exact, **{name: whole + move})) - base) / size for move in moves]
+            [
+                (values_of(replace(exact, **{name: whole + move})) - base) / size
+                for move in moves
+            ]
         )
 
     def scatter(noise: LaserNoise):
@@ -94,12 +102,16 @@ def recorded(machine, setups, *, rng, noise_m=0.0, extra=None):
         if len(name) > 1:
             order, along = trace(machine, name, setups.get(name, SetUp()))
             signs = signs_of([name])[0]
-            moves = [np.eye(dim)[index // n] * signs[index // n] * steps for index in order]
+            moves = [
+                np.eye(dim)[index // n] * signs[index // n] * steps for index in order
+            ]
             start = np.where(signs < 0, n * steps, 0.0)
         else:
             axis = "xyz".index(name)
             moves = [np.eye(dim)[axis] * steps] * n
-            along = np.concatenate([[0], np.cumsum(steps[axis] + machine.errors_m[axis, :, axis])])
+            along = np.concatenate(
+                [[0], np.cumsum(steps[axis] + machine.errors_m[axis, :, axis])]
+            )
             start = np.zeros(dim)
         places += [start + np.sum(moves[:k], axis=0) for k in range(len(moves) + 1)]
         distances += list(along + rng.normal(0, 1e-3))
@@ -116,4 +128,6 @@ def recorded(machine, setups, *, rng, noise_m=0.0, extra=None):
         leaving = share[:, 0] * 1e-3 * (ahead is not place)
         laser.append(distance + leaving + rng.normal(0, noise_m, 60))
     stamps = np.concatenate(stamps)
-    return Recording(stamps + 3_000_000, np.concatenate(laser), stamps, np.concatenate(positions))
+    return Recording(
+        stamps + 3_000_000, np.concatenate(laser), stamps, np.concatenate(positions)
+    )

@@ -9,7 +9,10 @@ QOS = [qos_profile(reliable=True, transient_local=False, depth=10)]
 
 
 def _header(stamp_ns):
-    return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": ""}
+    return {
+        "stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9},
+        "frame_id": "",
+    }
 
 
 def laser_fields(kind, stamp_ns, value):
@@ -55,7 +58,10 @@ def position_fields(kind, stamp_ns, values):
         "geometry_msgs/msg/PointStamped": {"header": _header(stamp_ns), "point": point},
         "geometry_msgs/msg/PoseStamped": {
             "header": _header(stamp_ns),
-            "pose": {"position": point, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}},
+            "pose": {
+                "position": point,
+                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            },
         },
     }[kind]
 
@@ -70,7 +76,11 @@ def write_laser_bag(
 ):
     """Write a recording as a bag; `backwards` puts the messages in reverse order."""
     items = [
-        (int(t) + EPOCH_NS, "cell/laser", laser_fields(laser, int(t) + EPOCH_NS, float(v)))
+        (
+            int(t) + EPOCH_NS,
+            "cell/laser",
+            laser_fields(laser, int(t) + EPOCH_NS, float(v)),
+        )
         for t, v in zip(series.laser_ns, series.laser_m, strict=True)
     ]
     items += [

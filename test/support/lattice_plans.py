@@ -39,7 +39,13 @@ def plan_of(names: str, artifact: Artifact, *, lines: int | None = None) -> Plan
         views.append(View(name, q * pi / 2, (a * pitch, b * pitch), True, angular))
     if lines is not None:
         views.append(
-            View("lines", lines * 2 * pi / artifact.angular_count, (0.0, 0.0), False, True)
+            View(
+                "lines",
+                lines * 2 * pi / artifact.angular_count,
+                (0.0, 0.0),
+                False,
+                True,
+            )
         )
     return Plan(names, artifact, tuple(views))
 
@@ -74,4 +80,6 @@ def in_datum(
     field: np.ndarray, known: np.ndarray, artifact: Artifact, *, scale: bool
 ) -> np.ndarray:
     """Return `field` (2, nx, ny) in the datum over the known sites only."""
-    return remove_modes(np.where(known, field, np.nan), datum_modes(artifact, scale=scale))
+    return remove_modes(
+        np.where(known, field, np.nan), datum_modes(artifact, scale=scale)
+    )

@@ -114,7 +114,9 @@ def running(folder: Path) -> Iterator[str]:
             env={**os.environ, "HOME": str(folder)},
         )
     try:
-        wait_until(lambda: process.poll() is not None or _listens(number), "linuxcncrsh")
+        wait_until(
+            lambda: process.poll() is not None or _listens(number), "linuxcncrsh"
+        )
         assert process.poll() is None, (folder / "log").read_text()
         _switch_on(number)
         yield f"socket://127.0.0.1:{number}"
@@ -147,7 +149,9 @@ def _as_ordinary_user(folder: Path) -> list[str]:
 
 def _ordinary_user() -> list[str]:
     """Return the words before a command that give up the rights of root, with which it stops."""
-    return ["setpriv", "--reuid", "nobody", "--clear-groups"] if os.getuid() == 0 else []
+    return (
+        ["setpriv", "--reuid", "nobody", "--clear-groups"] if os.getuid() == 0 else []
+    )
 
 
 def _listens(number: int) -> bool:
@@ -156,14 +160,19 @@ def _listens(number: int) -> bool:
 
 
 def _switch_on(number: int) -> None:
-    with socket.create_connection(("127.0.0.1", number), timeout=PATIENCE_S) as connection:
+    with socket.create_connection(
+        ("127.0.0.1", number), timeout=PATIENCE_S
+    ) as connection:
         lines = connection.makefile("rw", newline="\n")
         _answer(lines, "hello EMC test 1.0", "HELLO ACK")
         for words in SWITCHED_ON:
             answer = _answer(lines, f"set {words}", f"SET {words.split()[0].upper()} ")
             assert answer.endswith("ACK"), answer
         wait_until(
-            lambda: _answer(lines, "get joint_homed", "JOINT_HOMED").split()[1:3] == ["YES", "YES"],
+            lambda: (
+                _answer(lines, "get joint_homed", "JOINT_HOMED").split()[1:3]
+                == ["YES", "YES"]
+            ),
             "homing",
         )
 

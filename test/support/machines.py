@@ -34,7 +34,9 @@ def plane(x, y, values, edge="hold"):
 
 
 def numbers_in(line):
-    return [float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", line, re.I)]
+    return [
+        float(word) for word in re.findall(r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?", line, re.I)
+    ]
 
 
 def cal(texts, _counts):
@@ -55,7 +57,10 @@ def cal(texts, _counts):
     values = np.array([line.split() for line in lines if line[0] != ":"], dtype=float)
     values = values.reshape(len(values), -1, 2) / um
     assert values.shape[1] == width and outputs == [column, row]
-    x, y = across * np.arange(width) - offset["COL"], down * np.arange(len(values)) - offset["ROW"]
+    x, y = (
+        across * np.arange(width) - offset["COL"],
+        down * np.arange(len(values)) - offset["ROW"],
+    )
     if across < 0:
         x, values = x[::-1], values[:, ::-1]
     if down < 0:
@@ -63,7 +68,9 @@ def cal(texts, _counts):
     fields = [plane(x, y, values[:, :, axis]) for axis in (0, 1)]
 
     def add(px, py):
-        return np.stack([f(px, py) - f(np.zeros(1), np.zeros(1)) for f in fields], axis=-1)
+        return np.stack(
+            [f(px, py) - f(np.zeros(1), np.zeros(1)) for f in fields], axis=-1
+        )
 
     return add
 
@@ -78,7 +85,9 @@ def kmotion(texts, _counts):
         commands[int(row), int(column)] = command[:2]
     x, y = x0 + dx * np.arange(columns), y0 + dy * np.arange(rows)
     fields = [plane(x, y, commands[:, :, axis], "extrapolate") for axis in (0, 1)]
-    return lambda px, py: np.stack([fields[0](px, py) - px, fields[1](px, py) - py], axis=-1)
+    return lambda px, py: np.stack(
+        [fields[0](px, py) - px, fields[1](px, py) - py], axis=-1
+    )
 
 
 def pmac(texts, counts):
@@ -86,7 +95,9 @@ def pmac(texts, counts):
     lines = [re.sub(";.*", "", line).strip() for line in texts[0].splitlines()]
     fields, order = {}, []
     for at, line in enumerate(lines):
-        match = re.fullmatch(r"DEFINE COMP (\d+)\.(\d+),#(\d+)D,#(\d+)D,#(\d+),(\d+),(\d+)", line)
+        match = re.fullmatch(
+            r"DEFINE COMP (\d+)\.(\d+),#(\d+)D,#(\d+)D,#(\d+),(\d+),(\d+)", line
+        )
         if not match:
             continue
         rows, columns, row_motor, column_motor, target, row_span, column_span = map(
@@ -125,11 +136,15 @@ def beckhoff(texts, _counts, unit_m=1e-3, subtract=False):
             for n in (1, 2)
         )
         values = np.full((len(y), len(x)), np.nan)
-        for j, i, value in re.findall(r"table\[(\d+)\]\[(\d+)\]\.correction (\S+)", text):
+        for j, i, value in re.findall(
+            r"table\[(\d+)\]\[(\d+)\]\.correction (\S+)", text
+        ):
             values[int(j), int(i)] = float(value)
         fields.append(plane(x, y, values))
     sense = (-1 if subtract else 1) / per
-    return lambda px, py: sense * np.stack([f(px * per, py * per) for f in fields], axis=-1)
+    return lambda px, py: (
+        sense * np.stack([f(px * per, py * per) for f in fields], axis=-1)
+    )
 
 
 def linuxcnc(texts, _counts):
@@ -158,7 +173,9 @@ def siemens(texts, _counts, subtract=False):
             float(v)
             for _, v in sorted(
                 (int(n), v)
-                for n, v in re.findall(rf"^\$AN_CEC\[{table},(\d+)\]=(\S+)$", text, re.M)
+                for n, v in re.findall(
+                    rf"^\$AN_CEC\[{table},(\d+)\]=(\S+)$", text, re.M
+                )
             )
         ]
         at = float(get["MIN"]) + float(get["STEP"]) * np.arange(len(values))
@@ -169,7 +186,9 @@ def siemens(texts, _counts, subtract=False):
     def add(px, py):
         out = np.zeros((len(px), 2))
         for source, target, at, values in found:
-            out[:, names.index(target)] += np.interp((px, py)[names.index(source)], at, values)
+            out[:, names.index(target)] += np.interp(
+                (px, py)[names.index(source)], at, values
+            )
         return -out if subtract else out
 
     return add
@@ -224,7 +243,9 @@ class Machine:
     def reached(self, wanted, table, sense=1):
         """Return where the stage goes when positions (P, 2) are commanded, m."""
         command = self.sign * (wanted - self.home) / self.unit_m
-        encoder = self.sign * (command + sense * table(*command.T)) * self.unit_m + self.home
+        encoder = (
+            self.sign * (command + sense * table(*command.T)) * self.unit_m + self.home
+        )
         true = encoder
         for _ in range(12):
             true = encoder - self.error(true)
@@ -233,7 +254,11 @@ class Machine:
     def off(self, table, *, between=False, sense=1):
         """Return the largest residual at the nodes, or within cells, without the common shift."""
         x, y = (
-            np.sort(np.concatenate([at[:-1] + 0.3 * np.diff(at), at[:-1] + 0.8 * np.diff(at)]))
+            np.sort(
+                np.concatenate(
+                    [at[:-1] + 0.3 * np.diff(at), at[:-1] + 0.8 * np.diff(at)]
+                )
+            )
             if between
             else at
             for at in self.nodes

@@ -49,4 +49,6 @@ def map_covariance(measurements: Measurements, options: Options) -> MapCovarianc
         half_width_m=problem.half_width_m,
         sigma_m=found.xy.sigma,
     )
-    return MapCovariance(measurements.artifact, field, found.xy.sigma, measurements.sense)
+    return MapCovariance(
+        measurements.artifact, field, found.xy.sigma, measurements.sense
+    )

@@ -5,7 +5,12 @@ import numpy as np
 
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, datum_modes
-from selfcal_ros.model.result import ArtifactMap, CalibrationResult, Noise, Observability
+from selfcal_ros.model.result import (
+    ArtifactMap,
+    CalibrationResult,
+    Noise,
+    Observability,
+)
 from test.support.truth import random_truth
 
 
@@ -23,7 +28,9 @@ def random_map(
     return ErrorMap(artifact, gx, gy, *u, truth.g_theta, rng.uniform(1e-6, 2e-6, count))
 
 
-def result_of(error_map: ErrorMap, *, sense: str = "microscope_moves") -> CalibrationResult:
+def result_of(
+    error_map: ErrorMap, *, sense: str = "microscope_moves"
+) -> CalibrationResult:
     """Return a result that holds `error_map` and little else."""
     shape, count = error_map.artifact.shape, error_map.artifact.angular_count
     return CalibrationResult(

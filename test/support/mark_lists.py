@@ -5,7 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.model.artifact import Artifact, Interpolation, MapGrid, default_map_grid
+from selfcal_ros.model.artifact import (
+    Artifact,
+    Interpolation,
+    MapGrid,
+    default_map_grid,
+)
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.view import Plan, View
 
@@ -13,7 +18,12 @@ HALF_M = 50e-3
 
 
 def listed(
-    x, y, nodes: int = 0, interpolation: str = "bicubic", ids=None, angular_count: int = 0
+    x,
+    y,
+    nodes: int = 0,
+    interpolation: str = "bicubic",
+    ids=None,
+    angular_count: int = 0,
 ) -> Artifact:
     """Return a plate with marks at x, y (m) and odd ids that fall, not rise, with their order."""
     ids = [3 * number - 7 for number in range(len(x), 0, -1)] if ids is None else ids
@@ -45,7 +55,10 @@ def scatter(
     number: int = 80, nodes: int = 5, seed: int = 3, *, half_m: float = HALF_M, **kwargs
 ) -> Artifact:
     """Return a plate with marks at random places, no two closer than a third of their spacing."""
-    rng, found = np.random.default_rng(seed), np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
+    rng, found = (
+        np.random.default_rng(seed),
+        np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]]),
+    )
     found = found * half_m  # the corners: all nodes of the map have marks near them
     while len(found) < number:
         place = rng.uniform(-half_m, half_m, 2)
@@ -58,7 +71,8 @@ def lattice(size: int, holes=(), nodes: int = 5, **kwargs) -> Artifact:
     """Return the lattice of size x size marks as a list, without the marks of some numbers."""
     along = np.arange(size) - (size - 1) / 2
     x, y = (
-        part.ravel() * 2 * HALF_M / (size - 1) for part in np.meshgrid(along, along, indexing="ij")
+        part.ravel() * 2 * HALF_M / (size - 1)
+        for part in np.meshgrid(along, along, indexing="ij")
     )
     kept = np.setdiff1d(np.arange(size * size), holes)
     return listed(x[kept], y[kept], nodes, **kwargs)
@@ -68,7 +82,16 @@ def listed_plan(artifact: Artifact | None = None, *, repeats: int = 2) -> Plan:
     """Return a plan of scattered marks and 8 lines: 0, 90, 37 deg, shifted, turned by one line."""
     artifact = scatter(60, angular_count=8) if artifact is None else artifact
     lines = (
-        [View("line", 2 * np.pi / artifact.angular_count, (0.0, 0.0), False, True, repeats)]
+        [
+            View(
+                "line",
+                2 * np.pi / artifact.angular_count,
+                (0.0, 0.0),
+                False,
+                True,
+                repeats,
+            )
+        ]
         if artifact.angular_count
         else []
     )

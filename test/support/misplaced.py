@@ -21,7 +21,9 @@ def laid(
     """Return the messages of a cell whose plates lie otherwise than its commands say."""
     cell = scene(lies, with_ids=with_ids, seed=seed, **NOISE, **how)
     views = plan_of(planned, NOISE["size"], count=0, repeats=2).views
-    cell.commands = [replace(c, view=views[c.view_index]) if c.view else c for c in cell.commands]
+    cell.commands = [
+        replace(c, view=views[c.view_index]) if c.view else c for c in cell.commands
+    ]
     return cell, [view.name for view in views]
 
 
@@ -40,7 +42,9 @@ def laid_at(
     )
     views = [replace(view, sigma_xy=sigma, dof_xy=50) for view in found.views]
     here, there = planned.views[index], views[index]
-    taken, true = (view.view.pose.places(artifact, view.m, view.n) for view in (here, there))
+    taken, true = (
+        view.view.pose.places(artifact, view.m, view.n) for view in (here, there)
+    )
     nearest, marks = np.abs(true[:, None] - taken).argmin(axis=1), np.arange(len(taken))
     away = true - taken[nearest]
     kept = np.abs(away) < 0.05 * artifact.grid_pitch_m

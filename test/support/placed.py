@@ -30,7 +30,10 @@ def plate(marks: int, nodes: int, interpolation: str = "bicubic", **kwargs) -> A
     """Return a plate whose map spans it with `nodes` nodes a side."""
     pitch = (marks - 1) * PITCH_M / (nodes - 1)
     return Artifact(
-        marks, PITCH_M, map_grid=MapGrid(nodes, pitch, Interpolation(interpolation)), **kwargs
+        marks,
+        PITCH_M,
+        map_grid=MapGrid(nodes, pitch, Interpolation(interpolation)),
+        **kwargs,
     )
 
 
@@ -83,8 +86,11 @@ def readings(
         return rng.normal(size=shape) + 1j * rng.normal(size=shape)
 
     nodes = artifact.field.x_m + 1j * artifact.field.y_m
-    field = size * complex_normal(artifact.field.shape) if stage is None else stage(nodes)
-    if stage is None:  # a stage that turns as a whole turns the offsets seen: of second order
+    field = (
+        size * complex_normal(artifact.field.shape) if stage is None else stage(nodes)
+    )
+    # a stage that turns as a whole turns the offsets seen: of second order
+    if stage is None:
         x, y = remove_modes(
             np.stack([field.real, field.imag]), datum_modes(artifact.field, scale=True)
         )
@@ -100,7 +106,10 @@ def readings(
         )
         inside = view.pose.in_field(artifact)
         m, n = artifact.m[inside], artifact.n[inside]
-        at, mark = view.pose.places(artifact, m, n), (artifact.x_m + 1j * artifact.y_m)[inside]
+        at, mark = (
+            view.pose.places(artifact, m, n),
+            (artifact.x_m + 1j * artifact.y_m)[inside],
+        )
         phase, phi, t = (
             np.exp(1j * view.rotation_rad),
             turn * rng.normal(),
@@ -110,10 +119,16 @@ def readings(
         lies = (
             phase * (1j * phi * mark + plate_error[inside]) + t
             if linear
-            else (phase * np.exp(1j * phi) * (mark + plate_error[inside]) - phase * mark + t)
+            else (
+                phase * np.exp(1j * phi) * (mark + plate_error[inside])
+                - phase * mark
+                + t
+            )
         )
         seen = lies + of_stage + sigma * complex_normal(len(m))
-        views.append(ViewReadings(view, m, n, seen.real, seen.imag, np.ones(len(m), dtype=int)))
+        views.append(
+            ViewReadings(view, m, n, seen.real, seen.imag, np.ones(len(m), dtype=int))
+        )
     return Measurements("placed", artifact, tuple(views)), Truth(field, plate_error)
 
 
@@ -132,13 +147,14 @@ def dense(
     blocks, values = [], []
     for number, view in enumerate(measurements.views):
         phase, (a, b) = np.exp(1j * view.view.rotation_rad), view.view.translation_m
+        # each mark by its name
         own = np.array(
             [
                 (mark == each.reshape(2, -1).T).all(axis=1)
                 for mark in zip(view.m, view.n, strict=True)
             ],
             dtype=float,
-        )  # each mark by its name
+        )
         w = rows(artifact, phase * (own @ z) + complex(a, b))
         here = np.zeros((len(own), 3 * len(measurements.views)), dtype=complex)
         here[:, 3 * number] = phase * 1j * (own @ z) / z.real.max()

@@ -63,7 +63,9 @@ def plan_of(
         for name, (q, a, b) in ((name, POSES[name]) for name in names)
     ]
     if line:
-        views.append(View("line", 2 * math.pi / count, (0.0, 0.0), False, True, repeats))
+        views.append(
+            View("line", 2 * math.pi / count, (0.0, 0.0), False, True, repeats)
+        )
     return Plan(text, artifact, tuple(views))
 
 
@@ -80,17 +82,29 @@ def image_plan(
     Lines are read in all views, and turned by one line.
     """
     lines = (
-        [{"name": "line", "rotation_deg": 360 / count, "grid": False, "repeats": repeats}]
+        [
+            {
+                "name": "line",
+                "rotation_deg": 360 / count,
+                "grid": False,
+                "repeats": repeats,
+            }
+        ]
         if count
         else []
     )
     return plan_from_dict(
         {
             "plan_id": "images",
-            "artifact": {"grid_size": size, "grid_pitch": 0.001, "angular_count": count},
+            "artifact": {
+                "grid_size": size,
+                "grid_pitch": 0.001,
+                "angular_count": count,
+            },
             "image": {"nx": marks, "ny": marks},
             "views": [
-                {"name": f"{turn:g}", "rotation_deg": turn, "repeats": repeats} for turn in turns
+                {"name": f"{turn:g}", "rotation_deg": turn, "repeats": repeats}
+                for turn in turns
             ]
             + lines,
         },
@@ -99,7 +113,10 @@ def image_plan(
 
 
 def harmonic_plan(
-    count: int = 24, harmonics: int = 8, turns_deg: Sequence[float] = (37, 101), size: int = 5
+    count: int = 24,
+    harmonics: int = 8,
+    turns_deg: Sequence[float] = (37, 101),
+    size: int = 5,
 ) -> Plan:
     """Return {0, 90, tx} of marks, with lines at 0 and in views of their own at other turns."""
     plate, quarter = Artifact(size, 0.01, count, harmonics=harmonics), math.pi / 2
@@ -115,13 +132,22 @@ def harmonic_plan(
     )
 
 
-def placed_plan(size: int = 7, *, size_y: int = 0, count: int = 0, repeats: int = 1) -> Plan:
+def placed_plan(
+    size: int = 7, *, size_y: int = 0, count: int = 0, repeats: int = 1
+) -> Plan:
     """Return a plan of the views 0, 90, 37 deg and (1.3, -0.7) pitches, half a pitch.
 
     Lines are read in all views but the one at 37 deg, and turned by one line.
     """
     lines = (
-        [{"name": "line", "rotation_deg": 360 / count, "grid": False, "repeats": repeats}]
+        [
+            {
+                "name": "line",
+                "rotation_deg": 360 / count,
+                "grid": False,
+                "repeats": repeats,
+            }
+        ]
         if count
         else []
     )
@@ -135,7 +161,12 @@ def placed_plan(size: int = 7, *, size_y: int = 0, count: int = 0, repeats: int 
                 "grid_size_y": size_y,
             },
             "views": [
-                {"name": name, "rotation_deg": turn, "translation_pitch": shift, "repeats": repeats}
+                {
+                    "name": name,
+                    "rotation_deg": turn,
+                    "translation_pitch": shift,
+                    "repeats": repeats,
+                }
                 for name, turn, shift in (
                     ("0", 0, [0, 0]),
                     ("90", 90, [0, 0]),

@@ -22,7 +22,9 @@ from selfcal_ros.topics import DETECTION_TOPIC
 from test.support.cells import PLAN, SIMULATION
 
 PROCESSES = multiprocessing.get_context("forkserver")
-PROCESSES.set_forkserver_preload(["selfcal_ros.cli.measure", "selfcal_ros.machine.simulated"])
+PROCESSES.set_forkserver_preload(
+    ["selfcal_ros.cli.measure", "selfcal_ros.machine.simulated"]
+)
 CELL = """
 machine: surviving_stage:SurvivingStage
 SurvivingStage: {}
@@ -140,11 +142,15 @@ class Outcome(NamedTuple):
 def outcome(folder: Path, whole: Path, before: list[bytes]) -> Outcome:
     """Compare the map of a resumed run with that of an undisturbed one."""
     after = Counter(detections(folder))
-    result, other = (json.loads((each / "bag.json").read_text()) for each in (folder, whole))
+    result, other = (
+        json.loads((each / "bag.json").read_text()) for each in (folder, whole)
+    )
     away, u = [], []
     for axis in ("gx", "gy"):
         away.append(np.subtract(result["error_map"][axis], other["error_map"][axis]))
-        u.append(np.hypot(result["error_map"][f"u_{axis}"], other["error_map"][f"u_{axis}"]))
+        u.append(
+            np.hypot(result["error_map"][f"u_{axis}"], other["error_map"][f"u_{axis}"])
+        )
     distance = np.abs(np.array(away))
     return Outcome(
         (Counter(before) - after).total(),
@@ -200,6 +206,8 @@ def main(folder: Path, cut: Cut | None) -> None:
         contextlib.redirect_stdout(said),
         contextlib.redirect_stderr(said),
     ):
-        code = selfcal(["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"])
+        code = selfcal(
+            ["measure", "plan.yaml", "cell.yaml", "-o", "bag", "--yes", "--resume"]
+        )
         Path("passages.json").write_text(json.dumps(passed))
     raise SystemExit(code)

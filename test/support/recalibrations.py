@@ -16,7 +16,9 @@ from selfcal_ros.model.readings import Measurements
 
 def values_of(readings: Measurements) -> np.ndarray:
     """Return all readings in one row: dx, dy, dtheta of each view."""
-    return np.concatenate([part for v in readings.views for part in (v.dx, v.dy, v.dtheta)])
+    return np.concatenate(
+        [part for v in readings.views for part in (v.dx, v.dy, v.dtheta)]
+    )
 
 
 def with_values(readings: Measurements, values: np.ndarray) -> Measurements:
@@ -45,8 +47,12 @@ def sizes_of(readings: Measurements, sigma_m: float, sigma_rad: float) -> np.nda
 
 
 def responses(
-    solve: Callable[[Measurements], np.ndarray], readings: Measurements, steps: np.ndarray
+    solve: Callable[[Measurements], np.ndarray],
+    readings: Measurements,
+    steps: np.ndarray,
 ) -> np.ndarray:
     """Return what a step of each reading adds to the solution, (readings, numbers)."""
     values, start = values_of(readings), solve(readings)
-    return np.array([solve(with_values(readings, values + row)) - start for row in np.diag(steps)])
+    return np.array(
+        [solve(with_values(readings, values + row)) - start for row in np.diag(steps)]
+    )

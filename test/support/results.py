@@ -48,7 +48,12 @@ def noise_of(lines: int) -> Noise:
 
 
 def known_result(
-    size: int = 11, lines: int = 24, *, seed: int = 1, size_y: int = 0, noisy: bool = True
+    size: int = 11,
+    lines: int = 24,
+    *,
+    seed: int = 1,
+    size_y: int = 0,
+    noisy: bool = True,
 ) -> tuple[CalibrationResult, dict[str, np.ndarray]]:
     """Return a result whose map is a random truth plus noise of its stated uncertainty."""
     artifact = Artifact(size, 0.01, lines, size_y)
@@ -61,7 +66,9 @@ def known_result(
     gx, gy = truth.g + noise
     g_theta = truth.g_theta + rng.normal(0, 1, lines) * (u_theta if noisy else 0)
     nonorthogonality, scale = first_order(artifact, gx, gy)
-    emap = ErrorMap(artifact, gx, gy, u, u.copy(), g_theta, u_theta, nonorthogonality, scale)
+    emap = ErrorMap(
+        artifact, gx, gy, u, u.copy(), g_theta, u_theta, nonorthogonality, scale
+    )
     views = tuple(
         ViewResult(
             v.name,
@@ -89,7 +96,9 @@ def known_result(
     return result, {"gx": truth.g[0], "gy": truth.g[1], "g_theta": truth.g_theta}
 
 
-def with_residuals(size: int = 5, lines: int = 24, *, size_y: int = 0) -> CalibrationResult:
+def with_residuals(
+    size: int = 5, lines: int = 24, *, size_y: int = 0
+) -> CalibrationResult:
     """Return a result that keeps residuals, their course, and places of rejection."""
     result, _ = known_result(size, lines, size_y=size_y)
     rng, shape = np.random.default_rng(2), result.artifact.shape
@@ -116,9 +125,16 @@ def with_residuals(size: int = 5, lines: int = 24, *, size_y: int = 0) -> Calibr
             "y": [0.02, 0.0],
         }
     ]
-    removed = {"removed": [{"view": result.views[1].name, "kind": "grid", "mark": [1, 0]}]}
+    removed = {
+        "removed": [{"view": result.views[1].name, "kind": "grid", "mark": [1, 0]}]
+    }
     return replace(
-        result, extra={"residuals": {"views": rows}, "rejected_at": rejected, "outliers": removed}
+        result,
+        extra={
+            "residuals": {"views": rows},
+            "rejected_at": rejected,
+            "outliers": removed,
+        },
     )
 
 
@@ -130,7 +146,9 @@ def trusted(measurements: Measurements, options: Options) -> CalibrationResult:
 def covered(result: CalibrationResult, g: np.ndarray) -> float:
     """Return the part of the map's coordinates at which U = k u covers the true map `g`."""
     emap = result.error_map
-    off = in_datum(np.stack([emap.gx, emap.gy]) - g, emap.valid, result.artifact, scale=True)
+    off = in_datum(
+        np.stack([emap.gx, emap.gy]) - g, emap.valid, result.artifact, scale=True
+    )
     inside = abs(off) <= result.noise.k_xy * np.stack([emap.u_gx, emap.u_gy])
     return float(inside[:, emap.valid].mean())
 
@@ -143,6 +161,8 @@ def chapters_of(
     return chapters(result, truth_arrays(result.error_map, truth))
 
 
-def html_of(result: CalibrationResult, truth: dict[str, np.ndarray] | None = None) -> str:
+def html_of(
+    result: CalibrationResult, truth: dict[str, np.ndarray] | None = None
+) -> str:
     """Return the report that `selfcal report` writes as HTML."""
     return report_html(result, chapters_of(result, truth), heading(result, {}))

@@ -72,10 +72,14 @@ class Graph:
         By a timer: what is told in a loop of waiting comes faster than it can be heard.
         """
         if not self._alive:
-            self.hand.create_timer(0.1, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.hand.create_timer(
+                0.1, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            )
         if node not in self._voices:
             topic = names.of_node(node, names.HEALTH)
-            self._voices[node] = self.hand.create_publisher(topic.type, topic.name, topic.qos)
+            self._voices[node] = self.hand.create_publisher(
+                topic.type, topic.name, topic.qos
+            )
         self._alive[node] = values
 
     def _tell(self) -> None:
@@ -85,7 +89,9 @@ class Graph:
                     level=b"\0",
                     name=node,
                     message="as told",
-                    values=[KeyValue(key=key, value=value) for key, value in values.items()],
+                    values=[
+                        KeyValue(key=key, value=value) for key, value in values.items()
+                    ],
                 )
             )
 
@@ -106,7 +112,9 @@ class Graph:
             self._clients[name] = self.hand.create_client(kind, name)
         client = self._clients[name]
         self.until(client.service_is_ready, f"service {name}")
-        return self.finish(client.call_async(kind.Request(**fields)), f"answer of {name}")
+        return self.finish(
+            client.call_async(kind.Request(**fields)), f"answer of {name}"
+        )
 
     def close(self) -> None:
         for node in list(self.nodes):
@@ -115,10 +123,13 @@ class Graph:
         self.context.try_shutdown()
 
 
-def publish_events(graph: Graph, events: Iterable[Event], *, readers: int = 1) -> dict[str, int]:
+def publish_events(
+    graph: Graph, events: Iterable[Event], *, readers: int = 1
+) -> dict[str, int]:
     """Publish simulated messages on the topics of the cell; return how many, by topic."""
     publishers = {
-        topic.name: (topic, graph.publisher(topic, readers=readers)) for topic in names.INPUTS
+        topic.name: (topic, graph.publisher(topic, readers=readers))
+        for topic in names.INPUTS
     }
     counts = dict.fromkeys(publishers, 0)
     for event in events:

@@ -9,7 +9,9 @@ import subprocess
 import numpy as np
 
 RS274 = shutil.which("rs274")
-CALL = re.compile(r"(STRAIGHT_TRAVERSE|STRAIGHT_FEED|ARC_FEED|USE_LENGTH_UNITS)\((.*)\)")
+CALL = re.compile(
+    r"(STRAIGHT_TRAVERSE|STRAIGHT_FEED|ARC_FEED|USE_LENGTH_UNITS)\((.*)\)"
+)
 
 
 def ways_of(path) -> list[tuple[bool, np.ndarray]]:
@@ -46,15 +48,23 @@ def ways_of(path) -> list[tuple[bool, np.ndarray]]:
 def _arc(start: np.ndarray, numbers: list[float], unit: float) -> np.ndarray:
     """Return points of ARC_FEED in XY: end x, y, centre x, y, turns, end z."""
     x, y, cx, cy, turns, z = (
-        value * factor for value, factor in zip(numbers, (unit,) * 4 + (1, unit), strict=True)
+        value * factor
+        for value, factor in zip(numbers, (unit,) * 4 + (1, unit), strict=True)
     )
     first, last = (math.atan2(b - cy, a - cx) for a, b in (start[:2], (x, y)))
     sweep = (last - first) * np.sign(turns) % (2 * math.pi)
     sweep = (sweep if sweep > 1e-4 else 2 * math.pi) + (abs(turns) - 1) * 2 * math.pi
     way = np.linspace(0, 1, 1000)
-    radius = np.hypot(start[0] - cx, start[1] - cy) * (1 - way) + np.hypot(x - cx, y - cy) * way
+    radius = (
+        np.hypot(start[0] - cx, start[1] - cy) * (1 - way)
+        + np.hypot(x - cx, y - cy) * way
+    )
     angle = first + np.sign(turns) * sweep * way
     return np.stack(
-        [cx + radius * np.cos(angle), cy + radius * np.sin(angle), start[2] + way * (z - start[2])],
+        [
+            cx + radius * np.cos(angle),
+            cy + radius * np.sin(angle),
+            start[2] + way * (z - start[2]),
+        ],
         axis=1,
     )

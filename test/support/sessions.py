@@ -42,11 +42,15 @@ def events_of(plan: Plan, seed: int = 5) -> list[Event]:
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng)
     return list(
-        plan_events(truth, plan, settings=CellSettings(**NOISE), rng=rng, start_ns=START_NS)
+        plan_events(
+            truth, plan, settings=CellSettings(**NOISE), rng=rng, start_ns=START_NS
+        )
     )
 
 
-def collected(events: list[Event]) -> tuple[Collector, Measurements, dict[int, ViewProgress]]:
+def collected(
+    events: list[Event],
+) -> tuple[Collector, Measurements, dict[int, ViewProgress]]:
     """Return what the collector makes of them without any node."""
     collector = gathered(events)
     return collector, *collector.collect()
@@ -56,7 +60,9 @@ def cdr_of(event: Event) -> bytes:
     """Return the bytes of an event as a raw subscription of rclpy hands them over."""
     topic, fields = event_fields(event, "stage")
     name = INPUT_TOPICS[topic]
-    return bytes(typestore().serialize_cdr(build(typestore(), name, fields), name)) + TAIL
+    return (
+        bytes(typestore().serialize_cdr(build(typestore(), name, fields), name)) + TAIL
+    )
 
 
 def decoded(reader: BagReader) -> Iterator[tuple[str, int, Any]]:

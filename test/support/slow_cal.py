@@ -59,9 +59,9 @@ def slow_1d(table, at, axes, temperature=None):
         before = (table.home_offset or 0.0) + (table.full_travel or 0.0) * (
             table.home_direction == "CW"
         )
-        now = ref.get("offset", table.home_offset or 0.0) + (table.full_travel or 0.0) * (
-            ref.get("direction", table.home_direction) == "CW"
-        )
+        now = ref.get("offset", table.home_offset or 0.0) + (
+            table.full_travel or 0.0
+        ) * (ref.get("direction", table.home_direction) == "CW")
         positions = [p + before - now for p in positions]
     if table.absolute_feedback_offset is not None and "feedback" in ref:
         move = (ref["feedback"] - table.absolute_feedback_offset) / ref["counts"]
@@ -71,9 +71,9 @@ def slow_1d(table, at, axes, temperature=None):
     sign = -1 if table.negcor else 1
     values = [sign * v * per_unit(*word, out) for v in table.values]
     rollover = None if table.rollover is None else table.rollover / ref["counts"]
-    correction = interpolate(positions, values, wrap(positions, at, rollover)) - interpolate(
-        positions, values, wrap(positions, 0.0, rollover)
-    )
+    correction = interpolate(
+        positions, values, wrap(positions, at, rollover)
+    ) - interpolate(positions, values, wrap(positions, 0.0, rollover))
     if None not in (table.expand_coeff, table.material_temp, temperature):
         correction -= at * table.expand_coeff * (temperature - table.material_temp)
     return correction, positions, rollover
@@ -108,7 +108,9 @@ def slow_2d(table, row_at, column_at, axes):
         else:
             positions = [(n * sample - (offset or 0.0)) * size for n in range(count)]
         if feedback is not None and "feedback" in setup:
-            positions = [p + (setup["feedback"] - feedback) / setup["counts"] for p in positions]
+            positions = [
+                p + (setup["feedback"] - feedback) / setup["counts"] for p in positions
+            ]
         tracks.append((positions, None if roll is None else roll / setup["counts"]))
     (rows, row_roll), (columns, column_roll) = tracks
     slack = [
@@ -120,7 +122,8 @@ def slow_2d(table, row_at, column_at, axes):
     ]
     zeros = [wrap(p, 0.0, r) for p, r in tracks]
     inside = all(
-        min(p) - s <= z <= max(p) + s for (p, _), z, s in zip(tracks, zeros, slack, strict=True)
+        min(p) - s <= z <= max(p) + s
+        for (p, _), z, s in zip(tracks, zeros, slack, strict=True)
     )
     sign = -1 if table.negcor else 1
     corrections = []

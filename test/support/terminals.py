@@ -16,7 +16,11 @@ SELFCAL = (
 
 
 def in_terminal(
-    command: Sequence[str], *, columns: int = 80, folder: Path | None = None, keys: bytes = b""
+    command: Sequence[str],
+    *,
+    columns: int = 80,
+    folder: Path | None = None,
+    keys: bytes = b"",
 ) -> tuple[int, str]:
     """Run a command in a terminal; return its exit code and its output.
 

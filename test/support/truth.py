@@ -66,9 +66,18 @@ def simulate_measurements(
         Settings of the cell; replaces `sigma_m`, `sigma_theta_rad` and `sense`.
     """
     truth = truth if linear is None else replace(truth, linear=linear)
-    if visits or settings or differs_by_visit(truth) or any(view.image for view in plan.views):
+    if (
+        visits
+        or settings
+        or differs_by_visit(truth)
+        or any(view.image for view in plan.views)
+    ):
         settings = settings or cell.CellSettings(
-            sense, sigma_m, sigma_theta_rad, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0
+            sense,
+            sigma_m,
+            sigma_theta_rad,
+            servo_sigma_m=0.0,
+            servo_sigma_theta_rad=0.0,
         )
         return _by_visit(truth, plan, rng, settings=settings, missing=missing)
     return white.simulate_measurements(
@@ -107,7 +116,9 @@ def _of_cell(
     if sub_view.cell is None:
         return exposures
     visits = exposures.visits
-    seen = next((one for one in exposures.others if one.cell == sub_view.cell), None) or cell.Seen(
+    seen = next(
+        (one for one in exposures.others if one.cell == sub_view.cell), None
+    ) or cell.Seen(
         (0, 0), exposures.offset, np.stack([visits.m, visits.n]), exposures.there
     )
     m, n = seen.mark
@@ -137,7 +148,9 @@ def _by_visit(
             truth, item, rng, settings=settings, missing=missing, start_ns=start_ns
         ).parts
         views += made
-        start_ns += (sum(part.used for part in made) + 1) * settings.period_ns + BETWEEN_VIEWS_NS
+        start_ns += (
+            sum(part.used for part in made) + 1
+        ) * settings.period_ns + BETWEEN_VIEWS_NS
     return Measurements(plan.plan_id, plan.artifact, tuple(views), settings.sense)
 
 
@@ -194,15 +207,24 @@ def measured_view(
             else part
             for part in parts
         ]
-    parts = [replace(part, used=int(part.count.sum() + part.count_theta.sum())) for part in parts]
-    return parts[0] if len(parts) == 1 else replace(ViewReadings(view), cells=tuple(parts))
+    parts = [
+        replace(part, used=int(part.count.sum() + part.count_theta.sum()))
+        for part in parts
+    ]
+    return (
+        parts[0] if len(parts) == 1 else replace(ViewReadings(view), cells=tuple(parts))
+    )
 
 
-def _lost(rng: np.random.Generator, missing: float, shape: tuple[int, ...] | int) -> np.ndarray:
+def _lost(
+    rng: np.random.Generator, missing: float, shape: tuple[int, ...] | int
+) -> np.ndarray:
     return rng.random(shape) < missing if missing else np.zeros(shape, dtype=bool)
 
 
-def _read(sense: Sense, found: cell.GridExposures | cell.AngularExposures) -> np.ndarray:
+def _read(
+    sense: Sense, found: cell.GridExposures | cell.AngularExposures
+) -> np.ndarray:
     """Return the positions of marks as read by encoder and microscope."""
     if sense is Sense.PLATE_MOVES:
         return found.offset - found.position
@@ -291,9 +313,14 @@ def _angular(
     kept = ~lost[found.k]
     lines, line = np.unique(found.k[kept], return_inverse=True)
     repeats = np.bincount(line, minlength=len(lines))
-    deviation, offset = (_read(sense, found) - nominal)[None, kept], found.offset[None, kept]
+    deviation, offset = (
+        (_read(sense, found) - nominal)[None, kept],
+        found.offset[None, kept],
+    )
     (mean,), sigma, dof = _means(deviation, line, repeats)
-    motion = repeat_motion(line, deviation - offset, offset, np.zeros(len(line), dtype=bool))
+    motion = repeat_motion(
+        line, deviation - offset, offset, np.zeros(len(line), dtype=bool)
+    )
     about = np.angle(np.exp(1j * (deviation - offset))).mean()
     return replace(
         readings,

@@ -33,7 +33,10 @@ class TwoSessions:
     ):
         self.grid, self.sigma = grid, sigma
         self.n, self.marks = grid.field.m.size, grid.m.size
-        views = [*((0, view) for view in before.views), *((1, view) for view in after.views)]
+        views = [
+            *((0, view) for view in before.views),
+            *((1, view) for view in after.views),
+        ]
         self.sign = -1 if before.sense is Sense.PLATE_MOVES else 1
         self.e = len(microscope)
         self.K, first = grid.angular_count, 4 * self.n + 2 * self.marks + 3 * len(views)
@@ -66,7 +69,9 @@ class TwoSessions:
         before = without(old[: 2 * self.n], whole)
         after = (both[2 * self.n : 4 * self.n] - grown)[here]
         self.scale = np.linalg.pinv(whole[here])[3] @ (after - before[here])
-        of_lines = np.stack([old[self.lines], both[self.lines]]).reshape(2, 3, self.K, len(y))
+        of_lines = np.stack([old[self.lines], both[self.lines]]).reshape(
+            2, 3, self.K, len(y)
+        )
         of_lines = of_lines - of_lines.sum(axis=2, keepdims=True) / max(self.K, 1)
         self.after_theta = of_lines[1, 1]
         self.change_theta = of_lines[1, 1] - of_lines[0, 0]
@@ -80,7 +85,10 @@ class TwoSessions:
         phase = np.exp(1j * view.view.rotation_rad)
         row = np.zeros((len(view.m), size), dtype=complex)
         w = placed.rows(self.grid, self.sign * at) * self.sign
-        row[:, 2 * n * of : 2 * n * of + n], row[:, 2 * n * of + n : 2 * n * of + 2 * n] = w, 1j * w
+        (
+            row[:, 2 * n * of : 2 * n * of + n],
+            row[:, 2 * n * of + n : 2 * n * of + 2 * n],
+        ) = w, 1j * w
         own = np.zeros((len(view.m), marks))
         (hx, hy), ny = self.grid.half, self.grid.shape[1]
         own[np.arange(len(view.m)), (view.m + hx) * ny + view.n + hy] = 1
@@ -88,7 +96,9 @@ class TwoSessions:
         row[:, 4 * n + marks : 4 * n + 2 * marks] = 1j * phase * own
         first = 4 * n + 2 * marks + 3 * number
         z = (view.m + 1j * view.n) * pitch / (pitch * max(hx, hy))
-        row[:, first : first + 3] = np.stack([phase * 1j * z, 1 + 0 * z, 1j + 0 * z], axis=1)
+        row[:, first : first + 3] = np.stack(
+            [phase * 1j * z, 1 + 0 * z, 1j + 0 * z], axis=1
+        )
         if self.e:  # one visit of each mark
             o = np.zeros(len(view.m), dtype=complex)
             o[view.visits.mark] = view.visits.offset_x + 1j * view.visits.offset_y

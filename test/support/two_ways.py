@@ -35,8 +35,14 @@ def permuted(readings: Measurements, seed: int = 5) -> Measurements:
         views.append(
             replace(
                 view,
-                **{name: getattr(view, name)[grid] for name in ("m", "n", "dx", "dy", "count")},
-                **{name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")},
+                **{
+                    name: getattr(view, name)[grid]
+                    for name in ("m", "n", "dx", "dy", "count")
+                },
+                **{
+                    name: getattr(view, name)[lines]
+                    for name in ("k", "dtheta", "count_theta")
+                },
                 u=view.u[grid] if len(view.u) else view.u,
                 u_theta=view.u_theta[lines] if len(view.u_theta) else view.u_theta,
             )
@@ -48,7 +54,10 @@ def turned(readings: Measurements) -> Measurements:
     """Return the readings with stage, plate and plan turned by 90 deg together."""
     old = readings.artifact
     artifact = Artifact(
-        old.shape[1], old.grid_pitch_m, old.angular_count, old.shape[0] if old.grid_size_y else 0
+        old.shape[1],
+        old.grid_pitch_m,
+        old.angular_count,
+        old.shape[0] if old.grid_size_y else 0,
     )
     return replace(
         readings,
@@ -74,7 +83,12 @@ def turned_back(result: CalibrationResult) -> dict[str, np.ndarray]:
     """Return the maps of turned readings in the frame before the turn (microscope_moves)."""
     emap = maps_of(result)
     quarter = result.artifact.angular_count // 4
-    back = {"gx": emap["gy"], "gy": -emap["gx"], "u_gx": emap["u_gy"], "u_gy": emap["u_gx"]}
+    back = {
+        "gx": emap["gy"],
+        "gy": -emap["gx"],
+        "u_gx": emap["u_gy"],
+        "u_gy": emap["u_gx"],
+    }
     out = {key: field[::-1].T for key, field in back.items()}
     out |= {key: np.roll(emap[key], -quarter) for key in ("g_theta", "u_g_theta")}
     return out | {"o": -emap["o"], "r": -emap["r"]}
@@ -85,7 +99,9 @@ def mirrored(readings: Measurements) -> Measurements:
     views = []
     for view in readings.views:
         x, y = view.view.translation_m
-        pose = replace(view.view, rotation_rad=-view.view.rotation_rad, translation_m=(x, -y))
+        pose = replace(
+            view.view, rotation_rad=-view.view.rotation_rad, translation_m=(x, -y)
+        )
         views.append(
             replace(
                 view,
@@ -104,7 +120,10 @@ def mirrored_back(result: CalibrationResult) -> dict[str, np.ndarray]:
     emap, lines = maps_of(result), result.artifact.angular_count
     back = -np.arange(lines) % max(lines, 1)
     sign = {"gy": -1, "g_theta": -1}
-    out = {key: sign.get(key, 1) * emap[key][:, ::-1] for key in ("gx", "gy", "u_gx", "u_gy")}
+    out = {
+        key: sign.get(key, 1) * emap[key][:, ::-1]
+        for key in ("gx", "gy", "u_gx", "u_gy")
+    }
     out |= {key: sign.get(key, 1) * emap[key][back] for key in ("g_theta", "u_g_theta")}
     return out | {"o": -emap["o"], "r": emap["r"]}
 
@@ -116,7 +135,10 @@ def scaled(readings: Measurements, factor: float) -> Measurements:
         replace(
             view,
             view=replace(
-                view.view, translation_m=tuple(value * factor for value in view.view.translation_m)
+                view.view,
+                translation_m=tuple(
+                    value * factor for value in view.view.translation_m
+                ),
             ),
             dx=view.dx * factor,
             dy=view.dy * factor,
@@ -126,7 +148,9 @@ def scaled(readings: Measurements, factor: float) -> Measurements:
         for view in readings.views
     )
     return replace(
-        readings, views=views, artifact=replace(old, grid_pitch_m=old.grid_pitch_m * factor)
+        readings,
+        views=views,
+        artifact=replace(old, grid_pitch_m=old.grid_pitch_m * factor),
     )
 
 

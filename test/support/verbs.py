@@ -10,8 +10,12 @@ from selfcal_ros.cli.main import main
 def simulate(folder: Path, name: str, plan: dict, **machine: object) -> None:
     """Write the bag NAME of a plan, measured on a machine as simulation files describe it."""
     (folder / f"{name}_plan.yaml").write_text(json.dumps(plan))  # YAML, too
-    (folder / f"{name}.yaml").write_text(json.dumps(machine | {"plan": f"{name}_plan.yaml"}))
-    assert main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
+    (folder / f"{name}.yaml").write_text(
+        json.dumps(machine | {"plan": f"{name}_plan.yaml"})
+    )
+    assert (
+        main(["simulate", str(folder / f"{name}.yaml"), "-o", str(folder / name)]) == 0
+    )
 
 
 def two_and_a_view(
@@ -26,7 +30,15 @@ def two_and_a_view(
         simulate(folder, name, plan | {"views": views}, noise_seed=seed, **machine)
         if name != "again":
             assert (
-                main(["solve", str(folder / name), "-o", str(folder / f"{name}.json"), "--quiet"])
+                main(
+                    [
+                        "solve",
+                        str(folder / name),
+                        "-o",
+                        str(folder / f"{name}.json"),
+                        "--quiet",
+                    ]
+                )
                 == 0
             )
     return folder

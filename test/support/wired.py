@@ -34,7 +34,9 @@ def smooth_error(rng):
 def smooth_angle(rng):
     """Return an angular error (12,), rad."""
     angle = np.arange(12) * np.pi / 6
-    return sum(rng.normal(0, 2e-5) * np.cos(k * angle + rng.uniform(0, 6)) for k in (1, 2, 3))
+    return sum(
+        rng.normal(0, 2e-5) * np.cos(k * angle + rng.uniform(0, 6)) for k in (1, 2, 3)
+    )
 
 
 def calibrated(truth, rng):
@@ -51,7 +53,9 @@ def machine(seed, wiring):
     what the controller makes of the table (2, 7, 7).
     """
     rng = np.random.default_rng(seed)
-    first = replace(random_truth(ARTIFACT, 4, rng), g=smooth_error(rng), g_theta=smooth_angle(rng))
+    first = replace(
+        random_truth(ARTIFACT, 4, rng), g=smooth_error(rng), g_theta=smooth_angle(rng)
+    )
     before = calibrated(first, rng)
     table = np.stack([before.error_map.gx, before.error_map.gy])
     angle = before.error_map.g_theta

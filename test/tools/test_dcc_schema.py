@@ -6,7 +6,8 @@ import pytest
 from tools import dcc_schema
 
 INNER = (
-    '<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" targetNamespace="urn:{}">{}</xs:schema>'
+    '<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema" '
+    'targetNamespace="urn:{}">{}</xs:schema>'
 )
 IMPORT = '<xs:import namespace="urn:b" schemaLocation="{}"/>'
 
@@ -15,14 +16,18 @@ IMPORT = '<xs:import namespace="urn:b" schemaLocation="{}"/>'
 def published(tmp_path, monkeypatch):
     """Return the URL of a schema that imports another, both pinned."""
     texts = {
-        "a.xsd": INNER.format("a", IMPORT.format("in/b.xsd") + '<xs:element name="e"/>'),
+        "a.xsd": INNER.format(
+            "a", IMPORT.format("in/b.xsd") + '<xs:element name="e"/>'
+        ),
         "in/b.xsd": INNER.format("b", ""),
     }
     (tmp_path / "in").mkdir()
     for name, text in texts.items():
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(
-        dcc_schema, "PINNED", dict(dcc_schema.digest(text.encode()) for text in texts.values())
+        dcc_schema,
+        "PINNED",
+        dict(dcc_schema.digest(text.encode()) for text in texts.values()),
     )
     return (tmp_path / "a.xsd").as_uri()
 
@@ -36,7 +41,8 @@ def test_what_a_schema_imports_lies_beside_it(published, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("before", "after"), [('name="e"', 'name="f"'), ("in/b.xsd", "no.xsd"), ("</xs:schema>", "")]
+    ("before", "after"),
+    [('name="e"', 'name="f"'), ("in/b.xsd", "no.xsd"), ("</xs:schema>", "")],
 )
 def test_another_schema_is_one_line_and_nothing_is_written(
     published, tmp_path, capsys, monkeypatch, before, after
@@ -55,4 +61,6 @@ def test_places_notes_and_spaces_do_not_count():
         "b",
         "\n  <!-- c --><xs:annotation><xs:documentation>text</xs:documentation></xs:annotation>\n",
     )
-    assert dcc_schema.digest(noted.encode()) == dcc_schema.digest(INNER.format("b", "").encode())
+    assert dcc_schema.digest(noted.encode()) == dcc_schema.digest(
+        INNER.format("b", "").encode()
+    )

@@ -41,6 +41,8 @@ def test_the_demo_in_a_terminal_ends_with_its_picture_and_its_files():
     code, said = in_terminal([sys.executable, str(ROOT / "tools/demo.py")], folder=ROOT)
     assert code == 0, said
     assert "length of the error: from ' ' = 0 to '@' =" in said
-    assert re.search(r"known to ±0\.0\d+ µm at the nodes, ±0\.0\d+ µm anywhere \(k=2\)", said)
+    assert re.search(
+        r"known to ±0\.0\d+ µm at the nodes, ±0\.0\d+ µm anywhere \(k=2\)", said
+    )
     for name in ("result.json", "map.png", "report.html"):
         assert f"build/demo/{name}" in said and (ROOT / "build/demo" / name).exists()

@@ -63,7 +63,9 @@ def test_code_is_changed_and_text_is_not():
 
 
 def test_a_sample_is_the_same_for_the_same_seed():
-    one, same, other = (mutants.sample(20, seed, ["selfcal_ros/model"]) for seed in (1, 1, 2))
+    one, same, other = (
+        mutants.sample(20, seed, ["selfcal_ros/model"]) for seed in (1, 1, 2)
+    )
     assert one == same != other
     assert all(m.path.startswith("selfcal_ros/model/") for m in one)
 
@@ -89,7 +91,10 @@ def test_text_and_plots_are_changed_only_where_it_is_asked_for(tmp_path):
         }
 
     assert sampled() == {"estimation/a.py", "laser/a.py", "files.py"}
-    assert sampled("selfcal_ros/cli", "selfcal_ros/laser/") == {"cli/a.py", "laser/a.py"}
+    assert sampled("selfcal_ros/cli", "selfcal_ros/laser/") == {
+        "cli/a.py",
+        "laser/a.py",
+    }
     for module in mutants.LEFT_OUT:
         assert (mutants.PACKAGE / module).exists()
 
@@ -136,7 +141,11 @@ def noted(tmp_path):
     (tmp_path / "selfcal_ros/model").mkdir(parents=True)
     (tmp_path / "selfcal_ros/model/plan.py").write_text(FILE)
     name = "selfcal_ros/model/plan.py"
-    check, other, third = f"{name}:Plan.check", f"{name}:other", "selfcal_ros/files.py:third"
+    check, other, third = (
+        f"{name}:Plan.check",
+        f"{name}:other",
+        "selfcal_ros/files.py:third",
+    )
     (tmp_path / "gw0.json").write_text(
         json.dumps(
             {
@@ -175,9 +184,13 @@ def noted(tmp_path):
         (10, ["Plan.check", "other"]),
     ],
 )
-def test_a_line_is_used_by_the_function_around_it_or_those_that_name_it(tmp_path, line, functions):
+def test_a_line_is_used_by_the_function_around_it_or_those_that_name_it(
+    tmp_path, line, functions
+):
     name, _ = noted(tmp_path)
-    assert watched.functions_at(name, line, tmp_path) == {f"{name}:{one}" for one in functions}
+    assert watched.functions_at(name, line, tmp_path) == {
+        f"{name}:{one}" for one in functions
+    }
 
 
 def test_only_tests_that_enter_the_function_run_and_its_mirror_first(tmp_path):
@@ -187,7 +200,9 @@ def test_only_tests_that_enter_the_function_run_and_its_mirror_first(tmp_path):
     assert kept.groups(name, 12, 600) == [[mirror, "test/a.py::one"]]
     assert kept.groups(name, 8, 45) == [["test/c.py::one", "test/a.py::one"]]  # in 45 s
     (tmp_path / "selfcal_ros/files.py").write_text("def third():\n    return 1\n")
-    assert kept.groups("selfcal_ros/files.py", 2, 600) == [  # entered by the fixtures of a.py
+    assert kept.groups(
+        "selfcal_ros/files.py", 2, 600
+    ) == [  # entered by the fixtures of a.py
         ["test/a.py::two", "test/a.py::one", mirror]
     ]
 
@@ -196,7 +211,9 @@ def test_tests_that_start_processes_watch_their_whole_package(tmp_path):
     _, kept = noted(tmp_path)
     (tmp_path / "selfcal_ros/nodes").mkdir()
     (tmp_path / "selfcal_ros/nodes/solver.py").write_text("def spin():\n    return 1\n")
-    assert kept.groups("selfcal_ros/nodes/solver.py", 2, 600) == [["test/nodes/b.py::one"]]
+    assert kept.groups("selfcal_ros/nodes/solver.py", 2, 600) == [
+        ["test/nodes/b.py::one"]
+    ]
 
 
 def test_the_first_files_are_tried_before_many_others(tmp_path):
@@ -214,7 +231,9 @@ def test_the_first_files_are_tried_before_many_others(tmp_path):
             }
         )
     )
-    assert watched.Watched(tmp_path, tmp_path).groups("selfcal_ros/files.py", 2, 600) == [
+    assert watched.Watched(tmp_path, tmp_path).groups(
+        "selfcal_ros/files.py", 2, 600
+    ) == [
         tests[:4],
         tests[4:],
     ]
@@ -289,11 +308,14 @@ def test_what_tests_their_fixtures_and_their_file_enter_is_noted(tmp_path):
 def small_tree(tmp_path, monkeypatch, test):
     """Return a copy in which `half` of a module is watched by one test."""
     monkeypatch.setattr(
-        mutants.Tree, "__init__", lambda self, folder: self.__dict__.update(folder=folder, sound={})
+        mutants.Tree,
+        "__init__",
+        lambda self, folder: self.__dict__.update(folder=folder, sound={}),
     )
     folder = tmp_path / "tree"
     (folder / "test").mkdir(parents=True)
-    shutil.copy2(ROOT / "pyproject.toml", folder)  # also turns off plugins of an installed ROS
+    # also turns off plugins of an installed ROS
+    shutil.copy2(ROOT / "pyproject.toml", folder)
     (folder / "half.py").write_text(HALF)
     (folder / "test/test_half.py").write_text(test)
     return mutants.Tree(folder)
@@ -319,8 +341,10 @@ RED = "\n\ndef test_red():\n    assert half(2) is None\n"
 def test_a_change_survives_what_does_not_see_it_and_what_fails_anyway(
     tmp_path, monkeypatch, test, survives
 ):
-    monkeypatch.setenv("PYTEST_ADDOPTS", "-n 2")  # colcon test gives its options that way
-    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")  # of no use here; 0.5 s a start
+    # colcon test gives its options that way
+    monkeypatch.setenv("PYTEST_ADDOPTS", "-n 2")
+    # of no use here; 0.5 s a start
+    monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "")
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     tree = small_tree(tmp_path, monkeypatch, test)
@@ -328,7 +352,8 @@ def test_a_change_survives_what_does_not_see_it_and_what_fails_anyway(
     tests = ["test/test_half.py::test_half", "test/test_half.py::test_red"]
     assert tree.survives(divided, [tests]) is survives
     assert (tree.folder / "half.py").read_text() == HALF  # as before
-    assert not [*tree.folder.rglob("*.pyc")]  # it could be taken for that of the next change
+    # it could be taken for that of the next change
+    assert not [*tree.folder.rglob("*.pyc")]
     assert [name for name, sound in tree.sound.items() if not sound] == (
         ["test/test_half.py::test_red"] if "test_red" in test and survives else []
     )

@@ -42,7 +42,9 @@ def test_the_plan_that_resists_turns_and_shifts_both_ways():
     plan = resistant()
     poses = {view.name: view.lattice_pose(plan.artifact) for view in plan.views}
     assert {
-        name: (pose.quarter_turns, pose.shift) for name, pose in poses.items() if name != "line"
+        name: (pose.quarter_turns, pose.shift)
+        for name, pose in poses.items()
+        if name != "line"
     } == {
         "identity": (0, (0, 0)),
         "rot90": (1, (0, 0)),
@@ -58,7 +60,9 @@ def test_the_plan_that_resists_turns_and_shifts_both_ways():
 def test_a_site_that_is_wrong_by_more_than_its_u_is_counted_and_sized():
     plan, rng = resistant(1), np.random.default_rng(3)
     truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
-    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9, sigma_theta_rad=1e-5))
+    result = calibrate(
+        simulate_measurements(truth, plan, rng, sigma_m=20e-9, sigma_theta_rad=1e-5)
+    )
     right = compared(
         replace(
             result,
@@ -76,7 +80,10 @@ def test_a_site_that_is_wrong_by_more_than_its_u_is_counted_and_sized():
     gx = truth.g[0].copy()
     gx[3, 4] += 2e-7
     wrong = compared(
-        replace(result, error_map=replace(result.error_map, gx=gx, gy=truth.g[1].copy())), truth
+        replace(
+            result, error_map=replace(result.error_map, gx=gx, gy=truth.g[1].copy())
+        ),
+        truth,
     )
     assert wrong.error_m == pytest.approx(2e-7, rel=0.05)
     assert wrong.within == pytest.approx(1 - 1 / 242, abs=1e-9)
@@ -90,11 +97,15 @@ def test_cases_have_the_stop_errors_that_their_names_say():
     ]
     assert len(said) == 6
     for name, stop_m in said:
-        assert stop_m == pytest.approx(float(name.split("stop errors ")[1].split(" um")[0]) * 1e-6)
+        assert stop_m == pytest.approx(
+            float(name.split("stop errors ")[1].split(" um")[0]) * 1e-6
+        )
 
 
 def test_check_stops_are_in_every_grid_view():
-    asked = [(view.check_marks, view.check_offset_m) for view in checked(resistant()).views]
+    asked = [
+        (view.check_marks, view.check_offset_m) for view in checked(resistant()).views
+    ]
     assert asked == [(5, 20e-6)] * 5 + [(0, 0.0)]
 
 
@@ -116,11 +127,16 @@ def test_lines_of_the_second_view_are_turned_and_no_mark():
     truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
     readings = simulate_measurements(truth, plan, rng)
     turned = lines_turned(-2e-6)(readings, rng)
-    moved = [b.dtheta - a.dtheta for a, b in zip(readings.views, turned.views, strict=True)]
-    assert [float(np.abs(one).max()) for one in moved] == pytest.approx([0, 2e-6, 0, 0, 0, 0])
+    moved = [
+        b.dtheta - a.dtheta for a, b in zip(readings.views, turned.views, strict=True)
+    ]
+    assert [float(np.abs(one).max()) for one in moved] == pytest.approx(
+        [0, 2e-6, 0, 0, 0, 0]
+    )
     assert moved[1] == pytest.approx(np.full(24, -2e-6))
     assert all(
-        np.array_equal(a.dx, b.dx) for a, b in zip(readings.views, turned.views, strict=True)
+        np.array_equal(a.dx, b.dx)
+        for a, b in zip(readings.views, turned.views, strict=True)
     )
 
 
@@ -156,7 +172,8 @@ def read_once(case):
     return replace(
         drawn,
         plan=replace(
-            drawn.plan, views=tuple(replace(view, repeats=1) for view in drawn.plan.views)
+            drawn.plan,
+            views=tuple(replace(view, repeats=1) for view in drawn.plan.views),
         ),
     )
 
@@ -197,7 +214,8 @@ def test_advice_is_followed_until_none_is_left():
         next(
             case
             for case in every_case()
-            if case.name == "check stops: scale of the microscope +5 %, plates turned by 0.05 deg"
+            if case.name
+            == "check stops: scale of the microscope +5 %, plates turned by 0.05 deg"
         ),
         plan=checked(resistant(2)),
     )
@@ -232,8 +250,11 @@ def test_how_many_angles_outside_make_a_map_wrong(outside, holds):
     """Of 24: 7 outside come in 8 of 100,000 clean maps, 6 in 7 of 10,000."""
     plan, rng = resistant(1), np.random.default_rng(3)
     truth = random_truth(plan.artifact, len(plan.views), rng, MODEL)
-    result = calibrate(simulate_measurements(truth, plan, rng, sigma_m=20e-9, sigma_theta_rad=1e-5))
-    off = np.where(np.arange(24) < outside, 1e-3, 0.0)  # the others: -0.3e-3 from the mean
+    result = calibrate(
+        simulate_measurements(truth, plan, rng, sigma_m=20e-9, sigma_theta_rad=1e-5)
+    )
+    # the others: -0.3e-3 from the mean
+    off = np.where(np.arange(24) < outside, 1e-3, 0.0)
     found = compared(
         replace(
             result,
@@ -254,13 +275,18 @@ def test_a_table_takes_its_place_in_a_page(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(f"# Title\n\n{BEGIN}old\nrows{END}\n\nThe end.\n")
     write_table(str(page), ["| a |", "|---|", "| b |"])
-    assert page.read_text() == f"# Title\n\n{BEGIN}| a |\n|---|\n| b |{END}\n\nThe end.\n"
+    assert (
+        page.read_text() == f"# Title\n\n{BEGIN}| a |\n|---|\n| b |{END}\n\nThe end.\n"
+    )
     write_table(str(tmp_path / "new.md"), ["| a |"])
     assert (tmp_path / "new.md").read_text() == "| a |\n"
 
 
 def test_a_row_says_what_comes_after_the_advice():
-    bad, good = Run("not_qualified", 1e-7, 0.5, 0.9, 3, 1), Run("good", 1e-8, 0.95, 0.9, 1, 1)
+    bad, good = (
+        Run("not_qualified", 1e-7, 0.5, 0.9, 3, 1),
+        Run("good", 1e-8, 0.95, 0.9, 1, 1),
+    )
     courses = {0: Course(bad, ("--model drift",), good), 1: Course(good)}
     (name, first), (after, end) = rows(Case("drift"), courses)
     assert (name, after) == ("drift", "after the advice (1 of 2 followed)")
@@ -271,7 +297,9 @@ def test_a_row_says_what_comes_after_the_advice():
 @pytest.mark.parametrize("seed", [0, 1, 3])
 def test_noise_of_the_encoders_gives_no_wrong_map_that_is_accepted(seed):
     """It looks like a scale of the microscope, far beyond its size, that no test determines."""
-    (case,) = (c for c in every_case() if c.name.startswith("encoders with 20 nm of noise"))
+    (case,) = (
+        c for c in every_case() if c.name.startswith("encoders with 20 nm of noise")
+    )
     first = run_case(case, seed).first
     assert first.holds or first.grade == "not_qualified"
 
@@ -279,7 +307,9 @@ def test_noise_of_the_encoders_gives_no_wrong_map_that_is_accepted(seed):
 def test_lines_of_the_other_sign_are_not_taken_for_a_microscope_turned_over():
     """A scale of -1 would explain them here: a size beyond all that is plausible is a fault."""
     (case,) = (
-        c for c in every_case() if c.name.startswith("offsets of the other sign, lines alone")
+        c
+        for c in every_case()
+        if c.name.startswith("offsets of the other sign, lines alone")
     )
     first = run_case(case, 30).first
     assert (first.grade, first.causes) == ("refused", ("WiringError",))
@@ -309,7 +339,9 @@ def test_the_page_lists_the_cases_with_more_wrong_runs_than_one_in_twenty():
             ("bent", [replace(first, wrong=3)]),
         ]
     )
-    assert text[1:] == ["| bent | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (3) |  | microscope |"]
+    assert text[1:] == [
+        "| bent | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (3) |  | microscope |"
+    ]
     assert text[0].count("|") == 2 * text[1].count("|")
     assert row("scale, 3 urad", first, advised) == (
         "| scale, 3 µrad | 97.0 ± 0.7, – | 0.89, – | 1/39/0/0 (2) | 40/0/0/0 (0) | microscope |"
@@ -326,12 +358,24 @@ def test_the_record_has_each_case_at_first_and_after_the_advice():
         holds=False,
         causes=("drift",),
     )
-    courses = {0: Course(bad, ("--model drift",), Run("good", 1e-8, within=1.0)), 1: Course(bad)}
+    courses = {
+        0: Course(bad, ("--model drift",), Run("good", 1e-8, within=1.0)),
+        1: Course(bad),
+    }
     first, advised = (
-        dict(zip(COLUMNS, line, strict=True)) for line in record(Case("bent by 3 urad"), courses)
+        dict(zip(COLUMNS, line, strict=True))
+        for line in record(Case("bent by 3 urad"), courses)
     )
     assert (first["effect"], first["runs"]) == ("bent by 3 µrad", "2")
     assert first["largest_error_nm"] == "30"
     assert (first["in_u_xy"], first["in_u_theta"], first["enlarged"]) == ("50", "", "2")
-    assert (first["wrong"], first["first_cause"], first["runs_of_cause"]) == ("2", "drift", "2")
-    assert (advised["after_advice"], advised["good"], advised["wrong"]) == ("1", "1", "1")
+    assert (first["wrong"], first["first_cause"], first["runs_of_cause"]) == (
+        "2",
+        "drift",
+        "2",
+    )
+    assert (advised["after_advice"], advised["good"], advised["wrong"]) == (
+        "1",
+        "1",
+        "1",
+    )

@@ -16,7 +16,10 @@ def test_numbers_and_names_are_recorded_and_sentences_left_out():
     }
     found = dict(leaves(result))
     assert found.keys() == {"/verdict/grade", "/causes/0/size", "/map"}
-    assert found["/map"] != dict(leaves({"map": [[1.0, 2.0], [3.0, 4.000000000000001]]}))["/map"]
+    assert (
+        found["/map"]
+        != dict(leaves({"map": [[1.0, 2.0], [3.0, 4.000000000000001]]}))["/map"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -48,7 +51,9 @@ def test_a_session_is_drawn_from_its_number_alone():
         (1e-7, 0.51, 1),
     ],
 )
-def test_a_map_may_differ_by_a_part_of_its_u_and_a_number_by_that_of_itself(g, p, differing):
+def test_a_map_may_differ_by_a_part_of_its_u_and_a_number_by_that_of_itself(
+    g, p, differing
+):
     before, after = (
         {"case": {"/error_map/u_gx": [[1e-8]], "/error_map/gx": [[one]], "/p": two}}
         for one, two in ((1e-7, 0.5), (g, p))
@@ -81,7 +86,10 @@ def with_sign(row, *, of_plate):
         (with_sign(0, of_plate=True), 0),
         (with_sign(0, of_plate=False), 1),
         (with_sign(2, of_plate=False), 0),
-        (FACTORED | {FACTORS: FACTORED[FACTORS][::-1], PLATE: FACTORED[PLATE][::-1]}, 1),
+        (
+            FACTORED | {FACTORS: FACTORED[FACTORS][::-1], PLATE: FACTORED[PLATE][::-1]},
+            1,
+        ),
         (FACTORED | {FACTORS: [[[3.0, 1.0]], [[0.5, 2.0]], [[0.0, 0.2]]]}, 1),
     ],
 )

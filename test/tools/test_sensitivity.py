@@ -7,7 +7,14 @@ from selfcal_ros.laser.simulation import case_study_machine
 from selfcal_ros.reporting.figures.drawing import Label
 from selfcal_ros.reporting.figures.drawing import Path as Line
 from tools import sensitivity as tool
-from tools.sensitivity import FAULTS, effect_of, main, sensitivity_figure, sensitivity_text, sweep
+from tools.sensitivity import (
+    FAULTS,
+    effect_of,
+    main,
+    sensitivity_figure,
+    sensitivity_text,
+    sweep,
+)
 
 NM = 1e-9
 BY_NAME = {fault.name: fault for fault in FAULTS}
@@ -39,13 +46,18 @@ def test_a_laser_along_its_own_diagonal_spoils_only_the_conventional_linear_erro
     assert 30 * NM < conventional.linear_m < 45 * NM
     assert conventional.squareness_m < 1 * NM and max(vars(new).values()) < 1e-3 * NM
     conventional, new = effects("none: laser along the nominal diagonal")
-    assert max(vars(conventional).values()) < 1e-3 * NM and max(vars(new).values()) < 0.1 * NM
+    assert (
+        max(vars(conventional).values()) < 1e-3 * NM
+        and max(vars(new).values()) < 0.1 * NM
+    )
 
 
 def test_a_laser_off_on_one_diagonal_errs_by_its_cosine():
     _, new = effects("laser off, pp")
     # |D| psi^2/2 = 42.4 nm too short; half of it counts, times |D|/L = sqrt(2).
-    assert new.squareness_m == pytest.approx(60e-3 * np.sqrt(2) * 0.5e-6 / 2 * np.sqrt(2), rel=0.01)
+    assert new.squareness_m == pytest.approx(
+        60e-3 * np.sqrt(2) * 0.5e-6 / 2 * np.sqrt(2), rel=0.01
+    )
     _, alike = effects("laser off, pp and np equally")
     assert alike.squareness_m < 1e-2 * NM
     _, smaller = effects("laser off, pp", 1e-4)
@@ -76,7 +88,9 @@ def test_the_unit_of_the_laser_on_one_diagonal_leans_the_axes():
 
 def test_what_is_no_fault_has_no_size():
     none = [fault for fault in FAULTS if fault.name.startswith("none")]
-    assert len(none) == 2 and all((fault.size, fault.unit) == (0.0, "") for fault in none)
+    assert len(none) == 2 and all(
+        (fault.size, fault.unit) == (0.0, "") for fault in none
+    )
     assert all(fault.size and fault.unit for fault in FAULTS if fault not in none)
 
 
@@ -90,9 +104,17 @@ def test_random_faults_are_repeated_as_often_as_their_names_say():
 
 
 def test_the_table_has_a_line_for_every_row():
-    values = dict.fromkeys(("linear_m", "transverse_m", "squareness_m", "straightness_m"), 1e-6)
+    values = dict.fromkeys(
+        ("linear_m", "transverse_m", "squareness_m", "straightness_m"), 1e-6
+    )
     rows = [
-        {"fault": "mirror off", "size": 1e-3, "unit": "rad", "conventional": values, "new": values}
+        {
+            "fault": "mirror off",
+            "size": 1e-3,
+            "unit": "rad",
+            "conventional": values,
+            "new": values,
+        }
     ] * 2
     lines = sensitivity_text(rows).splitlines()
     assert len(lines) == 4 and lines[2].split()[2:] == ["0.001", "rad", *["1.0000"] * 8]

@@ -44,4 +44,6 @@ def test_each_tool_starts_and_says_what_it_takes():
     assert started.returncode == 0, started.stderr
     said = started.stdout.split("ended with 0\n")
     assert said.pop() == ""
-    assert [text.split()[:2] for text in said] == [["usage:", tool.name] for tool in TOOLS]
+    assert [text.split()[:2] for text in said] == [
+        ["usage:", tool.name] for tool in TOOLS
+    ]

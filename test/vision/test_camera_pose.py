@@ -24,7 +24,9 @@ def test_uncertainties_are_the_scatter_of_repeated_moves(mirror):
     moved = np.linalg.solve(camera, MOVES_M.T).T
     off = []
     for _ in range(300):
-        images = [MARKS_PX + row + rng.normal(0, NOISE_PX, MARKS_PX.shape) for row in moved]
+        images = [
+            MARKS_PX + row + rng.normal(0, NOISE_PX, MARKS_PX.shape) for row in moved
+        ]
         found = camera_pose(MOVES_M, images, Sense.PLATE_MOVES)
         assert found.mirror is mirror
         off.append(
@@ -50,7 +52,12 @@ def test_marks_are_followed_by_number():
         np.zeros((0, 2)),
         np.array([b, d, c]) + 2 * step,
     ]
-    assert [found.tolist() for found in tracks(images)] == [[0, 1], [2, 1], [], [1, 3, 2]]
+    assert [found.tolist() for found in tracks(images)] == [
+        [0, 1],
+        [2, 1],
+        [],
+        [1, 3, 2],
+    ]
 
 
 def test_images_without_marks_are_counted_as_such():

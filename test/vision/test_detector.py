@@ -34,7 +34,9 @@ def camera(mark="disc", size=25.0, **more):
 
 def detector(mark="disc", size=25.0, **more):
     return MarkDetector(
-        DetectorSettings(**({"pixel_size": PIXEL, "mark": mark, "mark_size": size * PIXEL} | more))
+        DetectorSettings(
+            **({"pixel_size": PIXEL, "mark": mark, "mark_size": size * PIXEL} | more)
+        )
     )
 
 
@@ -47,7 +49,9 @@ def errors(camera, detector, offsets, rng, angles=None):
     found = []
     for number, away in enumerate(offsets):
         angle = rng.uniform(-np.pi, np.pi) if angles is None else angles[number]
-        marks, faults = detector.marks(picture(camera.image(away[:, None], rng, angles=angle)))
+        marks, faults = detector.marks(
+            picture(camera.image(away[:, None], rng, angles=angle))
+        )
         # the squares of a corner end at the border of the image
         assert len(marks) == 1
         assert set(faults) <= ({"cut_off"} if camera.mark == "corner" else set())
@@ -60,13 +64,20 @@ def errors(camera, detector, offsets, rng, angles=None):
 @pytest.mark.parametrize("vignetting", [0.0, 0.03])
 @pytest.mark.parametrize("polarity", ["dark", "bright"])
 @pytest.mark.parametrize("mark", MARKS)
-def test_bias_is_below_a_two_hundredth_of_a_pixel_at_all_phases(mark, polarity, vignetting):
+def test_bias_is_below_a_two_hundredth_of_a_pixel_at_all_phases(
+    mark, polarity, vignetting
+):
     """Without noise; blur 0.6 px, the worst for pixels that integrate."""
     levels = {"ground": 0.8} if polarity == "dark" else {"ground": 0.1}
     cell = camera(mark, polarity=polarity, blur_px=0.6, vignetting=vignetting, **levels)
-    phases = (np.stack(np.meshgrid(np.arange(4), np.arange(4))).reshape(2, -1).T / 4 - 0.4) * PIXEL
+    phases = (
+        np.stack(np.meshgrid(np.arange(4), np.arange(4))).reshape(2, -1).T / 4 - 0.4
+    ) * PIXEL
     missed, _ = errors(
-        cell, detector(mark, polarity=polarity), phases + 20 * PIXEL, np.random.default_rng(3)
+        cell,
+        detector(mark, polarity=polarity),
+        phases + 20 * PIXEL,
+        np.random.default_rng(3),
     )
     assert np.abs(missed).max() < 0.005
 
@@ -99,7 +110,10 @@ def test_thin_lines_are_found_though_their_width_and_contrast_are_hard_to_tell_a
     for _ in range(60):
         size = rng.uniform(7, 12)
         cell = camera(
-            "ring", size, blur_px=0.7, read_noise=0.6 / np.exp(rng.uniform(np.log(20), np.log(200)))
+            "ring",
+            size,
+            blur_px=0.7,
+            read_noise=0.6 / np.exp(rng.uniform(np.log(20), np.log(200))),
         )
         found = detector("ring", size)
         ratios.append(errors(cell, found, rng.uniform(-3, 3, (1, 2)) * PIXEL, rng)[1])
@@ -135,7 +149,9 @@ def test_a_large_mark_sought_in_a_reduced_image_is_found_to_the_pixel():
     cell = camera(size=100.0, width=401, height=381)
     for away in np.array([(0.0, 0.0), (3.1, 4.9), (-4.2, 2.3), (5.8, -1.6)]) * PIXEL:
         image = cell.image(away[:, None], np.random.default_rng(1))
-        [found] = candidates(image, mark="disc", size=100.0, width=20.0, sign=-1, most=9)
+        [found] = candidates(
+            image, mark="disc", size=100.0, width=20.0, sign=-1, most=9
+        )
         true = cell.pixels_of(away[:, None])[:, 0]
         assert np.abs(np.subtract((found.column, found.row), true)).max() <= 1
 
@@ -157,7 +173,9 @@ def test_sigma_is_the_uncertainty_in_metres():
     image = picture(cell.image(np.zeros((2, 1)), np.random.default_rng(2)))
     [mark], _ = detector().marks(image)
     [found] = detector().detections([mark], image.values.shape, 0)
-    assert found.sigma == pytest.approx(PIXEL * np.sqrt((mark.u_u**2 + mark.u_v**2) / 2), rel=1e-12)
+    assert found.sigma == pytest.approx(
+        PIXEL * np.sqrt((mark.u_u**2 + mark.u_v**2) / 2), rel=1e-12
+    )
     assert found.score == mark.score > 0.98
 
 

@@ -22,7 +22,9 @@ def test_bright_pixels_that_are_noisier_weigh_less():
     for _ in range(60):
         away = rng.uniform(-0.5, 0.5, 2)
         shape = model.shape(
-            (u - 30 - away[0]).ravel(), (v - 30 - away[1]).ravel(), np.array([24.0, 3.0])
+            (u - 30 - away[0]).ravel(),
+            (v - 30 - away[1]).ravel(),
+            np.array([24.0, 3.0]),
         )[0].reshape(u.shape)
         image = 200 - 150 * shape + rng.normal(size=u.shape) * (20 - 19 * shape)
         fit = fitted(model, image, 30, radius=20.0, start=np.array([24.0, 2.0]))

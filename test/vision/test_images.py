@@ -46,7 +46,9 @@ def test_the_order_of_bytes_and_padded_rows_are_obeyed():
     big = (GREY.astype(np.uint16) * 1000).astype(">u2")
     padded = np.concatenate([big, np.zeros((3, 5), ">u2")], axis=1).astype(">u2")
     found = picture_of(
-        message(big, "mono16", is_bigendian=1, data=padded.tobytes(), step=padded.strides[0])
+        message(
+            big, "mono16", is_bigendian=1, data=padded.tobytes(), step=padded.strides[0]
+        )
     )
     assert (found.values == big).all()
 
@@ -80,7 +82,10 @@ def test_encoded_images(kind, full):
         ({"width": 5}, "12 bytes"),
         ({"height": 0}, "12 bytes"),
         ({"step": 0}, "in rows of 0"),
-        ({"height": 2**32 - 1, "width": 2**32 - 1, "step": 2**32 - 1}, "are not 4294967295"),
+        (
+            {"height": 2**32 - 1, "width": 2**32 - 1, "step": 2**32 - 1},
+            "are not 4294967295",
+        ),
         ({"data": b""}, "0 bytes"),
     ],
 )
@@ -92,13 +97,17 @@ def test_impossible_images_are_refused(wrong, problem):
 def test_a_grey_value_of_16_bits_needs_two_bytes():
     whole = message(GREY.astype("<u2"), "mono16")
     whole.data = whole.data[:-1]
-    with pytest.raises(InputError, match="23 bytes in rows of 8 are not 4 x 3 pixels of mono16"):
+    with pytest.raises(
+        InputError, match="23 bytes in rows of 8 are not 4 x 3 pixels of mono16"
+    ):
         picture_of(whole)
 
 
 @pytest.mark.parametrize("data", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(50)])
 def test_what_cannot_be_decoded_is_refused(data):
-    with pytest.raises(InputError, match=r"^f\.png: not an image of a known kind, or damaged; g"):
+    with pytest.raises(
+        InputError, match=r"^f\.png: not an image of a known kind, or damaged; g"
+    ):
         decoded(data, "f.png")
 
 
@@ -114,8 +123,14 @@ def test_no_format_is_decoded_that_needs_a_program(monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", run)
     monkeypatch.setattr(os, "system", run)
-    assert EpsImagePlugin.EpsImageFile(io.BytesIO(EPS)).size == (100, 100)  # Pillow would take it
-    with pytest.raises(InputError, match="not an image of a known kind, or damaged; give PNG"):
+    # Pillow would take it
+    assert EpsImagePlugin.EpsImageFile(io.BytesIO(EPS)).size == (
+        100,
+        100,
+    )
+    with pytest.raises(
+        InputError, match="not an image of a known kind, or damaged; give PNG"
+    ):
         decoded(EPS, "f.eps")
 
 
@@ -152,7 +167,9 @@ def test_few_bytes_are_no_large_image():
 def test_floating_point_values_are_refused():
     """Their black and white are not in the file: 0 and 1, or 0 and 65535."""
     data = saved(Image.fromarray(GREY.astype(np.float32) / 100), "TIFF")
-    with pytest.raises(InputError, match="floating-point values, whose black and white are unkn"):
+    with pytest.raises(
+        InputError, match="floating-point values, whose black and white are unkn"
+    ):
         decoded(data, "f.tif")
 
 
@@ -182,9 +199,12 @@ def tiff(values, *tags) -> bytes:
     }
     kind = 3 if order == ">" else 4
     directory = b"".join(
-        struct.pack(entry, tag, kind, 1, value) for tag, value in sorted(entries.items())
+        struct.pack(entry, tag, kind, 1, value)
+        for tag, value in sorted(entries.items())
     )
-    head = struct.pack(f"{order}2sHI", b"II" if order == "<" else b"MM", 42, 8 + len(data))
+    head = struct.pack(
+        f"{order}2sHI", b"II" if order == "<" else b"MM", 42, 8 + len(data)
+    )
     return head + data + struct.pack(f"{order}H", len(entries)) + directory + bytes(4)
 
 
@@ -193,12 +213,17 @@ def png(colour, depth, rows) -> bytes:
 
     def chunk(name, data):
         return (
-            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            struct.pack(">I", len(data))
+            + name
+            + data
+            + struct.pack(">I", zlib.crc32(name + data))
         )
 
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         [
-            chunk(b"IHDR", struct.pack(">IIBBBBB", 4, len(rows), depth, colour, 0, 0, 0)),
+            chunk(
+                b"IHDR", struct.pack(">IIBBBBB", 4, len(rows), depth, colour, 0, 0, 0)
+            ),
             chunk(b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows))),
             chunk(b"IEND", b""),
         ]
@@ -207,7 +232,9 @@ def png(colour, depth, rows) -> bytes:
 
 WIDE = GREY.astype("<u2") * 300
 COLOUR_16 = [np.repeat(row, 3).astype(">u2").tobytes() for row in WIDE]
-GREY_ALPHA_16 = [np.stack([row, 0 * row + 65535], axis=1).astype(">u2").tobytes() for row in WIDE]
+GREY_ALPHA_16 = [
+    np.stack([row, 0 * row + 65535], axis=1).astype(">u2").tobytes() for row in WIDE
+]
 VEILED = np.dstack([GREY, GREY, GREY, GREY + 240])
 
 
@@ -220,12 +247,17 @@ def test_a_tiff_of_16_bits_in_both_orders_of_bytes(order):
 def test_the_full_scale_is_that_of_the_bits():
     twelve = np.array([[0x12, 0x3A, 0xBC], [0xFF, 0xF0, 0x00]], np.uint8)
     found = decoded(tiff(twelve, (256, 2), (258, 12)), "f.tif")
-    assert found.values.tolist() == [[0x123, 0xABC], [0xFFF, 0]] and found.full_scale == 4095
+    assert (
+        found.values.tolist() == [[0x123, 0xABC], [0xFFF, 0]]
+        and found.full_scale == 4095
+    )
     assert decoded(tiff(WIDE, (339, 2)), "f.tif").full_scale == 32767
 
 
 def test_a_tiff_of_one_bit_without_a_tag_for_it():
-    data = saved(Image.fromarray((GREY > 5).astype(np.uint8) * 255).convert("1"), "TIFF")
+    data = saved(
+        Image.fromarray((GREY > 5).astype(np.uint8) * 255).convert("1"), "TIFF"
+    )
     assert (decoded(data, "f.tif").values == (GREY > 5) * 765).all()
 
 
@@ -249,7 +281,9 @@ def test_white_is_0_in_8_bits_is_turned_round():
     ],
 )
 def test_pixels_that_would_be_turned_cut_or_inverted_are_refused(data, problem):
-    with pytest.raises(InputError, match=rf"^f: cannot be decoded as an image \({problem}"):
+    with pytest.raises(
+        InputError, match=rf"^f: cannot be decoded as an image \({problem}"
+    ):
         decoded(data, "f")
 
 
@@ -262,5 +296,7 @@ def test_every_orientation_but_upright_is_refused(kind):
         if orientation == 1:
             assert decoded(data, "f").values.shape == (3, 4)
         else:
-            with pytest.raises(InputError, match="which way up the camera saw is unknown"):
+            with pytest.raises(
+                InputError, match="which way up the camera saw is unknown"
+            ):
                 decoded(data, "f")

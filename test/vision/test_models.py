@@ -20,7 +20,9 @@ def test_derivatives_are_those_of_the_shape(mark):
         change = np.zeros(2 + len(p))
         change[column] = STEP
         plus, minus = (
-            model.shape(u - sign * change[0], v - sign * change[1], p + sign * change[2:])[0]
+            model.shape(
+                u - sign * change[0], v - sign * change[1], p + sign * change[2:]
+            )[0]
             for sign in (1, -1)
         )
         assert by[column] == pytest.approx((plus - minus) / (2 * STEP), abs=3e-5)

@@ -14,7 +14,9 @@ def spots(side, *, dark, pitch=60, shape=(300, 360)):
     inside = away <= side / 2
     ground, mark = (180.0, 60.0) if dark else (60.0, 180.0)
     noise = np.random.default_rng(1).normal(0, 4, shape)
-    return np.clip(np.where(inside, mark, ground) + 0.05 * u + noise, 0, 255).astype(np.uint8)
+    return np.clip(np.where(inside, mark, ground) + 0.05 * u + noise, 0, 255).astype(
+        np.uint8
+    )
 
 
 @pytest.mark.parametrize("dark", [True, False])

@@ -106,7 +106,9 @@ def table(cases: list[tuple[str, list[Summary]]]) -> list[str]:
 def record(case: Case, courses: dict[int, Course]) -> Iterator[list[str]]:
     """Yield the lines of a case for the table of all cases, of `COLUMNS`."""
     followed = sum(bool(course.steps) for course in courses.values())
-    for (_, found), advised in zip(rows(case, courses), ("", str(followed)), strict=False):
+    for (_, found), advised in zip(
+        rows(case, courses), ("", str(followed)), strict=False
+    ):
         numbers = (
             found.error_m * NM_PER_M,
             100 * found.within,
@@ -139,14 +141,18 @@ def main() -> int:
         help="runs of each case (default: 40); "
         "25 times as many of the clean population, 5 times of the others",
     )
-    parser.add_argument("--first", type=int, default=0, help="seed of the first run (default: 0)")
+    parser.add_argument(
+        "--first", type=int, default=0, help="seed of the first run (default: 0)"
+    )
     parser.add_argument("--workers", type=int, help="processes (default: one per core)")
     parser.add_argument(
         "--only",
         action="append",
         help="only cases whose name contains this text; may be given again for others",
     )
-    parser.add_argument("--list", action="store_true", help="list the cases and do nothing")
+    parser.add_argument(
+        "--list", action="store_true", help="list the cases and do nothing"
+    )
     parser.add_argument(
         "-o",
         "--output",
@@ -209,7 +215,9 @@ def finished(jobs: list[tuple[int, int]], workers: int):
     wanted = {index: sum(one == index for one, _ in jobs) for index in waiting}
     for outcome in outcomes(once, jobs, workers=workers):
         if outcome.error is not None:
-            raise RuntimeError(f"case and seed {jobs[outcome.index]}") from outcome.error
+            raise RuntimeError(
+                f"case and seed {jobs[outcome.index]}"
+            ) from outcome.error
         index, seed = jobs[outcome.index]
         courses[index][seed] = outcome.value
         while waiting and len(courses[waiting[0]]) == wanted[waiting[0]]:
@@ -220,7 +228,9 @@ def finished(jobs: list[tuple[int, int]], workers: int):
 def as_json(case: Case, courses: dict[int, Course]) -> dict:
     return {
         "case": case.name,
-        "rows": [{"row": name, **asdict(summary)} for name, summary in rows(case, courses)],
+        "rows": [
+            {"row": name, **asdict(summary)} for name, summary in rows(case, courses)
+        ],
         "runs": [{"seed": seed, **asdict(course)} for seed, course in courses.items()],
     }
 

@@ -23,7 +23,10 @@ ARTIFACT = Artifact(11, 0.01, 24)
 SIGMA_M, SIGMA_RAD = 20e-9, np.deg2rad(0.001)
 MODEL = Spread(encoder="independent", rotation="finite")
 SETTINGS = CellSettings(
-    sigma_xy_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD, servo_sigma_m=20e-9, servo_sigma_theta_rad=0.0
+    sigma_xy_m=SIGMA_M,
+    sigma_theta_rad=SIGMA_RAD,
+    servo_sigma_m=20e-9,
+    servo_sigma_theta_rad=0.0,
 )
 
 
@@ -60,9 +63,12 @@ def resistant(repeats: int = 4) -> Plan:
         ("shift_y", 0.0, (0, p)),
     )
     views = tuple(
-        View(name, turn, shift, True, True, repeats, "x_back_y_back") for name, turn, shift in poses
+        View(name, turn, shift, True, True, repeats, "x_back_y_back")
+        for name, turn, shift in poses
     )
-    line = View("line", 2 * np.pi / ARTIFACT.angular_count, (0.0, 0.0), False, True, repeats)
+    line = View(
+        "line", 2 * np.pi / ARTIFACT.angular_count, (0.0, 0.0), False, True, repeats
+    )
     return Plan("resistant", ARTIFACT, (*views, line))
 
 
@@ -133,7 +139,9 @@ def _turned() -> list[Case]:
         )
         for angle in (0.3, 0.1, 0.03)
     ]
-    gaps = replace(turned[0], name=f"{turned[0].name}, 20 % of the marks missing", missing=0.2)
+    gaps = replace(
+        turned[0], name=f"{turned[0].name}, 20 % of the marks missing", missing=0.2
+    )
     return [turned[0], gaps, *turned[1:]]
 
 
@@ -177,7 +185,9 @@ def _drifts() -> list[Case]:
             settings=together,
         ),
         Case(
-            "drift 50 nm in a view, repeats consecutive", change=drifting(50e-9), settings=together
+            "drift 50 nm in a view, repeats consecutive",
+            change=drifting(50e-9),
+            settings=together,
         ),
         Case("drift 50 nm in a view, repeats as passes", change=drifting(50e-9)),
     ]
@@ -227,7 +237,10 @@ def _plates() -> list[Case]:
 def _noises() -> list[Case]:
     flicker = replace(SETTINGS, sigma_xy_m=5e-9, flicker_xy_m=SIGMA_M)
     return [
-        Case("1/f noise, repeats consecutive", settings=replace(flicker, consecutive=True)),
+        Case(
+            "1/f noise, repeats consecutive",
+            settings=replace(flicker, consecutive=True),
+        ),
         Case("1/f noise, repeats as passes", settings=flicker),
     ]
 
@@ -252,7 +265,11 @@ def _with_terms() -> list[Case]:
         drift_quadratic_m=50e-9,
     )
     too_small = [
-        case(f"size {factor} times too small: {name}", f"{term}:{size / factor:.3g}", change=change)
+        case(
+            f"size {factor} times too small: {name}",
+            f"{term}:{size / factor:.3g}",
+            change=change,
+        )
         for name, term, size, change in (
             ("plate scale 1 um/m in each view", "plate_scale", 1e-6, scaled(1e-6)),
             ("plate bent by 30 nm in each view", "plate_shape", 30e-9, bent(30e-9)),
@@ -267,7 +284,10 @@ def _with_terms() -> list[Case]:
             settings=stops,
         ),
         case(
-            "microscope scale 0.5 %, stop errors 20 um", "microscope", spread=_SCALE, settings=stops
+            "microscope scale 0.5 %, stop errors 20 um",
+            "microscope",
+            spread=_SCALE,
+            settings=stops,
         ),
         case("drift 500 nm in a view", "drift", change=drifting(500e-9)),
         case("plate grown by 1 um/m in one view", "plate_scale", change=grown),
@@ -302,7 +322,9 @@ def misread(size_m: float) -> Spoil:
         view, angle = readings.views[1], rng.uniform(0, 2 * np.pi)
         at = np.arange(len(view.m)) == rng.integers(len(view.m))
         off = replace(
-            view, dx=view.dx + at * size_m * np.cos(angle), dy=view.dy + at * size_m * np.sin(angle)
+            view,
+            dx=view.dx + at * size_m * np.cos(angle),
+            dy=view.dy + at * size_m * np.sin(angle),
         )
         return replace(readings, views=(readings.views[0], off, *readings.views[2:]))
 
@@ -359,7 +381,9 @@ def _together() -> list[Case]:
             plan=hu(1),
         ),
         Case(
-            "microscope turned by 0.5 mrad, backlash 10 nm, stop errors 20 um", back, settings=stops
+            "microscope turned by 0.5 mrad, backlash 10 nm, stop errors 20 um",
+            back,
+            settings=stops,
         ),
         Case(
             "microscope turned by 0.5 mrad, backlash 10 nm, stop errors 20 um; model microscope",
@@ -368,7 +392,11 @@ def _together() -> list[Case]:
             options=held,
             plan=resistant(),
         ),
-        Case("a mark off by 300 nm in a view, one pass", plan=hu(1), spoil=misread(300e-9)),
+        Case(
+            "a mark off by 300 nm in a view, one pass",
+            plan=hu(1),
+            spoil=misread(300e-9),
+        ),
         Case(
             "a mark off by 300 nm in a view, plate scale 0.2 um/m in each view",
             change=scaled(0.2e-6),

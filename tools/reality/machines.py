@@ -66,9 +66,16 @@ def _checked() -> list[Case]:
             more=stops,
             microscope_pixels=0.5,
         ),
-        _case("check stops: scale of the microscope +5 %", 0.05, more=stops, microscope_scale=0.05),
         _case(
-            "check stops: scale of the microscope +5 %, no lines", more=bare, microscope_scale=0.05
+            "check stops: scale of the microscope +5 %",
+            0.05,
+            more=stops,
+            microscope_scale=0.05,
+        ),
+        _case(
+            "check stops: scale of the microscope +5 %, no lines",
+            more=bare,
+            microscope_scale=0.05,
         ),
         _case(
             "check stops: microscope turned by 5 mrad",
@@ -77,7 +84,10 @@ def _checked() -> list[Case]:
             microscope_rotation_rad=5e-3,
         ),
         _case(
-            "check stops: shear of the microscope 2 mrad", 0.1, more=stops, microscope_shear=2e-3
+            "check stops: shear of the microscope 2 mrad",
+            0.1,
+            more=stops,
+            microscope_shear=2e-3,
         ),
         _case(
             "check stops: camera distortion 0.1 % at 250 um, plate against pins",
@@ -86,16 +96,26 @@ def _checked() -> list[Case]:
             microscope_distortion=1e-3,
             **_pins(0.2),
         ),
-        _case("check stops: plate strained by 1 um/m in each view", more=stops, plate_strain=1e-6),
+        _case(
+            "check stops: plate strained by 1 um/m in each view",
+            more=stops,
+            plate_strain=1e-6,
+        ),
         _case(
             "check stops: plate bowed by 5 um, optical axis tilted by 5 mrad",
             more=stops,
             plate_bow_m=5e-6,
             optical_tilt_x_rad=5e-3,
         ),
-        _case("check stops: stage bends by 10 nm in each view", more=stops, stage_bend_m=10e-9),
         _case(
-            "check stops: offsets of the lines of 0.9 times their size", more=stops, line_factor=0.9
+            "check stops: stage bends by 10 nm in each view",
+            more=stops,
+            stage_bend_m=10e-9,
+        ),
+        _case(
+            "check stops: offsets of the lines of 0.9 times their size",
+            more=stops,
+            line_factor=0.9,
         ),
         _case(
             "check stops: drift of 0.36 um a view, one raster, repeats consecutive",
@@ -131,7 +151,12 @@ def _wired() -> list[Case]:
     return [
         *(_case("offsets of the other sign", phi, **other) for phi in (0.003, 0.01)),
         _case("offsets of the other sign, plate moves", 0.01, settings=moved, **other),
-        _case("offsets of the other sign, no lines", 0.01, more=bare, microscope_axes="-x-y"),
+        _case(
+            "offsets of the other sign, no lines",
+            0.01,
+            more=bare,
+            microscope_axes="-x-y",
+        ),
         _case(
             "offsets of the other sign, no lines, stage that never scatters",
             0.01,
@@ -158,7 +183,11 @@ def _wired() -> list[Case]:
 def _scaled() -> list[Case]:
     return [
         *(
-            _case(f"scale of the microscope {100 * scale:+g} %", phi, microscope_scale=scale)
+            _case(
+                f"scale of the microscope {100 * scale:+g} %",
+                phi,
+                microscope_scale=scale,
+            )
             for scale, phi in (
                 (0.1, 0.03),
                 (0.05, 0.05),
@@ -174,7 +203,11 @@ def _scaled() -> list[Case]:
             microscope_scale=0.05,
         ),
         *(
-            _case(f"offsets of the lines of {factor:g} times their size", phi, line_factor=factor)
+            _case(
+                f"offsets of the lines of {factor:g} times their size",
+                phi,
+                line_factor=factor,
+            )
             for factor, phi in ((0.9, 0.03), (0.97, 0.03), (1.02, 0.001))
         ),
         _case("microscope turned by 5 mrad", 0.005, microscope_rotation_rad=5e-3),
@@ -187,7 +220,9 @@ def _scaled() -> list[Case]:
             **_pins(0.2),
         ),
         _case(
-            "camera distortion 0.1 % at 250 um, plate laid by hand", 0.1, microscope_distortion=1e-3
+            "camera distortion 0.1 % at 250 um, plate laid by hand",
+            0.1,
+            microscope_distortion=1e-3,
         ),
         _case(
             "scale of the microscope +2 %, plate against pins",
@@ -206,14 +241,22 @@ def _scaled() -> list[Case]:
 
 def _pins(phi_deg: float) -> dict[str, float]:
     """Return how a plate lies against pins: 50 um and `phi_deg` (sigma) off, alike in all views."""
-    return {"t_m": 1e-6, "t_common_m": 50e-6, "phi_common_rad": float(np.deg2rad(phi_deg))}
+    return {
+        "t_m": 1e-6,
+        "t_common_m": 50e-6,
+        "phi_common_rad": float(np.deg2rad(phi_deg)),
+    }
 
 
 def _plates() -> list[Case]:
     five = {"plan": resistant()}
     return [
         _case("plate strained by 1 um/m in each view", plate_strain=1e-6),
-        _case("plate strained by 1 um/m in each view, five views", more=five, plate_strain=1e-6),
+        _case(
+            "plate strained by 1 um/m in each view, five views",
+            more=five,
+            plate_strain=1e-6,
+        ),
         _case("plate 0.1 K warmer or colder in each view", plate_scale=0.9e-6),
         _case("plate tilted by 1 mrad in each view", plate_tilt_rad=1e-3),
         _case(
@@ -226,7 +269,10 @@ def _plates() -> list[Case]:
             plate_bow_m=5e-6,
             optical_tilt_x_rad=5e-3,
         ),
-        _case("circle of lines off the axis by 15 urad in each view", line_eccentricity_rad=15e-6),
+        _case(
+            "circle of lines off the axis by 15 urad in each view",
+            line_eccentricity_rad=15e-6,
+        ),
         _case("pitch declared 800 um/m wrong", pitch_error=800e-6),
     ]
 
@@ -236,7 +282,11 @@ def _stages() -> list[Case]:
     once = replace(SERVO, consecutive=True)
     return [
         _case("stage bends by 10 nm in each view", stage_bend_m=10e-9),
-        _case("stage bends by 10 nm in each view, five views", more=five, stage_bend_m=10e-9),
+        _case(
+            "stage bends by 10 nm in each view, five views",
+            more=five,
+            stage_bend_m=10e-9,
+        ),
         _case("backlash that grows to 35 nm in a view", backlash_growth_m=35e-9),
         _case(
             "backlash that grows to 35 nm in a view, repeats consecutive",
@@ -256,7 +306,10 @@ def _stages() -> list[Case]:
             drift_linear_m=0.36e-6,
         ),
         _case("drift as a random walk of 100 nm a view", drift_walk_m=100e-9),
-        _case("plate slips by 100 nm half-way through a view", more={"change": slipping(100e-9)}),
+        _case(
+            "plate slips by 100 nm half-way through a view",
+            more={"change": slipping(100e-9)},
+        ),
         _case(
             "stage follows marks that lie 2 mm beside their sites",
             settings=replace(SERVO, follow_mark=True),
@@ -277,7 +330,10 @@ def _stages() -> list[Case]:
             )
             for length, away_m in ((4, 1e-3), (4, 2e-3), (2, 2e-3))
         ),
-        _case("encoders err by 30 nm in each 20 um", more={"change": subdivided(20e-6, 30e-9)}),
+        _case(
+            "encoders err by 30 nm in each 20 um",
+            more={"change": subdivided(20e-6, 30e-9)},
+        ),
         *(
             _case(
                 "encoders err by 30 nm in each 20 um, stage follows marks",
@@ -298,7 +354,8 @@ def subdivided(period_m: float, size_m: float) -> Change:
         size = np.diag(size_m * np.exp(2j * np.pi * rng.uniform(size=2)))
         at_sites = np.real(size.sum(axis=0))  # a pitch is a number of whole periods
         waves = Waves(
-            np.concatenate([truth.waves.number, number]), np.concatenate([truth.waves.size, size])
+            np.concatenate([truth.waves.number, number]),
+            np.concatenate([truth.waves.size, size]),
         )
         return replace(truth, waves=waves, g=truth.g + at_sites[:, None, None])
 
@@ -311,9 +368,14 @@ def _noises() -> list[Case]:
             "noise of 40 nm along x and 10 nm along y",
             settings=replace(SERVO, sigma_xy_m=40e-9, noise_ratio=0.25),
         ),
-        _case("encoders with 20 nm of noise", settings=replace(SERVO, encoder_sigma_m=20e-9)),
+        _case(
+            "encoders with 20 nm of noise",
+            settings=replace(SERVO, encoder_sigma_m=20e-9),
+        ),
         _case("servo scatter of 1 um", settings=replace(SERVO, servo_sigma_m=1e-6)),
-        _case("offsets in steps of 50 nm", settings=replace(SERVO, resolution_xy_m=50e-9)),
+        _case(
+            "offsets in steps of 50 nm", settings=replace(SERVO, resolution_xy_m=50e-9)
+        ),
         _case(
             "1/f noise of 20 nm beside white noise of 5 nm",
             settings=replace(SERVO, sigma_xy_m=5e-9, flicker_xy_m=SIGMA_M),
@@ -352,7 +414,11 @@ def _laid() -> list[Case]:
     return [
         *(_case(f"view {name}", more={"change": laid(*how)}) for name, *how in poses),
         *(
-            _case(f"bag, {ids}: view {name}", settings=settings, more={"change": laid(*how), **bag})
+            _case(
+                f"bag, {ids}: view {name}",
+                settings=settings,
+                more={"change": laid(*how), **bag},
+            )
             for ids, settings in (("with ids", SERVO), ("without ids", bare))
             for name, *how in poses
         ),
@@ -407,7 +473,11 @@ def _hardly_told() -> list[Case]:
             for size_m in (20e-9, 30e-9)
         ),
         Case("views at any pose", **any_pose),
-        Case("views at any pose, one mark read in one of them", spoil=with_one_mark, **any_pose),
+        Case(
+            "views at any pose, one mark read in one of them",
+            spoil=with_one_mark,
+            **any_pose,
+        ),
         _case(
             "circle of 7 lines off the axis by 15 urad in each view",
             more={"plan": few},
@@ -449,7 +519,8 @@ def _seven_lines() -> Plan:
     return replace(
         plan,
         views=tuple(
-            replace(view, angular=False) if view.name == "rot90" else view for view in plan.views
+            replace(view, angular=False) if view.name == "rot90" else view
+            for view in plan.views
         ),
     )
 
@@ -457,12 +528,26 @@ def _seven_lines() -> Plan:
 def _any_pose() -> Plan:
     """Return six views turned and shifted by no multiples, on 9 x 9 marks."""
     plate = Artifact(9, 0.01, 0, map_grid=MapGrid(9, 0.01))
-    poses = ((0, 0, 0), (33, 2, -3), (71, -4, 1), (118, 3, 4), (203, -2, -4), (290, 5, 2))
+    poses = (
+        (0, 0, 0),
+        (33, 2, -3),
+        (71, -4, 1),
+        (118, 3, 4),
+        (203, -2, -4),
+        (290, 5, 2),
+    )
     return Plan(
         "any_pose",
         plate,
         tuple(
-            View(f"at_{turn}", float(np.deg2rad(turn)), (x * 1e-3, y * 1e-3), True, False, 5)
+            View(
+                f"at_{turn}",
+                float(np.deg2rad(turn)),
+                (x * 1e-3, y * 1e-3),
+                True,
+                False,
+                5,
+            )
             for turn, x, y in poses
         ),
     )
@@ -474,7 +559,10 @@ def with_one_mark(readings: Measurements, rng: np.random.Generator) -> Measureme
     left = np.arange(len(view.m)) == len(view.m) // 2
     return replace(
         readings,
-        views=(*readings.views[:-1], subset(view, left, np.zeros(len(view.k), dtype=bool))),
+        views=(
+            *readings.views[:-1],
+            subset(view, left, np.zeros(len(view.k), dtype=bool)),
+        ),
     )
 
 
@@ -484,7 +572,9 @@ def declaring(u_m: float) -> Spoil:
     def spoil(readings: Measurements, rng: np.random.Generator) -> Measurements:
         return replace(
             readings,
-            views=tuple(replace(view, u=np.full(len(view.m), u_m)) for view in readings.views),
+            views=tuple(
+                replace(view, u=np.full(len(view.m), u_m)) for view in readings.views
+            ),
         )
 
     return spoil

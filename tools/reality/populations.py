@@ -36,7 +36,10 @@ def populations() -> list[Case]:
     """Return a population a case."""
     return [
         Case("population clean", draw=_clean),
-        Case("population clean, microscope as its default uncertainty says", draw=_microscope),
+        Case(
+            "population clean, microscope as its default uncertainty says",
+            draw=_microscope,
+        ),
         Case("population mixture of twelve effects, half size", draw=_mixture),
         Case(
             "population mixture of twelve effects, half size; model plate_shape:5e-9",
@@ -76,7 +79,9 @@ def _clean(rng: np.random.Generator, case: Case) -> Case:
         spread=spread,
         settings=settings,
         missing=missing,
-        plan=checked(plan) if not settings.servo_sigma_m or rng.random() < 0.3 else plan,
+        plan=checked(plan)
+        if not settings.servo_sigma_m or rng.random() < 0.3
+        else plan,
     )
 
 
@@ -84,7 +89,9 @@ def _plan(artifact: Artifact, name: str, repeats: int) -> Plan:
     pitch, angular = artifact.grid_pitch_m, artifact.angular_count > 0
     views = []
     for pose in POSES[name].split():
-        turn = 0.0 if pose[1:] in "xy" and pose != "0" else float(np.deg2rad(float(pose)))
+        turn = (
+            0.0 if pose[1:] in "xy" and pose != "0" else float(np.deg2rad(float(pose)))
+        )
         shift = {
             "+x": (pitch, 0.0),
             "-x": (-pitch, 0.0),
@@ -94,7 +101,14 @@ def _plan(artifact: Artifact, name: str, repeats: int) -> Plan:
         views.append(View(pose, turn, shift, True, angular, repeats))
     if angular:
         views.append(
-            View("line", 2 * np.pi / artifact.angular_count, (0.0, 0.0), False, True, repeats)
+            View(
+                "line",
+                2 * np.pi / artifact.angular_count,
+                (0.0, 0.0),
+                False,
+                True,
+                repeats,
+            )
         )
     return Plan(name, artifact, tuple(views))
 
@@ -139,9 +153,13 @@ def _mixture(rng: np.random.Generator, case: Case) -> Case:
         "settling_m",
     ):
         sizes[name] *= float(rng.choice([-1, 1]))
-    spread = Spread(phi_rad=float(np.deg2rad(0.03)), backlash_y_m=sizes["backlash_x_m"], **sizes)
+    spread = Spread(
+        phi_rad=float(np.deg2rad(0.03)), backlash_y_m=sizes["backlash_x_m"], **sizes
+    )
     artifact = Artifact(11, 0.01, 24)
-    settings = CellSettings(sigma_xy_m=20e-9, sigma_theta_rad=SIGMA_RAD, flicker_xy_m=4e-9)
+    settings = CellSettings(
+        sigma_xy_m=20e-9, sigma_theta_rad=SIGMA_RAD, flicker_xy_m=4e-9
+    )
     return replace(
         case,
         spread=spread,

@@ -104,7 +104,8 @@ def run_case(case: Case, seed: int) -> Course:
         text, options = advice
         if steps[-AGAIN:] == [text] * AGAIN:
             break
-        if options.terms == case.options.terms:  # nothing to solve anew with: measure it again
+        # nothing to solve anew with: measure it again
+        if options.terms == case.options.terms:
             truth, readings, said = measured(case, seed, 2 + len(steps))
         steps.append(text)
         result = _calibrated(readings, options)
@@ -117,7 +118,9 @@ def _rng(case: Case, seed: int, part: int) -> np.random.Generator:
     return np.random.default_rng([zlib.crc32(case.name.encode()), seed, part])
 
 
-def measured(case: Case, seed: int, part: int) -> tuple[Truth, Measurements, tuple[str, ...]]:
+def measured(
+    case: Case, seed: int, part: int
+) -> tuple[Truth, Measurements, tuple[str, ...]]:
     """Return the machine of a run, a measurement of it, number `part`, from 1, and what it says.
 
     What is said is why most detections of a view were rejected.
@@ -130,7 +133,12 @@ def measured(case: Case, seed: int, part: int) -> tuple[Truth, Measurements, tup
     if case.messages:
         return truth, *_collected(truth, case, placing)
     readings = simulate_measurements(
-        truth, case.plan, placing, settings=case.settings, visits=True, missing=case.missing
+        truth,
+        case.plan,
+        placing,
+        settings=case.settings,
+        visits=True,
+        missing=case.missing,
     )
     return truth, case.spoil(readings, placing), ()
 
@@ -142,7 +150,9 @@ def _collected(
 ) -> tuple[Measurements, tuple[str, ...]]:
     """Return the readings, and what is said of them, as `selfcal solve` has them from a bag."""
     collector = gathered(
-        plan_events(truth, case.plan, settings=case.settings, rng=rng, start_ns=FIRST_STAMP_NS),
+        plan_events(
+            truth, case.plan, settings=case.settings, rng=rng, start_ns=FIRST_STAMP_NS
+        ),
         measurement_sense=str(case.settings.sense),
     )
     measurements, views = collector.collect()
@@ -161,7 +171,9 @@ def _calibrated(readings: Measurements, options: Options) -> CalibrationResult |
         return type(error).__name__
 
 
-def compared(result: CalibrationResult | str, truth: Truth, said: tuple[str, ...] = ()) -> Run:
+def compared(
+    result: CalibrationResult | str, truth: Truth, said: tuple[str, ...] = ()
+) -> Run:
     """Return how far a calibration lies from the truth, in its datum."""
     if isinstance(result, str):
         return Run("refused", causes=(*said, result))
@@ -173,7 +185,8 @@ def compared(result: CalibrationResult | str, truth: Truth, said: tuple[str, ...
     k = result.noise.k_xy
     within, z_xy = _covered(error, np.stack([emap.u_gx, emap.u_gy]), k)
     within_x, within_y = (
-        _covered(each, u, k)[0] for each, u in zip(error, (emap.u_gx, emap.u_gy), strict=True)
+        _covered(each, u, k)[0]
+        for each, u in zip(error, (emap.u_gx, emap.u_gy), strict=True)
     )
     within_theta, z_theta = _covered(theta, emap.u_g_theta, result.noise.k_theta)
     n_theta = int(np.isfinite(theta).sum())
@@ -265,7 +278,10 @@ def summarise(runs: list[Run], seeds: list[int]) -> Summary:
         float(np.median(_values(kept, "error_m"))),
         float(within.mean()),
         float(within.std() / np.sqrt(len(within))),
-        *(float(_values(kept, name).mean()) for name in ("within_x", "within_y", "within_theta")),
+        *(
+            float(_values(kept, name).mean())
+            for name in ("within_x", "within_y", "within_theta")
+        ),
         rms(_values(kept, "z_xy")),
         rms(_values(kept, "z_theta")),
         tuple(causes.most_common(3)),

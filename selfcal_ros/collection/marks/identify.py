@@ -101,7 +101,11 @@ def identify_grid(
     if not view.grid:
         reasons[:] = Reason.NOT_IN_VIEW
         return MarkAssignment(
-            ids, np.zeros(reading_m.shape), np.zeros(reading_m.shape), reasons, rigids.Rigid()
+            ids,
+            np.zeros(reading_m.shape),
+            np.zeros(reading_m.shape),
+            reasons,
+            rigids.Rigid(),
         )
     named_unknown = has_id & ~artifact.has(*ids)
     marks = np.where(
@@ -109,8 +113,10 @@ def identify_grid(
         ids,
         np.array([[artifact.marks.ids[0]], [0]]) if artifact.marks else 0,
     )
-    reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)  # squares stay finite
-    centred = reading_m - np.array(pose.shift)[:, None] * pitch  # about the plate's centre
+    # squares stay finite
+    reading_m = np.clip(reading_m, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
+    # about the plate's centre
+    centred = reading_m - np.array(pose.shift)[:, None] * pitch
     limit_m = rules.stage_limit_m(artifact) + view.check_offset_m
     astray = _astray(pose, marks, stage_m, artifact, limit_m, among=has_id)
     named = has_id & ~named_unknown & ~astray
@@ -151,7 +157,9 @@ def identify_grid(
 
 def _at_most_two(numbers: np.ndarray) -> bool:
     """Return whether the numbers have no more than two different values."""
-    return not len(numbers) or bool(((numbers == numbers.min()) | (numbers == numbers.max())).all())
+    return not len(numbers) or bool(
+        ((numbers == numbers.min()) | (numbers == numbers.max())).all()
+    )
 
 
 def _astray(
@@ -169,7 +177,10 @@ def _astray(
     astray = np.empty(marks.shape[1], dtype=bool)
     for start in range(0, len(astray), PART):
         columns = slice(start, start + PART)
-        site = np.stack(pose.site_of(*artifact.places(*marks[:, columns]))) * artifact.grid_pitch_m
+        site = (
+            np.stack(pose.site_of(*artifact.places(*marks[:, columns])))
+            * artifact.grid_pitch_m
+        )
         away = np.clip(stage_m[:, columns] - site, -OFF_ANY_PLATE_M, OFF_ANY_PLATE_M)
         astray[columns] = distances(away) > limit_m
     return astray & among
@@ -188,18 +199,34 @@ def _nearest(
     far_apart_m = np.full(centred.shape[1], np.inf)
     if artifact.marks:
         plate = np.stack(pose.turned_back(centred[0], centred[1]))
-        away, two = artifact.marks.tree.query(np.nan_to_num(plate.T, nan=OFF_ANY_PLATE_M), 2)
+        away, two = artifact.marks.tree.query(
+            np.nan_to_num(plate.T, nan=OFF_ANY_PLATE_M), 2
+        )
         apart = distances(np.diff(artifact.marks.places_m[:, two], axis=2)[:, :, 0])
-        mark = np.stack([artifact.marks.id_array[two[:, 0]], np.zeros(len(two), dtype=int)])
-        return mark, away[:, 0] / np.maximum(away[:, 1], 1e-12 * pitch), away[:, 0], apart
+        mark = np.stack(
+            [artifact.marks.id_array[two[:, 0]], np.zeros(len(two), dtype=int)]
+        )
+        return (
+            mark,
+            away[:, 0] / np.maximum(away[:, 1], 1e-12 * pitch),
+            away[:, 0],
+            apart,
+        )
     (first_m, last_m), (first_n, last_n) = artifact.limits
     step = centred / pitch
     plate = np.stack(pose.turned_back(step[0], step[1]))
-    mark = np.clip(artifact.nearest(*plate), [[first_m], [first_n]], [[last_m], [last_n]])
+    mark = np.clip(
+        artifact.nearest(*plate), [[first_m], [first_n]], [[last_m], [last_n]]
+    )
     away = np.abs(plate - np.stack(artifact.places(*mark)))
     first = distances(away)
     second = np.minimum(np.hypot(1 - away[0], away[1]), np.hypot(away[0], 1 - away[1]))
-    return mark.astype(np.int64), first / np.maximum(second, 1e-12), first * pitch, far_apart_m
+    return (
+        mark.astype(np.int64),
+        first / np.maximum(second, 1e-12),
+        first * pitch,
+        far_apart_m,
+    )
 
 
 def _settle(
@@ -225,12 +252,16 @@ def _settle(
     estimate = (
         fit.known(pitch, rules.max_rotation_rad)
         if named.any()
-        else innermost(_rows(pose, artifact), centred[:, free], artifact, rules.max_rotation_rad)
+        else innermost(
+            _rows(pose, artifact), centred[:, free], artifact, rules.max_rotation_rad
+        )
     )
     while free.any():
         nominal = estimate.rigid.undo(centred)
         nearest, ratio, _, apart = _nearest(pose, nominal, artifact)
-        sure = (estimate.error_at(nominal) <= SURE * np.minimum(pitch, apart)) & (ratio < 0.5)
+        sure = (estimate.error_at(nominal) <= SURE * np.minimum(pitch, apart)) & (
+            ratio < 0.5
+        )
         wider = named | (free & sure)
         if wider.sum() <= use.sum():
             break
@@ -267,7 +298,9 @@ def _innermost(
     near = np.hypot(*(centred - centre[:, None])) * max_rotation_rad <= SURE * pitch
     offset = np.array(
         [
-            _middle((row - off * pitch) * (2 * np.pi / pitch), 2 * np.pi) * pitch / (2 * np.pi)
+            _middle((row - off * pitch) * (2 * np.pi / pitch), 2 * np.pi)
+            * pitch
+            / (2 * np.pi)
             for row, off in zip(
                 rows.turned_back(*centred[:, near]), artifact.off_centre, strict=True
             )
@@ -275,7 +308,10 @@ def _innermost(
     )
     x, y = map(float, rows.turned(*offset))
     return rigids.MotionEstimate(
-        rigids.Rigid(0.0, x, y), (float(centre[0]), float(centre[1])), 0.0, max_rotation_rad
+        rigids.Rigid(0.0, x, y),
+        (float(centre[0]), float(centre[1])),
+        0.0,
+        max_rotation_rad,
     )
 
 
@@ -292,7 +328,9 @@ def _innermost_of_list(
     nearest = np.argsort(np.hypot(*centred), kind="stable")
     centre = centred[:, nearest[0]]
     near = centred[:, nearest]
-    near = near[:, np.hypot(*(near - centre[:, None])) * max_rotation_rad <= SURE * pitch]
+    near = near[
+        :, np.hypot(*(near - centre[:, None])) * max_rotation_rad <= SURE * pitch
+    ]
     some = np.stack(pose.turned_back(*near[:, :LOOKED_AT]))
     among = marks.tree.query(some.T, CANDIDATES)[1]
     offsets = (some[:, :, None] - marks.places_m[:, among]).reshape(2, -1)
@@ -367,7 +405,11 @@ def identify_angular(
     if not count or not view.angular:
         reasons[:] = Reason.NOT_IN_VIEW
         return MarkAssignment(
-            np.zeros(len(ids), int), np.zeros(len(ids)), np.zeros(len(ids)), reasons, rigids.Rigid()
+            np.zeros(len(ids), int),
+            np.zeros(len(ids)),
+            np.zeros(len(ids)),
+            reasons,
+            rigids.Rigid(),
         )
     step = 2 * np.pi / count
     whole_lines, fraction = divmod(view.on_stage(artifact).s, 1)
@@ -379,7 +421,9 @@ def identify_angular(
     rotation_known = phi_rad is not None or has_known_id.any()
     if phi_rad is None:
         named = wrap(reading_rad - (ids + base) * step)[has_known_id]
-        phi_rad = _middle(named, 2 * np.pi) if len(named) else _middle(reading_rad, step)
+        phi_rad = (
+            _middle(named, 2 * np.pi) if len(named) else _middle(reading_rad, step)
+        )
     nearest = np.rint(wrap(reading_rad - phi_rad) / step).astype(np.int64) - base
     line = np.where(has_known_id, ids, np.remainder(nearest, count))
     deviation = wrap(reading_rad - (line + base) * step)
@@ -388,13 +432,17 @@ def identify_angular(
     turned = abs(phi_rad) > max(rigids.LARGEST_TURN_RAD, step / 2)
     reasons[(away > step / 4) | turned] = Reason.TOO_FAR
     reasons[~has_id & (away > rules.ambiguity_ratio * (step - away))] = Reason.AMBIGUOUS
-    if not rotation_known and not _nearest_line_is_sure(phi_rad, step, rules.max_rotation_rad):
+    if not rotation_known and not _nearest_line_is_sure(
+        phi_rad, step, rules.max_rotation_rad
+    ):
         reasons[~has_id] = Reason.ROTATION
     reasons[has_id & ~has_known_id] = Reason.UNKNOWN_MARK
     return MarkAssignment(line, deviation, residual, reasons, rigids.Rigid(phi_rad))
 
 
-def _nearest_line_is_sure(phi_rad: float, step_rad: float, max_rotation_rad: float) -> bool:
+def _nearest_line_is_sure(
+    phi_rad: float, step_rad: float, max_rotation_rad: float
+) -> bool:
     """Return whether lines that are off by `phi_rad` are certainly the nearest ones.
 
     Lines determine a rotation only up to whole steps. The apparent rotation is the true one if
@@ -411,7 +459,9 @@ def _middle(angles_rad: np.ndarray, period_rad: float) -> float:
         return 0.0
     turn = 2 * np.pi / period_rad
     start = np.angle(np.exp(1j * turn * angles_rad).mean()) / turn
-    about_start_rad = np.remainder(angles_rad - start + period_rad / 2, period_rad) - period_rad / 2
+    about_start_rad = (
+        np.remainder(angles_rad - start + period_rad / 2, period_rad) - period_rad / 2
+    )
     middle = start + np.median(about_start_rad)
     return float(middle - period_rad * np.rint(middle / period_rad))
 

@@ -133,13 +133,20 @@ def reduce_repeats(
     if fitted:
         judged_means = average(key[~outlier], judged[:, ~outlier], sigma[~outlier])
         dof = max(judged_means.dof - fitted, 0)
-        pooled = judged_means.sigma * np.sqrt(judged_means.dof / dof) if dof else float("nan")
+        pooled = (
+            judged_means.sigma * np.sqrt(judged_means.dof / dof)
+            if dof
+            else float("nan")
+        )
         means = replace(means, sigma=float(pooled), dof=dof)
     return replace(means, outlier=outlier)
 
 
 def average(
-    key: np.ndarray, values: np.ndarray, sigma: np.ndarray, companions: np.ndarray | None = None
+    key: np.ndarray,
+    values: np.ndarray,
+    sigma: np.ndarray,
+    companions: np.ndarray | None = None,
 ) -> Means:
     """Average the readings of each key; arguments as for `reduce_repeats`, none is an outlier.
 
@@ -147,19 +154,30 @@ def average(
     """
     marks, inverse, count = _distinct(key)
     declared = np.bincount(inverse, sigma > 0, len(marks)) == count
-    best = np.full(len(marks), np.inf)  # weights relative to a mark's best reading stay finite
+    # weights relative to a mark's best reading stay finite
+    best = np.full(len(marks), np.inf)
     np.minimum.at(best, inverse, sigma)
     weight = np.where(
-        declared[inverse] & (sigma > 0), (best[inverse] / np.where(sigma > 0, sigma, 1)) ** 2, 1.0
+        declared[inverse] & (sigma > 0),
+        (best[inverse] / np.where(sigma > 0, sigma, 1)) ** 2,
+        1.0,
     )
     total = np.bincount(inverse, weight, len(marks))
     mean = _means(values, weight, inverse, total)
     residual = values - mean[:, inverse]
     dof = int(len(values) * (count - 1).sum())
     pooled = float(np.sqrt((residual**2).sum() / dof)) if dof else float("nan")
-    u = np.where(declared, best / np.sqrt(total), np.nan) if declared.any() else np.zeros(0)
-    more = mean[:0] if companions is None else _means(companions, weight, inverse, total)
-    return Means(marks, mean, count, u, pooled, dof, np.zeros(len(key), dtype=bool), more)
+    u = (
+        np.where(declared, best / np.sqrt(total), np.nan)
+        if declared.any()
+        else np.zeros(0)
+    )
+    more = (
+        mean[:0] if companions is None else _means(companions, weight, inverse, total)
+    )
+    return Means(
+        marks, mean, count, u, pooled, dof, np.zeros(len(key), dtype=bool), more
+    )
 
 
 def _distinct(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -196,7 +214,9 @@ def _relative(sigma: np.ndarray) -> np.ndarray:
     declared = sigma > 0
     if not declared.any():
         return np.ones(len(sigma))
-    return np.where(declared, sigma, np.median(sigma[declared])) / np.median(sigma[declared])
+    return np.where(declared, sigma, np.median(sigma[declared])) / np.median(
+        sigma[declared]
+    )
 
 
 def _outliers(
@@ -222,12 +242,17 @@ def _outliers(
     if cut <= floor:
         floor = max(floor, (STEPS + 0.5) * _sensor_step(groups, values, floor))
     for group in groups:
-        share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0  # of two, each is half-way off
+        # of two, each is half-way off
+        share = np.sqrt(0.5) if group.shape[1] == 2 else 1.0
         for members in _batches(group, group.shape[1]):
             repeats = np.take(values, members, axis=1)
             away = np.abs(repeats - row_medians(repeats))
-            bad = (away > np.maximum(cut * share * relative[members], floor)).any(axis=0)
-            out[members] = bad | (2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1])
+            bad = (away > np.maximum(cut * share * relative[members], floor)).any(
+                axis=0
+            )
+            out[members] = bad | (
+                2 * (~bad).sum(axis=1, keepdims=True) < group.shape[1]
+            )
     return out
 
 
@@ -236,7 +261,11 @@ def groups_of(key: np.ndarray) -> list[np.ndarray]:
     order = np.argsort(key, kind="stable")
     start = np.flatnonzero(np.diff(key[order], prepend=key[order[:1]] - 1))
     count = np.diff(np.append(start, len(key)))
-    return [order[start[count == r][:, None] + np.arange(r)] for r in np.unique(count) if r > 1]
+    return [
+        order[start[count == r][:, None] + np.arange(r)]
+        for r in np.unique(count)
+        if r > 1
+    ]
 
 
 def _batches(group: np.ndarray, width: int) -> Iterator[np.ndarray]:
@@ -252,13 +281,17 @@ def _sensor_step(groups: list[np.ndarray], values: np.ndarray, floor: float) -> 
     It applies to at least three marks, and three quarters of those that differ do so by one to
     `STEPS` of it.
     """
-    spread = np.concatenate([np.ptp(values[:, group], axis=2).ravel() for group in groups])
+    spread = np.concatenate(
+        [np.ptp(values[:, group], axis=2).ravel() for group in groups]
+    )
     spread = spread[spread > floor]
     if len(spread) < 3:
         return 0.0
     steps = spread / spread.min()
     whole_steps = (np.abs(steps - np.rint(steps)) < 1e-3) & (steps < STEPS + 0.5)
-    return float(spread.min()) if whole_steps.sum() >= max(3, 0.75 * len(steps)) else 0.0
+    return (
+        float(spread.min()) if whole_steps.sum() >= max(3, 0.75 * len(steps)) else 0.0
+    )
 
 
 @lru_cache(64)
@@ -278,7 +311,8 @@ def _pair_scale(
     if not groups:
         return float("nan"), 0
     differences = np.empty(
-        len(values) * sum(len(group) * len(pairs_of(group.shape[1])[0]) for group in groups)
+        len(values)
+        * sum(len(group) * len(pairs_of(group.shape[1])[0]) for group in groups)
     )
     filled, alike = 0, bool((relative == 1).all())  # as where no sigma is declared
     for group in groups:
@@ -294,7 +328,9 @@ def _pair_scale(
             apart = np.take(repeats, i, axis=2) - np.take(repeats, j, axis=2)
             differences[filled : filled + apart.size] = (np.abs(apart) / norm).ravel()
             filled += apart.size
-    independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(values)
+    independent = sum(len(group) * (group.shape[1] - 1) for group in groups) * len(
+        values
+    )
     return median(differences, overwrite=True) / 0.6744897501960817, independent
 
 
@@ -337,8 +373,13 @@ def grid_visits(
     no_outlier = ~means.outlier
     if not no_outlier.any():
         return None
-    stage_moves = np.abs(np.diff(deviation - offset, prepend=(deviation - offset)[:, :1])) > step_m
-    number = np.cumsum((np.diff(key, prepend=key[:1]) != 0) | stage_moves.any(axis=0))[no_outlier]
+    stage_moves = (
+        np.abs(np.diff(deviation - offset, prepend=(deviation - offset)[:, :1]))
+        > step_m
+    )
+    number = np.cumsum((np.diff(key, prepend=key[:1]) != 0) | stage_moves.any(axis=0))[
+        no_outlier
+    ]
     key, stamps_ns = key[no_outlier], stamps_ns[no_outlier]
     begins = np.diff(number, prepend=-1) != 0
     first = np.flatnonzero(begins)
@@ -351,12 +392,13 @@ def grid_visits(
         np.vstack([offset[:, no_outlier], since]),
     )
     mark = np.searchsorted(means.key, key[first])
-    order = np.argsort(mark, kind="stable")  # visits are numbered in the order of their stamps
+    # visits are numbered in the order of their stamps
+    order = np.argsort(mark, kind="stable")
     offset_x, offset_y, since = visits.companions[:, order]
     came_x, came_y = (
-        np.where(_differs(row[no_outlier], visit, first), 0, row[no_outlier][first]).astype(
-            np.int8
-        )[order]
+        np.where(
+            _differs(row[no_outlier], visit, first), 0, row[no_outlier][first]
+        ).astype(np.int8)[order]
         for row in approach
     )
     return GridVisits(
@@ -413,17 +455,23 @@ def repeat_motion(
         return None
     about = np.concatenate([_about_means(key, place), _about_means(key, offset)])
     slow = _about_means(
-        key, np.polynomial.legendre.legvander(np.linspace(-1, 1, len(key)), SLOW)[:, 1:].T
+        key,
+        np.polynomial.legendre.legvander(np.linspace(-1, 1, len(key)), SLOW)[:, 1:].T,
     )
     trend = np.linalg.lstsq(slow @ slow.T, slow @ about.T, rcond=None)[0]
     change = np.diff(about - trend.T @ slow)
-    return RepeatMotion(change @ change.T / 2, 2 * free // 3)  # neighbours share a reading
+    # neighbours share a reading
+    return RepeatMotion(change @ change.T / 2, 2 * free // 3)
 
 
 def _about_means(key: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return values (c, n) minus the mean of their mark."""
     first = np.zeros(key.max() + 1, dtype=int)
     count = np.bincount(key)
-    first[key[::-1]] = np.arange(len(key))[::-1]  # for equal indices the last assignment remains
+    # for equal indices the last assignment remains
+    first[key[::-1]] = np.arange(len(key))[::-1]
     values = values - values[:, first[key]]  # exact if repeats are equal
-    return values - np.stack([np.bincount(key, row) for row in values])[:, key] / count[key]
+    return (
+        values
+        - np.stack([np.bincount(key, row) for row in values])[:, key] / count[key]
+    )

@@ -121,14 +121,21 @@ class RigidFit:
             weight = max_rotation_rad**2 / (max_rotation_rad**2 + fit_error_rad**2)
             error = weight * fit_error_rad + (1 - weight) * max_rotation_rad
         rigid = _through(
-            weight * self.rigid.phi_rad, self.centre_m, self.rigid.at(np.array(self.centre_m))
+            weight * self.rigid.phi_rad,
+            self.centre_m,
+            self.rigid.at(np.array(self.centre_m)),
         )
         return MotionEstimate(
-            rigid, self.centre_m, float(scatter * np.sqrt(1 + 1 / max(self.marks, 1))), float(error)
+            rigid,
+            self.centre_m,
+            float(scatter * np.sqrt(1 + 1 / max(self.marks, 1))),
+            float(error),
         )
 
 
-def _through(phi_rad: float, centre: tuple[float, float], deviation: np.ndarray) -> Rigid:
+def _through(
+    phi_rad: float, centre: tuple[float, float], deviation: np.ndarray
+) -> Rigid:
     """Return the motion that turns by phi and has a given deviation at a point."""
     shift_m = deviation - Rigid(phi_rad).at(np.array(centre))
     return Rigid(float(phi_rad), float(shift_m[0]), float(shift_m[1]))
@@ -168,7 +175,9 @@ def fit_motion(p: np.ndarray, deviation: np.ndarray) -> RigidFit:
     first = near[:, np.append(True, differs)]
     marks = len(np.unique(first[0] + 1j * first[1]))
     share = marks / keep.sum()  # repeats of a mark are not further marks
-    return RigidFit(rigid, middle, marks, float(power * share), float((residual**2).sum() * share))
+    return RigidFit(
+        rigid, middle, marks, float(power * share), float((residual**2).sum() * share)
+    )
 
 
 def _median_motion(p: np.ndarray, deviation: np.ndarray) -> Rigid:
@@ -193,7 +202,11 @@ def _least_squares(
     power = (arm**2).sum()
     cross = _cross(arm, deviation - mean[:, None]).sum()
     centre = float(middle[0]), float(middle[1])
-    return _through(_turn(cross / power) if power > 0 else 0.0, centre, mean), centre, float(power)
+    return (
+        _through(_turn(cross / power) if power > 0 else 0.0, centre, mean),
+        centre,
+        float(power),
+    )
 
 
 def columns_where(keep: np.ndarray, *tables: np.ndarray) -> list[np.ndarray]:

@@ -82,7 +82,11 @@ class NamedMarks:
         """Return the median distance of the stage from the planned sites off the centre."""
         sites = self.sites
         outer = np.abs(sites) > OFF_CENTRE
-        return float(np.median(np.abs(stage + self.cells - sites)[outer])) if outer.any() else 0.0
+        return (
+            float(np.median(np.abs(stage + self.cells - sites)[outer]))
+            if outer.any()
+            else 0.0
+        )
 
 
 @dataclass(frozen=True)
@@ -120,14 +124,19 @@ def seen_poses(
         Largest rotation of a plate that lies as planned.
     """
     found_poses = (
-        (index, _found_pose(view, limit, max_rotation_rad)) for index, view in views.items()
+        (index, _found_pose(view, limit, max_rotation_rad))
+        for index, view in views.items()
     )
-    return {index: seen_pose for index, seen_pose in found_poses if seen_pose is not None}
+    return {
+        index: seen_pose for index, seen_pose in found_poses if seen_pose is not None
+    }
 
 
 def texts(poses: Mapping[int, SeenPose]) -> dict[int, str]:
     """Return view_index -> what is wrong with views that are not seen as planned."""
-    wrong = {index: seen_pose for index, seen_pose in poses.items() if not seen_pose.planned}
+    wrong = {
+        index: seen_pose for index, seen_pose in poses.items() if not seen_pose.planned
+    }
     right = len(wrong) < len(poses)
     other_views = (
         "; other views are as planned: leave the joints and the sense as they are"
@@ -179,7 +188,9 @@ def _lies_as(seen_pose: SeenPose, other_pose: SeenPose) -> bool:
     )
 
 
-def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> SeenPose | None:
+def _found_pose(
+    view: NamedMarks, limit: float, max_rotation_rad: float
+) -> SeenPose | None:
     """Return how the marks of a view are seen; None if they do not show it."""
     if not view.spread:
         return None
@@ -200,10 +211,15 @@ def _found_pose(view: NamedMarks, limit: float, max_rotation_rad: float) -> Seen
     if mirrored:
         back = np.degrees(np.angle(turn)) - pose.turn_deg
         return SeenPose(
-            as_planned, planned=False, mirrored=True, mirror=_mirror(back, listed=view.listed)
+            as_planned,
+            planned=False,
+            mirrored=True,
+            mirror=_mirror(back, listed=view.listed),
         )
     misplaced = replace(
-        as_planned, found_deg=_turn(turn, pose, max_rotation_rad), found_shift=_shift(shift, pose)
+        as_planned,
+        found_deg=_turn(turn, pose, max_rotation_rad),
+        found_shift=_shift(shift, pose),
     )
     lies_as_planned = (misplaced.found_deg, misplaced.found_shift) == (
         misplaced.planned_deg,
@@ -237,7 +253,12 @@ def _fitted(
 def _turn(turn: complex, pose: StagePose, max_rotation_rad: float) -> float:
     """Return a turn, 0 to 360 deg: a likely one, if it is within the rotation of a plate."""
     deg = float(np.degrees(np.angle(turn)))
-    likely = (pose.turn_deg, -pose.turn_deg, 0.0, *(pose.turn_deg + 90.0 * q for q in (1, 2, 3)))
+    likely = (
+        pose.turn_deg,
+        -pose.turn_deg,
+        0.0,
+        *(pose.turn_deg + 90.0 * q for q in (1, 2, 3)),
+    )
     away = [abs((deg - candidate_deg + 180) % 360 - 180) for candidate_deg in likely]
     best = int(np.argmin(away))
     turn_deg = likely[best] if away[best] < np.degrees(max_rotation_rad) else round(deg)
@@ -247,10 +268,21 @@ def _turn(turn: complex, pose: StagePose, max_rotation_rad: float) -> float:
 def _shift(shift: complex, pose: StagePose) -> tuple[float, float]:
     """Return a shift, pitches: a likely one, if it is near."""
     a, b = pose.shift
-    likely = [(a, b), (-a, -b), (0, 0), (b, a), (-b, -a), (round(shift.real), round(shift.imag))]
+    likely = [
+        (a, b),
+        (-a, -b),
+        (0, 0),
+        (b, a),
+        (-b, -a),
+        (round(shift.real), round(shift.imag)),
+    ]
     away = [abs(shift - complex(*candidate)) for candidate in likely]
     best = int(np.argmin(away))
-    return likely[best] if away[best] < NEAR else (round(shift.real, 1), round(shift.imag, 1))
+    return (
+        likely[best]
+        if away[best] < NEAR
+        else (round(shift.real, 1), round(shift.imag, 1))
+    )
 
 
 def _mirror(turn_deg: float, *, listed: bool) -> str:

@@ -37,7 +37,9 @@ def cells_of(view: View, offset_m: np.ndarray, shift: complex = 0j) -> np.ndarra
     return _rounded(_steps(view, offset_m) - shift)
 
 
-def places_of_cells(view: View, offset_m: np.ndarray, shift: complex = 0j) -> np.ndarray:
+def places_of_cells(
+    view: View, offset_m: np.ndarray, shift: complex = 0j
+) -> np.ndarray:
     """Return the place of the cell that shows each mark, stage axes, (2, n), m."""
     if view.image is None:
         return np.zeros_like(offset_m)
@@ -81,11 +83,14 @@ def shift_of(view: View, offset_m: np.ndarray, away_m: np.ndarray) -> complex:
     known_steps = known_steps - fraction
     nx, ny = (view.image.nx, view.image.ny) if view.image else (1, 1)
     return fraction + complex(
-        middle_of(cells.real, nx, known_steps.real), middle_of(cells.imag, ny, known_steps.imag)
+        middle_of(cells.real, nx, known_steps.real),
+        middle_of(cells.imag, ny, known_steps.imag),
     )
 
 
-def middle_of(numbers: np.ndarray, width: int, known_numbers: np.ndarray | None = None) -> int:
+def middle_of(
+    numbers: np.ndarray, width: int, known_numbers: np.ndarray | None = None
+) -> int:
     """Return the middle of the `width` neighbouring whole numbers that hold most of `numbers`.
 
     Of several that hold as many, but for a quarter of a number's share, that of the median of the
@@ -137,9 +142,14 @@ def middles(view: View, number: np.ndarray, away_m: np.ndarray) -> np.ndarray:
     out = np.zeros_like(away_m)
     cells = np.unique(number[number >= 0])
     for cell in cells if axis in cells else ():
-        out[:, number == cell] = np.median(away_m[:, number == cell], axis=1, keepdims=True)
+        out[:, number == cell] = np.median(
+            away_m[:, number == cell], axis=1, keepdims=True
+        )
     return (
-        out - np.where(number >= 0, np.median(away_m[:, number == axis], axis=1, keepdims=True), 0)
+        out
+        - np.where(
+            number >= 0, np.median(away_m[:, number == axis], axis=1, keepdims=True), 0
+        )
         if out.any()
         else out
     )
@@ -160,7 +170,9 @@ def marks_shown(artifact: Artifact, view: View) -> tuple[np.ndarray, ...]:
     return tuple(beside(stops, artifact, sub) for sub in view.sub_views)
 
 
-def beside(marks: np.ndarray, artifact: Artifact, sub_view: View, sign: int = 1) -> np.ndarray:
+def beside(
+    marks: np.ndarray, artifact: Artifact, sub_view: View, sign: int = 1
+) -> np.ndarray:
     """Return the marks shown in a cell where the stage stops at `marks`, bool (nx, ny).
 
     With `sign` -1, the marks at which the stage stops where `marks` are shown in the cell.
@@ -182,7 +194,9 @@ LOOKED_AT = 2000
 """Largest number of marks per number of readings used for the scatter."""
 
 
-def stage_aside(key: np.ndarray, place_m: np.ndarray, offset_m: float) -> np.ndarray | None:
+def stage_aside(
+    key: np.ndarray, place_m: np.ndarray, offset_m: float
+) -> np.ndarray | None:
     """Return the distance of the stage from its usual position at the mark, for check stops.
 
     Parameters
@@ -217,7 +231,9 @@ def _scatter(key: np.ndarray, place_m: np.ndarray) -> float:
     for group in groups_of(key):
         some = group[:: -(-len(group) // LOOKED_AT)]
         i, j = pairs_of(some.shape[1])
-        apart.append(np.abs(place_m[:, some[:, i]] - place_m[:, some[:, j]]).reshape(2, -1))
+        apart.append(
+            np.abs(place_m[:, some[:, i]] - place_m[:, some[:, j]]).reshape(2, -1)
+        )
     differences_m = np.concatenate(apart, axis=1)
     return (
         float(np.quantile(differences_m, 0.25, axis=1).min()) / QUARTILE
@@ -238,7 +254,10 @@ def _medians(key: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def without_aside(
-    key: np.ndarray, deviation_m: np.ndarray, offset_m: np.ndarray, check_offset_m: float
+    key: np.ndarray,
+    deviation_m: np.ndarray,
+    offset_m: np.ndarray,
+    check_offset_m: float,
 ) -> tuple[np.ndarray, int]:
     """Return deviations minus the microscope's error from check stops, and its parameter count.
 
@@ -255,7 +274,11 @@ def without_aside(
     check_offset_m : float
         Distance of check stops, m; 0 = none.
     """
-    aside = stage_aside(key, deviation_m - offset_m, check_offset_m) if check_offset_m else None
+    aside = (
+        stage_aside(key, deviation_m - offset_m, check_offset_m)
+        if check_offset_m
+        else None
+    )
     if aside is None or not aside.any():
         return deviation_m, 0
     about = np.stack([row - _medians(key, row) for row in deviation_m])
@@ -294,5 +317,7 @@ def count_stops(view: View, readings: ViewReadings) -> tuple[np.ndarray, int]:
     ]
     n_sides = np.sum(sides, axis=0)
     off = aside.any(axis=0) & (n_sides[visits.mark] > 1)
-    extra = np.bincount(visits.mark, visits.count * off, len(readings.m)).astype(np.int64)
+    extra = np.bincount(visits.mark, visits.count * off, len(readings.m)).astype(
+        np.int64
+    )
     return readings.count - extra, int((n_sides == 4).sum())

@@ -9,7 +9,15 @@ from selfcal_ros.collection.settings.parameter import ManagedSettings, declared
 MARKS = ("disc", "ring", "cross", "corner")
 OPTIONS = {
     name: name
-    for name in ("pixel_size", "mark", "mark_size", "mark_width", "polarity", "turn", "mirror")
+    for name in (
+        "pixel_size",
+        "mark",
+        "mark_size",
+        "mark_width",
+        "polarity",
+        "turn",
+        "mirror",
+    )
 }
 """Options of commands that look for marks -> names of parameters."""
 
@@ -24,7 +32,9 @@ class DetectorSettings(ManagedSettings):
 
     NODE: ClassVar[str] = "mark_detector"
     frame_id: str = declared("stage", "frame of published messages (REP-103)")
-    pixel_size: float = declared(0.0, "side of a pixel on the plate; must be set", "m", 0.0, 1.0)
+    pixel_size: float = declared(
+        0.0, "side of a pixel on the plate; must be set", "m", 0.0, 1.0
+    )
     mark: str = declared("disc", "kind of mark", choices=MARKS)
     mark_size: float = declared(
         0.0,
@@ -35,10 +45,16 @@ class DetectorSettings(ManagedSettings):
         1000.0,
     )
     mark_width: float = declared(
-        0.0, "width of the line of a ring or cross; 0 = a fifth of mark_size", "m", 0.0, 1000.0
+        0.0,
+        "width of the line of a ring or cross; 0 = a fifth of mark_size",
+        "m",
+        0.0,
+        1000.0,
     )
     polarity: str = declared(
-        "dark", "marks against the background; corners are both", choices=("dark", "bright")
+        "dark",
+        "marks against the background; corners are both",
+        choices=("dark", "bright"),
     )
     turn: float = declared(
         0.0,
@@ -48,7 +64,9 @@ class DetectorSettings(ManagedSettings):
         -360.0,
         360.0,
     )
-    mirror: bool = declared(False, "the image is mirrored: columns run along -x before the turn")
+    mirror: bool = declared(
+        False, "the image is mirrored: columns run along -x before the turn"
+    )
     aruco: str = declared(
         "",
         "marks along x and y of a plate with ArUco markers (selfcal plate --aruco), as in "
@@ -68,10 +86,18 @@ class DetectorSettings(ManagedSettings):
         65535,
     )
     max_blur: float = declared(
-        0.15, "blur of a mark, over its size, above which it is rejected as defocused", "", 0.0, 1.0
+        0.15,
+        "blur of a mark, over its size, above which it is rejected as defocused",
+        "",
+        0.0,
+        1.0,
     )
     size_tolerance: float = declared(
-        0.2, "relative deviation from mark_size above which a mark is rejected", "", 0.0, 1.0
+        0.2,
+        "relative deviation from mark_size above which a mark is rejected",
+        "",
+        0.0,
+        1.0,
     )
     max_sigma_px: float = declared(
         0.3,

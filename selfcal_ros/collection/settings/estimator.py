@@ -13,7 +13,12 @@ from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
-from selfcal_ros.model.terms import ModelTerm, default_terms, microscope_term, parse_terms
+from selfcal_ros.model.terms import (
+    ModelTerm,
+    default_terms,
+    microscope_term,
+    parse_terms,
+)
 from selfcal_ros.model.view import Plan
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.results import read_result
@@ -77,10 +82,14 @@ def _with_marks(data: object, where: str, folder: Path) -> object:
     for key in ("grid_size", "grid_pitch"):
         if key in plate:
             raise InputError(
-                f"{where}: artifact", f"marks and {key} are both given", "leave one of them out"
+                f"{where}: artifact",
+                f"marks and {key} are both given",
+                "leave one of them out",
             )
     path = folder / plate["marks"]
-    return data | {"artifact": plate | {"marks": _marks_in(read_text(path, MOST_BYTES), str(path))}}
+    return data | {
+        "artifact": plate | {"marks": _marks_in(read_text(path, MOST_BYTES), str(path))}
+    }
 
 
 def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
@@ -91,7 +100,10 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
         if line.strip(", ") and not line.startswith("#")
     ]
     head = (
-        [cell.lower().removesuffix("_m") for cell in csv_cells(lines[0][1], lines[0][0])]
+        [
+            cell.lower().removesuffix("_m")
+            for cell in csv_cells(lines[0][1], lines[0][0])
+        ]
         if lines
         else []
     )
@@ -106,7 +118,9 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
     for place, line in lines[1:]:
         cells = csv_cells(line, place)
         if len(cells) != len(head):
-            raise InputError(place, f"{len(cells)} cells, not {len(head)}", "correct the line")
+            raise InputError(
+                place, f"{len(cells)} cells, not {len(head)}", "correct the line"
+            )
         for name, values in columns.items():
             cell = cells[head.index(name)]
             try:
@@ -116,12 +130,20 @@ def _marks_in(text: str, where: str) -> dict[str, list[Any]]:
                 raise InputError(
                     place, f"{name} '{cell}' is not a {_KIND[name]}", "correct the line"
                 ) from None
-    marks_of(columns["id"], columns["x"], columns["y"], where=[place for place, _ in lines[1:]])
+    marks_of(
+        columns["id"],
+        columns["x"],
+        columns["y"],
+        where=[place for place, _ in lines[1:]],
+    )
     return columns
 
 
 def solver_options(
-    settings: SolverSettings, measurements: Measurements | None = None, *, plate_from: str = ""
+    settings: SolverSettings,
+    measurements: Measurements | None = None,
+    *,
+    plate_from: str = "",
 ) -> Options:
     """Return the estimator's options in a solver's settings.
 
@@ -175,7 +197,9 @@ def _reference(
     if kind == "none" or (marks and measurements is None):
         return None
     reference = (
-        ReferenceLength.between(marks, measurements.artifact, settings.reference_certificate)
+        ReferenceLength.between(
+            marks, measurements.artifact, settings.reference_certificate
+        )
         if marks and measurements
         else ReferenceLength(
             ReferenceKind(kind),
@@ -184,14 +208,20 @@ def _reference(
             settings.reference_certificate,
         )
     )
-    return reference.at_temperature(settings.reference_at) if settings.reference_at else reference
+    return (
+        reference.at_temperature(settings.reference_at)
+        if settings.reference_at
+        else reference
+    )
 
 
 def _terms(
     entries: list[str], measurements: Measurements | None
 ) -> tuple[tuple[ModelTerm, ...], str]:
     """Return the terms of the model, and where they come from: ``options`` or ``plan``."""
-    words = [word for text in entries for item in text.split(",") if (word := item.strip())]
+    words = [
+        word for text in entries for item in text.split(",") if (word := item.strip())
+    ]
     if words == [NO_TERMS]:
         return (), ""
     if NO_TERMS in words:
@@ -210,7 +240,9 @@ def _terms(
     terms = parse_terms(entries, "model_terms")
     # the microscope's uncertainty in the plan is no choice of a model
     microscope_terms = [
-        term for term in planned if term.parts and term.name not in {t.name for t in terms}
+        term
+        for term in planned
+        if term.parts and term.name not in {t.name for t in terms}
     ]
     return (*terms, *microscope_terms), "options"
 
@@ -220,4 +252,6 @@ def _assumed(settings: SolverSettings) -> tuple[ModelTerm, ...]:
     if [word.strip() for word in settings.model_terms] == [NO_TERMS]:
         return ()
     declared = microscope_term(settings.scale_u, settings.rotation_u, settings.shear_u)
-    return tuple(declared if term.name == declared.name else term for term in default_terms())
+    return tuple(
+        declared if term.name == declared.name else term for term in default_terms()
+    )

@@ -10,7 +10,12 @@ from typing import Any, ClassVar, get_args
 
 from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.parameter import ManagedSettings, Parameter, Settings, declared
+from selfcal_ros.collection.settings.parameter import (
+    ManagedSettings,
+    Parameter,
+    Settings,
+    declared,
+)
 from selfcal_ros.compensation.cells import Interpolation, Outside
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.model.error_map import ThetaDatum
@@ -57,16 +62,28 @@ class CollectorSettings(ManagedSettings):
     joint_y: str = declared("y", "name of the joint that indicates y")
     joint_theta: str = declared("theta", "name of the joint that indicates theta")
     max_encoder_gap: float = declared(
-        0.1, "largest gap between the encoder samples around an exposure", "s", 1e-6, 10.0
+        0.1,
+        "largest gap between the encoder samples around an exposure",
+        "s",
+        1e-6,
+        10.0,
     )
     max_speed: float = declared(
         5e-4, "largest speed at which the stage counts as at rest", "m/s", 0.0, 1.0
     )
     max_angular_speed: float = declared(
-        5e-3, "largest turn rate at which the stage counts as at rest", "rad/s", 0.0, 10.0
+        5e-3,
+        "largest turn rate at which the stage counts as at rest",
+        "rad/s",
+        0.0,
+        10.0,
     )
     encoder_agreement: float = declared(
-        1e-9, "largest difference between two samples with the same stamp", "m or rad", 0.0, 1e-3
+        1e-9,
+        "largest difference between two samples with the same stamp",
+        "m or rad",
+        0.0,
+        1e-3,
     )
     min_score: float = declared(
         0.4, "smallest score of a usable detection (ignored if all are 0)", "", 0.0, 1.0
@@ -127,7 +144,9 @@ class CollectorSettings(ManagedSettings):
         0.0,
         1e-2,
     )
-    status_period: float = declared(0.5, "time between two ViewStatus messages", "s", 0.02, 60.0)
+    status_period: float = declared(
+        0.5, "time between two ViewStatus messages", "s", 0.02, 60.0
+    )
     clock_limit: float = declared(
         0.1,
         "offset between the cell's clock and this machine's above which there is a warning; "
@@ -224,11 +243,16 @@ class SolverSettings(ManagedSettings):
         -0.09,
         0.09,
     )
-    reference_u: float = declared(0.0, "standard uncertainty of that (k=1)", "m/m", 0.0, 0.09)
-    reference_marks: str = declared(
-        "", "kind marks: marks, distance, its u (m), M,N:M,N:LENGTH:U; of a list ID:ID:LENGTH:U"
+    reference_u: float = declared(
+        0.0, "standard uncertainty of that (k=1)", "m/m", 0.0, 0.09
     )
-    reference_certificate: str = declared("", "certificate of the known length: number, issuer")
+    reference_marks: str = declared(
+        "",
+        "kind marks: marks, distance, its u (m), M,N:M,N:LENGTH:U; of a list ID:ID:LENGTH:U",
+    )
+    reference_certificate: str = declared(
+        "", "certificate of the known length: number, issuer"
+    )
     reference_at: str = declared(
         "",
         "temperatures for converting that length to the measurement: T:U_T:ALPHA:U_ALPHA[:T0], "
@@ -298,19 +322,28 @@ class SequencerSettings(ManagedSettings):
     NODE: ClassVar[str] = "pose_sequencer"
     plan: str = _plan()
     frame_id: str = _frame()
-    auto_start: bool = declared(False, "start the plan without waiting for the start service")
+    auto_start: bool = declared(
+        False, "start the plan without waiting for the start service"
+    )
     start_checks: bool = declared(
         True,
         "start only when collector, encoder, detections and solver are present; false = "
         "start without",
     )
     resume: bool = declared(
-        True, "the first start resumes the unfinished run of the plan that the collector knows"
+        True,
+        "the first start resumes the unfinished run of the plan that the collector knows",
     )
     stall_time: float = declared(
-        5.0, "time without a detection after which a view is reported as stalled", "s", 0.1, 3600.0
+        5.0,
+        "time without a detection after which a view is reported as stalled",
+        "s",
+        0.1,
+        3600.0,
     )
-    auto_confirm: bool = declared(False, "measure without waiting for confirm_view (robot loaders)")
+    auto_confirm: bool = declared(
+        False, "measure without waiting for confirm_view (robot loaders)"
+    )
     settle_time: float = declared(
         0.5, "time between PLACE and MEASURE when auto_confirm is set", "s", 0.0, 3600.0
     )
@@ -321,7 +354,9 @@ class SequencerSettings(ManagedSettings):
         0.0,
         1e6,
     )
-    max_redos: int = declared(0, "redos of an incomplete view after a time-out", "", 0, 100)
+    max_redos: int = declared(
+        0, "redos of an incomplete view after a time-out", "", 0, 100
+    )
     result_path: str = declared(
         "",
         "file to which run_calibration has the solver save the map; empty = PLAN_ID.json in "
@@ -338,7 +373,8 @@ class CompensatorSettings(ManagedSettings):
 
     NODE: ClassVar[str] = "compensator"
     frame_id: str = declared(
-        "stage", "frame of the positions to correct; a map that states another one is not used"
+        "stage",
+        "frame of the positions to correct; a map that states another one is not used",
     )
     joint_x: str = declared("x", "name of the joint that indicates x")
     joint_y: str = declared("y", "name of the joint that indicates y")
@@ -370,7 +406,11 @@ class CompensatorSettings(ManagedSettings):
         1.0,
     )
     max_map_age: float = declared(
-        0.0, "age of the map in use above which there is a warning; 0 = none", "s", 0.0, 1e9
+        0.0,
+        "age of the map in use above which there is a warning; 0 = none",
+        "s",
+        0.0,
+        1e9,
     )
     max_age: float = declared(
         0.02,
@@ -388,10 +428,18 @@ class PlayerSettings(Settings):
     NODE: ClassVar[str] = "bag_player"
     bag: str = declared("", "MCAP file or rosbag2 folder")
     rate: float = declared(
-        1.0, "speed of the replay; 0 = as fast as the subscribers keep up", "", 0.0, 1000.0
+        1.0,
+        "speed of the replay; 0 = as fast as the subscribers keep up",
+        "",
+        0.0,
+        1000.0,
     )
     seed: int = declared(
-        -1, "shuffle the order of arrival with this seed; -1 = as recorded", "", -1, 2**31
+        -1,
+        "shuffle the order of arrival with this seed; -1 = as recorded",
+        "",
+        -1,
+        2**31,
     )
     listener: str = declared(
         CollectorSettings.NODE,
@@ -420,7 +468,9 @@ class RecorderSettings(Settings):
 
     NODE: ClassVar[str] = "bag_recorder"
     bag: str = declared("", "folder to write")
-    all_topics: bool = declared(True, "record selfcal/* results in addition to the inputs")
+    all_topics: bool = declared(
+        True, "record selfcal/* results in addition to the inputs"
+    )
 
 
 @dataclass(frozen=True)
@@ -441,49 +491,78 @@ class SimulatorSettings(Settings):
     frame_id: str = _frame()
     plan: str = _plan()
     seed: int = declared(0, "seed of the truth and of the noise", "", 0, 2**31)
-    sigma_xy: float = declared(2e-8, "standard deviation of one grid reading", **_LENGTH)
+    sigma_xy: float = declared(
+        2e-8, "standard deviation of one grid reading", **_LENGTH
+    )
     sigma_theta: float = declared(
         1.7453292519943296e-05, "standard deviation of one angular reading", **_ANGLE
     )
     noise_ratio: float = declared(1.0, "noise of y over that of x", "", 0.0, 100.0)
-    encoder_rate: float = declared(500.0, "encoder samples per second", "Hz", 1.0, 10000.0)
-    exposure_period: float = declared(0.01, "time between two exposures", "s", 0.001, 10.0)
+    encoder_rate: float = declared(
+        500.0, "encoder samples per second", "Hz", 1.0, 10000.0
+    )
+    exposure_period: float = declared(
+        0.01, "time between two exposures", "s", 0.001, 10.0
+    )
     with_ids: bool = declared(True, "detections name their marks")
     truth_path: str = declared("", "JSON file for the known truth; empty = none")
-    camera: str = declared("", "SIM.yaml: camera for images, sizes of the truth; empty = none")
+    camera: str = declared(
+        "", "SIM.yaml: camera for images, sizes of the truth; empty = none"
+    )
     declare_sigma: bool = declared(False, "detections state their standard deviation")
-    servo_sigma: float = declared(2e-8, "scatter of the stage about its stop position", **_LENGTH)
+    servo_sigma: float = declared(
+        2e-8, "scatter of the stage about its stop position", **_LENGTH
+    )
     servo_sigma_theta: float = declared(1e-7, "the same of theta", **_ANGLE)
-    encoder_sigma: float = declared(0.0, "noise of the encoder readings, without motion", **_LENGTH)
+    encoder_sigma: float = declared(
+        0.0, "noise of the encoder readings, without motion", **_LENGTH
+    )
     encoder_sigma_theta: float = declared(0.0, "the same of theta", **_ANGLE)
-    stop_sigma: float = declared(0.0, "stop error of the stage relative to its target", **_LENGTH)
+    stop_sigma: float = declared(
+        0.0, "stop error of the stage relative to its target", **_LENGTH
+    )
     stop_sigma_theta: float = declared(0.0, "the same of theta", **_ANGLE)
     follow_mark: bool = declared(
-        False, "the stage goes to the actual position of the mark, not to the nominal one"
+        False,
+        "the stage goes to the actual position of the mark, not to the nominal one",
     )
     visit_order: str = declared(
         "", "order of the marks if the command specifies none; empty = serpentine"
     )
-    consecutive: bool = declared(False, "all repeats of a mark consecutively, in one pass")
-    visit_xy: float = declared(0.0, "noise shared by the exposures of a visit", **_LENGTH)
+    consecutive: bool = declared(
+        False, "all repeats of a mark consecutively, in one pass"
+    )
+    visit_xy: float = declared(
+        0.0, "noise shared by the exposures of a visit", **_LENGTH
+    )
     image_xy: float = declared(0.0, "noise shared by the marks of an image", **_LENGTH)
     flicker_xy: float = declared(0.0, "1/f noise of grid readings", **_LENGTH)
     flicker_theta: float = declared(0.0, "1/f noise of angular readings", **_ANGLE)
     resolution_xy: float = declared(0.0, "step of the offsets of marks", **_LENGTH)
     resolution_theta: float = declared(0.0, "step of the offsets of lines", **_ANGLE)
-    microscope_scale: float = declared(0.0, "true over measured length, minus 1", **_RATIO)
-    microscope_stretch: float = declared(0.0, "the same, positive for x, negative for y", **_RATIO)
+    microscope_scale: float = declared(
+        0.0, "true over measured length, minus 1", **_RATIO
+    )
+    microscope_stretch: float = declared(
+        0.0, "the same, positive for x, negative for y", **_RATIO
+    )
     microscope_rotation: float = declared(
         0.0, "rotation of the microscope relative to the stage", "rad", -0.1, 0.1
     )
-    microscope_shear: float = declared(0.0, "symmetric shear of the microscope", **_RATIO)
+    microscope_shear: float = declared(
+        0.0, "symmetric shear of the microscope", **_RATIO
+    )
     microscope_axes: str = declared(
         "xy",
         "what is published as x and y of an offset",
         choices=("xy", "-x-y", "-xy", "x-y", "yx", "-y-x", "y-x", "-yx"),
     )
-    microscope_pixels: float = declared(1.0, "published over measured offset", "", -100.0, 100.0)
-    line_factor: float = declared(1.0, "published over true offset of a line", "", -100.0, 100.0)
+    microscope_pixels: float = declared(
+        1.0, "published over measured offset", "", -100.0, 100.0
+    )
+    line_factor: float = declared(
+        1.0, "published over true offset of a line", "", -100.0, 100.0
+    )
     microscope_distortion: float = declared(
         0.0,
         "relative amount by which offsets are too long at the edge of the microscope's field",
@@ -501,10 +580,16 @@ class SimulatorSettings(Settings):
     )
     optical_tilt_y: float = declared(0.0, "the same along y", "rad", -0.1, 0.1)
     backlash_x: float = declared(
-        0.0, "indicated - true position of x after a motion in + direction", "m", -1e-3, 1e-3
+        0.0,
+        "indicated - true position of x after a motion in + direction",
+        "m",
+        -1e-3,
+        1e-3,
     )
     backlash_y: float = declared(0.0, "the same of y", "m", -1e-3, 1e-3)
-    backlash_growth: float = declared(0.0, "growth of both during a view", "m", -1e-3, 1e-3)
+    backlash_growth: float = declared(
+        0.0, "growth of both during a view", "m", -1e-3, 1e-3
+    )
     settling: float = declared(
         0.0,
         "distance by which an axis is short of its position at the exposure after a motion",
@@ -516,13 +601,19 @@ class SimulatorSettings(Settings):
         0.01, "time in which this falls to 1/e at rest", "s", 1e-6, 3600.0
     )
     stage_bend: float = declared(
-        0.0, "bending of the stage in each view, at mid-edge, standard deviation", **_LENGTH
+        0.0,
+        "bending of the stage in each view, at mid-edge, standard deviation",
+        **_LENGTH,
     )
     stage_yaw: float = declared(
         0.0, "rotation of the stage from site to site, standard deviation", **_ANGLE
     )
     plate_scale: float = declared(
-        0.0, "growth of the plate in views after the first, standard deviation", "m/m", 0.0, 0.1
+        0.0,
+        "growth of the plate in views after the first, standard deviation",
+        "m/m",
+        0.0,
+        0.1,
     )
     plate_shape: float = declared(
         0.0,
@@ -530,7 +621,11 @@ class SimulatorSettings(Settings):
         **_LENGTH,
     )
     plate_strain: float = declared(
-        0.0, "strain of the plate in views after the first, standard deviation", "m/m", 0.0, 0.1
+        0.0,
+        "strain of the plate in views after the first, standard deviation",
+        "m/m",
+        0.0,
+        0.1,
     )
     plate_tilt: float = declared(
         0.0, "tilt of the plate in each view, standard deviation", **_ANGLE
@@ -590,13 +685,17 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
         last = name.rsplit("/", 1)[-1]
         if last not in ("**", "*") and last not in NODE_PARAMETERS:
             raise InputError(
-                f"{where}: {name}", "no node of this package", known_are(last, NODE_PARAMETERS)
+                f"{where}: {name}",
+                "no node of this package",
+                known_are(last, NODE_PARAMETERS),
             )
         if last == node or last in ("**", "*"):
             flat = dict(_flatten(section, ""))
             if last != node:  # a wild-card section may hold parameters of other nodes
                 names_of_node = {parameter.name for parameter in NODE_PARAMETERS[node]}
-                everywhere = {p.name for table in NODE_PARAMETERS.values() for p in table}
+                everywhere = {
+                    p.name for table in NODE_PARAMETERS.values() for p in table
+                }
                 flat = {
                     key: value
                     for key, value in flat.items()
@@ -608,7 +707,9 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
 
 def _sections(data: object, prefix: str, where: str) -> list[tuple[str, dict]]:
     if not isinstance(data, dict):
-        raise InputError(where, "not a ROS parameter file", "write 'NODE: ros__parameters: ...'")
+        raise InputError(
+            where, "not a ROS parameter file", "write 'NODE: ros__parameters: ...'"
+        )
     out = []
     for key, value in data.items():
         if key == "ros__parameters":
@@ -628,5 +729,7 @@ def _flatten(section: dict, prefix: str) -> list[tuple[str, Any]]:
     out = []
     for key, value in section.items():
         name = f"{prefix}{key}"
-        out += _flatten(value, name + ".") if isinstance(value, dict) else [(name, value)]
+        out += (
+            _flatten(value, name + ".") if isinstance(value, dict) else [(name, value)]
+        )
     return out

@@ -58,7 +58,8 @@ class Parameter:
                 f"choose one of {', '.join(self.choices)}",
             )
         if kind in (int, float) and not (
-            (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+            (self.low is None or value >= self.low)
+            and (self.high is None or value <= self.high)
         ):
             raise InputError(
                 f"{where}: {self.name}",
@@ -78,7 +79,13 @@ def declared(
     choices: tuple[str, ...] = (),
 ) -> Any:
     """Return a field of a dataclass of settings, see `Parameter`."""
-    about = {"description": description, "unit": unit, "low": low, "high": high, "choices": choices}
+    about = {
+        "description": description,
+        "unit": unit,
+        "low": low,
+        "high": high,
+        "choices": choices,
+    }
     if isinstance(default, list):
         return field(default_factory=default.copy, metadata=about)
     return field(default=default, metadata=about)
@@ -96,7 +103,8 @@ class Settings:
 
     NODE: ClassVar[str]
     hardware_id: str = declared(
-        "", "name or serial number of the stage, in the health; empty = the namespace, or 'stage'"
+        "",
+        "name or serial number of the stage, in the health; empty = the namespace, or 'stage'",
     )
 
     @classmethod
@@ -126,7 +134,9 @@ class Settings:
                 continue
             if name not in table:
                 raise InputError(
-                    f"{where}: {name}", f"{cls.NODE} has no such parameter", known_are(name, table)
+                    f"{where}: {name}",
+                    f"{cls.NODE} has no such parameter",
+                    known_are(name, table),
                 )
             values[name] = table[name].check(value, where)
         return cls(**values)
@@ -137,5 +147,6 @@ class ManagedSettings(Settings):
     """The parameters of a managed node."""
 
     autostart: bool = declared(
-        True, "configure and activate automatically; false = wait for a lifecycle manager"
+        True,
+        "configure and activate automatically; false = wait for a lifecycle manager",
     )

@@ -76,7 +76,9 @@ class Misplaced:
         cls, view: str, planned: StagePose, lies: StagePose, gain: float = float("inf")
     ) -> "Misplaced":
         """Return the difference of two poses."""
-        return cls(view, planned.turn_deg, lies.turn_deg, planned.shift, lies.shift, gain)
+        return cls(
+            view, planned.turn_deg, lies.turn_deg, planned.shift, lies.shift, gain
+        )
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,9 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
         and (readings := _readings_in_window(artifact, view)) is not None
     ]
     compared_views = [
-        (view, readings) for view, readings in window_views if view.cell in (None, (0, 0))
+        (view, readings)
+        for view, readings in window_views
+        if view.cell in (None, (0, 0))
     ]
     if len(compared_views) < 3:
         compared_views = window_views
@@ -145,7 +149,8 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     sigma = (
         np.sqrt(
             np.average(
-                [view.sigma_xy**2 for view in repeated], weights=[view.dof_xy for view in repeated]
+                [view.sigma_xy**2 for view in repeated],
+                weights=[view.dof_xy for view in repeated],
             )
         )
         if repeated
@@ -167,9 +172,10 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     tried = []
     names = list(dict.fromkeys(view.plan_view for view, _ in compared_views))
     for view, readings in compared_views:
+        # their relative pose alone counts
         if view.cell not in (None, (0, 0)) or (
             len(names) == 2 and view.plan_view == names[0]
-        ):  # their relative pose alone counts
+        ):
             continue
         moved_views = [
             number
@@ -185,7 +191,9 @@ def misplaced(measurements: Measurements) -> Misplaced | Mirrored | None:
     tried.sort(key=lambda item: -item[0])
     best = max(tried[0][0] if tried else 0.0, 0.0)
     enough = max(CONTRADICTED, LEFT * square)
-    if mirrored := _mirrored(views, planned, sizes, max(best + CLEARLY, BETTER), enough):
+    if mirrored := _mirrored(
+        views, planned, sizes, max(best + CLEARLY, BETTER), enough
+    ):
         return mirrored
     if not tried:
         return None
@@ -209,7 +217,9 @@ def _mirrored(
         likelihood, mean_square = _likelihood(
             [
                 replace(
-                    readings, place=reflect(readings.place), deviation=reflect(readings.deviation)
+                    readings,
+                    place=reflect(readings.place),
+                    deviation=reflect(readings.deviation),
                 )
                 for readings in views
             ],
@@ -222,7 +232,9 @@ def _mirrored(
     return Mirrored(axes, best) if axes else None
 
 
-def _at_pose(readings: _WindowReadings, planned: AnyPose, pose: AnyPose) -> _WindowReadings:
+def _at_pose(
+    readings: _WindowReadings, planned: AnyPose, pose: AnyPose
+) -> _WindowReadings:
     """Return the readings of a cell of images at the pose of their view; the camera stays."""
     if readings.pose == planned:
         return replace(readings, pose=pose)
@@ -236,7 +248,16 @@ def other_poses(pose: LatticePose) -> Iterator[LatticePose]:
     """Yield other poses of a plate on the lattice: turned, shifted differently, not at all."""
     a, b = pose.shift
     yield from (replace(pose, quarter_turns=q) for q in range(4) if q != pose.q)
-    shifts = {(0, 0), (-a, -b), (b, a), (-b, -a), (a + 1, b), (a - 1, b), (a, b + 1), (a, b - 1)}
+    shifts = {
+        (0, 0),
+        (-a, -b),
+        (b, a),
+        (-b, -a),
+        (a + 1, b),
+        (a - 1, b),
+        (a, b + 1),
+        (a, b - 1),
+    }
     yield from (replace(pose, shift=shift) for shift in sorted(shifts - {pose.shift}))
 
 
@@ -250,8 +271,13 @@ def _poses(readings: _WindowReadings, artifact: Artifact) -> Iterator[AnyPose]:
     shift = complex(*pose.shift)
     for turn, step in motions(artifact, phase, shift):
         new_shift = shift + phase * step
-        new_pose = replace(pose, phase=phase * turn, shift=(new_shift.real, new_shift.imag))
-        if on_marks(artifact, replace(readings, pose=new_pose).marks)[1].mean() >= ON_MARKS:
+        new_pose = replace(
+            pose, phase=phase * turn, shift=(new_shift.real, new_shift.imag)
+        )
+        if (
+            on_marks(artifact, replace(readings, pose=new_pose).marks)[1].mean()
+            >= ON_MARKS
+        ):
             yield new_pose
 
 
@@ -262,7 +288,9 @@ def on_marks(artifact: Artifact, places: np.ndarray) -> tuple[np.ndarray, np.nda
     return away.argmin(axis=1), away.min(axis=1) < SAME_MARK
 
 
-def motions(artifact: Artifact, phase: complex, shift: complex) -> list[tuple[complex, complex]]:
+def motions(
+    artifact: Artifact, phase: complex, shift: complex
+) -> list[tuple[complex, complex]]:
     """Return turns, and shifts in pitches of the plate, with which marks may lie on marks.
 
     A shift by a pitch, in no, the opposite or another direction, and quarter turns; of a list, by
@@ -270,7 +298,10 @@ def motions(artifact: Artifact, phase: complex, shift: complex) -> list[tuple[co
     """
     if artifact.marks is not None:
         marks = (artifact.x_m + 1j * artifact.y_m).ravel() / artifact.grid_pitch_m
-        candidates = [*_symmetries(marks), *((1, step) for step in _steps(phase, shift))]
+        candidates = [
+            *_symmetries(marks),
+            *((1, step) for step in _steps(phase, shift)),
+        ]
         return [
             motion
             for number, motion in enumerate(candidates)
@@ -294,7 +325,11 @@ def motions(artifact: Artifact, phase: complex, shift: complex) -> list[tuple[co
 
 def _steps(phase: complex, shift: complex) -> list[complex]:
     """Return the steps on the plate from a shift to none, and to its other directions."""
-    return [(place - shift) / phase for place in (0, -shift, 1j * shift, -1j * shift) if shift]
+    return [
+        (place - shift) / phase
+        for place in (0, -shift, 1j * shift, -1j * shift)
+        if shift
+    ]
 
 
 def _symmetries(marks: np.ndarray) -> Iterator[tuple[complex, complex]]:
@@ -303,10 +338,14 @@ def _symmetries(marks: np.ndarray) -> Iterator[tuple[complex, complex]]:
     yield from ((mark / outer[0] / abs(mark / outer[0]), 0j) for mark in outer[1:])
     steps = marks - marks[np.abs(marks).argmin()]
     steps = steps[np.abs(steps) > SAME_MARK]
-    yield from ((1 + 0j, step) for step in steps[np.argsort(np.abs(steps))[:4]].tolist())
+    yield from (
+        (1 + 0j, step) for step in steps[np.argsort(np.abs(steps))[:4]].tolist()
+    )
 
 
-def _readings_in_window(artifact: Artifact, view: ViewReadings) -> _WindowReadings | None:
+def _readings_in_window(
+    artifact: Artifact, view: ViewReadings
+) -> _WindowReadings | None:
     """Return the readings of a view in the window; None if too few, or without a grid."""
     pose = view.view.on_stage(artifact)
     if not pose.has_sites or not len(view.m):
@@ -342,7 +381,9 @@ def _motion(readings: _WindowReadings) -> np.ndarray:
     Offset, rotation, strain and bending; the residual belongs to the marks.
     """
     z = readings.place / WINDOW
-    return np.stack([np.ones(len(z)), z, z.conj(), z * z, z * z.conj(), z.conj() ** 2], axis=1)
+    return np.stack(
+        [np.ones(len(z)), z, z.conj(), z * z, z * z.conj(), z.conj() ** 2], axis=1
+    )
 
 
 def _alike(views: list[_WindowReadings], nodes: float) -> np.ndarray:
@@ -360,7 +401,10 @@ def _alike(views: list[_WindowReadings], nodes: float) -> np.ndarray:
     site = np.concatenate([readings.place for readings in views])
     if not nodes:
         return np.equal.outer(site, site)
-    x, y = (np.subtract.outer(coordinate, coordinate) for coordinate in (site.real, site.imag))
+    x, y = (
+        np.subtract.outer(coordinate, coordinate)
+        for coordinate in (site.real, site.imag)
+    )
     return np.exp(-(x * x + y * y) / (2 * nodes**2))
 
 
@@ -396,12 +440,16 @@ class _FactoredReadings:
         stage: np.ndarray,
     ) -> None:
         self.noise, self.spread, self.free = noise, spread, FREE * len(views)
-        of_view = np.repeat(np.arange(len(views)), [len(readings.place) for readings in views])
+        of_view = np.repeat(
+            np.arange(len(views)), [len(readings.place) for readings in views]
+        )
         tried = np.isin(of_view, moved_views)
         fixed = np.flatnonzero(~tried)
         self.beside, self.own = stage[np.ix_(fixed, tried)], stage[np.ix_(tried, tried)]
         self.views = [
-            readings for number, readings in enumerate(views) if number not in moved_views
+            readings
+            for number, readings in enumerate(views)
+            if number not in moved_views
         ]
         self.factor = np.linalg.cholesky(
             self._covariance(self.views, self.views, stage[np.ix_(fixed, fixed)])
@@ -413,13 +461,16 @@ class _FactoredReadings:
         """Return the likelihood of all readings with those of the others at these poses."""
         white, sizes = self.white, self.sizes
         if moved_readings:
-            whitened_cross = self.whiten @ self._covariance(self.views, moved_readings, self.beside)
+            whitened_cross = self.whiten @ self._covariance(
+                self.views, moved_readings, self.beside
+            )
             factor = np.linalg.cholesky(
                 self._covariance(moved_readings, moved_readings, self.own)
                 - whitened_cross.conj().T @ whitened_cross
             )
             residual_columns = (
-                self._columns(moved_readings, len(self.views)) - whitened_cross.conj().T @ white
+                self._columns(moved_readings, len(self.views))
+                - whitened_cross.conj().T @ white
             )
             white = np.concatenate([white, np.linalg.solve(factor, residual_columns)])
             sizes = np.concatenate([sizes, np.diag(factor).real])
@@ -428,7 +479,9 @@ class _FactoredReadings:
             np.linalg.norm(white[:, -1]) ** 2
             - (inner[:, -1].conj() @ np.linalg.solve(inner[:, :-1], inner[:, -1])).real
         )
-        likelihood = -square / 2 - 2 * np.log(sizes).sum() - np.linalg.slogdet(inner[:, :-1])[1]
+        likelihood = (
+            -square / 2 - 2 * np.log(sizes).sum() - np.linalg.slogdet(inner[:, :-1])[1]
+        )
         return float(likelihood), float(square / 2 / (len(white) - self.free))
 
     @cached_property
@@ -437,13 +490,18 @@ class _FactoredReadings:
         return np.linalg.inv(self.factor)
 
     def _covariance(
-        self, some: list[_WindowReadings], others: list[_WindowReadings], stage: np.ndarray
+        self,
+        some: list[_WindowReadings],
+        others: list[_WindowReadings],
+        stage: np.ndarray,
     ) -> np.ndarray:
         """Return the covariance of readings, `stage` that of the stage's errors in them."""
         (turn, mark), (other_turn, other_mark) = map(_on_plate, (some, others))
         covariance = self.spread**2 / 2 * stage.astype(complex)
         row, column = np.equal.outer(mark, other_mark).nonzero()
-        covariance[row, column] += self.spread**2 / 2 * turn[row] * other_turn[column].conj()
+        covariance[row, column] += (
+            self.spread**2 / 2 * turn[row] * other_turn[column].conj()
+        )
         if some is others:
             covariance.flat[:: len(mark) + 1] += self.noise**2
         return covariance
@@ -467,7 +525,13 @@ def _on_plate(views: list[_WindowReadings]) -> tuple[np.ndarray, np.ndarray]:
     none = np.zeros(0, dtype=complex)
     return (
         np.concatenate(
-            [none, *(np.full(len(readings.place), readings.pose.phase) for readings in views)]
+            [
+                none,
+                *(
+                    np.full(len(readings.place), readings.pose.phase)
+                    for readings in views
+                ),
+            ]
         ),
         np.round(np.concatenate([none, *(readings.marks for readings in views)]), 3),
     )

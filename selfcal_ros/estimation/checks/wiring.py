@@ -25,7 +25,12 @@ from math import exp, lgamma, log, pi
 import numpy as np
 
 from selfcal_ros.errors import InputError
-from selfcal_ros.model.readings import GridVisits, Measurements, RepeatMotion, ViewReadings
+from selfcal_ros.model.readings import (
+    GridVisits,
+    Measurements,
+    RepeatMotion,
+    ViewReadings,
+)
 
 BEYOND_DOUBT = 1e-6
 """Probability, over all tests, below which a finding is beyond doubt, as that of a wrong wiring:
@@ -103,7 +108,9 @@ class WiringFault:
 def check_wiring(measurements: Measurements) -> None:
     """Raise WiringError for the first fault of `wiring_faults`."""
     for error in map(wiring_error, wiring_faults(measurements)):
-        raise WiringError(f"plan '{measurements.plan_id}', {error.where}", error.what, error.remedy)
+        raise WiringError(
+            f"plan '{measurements.plan_id}', {error.where}", error.what, error.remedy
+        )
 
 
 def wiring_faults(measurements: Measurements) -> list[WiringFault]:
@@ -144,18 +151,25 @@ def sign_of_lines_is_shown(measurements: Measurements) -> bool:
 
     A stage that rests on each line by its own sight has no offset, of whatever sign.
     """
-    motions = [view.motion_theta for view in measurements.views if view.motion_theta is not None]
+    motions = [
+        view.motion_theta
+        for view in measurements.views
+        if view.motion_theta is not None
+    ]
     if not motions:
         return False
     motion = _sum(motions)
     place, offset = np.diag(motion.products)
     follows = place > LEAST_NOISE_M**2 * motion.dof
     return bool(follows) and (
-        offset == 0 or (motion.dof > 1 and _p_for(motion, np.eye(1), -np.eye(1)) < SHOWN)
+        offset == 0
+        or (motion.dof > 1 and _p_for(motion, np.eye(1), -np.eye(1)) < SHOWN)
     )
 
 
-def contradicted_scale(measurements: Measurements, u_scale: float) -> OffsetResponse | None:
+def contradicted_scale(
+    measurements: Measurements, u_scale: float
+) -> OffsetResponse | None:
     """Return the response that most contradicts a microscope's scale of 1 ± u_scale; None if none.
 
     From all views together. The scale is between the slope and `OffsetResponse.most`, so noise of
@@ -192,7 +206,9 @@ def _sum(motions: Sequence[RepeatMotion]) -> RepeatMotion:
     )
 
 
-def _together(motions: list[tuple[str, RepeatMotion]]) -> Iterator[tuple[str, RepeatMotion]]:
+def _together(
+    motions: list[tuple[str, RepeatMotion]],
+) -> Iterator[tuple[str, RepeatMotion]]:
     """Yield the sums of all views, then those of each view with its name."""
     if motions:
         yield "", _sum([motion for _, motion in motions])
@@ -227,12 +243,19 @@ def _wrong(
     out = []
     for j in range(n):
         i = int(np.abs(wiring[j]).argmax())
-        if not (has_moved[i] and has_moved[n + j]) or motion.products[i, n + j] * wiring[j, i] >= 0:
+        if (
+            not (has_moved[i] and has_moved[n + j])
+            or motion.products[i, n + j] * wiring[j, i] >= 0
+        ):
             continue
         response = _response(motion, (i, j), axes)
         if response.p >= F_LEVEL or response.most < LEAST_SLOPE:
             continue
-        if response.crossed or wiring[j, i] < 0 or _p_of_scale(motion, [(i, j)], limits) < level:
+        if (
+            response.crossed
+            or wiring[j, i] < 0
+            or _p_of_scale(motion, [(i, j)], limits) < level
+        ):
             out.append(response)
     return tuple(out)
 
@@ -267,7 +290,9 @@ def _p_for(motion: RepeatMotion, wiring: np.ndarray, alternative: np.ndarray) ->
     """
     n = len(wiring)
     change = alternative - wiring
-    size2 = np.trace(motion.products[:n, :n] @ change.T @ motion.products[n:, n:] @ change)
+    size2 = np.trace(
+        motion.products[:n, :n] @ change.T @ motion.products[n:, n:] @ change
+    )
     if not size2 > 0:
         return 1.0
     evidence = np.trace(motion.products[:n, n:] @ change)
@@ -314,10 +339,14 @@ def _p_of(correlation: float, dof: int) -> float:
         return 0.5
     density = lgamma((d + 1) / 2) - lgamma(d / 2) - 0.5 * log(pi)
     log_uncorrelated = log(max(1 - correlation**2, 1e-30))
-    return min(0.5, exp(max(d / 2 * log_uncorrelated + density - log(d * correlation), -700.0)))
+    return min(
+        0.5, exp(max(d / 2 * log_uncorrelated + density - log(d * correlation), -700.0))
+    )
 
 
-def _response(motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]) -> OffsetResponse:
+def _response(
+    motion: RepeatMotion, at: tuple[int, int], axes: tuple[str, ...]
+) -> OffsetResponse:
     """Return the response of offset j to axis i, `at` = (i, j)."""
     i, j = at
     n = len(axes)
@@ -373,7 +402,9 @@ def wiring_error(fault: WiringFault) -> WiringError:
             "rad" if fault.kind == "angular" else "m"
         )
     where = "stage/mark_detections" + (f" of view '{fault.view}'" if fault.view else "")
-    return WiringError(where, f"{fault_text} (slope among repeats of {numbers})", remedy)
+    return WiringError(
+        where, f"{fault_text} (slope among repeats of {numbers})", remedy
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,7 +443,11 @@ PAIRS = (
     ),
     (
         Turned(-TURN @ MIRROR, 1, "offset_x and offset_y are exchanged"),
-        Turned(TURN @ MIRROR, 1, "offset_x and offset_y are exchanged, both with the other sign"),
+        Turned(
+            TURN @ MIRROR,
+            1,
+            "offset_x and offset_y are exchanged, both with the other sign",
+        ),
     ),
 )
 """Wirings that grid marks do not distinguish: the lines do."""
@@ -420,7 +455,9 @@ PAIRS = (
 
 def turned_readings(measurements: Measurements, wiring: Turned) -> Measurements:
     """Return the readings as they are with true offsets, if the published ones have this wiring."""
-    return replace(measurements, views=tuple(_undone(view, wiring) for view in measurements.views))
+    return replace(
+        measurements, views=tuple(_undone(view, wiring) for view in measurements.views)
+    )
 
 
 def shows_offsets(measurements: Measurements) -> bool:
@@ -474,7 +511,9 @@ def with_offsets(
     if len(visits.u) and np.isfinite(visits.u).all() and (visits.u > 0).all():
         least = np.full(len(view.m), np.inf)
         np.minimum.at(least, visits.mark, visits.u)
-        weight = (least[visits.mark] / visits.u) ** 2  # one of each mark is 1, however small
+        weight = (
+            least[visits.mark] / visits.u
+        ) ** 2  # one of each mark is 1, however small
     weight = weight / np.bincount(visits.mark, weight)[visits.mark]
     dx, dy = (
         np.bincount(visits.mark, weight * component, len(view.m))
@@ -495,7 +534,9 @@ def with_offsets(
     )
 
 
-def _turned_motion(motion: RepeatMotion | None, back: np.ndarray) -> RepeatMotion | None:
+def _turned_motion(
+    motion: RepeatMotion | None, back: np.ndarray
+) -> RepeatMotion | None:
     """Return the sums over repeats with other offsets."""
     if motion is None:
         return None

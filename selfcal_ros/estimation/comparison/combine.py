@@ -95,13 +95,22 @@ def require_own_readings(
     scale : bool
         Whether magnification belongs to the datum.
     """
-    first = next(index for index, member in enumerate(members) if member.result is not None)
+    first = next(
+        index for index, member in enumerate(members) if member.result is not None
+    )
     for kind, known_places in common.items():
         q = np.linalg.qr(
-            datum_columns(members[first].error_map.artifact, kind, known_places, scale=scale)
+            datum_columns(
+                members[first].error_map.artifact, kind, known_places, scale=scale
+            )
         )[0]
         maps, u = (
-            np.array([member.error_map.of(kind)[of][:, known_places].ravel() for member in members])
+            np.array(
+                [
+                    member.error_map.of(kind)[of][:, known_places].ravel()
+                    for member in members
+                ]
+            )
             for of in (0, 1)
         )
         maps -= maps @ q @ q.T
@@ -115,7 +124,9 @@ def require_own_readings(
                         f"{members[first].name}: is it in µ{KINDS[kind]}?",
                         "give m and rad",
                     )
-                if _is_opposite(*(maps[n] / np.maximum(u[n], NO_NOISE) for n in (index, first))):
+                if _is_opposite(
+                    *(maps[n] / np.maximum(u[n], NO_NOISE) for n in (index, first))
+                ):
                     raise InputError(
                         member.name,
                         f"of the opposite sign to {members[first].name}: its "
@@ -124,7 +135,9 @@ def require_own_readings(
                     )
             for earlier in range(index if kind == "xy" else 0):
                 if (
-                    rms((maps[index] - maps[earlier]) / np.minimum(u[index], u[earlier]))
+                    rms(
+                        (maps[index] - maps[earlier]) / np.minimum(u[index], u[earlier])
+                    )
                     < NEGLIGIBLE
                 ):
                     raise InputError(
@@ -174,7 +187,9 @@ def shared_reference(
         references = [replace(reference, certified=None) for reference in references]
     if all(reference == references[0] for reference in references):
         return references[0]
-    share = np.array([weight for result, weight in zip(results, weights, strict=True) if result])
+    share = np.array(
+        [weight for result, weight in zip(results, weights, strict=True) if result]
+    )
     errors = np.array([reference.relative_error for reference in references])
     names = dict.fromkeys(reference.certificate or "none" for reference in references)
     return replace(
@@ -292,7 +307,9 @@ class Mean:
         return np.sqrt(self.within + self.common + self.between)
 
 
-def independent_of(removed: np.ndarray, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def independent_of(
+    removed: np.ndarray, shapes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return orthonormal columns of `removed`, and of what `shapes` add to them, (d, r), (d, m)."""
     basis = np.linalg.qr(removed)[0] if removed.size else removed
     datum = basis.shape[1]
@@ -376,7 +393,8 @@ def _families(
     amplitude = values @ shapes
     within = np.stack([variances_of(c, shapes) for c in covariances])
     families = [
-        _Family(amplitude[:, [m]], within[:, m], shape**2, 1) for m, shape in enumerate(shapes.T)
+        _Family(amplitude[:, [m]], within[:, m], shape**2, 1)
+        for m, shape in enumerate(shapes.T)
     ]
     removed = np.concatenate([q, shapes], axis=1)
     n_rest = len(removed) - removed.shape[1]
@@ -411,7 +429,9 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
     shares = np.array([run.shares for run in runs], dtype=float)
     families = _families(values, covariances, q, shapes)
     spread = np.sum([family.between * family.share for family in families], axis=0)
-    weights = 1 / np.maximum([variances(c).sum() + spread.sum() for c in covariances], TINY)
+    weights = 1 / np.maximum(
+        [variances(c).sum() + spread.sum() for c in covariances], TINY
+    )
     weights = weights / weights.sum()
     shared = [without(run.common, q) for run in runs if run.shares]
     common = _sum(
@@ -419,9 +439,13 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
         np.append(0.0, weights[shares > 0] / max(weights @ shares, TINY)),
     )
     pooled = weights**2
-    power_within = sum(w * variances(c) for w, c in zip(pooled, covariances, strict=True))
+    power_within = sum(
+        w * variances(c) for w, c in zip(pooled, covariances, strict=True)
+    )
     between = pooled.sum() * spread
-    covariance = _sum([*covariances, common], np.append(pooled, (weights @ shares) ** 2))
+    covariance = _sum(
+        [*covariances, common], np.append(pooled, (weights @ shares) ** 2)
+    )
     added = spread
     if covariance.ndim == 2:
         of_shapes = np.array([family.between for family in families[: shapes.shape[1]]])
@@ -432,11 +456,19 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
     covariance = covariance + pooled.sum() * added
     shared_part = (weights @ shares) ** 2 * variances(common)
     p = _p_between(families, runs, covariances)
-    of_one = max(families[: shapes.shape[1]], key=lambda family: family.between, default=None)
+    of_one = max(
+        families[: shapes.shape[1]], key=lambda family: family.between, default=None
+    )
     if p < USUAL_LEVEL and of_one and of_one.between > SINGLE * spread.sum():
         dof = _dof_of_single(of_one, weights, shared_part)
     else:
-        dof = _dof(runs, covariances, families, weights, power=power_within + shared_part + between)
+        dof = _dof(
+            runs,
+            covariances,
+            families,
+            weights,
+            power=power_within + shared_part + between,
+        )
     return Mean(
         weights @ values,
         covariance,
@@ -480,9 +512,14 @@ def _p_between(
     return min(1.0, len(probabilities) * min(probabilities, default=1.0))
 
 
-def _noise_dof(runs: list[RunValues], covariances: list[np.ndarray], factors: np.ndarray) -> float:
+def _noise_dof(
+    runs: list[RunValues], covariances: list[np.ndarray], factors: np.ndarray
+) -> float:
     """Return the degrees of freedom of a sum of the runs' covariances (Welch-Satterthwaite)."""
-    power = [float(f * variances(c).mean()) for f, c in zip(factors, covariances, strict=True)]
+    power = [
+        float(f * variances(c).mean())
+        for f, c in zip(factors, covariances, strict=True)
+    ]
     return min(joint_dof(*zip(power, [run.dof for run in runs], strict=True)), MANY_DOF)
 
 
@@ -508,12 +545,18 @@ def _dof(
         if 0 < run.dof < MANY_DOF:
             terms = terms + (w**2 * variances(c)) ** 2 / run.dof
     dof_of_values = (power**2 / np.maximum(terms, TINY))[power > 0]
-    return min(float(np.median(dof_of_values)), MANY_DOF) if len(dof_of_values) else MANY_DOF
+    return (
+        min(float(np.median(dof_of_values)), MANY_DOF)
+        if len(dof_of_values)
+        else MANY_DOF
+    )
 
 
 def _scatter_of_mean(family: _Family, weights: np.ndarray) -> np.ndarray:
     """Return the variances (d,) that the scatter of a family between runs gives the mean."""
-    return ((weights**2).sum() * family.between + weights**2 @ family.within) * family.share
+    return (
+        (weights**2).sum() * family.between + weights**2 @ family.within
+    ) * family.share
 
 
 def _dof_of_single(family: _Family, weights: np.ndarray, shared: np.ndarray) -> float:
@@ -545,14 +588,21 @@ def _deviation(
     factors = weights_of_others**2 + (np.arange(len(runs)) == i)
     shares = np.array([run.shares for run in runs], dtype=float)
     total = _sum(
-        [*covariances, common], np.append(factors, (shares[i] - weights_of_others @ shares) ** 2)
+        [*covariances, common],
+        np.append(factors, (shares[i] - weights_of_others @ shares) ** 2),
     )
     dof = _noise_dof(runs, covariances, factors)
     full = all(run.covariance.ndim == 2 for run in runs)
-    test = significance(deviation, ReducedNoise(total if full else variances(total), q, dof))
+    test = significance(
+        deviation, ReducedNoise(total if full else variances(total), q, dof)
+    )
     u = np.sqrt(variances(total))
-    e_n = np.divide(deviation, coverage_factor(dof) * u, out=np.zeros_like(deviation), where=u > 0)
-    return Deviation(e_n, test, _p_scatter(i, values, covariances, weights_of_others, between))
+    e_n = np.divide(
+        deviation, coverage_factor(dof) * u, out=np.zeros_like(deviation), where=u > 0
+    )
+    return Deviation(
+        e_n, test, _p_scatter(i, values, covariances, weights_of_others, between)
+    )
 
 
 def _p_scatter(
@@ -570,12 +620,16 @@ def _p_scatter(
     runs = len(values)
     if runs < 3:
         return float("nan")
-    power = np.array([variances(c).sum() + variances(between).sum() for c in covariances])
+    power = np.array(
+        [variances(c).sum() + variances(between).sum() for c in covariances]
+    )
     mean = weights_of_others @ values
     of_mean = weights_of_others**2 @ power
     other_runs = np.flatnonzero(np.arange(runs) != i)
     scatter = ((values[other_runs] - mean) ** 2).sum()
-    expected = ((1 - 2 * weights_of_others[other_runs]) * power[other_runs] + of_mean).sum()
+    expected = (
+        (1 - 2 * weights_of_others[other_runs]) * power[other_runs] + of_mean
+    ).sum()
     ratio = (
         ((values[i] - mean) ** 2).sum()
         / max(power[i] + of_mean, TINY)
@@ -632,7 +686,10 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     first = _checked(members, keep_scale=keep_scale)
     common = {
         kind: np.logical_and.reduce(
-            [np.isfinite(member.error_map.of(kind)).all(axis=(0, 1)) for member in members]
+            [
+                np.isfinite(member.error_map.of(kind)).all(axis=(0, 1))
+                for member in members
+            ]
         )
         for kind in KINDS
     }
@@ -649,7 +706,10 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
         shapes["theta"] = _waves(lines)
     means = {
         kind: mean_of(
-            [_run(member, kind, common[kind], keep_scale=keep_scale) for member in members],
+            [
+                _run(member, kind, common[kind], keep_scale=keep_scale)
+                for member in members
+            ],
             datum_columns(first.artifact, kind, common[kind], scale=not keep_scale),
             of_kind,
         )
@@ -678,7 +738,9 @@ def _checked(members: Sequence[Member], *, keep_scale: bool) -> CalibrationResul
         )
         result = member.result
         if result is None or not result.verdict.qualified:
-            raise InputError(member.name, "its calibration is not qualified", "leave it out")
+            raise InputError(
+                member.name, "its calibration is not qualified", "leave it out"
+            )
         if keep_scale and result.reference is None:
             raise InputError(
                 "--keep-scale",
@@ -698,13 +760,17 @@ def _require_single_run(member: Member, earlier_members: Sequence[Member]) -> No
     if result is None:
         return
     if result.method == COMBINED:
-        raise InputError(member.name, "a mean of several runs", "name these runs themselves")
+        raise InputError(
+            member.name, "a mean of several runs", "name these runs themselves"
+        )
     for earlier in earlier_members:
         if earlier.result is None:
             continue
         if _same_recording(result, earlier.result):
             raise InputError(
-                member.name, f"of the same recording as {earlier.name}", "leave one of them out"
+                member.name,
+                f"of the same recording as {earlier.name}",
+                "leave one of them out",
             )
         plate = _readings_of_plate(result)
         if plate and plate == _readings_of_plate(earlier.result):
@@ -750,7 +816,9 @@ def _same_recording(first: CalibrationResult, second: CalibrationResult) -> bool
     )
 
 
-def _run(member: Member, kind: str, known_places: np.ndarray, *, keep_scale: bool) -> RunValues:
+def _run(
+    member: Member, kind: str, known_places: np.ndarray, *, keep_scale: bool
+) -> RunValues:
     values, u = (of[:, known_places].ravel() for of in member.error_map.of(kind))
     result = member.result
     factors = np.zeros((0, len(values)))
@@ -760,10 +828,14 @@ def _run(member: Member, kind: str, known_places: np.ndarray, *, keep_scale: boo
     if kind == "xy":
         factors = _common(result, known_places, keep_scale=keep_scale)
     common = factors.T @ factors if covariance.ndim == 2 else (factors**2).sum(axis=0)
-    return RunValues(values, covariance - common, common, True, result.noise.dof_of(kind))
+    return RunValues(
+        values, covariance - common, common, True, result.noise.dof_of(kind)
+    )
 
 
-def _common(result: CalibrationResult, known_sites: np.ndarray, *, keep_scale: bool) -> np.ndarray:
+def _common(
+    result: CalibrationResult, known_sites: np.ndarray, *, keep_scale: bool
+) -> np.ndarray:
     """Return factors L (r, 2n) of the covariance L' L of what the runs of a machine share, m.
 
     Terms of the microscope that are known from elsewhere, and the reference length.
@@ -807,7 +879,9 @@ def _polynomials(x: np.ndarray, y: np.ndarray, known_sites: np.ndarray) -> np.nd
 
 def _waves(lines: np.ndarray) -> np.ndarray:
     angle = 2 * np.pi * np.flatnonzero(lines) / len(lines)
-    return np.array([wave(k * angle) for k in range(1, DEGREE + 1) for wave in (np.cos, np.sin)]).T
+    return np.array(
+        [wave(k * angle) for k in range(1, DEGREE + 1) for wave in (np.cos, np.sin)]
+    ).T
 
 
 def _result(
@@ -820,7 +894,9 @@ def _result(
     plate = first.plate
     known_sites = common["xy"]
     shapes = {"xy": (2, *known_sites.shape), "theta": (1, len(common["theta"]))}
-    maps = {kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()}
+    maps = {
+        kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()
+    }
     u = {kind_of_map: np.full(shape, np.nan) for kind_of_map, shape in shapes.items()}
     dof = dict.fromkeys(KINDS, np.nan)
     k = dict.fromkeys(KINDS, 2.0)
@@ -896,12 +972,16 @@ def _runs(members: Sequence[Member], means: Mapping[str, Mean]) -> dict[str, Any
             "weight": float(means["xy"].weights[index]),
         }
         for kind, mean in means.items():
-            run |= _of_run(mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(members))
+            run |= _of_run(
+                mean.deviations[index], SUFFIX[kind], USUAL_LEVEL / len(members)
+            )
         facts["runs"].append(run)
     return facts
 
 
-def _covariances(members: Sequence[Member], means: Mapping[str, Mean]) -> dict[str, np.ndarray]:
+def _covariances(
+    members: Sequence[Member], means: Mapping[str, Mean]
+) -> dict[str, np.ndarray]:
     """Return the covariances of the means whose runs all have theirs."""
     all_calibrations = all(member.result is not None for member in members)
     return {
@@ -910,7 +990,8 @@ def _covariances(members: Sequence[Member], means: Mapping[str, Mean]) -> dict[s
         if (all_calibrations or kind == "theta")
         and mean.covariance.ndim == 2
         and all(
-            deviation.test is None or deviation.test.correlated for deviation in mean.deviations
+            deviation.test is None or deviation.test.correlated
+            for deviation in mean.deviations
         )
     }
 
@@ -965,12 +1046,20 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
     )
 
 
-def _budget(result: CalibrationResult, means: Mapping[str, Mean]) -> tuple[BudgetLine, ...]:
+def _budget(
+    result: CalibrationResult, means: Mapping[str, Mean]
+) -> tuple[BudgetLine, ...]:
     lines: list[BudgetLine] = []
     between = [line for line in budget_lines(result) if line.component == INTERPOLATION]
     for kind, mean in means.items():
         for component, variance, size, letter, dof in (
-            ("uncertainty of the runs", mean.within, rms(np.sqrt(mean.within)), "A", mean.dof),
+            (
+                "uncertainty of the runs",
+                mean.within,
+                rms(np.sqrt(mean.within)),
+                "A",
+                mean.dof,
+            ),
             ("shared by all runs", mean.common, rms(np.sqrt(mean.common)), "B", np.inf),
             ("between runs", mean.between, mean.u_between, "A", mean.dof),
         ):

@@ -40,7 +40,11 @@ from selfcal_ros.model.view import View, shared_rotations
 
 
 def covariance_of(
-    result: CalibrationResult, kind: str, known_places: np.ndarray, *, plate: bool = False
+    result: CalibrationResult,
+    kind: str,
+    known_places: np.ndarray,
+    *,
+    plate: bool = False,
 ) -> np.ndarray:
     """Return the covariance of the known values of a map, m^2 or rad^2.
 
@@ -71,7 +75,11 @@ def covariance_of(
     factors = behind(result)
     if factors is None or not np.isfinite(u).all():
         return u**2
-    cover = factors.of_sites(known_places) if kind == "xy" else factors.of_lines(known_places)
+    cover = (
+        factors.of_sites(known_places)
+        if kind == "xy"
+        else factors.of_lines(known_places)
+    )
     return u**2 if cover is None else _sized(cover, u)
 
 
@@ -101,7 +109,9 @@ def kept_covariances(covers: Mapping[str, np.ndarray]) -> Kept:
     )
 
 
-def _stored(result: CalibrationResult, kind: str, known_places: np.ndarray) -> np.ndarray:
+def _stored(
+    result: CalibrationResult, kind: str, known_places: np.ndarray
+) -> np.ndarray:
     """Return the stored covariance of the known values, which are among those of the map."""
     values = result.error_map.of(kind)[0]
     in_map = np.isfinite(values).all(axis=0)
@@ -120,7 +130,9 @@ def _stored(result: CalibrationResult, kind: str, known_places: np.ndarray) -> n
 def _sized(cover: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return a covariance with its correlations and the standard uncertainties `u`."""
     variances = np.diag(cover)
-    size = u / np.sqrt(np.maximum(variances, max(1e-12 * variances.max(), np.finfo(float).tiny)))
+    size = u / np.sqrt(
+        np.maximum(variances, max(1e-12 * variances.max(), np.finfo(float).tiny))
+    )
     return cover * size[:, None] * size
 
 
@@ -173,7 +185,9 @@ def lack_of_fit_m(result: CalibrationResult) -> float:
     """Return the contribution of lack of fit to u, m: at each place, with a sign of its own."""
     factors = factors_of(result)
     squares = (factors.of_map[factors.of_each_place] ** 2).sum(axis=0)
-    return float(np.sqrt(squares.max(initial=0.0)) * np.nan_to_num(result.noise.sigma_xy))
+    return float(
+        np.sqrt(squares.max(initial=0.0)) * np.nan_to_num(result.noise.sigma_xy)
+    )
 
 
 def _complex(factors: np.ndarray) -> np.ndarray:
@@ -211,8 +225,12 @@ def system_behind(result: CalibrationResult) -> NormalEquations | None:
             turned *= artifact.angular_count / (2 * np.pi)
             lines.append((index, (pose.turn_lines or 0) + turned, weight))
         if in_grid:
-            grid.append((index, pose, _weights(v.read_grid, in_field(view, artifact), of_grid)))
-    angular = np.array([weight for *_, weight in lines]).reshape(len(lines), artifact.angular_count)
+            grid.append(
+                (index, pose, _weights(v.read_grid, in_field(view, artifact), of_grid))
+            )
+    angular = np.array([weight for *_, weight in lines]).reshape(
+        len(lines), artifact.angular_count
+    )
     return system_of(
         Marks(
             tuple(at for _, at, _ in grid),
@@ -248,11 +266,15 @@ def kept_rotations(result: CalibrationResult, n_views: int) -> tuple[int, ...]:
     return shared_rotations([placings.index(number) for number in placings], steps)
 
 
-def _cells_of_views(images: ImagesKept, n_views: int) -> list[tuple[int, tuple[int, int]]]:
+def _cells_of_views(
+    images: ImagesKept, n_views: int
+) -> list[tuple[int, tuple[int, int]]]:
     """Return the placing of the plate in each grid view of a result, and the step of its cell."""
     if not len(images.placing) == len(images.step) == n_views:
         raise InputError(
-            "images", "no images of these views", "write the result again with `selfcal solve`"
+            "images",
+            "no images of these views",
+            "write the result again with `selfcal solve`",
         )
     return list(zip(images.placing, images.step, strict=True))
 
@@ -275,19 +297,25 @@ def _weights(weights: Any, field: np.ndarray, where: str) -> np.ndarray:
     """
     shape = field.shape if isinstance(weights, list | np.ndarray) else ()
     try:
-        weight = np.array(weights, dtype=float).reshape(shape) * (field if shape == () else 1.0)
+        weight = np.array(weights, dtype=float).reshape(shape) * (
+            field if shape == () else 1.0
+        )
     except (TypeError, ValueError):
         weight = np.array(np.nan)
     if not (np.isfinite(weight) & (weight >= 0)).all():
         raise InputError(
-            where, "no weights of this field", "write the result again with `selfcal solve`"
+            where,
+            "no weights of this field",
+            "write the result again with `selfcal solve`",
         )
     return weight
 
 
 def _missing_error(missing: str) -> InputError:
     """Return the error of a result whose factors do not have what belongs to them."""
-    return InputError(FACTORS, f"no {missing}", "write the result again with `selfcal solve`")
+    return InputError(
+        FACTORS, f"no {missing}", "write the result again with `selfcal solve`"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,7 +380,9 @@ class Together:
         if not share_of(self.result):
             return None
         grid = self.system.grid
-        cells_of_views = _cells_of_views(cast(ImagesKept, self.result.kept.images), grid.n_views)
+        cells_of_views = _cells_of_views(
+            cast(ImagesKept, self.result.kept.images), grid.n_views
+        )
         return ImageNoise(
             stops_of(cells_of_views, grid.read),
             grid.read,
@@ -365,7 +395,9 @@ class Together:
         """Return the functionals Gx, then Gy, at sites, in the frame of the equations."""
         return turned_over(self.result.sense, unit_rows(known_sites))
 
-    def of_noise(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
+    def of_noise(
+        self, sites: np.ndarray, marks: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the covariance of functionals of both maps for noise of marks and images."""
         cover = self.maps.of(sites, marks)
         if self._images is None:
@@ -378,7 +410,9 @@ class Together:
         """Return the covariance of Gx, then Gy, at sites for unit noise, None if it is not kept."""
         if known_sites.size > MAX_FULL or self.lacks_terms:
             return None
-        factors = self._saved.of_map[:, :, known_sites].reshape(-1, 2 * int(known_sites.sum()))
+        factors = self._saved.of_map[:, :, known_sites].reshape(
+            -1, 2 * int(known_sites.sum())
+        )
         return self.of_noise(self.stage_rows(known_sites)) + _product(
             factors, self._saved.of_each_place
         )
@@ -389,7 +423,10 @@ class Together:
         if len(known_lines) > MAX_FULL or not system.angular.n_views:
             return None
         conditions = conditions_for(
-            system, ThetaDatum(result.error_map.datum_theta), Sense(result.sense), self.half_width_m
+            system,
+            ThetaDatum(result.error_map.datum_theta),
+            Sense(result.sense),
+            self.half_width_m,
         )
         to_datum = np.eye(len(known_lines)) - conditions.gain @ conditions.rows
         rows = lines_turned_over(result.sense, to_datum)[known_lines]
@@ -407,7 +444,9 @@ class Together:
         lines, cover = self.lines()
         lines_of_plate = len(known_places) + np.flatnonzero(known_places)
         return (
-            cover[np.ix_(lines_of_plate, lines_of_plate)] if lines[1][known_places].all() else None
+            cover[np.ix_(lines_of_plate, lines_of_plate)]
+            if lines[1][known_places].all()
+            else None
         )
 
     @property
@@ -445,8 +484,12 @@ class Together:
         maps = np.zeros((r + effects, n_of_stage + 2 * int(marks.sum()) + 4))
         of_stage = stage[:, :, sites].reshape(len(stage), n_of_stage)
         maps[:n, :n_of_stage], maps[r:, :n_of_stage] = of_stage[:n], of_stage[n:]
-        maps[:r, n_of_stage:-4] = plate[:, :, marks].reshape(r, maps.shape[1] - n_of_stage - 4)
-        maps[:r, -4:] = self._saved_factors(block_of_offsets().name, (4,)) / self.half_width_m
+        maps[:r, n_of_stage:-4] = plate[:, :, marks].reshape(
+            r, maps.shape[1] - n_of_stage - 4
+        )
+        maps[:r, -4:] = (
+            self._saved_factors(block_of_offsets().name, (4,)) / self.half_width_m
+        )
         return maps
 
     def cover(self, sites: np.ndarray, marks: np.ndarray) -> np.ndarray:
@@ -473,12 +516,16 @@ class Together:
         if self._images is None:
             cover[:-4, :-4] *= self._ratio
         else:  # their noise moves the stage's map much and the plate's little
-            root = np.sqrt(np.repeat([self._ratio, self._ratio_of_plate, 1.0], [s, m, 4]))
+            root = np.sqrt(
+                np.repeat([self._ratio, self._ratio_of_plate, 1.0], [s, m, 4])
+            )
             cover *= np.outer(root, root)
         effects = factors[terms:]
         cover += _product(effects, self._saved.of_each_place[self._saved.with_map :])
         if len(effects):
-            cover[range(s, s + m), range(s, s + m)] += self._effects_on_plate[:, marks].ravel()
+            cover[range(s, s + m), range(s, s + m)] += self._effects_on_plate[
+                :, marks
+            ].ravel()
         return cover * self.result.noise.sigma_xy**2
 
     @cached_property
@@ -501,10 +548,14 @@ class Together:
         marks = self.marks
         rows = unit_rows(marks)
         white = np.trace(self.of_noise(np.zeros((len(rows), *self.sites.shape)), rows))
-        white += (self._saved_factors("plate", (2, *marks.shape))[..., marks] ** 2).sum()
+        white += (
+            self._saved_factors("plate", (2, *marks.shape))[..., marks] ** 2
+        ).sum()
         stated = (plate.u_ax[marks] ** 2 + plate.u_ay[marks] ** 2).sum()
         stated -= self._effects_on_plate[:, marks].sum() * self.result.noise.sigma_xy**2
-        return float(stated / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2)
+        return float(
+            stated / white / max(self.result.noise.sigma_xy, np.finfo(float).tiny) ** 2
+        )
 
     def lines(self) -> tuple[np.ndarray, np.ndarray]:
         """Return lines known in both angular maps, bool (2, K), and their covariance, rad^2.
@@ -558,7 +609,10 @@ def plate_as_map(result: CalibrationResult) -> CalibrationResult:
     """Return the result with the map of its plate in place of that of the stage."""
     plate_map = result.artifact_map
     artifact = replace(result.plate, map_grid=None, harmonics=0)
-    nothing, none = np.full(artifact.shape, np.nan), np.full(artifact.angular_count, np.nan)
+    nothing, none = (
+        np.full(artifact.shape, np.nan),
+        np.full(artifact.angular_count, np.nan),
+    )
     o, r = first_order(artifact, np.stack([plate_map.ax, plate_map.ay]))
     u_x, u_y, u_theta = (
         u if u.size else empty
@@ -572,6 +626,14 @@ def plate_as_map(result: CalibrationResult) -> CalibrationResult:
         result,
         placed_plate=None,
         error_map=ErrorMap(
-            artifact, plate_map.ax, plate_map.ay, u_x, u_y, plate_map.a_theta, u_theta, o, r
+            artifact,
+            plate_map.ax,
+            plate_map.ay,
+            u_x,
+            u_y,
+            plate_map.a_theta,
+            u_theta,
+            o,
+            r,
         ),
     )

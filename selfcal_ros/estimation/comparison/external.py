@@ -48,7 +48,9 @@ def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
         is_site = np.isfinite([row.cells["x"], row.cells["y"]]).all()
         place = _site(row, artifact) if is_site else _line(row, artifact)
         if place in places_read:
-            raise InputError(row.place, "its site is in the table twice", "delete one of the rows")
+            raise InputError(
+                row.place, "its site is in the table twice", "delete one of the rows"
+            )
         places_read.add(place)
         for name, values in (grid if is_site else circle).items():
             values[place] = row.cells[name]
@@ -61,10 +63,16 @@ def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
     known_sites = np.isfinite(list(grid.values())).all(axis=0)
     if not known_sites.any():
         raise InputError(
-            where, "no site has an error and its uncertainty", "fill the columns gx, gy, u_gx, u_gy"
+            where,
+            "no site has an error and its uncertainty",
+            "fill the columns gx, gy, u_gx, u_gy",
         )
-    gx, gy, u_gx, u_gy = (np.where(known_sites, values, np.nan) for values in grid.values())
-    return ErrorMap(artifact, gx, gy, u_gx, u_gy, circle["g_theta"], circle["u_g_theta"])
+    gx, gy, u_gx, u_gy = (
+        np.where(known_sites, values, np.nan) for values in grid.values()
+    )
+    return ErrorMap(
+        artifact, gx, gy, u_gx, u_gy, circle["g_theta"], circle["u_g_theta"]
+    )
 
 
 def _rows(text: str, where: str) -> list[_Row]:
@@ -93,7 +101,9 @@ def _rows(text: str, where: str) -> list[_Row]:
     for place, line in lines[1:]:
         cells = csv_cells(line, place)
         if len(cells) != len(head):
-            raise InputError(place, f"{len(cells)} cells, not {len(head)}", "correct the line")
+            raise InputError(
+                place, f"{len(cells)} cells, not {len(head)}", "correct the line"
+            )
         try:
             values = {
                 name: number_of(cell) if cell else np.nan
@@ -101,7 +111,9 @@ def _rows(text: str, where: str) -> list[_Row]:
                 if name in (*XY, *THETA)
             }
         except ValueError:
-            raise InputError(place, "a cell is not a number", "correct the line") from None
+            raise InputError(
+                place, "a cell is not a number", "correct the line"
+            ) from None
         if any(abs(value) > 1e3 for value in values.values()):
             raise InputError(place, "a value beyond 1000 m or rad", "give m and rad")
         rows.append(_Row(place, dict.fromkeys((*XY, *THETA), np.nan) | values))
@@ -109,9 +121,16 @@ def _rows(text: str, where: str) -> list[_Row]:
 
 
 def _site(row: _Row, artifact: Artifact) -> tuple[int, ...]:
-    steps = np.array([row.cells["x"], row.cells["y"]]) / artifact.grid_pitch_m + artifact.half
+    steps = (
+        np.array([row.cells["x"], row.cells["y"]]) / artifact.grid_pitch_m
+        + artifact.half
+    )
     at = np.rint(steps)
-    if np.abs(steps - at).max() > OFF_SITE or (at < 0).any() or (at >= artifact.shape).any():
+    if (
+        np.abs(steps - at).max() > OFF_SITE
+        or (at < 0).any()
+        or (at >= artifact.shape).any()
+    ):
         raise InputError(
             row.place,
             f"({row.cells['x']:g}, {row.cells['y']:g}) m is not a site of the other maps",
@@ -122,7 +141,10 @@ def _site(row: _Row, artifact: Artifact) -> tuple[int, ...]:
 
 def _line(row: _Row, artifact: Artifact) -> tuple[int, ...]:
     step = row.cells["angle"] / (2 * np.pi) * artifact.angular_count
-    if not abs(step - np.rint(step)) <= OFF_SITE or not 0 <= np.rint(step) < artifact.angular_count:
+    if (
+        not abs(step - np.rint(step)) <= OFF_SITE
+        or not 0 <= np.rint(step) < artifact.angular_count
+    ):
         raise InputError(
             row.place,
             "neither a site nor an angular line of the other maps",

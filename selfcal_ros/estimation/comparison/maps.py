@@ -175,7 +175,9 @@ def of_square(square: float, rank: float, dof: float) -> float:
 
     `dof` are the degrees of freedom of the noise behind that variance.
     """
-    return float(fdtrc(rank, dof, square / rank) if dof <= MANY_DOF else chdtrc(rank, square))
+    return float(
+        fdtrc(rank, dof, square / rank) if dof <= MANY_DOF else chdtrc(rank, square)
+    )
 
 
 def without(covariance: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -295,11 +297,14 @@ def compare(
     n_known = int((pair[0].valid & pair[1].valid).sum())
     if n_known < 3:
         raise InputError(
-            names[1], f"{n_known} sites are known in both maps", "compare maps that overlap"
+            names[1],
+            f"{n_known} sites are known in both maps",
+            "compare maps that overlap",
         )
 
     xy, theta = (
-        _difference((a, b), pair, kind, covariance, scale=not keep_scale) for kind in KINDS
+        _difference((a, b), pair, kind, covariance, scale=not keep_scale)
+        for kind in KINDS
     )
     o, r = (
         getattr(pair[1], name) - getattr(pair[0], name)
@@ -355,13 +360,20 @@ def _difference(
         return _Difference(out, datum, None)
 
     total = np.sum(
-        of_one_kind([covariance(result, kind, known_places) for result in results]), axis=0
+        of_one_kind([covariance(result, kind, known_places) for result in results]),
+        axis=0,
     )
     power = [float(np.nan_to_num(rms(emap.of(kind)[1]))) ** 2 for emap in maps]
     dof = joint_dof(
-        *zip(power, [getattr(result.noise, f"dof_{kind}") for result in results], strict=True)
+        *zip(
+            power,
+            [getattr(result.noise, f"dof_{kind}") for result in results],
+            strict=True,
+        )
     )
-    return _Difference(out, datum, significance(values, ReducedNoise(total, columns, dof)))
+    return _Difference(
+        out, datum, significance(values, ReducedNoise(total, columns, dof))
+    )
 
 
 def require_same_lattice(a: Artifact, b: Artifact, names: tuple[str, str]) -> None:
@@ -424,7 +436,9 @@ class LaserDifference:
 
 
 @one_thread()
-def compare_with_laser(result: CalibrationResult, laser: dict, where: str) -> list[LaserDifference]:
+def compare_with_laser(
+    result: CalibrationResult, laser: dict, where: str
+) -> list[LaserDifference]:
     """Compare O and R of a map with a step-diagonal measurement.
 
     Parameters

@@ -108,7 +108,11 @@ class Verification:
         A correction of x and y alone passes.
         """
         wrong_angle = self.theta_fault in (TableFault.SIGN, TableFault.FACTOR)
-        return self.better and self.fault in (TableFault.NONE, TableFault.OLDER) and not wrong_angle
+        return (
+            self.better
+            and self.fault in (TableFault.NONE, TableFault.OLDER)
+            and not wrong_angle
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +199,9 @@ class _Maps:
             (-1, self.after, self.cover_after),
         ):
             gain += sign * (_square(values) - float(variances(cover).sum()))
-            variance += 4 * float(variances_of(cover, values[:, None])[0]) + 2 * _square(cover)
+            variance += 4 * float(
+                variances_of(cover, values[:, None])[0]
+            ) + 2 * _square(cover)
         return gain, variance**0.5
 
     @property
@@ -230,7 +236,9 @@ class _Maps:
     def unexplained(self, explained: np.ndarray) -> float:
         """Return the part of the squares that is unexplained, noise taken off."""
         size = max(_square(self.action), _square(self.before))
-        remaining = _square(self.action - explained) - float(variances(self.cover).sum())
+        remaining = _square(self.action - explained) - float(
+            variances(self.cover).sum()
+        )
         return max(remaining, 0.0) / size if size else 0.0
 
     @property
@@ -244,7 +252,9 @@ def require_correctable(result: CalibrationResult, where: str) -> None:
     """Raise InputError unless the map of a result may be corrected."""
     if not result.observability.identifiable or not result.verdict.qualified:
         raise InputError(
-            where, "is not qualified, so it is not a map to correct with", "calibrate again"
+            where,
+            "is not qualified, so it is not a map to correct with",
+            "calibrate again",
         )
 
 
@@ -253,7 +263,11 @@ def is_believed(after: CalibrationResult, verification: "Verification") -> bool:
 
     Against a known plate, a stage that is corrected wrongly looks like another plate.
     """
-    named = verification.fault not in (TableFault.NONE, TableFault.OTHER, TableFault.OLDER)
+    named = verification.fault not in (
+        TableFault.NONE,
+        TableFault.OTHER,
+        TableFault.OLDER,
+    )
     other_plate = {cause.name for cause in after.verdict.failed} == {"other_plate"}
     return after.verdict.qualified or (named and other_plate)
 
@@ -262,7 +276,10 @@ def corrected(result: CalibrationResult) -> CalibrationResult:
     """Return a calibration of a plate whose stage is expected without error, as if corrected."""
     emap = result.error_map
     return replace(
-        result, error_map=replace(emap, gx=0 * emap.gx, gy=0 * emap.gy, g_theta=0 * emap.g_theta)
+        result,
+        error_map=replace(
+            emap, gx=0 * emap.gx, gy=0 * emap.gy, g_theta=0 * emap.g_theta
+        ),
     )
 
 
@@ -306,7 +323,9 @@ def verify(
     fault = _fault(maps, first)
     if maps.better and not maps.remains:
         fault = TableFault.NONE
-    elif fault is TableFault.OTHER and (maps.better or maps.alike * abs(maps.alike) > SHARED):
+    elif fault is TableFault.OTHER and (
+        maps.better or maps.alike * abs(maps.alike) > SHARED
+    ):
         fault = TableFault.OLDER
     axes = _axes(maps, (before, after))
 
@@ -323,12 +342,24 @@ def verify(
     gx, gy = np.full((2, *known_nodes.shape), np.nan)
     gx[known_nodes], gy[known_nodes] = maps.by_axis(maps.after)
     return Verification(
-        better, fault, theta_fault, maps.remains, axes, maps.alike, maps.remaining, gx, gy, g_theta
+        better,
+        fault,
+        theta_fault,
+        maps.remains,
+        axes,
+        maps.alike,
+        maps.remaining,
+        gx,
+        gy,
+        g_theta,
     )
 
 
 def _maps(
-    before: CalibrationResult, after: CalibrationResult, kind: str, known_places: np.ndarray
+    before: CalibrationResult,
+    after: CalibrationResult,
+    kind: str,
+    known_places: np.ndarray,
 ) -> _Maps:
     """Return both maps over known places; scale is datum unless both have one."""
     pair = (before, after)
@@ -338,7 +369,9 @@ def _maps(
     values = [result.error_map.of(kind)[0][:, known_places].ravel() for result in pair]
     covers = [
         without(cover, datum)
-        for cover in of_one_kind([covariance_of(result, kind, known_places) for result in pair])
+        for cover in of_one_kind(
+            [covariance_of(result, kind, known_places) for result in pair]
+        )
     ]
     dof = joint_dof(
         *(
@@ -346,11 +379,15 @@ def _maps(
             for cover, result in zip(covers, pair, strict=True)
         )
     )
-    free = [values_of_map - datum @ (datum.T @ values_of_map) for values_of_map in values]
+    free = [
+        values_of_map - datum @ (datum.T @ values_of_map) for values_of_map in values
+    ]
     return _Maps(kind, known_places, free[0], free[1], covers[0], covers[1], datum, dof)
 
 
-def _axes(maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult]) -> dict[str, AxisError]:
+def _axes(
+    maps: _Maps, pair: tuple[CalibrationResult, CalibrationResult]
+) -> dict[str, AxisError]:
     """Return the errors of each axis before and after, with U and the factor."""
     u_before, u_after = (
         getattr(result.noise, f"k_{maps.kind}") * result.error_map.of(maps.kind)[1]
@@ -394,11 +431,15 @@ def _fault(maps: _Maps, emap: ErrorMap) -> TableFault:
             weights = np.linalg.lstsq(action, maps.action, rcond=None)[0]
             if _kind(weights[0], 0.0) or _kind(weights[1], 0.0):
                 unexplained[fault] = maps.unexplained(action @ weights)
-    likely = min(unexplained, key=lambda name: unexplained[name], default=TableFault.OTHER)
+    likely = min(
+        unexplained, key=lambda name: unexplained[name], default=TableFault.OTHER
+    )
     return likely if unexplained.get(likely, np.inf) < NEAR else TableFault.OTHER
 
 
-def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[TableFault, tuple[np.ndarray, np.ndarray]]:
+def _arranged(
+    gx: np.ndarray, gy: np.ndarray
+) -> dict[TableFault, tuple[np.ndarray, np.ndarray]]:
     """Return a map (nx, ny) as it acts with each fault of arrangement."""
     arrangements = {
         TableFault.COMPONENTS: (gy, gx),
@@ -407,7 +448,10 @@ def _arranged(gx: np.ndarray, gy: np.ndarray) -> dict[TableFault, tuple[np.ndarr
         TableFault.MIRRORED: (gx[::-1, ::-1], gy[::-1, ::-1]),
     }
     if gx.shape[0] == gx.shape[1]:
-        arrangements |= {TableFault.PLACES: (gx.T, gy.T), TableFault.TRANSPOSED: (gy.T, gx.T)}
+        arrangements |= {
+            TableFault.PLACES: (gx.T, gy.T),
+            TableFault.TRANSPOSED: (gy.T, gx.T),
+        }
     return arrangements
 
 
@@ -415,7 +459,11 @@ def _kind(factor: float, u: float) -> TableFault | None:
     """Return what a factor says: None if it does not tell a correction from none."""
     if BEYOND * u >= max(1.0, abs(factor)):
         return None
-    for value, kind in ((1.0, TableFault.NONE), (-1.0, TableFault.SIGN), (0.0, TableFault.OFF)):
+    for value, kind in (
+        (1.0, TableFault.NONE),
+        (-1.0, TableFault.SIGN),
+        (0.0, TableFault.OFF),
+    ):
         if abs(factor - value) <= max(NEAR * abs(value), BEYOND * u):
             return kind
     return TableFault.FACTOR
@@ -433,7 +481,9 @@ def _of_factors(factors: list[tuple[float, float]]) -> TableFault:
     apart = float(values.max() - values.min())
     if apart <= max(NEAR * abs(values).max(), BEYOND * float(np.linalg.norm(u))):
         return TableFault.FACTOR
-    return TableFault.OLDER if abs(values - 1).max() < SHARED else TableFault.AXES_DIFFER
+    return (
+        TableFault.OLDER if abs(values - 1).max() < SHARED else TableFault.AXES_DIFFER
+    )
 
 
 def _theta_fault(maps: _Maps) -> TableFault:

@@ -52,7 +52,9 @@ def scale_of(
 ) -> float:
     """Return c for a map and a plate in their datum, m at the unit of position."""
     sites, marks = scale_rows(system, reference)
-    value = reference.relative_error * half_width_m * (-1 if reference.kind.of_plate else 1)
+    value = (
+        reference.relative_error * half_width_m * (-1 if reference.kind.of_plate else 1)
+    )
     return value + float(np.real(np.vdot(sites, field) + np.vdot(marks, plate)))
 
 
@@ -207,7 +209,10 @@ class MapsCovariance:
     def of_free(self, g: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the covariance of functionals (sites, k), (marks, k) of the free maps, (k, k)."""
         cov, factors, of_terms = self.independent(g, a)
-        cov += factors.T @ self._p @ factors + of_terms.T @ self.terms.covariance @ of_terms
+        cov += (
+            factors.T @ self._p @ factors
+            + of_terms.T @ self.terms.covariance @ of_terms
+        )
         return (cov + cov.T) / 2
 
     def independent(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -223,7 +228,9 @@ class MapsCovariance:
         cov += np.real(g.conj().T @ grid.solve(g))
         return cov, misalignments, of_terms
 
-    def sensitivities(self, sites: np.ndarray, marks: np.ndarray | None = None) -> np.ndarray:
+    def sensitivities(
+        self, sites: np.ndarray, marks: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return those of functionals as in `of` to the readings, over their weights, plate frame.
 
         Complex (k, views, nx, ny).
@@ -238,27 +245,39 @@ class MapsCovariance:
             if len(of_coefficients)
             else np.zeros(1)
         )
-        residuals = grid.plate(-y, maps, (parameters - self._moved @ of_coefficients).T)[1]
-        of_mark = (grid.noise_of_means[:, None] * a).T.reshape(-1, 1, *grid.views.plate_shape)
+        residuals = grid.plate(
+            -y, maps, (parameters - self._moved @ of_coefficients).T
+        )[1]
+        of_mark = (grid.noise_of_means[:, None] * a).T.reshape(
+            -1, 1, *grid.views.plate_shape
+        )
         return np.where(grid.read, of_mark, 0) - residuals
 
     def variance_of_scale(self, reference: ReferenceLength) -> float:
         """Return the variance of the scale that an exact reference would set, at the unit."""
-        return float(self.of_free(*self._free(*scale_rows(self.system, reference)))[0, 0])
+        return float(
+            self.of_free(*self._free(*scale_rows(self.system, reference)))[0, 0]
+        )
 
     @cached_property
     def of_stage(self) -> np.ndarray:
         """Variances of Gx and Gy at every site, (2, nx, ny); NaN if unknown."""
         system = self.system
-        variance = self._of_map(plate=False) + self._of_length(system.grid.views.z_sites)
-        return np.where(system.known_sites, variance.reshape(2, *system.known_sites.shape), np.nan)
+        variance = self._of_map(plate=False) + self._of_length(
+            system.grid.views.z_sites
+        )
+        return np.where(
+            system.known_sites, variance.reshape(2, *system.known_sites.shape), np.nan
+        )
 
     @cached_property
     def of_plate(self) -> np.ndarray:
         """Variances of Ax and Ay at every mark, (2, nx, ny); NaN if unknown."""
         system = self.system
         variance = self._of_map(plate=True) + self._of_length(system.grid.views.z)
-        return np.where(system.known_marks, variance.reshape(2, *system.known_marks.shape), np.nan)
+        return np.where(
+            system.known_marks, variance.reshape(2, *system.known_marks.shape), np.nan
+        )
 
     def maps_of_terms(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the maps for a unit of each coefficient in the datum, (sites, p), (marks, p)."""
@@ -274,7 +293,9 @@ class MapsCovariance:
 
     def _of_terms(self, g: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return functionals (sites, k), (marks, k) of free maps of the terms, (p, k)."""
-        return np.real(self.terms.fields.conj().T @ g) + np.real(self.terms.plates.conj().T @ a)
+        return np.real(self.terms.fields.conj().T @ g) + np.real(
+            self.terms.plates.conj().T @ a
+        )
 
     def functionals(self, sites: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return functionals (k, nx, ny) of the stage's map as those of the free maps."""
@@ -295,10 +316,19 @@ class MapsCovariance:
         views = self.system.grid.views
         g = sites.reshape(count, -1).T
         grown = np.zeros(count)
-        a = np.zeros((views.z.size, count)) if marks is None else marks.reshape(count, -1).T
+        a = (
+            np.zeros((views.z.size, count))
+            if marks is None
+            else marks.reshape(count, -1).T
+        )
         if self._scale is not None:
-            grown = np.real(views.z_sites.reshape(-1).conj() @ g - views.z.reshape(-1).conj() @ a)
-            g, a = (rows + scale * grown for rows, scale in zip((g, a), self._scale, strict=True))
+            grown = np.real(
+                views.z_sites.reshape(-1).conj() @ g - views.z.reshape(-1).conj() @ a
+            )
+            g, a = (
+                rows + scale * grown
+                for rows, scale in zip((g, a), self._scale, strict=True)
+            )
         return *self._free(g, a), grown
 
     def _free(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -322,7 +352,10 @@ class MapsCovariance:
             basis = system.plate_gauge.orthonormal
             fields = np.column_stack([-basis, system.plate_gauge.without(z)])
             g = np.column_stack(
-                [np.zeros((views.z_sites.size, basis.shape[1])), system.gauge.dual(3).reshape(-1)]
+                [
+                    np.zeros((views.z_sites.size, basis.shape[1])),
+                    system.gauge.dual(3).reshape(-1),
+                ]
             )
             a = np.column_stack([basis, np.zeros(len(z))])
         else:
@@ -333,11 +366,15 @@ class MapsCovariance:
         if self._scale is not None:
             fields, g, a = (
                 np.column_stack(pair)
-                for pair in zip((fields, g, a), (-z, *self._free(*self._scale)), strict=True)
+                for pair in zip(
+                    (fields, g, a), (-z, *self._free(*self._scale)), strict=True
+                )
             )
         return fields, g, a
 
-    def _solved(self, g: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _solved(
+        self, g: np.ndarray, a: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the covariance of functionals of free maps with the unknowns, for unit noise.
 
         With sites (sites, k) and misalignments (3 views, k), each without terms, and terms (p, k).
@@ -441,7 +478,9 @@ def conditions_for(
                 "use zero_mean",
             )
         sites = turned_over(sense, system.known_sites, sign=1)
-        slopes = turned_over(sense, slope_rows(system.grid.views.z_sites * half_width_m, sites))
+        slopes = turned_over(
+            sense, slope_rows(system.grid.views.z_sites * half_width_m, sites)
+        )
         rows = lines_turned_over(sense, np.eye(n_lines)[:, :: n_lines // 4]).T
         _require_axes(sites, [bool(known_lines[row != 0].all()) for row in rows])
         return _solve_conditions(system, rows, slopes)
@@ -488,7 +527,9 @@ def _require_axes(known_sites: np.ndarray, lines: list[bool]) -> None:
             )
 
 
-def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndarray) -> Conditions:
+def _solve_conditions(
+    system: NormalEquations, rows: np.ndarray, slopes: np.ndarray
+) -> Conditions:
     """Return the least-squares response of the angular equations, given phi of the grid views."""
     angular = system.angular
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
@@ -508,7 +549,9 @@ def _solve_conditions(system: NormalEquations, rows: np.ndarray, slopes: np.ndar
     return Conditions(ThetaDatum.XY_AXES, rows, slopes, gain, phi_gain)
 
 
-def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+def misclosure_test(
+    misclosure: np.ndarray, covariance: np.ndarray
+) -> tuple[float, float]:
     """Return probability and size (rad) of the misclosure of the redundant axis conditions.
 
     Parameters
@@ -527,7 +570,9 @@ def misclosure_test(misclosure: np.ndarray, covariance: np.ndarray) -> tuple[flo
     n = len(misclosure)
     if n < 2:
         return 1.0, 0.0
-    contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][:, 1:].T
+    contrasts = np.linalg.qr(np.column_stack([np.ones(n), np.eye(n)[:, 1:]]))[0][
+        :, 1:
+    ].T
     contrast = contrasts @ misclosure
     spread = contrasts @ covariance @ contrasts.T + LEAST_NOISE_M**2 * np.eye(n - 1)
     value = float(contrast @ np.linalg.solve(spread, contrast))
@@ -548,7 +593,11 @@ class LinesCovariance:
     """
 
     def __init__(self, cover: MapsCovariance, sigma: tuple[float, float]) -> None:
-        self.cover, self.system, self.angular = cover, cover.system, cover.system.angular
+        self.cover, self.system, self.angular = (
+            cover,
+            cover.system,
+            cover.system.angular,
+        )
         self._xy2, self._theta2 = sigma[0] ** 2, sigma[1] ** 2
         self._of_means = self._theta2 * self.angular.noise_of_means
 
@@ -563,13 +612,19 @@ class LinesCovariance:
     def of_stage(self, conditions: Conditions) -> tuple[np.ndarray, np.ndarray]:
         """Return the variance of Gtheta (K,) in its datum and the covariance of the misclosure."""
         rows = conditions.rows.T
-        misclosure = -rows, np.zeros(rows.shape), self.cover.functionals(conditions.slopes)
+        misclosure = (
+            -rows,
+            np.zeros(rows.shape),
+            self.cover.functionals(conditions.slopes),
+        )
         closure = self.of(*misclosure)
         y = self.angular.response
         n = self.angular.n_lines
         inverse = np.concatenate(
             [
-                self.angular.solve(np.eye(n, len(block), -block[0]))[block, block - block[0]]
+                self.angular.solve(np.eye(n, len(block), -block[0]))[
+                    block, block - block[0]
+                ]
                 for block in self._blocks()
             ]
         )
@@ -606,11 +661,15 @@ class LinesCovariance:
         for block in self._blocks():
             unit = np.eye(count, len(block), -block[0])
             rows, factors, of_terms, _ = self._free(0 * unit, unit)
-            own_variance[block] = self._theta2 * np.einsum("kl,kl->l", rows, angular.solve(rows))
+            own_variance[block] = self._theta2 * np.einsum(
+                "kl,kl->l", rows, angular.solve(rows)
+            )
             own_variance[block] += self._xy2 * np.einsum(
                 "vl,vw,wl->l", factors, self.cover.inverse, factors
             )
-            own_variance[block] += np.einsum("pl,pq,ql->l", of_terms, self._of_terms, of_terms)
+            own_variance[block] += np.einsum(
+                "pl,pq,ql->l", of_terms, self._of_terms, of_terms
+            )
         variance = in_datum(
             own_variance + self._of_means,
             (),
@@ -668,11 +727,17 @@ class LinesCovariance:
         """Return the covariance of functionals with both free maps, (K, k) each."""
         rows, factors, of_terms, _ = self._free(stage, plate, maps)
         coefficients = self._of_terms @ of_terms
-        phi = self._xy2 / self.cover.length * (self.cover.inverse @ factors)[self.system.phi_at]
+        phi = (
+            self._xy2
+            / self.cover.length
+            * (self.cover.inverse @ factors)[self.system.phi_at]
+        )
         field = self._theta2 * self.angular.solve(rows) - self.angular.response @ phi
         of_plate = self.angular.plate(np.zeros(1), field.T, phi.T)[0].T
         of_plate += self._of_means[:, None] * plate
-        return field + self.terms[0] @ coefficients, of_plate + self.terms[1] @ coefficients
+        return field + self.terms[0] @ coefficients, of_plate + self.terms[
+            1
+        ] @ coefficients
 
     @property
     def _of_terms(self) -> np.ndarray:
@@ -693,5 +758,7 @@ def lines_alone(system: NormalEquations) -> LinesCovariance:
     inverse = np.zeros((system.size, system.size))
     free = [v for v, i in enumerate(system.angular_index) if i not in system.grid_index]
     at = system.phi_at[free]
-    inverse[np.ix_(at, at)] = np.linalg.pinv(angular.schur[np.ix_(free, free)], hermitian=True)
+    inverse[np.ix_(at, at)] = np.linalg.pinv(
+        angular.schur[np.ix_(free, free)], hermitian=True
+    )
     return LinesCovariance(MapsCovariance(system, inverse), (1.0, 1.0))

@@ -110,7 +110,9 @@ class FittedCamera(Distortion):
         u_scale, u_turn = self.u_coefficients[1]
         cells_by_place = {
             cell: CameraCell(z.real, z.imag, e.real, e.imag, *u)
-            for cell, z, e, u in zip(self.cells, self.place, self.error, self.u, strict=True)
+            for cell, z, e, u in zip(
+                self.cells, self.place, self.error, self.u, strict=True
+            )
         }
         return CameraErrors(
             scale=scale.real,
@@ -125,12 +127,17 @@ class FittedCamera(Distortion):
             coefficients=tuple(
                 CameraPower(tuple(power), value.real, value.imag, *u)
                 for power, value, u in zip(
-                    self.powers, self.coefficients[1:], self.u_coefficients[1:], strict=True
+                    self.powers,
+                    self.coefficients[1:],
+                    self.u_coefficients[1:],
+                    strict=True,
                 )
             ),
             cells=tuple(
                 cells_by_place.get(cell)
-                or CameraCell(*(step * self.image.pitch_m for step in cell), *[math.nan] * 4)
+                or CameraCell(
+                    *(step * self.image.pitch_m for step in cell), *[math.nan] * 4
+                )
                 for cell in self.image.cells
             ),
             noise_image=self.noise_image,
@@ -143,7 +150,9 @@ def _terms(z: np.ndarray, powers: Powers) -> np.ndarray:
     power = [np.ones_like(z)]
     for _ in range(max(map(max, powers), default=0)):
         power.append(power[-1] * z)
-    return np.stack([power[0], *(power[a] * power[b].conj() for a, b in powers)], axis=-1)
+    return np.stack(
+        [power[0], *(power[a] * power[b].conj() for a, b in powers)], axis=-1
+    )
 
 
 def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | None:
@@ -171,7 +180,9 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
     noises = images.noises(model.fitted.residuals)
     drawn = offsets(images.parameters)
     layout = _layout(
-        [view_readings.view for view_readings in readings], image, grid.read.sum(axis=(1, 2)) > 1
+        [view_readings.view for view_readings in readings],
+        image,
+        grid.read.sum(axis=(1, 2)) > 1,
     )
     if layout is None:
         return None
@@ -185,7 +196,8 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
     if not _determined(published, POWERS[1]):
         return None
     error = error_of_cell
-    for _ in range(MAX_STEPS):  # from the optical axis on, not from the offsets in its cell
+    # from the optical axis on, not from the offsets in its cell
+    for _ in range(MAX_STEPS):
         before = error
         powers, fit = _polynomial(published - error, error_of_cell, samples)
         error = error_of_cell - (fit @ error_of_cell)[0]
@@ -211,18 +223,25 @@ Layout = tuple[list[tuple[int, int]], np.ndarray, Callable[[np.ndarray], np.ndar
 function from offsets (..., views) to those of cells relative to the one nearest the axis."""
 
 
-def _layout(views: Sequence[View], image: ImageCells, usable: np.ndarray) -> Layout | None:
+def _layout(
+    views: Sequence[View], image: ImageCells, usable: np.ndarray
+) -> Layout | None:
     """Return how offsets of sub-views, those `usable`, depend on view and cell.
 
     A gap has the value that the least squares of both effects give it, so that means over the
     views are the estimates. None if the views do not connect the cells.
     """
     row_of = {
-        (views[row].plan_view, views[row].cell): row for row in np.flatnonzero(usable).tolist()
+        (views[row].plan_view, views[row].cell): row
+        for row in np.flatnonzero(usable).tolist()
     }
     names = list(dict.fromkeys(name for name, _ in row_of))
-    cells = [cell for cell in image.cells if any((name, cell) in row_of for name in names)]
-    rows = np.array([[row_of.get((name, cell), -1) for cell in cells] for name in names])
+    cells = [
+        cell for cell in image.cells if any((name, cell) in row_of for name in names)
+    ]
+    rows = np.array(
+        [[row_of.get((name, cell), -1) for cell in cells] for name in names]
+    )
     effects = np.concatenate(
         [
             np.repeat(np.eye(len(names)), len(cells), axis=0),
@@ -246,7 +265,9 @@ def _layout(views: Sequence[View], image: ImageCells, usable: np.ndarray) -> Lay
 
 def _spread(samples: np.ndarray) -> np.ndarray:
     """Return the standard deviations of real and imaginary parts of draws (k, n), (n, 2)."""
-    return np.stack([samples.real.std(axis=0, ddof=1), samples.imag.std(axis=0, ddof=1)], axis=1)
+    return np.stack(
+        [samples.real.std(axis=0, ddof=1), samples.imag.std(axis=0, ddof=1)], axis=1
+    )
 
 
 def _polynomial(
@@ -298,7 +319,8 @@ def _place(views: Sequence[ViewReadings]) -> complex:
     return complex(
         np.mean(
             [
-                view.view.cell_m + (view.visits.offset_x + 1j * view.visits.offset_y).mean()
+                view.view.cell_m
+                + (view.visits.offset_x + 1j * view.visits.offset_y).mean()
                 for view in visited
                 if view.visits is not None
             ]
@@ -317,7 +339,9 @@ def straightened(measurements: Measurements, camera: Distortion) -> Measurements
         views=tuple(
             view
             if view.view.cell is None or view.visits is None
-            else _straight(view, view.visits, camera, places.get(view.view.cell, view.view.cell_m))
+            else _straight(
+                view, view.visits, camera, places.get(view.view.cell, view.view.cell_m)
+            )
             for view in measurements.views
         ),
     )
@@ -328,7 +352,12 @@ def known_camera(result: CalibrationResult) -> Distortion | None:
     if result.camera is None:
         return None
     return Distortion(
-        [(a, b) for a, b in (coefficient.power for coefficient in result.camera.coefficients)],
+        [
+            (a, b)
+            for a, b in (
+                coefficient.power for coefficient in result.camera.coefficients
+            )
+        ],
         np.array(
             [
                 0,
@@ -356,7 +385,9 @@ def straight_slope(camera: Distortion, place: complex) -> np.ndarray:
     return np.eye(2) - np.stack([slope.real, slope.imag])
 
 
-def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[Finding, ...]:
+def few_read(
+    measurements: Measurements, camera: FittedCamera | None
+) -> tuple[Finding, ...]:
     """Return a finding on the cells of images whose mark is missing in most images.
 
     Those of all views together, or of one.
@@ -365,7 +396,9 @@ def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[F
     counts = _read_and_shown(measurements)
     for cell in dict.fromkeys(cell for _, cell in counts):
         of_views = {
-            name: count for (name, cell_of_count), count in counts.items() if cell_of_count == cell
+            name: count
+            for (name, cell_of_count), count in counts.items()
+            if cell_of_count == cell
         }
         total = np.sum(list(of_views.values()), axis=0)
         few += [
@@ -388,7 +421,12 @@ def few_read(measurements: Measurements, camera: FittedCamera | None) -> tuple[F
             details={
                 "unknown": unknown,
                 "cells": [
-                    {"view": name, "cell": list(cell), "read": int(n_read), "shown": int(n_shown)}
+                    {
+                        "view": name,
+                        "cell": list(cell),
+                        "read": int(n_read),
+                        "shown": int(n_shown),
+                    }
                     for name, cell, (n_read, n_shown) in few
                 ],
             },
@@ -413,13 +451,20 @@ def _read_and_shown(
     ]
     for name, _, (m, n), view_readings in sub_views:
         stops.setdefault(name, set()).update(
-            zip((view_readings.m - m).tolist(), (view_readings.n - n).tolist(), strict=True)
+            zip(
+                (view_readings.m - m).tolist(),
+                (view_readings.n - n).tolist(),
+                strict=True,
+            )
         )
     (first_m, last_m), (first_n, last_n) = measurements.artifact.limits
     return {
         (name, cell): (
             len(view_readings.m),
-            sum(first_m <= i + m <= last_m and first_n <= j + n <= last_n for i, j in stops[name]),
+            sum(
+                first_m <= i + m <= last_m and first_n <= j + n <= last_n
+                for i, j in stops[name]
+            ),
         )
         for name, cell, (m, n), view_readings in sub_views
     }
@@ -431,10 +476,14 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
     None without images, or if they do not determine it up to its mean.
     """
     images, inputs = model.problem.images, model.problem.inputs
-    name = next((term.name for term in model.problem.terms if term.block.of_images), None)
+    name = next(
+        (term.name for term in model.problem.terms if term.block.of_images), None
+    )
     if images is None or name is None or model.equations is None:
         return None
-    free = replace(model.equations, columns=model.equations.columns.scaled(name, math.inf))
+    free = replace(
+        model.equations, columns=model.equations.columns.scaled(name, math.inf)
+    )
     rows = free.rows([name]) & (free.norm > free.norm.max() * TRACE)
     rows_of_yaw = rows[free.rows([name])]
     if np.linalg.matrix_rank(free.undetermined(free.free)[rows], tol=TRACE) > 1:
@@ -461,11 +510,15 @@ def yaw_of(model: ModelFit, sense: Sense) -> StageYawMap | None:
         (to_map @ fit.fields.T).reshape(-1, *grid.views.shape),
         to_map @ fit.parameters[: 3 * grid.n_views].T,
     )[1]
-    covariance = to_map[:, rows] @ centred + share * images.added_covariance(sensitivities)
+    covariance = to_map[:, rows] @ centred + share * images.added_covariance(
+        sensitivities
+    )
     covariance *= noise.sigma**2
     yaw_rad = centred @ values[rows]
     n = len(centred) - 1
-    statistic = yaw_rad @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw_rad
+    statistic = (
+        yaw_rad @ np.linalg.pinv(covariance, hermitian=True, rcond=1e-9) @ yaw_rad
+    )
     x, y = (
         sense.sign * axis.ravel()[rows_of_yaw]  # (1.6) and its rotations
         for axis in np.meshgrid(*inputs.node_axes_m, indexing="ij")

@@ -73,9 +73,13 @@ class FittedTerms:
     inverse: np.ndarray
     rank: int
 
-    def freed(self, residual: np.ndarray, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def freed(
+        self, residual: np.ndarray, parameters: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals and misalignments of a fit without the terms after one with them."""
-        right = np.einsum("pvij,vij->p", self.residuals.conj(), self.weight * residual).real
+        right = np.einsum(
+            "pvij,vij->p", self.residuals.conj(), self.weight * residual
+        ).real
         values = self.inverse @ right
         return (
             residual - np.tensordot(values, self.residuals, 1),
@@ -174,10 +178,14 @@ class ImageNoise:
         of_marks, of_images = self._by_marks_and_images(sensitivities)
         return (of_images @ of_images.conj().T - of_marks @ of_marks.conj().T).real
 
-    def _by_marks_and_images(self, sensitivities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _by_marks_and_images(
+        self, sensitivities: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return sensitivities to readings of unit noise, (k, n), and to images, (k, stops)."""
         of_marks = np.sqrt(self.weight) * sensitivities[:, self.read]
-        of_images = np.zeros((len(sensitivities), int(self.stop.max()) + 1), dtype=complex)
+        of_images = np.zeros(
+            (len(sensitivities), int(self.stop.max()) + 1), dtype=complex
+        )
         np.add.at(of_images.T, self.stop, of_marks.T)
         return of_marks, of_images
 
@@ -244,10 +252,14 @@ def _fitted_terms(system: NormalEquations, columns: np.ndarray) -> FittedTerms:
     values, vectors = np.linalg.eigh(gram)
     determined = values > GAP * norm**2 * len(flat.T)
     inverse = (vectors[:, determined] / values[determined]) @ vectors[:, determined].T
-    return FittedTerms(grid.weight, residuals, parameters, inverse, int(determined.sum()))
+    return FittedTerms(
+        grid.weight, residuals, parameters, inverse, int(determined.sum())
+    )
 
 
-def _drawn(system: NormalEquations, views: CellsSeen, columns: np.ndarray) -> ImageNoise:
+def _drawn(
+    system: NormalEquations, views: CellsSeen, columns: np.ndarray
+) -> ImageNoise:
     """Return images and draws of readings, with columns (p, views, nx, ny) fitted to them.
 
     `views` are the names in the plan and steps of cells.
@@ -264,9 +276,12 @@ def _drawn(system: NormalEquations, views: CellsSeen, columns: np.ndarray) -> Im
     rng = np.random.default_rng(0)
     for row, parameters in zip(drawn, plain.parameters, strict=True):
         mark, image = (
-            rng.normal(size=(size, 2)) @ [1, 1j] for size in (len(stops), stops.max() + 1)
+            rng.normal(size=(size, 2)) @ [1, 1j]
+            for size in (len(stops), stops.max() + 1)
         )
-        solved = [_solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])]
+        solved = [
+            _solved(system, values / np.sqrt(weight)) for values in (mark, image[stops])
+        ]
         power += [of_noise[2] for of_noise in solved]
         residuals, parameters[:] = zip(
             *(fitted.freed(*of_noise[:2]) for of_noise in solved), strict=True
@@ -294,7 +309,9 @@ def stops_of(views: CellsSeen, read: np.ndarray) -> np.ndarray:
     return np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def _solved(system: NormalEquations, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def _solved(
+    system: NormalEquations, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return residuals (views, nx, ny), misalignments and square of the map of readings (n,).
 
     Of the grid alone, in the datum.

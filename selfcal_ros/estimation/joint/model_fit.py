@@ -104,12 +104,18 @@ class ModelFit:
         Complex (V,), plate frame, m, without the terms.
         """
         of_terms = (
-            [] if self.equations is None else self.equations.columns.at_visits(self.coefficients)
+            []
+            if self.equations is None
+            else self.equations.columns.at_visits(self.coefficients)
         )
         for row, visits in enumerate(self.problem.inputs.visits):
             if visits is not None:
                 y = visits.y - (of_terms[row] if of_terms else 0.0)
-                yield row, visits, visits.about_means(y[None], self.problem.system.grid.n_marks)[0]
+                yield (
+                    row,
+                    visits,
+                    visits.about_means(y[None], self.problem.system.grid.n_marks)[0],
+                )
 
     @property
     def spread(self) -> TermSpread | None:
@@ -159,7 +165,9 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     found_at = 0
     for number in range(MAX_STEPS):
         change = state.step()
-        largest = max(float(np.abs(state.fitted.parameters).max()), problem.largest_turn_m)
+        largest = max(
+            float(np.abs(state.fitted.parameters).max()), problem.largest_turn_m
+        )
         if change <= max(ROUNDED * largest, ROUNDING * peak):
             return state.finished()
         stuck = number > 2 and 2 * change > before
@@ -172,7 +180,9 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
             break
         before = change
     if problem.terms:
-        free = " or ".join(str(term.name) for term in problem.terms if math.isinf(term.size))
+        free = " or ".join(
+            str(term.name) for term in problem.terms if math.isinf(term.size)
+        )
         raise NotSettledError(
             f"model {', '.join(str(term.name) for term in problem.terms)}",
             "the fit does not converge",
@@ -185,9 +195,13 @@ def settled(problem: Problem, check: Callable[[TermEquations], None]) -> ModelFi
     )
 
 
-def equations_of(problem: Problem, fitted: JointFit, columns: TermColumns) -> TermEquations:
+def equations_of(
+    problem: Problem, fitted: JointFit, columns: TermColumns
+) -> TermEquations:
     """Return the equations of columns about the estimate `fitted`."""
-    noises = filter(np.isfinite, (fitted.xy.declared, fitted.xy.repeats, fitted.xy.residuals))
+    noises = filter(
+        np.isfinite, (fitted.xy.declared, fitted.xy.repeats, fitted.xy.residuals)
+    )
     return equations_of_columns(
         problem.system,
         columns,
@@ -208,7 +222,10 @@ class _State:
         self.y = problem.grid.y
         self.fitted = fit(problem, self.y, self.theta)
         self.offset_steps = LATE
-        self.moved_m, self.changed = np.zeros(problem.system.size), np.zeros_like(self.y)
+        self.moved_m, self.changed = (
+            np.zeros(problem.system.size),
+            np.zeros_like(self.y),
+        )
         self.fell = self.rounds = False
         self.equations: TermEquations | None = None
         self.of_offsets = any(term.block.of_microscope for term in problem.terms)
@@ -225,7 +242,9 @@ class _State:
 
     def _refresh(self, equations: TermEquations) -> None:
         """Set up the equations again where visits, offsets or weights have changed."""
-        if 0 < self.steps <= self.offset_steps and (self.of_offsets or self.problem.moves):
+        if 0 < self.steps <= self.offset_steps and (
+            self.of_offsets or self.problem.moves
+        ):
             self._linearise(self._anew(equations.columns))
         elif self._stale(equations):
             self._linearise(equations.columns)
@@ -239,10 +258,12 @@ class _State:
         )
         columns = term_columns(inputs, self.problem.terms)
         rows = columns.having(lambda block: block.of_microscope)
-        effect = columns.shapes.combined(self.coefficients, rows) - before.shapes.combined(
+        effect = columns.shapes.combined(
             self.coefficients, rows
+        ) - before.shapes.combined(self.coefficients, rows)
+        largest = max(
+            float(np.abs(self.fitted.parameters).max()), self.problem.largest_turn_m
         )
-        largest = max(float(np.abs(self.fitted.parameters).max()), self.problem.largest_turn_m)
         if self.of_offsets and np.abs(effect).max() <= ROUNDED * largest:
             self.offset_steps = self.steps
         return columns
@@ -273,7 +294,9 @@ class _State:
         if self.equations is not None:
             self._solve_terms(self.equations)
         elif self.problem.moves:
-            self.problem = replace(self.problem, repeats_xy=self.moving.repeats(self.fitted))
+            self.problem = replace(
+                self.problem, repeats_xy=self.moving.repeats(self.fitted)
+            )
         place_change = self.moving.change_of_readings(self.fitted.field)
         self.y = np.where(
             self.problem.system.grid.read,
@@ -284,7 +307,8 @@ class _State:
         self.moved_m = np.abs(self.fitted.parameters - parameters)
         self.changed, self.stepped = self.y - y, self.coefficients - coefficients
         return max(
-            min(float(self.moved_m.max()), float(np.abs(self.changed).max())), self.moving.change
+            min(float(self.moved_m.max()), float(np.abs(self.changed).max())),
+            self.moving.change,
         )
 
     def within_noise(self, share: float) -> bool:
@@ -300,9 +324,12 @@ class _State:
         of_view = sigma / np.sqrt(weight.reshape(len(weight), -1).sum(axis=1).max())
         spread = np.diag(self.fitted.inverse)
         determined = spread > ROUNDED * spread.max(initial=0.0)
-        noise = np.where(determined, sigma * np.sqrt(np.where(determined, spread, 0.0)), of_view)
+        noise = np.where(
+            determined, sigma * np.sqrt(np.where(determined, spread, 0.0)), of_view
+        )
         still = bool((self.moved_m <= share * noise).all()) or (
-            self._changed_besides_m <= share * of_view and self._terms_are_still(share * sigma)
+            self._changed_besides_m <= share * of_view
+            and self._terms_are_still(share * sigma)
         )
         return still and self.moving.change <= share * of_view
 
@@ -315,7 +342,9 @@ class _State:
         """Return whether the last step of each coefficient was below a part of its noise."""
         if self.equations is None:
             return True
-        variances = np.maximum(np.diag(self.equations.inverse(self.fitted.xy.sigma)), 0.0)
+        variances = np.maximum(
+            np.diag(self.equations.inverse(self.fitted.xy.sigma)), 0.0
+        )
         return bool((np.abs(self.stepped) <= part_m * np.sqrt(variances)).all())
 
     def finished(self) -> ModelFit:
@@ -328,7 +357,9 @@ class _State:
         now = score(
             equations,
             self.fitted.both_residuals,
-            squares(self.problem, self.fitted, of_noise=False),  # less those `_of_lines`
+            squares(
+                self.problem, self.fitted, of_noise=False
+            ),  # less those `_of_lines`
             coefficients=self.coefficients,
         )
         sums = residual_sums(equations, now)
@@ -338,7 +369,8 @@ class _State:
         if sums.dof_between - dof < DECLARED_DOF or total > sums.between:
             total, dof = 0.0, 0.0
         residuals = sigma_of(sums.between - total, sums.dof_between - dof)
-        rounded = residuals[0] == 0  # the weight of nearly exact lines leaves nothing else
+        # the weight of nearly exact lines leaves nothing else
+        rounded = residuals[0] == 0
         self.problem = replace(
             self.problem,
             residuals_xy=self.problem.residuals_xy
@@ -355,13 +387,18 @@ class _State:
         )
         lines = equations.columns.lines
         if len(lines.at):
-            line_values = np.tensordot(self.coefficients[lines.at], lines.values, axes=1)
+            line_values = np.tensordot(
+                self.coefficients[lines.at], lines.values, axes=1
+            )
             columns_of_lines = equations.columns.having(
                 lambda block: block.of_lines and not block.turns_lines
             )
             within = inverse[np.ix_(columns_of_lines, columns_of_lines)]
             dof = float(
-                np.sum(within * equations.information[np.ix_(columns_of_lines, columns_of_lines)])
+                np.sum(
+                    within
+                    * equations.information[np.ix_(columns_of_lines, columns_of_lines)]
+                )
             )
             angular = replace(self.problem.angular, y=self.lines_read - line_values)
             self.problem = replace(self.problem, angular=angular, dof_lines=dof)
@@ -376,7 +413,9 @@ class _State:
         return self.rounds
 
     def _of_terms(
-        self, trait: Callable[[Block], bool] = lambda block: True, by: np.ndarray | None = None
+        self,
+        trait: Callable[[Block], bool] = lambda block: True,
+        by: np.ndarray | None = None,
     ) -> np.ndarray | float:
         """Return the effect of the terms with a trait on the readings, (views, nx, ny), m.
 
@@ -399,7 +438,9 @@ class _State:
         )
 
 
-def squares(problem: Problem, fitted: JointFit, *, of_noise: bool = True) -> tuple[float, float]:
+def squares(
+    problem: Problem, fitted: JointFit, *, of_noise: bool = True
+) -> tuple[float, float]:
     """Return the weighted squares of all residuals, m^2, and their degrees of freedom.
 
     Grid and angular readings together, as they share the rotations: angular residuals in units of
@@ -413,7 +454,9 @@ def squares(problem: Problem, fitted: JointFit, *, of_noise: bool = True) -> tup
         shared = len(set(system.angular_index) & set(system.grid_index))
         dof += max(shared - 1, 0)
         if not of_noise or lines_have_their_weight(problem, fitted):
-            squares_rad = float((system.angular.weight * fitted.residuals_theta**2).sum())
+            squares_rad = float(
+                (system.angular.weight * fitted.residuals_theta**2).sum()
+            )
             total += fitted.ratio * problem.half_width_m**2 * squares_rad
             dof += system.angular.n_readings - system.rank_angular
     return total, dof
@@ -438,10 +481,18 @@ def _of_lines(
         return 0.0, 0.0
     system = problem.system
     angular = problem.system.angular
-    columns = equations.projected.of_lines(system, equations.columns.lines, problem.half_width_m)
+    columns = equations.projected.of_lines(
+        system, equations.columns.lines, problem.half_width_m
+    )
     weight = equations.line_weight * angular.weight
-    rotations = fitted.ratio * fitted.inverse[np.ix_(system.phi_at, system.phi_at)] * angular.schur
-    followed = np.einsum("vk,pvk,qvk->pq", weight, columns, columns) * equations.free_inverse
+    rotations = (
+        fitted.ratio
+        * fitted.inverse[np.ix_(system.phi_at, system.phi_at)]
+        * angular.schur
+    )
+    followed = (
+        np.einsum("vk,pvk,qvk->pq", weight, columns, columns) * equations.free_inverse
+    )
     residuals = fitted.residuals_theta - np.tensordot(more, columns, axes=1)
     return (
         float((weight * residuals**2).sum()),
@@ -482,7 +533,9 @@ def is_too_large(system: PlacedEquations) -> bool:
 
 def equations_left(grid: PlacedSystem) -> int:
     """Return the readings of a map beyond plate and misalignments: two numbers each."""
-    return 2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (grid.n_misalignments - 7)
+    return (
+        2 * grid.n_readings - 2 * int(grid.mark_read.sum()) - (grid.n_misalignments - 7)
+    )
 
 
 def is_untested(problem: Problem) -> bool:
@@ -492,13 +545,19 @@ def is_untested(problem: Problem) -> bool:
         return system is not None
     views = system.grid.views
     n_left = equations_left(system.grid)
-    if views.spline.axes[0].degree == 1 or n_left > 2 * math.prod(views.spline.refined.shape):
+    if views.spline.axes[0].degree == 1 or n_left > 2 * math.prod(
+        views.spline.refined.shape
+    ):
         return False
-    fine = PlacedSystem(views.artifact, views.poses, system.grid.weight, views.spline.refined)
+    fine = PlacedSystem(
+        views.artifact, views.poses, system.grid.weight, views.spline.refined
+    )
     return (
         n_left
         - determined_coefficients(
-            PlacedEquations(fine, system.angular, system.grid_index, system.angular_index)
+            PlacedEquations(
+                fine, system.angular, system.grid_index, system.angular_index
+            )
         )
         < 1
     )
@@ -521,7 +580,8 @@ def finer(model: ModelFit) -> ModelFit | None:
     fits = [
         fine
         for spline in splines
-        if (fine := with_map(model, spline)) is not None and np.isfinite(fine.fitted.xy.residuals)
+        if (fine := with_map(model, spline)) is not None
+        and np.isfinite(fine.fitted.xy.residuals)
     ]
     return min(fits, key=lambda fine: fine.fitted.xy.residuals, default=None)
 
@@ -537,12 +597,16 @@ def with_map(model: ModelFit, spline: MapSpline) -> ModelFit | None:
         return None
     grid = system.grid
     system_of_map = FinerEquations(
-        PlacedSystem(grid.views.artifact, grid.views.poses, grid.weight, spline, grid.rotations),
+        PlacedSystem(
+            grid.views.artifact, grid.views.poses, grid.weight, spline, grid.rotations
+        ),
         system.angular,
         system.grid_index,
         system.angular_index,
     )
-    flat = np.zeros((len(problem.conditions.rows), *system_of_map.grid.views.shape), dtype=complex)
+    flat = np.zeros(
+        (len(problem.conditions.rows), *system_of_map.grid.views.shape), dtype=complex
+    )
     problem = replace(
         problem,
         system=system_of_map,
@@ -562,7 +626,10 @@ def _with_terms(model: ModelFit, columns: TermColumns) -> ModelFit:
     problem, fitted = model.problem, model.fitted
     equations = equations_of(problem, fitted, columns)
     now = score(
-        equations, fitted.both_residuals, squares(problem, fitted), coefficients=model.coefficients
+        equations,
+        fitted.both_residuals,
+        squares(problem, fitted),
+        coefficients=model.coefficients,
     )
     values = next_coefficients(
         equations,
@@ -624,7 +691,9 @@ def fit_model(
             if not any(test.contradicted for test in other_sizes):
                 sizes = (*first_sizes, *other_sizes)
                 break
-    return replace(settled(_raised(problem, sizes), check), sizes=sizes, given=problem.terms)
+    return replace(
+        settled(_raised(problem, sizes), check), sizes=sizes, given=problem.terms
+    )
 
 
 def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
@@ -635,7 +704,8 @@ def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
     """
     larger = {test.name: test.allowed / test.given for test in sizes if test.raised}
     offsets = max(
-        (factor for name, factor in larger.items() if block_of(name).of_offsets), default=1.0
+        (factor for name, factor in larger.items() if block_of(name).of_offsets),
+        default=1.0,
     )
     return replace(
         problem,
@@ -643,7 +713,10 @@ def _raised(problem: Problem, sizes: Sequence[SizeTest]) -> Problem:
             term
             if term.free
             else term.scaled(
-                max(larger.get(term.name, 1.0), offsets if term.block.of_offsets else 1.0)
+                max(
+                    larger.get(term.name, 1.0),
+                    offsets if term.block.of_offsets else 1.0,
+                )
             )
             for term in problem.terms
         ),
@@ -673,4 +746,6 @@ def _tests_of(model: ModelFit, terms: Sequence[ModelTerm]) -> tuple[SizeTest, ..
     right = scored.total + equations.information @ model.coefficients
     noise = model.fitted.xy
     excess = noise_excess(model.problem, model.fitted.residuals)
-    return size_tests(equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof))
+    return size_tests(
+        equations, right, terms, (noise.sigma * math.sqrt(excess), noise.dof)
+    )

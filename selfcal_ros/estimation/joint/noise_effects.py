@@ -15,7 +15,12 @@ from scipy.special import chdtrc, fdtrc
 
 from selfcal_ros.estimation.datum.covariance import MapsCovariance
 from selfcal_ros.estimation.joint.model_fit import ModelFit
-from selfcal_ros.estimation.joint.problem import F_LEVEL, MIN_REPEAT_DOF, SAME, noise_excess
+from selfcal_ros.estimation.joint.problem import (
+    F_LEVEL,
+    MIN_REPEAT_DOF,
+    SAME,
+    noise_excess,
+)
 from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.normal.equations import BLOCK
 from selfcal_ros.estimation.terms.visits import ViewVisits
@@ -32,13 +37,18 @@ def axis_contrast(model: ModelFit) -> float:
     for _, visits, residuals in model.visits_about_means():
         if visits.repeated:
             residuals = residuals / visits.phase
-            squares += visits.weight @ np.stack([residuals.real, residuals.imag], axis=1) ** 2
+            squares += (
+                visits.weight @ np.stack([residuals.real, residuals.imag], axis=1) ** 2
+            )
             dof += len(visits.mark) - len(np.unique(visits.mark))
     if 2 * dof < MIN_REPEAT_DOF:
         residuals = model.fitted.residuals * model.problem.to_stage[:, None, None]
         weight = problem.system.grid.weight
         squares = np.array(
-            [(weight * coordinate**2).sum() for coordinate in (residuals.real, residuals.imag)]
+            [
+                (weight * coordinate**2).sum()
+                for coordinate in (residuals.real, residuals.imag)
+            ]
         )
         dof = model.fitted.xy.dof_residuals / 2
     dof /= noise_excess(problem, model.fitted.residuals)
@@ -75,7 +85,11 @@ def structured(
 
 
 def image_variances(
-    model: ModelFit, cover: MapsCovariance, rows: np.ndarray | None = None, *, plate: bool = False
+    model: ModelFit,
+    cover: MapsCovariance,
+    rows: np.ndarray | None = None,
+    *,
+    plate: bool = False,
 ) -> np.ndarray | float:
     """Return what the noise that marks of an image share adds to the variances for unit noise.
 
@@ -89,11 +103,15 @@ def image_variances(
         return 0.0
     added = added_variances(cover, images.added, rows, plate=plate)
     variance = (
-        (cover.of_plate if plate else cover.of_stage) if rows is None else np.diag(cover.of(rows))
+        (cover.of_plate if plate else cover.of_stage)
+        if rows is None
+        else np.diag(cover.of(rows))
     )
     if (added < -variance).any():
         of_marks = added_variances(cover, images.of_marks, rows, plate=plate)
-        added = added * np.minimum(1.0, variance / np.where(of_marks > 0, of_marks, 1.0))
+        added = added * np.minimum(
+            1.0, variance / np.where(of_marks > 0, of_marks, 1.0)
+        )
     return share * added
 
 
@@ -171,11 +189,18 @@ def time_correlation(model: ModelFit) -> np.ndarray:
     correlation = products[1:] / products[0]
     p = float(chdtrc(TESTED, 2 * number * float((correlation[:TESTED] ** 2).sum())))
     correlation = correlation * (1 - np.arange(1, lags + 1) / (lags + 1))
-    return correlation if p < F_LEVEL and 1 + 2 * correlation.sum() > SAME**2 else np.zeros(0)
+    return (
+        correlation
+        if p < F_LEVEL and 1 + 2 * correlation.sum() > SAME**2
+        else np.zeros(0)
+    )
 
 
 def correlated_variances(
-    model: ModelFit, cover: MapsCovariance, correlation: np.ndarray, rows: np.ndarray | None = None
+    model: ModelFit,
+    cover: MapsCovariance,
+    correlation: np.ndarray,
+    rows: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return what correlated noise adds to the variances, as `added_variances`."""
     views = _by_time(model)

@@ -23,11 +23,19 @@ from selfcal_ros.estimation.joint.images import ImageNoise
 from selfcal_ros.estimation.lattice.maps import rotation_excess
 from selfcal_ros.estimation.lattice.readings import AngularData, GridData
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import NormalEquations, angular_residuals, noise_of
+from selfcal_ros.estimation.normal.equations import (
+    NormalEquations,
+    angular_residuals,
+    noise_of,
+)
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.places import StagePlaces, places_of
-from selfcal_ros.estimation.terms.visits import TermInputs, between_visits, squares_within
+from selfcal_ros.estimation.terms.visits import (
+    TermInputs,
+    between_visits,
+    squares_within,
+)
 from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.reference import ReferenceLength
@@ -99,7 +107,9 @@ class NoiseEstimate:
         if not self.exceeded:
             return self.p
         return _same_noise(
-            (self.repeats, self.dof_repeats), (self.residuals, self.dof_residuals), FLOOR
+            (self.repeats, self.dof_repeats),
+            (self.residuals, self.dof_residuals),
+            FLOOR,
         )
 
     @property
@@ -153,7 +163,9 @@ def noise_estimate(
     """
     if residuals[1] < 1:  # terms with sizes leave fractions of rounding
         residuals = (float("nan"), 0.0)
-    identical = repeats[1] > 0 and repeats[0] <= floor < residuals[0] and residuals[1] > 0
+    identical = (
+        repeats[1] > 0 and repeats[0] <= floor < residuals[0] and residuals[1] > 0
+    )
     base = (
         (declared, float("inf"))
         if np.isfinite(declared)
@@ -183,7 +195,9 @@ def noise_estimate(
     return estimate
 
 
-def _same_noise(base: tuple[float, float], residuals: tuple[float, float], floor: float) -> float:
+def _same_noise(
+    base: tuple[float, float], residuals: tuple[float, float], floor: float
+) -> float:
     """Return the two-sided probability that both are estimates of the same noise (F-test)."""
     if not (base[1] > 0 and residuals[1] > 0) or not max(base[0], residuals[0]) > floor:
         return float("nan")
@@ -311,7 +325,9 @@ class AngularPart:
     noise: NoiseEstimate
 
 
-def repeats_of(measurements: Measurements) -> tuple[tuple[float, float], tuple[float, float]]:
+def repeats_of(
+    measurements: Measurements,
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return pooled (sigma, degrees of freedom) of the repeats, grid and angular."""
     views = measurements.views
     return (
@@ -331,7 +347,10 @@ def grid_noise(problem: Problem, residual: np.ndarray) -> NoiseEstimate:
         n_taken = problem.images.dof_of_terms if problem.residuals_xy else 0
         without_images = sigma_of(total, grid_dof(problem) - n_taken)
         noises = problem.images.noises(residual)
-        residuals = residuals[0] * noises.sigma / without_images[0], min(noises.dof, residuals[1])
+        residuals = (
+            residuals[0] * noises.sigma / without_images[0],
+            min(noises.dof, residuals[1]),
+        )
         repeats = repeats[0], repeats[1] / noises.excess(problem.images.marks)
     return noise_estimate(repeats, residuals, problem.grid.sigma_declared, floor=FLOOR)
 
@@ -355,7 +374,9 @@ def sigma_of(total: float, dof: float) -> tuple[float, float]:
     return (float(np.sqrt(total / dof)), dof) if dof > 0 else (float("nan"), 0)
 
 
-def weight_ratio(problem: Problem, sigma_xy: float, sigma_theta: float, y: np.ndarray) -> float:
+def weight_ratio(
+    problem: Problem, sigma_xy: float, sigma_theta: float, y: np.ndarray
+) -> float:
     """Return the weight of an angular reading against a grid reading, in misalignment units.
 
     Without both noises, an angular reading counts like a grid reading at the half width.
@@ -480,7 +501,11 @@ def turned(problem: Problem) -> Problem:
     phi = own_rotations(grid, problem.grid.y) / length
     frame, bent = np.exp(-1j * phi), np.expm1(-1j * phi)
     marks = grid.views.z * length
-    y = np.where(grid.read, frame[:, None, None] * problem.grid.y + bent[:, None, None] * marks, 0)
+    y = np.where(
+        grid.read,
+        frame[:, None, None] * problem.grid.y + bent[:, None, None] * marks,
+        0,
+    )
     visits = tuple(
         None
         if v is None
@@ -590,8 +615,11 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
 
     field, parameters, plate, residuals = system.in_datum(y, field, parameters)
     if problem.reference is not None:
-        grown = scale_of(system, problem.reference, field=field, plate=plate, half_width_m=length)
-        if problem.reference.marks is not None:  # across, a distance changes by the square
+        grown = scale_of(
+            system, problem.reference, field=field, plate=plate, half_width_m=length
+        )
+        # across, a distance changes by the square
+        if problem.reference.marks is not None:
             across = np.vdot(scale_of_plate(system, problem.reference), plate).imag
             true = length * (1 + problem.reference.relative_error)
             grown += true - np.sqrt(max(true**2 - across**2, 0.0))
@@ -637,7 +665,10 @@ def angular_part(problem: Problem) -> AngularPart:
     dof = angular.n_readings - problem.system.rank_angular - problem.dof_lines
     total = float((angular.weight * residual**2).sum())
     noise = noise_estimate(
-        problem.repeats_theta, sigma_of(total, dof), problem.angular.sigma_declared, floor=FLOOR
+        problem.repeats_theta,
+        sigma_of(total, dof),
+        problem.angular.sigma_declared,
+        floor=FLOOR,
     )
     return AngularPart(*angular.reduced(y), noise)
 
@@ -680,7 +711,9 @@ class Moving:
         if self.places is None or self.moved is None:
             return inputs
         about = self.places.about(
-            fitted.field, self.places.errors(fitted.field, self.moved), self.problem.turn_rad
+            fitted.field,
+            self.places.errors(fitted.field, self.moved),
+            self.problem.turn_rad,
         )
         return replace(
             inputs,
@@ -726,7 +759,9 @@ def noise_gain(problem: Problem, fitted: JointFit) -> np.ndarray:
         y = sigma_m * noise_of(rng, grid.weight.shape, grid.weight)
         plain = now = fit(problem, y, still).field
         for _ in range(MAX_STEPS):
-            changes = places.changes(places.differences(now, error_there), problem.turn_rad)
+            changes = places.changes(
+                places.differences(now, error_there), problem.turn_rad
+            )
             before = now
             now = fit(problem, y - changes, still).field
             if np.abs(now - before).max() <= NEGLIGIBLE * np.abs(now).max():
@@ -740,4 +775,6 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
     """Return the sums of fields (k, nx, ny) over each node and those around it."""
     padded = np.pad(values, ((0, 0), (1, 1), (1, 1)))
     nx, ny = values.shape[1:]
-    return np.sum([padded[:, i : i + nx, j : j + ny] for i in range(3) for j in range(3)], axis=0)
+    return np.sum(
+        [padded[:, i : i + nx, j : j + ny] for i in range(3) for j in range(3)], axis=0
+    )

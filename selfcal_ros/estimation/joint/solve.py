@@ -185,7 +185,8 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
     ]
     views = []
     at_visits = {
-        row: (residuals + fitted.residuals[row].reshape(-1)[visits.mark]) * problem.to_stage[row]
+        row: (residuals + fitted.residuals[row].reshape(-1)[visits.mark])
+        * problem.to_stage[row]
         for row, visits, residuals in model.visits_about_means()
     }
     for index, view in enumerate(measurements.views):
@@ -193,7 +194,9 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
         if index in problem.grid.index:
             row = problem.grid.index.index(index)
             read = problem.grid.weight[row] > 0
-            residuals = np.where(read, fitted.residuals[row], np.nan) * problem.to_stage[row]
+            residuals = (
+                np.where(read, fitted.residuals[row], np.nan) * problem.to_stage[row]
+            )
             entry |= {
                 "dx": np.round(residuals.real, DECIMALS_M),
                 "dy": np.round(residuals.imag, DECIMALS_M),
@@ -210,7 +213,9 @@ def kept_residuals(measurements: Measurements, model: ModelFit) -> dict[str, Any
     return {RESIDUALS: {"views": views}}
 
 
-def _course(visits: GridVisits, residuals: np.ndarray, start_ns: int) -> dict[str, np.ndarray]:
+def _course(
+    visits: GridVisits, residuals: np.ndarray, start_ns: int
+) -> dict[str, np.ndarray]:
     """Return the mean residual in each of `MAX_PARTS` intervals of the view's time.
 
     Or of each visit, if there are fewer.
@@ -223,7 +228,11 @@ def _course(visits: GridVisits, residuals: np.ndarray, start_ns: int) -> dict[st
     since_s = (visits.stamp_ns - start_ns) / NS_PER_S
     columns = {
         name: np.add.reduceat(values[order] * counts, starts) / count
-        for name, values in (("time_s", since_s), ("dx", residuals.real), ("dy", residuals.imag))
+        for name, values in (
+            ("time_s", since_s),
+            ("dx", residuals.real),
+            ("dy", residuals.imag),
+        )
     }
     return {
         "time_s": np.round(columns["time_s"], DECIMALS_S),
@@ -275,7 +284,9 @@ def saved_terms(
     for name, root in roots_by_term(cover.terms.covariance, columns):
         directions, size, right = np.linalg.svd(coordinates @ root, full_matrices=False)
         significant = size > NEGLIGIBLE
-        factors += list((directions[:, significant] * size[significant]).T.reshape(-1, 2, *shape))
+        factors += list(
+            (directions[:, significant] * size[significant]).T.reshape(-1, 2, *shape)
+        )
         names += [name] * int(significant.sum())
         projector = right[significant].T @ right[significant]
         beside_map += list((other_quantities @ root @ right[significant].T).T)
@@ -283,7 +294,9 @@ def saved_terms(
             other_quantities @ (root - root @ projector), full_matrices=False
         )
         beside_alone += list((directions * size).T[size > NEGLIGIBLE])
-    factors_of_map = Factors(tuple(names), rounded(np.array(factors).reshape(-1, 2, *shape)))
+    factors_of_map = Factors(
+        tuple(names), rounded(np.array(factors).reshape(-1, 2, *shape))
+    )
     if not other_effects:
         return factors_of_map
     all_of = np.array([*beside_map, *beside_alone]).reshape(-1, len(other_quantities))
@@ -324,7 +337,9 @@ def angular_terms(
         rows = columns.rows([name])
         turned = cover.terms.turned[:, rows]
         turned = turned - turned[known_lines].mean(axis=0)
-        power = np.einsum("kp,pq,kq->k", turned, cover.terms.covariance[np.ix_(rows, rows)], turned)
+        power = np.einsum(
+            "kp,pq,kq->k", turned, cover.terms.covariance[np.ix_(rows, rows)], turned
+        )
         u_of_terms[str(name)] = rounded(np.sqrt(np.maximum(power, 0.0)) * sigma_m)
     return u_of_terms
 
@@ -334,7 +349,8 @@ def variance_of_terms(result: CalibrationResult) -> dict[str, np.ndarray]:
     factors = factors_of(result)
     names = np.array(factors.terms, dtype=str)
     return {
-        str(name): (factors.of_map[names == name] ** 2).sum(axis=0) * result.noise.sigma_xy**2
+        str(name): (factors.of_map[names == name] ** 2).sum(axis=0)
+        * result.noise.sigma_xy**2
         for name in dict.fromkeys(names.tolist())
         if name != FREE
     }
@@ -356,7 +372,9 @@ def solve_joint(
         assumed.
     """
     with one_thread():
-        model, observability, as_assumed = _fitted(measurements, options, whole_only=whole_only)
+        model, observability, as_assumed = _fitted(
+            measurements, options, whole_only=whole_only
+        )
         return replace(
             _solved(measurements, options, model=model, observability=observability),
             converged=as_assumed or model.fitted.xy.sigma < LEAST_NOISE_M,
@@ -387,7 +405,9 @@ def _fitted(
     failed: NotSettledError | None = None
     nearly_exact: tuple[ModelFit, Observability, bool] | None = None
     for assumed in dict.fromkeys((options.assumed, of_visits, ())):
-        problem, observability = prepare(measurements, replace(options, assumed=assumed))
+        problem, observability = prepare(
+            measurements, replace(options, assumed=assumed)
+        )
         for at_places in (True, False) if problem.moves else (False,):
             try:
                 model = fit_model(
@@ -412,7 +432,9 @@ def _fitted(
     raise failed or AssertionError("something was tried")
 
 
-def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Observability]:
+def prepare(
+    measurements: Measurements, options: Options
+) -> tuple[Problem, Observability]:
     """Return the problem that the readings pose and what it determines.
 
     Raises
@@ -434,7 +456,9 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     )
     if not observability.identifiable:
         plan = Plan(
-            measurements.plan_id, measurements.artifact, tuple(v.view for v in measurements.views)
+            measurements.plan_id,
+            measurements.artifact,
+            tuple(v.view for v in measurements.views),
         )
         if not identifies(plan.artifact, plan.views):
             observability = with_unseen_modes(observability, system, plan).observability
@@ -445,7 +469,9 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
             observability,
         )
     half_width_m = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
-    inputs = term_inputs(measurements, grid, half_width_m, drift_degree=options.drift_degree)
+    inputs = term_inputs(
+        measurements, grid, half_width_m, drift_degree=options.drift_degree
+    )
     # as a column, offsets would explain the noise that they hold
     inputs = replace(
         inputs, line_offsets=inputs.line_offsets - angular_residuals(system, angular.y)
@@ -453,7 +479,8 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
     terms = tuple(
         term
         for term in options.model_terms(
-            visits=all(v is not None for v in inputs.visits), assumed=options.finite_rotations
+            visits=all(v is not None for v in inputs.visits),
+            assumed=options.finite_rotations,
         )
         if inputs.has(term.name)
     )
@@ -465,12 +492,22 @@ def prepare(measurements: Measurements, options: Options) -> tuple[Problem, Obse
         terms=[term for term in terms if term.block.of_images],
     )
     return problem_of(
-        measurements, options, system, inputs, readings=(grid, angular), terms=terms, images=images
+        measurements,
+        options,
+        system,
+        inputs,
+        readings=(grid, angular),
+        terms=terms,
+        images=images,
     ), observability
 
 
 def _solved(
-    measurements: Measurements, options: Options, *, model: ModelFit, observability: Observability
+    measurements: Measurements,
+    options: Options,
+    *,
+    model: ModelFit,
+    observability: Observability,
 ) -> Solved:
     problem, fitted = model.problem, model.fitted
     asked_for = options.uncertainty
@@ -478,7 +515,8 @@ def _solved(
         problem.system.grid.n_sites <= UNASKED_SITES if asked_for is None else asked_for
     )
     exact = options.reference is not None and fitted.xy.sigma == 0
-    least = NO_NOISE if exact else fitted.xy.sigma  # 0 would hide the u of the reference
+    # 0 would hide the u of the reference
+    least = NO_NOISE if exact else fitted.xy.sigma
     sigma = np.full(problem.system.known_sites.shape, least)
     if with_uncertainty:
         sigma = sigma * noise_gain(problem, fitted)
@@ -511,7 +549,9 @@ def _solved(
         error_map,
         artifact_map,
         views_of(
-            measurements, problem, np.where(problem.system.known_views, fitted.parameters, np.nan)
+            measurements,
+            problem,
+            np.where(problem.system.known_views, fitted.parameters, np.nan),
         ),
         observability,
         noise_of(fitted.xy, fitted.theta),
@@ -552,7 +592,11 @@ def _magnification(plate_map: ArtifactMap, options: Options) -> tuple[Finding, .
         abs(plate_map.magnification) > options.magnification_limit
     ):
         return ()
-    return (Finding("magnification", plate_map.magnification, plate_map.u_magnification, "m/m"),)
+    return (
+        Finding(
+            "magnification", plate_map.magnification, plate_map.u_magnification, "m/m"
+        ),
+    )
 
 
 def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
@@ -562,7 +606,12 @@ def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
     lines = np.argwhere(lines_turned_over(sense, system.unchecked_lines, sign=1))
     if not len(sites) and not len(lines):
         return ()
-    return (Finding("unchecked", details={"sites": sites.tolist(), "lines": lines[:, 0].tolist()}),)
+    return (
+        Finding(
+            "unchecked",
+            details={"sites": sites.tolist(), "lines": lines[:, 0].tolist()},
+        ),
+    )
 
 
 def weights_read(problem: Problem, index: int) -> dict[str, Any]:
@@ -602,7 +651,10 @@ def term_results(model: ModelFit, declared: Collection[str]) -> tuple[TermResult
     columns = model.equations.columns.columns
     covariance = model.covariance
     determined = (
-        np.abs(model.equations.undetermined(model.equations.free)).max(axis=1, initial=0.0) < 1e-6
+        np.abs(model.equations.undetermined(model.equations.free)).max(
+            axis=1, initial=0.0
+        )
+        < 1e-6
     )
     size_before = {term.name: term.size for term in model.given}
     out = []
@@ -660,7 +712,8 @@ def _error_map(
             if system.grid.n_sites <= MAX_NODES:
                 more = structured(model, cover)
                 variance = variance + more
-                if np.any(more):  # O and R are combinations of nodes, whose noises are correlated
+                # O and R are combinations of nodes, whose noises are correlated
+                if np.any(more):
                     kept_parts = Kept(
                         added=np.asarray(structured(model, cover, system.gauge.shear))
                     )
@@ -675,7 +728,9 @@ def _error_map(
                     measurements.sense,
                     _beside_map(model, lines, measurements.sense),
                 ),
-                angular=angular_terms(cover, columns, fitted.xy.sigma, system.known_lines),
+                angular=angular_terms(
+                    cover, columns, fitted.xy.sigma, system.known_lines
+                ),
             )
         if system.angular.n_views:
             variance, closure = lines.of_stage(problem.conditions)
@@ -707,7 +762,9 @@ def _error_map(
     )
 
 
-def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[str, np.ndarray]:
+def _beside_map(
+    model: ModelFit, cover: LinesCovariance, sense: Sense
+) -> dict[str, np.ndarray]:
     """Return what a unit of each coefficient makes of the plate, the lines and the microscope."""
     problem = model.problem
     columns = cast(TermEquations, model.equations).columns
@@ -741,13 +798,17 @@ def _beside_map(model: ModelFit, cover: LinesCovariance, sense: Sense) -> dict[s
     }
 
 
-def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float) -> ArtifactMap:
+def _artifact_map(
+    model: ModelFit, cover: MapsCovariance | None, sigma_m: float
+) -> ArtifactMap:
     """Return the plate's map; `sigma_m` is the noise of a reading as it counts there."""
     problem, fitted = model.problem, model.fitted
     system, length = problem.system, problem.half_width_m
     plate = np.where(system.known_marks, fitted.plate, complex(np.nan, np.nan))
     unscaled = ReferenceLength(ReferenceKind.ARTIFACT, 0.0)
-    scale = scale_of(system, unscaled, field=fitted.field, plate=fitted.plate, half_width_m=length)
+    scale = scale_of(
+        system, unscaled, field=fitted.field, plate=fitted.plate, half_width_m=length
+    )
     u = float("nan")
     sigma = fitted.xy.sigma
     u_x = u_y = np.full(plate.shape, np.nan)
@@ -761,7 +822,9 @@ def _artifact_map(model: ModelFit, cover: MapsCovariance | None, sigma_m: float)
             variance = variance + image_variances(model, cover, plate=True)
         u_x, u_y = np.sqrt(variance) * sigma_m
         if system.angular.n_views and problem.conditions.datum is ThetaDatum.ZERO_MEAN:
-            u_theta = np.sqrt(LinesCovariance(cover, (sigma, fitted.theta.sigma)).of_plate())
+            u_theta = np.sqrt(
+                LinesCovariance(cover, (sigma, fitted.theta.sigma)).of_plate()
+            )
     return ArtifactMap(
         plate.real.copy(),
         plate.imag.copy(),
@@ -783,7 +846,9 @@ def views_of(
     offset: dict[int, complex] = {}
     for row, i in enumerate(system.grid_index):
         phi[i] = parameters[3 * row] + problem.turn_rad[row] * problem.half_width_m
-        offset[i] = problem.to_stage[row] * complex(*parameters[3 * row + 1 : 3 * row + 3])
+        offset[i] = problem.to_stage[row] * complex(
+            *parameters[3 * row + 1 : 3 * row + 3]
+        )
     nan = complex(np.nan, np.nan)
     return tuple(
         ViewResult(

@@ -34,7 +34,9 @@ class Components:
     @classmethod
     def of_one(cls, sites: np.ndarray, marks: np.ndarray) -> "Components":
         """Return one component, without a free vector, of the nodes in bool arrays."""
-        return cls(np.where(sites, 0, -1), np.where(marks, 0, -1), np.zeros(1, dtype=bool))
+        return cls(
+            np.where(sites, 0, -1), np.where(marks, 0, -1), np.zeros(1, dtype=bool)
+        )
 
     @property
     def first_sites(self) -> np.ndarray:
@@ -48,7 +50,9 @@ class Components:
     def largest(self) -> int:
         """The component with the most sites; the first one if equal."""
         component_of_site = self.of_site[self.of_site >= 0]
-        return int(np.bincount(component_of_site, minlength=len(self.balanced)).argmax())
+        return int(
+            np.bincount(component_of_site, minlength=len(self.balanced)).argmax()
+        )
 
 
 def components(
@@ -127,7 +131,9 @@ def free_turns(
     free = components_read.balanced[components_read.of_site[site]]
     if not free.any():
         return of_site, of_mark
-    ends, place = np.unique(np.stack([site, mark + len(of_site)])[:, free], return_inverse=True)
+    ends, place = np.unique(
+        np.stack([site, mark + len(of_site)])[:, free], return_inverse=True
+    )
     start, end = place.reshape(2, -1)
     # a vector v of a mark appears as i^q v on its site
     label = _cover(end, start, q[free], len(ends))
@@ -139,11 +145,16 @@ def free_turns(
     )
     home = label[0][np.searchsorted(ends, components_read.first_sites[component])]
     turn = np.argmax(label == home, axis=0)
-    of_site[ends[at_site]], of_mark[ends[~at_site] - len(of_site)] = turn[at_site], turn[~at_site]
+    of_site[ends[at_site]], of_mark[ends[~at_site] - len(of_site)] = (
+        turn[at_site],
+        turn[~at_site],
+    )
     return of_site, of_mark
 
 
-def rest_on_one(site: np.ndarray, mark: np.ndarray, *, n_sites: int, n_marks: int) -> np.ndarray:
+def rest_on_one(
+    site: np.ndarray, mark: np.ndarray, *, n_sites: int, n_marks: int
+) -> np.ndarray:
     """Return the sites whose error is known from single readings only, bool (sites,).
 
     A reading that is the only one of a site gives the site's error, and the only one of a mark
@@ -163,7 +174,9 @@ def rest_on_one(site: np.ndarray, mark: np.ndarray, *, n_sites: int, n_marks: in
     number = np.broadcast_to(np.arange(len(site)), ends.shape)
     n_left = np.bincount(ends.ravel(), minlength=n_sites + n_marks)
     # for a node with one reading left this sum is the index of that reading
-    total = np.bincount(ends.ravel(), number.ravel(), n_sites + n_marks).astype(np.int64)
+    total = np.bincount(ends.ravel(), number.ravel(), n_sites + n_marks).astype(
+        np.int64
+    )
     read = n_left[:n_sites] > 0
     last = np.flatnonzero(n_left == 1)
     while len(last):
@@ -212,7 +225,9 @@ class Gauge:
     @cached_property
     def orthonormal(self) -> np.ndarray:
         """Orthonormal basis of the modes, complex (sites, modes), real inner product."""
-        q = np.linalg.qr(np.concatenate([self._rows.real, self._rows.imag], axis=1).T)[0]
+        q = np.linalg.qr(np.concatenate([self._rows.real, self._rows.imag], axis=1).T)[
+            0
+        ]
         n = self.known.size
         return q[:n] + 1j * q[n:]
 
@@ -223,8 +238,12 @@ class Gauge:
     @property
     def everywhere(self) -> np.ndarray:
         """The modes of `orthonormal` at all sites, complex (sites, modes)."""
-        modes = _modes(self.z, np.ones(self.known.shape, dtype=bool))[: len(self._rows)].T
-        return modes @ (self._gram_inverse @ np.real(self._rows.conj() @ self.orthonormal))
+        modes = _modes(self.z, np.ones(self.known.shape, dtype=bool))[
+            : len(self._rows)
+        ].T
+        return modes @ (
+            self._gram_inverse @ np.real(self._rows.conj() @ self.orthonormal)
+        )
 
     @cached_property
     def shear(self) -> np.ndarray:

@@ -100,7 +100,10 @@ class LatticeViews:
     @cached_property
     def places(self) -> np.ndarray:
         """Mark positions, in pitches, complex (nx, ny)."""
-        x, y = (np.arange(size) - half for size, half in zip(self.shape, self.half, strict=True))
+        x, y = (
+            np.arange(size) - half
+            for size, half in zip(self.shape, self.half, strict=True)
+        )
         return x[:, None] + 1j * y
 
     @property
@@ -111,7 +114,9 @@ class LatticeViews:
     @cached_property
     def from_corner(self) -> tuple[np.ndarray, np.ndarray]:
         """Places of the marks in the pitch of the map from its first node, (views, nx, ny) each."""
-        turn, shift = (of_views[:, None, None] for of_views in (self.phases, self.shifts))
+        turn, shift = (
+            of_views[:, None, None] for of_views in (self.phases, self.shifts)
+        )
         at = (turn * self.places + shift) / self.node_pitch
         return at.real + self.half[0], at.imag + self.half[1]
 
@@ -234,9 +239,14 @@ class Axis:
     def refined(self) -> "Axis":
         """The spline with a further knot in the middle of each interval: it contains this one."""
         distinct = np.unique(self.knots)
-        knots = np.sort(np.concatenate([self.knots, (distinct[:-1] + distinct[1:]) / 2]))
+        knots = np.sort(
+            np.concatenate([self.knots, (distinct[:-1] + distinct[1:]) / 2])
+        )
         nodes = np.array(
-            [knots[i + 1 : i + self.degree + 1].mean() for i in range(len(knots) - self.degree - 1)]
+            [
+                knots[i + 1 : i + self.degree + 1].mean()
+                for i in range(len(knots) - self.degree - 1)
+            ]
         )
         return Axis(knots, self.degree, nodes, by_nodes=False)
 
@@ -245,7 +255,9 @@ class Axis:
 
         Places beyond the edge, which rounding moves there, count as on it.
         """
-        from scipy.interpolate import BSpline  # a tenth of a second, for marks off the sites alone
+        from scipy.interpolate import (
+            BSpline,
+        )  # a tenth of a second, for marks off the sites alone
 
         knots, k = self.knots, self.degree
         at = np.clip(at, knots[0], knots[-1])
@@ -302,7 +314,9 @@ class MapSpline:
     def within(self, finer: "MapSpline") -> np.ndarray:
         """Return the matrix to the coefficients of a refined spline, which contains this one."""
         axes = [
-            np.linalg.solve(fine.matrix(fine.nodes), axis.matrix(fine.nodes) @ axis.from_nodes)
+            np.linalg.solve(
+                fine.matrix(fine.nodes), axis.matrix(fine.nodes) @ axis.from_nodes
+            )
             for axis, fine in zip(self.axes, finer.axes, strict=True)
         ]
         return np.kron(*axes)
@@ -327,7 +341,8 @@ class MapSpline:
         n_of_place = values[0].size if len(values) else 1
         ends = np.arange(0, len(at) * n_of_place + 1, n_of_place)
         return csr_matrix(
-            (values.ravel(), index.ravel(), ends), shape=(len(at), self.shape[0] * self.shape[1])
+            (values.ravel(), index.ravel(), ends),
+            shape=(len(at), self.shape[0] * self.shape[1]),
         )
 
     def coefficients(self, field: np.ndarray) -> np.ndarray:
@@ -361,7 +376,10 @@ class PlacedViews(LatticeViews):
     poses: tuple[PlacedPose, ...]  # type: ignore[assignment]
 
     def __init__(
-        self, artifact: Artifact, poses: tuple[PlacedPose, ...], spline: MapSpline | None = None
+        self,
+        artifact: Artifact,
+        poses: tuple[PlacedPose, ...],
+        spline: MapSpline | None = None,
     ) -> None:
         grid = artifact.map_grid
         self.poses, self.artifact = poses, artifact
@@ -405,7 +423,9 @@ class PlacedViews(LatticeViews):
         """Rows of each view's marks on the spline's coefficients, real (marks, nodes); 0 off it."""
         pitch_m = self.artifact.grid_pitch_m
         return tuple(
-            self.spline.rows((x + 1j * y).ravel() * pitch_m).multiply(inside.reshape(-1, 1)).tocsr()
+            self.spline.rows((x + 1j * y).ravel() * pitch_m)
+            .multiply(inside.reshape(-1, 1))
+            .tocsr()
             for inside, (x, y) in zip(self.in_field, self.sites, strict=True)
         )
 

@@ -133,7 +133,10 @@ def _planned(view: View, artifact: Artifact) -> ViewReadings:
     if view.angular and artifact.angular_count:
         lines = np.arange(artifact.angular_count)
         out = replace(
-            out, k=lines, dtheta=np.zeros(len(lines)), count_theta=np.full(len(lines), view.repeats)
+            out,
+            k=lines,
+            dtheta=np.zeros(len(lines)),
+            count_theta=np.full(len(lines), view.repeats),
         )
     return out
 
@@ -162,7 +165,9 @@ def grid_data(measurements: Measurements) -> GridData:
             )
         if not (np.isfinite(readings.dx).all() and np.isfinite(readings.dy).all()):
             # before it is turned: infinity by a complex number warns
-            raise InputError(where, "a deviation is not a finite number", "remove the mark")
+            raise InputError(
+                where, "a deviation is not a finite number", "remove the mark"
+            )
         values = (readings.dx + 1j * readings.dy) * pose.phase.conjugate()
         _place(
             y[row].reshape(-1),
@@ -216,7 +221,9 @@ def angular_data(measurements: Measurements) -> AngularData:
         about = readings.axis_theta * artifact.angular_count / (2 * np.pi)
         turns.append(turn + about if artifact.harmonics and about else turn)
     sigma = _declare(weight, ones)
-    return AngularData(tuple(turns), weight, index, artifact.harmonics, y=y, sigma_declared=sigma)
+    return AngularData(
+        tuple(turns), weight, index, artifact.harmonics, y=y, sigma_declared=sigma
+    )
 
 
 def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
@@ -229,7 +236,9 @@ def _grid_pose(readings: ViewReadings, artifact: Artifact) -> AnyPose:
     return pose_of(readings.view, artifact)
 
 
-def _flat_marks(readings: ViewReadings, artifact: Artifact, *, where: str) -> np.ndarray:
+def _flat_marks(
+    readings: ViewReadings, artifact: Artifact, *, where: str
+) -> np.ndarray:
     """Return the flat index of every mark read, checked for plate and field."""
     m, n = np.asarray(readings.m), np.asarray(readings.n)
     if m.shape != n.shape:
@@ -237,7 +246,10 @@ def _flat_marks(readings: ViewReadings, artifact: Artifact, *, where: str) -> np
     off_plate = ~artifact.has(m, n)
     flat = np.where(off_plate, 0, artifact.flat(m, n))
     off_field = ~in_field(readings.view, artifact).reshape(-1)[flat]
-    for name, bad in (("off the plate", off_plate), ("off the stage's field", off_field)):
+    for name, bad in (
+        ("off the plate", off_plate),
+        ("off the stage's field", off_field),
+    ):
         if bad.any():
             k = int(np.argmax(bad))
             raise InputError(
@@ -259,7 +271,9 @@ def _place(
 ) -> None:
     if values.shape != flat.shape or np.shape(count) != flat.shape:
         raise InputError(
-            where, "marks, deviations and counts differ in length", "give one value a mark"
+            where,
+            "marks, deviations and counts differ in length",
+            "give one value a mark",
         )
     if not np.isfinite(values).all():
         raise InputError(where, "a deviation is not a finite number", "remove the mark")

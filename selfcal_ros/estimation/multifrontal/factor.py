@@ -80,7 +80,10 @@ class RealSymmetricForm:
 
 
 def fold(
-    views: LatticeViews, weight: np.ndarray, relative_weight: np.ndarray, pins: np.ndarray
+    views: LatticeViews,
+    weight: np.ndarray,
+    relative_weight: np.ndarray,
+    pins: np.ndarray,
 ) -> RealSymmetricForm:
     """Return the folded matrix of weighted readings.
 
@@ -108,7 +111,9 @@ def fold(
     place[free], place[cut] = np.arange(len(free)), np.arange(len(cut))
 
     on_cut = read & is_cut[index]
-    keys, copies = np.unique(place[index[on_cut]] * 4 + gain[on_cut], return_inverse=True)
+    keys, copies = np.unique(
+        place[index[on_cut]] * 4 + gain[on_cut], return_inverse=True
+    )
     variable = place[index]
     variable[on_cut] = len(free) + copies
     mean = weight.sum() / max(np.count_nonzero(read), 1)
@@ -119,7 +124,10 @@ def fold(
     pinned = place[pins[~is_cut[pins]]]
     diagonal[pinned] += mean
     entries = _entries(
-        variable, diagonal, weight.reshape(read.shape), relative_weight.reshape(read.shape)
+        variable,
+        diagonal,
+        weight.reshape(read.shape),
+        relative_weight.reshape(read.shape),
     )
     cut_pins = np.zeros(len(cut))
     cut_pins[place[pins[is_cut[pins]]]] = mean
@@ -148,7 +156,10 @@ def _quadrants(shape: tuple[int, int]) -> np.ndarray:
 
 
 def _entries(
-    variable: np.ndarray, diagonal: np.ndarray, weight: np.ndarray, relative_weight: np.ndarray
+    variable: np.ndarray,
+    diagonal: np.ndarray,
+    weight: np.ndarray,
+    relative_weight: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return rows, columns and values of one triangle of R."""
     rows = [np.arange(len(diagonal))]
@@ -242,7 +253,9 @@ class Dissection:
     rest: np.ndarray
 
 
-def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Dissection:
+def dissect(
+    folded: RealSymmetricForm, shape: tuple[int, int], reach: int
+) -> Dissection:
     """Return the nested dissection of a matrix over sites of a field.
 
     Parameters
@@ -285,7 +298,9 @@ def dissect(folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> Di
     )
 
 
-def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> tuple[Front, ...]:
+def _fronts(
+    pieces: list, row: np.ndarray, front: np.ndarray, *, size: int
+) -> tuple[Front, ...]:
     """Return the fronts of the pieces, given the matrix rows in each front's columns."""
     stops = np.cumsum([len(piece) for piece, _ in pieces], dtype=int)
     later = row >= stops[front]
@@ -294,7 +309,9 @@ def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> t
     keys %= size
     fronts: list[Front] = []
     start = offset = 0
-    for (_, children), (a, b), stop in zip(pieces, pairwise(cuts), stops.tolist(), strict=True):
+    for (_, children), (a, b), stop in zip(
+        pieces, pairwise(cuts), stops.tolist(), strict=True
+    ):
         boundary = keys[a:b]
         if children:
             later = np.concatenate([boundary, *(fronts[c].boundary for c in children)])
@@ -306,7 +323,12 @@ def _fronts(pieces: list, row: np.ndarray, front: np.ndarray, *, size: int) -> t
 
 
 def _addresses(
-    fronts: tuple[Front, ...], row: np.ndarray, column: np.ndarray, *, front: np.ndarray, size: int
+    fronts: tuple[Front, ...],
+    row: np.ndarray,
+    column: np.ndarray,
+    *,
+    front: np.ndarray,
+    size: int,
 ) -> np.ndarray:
     """Return the storage positions of entries (row, column) of the lower triangle."""
     start = np.array([item.start for item in fronts])[front]
@@ -329,7 +351,9 @@ def _addresses(
     )
 
 
-def _cut(sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list) -> tuple[int, ...]:
+def _cut(
+    sites: np.ndarray, folded: np.ndarray, reach: int, pieces: list
+) -> tuple[int, ...]:
     """Append the pieces of `sites`, separators last; return the indices of the topmost ones."""
     if not len(sites):
         return ()
@@ -382,7 +406,9 @@ class Factor:
         If the matrix is not positive definite.
     """
 
-    def __init__(self, folded: RealSymmetricForm, shape: tuple[int, int], reach: int) -> None:
+    def __init__(
+        self, folded: RealSymmetricForm, shape: tuple[int, int], reach: int
+    ) -> None:
         self.folded = folded
         self.dissection = dissect(folded, shape, reach)
         self._blocks: list[tuple[np.ndarray, np.ndarray]] = []
@@ -456,7 +482,9 @@ class Factor:
 
     def _forward(self, work: np.ndarray) -> None:
         real = work.view(float)
-        for front, (inverse, below) in zip(self.dissection.fronts, self._blocks, strict=True):
+        for front, (inverse, below) in zip(
+            self.dissection.fronts, self._blocks, strict=True
+        ):
             values = inverse @ real[front.start : front.stop]
             real[front.start : front.stop] = values
             if len(below):
@@ -493,7 +521,9 @@ class Factor:
         after = first[marks]
 
         def of_means(z: np.ndarray, mine: np.ndarray, at: np.ndarray) -> np.ndarray:
-            return np.einsum("vk,wk,vwk->k", shares[:, mine], shares[:, mine], z[at[:, None], at])
+            return np.einsum(
+                "vk,wk,vwk->k", shares[:, mine], shares[:, mine], z[at[:, None], at]
+            )
 
         of_sites = np.empty(len(folded.phase))
         means = np.zeros(len(marks))
@@ -509,7 +539,9 @@ class Factor:
         for number in range(len(fronts) - 1, -1, -1):
             front = fronts[number]
             z = self._selected(number, needed.pop(number))
-            of_sites[sites[front.start : front.stop]] = z.diagonal()[: front.stop - front.start]
+            of_sites[sites[front.start : front.stop]] = z.diagonal()[
+                : front.stop - front.start
+            ]
             mine = marks[slice(*np.searchsorted(after, (front.start, front.stop)))]
             means[mine] = of_means(z, mine, front.places(place[:, mine]))
             for child in front.children:
@@ -537,7 +569,9 @@ def _mirrored(lower: np.ndarray) -> np.ndarray:
     return out
 
 
-def _extend(blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarray) -> None:
+def _extend(
+    blocks: tuple[np.ndarray, ...], places: np.ndarray, update: np.ndarray
+) -> None:
     """Add the lower triangle of `update` to a symmetric matrix given by its lower blocks.
 
     Parameters
@@ -593,7 +627,9 @@ def one_thread() -> Iterator[None]:
     The number is restored when the outermost block of any thread of this process has ended.
     """
     with _lock:
-        _limits.append(_limits[0] if _limits else _controller().limit(limits=1, user_api="blas"))
+        _limits.append(
+            _limits[0] if _limits else _controller().limit(limits=1, user_api="blas")
+        )
     try:
         yield
     finally:

@@ -97,7 +97,9 @@ class AngularSystem(PlateEliminated):
     def adjoint(self, readings: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return sums of readings (k, views, K) at the lines, (K, k), and of views, (views, k)."""
         sites = np.zeros((self.n_lines, len(readings)))
-        for columns, view in zip(self._columns, readings.transpose(1, 2, 0), strict=True):
+        for columns, view in zip(
+            self._columns, readings.transpose(1, 2, 0), strict=True
+        ):
             sites += columns @ view
         return sites, readings.sum(axis=-1).T
 
@@ -110,7 +112,9 @@ class AngularSystem(PlateEliminated):
         """Factor of the eliminated matrix over the lines, one of each component pinned."""
         pins = np.zeros(self.n_lines)
         pins[self.pins] = self.weight.sum() / max(self.n_readings, 1)
-        matrix = over_nodes(self.rows, self.weight, self.relative_weight)[0] + diags(pins)
+        matrix = over_nodes(self.rows, self.weight, self.relative_weight)[0] + diags(
+            pins
+        )
         return splu(
             matrix.tocsc(),
             permc_spec="MMD_AT_PLUS_A",
@@ -164,7 +168,9 @@ class HarmonicSystem(AngularSystem):
         super().__init__(turns, weight, known_plate=known_plate)
         self.harmonics = harmonics
         line = 2 * np.pi / self.n_lines
-        places = (np.arange(self.n_lines) + np.array(turns, dtype=float)[:, None]) * line
+        places = (
+            np.arange(self.n_lines) + np.array(turns, dtype=float)[:, None]
+        ) * line
         self.basis = fourier_basis(places, harmonics)
         """Series at the plate lines in each view, (views, K, 2 H + 1)."""
         self.at_lines = fourier_basis(np.arange(self.n_lines) * line, harmonics)
@@ -202,7 +208,9 @@ class HarmonicSystem(AngularSystem):
     @property
     def mean_variance(self) -> float:
         """Mean variance of what they determine of the map, for unit noise of a reading."""
-        values, vectors = (values_of[..., self._determined] for values_of in self._spectrum)
+        values, vectors = (
+            values_of[..., self._determined] for values_of in self._spectrum
+        )
         return float(((vectors[1:] ** 2).sum(axis=0) / values).sum() / 2)
 
     @cached_property
@@ -233,8 +241,12 @@ class HarmonicSystem(AngularSystem):
     def _inverse(self) -> np.ndarray:
         """Covariance of the coefficients for unit noise; what is undetermined is held."""
         values, vectors = self._spectrum
-        return (vectors / np.where(self._determined, values, self.weight.sum())) @ vectors.T
+        return (
+            vectors / np.where(self._determined, values, self.weight.sum())
+        ) @ vectors.T
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Return the solution at the lines for (K,) or (K, k)."""
-        return self.at_lines @ (self._inverse @ np.tensordot(self.at_lines.T, right, axes=1))
+        return self.at_lines @ (
+            self._inverse @ np.tensordot(self.at_lines.T, right, axes=1)
+        )

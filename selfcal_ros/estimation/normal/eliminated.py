@@ -14,7 +14,11 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_matrix, diags
 
-from selfcal_ros.estimation.lattice.connectivity import Components, components, rest_on_one
+from selfcal_ros.estimation.lattice.connectivity import (
+    Components,
+    components,
+    rest_on_one,
+)
 
 
 class PlateEliminated(ABC):
@@ -42,7 +46,9 @@ class PlateEliminated(ABC):
         self.read = weight > 0
         total = weight.sum(axis=0)
         self.mark_read = total > 0
-        self.relative_weight = weight / np.where(self.mark_read, total, 1.0) * (not known_plate)
+        self.relative_weight = (
+            weight / np.where(self.mark_read, total, 1.0) * (not known_plate)
+        )
         """Share of each reading in the mean of its mark, (views, *marks) (method eq. 4.3)."""
 
     @property
@@ -87,7 +93,8 @@ class PlateEliminated(ABC):
         site, mark, q = self.edges
         if self.known_plate:
             return Components.of_one(
-                np.isin(np.arange(self.n_sites), site), np.zeros(self.n_marks, dtype=bool)
+                np.isin(np.arange(self.n_sites), site),
+                np.zeros(self.n_marks, dtype=bool),
             )
         return components(site, mark, q, n_sites=self.n_sites, n_marks=self.n_marks)
 
@@ -95,7 +102,9 @@ class PlateEliminated(ABC):
     def rank(self) -> int:
         """Rank of one coordinate of the readings with known misalignments (method eq. 6.1)."""
         connected = self.components
-        nodes = np.count_nonzero(connected.of_site >= 0) + np.count_nonzero(connected.of_mark >= 0)
+        nodes = np.count_nonzero(connected.of_site >= 0) + np.count_nonzero(
+            connected.of_mark >= 0
+        )
         return int(nodes - np.count_nonzero(connected.balanced))
 
     @cached_property
@@ -150,7 +159,9 @@ class PlateEliminated(ABC):
         sites = np.zeros((self.n_sites, 0))
         block = np.zeros((p, 0))
         for unit in np.eye(p).reshape(self.n_views, self.of_view, p):
-            of_sites, of_views = self.adjoint(self.weight * self.centred(self.misaligned(unit)))
+            of_sites, of_views = self.adjoint(
+                self.weight * self.centred(self.misaligned(unit))
+            )
             sites, block = np.hstack([sites, of_sites]), np.hstack([block, of_views])
         return sites, self.tied(block)
 
@@ -198,7 +209,9 @@ class PlateEliminated(ABC):
         free = self.solve(b)
         return free, d - self.coupled(free)
 
-    def fitted(self, y: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def fitted(
+        self, y: np.ndarray, inverse: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return map, (sites,), and misalignments, (p,), of readings fitted alone, in no datum.
 
         `inverse` is the pseudo-inverse of `schur`.
@@ -219,7 +232,9 @@ class PlateEliminated(ABC):
         out = np.where(self.read, residual - a, 0.0)
         return a.squeeze(axis=-self.weight.ndim), out
 
-    def functionals(self, sites: np.ndarray, marks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def functionals(
+        self, sites: np.ndarray, marks: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return functionals of map and plate as those of the sites and the misalignments.
 
         But for the noise of the means of the marks, whose factors are `marks`.
@@ -242,7 +257,9 @@ class PlateEliminated(ABC):
 
 
 def over_nodes(
-    rows: Sequence[csr_matrix | np.ndarray], weight: np.ndarray, relative_weight: np.ndarray
+    rows: Sequence[csr_matrix | np.ndarray],
+    weight: np.ndarray,
+    relative_weight: np.ndarray,
 ) -> tuple[csr_matrix, csr_matrix]:
     """Return the matrix over the nodes with the marks eliminated, and the rows of their means.
 
@@ -260,6 +277,8 @@ def over_nodes(
     )
     mean = sum(
         diags(view_share) @ row
-        for row, view_share in zip(rows, relative_weight.reshape(count, -1), strict=True)
+        for row, view_share in zip(
+            rows, relative_weight.reshape(count, -1), strict=True
+        )
     )
     return of_views - mean.conj().T @ (diags(weight.sum(axis=0).ravel()) @ mean), mean

@@ -146,7 +146,9 @@ class NormalEquations:
         field = self.gauge.remove(field, modes)
         rigid = self.rigid[:, : len(parameters)]
         parameters = parameters - modes @ rigid[: len(modes)]
-        plate, residuals = self.grid.plate(y, field, parameters[: 3 * self.grid.n_views])
+        plate, residuals = self.grid.plate(
+            y, field, parameters[: 3 * self.grid.n_views]
+        )
         modes = self.plate_gauge.coefficients(plate)
         return (
             field,
@@ -189,7 +191,9 @@ class NormalEquations:
         """Orthonormal undetermined misalignments, (size, nullity)."""
         values, vectors = self._spectrum
         if self.angular.n_views:
-            values, vectors = np.linalg.eigh(self.normal(self.grid_scale / self.angular_scale))
+            values, vectors = np.linalg.eigh(
+                self.normal(self.grid_scale / self.angular_scale)
+            )
         return vectors[:, values <= GAP * self.grid_scale]
 
     @cached_property
@@ -224,7 +228,9 @@ class NormalEquations:
         Then a common rotation of the angular views and the constant of the plate's lines are an
         additional datum, which does not affect the stage's map.
         """
-        return bool(self.angular_index) and set(self.angular_index).isdisjoint(self.grid_index)
+        return bool(self.angular_index) and set(self.angular_index).isdisjoint(
+            self.grid_index
+        )
 
     @property
     def _turn_of_lines(self) -> np.ndarray:
@@ -242,7 +248,9 @@ class NormalEquations:
         if np.any(np.abs(hidden) > TRACE) and is_known.any():
             fields = self.grid.response @ hidden
             gauge = Gauge(
-                self.grid.views.z_sites, is_known.reshape(self.grid.views.shape), scale=True
+                self.grid.views.z_sites,
+                is_known.reshape(self.grid.views.shape),
+                scale=True,
             )
             for column in fields.T:
                 field = column.reshape(self.grid.views.shape)
@@ -308,7 +316,9 @@ class NormalEquations:
     @cached_property
     def gauge(self) -> Gauge:
         """Datum of the stage: its scale is a convention, unless the plate is known."""
-        return Gauge(self.grid.views.z_sites, self.known_sites, scale=not self.grid.known_plate)
+        return Gauge(
+            self.grid.views.z_sites, self.known_sites, scale=not self.grid.known_plate
+        )
 
     @cached_property
     def plate_gauge(self) -> Gauge:
@@ -353,9 +363,13 @@ def in_datum(
     out = []
     for coordinate in (np.real, np.imag):
         field = coordinate(fields)
-        value = own_variance + np.einsum("pk,pk->p", field @ inner + 2 * coordinate(spread), field)
+        value = own_variance + np.einsum(
+            "pk,pk->p", field @ inner + 2 * coordinate(spread), field
+        )
         for answer, covariance in answers:
-            value += np.einsum("pa,pa->p", coordinate(answer) @ covariance, coordinate(answer))
+            value += np.einsum(
+                "pa,pa->p", coordinate(answer) @ covariance, coordinate(answer)
+            )
         out.append(value)
     return np.maximum(out, 0.0)
 
@@ -373,7 +387,9 @@ def angular_residuals(system: NormalEquations, y: np.ndarray) -> np.ndarray:
     return angular.plate(y, *angular.fitted(y, system.angular_inverse))[1]
 
 
-def noise_of(rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray) -> np.ndarray:
+def noise_of(
+    rng: np.random.Generator, shape: tuple[int, ...], weight: np.ndarray
+) -> np.ndarray:
     """Return noise of variance 1 / weight on each axis, complex `shape`; 0 where weight is 0."""
     root = np.sqrt(np.where(weight > 0, weight, 1.0))
     coordinates = rng.standard_normal((2, *shape)) / root * (weight > 0)
@@ -496,7 +512,9 @@ class PlacedSystem(GridSystem):
         n = self.n_sites
         if n > MAX_NODES:
             raise InputError(
-                "map grid_size", f"{n} nodes are more than {MAX_NODES}", "give the map fewer nodes"
+                "map grid_size",
+                f"{n} nodes are more than {MAX_NODES}",
+                "give the map fewer nodes",
             )
         out = self.views.spline.on_nodes(self._over_coefficients[0].toarray())
         out[np.diag_indices(n)] += self.vague
@@ -533,9 +551,9 @@ class PlacedSystem(GridSystem):
         rows = self._over_coefficients[1].tocsr()
         inverse = self.factor.inverse.reshape(self.n_sites, *views.shape)
         half = views.spline.coefficients(inverse).reshape(self.n_sites, -1)
-        cover = views.spline.coefficients(half.conj().T.reshape(-1, *views.shape)).reshape(
-            self.n_sites, -1
-        )
+        cover = views.spline.coefficients(
+            half.conj().T.reshape(-1, *views.shape)
+        ).reshape(self.n_sites, -1)
         out = np.zeros(self.n_marks)
         for start in range(0, self.n_marks, BLOCK):
             block = rows[start : start + BLOCK]
@@ -573,7 +591,9 @@ class PlacedEquations(NormalEquations):
             return np.zeros(views.shape, dtype=bool)
         ratio = self.grid_scale / self.angular_scale if self.angular.n_views else 0.0
         inverse = self.inverse(ratio) if ratio else self.grid_inverse
-        is_known = some & (np.maximum(abs(views.z_sites.real), abs(views.z_sites.imag)) < CORE)
+        is_known = some & (
+            np.maximum(abs(views.z_sites.real), abs(views.z_sites.imag)) < CORE
+        )
         if is_known.sum() < 3:  # three nodes a side
             is_known = some
         settled = 0
@@ -624,7 +644,9 @@ class PlacedEquations(NormalEquations):
         cover = np.block([[inverse.real, -inverse.imag], [inverse.imag, inverse.real]])
         answer = np.concatenate([response.real, response.imag])
         cover += answer @ self.grid_inverse @ answer.T
-        basis = Gauge(views.z_sites, np.ones(views.shape, dtype=bool), scale=True).orthonormal
+        basis = Gauge(
+            views.z_sites, np.ones(views.shape, dtype=bool), scale=True
+        ).orthonormal
         rigid = np.concatenate([basis.real, basis.imag])
         cover -= rigid @ (rigid.T @ cover)
         cover -= (cover @ rigid) @ rigid.T
@@ -661,7 +683,9 @@ def _equations(grid: Marks[AnyPose], angular: Marks[float]) -> NormalEquations:
         )
     poses = cast(tuple[LatticePose, ...], grid.poses)
     return NormalEquations(
-        GridSystem(poses, grid.weight, rotations=grid.rotations, known_plate=grid.known_plate),
+        GridSystem(
+            poses, grid.weight, rotations=grid.rotations, known_plate=grid.known_plate
+        ),
         lines,
         grid.index,
         angular.index,
@@ -672,7 +696,10 @@ def lines_of(angular: Marks[float]) -> AngularSystem:
     """Return the equations of the angular readings."""
     if angular.harmonics and angular.poses:
         return HarmonicSystem(
-            angular.poses, angular.weight, angular.harmonics, known_plate=angular.known_plate
+            angular.poses,
+            angular.weight,
+            angular.harmonics,
+            known_plate=angular.known_plate,
         )
     return AngularSystem(angular.poses, angular.weight, known_plate=angular.known_plate)
 
@@ -698,9 +725,13 @@ class Memo[Key, Value]:
     """
 
     def __init__(self) -> None:
-        self._values: WeakKeyDictionary[NormalEquations, dict[Key, Value]] = WeakKeyDictionary()
+        self._values: WeakKeyDictionary[NormalEquations, dict[Key, Value]] = (
+            WeakKeyDictionary()
+        )
 
-    def get(self, system: NormalEquations, key: Key, make: Callable[[], Value]) -> Value:
+    def get(
+        self, system: NormalEquations, key: Key, make: Callable[[], Value]
+    ) -> Value:
         """Return the value of `key` for `system`, computed by `make` the first time."""
         values = self._values.setdefault(system, {})
         if key not in values:

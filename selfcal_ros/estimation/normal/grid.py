@@ -117,7 +117,9 @@ class GridSystem(PlateEliminated):
 
     def gather(self, field: np.ndarray) -> np.ndarray:
         """Return maps, complex (sites,) or (..., nx, ny), at the marks, (..., views, nx, ny)."""
-        return self.views.gather(field.reshape(self.views.shape) if field.ndim == 1 else field)
+        return self.views.gather(
+            field.reshape(self.views.shape) if field.ndim == 1 else field
+        )
 
     def covariance(self, matrix: np.ndarray, first: int, second: int) -> np.ndarray:
         """Return the covariances of the map at marks of one and another view, (nx, ny)."""
@@ -161,12 +163,18 @@ class GridSystem(PlateEliminated):
             return field, plate
         at_site, at_mark = self.free_turns
         n = len(components.balanced)
-        sites = np.flatnonzero((components.of_site >= 0) & components.balanced[components.of_site])
-        marks = np.flatnonzero((components.of_mark >= 0) & components.balanced[components.of_mark])
+        sites = np.flatnonzero(
+            (components.of_site >= 0) & components.balanced[components.of_site]
+        )
+        marks = np.flatnonzero(
+            (components.of_mark >= 0) & components.balanced[components.of_mark]
+        )
         component = components.of_mark[marks]
         unit = PHASES[at_mark[marks]]
         back = unit.conj() * plate.ravel()[marks]
-        mean = np.bincount(component, back.real, n) + 1j * np.bincount(component, back.imag, n)
+        mean = np.bincount(component, back.real, n) + 1j * np.bincount(
+            component, back.imag, n
+        )
         mean /= np.maximum(np.bincount(component, minlength=n), 1)
         field, plate = field.copy(), plate.copy()
         field.ravel()[sites] += PHASES[at_site[sites]] * mean[components.of_site[sites]]

@@ -11,9 +11,17 @@ from itertools import combinations, islice
 
 import numpy as np
 
-from selfcal_ros.estimation.datum.covariance import MapsCovariance, conditions_for, lines_alone
+from selfcal_ros.estimation.datum.covariance import (
+    MapsCovariance,
+    conditions_for,
+    lines_alone,
+)
 from selfcal_ros.estimation.multifrontal.factor import one_thread
-from selfcal_ros.estimation.normal.equations import UNASKED_SITES, NormalEquations, planned_system
+from selfcal_ros.estimation.normal.equations import (
+    UNASKED_SITES,
+    NormalEquations,
+    planned_system,
+)
 from selfcal_ros.estimation.observability.rank import (
     add_views,
     full_observability,
@@ -141,12 +149,16 @@ class PlanCheck:
 def check_plan(plan: Plan) -> PlanCheck:
     """Return rank, deficiency, unseen modes and cures of a plan with every mark read."""
     system = planned_system(plan.artifact, plan.views)
-    observability = with_unchecked(full_observability(system, plan.artifact, plan.views), system)
+    observability = with_unchecked(
+        full_observability(system, plan.artifact, plan.views), system
+    )
     if not observability.identifiable:
         return with_unseen_modes(observability, system, plan)
     return PlanCheck(
         observability,
-        unknown_sites=0 if plan.artifact.map_grid is None else int((~system.known_sites).sum()),
+        unknown_sites=0
+        if plan.artifact.map_grid is None
+        else int((~system.known_sites).sum()),
     )
 
 
@@ -171,7 +183,8 @@ def with_unseen_modes(
         for number, cure in enumerate(cures[:3])
     )
     return PlanCheck(
-        replace(observability, modes=modes, advice=advice or observability.advice), cures
+        replace(observability, modes=modes, advice=advice or observability.advice),
+        cures,
     )
 
 
@@ -193,7 +206,11 @@ def predict_plan(plan: Plan, datum: ThetaDatum) -> Prediction:
 
 def predicted_on(plan: Plan) -> Plan:
     """Return the plan, on a field of PROXY_SIZE sites a side if it has above UNASKED_SITES."""
-    return smaller(plan, PROXY_SIZE) if math.prod(plan.artifact.shape) > UNASKED_SITES else plan
+    return (
+        smaller(plan, PROXY_SIZE)
+        if math.prod(plan.artifact.shape) > UNASKED_SITES
+        else plan
+    )
 
 
 def unit_repeats(plan: Plan) -> int:
@@ -222,7 +239,8 @@ def candidate_views(artifact: Artifact, *, angular: bool) -> list[View]:
             q * math.pi / 2,
             (a * pitch + q % 2 * quarter_shift_m, b * pitch + q % 2 * quarter_shift_m),
             True,
-            angular and (bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0),
+            angular
+            and (bool(artifact.harmonics) or q * artifact.angular_count % 4 == 0),
         )
         for (a, b), name in names.items()
         for q in range(4)
@@ -259,7 +277,11 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
     cures: list[tuple[View, ...]] = [()]
     if not _grid_seen(small, ()):
         for size in (1, 2):
-            good = (views for views in combinations(grid_only, size) if _grid_seen(small, views))
+            good = (
+                views
+                for views in combinations(grid_only, size)
+                if _grid_seen(small, views)
+            )
             cures = list(islice(good, MAX_CURES))
             if cures:
                 break
@@ -278,7 +300,8 @@ def find_cures(plan: Plan) -> Iterator[tuple[View, ...]]:
 
 def _grid_seen(plan: Plan, views: tuple[View, ...]) -> bool:
     return identifies(
-        plan.artifact, [replace(view, angular=False) for view in (*plan.views, *views) if view.grid]
+        plan.artifact,
+        [replace(view, angular=False) for view in (*plan.views, *views) if view.grid],
     )
 
 
@@ -340,7 +363,9 @@ def more_repeats(plan: Plan) -> list[Step]:
     out = []
     for index, view in enumerate(plan.views):
         more = replace(view, repeats=view.repeats + unit)
-        out.append(Step(more, (*plan.views[:index], more, *plan.views[index + 1 :]), index))
+        out.append(
+            Step(more, (*plan.views[:index], more, *plan.views[index + 1 :]), index)
+        )
     return out
 
 

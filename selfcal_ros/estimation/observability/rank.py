@@ -65,10 +65,15 @@ def _identifies(artifact: Artifact, views: tuple[View, ...]) -> bool:
     if artifact.map_grid is not None:
         return _nodes_known(system)
     components = system.grid.components
-    if components.balanced.any() or min(components.of_site.min(), components.of_mark.min()) < 0:
+    if (
+        components.balanced.any()
+        or min(components.of_site.min(), components.of_mark.min()) < 0
+    ):
         return False
     middle = smaller(Plan("", artifact, views), FULL_SIZE)
-    if middle.artifact != artifact and not deficiency(planned_system(middle.artifact, views)):
+    if middle.artifact != artifact and not deficiency(
+        planned_system(middle.artifact, views)
+    ):
         return True  # further readings can only add
     return deficiency(system) == 0
 
@@ -86,10 +91,14 @@ def smaller(plan: Plan, size: int) -> Plan:
         max(map(abs, view.translation_m)) / plan.artifact.grid_pitch_m
         for view in with_sub_views(plan.views)
     ]
-    room = 2 * round(max(reach, default=0)) + 3  # a plan to be searched has no views yet
+    # a plan to be searched has no views yet
+    room = 2 * round(max(reach, default=0)) + 3
     share = min(1.0, max(size, room) / max(plan.artifact.shape))
     nx, ny = (
-        max(2 * round((n * share - n % 2) / 2) + n % 2, min(n, max(room, NARROW) + 1 - n % 2))
+        max(
+            2 * round((n * share - n % 2) / 2) + n % 2,
+            min(n, max(room, NARROW) + 1 - n % 2),
+        )
         for n in plan.artifact.shape
     )
     plate = Artifact(
@@ -105,14 +114,17 @@ def smaller(plan: Plan, size: int) -> Plan:
         artifact=plate
         if grid is None
         else replace(
-            plate, map_grid=replace(default_map_grid(plate), interpolation=grid.interpolation)
+            plate,
+            map_grid=replace(default_map_grid(plate), interpolation=grid.interpolation),
         ),
     )
 
 
 def deficiency(system: NormalEquations) -> int:
     """Return the number of undetermined parameters of map, plate and misalignments."""
-    return unknowns_of(system) - system.rank_grid - DATUM_ROWS + angular_deficiency(system)
+    return (
+        unknowns_of(system) - system.rank_grid - DATUM_ROWS + angular_deficiency(system)
+    )
 
 
 def unknowns_of(system: NormalEquations) -> int:
@@ -182,7 +194,9 @@ def measured_observability(
     return with_unchecked(_measured_observability(system, artifact, views), system)
 
 
-def with_unchecked(observability: Observability, system: NormalEquations) -> Observability:
+def with_unchecked(
+    observability: Observability, system: NormalEquations
+) -> Observability:
     """Return the observability with the counts of unchecked sites and lines."""
     return (
         observability
@@ -215,7 +229,9 @@ def _measured_observability(
                 "of_lines": len(lines),
             },
         )
-        return Observability(full.rank, full.unknowns, full.deficiency, False, advice=(missing,))
+        return Observability(
+            full.rank, full.unknowns, full.deficiency, False, advice=(missing,)
+        )
     n_determined = 2 * int(sites.sum() + system.known_marks.sum())
     n_determined += int(system.known_views[: 3 * system.grid.n_views].sum())
     n_determined -= system.grid.differences.shape[1]
@@ -241,13 +257,19 @@ def _placed_observability(
     n_known = int(system.known_sites.sum())
     grid = system.grid
     if _nodes_known(system):
-        n_determined = 2 * (n_known + int(system.known_marks.sum())) + grid.n_misalignments
+        n_determined = (
+            2 * (n_known + int(system.known_marks.sum())) + grid.n_misalignments
+        )
         return Observability(n_determined, n_determined, 0, True)
     missing = len(system.loose_modes) or 2 * (grid.n_sites - n_known)
     missing += angular_deficiency(system)
     advice = advice_for(artifact, views) if n_known < DETERMINED * grid.n_sites else ()
     return Observability(
-        unknowns_of(system) - missing, unknowns_of(system), max(missing, 1), False, advice=advice
+        unknowns_of(system) - missing,
+        unknowns_of(system),
+        max(missing, 1),
+        False,
+        advice=advice,
     )
 
 
@@ -277,7 +299,10 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[Finding, ...]
     if (
         len(
             {
-                (round(x / artifact.grid_pitch_m, 3), round(y / artifact.grid_pitch_m, 3))
+                (
+                    round(x / artifact.grid_pitch_m, 3),
+                    round(y / artifact.grid_pitch_m, 3),
+                )
                 for x, y in (pose.shift_m for pose in poses)
             }
         )
@@ -288,7 +313,9 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[Finding, ...]
         missing += _missing_lines(
             artifact, [v.on_stage(artifact).turn_lines or 0 for v in views if v.angular]
         )
-    return tuple(add_views(artifact, view) for view in missing) or (_tried(artifact, views),)
+    return tuple(add_views(artifact, view) for view in missing) or (
+        _tried(artifact, views),
+    )
 
 
 def add_views(artifact: Artifact, *views: View, name: str = "add_views") -> Finding:
@@ -325,11 +352,17 @@ def _missing_lines(artifact: Artifact, turns: list[float]) -> list[View]:
     """Return the view of lines that is missing, if one is; turns in lines."""
     count = artifact.angular_count
     if artifact.harmonics:
-        lacks = HarmonicSystem(tuple(turns), np.ones((len(turns), count)), artifact.harmonics)
+        lacks = HarmonicSystem(
+            tuple(turns), np.ones((len(turns), count)), artifact.harmonics
+        )
         best = best_turn_deg(np.array(turns) * (2 * np.pi / count), artifact.harmonics)
         return [View("", math.radians(best), grid=False)] if lacks.missed else []
     apart = [round(turn - turns[0]) for turn in turns]
-    return [View("", 2 * math.pi / count, grid=False)] if math.gcd(count, *apart) > 1 else []
+    return (
+        [View("", 2 * math.pi / count, grid=False)]
+        if math.gcd(count, *apart) > 1
+        else []
+    )
 
 
 def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
@@ -340,7 +373,8 @@ def best_turn_deg(turns_rad: np.ndarray, harmonics: int) -> int:
     more = of_turns.sum(axis=0) + np.exp(
         1j * np.outer(np.radians(turns_deg), np.arange(1, harmonics + 1))
     )
-    information = number + 1 - np.abs(more) ** 2 / (number + 1)  # information on each, in 2 / K
+    # information on each, in 2 / K
+    information = number + 1 - np.abs(more) ** 2 / (number + 1)
     return int(turns_deg[(1 / np.maximum(information, 1e-12)).sum(axis=1).argmin()])
 
 
@@ -368,7 +402,9 @@ def is_unseen(system: NormalEquations, field: np.ndarray) -> bool:
         weight = system.grid_scale / system.angular_scale
         block[np.ix_(system.phi_at, system.phi_at)] += weight * system.angular.schur
         block = grid.tied(block)
-    explained = right @ pseudo_inverse(*np.linalg.eigh(block), system.grid_scale) @ right
+    explained = (
+        right @ pseudo_inverse(*np.linalg.eigh(block), system.grid_scale) @ right
+    )
     return bool(total - explained <= GAP * scale)
 
 
@@ -418,7 +454,9 @@ def _component_family(grid: GridSystem) -> Iterator[Finding]:
     if len(free) < 2 and not (len(free) == 1 and len(components.balanced) > 1):
         return
     label = np.where(
-        (components.of_site >= 0) & np.isin(components.of_site, free), components.of_site, -1
+        (components.of_site >= 0) & np.isin(components.of_site, free),
+        components.of_site,
+        -1,
     )
     yield _shape_of(grid, label.reshape(grid.views.shape), n=len(free))
 
@@ -432,7 +470,9 @@ def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> Finding:
     for axis, lines in ((0, "rows"), (1, "columns")):
         first = np.take(label, [label.shape[axis] // 2], axis=axis)
         if (label == first).all():
-            return Finding("line_offsets", details={"lines": lines, "opposite": len(turns) > 1})
+            return Finding(
+                "line_offsets", details={"lines": lines, "opposite": len(turns) > 1}
+            )
     beside_datum = 2 * n - 2  # rotation and scale, or the translations
     if len(shifts) == 1:
         return Finding(
@@ -440,11 +480,16 @@ def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> Finding:
             details={"half": not any(t % 2 for t in turns), "numbers": beside_datum},
         )
     if period := _period(label):
-        return Finding("periodic_fields", details={"period": period, "numbers": beside_datum})
+        return Finding(
+            "periodic_fields", details={"period": period, "numbers": beside_datum}
+        )
     numbers, sizes = np.unique(label[label >= 0], return_counts=True)
     return Finding(
         "groups_of_sites",
-        details={"count": n, "smallest": _sites(label == numbers[np.argmin(sizes)], grid)},
+        details={
+            "count": n,
+            "smallest": _sites(label == numbers[np.argmin(sizes)], grid),
+        },
     )
 
 
@@ -473,7 +518,10 @@ def _angular_families(angular: AngularSystem) -> Iterator[Finding]:
         if angular.missed:
             yield Finding(
                 "harmonics_unseen",
-                details={"harmonics": [*map(int, angular.missed)], "turned": angular.n_views > 1},
+                details={
+                    "harmonics": [*map(int, angular.missed)],
+                    "turned": angular.n_views > 1,
+                },
             )
         return
     components = angular.components
@@ -506,7 +554,9 @@ def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:
     forms_of_views = []
     for view in views:
         turn = round(view.pose.turn_rad / (math.pi / 2), 9) % 4
-        shift = complex(*(round(step / artifact.grid_pitch_m, 6) for step in view.pose.shift_m))
+        shift = complex(
+            *(round(step / artifact.grid_pitch_m, 6) for step in view.pose.shift_m)
+        )
         forms_of_views.append(_forms(turn, shift, square=square, listed=listed))
     return min(tuple(sorted(form)) for form in zip(*forms_of_views, strict=True))
 

@@ -121,7 +121,11 @@ class PlannedTerms:
 
     @one_thread()
     def __init__(
-        self, plan: Plan, model: Sequence[ModelTerm], assumed: Assumed, against: Iterable[str] = ()
+        self,
+        plan: Plan,
+        model: Sequence[ModelTerm],
+        assumed: Assumed,
+        against: Iterable[str] = (),
     ) -> None:
         plan = predicted_on(plan)
         self.model, self.assumed = tuple(model), assumed
@@ -156,7 +160,9 @@ class PlannedTerms:
             return error.observability
         free = int(self.of_model.free.sum())
         return replace(
-            observability, rank=observability.rank + free, unknowns=observability.unknowns + free
+            observability,
+            rank=observability.rank + free,
+            unknowns=observability.unknowns + free,
         )
 
     @one_thread()
@@ -202,11 +208,15 @@ class PlannedTerms:
         """Return rms and largest effect of the term on the map."""
         all_terms = self.all_terms
         term = self.all_terms.rows([name])
-        model, explained, _ = self._remainder(name, self._other_terms(name), self.assumed.sigma_m)
+        model, explained, _ = self._remainder(
+            name, self._other_terms(name), self.assumed.sigma_m
+        )
         fields = all_terms.maps[:, term] - all_terms.maps[:, model] @ explained
         known_sites = all_terms.system.known_sites.ravel()
         spread = size * np.sqrt(
-            np.stack([(fields.real**2).sum(axis=1), (fields.imag**2).sum(axis=1)])[:, known_sites]
+            np.stack([(fields.real**2).sum(axis=1), (fields.imag**2).sum(axis=1)])[
+                :, known_sites
+            ]
         )
         return rms(spread), float(spread.max())
 
@@ -244,9 +254,15 @@ class PlannedTerms:
         columns = rows_of(all_terms.columns, other_terms)
         cross = all_terms.information[np.ix_(columns, term)]
         explained = of_others.inverse(sigma_m) @ of_others.unbiased_sums(cross)
-        return columns, explained, all_terms.information[np.ix_(term, term)] - cross.T @ explained
+        return (
+            columns,
+            explained,
+            all_terms.information[np.ix_(term, term)] - cross.T @ explained,
+        )
 
-    def _information(self, name: str, other_terms: Sequence[ModelTerm]) -> tuple[np.ndarray, int]:
+    def _information(
+        self, name: str, other_terms: Sequence[ModelTerm]
+    ) -> tuple[np.ndarray, int]:
         """Return the eigenvalues of the information on a term given others, and its rank."""
         all_terms = self.all_terms
         term = self.all_terms.rows([name])
@@ -257,7 +273,9 @@ class PlannedTerms:
         return np.linalg.eigvalsh(information)[len(information) - rank :], rank
 
 
-def with_part_of_terms(without_terms: Prediction, terms: TermEquations, repeats: int) -> Prediction:
+def with_part_of_terms(
+    without_terms: Prediction, terms: TermEquations, repeats: int
+) -> Prediction:
     """Return a prediction with the contribution of terms added.
 
     Parameters
@@ -291,7 +309,9 @@ def check_terms(
     sizes_of_model = {term.name: term.size for term in planned.model if not term.free}
     all_sizes = nominal_sizes() | sizes_of_model | dict(sizes)
     return tuple(
-        planned.check(name, all_sizes[name], level) for name in blocks() if name in all_sizes
+        planned.check(name, all_sizes[name], level)
+        for name in blocks()
+        if name in all_sizes
     )
 
 
@@ -343,14 +363,18 @@ class PlanBudget:
     removals: Mapping[tuple[str, str], Removal]
     if_larger: tuple[BudgetLine, ...] = ()
 
-    def u_rms(self, quantity: str, *, noise_only: bool = False, if_larger: bool = False) -> float:
+    def u_rms(
+        self, quantity: str, *, noise_only: bool = False, if_larger: bool = False
+    ) -> float:
         """Return the standard uncertainty, rms over the map; NaN without such a map."""
         effects_m = [
             line.effect_rms
             for line in (self.if_larger if if_larger else self.lines)
             if line.quantity == quantity and (line.component == NOISE or not noise_only)
         ]
-        return float(np.sqrt(np.sum(np.square(effects_m)))) if effects_m else float("nan")
+        return (
+            float(np.sqrt(np.sum(np.square(effects_m)))) if effects_m else float("nan")
+        )
 
     def share(self, line: BudgetLine) -> float:
         """Return the share of a line in u^2."""
@@ -390,7 +414,9 @@ def plan_budget(
     return replace(
         budget,
         removals=_removals(budget, plan, terms, assumed),
-        if_larger=_budget(plan, larger, assumed, without_terms, declared=declared).lines,
+        if_larger=_budget(
+            plan, larger, assumed, without_terms, declared=declared
+        ).lines,
     )
 
 
@@ -421,10 +447,18 @@ def _budget(
         if not gains.size:
             continue
         determined = np.isfinite(gains)
-        noise = (gains**2 * sigma**2 / n + (0.0 if free is None else free[at]))[determined]
-        lines.append(_line(quantity, NOISE, noise, u=sigma, unit=unit, source="readings"))
+        noise = (gains**2 * sigma**2 / n + (0.0 if free is None else free[at]))[
+            determined
+        ]
+        lines.append(
+            _line(quantity, NOISE, noise, u=sigma, unit=unit, source="readings")
+        )
         for term in terms:
-            effect = effects[term.name][at][determined] if term.name in effects else np.zeros(1)
+            effect = (
+                effects[term.name][at][determined]
+                if term.name in effects
+                else np.zeros(1)
+            )
             if effect.mean() > TRACE * noise.mean():
                 source = "declared" if term.name in declared else "default"
                 lines.append(
@@ -452,11 +486,21 @@ def _undetermined_terms(
     more = nominal_terms({*declared, *(term.name for term in terms)}, visits=True)
     effects = effects_of_terms(plan, [*terms, *more], assumed) if terms and more else {}
     least = (UNDETERMINED * budget.u_rms("xy")) ** 2
-    return [term for term in more if term.name in effects and effects[term.name][0].mean() > least]
+    return [
+        term
+        for term in more
+        if term.name in effects and effects[term.name][0].mean() > least
+    ]
 
 
 def _line(
-    quantity: str, component: str, variance: np.ndarray, *, u: float, unit: str, source: str
+    quantity: str,
+    component: str,
+    variance: np.ndarray,
+    *,
+    u: float,
+    unit: str,
+    source: str,
 ) -> BudgetLine:
     return BudgetLine(
         quantity,
@@ -481,7 +525,10 @@ def effects_of_terms(
     system = planned_system(plan.artifact, plan.views)
     equations = planned_equations(plan, system, terms, assumed)
     roots = roots_by_term(equations.inverse(assumed.sigma_m), equations.columns)
-    return {name: equations.variances(assumed.sigma_m**2 * root @ root.T) for name, root in roots}
+    return {
+        name: equations.variances(assumed.sigma_m**2 * root @ root.T)
+        for name, root in roots
+    }
 
 
 def _removals(
@@ -493,9 +540,15 @@ def _removals(
 
     def effect(step: Step, line: BudgetLine) -> float:
         if step.views not in tried:
-            tried[step.views] = effects_of_terms(replace(judged, views=step.views), terms, assumed)
+            tried[step.views] = effects_of_terms(
+                replace(judged, views=step.views), terms, assumed
+            )
         at = tried[step.views].get(line.component)
-        return 0.0 if at is None else float(np.sqrt(at[QUANTITIES.index(line.quantity)].mean()))
+        return (
+            0.0
+            if at is None
+            else float(np.sqrt(at[QUANTITIES.index(line.quantity)].mean()))
+        )
 
     out = {}
     for line in budget.lines:
@@ -503,11 +556,12 @@ def _removals(
             continue
         kind, steps = _changes(plan, line.component)
         now = effect(Step(None, plan.views), line)
+        # the first of equal ones
         best = min(
             ((effect(step, line), step) for step in steps),
             default=None,
             key=lambda item: float(f"{item[0]:.9g}"),
-        )  # the first of equal ones
+        )
         out[line.quantity, line.component] = (
             Removal(CERTIFICATE)
             if best is None or best[0] > REMOVED * now

@@ -59,7 +59,9 @@ Pose = tuple[int, float, float]
 def view_at(view: View, pose: Pose, pitch_m: float) -> View:
     """Return the view at a pose, named after it."""
     turn, *shift = pose
-    shift_text = "".join(f"{step:+g}{axis}" for step, axis in zip(shift, "xy", strict=True) if step)
+    shift_text = "".join(
+        f"{step:+g}{axis}" for step, axis in zip(shift, "xy", strict=True) if step
+    )
     return replace(
         view,
         name=f"{turn}deg{shift_text}",
@@ -112,7 +114,9 @@ def best_pose(
     local_best = []
     for best in sorted(starts, key=key)[:FINALISTS]:
         for turn, shift in STEPS:
-            while key(near := min(_neighbours(best, turn, shift, reach), key=key)) < key(best):
+            while key(
+                near := min(_neighbours(best, turn, shift, reach), key=key)
+            ) < key(best):
                 best = near
         local_best.append(best)
     return min(local_best, key=key)
@@ -124,8 +128,16 @@ def _neighbours(pose: Pose, turn: int, shift: float, reach: float) -> Iterator[P
     angle, x, y = pose
     for sign in (1, -1):
         yield (angle + sign * turn) % 360, x, y
-        yield from ((angle, to + 0.0, y) for to in [round(x + sign * shift, 1)] if abs(to) <= reach)
-        yield from ((angle, x, to + 0.0) for to in [round(y + sign * shift, 1)] if abs(to) <= reach)
+        yield from (
+            (angle, to + 0.0, y)
+            for to in [round(x + sign * shift, 1)]
+            if abs(to) <= reach
+        )
+        yield from (
+            (angle, x, to + 0.0)
+            for to in [round(y + sign * shift, 1)]
+            if abs(to) <= reach
+        )
 
 
 EXHAUSTIVE = 2000
@@ -163,7 +175,9 @@ class PlanScore:
         For a plan deficient even without terms, their effect is not counted: it comes last.
         """
         first, second = (
-            (self.rms_xy, self.max_xy) if criterion == "rms" else (self.max_xy, self.rms_xy)
+            (self.rms_xy, self.max_xy)
+            if criterion == "rms"
+            else (self.max_xy, self.rms_xy)
         )
         # rounding must not decide between plans equal by symmetry
         return (
@@ -265,7 +279,9 @@ def score_plan(
             return PlanScore(hidden, inf, inf, inf, of_terms=True)
         prediction = with_part_of_terms(prediction, terms, repeats)
     theta = prediction.rms_theta if len(prediction.u_theta) else 0.0
-    return PlanScore(0, prediction.rms_xy, prediction.max_xy, theta, unknown_sites=unknown_sites)
+    return PlanScore(
+        0, prediction.rms_xy, prediction.max_xy, theta, unknown_sites=unknown_sites
+    )
 
 
 @one_thread()
@@ -296,11 +312,15 @@ def rank_next(
     progress : callable
         Called with the number of plans evaluated and the total.
     """
-    judged = smaller(plan, SEARCH_SIZE) if max(plan.artifact.shape) > FULL_SIZE else plan
+    judged = (
+        smaller(plan, SEARCH_SIZE) if max(plan.artifact.shape) > FULL_SIZE else plan
+    )
     unit = unit_repeats(plan)
 
     def score(views: tuple[View, ...]) -> PlanScore:
-        return score_plan(replace(judged, views=views), datum, repeats=unit, against=against)
+        return score_plan(
+            replace(judged, views=views), datum, repeats=unit, against=against
+        )
 
     views = more_views(plan)
     if plan.artifact.map_grid:
@@ -347,28 +367,43 @@ def best_plan(
     fixed = int(angular)
     if n_views < 3 + fixed:
         raise InputError(
-            "--views", f"{n_views} views cannot identify the stage", f"give {3 + fixed} or more"
+            "--views",
+            f"{n_views} views cannot identify the stage",
+            f"give {3 + fixed} or more",
         )
     like = like or View("")
-    candidates = [measured_like(view, like) for view in candidate_views(artifact, angular=angular)]
+    candidates = [
+        measured_like(view, like) for view in candidate_views(artifact, angular=angular)
+    ]
     pool = [view for view in candidates if view.grid]
     empty_plan = Plan("best", artifact, ())
     small = smaller(empty_plan, SEARCH_SIZE)
     tried, how = _search(
-        small, pool, n_views - 1 - fixed, criterion=criterion, against=against, progress=progress
+        small,
+        pool,
+        n_views - 1 - fixed,
+        criterion=criterion,
+        against=against,
+        progress=progress,
     )
     if small is not empty_plan:
         how = replace(how, size=SEARCH_SIZE)
     judged = empty_plan if max(artifact.shape) <= FULL_SIZE else small
 
     def with_lines(chosen: tuple[int, ...]) -> Plan:
-        views = (pool[0], *(pool[i] for i in chosen), *(candidates[-1:] if angular else []))
+        views = (
+            pool[0],
+            *(pool[i] for i in chosen),
+            *(candidates[-1:] if angular else []),
+        )
         return replace(judged, views=_named(views))
 
     finalists = sorted(tried, key=lambda chosen: (tried[chosen], chosen))
     ties = sum(tried[chosen] == tried[finalists[0]] for chosen in finalists)
     finalists = finalists[: max(FINALISTS, min(ties, MAX_TIES) if angular else 0)]
-    scores = [score_plan(with_lines(chosen), datum, against=against) for chosen in finalists]
+    scores = [
+        score_plan(with_lines(chosen), datum, against=against) for chosen in finalists
+    ]
     best = min(range(len(scores)), key=lambda at: scores[at].key(criterion))
     plan = with_lines(finalists[best])
     least = scores[best]
@@ -376,9 +411,9 @@ def best_plan(
         views = _moved_off_the_lattice(
             plan.views,
             artifact,
-            lambda views: score_plan(replace(judged, views=views), datum, against=against).key(
-                criterion
-            ),
+            lambda views: score_plan(
+                replace(judged, views=views), datum, against=against
+            ).key(criterion),
         )
         plan = replace(judged, views=views)
         least = score_plan(plan, datum, against=against)
@@ -397,8 +432,12 @@ def _anywhere(
         return *plan.views, replace(view, name=unused_name(view.name, plan.views))
 
     reach = reach_of(plan.artifact)
-    starts = [pose_of_view(step.views[-1], pitch_m) for step in steps if step.views[-1].grid]
-    best = best_pose([*starts, *start_poses(reach)], reach, lambda pose: key(views(pose)))
+    starts = [
+        pose_of_view(step.views[-1], pitch_m) for step in steps if step.views[-1].grid
+    ]
+    best = best_pose(
+        [*starts, *start_poses(reach)], reach, lambda pose: key(views(pose))
+    )
     return [] if best in starts else [Step(views(best)[-1], views(best))]
 
 
@@ -427,7 +466,9 @@ def _moved_off_the_lattice(
             better = instead(
                 now,
                 at,
-                best_pose([pose_of_view(now[at], pitch_m)], reach_of(artifact), value(now, at)),
+                best_pose(
+                    [pose_of_view(now[at], pitch_m)], reach_of(artifact), value(now, at)
+                ),
             )
             now = better if key(better) < key(now) else now
     return _named(now)
@@ -448,16 +489,25 @@ def _search(
     """
     pool = [replace(view, angular=False) for view in pool]
     keys: dict[tuple, tuple[float, ...]] = {}
-    one_by_one = against is not None and any(term.block.needs_visits for term in against.terms)
-    if against is not None:  # no choice of views determines the default terms of the visits
+    one_by_one = against is not None and any(
+        term.block.needs_visits for term in against.terms
+    )
+    # no choice of views determines the default terms of the visits
+    if against is not None:
         against = replace(
             against,
-            by_default=tuple(term for term in against.by_default if not term.block.needs_visits),
+            by_default=tuple(
+                term for term in against.by_default if not term.block.needs_visits
+            ),
         )
 
     def key(chosen: tuple[int, ...]) -> tuple[float, ...]:
         views = (pool[0], *(pool[i] for i in chosen))
-        equivalent = tuple(sorted(chosen)) if one_by_one else equivalent_key(field.artifact, views)
+        equivalent = (
+            tuple(sorted(chosen))
+            if one_by_one
+            else equivalent_key(field.artifact, views)
+        )
         if equivalent not in keys:
             plan = replace(field, views=_named(views))
             keys[equivalent] = score_plan(plan, against=against).key(criterion)
@@ -497,7 +547,11 @@ def _exchange(
             if value(best) < value(now):
                 now = best
                 improved = True
-    return {chosen: key_of_plan for chosen, key_of_plan in tried.items() if len(chosen) == free}
+    return {
+        chosen: key_of_plan
+        for chosen, key_of_plan in tried.items()
+        if len(chosen) == free
+    }
 
 
 def _named(views: Iterable[View]) -> tuple[View, ...]:

@@ -84,14 +84,18 @@ class Residuals:
     @property
     def level(self) -> float:
         """Level of the test of one reading, so that all checked ones have OUTLIER_LEVEL."""
-        checked = sum(np.isfinite(kind.squares).sum() for kind in (self.marks, self.lines))
+        checked = sum(
+            np.isfinite(kind.squares).sum() for kind in (self.marks, self.lines)
+        )
         return OUTLIER_LEVEL / max(checked, 1)
 
 
 def residuals_of(measurements: Measurements, options: Options) -> Residuals:
     """Fit marks and lines, each by themselves, and return their residuals."""
     problem, _ = prepare(measurements, options)
-    exact = measurements.artifact.map_grid is None and (problem.system.grid.n_sites <= MAX_FULL)
+    exact = measurements.artifact.map_grid is None and (
+        problem.system.grid.n_sites <= MAX_FULL
+    )
     return Residuals(
         problem,
         marks_alone(problem.system, problem.grid.y, exact=exact),
@@ -136,7 +140,9 @@ def _mixing(system: NormalEquations) -> np.ndarray:
             noise = np.zeros(grid.weight.shape, dtype=complex)
             noise[u] = noise_of(rng, noise[u].shape, grid.weight[u])
             residuals = grid_residuals(system, noise)
-            mixing[:, u] += (abs(residuals) ** 2 * grid.weight).sum(axis=(1, 2)) / FEW_DRAWS
+            mixing[:, u] += (abs(residuals) ** 2 * grid.weight).sum(
+                axis=(1, 2)
+            ) / FEW_DRAWS
     return (mixing + mixing.T) / 2
 
 
@@ -150,14 +156,23 @@ MAX_RATIO = 20.0
 """Largest ratio of noises that residuals can show: a noisy view hides the noise of the others."""
 
 
-def noisy_views(residuals: Residuals, measurements: Measurements) -> tuple[tuple[str, float], ...]:
+def noisy_views(
+    residuals: Residuals, measurements: Measurements
+) -> tuple[tuple[str, float], ...]:
     """Return the noisy views, each with the ratio of its noise to that of the others.
 
     By their own repeats, and by residuals.
     """
-    ratios = {cause.view: cause.size for cause in noisier_views(scatter_of_views(measurements))}
-    names = [measurements.views[index].view.name for index in residuals.problem.grid.index]
-    for name, (own_noise, noise_of_others, dof) in zip(names, view_noise(residuals), strict=True):
+    ratios = {
+        cause.view: cause.size
+        for cause in noisier_views(scatter_of_views(measurements))
+    }
+    names = [
+        measurements.views[index].view.name for index in residuals.problem.grid.index
+    ]
+    for name, (own_noise, noise_of_others, dof) in zip(
+        names, view_noise(residuals), strict=True
+    ):
         ratio = float(own_noise / max(noise_of_others, own_noise / MAX_RATIO, FLOOR))
         if ratio > NOISY_RESIDUALS and dof >= MIN_VIEW_DOF:
             ratios[name] = max(ratio, ratios.get(name, 0.0))
@@ -238,7 +253,9 @@ class Slip(SlipPlace):
         )
 
 
-def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) -> Slip | None:
+def find_slip(
+    residuals: Residuals, sigma_m: float, measurements: Measurements
+) -> Slip | None:
     """Return the slip that explains the residuals best; None if no place passes the test.
 
     Of the places that explain most of the clipped residuals, the one where a second misalignment
@@ -255,7 +272,9 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) 
     """
     problem, marks = residuals.problem, residuals.marks
     limit = CLIP * sigma_m / np.sqrt(np.where(marks.weight > 0, marks.weight, 1.0))
-    clipped = marks.residual * np.minimum(1.0, limit / np.maximum(abs(marks.residual), 1e-300))
+    clipped = marks.residual * np.minimum(
+        1.0, limit / np.maximum(abs(marks.residual), 1e-300)
+    )
     gains = [
         (_second_misalignment(problem, place, clipped)[1], place)
         for place in _places(problem, measurements)
@@ -267,16 +286,22 @@ def find_slip(residuals: Residuals, sigma_m: float, measurements: Measurements) 
             after = grid_residuals(problem.system, _slipped(problem, place, size))
             places.append(replace(place, chi2=gain / sigma_m**2))
             sizes.append(size)
-            squares_left.append((abs(marks.residual - after) ** 2 * marks.weight)[marks.weight > 0])
+            squares_left.append(
+                (abs(marks.residual - after) ** 2 * marks.weight)[marks.weight > 0]
+            )
     if not places:
         return None
     # residuals are smaller than the noise by the part that the fit follows
     dof_part = (marks.dof - 3) / (2 * len(squares_left[0]))
-    variance = np.maximum(np.median(squares_left, axis=1) / chdtri(2, 0.5) / dof_part, FLOOR**2)
+    variance = np.maximum(
+        np.median(squares_left, axis=1) / chdtri(2, 0.5) / dof_part, FLOOR**2
+    )
     losses = np.minimum(squares_left, CLIP**2 * variance.min()).sum(axis=1)
     order = np.argsort(losses, kind="stable")
     best, (phi, x, y) = places[order[0]], sizes[order[0]]
-    shift = complex(x, y) * problem.grid.poses[problem.grid.index.index(best.index)].phase
+    shift = (
+        complex(x, y) * problem.grid.poses[problem.grid.index.index(best.index)].phase
+    )
     near = losses < losses.min() + AMBIGUOUS * variance[order[0]]
     return Slip(
         **asdict(best),
@@ -293,9 +318,14 @@ def _places(problem: Problem, measurements: Measurements) -> Iterator[SlipPlace]
         read = problem.grid.weight[row] > 0
         for axis in (0, 1) if measurements.artifact.marks is None else ():
             lines = np.flatnonzero(read.any(axis=1 - axis))[1:] - read.shape[axis] // 2
-            for at in np.linspace(0, len(lines) - 1, min(len(lines), MAX_PLACES)).round():
+            for at in np.linspace(
+                0, len(lines) - 1, min(len(lines), MAX_PLACES)
+            ).round():
                 place = SlipPlace(
-                    measurements.views[index].view.name, index, "mn"[axis], int(lines[int(at)])
+                    measurements.views[index].view.name,
+                    index,
+                    "mn"[axis],
+                    int(lines[int(at)]),
                 )
                 if 3 <= after_slip(problem, place).sum() <= read.sum() - 3:
                     yield place
@@ -327,7 +357,10 @@ def _second_misalignment(
     By the projection of its three columns on the residuals (views, nx, ny); 0 where the readings
     do not determine it.
     """
-    columns = [grid_residuals(problem.system, _slipped(problem, place, unit)) for unit in np.eye(3)]
+    columns = [
+        grid_residuals(problem.system, _slipped(problem, place, unit))
+        for unit in np.eye(3)
+    ]
     weighted = np.conj(columns) * problem.grid.weight
     normal = np.tensordot(weighted, columns, axes=([1, 2, 3], [1, 2, 3])).real
     if np.linalg.matrix_rank(normal, tol=1e-9 * max(np.trace(normal), 1e-300)) < 3:
@@ -344,17 +377,28 @@ def split_view(measurements: Measurements, slip: SlipPlace) -> Measurements:
     """
     view = measurements.views[slip.index]
     after = getattr(view, slip.axis) >= slip.first
-    placements = [_placement_of(view, ~after, ""), _placement_of(view, after, AFTER_SLIP)]
+    placements = [
+        _placement_of(view, ~after, ""),
+        _placement_of(view, after, AFTER_SLIP),
+    ]
     if len(view.k):
-        placements.append(_placement_of(view, np.zeros(len(view.m), dtype=bool), " lines"))
-    views = (*measurements.views[: slip.index], *placements, *measurements.views[slip.index + 1 :])
+        placements.append(
+            _placement_of(view, np.zeros(len(view.m), dtype=bool), " lines")
+        )
+    views = (
+        *measurements.views[: slip.index],
+        *placements,
+        *measurements.views[slip.index + 1 :],
+    )
     return replace(measurements, views=views)
 
 
 def _placement_of(view: ViewReadings, marks: np.ndarray, suffix: str) -> ViewReadings:
     """Return some marks of a view, or its lines if there are none, as a placement of their own."""
     lines = not marks.any()
-    named = replace(view.view, name=view.view.name + suffix, grid=not lines, angular=lines)
+    named = replace(
+        view.view, name=view.view.name + suffix, grid=not lines, angular=lines
+    )
     return replace(
         subset(view, marks, np.full(len(view.k), lines)),
         view=named,
@@ -367,7 +411,9 @@ def _placement_of(view: ViewReadings, marks: np.ndarray, suffix: str) -> ViewRea
     )
 
 
-def likelier_term(measurements: Measurements, options: Options, slip: Slip) -> Cause | None:
+def likelier_term(
+    measurements: Measurements, options: Options, slip: Slip
+) -> Cause | None:
     """Return the term that explains the residuals better than a slip; None if the slip does.
 
     Raises
@@ -398,7 +444,13 @@ increases the residuals of its neighbours."""
 NAMED = 5
 """Number of outliers listed in their finding; ``extra["outliers"]`` has all."""
 
-LEFT = {"noisy_view", "too_many_outliers", "outliers_kept", "outliers_given_up", "slips_given_up"}
+LEFT = {
+    "noisy_view",
+    "too_many_outliers",
+    "outliers_kept",
+    "outliers_given_up",
+    "slips_given_up",
+}
 """Findings of faults that could not be corrected."""
 
 
@@ -453,11 +505,17 @@ def clean(measurements: Measurements, options: Options) -> OutlierScreening:
         datum_theta=ThetaDatum.ZERO_MEAN,
     )
     screened = _without_slips(measurements, options, linear)
-    outliers, residuals, stopped = _reject(screened.flattened, linear, screened.residuals)
-    removed = tuple(sorted(outliers.values(), key=lambda item: (item.kind, item.view, item.mark)))
+    outliers, residuals, stopped = _reject(
+        screened.flattened, linear, screened.residuals
+    )
+    removed = tuple(
+        sorted(outliers.values(), key=lambda item: (item.kind, item.view, item.mark))
+    )
     noisy = noisy_views(residuals, screened.measurements)
     findings = [*screened.notes, *_findings(removed, noisy, stopped)]
-    unchecked = int((np.isnan(residuals.marks.squares) & (residuals.marks.weight > 0)).sum())
+    unchecked = int(
+        (np.isnan(residuals.marks.squares) & (residuals.marks.weight > 0)).sum()
+    )
     return OutlierScreening(
         without(screened.measurements, outliers, mark=True),
         removed,
@@ -479,13 +537,17 @@ class _Screened:
     notes: tuple[Finding, ...] = ()
 
 
-def _without_slips(measurements: Measurements, options: Options, linear: Options) -> _Screened:
+def _without_slips(
+    measurements: Measurements, options: Options, linear: Options
+) -> _Screened:
     """Return the readings split at slips, minus terms that explain them better than a slip."""
     flattened = _flattened(measurements, options)
     screened = _Screened(measurements, flattened, residuals_of(flattened, linear))
     for _ in range(2 * MAX_CAUSES + 1):
         slip = find_slip(
-            screened.residuals, robust_sigma(screened.residuals.marks), screened.flattened
+            screened.residuals,
+            robust_sigma(screened.residuals.marks),
+            screened.flattened,
         )
         if slip is None:
             return screened
@@ -524,10 +586,15 @@ def _without_slips(measurements: Measurements, options: Options, linear: Options
             flattened = _flattened(screened.measurements, options)
         except (NotIdentifiableError, InputError):
             return screened
-        screened = replace(screened, flattened=flattened, residuals=residuals_of(flattened, linear))
+        screened = replace(
+            screened, flattened=flattened, residuals=residuals_of(flattened, linear)
+        )
     return replace(
         screened,
-        notes=(*screened.notes, Finding("slips_given_up", details={"slips": len(screened.slips)})),
+        notes=(
+            *screened.notes,
+            Finding("slips_given_up", details={"slips": len(screened.slips)}),
+        ),
     )
 
 
@@ -535,7 +602,11 @@ def _split(at: _Screened, slip: Slip, linear: Options) -> tuple[_Screened, bool]
     """Return the readings split at a slip, or without its view, and whether that was possible."""
 
     def split(readings: Measurements) -> Measurements:
-        return left_out(readings, slip.index) if slip.alternatives else split_view(readings, slip)
+        return (
+            left_out(readings, slip.index)
+            if slip.alternatives
+            else split_view(readings, slip)
+        )
 
     flattened = split(at.flattened)
     try:
@@ -558,7 +629,9 @@ def robust_sigma(readings: FitOfKind) -> float:
     squares = readings.squares[np.isfinite(readings.squares)]
     if not len(squares):
         return FLOOR
-    return max(float(np.sqrt(np.median(squares) / chdtri(readings.coordinates, 0.5))), FLOOR)
+    return max(
+        float(np.sqrt(np.median(squares) / chdtri(readings.coordinates, 0.5))), FLOOR
+    )
 
 
 def _reject(
@@ -595,7 +668,10 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
     problem = residuals.problem
     sites = problem.system.grid.views.site_index
     outliers: dict[Key, Removed] = {}
-    for readings, of_views in ((residuals.marks, problem.grid), (residuals.lines, problem.angular)):
+    for readings, of_views in (
+        (residuals.marks, problem.grid),
+        (residuals.lines, problem.angular),
+    ):
         ratio = np.nan_to_num(readings.squares, nan=0.0) / robust_sigma(readings) ** 2
         # by rounded ratios, so that equal ones keep the order of the readings
         order = np.argsort(-np.round(ratio.ravel(), 6), kind="stable")
@@ -609,7 +685,8 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
             grid = readings.kind == "grid"
             nodes = (("mark", at[1:]), ("site", int(sites[at]))) if grid else ("lines",)
             above = max(
-                (largest_of_node[node] for node in nodes if node in largest_of_node), default=0.0
+                (largest_of_node[node] for node in nodes if node in largest_of_node),
+                default=0.0,
             )
             if above > (1 + TRACE) * ratio[at]:
                 continue
@@ -630,7 +707,10 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
 
 
 def _restored(
-    measurements: Measurements, options: Options, outliers: dict[Key, Removed], residuals: Residuals
+    measurements: Measurements,
+    options: Options,
+    outliers: dict[Key, Removed],
+    residuals: Residuals,
 ) -> tuple[dict[Key, Removed], Residuals]:
     """Restore readings, one by one, that agree with the good ones.
 
@@ -649,7 +729,9 @@ def _restored(
         for restored in dict.fromkeys((frozenset([key]), frozenset(mates))):
             still_out = {k: v for k, v in outliers.items() if k not in restored}
             residuals_without = residuals_of(without(measurements, still_out), options)
-            if all(_agrees(residuals_without, restored_key) for restored_key in restored):
+            if all(
+                _agrees(residuals_without, restored_key) for restored_key in restored
+            ):
                 outliers, residuals = still_out, residuals_without
                 break
     return outliers, residuals
@@ -661,13 +743,21 @@ def _agrees(residuals: Residuals, key: Key) -> bool:
     problem = residuals.problem
     # NaN: a reading that cannot be checked does not agree
     if kind == "grid":
-        at = (problem.grid.index.index(index), *problem.system.grid.views.index_of(*mark))
+        at = (
+            problem.grid.index.index(index),
+            *problem.system.grid.views.index_of(*mark),
+        )
         return residuals.marks.p_outlier(at) >= residuals.level
-    return residuals.lines.p_outlier((problem.angular.index.index(index), *mark)) >= residuals.level
+    return (
+        residuals.lines.p_outlier((problem.angular.index.index(index), *mark))
+        >= residuals.level
+    )
 
 
 def _findings(
-    removed: tuple[Removed, ...], noisy: tuple[tuple[str, float], ...], stopped: Finding | None
+    removed: tuple[Removed, ...],
+    noisy: tuple[tuple[str, float], ...],
+    stopped: Finding | None,
 ) -> list[Finding]:
     out = (
         [
@@ -690,7 +780,9 @@ def _findings(
         if removed
         else []
     )
-    out += [Finding("noisy_view", ratio, unit="m/m", view=name) for name, ratio in noisy]
+    out += [
+        Finding("noisy_view", ratio, unit="m/m", view=name) for name, ratio in noisy
+    ]
     return out + ([stopped] if stopped else [])
 
 
@@ -735,5 +827,7 @@ def listed(cleaned: OutlierScreening) -> dict[str, Any]:
     return {
         "outliers": outliers,
         "slips": [asdict(item) for item in cleaned.slips],
-        "noisy_views": [{"view": name, "ratio": ratio} for name, ratio in cleaned.noisy],
+        "noisy_views": [
+            {"view": name, "ratio": ratio} for name, ratio in cleaned.noisy
+        ],
     }

@@ -35,13 +35,23 @@ from selfcal_ros.estimation.lattice.readings import (
 )
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.normal.angular import FLOOR, MAX_STEPS
-from selfcal_ros.estimation.normal.equations import FULL_SIZE, N_DRAWS, lines_of, noise_of
+from selfcal_ros.estimation.normal.equations import (
+    FULL_SIZE,
+    N_DRAWS,
+    lines_of,
+    noise_of,
+)
 from selfcal_ros.estimation.observability.plan_check import SEARCH_SIZE, candidate_views
 from selfcal_ros.estimation.observability.rank import identifies, smaller
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.columns import NO_LINES, term_columns
 from selfcal_ros.estimation.terms.places import places_of
-from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, term_inputs, time_ranges
+from selfcal_ros.estimation.terms.visits import (
+    TermInputs,
+    ViewVisits,
+    term_inputs,
+    time_ranges,
+)
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
 from selfcal_ros.model.readings import Measurements, subset
@@ -79,11 +89,16 @@ class HeldReadings:
     place_change: np.ndarray
 
 
-def held_readings(model: ModelFit, fitted: Measurements, held_out: Measurements) -> HeldReadings:
+def held_readings(
+    model: ModelFit, fitted: Measurements, held_out: Measurements
+) -> HeldReadings:
     """Return the grid readings `held_out` with the columns of the terms of the fit of `fitted`."""
     problem = model.problem
     grid = grid_data(held_out)
-    rows = tuple(problem.grid.index.index(i) if i in problem.grid.index else -1 for i in grid.index)
+    rows = tuple(
+        problem.grid.index.index(i) if i in problem.grid.index else -1
+        for i in grid.index
+    )
     inputs = term_inputs(held_out, grid, problem.half_width_m)
     places = places_of(held_out, grid, inputs, problem.system.known_sites)
     place_change: np.ndarray = np.zeros(grid.y.shape, dtype=complex)
@@ -99,13 +114,16 @@ def held_readings(model: ModelFit, fitted: Measurements, held_out: Measurements)
         inputs = _in_time_of(inputs, grid, fitted, held_out)
         columns = term_columns(inputs, problem.terms)
         row_of_column = {
-            (c.term, c.view, c.component): k for k, c in enumerate(equations.columns.columns)
+            (c.term, c.view, c.component): k
+            for k, c in enumerate(equations.columns.columns)
         }
         for column, block in zip(columns.columns, columns.grid, strict=True):
             if block_of(column.term).of_lines:
                 continue  # its views are those with lines, and no mark has a part of it
             shared = column.view == -1
-            row = -1 if shared else _fitted_row(problem.inputs, inputs, rows, column.view)
+            row = (
+                -1 if shared else _fitted_row(problem.inputs, inputs, rows, column.view)
+            )
             if row < 0 and not shared:
                 own_columns.append(
                     np.where(np.isfinite(column.size), column.size, 0.0) * block[None]
@@ -115,11 +133,17 @@ def held_readings(model: ModelFit, fitted: Measurements, held_out: Measurements)
     return HeldReadings(grid, of_terms, rows, np.concatenate(own_columns), place_change)
 
 
-def _fitted_row(fitted: TermInputs, held_out: TermInputs, rows: tuple[int, ...], first: int) -> int:
+def _fitted_row(
+    fitted: TermInputs, held_out: TermInputs, rows: tuple[int, ...], first: int
+) -> int:
     """Return the first view of a placing in the fit; -1 if no view of it was fitted."""
     fitted_rows = [rows[view] for view in held_out.members[first] if rows[view] >= 0]
     return (
-        next(first for first, members in fitted.members.items() if fitted_rows[0] in members)
+        next(
+            first
+            for first, members in fitted.members.items()
+            if fitted_rows[0] in members
+        )
         if fitted_rows
         else -1
     )
@@ -153,7 +177,9 @@ def prediction_errors(solved: Solved, held_out: HeldReadings) -> np.ndarray:
     problem = model.problem
     system = model.problem.system
     views = maps_of(held_out.grid)
-    predictable = (held_out.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
+    predictable = (
+        (held_out.grid.weight > 0) & views.near(system.known_sites) & system.known_marks
+    )
     plate = model.fitted.plate
     marks = views.z * problem.half_width_m
     error = (
@@ -161,7 +187,9 @@ def prediction_errors(solved: Solved, held_out: HeldReadings) -> np.ndarray:
         - held_out.place_change
         - np.tensordot(model.coefficients, held_out.columns, axes=1)
     )
-    error = np.where(predictable, error - views.gather(model.fitted.field) - plate, complex(np.nan))
+    error = np.where(
+        predictable, error - views.gather(model.fitted.field) - plate, complex(np.nan)
+    )
     for error_of_view, predictable_marks, index, pose in zip(
         error, predictable, held_out.grid.index, held_out.grid.poses, strict=True
     ):
@@ -207,13 +235,17 @@ def line_errors(solved: Solved, held_out: AngularData) -> np.ndarray:
     joint_fit = model.fitted
     fitted = model.problem.angular.index
     field = np.where(system.known_lines, joint_fit.g_theta, np.nan)
-    plate = np.where((held_out.weight > 0) & system.known_plate_lines, joint_fit.a_theta, np.nan)
+    plate = np.where(
+        (held_out.weight > 0) & system.known_plate_lines, joint_fit.a_theta, np.nan
+    )
     lines = lines_of(held_out)
     error = held_out.y - lines.gather(field) - plate
     terms = NO_LINES if model.equations is None else model.equations.columns.lines
     for error_of_view, index in zip(error, held_out.index, strict=True):
         if index in fitted and len(terms.at):
-            error_of_view -= model.coefficients[terms.at] @ terms.values[:, fitted.index(index)]
+            error_of_view -= (
+                model.coefficients[terms.at] @ terms.values[:, fitted.index(index)]
+            )
         phi = solved.result.views[index].phi
         if not np.isfinite(phi) and np.isfinite(error_of_view).any():
             phi = np.nanmean(error_of_view)
@@ -285,7 +317,9 @@ def prediction_limit(
                     views.z[predictable_marks], error_of_view[predictable_marks]
                 )
                 error_of_view -= 1j * phi * views.z + tau
-        squares[draw] = (weight * abs(error) ** 2)[predictable].sum() / (2 * predictable.sum())
+        squares[draw] = (weight * abs(error) ** 2)[predictable].sum() / (
+            2 * predictable.sum()
+        )
     mean = float(squares.mean())
     return PredictionLimit(mean, 2 * mean**2 / float(squares.var(ddof=1)))
 
@@ -317,7 +351,9 @@ def _fitted(
     within = vectors * np.sqrt(np.maximum(values, 0.0))
     right += within @ rng.standard_normal((now.n, len(noise)))
     feigned = np.sqrt(now.position_noise)[:, None]
-    right = now.unbiased_sums(right + feigned * rng.standard_normal((now.n, len(noise))))
+    right = now.unbiased_sums(
+        right + feigned * rng.standard_normal((now.n, len(noise)))
+    )
     # a term with a size is not 0: its estimate minus its value is drawn
     prior = np.where(now.free, 0.0, joint_fit.xy.sigma / now.columns.size)
     right -= prior[:, None] * rng.standard_normal((now.n, len(noise)))
@@ -331,7 +367,9 @@ def _fitted(
 
 def fitted_misalignment(marks: np.ndarray, errors: np.ndarray) -> tuple[float, complex]:
     """Return phi and tau that fit errors, complex (P,), at marks (P,) best."""
-    columns = np.stack([1j * marks, np.ones_like(marks), np.full_like(marks, 1j)], axis=1)
+    columns = np.stack(
+        [1j * marks, np.ones_like(marks), np.full_like(marks, 1j)], axis=1
+    )
     rows = np.concatenate([columns.real, columns.imag])
     scale = np.linalg.norm(rows, axis=0)
     values = np.concatenate([errors.real, errors.imag])
@@ -384,7 +422,9 @@ class HeldOut:
 
 
 @one_thread()
-def validate(measurements: Measurements, options: Options, *, folds: int = 3) -> list[HeldOut]:
+def validate(
+    measurements: Measurements, options: Options, *, folds: int = 3
+) -> list[HeldOut]:
     """Hold out random tenths and whole views in turn, and predict them.
 
     Parameters
@@ -402,14 +442,18 @@ def validate(measurements: Measurements, options: Options, *, folds: int = 3) ->
         As `calibrate`, for all readings.
     """
     # a pure datum: half axes that lose a mark would not do for xy_axes
-    options = replace(options, uncertainty=False, causes=False, datum_theta=ThetaDatum.ZERO_MEAN)
+    options = replace(
+        options, uncertainty=False, causes=False, datum_theta=ThetaDatum.ZERO_MEAN
+    )
     fit_joint(measurements, options)  # refuses what cannot be solved as a whole
     rng = np.random.default_rng(0)
     group = []
     for view in measurements.views:
         # drawn in the order of the lattice: the order of the readings changes nothing
         ranks = (np.lexsort((view.n, view.m)).argsort(), np.argsort(view.k).argsort())
-        group.append(tuple((rng.permutation(len(rank)) % TENTHS)[rank] for rank in ranks))
+        group.append(
+            tuple((rng.permutation(len(rank)) % TENTHS)[rank] for rank in ranks)
+        )
     out = []
     for fold in range(folds):
         chosen = [(grid == fold, lines == fold) for grid, lines in group]
@@ -419,12 +463,16 @@ def validate(measurements: Measurements, options: Options, *, folds: int = 3) ->
             (np.full(len(v.m), i == index), np.full(len(v.k), i == index))
             for i, v in enumerate(measurements.views)
         ]
-        out.append(replace(_held_out(measurements, options, chosen), view=view.view.name))
+        out.append(
+            replace(_held_out(measurements, options, chosen), view=view.view.name)
+        )
     return out
 
 
 def _held_out(
-    measurements: Measurements, options: Options, chosen: list[tuple[np.ndarray, np.ndarray]]
+    measurements: Measurements,
+    options: Options,
+    chosen: list[tuple[np.ndarray, np.ndarray]],
 ) -> HeldOut:
     """Calibrate without the chosen readings, and predict them."""
     fitted, held_out = (
@@ -451,7 +499,9 @@ def _held_out(
     lines_off = angles[np.isfinite(angles)]
     if not coordinates.size and not lines_off.size:
         return HeldOut(why=Finding("nothing_to_predict"))
-    ratio, limit, why = _ratio_and_limit(solved, predicted, predictable=predictable, error=error)
+    ratio, limit, why = _ratio_and_limit(
+        solved, predicted, predictable=predictable, error=error
+    )
     return HeldOut(
         "",
         0,
@@ -467,7 +517,11 @@ def _held_out(
 
 
 def _ratio_and_limit(
-    solved: Solved, held_out: HeldReadings, *, predictable: np.ndarray, error: np.ndarray
+    solved: Solved,
+    held_out: HeldReadings,
+    *,
+    predictable: np.ndarray,
+    error: np.ndarray,
 ) -> tuple[float, float, Finding | None]:
     """Return error over noise, its limit, and why there is no limit."""
     noise = solved.result.noise
@@ -475,19 +529,33 @@ def _ratio_and_limit(
     if not predictable.any():
         return NOTHING, NOTHING, None
     weight = held_out.grid.weight
-    if np.isfinite(held_out.grid.sigma_declared) and np.isfinite(noise.sigma_xy_declared):
+    if np.isfinite(held_out.grid.sigma_declared) and np.isfinite(
+        noise.sigma_xy_declared
+    ):
         # each is relative to what its own detections declare on average
         weight = weight * (noise.sigma_xy_declared / held_out.grid.sigma_declared) ** 2
-    square = float((weight * abs(error) ** 2)[predictable].sum()) / (2 * int(predictable.sum()))
+    square = float((weight * abs(error) ** 2)[predictable].sum()) / (
+        2 * int(predictable.sum())
+    )
     ratio = float(np.sqrt(square)) / max(noise.sigma_xy, 1e-300)
     own_terms = [
-        str(term.name) for term in model.problem.terms if term.free and term.block.by_placing
+        str(term.name)
+        for term in model.problem.terms
+        if term.free and term.block.by_placing
     ]
     if own_terms and -1 in held_out.rows:
-        return ratio, NOTHING, Finding("own_terms_unknown", details={"terms": own_terms})
+        return (
+            ratio,
+            NOTHING,
+            Finding("own_terms_unknown", details={"terms": own_terms}),
+        )
     if not (noise.sigma_xy > FLOOR and noise.dof_xy > 0):
         return ratio, NOTHING, None
-    return ratio, prediction_limit(model, held_out, predictable, weight).ratio(noise.dof_xy), None
+    return (
+        ratio,
+        prediction_limit(model, held_out, predictable, weight).ratio(noise.dof_xy),
+        None,
+    )
 
 
 def _rest_not_identified(fitted: Measurements, held_out: Measurements) -> Finding:
@@ -498,12 +566,16 @@ def _rest_not_identified(fitted: Measurements, held_out: Measurements) -> Findin
         if len(v.m) or len(v.k)
     )
     poses_held_out = {
-        pose_of(v.view, held_out.artifact) for v in held_out.views if len(v.m) or len(v.k)
+        pose_of(v.view, held_out.artifact)
+        for v in held_out.views
+        if len(v.m) or len(v.k)
     }
     plan = Plan("", fitted.artifact, views)
     if max(fitted.artifact.shape) > FULL_SIZE and views:
         plan = smaller(plan, SEARCH_SIZE)
-    for more in candidate_views(plan.artifact, angular=any(view.angular for view in views)):
+    for more in candidate_views(
+        plan.artifact, angular=any(view.angular for view in views)
+    ):
         if pose_of(more, plan.artifact) not in poses_held_out and identifies(
             plan.artifact, (*plan.views, more)
         ):
@@ -522,7 +594,9 @@ def _rest_not_identified(fitted: Measurements, held_out: Measurements) -> Findin
     return Finding("rest_not_identified")
 
 
-def judged_by(result: CalibrationResult, predictions: list[HeldOut]) -> CalibrationResult:
+def judged_by(
+    result: CalibrationResult, predictions: list[HeldOut]
+) -> CalibrationResult:
     """Return the result, disqualified if a prediction error exceeds its limit."""
     failed = tuple(
         Finding(
@@ -540,5 +614,7 @@ def judged_by(result: CalibrationResult, predictions: list[HeldOut]) -> Calibrat
     verdict = result.verdict
     return replace(
         result,
-        verdict=replace(verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *failed)),
+        verdict=replace(
+            verdict, grade=Grade.NOT_QUALIFIED, failed=(*verdict.failed, *failed)
+        ),
     )

@@ -66,7 +66,12 @@ class ChangeTests(ReducedNoise):
         """Orthonormal polynomials of both coordinates that are free from `removed`, (2n, k)."""
         z = self.places / np.abs(self.places).max()
         columns = np.stack(
-            [z.real**i * z.imag**j for i in range(ORDER + 1) for j in range(ORDER + 1 - i)], axis=1
+            [
+                z.real**i * z.imag**j
+                for i in range(ORDER + 1)
+                for j in range(ORDER + 1 - i)
+            ],
+            axis=1,
         )
         basis, size, _ = np.linalg.svd(
             self.without(np.kron(np.eye(2), columns)), full_matrices=False
@@ -117,7 +122,11 @@ class ChangeTests(ReducedNoise):
     def _bound(self, values: np.ndarray, of_change: np.ndarray) -> float:
         """Return a bound of the probability (Bonferroni)."""
         probabilities = [
-            float(2 * len(self.u) * stdtr(min(self.dof, MANY_DOF), -np.abs(values / self.u).max())),
+            float(
+                2
+                * len(self.u)
+                * stdtr(min(self.dof, MANY_DOF), -np.abs(values / self.u).max())
+            ),
             of_square(of_change[0], self.rank, self.dof),
             of_square(of_change[2], self._smooth.shape[1], self.dof),
         ]
@@ -138,11 +147,19 @@ class ChangeTests(ReducedNoise):
         nodes = rng.integers(n, size=len(number))
         turn = 2 * np.pi * rng.random(len(number))
         at_one_node = np.zeros(noise.shape)
-        at_one_node[nodes, number], at_one_node[nodes + n, number] = np.cos(turn), np.sin(turn)
-        smooth = self._smooth @ rng.standard_normal((self._smooth.shape[1], len(number)))
+        at_one_node[nodes, number], at_one_node[nodes + n, number] = (
+            np.cos(turn),
+            np.sin(turn),
+        )
+        smooth = self._smooth @ rng.standard_normal(
+            (self._smooth.shape[1], len(number))
+        )
         smooth /= np.sqrt((smooth**2).mean(axis=0))
         return Detectable(
-            *(self._size(self.without(shape), noise, limits) for shape in (at_one_node, smooth))
+            *(
+                self._size(self.without(shape), noise, limits)
+                for shape in (at_one_node, smooth)
+            )
         )
 
     def _size(self, shape: np.ndarray, noise: np.ndarray, limits: np.ndarray) -> float:
@@ -376,7 +393,12 @@ def line_change(new: NewMap, plate: KnownPlate) -> Change:
     values = values - values.mean()
     out[:, common] = values, np.sqrt(np.maximum(spread.variance, 0.0))
     test = significance(values, spread)
-    return Change(out[0], out[1], test, 1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0))
+    return Change(
+        out[0],
+        out[1],
+        test,
+        1.0 if test is None else min(2 * test.p, 2 * test.p_z, 1.0),
+    )
 
 
 def scale_row(modes: np.ndarray) -> np.ndarray:
@@ -392,7 +414,10 @@ def _on_nodes(artifact: Artifact, plate: KnownPlate) -> tuple[np.ndarray, np.nda
     """
     known_sites = plate.together.sites.ravel()
     old = plate.result.artifact
-    if artifact.shape == old.shape and abs(artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP:
+    if (
+        artifact.shape == old.shape
+        and abs(artifact.grid_pitch_m / old.grid_pitch_m - 1) < GAP
+    ):
         return np.eye(len(known_sites))[:, known_sites], known_sites
     return rows_at((artifact.x_m + 1j * artifact.y_m).ravel(), plate)
 
@@ -415,7 +440,9 @@ def recheck_found(
     )
     tested = [of_map.p for of_map in (change, lines) if of_map.test is not None]
     p = min(len(tested) * min(tested), 1.0) if tested else float("nan")
-    scale = ScaleChange(change.p_scale < USUAL_LEVEL, change.scale, change.u_scale, change.p_scale)
+    scale = ScaleChange(
+        change.p_scale < USUAL_LEVEL, change.scale, change.u_scale, change.p_scale
+    )
     (dx, dy), (u_dx, u_dy) = change.values, change.u
     outcome = Recheck(
         plate.where,
@@ -435,7 +462,9 @@ def recheck_found(
         passes=passes,
     )
     if change.tests is not None:
-        outcome = replace(outcome, detectable=change.tests.detectable(USUAL_LEVEL / len(tested)))
+        outcome = replace(
+            outcome, detectable=change.tests.detectable(USUAL_LEVEL / len(tested))
+        )
     if lines.test is None:
         return outcome
     (line,) = lines.worst
@@ -445,7 +474,9 @@ def recheck_found(
         significance_theta=lines.test,
         d_theta=lines.values,
         u_d_theta=lines.u,
-        largest_theta=LargestTurn(line, float(lines.values[line]), float(lines.u[line])),
+        largest_theta=LargestTurn(
+            line, float(lines.values[line]), float(lines.u[line])
+        ),
     )
 
 

@@ -105,7 +105,10 @@ class KnownPlate:
             return 0.0
         u_kelvin = np.hypot(now.u_temperature_k, then.u_temperature_k)
         warmer = now.temperature_c - then.temperature_c
-        return float((now.expansion_per_k * u_kelvin) ** 2 + (warmer * now.u_expansion_per_k) ** 2)
+        return float(
+            (now.expansion_per_k * u_kelvin) ** 2
+            + (warmer * now.u_expansion_per_k) ** 2
+        )
 
     def length_at(self, marks: np.ndarray) -> np.ndarray:
         """Return what a relative expansion of 1 adds to Ax, Ay of marks, and to the microscope.
@@ -125,11 +128,16 @@ class KnownPlate:
             for estimate in term.estimates
         }
         return np.array(
-            [values.get(component, 0.0 if values else np.nan) for component in MICROSCOPE_PARTS]
+            [
+                values.get(component, 0.0 if values else np.nan)
+                for component in MICROSCOPE_PARTS
+            ]
         )
 
 
-def reference_now(result: CalibrationResult, where: str, at: str) -> ReferenceLength | None:
+def reference_now(
+    result: CalibrationResult, where: str, at: str
+) -> ReferenceLength | None:
     """Return the reference length of a calibration at the temperature of its plate now.
 
     Parameters
@@ -199,7 +207,9 @@ def known_plate(result: CalibrationResult, where: str, at: str = "") -> KnownPla
             f"name the calibration that it used, {result.recheck.of}",
         )
     if not result.observability.identifiable or not result.verdict.qualified:
-        raise InputError(where, "is not qualified, so its plate is not known", "calibrate again")
+        raise InputError(
+            where, "is not qualified, so its plate is not known", "calibrate again"
+        )
     covariances = together(result)
     if covariances is None:
         raise InputError(
@@ -317,15 +327,17 @@ class _ReadMarks:
             remaining = (
                 differences[readable]
                 - free
-                @ np.linalg.lstsq(weight * free, weight[:, 0] * differences[readable], rcond=None)[
-                    0
-                ]
+                @ np.linalg.lstsq(
+                    weight * free, weight[:, 0] * differences[readable], rcond=None
+                )[0]
             )
             weight = np.maximum(abs(remaining), self.u)[:, None] ** -0.5
         return remaining, readable
 
 
-def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> Finding | None:
+def check_plate(
+    measurements: Measurements, plate: KnownPlate, sigma: float
+) -> Finding | None:
     """Return a finding if another plate was read, or one whose marks have changed.
 
     Of images by the marks on the optical axis.
@@ -345,7 +357,9 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
         If the plate is not placed as planned.
     """
     for view in (
-        readings for readings in measurements.views if readings.view.cell in (None, (0, 0))
+        readings
+        for readings in measurements.views
+        if readings.view.cell in (None, (0, 0))
     ):
         read_marks = _read(view, measurements, plate, sigma)
         planned = (
@@ -361,7 +375,8 @@ def check_plate(measurements: Measurements, plate: KnownPlate, sigma: float) -> 
         other_pose = _other_pose(read_marks, plate.field, measurements.artifact)
         if other_pose is not None:
             raise placing_error(
-                _misplaced(view, read_marks, other_pose), f"plan '{measurements.plan_id}', "
+                _misplaced(view, read_marks, other_pose),
+                f"plan '{measurements.plan_id}', ",
             )
         if _of_marks(read_marks.marks[readable], remaining, read_marks.u):
             return Finding(
@@ -395,7 +410,9 @@ def _read(
         rms(np.stack([marks.u_ax, marks.u_ay])),
         LEAST * rms(np.stack([marks.ax, marks.ay])),
     ]
-    offsets = np.where(stage_known, view.dx + 1j * view.dy - stage, complex(np.nan, np.nan))
+    offsets = np.where(
+        stage_known, view.dx + 1j * view.dy - stage, complex(np.nan, np.nan)
+    )
     x, y = artifact.places(view.m, view.n)
     return _ReadMarks(
         x + 1j * y,
@@ -417,11 +434,14 @@ def _other_pose(
     tried = []
     for pose in motions(artifact, read_marks.turn, read_marks.shift):
         at_pose, planned = (
-            read_marks.remaining_at(plate, artifact, tried_pose) for tried_pose in (pose, PLANNED)
+            read_marks.remaining_at(plate, artifact, tried_pose)
+            for tried_pose in (pose, PLANNED)
         )
         if at_pose is None or planned is None:
             continue
-        before, after = (max(_size(remaining), read_marks.u) for remaining, _ in (planned, at_pose))
+        before, after = (
+            max(_size(remaining), read_marks.u) for remaining, _ in (planned, at_pose)
+        )
         if before**2 > CONTRADICTED * after**2:
             tried.append((2 * len(at_pose[0]) * float(np.log(before / after)), pose))
     tried.sort(key=lambda item: -item[0])
@@ -465,7 +485,9 @@ def _of_marks(marks: np.ndarray, remaining: np.ndarray, u: float) -> bool:
     Single marks that are far off count as far off as others.
     """
     away = np.abs(marks[:, None] - marks)
-    remaining = remaining / np.maximum(np.abs(remaining) / (BEYOND * _size(remaining)), 1.0)
+    remaining = remaining / np.maximum(
+        np.abs(remaining) / (BEYOND * _size(remaining)), 1.0
+    )
     best = {True: -math.inf, False: -math.inf}
     length = 1.0
     while length < 2 * away.max():
@@ -473,7 +495,9 @@ def _of_marks(marks: np.ndarray, remaining: np.ndarray, u: float) -> bool:
         power = np.abs(axes.T @ remaining) ** 2
         for own_variance in 2.0 ** np.arange(-20, 20):
             variance = np.mean(power / (alike + own_variance)) / 2
-            likelihood = -len(remaining) * np.log(variance) - np.log(alike + own_variance).sum()
+            likelihood = (
+                -len(remaining) * np.log(variance) - np.log(alike + own_variance).sum()
+            )
             differs = bool(own_variance * variance > CONTRADICTED * u**2)
             best[differs] = max(best[differs], float(likelihood))
         length *= 2

@@ -12,7 +12,11 @@ import numpy as np
 
 from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.estimation.comparison.covariance import dof_of_marks, kept_covariances, share_of
+from selfcal_ros.estimation.comparison.covariance import (
+    dof_of_marks,
+    kept_covariances,
+    share_of,
+)
 from selfcal_ros.estimation.comparison.maps import USUAL_LEVEL, joint_dof, of_square
 from selfcal_ros.estimation.joint.images import marks_of_image, stops_of
 from selfcal_ros.estimation.joint.problem import (
@@ -67,12 +71,25 @@ from selfcal_ros.estimation.terms.visits import term_inputs, without_noise
 from selfcal_ros.estimation.verdict.judge import provenance_of, views_findings
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION, budget_lines
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, datum_modes, first_order, rms
+from selfcal_ros.model.error_map import (
+    ErrorMap,
+    ThetaDatum,
+    datum_modes,
+    first_order,
+    rms,
+)
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, block_of_offsets
-from selfcal_ros.model.verdict import BudgetLine, Finding, Grade, ModelResult, TermResult, Verdict
+from selfcal_ros.model.verdict import (
+    BudgetLine,
+    Finding,
+    Grade,
+    ModelResult,
+    TermResult,
+    Verdict,
+)
 from selfcal_ros.model.view import Plan, cells_seen
 
 
@@ -128,7 +145,10 @@ class Rechecked:
     @cached_property
     def variances(self) -> dict[str, np.ndarray]:
         """Variances of this map by their sources, (q,) each, m^2."""
-        return {name: np.maximum(cover.diagonal(), 0.0) for name, cover in self.covariances.items()}
+        return {
+            name: np.maximum(cover.diagonal(), 0.0)
+            for name, cover in self.covariances.items()
+        }
 
     @property
     def of_lines(self) -> np.ndarray:
@@ -148,10 +168,14 @@ class Rechecked:
             self.lines.on_whole_map(values) for values in (self.lines.values, u_theta)
         )
         o, r = first_order(artifact, np.stack([gx, gy]))
-        return ErrorMap(artifact, gx, gy, u_x, u_y, theta, u_theta, o, r, ThetaDatum.ZERO_MEAN)
+        return ErrorMap(
+            artifact, gx, gy, u_x, u_y, theta, u_theta, o, r, ThetaDatum.ZERO_MEAN
+        )
 
 
-def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) -> Rechecked:
+def recheck_of(
+    measurements: Measurements, options: Options, plate: KnownPlate
+) -> Rechecked:
     """Return the parts from which `recheck` assembles its result."""
     if options.reference is not None:
         raise InputError(
@@ -168,11 +192,17 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
             measurements, views=tuple(map(microscope.corrected, measurements.views))
         )
         problem = replace(
-            _problem(measurements, options, plate), repeats_xy=(min(sigma, microscope.sigma), dof)
+            _problem(measurements, options, plate),
+            repeats_xy=(min(sigma, microscope.sigma), dof),
         )
     xy, theta = _noise(measurements, problem, plate)
     readings = _readings(
-        measurements, problem, options, plate=plate, sigma=xy.sigma, microscope=microscope
+        measurements,
+        problem,
+        options,
+        plate=plate,
+        sigma=xy.sigma,
+        microscope=microscope,
     )
     solution = solve_marks(readings)
     return Rechecked(
@@ -189,7 +219,9 @@ def recheck_of(measurements: Measurements, options: Options, plate: KnownPlate) 
 
 
 @one_thread()
-def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> CalibrationResult:
+def recheck(
+    measurements: Measurements, options: Options, plate: KnownPlate
+) -> CalibrationResult:
     """Return the map of the stage from views of a known plate, and what has changed.
 
     Parameters
@@ -211,7 +243,10 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
     readings = solved.readings
     solution = solved.solution
     problem = solved.readings.problem
-    covers = {"xy": np.sum(list(solved.covariances.values()), axis=0), "theta": solved.of_lines}
+    covers = {
+        "xy": np.sum(list(solved.covariances.values()), axis=0),
+        "theta": solved.of_lines,
+    }
     change = map_change(solved.new, solved.artifact, plate)
     outcome = recheck_found(
         change,
@@ -233,14 +268,23 @@ def recheck(measurements: Measurements, options: Options, plate: KnownPlate) -> 
             dof_of_marks(plate.result) if measurements.has_images else solved.xy.dof,
         )
     )
-    if not failed and outcome.changed and outcome.passes == 1 and "drift" not in declared:
+    if (
+        not failed
+        and outcome.changed
+        and outcome.passes == 1
+        and "drift" not in declared
+    ):
         failed = (replace(changes[0], name="changed_or_drifted"),)
     if outcome.changed:
         failed += _by_microscope(solved, outcome, changes[0])
     unknowns = 2 * int(readings.known.sum()) + problem.system.grid.n_misalignments
     terms = tuple(
         TermResult(
-            str(term.name), term.size, (), None, "declared" if term.name in declared else "default"
+            str(term.name),
+            term.size,
+            (),
+            None,
+            "declared" if term.name in declared else "default",
         )
         for term in problem.terms
     )
@@ -290,13 +334,18 @@ def _findings(outcome: Recheck) -> tuple[Finding, ...]:
             ),
         )
     if scale.changed:
-        out += (Finding("scale_changed", scale.change, scale.u, "m/m", scale.p, details=of),)
+        out += (
+            Finding("scale_changed", scale.change, scale.u, "m/m", scale.p, details=of),
+        )
     return out
 
 
 def _off(solved: Rechecked) -> tuple[Finding, ...]:
     """Return a finding if visits show another microscope than is assumed."""
-    term = next((term for term in solved.readings.problem.terms if term.block.of_microscope), None)
+    term = next(
+        (term for term in solved.readings.problem.terms if term.block.of_microscope),
+        None,
+    )
     if solved.microscope is None or term is None:
         return ()
     values = solved.microscope.values
@@ -323,7 +372,9 @@ SAME_VARIANCE = 1e-6
 """Relative change of a variance at which its estimate ends."""
 
 
-def _by_microscope(solved: Rechecked, outcome: Recheck, changed: Finding) -> tuple[Finding, ...]:
+def _by_microscope(
+    solved: Rechecked, outcome: Recheck, changed: Finding
+) -> tuple[Finding, ...]:
     """Return a finding if another microscope explains a change as well as a changed stage does.
 
     Its scale and its turn may be any, if neither visits of one mark at several places nor the model
@@ -342,7 +393,10 @@ def _by_microscope(solved: Rechecked, outcome: Recheck, changed: Finding) -> tup
     if not rows or of_lines or readings.shows_microscope:
         return ()
     explained_by = change_by_effects(solved.new, solved.artifact, solved.plate, rows)
-    if min(explained_by.p_left, 1.0) < USUAL_LEVEL or explained_by.p_none >= USUAL_LEVEL:
+    if (
+        min(explained_by.p_left, 1.0) < USUAL_LEVEL
+        or explained_by.p_none >= USUAL_LEVEL
+    ):
         return ()
     scale, turn = readings.effects.mean[rows] + explained_by.values
     u_scale, u_turn = explained_by.u
@@ -361,7 +415,9 @@ def _by_microscope(solved: Rechecked, outcome: Recheck, changed: Finding) -> tup
     )
 
 
-def _problem(measurements: Measurements, options: Options, plate: KnownPlate) -> Problem:
+def _problem(
+    measurements: Measurements, options: Options, plate: KnownPlate
+) -> Problem:
     """Return the problem that the readings of known marks pose."""
     grid, angular = grid_data(measurements), angular_data(measurements)
     grid = replace(grid, weight=np.where(plate.together.marks, grid.weight, 0.0))
@@ -371,11 +427,15 @@ def _problem(measurements: Measurements, options: Options, plate: KnownPlate) ->
             "no known mark was read",
             "record detections of the marks of the plate",
         )
-    system = system_of(replace(grid, known_plate=True), Marks((), angular.weight[:0], ()))
+    system = system_of(
+        replace(grid, known_plate=True), Marks((), angular.weight[:0], ())
+    )
     length = measurements.artifact.grid_pitch_m * max(measurements.artifact.reach)
     inputs = term_inputs(measurements, grid, length, drift_degree=options.drift_degree)
     terms = _terms(options, visits=all(v is not None for v in inputs.visits))
-    return problem_of(measurements, options, system, inputs, readings=(grid, angular), terms=terms)
+    return problem_of(
+        measurements, options, system, inputs, readings=(grid, angular), terms=terms
+    )
 
 
 def _readings(
@@ -420,12 +480,16 @@ def _readings(
         dtype=int,
     )
     source = np.where(
-        columns.rows([PLATE]) | known_offsets, PLATE, np.where(columns.rows([NOISE]), NOISE, TERMS)
+        columns.rows([PLATE]) | known_offsets,
+        PLATE,
+        np.where(columns.rows([NOISE]), NOISE, TERMS),
     )
     start = 2 * int(sites.sum())
     end = 2 * int(sites.sum() + marks.sum())
     of_plate_and_offsets = np.append(np.arange(end), end + components)
-    before = plate.together.cover(sites, marks)[np.ix_(of_plate_and_offsets, of_plate_and_offsets)]
+    before = plate.together.cover(sites, marks)[
+        np.ix_(of_plate_and_offsets, of_plate_and_offsets)
+    ]
     now = plate.field[marks]
     effects = Effects.of(
         source,
@@ -475,17 +539,22 @@ class SeenMicroscope:
             return view
         scale, turn, stretch, shear = self.values
         offset = visits.offset_x + 1j * visits.offset_y
-        missing = complex(scale, turn) * offset + complex(stretch, shear) * offset.conj()
+        missing = (
+            complex(scale, turn) * offset + complex(stretch, shear) * offset.conj()
+        )
         number = np.bincount(visits.mark, visits.count, len(view.m))
         dx, dy = (
-            np.bincount(visits.mark, visits.count * coordinate, len(view.m)) / np.maximum(number, 1)
+            np.bincount(visits.mark, visits.count * coordinate, len(view.m))
+            / np.maximum(number, 1)
             for coordinate in (missing.real, missing.imag)
         )
         return replace(
             view,
             dx=view.dx + dx,
             dy=view.dy + dy,
-            visits=replace(visits, dx=visits.dx + missing.real, dy=visits.dy + missing.imag),
+            visits=replace(
+                visits, dx=visits.dx + missing.real, dy=visits.dy + missing.imag
+            ),
         )
 
 
@@ -496,20 +565,26 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
     of the motion. What other terms make of the visits is fitted beside it. None if the visits do
     not tell its scale and turn well.
     """
-    builder = ColumnBuilder(without_noise(problem.inputs, np.zeros(problem.grid.y.shape)))
+    builder = ColumnBuilder(
+        without_noise(problem.inputs, np.zeros(problem.grid.y.shape))
+    )
     builder.add_terms(problem.terms)
     columns = builder.build()
     of_offsets = columns.having(lambda block: block.of_microscope)
     within = columns.within
     if not of_offsets.any() or not within.dof:
         return None
-    free = np.array([column.component in SIMILAR for column in columns.columns]) & of_offsets
+    free = (
+        np.array([column.component in SIMILAR for column in columns.columns])
+        & of_offsets
+    )
     size = np.where(free, ANY, columns.size)
 
     fitted_values = np.zeros(len(size))
     covariance = np.diag(size**2)
     variance = within.total / within.dof
-    for _ in range(MAX_STEPS):  # the scatter that is left weighs the visits against the sizes
+    # the scatter that is left weighs the visits against the sizes
+    for _ in range(MAX_STEPS):
         if not variance > FLOOR**2:
             return None
         covariance = np.linalg.inv(np.diag(size**-2) + within.gram / variance)
@@ -549,9 +624,14 @@ def _columns(problem: Problem, of_mark: np.ndarray, of_stop: np.ndarray) -> Term
 
     The latter for offsets as they were seen.
     """
-    builder = ColumnBuilder(without_noise(problem.inputs, np.zeros(problem.grid.y.shape)))
+    builder = ColumnBuilder(
+        without_noise(problem.inputs, np.zeros(problem.grid.y.shape))
+    )
     for name, shapes in ((PLATE, of_mark), (NOISE, of_stop)):
-        numbers = [builder.add(dict(enumerate(shape.reshape(len(shape), -1)))) for shape in shapes]
+        numbers = [
+            builder.add(dict(enumerate(shape.reshape(len(shape), -1))))
+            for shape in shapes
+        ]
         for axis, unit in AXES:
             for number in numbers:
                 builder.column(Column(name, SHARED, axis, 1.0), number, unit)
@@ -564,7 +644,8 @@ def _stops(measurements: Measurements, problem: Problem) -> np.ndarray:
     read = problem.system.grid.read
     out = np.full(read.shape, -1)
     cells = cells_seen(
-        measurements.artifact, [measurements.views[index].view for index in problem.grid.index]
+        measurements.artifact,
+        [measurements.views[index].view for index in problem.grid.index],
     )
     if cells is not None:
         out[read] = stops_of(cells, read)
@@ -612,19 +693,25 @@ def _noise(
         noise = noise_estimate(repeats, (nan, 0), declared)
         if not (noise.sigma > FLOOR and noise.dof >= MIN_REPEAT_DOF):
             noise = replace(
-                noise, sigma=getattr(before, f"sigma_{kind}"), dof=getattr(before, f"dof_{kind}")
+                noise,
+                sigma=getattr(before, f"sigma_{kind}"),
+                dof=getattr(before, f"dof_{kind}"),
             )
         out.append(noise)
     return out[0], out[1]
 
 
-def _new_lines(readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate) -> NewMap:
+def _new_lines(
+    readings: PlateReadings, plate: KnownPlate, theta: NoiseEstimate
+) -> NewMap:
     """Return the angular map, stage frame; nothing is known where no known line was read."""
     angular, of_terms = readings.problem.angular, readings.columns.lines
     (_, known_lines), before = plate.together.lines()
     count = len(known_lines)
     lines = lines_of(
-        replace(angular, weight=np.where(known_lines, angular.weight, 0.0), known_plate=True)
+        replace(
+            angular, weight=np.where(known_lines, angular.weight, 0.0), known_plate=True
+        )
     )
     if lines.n_readings:
         _require_noise(theta.sigma)
@@ -663,7 +750,9 @@ def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
     return (Finding("plate_misfit", ratio, unit="m/m", p=p),)
 
 
-def _with_coverage(noise: Noise, variances: dict[str, np.ndarray], plate: KnownPlate) -> Noise:
+def _with_coverage(
+    noise: Noise, variances: dict[str, np.ndarray], plate: KnownPlate
+) -> Noise:
     """Return the noise with degrees of freedom and k of the map's uncertainty."""
     before = plate.result.noise
     dof = joint_dof(
@@ -705,7 +794,13 @@ def _budget(
             plate.result.noise.dof_of("xy"),
             "declared",
         ),
-        TEMPERATURE: ("B", float(np.sqrt(plate.variance_of_length)), "m/m", inf, "declared"),
+        TEMPERATURE: (
+            "B",
+            float(np.sqrt(plate.variance_of_length)),
+            "m/m",
+            inf,
+            "declared",
+        ),
         TERMS: ("B", float("nan"), "m", inf, "default"),
     }
     for name, variance in variances.items():
@@ -717,7 +812,17 @@ def _budget(
         if name == NOISE:
             details = {"by": by, "contradicted": False}
         yield BudgetLine(
-            "xy", name, kind, 0.0, u, unit, rms(u_map), float(u_map.max()), dof, source, details
+            "xy",
+            name,
+            kind,
+            0.0,
+            u,
+            unit,
+            rms(u_map),
+            float(u_map.max()),
+            dof,
+            source,
+            details,
         )
     yield from (
         line
@@ -751,7 +856,9 @@ def predict_recheck(plan: Plan, plate: KnownPlate) -> PlannedRecheck:
     NotIdentifiableError, InputError
         As `selfcal_ros.estimation.recheck.solve.recheck`.
     """
-    readings = replace(planned_readings(plan.artifact, plan.views), plan_id=plan.plan_id)
+    readings = replace(
+        planned_readings(plan.artifact, plan.views), plan_id=plan.plan_id
+    )
     solved: Rechecked = recheck_of(
         readings, Options(assumed=(), misalignment_model="linear"), plate
     )

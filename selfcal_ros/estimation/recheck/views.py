@@ -156,7 +156,10 @@ class NewMap:
             for values_of in (self.values, self.white, self.of_effects)
         )
         return replace(
-            self, values=values, of_effects=of_effects, white=white - (white @ basis) @ basis.T
+            self,
+            values=values,
+            of_effects=of_effects,
+            white=white - (white @ basis) @ basis.T,
         )
 
     def covariances(self, variance_of_length: float) -> dict[str, np.ndarray]:
@@ -169,10 +172,14 @@ class NewMap:
             of_source = self.effects.source == source
             response = self.of_effects[:, of_source]
             out[source] = (
-                response @ self.effects.covariance[np.ix_(of_source, of_source)] @ response.T
+                response
+                @ self.effects.covariance[np.ix_(of_source, of_source)]
+                @ response.T
             )
         out[NOISE] = out[NOISE] + self.white
-        out[TEMPERATURE] = variance_of_length * np.outer(self.from_length, self.from_length)
+        out[TEMPERATURE] = variance_of_length * np.outer(
+            self.from_length, self.from_length
+        )
         return out
 
     def on_whole_map(self, values: np.ndarray) -> np.ndarray:
@@ -317,7 +324,9 @@ def solve_marks(readings: PlateReadings) -> PlateSolution:
             + problem.excess(parameters, plate, grid.views.gather(field))
         )
         if np.abs(lacking - before).max() <= FLOOR:
-            square = float((grid.weight * np.abs(residuals) ** 2).sum() - estimated @ right)
+            square = float(
+                (grid.weight * np.abs(residuals) ** 2).sum() - estimated @ right
+            )
             return PlateSolution(
                 field.ravel(), parameters, square / readings.variance, fields, remaining
             )
@@ -356,11 +365,17 @@ def _map_of(
     )
 
 
-def map_of_marks(readings: PlateReadings, solution: PlateSolution, dof: float) -> NewMap:
+def map_of_marks(
+    readings: PlateReadings, solution: PlateSolution, dof: float
+) -> NewMap:
     """Return the map of a solution."""
     system = readings.problem.system
     known_sites = turned_over(readings.sense, readings.known, sign=1)
-    rows = turned_over(readings.sense, unit_rows(known_sites)).reshape(-1, known_sites.size).T
+    rows = (
+        turned_over(readings.sense, unit_rows(known_sites))
+        .reshape(-1, known_sites.size)
+        .T
+    )
     rows = system.gauge.without(rows)
     white = readings.variance * MapsCovariance(system, system.grid_inverse).of_free(
         rows, np.zeros((system.grid.n_marks, rows.shape[1]))
@@ -405,10 +420,14 @@ def map_of_lines(
     spectrum = np.linalg.eigh(lines.schur)
     variance = noise.sigma**2
     determined = np.count_nonzero(spectrum[0] > GAP * scale) == lines.n_views - 1
-    known_lines = lines_turned_over(sense, (lines.components.of_site >= 0) & determined, sign=1)
+    known_lines = lines_turned_over(
+        sense, (lines.components.of_site >= 0) & determined, sign=1
+    )
     if not known_lines.any():
         nothing = np.zeros((0, len(effects.mean)))
-        return NewMap(known_lines, np.zeros(0), np.zeros((0, 0)), nothing, effects, noise.dof)
+        return NewMap(
+            known_lines, np.zeros(0), np.zeros((0, 0)), nothing, effects, noise.dof
+        )
     inverse = pseudo_inverse(spectrum[0], spectrum[1], scale)
     fields, _, remaining = effects.projected(
         lines_eliminated(lines, columns), lines.response, inverse, variance

@@ -19,7 +19,8 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     # in the nominal frame, as the map: an approach that every visit has is the map's
     signs = inputs.at_visits(
         lambda visits: (
-            inputs.sense.sign * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
+            inputs.sense.sign
+            * np.stack([visits.approach_x, visits.approach_y]).astype(complex)
         ),
         nominal=True,
     )

@@ -92,7 +92,9 @@ class Shapes:
             out[rows] += (values.real**2 + values.imag**2) @ of_view.reshape(-1)
         return out[self.of_column]
 
-    def combined(self, coefficients: np.ndarray, only: np.ndarray | None = None) -> np.ndarray:
+    def combined(
+        self, coefficients: np.ndarray, only: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the sum of coefficients (p,) times columns, complex (views, nx, ny).
 
         `only`, bool (p,), selects columns.
@@ -100,7 +102,9 @@ class Shapes:
         selected = slice(None) if only is None else only
         coefficient_of_shape: np.ndarray = np.zeros(self.n, dtype=complex)
         np.add.at(
-            coefficient_of_shape, self.of_column[selected], (coefficients * self.unit)[selected]
+            coefficient_of_shape,
+            self.of_column[selected],
+            (coefficients * self.unit)[selected],
         )
         out = np.empty((len(self.rows), *self.lattice), dtype=complex)
         for of_view, rows, values in zip(out, self.rows, self.values, strict=True):
@@ -121,7 +125,9 @@ class LineColumns:
 
     def sums(self, weighted: np.ndarray, power: int = 1) -> np.ndarray:
         """Return the sums of values, to a power, times `weighted` (views, K), (q,)."""
-        return np.array([(value**power * weighted).sum() for value in self.values], dtype=float)
+        return np.array(
+            [(value**power * weighted).sum() for value in self.values], dtype=float
+        )
 
 
 NO_LINES = LineColumns(np.zeros(0, dtype=int), np.zeros((0, 0, 0)))
@@ -207,15 +213,21 @@ def within_marks(
         if view_visits is None or not view_visits.repeated:
             continue
         dof += 2 * (len(view_visits.mark) - len(np.unique(view_visits.mark)))
-        shapes_of_view = [number for number, values in enumerate(at_visits) if view in values]
+        shapes_of_view = [
+            number for number, values in enumerate(at_visits) if view in values
+        ]
         if shapes_of_view:
             values = np.array([at_visits[number][view] for number in shapes_of_view])
             # about the means of their marks: then those of the others drop out
-            weighted = np.conj(view_visits.about_means(values, n_marks)) * view_visits.weight
+            weighted = (
+                np.conj(view_visits.about_means(values, n_marks)) * view_visits.weight
+            )
             inner[np.ix_(shapes_of_view, shapes_of_view)] += weighted @ values.T
             against[shapes_of_view] += (weighted @ view_visits.y).conj()
     gram = shapes.products(inner)
-    return WithinMarks((gram + gram.T) / 2, shapes.against(against), squares_within(visits), dof)
+    return WithinMarks(
+        (gram + gram.T) / 2, shapes.against(against), squares_within(visits), dof
+    )
 
 
 @dataclass(frozen=True)
@@ -302,7 +314,9 @@ class TermColumns:
         return replace(
             self,
             columns=tuple(
-                replace(column, size=column.size * factor) if column.term == name else column
+                replace(column, size=column.size * factor)
+                if column.term == name
+                else column
                 for column in self.columns
             ),
         )
@@ -320,7 +334,9 @@ class ColumnBuilder:
     at: AtVisits = field(default_factory=list)
     lines: list[tuple[int, np.ndarray]] = field(default_factory=list)
 
-    def add(self, means: dict[int, np.ndarray], at: dict[int, np.ndarray] | None = None) -> int:
+    def add(
+        self, means: dict[int, np.ndarray], at: dict[int, np.ndarray] | None = None
+    ) -> int:
         """Add a shape; return its number."""
         self.means.append(means)
         self.at.append(at or {})
@@ -342,7 +358,9 @@ class ColumnBuilder:
             numbers: dict[int, int] = {}  # patterns may share the values of their marks
             for pattern in patterns:
                 if (values := id(pattern.marks)) not in numbers:
-                    numbers[values] = self.add(dict(pattern.marks), dict(pattern.visits))
+                    numbers[values] = self.add(
+                        dict(pattern.marks), dict(pattern.visits)
+                    )
                 for component, unit in pattern.coefficients:
                     if size := term.size_of(component):
                         if pattern.lines is not None:

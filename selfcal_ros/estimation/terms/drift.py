@@ -28,11 +28,17 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     orders = range(1, inputs.drift_degree + 1)
     for first, members in inputs.members.items():
         polynomials = inputs.at_visits(
-            lambda visits: np.stack([polynomial(order, visits.time) for order in orders]), members
+            lambda visits: np.stack(
+                [polynomial(order, visits.time) for order in orders]
+            ),
+            members,
         )
         for order, (marks, visits) in zip(orders, polynomials, strict=False):
             yield Pattern(
-                tuple((f"{axis} P{order}", unit) for axis, unit in AXES), marks, visits, view=first
+                tuple((f"{axis} P{order}", unit) for axis, unit in AXES),
+                marks,
+                visits,
+                view=first,
             )
 
 

@@ -82,7 +82,11 @@ def reduce_columns(grid: GridSystem, shapes: Shapes) -> ReducedColumns:
     sites, inner, coupling = _marks_eliminated(grid, shapes)
     inner -= grid.factor.products(sites)
     return ReducedColumns(
-        grid, shapes, sites, (inner + inner.conj().T) / 2, coupling - _coupled(grid, sites)
+        grid,
+        shapes,
+        sites,
+        (inner + inner.conj().T) / 2,
+        coupling - _coupled(grid, sites),
     )
 
 
@@ -105,13 +109,17 @@ def _marks_eliminated(
         inner[rows[:, None], rows] += values.conj() @ weighted.T
         coupling[v][:, rows] += to_views @ weighted.T
         of_view = np.zeros((len(rows), *grid.views.shape), dtype=complex)
-        grid.views.add_scattered(of_view, v, weighted.reshape(len(rows), *shapes.lattice))
+        grid.views.add_scattered(
+            of_view, v, weighted.reshape(len(rows), *shapes.lattice)
+        )
         sites[rows] += of_view
     # minus the mean of each mark, which all views share
     inner -= (means * weight.sum(axis=0)).conj() @ means.T
     coupling -= (to_views * weight[:, None]) @ means.T
     for v in range(n):
-        grid.views.add_scattered(sites, v, (means * -weight[v]).reshape(-1, *shapes.lattice))
+        grid.views.add_scattered(
+            sites, v, (means * -weight[v]).reshape(-1, *shapes.lattice)
+        )
     return (
         np.ascontiguousarray(sites.reshape(shapes.n, grid.n_sites).T),
         inner,
@@ -213,7 +221,11 @@ def lines_eliminated(
     Of the misalignments, (views, q), and of the residuals, (q, q).
     """
     if not len(lines.at):
-        return np.zeros((angular.n_lines, 0)), np.zeros((angular.n_views, 0)), np.zeros((0, 0))
+        return (
+            np.zeros((angular.n_lines, 0)),
+            np.zeros((angular.n_views, 0)),
+            np.zeros((0, 0)),
+        )
     weighted = angular.weight * angular.centred(lines.values)
     of_sites, of_rotations = angular.adjoint(weighted)
     free = angular.solve(of_sites)
@@ -274,7 +286,9 @@ class TermEquations:
         grid = self.columns.shapes.squares(self.system.grid.weight)
         lines = self.columns.lines
         grid[lines.at] += self.line_weight * lines.sums(self.system.angular.weight, 2)
-        return np.sqrt(np.maximum(grid + np.diag(self.columns.within.gram), np.finfo(float).tiny))
+        return np.sqrt(
+            np.maximum(grid + np.diag(self.columns.within.gram), np.finfo(float).tiny)
+        )
 
     @property
     def free(self) -> np.ndarray:
@@ -282,14 +296,20 @@ class TermEquations:
         return np.isinf(self.columns.size)
 
     def undetermined(
-        self, rows: np.ndarray, limit: float | None = None, *, unknown: np.ndarray | None = None
+        self,
+        rows: np.ndarray,
+        limit: float | None = None,
+        *,
+        unknown: np.ndarray | None = None,
     ) -> np.ndarray:
         """Return undetermined combinations of the coefficients `rows`, (p, k).
 
         Orthonormal in scaled coefficients (times `norm`); others are taken as known, but for those
         that are `unknown`. Eigenvalues up to `limit`, by default that of `rows`, count as zero.
         """
-        values, vectors = self._spectrum if rows.all() else self._spectrum_of(rows, unknown)
+        values, vectors = (
+            self._spectrum if rows.all() else self._spectrum_of(rows, unknown)
+        )
         hidden = values <= (self.limit(rows) if limit is None else limit)
         out = np.zeros((len(rows), int(hidden.sum())))
         out[rows] = vectors[:, hidden]
@@ -328,7 +348,8 @@ class TermEquations:
         theirs is a combination of its own.
         """
         of_marks, of_lines = (
-            float(noise_shares[rows].max(initial=0.0)) for noise_shares in self._noise_of_offsets
+            float(noise_shares[rows].max(initial=0.0))
+            for noise_shares in self._noise_of_offsets
         )
         lines_alone = self._noise_of_offsets[1][rows].all()
         return max(GAP, OVER_NOISE * (of_lines if lines_alone else of_marks))
@@ -360,7 +381,9 @@ class TermEquations:
         """Angular map for a unit of each coefficient in the datum, sign reversed, (K, p)."""
         known_lines = self.system.known_lines
         turned = self.projected.turned
-        return turned - turned[known_lines].mean(axis=0) if known_lines.any() else turned
+        return (
+            turned - turned[known_lines].mean(axis=0) if known_lines.any() else turned
+        )
 
     def variances(self, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the variances that coefficients with a covariance (p, p) give the maps.
@@ -412,7 +435,9 @@ class TermEquations:
         """(K + D)^-1 D of method eq. 7.11, (p, p)."""
         none = self.norm**2 <= np.finfo(float).tiny * 2  # an approach that is not known
         scale = np.hypot(np.where(none, 1.0, self.norm), np.sqrt(self.position_noise))
-        matrix = (self.information + np.diag(self.position_noise)) / np.outer(scale, scale)
+        matrix = (self.information + np.diag(self.position_noise)) / np.outer(
+            scale, scale
+        )
         inverse = np.linalg.pinv(matrix, hermitian=True, rcond=1e-14)
         return inverse / np.outer(scale, scale) * self.position_noise
 
@@ -460,7 +485,9 @@ class TermEquations:
         null = np.linalg.qr(unit[:, None] * undetermined)[0]
         inverse = (
             np.linalg.pinv(
-                matrix / np.outer(unit, unit) + null @ null.T, hermitian=True, rcond=1e-14
+                matrix / np.outer(unit, unit) + null @ null.T,
+                hermitian=True,
+                rcond=1e-14,
             )
             - null @ null.T
         )
@@ -487,7 +514,8 @@ class TermEquations:
         scaled = self.information[np.ix_(free, free)] / np.outer(norm, norm)
         out = np.zeros((self.n, self.n))
         out[np.ix_(free, free)] = (
-            np.linalg.inv(scaled + undetermined @ undetermined.T) - undetermined @ undetermined.T
+            np.linalg.inv(scaled + undetermined @ undetermined.T)
+            - undetermined @ undetermined.T
         ) / np.outer(norm, norm)
         return out
 
@@ -601,7 +629,11 @@ def score(
     between[columns.lines.at] += equations.line_weight * columns.lines.sums(
         equations.system.angular.weight * residuals[1]
     )
-    inner = within.total - 2 * subtracted @ within.right + subtracted @ within.gram @ subtracted
+    inner = (
+        within.total
+        - 2 * subtracted @ within.right
+        + subtracted @ within.gram @ subtracted
+    )
     sums = Sums(*squares, float(inner), within.dof)
     return Score(between, within.right - within.gram @ subtracted, sums)
 
@@ -651,7 +683,9 @@ def next_coefficients(
     right = equations.unbiased_sums(scored.total)
     # no reading tells anything of these: what is there is rounding
     undetermined = equations.undetermined(np.ones(equations.n, dtype=bool), ROUNDED)
-    right = right - equations.norm * (undetermined @ (undetermined.T @ (right / equations.norm)))
+    right = right - equations.norm * (
+        undetermined @ (undetermined.T @ (right / equations.norm))
+    )
     prior = equations.prior(sigma_m)
     return coefficients + inverse @ (right - prior * coefficients)
 
@@ -663,7 +697,9 @@ def root_of(covariance: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return covariance[:, rows] @ (vectors[:, determined] / np.sqrt(values[determined]))
 
 
-def roots_by_term(covariance: np.ndarray, columns: TermColumns) -> list[tuple[str, np.ndarray]]:
+def roots_by_term(
+    covariance: np.ndarray, columns: TermColumns
+) -> list[tuple[str, np.ndarray]]:
     """Return roots (p, k) of parts of a covariance: of each term with a size, of the free ones.
 
     A part is the reduction of the covariance if that term, and those before it, are
@@ -746,7 +782,10 @@ class SizeTest:
 
 
 def size_test(
-    equations: TermEquations, right: np.ndarray, term: ModelTerm, noise: tuple[float, float]
+    equations: TermEquations,
+    right: np.ndarray,
+    term: ModelTerm,
+    noise: tuple[float, float],
 ) -> SizeTest:
     """Return the test of one size, the other terms with their sizes or free.
 
@@ -771,7 +810,9 @@ def size_test(
         for family in term.block.families
     ]
     together, *of_families = [
-        _coefficients_test(equations, right, term, noise, rows=rows, among=1 + len(families))
+        _coefficients_test(
+            equations, right, term, noise, rows=rows, among=1 + len(families)
+        )
         for rows in (of_term, *families)
     ]
     return replace(
@@ -798,7 +839,8 @@ def _coefficients_test(
     if not rank:
         return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0, 1.0)
     root = np.sqrt(information)
-    of_unit, turn = np.linalg.eigh(root[:, None] * of_size * root)  # in independent combinations
+    # in independent combinations
+    of_unit, turn = np.linalg.eigh(root[:, None] * of_size * root)
     squares = (turn.T @ (root * values)) ** 2
 
     def variances(size: float) -> np.ndarray:
@@ -810,11 +852,19 @@ def _coefficients_test(
     of_given = statistic(term.size)
     p = float(fdtrc(rank, min(dof, MANY_DOF), of_given / rank))
     test = SizeTest(
-        term.name, term.size, term.size, term.size, of_given, rank, p, min(1.0, among * p)
+        term.name,
+        term.size,
+        term.size,
+        term.size,
+        of_given,
+        rank,
+        p,
+        min(1.0, among * p),
     )
     if not test.raised:
         return test
-    beyond = np.sqrt((squares / of_unit).sum())  # the statistic is below its square / size^2
+    # the statistic is below its square / size^2
+    beyond = np.sqrt((squares / of_unit).sum())
 
     def size_at(level: float) -> float:
         low = term.size
@@ -860,7 +910,9 @@ def _estimates_if_free(
     )
     couple = scaled[np.ix_(rows, other_columns)] @ of_others
     scores = equations.unbiased_sums(right) / norm
-    information = scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(other_columns, rows)]
+    information = (
+        scaled[np.ix_(rows, rows)] - couple @ scaled[np.ix_(other_columns, rows)]
+    )
     size, vectors = np.linalg.eigh((information + information.T) / 2)
     determined = size > equations.limit(rows)
     vectors = vectors[:, determined]
@@ -890,7 +942,9 @@ def size_tests(
         All terms.
     """
     raised: list[SizeTest] = []
-    sized = [term for term in terms if not term.free and equations.rows([term.name]).any()]
+    sized = [
+        term for term in terms if not term.free and equations.rows([term.name]).any()
+    ]
     if not np.isfinite(noise[0]):
         return ()
     while sized:
@@ -902,7 +956,8 @@ def size_tests(
         raised.append(worst)
         sized = [term for term in sized if term.name != worst.name]
         equations = replace(
-            equations, columns=equations.columns.scaled(worst.name, worst.allowed / worst.given)
+            equations,
+            columns=equations.columns.scaled(worst.name, worst.allowed / worst.given),
         )
     return tuple(raised)
 
@@ -912,7 +967,11 @@ def unseen_by_term(equations: TermEquations) -> dict[str, int]:
 
     Terms that are not separable only in combination are all named, with the modes hidden together.
     """
-    free = {column.term for column in equations.columns.columns if column.size == float("inf")}
+    free = {
+        column.term
+        for column in equations.columns.columns
+        if column.size == float("inf")
+    }
     out = {}
     for name in blocks():
         if name in free:
@@ -925,7 +984,9 @@ def unseen_by_term(equations: TermEquations) -> dict[str, int]:
     return out
 
 
-def require_terms_determined(equations: TermEquations, observability: Observability) -> None:
+def require_terms_determined(
+    equations: TermEquations, observability: Observability
+) -> None:
     """Raise NotIdentifiableError if free terms hide modes of the stage.
 
     Parameters

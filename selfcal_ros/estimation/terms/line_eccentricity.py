@@ -30,7 +30,10 @@ def located(explanation: Any, names: tuple[str, ...]) -> Located:
     for view in sorted({column.view for column in explanation.columns}):
         mine = np.array([column.view == view for column in explanation.columns])
         size = float(np.hypot.reduce(explanation.values[mine]))
-        yield {"view": names[view]}, np.where(mine, explanation.values, 0.0) / (size or 1.0)
+        yield (
+            {"view": names[view]},
+            np.where(mine, explanation.values, 0.0) / (size or 1.0),
+        )
 
 
 BLOCK = Block(

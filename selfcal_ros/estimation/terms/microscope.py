@@ -17,7 +17,9 @@ PAIRS = ((("scale", 1), ("turn", 1j)), (("stretch", 1), ("shear", 1j)))
 
 def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     """Yield the offsets, and their conjugates."""
-    offsets = inputs.at_visits(lambda visits: -np.stack([visits.offset, visits.offset.conj()]))
+    offsets = inputs.at_visits(
+        lambda visits: -np.stack([visits.offset, visits.offset.conj()])
+    )
     for pair, (marks, visits) in zip(PAIRS, offsets, strict=False):
         yield Pattern(pair, marks, visits)
 
@@ -26,7 +28,10 @@ def located(explanation: object, names: tuple[str, ...]) -> Located:
     """Yield every coefficient; of a rotation in rad."""
     for fields, weights in by_coefficient(explanation, names):
         component = fields["details"]["part"]
-        yield fields | {"unit": "rad" if component in ("turn", "shear") else "m/m"}, weights
+        yield (
+            fields | {"unit": "rad" if component in ("turn", "shear") else "m/m"},
+            weights,
+        )
 
 
 BLOCK = Block(

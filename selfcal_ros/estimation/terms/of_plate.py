@@ -34,7 +34,9 @@ def of_each_placing(
     """
     for first, members in list(inputs.members.items())[1 if term.free else 0 :]:
         read_marks = {view: inputs.weight[view].reshape(-1) > 0 for view in members}
-        of_form = [{view: form * read for view, read in read_marks.items()} for form in forms]
+        of_form = [
+            {view: form * read for view, read in read_marks.items()} for form in forms
+        ]
         for component, number, factor in coefficients:
             yield Pattern(((component, factor),), of_form[number], view=first)
 
@@ -44,8 +46,12 @@ def against_first(explanation: Any, names: tuple[str, ...]) -> Located:
 
     If the term is free, the first view has no coefficients of its own: they are 0.
     """
-    for column, row in zip(explanation.columns, np.eye(len(explanation.columns)), strict=True):
-        row -= [c.view == 0 and c.component == column.component for c in explanation.columns]
+    for column, row in zip(
+        explanation.columns, np.eye(len(explanation.columns)), strict=True
+    ):
+        row -= [
+            c.view == 0 and c.component == column.component for c in explanation.columns
+        ]
         if row.any():
             yield (
                 {

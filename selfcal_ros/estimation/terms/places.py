@@ -96,10 +96,14 @@ class StagePlaces:
         """Return a field at the nominal place of each reading, (P,)."""
         return self.views.gather(field)[self.at] * self.views.phases[self.at[0]]
 
-    def errors(self, field: np.ndarray, differences: np.ndarray | None = None) -> np.ndarray:
+    def errors(
+        self, field: np.ndarray, differences: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the stage error where the stage stood, (P,), m, given that at the sites."""
         at_site = self._at_nominal(_filled(field, self.known))
-        return at_site + (self.differences(field) if differences is None else differences)
+        return at_site + (
+            self.differences(field) if differences is None else differences
+        )
 
     def changes(self, differences: np.ndarray, turn_rad: np.ndarray) -> np.ndarray:
         """Return what differences of the stage error do to the readings, (views, nx, ny), m.
@@ -124,9 +128,15 @@ class StagePlaces:
         """
         cells = self._cells(_filled(field, self.known))
         s, t = self._place(near)
-        slopes = np.zeros((2, len(self.about_m), *self.views.plate_shape), dtype=complex)
-        for slope, (a, b) in zip(slopes, ((AT_SITES, 0.0), (0.0, AT_SITES)), strict=True):
-            x, y = (cells.beyond(s + a, t + b) - cells.beyond(s - a, t - b)) / (2 * AT_SITES)
+        slopes = np.zeros(
+            (2, len(self.about_m), *self.views.plate_shape), dtype=complex
+        )
+        for slope, (a, b) in zip(
+            slopes, ((AT_SITES, 0.0), (0.0, AT_SITES)), strict=True
+        ):
+            x, y = (cells.beyond(s + a, t + b) - cells.beyond(s - a, t - b)) / (
+                2 * AT_SITES
+            )
             slope[self.at] = (x + 1j * y) / self.pitch_m
         out: list[np.ndarray | float] = []
         for row, (away, marks) in enumerate(zip(self.about_m, self.marks, strict=True)):
@@ -134,7 +144,9 @@ class StagePlaces:
                 out.append(0.0)
                 continue
             along_x, along_y = slopes[:, row].reshape(2, -1)[:, marks]
-            out.append((along_x * away.real + along_y * away.imag) * self._phase(turn_rad)[row])
+            out.append(
+                (along_x * away.real + along_y * away.imag) * self._phase(turn_rad)[row]
+            )
         return out
 
     def _place(self, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,7 +180,9 @@ def _along_both(field: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
     """Return a field filled along rows and columns with two known sites, then with one."""
     for least in (2, 2, 1, 1):
         field, known_sites = field.copy(), known_sites.copy()
-        for row in np.flatnonzero((known_sites.sum(axis=1) >= least) & ~known_sites.all(axis=1)):
+        for row in np.flatnonzero(
+            (known_sites.sum(axis=1) >= least) & ~known_sites.all(axis=1)
+        ):
             places_known = np.flatnonzero(known_sites[row])
             unknown = np.flatnonzero(~known_sites[row])
             above = np.clip(
@@ -186,7 +200,10 @@ def _along_both(field: np.ndarray, known_sites: np.ndarray) -> np.ndarray:
 
 
 def places_of(
-    measurements: Measurements, grid: GridData, inputs: TermInputs, known_sites: np.ndarray
+    measurements: Measurements,
+    grid: GridData,
+    inputs: TermInputs,
+    known_sites: np.ndarray,
 ) -> StagePlaces | None:
     """Return where the stage stood; None where it stood at the sites, or no visit tells.
 
@@ -210,9 +227,16 @@ def places_of(
             marks.append(None)
             about.append(None)
             continue
-        stood = read_visits.dx - read_visits.offset_x + 1j * (read_visits.dy - read_visits.offset_y)
+        stood = (
+            read_visits.dx
+            - read_visits.offset_x
+            + 1j * (read_visits.dy - read_visits.offset_y)
+        )
         mean = visits.means(stood[None], grid.y[0].size)[0]
-        away[row], located[row].reshape(-1)[visits.mark] = mean.reshape(grid.y.shape[1:]), True
+        away[row], located[row].reshape(-1)[visits.mark] = (
+            mean.reshape(grid.y.shape[1:]),
+            True,
+        )
         marks.append(visits.mark)
         about.append(stood - mean[visits.mark])
     located &= views.near(known_sites) & (grid.weight > 0)
@@ -220,5 +244,11 @@ def places_of(
     if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
         return None
     return StagePlaces(
-        views, pitch_m, known_sites, np.nonzero(located), away[located], tuple(marks), tuple(about)
+        views,
+        pitch_m,
+        known_sites,
+        np.nonzero(located),
+        away[located],
+        tuple(marks),
+        tuple(about),
     )

@@ -14,7 +14,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from selfcal_ros.blocks import block_of
-from selfcal_ros.estimation.lattice.readings import angular_data, grid_data, planned_readings
+from selfcal_ros.estimation.lattice.readings import (
+    angular_data,
+    grid_data,
+    planned_readings,
+)
 from selfcal_ros.estimation.normal.equations import NormalEquations, lines_of
 from selfcal_ros.estimation.terms.columns import (
     Column,
@@ -85,7 +89,9 @@ class Assumed:
     error_rad: float = 10e-6
 
 
-def planned_inputs(artifact: Artifact, views: Sequence[View], assumed: Assumed) -> TermInputs:
+def planned_inputs(
+    artifact: Artifact, views: Sequence[View], assumed: Assumed
+) -> TermInputs:
     """Return the inputs for planned views.
 
     Parameters
@@ -98,20 +104,28 @@ def planned_inputs(artifact: Artifact, views: Sequence[View], assumed: Assumed) 
         Visiting order, placings, errors.
     """
     rng = np.random.default_rng(1)
-    x, y = assumed.error_m * np.random.default_rng([1, 1]).normal(size=(2, 2, *artifact.shape))
+    x, y = assumed.error_m * np.random.default_rng([1, 1]).normal(
+        size=(2, 2, *artifact.shape)
+    )
     stage, plate = assumed.error_rad * np.random.default_rng([1, 2]).normal(
         size=(2, artifact.angular_count)
     )
     planned = planned_readings(artifact, views)
     lines = angular_data(planned)
-    of_lines = dict(zip(lines.index, lines_of(lines).gather(stage) + plate, strict=True))
+    of_lines = dict(
+        zip(lines.index, lines_of(lines).gather(stage) + plate, strict=True)
+    )
     expected = []
-    for index, (view, number) in enumerate(zip(planned.views, _placings(planned), strict=True)):
+    for index, (view, number) in enumerate(
+        zip(planned.views, _placings(planned), strict=True)
+    ):
         turn, *away = (ndtri((first + step * number) % 1) for first, step in SPREAD)
         lies = assumed.turn_rad * turn, assumed.away_m * complex(*away)
         if len(view.m):
             visits = _visits(artifact, view, assumed, rng, lies=lies, errors=x + 1j * y)
-            view = replace(view, visits=visits, count=np.bincount(visits.mark, visits.count))
+            view = replace(
+                view, visits=visits, count=np.bincount(visits.mark, visits.count)
+            )
         if index in of_lines:
             view = replace(view, dtheta=of_lines[index] + lies[0])
         expected.append(view)
@@ -131,7 +145,9 @@ def _placings(planned: Measurements) -> list[int]:
     """
     placings = placings_of(view.view for view in planned.views)
     number: dict[int, int] = {}
-    marks_first = sorted(range(len(placings)), key=lambda row: not planned.views[row].view.grid)
+    marks_first = sorted(
+        range(len(placings)), key=lambda row: not planned.views[row].view.grid
+    )
     for row in marks_first:
         number.setdefault(placings[row], len(number))
     return [number[placing] for placing in placings]
@@ -172,7 +188,9 @@ def _visits(
             *(
                 np.clip(at, *ends).astype(int)  # the nearest, off the lattice
                 for at, ends in zip(
-                    artifact.nearest(sequence.i, sequence.j), artifact.limits, strict=True
+                    artifact.nearest(sequence.i, sequence.j),
+                    artifact.limits,
+                    strict=True,
                 )
             )
         )
@@ -181,7 +199,9 @@ def _visits(
     plate = errors[1].ravel()[mark] * phase
     u, v = artifact.places(sequence.m, sequence.n)
     arm = (u + 1j * v) * artifact.grid_pitch_m * phase
-    offset = np.exp(-1j * turn) * (np.expm1(1j * turn) * arm + away + plate - stage - stops - aside)
+    offset = np.exp(-1j * turn) * (
+        np.expm1(1j * turn) * arm + away + plate - stage - stops - aside
+    )
     # the sense of measurement does not matter: the stage's motion and its part of a reading
     # both change sign
     return GridVisits(
@@ -222,7 +242,12 @@ def planned_equations(
         ratio = (assumed.sigma_m / (assumed.sigma_rad * length)) ** 2  # method eq. 4.2
         inverse = system.inverse(ratio)
     return equations_of_columns(
-        system, columns, inverse, ratio=ratio, half_width_m=length, noise_m=assumed.sigma_m
+        system,
+        columns,
+        inverse,
+        ratio=ratio,
+        half_width_m=length,
+        noise_m=assumed.sigma_m,
     )
 
 
@@ -245,15 +270,20 @@ def with_terms(equations: TermEquations, terms: Iterable[ModelTerm]) -> TermEqua
         if is_chosen
     )
     inner = all_columns.within
-    within = WithinMarks(inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof)
+    within = WithinMarks(
+        inner.gram[np.ix_(rows, rows)], inner.right[rows], inner.total, inner.dof
+    )
     projected = equations.projected
     of_lines = rows[all_columns.lines.at]
     lines = LineColumns(
-        np.cumsum(rows)[all_columns.lines.at[of_lines]] - 1, all_columns.lines.values[of_lines]
+        np.cumsum(rows)[all_columns.lines.at[of_lines]] - 1,
+        all_columns.lines.values[of_lines],
     )
     return TermEquations(
         equations.system,
-        TermColumns(columns, all_columns.shapes.chosen(rows), within, all_columns.at, lines),
+        TermColumns(
+            columns, all_columns.shapes.chosen(rows), within, all_columns.at, lines
+        ),
         ProjectedColumns(
             lambda: projected.fields[:, rows],
             projected.parameters[:, rows],

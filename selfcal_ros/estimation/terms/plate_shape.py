@@ -15,7 +15,9 @@ from selfcal_ros.model.terms import ModelTerm
 FORMS = ("z^2", "|z|^2", "z*^2")
 
 COEFFICIENTS = [
-    (f"{form} {axis}", number, unit) for number, form in enumerate(FORMS) for axis, unit in AXES
+    (f"{form} {axis}", number, unit)
+    for number, form in enumerate(FORMS)
+    for axis, unit in AXES
 ]
 
 

@@ -25,7 +25,9 @@ def located(explanation: Any, names: tuple[str, ...]) -> Located:
     unit = np.eye(len(explanation.values))
     apart = []
     for at in range(n):
-        differences = [unit[at] - unit[another] for another in range(n) if another != at]
+        differences = [
+            unit[at] - unit[another] for another in range(n) if another != at
+        ]
         apart.append(
             min(
                 (
@@ -40,14 +42,19 @@ def located(explanation: Any, names: tuple[str, ...]) -> Located:
     # u is that of the difference from the nearest
     nearest = abs(float(explanation.values @ weights)) / max(apart[at], 1e-300)
     yield (
-        {"view": names[explanation.columns[at].view], "u": max(_u(explanation, weights), nearest)},
+        {
+            "view": names[explanation.columns[at].view],
+            "u": max(_u(explanation, weights), nearest),
+        },
         weights,
     )
 
 
 def _u(explanation: Any, weights: np.ndarray) -> float:
     """Return the standard uncertainty of weights @ values, at least the least number."""
-    return max(float(np.sqrt(max(weights @ explanation.covariance @ weights, 0.0))), 1e-300)
+    return max(
+        float(np.sqrt(max(weights @ explanation.covariance @ weights, 0.0))), 1e-300
+    )
 
 
 BLOCK = Block(

@@ -116,7 +116,11 @@ def time_ranges(
 
 
 def _visits_of(
-    view: ViewReadings, grid: GridData, row: int, ends: tuple[int, int] | None, flat: np.ndarray
+    view: ViewReadings,
+    grid: GridData,
+    row: int,
+    ends: tuple[int, int] | None,
+    flat: np.ndarray,
 ) -> ViewVisits | None:
     """Return the visits of a view whose marks have the indices `flat` (P,); None if unknown.
 
@@ -172,7 +176,9 @@ def check_visits(measurements: Measurements) -> None:
                 "number the marks as `m` and `n` have them",
             )
         if visits.count.min() < 1:
-            raise InputError(where, "a count below 1", "leave out visits without a reading")
+            raise InputError(
+                where, "a count below 1", "leave out visits without a reading"
+            )
         for values in (visits.dx, visits.dy, visits.offset_x, visits.offset_y):
             if not (np.abs(values) < FARTHEST_M).all():
                 raise InputError(
@@ -199,7 +205,9 @@ def view_time(instants: np.ndarray, first: float, last: float) -> np.ndarray:
     return 2 * (instants - first) / (last - first) - 1
 
 
-def between_visits(measurements: Measurements, least_dof: int) -> tuple[float, int] | None:
+def between_visits(
+    measurements: Measurements, least_dof: int
+) -> tuple[float, int] | None:
     """Return the noise of one reading from the visits of each mark, m, and its dof.
 
     Repeats of one visit share slow effects, visits do not: with both, the scatter between visits
@@ -299,13 +307,17 @@ class TermInputs:
         most = max(2, int(np.sqrt(MOST_VALUES / (len(self.names) * self.z.size))))
         return [
             np.linspace(-half, half, min(sites, most, MOST_NODES))
-            for half, sites in zip(self.stage.field_half_m, self.stage.shape, strict=True)
+            for half, sites in zip(
+                self.stage.field_half_m, self.stage.shape, strict=True
+            )
         ]
 
     def on_stage(self, view: int) -> np.ndarray:
         """Return the nominal places of all marks in a view, stage axes, complex (marks,), m."""
         pose = self.poses[view]
-        return complex(*pose.shift_m) + pose.phase * self.z.reshape(-1) * self.half_width_m
+        return (
+            complex(*pose.shift_m) + pose.phase * self.z.reshape(-1) * self.half_width_m
+        )
 
     def at_visits(
         self,
@@ -365,7 +377,9 @@ class TermInputs:
         block = block_of(term)
         if block.of_images:
             return bool(self.cells_m.any())
-        return not block.of_lines or bool(self.with_lines if block.between else self.line_names)
+        return not block.of_lines or bool(
+            self.with_lines if block.between else self.line_names
+        )
 
     def name_of(self, term: str, view: int) -> str:
         """Return the name of the view of a column; empty where all views share it (-1)."""
@@ -389,7 +403,11 @@ def term_inputs(
     ranges = time_ranges(readings, placings)
     visits = tuple(
         _visits_of(
-            view, grid, row, ranges.get(placings[row]), measurements.artifact.flat(view.m, view.n)
+            view,
+            grid,
+            row,
+            ranges.get(placings[row]),
+            measurements.artifact.flat(view.m, view.n),
         )
         for row, view in enumerate(readings)
     )
@@ -426,7 +444,9 @@ def _line_offsets_of(views: Sequence[ViewReadings], n_lines: int) -> np.ndarray:
 
 
 def without_noise(
-    inputs: TermInputs, residuals: np.ndarray, of_terms: Sequence[np.ndarray | float] = ()
+    inputs: TermInputs,
+    residuals: np.ndarray,
+    of_terms: Sequence[np.ndarray | float] = (),
 ) -> TermInputs:
     """Return the inputs with offsets from which the noise of the readings is taken off.
 
@@ -447,8 +467,12 @@ def without_noise(
     terms = of_terms or [0.0] * len(inputs.visits)
     for view, residual, of_model in zip(inputs.visits, residuals, terms, strict=True):
         if view is not None:
-            residuals_of_visits = view.about_means((view.y - of_model)[None], residual.size)[0]
+            residuals_of_visits = view.about_means(
+                (view.y - of_model)[None], residual.size
+            )[0]
             residuals_of_visits = residuals_of_visits + residual.reshape(-1)[view.mark]
-            view = replace(view, offset=view.offset - residuals_of_visits * np.conj(view.phase))
+            view = replace(
+                view, offset=view.offset - residuals_of_visits * np.conj(view.phase)
+            )
         visits.append(view)
     return replace(inputs, visits=tuple(visits))

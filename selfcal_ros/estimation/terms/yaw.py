@@ -24,7 +24,9 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     places = np.array([inputs.on_stage(view) for view in views])
     along = [
         _hats(coordinate, axis)
-        for coordinate, axis in zip((places.real, places.imag), inputs.node_axes_m, strict=True)
+        for coordinate, axis in zip(
+            (places.real, places.imag), inputs.node_axes_m, strict=True
+        )
     ]
     phases = np.array(
         [
@@ -40,13 +42,17 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
     for number, (of_x, of_y) in enumerate(nodes):
         # a constant yaw is a turn of the camera: it does not act beside the cells
         values = turned * of_x * of_y - beside_cells / len(nodes)
-        yield Pattern(((f"node {number}", 1),), {view: values[view] for view in turned_views})
+        yield Pattern(
+            ((f"node {number}", 1),), {view: values[view] for view in turned_views}
+        )
 
 
 def _hats(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return the weight of each node at places along an axis, m; linear between two of them."""
     at = np.interp(places, nodes, np.arange(len(nodes)))
-    return np.array([np.maximum(1 - np.abs(at - node), 0) for node in range(len(nodes))])
+    return np.array(
+        [np.maximum(1 - np.abs(at - node), 0) for node in range(len(nodes))]
+    )
 
 
 def _beside_cells(inputs: TermInputs) -> np.ndarray:
@@ -59,7 +65,9 @@ def _beside_cells(inputs: TermInputs) -> np.ndarray:
     for row, visits in enumerate(inputs.visits):
         if visits is not None:
             mean[row] = visits.offset.mean()
-            out[row, visits.mark] = visits.means(visits.offset[None], inputs.z.size)[0, visits.mark]
+            out[row, visits.mark] = visits.means(visits.offset[None], inputs.z.size)[
+                0, visits.mark
+            ]
     for members in inputs.members.values():
         axis = [row for row in members if not inputs.cells_m[row]]
         out[members] += np.where(
@@ -81,7 +89,9 @@ BLOCK = Block(
     "rad",
     patterns,
     undetected=1e-9,
-    sizes=(1e-4,),  # 20", more than the yaw of almost any stage, so that images determine it
+    sizes=(
+        1e-4,
+    ),  # 20", more than the yaw of almost any stage, so that images determine it
     of_images=True,
     shared=True,
     located=located,

@@ -36,7 +36,12 @@ from selfcal_ros.estimation.joint.problem import (
 )
 from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
-from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL, Score, TermEquations, score
+from selfcal_ros.estimation.terms.equations import (
+    CAUSE_LEVEL,
+    Score,
+    TermEquations,
+    score,
+)
 from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, lines_alone
@@ -111,7 +116,9 @@ def slip_columns(builder: ColumnBuilder) -> Iterator[tuple[range, int, float]]:
             if 3 <= after.sum() <= len(after) - 3:
                 places = builder.inputs.z.reshape(-1)[visits.mark]
                 yield (
-                    add_slip(builder, view, (after * visits.phase, after * places), visits),
+                    add_slip(
+                        builder, view, (after * visits.phase, after * places), visits
+                    ),
                     view,
                     share_before,
                 )
@@ -144,7 +151,8 @@ def add_slip(
             builder.add({view: motion})
             if visits is None
             else builder.add(
-                {view: visits.means(motion[None], builder.inputs.z.size)[0]}, {view: motion}
+                {view: visits.means(motion[None], builder.inputs.z.size)[0]},
+                {view: motion},
             )
         )
         for component, unit in components:
@@ -289,7 +297,10 @@ def _noise(
     for _ in range(FEW_DRAWS):
         drawn = rng.normal(0, u)
         missed = _missed(problem, places, drawn[0] + 1j * drawn[1], error_there)
-        total += [np.bincount(sites, coordinate**2, n_sites) for coordinate in _coordinates(missed)]
+        total += [
+            np.bincount(sites, coordinate**2, n_sites)
+            for coordinate in _coordinates(missed)
+        ]
     return np.sqrt(
         total / (FEW_DRAWS * np.maximum(np.bincount(sites, minlength=n_sites), 1))
     ).reshape(u.shape)
@@ -307,7 +318,9 @@ def _uncertainty(model: ModelFit, error_map: ErrorMap) -> np.ndarray:
     u = error_map.u_xy
     grid = model.problem.system.grid
     if not np.isfinite(u).any():
-        return np.full_like(u, model.fitted.xy.sigma / math.sqrt(grid.weight[grid.read].mean()))
+        return np.full_like(
+            u, model.fitted.xy.sigma / math.sqrt(grid.weight[grid.read].mean())
+        )
     u = np.nan_to_num(u, nan=rms(u))
     return turned_over(model.problem.inputs.sense, u, sign=1)
 
@@ -376,7 +389,9 @@ class Candidates:
         right = self._total[chosen]
         gram = self.equations.projected.gram[square]
         values = inverse @ right
-        between = sums.between + values @ (gram @ values - 2 * self.right.between[chosen])
+        between = sums.between + values @ (
+            gram @ values - 2 * self.right.between[chosen]
+        )
         return Explained(
             chosen,
             inverse,
@@ -399,13 +414,20 @@ class Candidates:
 
     @cached_property
     def _total(self) -> np.ndarray:
-        return self.equations.unbiased_sums(self.right.total) - self.prior * self.coefficients
+        return (
+            self.equations.unbiased_sums(self.right.total)
+            - self.prior * self.coefficients
+        )
 
     @cached_property
     def everything(self) -> tuple[float, float]:
         """Sum of squares of all residuals, m^2, and its degrees of freedom, without any column."""
         sums = self.right.sums
-        return (sums.total, sums.dof) if sums.dof_within >= 1 else (sums.between, sums.dof_between)
+        return (
+            (sums.total, sums.dof)
+            if sums.dof_within >= 1
+            else (sums.between, sums.dof_between)
+        )
 
     def noise(self, fitted: Explained) -> tuple[float, float]:
         """Return the remaining variance of one reading, m^2, and its degrees of freedom.
@@ -469,11 +491,15 @@ class Explanation:
     effect_rad: float = 0.0
     angle_change: np.ndarray | None = None
 
-    def with_effect(self, equations: TermEquations, coefficients: np.ndarray) -> "Explanation":
+    def with_effect(
+        self, equations: TermEquations, coefficients: np.ndarray
+    ) -> "Explanation":
         """Return the explanation with the effect of `coefficients` (p,) on the maps."""
         system = equations.system
         map_change = equations.maps @ coefficients
-        angle_change = np.where(system.known_lines, -(equations.turned @ coefficients), 0.0)
+        angle_change = np.where(
+            system.known_lines, -(equations.turned @ coefficients), 0.0
+        )
         n_sites, n_lines = (
             max(int(at.sum()), 1) for at in (system.known_sites, system.known_lines)
         )
@@ -499,7 +525,11 @@ class Group:
 
 
 def find_explanations(
-    model: ModelFit, *, slips: bool, readings: bool = True, placed: PlacedSlip | None = None
+    model: ModelFit,
+    *,
+    slips: bool,
+    readings: bool = True,
+    placed: PlacedSlip | None = None,
 ) -> list[Explanation]:
     """Return the significant explanations of the residuals of a fit, the most likely first.
 
@@ -514,7 +544,9 @@ def find_explanations(
     """
     problem = model.problem
     at_visits = (
-        () if model.equations is None else model.equations.columns.at_visits(model.coefficients)
+        ()
+        if model.equations is None
+        else model.equations.columns.at_visits(model.coefficients)
     )
     inputs = without_noise(problem.inputs, model.fitted.residuals, at_visits)
     own_terms = [term.name for term in problem.terms]
@@ -538,8 +570,16 @@ def find_explanations(
         ]
     if readings:
         groups += [
-            Group(READING, np.array(rows), view, places=n_readings, mark=views.mark_at(*place))
-            for rows, view, place in reading_columns(builder, model.fitted.residuals, phases)
+            Group(
+                READING,
+                np.array(rows),
+                view,
+                places=n_readings,
+                mark=views.mark_at(*place),
+            )
+            for rows, view, place in reading_columns(
+                builder, model.fitted.residuals, phases
+            )
         ]
     if placed is not None:
         shift = placed.after * phases[placed.view]
@@ -579,7 +619,8 @@ def _groups(columns: Sequence[Column], names: Iterable[str]) -> Iterator[Group]:
     """
     of_view = np.array([c.view for c in columns], dtype=int)
     tested_alone = np.array(
-        [c.term in blocks() and blocks()[c.term].alone(c.component) for c in columns], dtype=bool
+        [c.term in blocks() and blocks()[c.term].alone(c.component) for c in columns],
+        dtype=bool,
     )
     for name in names:
         of_term = np.array([c.term == name for c in columns], dtype=bool)
@@ -609,7 +650,9 @@ def select_explanations(
             for group in groups
         ]
         significant = [
-            (test, group) for test, group in tests if test is not None and test[0] < CAUSE_LEVEL
+            (test, group)
+            for test, group in tests
+            if test is not None and test[0] < CAUSE_LEVEL
         ]
         if not significant:
             break
@@ -625,7 +668,9 @@ def select_explanations(
         for (p, _), group in as_good:
             if group.name not in names:
                 names.append(group.name)
-                explanations.append(replace(_explanation(pool, in_model, group, p), rank=rank))
+                explanations.append(
+                    replace(_explanation(pool, in_model, group, p), rank=rank)
+                )
         rank += 1
         in_model = in_model | best.rows
         groups = [
@@ -642,12 +687,19 @@ def _is_shared(name: str) -> bool:
     return name in blocks() and blocks()[name].shared
 
 
-def _replaces(pool: Candidates, in_model: np.ndarray, group: Group, best: Group) -> bool:
+def _replaces(
+    pool: Candidates, in_model: np.ndarray, group: Group, best: Group
+) -> bool:
     """Return whether `best` explains nothing beyond what `group` explains."""
-    if any(name not in blocks() or blocks()[name].between for name in (group.name, best.name)):
+    if any(
+        name not in blocks() or blocks()[name].between
+        for name in (group.name, best.name)
+    ):
         return False
     with_group = in_model | group.rows
-    beyond_group = _test(pool, pool.explain(with_group), pool.explain(with_group | best.rows), best)
+    beyond_group = _test(
+        pool, pool.explain(with_group), pool.explain(with_group | best.rows), best
+    )
     return beyond_group is None or beyond_group[0] >= CAUSE_LEVEL
 
 
@@ -661,9 +713,14 @@ def _test(
     gained = max(after.explained - before.explained, 0.0)
     n_gained = after.rank - before.rank
     variance, dof = pool.noise(after)
-    if n_gained <= 0 or not variance > FLOOR**2:  # NaN where nothing is left to test against
+    # NaN where nothing is left to test against
+    if n_gained <= 0 or not variance > FLOOR**2:
         return None
-    p = float(fdtrc(n_gained, dof / pool.excess, gained / n_gained / max(variance, pool.common)))
+    p = float(
+        fdtrc(
+            n_gained, dof / pool.excess, gained / n_gained / max(variance, pool.common)
+        )
+    )
     # of all readings together, so that explanations are compared by the same squares
     total_squares, n = pool.everything
     unexplained = max(total_squares - after.explained, FLOOR**2)
@@ -671,7 +728,9 @@ def _test(
     return min(p * group.places, 1.0), evidence - 2 * math.log(group.places)
 
 
-def _explanation(pool: Candidates, in_model: np.ndarray, group: Group, p: float) -> Explanation:
+def _explanation(
+    pool: Candidates, in_model: np.ndarray, group: Group, p: float
+) -> Explanation:
     fitted = pool.explain(in_model | group.rows)
     variance, _ = pool.noise(fitted)
     of_group = group.rows[fitted.columns]
@@ -792,7 +851,9 @@ def noisier_views(views: Sequence[tuple[str, float, float]]) -> list[Cause]:
     """
     causes = []
     for index, (name, sigma, dof) in enumerate(views):
-        other_noise, other_dof = pooled((s, d) for i, (_, s, d) in enumerate(views) if i != index)
+        other_noise, other_dof = pooled(
+            (s, d) for i, (_, s, d) in enumerate(views) if i != index
+        )
         if not other_dof or not other_noise > FLOOR:
             continue
         ratio = sigma / other_noise
@@ -818,12 +879,18 @@ def _reading(explanation: Explanation, names: tuple[str, ...], _: float) -> Loca
     )
 
 
-def _slip(explanation: Explanation, names: tuple[str, ...], half_width_m: float) -> Located:
+def _slip(
+    explanation: Explanation, names: tuple[str, ...], half_width_m: float
+) -> Located:
     order = {column.component: i for i, column in enumerate(explanation.columns)}
-    x, y, phi = (float(explanation.values[order[component]]) for component in ("x", "y", "phi"))
+    x, y, phi = (
+        float(explanation.values[order[component]]) for component in ("x", "y", "phi")
+    )
     size = math.hypot(x, y)
     toward = np.zeros(3)
-    toward[order["x"]], toward[order["y"]] = (x / size, y / size) if size else (1.0, 0.0)
+    toward[order["x"]], toward[order["y"]] = (
+        (x / size, y / size) if size else (1.0, 0.0)
+    )
     yield (
         {
             "view": names[explanation.columns[0].view],
@@ -850,13 +917,14 @@ def turned_too_far(
     A plate that moved does not explain that: the offsets of lines have the wrong sign, or those of
     marks the wrong unit. None otherwise, or if the model has no such rotation.
     """
-    between = next((term.name for term in model.problem.terms if block_of(term.name).between), None)
+    between = next(
+        (term.name for term in model.problem.terms if block_of(term.name).between), None
+    )
     if between is None:
         return None
     rotations = fitted_term(model, between)
-    first = len(model.problem.inputs.with_lines) - len(
-        rotations.values
-    )  # fewer if the term is free
+    # fewer if the term is free
+    first = len(model.problem.inputs.with_lines) - len(rotations.values)
     values = np.pad(rotations.values, (first, 0))
     covariance = np.pad(rotations.covariance, (first, 0))
     apart = abs(values[:, None] - values)
@@ -903,7 +971,9 @@ def line_cause(model: ModelFit, measurements: Measurements) -> Cause | None:
     u = lines.noise_without((v, k), least) / math.sqrt(lines.weight[v, k] * checked)
     view = measurements.views[problem.angular.index[v]].view.name
     return (
-        Cause(READING, float(lines.residual[v, k] / checked), u, "rad", p, view, mark=(k,))
+        Cause(
+            READING, float(lines.residual[v, k] / checked), u, "rad", p, view, mark=(k,)
+        )
         if p < CAUSE_LEVEL
         else None
     )

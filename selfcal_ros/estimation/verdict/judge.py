@@ -54,7 +54,12 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 from selfcal_ros.estimation.verdict.undetermined import undetermined_effects
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.kept import LACK_OF_FIT
-from selfcal_ros.model.readings import AFTER_SLIP, REPEAT_OUTLIER, Measurements, ViewReadings
+from selfcal_ros.model.readings import (
+    AFTER_SLIP,
+    REPEAT_OUTLIER,
+    Measurements,
+    ViewReadings,
+)
 from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
@@ -104,7 +109,9 @@ def judged(
         failed.append(Finding("not_converged"))
     failed += _sign_findings(checked, measurements, options)
     failed += _lines_sign_findings(checked, measurements, options)
-    searched = search_causes(checked, measurements, options, failed=bool(noises), advise=advise)
+    searched = search_causes(
+        checked, measurements, options, failed=bool(noises), advise=advise
+    )
     zero = {str(term.name) for term in options.terms if term.size == 0}
     causes = tuple(
         replace(cause, details={**cause.details, "declared": 0.0})
@@ -115,11 +122,17 @@ def judged(
     if is_same:
         solved = searched.solved
         noises = _noise_findings(solved)
-    failed += _scale_findings(solved if is_same else checked, measurements, options, causes)
+    failed += _scale_findings(
+        solved if is_same else checked, measurements, options, causes
+    )
     result = replace(solved.result, reference=options.reference)
     effects = [*searched.effects, *_beyond_repeats(solved)]
-    result = with_coverage(enlarged(result, [*effects, *undetermined_effects(solved, options)]))
-    bounded = searched.bounded and (is_same or not causes) and not _unexplained_noise(solved)
+    result = with_coverage(
+        enlarged(result, [*effects, *undetermined_effects(solved, options)])
+    )
+    bounded = (
+        searched.bounded and (is_same or not causes) and not _unexplained_noise(solved)
+    )
     grade = (
         Grade.GOOD
         if not (failed or noises or causes)
@@ -127,10 +140,11 @@ def judged(
         if bounded and not failed and result.has_uncertainty
         else Grade.NOT_QUALIFIED
     )
+    # else a line of the budget alone
     named = [
         *((cause.name, cause.unit) for cause in causes),
         *((LACK_OF_FIT, noise.unit) for noise in noises),
-    ]  # else a line of the budget alone
+    ]
     verdict = Verdict(
         grade,
         (*failed, *noises),
@@ -189,16 +203,22 @@ def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
         sign = 1 - 2 * (np.indices(shape).sum(axis=0) % 2)
         alternating_m = np.where(emap.valid, sign * size_m, 0.0)
         yield Effect(
-            LACK_OF_FIT, np.stack([alternating_m, alternating_m]), np.zeros(len(emap.g_theta))
+            LACK_OF_FIT,
+            np.stack([alternating_m, alternating_m]),
+            np.zeros(len(emap.g_theta)),
         )
     size_rad = _lack_of_fit(solved.theta, system.angular.weight, fitted.residuals_theta)
     if size_rad:
         yield Effect(
-            LACK_OF_FIT, np.zeros((2, *shape)), np.where(np.isfinite(emap.g_theta), size_rad, 0.0)
+            LACK_OF_FIT,
+            np.zeros((2, *shape)),
+            np.where(np.isfinite(emap.g_theta), size_rad, 0.0),
         )
 
 
-def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray) -> float:
+def _lack_of_fit(
+    noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
+) -> float:
     """Return the most that one mean has beyond noise, m or rad; 0 if residuals leave no doubt.
 
     By the upper limit of the residuals of each view, with the confidence of a doubtful size.
@@ -213,7 +233,9 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
     if not (noise.p_of_known < LACK_LEVEL and noise.residuals > noise.known):
         return 0.0
     weight_of_views = weight.reshape(len(weight), -1)
-    squares = (weight_of_views * residuals.reshape(weight_of_views.shape) ** 2).sum(axis=1)
+    squares = (weight_of_views * residuals.reshape(weight_of_views.shape) ** 2).sum(
+        axis=1
+    )
     share_of_view = (weight_of_views > 0).sum(axis=1) / (weight_of_views > 0).sum()
     dof = noise.dof_residuals * share_of_view
     largest = (
@@ -225,7 +247,8 @@ def _lack_of_fit(noise: NoiseEstimate, weight: np.ndarray, residuals: np.ndarray
     )
     return float(
         np.sqrt(
-            max(largest.max() - noise.known**2, 0.0) / weight_of_views[weight_of_views > 0].mean()
+            max(largest.max() - noise.known**2, 0.0)
+            / weight_of_views[weight_of_views > 0].mean()
         )
     )
 
@@ -249,7 +272,11 @@ def checked_by(
     """
     nx, ny = measurements.artifact.shape
     is_checked = failed or nx * ny <= ALWAYS_SITES
-    if options.causes is False or not is_checked or options.misalignment_model != "linear":
+    if (
+        options.causes is False
+        or not is_checked
+        or options.misalignment_model != "linear"
+    ):
         return solved
     try:
         linear = (
@@ -263,25 +290,32 @@ def checked_by(
     return rigid if SAME * rigid.xy.residuals < linear.xy.residuals else linear
 
 
-def _sign_findings(solved: Solved, measurements: Measurements, options: Options) -> list[Finding]:
+def _sign_findings(
+    solved: Solved, measurements: Measurements, options: Options
+) -> list[Finding]:
     """Return a finding if nothing shows the sign of the offsets, or lines alone do.
 
     Repeats show it, or the joint fit does (through where the stage stood beside its targets,
     rotations that lines share, and their squares), or the microscope was declared. Lines share
     rotations with the other sign as well if it is that of their own offsets, too.
     """
-    visits_known = all(view.visits is not None for view in measurements.views if len(view.m))
-    if (
-        _is_declared(options) or not visits_known or sign_is_shown(measurements)
-    ):  # nothing can show it
+    visits_known = all(
+        view.visits is not None for view in measurements.views if len(view.m)
+    )
+    # nothing can show it
+    if _is_declared(options) or not visits_known or sign_is_shown(measurements):
         return []
-    model = solved.model if options.finite_rotations else _rigid_fit(measurements, options)
+    model = (
+        solved.model if options.finite_rotations else _rigid_fit(measurements, options)
+    )
     if model is None or model.equations is None:
         return []
     equations = model.equations
     rows = equations.columns.having(lambda block: block.of_microscope)
     scale = [
-        at for at in np.flatnonzero(rows) if equations.columns.columns[at].component == "scale"
+        at
+        for at in np.flatnonzero(rows)
+        if equations.columns.columns[at].component == "scale"
     ]
     if not scale or not np.isfinite(model.fitted.xy.sigma):
         return []
@@ -294,7 +328,9 @@ def _sign_findings(solved: Solved, measurements: Measurements, options: Options)
         return not hidden and 0 <= spread * model.fitted.xy.sigma**2 <= SIGN_U**2
 
     with_lines = is_shown(by_lines=True)
-    if with_lines and (is_shown(by_lines=False) or sign_of_lines_is_shown(measurements)):
+    if with_lines and (
+        is_shown(by_lines=False) or sign_of_lines_is_shown(measurements)
+    ):
         return []
     if _stops_show_the_sign(model, measurements):
         return []
@@ -312,7 +348,8 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
     a = (Q(0) + Q(2)) / 2 - Q(1). It has to be nearer to 0 than to 1. All signs reversed, o - s is
     a reading as good as s - o: a stage that stood on its targets has nothing to tell them apart by.
     """
-    problem = replace(model.problem, terms=())  # with its noise: lines weigh the same for each k
+    # with its noise: lines weigh the same for each k
+    problem = replace(model.problem, terms=())
     stood = np.zeros_like(model.y)
     for row, (index, placed) in enumerate(
         zip(problem.grid.index, problem.inputs.visits, strict=True)
@@ -324,7 +361,8 @@ def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
         means = placed.means((motion * placed.phase)[None], stood[row].size)[0]
         stood[row] = means.reshape(stood[row].shape)
     with_it, halfway, without = (
-        squares(problem, fit(problem, model.y - k * stood), of_noise=False)[0] for k in range(3)
+        squares(problem, fit(problem, model.y - k * stood), of_noise=False)[0]
+        for k in range(3)
     )
     noise = max(model.fitted.xy.sigma, LEAST_NOISE_M)
     information = (with_it + without) / 2 - halfway
@@ -366,7 +404,11 @@ def _lines_sign_findings(
         return []
     turns = dict(zip(problem.grid.index, problem.turn_rad, strict=True))
     turn = np.array([turns.get(index, 0.0) for index in angular.index])[:, None]
-    for sign in (1, -1):  # of the readings before they were turned into the frame of the plate
+    # of the readings before they were turned into the frame of the plate
+    for sign in (
+        1,
+        -1,
+    ):
         y = np.where(angular.weight > 0, sign * (angular.y + turn) - turn, 0.0)
         read = replace(problem, angular=replace(angular, y=y))
         squared.append(squares(read, fit(read, model.y), of_noise=False)[0])
@@ -375,7 +417,10 @@ def _lines_sign_findings(
 
 
 def _scale_findings(
-    solved: Solved, measurements: Measurements, options: Options, causes: Iterable[Cause]
+    solved: Solved,
+    measurements: Measurements,
+    options: Options,
+    causes: Iterable[Cause],
 ) -> list[Finding]:
     """Return a finding if repeats contradict a scale of the microscope that is not fitted.
 
@@ -383,7 +428,8 @@ def _scale_findings(
     reduces the scale and that of detections increases it: they give limits.
     """
     term = next(
-        (term for term in options.model_terms(visits=True) if term.block.of_microscope), None
+        (term for term in options.model_terms(visits=True) if term.block.of_microscope),
+        None,
     )
     u = 0.0 if term is None else term.size_of("scale")
     fitted = [
@@ -396,7 +442,10 @@ def _scale_findings(
     if (
         np.isinf(u)
         or fitted
-        or any(cause.name in blocks() and blocks()[cause.name].of_microscope for cause in causes)
+        or any(
+            cause.name in blocks() and blocks()[cause.name].of_microscope
+            for cause in causes
+        )
     ):
         return []
     response = contradicted_scale(measurements, u)
@@ -432,7 +481,10 @@ def _noise_findings(solved: Solved) -> list[Finding]:
             noise.residuals,
             unit=unit,
             p=noise.p,
-            details={"stated": noise.stated, "declared": bool(np.isfinite(noise.declared))},
+            details={
+                "stated": noise.stated,
+                "declared": bool(np.isfinite(noise.declared)),
+            },
         )
         for noise, unit in ((solved.xy, "m"), (solved.theta, "rad"))
         if noise.contradicted
@@ -447,7 +499,9 @@ def _visits_findings(solved: Solved) -> list[Finding]:
     problem = solved.model.problem
     time_fitted = any(term.block.of_time for term in problem.terms)
     visits = [view for view in problem.inputs.visits if view is not None]
-    visited_once = len(visits) == len(problem.inputs.visits) and not any(v.repeated for v in visits)
+    visited_once = len(visits) == len(problem.inputs.visits) and not any(
+        v.repeated for v in visits
+    )
     return (
         [Finding("visited_once")]
         if visited_once and not time_fitted and problem.repeats_xy[1] > 0
@@ -468,7 +522,9 @@ def views_findings(measurements: Measurements) -> Iterator[Finding]:
         total = counts[REPEAT_OUTLIER] + n_used[name]
         if n_lost > max(FEW_OUTLIERS, MAX_REMOVED * total):
             yield Finding(
-                "repeats_contradict", view=name, details={"rejected": n_lost, "of": total}
+                "repeats_contradict",
+                view=name,
+                details={"rejected": n_lost, "of": total},
             )
     yield from _left_out_findings(measurements)
 
@@ -482,14 +538,18 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
     artifact = measurements.artifact
     readings_of_view = dict[str, list[ViewReadings]]()
     for readings in measurements.views:
-        view_of_part = replace(readings.view, name=readings.view.name.split(AFTER_SLIP)[0])
+        view_of_part = replace(
+            readings.view, name=readings.view.name.split(AFTER_SLIP)[0]
+        )
         readings_of_view.setdefault(view_of_part.plan_view, []).append(readings)
     kinds_read = (
         any(len(readings.m) for readings in measurements.views),
         any(len(readings.k) for readings in measurements.views),
     )
     for name, readings_of_cells in readings_of_view.items():
-        views = {readings.view.cell: readings.view for readings in readings_of_cells}.values()
+        views = {
+            readings.view.cell: readings.view for readings in readings_of_cells
+        }.values()
         n_planned = (
             sum(
                 int(view.on_stage(artifact).mark_rows(artifact)[1].sum())
@@ -504,11 +564,14 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
         )
         few = any(
             kind_read and got < DETERMINED * planned
-            for kind_read, got, planned in zip(kinds_read, n_read, n_planned, strict=True)
+            for kind_read, got, planned in zip(
+                kinds_read, n_read, n_planned, strict=True
+            )
         )
         if few or not any(n_read):
             rejected = sum(
-                (Counter(readings.rejected) for readings in readings_of_cells), Counter[str]()
+                (Counter(readings.rejected) for readings in readings_of_cells),
+                Counter[str](),
             )
             yield Finding(
                 "view_left_out",
@@ -516,7 +579,9 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
                 details={
                     "read": list(n_read),
                     "asked": list(n_planned),
-                    "rejected": {str(reason): count for reason, count in rejected.most_common(3)},
+                    "rejected": {
+                        str(reason): count for reason, count in rejected.most_common(3)
+                    },
                 },
             )
 
@@ -532,7 +597,9 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     left empty, so that the same readings give the same result. Stamps of 1970 are no dates: those
     of a simulated clock, or of images whose times are not known.
     """
-    first, last = time_ranges(measurements.views, [0] * len(measurements.views)).get(0, (0, 0))
+    first, last = time_ranges(measurements.views, [0] * len(measurements.views)).get(
+        0, (0, 0)
+    )
     extra: dict[str, Any] = {
         "visit_order": {
             view.view.name: view.view.visit_order
@@ -551,6 +618,8 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
 def _iso(stamp_ns: int) -> str:
     """Return a stamp as ISO 8601 in UTC; as nanoseconds if it is not a date."""
     try:
-        return datetime.fromtimestamp(stamp_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+        return datetime.fromtimestamp(stamp_ns / NS_PER_S, UTC).isoformat(
+            timespec="milliseconds"
+        )
     except (OverflowError, ValueError, OSError):
         return f"{stamp_ns} ns"

@@ -82,9 +82,9 @@ class FitOfKind:
         NaN where the others do not check the reading, or have no noise to compare it with.
         """
         dof = self.dof - self.coordinates
-        squares_of_others = float((self.weight * abs(self.residual) ** 2).sum()) - float(
-            self.squares[at]
-        )
+        squares_of_others = float(
+            (self.weight * abs(self.residual) ** 2).sum()
+        ) - float(self.squares[at])
         is_checked = dof > 0 and np.isfinite(squares_of_others)
         return (
             max(float(np.sqrt(max(squares_of_others, 0.0) / dof)), least)
@@ -151,7 +151,9 @@ def exact_leverage(
                     own_weight[i] * system.covariance(inverse, i, j) * own_weight[j]
                 )
     maps = system.response.T.reshape(len(misaligned), *system.shape)
-    basis = system.centred(system.misaligned(np.eye(len(misaligned))) - system.gather(maps))
+    basis = system.centred(
+        system.misaligned(np.eye(len(misaligned))) - system.gather(maps)
+    )
     answer = np.tensordot(misaligned, basis, axes=1)
     spread = (np.conj(basis) * answer).real.sum(axis=0) / system.coordinates
     h = weight * (1 / np.where(total > 0, total, 1.0) + (variance + spread))

@@ -94,7 +94,9 @@ class Adequacy:
         if not self.p < F_LEVEL:
             return None
         size: dict[str, Any] = (
-            {"harmonics": self.nodes[0]} if self.of_lines else {"nodes": list(self.nodes)}
+            {"harmonics": self.nodes[0]}
+            if self.of_lines
+            else {"nodes": list(self.nodes)}
         )
         return Cause(
             NAME,
@@ -149,12 +151,19 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
     if bilinear and squares_coarse > readings * FLOOR**2:
         smooth = MapSpline.of(grid.views.artifact.field, Interpolation.BICUBIC)
         if (refit := with_map(model, smooth)) is not None:
-            squares_refit = max(_squares(_of_marks(refit), refit.y), FLOOR * squares_coarse)
+            squares_refit = max(
+                _squares(_of_marks(refit), refit.y), FLOOR * squares_coarse
+            )
             likelier = math.exp(
-                min((readings - n[1]) / 2 * math.log(squares_refit / squares_coarse), 0.0)
+                min(
+                    (readings - n[1]) / 2 * math.log(squares_refit / squares_coarse),
+                    0.0,
+                )
             )
             p, apart = min(p, likelier), _apart(refit, model)
-            power = apart if likelier < F_LEVEL and apart.mean() > power.mean() else power
+            power = (
+                apart if likelier < F_LEVEL and apart.mean() > power.mean() else power
+            )
     local = np.zeros((2, *grid.views.shape))
     i, j = _halves(coarse)
     nodes = (i % 2 == 0) & (j % 2 == 0)
@@ -165,14 +174,18 @@ def adequacy_of(model: ModelFit) -> Adequacy | None:
 def _of_marks(model: ModelFit) -> PlacedEquations:
     """Return the equations of the marks alone."""
     system = cast(PlacedEquations, model.problem.system)
-    return PlacedEquations(system.grid, AngularSystem((), np.zeros((0, 0))), system.grid_index, ())
+    return PlacedEquations(
+        system.grid, AngularSystem((), np.zeros((0, 0))), system.grid_index, ()
+    )
 
 
 def _of_terms(model: ModelFit, of_other_map: ModelFit) -> float:
     """Return what the terms change of a map by what another map makes of them, rms, m."""
     if model.equations is None:
         return 0.0
-    map_change_m = model.equations.maps @ (of_other_map.coefficients - model.coefficients)
+    map_change_m = model.equations.maps @ (
+        of_other_map.coefficients - model.coefficients
+    )
     return float(np.sqrt((np.abs(map_change_m) ** 2).mean() / 2))
 
 
@@ -188,7 +201,9 @@ def maps_to_try(measurements: Measurements) -> Iterator[tuple[str, Measurements]
         yield text, replace(measurements, artifact=with_nodes(artifact, text, "map"))
 
 
-def _improved(squares_coarse: float, squares_fine: float, n_further: float, dof: float) -> float:
+def _improved(
+    squares_coarse: float, squares_fine: float, n_further: float, dof: float
+) -> float:
     """Return the probability of such an improvement by chance (method eq. 12.4)."""
     if squares_fine < dof * FLOOR**2:  # there is no F of rounding
         return 1.0 if squares_coarse < 4 * (dof + n_further) * FLOOR**2 else 0.0
@@ -212,7 +227,12 @@ def line_adequacy_of(model: ModelFit) -> Adequacy | None:
     finer = min(2 * coarse.harmonics, (coarse.n_lines - 1) // 2)
     fine = HarmonicSystem(coarse.turns, coarse.weight, finer)
     n_further = fine.n_determined - coarse.n_determined
-    dof = coarse.n_readings - int(coarse.mark_read.sum()) - fine.n_determined - (coarse.n_views - 1)
+    dof = (
+        coarse.n_readings
+        - int(coarse.mark_read.sum())
+        - fine.n_determined
+        - (coarse.n_views - 1)
+    )
     if n_further < 1 or dof < 1:
         return None
     (squares_coarse, coarse_map), (squares_fine, fine_map) = (
@@ -276,12 +296,16 @@ def _map_of_marks(model: ModelFit, places_m: np.ndarray) -> np.ndarray:
     """Return the map of the marks alone at places, in no particular datum, complex (P,), m."""
     system = _of_marks(model)
     spline = system.grid.views.spline
-    return spline.rows(places_m) @ spline.coefficients(system.grid_fit(model.y)[0]).ravel()
+    return (
+        spline.rows(places_m) @ spline.coefficients(system.grid_fit(model.y)[0]).ravel()
+    )
 
 
 def _datum_of(places_m: np.ndarray) -> Gauge:
     """Return the datum of a map at places, complex (P,)."""
-    return Gauge(places_m / abs(places_m).max(), np.ones(len(places_m), dtype=bool), scale=True)
+    return Gauge(
+        places_m / abs(places_m).max(), np.ones(len(places_m), dtype=bool), scale=True
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +329,9 @@ class _Further:
     error: np.ndarray
 
     @classmethod
-    def of(cls, fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray) -> "_Further":
+    def of(
+        cls, fine: PlacedEquations, coarse: PlacedEquations, y: np.ndarray
+    ) -> "_Further":
         """Return it for refined and coarse equations of the same readings y."""
         places_m = known_places(coarse)
         grid = fine.grid
@@ -320,19 +346,32 @@ class _Further:
         normal -= elimination @ coupling.T
         right = np.concatenate([b.real, b.imag]) - elimination @ d
         contained = nodes.within(spline)
-        further = np.eye(len(b)) - contained @ spline.rows(nodes.places_m.ravel()).toarray()
-        coarse_basis, further_basis = (np.kron(np.eye(2), basis) for basis in (contained, further))
-        inverse = np.linalg.pinv(coarse_basis.T @ normal @ coarse_basis, hermitian=True, rcond=GAP)
+        further = (
+            np.eye(len(b)) - contained @ spline.rows(nodes.places_m.ravel()).toarray()
+        )
+        coarse_basis, further_basis = (
+            np.kron(np.eye(2), basis) for basis in (contained, further)
+        )
+        inverse = np.linalg.pinv(
+            coarse_basis.T @ normal @ coarse_basis, hermitian=True, rcond=GAP
+        )
         answer = inverse @ (coarse_basis.T @ normal)
         projected = further_basis.T @ (normal - normal @ coarse_basis @ answer)
         eigenvalues, vectors = np.linalg.eigh(projected @ further_basis)
-        coefficient_errors = (coarse_basis @ (answer @ further_basis) - further_basis) @ vectors
-        scalar = np.asarray(spline.rows(places_m) @ np.hstack(np.split(coefficient_errors, 2)))
+        coefficient_errors = (
+            coarse_basis @ (answer @ further_basis) - further_basis
+        ) @ vectors
+        scalar = np.asarray(
+            spline.rows(places_m) @ np.hstack(np.split(coefficient_errors, 2))
+        )
         field = (
-            scalar[:, : coefficient_errors.shape[1]] + 1j * scalar[:, coefficient_errors.shape[1] :]
+            scalar[:, : coefficient_errors.shape[1]]
+            + 1j * scalar[:, coefficient_errors.shape[1] :]
         )
         field = _datum_of(places_m).without(field)
-        right_of_further = right - normal @ coarse_basis @ (inverse @ (coarse_basis.T @ right))
+        right_of_further = right - normal @ coarse_basis @ (
+            inverse @ (coarse_basis.T @ right)
+        )
         return cls(
             np.maximum(eigenvalues, 0.0),
             vectors.T @ (further_basis.T @ right_of_further),
@@ -346,7 +385,9 @@ class _Further:
         least = sigma_m / np.sqrt(values.max())
         sizes = np.concatenate([[0.0], least * np.geomspace(*SIZES)])
         variance = values * sigma_m**2 + np.multiply.outer(sizes, values) ** 2
-        return float(sizes[(np.log(variance) + right**2 / variance).sum(axis=1).argmin()])
+        return float(
+            sizes[(np.log(variance) + right**2 / variance).sum(axis=1).argmin()]
+        )
 
     def power(self, sigma_m: float) -> np.ndarray:
         """Return the mean squared error of the coarse map at the places (eq. 12.6), (2 P,), m^2."""
@@ -354,4 +395,6 @@ class _Further:
         if not size:
             return np.zeros(len(self.error))
         share = size**2 / (sigma_m**2 + size**2 * self.information)
-        return (self.error @ (share * self.right)) ** 2 + self.error**2 @ (share * sigma_m**2)
+        return (self.error @ (share * self.right)) ** 2 + self.error**2 @ (
+            share * sigma_m**2
+        )

@@ -32,7 +32,11 @@ from selfcal_ros.estimation.verdict.causes import (
     scatter_of_views,
     turned_too_far,
 )
-from selfcal_ros.estimation.verdict.roughness import adequacy_of, line_adequacy_of, maps_to_try
+from selfcal_ros.estimation.verdict.roughness import (
+    adequacy_of,
+    line_adequacy_of,
+    maps_to_try,
+)
 from selfcal_ros.estimation.verdict.uncertainty import (
     Effect,
     difference,
@@ -116,19 +120,24 @@ def search_causes(
     raised = {
         str(test.name): _raised_cause(solved, test)
         for test in tests
-        if (test.contradicted or not _is_plausible(test)) and test.name not in search.terms
+        if (test.contradicted or not _is_plausible(test))
+        and test.name not in search.terms
     }
     scales = (
         _either_scale(solved, measurements, options)
         if any(block_of(name).of_offsets for name, cause in raised.items() if cause)
         else {}
     )
-    raised = scales | {name: cause for name, cause in raised.items() if name not in scales}
+    raised = scales | {
+        name: cause for name, cause in raised.items() if name not in scales
+    }
     names = [name for name, cause in raised.items() if cause is not None]
     search.bounded &= not any(_beyond_u(solved, test) for test in tests)
     plausible = all(map(_is_plausible, tests))
     between = any(block_of(name).between for name in raised)
-    alike = bool(scales) or (between and _as_a_microscope(search, measurements, options))
+    alike = bool(scales) or (
+        between and _as_a_microscope(search, measurements, options)
+    )
     search.causes[:0] = [cause for cause in raised.values() if cause is not None]
     _allow_for_plates(search, names, measurements, options)
     turned = turned_too_far(solved.joint, solved.result, measurements)
@@ -136,11 +145,19 @@ def search_causes(
         search.bounded = False
         if turned.name not in [cause.name for cause in search.causes]:
             search.causes.append(turned)
-    for rough in filter(None, (adequacy_of(solved.joint), line_adequacy_of(solved.joint))):
+    for rough in filter(
+        None, (adequacy_of(solved.joint), line_adequacy_of(solved.joint))
+    ):
         search.effects.append(rough.effect(solved.result))
         if (cause := rough.cause) is not None:
-            nodes = _better_map(measurements, options) if advise and not rough.of_lines else ""
-            search.causes.append(replace(cause, remedies=(Remedy("map", nodes),) if nodes else ()))
+            nodes = (
+                _better_map(measurements, options)
+                if advise and not rough.of_lines
+                else ""
+            )
+            search.causes.append(
+                replace(cause, remedies=(Remedy("map", nodes),) if nodes else ())
+            )
     if off_sites is not None:
         search.causes.insert(
             0 if off_sites.residuals_show_it else len(search.causes), off_sites.cause
@@ -154,7 +171,10 @@ def search_causes(
             )
         )
         search.bounded &= off_sites.bounded
-    search.solved, search.terms = _from_readings(solved, search.terms), [*names, *search.terms]
+    search.solved, search.terms = (
+        _from_readings(solved, search.terms),
+        [*names, *search.terms],
+    )
     search.bounded &= plausible
     if advise and search.causes:
         tried = search.terms and plausible and not alike
@@ -164,7 +184,9 @@ def search_causes(
             READING,
             *([turned.name] if turned else []),
         )
-        search.causes = [_advised(cause, model, search.terms, faulty) for cause in search.causes]
+        search.causes = [
+            _advised(cause, model, search.terms, faulty) for cause in search.causes
+        ]
     return search
 
 
@@ -204,7 +226,9 @@ def _advised(
     return replace(cause, remedies=tuple(remedies))
 
 
-def _best_model(searched: SearchResult, measurements: Measurements, options: Options) -> str | None:
+def _best_model(
+    searched: SearchResult, measurements: Measurements, options: Options
+) -> str | None:
     """Return the model with which these readings give a good map; None if there is none.
 
     Its terms are free, or have the sizes that the readings allow: of the two models, if nothing
@@ -215,7 +239,8 @@ def _best_model(searched: SearchResult, measurements: Measurements, options: Opt
     least = np.inf
     for free in (True, False):
         terms = [
-            ModelTerm(name) if free else terms_used[name].rounded_up for name in searched.terms
+            ModelTerm(name) if free else terms_used[name].rounded_up
+            for name in searched.terms
         ]
         tried = replace(options, terms=merged(options.terms, terms))
         if (solved := _uncontradicted(measurements, tried)) is not None:
@@ -234,7 +259,9 @@ def _from_readings(solved: Solved, joined: Iterable[str]) -> Solved:
     def of(term: TermResult) -> TermResult:
         if term.name not in joined:
             return term
-        return replace(term, size=term.size_used or term.size, size_used=None, source="readings")
+        return replace(
+            term, size=term.size_used or term.size, size_used=None, source="readings"
+        )
 
     result = solved.result
     model = replace(result.model, terms=tuple(of(term) for term in result.model.terms))
@@ -265,7 +292,9 @@ def _search(
     explanations: list[Explanation] = []
     for _ in range(MAX_CAUSES + 1):
         explanations = _explanations(search.solved, failed=failed)
-        first = [item for item in explanations if item.rank == 0 and item.name in blocks()]
+        first = [
+            item for item in explanations if item.rank == 0 and item.name in blocks()
+        ]
         if not first or not _join(search, first, measurements, options):
             break
         failed = False
@@ -289,11 +318,15 @@ def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
     """Return explanations of the residuals of a solution, the most likely first."""
     model = solved.joint
     explanations = [
-        item for item in find_explanations(model, slips=False) if failed or _counts(item, solved)
+        item
+        for item in find_explanations(model, slips=False)
+        if failed or _counts(item, solved)
     ]
     if explanations or failed:
         explanations = [
-            item for item in find_explanations(model, slips=True) if failed or _counts(item, solved)
+            item
+            for item in find_explanations(model, slips=True)
+            if failed or _counts(item, solved)
         ]
     if not explanations or (fine := finer(model)) is None:
         return explanations
@@ -303,17 +336,16 @@ def _explanations(solved: Solved, *, failed: bool) -> list[Explanation]:
 
 def _counts(explanation: Explanation, solved: Solved) -> bool:
     """Return whether an explanation matters for the map."""
-    if (
-        not explanation.determined or explanation.name == READING
-    ):  # one node may be far off, and the rest not
+    # one node may be far off, and the rest not
+    if not explanation.determined or explanation.name == READING:
         return True
     emap = solved.result.error_map
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
     if not np.isfinite(u).any():
         return True
-    return explanation.effect_m > MATTERS * rms(u) or explanation.effect_rad > MATTERS * rms(
-        emap.u_g_theta
-    )
+    return explanation.effect_m > MATTERS * rms(
+        u
+    ) or explanation.effect_rad > MATTERS * rms(emap.u_g_theta)
 
 
 def solved_with(
@@ -321,7 +353,9 @@ def solved_with(
 ) -> Solved | None:
     """Return the solution with further terms; None if there is none."""
     try:
-        return solve_joint(measurements, replace(options, terms=merged(options.terms, terms)))
+        return solve_joint(
+            measurements, replace(options, terms=merged(options.terms, terms))
+        )
     except (NotIdentifiableError, InputError):
         return None
 
@@ -332,7 +366,10 @@ def _hardly(name: str) -> ModelTerm:
 
 
 def _join(
-    search: SearchResult, first: list[Explanation], measurements: Measurements, options: Options
+    search: SearchResult,
+    first: list[Explanation],
+    measurements: Measurements,
+    options: Options,
 ) -> bool:
     """Add the first of equally good explanations to the model; the others enlarge u.
 
@@ -347,14 +384,21 @@ def _join(
         return False
     for alternative in first[1:]:
         twin = solved_with(
-            measurements, options, [_hardly(n) for n in (*search.terms, alternative.name)]
+            measurements,
+            options,
+            [_hardly(n) for n in (*search.terms, alternative.name)],
         )
         if twin is not None:
-            search.effects.append(difference(alternative.name, twin.result, solved.result))
+            search.effects.append(
+                difference(alternative.name, twin.result, solved.result)
+            )
     search.causes += [cause_of(item, inputs) for item in first]
     search.solved, search.terms = solved, names
     search.causes[-len(first)] = cause_of(
-        fitted_term(solved.joint, first[0].name, first[0].p, determined=first[0].determined), inputs
+        fitted_term(
+            solved.joint, first[0].name, first[0].p, determined=first[0].determined
+        ),
+        inputs,
     )
     return True
 
@@ -378,10 +422,14 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
     u_of_map = {"m": u, "rad": rms(solved.result.error_map.u_g_theta)}
     # the part that no reading determines is in the uncertainty, as far as that is known
     little = bool(contributions) and all(
-        contribution.u_rms < MATTERS * u_of_map[contribution.unit] for contribution in contributions
+        contribution.u_rms < MATTERS * u_of_map[contribution.unit]
+        for contribution in contributions
     )
     fitted = fitted_term(
-        solved.joint, term.name, test.p, determined=little or test.rank == len(term.estimates)
+        solved.joint,
+        term.name,
+        test.p,
+        determined=little or test.rank == len(term.estimates),
     )
     if not _counts(fitted, solved) and _is_plausible(test):
         return None
@@ -416,7 +464,10 @@ def _beyond_u(solved: Solved, test: SizeTest) -> bool:
 
 
 def _allow_for_plates(
-    search: SearchResult, raised: Collection[str], measurements: Measurements, options: Options
+    search: SearchResult,
+    raised: Collection[str],
+    measurements: Measurements,
+    options: Options,
 ) -> None:
     """Add plates that differ as causes beside scales of offsets that explain no more than they do.
 
@@ -431,15 +482,21 @@ def _allow_for_plates(
             continue
         contradicted = [test for test in twin.joint.sizes if test.contradicted]
         plausible = [
-            test for test in contradicted if block_of(test.name).of_plate and _is_plausible(test)
+            test
+            for test in contradicted
+            if block_of(test.name).of_plate and _is_plausible(test)
         ]
         if not contradicted or plausible != contradicted:
             continue
-        search.causes += filter(None, (_raised_cause(twin, test) for test in contradicted))
+        search.causes += filter(
+            None, (_raised_cause(twin, test) for test in contradicted)
+        )
         search.effects.append(difference(name, twin.result, search.solved.result))
 
 
-def _as_a_microscope(search: SearchResult, measurements: Measurements, options: Options) -> bool:
+def _as_a_microscope(
+    search: SearchResult, measurements: Measurements, options: Options
+) -> bool:
     """Return whether a microscope of another scale explains the rotation of lines equally well.
 
     If so it is a cause as well, and its effect enlarges the uncertainty, unless that is small.
@@ -458,13 +515,16 @@ def _as_a_microscope(search: SearchResult, measurements: Measurements, options: 
     fitted = fitted_term(twin.joint, microscope.name)
     effect = difference(str(microscope.name), twin.result, search.solved.result)
     if not _counts(
-        replace(fitted, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)), search.solved
+        replace(fitted, effect_m=rms(effect.xy), effect_rad=rms(effect.theta)),
+        search.solved,
     ):
         return False
     cause = cause_of(fitted, twin.joint.problem.inputs)
     search.causes.append(cause)
     search.effects.append(effect)
-    search.bounded &= not abs(cause.size) > max(microscope.size, microscope.block.plausible)
+    search.bounded &= not abs(cause.size) > max(
+        microscope.size, microscope.block.plausible
+    )
     return True
 
 
@@ -491,7 +551,10 @@ def _noisy_views(search: SearchResult, measurements: Measurements) -> None:
     views = scatter_of_views(measurements, search.solved.joint)
     emap = search.solved.result.error_map
     noisy = noisier_views(views)
-    largest = max((sigma for name, sigma, _ in views if name in [c.view for c in noisy]), default=0)
+    largest = max(
+        (sigma for name, sigma, _ in views if name in [c.view for c in noisy]),
+        default=0,
+    )
     if (ratio := largest / search.solved.xy.sigma) > 1:
         more = np.nan_to_num(emap.u_xy) * np.sqrt(ratio**2 - 1)
         search.effects.append(Effect("noise", more, np.zeros(len(emap.g_theta))))
@@ -505,7 +568,9 @@ def _with_wide(
 
     None if there is none, or the readings contradict another size.
     """
-    wider = microscope.scaled(max(BEYOND * microscope.block.plausible / microscope.size, 1.0))
+    wider = microscope.scaled(
+        max(BEYOND * microscope.block.plausible / microscope.size, 1.0)
+    )
     twin = solved_with(measurements, options, [wider])
     contradicted = twin is None or any(test.contradicted for test in twin.joint.sizes)
     return None if contradicted else twin
@@ -524,6 +589,10 @@ def _either_scale(
             twin = _with_wide(term, measurements, options)
             if twin is None:
                 return {}
-            cause = cause_of(fitted_term(twin.joint, term.name), twin.joint.problem.inputs)
-            causes[str(term.name)] = replace(cause, details=cause.details | {"either": True})
+            cause = cause_of(
+                fitted_term(twin.joint, term.name), twin.joint.problem.inputs
+            )
+            causes[str(term.name)] = replace(
+                cause, details=cause.details | {"either": True}
+            )
     return causes if len(causes) > 1 else {}

@@ -55,7 +55,9 @@ class Effect:
         return "m" if self.xy.any() else "rad"
 
 
-def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray) -> Effect:
+def effect_of_field(
+    name: str, field: np.ndarray, sense: str, theta: np.ndarray
+) -> Effect:
     """Return an effect that is given in the frame of the equations.
 
     Parameters
@@ -68,16 +70,22 @@ def effect_of_field(name: str, field: np.ndarray, sense: str, theta: np.ndarray)
         Sense of the measurement.
     """
     field = turned_over(sense, field)
-    return Effect(name, np.stack([field.real, field.imag]), lines_turned_over(sense, theta))
+    return Effect(
+        name, np.stack([field.real, field.imag]), lines_turned_over(sense, theta)
+    )
 
 
-def difference(name: str, result: CalibrationResult, other: CalibrationResult) -> Effect:
+def difference(
+    name: str, result: CalibrationResult, other: CalibrationResult
+) -> Effect:
     """Return the difference of two maps of the same readings; 0 where one is unknown."""
     a, b = result.error_map, other.error_map
     theta = a.g_theta - b.g_theta
     if np.isfinite(theta).any():
         theta = theta - np.nanmean(theta)
-    return Effect(name, np.nan_to_num(np.stack([a.gx - b.gx, a.gy - b.gy])), np.nan_to_num(theta))
+    return Effect(
+        name, np.nan_to_num(np.stack([a.gx - b.gx, a.gy - b.gy])), np.nan_to_num(theta)
+    )
 
 
 def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> CalibrationResult:
@@ -88,7 +96,10 @@ def enlarged(result: CalibrationResult, effects: Iterable[Effect]) -> Calibratio
     emap, plate, kept_parts = result.error_map, result.artifact_map, result.kept
     power = np.sum([effect.xy**2 for effect in effects], axis=0)
     of_plate = sum(
-        (np.mean(effect.xy**2) if effect.plate is None else effect.plate**2 for effect in effects),
+        (
+            np.mean(effect.xy**2) if effect.plate is None else effect.plate**2
+            for effect in effects
+        ),
         np.zeros((2, *plate.ax.shape)),
     )
     u_theta = np.sqrt(emap.u_g_theta**2 + sum(effect.theta**2 for effect in effects))
@@ -142,11 +153,18 @@ def enlargements(
     for name in dict.fromkeys(names):
         if name in result.kept.angular:
             u = result.kept.angular[name]
-            contributions.append(Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad"))
+            contributions.append(
+                Enlargement(name, rms(u), float(u.max(initial=0.0)), "rad")
+            )
     for effect in effects:
         values = effect.xy if effect.unit == "m" else effect.theta
         contributions.append(
-            Enlargement(effect.name, rms(values), float(np.abs(values).max(initial=0)), effect.unit)
+            Enlargement(
+                effect.name,
+                rms(values),
+                float(np.abs(values).max(initial=0)),
+                effect.unit,
+            )
         )
     return tuple(sorted(contributions, key=lambda item: -item.u_rms))
 
@@ -185,7 +203,11 @@ def with_coverage(result: CalibrationResult) -> CalibrationResult:
     noise, emap = result.noise, result.error_map
     terms = {term.name: term for term in result.model.terms}
     of_lines = sum(
-        (u**2 for name, u in result.kept.angular.items() if _is_undetermined(terms.get(name))),
+        (
+            u**2
+            for name, u in result.kept.angular.items()
+            if _is_undetermined(terms.get(name))
+        ),
         np.zeros(emap.u_g_theta.shape),
     )
     changed: dict[str, float] = {}
@@ -249,7 +271,11 @@ class Budget:
         return float(
             np.hypot(
                 self.worst,
-                sum(line.effect_max for line in self.lines if line.component == INTERPOLATION),
+                sum(
+                    line.effect_max
+                    for line in self.lines
+                    if line.component == INTERPOLATION
+                ),
             )
         )
 
@@ -270,7 +296,10 @@ class Budget:
             line
             for line in self.lines
             if line.source == "default"
-            and (line.component.startswith(TERM) and line.effect_rms**2 > OWED * self.u_rms**2)
+            and (
+                line.component.startswith(TERM)
+                and line.effect_rms**2 > OWED * self.u_rms**2
+            )
         )
 
     @property
@@ -326,7 +355,9 @@ def budget_lines(result: CalibrationResult) -> Iterator[BudgetLine]:
     yield _reference_line(np.sqrt(of_reference), result.reference)
     yield _interpolation_xy(result)
     if np.isfinite(emap.u_g_theta).any():
-        power_of_noise = emap.u_g_theta**2 - sum(u**2 for u in result.kept.angular.values())
+        power_of_noise = emap.u_g_theta**2 - sum(
+            u**2 for u in result.kept.angular.values()
+        )
         yield _noise_line("theta", np.sqrt(np.maximum(power_of_noise, 0.0)), noise)
         for name, u in result.kept.angular.items():
             yield _term_line("theta", name, u, result)
@@ -355,7 +386,9 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
     )
     unit = "m" if kind == "xy" else "rad"
     if not (np.isfinite(sigma) and sigma > 0):
-        return BudgetLine(kind, "reading noise", "A", 0.0, 0.0, unit, 0.0, 0.0, np.inf, "readings")
+        return BudgetLine(
+            kind, "reading noise", "A", 0.0, 0.0, unit, 0.0, 0.0, np.inf, "readings"
+        )
     dof = _dof(noise, kind)
     by = (
         "residuals"
@@ -381,7 +414,9 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
     )
 
 
-def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResult) -> BudgetLine:
+def _term_line(
+    quantity: str, name: str, u: np.ndarray, result: CalibrationResult
+) -> BudgetLine:
     """Return the contribution of a term with a size, or of a cause, to a map's uncertainty.
 
     A term is of type A if the readings determine it, otherwise of type B.
@@ -389,7 +424,9 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
     effect = rms(u), float(u.max(initial=0.0))
     term = next((term for term in result.model.terms if term.name == name), None)
     if term is None:
-        cause = next((cause for cause in result.verdict.causes if cause.name == name), None)
+        cause = next(
+            (cause for cause in result.verdict.causes if cause.name == name), None
+        )
         if cause is None and name in blocks():  # not determined by the readings
             block = block_of(name)
             return BudgetLine(
@@ -405,7 +442,9 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
                 {"given": block.nominal},
             )
         value, u_value, unit = (
-            (np.nan, np.nan, "m") if cause is None else (cause.size, cause.u, cause.unit)
+            (np.nan, np.nan, "m")
+            if cause is None
+            else (cause.size, cause.u, cause.unit)
         )
         return BudgetLine(
             quantity,
@@ -421,7 +460,9 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
         )
     remaining = remaining_part(term)
     determined = remaining < DETERMINED_BELOW
-    largest = max(term.estimates, key=lambda estimate: abs(np.nan_to_num(estimate.value)))
+    largest = max(
+        term.estimates, key=lambda estimate: abs(np.nan_to_num(estimate.value))
+    )
     return BudgetLine(
         quantity,
         TERM + name,
@@ -432,7 +473,11 @@ def _term_line(quantity: str, name: str, u: np.ndarray, result: CalibrationResul
         *effect,
         _dof(result.noise, quantity) if determined else np.inf,
         "readings" if determined or term.size_used else term.source,
-        {"given": term.size or term.solved_with, "allowed": term.size_used, "remaining": remaining},
+        {
+            "given": term.size or term.solved_with,
+            "allowed": term.size_used,
+            "remaining": remaining,
+        },
     )
 
 
@@ -465,7 +510,10 @@ def _interpolation_xy(result: CalibrationResult) -> BudgetLine:
     if result.plate.map_grid is not None:
         return _interpolation("xy", 0.0, 0.0)
     errors = [
-        [error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0)) for axis in (0, 1)]
+        [
+            error_halfway(np.moveaxis(field, axis, 0), np.moveaxis(u, axis, 0))
+            for axis in (0, 1)
+        ]
         for field, u in ((emap.gx, emap.u_gx), (emap.gy, emap.u_gy))
     ]
     return _interpolation(
@@ -479,7 +527,9 @@ def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
     if result.plate.harmonics:  # a Fourier series is known between the lines as on them
         return _interpolation("theta", 0.0, 0.0)
     emap = result.error_map
-    return _interpolation("theta", *error_halfway(emap.g_theta, emap.u_g_theta, ring=True))
+    return _interpolation(
+        "theta", *error_halfway(emap.g_theta, emap.u_g_theta, ring=True)
+    )
 
 
 def _interpolation(quantity: str, halfway: float, largest: float) -> BudgetLine:

@@ -73,5 +73,7 @@ def _effect(name: str, coordinates: np.ndarray, solved: Solved) -> Effect:
     emap, plate = solved.result.error_map, solved.result.artifact_map
     stage, of_plate = np.split(coordinates, [2 * emap.gx.size])
     x, y = stage.reshape(2, *emap.gx.shape)
-    effect = effect_of_field(name, x + 1j * y, solved.result.sense, np.zeros(len(emap.g_theta)))
+    effect = effect_of_field(
+        name, x + 1j * y, solved.result.sense, np.zeros(len(emap.g_theta))
+    )
     return replace(effect, plate=of_plate.reshape(2, *plate.ax.shape))

@@ -46,10 +46,12 @@ def _mixed(stops: tuple[str, ...], fraction: float) -> str:
     place = fraction * (len(stops) - 1)
     index = min(int(place), len(stops) - 2)
     low, high = (
-        tuple(int(stops[i][at : at + 2], 16) for at in (1, 3, 5)) for i in (index, index + 1)
+        tuple(int(stops[i][at : at + 2], 16) for at in (1, 3, 5))
+        for i in (index, index + 1)
     )
     return "#" + "".join(
-        f"{round(a + (b - a) * (place - index)):02x}" for a, b in zip(low, high, strict=True)
+        f"{round(a + (b - a) * (place - index)):02x}"
+        for a, b in zip(low, high, strict=True)
     )
 
 
@@ -175,10 +177,16 @@ class Drawing:
         dash: Sequence[float] = (),
     ) -> None:
         """Draw one line through points."""
-        self.items.append(Path((tuple(points),), stroke=stroke, width=width, dash=tuple(dash)))
+        self.items.append(
+            Path((tuple(points),), stroke=stroke, width=width, dash=tuple(dash))
+        )
 
     def lines(
-        self, lines: Iterable[Iterable[Point]], *, stroke: str = "ink", width: float = 1.0
+        self,
+        lines: Iterable[Iterable[Point]],
+        *,
+        stroke: str = "ink",
+        width: float = 1.0,
     ) -> None:
         """Draw many lines in one style."""
         together = tuple(tuple(line) for line in lines)
@@ -374,7 +382,9 @@ class Frame:
             return [(value, tick_text(value)) for value in round_ticks(*span, count)]
         step = max(1, round((span[1] - span[0]) / count))
         decades = range(math.ceil(span[0]), math.floor(span[1]) + 1, step)
-        return [(decade, "10" + str(decade).translate(SUPERSCRIPT)) for decade in decades]
+        return [
+            (decade, "10" + str(decade).translate(SUPERSCRIPT)) for decade in decades
+        ]
 
 
 def round_step(span: float, count: int) -> float:
@@ -387,14 +397,17 @@ def round_step(span: float, count: int) -> float:
     rough = span / max(count, 1)
     power = 10.0 ** math.floor(math.log10(rough))
     return next(
-        (step * power for step in (1, 2, 5) if step * power >= rough * (1 - 1e-9)), 10 * power
+        (step * power for step in (1, 2, 5) if step * power >= rough * (1 - 1e-9)),
+        10 * power,
     )
 
 
 def round_down(value: float) -> float:
     """Return the largest of 1, 2, 5 times a power of ten that is not above `value` > 0."""
     power = 10.0 ** math.floor(math.log10(value))
-    return next((step * power for step in (5, 2) if step * power <= value * (1 + 1e-12)), power)
+    return next(
+        (step * power for step in (5, 2) if step * power <= value * (1 + 1e-12)), power
+    )
 
 
 def round_ticks(low: float, high: float, count: int) -> list[float]:

@@ -62,7 +62,10 @@ def map_picture(
 
 
 def difference_picture(
-    a: CalibrationResult, b: CalibrationResult, difference: Mapping[str, Any], verdict: str
+    a: CalibrationResult,
+    b: CalibrationResult,
+    difference: Mapping[str, Any],
+    verdict: str,
 ) -> draw.Drawing:
     """Return two maps and their difference side by side, each at its own scale.
 
@@ -78,7 +81,9 @@ def difference_picture(
     """
     map_a, map_b = a.error_map, b.error_map
     noise = replace(
-        a.noise, k_xy=max(a.noise.k_xy, b.noise.k_xy), k_theta=max(a.noise.k_theta, b.noise.k_theta)
+        a.noise,
+        k_xy=max(a.noise.k_xy, b.noise.k_xy),
+        k_theta=max(a.noise.k_theta, b.noise.k_theta),
     )
     names = ("gx", "gy", "g_theta")
     of_b = replace(
@@ -94,7 +99,9 @@ def difference_picture(
             map_a,
             **difference,
             **{
-                f"u_{name}": np.hypot(*(getattr(emap, f"u_{name}") for emap in (map_a, map_b)))
+                f"u_{name}": np.hypot(
+                    *(getattr(emap, f"u_{name}") for emap in (map_a, map_b))
+                )
                 for name in names
             },
         ),
@@ -103,13 +110,18 @@ def difference_picture(
     pictures = [error_map(result, title=title) for title, result in titled]
     if np.isfinite(difference["g_theta"]).any():
         pictures.append(
-            angular_map(of_both, title="B − A in θ in arcsec, outwards = counter-clockwise")
+            angular_map(
+                of_both, title="B − A in θ in arcsec, outwards = counter-clockwise"
+            )
         )
     return _side_by_side(pictures, verdict, f"A: {_origin(a)}", f"B: {_origin(b)}")
 
 
 def verification_picture(
-    before: CalibrationResult, after: CalibrationResult, verification: Verification, sentence: str
+    before: CalibrationResult,
+    after: CalibrationResult,
+    verification: Verification,
+    sentence: str,
 ) -> draw.Drawing:
     """Return the maps without and with the correction side by side, at one scale.
 
@@ -123,7 +135,8 @@ def verification_picture(
         Heading.
     """
     with_it = replace(
-        after, error_map=replace(after.error_map, gx=verification.gx, gy=verification.gy)
+        after,
+        error_map=replace(after.error_map, gx=verification.gx, gy=verification.gy),
     )
     largest = max(
         float(np.nanmax(np.hypot(result.error_map.gx, result.error_map.gy)))
@@ -131,14 +144,19 @@ def verification_picture(
     )
     pictures = [
         error_map(result, title=title, largest_m=largest)
-        for title, result in (("Without the correction", before), ("With the correction", with_it))
+        for title, result in (
+            ("Without the correction", before),
+            ("With the correction", with_it),
+        )
     ]
     return _side_by_side(
         pictures, sentence, f"without: {_origin(before)}", f"with: {_origin(after)}"
     )
 
 
-def _side_by_side(pictures: list[draw.Drawing], heading: str, *foot: str) -> draw.Drawing:
+def _side_by_side(
+    pictures: list[draw.Drawing], heading: str, *foot: str
+) -> draw.Drawing:
     """Return pictures side by side below a heading, with lines on their origin."""
     margin, top = 28.0, 30.0
     width = margin + len(pictures) * (parts.WIDTH + margin)
@@ -160,7 +178,9 @@ def _origin(result: CalibrationResult) -> str:
     words = [
         f"plan {parts.shortened(result.plan_id, 60)}",
         f"method {parts.shortened(result.method, 20)}",
-        f"θ datum {result.error_map.datum_theta}" if result.artifact.angular_count else "",
+        f"θ datum {result.error_map.datum_theta}"
+        if result.artifact.angular_count
+        else "",
         f"input {parts.shortened(source, 60)}" if source else "",
         f"selfcal {__version__}",
     ]
@@ -203,14 +223,21 @@ def error_map(
     ]
     tips = [at + field * factor * MM_PER_M for field in fields]
     drawing = parts.titled(
-        f"{'error' if of == 'stage' else of}-map", title or f"Error of the {of}, {ERRORS[of]}"
+        f"{'error' if of == 'stage' else of}-map",
+        title or f"Error of the {of}, {ERRORS[of]}",
     )
-    frame = _frame(drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips])
-    scale = parts.Scale("e", 0.0, parts.round_end(np.fmax(length, largest_m) * UM_PER_M))
+    frame = _frame(
+        drawing, artifact, [np.abs(tip) + np.nan_to_num(around) for tip in tips]
+    )
+    scale = parts.Scale(
+        "e", 0.0, parts.round_end(np.fmax(length, largest_m) * UM_PER_M)
+    )
     parts.cells(frame, artifact, length * UM_PER_M, scale)
     entries = [("ink", "measured")]
     if truth is not None:
-        parts.arrows(frame, at, fields[1], factor, colour="truth", width=3.4, heads=False)
+        parts.arrows(
+            frame, at, fields[1], factor, colour="truth", width=3.4, heads=False
+        )
         entries.append(("truth", "known truth"))
     if _ellipses(frame, tips[0], around):
         entries.append(("band", f"U at the nodes, k = {k:.3g}"))
@@ -224,22 +251,30 @@ def error_map(
     drawing.label(
         LEFT + 130,
         top + height + 62,
-        f"vectors enlarged {factor:,.0f} ×{thin}" if emap.valid.any() else "no site is known",
+        f"vectors enlarged {factor:,.0f} ×{thin}"
+        if emap.valid.any()
+        else "no site is known",
     )
     parts.legend(drawing, entries, (LEFT, top + height + 82))
     drawing.height = top + height + 92
     return drawing
 
 
-def _frame(drawing: draw.Drawing, artifact: Artifact, ends_mm: list[np.ndarray]) -> draw.Frame:
+def _frame(
+    drawing: draw.Drawing, artifact: Artifact, ends_mm: list[np.ndarray]
+) -> draw.Frame:
     """Return a frame of the field and of points (2, P) up to four pitches outside of it."""
     pitch = artifact.grid_pitch_m * MM_PER_M
     x, y = (
         min(
-            max((half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch),
+            max(
+                (half + 0.5) * pitch, float(np.nanmax(ends, initial=0.0)) + 0.2 * pitch
+            ),
             (half + 4) * pitch,
         )
-        for half, ends in zip(artifact.reach, np.concatenate(ends_mm, axis=1), strict=True)
+        for half, ends in zip(
+            artifact.reach, np.concatenate(ends_mm, axis=1), strict=True
+        )
     )
     return draw.Frame(drawing, (LEFT, TOP, SIDE, SIDE * y / x), (-x, x), (-y, y))
 
@@ -268,7 +303,9 @@ def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
         return
     radius = 0.45 * artifact.grid_pitch_m * MM_PER_M * frame.per_x
     for index in np.ndindex(artifact.shape):
-        x, y = (float(values[index]) * MM_PER_M for values in (artifact.x_m, artifact.y_m))
+        x, y = (
+            float(values[index]) * MM_PER_M for values in (artifact.x_m, artifact.y_m)
+        )
         gx, gy, ux, uy = (
             significant(float(values[index]) * scale)
             for values, scale in (
@@ -283,7 +320,9 @@ def _spots(frame: draw.Frame, result: CalibrationResult, name: str) -> None:
             if gx == UNKNOWN
             else (f"{name}x {gx} ± {ux} µm, {name}y {gy} ± {uy} µm (k = {k:.3g})")
         )
-        frame.drawing.spot(*frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}")
+        frame.drawing.spot(
+            *frame.at(x, y), radius, f"x {x:.6g} mm, y {y:.6g} mm: {words}"
+        )
 
 
 def uncertainty_map(result: CalibrationResult) -> draw.Drawing | None:
@@ -294,7 +333,9 @@ def uncertainty_map(result: CalibrationResult) -> draw.Drawing | None:
     U_um = np.where(emap.valid, np.fmax(emap.u_gx, emap.u_gy), np.nan) * k * UM_PER_M
     if not np.isfinite(U_um).any():
         return None
-    drawing = parts.titled("uncertainty-map", f"Uncertainty of the map, U with k = {k:.3g}")
+    drawing = parts.titled(
+        "uncertainty-map", f"Uncertainty of the map, U with k = {k:.3g}"
+    )
     frame = _frame(drawing, artifact, [np.zeros((2, 1))])
     scale = parts.range_scale("v", U_um)
     parts.cells(frame, artifact, U_um, scale)
@@ -353,7 +394,9 @@ def component_maps(result: CalibrationResult, *, of: str = "stage") -> draw.Draw
                     anchor="middle",
                 )
         if not uniform:
-            parts.scale_bar(drawing, scale, (left + 2 * side + gap + 14, top, 12.0, frame.box[3]))
+            parts.scale_bar(
+                drawing, scale, (left + 2 * side + gap + 14, top, 12.0, frame.box[3])
+            )
         top += frame.box[3] + 56
     drawing.height = top - 8
     return drawing
@@ -379,10 +422,16 @@ def angular_map(
     drawing = parts.titled(
         "angular-map" if of == "stage" else f"{of}-angular", title, CENTRE[1] + 230
     )
-    curves = [np.abs(error) + np.nan_to_num(u)] + ([] if true is None else [np.abs(true)])
+    curves = [np.abs(error) + np.nan_to_num(u)] + (
+        [] if true is None else [np.abs(true)]
+    )
     magnitudes = np.concatenate(curves)
     magnitudes = magnitudes[np.isfinite(magnitudes)]
-    span = 1.05 * float(magnitudes.max()) if magnitudes.size and magnitudes.max() > 0 else 1.0
+    span = (
+        1.05 * float(magnitudes.max())
+        if magnitudes.size and magnitudes.max() > 0
+        else 1.0
+    )
     angles = emap.artifact.theta_rad
     _rings(drawing, span)
     entries = [("ink", "measured")]
@@ -453,7 +502,9 @@ def _between(line_known: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs of neighbouring lines that are both known."""
     count = len(line_known)
     return [
-        (i, (i + 1) % count) for i in range(count) if line_known[i] and line_known[(i + 1) % count]
+        (i, (i + 1) % count)
+        for i in range(count)
+        if line_known[i] and line_known[(i + 1) % count]
     ]
 
 
@@ -467,14 +518,21 @@ def _curve(
     width: float,
 ) -> None:
     drawing.lines(
-        [[_at(angles[k], values[k], span) for k in pair] for pair in _between(np.isfinite(values))],
+        [
+            [_at(angles[k], values[k], span) for k in pair]
+            for pair in _between(np.isfinite(values))
+        ],
         stroke=colour,
         width=width,
     )
 
 
 def _band(
-    drawing: draw.Drawing, angles: np.ndarray, error: np.ndarray, u: np.ndarray, span: float
+    drawing: draw.Drawing,
+    angles: np.ndarray,
+    error: np.ndarray,
+    u: np.ndarray,
+    span: float,
 ) -> None:
     drawing.shapes(
         [

@@ -19,7 +19,14 @@ from matplotlib.path import Path as Outline
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.outputs import write_bytes
-from selfcal_ros.reporting.figures.drawing import COLOURS, Discs, Drawing, Label, Path, Point
+from selfcal_ros.reporting.figures.drawing import (
+    COLOURS,
+    Discs,
+    Drawing,
+    Label,
+    Path,
+    Point,
+)
 
 DPI = 150
 """Resolution of a PNG, in which a pixel of a drawing is a point."""
@@ -68,7 +75,9 @@ def save_picture(drawing: Drawing, path: str | os.PathLike) -> None:
 def figure(drawing: Drawing) -> Figure:
     """Return a drawing as a figure of matplotlib."""
     with rc_context(RC):
-        page = Figure(figsize=(drawing.width / POINTS_PER_INCH, drawing.height / POINTS_PER_INCH))
+        page = Figure(
+            figsize=(drawing.width / POINTS_PER_INCH, drawing.height / POINTS_PER_INCH)
+        )
         put(drawing, page.add_axes((0, 0, 1, 1)), 1.0)
     return page
 
@@ -166,7 +175,9 @@ def _label(item: Label, axes: Axes, points: float, order: int) -> None:
 def drawable(text: object, limit: int = 300) -> str:
     """Return `text` as one line of characters in the font, truncated at `limit`."""
     in_font = _characters()
-    line = "".join(c if c.isprintable() and c in in_font else "?" for c in str(text)[: limit + 1])
+    line = "".join(
+        c if c.isprintable() and c in in_font else "?" for c in str(text)[: limit + 1]
+    )
     return line if len(line) <= limit else line[: limit - 1] + "…"
 
 

@@ -57,13 +57,17 @@ def thinned(artifact: Artifact, most: int) -> tuple[slice, slice]:
     Of a list of marks as many as of such a lattice.
     """
     if artifact.marks:
-        return slice(0, None, max(1, math.ceil(artifact.shape[0] / most**2))), slice(0, None, None)
+        return slice(0, None, max(1, math.ceil(artifact.shape[0] / most**2))), slice(
+            0, None, None
+        )
     step = max(1, math.ceil(max(artifact.shape) / most))
     i, j = artifact.middle
     return slice(i % step, None, step), slice(j % step, None, step)
 
 
-def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scale) -> None:
+def cells(
+    frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scale
+) -> None:
     """Colour the cell of every site; unknown sites are grey."""
     sites = thinned(artifact, MAX_CELLS)
     step = sites[0].step or 1
@@ -83,12 +87,17 @@ def cells(frame: draw.Frame, artifact: Artifact, values: np.ndarray, scale: Scal
                 (low, (high[0], low[1]), high, (low[0], high[1]))
             )
     for shade in sorted(outlines):
-        frame.drawing.shapes(outlines[shade], fill="none" if shade < 0 else f"{scale.ramp}{shade}")
+        frame.drawing.shapes(
+            outlines[shade], fill="none" if shade < 0 else f"{scale.ramp}{shade}"
+        )
 
 
 def _clipped(frame: draw.Frame, point: draw.Point) -> draw.Point:
     left, top, width, height = frame.box
-    return (min(max(point[0], left), left + width), min(max(point[1], top), top + height))
+    return (
+        min(max(point[0], left), left + width),
+        min(max(point[1], top), top + height),
+    )
 
 
 def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
@@ -101,12 +110,19 @@ def levels(values: np.ndarray, scale: Scale) -> np.ndarray:
         offset = np.asarray(values) - scale.low
         span = scale.high - scale.low
         fraction = np.clip(offset / span if span else 0.4 + 0 * offset, 0, 1)
-        step = np.rint(fraction * top) if scale.ramp == "d" else np.floor(fraction * draw.LEVELS)
+        step = (
+            np.rint(fraction * top)
+            if scale.ramp == "d"
+            else np.floor(fraction * draw.LEVELS)
+        )
     return np.where(np.isfinite(fraction), np.minimum(step, top), -1).astype(int)
 
 
 def scale_bar(
-    drawing: draw.Drawing, scale: Scale, box: tuple[float, float, float, float], unit: str = "µm"
+    drawing: draw.Drawing,
+    scale: Scale,
+    box: tuple[float, float, float, float],
+    unit: str = "µm",
 ) -> None:
     """Draw a colour bar from bottom to top, with round numbers on its right."""
     left, top, width, height = box
@@ -121,9 +137,13 @@ def scale_bar(
             fill=f"{scale.ramp}{step}",
         )
     drawing.box(*box, stroke="soft")
-    inset = step_height / 2 if scale.ramp == "d" else 0.0  # its outer steps are centred on the ends
+    # its outer steps are centred on the ends
+    inset = step_height / 2 if scale.ramp == "d" else 0.0
     frame = draw.Frame(
-        drawing, (left, top + inset, width, height - 2 * inset), (0.0, 1.0), (scale.low, scale.high)
+        drawing,
+        (left, top + inset, width, height - 2 * inset),
+        (0.0, 1.0),
+        (scale.low, scale.high),
     )
     for value in draw.round_ticks(scale.low, scale.high, 5):
         y = frame.at(0, value)[1]
@@ -135,7 +155,9 @@ def scale_bar(
             size=draw.TICK,
             colour="soft",
         )
-    drawing.label(left + width / 2, top - 7, unit, size=draw.TICK, anchor="middle", colour="soft")
+    drawing.label(
+        left + width / 2, top - 7, unit, size=draw.TICK, anchor="middle", colour="soft"
+    )
 
 
 def round_end(values: np.ndarray) -> float:
@@ -154,11 +176,15 @@ def range_scale(ramp: str, values: np.ndarray) -> Scale:
     Its ends are equal if the values agree to 1 %, or if none is known.
     """
     finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    low, high = (
+        (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    )
     if high - low <= 0.01 * high:
         return Scale(ramp, high, high)
     step = draw.round_step(high - low, 5) / 2
-    return Scale(ramp, step * math.floor(low / step + 1e-9), step * math.ceil(high / step - 1e-9))
+    return Scale(
+        ramp, step * math.floor(low / step + 1e-9), step * math.ceil(high / step - 1e-9)
+    )
 
 
 def enlargement(lengths_m: np.ndarray, spacing_m: float) -> float:
@@ -215,9 +241,13 @@ def _head(
     )
 
 
-def curved_arrow(drawing: draw.Drawing, way: Sequence[draw.Point], *, colour: str) -> None:
+def curved_arrow(
+    drawing: draw.Drawing, way: Sequence[draw.Point], *, colour: str
+) -> None:
     """Draw a line through points that ends in an arrowhead."""
-    back = next((point for point in reversed(way) if math.dist(point, way[-1]) >= 9), way[0])
+    back = next(
+        (point for point in reversed(way) if math.dist(point, way[-1]) >= 9), way[0]
+    )
     drawing.line(way, stroke=colour, width=1.4)
     drawing.shapes([_head(back, way[-1], math.dist(back, way[-1]), 3.0)], fill=colour)
 
@@ -229,10 +259,14 @@ def arrow_key(frame: draw.Frame, factor: float, at: draw.Point) -> None:
     end = at[0] + value * per_unit, at[1]
     frame.drawing.lines([(at, end)], width=1.4)
     frame.drawing.shapes([_head(at, end, value * per_unit, 1.4)], fill="ink")
-    frame.drawing.label(end[0] + 6, at[1] + 4, f"{significant(value, 1)} µm", size=draw.TICK + 1)
+    frame.drawing.label(
+        end[0] + 6, at[1] + 4, f"{significant(value, 1)} µm", size=draw.TICK + 1
+    )
 
 
-def legend(drawing: draw.Drawing, entries: Sequence[tuple[str, str]], at: draw.Point) -> None:
+def legend(
+    drawing: draw.Drawing, entries: Sequence[tuple[str, str]], at: draw.Point
+) -> None:
     """Write texts in a row, each after a dot of its colour."""
     x, y = at
     for colour, words in entries:
@@ -253,14 +287,22 @@ def ordinal(number: int) -> str:
 
 
 def panels(
-    drawing: draw.Drawing, titles: Sequence[str], reach_mm: Sequence[float], below: float = 50.0
+    drawing: draw.Drawing,
+    titles: Sequence[str],
+    reach_mm: Sequence[float],
+    below: float = 50.0,
 ) -> list[draw.Frame]:
     """Return titled frames of the field, two per row; the drawing grows as needed."""
     side, gap, left, top = 186.0, 42.0, 46.0, 48.0
     height = side * reach_mm[1] / reach_mm[0]
     out = []
     for number, title in enumerate(titles):
-        box = (left + number % 2 * (side + gap), top + number // 2 * (height + below), side, height)
+        box = (
+            left + number % 2 * (side + gap),
+            top + number // 2 * (height + below),
+            side,
+            height,
+        )
         drawing.label(box[0], box[1] - 6, shortened(title, 26), bold=True)
         spans = [(-reach, reach) for reach in reach_mm]
         out.append(draw.Frame(drawing, box, spans[0], spans[1]))
@@ -302,10 +344,20 @@ def chart(
 
     With `log` both axes are logarithmic.
     """
-    scaled = [replace(c, x=np.log10(c.x), y=np.log10(c.y)) for c in curves] if log else curves
-    reach = [c.y + side * (0.0 if c.U is None else c.U) for c in scaled for side in (-1, 1)]
+    scaled = (
+        [replace(c, x=np.log10(c.x), y=np.log10(c.y)) for c in curves]
+        if log
+        else curves
+    )
+    reach = [
+        c.y + side * (0.0 if c.U is None else c.U) for c in scaled for side in (-1, 1)
+    ]
     frame = draw.Frame(
-        drawing, box, x or _span([c.x for c in scaled], 0.04), y or _span(reach, 0.06), log
+        drawing,
+        box,
+        x or _span([c.x for c in scaled], 0.04),
+        y or _span(reach, 0.06),
+        log,
     )
     drawing.label(box[0], box[1] - 7, title, bold=True)
     for curve in scaled:
@@ -313,7 +365,9 @@ def chart(
             [
                 frame.at(*point)
                 for point in zip(
-                    curve.x, curve.y + side * (0.0 if curve.U is None else curve.U), strict=True
+                    curve.x,
+                    curve.y + side * (0.0 if curve.U is None else curve.U),
+                    strict=True,
                 )
             ]
             for side in (-1, 1)
@@ -324,7 +378,9 @@ def chart(
             drawing.lines(zip(low, high, strict=True), stroke=curve.colour)
         places = [frame.at(*point) for point in zip(curve.x, curve.y, strict=True)]
         if curve.width:
-            drawing.line(places, stroke=curve.colour, width=curve.width, dash=curve.dash)
+            drawing.line(
+                places, stroke=curve.colour, width=curve.width, dash=curve.dash
+            )
         if curve.dots:
             drawing.discs(places, curve.dots, fill=curve.colour)
     frame.axes(x_label=labels[0], y_label=labels[1])
@@ -334,6 +390,8 @@ def _span(values: Sequence[np.ndarray], margin: float) -> tuple[float, float]:
     """Return a range that includes all values, with a margin at either end."""
     finite = np.concatenate(values)
     finite = finite[np.isfinite(finite)]
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    low, high = (
+        (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    )
     room = margin * (high - low) or abs(low) or 1.0
     return low - room, high + room

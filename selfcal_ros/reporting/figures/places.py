@@ -33,7 +33,9 @@ def plan_figure(artifact: Artifact, views: Sequence[View]) -> Drawing:
     reach = [(half + margin) * MM_PER_M for half in artifact.field_half_m]
     if artifact.map_grid is not None:  # the corners may reach far beyond the field
         corners = np.abs([_places_mm(view, *_corners(artifact)) for view in views])
-        reach = np.maximum(reach, corners.max(axis=(0, 2)) + margin / 2 * MM_PER_M).tolist()
+        reach = np.maximum(
+            reach, corners.max(axis=(0, 2)) + margin / 2 * MM_PER_M
+        ).tolist()
     titles = [
         f"{view.name}: {pose_text(view.rotation_rad, view.translation_m, artifact)}"
         for view in views
@@ -73,14 +75,19 @@ def views_in(result: CalibrationResult) -> list[View]:
             angular=False,
         )
         for view in result.views
-        if view.name.endswith(cell_label((0, 0))) or view.name == without_cell(view.name)
+        if view.name.endswith(cell_label((0, 0)))
+        or view.name == without_cell(view.name)
     ]
 
 
 def _corners(artifact: Artifact) -> np.ndarray:
     """Return the outline of the plate, plate frame, (2, 5), m."""
     half = np.array(artifact.reach)[:, None]
-    return np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * (half + 0.6) * artifact.grid_pitch_m
+    return (
+        np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]])
+        * (half + 0.6)
+        * artifact.grid_pitch_m
+    )
 
 
 def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
@@ -90,7 +97,9 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     low = frame.at(-field[0], -field[1])
     high = frame.at(*field)
     drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="e2")
-    drawing.line(_at(frame, _places_mm(view, *_corners(artifact))), stroke="truth", width=1.6)
+    drawing.line(
+        _at(frame, _places_mm(view, *_corners(artifact))), stroke="truth", width=1.6
+    )
     sites = parts.thinned(artifact, parts.MAX_ARROWS)
     place = _places_mm(view, artifact.x_m[sites], artifact.y_m[sites])
     if view.grid:
@@ -104,10 +113,15 @@ def _plate(frame: Frame, view: View, artifact: Artifact) -> None:
     if view.check_marks:
         field_sites = pose.marks_in_field(artifact)[1]
         for x, y in _at(
-            frame, field_sites[:, check_marks(field_sites, view.check_marks)] * pitch * MM_PER_M
+            frame,
+            field_sites[:, check_marks(field_sites, view.check_marks)]
+            * pitch
+            * MM_PER_M,
         ):
             drawing.lines(
-                [[(x - 6, y), (x + 6, y)], [(x, y - 6), (x, y + 6)]], stroke="c0", width=1.6
+                [[(x - 6, y), (x + 6, y)], [(x, y - 6), (x, y + 6)]],
+                stroke="c0",
+                width=1.6,
             )
     drawing.discs(_at(frame, _places_mm(view, *(half * pitch))), 3.6, fill="truth")
     if view.rotation_rad:
@@ -159,7 +173,11 @@ def rejected_in(result: CalibrationResult) -> list[Place]:
 
 
 def _rows(value: object) -> list[dict]:
-    return [row for row in value if isinstance(row, dict)] if isinstance(value, list) else []
+    return (
+        [row for row in value if isinstance(row, dict)]
+        if isinstance(value, list)
+        else []
+    )
 
 
 def _number(value: object) -> bool:
@@ -172,7 +190,9 @@ def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[P
     m, n = (np.array(component) for component in mark)
     if result.plate.marks and not result.plate.has(m, n):
         return []
-    at = (component * result.plate.grid_pitch_m for component in result.plate.places(m, n))
+    at = (
+        component * result.plate.grid_pitch_m for component in result.plate.places(m, n)
+    )
     x, y = places_mm(view.rotation, (view.translation_x, view.translation_y), *at)
     return [(view.name, "outlier_among_views", float(x), float(y))]
 
@@ -180,11 +200,16 @@ def _marked(result: CalibrationResult, view: ViewResult, mark: object) -> list[P
 def rejected_map(result: CalibrationResult) -> Drawing | None:
     """Return where readings were rejected in each view, coloured by reason; None if nowhere."""
     places = rejected_in(result)
-    names = [view.name for view in result.views if any(view.name == row[0] for row in places)]
+    names = [
+        view.name for view in result.views if any(view.name == row[0] for row in places)
+    ]
     if not names:
         return None
     artifact = result.plate
-    field = [(half + 0.5 * artifact.grid_pitch_m) * MM_PER_M for half in artifact.field_half_m]
+    field = [
+        (half + 0.5 * artifact.grid_pitch_m) * MM_PER_M
+        for half in artifact.field_half_m
+    ]
     reach = [half + 1.2 * artifact.grid_pitch_m * MM_PER_M for half in field]
     colours = {
         reason: f"c{i % SERIES}"
@@ -196,11 +221,16 @@ def rejected_map(result: CalibrationResult) -> Drawing | None:
         high = frame.at(*field)
         drawing.box(low[0], high[1], high[0] - low[0], low[1] - high[1], fill="card")
         for reason, colour in colours.items():
-            at = [(x, y) for view, why, x, y in places if (view, why) == (title, reason)]
-            inside = [
-                (min(max(x, -reach[0]), reach[0]), min(max(y, -reach[1]), reach[1])) for x, y in at
+            at = [
+                (x, y) for view, why, x, y in places if (view, why) == (title, reason)
             ]
-            drawing.discs([frame.at(x, y) for x, y in inside], 3.0, fill=colour, opacity=0.8)
+            inside = [
+                (min(max(x, -reach[0]), reach[0]), min(max(y, -reach[1]), reach[1]))
+                for x, y in at
+            ]
+            drawing.discs(
+                [frame.at(x, y) for x, y in inside], 3.0, fill=colour, opacity=0.8
+            )
         frame.axes(ticks=(4, 4))
     _legend(
         drawing,
@@ -241,14 +271,18 @@ def camera_errors(result: CalibrationResult) -> draw.Drawing | None:
     apart = abs(place[0] + 1j * place[1] - (place[0] + 1j * place[1])[:, None])
     spacing = float(apart[apart > 0].min(initial=np.inf)) if len(apart) > 1 else 1.0
     factor = parts.enlargement(np.hypot(*error), spacing / MM_PER_M)
-    reach = float(np.abs(np.concatenate([place, place + error * factor * MM_PER_M])).max())
+    reach = float(
+        np.abs(np.concatenate([place, place + error * factor * MM_PER_M])).max()
+    )
     half = max(reach, float(np.abs(place).max()) + spacing / 2) * 1.1
     drawing = parts.titled("camera", "Error of the camera, published − true offset")
     frame = draw.Frame(drawing, (LEFT, TOP, SIDE, SIDE), (-half, half), (-half, half))
     drawing.discs([frame.at(x, y) for x, y in place.T], 2.0, fill="soft")
     parts.arrows(frame, place, error, factor)
     frame.axes(x_label="offset x in mm", y_label="offset y in mm")
-    for x, y, dx, dy, ux, uy in np.concatenate([place, error * UM_PER_M, u * UM_PER_M]).T:
+    for x, y, dx, dy, ux, uy in np.concatenate(
+        [place, error * UM_PER_M, u * UM_PER_M]
+    ).T:
         words = (
             f"{significant(dx)} ± {significant(ux)} µm, {significant(dy)} ± "
             f"{significant(uy)} µm (k = {result.noise.k_xy:.3g})"
@@ -269,7 +303,10 @@ def stage_yaw(result: CalibrationResult) -> draw.Drawing | None:
     yaw, u = yaw_map.yaw * URAD_PER_RAD, yaw_map.u_yaw * URAD_PER_RAD
     half = [np.diff(np.unique(along)).min(initial=np.inf) / 2 for along in place]
     dx, dy = (side if np.isfinite(side) else min(half) for side in half)
-    x, y = (float(np.abs(along).max()) + side for along, side in zip(place, (dx, dy), strict=True))
+    x, y = (
+        float(np.abs(along).max()) + side
+        for along, side in zip(place, (dx, dy), strict=True)
+    )
     drawing = parts.titled("yaw", "Yaw of the stage about its mean, counter-clockwise")
     width, height = (SIDE, SIDE * y / x) if y < x else (SIDE * x / y, SIDE)
     frame = draw.Frame(drawing, (LEFT, TOP, width, height), (-x, x), (-y, y))

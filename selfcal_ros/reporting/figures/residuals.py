@@ -47,12 +47,17 @@ class ViewResiduals:
 
 
 def places_mm(
-    rotation_rad: float, translation_m: tuple[float, float], x_m: np.ndarray, y_m: np.ndarray
+    rotation_rad: float,
+    translation_m: tuple[float, float],
+    x_m: np.ndarray,
+    y_m: np.ndarray,
 ) -> np.ndarray:
     """Return the nominal stage positions of points on a plate in this pose, mm, (2, ...)."""
     c, s = math.cos(rotation_rad), math.sin(rotation_rad)
     return (
-        np.stack([c * x_m - s * y_m + translation_m[0], s * x_m + c * y_m + translation_m[1]])
+        np.stack(
+            [c * x_m - s * y_m + translation_m[0], s * x_m + c * y_m + translation_m[1]]
+        )
         * MM_PER_M
     )
 
@@ -100,7 +105,9 @@ def _array(value: object, shape: tuple[int, ...]) -> np.ndarray:
     return array if array.shape == shape else np.full(shape, np.nan)
 
 
-def residual_maps(result: CalibrationResult, residuals: Sequence[ViewResiduals]) -> Drawing | None:
+def residual_maps(
+    result: CalibrationResult, residuals: Sequence[ViewResiduals]
+) -> Drawing | None:
     """Return the grid residuals of every view as vectors at the marks; None if there are none."""
     views = [v for v in residuals if np.isfinite(v.xy_m).any()]
     if not views:
@@ -149,7 +156,10 @@ def distributions(residuals: Sequence[ViewResiduals], kind: str) -> Drawing | No
     xy = kind == "xy"
     unit = "µm" if xy else "arcsec"
     rows = [
-        (v.view.name, (v.xy_m * UM_PER_M if xy else v.theta_rad * ARCSEC_PER_RAD).ravel())
+        (
+            v.view.name,
+            (v.xy_m * UM_PER_M if xy else v.theta_rad * ARCSEC_PER_RAD).ravel(),
+        )
         for v in residuals
     ]
     rows = [(name, np.sort(values[np.isfinite(values)])) for name, values in rows]
@@ -199,7 +209,12 @@ def _histogram(
     frame = Frame(drawing, box, (-end, end), (0.0, top))
     drawing.shapes(
         [
-            (frame.at(low, 0), frame.at(low, count), frame.at(high, count), frame.at(high, 0))
+            (
+                frame.at(low, 0),
+                frame.at(low, count),
+                frame.at(high, count),
+                frame.at(high, 0),
+            )
             for low, high, count in zip(edges[:-1], edges[1:], counts, strict=True)
             if count
         ],
@@ -210,7 +225,8 @@ def _histogram(
         along = np.linspace(-end, end, 101)
         curve = len(values) * width * (_normal_density(along / size) / size)
         drawing.line(
-            [frame.at(x, min(y, top)) for x, y in zip(along, curve, strict=True)], width=1.3
+            [frame.at(x, min(y, top)) for x, y in zip(along, curve, strict=True)],
+            width=1.3,
         )
     return frame
 
@@ -231,7 +247,10 @@ def _normal_plot(
     reach = max(3.2, float(np.abs(quantiles).max()) * 1.05)
     frame = Frame(drawing, box, (-reach, reach), (-end, end))
     drawing.line(
-        [frame.at(q, min(max(q * size, -end), end)) for q in np.linspace(-reach, reach, 41)],
+        [
+            frame.at(q, min(max(q * size, -end), end))
+            for q in np.linspace(-reach, reach, 41)
+        ],
         stroke="truth",
         width=1.2,
     )
@@ -256,7 +275,9 @@ def courses(residuals: Sequence[ViewResiduals], sigma_m: float) -> Drawing | Non
     if not views:
         return None
     drawing = parts.titled("courses", "Mean residuals over the time of each view, µm")
-    bands = [2 * sigma_m * UM_PER_M / np.sqrt(np.maximum(v.course[3], 1)) for v in views]
+    bands = [
+        2 * sigma_m * UM_PER_M / np.sqrt(np.maximum(v.course[3], 1)) for v in views
+    ]
     end = 1.1 * max(
         span_of((v.course[1:3] * UM_PER_M).ravel().tolist() + band.tolist())
         for v, band in zip(views, bands, strict=True)
@@ -272,7 +293,10 @@ def courses(residuals: Sequence[ViewResiduals], sigma_m: float) -> Drawing | Non
             (52, top, 420, 84),
             [
                 *(expected if np.isfinite(band).all() else []),
-                *(parts.Curve(t, view.course[axis] * UM_PER_M, f"c{axis - 1}") for axis in (1, 2)),
+                *(
+                    parts.Curve(t, view.course[axis] * UM_PER_M, f"c{axis - 1}")
+                    for axis in (1, 2)
+                ),
             ],
             title=parts.shortened(view.view.name, 40),
             x=(0.0, float(t[-1]) or 1.0),
@@ -288,7 +312,9 @@ def courses(residuals: Sequence[ViewResiduals], sigma_m: float) -> Drawing | Non
         )
         top += 84 + 46
     parts.legend(
-        drawing, [("c0", "x"), ("c1", "y"), ("band", "95 % of random noise")], (52, top - 14)
+        drawing,
+        [("c0", "x"), ("c1", "y"), ("band", "95 % of random noise")],
+        (52, top - 14),
     )
     drawing.height = top - 4
     return drawing
@@ -306,7 +332,9 @@ def drift_found(result: CalibrationResult) -> Drawing | None:
         if degree.isdigit() and int(degree) < 20 and math.isfinite(item.value):
             shape = np.polynomial.legendre.Legendre.basis(int(degree))(tau)
             key = (item.view, axis)
-            paths[key] = paths.get(key, np.zeros(len(tau))) + item.value * shape * UM_PER_M
+            paths[key] = (
+                paths.get(key, np.zeros(len(tau))) + item.value * shape * UM_PER_M
+            )
     if not paths:
         return None
     names = list(dict.fromkeys(view for view, _ in paths))
@@ -318,7 +346,9 @@ def drift_found(result: CalibrationResult) -> Drawing | None:
         [
             parts.Curve(np.array([0.0, 1.0]), np.zeros(2), "line", 1.0),
             *(
-                parts.Curve((tau + 1) / 2, paths[name, axis], f"c{number % SERIES}", 1.8, dash)
+                parts.Curve(
+                    (tau + 1) / 2, paths[name, axis], f"c{number % SERIES}", 1.8, dash
+                )
                 for number, name in enumerate(names)
                 for axis, dash in (("x", ()), ("y", (5, 3)))
                 if (name, axis) in paths

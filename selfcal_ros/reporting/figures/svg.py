@@ -64,7 +64,11 @@ def svg_file(drawing: draw.Drawing) -> str:
 
 
 def _svg(
-    drawing: draw.Drawing, *, paint: Paint = by_class, before: str = "", attributes: str = ""
+    drawing: draw.Drawing,
+    *,
+    paint: Paint = by_class,
+    before: str = "",
+    attributes: str = "",
 ) -> str:
     items = [
         _item(item, paint)
@@ -98,7 +102,9 @@ def _item(item: draw.Item, paint: Paint) -> str:
 
 
 def _look(item: draw.Path | draw.Discs) -> str:
-    more = f' stroke-width="{_n(item.width)}"' if item.stroke and item.width != 1 else ""
+    more = (
+        f' stroke-width="{_n(item.width)}"' if item.stroke and item.width != 1 else ""
+    )
     if isinstance(item, draw.Path) and item.dash:
         more += f' stroke-dasharray="{" ".join(map(_n, item.dash))}"'
     return more + (f' fill-opacity="{_n(item.opacity)}"' if item.opacity != 1 else "")
@@ -107,7 +113,8 @@ def _look(item: draw.Path | draw.Discs) -> str:
 def _d(lines: Iterable[tuple[draw.Point, ...]], *, closed: bool) -> str:
     """Return path data."""
     return "".join(
-        "M" + "L".join(f"{_n(x)} {_n(y)}" for x, y in line) + "Z" * closed for line in lines
+        "M" + "L".join(f"{_n(x)} {_n(y)}" for x, y in line) + "Z" * closed
+        for line in lines
     )
 
 

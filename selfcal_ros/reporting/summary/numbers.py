@@ -12,7 +12,13 @@ import numpy as np
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.error_map import ErrorMap, datum_modes, remove_modes, rms
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M, URAD_PER_RAD
+from selfcal_ros.units import (
+    ARCSEC_PER_RAD,
+    MM_PER_M,
+    MRAD_PER_RAD,
+    UM_PER_M,
+    URAD_PER_RAD,
+)
 
 UNKNOWN = "–"
 _NUMBER = re.compile(r"(> )?[−+-]?\d[\d.]*(e[+-]?\d+)?|–|∞")
@@ -35,7 +41,11 @@ def significant(value: float, digits: int = 3) -> str:
 
 def um(value_m: float) -> str:
     """Return a length in µm with its unit, or ``not known``."""
-    return f"{significant(value_m * UM_PER_M)} µm" if math.isfinite(value_m) else "not known"
+    return (
+        f"{significant(value_m * UM_PER_M)} µm"
+        if math.isfinite(value_m)
+        else "not known"
+    )
 
 
 def arcsec(value_rad: float) -> str:
@@ -67,7 +77,9 @@ def fixed_column(values: Sequence[float], digits: int = 3) -> list[str]:
     return [fixed(value, decimals) for value in values]
 
 
-def aligned_numbers(values: Sequence[float], digits: int = 3, *, more: int = 3) -> list[str]:
+def aligned_numbers(
+    values: Sequence[float], digits: int = 3, *, more: int = 3
+) -> list[str]:
     """Return the values of a column with equal decimals that resolve even the smallest one.
 
     The largest has `digits` significant digits, and up to `more` decimals are added until the
@@ -90,11 +102,14 @@ def counted(number: int, noun: str) -> str:
 def numeric_columns(table: Sequence[Sequence[str]]) -> list[bool]:
     """Return which columns of a table contain only numbers below the header."""
     return [
-        all(_NUMBER.fullmatch(cell) for cell in column) for column in zip(*table[1:], strict=True)
+        all(_NUMBER.fullmatch(cell) for cell in column)
+        for column in zip(*table[1:], strict=True)
     ]
 
 
-def aligned(rows: Sequence[Sequence[str]], *, left: int = 1, indent: str = "  ") -> list[str]:
+def aligned(
+    rows: Sequence[Sequence[str]], *, left: int = 1, indent: str = "  "
+) -> list[str]:
     """Return `rows` as lines in columns; the first `left` columns flush left, the rest right."""
     if not rows:
         return []
@@ -182,7 +197,9 @@ def largest(values: np.ndarray) -> tuple[float, tuple[int, ...] | None]:
     if not np.isfinite(sizes).any():
         return math.nan, None
     flat = int(np.nanargmax(np.where(np.isfinite(sizes), sizes, np.nan)))
-    return float(sizes.flat[flat]), tuple(int(i) for i in np.unravel_index(flat, sizes.shape))
+    return float(sizes.flat[flat]), tuple(
+        int(i) for i in np.unravel_index(flat, sizes.shape)
+    )
 
 
 def summary_numbers(result: CalibrationResult | None) -> dict[str, float]:
@@ -219,7 +236,9 @@ def anywhere_m(result: CalibrationResult) -> tuple[float, float, float]:
 
     NaN without an uncertainty map, and with damaged factors of its covariance.
     """
-    from selfcal_ros.estimation.verdict.uncertainty import budgets  # with scipy, not for figures
+    from selfcal_ros.estimation.verdict.uncertainty import (
+        budgets,
+    )  # with scipy, not for figures
 
     try:
         result_budgets = budgets(result)
@@ -301,14 +320,23 @@ def truth_figures(emap: ErrorMap, truth: Mapping[str, np.ndarray]) -> TruthFigur
         difference = remove_modes(difference, datum_modes(artifact, scale=True))
     difference[:, ~np.isfinite(difference).all(axis=0)] = np.nan
     longest, index = largest(np.hypot(*difference))
-    xy = (longest, _site(emap, index), rms(difference), *_in_units(difference, emap.u_xy))
+    xy = (
+        longest,
+        _site(emap, index),
+        rms(difference),
+        *_in_units(difference, emap.u_xy),
+    )
     if "g_theta" not in true:
         return TruthFigures(*xy)
     theta = emap.g_theta - true["g_theta"]
     theta = theta - _common(theta, emap.u_g_theta)
     largest_theta, line = largest(theta)
     return TruthFigures(
-        *xy, largest_theta, line[0] if line else None, rms(theta), *_in_units(theta, emap.u_g_theta)
+        *xy,
+        largest_theta,
+        line[0] if line else None,
+        rms(theta),
+        *_in_units(theta, emap.u_g_theta),
     )
 
 
@@ -318,7 +346,9 @@ def _common(theta_rad: np.ndarray, u_rad: np.ndarray) -> float:
     weighted = finite & np.isfinite(u_rad) & (u_rad > 0)
     if weighted.any():
         smallest = u_rad[weighted].min()
-        return float(np.average(theta_rad[weighted], weights=(smallest / u_rad[weighted]) ** 2))
+        return float(
+            np.average(theta_rad[weighted], weights=(smallest / u_rad[weighted]) ** 2)
+        )
     return float(theta_rad[finite].mean()) if finite.any() else 0.0
 
 
@@ -348,11 +378,15 @@ def truth_arrays(
     shape = emap.artifact.shape
     arrays = {key: _truth_array(truth, key, shape) for key in ("gx", "gy")}
     if emap.artifact.angular_count and truth.get("g_theta") is not None:
-        arrays["g_theta"] = _truth_array(truth, "g_theta", (emap.artifact.angular_count,))
+        arrays["g_theta"] = _truth_array(
+            truth, "g_theta", (emap.artifact.angular_count,)
+        )
     return arrays
 
 
-def _truth_array(truth: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]) -> np.ndarray:
+def _truth_array(
+    truth: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...]
+) -> np.ndarray:
     if key not in truth:
         raise InputError(f"truth {key}", "missing", "give gx, gy (m) and g_theta (rad)")
     try:
@@ -401,7 +435,10 @@ def camera_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
             value_text(camera.scale, camera.u_scale, PERCENT, "%")
             + ", positive: published offsets too long",
         ),
-        ("rotation", value_text(camera.rotation, camera.u_rotation, MRAD_PER_RAD, "mrad")),
+        (
+            "rotation",
+            value_text(camera.rotation, camera.u_rotation, MRAD_PER_RAD, "mrad"),
+        ),
         (
             "stretch, shear",
             f"{value_text(camera.stretch, camera.u_stretch, PERCENT, '%')}, "
@@ -429,7 +466,11 @@ def yaw_facts(result: CalibrationResult) -> tuple[tuple[str, str], ...]:
         return ()
     low, high, mean_u = (
         significant(value * URAD_PER_RAD)
-        for value in (yaw_map.yaw.min(), yaw_map.yaw.max(), math.sqrt(np.mean(yaw_map.u_yaw**2)))
+        for value in (
+            yaw_map.yaw.min(),
+            yaw_map.yaw.max(),
+            math.sqrt(np.mean(yaw_map.u_yaw**2)),
+        )
     )
     significance = (
         f"p = {yaw_map.p:.1g}"

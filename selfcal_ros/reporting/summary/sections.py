@@ -74,7 +74,8 @@ def verdict_section(result: CalibrationResult) -> Section:
     verdict = result.verdict
     notes = [printable(reason) for reason in verdict.reasons]
     notes += [
-        f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})" for cause in verdict.causes
+        f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})"
+        for cause in verdict.causes
     ]
     return Section(_TITLES[verdict.grade], notes=(*notes, *enlargement_texts(verdict)))
 
@@ -118,7 +119,8 @@ def terms_section(result: CalibrationResult) -> Section:
         for item in term.estimates:
             scale, unit = unit_of(term.name, item.unit)
             value, u = item.value * scale, item.u * scale
-            decimals = decimals_for([u], 2)  # two figures of u, and the value to the same place
+            # two figures of u, and the value to the same place
+            decimals = decimals_for([u], 2)
             rows.append(
                 (
                     f"{term.name} ({how})",
@@ -154,7 +156,9 @@ def measurement_section(result: CalibrationResult) -> Section:
     )
     x, y = (2 * half * pitch for half in artifact.reach)
     observability = result.observability
-    measured_names = {without_cell(view.name) for view in filter(_in_the_map(result), result.views)}
+    measured_names = {
+        without_cell(view.name) for view in filter(_in_the_map(result), result.views)
+    }
     views = f"{counted_views(result.views)}, {len(measured_names)} measured"
     facts = [
         ("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
@@ -162,9 +166,18 @@ def measurement_section(result: CalibrationResult) -> Section:
             "plate",
             f"{marks}, field {x:.6g} × {y:.6g} mm, {artifact.angular_count or 'no'} angular lines",
         ),
-        *([("map", _nodes(artifact.map_grid, artifact.field.shape))] if artifact.map_grid else []),
         *(
-            [("angular map", f"Fourier series, {counted(artifact.harmonics, 'harmonic')}")]
+            [("map", _nodes(artifact.map_grid, artifact.field.shape))]
+            if artifact.map_grid
+            else []
+        ),
+        *(
+            [
+                (
+                    "angular map",
+                    f"Fourier series, {counted(artifact.harmonics, 'harmonic')}",
+                )
+            ]
             if artifact.harmonics
             else []
         ),
@@ -182,7 +195,9 @@ def measurement_section(result: CalibrationResult) -> Section:
     ]
     plate_map = result.artifact_map
     if math.isfinite(plate_map.magnification):
-        value, u = (x * UM_PER_M for x in (plate_map.magnification, plate_map.u_magnification))
+        value, u = (
+            x * UM_PER_M for x in (plate_map.magnification, plate_map.u_magnification)
+        )
         spread = f" ± {significant(u)} (k=1)" if math.isfinite(u) else ""
         facts.append(
             (
@@ -196,7 +211,8 @@ def measurement_section(result: CalibrationResult) -> Section:
         facts.append(
             (
                 "input",
-                printable(result.input["file"]) + (f" (sha256 {digest[:16]})" if digest else ""),
+                printable(result.input["file"])
+                + (f" (sha256 {digest[:16]})" if digest else ""),
             )
         )
     return Section("Measurement", tuple(facts))
@@ -209,7 +225,9 @@ def measured(view: ViewResult) -> bool:
 
 def _in_the_map(result: CalibrationResult) -> Callable[[ViewResult], bool]:
     """Return whether a view was measured, and no finding says that most of it is missing."""
-    missing = {finding.view for finding in result.findings if finding.name == "view_left_out"}
+    missing = {
+        finding.view for finding in result.findings if finding.name == "view_left_out"
+    }
     return lambda view: measured(view) and without_cell(view.name) not in missing
 
 
@@ -218,7 +236,10 @@ def views_section(result: CalibrationResult) -> Section:
     artifact, views = result.plate, result.views
     columns = [
         [printable(v.name) for v in views],
-        [pose_text(v.rotation, (v.translation_x, v.translation_y), artifact) for v in views],
+        [
+            pose_text(v.rotation, (v.translation_x, v.translation_y), artifact)
+            for v in views
+        ],
         fixed_column([v.phi / RAD_PER_MRAD for v in views]),
         fixed_column([v.tx * UM_PER_M for v in views]),
         fixed_column([v.ty * UM_PER_M for v in views]),
@@ -228,14 +249,20 @@ def views_section(result: CalibrationResult) -> Section:
     pose = f"pose ({'mm' if artifact.marks else 'pitches'})"
     header = ("view", pose, "φ mrad", "tx µm", "ty µm", "used", "rejected")
     return Section(
-        "Views and their misalignment", table=(header, *zip(*columns, strict=True)) if views else ()
+        "Views and their misalignment",
+        table=(header, *zip(*columns, strict=True)) if views else (),
     )
 
 
-def pose_text(rotation_rad: float, translation_m: tuple[float, float], artifact: Artifact) -> str:
+def pose_text(
+    rotation_rad: float, translation_m: tuple[float, float], artifact: Artifact
+) -> str:
     """Return a nominal pose as ``90° (+1, 0)``: turn, and pitches (mm for a list of marks)."""
     unit = 1 / MM_PER_M if artifact.marks else artifact.grid_pitch_m
-    x, y = (f"{value / unit:+.6g}" if round(value / unit, 9) else "0" for value in translation_m)
+    x, y = (
+        f"{value / unit:+.6g}" if round(value / unit, 9) else "0"
+        for value in translation_m
+    )
     return f"{math.degrees(rotation_rad):.6g}° ({x}, {y})"
 
 
@@ -251,7 +278,11 @@ def position_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
 
 def place_text(emap: ErrorMap, site: tuple[int, int] | None) -> str:
     """Return a site and its position as ``at x 40 mm, y -20 mm (site 4, -2)``."""
-    return "" if site is None else f"{position_text(emap, site)} (site {site[0]}, {site[1]})"
+    return (
+        ""
+        if site is None
+        else f"{position_text(emap, site)} (site {site[0]}, {site[1]})"
+    )
 
 
 def error_section(result: CalibrationResult) -> Section:
@@ -259,7 +290,10 @@ def error_section(result: CalibrationResult) -> Section:
     emap = result.error_map
     figures = map_figures(emap)
     facts = [
-        ("largest error", f"{um(figures.max_error_m)} {place_text(emap, figures.max_site)}"),
+        (
+            "largest error",
+            f"{um(figures.max_error_m)} {place_text(emap, figures.max_site)}",
+        ),
         ("rms error", f"{um(figures.rms_error_m)} per axis"),
     ]
     if figures.n_known < figures.n_sites:
@@ -275,11 +309,19 @@ def error_section(result: CalibrationResult) -> Section:
         *_between_nodes(result),
         (
             "non-orthogonality",
-            _slope_text(emap, (emap.nonorthogonality, u_o), "O", "µrad", "out of square by 2|O|"),
+            _slope_text(
+                emap, (emap.nonorthogonality, u_o), "O", "µrad", "out of square by 2|O|"
+            ),
         ),
         (
             "scale difference",
-            _slope_text(emap, (emap.scale_difference, u_r), "R", "µm/m", "X and Y differ by 2|R|"),
+            _slope_text(
+                emap,
+                (emap.scale_difference, u_r),
+                "R",
+                "µm/m",
+                "X and Y differ by 2|R|",
+            ),
         ),
     ]
     if emap.artifact.angular_count:
@@ -313,7 +355,11 @@ def _first_order_u(result: CalibrationResult) -> tuple[float, float]:
 
 
 def _slope_text(
-    emap: ErrorMap, slope_and_u: tuple[float, float], symbol: str, unit: str, meaning: str
+    emap: ErrorMap,
+    slope_and_u: tuple[float, float],
+    symbol: str,
+    unit: str,
+    meaning: str,
 ) -> str:
     """Return a slope, with its standard uncertainty, and what it means."""
     length = (max(emap.artifact.shape) - 1) * emap.artifact.grid_pitch_m
@@ -352,7 +398,10 @@ def _theta_facts(result: CalibrationResult) -> list[tuple[str, str]]:
 
 
 def _spread_facts(
-    label: str, unit: Callable[[float], str], u: tuple[float, float], student: tuple[float, float]
+    label: str,
+    unit: Callable[[float], str],
+    u: tuple[float, float],
+    student: tuple[float, float],
 ) -> list[tuple[str, str]]:
     """Return u and U (rms, largest), with coverage factor and degrees of freedom."""
     (rms_u, max_u), (k, dof) = u, student
@@ -378,13 +427,18 @@ def noise_section(noise: Noise) -> Section:
         ("θ", "theta", ARCSEC_PER_RAD, "arcsec"),
     ):
         sigma, repeats, residuals = (
-            getattr(noise, f"sigma_{name}{suffix}") for suffix in ("", "_repeats", "_residuals")
+            getattr(noise, f"sigma_{name}{suffix}")
+            for suffix in ("", "_repeats", "_residuals")
         )
         if not any(map(math.isfinite, (sigma, repeats, residuals))):
             continue
-        dofs = [getattr(noise, f"dof_{name}_{kind}") for kind in ("repeats", "residuals")]
+        dofs = [
+            getattr(noise, f"dof_{name}_{kind}") for kind in ("repeats", "residuals")
+        ]
         ratio = residuals / repeats if repeats > 0 else float("nan")
-        texts = aligned_numbers([value * scale for value in (sigma, repeats, residuals)])
+        texts = aligned_numbers(
+            [value * scale for value in (sigma, repeats, residuals)]
+        )
         rows.append(
             (
                 f"{label} ({unit})",
@@ -407,7 +461,9 @@ def noise_section(noise: Noise) -> Section:
     if not rows:
         return Section(
             "Noise",
-            notes=("not known: no mark was read twice and no detection declared its uncertainty",),
+            notes=(
+                "not known: no mark was read twice and no detection declared its uncertainty",
+            ),
         )
     return Section("Noise", table=(header, *rows))
 
@@ -454,7 +510,10 @@ def rejected_section(result: CalibrationResult) -> Section:
     used = sum(v.used for v in result.views)
     facts = [
         ("detections", f"{used} used, {total} rejected"),
-        *((printable(reason).replace("_", " "), str(count)) for reason, count in counts),
+        *(
+            (printable(reason).replace("_", " "), str(count))
+            for reason, count in counts
+        ),
     ]
     return Section("Rejected detections", tuple(facts))
 
@@ -462,7 +521,9 @@ def rejected_section(result: CalibrationResult) -> Section:
 def attention_section(result: CalibrationResult) -> Section:
     """Return unseen modes, advice and warnings, which require action."""
     observability = result.observability
-    lines = [f"undetermined mode: {printable(mode.text)}" for mode in observability.modes]
+    lines = [
+        f"undetermined mode: {printable(mode.text)}" for mode in observability.modes
+    ]
     lines += [f"advice: {printable(advice.text)}" for advice in observability.advice]
     lines += [f"warning: {printable(warning)}" for warning in result.warnings]
     return Section("Attention", notes=tuple(lines))
@@ -473,7 +534,11 @@ def state_sentence(result: CalibrationResult) -> str:
     observability = result.observability
     figures = map_figures(result.error_map)
     if not observability.identifiable:
-        advice = f"; {printable(observability.advice[0].text)}" if observability.advice else ""
+        advice = (
+            f"; {printable(observability.advice[0].text)}"
+            if observability.advice
+            else ""
+        )
         return (
             f"Not a calibration: {counted(observability.deficiency, 'mode')} of the stage error "
             f"cannot be determined from the marks that were read{advice}."
@@ -481,13 +546,17 @@ def state_sentence(result: CalibrationResult) -> str:
     if not figures.n_known and not figures.n_lines_known:
         return "No calibration: no site of the error map is known."
     k = result.noise.k_theta
-    text = f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
+    text = (
+        f"{_map_clause(result, figures)}{_theta_clause(figures, k)}{_warnings(result)}."
+    )
     if result.verdict.grade is Grade.GOOD and result.recheck is None:
         assumed = assumption_text(result)
         return text + f" {assumed}." * bool(assumed)
     sentence = printable(result.verdict.sentence).rstrip(".")
     return (
-        f"{sentence}. {text}" if result.verdict.qualified else f"{sentence}. Map as it is: {text}"
+        f"{sentence}. {text}"
+        if result.verdict.qualified
+        else f"{sentence}. Map as it is: {text}"
     )
 
 
@@ -500,7 +569,9 @@ def state_line(result: CalibrationResult) -> str:
     verdict = result.verdict
     if result.verification is not None:
         return result.verification.sentence
-    if not result.observability.identifiable or not (figures.n_known or figures.n_lines_known):
+    if not result.observability.identifiable or not (
+        figures.n_known or figures.n_lines_known
+    ):
         return state_sentence(result)
 
     clauses = []
@@ -520,7 +591,9 @@ def state_line(result: CalibrationResult) -> str:
     if verdict.grade is Grade.GOOD:
         return f"Good: {line}."
     lead = "Good within an enlarged U" if verdict.qualified else "Not qualified"
-    reasons = [f"most likely {cause.text}" for cause in verdict.causes] or verdict.reasons
+    reasons = [
+        f"most likely {cause.text}" for cause in verdict.causes
+    ] or verdict.reasons
     return f"{lead}: {'; '.join((line, *map(printable, reasons[:1])))}."
 
 
@@ -530,7 +603,9 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
         if figures.n_known < figures.n_sites
         else ""
     )
-    views = counted_views(result.views, _in_the_map(result)) + of_few_read(result.findings)
+    views = counted_views(result.views, _in_the_map(result)) + of_few_read(
+        result.findings
+    )
     text = f"Calibrated{share} from {views}"
     if not figures.n_known:
         return text
@@ -540,7 +615,9 @@ def _map_clause(result: CalibrationResult, figures: MapFigures) -> str:
     between = anywhere_m(result)[2]
     if math.isfinite(figures.max_u_m):
         also = f", any place to ±{um(between)}" if math.isfinite(between) else ""
-        uncertainty = f"{sites} known to ±{um(k * figures.max_u_m)}{also} or better (k={k:.3g})"
+        uncertainty = (
+            f"{sites} known to ±{um(k * figures.max_u_m)}{also} or better (k={k:.3g})"
+        )
     where = position_text(result.error_map, figures.max_site)
     return f"{text}: largest error {um(figures.max_error_m)} {where}, {uncertainty}"
 

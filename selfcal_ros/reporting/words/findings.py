@@ -66,7 +66,9 @@ def plus_minus(finding: Finding, unit: DisplayUnit, times: float = 1.0) -> str:
     times : float
         Factor of the size.
     """
-    value, u = (times * unit.per_si * size_si for size_si in (abs(finding.size), finding.u))
+    value, u = (
+        times * unit.per_si * size_si for size_si in (abs(finding.size), finding.u)
+    )
     digits = 3
     if math.isfinite(u) and u > 0:
         digits = min(max(1 - math.floor(math.log10(u)), 0), 9)
@@ -104,7 +106,9 @@ _MICROSCOPE: dict[str, Callable[[Cause], str]] = {
 _STRAIN: dict[str, Callable[[Cause], str]] = {
     "scale": lambda c: _either(c, "enlarged", "shrunk"),
     "stretch": lambda c: _either(
-        c, "stretched along x and compressed along y", "stretched along y and compressed along x"
+        c,
+        "stretched along x and compressed along y",
+        "stretched along y and compressed along x",
     ),
     "shear": lambda c: (
         f"stretched along its diagonal at {_either(c, '45', '135')}° and compressed along the other"
@@ -123,7 +127,9 @@ _CAUSES: dict[str, Words] = {
             else ""
         )
     ),
-    "drift": lambda c, of: f"a drift of {plus_minus(c, UM)} along {c.axis} during view '{c.view}'",
+    "drift": lambda c, of: (
+        f"a drift of {plus_minus(c, UM)} along {c.axis} during view '{c.view}'"
+    ),
     "plate_scale": lambda c, of: (
         f"a plate {_either(c, 'larger', 'smaller')} by {plus_minus(c, RATIO)} in view '{c.view}' "
         f"than in view '{of['against']}'"
@@ -149,7 +155,9 @@ _CAUSES: dict[str, Words] = {
             else ""
         )
     ),
-    "yaw": lambda c, of: f"a stage that yaws by up to {plus_minus(c, URAD)} over its travel",
+    "yaw": lambda c, of: (
+        f"a stage that yaws by up to {plus_minus(c, URAD)} over its travel"
+    ),
     "approach": lambda c, of: (
         f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
         "approach"
@@ -176,7 +184,9 @@ _CAUSES: dict[str, Words] = {
         else f"a stage rougher than the {of['nodes'][0]} x {of['nodes'][1]} nodes of its map can "
         f"follow, by {c.size * UM_PER_M:.3g} µm (rms)"
     ),
-    "noise": lambda c, of: f"{c.size:.2f} times as much noise in view '{c.view}' as in the others",
+    "noise": lambda c, of: (
+        f"{c.size:.2f} times as much noise in view '{c.view}' as in the others"
+    ),
 }
 
 _ACTIONS = {
@@ -260,7 +270,9 @@ SENTENCES: dict[str, Words] = {
         f"{f.size * (UM if f.unit == 'm' else ARCSEC).per_si:.3g} "
         f"{(UM if f.unit == 'm' else ARCSEC).name} (rms) between runs, p = {f.p:.2g}, is in U"
     ),
-    "enlarged_runs": lambda f, of: f"the uncertainty of {', '.join(of['runs'])} was enlarged",
+    "enlarged_runs": lambda f, of: (
+        f"the uncertainty of {', '.join(of['runs'])} was enlarged"
+    ),
     # what was left out, or could not be done
     "not_in_all": lambda f, of: (
         f"sites that are not known in all runs are unknown in the mean: {of['sites']}"
@@ -301,7 +313,9 @@ SENTENCES: dict[str, Words] = {
         f"more than {of['limit']:.0%} of the readings contradict the others: none was removed; "
         "look for a wrong plan or a faulty view"
     ),
-    "outliers_kept": lambda f, of: "removing more outliers would leave the stage undetermined",
+    "outliers_kept": lambda f, of: (
+        "removing more outliers would leave the stage undetermined"
+    ),
     "outliers_given_up": lambda f, of: (
         f"gave up on outliers after {of['rounds']} rounds: the readings seem to contain more; look "
         "for a wrong plan or a faulty view"
@@ -309,14 +323,18 @@ SENTENCES: dict[str, Words] = {
     "slip_found": lambda f, of: _slip_found(f, of),
     "taken_for_slip": lambda f, of: (
         f"view '{of['slip_in']}' looks as if the plate slipped, but the readings show "
-        + what_it_is(Cause(**{**vars(f), "name": of["cause"], "told": of.get("told", True)}))
+        + what_it_is(
+            Cause(**{**vars(f), "name": of["cause"], "told": of.get("told", True)})
+        )
         + ", which explains them better: no view was split"
     ),
     "slips_given_up": lambda f, of: (
         f"gave up on slips after {of['slips']}: the readings seem to contain more; measure again"
     ),
     # why readings held out were not predicted, or not judged
-    "rest_not_converged": lambda f, of: "cannot be held out: the rest does not converge",
+    "rest_not_converged": lambda f, of: (
+        "cannot be held out: the rest does not converge"
+    ),
     "nothing_to_predict": lambda f, of: (
         "nothing to predict: no held-out mark is known from the rest"
     ),
@@ -481,14 +499,22 @@ def worded(result: CalibrationResult) -> CalibrationResult:
     """Return a result with the texts of its findings; existing texts are kept."""
     findings = tuple(map(_with_text, result.findings))
     new = (
-        finding.text for finding, old in zip(findings, result.findings, strict=True) if not old.text
+        finding.text
+        for finding, old in zip(findings, result.findings, strict=True)
+        if not old.text
     )
     verdict = worded_verdict(result.verdict, result.noise)
-    assumed = assumption_text(result) if verdict.qualified and not result.verdict.sentence else ""
+    assumed = (
+        assumption_text(result)
+        if verdict.qualified and not result.verdict.sentence
+        else ""
+    )
     if assumed:
         verdict = replace(verdict, sentence=f"{verdict.sentence}; {assumed}")
     if result.method == COMBINED and verdict.grade is Grade.GOOD:
-        verdict = replace(verdict, sentence="Good: the runs agree within their uncertainties")
+        verdict = replace(
+            verdict, sentence="Good: the runs agree within their uncertainties"
+        )
     if result.recheck is not None and verdict.qualified:
         verdict = replace(verdict, sentence=phrases.recheck_sentence(result.recheck))
     return replace(
@@ -497,7 +523,9 @@ def worded(result: CalibrationResult) -> CalibrationResult:
         findings=findings,
         observability=worded_observability(result.observability),
         warnings=(*result.warnings, *new),
-        budget=tuple(replace(line, text=line.text or line_text(line)) for line in result.budget),
+        budget=tuple(
+            replace(line, text=line.text or line_text(line)) for line in result.budget
+        ),
     )
 
 
@@ -548,7 +576,9 @@ def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
 
     `noise` of the same result tells whether there was something to compare residuals with.
     """
-    new = [finding for finding in (*verdict.failed, *verdict.causes) if not finding.text]
+    new = [
+        finding for finding in (*verdict.failed, *verdict.causes) if not finding.text
+    ]
     if verdict.sentence and not new:
         return verdict
     reasons = (
@@ -560,7 +590,9 @@ def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
             for finding in new
         ),
     )
-    causes = tuple(replace(_with_text(cause), remedies=remedies(cause)) for cause in verdict.causes)
+    causes = tuple(
+        replace(_with_text(cause), remedies=remedies(cause)) for cause in verdict.causes
+    )
     return replace(
         verdict,
         failed=tuple(map(_with_text, verdict.failed)),

@@ -42,7 +42,9 @@ def with_advice(error: NotIdentifiableError) -> NotIdentifiableError:
 def worded(finding: Finding) -> Finding:
     """Return a mode or an advice with its sentence; an existing one is kept."""
     return (
-        finding if finding.text else replace(finding, text=SENTENCES[finding.name](finding.details))
+        finding
+        if finding.text
+        else replace(finding, text=SENTENCES[finding.name](finding.details))
     )
 
 
@@ -60,17 +62,25 @@ def describe_view(view: View, artifact: Artifact) -> str:
         description = f"a view turned by {turn:.6g} deg"
     else:
         description = "an unturned view"
-    unit, name = (1 / MM_PER_M, "mm") if artifact.marks else (artifact.grid_pitch_m, "pitch")
+    unit, name = (
+        (1 / MM_PER_M, "mm") if artifact.marks else (artifact.grid_pitch_m, "pitch")
+    )
     steps = [round(shift / unit, 3) + 0.0 for shift in view.translation_m]
     shifted = [
-        f"{step:+g} {name} along {axis}" for step, axis in zip(steps, "XY", strict=True) if step
+        f"{step:+g} {name} along {axis}"
+        for step, axis in zip(steps, "XY", strict=True)
+        if step
     ]
-    also = " shifted by " if description.startswith("an unturned") else " and shifted by "
+    also = (
+        " shifted by " if description.startswith("an unturned") else " and shifted by "
+    )
     return description + (also + " and ".join(shifted) if shifted else "")
 
 
 def _add(of: Mapping[str, Any]) -> str:
-    return "add " + " and ".join(describe_view(view, of["plate"]) for view in of["views"])
+    return "add " + " and ".join(
+        describe_view(view, of["plate"]) for view in of["views"]
+    )
 
 
 def _line_offsets(of: Mapping[str, Any]) -> str:
@@ -125,8 +135,12 @@ SENTENCES: dict[str, Callable[[Mapping[str, Any]], str]] = {
         f"{of['count']} sites that no mark reaches, the first is "
         f"({of['first'][0]}, {of['first'][1]})"
     ),
-    "marks_never_read": lambda of: f"{of['count']} marks of the plate that no view reads",
-    "every_field": lambda of: "everything: one view cannot separate the stage from the plate",
+    "marks_never_read": lambda of: (
+        f"{of['count']} marks of the plate that no view reads"
+    ),
+    "every_field": lambda of: (
+        "everything: one view cannot separate the stage from the plate"
+    ),
     "line_offsets": _line_offsets,
     "rotation_symmetric": lambda of: (
         f"rotation-symmetric fields: every field that a {'half' if of['half'] else 'quarter'} "
@@ -139,7 +153,9 @@ SENTENCES: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "groups_of_lines": lambda of: (
         f"angular map: {of['count']} groups of lines that no view connects"
     ),
-    "lines_never_visited": lambda of: f"{of['count']} angles of the stage that no line reaches",
+    "lines_never_visited": lambda of: (
+        f"{of['count']} angles of the stage that no line reaches"
+    ),
     "looks_like_stage": lambda of: (
         f"{of['term']}: {of['count']} mode{'s' * (of['count'] != 1)} of the stage look like it"
     ),

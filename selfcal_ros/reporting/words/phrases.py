@@ -42,14 +42,18 @@ def dof_text(dof: float) -> str:
     return f"> {COUNTED_DOF:.0f}" if math.isfinite(dof) else "∞"
 
 
-def counted_views(views: Sequence[ViewResult], of: Callable[[ViewResult], bool] = bool) -> str:
+def counted_views(
+    views: Sequence[ViewResult], of: Callable[[ViewResult], bool] = bool
+) -> str:
     """Return ``4 views``, ``2 views with images of 9 marks``: the cells of images are not views.
 
     ``3 of 4 views`` if not in all of them a cell is one `of` those meant.
     """
     number = len({without_cell(view.name) for view in views})
     meant = len({without_cell(view.name) for view in views if of(view)})
-    cells = len({view.name.removeprefix(without_cell(view.name)) for view in views} - {""})
+    cells = len(
+        {view.name.removeprefix(without_cell(view.name)) for view in views} - {""}
+    )
     images = f" with images of {cells} marks" if cells else ""
     share = f"{meant} of " * (meant != number)
     return f"{share}{number} view{'s' * (number != 1)}{images}"
@@ -67,25 +71,34 @@ def few_read_text(finding: Finding, of: dict[str, Any]) -> str:
         if of["unknown"] is None
         else (f"the camera's error is not known in {_named(of['unknown'])}")
     )
-    return f"few marks were read {where}: look for dirt or a shadow in that part of the image" + (
-        f"; {unknown}" if of["unknown"] != [] else ""
+    return (
+        f"few marks were read {where}: look for dirt or a shadow in that part of the image"
+        + (f"; {unknown}" if of["unknown"] != [] else "")
     )
 
 
 def view_left_out_text(finding: Finding, of: dict[str, Any]) -> str:
     """Return the sentence on a view of which nothing, or a small part, became readings."""
-    rejected = ", ".join(f"{reason} {count}" for reason, count in of["rejected"].items())
+    rejected = ", ".join(
+        f"{reason} {count}" for reason, count in of["rejected"].items()
+    )
     read = of.get("read", [0, 0])  # older results name only views without readings
     if any(read):
         counts = " and ".join(
             f"{got} of {asked} {kind}"
-            for got, asked, kind in zip(read, of["asked"], ("marks", "lines"), strict=True)
+            for got, asked, kind in zip(
+                read, of["asked"], ("marks", "lines"), strict=True
+            )
             if asked
         )
-        text = f"view '{finding.view}' is only partly in the map: {counts} became readings"
+        text = (
+            f"view '{finding.view}' is only partly in the map: {counts} became readings"
+        )
     else:
         text = f"view '{finding.view}' is not part of the map: " + (
-            "none of its detections became a reading" if rejected else "nothing was detected in it"
+            "none of its detections became a reading"
+            if rejected
+            else "nothing was detected in it"
         )
     return f"{text} ({rejected})" if rejected else text
 
@@ -291,7 +304,9 @@ def microscope_off_text(finding: Finding, of: Mapping[str, Any]) -> str:
 
 
 def _clearest_of(finding: Finding, of: Mapping[str, Any]) -> str:
-    return _clearest(LargestChange(of["x"], of["y"], finding.axis, finding.size, finding.u))
+    return _clearest(
+        LargestChange(of["x"], of["y"], finding.axis, finding.size, finding.u)
+    )
 
 
 def misfit_text(finding: Finding, _: Mapping[str, Any]) -> str:

@@ -37,7 +37,9 @@ def why_text(why: Finding | None, artifact: Artifact) -> str:
     return f"cannot be held out: the rest does not identify the stage; {more}"
 
 
-def validation_json(held_out: list[HeldOut], artifact: Artifact) -> list[dict[str, Any]]:
+def validation_json(
+    held_out: list[HeldOut], artifact: Artifact
+) -> list[dict[str, Any]]:
     """Return the validation for ``extra["validation"]`` of a result: SI units."""
     return [
         {
@@ -91,7 +93,10 @@ def _limit_text(item: HeldOut, why: str) -> str:
 
 _QUANTITIES = {
     ("xy", False): "XY, one coordinate at the nodes of the map",
-    ("xy", True): "XY, one coordinate anywhere in the field, map interpolated between its nodes",
+    (
+        "xy",
+        True,
+    ): "XY, one coordinate anywhere in the field, map interpolated between its nodes",
     ("theta", False): "theta at the lines of the map",
     ("theta", True): "theta at any angle, map interpolated between its lines",
 }
@@ -106,7 +111,9 @@ def budget_text(budgets: list[Budget]) -> list[str]:
     """Return the budgets as a table, µm and arcsec."""
     lines = []
     for budget in budgets:
-        factor, unit = (UM_PER_M, "µm") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
+        factor, unit = (
+            (UM_PER_M, "µm") if budget.unit == "m" else (ARCSEC_PER_RAD, "arcsec")
+        )
         lines += [
             f"uncertainty of {quantity_text(budget)}, {unit}",
             f"  {'component':18}{'type':>5}{'u rms':>12}{'u max':>12}{'dof':>10}  from",
@@ -153,7 +160,8 @@ def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
             )
         if lines:
             expanded, noise = (
-                2 * factor * budget.u_rms(quantity, noise_only=only) for only in (False, True)
+                2 * factor * budget.u_rms(quantity, noise_only=only)
+                for only in (False, True)
             )
             larger = 2 * factor * budget.u_rms(quantity, if_larger=True)
             out.append(
@@ -167,7 +175,9 @@ def plan_budget_text(budget: PlanBudget, plan: Plan) -> list[str]:
 def removal_text(removal: Removal, line: BudgetLine, plan: Plan) -> str:
     """Return what removes a line of a plan's budget, and what is left of it."""
     if removal.step is None:
-        return _CERTIFICATES.get(line.component, f"declare a smaller {line.component}:SIZE")
+        return _CERTIFICATES.get(
+            line.component, f"declare a smaller {line.component}:SIZE"
+        )
     factor, unit = (NM_PER_M, "nm") if line.quantity == "xy" else (URAD_PER_RAD, "µrad")
     return f"{step_text(removal.step, plan)}: {removal.effect_rms * factor:.3g} {unit}"
 
@@ -189,7 +199,8 @@ def step_text(step: plan_check.Step, plan: Plan) -> str:
         )
     if step.view is None:
         pairs = {
-            (old.repeats, new.repeats) for old, new in zip(plan.views, step.views, strict=True)
+            (old.repeats, new.repeats)
+            for old, new in zip(plan.views, step.views, strict=True)
         }
         return f"visit the marks in the order {step.order}" + "".join(
             f", {new} repeats for {old}" for old, new in sorted(pairs) if new != old
@@ -197,7 +208,9 @@ def step_text(step: plan_check.Step, plan: Plan) -> str:
     if step.repeat_of is None:
         return "add " + describe_view(step.view, plan.artifact)
     before = plan.views[step.repeat_of]
-    return f"measure view '{before.name}' {step.view.repeats} times, not {before.repeats}"
+    return (
+        f"measure view '{before.name}' {step.view.repeats} times, not {before.repeats}"
+    )
 
 
 def search_text(search: Search) -> str:

@@ -37,7 +37,11 @@ _FAULTS = {
 
 _ACTS = {TableFault.OFF: "does not act", TableFault.SIGN: "has the wrong sign"}
 
-UNIT = {"x": ("µm", UM_PER_M), "y": ("µm", UM_PER_M), "theta": ("arcsec", ARCSEC_PER_RAD)}
+UNIT = {
+    "x": ("µm", UM_PER_M),
+    "y": ("µm", UM_PER_M),
+    "theta": ("arcsec", ARCSEC_PER_RAD),
+}
 """Unit of an axis in a text, and how many of it are an SI unit."""
 
 
@@ -66,7 +70,9 @@ def verification_sentence(verification: Verification) -> str:
     """Return the verdict in one sentence."""
     axes = [verification.axes[name] for name in "xy"]
     was, now, U_was, U_now = (
-        significant(UM_PER_M * math.sqrt(sum(getattr(axis, name) ** 2 for axis in axes) / 2))
+        significant(
+            UM_PER_M * math.sqrt(sum(getattr(axis, name) ** 2 for axis in axes) / 2)
+        )
         for name in ("rms_before", "rms_after", "U_before", "U_after")
     )
     head = "Better" if verification.better else "Not better"
@@ -146,7 +152,9 @@ def verification_text(verification: Verification) -> str:
             axis.U_after,
         )
         acts = (
-            "not shown" if math.isnan(axis.factor) else (f"{axis.factor:.3f} ± {axis.u_factor:.3f}")
+            "not shown"
+            if math.isnan(axis.factor)
+            else (f"{axis.factor:.3f} ± {axis.u_factor:.3f}")
         )
         rows.append(
             [

@@ -29,11 +29,36 @@ WRONG = {  # what the plan says, where the plate lies, in which view, and what i
         1,
         "turned by 270°, not by 90°; turn it counter-clockwise",
     ),
-    "half a turn": ("0, 90, tx", "0, 180, tx", 1, "turned by 180°, not by 90°; turn it as planned"),
-    "not turned": ("0, 90, tx, ty", "0, 0, tx, ty", 1, "turned by 0°, not by 90°; turn it as "),
-    "other side": ("0, 90, tx", "0, 90, -tx", 2, "shifted by (-1, +0) pitches, not by (+1, +0) "),
-    "other axis": ("0, 90, tx", "0, 90, ty", 2, "shifted by (+0, +1) pitches, not by (+1, +0) "),
-    "not shifted": ("0, 90, 180, tx", "0, 90, 180, 0", 3, "shifted by (+0, +0) pitches, not by "),
+    "half a turn": (
+        "0, 90, tx",
+        "0, 180, tx",
+        1,
+        "turned by 180°, not by 90°; turn it as planned",
+    ),
+    "not turned": (
+        "0, 90, tx, ty",
+        "0, 0, tx, ty",
+        1,
+        "turned by 0°, not by 90°; turn it as ",
+    ),
+    "other side": (
+        "0, 90, tx",
+        "0, 90, -tx",
+        2,
+        "shifted by (-1, +0) pitches, not by (+1, +0) ",
+    ),
+    "other axis": (
+        "0, 90, tx",
+        "0, 90, ty",
+        2,
+        "shifted by (+0, +1) pitches, not by (+1, +0) ",
+    ),
+    "not shifted": (
+        "0, 90, 180, tx",
+        "0, 90, 180, 0",
+        3,
+        "shifted by (+0, +0) pitches, not by ",
+    ),
 }
 
 
@@ -62,7 +87,9 @@ def test_without_ids_the_other_views_tell_how_a_plate_lies(name, sense):
     assert str(error.value).startswith(
         f"plan '{lies}', view '{names[index]}': the plate lies {said}"
     )
-    assert str(error.value).endswith("and measure this view again, or correct its pose in the plan")
+    assert str(error.value).endswith(
+        "and measure this view again, or correct its pose in the plan"
+    )
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -77,7 +104,10 @@ def test_readings_without_repeats_tell_how_a_plate_lies(name):
 def test_a_contradiction_that_hides_in_scattered_repeats_tells_how_a_plate_lies():
     readings, names = read("0, 90, tx, ty", "0, 270, tx, ty")
     drifting = replace(
-        readings, views=tuple(replace(view, sigma_xy=8 * view.sigma_xy) for view in readings.views)
+        readings,
+        views=tuple(
+            replace(view, sigma_xy=8 * view.sigma_xy) for view in readings.views
+        ),
     )
     found = misplaced(drifting)
     assert found is not None and (found.view, found.found_deg) == (names[1], 270)
@@ -87,7 +117,9 @@ def unrepeated(readings):
     """Return readings of which nothing tells the noise of repeats."""
     return replace(
         readings,
-        views=tuple(replace(view, sigma_xy=float("nan"), dof_xy=0) for view in readings.views),
+        views=tuple(
+            replace(view, sigma_xy=float("nan"), dof_xy=0) for view in readings.views
+        ),
     )
 
 
@@ -127,7 +159,8 @@ def test_the_cells_of_one_view_alone_name_no_pose():
     )
     rng = np.random.default_rng(5)
     dirty = tuple(
-        replace(cell, dx=cell.dx + rng.normal(0, 1e-6, len(cell.dx))) for cell in readings.views
+        replace(cell, dx=cell.dx + rng.normal(0, 1e-6, len(cell.dx)))
+        for cell in readings.views
     )
     assert len({cell.view.plan_view for cell in dirty}) == 1 < len(dirty)
     assert misplaced(unrepeated(replace(readings, views=dirty))) is None
@@ -153,7 +186,11 @@ def test_a_plate_without_errors_of_its_own_tells_nothing():
     blank = replace(
         readings,
         views=tuple(
-            replace(v, dx=noise.normal(0, 1.4e-8, len(v.m)), dy=noise.normal(0, 1.4e-8, len(v.m)))
+            replace(
+                v,
+                dx=noise.normal(0, 1.4e-8, len(v.m)),
+                dy=noise.normal(0, 1.4e-8, len(v.m)),
+            )
             for v in readings.views
         ),
     )
@@ -175,13 +212,19 @@ def test_plates_that_lie_as_planned_are_no_finding(text):
     for seed in range(3):
         readings = collect(scene(text, with_ids=False, seed=seed, **NOISE).events)[0]
         for size in (1.0, 0.1, 0.01):
-            views = tuple(replace(v, dx=size * v.dx, dy=size * v.dy) for v in readings.views)
+            views = tuple(
+                replace(v, dx=size * v.dx, dy=size * v.dy) for v in readings.views
+            )
             assert misplaced(replace(readings, views=views)) is None
             assert misplaced(unrepeated(replace(readings, views=views))) is None
 
 
 def test_other_poses_are_turns_and_shifts_each_once():
-    pose = plan_of("tx", 5, count=0).views[0].lattice_pose(plan_of("tx", 5, count=0).artifact)
+    pose = (
+        plan_of("tx", 5, count=0)
+        .views[0]
+        .lattice_pose(plan_of("tx", 5, count=0).artifact)
+    )
     poses = [(other.q, other.shift) for other in other_poses(pose)]
     assert len(poses) == len(set(poses)) and (0, (1, 0)) not in poses
     assert {
@@ -198,7 +241,12 @@ def test_other_poses_are_turns_and_shifts_each_once():
     } == set(poses)
 
 
-PLATES = {"lattice": plate(9, 5), "list": lattice(7), "rings": rings(), "scatter": scatter()}
+PLATES = {
+    "lattice": plate(9, 5),
+    "list": lattice(7),
+    "rings": rings(),
+    "scatter": scatter(),
+}
 
 
 @pytest.mark.parametrize(
@@ -215,7 +263,9 @@ PLATES = {"lattice": plate(9, 5), "list": lattice(7), "rings": rings(), "scatter
 def test_plates_off_the_lattice_and_lists_of_marks_are_found_to_lie_otherwise(
     name, index, pose, said
 ):
-    with pytest.raises(PlacingError, match=re.escape(f"'view {index}': the plate lies {said}")):
+    with pytest.raises(
+        PlacingError, match=re.escape(f"'view {index}': the plate lies {said}")
+    ):
         calibrate(laid_at(PLATES[name], index, pose, 0), UNSEARCHED)
 
 

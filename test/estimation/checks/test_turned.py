@@ -89,7 +89,9 @@ def test_another_contradiction_is_not_taken_for_wrong_offsets():
     assert not calibrate(spoilt).verdict.qualified
 
 
-@pytest.mark.parametrize(("scale", "fits"), [(0.05, True), (-0.09, True), (-2.0, False)])
+@pytest.mark.parametrize(
+    ("scale", "fits"), [(0.05, True), (-0.09, True), (-2.0, False)]
+)
 def test_a_microscope_that_undoes_the_sign_speaks_against_it(scale, fits):
     """Marks that repeat wrongly in all views made lines of the other sign fit, with a scale of -1.
 
@@ -97,4 +99,6 @@ def test_a_microscope_that_undoes_the_sign_speaks_against_it(scale, fits):
     """
     result = calibrate(measured())
     cause = Cause("microscope", scale, 1e-3, "m/m", 1e-9)
-    assert _fits(replace(result, verdict=replace(result.verdict, causes=(cause,)))) is fits
+    assert (
+        _fits(replace(result, verdict=replace(result.verdict, causes=(cause,)))) is fits
+    )

@@ -104,7 +104,9 @@ def test_every_other_wiring_is_named_with_its_axes_and_signs(name):
         i = int(np.abs(wiring[j]).argmax())
         if wiring[j, i] != 1 or i != j:
             expected[offset] = ("xy"[i], -wiring[j, i])
-    assert {offset: (axis, np.sign(slope)) for offset, (axis, slope) in told.items()} == expected
+    assert {
+        offset: (axis, np.sign(slope)) for offset, (axis, slope) in told.items()
+    } == expected
     assert all(abs(slope) == pytest.approx(1, abs=0.1) for _, slope in told.values())
 
 
@@ -120,9 +122,14 @@ def test_every_other_wiring_is_named_with_its_axes_and_signs(name):
     ],
 )
 def test_units_far_from_one_are_refused_and_others_left_to_the_fit(scale, named):
-    told = found(motion(np.random.default_rng(2), wiring=np.diag(scale), servo=100 * NM))
+    told = found(
+        motion(np.random.default_rng(2), wiring=np.diag(scale), servo=100 * NM)
+    )
     assert "".join(told) == named
-    assert all(told[axis][1] == pytest.approx(-scale["xy".index(axis)], abs=0.1) for axis in told)
+    assert all(
+        told[axis][1] == pytest.approx(-scale["xy".index(axis)], abs=0.1)
+        for axis in told
+    )
 
 
 @pytest.mark.parametrize(
@@ -140,7 +147,10 @@ def test_units_far_from_one_are_refused_and_others_left_to_the_fit(scale, named)
 def test_repeats_contradict_a_scale_that_no_noise_explains(scale, how, wanted):
     """Encoder noise makes a scale smaller, noise of detections larger than the offsets show."""
     told = measured(
-        *(motion(np.random.default_rng(seed), wiring=np.diag(scale), **how) for seed in range(4))
+        *(
+            motion(np.random.default_rng(seed), wiring=np.diag(scale), **how)
+            for seed in range(4)
+        )
     )
     response = contradicted_scale(told, 0.01)
     assert (response is None) == (wanted is None)
@@ -149,7 +159,10 @@ def test_repeats_contradict_a_scale_that_no_noise_explains(scale, how, wanted):
         assert -response.slope == pytest.approx(wanted, rel=0.08)
         assert -response.slope < response.most
         assert contradicted_scale(told, 0.2) is None
-        assert contradicted_scale(measured(motion(np.random.default_rng(0), servo=0.0)), 0) is None
+        assert (
+            contradicted_scale(measured(motion(np.random.default_rng(0), servo=0.0)), 0)
+            is None
+        )
 
 
 @pytest.mark.parametrize(
@@ -181,21 +194,36 @@ def test_readout_noise_is_no_scale_and_turns_no_sign():
 
 def test_noise_of_the_microscope_is_no_scale():
     assert (
-        found(motion(np.random.default_rng(4), servo=20 * NM, noise=60 * NM, repeats=10, marks=121))
+        found(
+            motion(
+                np.random.default_rng(4),
+                servo=20 * NM,
+                noise=60 * NM,
+                repeats=10,
+                marks=121,
+            )
+        )
         == {}
     )
 
 
 def test_motion_along_a_diagonal_tells_no_exchange_but_a_sign():
     assert found(motion(np.random.default_rng(5), correlation=1.0)) == {}
-    assert found(motion(np.random.default_rng(5), correlation=1.0, wiring=WIRINGS["yx"])) == {}
-    assert found(motion(np.random.default_rng(5), correlation=1.0, wiring=WIRINGS["-x-y"])) == {
+    assert (
+        found(motion(np.random.default_rng(5), correlation=1.0, wiring=WIRINGS["yx"]))
+        == {}
+    )
+    assert found(
+        motion(np.random.default_rng(5), correlation=1.0, wiring=WIRINGS["-x-y"])
+    ) == {
         "x": ("x", 1.0),
         "y": ("y", 1.0),
     }
 
 
-@pytest.mark.parametrize("how", [{"servo": 0.0}, {"repeats": 1}, {"servo": 0.0, "noise": 0.0}])
+@pytest.mark.parametrize(
+    "how", [{"servo": 0.0}, {"repeats": 1}, {"servo": 0.0, "noise": 0.0}]
+)
 def test_without_motion_nothing_is_said(how):
     assert found(motion(np.random.default_rng(6), wiring=WIRINGS["-x-y"], **how)) == {}
 
@@ -203,7 +231,9 @@ def test_without_motion_nothing_is_said(how):
 def test_a_drift_that_the_stage_follows_is_no_response_of_the_microscope():
     """Place and offset both change by it, slowly: +0.01 and -0.01 of 1 µm."""
     for wiring in (1, -1):
-        told = motion(np.random.default_rng(7), servo=0.0, noise=0.1 * NM, drift=wiring * UM)
+        told = motion(
+            np.random.default_rng(7), servo=0.0, noise=0.1 * NM, drift=wiring * UM
+        )
         assert found(told) == {}
 
 
@@ -295,7 +325,10 @@ def exchanged(d):
 
 def doubled(d):
     return replace(
-        d, offset_x=2 * d.offset_x, offset_y=2 * d.offset_y, offset_theta=2 * d.offset_theta
+        d,
+        offset_x=2 * d.offset_x,
+        offset_y=2 * d.offset_y,
+        offset_theta=2 * d.offset_theta,
     )
 
 
@@ -320,7 +353,8 @@ def test_a_session_with_wrong_offsets_is_refused(sense, with_ids, spoilt, expect
         for r in fault.responses
     }
     assert told == {
-        name: (axis, pytest.approx(slope, abs=0.11)) for name, (axis, slope) in expected.items()
+        name: (axis, pytest.approx(slope, abs=0.11))
+        for name, (axis, slope) in expected.items()
     }
     with pytest.raises(WiringError):
         calibrate(readings)
@@ -346,7 +380,9 @@ def test_a_session_with_good_offsets_is_calibrated(sense, with_ids):
 def test_without_ids_reversed_offsets_are_of_the_same_marks():
     told = [
         measured_session(
-            lambda d: reversed_x(reversed_y(d)), sense=Sense.MICROSCOPE_MOVES, with_ids=with_ids
+            lambda d: reversed_x(reversed_y(d)),
+            sense=Sense.MICROSCOPE_MOVES,
+            with_ids=with_ids,
         )
         for with_ids in (True, False)
     ]
@@ -380,9 +416,15 @@ def test_rejected_kinds_are_in_no_sums():
     """Lines tell nothing of x and y, marks nothing of the angle."""
     cell = scene("0", repeats=3, line=False, count=0)
     readings = collect(
-        [e for e in cell.events if not (isinstance(e, Detection) and e.kind == Kind.ANGULAR)]
+        [
+            e
+            for e in cell.events
+            if not (isinstance(e, Detection) and e.kind == Kind.ANGULAR)
+        ]
     )[0].views[0]
-    assert readings.motion_theta is None and readings.motion.dof == 2 * (25 * 2 - 5) // 3
+    assert (
+        readings.motion_theta is None and readings.motion.dof == 2 * (25 * 2 - 5) // 3
+    )
 
 
 @pytest.mark.parametrize("correlation", [0.0, -0.3])

@@ -44,7 +44,9 @@ GTC_DOF = 7.518796992481201
 def run_of(values, variance, *, common=0.0, shares=True, dof=np.inf):
     values = np.asarray(values, dtype=float)
     n = len(values)
-    return RunValues(values, variance * np.eye(n), common * np.ones((n, n)), shares, dof)
+    return RunValues(
+        values, variance * np.eye(n), common * np.ones((n, n)), shares, dof
+    )
 
 
 def calibrated(seed, *, options=None, artifact=ARTIFACT, truth=None, sigma=2e-8):
@@ -62,7 +64,9 @@ def part(name, result):
 
 def run_at(run_id, **changed):
     """Return run A with another map, and what tells when it was recorded."""
-    times = dict.fromkeys(("first_exposure", "last_exposure"), "2026-01-01T00:00:00+00:00")
+    times = dict.fromkeys(
+        ("first_exposure", "last_exposure"), "2026-01-01T00:00:00+00:00"
+    )
     return replace(
         A,
         run_id=run_id,
@@ -78,7 +82,10 @@ def thrice(result):
         part(
             name,
             replace(
-                result, error_map=replace(result.error_map, gx=result.error_map.gx + sign * off)
+                result,
+                error_map=replace(
+                    result.error_map, gx=result.error_map.gx + sign * off
+                ),
             ),
         )
         for name, sign in zip("abc", (1, -1, 0), strict=True)
@@ -87,7 +94,8 @@ def thrice(result):
 
 def scaled(emap, by):
     return replace(
-        emap, **{name: by * getattr(emap, name) for name in ("gx", "gy", "u_gx", "u_gy")}
+        emap,
+        **{name: by * getattr(emap, name) for name in ("gx", "gy", "u_gx", "u_gy")},
     )
 
 
@@ -104,18 +112,29 @@ def test_weights_are_inverse_variances_and_what_is_shared_does_not_average_out()
     np.testing.assert_allclose(found.covariance, 0.75 * np.eye(4) + 4.0, rtol=1e-12)
     np.testing.assert_allclose(found.u, np.sqrt(4.75))
     assert not found.between.any()
-    other = mean_of([runs[0], replace(runs[1], shares=False)], np.zeros((4, 0)), NO_SHAPES)
+    other = mean_of(
+        [runs[0], replace(runs[1], shares=False)], np.zeros((4, 0)), NO_SHAPES
+    )
     np.testing.assert_allclose(other.covariance, 0.75 * np.eye(4) + 0.75**2 * 4.0)
 
 
 def test_the_common_part_cancels_between_runs_of_one_machine_alone():
     """E_n of two runs: the difference over its U, where a common error counts for others only."""
-    runs = [run_of([2.0, 0, 0, 0], 1.0, common=8.0), run_of(np.zeros(4), 1.0, common=8.0)]
+    runs = [
+        run_of([2.0, 0, 0, 0], 1.0, common=8.0),
+        run_of(np.zeros(4), 1.0, common=8.0),
+    ]
     alike = mean_of(runs, np.zeros((4, 0)), NO_SHAPES).deviations[0]
     assert alike.e_n[0] == pytest.approx(2 / (2.0 * np.sqrt(2)), rel=1e-3)
-    of_other = mean_of([runs[0], replace(runs[1], shares=False)], np.zeros((4, 0)), NO_SHAPES)
-    assert of_other.deviations[0].e_n[0] == pytest.approx(2 / (2.0 * np.sqrt(10)), rel=1e-3)
-    assert alike.e_n[0] == -mean_of(runs, np.zeros((4, 0)), NO_SHAPES).deviations[1].e_n[0]
+    of_other = mean_of(
+        [runs[0], replace(runs[1], shares=False)], np.zeros((4, 0)), NO_SHAPES
+    )
+    assert of_other.deviations[0].e_n[0] == pytest.approx(
+        2 / (2.0 * np.sqrt(10)), rel=1e-3
+    )
+    assert (
+        alike.e_n[0] == -mean_of(runs, np.zeros((4, 0)), NO_SHAPES).deviations[1].e_n[0]
+    )
 
 
 def test_mandel_and_paule_for_equal_variances_is_a_difference_of_variances():
@@ -125,7 +144,9 @@ def test_mandel_and_paule_for_equal_variances_is_a_difference_of_variances():
     assert variance_between(values, np.full(3, 8.0)) == 0.0
     unequal = variance_between(values, np.array([1.0, 2.0, 3.0]))
     weight = 1 / (np.array([1.0, 2.0, 3.0]) + unequal)
-    assert weight @ (values[:, 0] - weight @ values[:, 0] / weight.sum()) ** 2 == pytest.approx(2.0)
+    assert weight @ (
+        values[:, 0] - weight @ values[:, 0] / weight.sum()
+    ) ** 2 == pytest.approx(2.0)
 
 
 def test_scatter_in_a_shape_enters_u_with_the_pattern_of_that_shape():
@@ -134,7 +155,8 @@ def test_scatter_in_a_shape_enters_u_with_the_pattern_of_that_shape():
     found = mean_of(runs, np.zeros((4, 0)), shape)
     size = found.between / (shape[:, 0] ** 2)
     np.testing.assert_allclose(size, size[0])
-    assert 20 * size[0] == pytest.approx((20 - 0.01) / 3)  # amplitudes of the unit shape: ±√20, 0
+    # amplitudes of the unit shape: ±√20, 0
+    assert 20 * size[0] == pytest.approx((20 - 0.01) / 3)
     assert found.p_between < 1e-6 and found.dof == pytest.approx(2.0, rel=0.02)
     np.testing.assert_allclose(np.diag(found.covariance), found.u**2)
     assert found.covariance[0, 3] < 0 < found.covariance[0, 1]
@@ -168,7 +190,9 @@ def test_what_is_shared_is_known_and_adds_degrees_of_freedom():
 def test_a_single_number_that_differs_between_two_runs_has_one_degree_of_freedom():
     """At the nodes that it moves: half of them it leaves alone, and the median would be large."""
     shape = np.array([[1.0], [0.0], [0.0], [-1.0]])
-    single = mean_of([run_of(a * shape[:, 0], 0.01) for a in (-1.0, 1.0)], np.zeros((4, 0)), shape)
+    single = mean_of(
+        [run_of(a * shape[:, 0], 0.01) for a in (-1.0, 1.0)], np.zeros((4, 0)), shape
+    )
     assert single.dof == pytest.approx(1.0, rel=1e-12)
 
 
@@ -193,11 +217,19 @@ def test_three_equal_runs_give_their_map_with_a_third_of_the_variance():
     found = combine(thrice(A)).result
     np.testing.assert_allclose(found.error_map.gx, A.error_map.gx, atol=1e-18)
     np.testing.assert_allclose(
-        found.error_map.g_theta, A.error_map.g_theta - A.error_map.g_theta.mean(), atol=1e-18
+        found.error_map.g_theta,
+        A.error_map.g_theta - A.error_map.g_theta.mean(),
+        atol=1e-18,
     )
-    np.testing.assert_allclose(found.error_map.u_gy * np.sqrt(3), A.error_map.u_gy, rtol=1e-9)
-    assert found.error_map.nonorthogonality == pytest.approx(A.error_map.nonorthogonality)
-    assert found.error_map.scale_difference == pytest.approx(A.error_map.scale_difference)
+    np.testing.assert_allclose(
+        found.error_map.u_gy * np.sqrt(3), A.error_map.u_gy, rtol=1e-9
+    )
+    assert found.error_map.nonorthogonality == pytest.approx(
+        A.error_map.nonorthogonality
+    )
+    assert found.error_map.scale_difference == pytest.approx(
+        A.error_map.scale_difference
+    )
     assert found.verdict.grade is Grade.GOOD
 
 
@@ -209,9 +241,13 @@ def test_the_mean_keeps_its_covariance_in_its_file():
     np.testing.assert_allclose(whole, found.xy.covariance, atol=1e-6 * whole.max())
     known[0, 1] = False
     chosen = np.tile(known.ravel(), 2)
-    np.testing.assert_array_equal(covariance_of(read, "xy", known), whole[np.ix_(chosen, chosen)])
+    np.testing.assert_array_equal(
+        covariance_of(read, "xy", known), whole[np.ix_(chosen, chosen)]
+    )
     angular = covariance_of(read, "theta", np.ones(ARTIFACT.angular_count, dtype=bool))
-    np.testing.assert_allclose(angular, found.theta.covariance, atol=1e-6 * angular.max())
+    np.testing.assert_allclose(
+        angular, found.theta.covariance, atol=1e-6 * angular.max()
+    )
     a, b = StageMap(read).length_uncertainty()
     assert 0 < a < 1e-6 and b >= 0
     damaged = replace(read, kept=Kept(covariances={"xy": Covariance(np.ones(1), 1.0)}))
@@ -224,7 +260,11 @@ def test_an_assumed_microscope_is_shared_by_all_runs():
     truth = random_truth(Artifact(5, 0.01), 4, np.random.default_rng(4))
     result = calibrate(
         simulate_measurements(
-            truth, hu_plan(truth.artifact, 2), np.random.default_rng(5), sigma_m=2e-8, visits=True
+            truth,
+            hu_plan(truth.artifact, 2),
+            np.random.default_rng(5),
+            sigma_m=2e-8,
+            visits=True,
         ),
         Options(causes=False, terms=parse_terms(["microscope:2e-5"], "")),
     )
@@ -233,16 +273,23 @@ def test_an_assumed_microscope_is_shared_by_all_runs():
     of = np.array(result.kept.factors.terms) == "microscope"
     assert of.any()
     shared = (factors[of] ** 2).sum(axis=0).ravel() * result.noise.sigma_xy**2
-    np.testing.assert_allclose(found.xy.common, shared, rtol=0.02, atol=1e-3 * shared.max())
+    np.testing.assert_allclose(
+        found.xy.common, shared, rtol=0.02, atol=1e-3 * shared.max()
+    )
     u = np.concatenate([result.error_map.u_gx.ravel(), result.error_map.u_gy.ravel()])
     np.testing.assert_allclose(found.xy.within, (u**2 - shared) / 3, rtol=0.02)
 
 
 def test_a_reference_length_is_kept_once():
     reference = Options(
-        assumed=(), causes=False, reference=ReferenceLength("artifact", 1e-5, 2e-6, "PTB 1")
+        assumed=(),
+        causes=False,
+        reference=ReferenceLength("artifact", 1e-5, 2e-6, "PTB 1"),
     )
-    runs = [part(name, calibrated(seed, options=reference)) for name, seed in (("a", 1), ("b", 2))]
+    runs = [
+        part(name, calibrated(seed, options=reference))
+        for name, seed in (("a", 1), ("b", 2))
+    ]
     kept, removed = (combine(runs, keep_scale=keep) for keep in (True, False))
     place = np.concatenate([ARTIFACT.x_m.ravel(), ARTIFACT.y_m.ravel()]) * 2e-6
     np.testing.assert_allclose(kept.xy.common, place**2, rtol=1e-3, atol=1e-22)
@@ -250,7 +297,9 @@ def test_a_reference_length_is_kept_once():
     assert removed.result.reference is None
     assert kept.result.reference.certificate == "PTB 1"
     scale = np.polyfit(ARTIFACT.x_m.ravel(), kept.result.error_map.gx.ravel(), 1)[0]
-    each = [np.polyfit(ARTIFACT.x_m.ravel(), p.error_map.gx.ravel(), 1)[0] for p in runs]
+    each = [
+        np.polyfit(ARTIFACT.x_m.ravel(), p.error_map.gx.ravel(), 1)[0] for p in runs
+    ]
     assert min(each) < scale < max(each)
     with pytest.raises(InputError, match="c has no reference length"):
         combine([*runs, part("c", C)], keep_scale=True)
@@ -259,8 +308,12 @@ def test_a_reference_length_is_kept_once():
 def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
     """x y in Gx and two waves per turn, amplitudes -1, 0, 1 of 1 µm and 1 mrad."""
     x, y = ARTIFACT.x_m / 0.03, ARTIFACT.y_m / 0.03
-    field = remove_modes(np.stack([x * y, np.zeros_like(x)]), datum_modes(ARTIFACT, scale=True))
-    wave = np.cos(2 * np.arange(ARTIFACT.angular_count) * 2 * np.pi / ARTIFACT.angular_count)
+    field = remove_modes(
+        np.stack([x * y, np.zeros_like(x)]), datum_modes(ARTIFACT, scale=True)
+    )
+    wave = np.cos(
+        2 * np.arange(ARTIFACT.angular_count) * 2 * np.pi / ARTIFACT.angular_count
+    )
     runs = []
     for amplitude in (-1.0, 0.0, 1.0):
         emap = A.error_map
@@ -291,7 +344,10 @@ def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     """Twice the u of the calibration: a fifth of the weight of both."""
     emap = A.error_map
     other = replace(
-        thrice(A)[0].error_map, u_gx=2 * emap.u_gx, u_gy=2 * emap.u_gy, u_g_theta=2 * emap.u_g_theta
+        thrice(A)[0].error_map,
+        u_gx=2 * emap.u_gx,
+        u_gy=2 * emap.u_gy,
+        u_g_theta=2 * emap.u_g_theta,
     )
     found = combine([part("a", A), Member("b", other)])
     np.testing.assert_allclose(found.xy.weights, [0.8, 0.2], atol=0.02)
@@ -300,7 +356,9 @@ def test_a_map_of_other_origin_has_its_own_u_and_no_correlations():
     assert covariance_of(found.result, "xy", found.known).ndim == 1
 
 
-@pytest.mark.parametrize(("kind", "size"), [("none", 0.0), ("white", 20e-9), ("smooth", 20e-9)])
+@pytest.mark.parametrize(
+    ("kind", "size"), [("none", 0.0), ("white", 20e-9), ("smooth", 20e-9)]
+)
 def test_coverage_and_false_alarms(kind, size):
     """95.45 % within U; E_n beyond 1 in 4.55 % of the nodes, and 5 % of runs, without a part.
 
@@ -325,14 +383,19 @@ def test_the_run_that_differs_is_named():
     emap = runs[2].error_map
     noise = np.random.default_rng(1).normal(0, 8e-8, (2, *ARTIFACT.shape))
     off = remove_modes(noise, datum_modes(ARTIFACT, scale=True))
-    runs[2] = replace(runs[2], error_map=replace(emap, gx=emap.gx + off[0], gy=emap.gy + off[1]))
+    runs[2] = replace(
+        runs[2], error_map=replace(emap, gx=emap.gx + off[0], gy=emap.gy + off[1])
+    )
     found = combine([part(str(i), run) for i, run in enumerate(runs)]).result
     rows = found.extra["combined"]["runs"]
     assert [row["stands_out"] for row in rows] == [False, False, True, False]
     assert not rows[2]["agrees"] and rows[2]["e_n_rms"] > 2 * rows[0]["e_n_rms"]
     assert found.verdict.grade is Grade.ENLARGED
     assert found.verdict.enlarged_by[0].name == "between_runs"
-    assert "the 4 runs differ by more than their uncertainties" in worded(found).verdict.sentence
+    assert (
+        "the 4 runs differ by more than their uncertainties"
+        in worded(found).verdict.sentence
+    )
     u = next(line for line in found.budget if line.component == "between runs")
     total = np.mean([found.error_map.u_gx**2, found.error_map.u_gy**2])
     assert 0 < u.effect_rms < np.sqrt(total)
@@ -366,7 +429,13 @@ def test_large_fields_are_combined_by_their_variances():
     base = random_map(artifact, 1)
     u = np.full(artifact.shape, 3e-9)
     maps = [
-        replace(base, gx=base.gx + rng.normal(0, u), gy=base.gy + rng.normal(0, u), u_gx=u, u_gy=u)
+        replace(
+            base,
+            gx=base.gx + rng.normal(0, u),
+            gy=base.gy + rng.normal(0, u),
+            u_gx=u,
+            u_gy=u,
+        )
         for _ in range(3)
     ]
     found = combine(
@@ -378,7 +447,10 @@ def test_large_fields_are_combined_by_their_variances():
     assert found.xy.covariance.ndim == 1 and not found.result.kept.covariances
     emap = found.result.error_map
     np.testing.assert_allclose(emap.u_gx, 3e-9 / np.sqrt(3), rtol=0.05)
-    assert all(not run.test.correlated and not run.test.significant for run in found.xy.deviations)
+    assert all(
+        not run.test.correlated and not run.test.significant
+        for run in found.xy.deviations
+    )
     beyond = np.mean([abs(run.e_n) > 1 for run in found.xy.deviations])
     assert beyond == pytest.approx(0.0455, abs=0.01)
 
@@ -387,14 +459,19 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
     """dof(x1 - x2) by GTC 1.5.1, ureal(0, 2, 5) - ureal(0, 1, 8): E_n has its k."""
     runs = [run_of([9.0, 0, 0, 0], 4.0, dof=5.0), run_of(np.zeros(4), 1.0, dof=8.0)]
     e_n = mean_of(runs, np.zeros((4, 0)), NO_SHAPES).deviations[0].e_n[0]
-    assert e_n == pytest.approx(9.0 / (coverage_factor(GTC_DOF) * np.sqrt(5.0)), rel=1e-6)
+    assert e_n == pytest.approx(
+        9.0 / (coverage_factor(GTC_DOF) * np.sqrt(5.0)), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
         ([part("a", A)], "a single map"),
-        ([Member("a", A.error_map), Member("b", B.error_map)], "no RESULT.json among them"),
+        (
+            [Member("a", A.error_map), Member("b", B.error_map)],
+            "no RESULT.json among them",
+        ),
         (
             [part("a", A), part("b", replace(B, verdict=Verdict(Grade.NOT_QUALIFIED)))],
             "b: its calibration is not qualified",
@@ -414,9 +491,15 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
             [part("a", run_at("1")), part("b", run_at("1", gx=B.error_map.gx))],
             "b: of the same recording as a",
         ),
-        ([part("a", A), Member("b", scaled(B.error_map, 1e6))], r"b: .* of a: is it in µm\?"),
         (
-            [part("a", A), Member("b", replace(B.error_map, g_theta=1e6 * B.error_map.g_theta))],
+            [part("a", A), Member("b", scaled(B.error_map, 1e6))],
+            r"b: .* of a: is it in µm\?",
+        ),
+        (
+            [
+                part("a", A),
+                Member("b", replace(B.error_map, g_theta=1e6 * B.error_map.g_theta)),
+            ],
             r"b: .* of a: is it in µrad\?",
         ),
         (
@@ -429,7 +512,10 @@ def test_the_degrees_of_freedom_of_a_deviation_are_those_of_gtc():
                 part(
                     "b",
                     replace(
-                        B, error_map=replace(B.error_map, u_gx=np.full(ARTIFACT.shape, np.nan))
+                        B,
+                        error_map=replace(
+                            B.error_map, u_gx=np.full(ARTIFACT.shape, np.nan)
+                        ),
                     ),
                 ),
             ],
@@ -471,14 +557,19 @@ def test_what_shapes_leave_of_a_run_has_the_variance_of_the_other_directions():
     rng = np.random.default_rng(3)
     basis = np.linalg.qr(rng.normal(size=(8, 8)))[0]
     q, shapes, others = basis[:, :2], basis[:, 2:4], basis[:, 4:]
-    variances = np.array([3.0, 1.0, 2.0, 4.0, 6.0, 8.0]) * 1e-16  # nothing along the datum
+    # nothing along the datum
+    variances = np.array([3.0, 1.0, 2.0, 4.0, 6.0, 8.0]) * 1e-16
     free = basis[:, 2:]
     values = rng.normal(size=(3, 6)) @ free.T
     *of_shapes, rest = _families(values, [free * variances @ free.T] * 3, q, shapes)
-    np.testing.assert_allclose([family.within[0] for family in of_shapes], [3e-16, 1e-16])
+    np.testing.assert_allclose(
+        [family.within[0] for family in of_shapes], [3e-16, 1e-16]
+    )
     np.testing.assert_allclose(rest.within, 5e-16)
     assert rest.most == 4  # of 8 values are independent
-    np.testing.assert_allclose(rest.values, np.sqrt(2) * values @ others @ others.T, atol=1e-12)
+    np.testing.assert_allclose(
+        rest.values, np.sqrt(2) * values @ others @ others.T, atol=1e-12
+    )
     np.testing.assert_allclose(rest.share, (others**2).sum(axis=1))
 
 
@@ -515,7 +606,10 @@ def test_a_recheck_is_not_combined_with_what_its_plate_is_known_from():
     def rechecked(run, of):
         calibration = SimpleNamespace(readings={"sha256": of})
         return replace(
-            run, result=replace(run.result, recheck=SimpleNamespace(calibration=calibration))
+            run,
+            result=replace(
+                run.result, recheck=SimpleNamespace(calibration=calibration)
+            ),
         )
 
     assert combine([one, rechecked(other, "c")])
@@ -524,5 +618,7 @@ def test_a_recheck_is_not_combined_with_what_its_plate_is_known_from():
         [rechecked(other, "a"), one],
         [rechecked(one, "c"), rechecked(other, "c")],
     ):
-        with pytest.raises(InputError, match=r"of the same plate errors as .*one calibration"):
+        with pytest.raises(
+            InputError, match=r"of the same plate errors as .*one calibration"
+        ):
             combine(pair)

@@ -37,15 +37,26 @@ APART = replace(
     _BARE,
     views=(
         *(replace(view, angular=False) for view in _BARE.views),
-        *(View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (0, 1, 6)),
+        *(
+            View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True)
+            for k in (0, 1, 6)
+        ),
     ),
 )
 
 
 def measured(
-    plan, seed, truth_seed=99, sense=Sense.MICROSCOPE_MOVES, missing=0.0, linear=False, spread=None
+    plan,
+    seed,
+    truth_seed=99,
+    sense=Sense.MICROSCOPE_MOVES,
+    missing=0.0,
+    linear=False,
+    spread=None,
 ):
-    truth = random_truth(plan.artifact, len(plan.views), np.random.default_rng(truth_seed), spread)
+    truth = random_truth(
+        plan.artifact, len(plan.views), np.random.default_rng(truth_seed), spread
+    )
     return simulate_measurements(
         truth,
         plan,
@@ -74,7 +85,11 @@ def test_covariance_of_a_saved_map(sense, reference):
     options = bare(reference=reference)
     result = calibrate(readings, options)
     known = result.error_map.valid
-    assert all(np.ndim(view.read_grid) == 0 for view in result.views if view.read_grid is not None)
+    assert all(
+        np.ndim(view.read_grid) == 0
+        for view in result.views
+        if view.read_grid is not None
+    )
     found = covariance_of(result, "xy", known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
     assert abs(found - wanted).max() < 1e-6 * wanted.max()
@@ -83,15 +98,22 @@ def test_covariance_of_a_saved_map(sense, reference):
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize(
     "reference",
-    [None, ReferenceLength("stage_x", 1e-6, 2e-6), reference_length("marks", 1e-6, 2e-6)],
+    [
+        None,
+        ReferenceLength("stage_x", 1e-6, 2e-6),
+        reference_length("marks", 1e-6, 2e-6),
+    ],
 )
 def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference):
     readings = measured(TURNED, 1, sense=sense, missing=0.1)
     options = bare(
-        reference=reference, terms=(ModelTerm("plate_scale"), ModelTerm("plate_shape", 3e-8))
+        reference=reference,
+        terms=(ModelTerm("plate_scale"), ModelTerm("plate_shape", 3e-8)),
     )
     result = calibrate(readings, options)
-    saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(result)))), "r")
+    saved = result_from_dict(
+        json.loads(json.dumps(result_to_dict(worded(result)))), "r"
+    )
     known = result.error_map.valid
     found = covariance_of(saved, "xy", known)
     wanted = map_covariance(readings, options).nodes(*np.nonzero(known))
@@ -99,7 +121,10 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
     u = np.concatenate([result.error_map.u_gx[known], result.error_map.u_gy[known]])
     assert np.sqrt(np.diag(wanted)) == pytest.approx(u, rel=1e-6)
     shear = first_order_u(saved)
-    assert shear[0] > 1.5 * first_order_u(calibrate(readings, bare(reference=reference)))[0]
+    assert (
+        shear[0]
+        > 1.5 * first_order_u(calibrate(readings, bare(reference=reference)))[0]
+    )
     alone = replace(saved, kept=Kept())
     assert covariance_of(alone, "xy", known).ndim == 1
     assert np.isnan(first_order_u(alone)).all()  # noise alone would be too little
@@ -117,7 +142,9 @@ def test_covariance_of_a_saved_map_with_missing_marks_and_terms(sense, reference
 def test_weights_that_are_none_are_refused(read, message):
     result = calibrate(measured(PLAN, 1), BARE)
     views = (replace(result.views[0], read_grid=read), *result.views[1:])
-    with pytest.raises(InputError, match=f"view '0', read.grid: {message}; write the result again"):
+    with pytest.raises(
+        InputError, match=f"view '0', read.grid: {message}; write the result again"
+    ):
         covariance_of(replace(result, views=views), "xy", result.error_map.valid)
 
 
@@ -135,11 +162,17 @@ def test_without_weights_only_the_variances_are_known():
     emap, bare_views = (
         result.error_map,
         replace(
-            result, views=tuple(replace(v, read_grid=None, read_angular=None) for v in result.views)
+            result,
+            views=tuple(
+                replace(v, read_grid=None, read_angular=None) for v in result.views
+            ),
         ),
     )
     found = covariance_of(bare_views, "xy", emap.valid)
-    assert found.tolist() == [*(emap.u_gx[emap.valid] ** 2), *(emap.u_gy[emap.valid] ** 2)]
+    assert found.tolist() == [
+        *(emap.u_gx[emap.valid] ** 2),
+        *(emap.u_gy[emap.valid] ** 2),
+    ]
     assert covariance_of(bare_views, "theta", np.isfinite(emap.g_theta)).ndim == 1
     assert np.isnan(first_order_u(bare_views)).all()
 
@@ -155,7 +188,10 @@ def test_maps_with_references_agree_as_often_as_they_should(keep_scale):
             error = 3e-6 * np.random.default_rng((seed, one)).normal()
             reference = ReferenceLength("stage_x", error, 3e-6)
             pair.append(
-                calibrate(measured(HU, 1000 * seed + one), replace(options, reference=reference))
+                calibrate(
+                    measured(HU, 1000 * seed + one),
+                    replace(options, reference=reference),
+                )
             )
         test = compare(*pair, keep_scale=keep_scale).xy
         assert test.correlated
@@ -202,7 +238,9 @@ def stated(readings):
     ("datum", "sense", "theta"),
     [("xy_axes", Sense.MICROSCOPE_MOVES, 0.02), ("zero_mean", Sense.PLATE_MOVES, 1e-6)],
 )
-def test_lines_in_views_of_their_own_have_the_covariance_of_their_readings(datum, sense, theta):
+def test_lines_in_views_of_their_own_have_the_covariance_of_their_readings(
+    datum, sense, theta
+):
     """Angular noise alone tells how lines correlate: the slopes that the axes add are small."""
     readings = stated(measured(APART, 1, sense=sense, linear=True))
     options = bare(misalignment_model="linear", datum_theta=datum, causes=False)

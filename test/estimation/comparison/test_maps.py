@@ -58,14 +58,21 @@ small = st.floats(-1e-4, 1e-4)
 def test_a_datum_shift_of_either_map_changes_nothing(tx, ty, rotation, scale, theta):
     base = compare(A, B)
     change = {"shift": (tx, ty), "rotation": rotation, "scale": scale, "theta": theta}
-    for found, sign in ((compare(A, moved(B, **change)), 1), (compare(moved(A, **change), B), -1)):
+    for found, sign in (
+        (compare(A, moved(B, **change)), 1),
+        (compare(moved(A, **change), B), -1),
+    ):
         assert np.allclose(found.dx, base.dx, rtol=0, atol=1e-17)
         assert np.allclose(found.dy, base.dy, rtol=0, atol=1e-17)
         assert np.allclose(found.d_theta, base.d_theta, rtol=0, atol=1e-17)
         assert found.xy.chi2_ratio == pytest.approx(base.xy.chi2_ratio, rel=1e-6)
-        assert found.rotation_rad - base.rotation_rad == pytest.approx(sign * rotation, abs=1e-12)
+        assert found.rotation_rad - base.rotation_rad == pytest.approx(
+            sign * rotation, abs=1e-12
+        )
         assert found.scale - base.scale == pytest.approx(sign * scale, abs=1e-12)
-        assert found.translation_m[0] - base.translation_m[0] == pytest.approx(sign * tx, abs=1e-15)
+        assert found.translation_m[0] - base.translation_m[0] == pytest.approx(
+            sign * tx, abs=1e-15
+        )
 
 
 def test_a_map_against_itself():
@@ -87,7 +94,8 @@ def test_maps_of_the_same_marks_share_their_equations_and_others_do_not(monkeypa
     repeated = replace(B, views=tuple(replace(v, read_angular=2) for v in B.views))
     other = compare(A, repeated)
     assert len(made) == 2 and other.theta.p == pytest.approx(compare(A, B).theta.p)
-    assert other.xy.p != compare(A, B).xy.p  # lines that weigh more tell more of the rotations
+    # lines that weigh more tell more of the rotations
+    assert other.xy.p != compare(A, B).xy.p
 
 
 def test_known_difference_is_found_with_its_sign_and_size():
@@ -123,11 +131,21 @@ def test_p_values_of_repeated_calibrations_are_uniform():
     for kind, four_sigma in (("xy", 0.16), ("theta", 0.2)):
         found = [getattr(test, kind) for test in tests]
         assert all(test.correlated for test in found)
-        assert np.mean([test.chi2_ratio for test in found]) == pytest.approx(1, abs=four_sigma)
+        assert np.mean([test.chi2_ratio for test in found]) == pytest.approx(
+            1, abs=four_sigma
+        )
         low = sum(test.p < 0.1 for test in found)
-        assert binom.ppf(0.001, len(found), 0.1) <= low <= binom.ppf(0.999, len(found), 0.1)
+        assert (
+            binom.ppf(0.001, len(found), 0.1)
+            <= low
+            <= binom.ppf(0.999, len(found), 0.1)
+        )
         half = sum(test.p < 0.5 for test in found)
-        assert binom.ppf(0.001, len(found), 0.5) <= half <= binom.ppf(0.999, len(found), 0.5)
+        assert (
+            binom.ppf(0.001, len(found), 0.5)
+            <= half
+            <= binom.ppf(0.999, len(found), 0.5)
+        )
 
 
 def test_another_stage_is_significantly_different():
@@ -155,12 +173,17 @@ def test_unknown_sites_do_not_count(coordinates):
     found = compare(holed, B)
     wholly = compare(
         replace(
-            A, error_map=replace(A.error_map, gx=A.error_map.gx + hole, gy=A.error_map.gy + hole)
+            A,
+            error_map=replace(
+                A.error_map, gx=A.error_map.gx + hole, gy=A.error_map.gy + hole
+            ),
         ),
         B,
     )
     assert np.isnan(wholly.dx[0, 0]) and np.isnan(wholly.dx).sum() == 1
-    assert (found.rms_m, found.max_m) == pytest.approx((wholly.rms_m, wholly.max_m), rel=0.02)
+    assert (found.rms_m, found.max_m) == pytest.approx(
+        (wholly.rms_m, wholly.max_m), rel=0.02
+    )
     assert np.isfinite([found.rms_m, found.max_m, found.xy.p]).all()
 
 
@@ -175,7 +198,8 @@ def test_views_that_tell_no_correlation_are_said_so():
     assert found.xy.correlated is False
     assert 0.2 < found.xy.chi2_ratio < 5
     sites, lines = ARTIFACT.shape[0] * ARTIFACT.shape[1], ARTIFACT.angular_count
-    assert found.xy.dof == pytest.approx(2 * sites - 4)  # translation, rotation, magnification
+    # translation, rotation, magnification
+    assert found.xy.dof == pytest.approx(2 * sites - 4)
     assert found.theta.dof == pytest.approx(lines - 1)
 
 
@@ -214,7 +238,9 @@ def test_laser_squareness_against_the_map():
     assert same.difference == 0.0 and same.p == 1.0 and same.u > 1e-9
     assert other.difference == pytest.approx(1e-5) and other.p < 1e-6
     laser["error_map_equivalent"]["scale_difference"] = None
-    assert [row.name for row in compare_with_laser(A, laser, "out.json")] == ["nonorthogonality"]
+    assert [row.name for row in compare_with_laser(A, laser, "out.json")] == [
+        "nonorthogonality"
+    ]
     with pytest.raises(InputError, match="no error_map_equivalent"):
         compare_with_laser(A, {"squareness": 0.1}, "out.json")
 
@@ -222,7 +248,12 @@ def test_laser_squareness_against_the_map():
 def test_without_any_uncertainty_no_difference_has_a_probability():
     exact = replace(A, noise=replace(A.noise, sigma_xy=0.0))
     for of_laser in (0.0, 2e-9):
-        laser = {"error_map_equivalent": {"nonorthogonality": 3e-9, "u_nonorthogonality": of_laser}}
+        laser = {
+            "error_map_equivalent": {
+                "nonorthogonality": 3e-9,
+                "u_nonorthogonality": of_laser,
+            }
+        }
         (row,) = compare_with_laser(exact, laser, "out.json")
         gap = abs(3e-9 - A.error_map.nonorthogonality)
         assert row.u == of_laser
@@ -241,7 +272,13 @@ def test_uncertainty_of_squareness_is_that_of_every_reading_moved_in_turn():
     readings = replace(
         readings,
         views=tuple(
-            replace(view, sigma_xy=SIGMA_M, dof_xy=1000, sigma_theta=SIGMA_RAD, dof_theta=1000)
+            replace(
+                view,
+                sigma_xy=SIGMA_M,
+                dof_xy=1000,
+                sigma_theta=SIGMA_RAD,
+                dof_theta=1000,
+            )
             for view in readings.views
         ),
     )
@@ -257,6 +294,8 @@ def test_uncertainty_of_squareness_is_that_of_every_reading_moved_in_turn():
         readings,
         sizes_of(readings, SIGMA_M, SIGMA_RAD),
     )
-    laser = {"error_map_equivalent": {"nonorthogonality": 0.0, "u_nonorthogonality": 0.0}}
+    laser = {
+        "error_map_equivalent": {"nonorthogonality": 0.0, "u_nonorthogonality": 0.0}
+    }
     row = compare_with_laser(calibrate(readings, linear), laser, "out.json")[0]
     assert row.u == pytest.approx(np.sqrt((answers**2).sum()), rel=1e-4)

@@ -24,14 +24,16 @@ DRAWS = 40
 
 def calibrated(truth, rng):
     return solve_joint(
-        simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, sigma_theta_rad=2e-6), BARE
+        simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
+        BARE,
     ).result
 
 
 def test_plates_measured_twice_agree_five_times_in_hundred():
     """On two machines, with lines: two tests of 5 %, each a little below."""
     machines = [
-        random_truth(PLAN.artifact, len(PLAN.views), np.random.default_rng(k)) for k in (1, 2)
+        random_truth(PLAN.artifact, len(PLAN.views), np.random.default_rng(k))
+        for k in (1, 2)
     ]
     machines[1] = replace(machines[1], a=machines[0].a, a_theta=machines[0].a_theta)
     xy = theta = 0
@@ -51,7 +53,9 @@ def test_what_differs_is_found_without_motion_and_scale():
     moved = np.zeros((2, 5, 5))
     moved[0, 1, 3] = 4e-7
     modes = datum_modes(PLAN.artifact, scale=True)
-    other = replace(truth, a=truth.a + moved + np.tensordot([2e-7, 0, 3e-6, 4e-6], modes, axes=1))
+    other = replace(
+        truth, a=truth.a + moved + np.tensordot([2e-7, 0, 3e-6, 4e-6], modes, axes=1)
+    )
     found = compare(calibrated(truth, rng), calibrated(other, rng), plates=True)
     flat = modes.reshape(4, -1).T
     wanted = moved.ravel() - flat @ np.linalg.lstsq(flat, moved.ravel(), rcond=None)[0]
@@ -62,7 +66,9 @@ def test_what_differs_is_found_without_motion_and_scale():
 
 def test_u_off_the_lattice_is_what_each_reading_does_to_the_plate():
     artifact = placed.plate(5, 3)
-    whole, _ = placed.readings(artifact, placed.SIX[:4], np.random.default_rng(1), linear=True)
+    whole, _ = placed.readings(
+        artifact, placed.SIX[:4], np.random.default_rng(1), linear=True
+    )
     options = replace(BARE, misalignment_model="linear", causes=False)
     result, maps = calibrate(whole, options), []
     for index, view in enumerate(whole.views):
@@ -70,10 +76,15 @@ def test_u_off_the_lattice_is_what_each_reading_does_to_the_plate():
             for at in range(len(view.m)):
                 views = list(whole.views)
                 views[index] = replace(
-                    view, **{name: getattr(view, name) + 1e-7 * (np.arange(len(view.m)) == at)}
+                    view,
+                    **{
+                        name: getattr(view, name)
+                        + 1e-7 * (np.arange(len(view.m)) == at)
+                    },
                 )
                 plate = solve_joint(
-                    replace(whole, views=tuple(views)), replace(options, uncertainty=False)
+                    replace(whole, views=tuple(views)),
+                    replace(options, uncertainty=False),
                 ).result.artifact_map
                 maps.append(np.concatenate([plate.ax.ravel(), plate.ay.ravel()]))
     plate = result.artifact_map

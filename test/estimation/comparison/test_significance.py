@@ -99,7 +99,9 @@ def pair_of(seed, *, missing=0.0):
     truth = random_truth(PLAN.artifact, len(PLAN.views), rng)
     return [
         solve_joint(
-            simulate_measurements(truth, PLAN, rng, sigma_m=2e-8, missing=missing, linear=True),
+            simulate_measurements(
+                truth, PLAN, rng, sigma_m=2e-8, missing=missing, linear=True
+            ),
             PLAIN,
         ).result
         for _ in range(2)
@@ -136,7 +138,8 @@ def test_one_node_that_moved_is_found():
 def test_the_comparison_is_the_same_after_the_file():
     a, b = pair_of(5, missing=0.2)
     again = [
-        result_from_dict(json.loads(json.dumps(result_to_dict(worded(r)))), "r") for r in (a, b)
+        result_from_dict(json.loads(json.dumps(result_to_dict(worded(r)))), "r")
+        for r in (a, b)
     ]
     one, two = compare(a, b), compare(*again)
     assert two.xy.chi2_ratio == pytest.approx(one.xy.chi2_ratio, rel=1e-9)

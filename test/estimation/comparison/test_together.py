@@ -51,7 +51,8 @@ def require_same(found, wanted, rel):
 
 @pytest.mark.parametrize("model", ["none", "assumed", "sized", "free"])
 @pytest.mark.parametrize(
-    ("plan", "sense"), [("lines", Sense.MICROSCOPE_MOVES), ("oblong", Sense.PLATE_MOVES)]
+    ("plan", "sense"),
+    [("lines", Sense.MICROSCOPE_MOVES), ("oblong", Sense.PLATE_MOVES)],
 )
 def test_covariance_of_both_maps_and_the_microscope(plan, model, sense):
     result, dense = solved(plan, model, sense)
@@ -60,7 +61,9 @@ def test_covariance_of_both_maps_and_the_microscope(plan, model, sense):
     dense.plate(known.marks, known.sites)
     of = {
         part: at
-        for (term, _, part), at in zip(dense.keys, range(len(dense.p))[dense.b], strict=True)
+        for (term, _, part), at in zip(
+            dense.keys, range(len(dense.p))[dense.b], strict=True
+        )
         if term == "microscope"
     }
     rows = np.zeros((4, len(dense.p)))
@@ -73,7 +76,9 @@ def test_covariance_of_both_maps_and_the_microscope(plan, model, sense):
             rows,
         ]
     )
-    require_same(known.cover(known.sites, known.marks), rows @ dense.covariance @ rows.T, 2e-3)
+    require_same(
+        known.cover(known.sites, known.marks), rows @ dense.covariance @ rows.T, 2e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -105,7 +110,10 @@ def test_what_is_not_kept_is_not_known():
     assert together(replace(result, kept=kept)) is None
     assert (
         together(
-            replace(result, views=tuple(replace(view, read_grid=None) for view in result.views))
+            replace(
+                result,
+                views=tuple(replace(view, read_grid=None) for view in result.views),
+            )
         )
         is None
     )
@@ -115,7 +123,9 @@ def test_what_is_not_kept_is_not_known():
     ("changed", "message"),
     [
         (
-            lambda kept: {"beside": {k: v for k, v in kept.beside.items() if k != "plate"}},
+            lambda kept: {
+                "beside": {k: v for k, v in kept.beside.items() if k != "plate"}
+            },
             "no plate of this plate",
         ),
         (
@@ -131,5 +141,7 @@ def test_factors_without_what_belongs_to_them_are_refused(changed, message):
     result, _ = solved("oblong", "sized")
     factors = replace(result.kept.factors, **changed(result.kept.factors))
     known = together(replace(result, kept=replace(result.kept, factors=factors)))
-    with pytest.raises(InputError, match=f"covariance_terms: {message}; write the result again"):
+    with pytest.raises(
+        InputError, match=f"covariance_terms: {message}; write the result again"
+    ):
         known.cover(known.sites, known.marks)

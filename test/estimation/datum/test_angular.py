@@ -71,7 +71,9 @@ def test_the_conditions_are_met_and_the_free_rotations_follow(sense):
     constraint = np.hstack([conditions.rows, np.zeros((4, k + 1))])
     normal = np.array(rows).T @ rows
     kkt = np.block([[normal, constraint.T], [constraint, np.zeros((4, 4))]])
-    dense = np.linalg.lstsq(kkt, np.concatenate([np.array(rows).T @ right, slopes]), rcond=None)[0]
+    dense = np.linalg.lstsq(
+        kkt, np.concatenate([np.array(rows).T @ right, slopes]), rcond=None
+    )[0]
     assert found.g_theta == pytest.approx(dense[:k], abs=1e-12)
     assert phi[3] == pytest.approx(dense[2 * k], abs=1e-12)
 
@@ -79,7 +81,11 @@ def test_the_conditions_are_met_and_the_free_rotations_follow(sense):
 def test_variances_do_not_depend_on_how_many_lines_are_computed_at_once(monkeypatch):
     rng = np.random.default_rng(3)
     readings = simulate_measurements(
-        random_truth(ARTIFACT, 4, rng, Spread()), PLAN, rng, sigma_m=1e-7, sigma_theta_rad=1e-5
+        random_truth(ARTIFACT, 4, rng, Spread()),
+        PLAN,
+        rng,
+        sigma_m=1e-7,
+        sigma_theta_rad=1e-5,
     )
     whole = calibrate(readings).error_map.u_g_theta
     monkeypatch.setattr(covers, "BLOCK", 5)  # of 12
@@ -90,7 +96,9 @@ def test_zero_mean_counts_the_known_lines_alone():
     system = planned_system(ARTIFACT, PLAN.views)
     found = conditions_for(system, ThetaDatum.ZERO_MEAN, Sense.MICROSCOPE_MOVES, 0.03)
     assert found.rows == pytest.approx(np.full((1, 12), 1 / 12))
-    assert not found.slopes.any() and (found.gain == 1).all() and not found.phi_gain.any()
+    assert (
+        not found.slopes.any() and (found.gain == 1).all() and not found.phi_gain.any()
+    )
 
 
 def test_the_misclosure_is_tested_without_its_free_constant():

@@ -42,7 +42,9 @@ def known(truth, pair=PAIR, u_m=0.0, error_m=0.0):
 
 def drawn(seed, *, sense=Sense.MICROSCOPE_MOVES, sigma_m=0.0, spread=None):
     rng = np.random.default_rng(seed)
-    truth = random_truth(ARTIFACT, len(PLAN.views), rng, spread or Spread(rotation="finite"))
+    truth = random_truth(
+        ARTIFACT, len(PLAN.views), rng, spread or Spread(rotation="finite")
+    )
     truth = replace(truth, g=truth.g + 3e-6 * PLACE)  # encoders that indicate too much
     return truth, simulate_measurements(truth, PLAN, rng, sense=sense, sigma_m=sigma_m)
 
@@ -98,7 +100,10 @@ def test_a_certified_distance_belongs_to_its_temperature():
         ("-2,0:x,0:0.04:0", "is not M,N:M,N:LENGTH:U"),
         ("-2,0:2,0,1:0.04:0", "is not M,N:M,N:LENGTH:U"),
         ("", "is not M,N:M,N:LENGTH:U"),
-        ("-2,0:3,0:0.05:0", r"no mark \(3, 0\); its marks go from \(-2, -2\) to \(2, 2\)"),
+        (
+            "-2,0:3,0:0.05:0",
+            r"no mark \(3, 0\); its marks go from \(-2, -2\) to \(2, 2\)",
+        ),
         ("1,0:1,0:0.01:0", "names one mark twice; name two marks"),
         ("-2,0:2,0:40:0", "is not a relative error"),
         ("-2,0:2,0:nan:0", "is not a relative error"),
@@ -122,7 +127,9 @@ def test_a_mark_that_was_not_measured_is_refused():
         )
         for view in readings.views
     )
-    with pytest.raises(InputError, match=r"the mark \(2, 0\) was not measured; measure it, or"):
+    with pytest.raises(
+        InputError, match=r"the mark \(2, 0\) was not measured; measure it, or"
+    ):
         calibrate(replace(readings, views=views), bare(reference=known(truth)))
 
 
@@ -135,7 +142,9 @@ def test_a_mark_that_was_not_measured_is_refused():
     ],
 )
 def test_kind_and_marks_belong_together(given):
-    with pytest.raises(InputError, match=r"reference_marks: .* does not fit reference_kind"):
+    with pytest.raises(
+        InputError, match=r"reference_marks: .* does not fit reference_kind"
+    ):
         solver_options(SolverSettings.checked(given, "here"))
 
 

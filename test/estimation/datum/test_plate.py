@@ -24,10 +24,13 @@ def linear(**how):
 
 
 def readings(sense=Sense.MICROSCOPE_MOVES, size=3, lines=0):
-    plan = plan_of("0,90,tx,ty", Artifact(size, 0.01, lines), lines=1 if lines else None)
+    plan = plan_of(
+        "0,90,tx,ty", Artifact(size, 0.01, lines), lines=1 if lines else None
+    )
     rng = np.random.default_rng(1)
     plan = replace(
-        plan, views=tuple(replace(view, repeats=2 + i) for i, view in enumerate(plan.views))
+        plan,
+        views=tuple(replace(view, repeats=2 + i) for i, view in enumerate(plan.views)),
     )
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(rotation="linear"))
     return simulate_measurements(
@@ -44,7 +47,9 @@ def plate_of(measurements, options):
 @pytest.mark.parametrize("kind", [None, *ReferenceKind])
 def test_each_reading_adds_what_it_does_to_the_plate(kind, sense):
     whole, u_scale = readings(sense), 0.0 if kind is None else 2e-6
-    options = linear(reference=None if kind is None else reference_length(kind, 0.0, u_scale))
+    options = linear(
+        reference=None if kind is None else reference_length(kind, 0.0, u_scale)
+    )
     result, centre = calibrate(whole, options), plate_of(whole, options)
     power = (u_scale * np.stack([whole.artifact.x_m, whole.artifact.y_m])) ** 2
     for index, view in enumerate(whole.views):
@@ -67,7 +72,9 @@ def test_each_reading_adds_what_it_does_to_the_lines_of_the_plate(sense):
         whole,
         views=tuple(
             replace(
-                view, u=1.5e-8 / np.sqrt(view.count), u_theta=1.5e-6 / np.sqrt(view.count_theta)
+                view,
+                u=1.5e-8 / np.sqrt(view.count),
+                u_theta=1.5e-6 / np.sqrt(view.count_theta),
             )
             for view in whole.views
         ),
@@ -79,9 +86,15 @@ def test_each_reading_adds_what_it_does_to_the_lines_of_the_plate(sense):
             for at, u in enumerate(each):
                 views = list(whole.views)
                 views[index] = replace(
-                    view, **{name: getattr(view, name) + u / 10 * (np.arange(len(each)) == at)}
+                    view,
+                    **{
+                        name: getattr(view, name)
+                        + u / 10 * (np.arange(len(each)) == at)
+                    },
                 )
-                moved = calibrate(replace(whole, views=tuple(views)), least).artifact_map.a_theta
+                moved = calibrate(
+                    replace(whole, views=tuple(views)), least
+                ).artifact_map.a_theta
                 power = power + (10 * (moved - centre)) ** 2
     result = calibrate(whole, options)
     np.testing.assert_allclose(result.artifact_map.u_a_theta, np.sqrt(power), rtol=1e-5)
@@ -90,5 +103,7 @@ def test_each_reading_adds_what_it_does_to_the_lines_of_the_plate(sense):
 def test_without_an_uncertainty_or_with_tied_axes_there_is_none():
     found = calibrate(readings(size=5, lines=8), linear(uncertainty=False)).artifact_map
     assert np.isnan(found.u_ax).all() and np.isnan(found.u_a_theta).all()
-    tied = calibrate(readings(size=5, lines=8), linear(datum_theta=ThetaDatum.XY_AXES)).artifact_map
+    tied = calibrate(
+        readings(size=5, lines=8), linear(datum_theta=ThetaDatum.XY_AXES)
+    ).artifact_map
     assert np.isfinite(tied.u_ay).all() and np.isnan(tied.u_a_theta).all()

@@ -21,7 +21,9 @@ def in_datum(system, field, parameters):
     field = system.gauge.remove(field, parts)
     parameters = parameters - parts @ system.rigid[:4]
     plate, _ = system.grid.plate(np.zeros(system.grid.weight.shape), field, parameters)
-    return field, system.plate_gauge.remove(plate, system.plate_gauge.coefficients(plate))
+    return field, system.plate_gauge.remove(
+        plate, system.plate_gauge.coefficients(plate)
+    )
 
 
 @pytest.mark.parametrize("kind", ReferenceKind)
@@ -37,7 +39,9 @@ def test_the_rows_give_the_change_of_the_scale(kind):
         raw = rng.normal(size=none.shape) + 1j * rng.normal(size=none.shape)
         raw, parameters = raw * 1e-7, rng.normal(size=system.size) * 1e-7
         field, plate = in_datum(system, raw, parameters)
-        found = scale_of(system, reference, field=field, plate=plate, half_width_m=HALF_M)
+        found = scale_of(
+            system, reference, field=field, plate=plate, half_width_m=HALF_M
+        )
         change = (np.vdot(sites, field.ravel()) + np.vdot(marks, plate.ravel())).real
         assert abs(change) > 1e-12
         assert found - start == pytest.approx(change, rel=1e-6)
@@ -54,9 +58,9 @@ def test_a_longer_plate_and_an_axis_that_indicates_too_much_turn_the_scale_the_r
         ) == pytest.approx(0.0, abs=1e-18)
     axis = reference_length(ReferenceKind.STAGE_Y, 2e-6)
     only_y = 1j * 2e-6 * HALF_M * z.imag
-    assert scale_of(system, axis, field=only_y, plate=none, half_width_m=HALF_M) == pytest.approx(
-        0.0, abs=1e-18
-    )
+    assert scale_of(
+        system, axis, field=only_y, plate=none, half_width_m=HALF_M
+    ) == pytest.approx(0.0, abs=1e-18)
     assert scale_of(
         system, axis, field=2e-6 * HALF_M * z.real, plate=none, half_width_m=HALF_M
     ) == pytest.approx(2e-6 * HALF_M)

@@ -22,9 +22,14 @@ from test.support.truth import hu_plan, simulate_measurements
 SIZED = "plate_scale:1e-7,plate_shape:5e-9"
 
 
-def measured(ratio, *, size=5, lines=8, repeats=4, sense=Sense.MICROSCOPE_MOVES, seed=0):
+def measured(
+    ratio, *, size=5, lines=8, repeats=4, sense=Sense.MICROSCOPE_MOVES, seed=0
+):
     """Return truth and readings with noise of 40 nm along x and `ratio` times that along y."""
-    plan, rng = hu_plan(Artifact(size, 0.01, lines), repeats), np.random.default_rng(seed)
+    plan, rng = (
+        hu_plan(Artifact(size, 0.01, lines), repeats),
+        np.random.default_rng(seed),
+    )
     truth = random_truth(plan.artifact, len(plan.views), rng, Spread(phi_rad=5e-4))
     settings = CellSettings(sense, 40e-9, 2e-6, noise_ratio=ratio)
     return truth, simulate_measurements(
@@ -37,12 +42,16 @@ def measured(ratio, *, size=5, lines=8, repeats=4, sense=Sense.MICROSCOPE_MOVES,
 def test_each_axis_has_the_uncertainty_of_its_noise(text, lines, sense):
     _, readings = measured(0.2, lines=lines, sense=sense)
     terms = parse_terms([text], "") if text else ()
-    options = Options(terms=terms, assumed=(), causes=False, misalignment_model="linear")
+    options = Options(
+        terms=terms, assumed=(), causes=False, misalignment_model="linear"
+    )
     solved = solve_joint(readings, options)
     contrast = axis_contrast(solved.model)
     assert contrast == pytest.approx((1 - 0.04) / (1 + 0.04), abs=0.02)
     emap, noise = solved.result.error_map, solved.result.noise
-    dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta), contrast=contrast)
+    dense = DenseFit(
+        readings, terms, (noise.sigma_xy, noise.sigma_theta), contrast=contrast
+    )
     _, (u_x, u_y) = dense.grid(np.isfinite(emap.gx))
     assert np.allclose(emap.u_gx, u_x, rtol=1e-6, atol=0, equal_nan=True)
     assert np.allclose(emap.u_gy, u_y, rtol=1e-6, atol=0, equal_nan=True)
@@ -54,7 +63,9 @@ def test_either_coordinate_lies_within_its_own_uncertainty(repeats):
     inside = []
     for seed in range(6):
         truth, readings = measured(0.25, size=11, repeats=repeats, seed=seed)
-        result = calibrate(readings, Options(terms=(*STILL, *parse_terms(["plate_shape:0"], ""))))
+        result = calibrate(
+            readings, Options(terms=(*STILL, *parse_terms(["plate_shape:0"], "")))
+        )
         k, emap = result.noise.k_xy, result.error_map
         known = np.isfinite(emap.gx)
         error = np.stack([emap.gx, emap.gy]) - truth.g

@@ -29,13 +29,17 @@ def measured(size, seed=0, *, sense=Sense.MICROSCOPE_MOVES, slow_m=0.0):
     settings = CellSettings(
         sense, 5e-9 if slow_m else 20e-9, 2e-6, flicker_xy_m=slow_m, servo_sigma_m=0.0
     )
-    return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings, visits=True
+    )
 
 
 def u_of_first_order(dense, artifact):
     """Return the u of O and R by the least squares of the dense map on a whole square field."""
     x, y = artifact.x_m.ravel(), artifact.y_m.ravel()
-    rows = np.stack([np.concatenate(pair) for pair in ((y, x), (x, -y))]) / (x @ x + y @ y)
+    rows = np.stack([np.concatenate(pair) for pair in ((y, x), (x, -y))]) / (
+        x @ x + y @ y
+    )
     rows = rows @ dense.to_map
     return tuple(np.sqrt(np.diag(rows @ dense.covariance @ rows.T)))
 
@@ -43,15 +47,22 @@ def u_of_first_order(dense, artifact):
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("text", ["", SIZED])
 @pytest.mark.parametrize("correlation", [[0.6, 0.3, 0.1], [-0.4, 0.1]])
-def test_each_node_has_the_uncertainty_of_such_noise(monkeypatch, text, correlation, sense):
-    monkeypatch.setattr(noise_effects, "time_correlation", lambda model: np.array(correlation))
+def test_each_node_has_the_uncertainty_of_such_noise(
+    monkeypatch, text, correlation, sense
+):
+    monkeypatch.setattr(
+        noise_effects, "time_correlation", lambda model: np.array(correlation)
+    )
     _, readings = measured(5, sense=sense)
     terms = parse_terms([text], "") if text else ()
     result = solve_joint(
-        readings, Options(terms=terms, assumed=(), causes=False, misalignment_model="linear")
+        readings,
+        Options(terms=terms, assumed=(), causes=False, misalignment_model="linear"),
     ).result
     emap, noise = result.error_map, result.noise
-    dense = DenseFit(readings, terms, (noise.sigma_xy, noise.sigma_theta), correlation=correlation)
+    dense = DenseFit(
+        readings, terms, (noise.sigma_xy, noise.sigma_theta), correlation=correlation
+    )
     _, (u_x, u_y) = dense.grid(np.isfinite(emap.gx))
     assert np.allclose(emap.u_gx, u_x, rtol=1e-6, atol=0)
     assert np.allclose(emap.u_gy, u_y, rtol=1e-6, atol=0)

@@ -41,13 +41,17 @@ def with_dirt(
                 **{
                     item.name: value[of_visits]
                     for item in fields(one.visits)
-                    if len(value := np.atleast_1d(getattr(one.visits, item.name))) == len(of_visits)
+                    if len(value := np.atleast_1d(getattr(one.visits, item.name)))
+                    == len(of_visits)
                 },
             )
             one = replace(
                 one,
                 visits=visits,
-                **{name: getattr(one, name)[:left] for name in ("m", "n", "dx", "dy", "count")},
+                **{
+                    name: getattr(one, name)[:left]
+                    for name in ("m", "n", "dx", "dy", "count")
+                },
             )
         out.append(one)
     return replace(measurements, views=tuple(out))
@@ -62,11 +66,16 @@ def population(dirty, runs):
     maps, cameras, results = [], [], []
     for seed in range(runs):
         truth, measurements = measured(MARK, seed, size=7, **DISTORTED)
-        found = calibrate(with_dirt(measurements, dirty), Options(causes=False, terms=STILL))
+        found = calibrate(
+            with_dirt(measurements, dirty), Options(causes=False, terms=STILL)
+        )
         emap, cells = found.error_map, found.camera.known_cells
-        maps.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
+        maps.append(
+            (np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy])
+        )
         cameras.append(
-            (cells[2:4] - (physics.seen_offset(truth, cells[:2]) - cells[:2])) / cells[4:]
+            (cells[2:4] - (physics.seen_offset(truth, cells[:2]) - cells[:2]))
+            / cells[4:]
         )
         results.append(found)
     return np.array(maps), np.array(cameras), results
@@ -115,7 +124,9 @@ def test_a_cell_that_no_view_shows_is_said_to_be_unknown():
         "Calibrated from 2 views with images of 9 marks, few of them read in cell [+1,+1]: largest"
     )
     assert dict(camera_facts(found))["distortion"] == "radial (cubic)"
-    spots = [item for item in camera_errors(found).items if type(item).__name__ == "Spot"]
+    spots = [
+        item for item in camera_errors(found).items if type(item).__name__ == "Spot"
+    ]
     assert len(spots) == 8
 
 
@@ -133,7 +144,9 @@ def test_a_cell_that_one_view_lacks_is_named_with_the_view():
 def test_two_rows_of_cells_show_the_linear_part():
     """Of six cells in two rows a polynomial of the second degree is not determined."""
     _, measurements = measured(MARK, 3, size=7, **DISTORTED)
-    shown = calibrate(with_dirt(measurements, everywhere((-1, 0), (0, 0), (1, 0)))).camera
+    shown = calibrate(
+        with_dirt(measurements, everywhere((-1, 0), (0, 0), (1, 0)))
+    ).camera
     assert shown.scale == pytest.approx(-0.005, abs=0.02)
     assert (2, 0) not in [part.power for part in shown.coefficients]
 
@@ -153,7 +166,9 @@ def test_one_row_of_cells_shows_no_camera():
 
 def test_full_images_have_no_cell_with_few_readings():
     _, measurements = measured(MARK, 3, size=7, missing=0.3)
-    assert not [one for one in calibrate(measurements).findings if one.name == "few_read"]
+    assert not [
+        one for one in calibrate(measurements).findings if one.name == "few_read"
+    ]
 
 
 def test_gaps_have_the_value_of_the_other_views():

@@ -21,7 +21,10 @@ def without_lost_marks():
     """Return readings of plates turned by a degree, whose sites `APART` hang on no others."""
     plan, rng = plan_of("0, 90, tx, ty", 5), np.random.default_rng(3)
     truth = random_truth(
-        plan.artifact, len(plan.views), rng, Spread(phi_rad=np.deg2rad(1), rotation="finite")
+        plan.artifact,
+        len(plan.views),
+        rng,
+        Spread(phi_rad=np.deg2rad(1), rotation="finite"),
     )
     readings = simulate_measurements(truth, plan, rng)
     views = []
@@ -31,7 +34,10 @@ def without_lost_marks():
             keep = np.array([mark not in LOST for mark in at])
         elif view.view.name == "ty":
             keep = np.array(
-                [mark not in APART and (mark[0], mark[1] + 1) not in APART for mark in at]
+                [
+                    mark not in APART and (mark[0], mark[1] + 1) not in APART
+                    for mark in at
+                ]
             )
         else:
             keep = np.ones(len(at), dtype=bool)
@@ -49,7 +55,10 @@ def without_lost_marks():
 
 
 def test_what_is_taken_off_sites_and_plate_there_changes_no_reading():
-    grid, rng = prepare(without_lost_marks()[0], Options())[0].system.grid, np.random.default_rng(1)
+    grid, rng = (
+        prepare(without_lost_marks()[0], Options())[0].system.grid,
+        np.random.default_rng(1),
+    )
     field, plate = rng.normal(size=(2, *grid.views.shape, 2)) @ [1, 1j]
     found, small = grid.free_parts_small(field, plate)
     change = grid.views.gather(found - field) + (small - plate)

@@ -49,10 +49,17 @@ def measured(
     """Return truth and readings of two turns with images of 3 x 3 marks."""
     plan, rng = image_plan(size, repeats=repeats), np.random.default_rng(seed)
     truth = random_truth(
-        plan.artifact, 2, rng, Spread(**{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread)
+        plan.artifact,
+        2,
+        rng,
+        Spread(**{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread),
     )
-    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=servo_m, sense=sense)
-    return truth, simulate_measurements(truth, plan, rng, settings=settings, missing=missing)
+    settings = CellSettings(
+        sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=servo_m, sense=sense
+    )
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings, missing=missing
+    )
 
 
 def dense(measurements):
@@ -70,7 +77,10 @@ def dense(measurements):
     for number, view in enumerate(measurements.views):
         turn = round(view.view.rotation_rad / (np.pi / 2))
         cosine, sine = ((1, 0), (0, 1))[turn]
-        a, b = (round(t / measurements.artifact.grid_pitch_m) for t in view.view.translation_m)
+        a, b = (
+            round(t / measurements.artifact.grid_pitch_m)
+            for t in view.view.translation_m
+        )
         for m, n in zip(view.m, view.n, strict=True):
             x, y = cosine * m - sine * n, sine * m + cosine * n
             site = (x + a + hx) * ny + y + b + hy
@@ -93,7 +103,10 @@ def datum(artifact) -> np.ndarray:
     x, y = artifact.m.ravel().astype(float), artifact.n.ravel().astype(float)
     zero, one = np.zeros_like(x), np.ones_like(x)
     modes = np.stack(
-        [np.stack(pair, axis=1).ravel() for pair in ((one, zero), (zero, one), (-y, x), (x, y))]
+        [
+            np.stack(pair, axis=1).ravel()
+            for pair in ((one, zero), (zero, one), (-y, x), (x, y))
+        ]
     )
     basis = np.linalg.qr(modes.T)[0]
     return np.eye(2 * x.size) - basis @ basis.T
@@ -127,13 +140,21 @@ def test_u_holds_the_noise_that_marks_of_an_image_share(missing):
     # the plate has the scale of stage and plate together: noise of images moves it little
     artifact = measurements.artifact
     z = np.stack([artifact.m.ravel(), artifact.n.ravel()], axis=1).ravel().astype(float)
-    both = inverse[2 * sites : 4 * sites] + np.outer(z, z @ inverse[: 2 * sites]) / (z @ z)
+    both = inverse[2 * sites : 4 * sites] + np.outer(z, z @ inverse[: 2 * sites]) / (
+        z @ z
+    )
     kept = np.eye(2 * sites) - datum(artifact) - np.outer(z, z) / (z @ z)
     gain = both - kept @ both
     u = np.sqrt(np.diag(gain @ covariance @ gain.T))
-    np.testing.assert_allclose(result.artifact_map.u_ax, u[::2].reshape(shape), rtol=1e-5)
-    np.testing.assert_allclose(result.artifact_map.u_ay, u[1::2].reshape(shape), rtol=1e-5)
-    assert u.mean() < 0.9 * np.hypot(mark, image) * np.sqrt(np.diag(gain @ gain.T)).mean()
+    np.testing.assert_allclose(
+        result.artifact_map.u_ax, u[::2].reshape(shape), rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        result.artifact_map.u_ay, u[1::2].reshape(shape), rtol=1e-5
+    )
+    assert (
+        u.mean() < 0.9 * np.hypot(mark, image) * np.sqrt(np.diag(gain @ gain.T)).mean()
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -142,12 +163,12 @@ def test_covariance_of_a_saved_map_holds_the_noise_that_marks_of_an_image_share(
     matrix, stops = dense(measurements)
     result = calibrate(measurements, ALONE)
     camera = result.camera
-    covariance = camera.noise_mark**2 * np.eye(len(matrix)) + camera.noise_image**2 * np.kron(
-        stops[:, None] == stops, np.eye(2)
-    )
-    gain = (datum(measurements.artifact) @ np.linalg.pinv(matrix, rcond=1e-10)[:50]).reshape(
-        5, 5, 2, -1
-    )
+    covariance = camera.noise_mark**2 * np.eye(
+        len(matrix)
+    ) + camera.noise_image**2 * np.kron(stops[:, None] == stops, np.eye(2))
+    gain = (
+        datum(measurements.artifact) @ np.linalg.pinv(matrix, rcond=1e-10)[:50]
+    ).reshape(5, 5, 2, -1)
     if sense is Sense.PLATE_MOVES:
         gain = -gain[::-1, ::-1]
     known = result.error_map.valid.copy()
@@ -176,14 +197,19 @@ def test_draws_show_what_either_noise_leaves_in_the_residuals(missing):
         [np.trace(left), np.trace(left @ together @ left)],
         [np.trace(left @ together @ left), np.trace(together @ left @ together @ left)],
     ]
-    expected = np.append(expected, np.zeros((2, 1)), axis=1)  # the two noises are independent
+    # the two noises are independent
+    expected = np.append(expected, np.zeros((2, 1)), axis=1)
     spread = images.drawn.std(axis=0) / np.sqrt(len(images.drawn))
     away = images.drawn.mean(axis=0) - expected
     assert (np.abs(away) < 4 * spread).all()
-    assert images.marks == pytest.approx(np.mean([(stops == stop).sum() for stop in stops]))
+    assert images.marks == pytest.approx(
+        np.mean([(stops == stop).sum() for stop in stops])
+    )
 
 
-def population(image_m: float, size: int, runs: int, *, options: Options | None = None, **settings):
+def population(
+    image_m: float, size: int, runs: int, *, options: Options | None = None, **settings
+):
     """Return (G - truth) / u of every node and run, and the truths and results."""
     away, results = [], []
     for seed in range(runs):
@@ -210,7 +236,9 @@ def within(away: np.ndarray, independent: int, *, least: float = 1.0) -> None:
 def away_of(truth, camera) -> np.ndarray:
     """Return (error of the camera - truth) / u at every cell, (2, cells)."""
     place, error, u = (
-        np.array([[getattr(cell, f"{name}{axis}") for cell in camera.cells] for axis in "xy"])
+        np.array(
+            [[getattr(cell, f"{name}{axis}") for cell in camera.cells] for axis in "xy"]
+        )
         for name in ("", "d", "u_d")
     )
     return (error - (physics.seen_offset(truth, place) - place)) / u
@@ -233,7 +261,9 @@ DISTORTED = {
         (3.0, 7, Sense.MICROSCOPE_MOVES, 6),
     ],
 )  # the more images share, the fewer numbers a run has
-def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size, sense, runs):
+def test_stage_camera_and_noises_are_found_within_their_uncertainties(
+    part, size, sense, runs
+):
     away, results = population(part * MARK, size, runs, sense=sense, **DISTORTED)
     assert all(found.verdict.qualified for _, found in results)
     within(away, 20)
@@ -247,7 +277,8 @@ def test_stage_camera_and_noises_are_found_within_their_uncertainties(part, size
     dof = sum(found.kept.images.dof_mark for _, found in results)
     assert mark == pytest.approx(MARK**2, rel=3 * np.sqrt(2 / dof))
     assert image == pytest.approx((part * MARK) ** 2, rel=0.15)
-    for camera in cameras:  # published offsets are (1 + E)^-1 times the true ones, then distorted
+    # published offsets are (1 + E)^-1 times the true ones, then distorted
+    for camera in cameras:
         assert camera.scale == pytest.approx(-0.005, abs=1e-4)
         assert camera.rotation == pytest.approx(0.003, abs=1e-4)
         radial = next(c.x for c in camera.coefficients if c.power == (2, 1))
@@ -267,10 +298,17 @@ def test_repeats_are_compared_with_the_scale_that_the_camera_shows(sense):
     assert calibrate(readings, Options(causes=False)).verdict.qualified
     longer = np.diag([1.0, 1.0, 1.01, 1.01])
     views = tuple(
-        replace(view, motion=replace(view.motion, products=longer @ view.motion.products @ longer))
+        replace(
+            view,
+            motion=replace(
+                view.motion, products=longer @ view.motion.products @ longer
+            ),
+        )
         for view in readings.views
     )
-    failed = calibrate(replace(readings, views=views), Options(causes=False)).verdict.failed
+    failed = calibrate(
+        replace(readings, views=views), Options(causes=False)
+    ).verdict.failed
     assert [one.name for one in failed] == ["scale_of_offsets"]
 
 
@@ -278,7 +316,8 @@ def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
     """True offsets are minus the motion; published ones have the camera's error, (x, y) mixed."""
     rng, place = np.random.default_rng(4), 3e-4 - 2e-4j
     camera = Distortion(
-        ((1, 0), (0, 1), (2, 1)), np.array([0, 0.004 + 0.03j, 0.002 - 0.005j, 2e4 + 1e4j])
+        ((1, 0), (0, 1), (2, 1)),
+        np.array([0, 0.004 + 0.03j, 0.002 - 0.005j, 2e4 + 1e4j]),
     )
     true = place + rng.normal(0, 1e-7, 500) + 2e-7j * rng.normal(0, 1, 500)
     published = true.copy()
@@ -291,7 +330,10 @@ def test_offsets_of_repeats_are_straightened_with_the_turn_of_the_camera():
     slopes = straight @ rows @ rows.T @ straight.T
     on_motion = np.linalg.solve(slopes[:2, :2], slopes[:2, 2:])
     np.testing.assert_allclose(on_motion, -np.eye(2), atol=2e-5)
-    assert abs(np.linalg.solve(slopes[:2, :2], (rows @ rows.T)[:2, 2:]) + np.eye(2)).max() > 0.02
+    assert (
+        abs(np.linalg.solve(slopes[:2, :2], (rows @ rows.T)[:2, 2:]) + np.eye(2)).max()
+        > 0.02
+    )
 
 
 def test_degrees_of_freedom_are_those_of_the_maps_variance():
@@ -301,7 +343,8 @@ def test_degrees_of_freedom_are_those_of_the_maps_variance():
         power.append((found.error_map.u_gx**2).mean())
         dof.append(found.noise.dof_xy)
     shown = 2 * np.mean(power) ** 2 / np.var(power, ddof=1)
-    assert 0.6 < np.mean(dof) / shown < 1.6  # 95.45 % of such variances lie within 0.55 and 1.6
+    # 95.45 % of such variances lie within 0.55 and 1.6
+    assert 0.6 < np.mean(dof) / shown < 1.6
     assert np.mean(dof) < 100
 
 
@@ -330,7 +373,9 @@ def test_images_in_one_line_show_no_distortion_of_the_camera():
     plan, rng = image_plan(5), np.random.default_rng(2)
     image = replace(plan.views[0].image, ny=1)
     more = View("shifted", 0.0, (0.0, 1e-3), angular=False)
-    plan = replace(plan, views=tuple(replace(v, image=image) for v in (*plan.views, more)))
+    plan = replace(
+        plan, views=tuple(replace(v, image=image) for v in (*plan.views, more))
+    )
     truth = random_truth(plan.artifact, 3, rng, Spread(phi_rad=0.003))
     found = calibrate(simulate_measurements(truth, plan, rng, sigma_m=MARK))
     assert found.camera is None and found.stage_yaw is not None
@@ -340,7 +385,8 @@ def test_images_in_one_line_show_no_distortion_of_the_camera():
 def test_hus_law_refuses_images():
     _, measurements = measured(MARK, 1, size=5)
     with pytest.raises(
-        InputError, match="Hu's law cannot use images of several marks; solve with --method"
+        InputError,
+        match="Hu's law cannot use images of several marks; solve with --method",
     ):
         calibrate_by_law(measurements, Options())
 
@@ -348,7 +394,9 @@ def test_hus_law_refuses_images():
 def test_noise_of_offsets_taken_for_a_microscope_makes_no_variance_negative():
     """A draw whose noise, in a view that hardly turns, looks like a microscope's strain."""
     plan, rng = image_plan(7), np.random.default_rng(3)
-    truth = random_truth(plan.artifact, 3, rng, Spread(phi_rad=0.003, correlation_pitches=4.0))
+    truth = random_truth(
+        plan.artifact, 3, rng, Spread(phi_rad=0.003, correlation_pitches=4.0)
+    )
     settings = CellSettings(sigma_xy_m=MARK, image_xy_m=MARK, servo_sigma_m=0.0)
     found = calibrate(simulate_measurements(truth, plan, rng, settings=settings))
     assert [cause.name for cause in found.verdict.causes] == ["microscope"]

@@ -42,14 +42,19 @@ def test_residuals_are_what_maps_and_misalignment_leave_of_the_readings(sense):
     h, pitch, lines = artifact.half[0], artifact.grid_pitch_m, artifact.angular_count
     seen = 0
     for view, found, kept in zip(
-        measurements.views, result.views, result.extra["residuals"]["views"], strict=True
+        measurements.views,
+        result.views,
+        result.extra["residuals"]["views"],
+        strict=True,
     ):
         assert kept["view"] == view.view.name
         pose = view.view.lattice_pose(artifact)
         turns = pose.turn_lines
         for k, value in zip(view.k, view.dtheta, strict=True):
             at = (k + turns) % lines
-            stage = -emap.g_theta[-at] if sense is Sense.PLATE_MOVES else emap.g_theta[at]
+            stage = (
+                -emap.g_theta[-at] if sense is Sense.PLATE_MOVES else emap.g_theta[at]
+            )
             expected = value - (stage + amap.a_theta[k] + found.phi)
             assert kept["dtheta"][k] == pytest.approx(expected, abs=2e-12)
         if not len(view.m):
@@ -85,12 +90,14 @@ def test_a_course_follows_the_readings_of_each_visit():
         visits.mark, visits.count
     )
     views[0] = replace(views[0], dx=means, visits=jumped)
-    kept = calibrate(replace(measurements, views=tuple(views)), bare(causes=False)).extra[
-        "residuals"
-    ]["views"]
+    kept = calibrate(
+        replace(measurements, views=tuple(views)), bare(causes=False)
+    ).extra["residuals"]["views"]
     course = kept[0]["course"]
     early = course["time_s"] < np.median(course["time_s"])
-    assert course["dx"][~early].mean() - course["dx"][early].mean() == pytest.approx(5e-7, rel=0.1)
+    assert course["dx"][~early].mean() - course["dx"][early].mean() == pytest.approx(
+        5e-7, rel=0.1
+    )
     assert abs(course["dy"][~early].mean() - course["dy"][early].mean()) < 2e-8
     assert course["count"].sum() == visits.count.sum()
 
@@ -115,7 +122,9 @@ def test_the_course_of_marks_visited_once_is_that_of_their_residuals():
 
 
 @pytest.mark.parametrize("parts", [1, 8, 60, 200])
-def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkeypatch, parts):
+def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(
+    monkeypatch, parts
+):
     """Two visits a mark, in an order of their own, with unequal repeats: part by part."""
     monkeypatch.setattr(solve, "MAX_PARTS", parts)
     rng, measurements = np.random.default_rng(2), measured(visits=True)
@@ -131,12 +140,14 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkey
             np.bincount(visits.mark, visits.count * values) / count
             for values in (visits.dx, visits.dy)
         )
-        views.append(replace(view, count=count.astype(int), dx=dx, dy=dy, visits=visits))
+        views.append(
+            replace(view, count=count.astype(int), dx=dx, dy=dy, visits=visits)
+        )
         about.append((visits.dx - dx[visits.mark], visits.dy - dy[visits.mark]))
     views += measurements.views[2:]
-    kept = calibrate(replace(measurements, views=tuple(views)), bare(causes=False)).extra[
-        "residuals"
-    ]["views"]
+    kept = calibrate(
+        replace(measurements, views=tuple(views)), bare(causes=False)
+    ).extra["residuals"]["views"]
     first = min(view.visits.stamp_ns.min() for view in views if len(view.m))
     for view, (dx, dy), entry in zip(views[:2], about, kept[:2], strict=True):
         visits, course = view.visits, entry["course"]
@@ -146,12 +157,18 @@ def test_each_part_of_a_course_is_a_mean_of_readings_in_the_order_of_time(monkey
             "dx": entry["dx"][at] + dx,
             "dy": entry["dy"][at] + dy,
         }
-        chosen = [part for part in np.array_split(np.argsort(visits.stamp_ns), parts) if len(part)]
+        chosen = [
+            part
+            for part in np.array_split(np.argsort(visits.stamp_ns), parts)
+            if len(part)
+        ]
         assert len(chosen) == len(course["count"])
         for number, part in enumerate(chosen):
             assert course["count"][number] == visits.count[part].sum()
             for name, values in found.items():
-                mean = (values[part] * visits.count[part]).sum() / visits.count[part].sum()
+                mean = (values[part] * visits.count[part]).sum() / visits.count[
+                    part
+                ].sum()
                 assert course[name][number] == pytest.approx(
                     mean, abs=1e-3 if name == "time_s" else 2e-13
                 )

@@ -37,7 +37,9 @@ ROOT = Path(__file__).parents[3]
         ("0,90,tx", True),
     ],
 )
-def test_the_middle_of_a_large_plan_tells_what_the_whole_does(monkeypatch, names, identified):
+def test_the_middle_of_a_large_plan_tells_what_the_whole_does(
+    monkeypatch, names, identified
+):
     plan, sizes = plan_of(names, Artifact(21, 0.005)), []
     assert identifies(plan.artifact, plan.views) == identified
 
@@ -58,7 +60,10 @@ def test_the_uncertainty_of_a_large_field_is_given_on_request(monkeypatch):
     readings = simulate_measurements(truth, plan, rng, sigma_m=2e-8)
     wanted = calibrate(readings, Options())
     monkeypatch.setattr(solve, "UNASKED_SITES", 11 * 11 - 1)
-    plain, asked = calibrate(readings, Options()), calibrate(readings, Options(uncertainty=True))
+    plain, asked = (
+        calibrate(readings, Options()),
+        calibrate(readings, Options(uncertainty=True)),
+    )
     assert "no_uncertainty" in [finding.name for finding in plain.findings]
     assert np.isnan(plain.error_map.u_gx).all()
     np.testing.assert_array_equal(plain.error_map.gx, wanted.error_map.gx)

@@ -52,7 +52,9 @@ def dense_dof(plan: Plan) -> int:
         q = round(view.rotation_rad / (pi / 2)) if view.grid else 0
         turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), q)
         shift = np.round(np.array(view.translation_m) / PITCH).astype(int)
-        marks = [(m, n) for m in range(-2, 3) for n in range(-2, 3)] if view.grid else []
+        marks = (
+            [(m, n) for m in range(-2, 3) for n in range(-2, 3)] if view.grid else []
+        )
         for m, n in marks:
             site = turn @ [m, n] + shift
             if np.abs(site).max() > 2:
@@ -71,11 +73,19 @@ def dense_dof(plan: Plan) -> int:
     return len(rows) - int(np.linalg.matrix_rank(np.array(rows)))
 
 
-@pytest.mark.parametrize(("shared", "alone"), [(0, 0), (0, 2), (1, 1), (1, 2), (2, 1), (4, 2)])
-def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(shared, alone):
+@pytest.mark.parametrize(
+    ("shared", "alone"), [(0, 0), (0, 2), (1, 1), (1, 2), (2, 1), (4, 2)]
+)
+def test_degrees_of_freedom_count_rotations_that_marks_and_lines_share_once(
+    shared, alone
+):
     plan, rng = plan_with(shared, alone), np.random.default_rng(6)
     readings = simulate_measurements(
-        random_truth(ARTIFACT, len(plan.views), rng), plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-6
+        random_truth(ARTIFACT, len(plan.views), rng),
+        plan,
+        rng,
+        sigma_m=2e-8,
+        sigma_theta_rad=2e-6,
     )
     model = fit_model(prepare(readings, BARE)[0])
     assert squares(model.problem, model.fitted)[1] == dense_dof(plan)
@@ -104,7 +114,11 @@ def test_what_does_not_settle_is_named(monkeypatch, terms, message):
     monkeypatch.setattr(model_fit, "MAX_STEPS", 1)
     plan, rng = plan_with(0, 0), np.random.default_rng(6)
     readings = simulate_measurements(
-        random_truth(ARTIFACT, len(plan.views), rng), plan, rng, sigma_m=2e-8, visits=True
+        random_truth(ARTIFACT, len(plan.views), rng),
+        plan,
+        rng,
+        sigma_m=2e-8,
+        visits=True,
     )
     with pytest.raises(InputError) as caught:
         fit_model(prepare(readings, bare(terms=parse_terms([terms], "")))[0])
@@ -113,7 +127,9 @@ def test_what_does_not_settle_is_named(monkeypatch, terms, message):
 
 def test_an_iteration_in_circles_is_given_up_and_a_slow_one_is_not(monkeypatch):
     plan, rng = plan_with(0, 0), np.random.default_rng(6)
-    readings = simulate_measurements(random_truth(ARTIFACT, len(plan.views), rng), plan, rng)
+    readings = simulate_measurements(
+        random_truth(ARTIFACT, len(plan.views), rng), plan, rng
+    )
     problem = prepare(readings, BARE)[0]
     step, steps = model_fit._State.step, []
 
@@ -142,7 +158,11 @@ def test_in_a_linear_model_only_the_terms_change_what_is_taken_off_the_readings(
     """What finite rotations take off is another change, which coefficients do not explain."""
     plan, rng = plan_with(0, 0), np.random.default_rng(6)
     readings = simulate_measurements(
-        random_truth(ARTIFACT, len(plan.views), rng), plan, rng, sigma_m=2e-8, visits=True
+        random_truth(ARTIFACT, len(plan.views), rng),
+        plan,
+        rng,
+        sigma_m=2e-8,
+        visits=True,
     )
     terms = parse_terms(["plate_scale:1e-6"], "")
     for model, besides in (("linear", False), ("rigid", True)):

@@ -51,7 +51,9 @@ def measured(
     settings = CellSettings(
         sense, sigma_m, 2e-5, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0, **cell
     )
-    return truth, simulate_measurements(truth, plan, rng, settings=settings, missing=missing)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings, missing=missing
+    )
 
 
 def off(truth, result):
@@ -67,7 +69,9 @@ def maps_of(machines, *, size=11, **how):
     """Return the maps of machines in both senses: which qualify, which hold, error over u."""
     plan, qualified, holds, errors = hu_plan(Artifact(size, 0.01, 24), 5), [], [], []
     for seed in range(machines):
-        truth, readings = measured(plan, seed, sense=tuple(Sense)[seed % 2], **FOLLOWS, **how)
+        truth, readings = measured(
+            plan, seed, sense=tuple(Sense)[seed % 2], **FOLLOWS, **how
+        )
         result = trusted(readings, bare())
         errors.append(off(truth, result))
         qualified.append(result.verdict.qualified)
@@ -97,16 +101,23 @@ def test_a_stage_too_rough_for_it_is_rather_not_qualified_than_wrong():
 def test_taking_the_sites_for_the_places_makes_errors_larger_than_u(sense):
     errors = []
     for seed in range(6):
-        truth, readings = measured(hu_plan(Artifact(9, 0.01, 24), 5), seed, sense=sense, **FOLLOWS)
+        truth, readings = measured(
+            hu_plan(Artifact(9, 0.01, 24), 5), seed, sense=sense, **FOLLOWS
+        )
         errors.append(off(truth, solve_joint(readings, bare(at_places=False)).result))
     assert np.sqrt(np.mean(np.square(errors))) > 1.05
 
 
-def test_at_two_tenths_u_holds_the_noise_that_readings_between_nodes_have_more(monkeypatch):
+def test_at_two_tenths_u_holds_the_noise_that_readings_between_nodes_have_more(
+    monkeypatch,
+):
     def ratio():
         return np.sqrt(
             np.mean(
-                [off(truth, solve_joint(readings, bare()).result) ** 2 for truth, readings in made]
+                [
+                    off(truth, solve_joint(readings, bare()).result) ** 2
+                    for truth, readings in made
+                ]
             )
         )
 
@@ -128,7 +139,9 @@ def test_a_stage_that_is_white_there_is_not_qualified():
 
 
 def test_micrometres_off_the_sites_are_nothing():
-    _, readings = measured(hu_plan(Artifact(11, 0.01, 24), 5), stop_sigma_m=5e-6, t_m=30e-6)
+    _, readings = measured(
+        hu_plan(Artifact(11, 0.01, 24), 5), stop_sigma_m=5e-6, t_m=30e-6
+    )
     one, two = (calibrate(readings, Options(at_places=at)) for at in (True, False))
     assert not np.array_equal(one.error_map.gx, two.error_map.gx)
     for name in ("gx", "gy"):
@@ -140,7 +153,8 @@ def test_micrometres_off_the_sites_are_nothing():
 def test_a_stage_at_the_sites_has_the_same_result_to_the_bit():
     _, readings = measured(hu_plan(Artifact(11, 0.01, 24), 5), t_m=30e-6)
     one, two = (
-        result_to_dict(worded(calibrate(readings, Options(at_places=at)))) for at in (True, False)
+        result_to_dict(worded(calibrate(readings, Options(at_places=at))))
+        for at in (True, False)
     )
     for made in (one, two):
         made["provenance"].pop("created", None)
@@ -164,7 +178,9 @@ def test_repeats_scatter_by_their_noise_alone(terms):
 
 def test_readings_held_out_are_predicted_where_the_stage_stood():
     _, readings = measured(hu_plan(Artifact(11, 0.01, 24), 5), g_m=1e-6, **FOLLOWS)
-    there, at_sites = (validate(readings, bare(at_places=at), folds=2) for at in (True, False))
+    there, at_sites = (
+        validate(readings, bare(at_places=at), folds=2) for at in (True, False)
+    )
     assert not any(part.exceeds for part in there)
     for one, other in zip(there[:2], at_sites[:2], strict=True):
         assert other.rms_m > 1.5 * one.rms_m
@@ -178,6 +194,14 @@ def test_the_worst_reading_is_found_and_no_other():
     views = list(readings.views)
     views[1] = replace(views[1], dx=spoilt, visits=more)
     found = robust_calibrate(replace(readings, views=tuple(views)), bare())
-    (removed,) = (finding for finding in found.findings if finding.name == "outliers_removed")
-    assert removed.details["number"] == 1 and removed.details["first"][0]["view"] == "rot90"
-    assert removed.details["first"][0]["mark"] == [int(views[1].m[50]), int(views[1].n[50])]
+    (removed,) = (
+        finding for finding in found.findings if finding.name == "outliers_removed"
+    )
+    assert (
+        removed.details["number"] == 1
+        and removed.details["first"][0]["view"] == "rot90"
+    )
+    assert removed.details["first"][0]["mark"] == [
+        int(views[1].m[50]),
+        int(views[1].n[50]),
+    ]

@@ -16,16 +16,24 @@ def test_one_noise_is_contradicted_once_in_a_thousand():
     draws, dofs = 4000, (40, 12)
     alarms = sum(
         noise_estimate((a * 1e-8, dofs[0]), (b * 1e-8, dofs[1]), NAN).contradicted
-        for a, b in zip(*(np.sqrt(rng.chisquare(d, draws) / d) for d in dofs), strict=True)
+        for a, b in zip(
+            *(np.sqrt(rng.chisquare(d, draws) / d) for d in dofs), strict=True
+        )
     )
-    assert binom.ppf(1e-4, draws, F_LEVEL) <= alarms <= binom.ppf(1 - 1e-4, draws, F_LEVEL)
+    assert (
+        binom.ppf(1e-4, draws, F_LEVEL) <= alarms <= binom.ppf(1 - 1e-4, draws, F_LEVEL)
+    )
 
 
 @pytest.mark.parametrize(("ratio", "larger"), [(3.0, "residuals"), (1 / 3, "repeats")])
 def test_the_larger_of_two_noises_that_contradict_each_other_counts(ratio, larger):
     found = noise_estimate((1e-8, 100), (ratio * 1e-8, 50), NAN)
     assert found.contradicted
-    wanted = f_distribution.sf(9, 50, 100) if ratio > 1 else f_distribution.cdf(1 / 9, 50, 100)
+    wanted = (
+        f_distribution.sf(9, 50, 100)
+        if ratio > 1
+        else f_distribution.cdf(1 / 9, 50, 100)
+    )
     assert found.p == pytest.approx(2 * wanted, rel=1e-6)
     assert found.sigma == max(1e-8, ratio * 1e-8)
     assert found.dof == {"residuals": 50, "repeats": 100}[larger]
@@ -50,7 +58,8 @@ def test_repeats_count_from_thirty_degrees_of_freedom(dof, used):
 
 
 @pytest.mark.parametrize(
-    ("ratio", "contradicted"), [(1.09, False), (1.11, True), (1 / 1.09, False), (1 / 1.11, True)]
+    ("ratio", "contradicted"),
+    [(1.09, False), (1.11, True), (1 / 1.09, False), (1 / 1.11, True)],
 )
 def test_noises_within_a_tenth_are_the_same_for_every_purpose(ratio, contradicted):
     found = noise_estimate((1e-8, 1_000_000), (ratio * 1e-8, 1_000_000), NAN)

@@ -27,18 +27,22 @@ def calibrated(seed, artifact=PLATE, repeats=2):
         Spread(rotation="finite", phi_rad=1e-3, t_m=2e-5, microscope_rotation_rad=0.01),
     )
     settings = CellSettings(sigma_xy_m=NOISE, sigma_theta_rad=2e-6, servo_sigma_m=3e-7)
-    return calibrate(simulate_measurements(truth, plan, rng, settings=settings, visits=True))
+    return calibrate(
+        simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    )
 
 
 def test_residuals_of_few_marks_show_their_own_noise_and_not_that_of_lines():
     results = [calibrated(seed) for seed in range(10)]
     grades = Counter(result.verdict.grade for result in results)
-    assert not grades[Grade.NOT_QUALIFIED]  # 3 of them with the residuals of lines counted
+    # 3 of them with the residuals of lines counted
+    assert not grades[Grade.NOT_QUALIFIED]
     noises = [result.noise for result in results]
     dof = np.array([noise.dof_xy_residuals for noise in noises])
     found = np.array([noise.sigma_xy_residuals for noise in noises]) ** 2 / NOISE**2
     assert abs(dof @ found / dof.sum() - 1) < 4 * np.sqrt(2 / dof.sum())
-    assert abs(np.mean(dof * (found - 1) ** 2) / 2 - 1) < 0.8  # as scattered as they say
+    # as scattered as they say
+    assert abs(np.mean(dof * (found - 1) ** 2) / 2 - 1) < 0.8
 
 
 def test_the_noise_of_very_few_marks_is_that_of_lines_as_well():
@@ -72,10 +76,13 @@ def test_lines_without_noise_neither_stop_the_fit_nor_contradict_anything(
     for seed in range(4):
         plan, rng = hu_plan(plate, repeats), np.random.default_rng(seed)
         truth = random_truth(plate, 4, rng, Spread(rotation="finite", phi_rad=phi_rad))
-        result = calibrate(simulate_measurements(truth, plan, rng, settings=exact, visits=True))
+        result = calibrate(
+            simulate_measurements(truth, plan, rng, settings=exact, visits=True)
+        )
         assert result.verdict.failed == () and result.verdict.causes == ()
         error = np.stack([result.error_map.gx, result.error_map.gy]) - truth.g
         error = remove_modes(error, datum_modes(plate, scale=True))
         u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
         assert (abs(error) < 2 * u).mean() > 0.9
-        assert u.max() < 100e-9  # what is assumed of the machine, and hardly anything else
+        # what is assumed of the machine, and hardly anything else
+        assert u.max() < 100e-9

@@ -22,7 +22,11 @@ from test.support.truth import hu_plan, random_truth, simulate_measurements
 def problem():
     plan, rng = hu_plan(Artifact(7, 0.01, 12), repeats=3), np.random.default_rng(0)
     readings = simulate_measurements(
-        random_truth(plan.artifact, 4, rng), plan, rng, sigma_m=1e-8, sigma_theta_rad=1e-6
+        random_truth(plan.artifact, 4, rng),
+        plan,
+        rng,
+        sigma_m=1e-8,
+        sigma_theta_rad=1e-6,
     )
     return prepare(readings, Options())[0], readings
 
@@ -32,8 +36,12 @@ def test_a_line_weighs_by_its_noise_at_the_half_width(problem):
     found = weight_ratio(problem[0], 2e-8, 2e-6, problem[0].grid.y)
     assert problem[0].half_width_m == pytest.approx(0.03)
     assert found == pytest.approx(1 / 9, rel=1e-12)
-    assert weight_ratio(problem[0], 4e-8, 2e-6, problem[0].grid.y) == pytest.approx(4 / 9)
-    assert weight_ratio(problem[0], 2e-8, 1e-6, problem[0].grid.y) == pytest.approx(4 / 9)
+    assert weight_ratio(problem[0], 4e-8, 2e-6, problem[0].grid.y) == pytest.approx(
+        4 / 9
+    )
+    assert weight_ratio(problem[0], 2e-8, 1e-6, problem[0].grid.y) == pytest.approx(
+        4 / 9
+    )
 
 
 def test_without_both_noises_a_line_counts_like_a_mark(problem):

@@ -48,7 +48,9 @@ def test_hu_simulation_comes_back_exactly(size, pitch, lines, sense):
     for index, view in enumerate(found.views):
         assert view.phi == pytest.approx(truth.phi_rad[index], abs=EXACT)
         if view.name != "line":
-            assert (view.tx, view.ty) == pytest.approx(tuple(truth.t_m[index]), abs=EXACT)
+            assert (view.tx, view.ty) == pytest.approx(
+                tuple(truth.t_m[index]), abs=EXACT
+            )
     assert np.isnan(found.views[2].tx)
     assert found.observability.identifiable and found.findings == ()
     assert np.nanmax(found.error_map.u_gx) < EXACT
@@ -56,7 +58,9 @@ def test_hu_simulation_comes_back_exactly(size, pitch, lines, sense):
 
 @pytest.mark.parametrize("shape", [(7, 7), (9, 5)])
 @pytest.mark.parametrize("sense", Sense)
-def test_squareness_and_scale_difference_are_those_of_a_straight_fit_to_the_map(shape, sense):
+def test_squareness_and_scale_difference_are_those_of_a_straight_fit_to_the_map(
+    shape, sense
+):
     """O and R of Gx = O y + R x + Fx, Gy = O x - R y + Fy (Hu eq. 6), also where marks miss."""
     artifact = Artifact(shape[0], 0.01, 0, shape[1])
     _, readings = measured(plan_of("0,90,tx,ty", artifact), sense=sense, missing=0.2)
@@ -68,7 +72,9 @@ def test_squareness_and_scale_difference_are_those_of_a_straight_fit_to_the_map(
     right = np.concatenate([emap.gx[known], emap.gy[known]])
     wanted = np.linalg.lstsq(design, right, rcond=None)[0][:2]
     assert np.abs(wanted).min() > 1e-8
-    assert (emap.nonorthogonality, emap.scale_difference) == pytest.approx(tuple(wanted), rel=1e-6)
+    assert (emap.nonorthogonality, emap.scale_difference) == pytest.approx(
+        tuple(wanted), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -134,13 +140,22 @@ def test_missing_marks(missing, sense):
 def test_order_of_readings_changes_no_bit(seed):
     random, (_, readings) = (
         np.random.default_rng(seed),
-        measured(hu_plan(Artifact(5, 0.01, 8)), sigma_m=1e-8, sigma_theta_rad=1e-7, missing=0.05),
+        measured(
+            hu_plan(Artifact(5, 0.01, 8)),
+            sigma_m=1e-8,
+            sigma_theta_rad=1e-7,
+            missing=0.05,
+        ),
     )
     shuffled = []
     for view in readings.views:
         marks, lines = (random.permutation(len(of)) for of in (view.m, view.k))
-        fields = {name: getattr(view, name)[marks] for name in ("m", "n", "dx", "dy", "count")}
-        fields |= {name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")}
+        fields = {
+            name: getattr(view, name)[marks] for name in ("m", "n", "dx", "dy", "count")
+        }
+        fields |= {
+            name: getattr(view, name)[lines] for name in ("k", "dtheta", "count_theta")
+        }
         shuffled.append(replace(view, **fields))
     other = replace(readings, views=tuple(shuffled))
     one, other = calibrate(readings, BARE), calibrate(other, BARE)
@@ -153,7 +168,10 @@ def test_order_of_readings_changes_no_bit(seed):
     assert repr(one.views) == repr(other.views) == repr(again.views)
 
 
-@given(st.tuples(*[st.floats(-1e-4, 1e-4)] * 7), st.sampled_from(["0,90,tx", "0,90,180,ty"]))
+@given(
+    st.tuples(*[st.floats(-1e-4, 1e-4)] * 7),
+    st.sampled_from(["0,90,tx", "0,90,180,ty"]),
+)
 @settings(max_examples=12, deadline=None)
 def test_datum_shifts_change_nothing(shift, names):
     """A stage or a plate moved, turned or grown as a whole gives the same map.
@@ -171,7 +189,9 @@ def test_datum_shifts_change_nothing(shift, names):
         a=truth.a + np.stack([ax - plate * y, ay + plate * x]),
     )
     plan = plan_of(names, artifact)
-    largest = max(np.nanmax(abs(grid_deviation(truth, i, v))) for i, v in enumerate(plan.views))
+    largest = max(
+        np.nanmax(abs(grid_deviation(truth, i, v))) for i, v in enumerate(plan.views)
+    )
     for model, limit in (("linear", EXACT), ("rigid", EXACT + 4e-4 * largest)):
         one, two = (
             calibrate(
@@ -194,7 +214,10 @@ def test_a_plan_turned_as_a_whole_gives_the_map_turned(names):
     turned = replace(truth, g=np.stack([-truth.g[1][:, ::-1].T, truth.g[0][:, ::-1].T]))
     found = calibrate(readings, BARE).error_map
     other = calibrate(
-        simulate_measurements(turned, plan_of(names, artifact), np.random.default_rng(0)), BARE
+        simulate_measurements(
+            turned, plan_of(names, artifact), np.random.default_rng(0)
+        ),
+        BARE,
     ).error_map
     assert np.abs(other.gx + found.gy[:, ::-1].T).max() < EXACT
     assert np.abs(other.gy - found.gx[:, ::-1].T).max() < EXACT
@@ -205,7 +228,9 @@ def test_weights_of_repeats_are_those_of_repeated_readings():
     plan = plan_of("0,90,tx", Artifact(5, 0.01))
     _, readings = measured(plan, sigma_m=1e-7)
     heavy = replace(readings.views[0], count=readings.views[0].count * 2)
-    weighted = calibrate(replace(readings, views=(heavy, *readings.views[1:])), BARE).error_map
+    weighted = calibrate(
+        replace(readings, views=(heavy, *readings.views[1:])), BARE
+    ).error_map
     declared = [
         replace(view, u=np.full(len(view.m), 1e-7 / np.sqrt(2 if i == 0 else 1)))
         for i, view in enumerate(readings.views)
@@ -229,7 +254,9 @@ def test_a_view_broken_off_after_one_mark_harms_nothing():
     )
     found = calibrate(replace(readings, views=(*readings.views, broken)), BARE)
     assert np.abs(found.error_map.gx - truth.g[0]).max() < EXACT
-    assert [view.phi for view in found.views[:4]] == pytest.approx(list(truth.phi_rad), abs=EXACT)
+    assert [view.phi for view in found.views[:4]] == pytest.approx(
+        list(truth.phi_rad), abs=EXACT
+    )
     assert np.isnan(found.views[4].phi)
     assert found.observability.identifiable and found.observability.deficiency == 0
 
@@ -239,7 +266,12 @@ def test_angular_marks_planned_but_never_read_leave_the_xy_map():
     bare = replace(
         readings,
         views=tuple(
-            replace(view, k=view.k[:0], dtheta=view.dtheta[:0], count_theta=view.count_theta[:0])
+            replace(
+                view,
+                k=view.k[:0],
+                dtheta=view.dtheta[:0],
+                count_theta=view.count_theta[:0],
+            )
             for view in readings.views
         ),
     )
@@ -258,9 +290,13 @@ class TestHostile:
 
     def test_nothing_read(self):
         empty = Measurements(
-            "p", self.plan.artifact, tuple(ViewReadings(view) for view in self.plan.views)
+            "p",
+            self.plan.artifact,
+            tuple(ViewReadings(view) for view in self.plan.views),
         )
-        with pytest.raises(NoDataError, match="plan 'p': no grid mark was read; record"):
+        with pytest.raises(
+            NoDataError, match="plan 'p': no grid mark was read; record"
+        ):
             calibrate(empty, BARE)
 
     def test_mark_off_the_plate(self):

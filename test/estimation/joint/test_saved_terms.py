@@ -55,7 +55,9 @@ def test_factors_are_kept_up_to_31_by_31_sites(shape, is_kept):
     assert (found is not None) == is_kept
 
 
-@pytest.mark.parametrize(("size", "names"), [(float("inf"), [""]), (1e-6, ["plate_scale"])])
+@pytest.mark.parametrize(
+    ("size", "names"), [(float("inf"), [""]), (1e-6, ["plate_scale"])]
+)
 @pytest.mark.parametrize("sense", Sense)
 def test_a_factor_is_what_a_standard_deviation_of_the_coefficient_does_to_the_map(
     sense, size, names

@@ -48,12 +48,18 @@ def solution(measurements, ratio: float):
             row = np.zeros(n + 1 + 2 * lines)
             turn = round(view.view.rotation_rad * lines / (2 * np.pi))
             row[n + 1 + (k + turn) % lines] = row[n + 1 + lines + k] = 1
-            at = n - len(placed) + placed.index(view.view.plan_view) if view.view.grid else n
+            at = (
+                n - len(placed) + placed.index(view.view.plan_view)
+                if view.view.grid
+                else n
+            )
             row[at] = 1 / PITCH if view.view.grid else 1  # the others are per pitch
             rows.append(np.sqrt(ratio) * row)
             y.append(np.sqrt(ratio) * value)
     matrix = np.vstack([np.pad(marks, ((0, 0), (0, 1 + 2 * lines))), rows])
-    values = np.concatenate([*(np.stack([v.dx, v.dy], axis=1).ravel() for v in grid), y])
+    values = np.concatenate(
+        [*(np.stack([v.dx, v.dy], axis=1).ravel() for v in grid), y]
+    )
     return np.linalg.pinv(matrix, rcond=1e-10) @ values, slice(n - len(placed), n)
 
 
@@ -126,7 +132,9 @@ def test_a_cell_turned_by_itself_is_not_followed():
     _, measurements = measured(0.0, 2, size=5, phi_rad=1e-5, t_m=1e-6)
     at = [view.view.cell for view in measurements.views].index((1, 1))
     view = measurements.views[at]
-    turned = replace(view, dx=view.dx - 1e-3 * PITCH * view.n, dy=view.dy + 1e-3 * PITCH * view.m)
+    turned = replace(
+        view, dx=view.dx - 1e-3 * PITCH * view.n, dy=view.dy + 1e-3 * PITCH * view.m
+    )
     views = (*measurements.views[:at], turned, *measurements.views[at + 1 :])
     before, after = (
         solve_joint(one, LINEAR).xy.residuals
@@ -149,7 +157,9 @@ def test_a_saved_result_has_the_equations_of_its_readings():
     _, measurements = measured(MARK, 5, size=5)
     solved = solve_joint(measurements, LINEAR)
     kept = system_behind(solved.result)
-    np.testing.assert_array_equal(kept.grid_inverse, solved.model.problem.system.grid_inverse)
+    np.testing.assert_array_equal(
+        kept.grid_inverse, solved.model.problem.system.grid_inverse
+    )
     assert kept.grid.rotations == (0,) * 9 + (9,) * 9
 
 
@@ -157,7 +167,9 @@ def test_one_rotation_tells_a_linear_yaw_from_a_bent_plate():
     """A plate bent in its second view looks like a linear yaw only if its cells turn apart."""
     _, measurements = measured(0.0, 1, size=7)
     matrix, sites, views = dense(measurements)[0], 49, measurements.views
-    turn = np.repeat([(1, 1j)[v.view.plan_view == "90"] for v in views], [len(v.m) for v in views])
+    turn = np.repeat(
+        [(1, 1j)[v.view.plan_view == "90"] for v in views], [len(v.m) for v in views]
+    )
     z = np.concatenate([view.m + 1j * view.n for view in views]) / 3
     forms = [
         turn * (turn == 1j) * unit * form

@@ -58,7 +58,9 @@ def test_rms_uncertainty_is_the_published_bound(names, size):
 )
 def test_angular_bounds(lines, datum, bound):
     """With XY readings so good that the rotations are known (method, section 11)."""
-    _, readings = measured(hu_plan(Artifact(11, 0.01, lines)), sigma_m=1e-12, sigma_theta_rad=1e-5)
+    _, readings = measured(
+        hu_plan(Artifact(11, 0.01, lines)), sigma_m=1e-12, sigma_theta_rad=1e-5
+    )
     found = calibrate(readings, bare(datum_theta=ThetaDatum(datum), causes=False))
     rms = np.sqrt(np.mean(found.error_map.u_g_theta**2)) / found.noise.sigma_theta
     assert round(rms, 3) == bound
@@ -69,7 +71,13 @@ def stated(readings, sigma, sigma_theta):
     return replace(
         readings,
         views=tuple(
-            replace(view, sigma_xy=sigma, dof_xy=1000, sigma_theta=sigma_theta, dof_theta=1000)
+            replace(
+                view,
+                sigma_xy=sigma,
+                dof_xy=1000,
+                sigma_theta=sigma_theta,
+                dof_theta=1000,
+            )
             for view in readings.views
         ),
     )
@@ -107,7 +115,8 @@ def test_uncertainty_is_that_of_every_reading_moved_in_turn(missing, sigma_theta
             replace(
                 readings,
                 views=tuple(
-                    replace(view, count=1 + (view.m + 2 * view.n) % 3) for view in readings.views
+                    replace(view, count=1 + (view.m + 2 * view.n) % 3)
+                    for view in readings.views
                 ),
             ),
             sigma,
@@ -196,15 +205,20 @@ def test_a_reference_length_sets_the_scale_and_its_uncertainty(kind, sense):
         (free.error_map.gy + scale * artifact.y_m)[known], abs=1e-14
     )
     assert (
-        np.nanmax(abs(found.artifact_map.ax - free.artifact_map.ax + scale * artifact.x_m)) < 1e-14
+        np.nanmax(
+            abs(found.artifact_map.ax - free.artifact_map.ax + scale * artifact.x_m)
+        )
+        < 1e-14
     )
     readings, options = stated(clean, sigma, 1.0), replace(linear, reference=reference)
     emap = calibrate(readings, options).error_map
     answers = responses(map_numbers(options), readings, sizes_of(readings, sigma, 1.0))
-    longer = replace(reference, relative_error=reference.relative_error + reference.u_relative)
-    of_length = map_numbers(replace(linear, reference=longer))(readings) - map_numbers(options)(
-        readings
+    longer = replace(
+        reference, relative_error=reference.relative_error + reference.u_relative
     )
+    of_length = map_numbers(replace(linear, reference=longer))(readings) - map_numbers(
+        options
+    )(readings)
     spread = np.sqrt((answers**2).sum(axis=0) + of_length**2)
     predicted = np.concatenate([emap.u_gx.ravel(), emap.u_gy.ravel()])
     known = np.isfinite(predicted)
@@ -220,7 +234,9 @@ def test_a_reference_length_of_a_plate_that_turns_is_met_exactly(sense):
     plate_scale = (truth.a * grown).sum() / (grown**2).sum()
     long = replace(truth, g=truth.g + 3e-6 * grown)
     readings = simulate_measurements(long, plan, np.random.default_rng(1), sense=sense)
-    found = calibrate(readings, bare(reference=ReferenceLength("artifact", plate_scale)))
+    found = calibrate(
+        readings, bare(reference=ReferenceLength("artifact", plate_scale))
+    )
     assert np.abs(found.error_map.gx - long.g[0]).max() < 1e-12
     assert np.abs(found.error_map.gy - long.g[1]).max() < 1e-12
 
@@ -240,10 +256,13 @@ class TestNoise:
         noise = calibrate(readings, BARE).noise
         assert noise.sigma_xy == noise.sigma_xy_repeats == pytest.approx(1e-8)
         assert noise.dof_xy_residuals == 2 * (121 + 121 + 110) - (493 - 7)
-        low, high = chi2.ppf([1e-4, 1 - 1e-4], noise.dof_xy_residuals) / noise.dof_xy_residuals
+        low, high = (
+            chi2.ppf([1e-4, 1 - 1e-4], noise.dof_xy_residuals) / noise.dof_xy_residuals
+        )
         assert low < (noise.sigma_xy_residuals / 1e-8) ** 2 < high
         low, high = (
-            chi2.ppf([1e-4, 1 - 1e-4], noise.dof_theta_residuals) / noise.dof_theta_residuals
+            chi2.ppf([1e-4, 1 - 1e-4], noise.dof_theta_residuals)
+            / noise.dof_theta_residuals
         )
         assert low < (noise.sigma_theta_residuals / 1e-6) ** 2 < high
         assert calibrate(readings, BARE).findings == ()
@@ -252,7 +271,9 @@ class TestNoise:
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
         calm = replace(
             readings,
-            views=tuple(replace(view, sigma_xy=view.sigma_xy / 3) for view in readings.views),
+            views=tuple(
+                replace(view, sigma_xy=view.sigma_xy / 3) for view in readings.views
+            ),
         )
         found = worded(calibrate(calm, BARE))
         text = " ".join(found.verdict.reasons)
@@ -267,7 +288,9 @@ class TestNoise:
         _, readings = measured(self.plan, sigma_m=1e-8, sigma_theta_rad=1e-6)
         wild = replace(
             readings,
-            views=tuple(replace(view, sigma_xy=view.sigma_xy * 2) for view in readings.views),
+            views=tuple(
+                replace(view, sigma_xy=view.sigma_xy * 2) for view in readings.views
+            ),
         )
         found = worded(calibrate(wild, BARE))
         assert "the stated noise is too large" in found.verdict.reasons[0]
@@ -277,7 +300,8 @@ class TestNoise:
     def test_repeats_identical_to_the_last_bit_tell_no_noise(self, sigma_m):
         _, readings = measured(self.plan, sigma_m=sigma_m, sigma_theta_rad=1e-6)
         stuck = replace(
-            readings, views=tuple(replace(view, sigma_xy=0.0) for view in readings.views)
+            readings,
+            views=tuple(replace(view, sigma_xy=0.0) for view in readings.views),
         )
         found = calibrate(stuck, BARE)
         assert found.verdict.qualified
@@ -295,12 +319,16 @@ class TestNoise:
         _, readings = measured(hu_plan(Artifact(11, 0.01)), sigma_m=1e-8)
         declared = replace(
             readings,
-            views=tuple(replace(view, u=np.full(len(view.m), 1e-8)) for view in readings.views),
+            views=tuple(
+                replace(view, u=np.full(len(view.m), 1e-8)) for view in readings.views
+            ),
         )
         found = calibrate(declared, BARE)
         of = found.noise  # eight degrees of freedom, with those of the residuals
         squares = 8 * 1e-8**2 + of.dof_xy_residuals * of.sigma_xy_residuals**2
-        assert of.sigma_xy == pytest.approx(np.sqrt(squares / (8 + of.dof_xy_residuals)))
+        assert of.sigma_xy == pytest.approx(
+            np.sqrt(squares / (8 + of.dof_xy_residuals))
+        )
         assert np.sqrt(np.mean(found.error_map.u_gx**2)) == pytest.approx(
             0.89 * found.noise.sigma_xy, rel=0.02
         )
@@ -327,7 +355,10 @@ def test_an_encoder_that_does_not_follow_the_axes_is_told_and_bends_nothing():
 
 
 def test_half_axes_that_are_not_known_as_a_whole_are_refused():
-    plan, rng = plan_of("0,90,tx", Artifact(3, 0.01, 8), lines=1), np.random.default_rng(1)
+    plan, rng = (
+        plan_of("0,90,tx", Artifact(3, 0.01, 8), lines=1),
+        np.random.default_rng(1),
+    )
     readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng)
     axes = bare(datum_theta="xy_axes")
     with pytest.raises(InputError) as caught:
@@ -414,7 +445,9 @@ def test_a_length_of_the_stage_is_the_slope_of_the_known_sites(kind):
     ).error_map
     assert not emap.valid.all() and emap.valid.sum() > 20
     along, error = (
-        (artifact.x_m, emap.gx) if kind is ReferenceKind.STAGE_X else (artifact.y_m, emap.gy)
+        (artifact.x_m, emap.gx)
+        if kind is ReferenceKind.STAGE_X
+        else (artifact.y_m, emap.gy)
     )
     assert abs(along[emap.valid].mean()) > 1e-3
     slope = np.polyfit(along[emap.valid], error[emap.valid], 1)[0]

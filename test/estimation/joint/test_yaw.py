@@ -15,7 +15,14 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.physics import between_sites
-from test.estimation.joint.test_images import MARK, datum, dense, measured, population, within
+from test.estimation.joint.test_images import (
+    MARK,
+    datum,
+    dense,
+    measured,
+    population,
+    within,
+)
 from test.support.options import STILL
 from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
@@ -34,7 +41,9 @@ def of_yaw(measurements):
     """
     (nx, ny), (hx, hy) = measurements.artifact.shape, measurements.artifact.half
     rows, place = np.zeros((2 * sum(len(v.m) for v in measurements.views), nx * ny)), 0
-    axis = {v.view.plan_view: v.visits for v in measurements.views if v.view.cell == (0, 0)}
+    axis = {
+        v.view.plan_view: v.visits for v in measurements.views if v.view.cell == (0, 0)
+    }
     for view in measurements.views:
         seen, on_axis = view.visits, axis[view.view.plan_view]
         ox, oy = (
@@ -75,13 +84,18 @@ def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
     solved = solve_joint(
         measurements,
         Options(
-            assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear", at_places=False
+            assumed=(),
+            terms=(ModelTerm("yaw"),),
+            misalignment_model="linear",
+            at_places=False,
         ),
     )
     matrix, stops = dense(measurements)
     matrix = np.hstack([matrix, of_yaw(measurements) / PITCH])
     inverse = np.linalg.pinv(matrix, rcond=1e-10)
-    y = np.concatenate([np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views])
+    y = np.concatenate(
+        [np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views]
+    )
     noises = solved.model.problem.images.noises(solved.model.fitted.residuals)
     assert noises.image > 2 * noises.mark > 0
     covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
@@ -99,7 +113,9 @@ def test_yaw_and_map_are_those_of_one_dense_least_squares(missing):
     g = np.stack([emap.gx, emap.gy], axis=-1).ravel()
     np.testing.assert_allclose(g, to_map @ y, atol=TURNED * g.std())
     u = np.stack([emap.u_gx, emap.u_gy], axis=-1).ravel()
-    np.testing.assert_allclose(u, np.sqrt(np.diag(to_map @ covariance @ to_map.T)), rtol=TURNED)
+    np.testing.assert_allclose(
+        u, np.sqrt(np.diag(to_map @ covariance @ to_map.T)), rtol=TURNED
+    )
 
 
 def at_places(matrix, measurements, field):
@@ -123,7 +139,9 @@ def at_places(matrix, measurements, field):
             error = complex(*field[2 * site : 2 * site + 2])
             for _ in range(6):
                 away = (stood[reading] - error) / PITCH
-                weight = np.outer(along(site // ny + away.real), across(site % ny + away.imag))
+                weight = np.outer(
+                    along(site // ny + away.real), across(site % ny + away.imag)
+                )
                 error = complex(*(weight.ravel() @ field.reshape(-1, 2)))
             for axis in range(2):
                 out[place + axis, axis : 2 * nx * ny : 2] = weight.ravel()
@@ -135,7 +153,9 @@ def at_places(matrix, measurements, field):
     ("stop_m", "image_m", "near"),
     [(0.0, 3 * MARK, 1e-3), (3e-5, 3 * MARK, 0.015), (3e-5, 0.3 * MARK, 0.015)],
 )
-def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image_m, near):
+def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(
+    stop_m, image_m, near
+):
     """Plates 30 um beside, stops off the sites; the equations are those of the sites.
 
     So the estimate is the place at which what the stage's error differs there, taken off, stands
@@ -147,23 +167,32 @@ def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image
         2,
         rng,
         Spread(
-            phi_rad=1e-5, t_m=3e-5, stage_yaw_rad=2e-5, rotation="linear", correlation_pitches=4.0
+            phi_rad=1e-5,
+            t_m=3e-5,
+            stage_yaw_rad=2e-5,
+            rotation="linear",
+            correlation_pitches=4.0,
         ),
     )
     measurements = simulate_measurements(
         truth,
         plan,
         rng,
-        settings=CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=stop_m),
+        settings=CellSettings(
+            sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=stop_m
+        ),
     )
     solved = solve_joint(
-        measurements, Options(assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear")
+        measurements,
+        Options(assumed=(), terms=(ModelTerm("yaw"),), misalignment_model="linear"),
     )
     matrix, stops = dense(measurements)
     whole = np.hstack([matrix, of_yaw(measurements) / PITCH])
     inverse, sites = np.linalg.pinv(whole, rcond=1e-10), np.prod(plan.artifact.shape)
     project = datum(plan.artifact)
-    y = np.concatenate([np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views])
+    y = np.concatenate(
+        [np.stack([v.dx, v.dy], axis=1).ravel() for v in measurements.views]
+    )
     field = project @ inverse[: 2 * sites] @ y
     for _ in range(4):
         moved = np.zeros_like(whole)
@@ -174,7 +203,9 @@ def test_yaw_where_the_stage_stood_is_that_of_dense_linear_algebra(stop_m, image
         field = project @ estimate[: 2 * sites] @ y
     emap, yaw = solved.result.error_map, yaw_of(solved.model, measurements.sense)
     np.testing.assert_allclose(
-        np.stack([emap.gx, emap.gy], axis=-1).ravel(), field, atol=1e-3 * emap.u_gx.mean()
+        np.stack([emap.gx, emap.gy], axis=-1).ravel(),
+        field,
+        atol=1e-3 * emap.u_gx.mean(),
     )
     noises = solved.model.problem.images.noises(solved.model.fitted.residuals)
     covariance = noises.mark**2 * np.eye(len(y)) + noises.image**2 * np.kron(
@@ -209,9 +240,13 @@ def turns(truth, found) -> np.ndarray:
     ("size", "sense", "rad", "runs"),
     [(7, Sense.MICROSCOPE_MOVES, 1e-5, 3), (7, Sense.PLATE_MOVES, 3e-5, 3)],
 )
-def test_yaw_and_map_of_a_stage_that_turns_are_within_their_uncertainties(size, sense, rad, runs):
+def test_yaw_and_map_of_a_stage_that_turns_are_within_their_uncertainties(
+    size, sense, rad, runs
+):
     away, results = population(MARK, size, runs, sense=sense, stage_yaw_rad=rad)
-    assert all(found.verdict.qualified and not found.verdict.causes for _, found in results)
+    assert all(
+        found.verdict.qualified and not found.verdict.causes for _, found in results
+    )
     within(away, 20)
     within(np.array([turns(truth, found.stage_yaw) for truth, found in results]), 20)
 
@@ -223,7 +258,9 @@ def test_a_stage_that_does_not_turn_shows_none():
     assert min(p) > 1e-3
 
 
-@pytest.mark.parametrize(("size", "more"), [(2e-4, ()), (1e-3, ()), (1e-3, ("yaw:1e-3",))])
+@pytest.mark.parametrize(
+    ("size", "more"), [(2e-4, ()), (1e-3, ()), (1e-3, ("yaw:1e-3",))]
+)
 def test_a_stage_that_yaws_smoothly_by_more_than_assumed_bends_no_plate(size, more):
     """The yaw that is linear looks like a plate bent in the second view."""
     truth, _ = measured(0.0, 3, phi_rad=1e-3, t_m=1e-5)
@@ -239,7 +276,12 @@ def test_a_stage_that_yaws_smoothly_by_more_than_assumed_bends_no_plate(size, mo
     causes = {cause.name: cause for cause in found.verdict.causes}
     assert list(causes) == ["yaw"] * (size == 1e-3 and not more)
     emap = found.error_map
-    within(((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))[None], 20)
+    within(
+        ((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))[
+            None
+        ],
+        20,
+    )
     if causes:
         (tried, *_) = causes["yaw"].remedies
         assert tried.kind == "model"
@@ -274,11 +316,16 @@ def test_a_plate_bent_in_one_view_is_told_from_a_stage_that_yaws_linearly():
             for one in term.estimates
         }
         for name in ("z^2 y", "|z|^2 y"):  # (xy, -x^2) = -i/2 (z^2 + |z|^2)
-            assert of[name, "90"] - of[name, "0"] == pytest.approx(-bend_m / 2, abs=MARK)
+            assert of[name, "90"] - of[name, "0"] == pytest.approx(
+                -bend_m / 2, abs=MARK
+            )
         emap = found.error_map
-        away.append((np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy]))
+        away.append(
+            (np.stack([emap.gx, emap.gy]) - truth.g) / np.stack([emap.u_gx, emap.u_gy])
+        )
         turned.append(turns(truth, found.stage_yaw))
-    within(np.array(away), 20, least=0.85)  # u has the largest size that the readings allow
+    # u has the largest size that the readings allow
+    within(np.array(away), 20, least=0.85)
     within(np.array(turned), 20)
 
 
@@ -301,9 +348,14 @@ def test_one_line_of_marks_shows_it_too():
     plan, rng = image_plan(7), np.random.default_rng(2)
     image = replace(plan.views[0].image, ny=1)
     more = replace(plan.views[0], name="shifted", translation_m=(PITCH, 0.0))
-    plan = replace(plan, views=tuple(replace(v, image=image) for v in (*plan.views, more)))
+    plan = replace(
+        plan, views=tuple(replace(v, image=image) for v in (*plan.views, more))
+    )
     truth = random_truth(
-        plan.artifact, 3, rng, Spread(phi_rad=1e-4, stage_yaw_rad=5e-5, correlation_pitches=4.0)
+        plan.artifact,
+        3,
+        rng,
+        Spread(phi_rad=1e-4, stage_yaw_rad=5e-5, correlation_pitches=4.0),
     )
     found = calibrate(
         simulate_measurements(

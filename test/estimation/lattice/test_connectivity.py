@@ -38,7 +38,10 @@ def test_components_are_those_that_a_walk_finds(readings, seed):
     rng = np.random.default_rng(seed)
     site, mark = rng.integers(0, 14, readings), rng.integers(0, 11, readings)
     q = rng.integers(0, 4, readings) * (rng.random(readings) < 0.3)
-    found, expected = components(site, mark, q, n_sites=14, n_marks=11), walked(site, mark, q)
+    found, expected = (
+        components(site, mark, q, n_sites=14, n_marks=11),
+        walked(site, mark, q),
+    )
     assert len(found.balanced) == len(expected)
     for sites, agree in expected:
         number = found.of_site[min(sites)]
@@ -64,9 +67,14 @@ def test_free_vectors_change_no_reading(seed):
     q = rng.integers(0, 4, 24)
     parts = components(site, mark, q, n_sites=31, n_marks=31)
     at_site, at_mark = free_turns(site, mark, q, parts)
-    vector = np.append(parts.balanced * (rng.normal(size=(2, len(parts.balanced))).T @ [1, 1j]), 0)
+    vector = np.append(
+        parts.balanced * (rng.normal(size=(2, len(parts.balanced))).T @ [1, 1j]), 0
+    )
     g, a = 1j**at_site * vector[parts.of_site], -(1j**at_mark) * vector[parts.of_mark]
     assert abs(g).any() and abs(1j**-q * g[site] + a[mark]).max() < 1e-12
     held = np.append(parts.balanced, False)
-    assert not at_site[~held[parts.of_site]].any() and not at_mark[~held[parts.of_mark]].any()
+    assert (
+        not at_site[~held[parts.of_site]].any()
+        and not at_mark[~held[parts.of_mark]].any()
+    )
     assert not at_site[parts.first_sites].any()

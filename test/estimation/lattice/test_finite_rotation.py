@@ -19,7 +19,12 @@ def test_a_mark_lies_where_a_turned_rectangular_plate_has_it(q, phi):
     m, n = np.array([-2, 0, 1, 2, 2]), np.array([4, -3, 0, -4, 2])
     nominal = np.stack([m, n]) * 0.01
     own = np.stack([ax[m + 2, n + 4], ay[m + 2, n + 4]])
-    x, y = turn(phi) @ turn(q * np.pi / 2) @ (nominal + own) - turn(q * np.pi / 2) @ nominal
+    x, y = (
+        turn(phi) @ turn(q * np.pi / 2) @ (nominal + own)
+        - turn(q * np.pi / 2) @ nominal
+    )
     marks, plate = ((part[0] + 1j * part[1]) * 1j**q for part in (nominal, own))
     linear = plate + 1j * phi * marks
-    assert rotation_excess(phi, marks, plate) == pytest.approx(x + 1j * y - linear, abs=1e-16)
+    assert rotation_excess(phi, marks, plate) == pytest.approx(
+        x + 1j * y - linear, abs=1e-16
+    )

@@ -32,6 +32,8 @@ def test_first_order_parts_of_any_field_are_those_of_a_dense_least_squares():
     one, none = np.ones(SHAPE), np.zeros(SHAPE)
     columns = [(one, none), (none, one), (-y, x), (x, y), (y, x), (x, -y)]
     design = np.array([np.concatenate([a[known], b[known]]) for a, b in columns]).T
-    want = np.linalg.lstsq(design, np.concatenate([gx[known], gy[known]]), rcond=None)[0]
+    want = np.linalg.lstsq(design, np.concatenate([gx[known], gy[known]]), rcond=None)[
+        0
+    ]
     gauge = Gauge(x + 1j * y, known, scale=True)
     assert gauge.first_order(gx + 1j * gy) == pytest.approx(tuple(want[4:]), abs=1e-20)

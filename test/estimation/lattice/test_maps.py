@@ -9,17 +9,42 @@ from selfcal_ros.model.pose import LatticePose
 
 TURNS = [
     np.array(rows)
-    for rows in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]])
+    for rows in (
+        [[1, 0], [0, 1]],
+        [[0, -1], [1, 0]],
+        [[-1, 0], [0, -1]],
+        [[0, 1], [-1, 0]],
+    )
 ]
 
 
 @pytest.mark.parametrize(
     "shift",
-    [(0, 0), (1, 0), (0, -2), (-2, 1), (4, 0), (5, 0), (0, 3), (0, -3), (-7, 1), (9, 9), (-9, -9)],
+    [
+        (0, 0),
+        (1, 0),
+        (0, -2),
+        (-2, 1),
+        (4, 0),
+        (5, 0),
+        (0, 3),
+        (0, -3),
+        (-7, 1),
+        (9, 9),
+        (-9, -9),
+    ],
 )
 @pytest.mark.parametrize(
     ("shape", "q"),
-    [((5, 5), 0), ((5, 5), 1), ((5, 5), 2), ((5, 5), 3), ((5, 3), 0), ((5, 3), 2), ((1, 7), 0)],
+    [
+        ((5, 5), 0),
+        ((5, 5), 1),
+        ((5, 5), 2),
+        ((5, 5), 3),
+        ((5, 3), 0),
+        ((5, 3), 2),
+        ((1, 7), 0),
+    ],
 )
 def test_sites_of_marks(shape, q, shift):
     hx, hy = (shape[0] - 1) // 2, (shape[1] - 1) // 2
@@ -50,7 +75,9 @@ def dense(pose):
         for n in range(-HALF, HALF + 1):
             i, j = TURNS[pose.q] @ [m, n] + pose.shift
             if max(abs(i), abs(j)) <= HALF:
-                out[(m + HALF) * SIDE + n + HALF, (i + HALF) * SIDE + j + HALF] = (-1j) ** pose.q
+                out[(m + HALF) * SIDE + n + HALF, (i + HALF) * SIDE + j + HALF] = (
+                    -1j
+                ) ** pose.q
     return out
 
 

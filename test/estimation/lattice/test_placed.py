@@ -19,7 +19,11 @@ def views_of(artifact: Artifact, poses) -> PlacedViews:
         artifact,
         tuple(
             pose_of(
-                View("", np.radians(turn), tuple(step * artifact.grid_pitch_m for step in shift)),
+                View(
+                    "",
+                    np.radians(turn),
+                    tuple(step * artifact.grid_pitch_m for step in shift),
+                ),
                 artifact,
             )
             for turn, shift in poses
@@ -62,7 +66,9 @@ def test_on_the_lattice_the_maps_are_those_of_the_lattice():
     lattice = LatticeViews(
         (7, 7),
         tuple(
-            View("", np.radians(turn), tuple(10e-3 * step for step in shift)).lattice_pose(bare)
+            View(
+                "", np.radians(turn), tuple(10e-3 * step for step in shift)
+            ).lattice_pose(bare)
             for turn, shift in poses
         ),
     )

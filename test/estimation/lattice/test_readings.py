@@ -32,7 +32,9 @@ def test_a_declared_uncertainty_is_that_of_the_mean_not_of_one_reading():
     variance = (9 * 1 + 1 * 4 + 4 * 9) / 3 * 1e-16
     assert data.sigma_declared == pytest.approx(np.sqrt(variance), rel=1e-12)
     marks = data.weight[0][[1, 2, 0], [4, 2, 0]]
-    assert marks == pytest.approx([variance / 9e-16, variance / 1e-16, variance / 4e-16])
+    assert marks == pytest.approx(
+        [variance / 9e-16, variance / 1e-16, variance / 4e-16]
+    )
     assert np.count_nonzero(data.weight) == 3
 
 
@@ -105,7 +107,8 @@ def test_a_line_on_a_plate_without_lines_is_refused():
         count_theta=np.ones(1, dtype=int),
     )
     with pytest.raises(
-        InputError, match="view 'a' angular readings: a line that the plate does not have"
+        InputError,
+        match="view 'a' angular readings: a line that the plate does not have",
     ):
         angular_data(Measurements("p", Artifact(5, 0.01), (view,)))
 
@@ -139,6 +142,10 @@ def test_the_first_and_the_last_line_of_the_plate_are_read():
 @pytest.mark.parametrize("lengths", [(2, 3, 3), (3, 2, 3), (3, 3, 2), (2, 2, 2)])
 def test_marks_and_deviations_of_different_number_are_refused(lengths):
     dx, dy, count = (np.ones(length) for length in lengths)
-    view = ViewReadings(View("a"), np.array([0, 1, -1]), np.array([2, 0, -2]), dx, dy, count)
-    with pytest.raises(InputError, match=r"view 'a' grid readings: marks.* differ in length"):
+    view = ViewReadings(
+        View("a"), np.array([0, 1, -1]), np.array([2, 0, -2]), dx, dy, count
+    )
+    with pytest.raises(
+        InputError, match=r"view 'a' grid readings: marks.* differ in length"
+    ):
         grid_data(measurements(view))

@@ -30,7 +30,8 @@ def one_by_one(site, mark):
             (
                 r
                 for r in left
-                if [s for s, _ in left].count(r[0]) == 1 or [m for _, m in left].count(r[1]) == 1
+                if [s for s, _ in left].count(r[0]) == 1
+                or [m for _, m in left].count(r[1]) == 1
             ),
             None,
         )
@@ -49,7 +50,9 @@ def test_sites_are_those_that_are_left_without_readings(readings, seed):
 
 
 def test_a_mark_read_twice_at_a_site_is_checked():
-    assert not rest_on_one(np.array([0, 0]), np.array([0, 0]), n_sites=1, n_marks=1).any()
+    assert not rest_on_one(
+        np.array([0, 0]), np.array([0, 0]), n_sites=1, n_marks=1
+    ).any()
 
 
 def measured(names, gone, *, sense=Sense.MICROSCOPE_MOVES, lines=(), size=5, size_y=0):
@@ -74,7 +77,8 @@ def measured(names, gone, *, sense=Sense.MICROSCOPE_MOVES, lines=(), size=5, siz
             bool,
         )
         rows = np.array(
-            [k not in dict(lines).get(view.view.name, ()) for k in view.k.tolist()], bool
+            [k not in dict(lines).get(view.view.name, ()) for k in view.k.tolist()],
+            bool,
         )
         views.append(
             replace(
@@ -99,7 +103,9 @@ def off(readings, name, mark, by_m):
         views=tuple(
             view
             if view.view.name != name
-            else replace(view, dx=view.dx + by_m * ((view.m == mark[0]) & (view.n == mark[1])))
+            else replace(
+                view, dx=view.dx + by_m * ((view.m == mark[0]) & (view.n == mark[1]))
+            )
             for view in readings.views
         ),
     )
@@ -116,12 +122,18 @@ def test_an_error_of_a_reading_that_no_other_checks_is_in_the_map_and_said(sense
     good, bad = calibrate(readings), calibrate(off(readings, "0", (2, 1), 1e-6))
     at = (2 + 2 * sign, 2 + sign)
     moved = bad.error_map.gx - good.error_map.gx
-    assert moved[at] == pytest.approx(sign * 1e-6, rel=0.15)  # the datum takes part of it
+    # the datum takes part of it
+    assert moved[at] == pytest.approx(sign * 1e-6, rel=0.15)
     assert np.sort(abs(moved).ravel())[-2] < 0.15e-6
-    assert bad.noise.sigma_xy_residuals == pytest.approx(good.noise.sigma_xy_residuals, rel=0.01)
+    assert bad.noise.sigma_xy_residuals == pytest.approx(
+        good.noise.sigma_xy_residuals, rel=0.01
+    )
     assert bad.verdict.qualified
     assert bad.findings == good.findings == (unchecked([[2 * sign, sign]], []),)
-    assert good.observability.unchecked_sites == 1 and good.observability.unchecked_lines == 0
+    assert (
+        good.observability.unchecked_sites == 1
+        and good.observability.unchecked_lines == 0
+    )
 
 
 @pytest.mark.parametrize("sense", list(Sense))
@@ -131,7 +143,10 @@ def test_an_error_of_a_line_that_no_other_checks_is_in_the_map_and_said(sense):
     )
     first = readings.views[0]
     bad = replace(first, dtheta=first.dtheta + 1e-3 * (first.k == 3))
-    good, bad = calibrate(readings), calibrate(replace(readings, views=(bad, *readings.views[1:])))
+    good, bad = (
+        calibrate(readings),
+        calibrate(replace(readings, views=(bad, *readings.views[1:]))),
+    )
     moved = np.argmax(abs(bad.error_map.g_theta - good.error_map.g_theta))
     assert moved == (3 if sense is Sense.MICROSCOPE_MOVES else 5)
     assert bad.findings == good.findings == (unchecked([], [moved]),)
@@ -142,11 +157,21 @@ def test_an_error_of_a_line_that_no_other_checks_is_in_the_map_and_said(sense):
     [
         ("0, 90, tx", {}, (), ()),
         # two readings are left of site (2, 1), but one of them is all that tells of mark (1, -2)
-        ("0, 90, tx", {"tx": {(1, 1), (1, -2)}, "0": {(1, -2)}}, (), (unchecked([[2, 1]], []),)),
+        (
+            "0, 90, tx",
+            {"tx": {(1, 1), (1, -2)}, "0": {(1, -2)}},
+            (),
+            (unchecked([[2, 1]], []),),
+        ),
         # a mark that is read once tells nothing of its site, which others reach
         ("0, 90, tx, ty", {"tx": {(1, 1)}, "90": {(1, 1)}, "ty": {(1, 1)}}, (), ()),
         ("0, 90, tx, ty", ONE_LEFT, (), ()),
-        ("0, 90, tx", {}, {"90": {1}, "tx": {3}, "line": {2}}.items(), (unchecked([], [3]),)),
+        (
+            "0, 90, tx",
+            {},
+            {"90": {1}, "tx": {3}, "line": {2}}.items(),
+            (unchecked([], [3]),),
+        ),
     ],
 )
 def test_what_is_counted(names, gone, lines, expected):
@@ -163,11 +188,15 @@ def test_a_site_that_is_not_known_is_not_counted():
     assert np.isnan(result.error_map.gx[4, 3]) and result.findings == ()
 
 
-@pytest.mark.parametrize(("names", "expected"), [("0, 90, tx", 12), ("0, 90, tx, -tx", 0)])
+@pytest.mark.parametrize(
+    ("names", "expected"), [("0, 90, tx", 12), ("0, 90, tx, -tx", 0)]
+)
 def test_a_plan_tells_where_it_leaves_sites_unchecked(names, expected):
     """Where no quarter turn reaches, one shift joins the sites of a row in a chain."""
     plan = plan_of(names, 7, size_y=3)
     assert check_plan(plan).observability.unchecked_sites == expected
     result = calibrate(measured(names, {}, size=7, size_y=3))
     assert result.observability.unchecked_sites == expected
-    assert all(abs(m) > 1 for found in result.findings for m, _ in found.details["sites"])
+    assert all(
+        abs(m) > 1 for found in result.findings for m, _ in found.details["sites"]
+    )

@@ -20,7 +20,9 @@ def grid_of(poses, shape, seed):
     """Return readings of uneven weights, a fifth of them missing, as far as sites are there."""
     rng = np.random.default_rng(seed)
     views = tuple(LatticePose(q, shift, None) for q, *shift in poses)
-    weight = rng.integers(1, 6, (len(poses), *shape)) * (rng.random((len(poses), *shape)) > 0.2)
+    weight = rng.integers(1, 6, (len(poses), *shape)) * (
+        rng.random((len(poses), *shape)) > 0.2
+    )
     field = GridSystem(views, np.zeros((len(poses), *shape))).views.in_field
     return GridSystem(views, weight * field * 1.0)
 
@@ -59,7 +61,9 @@ def mean_at_sites(grid):
         strict=True,
     ):
         read = np.flatnonzero(part)
-        np.add.at(out, (read, index.ravel()[read]), (-1j) ** pose.q * part.ravel()[read])
+        np.add.at(
+            out, (read, index.ravel()[read]), (-1j) ** pose.q * part.ravel()[read]
+        )
     return out
 
 
@@ -84,7 +88,9 @@ def test_solution_and_diagonal_of_the_inverse_are_those_of_the_dense_matrix(
     )
     rng = np.random.default_rng(1)
     right = rng.normal(size=(grid.n_sites, 3)) + 1j * rng.normal(size=(grid.n_sites, 3))
-    np.testing.assert_allclose(grid.factor.solve(right), inverse @ right, atol=1e-9 * size)
+    np.testing.assert_allclose(
+        grid.factor.solve(right), inverse @ right, atol=1e-9 * size
+    )
     np.testing.assert_allclose(
         grid.factor.solve(right[:, 0]), (inverse @ right)[:, 0], atol=1e-9 * size
     )

@@ -46,7 +46,11 @@ def test_the_search_finds_the_minimum_to_a_degree_and_a_tenth(target):
 
 
 def test_the_search_keeps_within_its_reach():
-    assert best_pose([(0, 0.0, 0.0)], 1.6, lambda pose: (-pose[1] - 2 * pose[2],)) == (0, 1.6, 1.6)
+    assert best_pose([(0, 0.0, 0.0)], 1.6, lambda pose: (-pose[1] - 2 * pose[2],)) == (
+        0,
+        1.6,
+        1.6,
+    )
 
 
 @pytest.mark.parametrize(("size", "reach"), [(5, 1.0), (9, 1.6), (11, 2.0), (41, 8.0)])
@@ -73,10 +77,15 @@ def test_a_plan_of_any_pose_gets_a_view_of_any_pose():
         near = tuple(a + b for a, b in zip(found, change, strict=True))
         if max(map(abs, near[1:])) <= reach_of(PLATE):
             views = (*PLAN.views, view_at(best.view, near, 0.01))
-            assert score_plan(replace(PLAN, views=views), repeats=2).rms_xy >= best.score.rms_xy
+            assert (
+                score_plan(replace(PLAN, views=views), repeats=2).rms_xy
+                >= best.score.rms_xy
+            )
     plan = replace(PLAN, views=best.views)
     again = plan_from_dict(plan_to_dict(plan), "plan")
-    assert score_plan(again, repeats=2).rms_xy == pytest.approx(best.score.rms_xy, rel=1e-9)
+    assert score_plan(again, repeats=2).rms_xy == pytest.approx(
+        best.score.rms_xy, rel=1e-9
+    )
 
 
 def test_the_best_plan_of_any_pose_is_no_worse_than_that_on_the_lattice():

@@ -42,7 +42,9 @@ def test_what_only_renames_marks_and_sites_has_one_key_and_one_score(name):
     views = views_of(SAME[name])
     assert equivalent_key(SQUARE, views) == equivalent_key(SQUARE, views_of(BASE))
     found, base = (score_plan(Plan("p", SQUARE, v)) for v in (views, views_of(BASE)))
-    assert (found.rms_xy, found.max_xy) == pytest.approx((base.rms_xy, base.max_xy), rel=1e-9)
+    assert (found.rms_xy, found.max_xy) == pytest.approx(
+        (base.rms_xy, base.max_xy), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", OTHER)
@@ -58,7 +60,9 @@ def test_shifts_are_compared_in_pitches_whatever_the_pitch():
     small = Artifact(5, 1e-5)
     plans = [
         [
-            replace(view, translation_m=tuple(1e-3 * part for part in view.translation_m))
+            replace(
+                view, translation_m=tuple(1e-3 * part for part in view.translation_m)
+            )
             for view in views_of(poses)
         ]
         for poses in (BASE, OTHER["one shift back"])
@@ -72,10 +76,14 @@ def test_a_long_field_only_turns_by_a_half():
     along_y = [(-q, b, a) for q, a, b in poses]
     key = equivalent_key(LONG, views_of(poses))
     assert key != equivalent_key(LONG, views_of(along_y))
-    assert equivalent_key(SQUARE, views_of(poses)) == equivalent_key(SQUARE, views_of(along_y))
+    assert equivalent_key(SQUARE, views_of(poses)) == equivalent_key(
+        SQUARE, views_of(along_y)
+    )
     half = [(2 - q, -a, b) for q, a, b in poses]
     assert key == equivalent_key(LONG, views_of(half))
-    scores = [score_plan(Plan("p", LONG, views_of(p))).rms_xy for p in (poses, half, along_y)]
+    scores = [
+        score_plan(Plan("p", LONG, views_of(p))).rms_xy for p in (poses, half, along_y)
+    ]
     assert np.isfinite(scores).all()
     assert scores[0] == pytest.approx(scores[1], rel=1e-9)
     assert abs(scores[0] - scores[2]) > 1e-6

@@ -9,7 +9,11 @@ import pytest
 
 from selfcal_ros.estimation.observability import resistance as module
 from selfcal_ros.estimation.observability.plan_check import check_stops, predict_plan
-from selfcal_ros.estimation.observability.resistance import NOISE, effects_of_terms, plan_budget
+from selfcal_ros.estimation.observability.resistance import (
+    NOISE,
+    effects_of_terms,
+    plan_budget,
+)
 from selfcal_ros.estimation.terms.planned import Assumed
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -18,15 +22,23 @@ from selfcal_ros.model.view import Plan, View
 from test.support.dense_terms import SIGMA, Dense
 from test.support.plans import plan_of
 
-TERMS = parse_terms(["microscope:0.01", "drift:3e-9", "plate_strain:2e-7", "approach:2e-9"], "")
+TERMS = parse_terms(
+    ["microscope:0.01", "drift:3e-9", "plate_strain:2e-7", "approach:2e-9"], ""
+)
 
 
 def budget_of(plan, terms, assumed, **how):
-    return plan_budget(plan, terms, assumed, predict_plan(plan, ThetaDatum.ZERO_MEAN), **how)
+    return plan_budget(
+        plan, terms, assumed, predict_plan(plan, ThetaDatum.ZERO_MEAN), **how
+    )
 
 
 def effects(budget, quantity="xy"):
-    return {line.component: line.effect_rms for line in budget.lines if line.quantity == quantity}
+    return {
+        line.component: line.effect_rms
+        for line in budget.lines
+        if line.quantity == quantity
+    }
 
 
 def test_each_line_is_what_is_gained_if_its_term_is_known_as_well():
@@ -39,13 +51,18 @@ def test_each_line_is_what_is_gained_if_its_term_is_known_as_well():
     gains = [SIGMA * dense.gain(tuple(order[at:])) for at in range(len(order) + 1)]
     assert found.pop(NOISE) == pytest.approx(gains[-1], rel=1e-6)
     for term, more, less in zip(order, gains, gains[1:], strict=False):
-        assert found[term.name] == pytest.approx(np.sqrt(more**2 - less**2), rel=1e-4), term
+        assert found[term.name] == pytest.approx(
+            np.sqrt(more**2 - less**2), rel=1e-4
+        ), term
 
 
 def test_check_stops_are_further_visits():
     """They determine the microscope as in the dense matrix, which gives them their weights, too."""
     plan = plan_of("0, 90, tx", 9, repeats=2)
-    plan, assumed = replace(plan, views=check_stops(plan)[0].views), Assumed(SIGMA, turn_rad=1e-4)
+    plan, assumed = (
+        replace(plan, views=check_stops(plan)[0].views),
+        Assumed(SIGMA, turn_rad=1e-4),
+    )
     found, dense = effects(budget_of(plan, TERMS[:1], assumed)), Dense(plan, assumed)
     wanted = SIGMA * np.sqrt(dense.gain(TERMS[:1]) ** 2 - dense.gain(()) ** 2)
     assert found["microscope"] == pytest.approx(wanted, rel=0.05)
@@ -55,7 +72,10 @@ def test_a_free_term_adds_to_the_noise():
     plan = plan_of("0, 90, tx", 5, repeats=4)
     assumed = Assumed(SIGMA, order="x_back_y_back")
     terms = parse_terms(["drift", "plate_strain:2e-7"], "")
-    found, dense = budget_of(plan, terms, assumed, declared=["plate_strain"]), Dense(plan, assumed)
+    found, dense = (
+        budget_of(plan, terms, assumed, declared=["plate_strain"]),
+        Dense(plan, assumed),
+    )
     free = SIGMA * dense.gain((terms[0],))
     assert effects(found)[NOISE] == pytest.approx(free, rel=1e-6)
     assert effects(found)["plate_strain"] == pytest.approx(
@@ -120,7 +140,9 @@ def test_the_lines_have_a_budget_of_their_own():
         dense_lines((1e-12, 1e-12), sigma), rel=1e-3
     )
     assert effects(found, "theta")["line_eccentricity"] == pytest.approx(
-        np.sqrt(dense_lines(sizes, sigma) ** 2 - dense_lines((1e-12, sizes[1]), sigma) ** 2),
+        np.sqrt(
+            dense_lines(sizes, sigma) ** 2 - dense_lines((1e-12, sizes[1]), sigma) ** 2
+        ),
         rel=1e-3,
     )
     assert np.isnan(budget_of(plan_of("0, 90, tx", 5), (), Assumed()).u_rms("theta"))
@@ -129,7 +151,8 @@ def test_the_lines_have_a_budget_of_their_own():
 def test_a_removal_leaves_what_it_says():
     plan = plan_of("0, 90, tx", 7, repeats=2)
     assumed = Assumed(1e-9, turn_rad=3e-4)
-    terms = tuple(term for term in default_terms() if term.name != "plate_shape")  # costs most
+    # costs most
+    terms = tuple(term for term in default_terms() if term.name != "plate_shape")
     found = budget_of(plan, terms, assumed)
     removal = found.removals["xy", "microscope"]
     assert removal.kind == "check_stops"
@@ -143,7 +166,9 @@ def test_a_removal_leaves_what_it_says():
     moving = budget_of(once, parse_terms(["drift:1e-8"], ""), Assumed(1e-9))
     assert moving.removals["xy", "drift"].kind == "order"
     assert moving.removals["xy", "drift"].step.order == "x_back_y_back"
-    circle = budget_of(LINES, parse_terms(["line_eccentricity:1e-5"], ""), Assumed(1e-9))
+    circle = budget_of(
+        LINES, parse_terms(["line_eccentricity:1e-5"], ""), Assumed(1e-9)
+    )
     removal = circle.removals["theta", "line_eccentricity"]
     assert (removal.kind, removal.step.view.name) == ("view", "180deg")
     ratio = removal.effect_rms / effects(circle, "theta")["line_eccentricity"]
@@ -151,12 +176,21 @@ def test_a_removal_leaves_what_it_says():
 
 
 def test_a_larger_assumption_changes_what_the_readings_leave_of_it_and_nothing_declared():
-    plan, assumed = plan_of("0, 90, tx", 5, repeats=2), Assumed(1e-9, order="x_back_y_back")
+    plan, assumed = (
+        plan_of("0, 90, tx", 5, repeats=2),
+        Assumed(1e-9, order="x_back_y_back"),
+    )
     terms = parse_terms(["plate_strain:7e-8", "plate_shape:5e-9"], "")
     larger = parse_terms(["plate_strain:7e-8", "plate_shape:15e-9"], "")
-    found = budget_of(plan, terms, assumed, declared=["plate_strain", "drift", "approach"])
-    wanted = budget_of(plan, larger, assumed, declared=["plate_strain", "drift", "approach"])
-    assert found.u_rms("xy", if_larger=True) == pytest.approx(wanted.u_rms("xy"), rel=1e-9)
+    found = budget_of(
+        plan, terms, assumed, declared=["plate_strain", "drift", "approach"]
+    )
+    wanted = budget_of(
+        plan, larger, assumed, declared=["plate_strain", "drift", "approach"]
+    )
+    assert found.u_rms("xy", if_larger=True) == pytest.approx(
+        wanted.u_rms("xy"), rel=1e-9
+    )
     assert found.u_rms("xy", if_larger=True) > 2 * found.u_rms("xy")
 
 
@@ -165,12 +199,19 @@ def test_removals_of_a_large_field_are_tried_on_a_small_one(monkeypatch):
     monkeypatch.setattr(
         module,
         "effects_of_terms",
-        lambda plan, *more: (sizes.append(plan.artifact.shape), effects_of_terms(plan, *more))[1],
+        lambda plan, *more: (
+            sizes.append(plan.artifact.shape),
+            effects_of_terms(plan, *more),
+        )[1],
     )
     found = budget_of(plan_of("0, 90, tx", 15), default_terms(), Assumed(1e-9))
     # with the drift, and with larger sizes
     assert sizes.count((15, 15)) == 4 and set(sizes) == {(15, 15), (11, 11)}
     before = effects_of_terms(
-        plan_of("0, 90, tx", 15), [*default_terms(), ModelTerm("drift", 10e-9)], Assumed(1e-9)
+        plan_of("0, 90, tx", 15),
+        [*default_terms(), ModelTerm("drift", 10e-9)],
+        Assumed(1e-9),
     )
-    assert effects(found)["microscope"] == pytest.approx(np.sqrt(before["microscope"][0].mean()))
+    assert effects(found)["microscope"] == pytest.approx(
+        np.sqrt(before["microscope"][0].mean())
+    )

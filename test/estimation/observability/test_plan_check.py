@@ -69,7 +69,9 @@ def dense_rank(plan):
 
 
 @pytest.mark.parametrize("size", [3, 5, 7, 9, 11])
-@pytest.mark.parametrize(("views", "rank", "extra"), QIAO_TABLES, ids=lambda v: str(v)[:16])
+@pytest.mark.parametrize(
+    ("views", "rank", "extra"), QIAO_TABLES, ids=lambda v: str(v)[:16]
+)
 def test_all_rank_tables_of_qiao(views, rank, extra, size):
     seen = plan_observability(plan_of(views, size))
     assert (seen.rank, seen.unknowns) == (rank(size), 4 * size**2 + extra)
@@ -99,7 +101,12 @@ def test_few_sites_of_a_small_plate_leave_nothing_to_eliminate(views):
 
 @pytest.mark.parametrize(
     ("views", "asks"),
-    [("0", False), ("-tx, -ty, 90tx", False), ("90tx, tx, ty", False), ("0, 90, tx", True)],
+    [
+        ("0", False),
+        ("-tx, -ty, 90tx", False),
+        ("90tx, tx, ty", False),
+        ("0, 90, tx", True),
+    ],
 )
 def test_no_matrix_is_made_where_a_count_says_no(monkeypatch, views, asks):
     """One view joins each mark to one site; then one mark is never read, then no corner visited."""
@@ -115,7 +122,10 @@ def test_an_arbitrary_field_is_seen_by_hus_plan_and_not_by_one_view():
     for views, unseen in (("0, 90, tx", False), ("0, 90", False), ("0", True)):
         plan = plan_of(views)
         assert (
-            is_unseen(planned_system(plan.artifact, plan.views), field[0] + 1j * field[1]) is unseen
+            is_unseen(
+                planned_system(plan.artifact, plan.views), field[0] + 1j * field[1]
+            )
+            is unseen
         )
 
 
@@ -129,7 +139,9 @@ def test_no_error_is_unseen_and_the_least_one_is_not():
 
 def names(views, **kwargs):
     plan = plan_of(views, **kwargs)
-    return [mode.name for mode in unseen_modes(planned_system(plan.artifact, plan.views))]
+    return [
+        mode.name for mode in unseen_modes(planned_system(plan.artifact, plan.views))
+    ]
 
 
 def test_groups_that_no_reading_joins_are_counted_and_the_smallest_is_named():
@@ -164,8 +176,14 @@ def test_four_turns_leave_half_of_n_squared_less_5_fields(size):
         ("0, 90", ["rotation_symmetric"]),
         ("0, 90, 180, 270", ["rotation_symmetric"]),
         ("0, 180", ["nonorthogonality", "scale_difference", "rotation_symmetric"]),
-        ("0, tx", ["nonorthogonality", "scale_difference", "bending_x", "line_offsets"]),
-        ("0, ty", ["nonorthogonality", "scale_difference", "bending_y", "line_offsets"]),
+        (
+            "0, tx",
+            ["nonorthogonality", "scale_difference", "bending_x", "line_offsets"],
+        ),
+        (
+            "0, ty",
+            ["nonorthogonality", "scale_difference", "bending_y", "line_offsets"],
+        ),
         ("0, 180, tx", ["nonorthogonality", "scale_difference", "line_offsets"]),
         ("0, tx2, ty2", ["nonorthogonality", "scale_difference", "periodic_fields"]),
         ("0, 90, tx", []),
@@ -209,20 +227,27 @@ def test_unseen_modes_in_words():
     [
         ("0, 90", "add an unturned view shifted by +1 pitch along X"),
         ("0, tx, ty", "add a view turned by 90 deg"),
-        ("0", "add a view turned by 90 deg and an unturned view shifted by +1 pitch along X"),
+        (
+            "0",
+            "add a view turned by 90 deg and an unturned view shifted by +1 pitch along X",
+        ),
     ],
 )
 def test_advice_names_the_missing_view(views, first):
     assert in_words(check_plan(plan_of(views)).observability.advice)[0] == first
 
 
-@pytest.mark.parametrize(("views", "size"), [("tx", 3), ("0, 180", 5), ("0, 180, +tx, -tx", 5)])
+@pytest.mark.parametrize(
+    ("views", "size"), [("tx", 3), ("0, 180", 5), ("0, 180, +tx, -tx", 5)]
+)
 def test_every_cure_cures_and_nothing_smaller_does(views, size):
     plan = plan_of(views, size, count=8)
     cures = list(find_cures(plan))
     assert cures
     for cure in cures:
-        assert plan_observability(replace(plan, views=(*plan.views, *cure))).identifiable
+        assert plan_observability(
+            replace(plan, views=(*plan.views, *cure))
+        ).identifiable
         if len(cure) > 1:
             for left_out in range(len(cure)):
                 part = cure[:left_out] + cure[left_out + 1 :]
@@ -236,7 +261,8 @@ def test_every_cure_cures_and_nothing_smaller_does(views, size):
 def test_turns_identify_the_circle_if_they_generate_it(turns):
     plan = plan_of("0, 90, tx", 3, count=24)
     lines = tuple(
-        View(f"l{i}", turn * np.pi / 12, (0.0, 0.0), False, True) for i, turn in enumerate(turns)
+        View(f"l{i}", turn * np.pi / 12, (0.0, 0.0), False, True)
+        for i, turn in enumerate(turns)
     )
     grid = tuple(replace(view, angular=view.name == "0") for view in plan.views)
     step = gcd(24, *turns)
@@ -246,10 +272,20 @@ def test_turns_identify_the_circle_if_they_generate_it(turns):
 
 def test_two_turns_that_only_together_generate_the_circle():
     grid = plan_of("0, 90, tx", 3, count=24)
-    eight, nine = (View(f"l{k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (8, 9))
-    assert check_plan(replace(grid, views=(*grid.views, nine))).observability.deficiency == 2
-    assert check_plan(replace(grid, views=(*grid.views, eight))).observability.deficiency == 1
-    assert check_plan(replace(grid, views=(*grid.views, eight, nine))).observability.identifiable
+    eight, nine = (
+        View(f"l{k}", k * np.pi / 12, (0.0, 0.0), False, True) for k in (8, 9)
+    )
+    assert (
+        check_plan(replace(grid, views=(*grid.views, nine))).observability.deficiency
+        == 2
+    )
+    assert (
+        check_plan(replace(grid, views=(*grid.views, eight))).observability.deficiency
+        == 1
+    )
+    assert check_plan(
+        replace(grid, views=(*grid.views, eight, nine))
+    ).observability.identifiable
 
 
 def test_missing_marks_change_the_verdict():
@@ -259,7 +295,10 @@ def test_missing_marks_change_the_verdict():
     assert calibrate(readings, BARE).observability.identifiable
     shifted = readings.views[2]
     gone = replace(
-        shifted, **{name: getattr(shifted, name)[:1] for name in ("m", "n", "dx", "dy", "count")}
+        shifted,
+        **{
+            name: getattr(shifted, name)[:1] for name in ("m", "n", "dx", "dy", "count")
+        },
     )
     with pytest.raises(NotIdentifiableError, match="do not identify the stage"):
         calibrate(replace(readings, views=(*readings.views[:2], gone)), BARE)
@@ -273,13 +312,18 @@ def test_candidates_and_their_description():
     assert texts[-1] == "an angular view turned by 1 line (45 deg)"
     assert "a view turned by 270 deg and shifted by -1 pitch along Y" in texts
     tall = plan_of("0", 5, size_y=9).artifact
-    assert all(describe_view(view, tall) for view in candidate_views(tall, angular=False))
+    assert all(
+        describe_view(view, tall) for view in candidate_views(tall, angular=False)
+    )
 
 
 def test_shifts_are_described_to_a_thousandth_of_a_pitch():
     artifact = plan_of("0", 5).artifact
     third = View("third", 0.0, (artifact.grid_pitch_m / 3, 0.0), True, False)
-    assert describe_view(third, artifact) == "an unturned view shifted by +0.333 pitch along X"
+    assert (
+        describe_view(third, artifact)
+        == "an unturned view shifted by +0.333 pitch along X"
+    )
 
 
 def test_smaller_fields_keep_room_for_the_shifts():
@@ -327,19 +371,26 @@ def test_a_deficient_measurement_is_refused_with_its_modes_and_cures():
 def test_lines_may_be_measured_in_views_of_their_own(datum):
     plan = plan_of("0, 90, tx", 5, count=12)
     grid = tuple(replace(view, angular=False) for view in plan.views)
-    lines = tuple(View(f"line {s}", s * np.pi / 6, (0.0, 0.0), False, True) for s in (0, 1))
+    lines = tuple(
+        View(f"line {s}", s * np.pi / 6, (0.0, 0.0), False, True) for s in (0, 1)
+    )
     plan = replace(plan, views=(*grid, *lines))
     assert plan_observability(plan).identifiable
     assert plan_observability(replace(plan, views=(*grid, lines[0]))).deficiency == 11
     rng = np.random.default_rng(2)
     truth = random_truth(
-        plan.artifact, 5, rng, Spread(encoder="xy_axes" if datum == "xy_axes" else "independent")
+        plan.artifact,
+        5,
+        rng,
+        Spread(encoder="xy_axes" if datum == "xy_axes" else "independent"),
     )
     result = calibrate(simulate_measurements(truth, plan, rng), bare(datum_theta=datum))
     shift = truth.g_theta.mean() if datum == "zero_mean" else 0.0
     assert np.abs(result.error_map.g_theta - truth.g_theta + shift).max() < 1e-15
     # the rotation of the lines' own views and the constant of the plate's lines are one datum
-    assert np.allclose([v.phi for v in result.views[:3]], truth.phi_rad[:3], rtol=0, atol=1e-13)
+    assert np.allclose(
+        [v.phi for v in result.views[:3]], truth.phi_rad[:3], rtol=0, atol=1e-13
+    )
     assert np.isnan([v.phi for v in result.views[3:]]).all()
 
 

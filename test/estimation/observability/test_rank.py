@@ -12,7 +12,10 @@ from selfcal_ros.estimation.lattice.maps import PHASES, LatticeViews
 from selfcal_ros.estimation.normal.angular import AngularSystem
 from selfcal_ros.estimation.normal.equations import NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem
-from selfcal_ros.estimation.observability.rank import measured_observability, plan_observability
+from selfcal_ros.estimation.observability.rank import (
+    measured_observability,
+    plan_observability,
+)
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.pose import LatticePose
@@ -57,9 +60,13 @@ def test_rank_is_that_of_the_full_matrix(poses, shape, missing):
     rng = np.random.default_rng(int(100 * missing))
     views = tuple(LatticePose(pose[0], pose[1:], None) for pose in poses)
     field = LatticeViews(shape, views).in_field
-    weight = field * (rng.random(field.shape) >= missing) * rng.integers(1, 5, field.shape)
+    weight = (
+        field * (rng.random(field.shape) >= missing) * rng.integers(1, 5, field.shape)
+    )
     grid = GridSystem(views, weight.astype(float))
-    joint = NormalEquations(grid, AngularSystem((), np.zeros((0, 0))), tuple(range(len(views))), ())
+    joint = NormalEquations(
+        grid, AngularSystem((), np.zeros((0, 0))), tuple(range(len(views))), ()
+    )
     assert joint.rank_grid == np.linalg.matrix_rank(dense(grid), tol=1e-8)
 
 
@@ -79,7 +86,9 @@ def test_deficient_plans_are_refused_by_name(names, needs, lines):
     artifact = Artifact(7, 0.01, lines)
     plan = plan_of(names, artifact, lines=1 if lines else None)
     rng = np.random.default_rng(0)
-    readings = simulate_measurements(random_truth(artifact, len(plan.views), rng), plan, rng)
+    readings = simulate_measurements(
+        random_truth(artifact, len(plan.views), rng), plan, rng
+    )
     with refused(needs) as caught:
         calibrate(readings)
     assert "\n" not in str(with_advice(caught.value))
@@ -109,7 +118,9 @@ def test_too_many_missing_marks_are_refused():
     artifact = Artifact(11, 0.01)
     plan = plan_of("0,90,tx", artifact)
     rng = np.random.default_rng(0)
-    readings = simulate_measurements(random_truth(artifact, 3, rng), plan, rng, missing=0.7)
+    readings = simulate_measurements(
+        random_truth(artifact, 3, rng), plan, rng, missing=0.7
+    )
     with refused("read the missing marks: only"):
         calibrate(readings)
 
@@ -130,7 +141,11 @@ def test_without_a_mark_the_rank_is_that_of_what_is_read():
     system = prepare(readings, Options())[0].system
     seen = measured_observability(system, artifact, plan.views)
     assert seen.identifiable
-    assert seen.rank == seen.unknowns == np.linalg.matrix_rank(dense(system.grid), tol=1e-8) + 7
+    assert (
+        seen.rank
+        == seen.unknowns
+        == np.linalg.matrix_rank(dense(system.grid), tol=1e-8) + 7
+    )
 
 
 @pytest.mark.parametrize(
@@ -144,7 +159,10 @@ def test_without_a_mark_the_rank_is_that_of_what_is_read():
 )
 def test_a_turn_by_one_line_is_advised_where_none_tells_the_lines_apart(lines, more):
     seen = plan_observability(plan_of("0,90", Artifact(5, 0.01, 8), lines=lines))
-    assert in_words(seen.advice) == ["add an unturned view shifted by +1 pitch along X", *more]
+    assert in_words(seen.advice) == [
+        "add an unturned view shifted by +1 pitch along X",
+        *more,
+    ]
 
 
 def test_a_view_of_a_single_mark_hides_its_own_rotation_alone():

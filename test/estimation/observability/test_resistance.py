@@ -11,8 +11,16 @@ from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.normal.equations import planned_system
 from selfcal_ros.estimation.observability import plan_check, resistance
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
-from selfcal_ros.estimation.observability.resistance import PlannedTerms, check_terms, nominal_sizes
-from selfcal_ros.estimation.terms.planned import Assumed, planned_equations, planned_inputs
+from selfcal_ros.estimation.observability.resistance import (
+    PlannedTerms,
+    check_terms,
+    nominal_sizes,
+)
+from selfcal_ros.estimation.terms.planned import (
+    Assumed,
+    planned_equations,
+    planned_inputs,
+)
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
@@ -66,7 +74,9 @@ UNLIKE = replace(
     plan_of("0, 90, tx, -ty", 5, size_y=3),
     views=tuple(
         replace(view, repeats=repeats)
-        for view, repeats in zip(plan_of("0, 90, tx, -ty", 5).views, (2, 4, 3, 2), strict=True)
+        for view, repeats in zip(
+            plan_of("0, 90, tx, -ty", 5).views, (2, 4, 3, 2), strict=True
+        )
     ),
 )
 """A plate of 5 x 3 marks, and views of unlike repeats."""
@@ -78,7 +88,9 @@ def test_columns_are_as_long_as_those_of_all_visits(name, size):
     """Means of marks and visits about them hold together what every visit has."""
     assumed = Assumed(SIGMA, 10e-6, 2, "serpentine@plate")
     system = planned_system(UNLIKE.artifact, UNLIKE.views)
-    found = planned_equations(UNLIKE, system, parse_terms([name + size], "test"), assumed)
+    found = planned_equations(
+        UNLIKE, system, parse_terms([name + size], "test"), assumed
+    )
     dense = dense_of(UNLIKE, assumed, Sense.MICROSCOPE_MOVES)
     columns = dense.root[:, None] * dense.columns(name, free=not size)
     assert found.norm == pytest.approx(np.linalg.norm(columns, axis=0), rel=1e-9)
@@ -99,7 +111,9 @@ def test_models_as_the_dense_matrix_has_them(text, plan, order, sense):
     assert seen.deficiency == dense.n_unseen(free)
     if seen.identifiable:
         unit = min(view.repeats for view in plan.views) ** 0.5
-        assert planned.predicted(alone).rms_xy == pytest.approx(dense.gain(model) * unit, rel=1e-6)
+        assert planned.predicted(alone).rms_xy == pytest.approx(
+            dense.gain(model) * unit, rel=1e-6
+        )
         assert alone.rms_xy == pytest.approx(dense.gain([]) * unit, rel=1e-9)
     sizes = nominal_sizes() | {"microscope": 1e-4}
     for found in check_terms(planned, sizes, LEVEL):
@@ -134,7 +148,9 @@ def test_what_a_drift_hides_depends_on_the_visiting_order(order, repeats):
     assert alone.rms_xy == pytest.approx(0.843, abs=5e-4)
     row = []
     for degree in (1, 2, 3, 5):
-        planned = PlannedTerms(plan, [ModelTerm("drift")], Assumed(SIGMA, 10e-6, degree, order))
+        planned = PlannedTerms(
+            plan, [ModelTerm("drift")], Assumed(SIGMA, 10e-6, degree, order)
+        )
         hidden = planned.check("drift", 1e-8, LEVEL).unseen_modes
         row.append(hidden or round(planned.predicted(alone).rms_xy, 3))
     assert tuple(row) == pytest.approx(ORDER_TABLE[order, repeats], abs=1e-9)
@@ -144,12 +160,16 @@ def test_free_terms_that_are_not_told_are_named_with_their_cure():
     plan = plan_of("0, 90, tx", 5)
     seen = check_plan(plan).observability
     planned = PlannedTerms(plan, parse_terms(["drift"], ""), Assumed(order="raster"))
-    with pytest.raises(NotIdentifiableError, match=r"do not separate drift .*\(7 modes"):
+    with pytest.raises(
+        NotIdentifiableError, match=r"do not separate drift .*\(7 modes"
+    ):
         planned.require_determined(seen)
     found = planned.with_free_terms(seen)
     assert (found.rank, found.unknowns) == (seen.rank + 18 - 7, seen.unknowns + 18)
     assert (found.deficiency, found.identifiable) == (7, False)
-    assert in_words(found.advice)[0].startswith("drift: visit the marks in more than one order")
+    assert in_words(found.advice)[0].startswith(
+        "drift: visit the marks in more than one order"
+    )
     sized = PlannedTerms(plan, parse_terms(["drift:1e-8"], ""), Assumed(order="raster"))
     assert sized.with_free_terms(seen) == seen
 
@@ -202,15 +222,20 @@ def test_terms_of_the_model_are_judged_as_the_readings_would_be(text):
     plan = plan_of("0, 90, tx", 5, count=8, line=True)
     terms, assumed = parse_terms(text.split(","), ""), Assumed()
     planned = PlannedTerms(plan, terms, assumed, ["line_scale"])
-    alone = planned_equations(plan, planned_system(plan.artifact, plan.views), terms, assumed)
+    alone = planned_equations(
+        plan, planned_system(plan.artifact, plan.views), terms, assumed
+    )
     assert planned.of_model.n == alone.n > 0
     assert (
-        planned.of_model.unseen(planned.of_model.free).shape[1] == alone.unseen(alone.free).shape[1]
+        planned.of_model.unseen(planned.of_model.free).shape[1]
+        == alone.unseen(alone.free).shape[1]
     )
     assert planned.of_model.columns.columns == alone.columns.columns
     named = [found.name for found in check_terms(planned, {"line_scale": 0.1}, LEVEL)]
     assert set(nominal_sizes()) < set(named)
-    assert ("line_scale" in named) and ("line_eccentricity" in named) == ("city:" in text)
+    assert ("line_scale" in named) and ("line_eccentricity" in named) == (
+        "city:" in text
+    )
 
 
 def test_the_assumed_offsets_are_misalignments_and_stop_errors():
@@ -224,7 +249,8 @@ def test_the_assumed_offsets_are_misalignments_and_stop_errors():
         design = np.stack([np.ones_like(place), place], axis=1)
         (shift, slope), *_ = np.linalg.lstsq(design, visits.offset, rcond=None)
         np.testing.assert_allclose(design @ (shift, slope), visits.offset, atol=1e-12)
-        turn = -np.angle(1 - slope)  # in the frame of the plate, which lies turned itself
+        # in the frame of the plate, which lies turned itself
+        turn = -np.angle(1 - slope)
         assert slope == pytest.approx(1 - np.exp(-1j * turn), abs=1e-12)
         assert 1e-5 < abs(turn) < 3 * np.radians(0.3)
         assert 1e-6 < abs(shift) < 3 * 30e-6 * 2**0.5
@@ -237,20 +263,26 @@ def test_the_assumed_offsets_are_misalignments_and_stop_errors():
             added = rough.visits[plan.views.index(view)].offset - visits.offset
             n = len(added)
             for part in (added.real, added.imag):
-                assert np.var(part) * n / size**2 == pytest.approx(n, abs=5 * (2 * n) ** 0.5)
+                assert np.var(part) * n / size**2 == pytest.approx(
+                    n, abs=5 * (2 * n) ** 0.5
+                )
 
 
 def test_a_power_is_the_rate_of_drawn_tests():
     """No term at all: the test finds one as often as its level says."""
     found = PlannedTerms(SMALL, (), Assumed()).check("approach", 1e-15, 0.05)
-    assert found.power == pytest.approx(0.05, abs=5 * (0.05 * 0.95 / resistance.DRAWS) ** 0.5)
+    assert found.power == pytest.approx(
+        0.05, abs=5 * (0.05 * 0.95 / resistance.DRAWS) ** 0.5
+    )
     assert PlannedTerms(SMALL, (), Assumed()).check("approach", 1e-5, 0.05).power == 1.0
 
 
 def test_large_fields_are_judged_on_a_smaller_one(monkeypatch):
     monkeypatch.setattr(plan_check, "UNASKED_SITES", 100)
     monkeypatch.setattr(plan_check, "PROXY_SIZE", 9)
-    large, small = (PlannedTerms(plan_of("0, 90, tx", size), (), Assumed()) for size in (21, 9))
+    large, small = (
+        PlannedTerms(plan_of("0, 90, tx", size), (), Assumed()) for size in (21, 9)
+    )
     assert check_terms(large, {}, LEVEL) == check_terms(small, {}, LEVEL)
 
 

@@ -48,7 +48,10 @@ BOUNDS = {  # method, section 11: rms gain at N = 5, 11, 21
 
 @pytest.mark.parametrize("views", BOUNDS)
 def test_gains_of_the_table(views):
-    found = [predict_plan(plan_of(views, size), ThetaDatum.XY_AXES).rms_xy for size in (5, 11, 21)]
+    found = [
+        predict_plan(plan_of(views, size), ThetaDatum.XY_AXES).rms_xy
+        for size in (5, 11, 21)
+    ]
     assert np.round(found, 3) == pytest.approx(BOUNDS[views], abs=1e-9)
 
 
@@ -71,26 +74,40 @@ def test_prediction_is_the_uncertainty_that_the_solver_reports():
     plan = plan_of("0, 90, tx, ty", 7, count=12, line=True)
     rng = np.random.default_rng(2)
     readings = simulate_measurements(
-        random_truth(plan.artifact, 5, rng), plan, rng, sigma_m=1e-8, sigma_theta_rad=1e-3
+        random_truth(plan.artifact, 5, rng),
+        plan,
+        rng,
+        sigma_m=1e-8,
+        sigma_theta_rad=1e-3,
     )
     result = calibrate(readings, BARE)
     found = predict_plan(plan, ThetaDatum.ZERO_MEAN)
-    assert np.allclose(result.error_map.u_gx / result.noise.sigma_xy, found.ux, rtol=1e-4)
-    assert np.allclose(result.error_map.u_gy / result.noise.sigma_xy, found.uy, rtol=1e-4)
     assert np.allclose(
-        result.error_map.u_g_theta / result.noise.sigma_theta, found.u_theta, rtol=1e-4, atol=1e-3
+        result.error_map.u_gx / result.noise.sigma_xy, found.ux, rtol=1e-4
+    )
+    assert np.allclose(
+        result.error_map.u_gy / result.noise.sigma_xy, found.uy, rtol=1e-4
+    )
+    assert np.allclose(
+        result.error_map.u_g_theta / result.noise.sigma_theta,
+        found.u_theta,
+        rtol=1e-4,
+        atol=1e-3,
     )
 
 
 def test_equal_repeats_change_nothing_for_an_averaged_reading():
     once, five = (
-        predict_plan(plan_of("0, 90, tx", 5, repeats=r), ThetaDatum.XY_AXES) for r in (1, 5)
+        predict_plan(plan_of("0, 90, tx", 5, repeats=r), ThetaDatum.XY_AXES)
+        for r in (1, 5)
     )
     assert np.allclose(once.ux, five.ux, rtol=1e-12)
 
 
 def test_large_fields_are_predicted_on_a_smaller_one_and_say_so(monkeypatch):
-    monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.UNASKED_SITES", 100)
+    monkeypatch.setattr(
+        "selfcal_ros.estimation.observability.plan_check.UNASKED_SITES", 100
+    )
     monkeypatch.setattr("selfcal_ros.estimation.observability.plan_check.PROXY_SIZE", 9)
     found = predict_plan(plan_of("0, 90, tx", 21), ThetaDatum.XY_AXES)
     assert found.ux.shape == (9, 9)
@@ -106,7 +123,9 @@ def test_next_views_are_ranked_by_what_they_give():
     by_text = {step_text(item, plan): item.score for item in ranked}
     added = by_text["add an unturned view shifted by +1 pitch along Y"]
     assert added.rms_xy == pytest.approx(0.660, abs=5e-4)
-    assert by_text["add a view turned by 180 deg"].rms_xy == pytest.approx(0.763, abs=5e-4)
+    assert by_text["add a view turned by 180 deg"].rms_xy == pytest.approx(
+        0.763, abs=5e-4
+    )
     line = by_text["add an angular view turned by 1 line (15 deg)"]
     assert line.rms_xy == pytest.approx(now.rms_xy) and line.rms_theta < now.rms_theta
     again = by_text["measure view 'rot90' 2 times, not 1"]
@@ -139,7 +158,8 @@ def few_candidates(monkeypatch):
     few = [
         view
         for view in candidate_views(Artifact(3, 0.01), angular=False)
-        if view.name in ("0deg", "90deg", "180deg", "270deg", "0deg+x", "0deg+y", "0deg-x")
+        if view.name
+        in ("0deg", "90deg", "180deg", "270deg", "0deg+x", "0deg+y", "0deg-x")
     ]
     for module in (suggest, plan_check):
         monkeypatch.setattr(module, "candidate_views", lambda *_, **__: few)
@@ -148,7 +168,9 @@ def few_candidates(monkeypatch):
 
 @pytest.mark.parametrize("criterion", ("rms", "max"))
 def test_best_plan_of_three_views_is_the_best_of_all(criterion, few_candidates):
-    plan, score, how = best_plan(Artifact(3, 0.01), 3, angular=False, criterion=criterion)
+    plan, score, how = best_plan(
+        Artifact(3, 0.01), 3, angular=False, criterion=criterion
+    )
     assert search_text(how) == "all 28 plans tried"
     every = [
         score_plan(replace(plan, views=(few_candidates[0], *views))).key(criterion)
@@ -169,7 +191,9 @@ def test_exchange_finds_what_trying_all_finds(monkeypatch, few_candidates):
 
 
 def test_best_plan_measures_the_angular_map_too():
-    plan, score, _ = best_plan(Artifact(3, 0.01, 24), 4, angular=True, like=View("", repeats=5))
+    plan, score, _ = best_plan(
+        Artifact(3, 0.01, 24), 4, angular=True, like=View("", repeats=5)
+    )
     assert check_plan(plan).observability.identifiable
     assert plan.views[-1].grid is False and {view.repeats for view in plan.views} == {5}
     assert np.isfinite(score.rms_theta) and score.rms_theta > 0
@@ -192,7 +216,9 @@ def test_gain_is_that_of_every_reading_moved_in_turn():
     system = planned_system(plan.artifact, plan.views)
     found = predict(system, plan.artifact, ThetaDatum.XY_AXES)
     rng = np.random.default_rng(7)
-    readings = simulate_measurements(random_truth(plan.artifact, 3, rng), plan, rng, linear=True)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 3, rng), plan, rng, linear=True
+    )
     options = bare(misalignment_model="linear", uncertainty=False)
 
     def solve(moved):
@@ -200,7 +226,9 @@ def test_gain_is_that_of_every_reading_moved_in_turn():
         return np.array([emap.gx.ravel(), emap.gy.ravel()])
 
     answers = responses(solve, readings, sizes_of(readings, 1e-8, 1.0)) / 1e-8
-    assert np.sqrt((answers**2).sum(axis=0).mean()) == pytest.approx(found.rms_xy, rel=1e-6)
+    assert np.sqrt((answers**2).sum(axis=0).mean()) == pytest.approx(
+        found.rms_xy, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -243,7 +271,10 @@ def test_bent_plates_ask_for_a_shift_the_other_way():
     # by noise alone a shift along y is as good
     assert set(shifts(alone[:3])) == {(-1, 0), (0, 1), (0, -1)}
     by_text = {step_text(item, plan): item.score.rms_xy for item in ranked}
-    back, on = (by_text[f"add an unturned view shifted by {a} pitch along X"] for a in ("-1", "+1"))
+    back, on = (
+        by_text[f"add an unturned view shifted by {a} pitch along X"]
+        for a in ("-1", "+1")
+    )
     assert back < 0.7 * on
     # a plate's shape does not ask in which order it is visited
     assert not any(item.order for item in ranked)
@@ -251,21 +282,30 @@ def test_bent_plates_ask_for_a_shift_the_other_way():
 
 def test_a_drift_asks_for_another_order():
     plan = plan_of("0, 90, tx", 7)
-    plan = replace(plan, views=tuple(replace(view, visit_order="raster") for view in plan.views))
+    plan = replace(
+        plan, views=tuple(replace(view, visit_order="raster") for view in plan.views)
+    )
     drift = Against(parse_terms(["drift:5e-7"], ""))
     now, ranked = rank_next(plan, against=drift)
     orders = {item.order: item for item in ranked if item.order}
     assert set(orders) == set(ORDERS) - {"raster"}
     best = orders["x_back_y_back"]
-    assert step_text(best, plan) == "visit the marks in the order x_back_y_back, 4 repeats for 1"
+    assert (
+        step_text(best, plan)
+        == "visit the marks in the order x_back_y_back, 4 repeats for 1"
+    )
     assert {view.visit_order for view in best.views} == {"x_back_y_back"}
     assert {view.repeats for view in best.views} == {4} and best.view is None
     assert best.score.rms_xy < orders["x_then_y"].score.rms_xy < now.rms_xy
     assert best.score.rms_xy == pytest.approx(0.845 / 2, abs=1e-3)
     added = next(
-        item for item in ranked if step_text(item, plan).startswith("add a view turned by 180")
+        item
+        for item in ranked
+        if step_text(item, plan).startswith("add a view turned by 180")
     )
-    assert added.views == (*plan.views, added.view) and added.view.visit_order == "raster"
+    assert (
+        added.views == (*plan.views, added.view) and added.view.visit_order == "raster"
+    )
 
 
 def test_free_terms_that_are_not_told_are_a_deficiency():
@@ -279,17 +319,26 @@ def test_what_terms_hide_is_better_than_a_plan_that_is_deficient_without_them():
     """Of such a plan nobody counts what the terms would hide besides."""
     free = Against(parse_terms(["drift"], ""), Assumed(order="raster"))
     hidden, none = (
-        score_plan(plan_of(text, 5), against=free) for text in ("0, 90, tx", "0, tx, ty")
+        score_plan(plan_of(text, 5), against=free)
+        for text in ("0, 90, tx", "0, tx, ty")
     )
-    assert hidden.of_terms and not none.of_terms and 0 < none.deficiency < hidden.deficiency
+    assert (
+        hidden.of_terms
+        and not none.of_terms
+        and 0 < none.deficiency < hidden.deficiency
+    )
     assert hidden.key("rms") < none.key("rms")
     assert score_plan(plan_of("0, 90, tx", 5)).key("max") < hidden.key("max")
 
 
 def test_the_best_plan_against_bent_plates_shifts_both_ways(few_candidates):
-    plan, found, _ = best_plan(Artifact(5, 0.01), 4, angular=False, against=Against(BENT))
+    plan, found, _ = best_plan(
+        Artifact(5, 0.01), 4, angular=False, against=Against(BENT)
+    )
     every = [
-        score_plan(replace(plan, views=(few_candidates[0], *views)), against=Against(BENT))
+        score_plan(
+            replace(plan, views=(few_candidates[0], *views)), against=Against(BENT)
+        )
         for views in combinations_with_replacement(few_candidates, 3)
     ]
     assert found.key("rms") == min(score.key("rms") for score in every)

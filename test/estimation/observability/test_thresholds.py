@@ -24,7 +24,8 @@ def with_marks(keep):
     plan, rng = plan_of("0,90,tx", FIELD), np.random.default_rng(0)
     data = simulate_measurements(random_truth(FIELD, 3, rng), plan, rng)
     views = tuple(
-        subset(view, keep(view.m, view.n), np.zeros(0, dtype=bool)) for view in data.views
+        subset(view, keep(view.m, view.n), np.zeros(0, dtype=bool))
+        for view in data.views
     )
     return replace(data, views=views)
 
@@ -40,7 +41,10 @@ def test_half_of_the_field_must_be_determined(half, determined):
     with pytest.raises(NotIdentifiableError) as refused:
         calibrate(data)
     advice = refused.value.observability.advice[0]
-    assert advice.name == "marks_missing" and 0.4 * 121 < advice.details["sites"] < 0.5 * 121
+    assert (
+        advice.name == "marks_missing"
+        and 0.4 * 121 < advice.details["sites"] < 0.5 * 121
+    )
 
 
 def dense_theta(turns, repeats, free, k):
@@ -62,7 +66,9 @@ def dense_theta(turns, repeats, free, k):
 @pytest.mark.parametrize("repeats", [(1, 1, 1, 1), (1, 2, 5, 3), (4, 3, 2, 3)])
 def test_the_prediction_for_lines_counts_the_repeats_of_each_view(repeats):
     plan = hu_plan(Artifact(5, 0.01, 12))
-    views = tuple(replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True))
+    views = tuple(
+        replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True)
+    )
     system = planned_system(plan.artifact, views)
     found = predict(system, plan.artifact, ThetaDatum.ZERO_MEAN).u_theta ** 2
     wanted = dense_theta([0, 3, 1, 0], repeats, [2], 12)
@@ -76,8 +82,12 @@ def test_the_prediction_for_marks_counts_the_repeats_of_each_view():
     plan = plan_of("0,90,tx", Artifact(5, 0.01, 0, 7))
 
     def of(*repeats):
-        views = tuple(replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True))
-        found = predict(planned_system(plan.artifact, views), plan.artifact, ThetaDatum.ZERO_MEAN)
+        views = tuple(
+            replace(v, repeats=n) for v, n in zip(plan.views, repeats, strict=True)
+        )
+        found = predict(
+            planned_system(plan.artifact, views), plan.artifact, ThetaDatum.ZERO_MEAN
+        )
         assert found.u_theta.shape == (0,)  # a plate without lines
         return found.ux[np.isfinite(found.ux)] ** 2
 

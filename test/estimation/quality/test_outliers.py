@@ -18,7 +18,14 @@ from selfcal_ros.estimation.verdict.leverage import (
     exact_leverage,
 )
 from selfcal_ros.model.artifact import Artifact
-from selfcal_ros.model.readings import OUTLIER, GridVisits, Sense, ViewReadings, subset, without
+from selfcal_ros.model.readings import (
+    OUTLIER,
+    GridVisits,
+    Sense,
+    ViewReadings,
+    subset,
+    without,
+)
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Grade
@@ -49,7 +56,12 @@ def measured(
     plan = hu_plan(ARTIFACT, repeats)
     if more:
         plan = replace(
-            plan, views=(*plan.views, View("rot180", np.pi), View("shift_y", 0.0, (0.0, 0.01)))
+            plan,
+            views=(
+                *plan.views,
+                View("rot180", np.pi),
+                View("shift_y", 0.0, (0.0, 0.01)),
+            ),
         )
     truth = random_truth(ARTIFACT, len(plan.views), rng)
     return truth, simulate_measurements(
@@ -84,7 +96,9 @@ def solved(readings, options=ZERO_MEAN):
 
 def error_rms(result, truth):
     emap = result.error_map
-    return float(np.sqrt(np.nanmean(np.stack([emap.gx - truth.g[0], emap.gy - truth.g[1]]) ** 2)))
+    return float(
+        np.sqrt(np.nanmean(np.stack([emap.gx - truth.g[0], emap.gy - truth.g[1]]) ** 2))
+    )
 
 
 def refused(result, reason):
@@ -163,7 +177,12 @@ def test_good_readings_stay(monkeypatch):
         truth = random_truth(plan.artifact, 4, rng)
         found = clean(
             simulate_measurements(
-                truth, plan, rng, sigma_m=SIGMA_M, linear=True, sigma_theta_rad=SIGMA_RAD
+                truth,
+                plan,
+                rng,
+                sigma_m=SIGMA_M,
+                linear=True,
+                sigma_theta_rad=SIGMA_RAD,
             ),
             LINEAR,
         )
@@ -254,7 +273,9 @@ def test_a_turned_microscope_is_no_slip():
             replace(
                 view,
                 dy=dy,
-                visits=replace(view.visits, offset_x=view.visits.offset_x + step, dy=dy),
+                visits=replace(
+                    view.visits, offset_x=view.visits.offset_x + step, dy=dy
+                ),
             ),
             *seen.views[4:],
         ),
@@ -270,7 +291,9 @@ def test_a_turned_microscope_is_no_slip():
     bad = replace(
         bad,
         views=tuple(
-            view if view.visits is None else replace(view, visits=replace(view.visits, dx=view.dx))
+            view
+            if view.visits is None
+            else replace(view, visits=replace(view.visits, dx=view.dx))
             for view in bad.views
         ),
     )
@@ -306,8 +329,9 @@ def test_giving_up_is_said(monkeypatch):
     _, readings = measured(3)
     bad = with_errors(readings, 1, dx={(-4, 2): 1e-6, (0, 0): 3e-6, (3, -3): 5e-7})
     result = robust_calibrate(bad, ZERO_MEAN)
-    assert "gave up on outliers after 1 rounds: the readings seem to contain more" in " ".join(
-        worded(result).warnings
+    assert (
+        "gave up on outliers after 1 rounds: the readings seem to contain more"
+        in " ".join(worded(result).warnings)
     )
     refused(result, "gave up on outliers after 1 rounds")
     monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.MAX_CAUSES", 0)
@@ -345,7 +369,9 @@ def test_a_reading_goes_where_it_adds_more_than_one_in_a_hundred_sets_of_good_on
         found = residuals_of(
             without(given, {(1, "grid", (2, -3))}) if without_it else given, LINEAR
         )
-        checked = sum(np.isfinite(kind.squares).sum() for kind in (found.marks, found.lines))
+        checked = sum(
+            np.isfinite(kind.squares).sum() for kind in (found.marks, found.lines)
+        )
         return float((abs(found.marks.residual) ** 2).sum()), found.marks.dof, checked
 
     rest, dof, _ = squares(0.0, without_it=True)
@@ -374,7 +400,9 @@ def test_planted_outliers_are_removed_and_nothing_else(sense):
     assert error_rms(result, truth) < 1.2 * error_rms(solved(readings), truth)
     assert error_rms(solved(bad), truth) > 1.5 * error_rms(result, truth)
     assert result.rejected[OUTLIER] == 4
-    assert result.views[1].used == bad.views[1].used - 3 and result.views[1].rejected == 3
+    assert (
+        result.views[1].used == bad.views[1].used - 3 and result.views[1].rejected == 3
+    )
     row = next(r for r in result.extra["outliers"]["removed"] if r["mark"] == [-4, 2])
     assert row["standardised"] > 10 and 0 < row["leverage"] < 1
     # the fit follows the outlier by its leverage: the residual is the rest of it
@@ -399,7 +427,11 @@ def test_removed_readings_survive_the_file(tmp_path):
 
 @pytest.mark.parametrize(
     ("index", "axis", "first", "change"),
-    [(3, "m", 2, (2e-7, -1e-7, 0.0)), (0, "n", -1, (2e-6, 0.0, 1e-5)), (1, "m", 0, (0, 3e-7, 0))],
+    [
+        (3, "m", 2, (2e-7, -1e-7, 0.0)),
+        (0, "n", -1, (2e-6, 0.0, 1e-5)),
+        (1, "m", 0, (0, 3e-7, 0)),
+    ],
 )
 def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
     truth, readings = measured(4, more=True)
@@ -426,13 +458,18 @@ def test_a_slipped_view_is_named_sized_and_split(index, axis, first, change):
 
 def test_a_slip_whose_place_three_views_do_not_tell_is_reported_not_mended():
     _, readings = measured(4)
-    result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
+    result = robust_calibrate(
+        slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN
+    )
     (slip,) = result.extra["slips"]
     assert slip["view"] == "shift_x"
-    places = [(place["axis"], place["first"]) for place in (slip, *slip["alternatives"])]
+    places = [
+        (place["axis"], place["first"]) for place in (slip, *slip["alternatives"])
+    ]
     assert ("m", 2) in places and len(set(places)) >= 2
-    assert "do not determine which; this spoils the map: measure the view again" in " ".join(
-        worded(result).warnings
+    assert (
+        "do not determine which; this spoils the map: measure the view again"
+        in " ".join(worded(result).warnings)
     )
     assert [v.name for v in result.views] == [v.view.name for v in readings.views]
 
@@ -448,7 +485,9 @@ def slipped(readings, index, axis, first, change):
         dx=view.dx + after * (change[0] - change[2] * y * 0.01),
         dy=view.dy + after * (change[1] + change[2] * x * 0.01),
     )
-    return replace(readings, views=(*readings.views[:index], moved, *readings.views[index + 1 :]))
+    return replace(
+        readings, views=(*readings.views[:index], moved, *readings.views[index + 1 :])
+    )
 
 
 def test_one_gross_outlier_is_no_slip():
@@ -472,7 +511,9 @@ def test_a_noisy_view_is_named(index):
     result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
     (named,) = result.extra["noisy_views"]
     assert named["view"] == view.view.name and 3 < named["ratio"] <= 20
-    assert "times as noisy as the others: measure it again" in worded(result).warnings[-1]
+    assert (
+        "times as noisy as the others: measure it again" in worded(result).warnings[-1]
+    )
     refused(result, f"view '{view.view.name}' is ")
 
 
@@ -494,7 +535,9 @@ def test_exact_readings_have_no_outliers():
     _, readings = measured(8, sigma=0.0)
     views = tuple(replace(v, dtheta=v.dtheta) for v in readings.views)
     result = robust_calibrate(replace(readings, views=views), ZERO_MEAN)
-    assert {kind for _, kind, _ in removed(result)} <= {"angular"} and not result.extra["slips"]
+    assert {kind for _, kind, _ in removed(result)} <= {"angular"} and not result.extra[
+        "slips"
+    ]
 
 
 def test_order_of_readings_does_not_matter():
@@ -507,11 +550,20 @@ def test_order_of_readings_does_not_matter():
         shuffled.append(
             replace(
                 view,
-                **{name: getattr(view, name)[at] for name in ("m", "n", "dx", "dy", "count")},
-                **{name: getattr(view, name)[to] for name in ("k", "dtheta", "count_theta")},
+                **{
+                    name: getattr(view, name)[at]
+                    for name in ("m", "n", "dx", "dy", "count")
+                },
+                **{
+                    name: getattr(view, name)[to]
+                    for name in ("k", "dtheta", "count_theta")
+                },
             )
         )
-    a, b = (robust_calibrate(r, ZERO_MEAN) for r in (bad, replace(bad, views=tuple(shuffled))))
+    a, b = (
+        robust_calibrate(r, ZERO_MEAN)
+        for r in (bad, replace(bad, views=tuple(shuffled)))
+    )
     assert np.array_equal(a.error_map.gx, b.error_map.gx)
     assert a.extra["outliers"] == b.extra["outliers"]
 
@@ -525,7 +577,9 @@ def test_finite_rotations_are_no_outliers_with_the_rigid_model():
         if len(view.m):
             x, y = (c * 0.01 for c in ((view.m, view.n), (-view.n, view.m))[q])
             cos, sin = np.cos(phi) - 1, np.sin(phi) - phi
-            view = replace(view, dx=view.dx + cos * x - sin * y, dy=view.dy + sin * x + cos * y)
+            view = replace(
+                view, dx=view.dx + cos * x - sin * y, dy=view.dy + sin * x + cos * y
+            )
         views.append(view)
     bad = with_errors(replace(readings, views=tuple(views)), 1, dx={(-4, 2): 1e-6})
     result = robust_calibrate(bad, ZERO_MEAN)
@@ -533,10 +587,14 @@ def test_finite_rotations_are_no_outliers_with_the_rigid_model():
     assert error_rms(result, truth) < 1.3 * error_rms(solved(readings, plain), truth)
 
 
-def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(monkeypatch):
+def test_a_view_whose_slip_cannot_be_placed_is_left_out_if_it_can_be_spared(
+    monkeypatch,
+):
     monkeypatch.setattr("selfcal_ros.estimation.quality.outliers.AMBIGUOUS", 1e9)
     truth, readings = measured(4, more=True)
-    result = robust_calibrate(slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN)
+    result = robust_calibrate(
+        slipped(readings, 3, "m", 2, (2e-7, -1e-7, 0.0)), ZERO_MEAN
+    )
     said = " ".join(worded(result).warnings)
     assert "the readings do not determine which; the view is left out" in said
     view = result.views[3]
@@ -580,6 +638,8 @@ def test_a_part_of_a_view_keeps_the_visits_of_its_marks():
     assert kept.approach_y.tolist() == [1, 0, -1, 1]
     assert kept.u.tolist() == [41, 42, 43, 44] and (kept.sigma_m, kept.dof) == (1e-8, 9)
     assert (
-        subset(replace(view, visits=None), np.ones(4, dtype=bool), np.zeros(0, dtype=bool)).visits
+        subset(
+            replace(view, visits=None), np.ones(4, dtype=bool), np.zeros(0, dtype=bool)
+        ).visits
         is None
     )

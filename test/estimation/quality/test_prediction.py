@@ -48,14 +48,20 @@ def with_visits(readings: Measurements, rng: np.random.Generator) -> Measurement
     return replace(readings, views=tuple(views))
 
 
-def with_values(readings: Measurements, values: np.ndarray, grid: GridData) -> Measurements:
+def with_values(
+    readings: Measurements, values: np.ndarray, grid: GridData
+) -> Measurements:
     """Return the readings with `values` (views, nx, ny) of the plate frame in place of theirs."""
     views = []
     for row, view in enumerate(readings.views):
         half = readings.artifact.half
-        value = values[row][view.m + half[0], view.n + half[1]] * 1j ** grid.poses[row].q
+        value = (
+            values[row][view.m + half[0], view.n + half[1]] * 1j ** grid.poses[row].q
+        )
         visits = replace(
-            view.visits, dx=value.real[view.visits.mark], dy=value.imag[view.visits.mark]
+            view.visits,
+            dx=value.real[view.visits.mark],
+            dy=value.imag[view.visits.mark],
         )
         views.append(replace(view, dx=value.real, dy=value.imag, visits=visits))
     return replace(readings, views=tuple(views))
@@ -83,7 +89,9 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
         rng,
     )
     terms = [ModelTerm("microscope"), *[ModelTerm("drift")] * of_view]
-    options = bare(misalignment_model="linear", terms=tuple(terms), drift_degree=1, at_places=False)
+    options = bare(
+        misalignment_model="linear", terms=tuple(terms), drift_degree=1, at_places=False
+    )
     seen, limit_of = [], validation.prediction_limit
 
     def judged(
@@ -114,4 +122,6 @@ def test_each_draw_is_predicted_as_such_readings_are(monkeypatch, of_view):
         found = validation.validate(again, options, folds=1)
         squares.append((found[number].rms_m / UNIT_M) ** 2)
     assert limit.mean == pytest.approx(np.mean(squares), rel=1e-4)
-    assert limit.dof == pytest.approx(2 * np.mean(squares) ** 2 / np.var(squares, ddof=1), rel=1e-4)
+    assert limit.dof == pytest.approx(
+        2 * np.mean(squares) ** 2 / np.var(squares, ddof=1), rel=1e-4
+    )

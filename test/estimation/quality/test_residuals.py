@@ -32,7 +32,12 @@ def measured():
         ),
     )
     readings = simulate_measurements(
-        random_truth(artifact, 5, rng), plan, rng, sigma_m=2e-8, sigma_theta_rad=0.0, linear=True
+        random_truth(artifact, 5, rng),
+        plan,
+        rng,
+        sigma_m=2e-8,
+        sigma_theta_rad=0.0,
+        linear=True,
     )
     noisy = readings.views[3]
     more = rng.normal(size=(2, len(noisy.m))) * 2e-8 * np.sqrt(8)
@@ -47,7 +52,9 @@ def dense(readings):
     for v, view in enumerate(readings.views):
         turn = np.array(TURNS[view.view.rotation_rad])
         shift = np.round(np.array(view.view.translation_m) / 0.01).astype(int)
-        for m, n, count, *offset in zip(view.m, view.n, view.count, view.dx, view.dy, strict=True):
+        for m, n, count, *offset in zip(
+            view.m, view.n, view.count, view.dx, view.dy, strict=True
+        ):
             at = turn @ (m, n) + shift
             for axis in range(2):
                 row = np.zeros(4 * sites + 3 * len(readings.views))
@@ -55,7 +62,9 @@ def dense(readings):
                 mark = 2 * (sites + (m + hx) * ny + n + hy)
                 row[mark : mark + 2] = turn[axis]
                 place = turn @ (m, n)
-                row[4 * sites + 3 * v :][:3] = ((-place[1], 1, 0), (place[0], 0, 1))[axis]
+                row[4 * sites + 3 * v :][:3] = ((-place[1], 1, 0), (place[0], 0, 1))[
+                    axis
+                ]
                 rows.append(np.sqrt(count) * row)
                 right.append(np.sqrt(count) * offset[axis])
                 of_view.append(v)
@@ -67,8 +76,13 @@ def dense(readings):
 def two_variances(left, of_view, v):
     """Return the forms A (rows, rows) whose y' A y are the variances of view `v` and of others."""
     own = of_view == v
-    parts = [left * np.where(own, 1.0, 0.0) @ left, left * np.where(own, 0.0, 1.0) @ left]
-    mixing = np.array([[np.trace(left * a @ left * b) for b in (own, ~own)] for a in (own, ~own)])
+    parts = [
+        left * np.where(own, 1.0, 0.0) @ left,
+        left * np.where(own, 0.0, 1.0) @ left,
+    ]
+    mixing = np.array(
+        [[np.trace(left * a @ left * b) for b in (own, ~own)] for a in (own, ~own)]
+    )
     return np.tensordot(np.linalg.inv(mixing), np.array(parts), axes=1)
 
 

@@ -20,7 +20,11 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import held_out_text, worded
-from selfcal_ros.reporting.words.tables import validation_json, validation_text, why_text
+from selfcal_ros.reporting.words.tables import (
+    validation_json,
+    validation_text,
+    why_text,
+)
 from selfcal_ros.simulation.machine import Spread
 from test.support.lattice_plans import plan_of
 from test.support.options import BARE, bare
@@ -34,12 +38,18 @@ def measured(*, more=True, sense=Sense.MICROSCOPE_MOVES, sigma=SIGMA_M, repeats=
     plan = hu_plan(ARTIFACT, repeats)
     if more:
         plan = replace(
-            plan, views=(*plan.views, View("both", pi / 2, (0.0, 0.01), True, True, repeats))
+            plan,
+            views=(*plan.views, View("both", pi / 2, (0.0, 0.01), True, True, repeats)),
         )
     rng = np.random.default_rng(3)
     truth = random_truth(ARTIFACT, len(plan.views), rng)
     return simulate_measurements(
-        truth, plan, rng, sense=sense, sigma_m=sigma, sigma_theta_rad=SIGMA_RAD * bool(sigma)
+        truth,
+        plan,
+        rng,
+        sense=sense,
+        sigma_m=sigma,
+        sigma_theta_rad=SIGMA_RAD * bool(sigma),
     )
 
 
@@ -56,7 +66,8 @@ def few_draws(monkeypatch):
 @pytest.mark.parametrize("sense", list(Sense))
 def test_exact_readings_are_predicted_exactly(sense, few_draws):
     found = {
-        called(item): item for item in validate(measured(sense=sense, sigma=0.0), BARE, folds=1)
+        called(item): item
+        for item in validate(measured(sense=sense, sigma=0.0), BARE, folds=1)
     }
     assert len(found) == 6
     for name in (
@@ -77,7 +88,9 @@ def test_noise_is_predicted_within_noise_and_leverage(repeats, few_draws):
         if item.n_grid:
             # deletion residuals have sigma / sqrt(1 - h), h about 2/3 and below
             assert 1.0 < item.ratio < 2.3
-            assert item.rms_m == pytest.approx(item.ratio * SIGMA_M / np.sqrt(repeats), rel=0.15)
+            assert item.rms_m == pytest.approx(
+                item.ratio * SIGMA_M / np.sqrt(repeats), rel=0.15
+            )
     assert sum(item.n_grid > 0 for item in found) >= 8
 
 
@@ -88,7 +101,9 @@ def test_a_spoiled_view_is_predicted_badly(few_draws):
     swapped = replace(view, dx=view.dy, dy=view.dx)
     wrong = {
         called(item): item
-        for item in validate(replace(readings, views=(*readings.views[:4], swapped)), BARE, folds=1)
+        for item in validate(
+            replace(readings, views=(*readings.views[:4], swapped)), BARE, folds=1
+        )
     }
     for name in ("a random tenth (1)", "view 'both'"):
         assert wrong[name].rms_m > 3 * right[name].rms_m
@@ -99,7 +114,8 @@ def test_a_spoiled_view_is_predicted_badly(few_draws):
 def test_views_that_are_needed_cannot_be_held_out(few_draws):
     readings = measured(more=False)
     notes = {
-        called(item): why_text(item.why, ARTIFACT) for item in validate(readings, BARE, folds=1)
+        called(item): why_text(item.why, ARTIFACT)
+        for item in validate(readings, BARE, folds=1)
     }
     assert notes["a random tenth (1)"] == ""
     for name in ("identity", "rot90", "line", "shift_x"):
@@ -110,9 +126,13 @@ def test_views_that_are_needed_cannot_be_held_out(few_draws):
     )
     rng = np.random.default_rng(3)
     plan = hu_plan(ARTIFACT)
-    plan = replace(plan, views=(*plan.views, View("more", pi / 2, (0.01, 0.0), True, True)))
+    plan = replace(
+        plan, views=(*plan.views, View("more", pi / 2, (0.01, 0.0), True, True))
+    )
     truth = random_truth(ARTIFACT, 5, rng)
-    more = simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD)
+    more = simulate_measurements(
+        truth, plan, rng, sigma_m=SIGMA_M, sigma_theta_rad=SIGMA_RAD
+    )
     held = {called(item): item for item in validate(more, BARE, folds=1)}
     assert held["view 'shift_x'"].why is None and held["view 'shift_x'"].n_grid > 0
 
@@ -123,7 +143,9 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
 
     def without_first(kept, options):
         if not len(kept.views[0].m):
-            raise NotSettledError("model drift", "the fit does not converge", "leave it out")
+            raise NotSettledError(
+                "model drift", "the fit does not converge", "leave it out"
+            )
         return solve(kept, options)
 
     monkeypatch.setattr(validation, "solve_joint", without_first)
@@ -142,7 +164,9 @@ def test_a_rest_that_does_not_settle_costs_its_own_line_alone(few_draws, monkeyp
 def drawn(seed, plan, spread=None, **how):
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, spread or Spread())
-    return simulate_measurements(truth, plan, rng, sigma_m=SIGMA_M, linear=spread is None, **how)
+    return simulate_measurements(
+        truth, plan, rng, sigma_m=SIGMA_M, linear=spread is None, **how
+    )
 
 
 SMALL = plan_of("0,90,180,tx,ty", Artifact(5, 0.01))
@@ -179,14 +203,20 @@ def test_a_spoiled_view_exceeds_its_limit_and_disqualifies_the_result():
     readings = drawn(3, SMALL)
     right = validate(readings, LINEAR, folds=1)
     assert not any(item.exceeds for item in right)
-    assert "times the noise, within the limit of " in validation_text(right, ARTIFACT)[0]
+    assert (
+        "times the noise, within the limit of " in validation_text(right, ARTIFACT)[0]
+    )
     result = calibrate(readings, LINEAR)
     assert judged_by(result, right).verdict == result.verdict
     view = readings.views[4]
-    wrong = replace(readings, views=(*readings.views[:4], replace(view, dx=view.dy, dy=view.dx)))
+    wrong = replace(
+        readings, views=(*readings.views[:4], replace(view, dx=view.dy, dy=view.dx))
+    )
     found = validate(wrong, LINEAR, folds=1)
     bad = next(item for item in found if item.view == "ty")
-    assert bad.exceeds and ", EXCEEDS the limit of " in "\n".join(validation_text(found, ARTIFACT))
+    assert bad.exceeds and ", EXCEEDS the limit of " in "\n".join(
+        validation_text(found, ARTIFACT)
+    )
     judged = worded(judged_by(result, [bad]))
     assert not judged.verdict.qualified
     assert judged.verdict.reasons == (
@@ -230,9 +260,14 @@ def test_terms_are_predicted_with_the_readings(few_draws):
     for item in tenths:
         assert item.ratio < item.limit < 3
     assert why_text(whole.why, ARTIFACT) == "its own drift cannot be known: not judged"
-    assert "its own drift cannot be known: not judged)" in validation_text(found, ARTIFACT)[2]
+    assert (
+        "its own drift cannot be known: not judged)"
+        in validation_text(found, ARTIFACT)[2]
+    )
     for left_out in (terms[:1], terms[1:]):
-        poor = validate(readings, replace(LINEAR, terms=left_out, drift_degree=1), folds=1)[0]
+        poor = validate(
+            readings, replace(LINEAR, terms=left_out, drift_degree=1), folds=1
+        )[0]
         assert poor.rms_m > 2 * tenths[0].rms_m
     shared = validate(readings, replace(LINEAR, terms=terms[:1]), folds=1)[1]
     assert why_text(shared.why, ARTIFACT) == "" and np.isfinite(shared.limit)
@@ -251,7 +286,10 @@ def test_a_view_held_out_has_own_terms_within_their_sizes(few_draws, monkeypatch
     ]
     assert len(found) >= 30 and all(item.why is None for item in found)
     assert sum(item.exceeds for item in found) <= binom.ppf(0.9995, len(found), 0.05)
-    assert min(item.ratio for item in found) > 1 and np.mean([item.ratio for item in found]) > 3
+    assert (
+        min(item.ratio for item in found) > 1
+        and np.mean([item.ratio for item in found]) > 3
+    )
 
 
 @pytest.mark.parametrize("sense", list(Sense))

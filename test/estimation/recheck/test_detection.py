@@ -26,7 +26,9 @@ def change_tests(dof: float) -> ChangeTests:
 
 def noise(tests: ChangeTests, rng, number=DRAWS) -> np.ndarray:
     """Return changes of unchanged stages: their noise was estimated too small or too large."""
-    drawn = np.linalg.cholesky(tests.covariance) @ rng.normal(size=(len(tests.u), number))
+    drawn = np.linalg.cholesky(tests.covariance) @ rng.normal(
+        size=(len(tests.u), number)
+    )
     scale = rng.chisquare(tests.dof, number) / tests.dof if tests.dof < 1e9 else 1.0
     return tests.without(drawn) / np.sqrt(scale)
 
@@ -70,7 +72,10 @@ def test_smooth_changes_and_those_of_few_nodes_are_found_better_than_by_one_sum_
     )
     bend = tests.without(np.concatenate([tests.places.real**2, 0 * tests.places.real]))
     limit = chi2.ppf(0.95, 94)
-    for shape in (0.5 * bend / np.sqrt((bend**2).mean()), tests.without(5.5 * np.eye(98)[24])):
+    for shape in (
+        0.5 * bend / np.sqrt((bend**2).mean()),
+        tests.without(5.5 * np.eye(98)[24]),
+    ):
         changed = noise(tests, rng) + shape[:, None]
         ours = np.mean([tests.p(one) < 0.05 for one in changed.T])
         assert ours > 0.88 > 0.75 > np.mean((changed**2).sum(axis=0) > limit)

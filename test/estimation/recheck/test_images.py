@@ -43,9 +43,14 @@ def sessions(
     plan, rng = image_plan(size), np.random.default_rng(seed)
     again = image_plan(size, turns=(turn,), repeats=repeats)
     truth = random_truth(
-        plan.artifact, 3, rng, Spread(**{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread)
+        plan.artifact,
+        3,
+        rng,
+        Spread(**{"phi_rad": 0.003, "correlation_pitches": 4.0} | spread),
     )
-    settings = CellSettings(sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=0.0, sense=sense)
+    settings = CellSettings(
+        sigma_xy_m=MARK, image_xy_m=image_m, servo_sigma_m=0.0, sense=sense
+    )
     later = replace(
         truth,
         t_m=truth.t_m[2:],
@@ -66,11 +71,19 @@ def values(measurements) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize(("image", "missing", "repeats"), [(3.0, 0.0, 1), (1.0, 0.06, 2)])
+@pytest.mark.parametrize(
+    ("image", "missing", "repeats"), [(3.0, 0.0, 1), (1.0, 0.06, 2)]
+)
 def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
     """The plate of the calibration with its noise, then generalised least squares, both dense."""
     _, before, after = sessions(
-        image * MARK, 5, size=5, missing=missing, repeats=repeats, change=3e-8, phi_rad=0.0
+        image * MARK,
+        5,
+        size=5,
+        missing=missing,
+        repeats=repeats,
+        change=3e-8,
+        phi_rad=0.0,
     )
     first = solve_joint(before, LINEAR).result
     found = recheck(after, LINEAR, known_plate(first, "r.json"))
@@ -79,15 +92,22 @@ def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
     later = found.noise.sigma_xy**2
 
     (early, stops), (late, again) = dense(before), dense(after)
-    one = np.eye(len(early)) * (1 - share) + share * np.kron(stops[:, None] == stops, np.eye(2))
+    one = np.eye(len(early)) * (1 - share) + share * np.kron(
+        stops[:, None] == stops, np.eye(2)
+    )
     weight = np.repeat(np.concatenate([view.count for view in after.views]), 2)
     mark = (1 - share) * power
-    two = mark * np.eye(len(late)) + (later - mark) * np.kron(again[:, None] == again, np.eye(2))
+    two = mark * np.eye(len(late)) + (later - mark) * np.kron(
+        again[:, None] == again, np.eye(2)
+    )
     two /= np.sqrt(np.outer(weight, weight))
     noise = block_diag(power * one, two)
     # G and A of the calibration: the scale is the plate's
     inverse, project = np.linalg.pinv(early, rcond=1e-10), datum(before.artifact)
-    z = np.stack([before.artifact.m.ravel(), before.artifact.n.ravel()], axis=1).ravel() * 1.0
+    z = (
+        np.stack([before.artifact.m.ravel(), before.artifact.n.ravel()], axis=1).ravel()
+        * 1.0
+    )
     grown = np.outer(z, z) / (z @ z)
     old = project @ inverse[: 2 * sites]
     plate = inverse[2 * sites : 4 * sites] + grown @ inverse[: 2 * sites]
@@ -114,27 +134,39 @@ def test_map_and_change_as_dense_linear_algebra(image, missing, repeats):
     ):
         spread = np.sqrt(np.diag(rows @ noise @ rows.T))
         for axis in range(2):
-            np.testing.assert_allclose(u[axis], spread[axis::2].reshape(shape), rtol=1e-5)
             np.testing.assert_allclose(
-                of[axis], (rows @ y)[axis::2].reshape(shape), rtol=0, atol=1e-4 * spread.min()
+                u[axis], spread[axis::2].reshape(shape), rtol=1e-5
+            )
+            np.testing.assert_allclose(
+                of[axis],
+                (rows @ y)[axis::2].reshape(shape),
+                rtol=0,
+                atol=1e-4 * spread.min(),
             )
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.06])
-def test_both_maps_of_a_calibration_with_noise_of_images_as_dense_linear_algebra(missing):
+def test_both_maps_of_a_calibration_with_noise_of_images_as_dense_linear_algebra(
+    missing,
+):
     _, before, _ = sessions(3 * MARK, 5, size=5, missing=missing, phi_rad=0.0)
     first = solve_joint(before, LINEAR).result
     kept, project = together(first), datum(before.artifact)
     (matrix, stops), share = dense(before), first.kept.images.share
     inverse = np.linalg.pinv(matrix, rcond=1e-10)
-    z = np.stack([before.artifact.m.ravel(), before.artifact.n.ravel()], axis=1).ravel() * 1.0
+    z = (
+        np.stack([before.artifact.m.ravel(), before.artifact.n.ravel()], axis=1).ravel()
+        * 1.0
+    )
     grown = np.outer(z, z) / (z @ z)
     plate = inverse[50:100] + grown @ inverse[:50]
     plate = plate - (np.eye(50) - project - grown) @ plate
     both = np.vstack(
         [rows[axis::2] for rows in (project @ inverse[:50], plate) for axis in range(2)]
     )
-    noise = np.eye(len(matrix)) * (1 - share) + share * np.kron(stops[:, None] == stops, np.eye(2))
+    noise = np.eye(len(matrix)) * (1 - share) + share * np.kron(
+        stops[:, None] == stops, np.eye(2)
+    )
     wanted = first.noise.sigma_xy**2 * both @ noise @ both.T
     cover = kept.cover(kept.sites, kept.marks)[:-4, :-4]
     np.testing.assert_allclose(cover, wanted, rtol=0, atol=1e-6 * wanted.max())
@@ -154,7 +186,9 @@ def population(image_m, runs, **settings):
             / np.stack([emap.u_gx, emap.u_gy])
         )
         if not settings.get("change"):
-            changes.append(np.stack([told.dx, told.dy]) / np.stack([told.u_dx, told.u_dy]))
+            changes.append(
+                np.stack([told.dx, told.dy]) / np.stack([told.u_dx, told.u_dy])
+            )
         results.append(result)
     return np.array(away), np.array(changes), results
 
@@ -162,19 +196,26 @@ def population(image_m, runs, **settings):
 def require_within(away: np.ndarray) -> None:
     """Require errors of the size of u; a map has some 20 independent ones."""
     assert 0.85 < np.sqrt((away**2).mean()) < 1.15
-    assert (np.abs(away) < 2).mean() >= binom.ppf(1e-3, 20 * len(away), 0.9545) / 20 / len(away)
+    assert (np.abs(away) < 2).mean() >= binom.ppf(
+        1e-3, 20 * len(away), 0.9545
+    ) / 20 / len(away)
 
 
 @pytest.mark.parametrize(
     ("part", "settings"),
-    [(0.3, {"sense": Sense.PLATE_MOVES, "turn": 180}), (1.0, {"repeats": 2, **DISTORTED})],
+    [
+        (0.3, {"sense": Sense.PLATE_MOVES, "turn": 180}),
+        (1.0, {"repeats": 2, **DISTORTED}),
+    ],
 )
 def test_an_unchanged_stage_is_found_within_its_uncertainty(part, settings):
     away, changes, results = population(part * MARK, RUNS, **settings)
     assert all(result.verdict.qualified or result.recheck.changed for result in results)
     require_within(away)
     require_within(changes)
-    assert sum(result.recheck.changed for result in results) <= binom.ppf(0.999, RUNS, 0.05)
+    assert sum(result.recheck.changed for result in results) <= binom.ppf(
+        0.999, RUNS, 0.05
+    )
 
 
 def test_a_changed_stage_is_said_to_have_changed():
@@ -187,9 +228,14 @@ def test_what_a_view_with_images_will_tell_is_predicted():
     """Noise of images alone: the map of one image a site has its noise but for the datum's."""
     _, before, after = sessions(100 * MARK, 5, phi_rad=0.0)
     plate = known_plate(solve_joint(before, LINEAR).result, "r.json")
-    planned = predict_recheck(replace(image_plan(7, turns=(0,)), artifact_from="r.json"), plate)
+    planned = predict_recheck(
+        replace(image_plan(7, turns=(0,)), artifact_from="r.json"), plate
+    )
     result = recheck(after, LINEAR, plate)
-    u = np.stack([result.error_map.u_gx, result.error_map.u_gy]) / plate.result.noise.sigma_xy
+    u = (
+        np.stack([result.error_map.u_gx, result.error_map.u_gy])
+        / plate.result.noise.sigma_xy
+    )
     np.testing.assert_allclose(np.stack([planned.map.ux, planned.map.uy]), u, rtol=1e-6)
     assert 0.9 < planned.map.rms_xy < 1.3
 
@@ -198,5 +244,7 @@ def test_a_plate_calibrated_with_one_mark_an_image_does_not_tell_its_noise():
     _, before, after = sessions(MARK, 1, size=5)
     first = calibrate(before)
     alone = replace(first, kept=replace(first.kept, images=None))
-    with pytest.raises(InputError, match="not separated into that of images and that of marks"):
+    with pytest.raises(
+        InputError, match="not separated into that of images and that of marks"
+    ):
         calibrate(after, Options(plate=alone, plate_from="r.json"))

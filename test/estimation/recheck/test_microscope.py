@@ -40,7 +40,9 @@ STOPS = {"check_marks": 5, "check_offset_m": 20e-6}
 
 
 def settings(sense=Sense.MICROSCOPE_MOVES, stop_m=0.0, noise_m=20e-9):
-    return CellSettings(sense, noise_m, 2e-6, stop_sigma_m=stop_m, visit_order="there_and_back")
+    return CellSettings(
+        sense, noise_m, 2e-6, stop_sigma_m=stop_m, visit_order="there_and_back"
+    )
 
 
 @cache
@@ -48,17 +50,28 @@ def calibrated(sense=Sense.MICROSCOPE_MOVES):
     """Return the truth of a cell and its known plate."""
     rng = np.random.default_rng(8)
     truth = random_truth(
-        PLATE, len(FIRST.views), rng, Spread(phi_rad=1e-3, t_m=3e-5, correlation_pitches=3.0)
+        PLATE,
+        len(FIRST.views),
+        rng,
+        Spread(phi_rad=1e-3, t_m=3e-5, correlation_pitches=3.0),
     )
-    readings = simulate_measurements(truth, FIRST, rng, visits=True, settings=settings(sense))
-    return truth, known_plate(worded(calibrate(readings, Options(causes=False))), "first.json")
+    readings = simulate_measurements(
+        truth, FIRST, rng, visits=True, settings=settings(sense)
+    )
+    return truth, known_plate(
+        worded(calibrate(readings, Options(causes=False))), "first.json"
+    )
 
 
 def later(truth, view, sense=Sense.MICROSCOPE_MOVES, **cell):
     """Return the readings of one view of the plate."""
     plan = Plan("again", PLATE, (replace(FIRST.views[0], name="again", **view),))
     return simulate_measurements(
-        truth, plan, np.random.default_rng(9), visits=True, settings=settings(sense, **cell)
+        truth,
+        plan,
+        np.random.default_rng(9),
+        visits=True,
+        settings=settings(sense, **cell),
     )
 
 
@@ -75,7 +88,8 @@ def touched(scale=0.0, turn=0.0):
 def another_stage(truth):
     x, y = PLATE.x_m, PLATE.y_m
     return replace(
-        truth, g=truth.g + 1e-7 * np.stack([np.sin(60 * x + 40 * y), np.cos(70 * x - 20 * y)])
+        truth,
+        g=truth.g + 1e-7 * np.stack([np.sin(60 * x + 40 * y), np.cos(70 * x - 20 * y)]),
     )
 
 
@@ -84,7 +98,9 @@ def larger_errors(truth):
 
 
 @pytest.mark.parametrize("sense", Sense)
-@pytest.mark.parametrize("scale, turn", [(-0.1, 0.0), (0.1, 0.0), (0.0, 0.1), (-0.05, -0.1)])
+@pytest.mark.parametrize(
+    "scale, turn", [(-0.1, 0.0), (0.1, 0.0), (0.0, 0.1), (-0.05, -0.1)]
+)
 def test_a_touched_camera_is_named_beside_a_changed_stage(scale, turn, sense):
     result = rechecked(touched(scale, turn), sense=sense)
     assert result.recheck.changed and result.verdict.grade is Grade.NOT_QUALIFIED
@@ -102,7 +118,9 @@ def test_a_changed_stage_that_no_camera_explains_is_changed(view):
 
 def test_errors_that_have_grown_are_a_changed_stage_where_check_stops_show_the_camera():
     result = rechecked(larger_errors, STOPS)
-    assert result.verdict.qualified and [found.name for found in result.findings] == ["changed"]
+    assert result.verdict.qualified and [found.name for found in result.findings] == [
+        "changed"
+    ]
 
 
 @pytest.mark.parametrize("view, stop_m", [(STOPS, 0.0), ({}, 30e-6), (STOPS, 30e-6)])
@@ -111,7 +129,9 @@ def test_a_touched_camera_that_visits_show_is_no_changed_stage(view, stop_m, sen
     result = rechecked(touched(-0.1, 0.05), view, sense, stop_m=stop_m)
     assert result.verdict.qualified and not result.recheck.changed
     (found,) = result.findings
-    assert found.name == "microscope_off" and found.size == pytest.approx(-0.1, abs=4 * found.u)
+    assert found.name == "microscope_off" and found.size == pytest.approx(
+        -0.1, abs=4 * found.u
+    )
     assert found.details["turn"] == pytest.approx(0.05, abs=4 * found.details["u_turn"])
     _, plate = calibrated(sense)
     assert result.noise.sigma_xy < 1.5 * plate.result.noise.sigma_xy

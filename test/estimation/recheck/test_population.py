@@ -13,7 +13,9 @@ MACHINES = 3
 @pytest.mark.parametrize("plan", ["lattice", "general six"])
 def test_five_of_hundred_unchanged_machines_are_said_to_have_changed(plan):
     """And those with three nodes moved by ten u are found; the new map has its U at the nodes."""
-    same, other = ([run(Case(plan, seed, size)) for seed in range(MACHINES)] for size in (0, 10.0))
+    same, other = (
+        [run(Case(plan, seed, size)) for seed in range(MACHINES)] for size in (0, 10.0)
+    )
     assert all(qualified for qualified, *_ in (*same, *other))
     assert sum(changed for _, changed, *_ in same) <= binom.ppf(0.999, MACHINES, 0.05)
     assert sum(changed for _, changed, *_ in other) >= 0.9 * MACHINES

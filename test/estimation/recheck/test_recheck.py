@@ -46,10 +46,16 @@ QUIET = {"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0, "stop_sigma_m": 20e
 MODELS = {"none": "", "microscope": "microscope:0.01:0.01:0.002"}
 
 
-@pytest.mark.parametrize(("dof_noise", "p"), [(1e9, chi2.sf(100, 1)), (9, f.sf(100, 1, 9))])
+@pytest.mark.parametrize(
+    ("dof_noise", "p"), [(1e9, chi2.sf(100, 1)), (9, f.sf(100, 1, 9))]
+)
 def test_one_degree_of_freedom_can_contradict_the_plate(dof_noise, p):
     (finding,) = _misfit(100.0, 1, dof_noise)
-    assert (finding.name, finding.size, finding.p) == ("plate_misfit", 10, pytest.approx(p))
+    assert (finding.name, finding.size, finding.p) == (
+        "plate_misfit",
+        10,
+        pytest.approx(p),
+    )
     assert _misfit(2.0, 1, dof_noise) == _misfit(100.0, 0, dof_noise) == ()
 
 
@@ -95,13 +101,18 @@ def one_view(artifact, q=0, a=0, b=0, degrees=0.0):
 @cache
 def sessions(sense=Sense.MICROSCOPE_MOVES, pose=(0, 0, 0), microscope=False):
     """Readings of a calibration on the lattice, and of a view of a stage that has changed."""
-    plan, rng = plan_of("0,90,tx", Artifact(5, PITCH, 8), lines=1), np.random.default_rng(5)
+    plan, rng = (
+        plan_of("0,90,tx", Artifact(5, PITCH, 8), lines=1),
+        np.random.default_rng(5),
+    )
     truth = random_truth(
         plan.artifact,
         len(plan.views),
         rng,
         Spread(
-            phi_rad=1e-5, microscope_scale=4e-3 * microscope, microscope_shear=5e-4 * microscope
+            phi_rad=1e-5,
+            microscope_scale=4e-3 * microscope,
+            microscope_shear=5e-4 * microscope,
         ),
     )
     changed = replace(truth, g=truth.g + rng.normal(0, 3e-8, truth.g.shape))
@@ -117,10 +128,15 @@ def require_first_order(emap):
     known = emap.valid
     x, y = (part[known] for part in (emap.artifact.x_m, emap.artifact.y_m))
     one, none = np.ones_like(x), np.zeros_like(x)
-    along_x, along_y = np.stack([one, none, -y, x, y, x]), np.stack([none, one, x, y, x, -y])
+    along_x, along_y = (
+        np.stack([one, none, -y, x, y, x]),
+        np.stack([none, one, x, y, x, -y]),
+    )
     values = np.concatenate([emap.gx[known], emap.gy[known]])
     fitted = np.linalg.lstsq(np.hstack([along_x, along_y]).T, values, rcond=None)[0]
-    assert [emap.nonorthogonality, emap.scale_difference] == pytest.approx(fitted[4:], rel=1e-6)
+    assert [emap.nonorthogonality, emap.scale_difference] == pytest.approx(
+        fitted[4:], rel=1e-6
+    )
     assert np.abs(fitted[4:]).min() > 1e-9
     return np.linalg.pinv(np.hstack([along_x, along_y]).T)[4:]
 
@@ -149,7 +165,9 @@ def require_same(result, wanted, *, rel=1e-5):
             assert u == pytest.approx(spread, rel=rel)
             assert np.abs(value - of).max() < rel * spread.min()
     shear = require_first_order(emap)
-    assert first_order_u(result) == pytest.approx(wanted.of(shear @ wanted.after)[1], rel=rel)
+    assert first_order_u(result) == pytest.approx(
+        wanted.of(shear @ wanted.after)[1], rel=rel
+    )
     cover = covariance_of(result, "xy", emap.valid)
     assert cover == pytest.approx(wanted.after @ wanted.after.T, abs=rel * cover.max())
     if wanted.K:
@@ -165,7 +183,9 @@ def require_same(result, wanted, *, rel=1e-5):
 @pytest.mark.parametrize("sense", Sense)
 @pytest.mark.parametrize("pose", [(0, 0, 0), (2, 0, 0), (3, 0, 0)])
 @pytest.mark.parametrize("model", MODELS)
-def test_a_view_on_the_lattice_as_one_least_squares_of_both_sessions(model, pose, sense):
+def test_a_view_on_the_lattice_as_one_least_squares_of_both_sessions(
+    model, pose, sense
+):
     before, after = sessions(sense, pose, model == "microscope")
     first = saved(calibrate(before, linear(model)))
     result = recheck(after, linear(model), known_plate(first, "r.json"))
@@ -212,7 +232,12 @@ def general(pose, sigma=20e-9, seed=3, change=0.0, how="bicubic", nodes=5):
 
 @pytest.mark.parametrize(
     ("pose", "nodes"),
-    [((0, (0, 0)), 5), ((4, (0.1, -0.1)), 5), ((90, (0.5, 0.5)), 5), ((4, (0.1, -0.1)), 3)],
+    [
+        ((0, (0, 0)), 5),
+        ((4, (0.1, -0.1)), 5),
+        ((90, (0.5, 0.5)), 5),
+        ((4, (0.1, -0.1)), 3),
+    ],
 )
 def test_a_view_off_the_lattice_as_one_least_squares_of_both_sessions(pose, nodes):
     before, after = general(pose, change=3e-8, nodes=nodes)
@@ -223,7 +248,11 @@ def test_a_view_off_the_lattice_as_one_least_squares_of_both_sessions(pose, node
     require_same(
         result,
         TwoSessions(
-            before, after, before.artifact, first.noise.sigma_xy, known=result.error_map.valid
+            before,
+            after,
+            before.artifact,
+            first.noise.sigma_xy,
+            known=result.error_map.valid,
         ),
         rel=1e-4,
     )
@@ -261,7 +290,9 @@ def test_terms_with_sizes_are_part_of_the_noise():
 def test_what_has_changed_is_read_as_it_was_written():
     written = recheck(sessions()[1], linear(), known_plate(calibrated(), "r.json"))
     data = result_to_dict(worded(written))
-    assert {"of", "changed", "p", "largest", "dx", "largest_theta"} < set(data["recheck"])
+    assert {"of", "changed", "p", "largest", "dx", "largest_theta"} < set(
+        data["recheck"]
+    )
     read = saved(written)
     assert read.recheck.to_dict() == data["recheck"]
     np.testing.assert_array_equal(read.recheck.u_dy, written.recheck.u_dy)
@@ -277,7 +308,9 @@ def test_the_noise_is_that_of_many_repeats_or_of_the_calibration():
     assert recheck(after, linear(), plate).noise.sigma_xy == plate.result.noise.sigma_xy
     view = after.views[0]
     for dof, sigma in ((29, plate.result.noise.sigma_xy), (30, 5e-8)):
-        more = replace(after, views=(replace(view, sigma_xy=5e-8, dof_xy=dof, visits=None),))
+        more = replace(
+            after, views=(replace(view, sigma_xy=5e-8, dof_xy=dof, visits=None),)
+        )
         assert recheck(more, linear(), plate).noise.sigma_xy == pytest.approx(sigma)
 
 
@@ -290,7 +323,9 @@ def test_marks_and_lines_that_are_missing_are_unknown():
     np.testing.assert_array_equal(
         result.error_map.valid, np.tile(np.arange(-2, 3)[:, None] > -2, 5)
     )
-    np.testing.assert_array_equal(np.isfinite(result.error_map.g_theta), np.arange(8) > 1)
+    np.testing.assert_array_equal(
+        np.isfinite(result.error_map.g_theta), np.arange(8) > 1
+    )
     assert abs(np.nansum(result.error_map.gx)) < 1e-15
     assert np.nansum(result.error_map.g_theta) == pytest.approx(0, abs=1e-15)
 
@@ -302,20 +337,28 @@ def test_a_view_that_is_only_partly_read_is_said():
     few = subset(view, np.arange(len(view.m)) < 12, np.ones(len(view.k), dtype=bool))
     for part, warned in ((view, False), (few, True)):
         found = worded(recheck(replace(after, views=(part,)), linear(), plate))
-        said = "is only partly in the map: 12 of 25 marks and 8 of 8 lines became readings"
+        said = (
+            "is only partly in the map: 12 of 25 marks and 8 of 8 lines became readings"
+        )
         assert any(said in text for text in result_to_dict(found)["warnings"]) is warned
 
 
 def test_a_mark_that_is_not_known_but_visited_twice_is_left_out():
     """The calibration has not read it: map and u are those of a view without it."""
-    before, again = sessions()[0], replace(one_view(Artifact(5, PITCH, 8)).views[0], repeats=2)
+    before, again = (
+        sessions()[0],
+        replace(one_view(Artifact(5, PITCH, 8)).views[0], repeats=2),
+    )
     kept = [
         replace(
-            subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool)), visits=None
+            subset(view, (view.m != 1) | (view.n != -2), np.ones(len(view.k), bool)),
+            visits=None,
         )
         for view in before.views
     ]
-    plate = known_plate(saved(calibrate(replace(before, views=tuple(kept)), linear())), "r.json")
+    plate = known_plate(
+        saved(calibrate(replace(before, views=tuple(kept)), linear())), "r.json"
+    )
     assert plate.together.marks.sum() == 24
     plan, rng = Plan("again", before.artifact, (again,)), np.random.default_rng(6)
     truth = random_truth(plan.artifact, 1, rng, Spread(phi_rad=1e-5))
@@ -332,8 +375,12 @@ def test_a_mark_that_is_not_known_but_visited_twice_is_left_out():
         recheck(replace(after, views=(replace(one, visits=seen),)), linear(), plate)
         for one, seen in ((view, view.visits), (fewer, None))
     )
-    assert whole.error_map.gx == pytest.approx(part.error_map.gx, abs=1e-15, nan_ok=True)
-    assert whole.error_map.u_gx == pytest.approx(part.error_map.u_gx, rel=1e-9, nan_ok=True)
+    assert whole.error_map.gx == pytest.approx(
+        part.error_map.gx, abs=1e-15, nan_ok=True
+    )
+    assert whole.error_map.u_gx == pytest.approx(
+        part.error_map.u_gx, rel=1e-9, nan_ok=True
+    )
 
 
 def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
@@ -349,7 +396,10 @@ def test_a_plate_of_another_kind_is_not_the_one_that_is_known():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"verdict": Verdict(Grade.NOT_QUALIFIED)}, "is not qualified, so its plate is not known"),
+        (
+            {"verdict": Verdict(Grade.NOT_QUALIFIED)},
+            "is not qualified, so its plate is not known",
+        ),
         ({"views": ()}, "does not contain the covariance of its plate"),
         (
             {"recheck": SimpleNamespace(of="first.json")},
@@ -366,8 +416,14 @@ def test_what_one_view_cannot_tell_is_refused():
     plate, (_, after) = known_plate(calibrated(), "r.json"), sessions()
     with pytest.raises(InputError, match="term 'drift'; give it a size, drift:SIZE"):
         recheck(after, replace(linear(), terms=parse_terms(["drift"], "")), plate)
-    with pytest.raises(InputError, match="a recheck always uses the reference length of"):
-        recheck(after, replace(linear(), reference=ReferenceLength("artifact", 0.0, 0.0)), plate)
+    with pytest.raises(
+        InputError, match="a recheck always uses the reference length of"
+    ):
+        recheck(
+            after,
+            replace(linear(), reference=ReferenceLength("artifact", 0.0, 0.0)),
+            plate,
+        )
     nothing = replace(
         after,
         views=(
@@ -385,8 +441,12 @@ def test_what_one_view_cannot_tell_is_refused():
     with pytest.raises(NoDataError, match="no known mark was read"):
         recheck(nothing, linear(), plate)
     before, few = general((0, (3.2, 3.1)))
-    with pytest.raises(NotIdentifiableError, match=r"leaves .* of 25 nodes of the map unknown"):
-        recheck(few, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
+    with pytest.raises(
+        NotIdentifiableError, match=r"leaves .* of 25 nodes of the map unknown"
+    ):
+        recheck(
+            few, linear(), known_plate(saved(calibrate(before, linear())), "r.json")
+        )
 
 
 @pytest.mark.parametrize(
@@ -402,7 +462,9 @@ def test_nodes_that_the_readings_do_not_determine_are_unknown(how, gone, free):
     view, artifact = after.views[0], after.artifact
     kept = ~gone(view.m, view.n)
     after = replace(after, views=(subset(view, kept, np.zeros(0, bool)),))
-    result = recheck(after, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
+    result = recheck(
+        after, linear(), known_plate(saved(calibrate(before, linear())), "r.json")
+    )
     m, n, valid = view.m[kept], view.n[kept], result.error_map.valid.ravel()
     w = placed.rows(artifact, view.view.pose.places(artifact, m, n)) + 0j
     turn = np.exp(1j * view.view.rotation_rad)
@@ -424,7 +486,9 @@ def test_the_budget_is_of_the_known_nodes_alone():
     after = replace(
         after, views=(subset(after.views[0], after.views[0].m <= 5, np.zeros(0, bool)),)
     )
-    found = recheck(after, linear(), known_plate(saved(calibrate(before, linear())), "r.json"))
+    found = recheck(
+        after, linear(), known_plate(saved(calibrate(before, linear())), "r.json")
+    )
     emap, lines = found.error_map, [line for line in found.budget if line.effect_max]
     u = np.concatenate([emap.u_gx[emap.valid], emap.u_gy[emap.valid]])
     assert np.count_nonzero(~emap.valid) > 0 and len(lines) >= 2
@@ -441,7 +505,10 @@ def test_a_map_with_as_many_nodes_as_marks_needs_more_than_one_view():
     plate = known_plate(saved(calibrate(before, linear())), "r.json")
     after, _ = placed.readings(artifact, [(0, (0.3, 0))], rng, linear=True)
     planned = Plan("again", artifact, (after.views[0].view,))
-    for what in (lambda: recheck(after, linear(), plate), lambda: predict_recheck(planned, plate)):
+    for what in (
+        lambda: recheck(after, linear(), plate),
+        lambda: predict_recheck(planned, plate),
+    ):
         with pytest.raises(
             NotIdentifiableError,
             match=r"leaves 81 of 81 nodes of the map unknown: "
@@ -455,7 +522,9 @@ def test_another_plate_beneath_a_map_with_fewer_nodes_than_marks_is_named():
     plate = known_plate(saved(calibrate(before, linear())), "r.json")
     assert recheck(after, linear(), plate).verdict.grade is Grade.GOOD
     rng, view = np.random.default_rng(1), after.views[0]
-    other = replace(after, views=(replace(view, dx=view.dx + rng.normal(0, 3e-7, len(view.m))),))
+    other = replace(
+        after, views=(replace(view, dx=view.dx + rng.normal(0, 3e-7, len(view.m))),)
+    )
     result = recheck(other, linear(), plate)
     assert [found.name for found in result.verdict.failed] == ["other_plate"]
 
@@ -467,12 +536,19 @@ def test_a_stage_read_beside_its_sites_where_the_calibration_was_as_well():
     truth = random_truth(
         artifact, 3, rng, Spread(correlation_pitches=5.0, t_m=0, phi_rad=1e-3, g_m=2e-6)
     )
-    settings = CellSettings(sigma_xy_m=5e-9, follow_mark=True, **(QUIET | {"stop_sigma_m": 0}))
+    settings = CellSettings(
+        sigma_xy_m=5e-9, follow_mark=True, **(QUIET | {"stop_sigma_m": 0})
+    )
     first = saved(
-        calibrate(simulate_measurements(truth, plan, rng, visits=True, settings=settings), BARE)
+        calibrate(
+            simulate_measurements(truth, plan, rng, visits=True, settings=settings),
+            BARE,
+        )
     )
     beside = replace(truth, t_m=np.array([[5e-4, -4e-4]]), phi_rad=truth.phi_rad[:1])
-    after = simulate_measurements(beside, one_view(artifact), rng, visits=True, settings=settings)
+    after = simulate_measurements(
+        beside, one_view(artifact), rng, visits=True, settings=settings
+    )
     plate = known_plate(first, "r.json")
     found = recheck(after, BARE, plate).recheck
     assert not found.changed
@@ -484,17 +560,28 @@ def test_a_stage_read_beside_its_sites_where_the_calibration_was_as_well():
 def test_lines_of_two_views_as_one_generalised_least_squares(sense):
     """Some are not read; the plate is known with a dense covariance, and a term has a size."""
     rng, count, sigma, turns = np.random.default_rng(8), 7, 2e-6, (0, 3)
-    weight = rng.integers(1, 4, (2, count)).astype(float) * (rng.random((2, count)) < 0.8)
-    root, y = 3e-6 * rng.normal(size=(2 * count, count)), 1e-5 * rng.normal(size=(2, count))
+    weight = rng.integers(1, 4, (2, count)).astype(float) * (
+        rng.random((2, count)) < 0.8
+    )
+    root, y = (
+        3e-6 * rng.normal(size=(2 * count, count)),
+        1e-5 * rng.normal(size=(2, count)),
+    )
     before, of_term, plate = (
         root @ root.T,
         rng.normal(size=(2, count)),
         1e-5 * rng.normal(size=count),
     )
-    columns = np.concatenate([np.tile(np.eye(count)[:, None], (1, 2, 1)), of_term[None]])
+    columns = np.concatenate(
+        [np.tile(np.eye(count)[:, None], (1, 2, 1)), of_term[None]]
+    )
     source = np.array(["known plate"] * count + ["terms"])
     effects = Effects.of(
-        source, np.append(np.ones(count), 4e-6), plate, before=before, length=np.zeros(count)
+        source,
+        np.append(np.ones(count), 4e-6),
+        plate,
+        before=before,
+        length=np.zeros(count),
     )
     noise = noise_estimate((sigma, 99), (np.nan, 0), np.nan)
     found = map_of_lines(
@@ -513,14 +600,21 @@ def test_lines_of_two_views_as_one_generalised_least_squares(sense):
     else:
         design = np.eye(count)[at]
     known, of_plate = np.isin(np.arange(count), at), np.eye(count)[line]
-    cover = np.diag(sigma**2 / weight[view, line]) + of_plate @ before[count:, count:] @ of_plate.T
+    cover = (
+        np.diag(sigma**2 / weight[view, line])
+        + of_plate @ before[count:, count:] @ of_plate.T
+    )
     cover += 4e-6**2 * np.outer(of_term[view, line], of_term[view, line])
     white = np.linalg.inv(np.linalg.cholesky(cover))
-    gain = np.linalg.pinv(white @ np.hstack([design, np.eye(2)[view]]), rcond=1e-9) @ white
+    gain = (
+        np.linalg.pinv(white @ np.hstack([design, np.eye(2)[view]]), rcond=1e-9) @ white
+    )
     rows = gain[:count][known]
     rows = rows - rows.mean(axis=0)
     np.testing.assert_array_equal(found.known, known)
-    np.testing.assert_allclose(found.values, rows @ (y[view, line] - plate[line]), atol=1e-15)
+    np.testing.assert_allclose(
+        found.values, rows @ (y[view, line] - plate[line]), atol=1e-15
+    )
     whole = sum(found.covariances(0.0).values())
     np.testing.assert_allclose(whole, rows @ cover @ rows.T, atol=1e-20)
     np.testing.assert_allclose(found.from_plate, rows @ of_plate, atol=1e-9)
@@ -530,7 +624,8 @@ def test_lines_without_noise_are_refused():
     """There is nothing to judge their change by, however noisy the marks are."""
     _, after = sessions()
     plate = known_plate(
-        replace(calibrated(), noise=replace(calibrated().noise, sigma_theta=1e-14)), "r.json"
+        replace(calibrated(), noise=replace(calibrated().noise, sigma_theta=1e-14)),
+        "r.json",
     )
     with pytest.raises(InputError, match="no noise against which to judge a change"):
         recheck(after, linear(), plate)

@@ -35,10 +35,16 @@ HIDDEN = [(0, (1, 0)), (90, (0, 0)), (180, (0, 0)), (270, (0, -1))]
 def calibrated(sense):
     """Return the truth, and what a calibration of it makes known."""
     plan, rng = plan_of("0,90,180,tx,ty", ARTIFACT), np.random.default_rng(2)
-    truth = random_truth(ARTIFACT, len(plan.views), rng, Spread(correlation_pitches=4.0))
-    readings = simulate_measurements(truth, plan, rng, settings=CellSettings(sense, 20e-9))
+    truth = random_truth(
+        ARTIFACT, len(plan.views), rng, Spread(correlation_pitches=4.0)
+    )
+    readings = simulate_measurements(
+        truth, plan, rng, settings=CellSettings(sense, 20e-9)
+    )
     result = calibrate(readings, BARE)
-    return truth, known_plate(result_from_dict(result_to_dict(worded(result)), "r"), "r.json")
+    return truth, known_plate(
+        result_from_dict(result_to_dict(worded(result)), "r"), "r.json"
+    )
 
 
 def once_more(sense, degrees=0.0, shift=(0, 0), *, repeats=2, **changes):
@@ -64,15 +70,23 @@ def once_more(sense, degrees=0.0, shift=(0, 0), *, repeats=2, **changes):
 def said_to_lie(after, degrees, shift=(0, 0)):
     """Return the readings of a view as those of the sites of another pose, as if without ids."""
     (seen,), turn = after.views, np.exp(1j * np.radians(degrees))
-    at = (seen.view.pose.places(ARTIFACT, seen.m, seen.n) / 0.01 - complex(*shift)) / turn
-    view = View("again", np.radians(degrees), tuple(0.01 * part for part in shift), True, False)
+    at = (
+        seen.view.pose.places(ARTIFACT, seen.m, seen.n) / 0.01 - complex(*shift)
+    ) / turn
+    view = View(
+        "again", np.radians(degrees), tuple(0.01 * part for part in shift), True, False
+    )
     m, n = np.rint(at.real).astype(int), np.rint(at.imag).astype(int)
     on = np.maximum(abs(m), abs(n)) <= ARTIFACT.half[0]
     order = np.lexsort((n[on], m[on]))
     part = {name: getattr(seen, name)[on][order] for name in ("dx", "dy", "count")}
     return replace(
         after,
-        views=(replace(seen, view=view, m=m[on][order], n=n[on][order], **part, visits=None),),
+        views=(
+            replace(
+                seen, view=view, m=m[on][order], n=n[on][order], **part, visits=None
+            ),
+        ),
     )
 
 
@@ -112,17 +126,25 @@ def test_a_plate_of_the_same_drawing_is_another_plate_though_it_differs_little(s
     marks = plate.result.artifact_map
     u = rms(np.stack([marks.u_ax, marks.u_ay, plate.result.error_map.u_gx]))
     rng = np.random.default_rng(seed)
-    other = once_more(Sense.MICROSCOPE_MOVES, a=truth.a + rng.normal(0, 5 * u, truth.a.shape))
-    assert [found.name for found in recheck(other, BARE, plate).verdict.failed] == ["other_plate"]
+    other = once_more(
+        Sense.MICROSCOPE_MOVES, a=truth.a + rng.normal(0, 5 * u, truth.a.shape)
+    )
+    assert [found.name for found in recheck(other, BARE, plate).verdict.failed] == [
+        "other_plate"
+    ]
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_another_machine_with_another_plate_is_not_a_changed_stage(seed):
     """The stages differ smoothly, as much as the plates do from mark to mark; no pose is named."""
     _, plate = calibrated(Sense.MICROSCOPE_MOVES)
-    other = random_truth(ARTIFACT, 1, np.random.default_rng(seed), Spread(correlation_pitches=4.0))
+    other = random_truth(
+        ARTIFACT, 1, np.random.default_rng(seed), Spread(correlation_pitches=4.0)
+    )
     size = np.std(other.g) / np.std(other.a)
-    result = recheck(once_more(Sense.MICROSCOPE_MOVES, g=other.g, a=size * other.a), BARE, plate)
+    result = recheck(
+        once_more(Sense.MICROSCOPE_MOVES, g=other.g, a=size * other.a), BARE, plate
+    )
     assert [found.name for found in result.verdict.failed] == ["other_plate"]
 
 
@@ -148,9 +170,13 @@ def test_a_bent_stage_and_a_few_marks_are_not_another_plate(size):
         size * np.stack([np.sin(4 * y), np.sin(4 * x)]),
         few,
     ):
-        result = worded(recheck(once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent), BARE, plate))
+        result = worded(
+            recheck(once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent), BARE, plate)
+        )
         assert result.recheck.changed
-        assert result.verdict.sentence.startswith("Changed since r.json: calibrate again, provided")
+        assert result.verdict.sentence.startswith(
+            "Changed since r.json: calibrate again, provided"
+        )
 
 
 def test_a_scale_that_has_changed_is_the_headline():
@@ -158,7 +184,9 @@ def test_a_scale_that_has_changed_is_the_headline():
     grown = 5e-6 * np.stack([ARTIFACT.x_m, ARTIFACT.y_m])
     for sign in (1, -1):
         result = worded(
-            recheck(once_more(Sense.MICROSCOPE_MOVES, a=truth.a + sign * grown), BARE, plate)
+            recheck(
+                once_more(Sense.MICROSCOPE_MOVES, a=truth.a + sign * grown), BARE, plate
+            )
         )
         found = result.recheck
         assert found.scale.changed and not found.changed
@@ -174,13 +202,20 @@ def test_a_change_that_one_pass_shows_is_not_qualified_unless_drift_is_declared(
     truth, plate = calibrated(Sense.MICROSCOPE_MOVES)
     bent = 3e-7 * np.stack([ARTIFACT.y_m**2, ARTIFACT.x_m**2]) / 9e-4
     one, two = (
-        once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent, repeats=repeats) for repeats in (1, 2)
+        once_more(Sense.MICROSCOPE_MOVES, g=truth.g + bent, repeats=repeats)
+        for repeats in (1, 2)
     )
     drift = replace(BARE, terms=(*BARE.terms, ModelTerm("drift", 1e-8)))
-    for readings, options, told in ((one, BARE, False), (two, BARE, True), (one, drift, True)):
+    for readings, options, told in (
+        (one, BARE, False),
+        (two, BARE, True),
+        (one, drift, True),
+    ):
         result = worded(recheck(readings, options, plate))
         assert result.recheck.changed and result.verdict.qualified is told
-        assert ("cannot tell a change from drift" in result.verdict.sentence) is not told
+        assert (
+            "cannot tell a change from drift" in result.verdict.sentence
+        ) is not told
         assert result.verdict.sentence.startswith("Changed since r.json") is told
 
 
@@ -190,13 +225,18 @@ def test_a_view_off_the_lattice_that_lies_a_quarter_turn_on():
     readings, _ = placed.readings(artifact, poses, rng)
     plate = known_plate(
         result_from_dict(
-            result_to_dict(worded(calibrate(replace(readings, views=readings.views[:6]), BARE))),
+            result_to_dict(
+                worded(calibrate(replace(readings, views=readings.views[:6]), BARE))
+            ),
             "r",
         ),
         "r.json",
     )
     seen, turned = readings.views[6:]
-    assert recheck(replace(readings, views=(turned,)), BARE, plate).verdict.grade is Grade.GOOD
+    assert (
+        recheck(replace(readings, views=(turned,)), BARE, plate).verdict.grade
+        is Grade.GOOD
+    )
     lies = replace(turned, view=seen.view, m=-turned.n, n=turned.m)
     with pytest.raises(PlacingError, match="the plate lies turned by 127°, not by 37°"):
         recheck(replace(readings, views=(lies,)), BARE, plate)

@@ -41,22 +41,29 @@ def session(seed, warmer, *, told=True, sense=Sense.MICROSCOPE_MOVES):
     """Return a recheck of a plate that is now warmer, K, and the true error of the stage."""
     rng = np.random.default_rng(seed)
     expansion = EXPANSION + U_EXPANSION * rng.normal()
-    length, truth = LENGTH + U_LENGTH * rng.normal(), random_truth(PLAN.artifact, 3, rng)
+    length, truth = (
+        LENGTH + U_LENGTH * rng.normal(),
+        random_truth(PLAN.artifact, 3, rng),
+    )
 
     def shown(celsius):
         read = celsius + U_KELVIN * rng.normal()
         return f"{read}:{U_KELVIN}:{EXPANSION}:{U_EXPANSION}"
 
-    reference = ReferenceLength(ReferenceKind.ARTIFACT, LENGTH, U_LENGTH, "C 1").at_temperature(
-        shown(20.4)
+    reference = ReferenceLength(
+        ReferenceKind.ARTIFACT, LENGTH, U_LENGTH, "C 1"
+    ).at_temperature(shown(20.4))
+    cold, warm = (
+        of_length(truth, length + expansion * (kelvin + 0.4)) for kelvin in (0, warmer)
     )
-    cold, warm = (of_length(truth, length + expansion * (kelvin + 0.4)) for kelvin in (0, warmer))
     of_plate = simulate_measurements(cold, PLAN, rng, sigma_m=2e-8, sense=sense)
     before = worded(calibrate(of_plate, Options(reference=reference, causes=False)))
     view = replace(PLAN, plan_id="again", views=PLAN.views[:1])
     plate = known_plate(before, "before.json", shown(20.4 + warmer) if told else "")
     again = simulate_measurements(warm, view, rng, sigma_m=2e-8, sense=sense)
-    return recheck(again, Options(terms=parse_terms(["plate_shape:0"], "")), plate), truth
+    return recheck(
+        again, Options(terms=parse_terms(["plate_shape:0"], "")), plate
+    ), truth
 
 
 @pytest.mark.parametrize(
@@ -74,7 +81,9 @@ def test_a_recheck_of_a_warmer_plate_is_within_its_u(warmer, told, sense):
         result, truth = session(seed, warmer, told=told, sense=sense)
         emap = result.error_map
         modes = datum_modes(PLAN.artifact, scale=True)
-        error = remove_modes(np.stack([emap.gx, emap.gy]) - truth.g, modes[: 3 if told else 4])
+        error = remove_modes(
+            np.stack([emap.gx, emap.gy]) - truth.g, modes[: 3 if told else 4]
+        )
         ratios.append(error / np.stack([emap.u_gx, emap.u_gy]))
         scales.append(result.recheck.scale.p)
         assert (result.reference is not None) is told is is_traceable(result)
@@ -88,9 +97,14 @@ def test_what_was_converted_is_stated():
     assert told.reference.certified.temperature_c == pytest.approx(20.9, abs=0.2)
     assert "converted to the temperature of this measurement" in scale_texts(told)[0]
     by_kind = {line.component: line for line in told.budget}
-    assert by_kind["plate temperature"].kind == "B" and by_kind["plate temperature"].u > 0
+    assert (
+        by_kind["plate temperature"].kind == "B" and by_kind["plate temperature"].u > 0
+    )
     [convention] = scale_texts(session(1, 0.5, told=False)[0])
-    assert "the temperature of the known plate in this measurement was not stated" in convention
+    assert (
+        "the temperature of the known plate in this measurement was not stated"
+        in convention
+    )
 
 
 def test_a_temperature_that_has_nothing_to_convert_is_refused():
@@ -105,10 +119,16 @@ def test_a_temperature_that_has_nothing_to_convert_is_refused():
     text = "20.4:0.05:8e-6:4e-7"
     for reference in (None, certified, axis.at_temperature(text)):
         result = worded(calibrate(readings, Options(reference=reference, causes=False)))
-        with pytest.raises(InputError, match="r has no reference length of its plate with the"):
+        with pytest.raises(
+            InputError, match="r has no reference length of its plate with the"
+        ):
             known_plate(result, "r", text)
     result = worded(
-        calibrate(readings, Options(reference=certified.at_temperature(text), causes=False))
+        calibrate(
+            readings, Options(reference=certified.at_temperature(text), causes=False)
+        )
     )
-    with pytest.raises(InputError, match="expansion_per_k is 5e-07, and 8e-06 in r; change the"):
+    with pytest.raises(
+        InputError, match="expansion_per_k is 5e-07, and 8e-06 in r; change the"
+    ):
         known_plate(result, "r", "20.4:0.05:5e-7:4e-7")

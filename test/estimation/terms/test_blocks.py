@@ -68,7 +68,9 @@ def sagging(tmp_path, monkeypatch):
             "noise": {"sigma_xy": 5e-9, "sigma_theta": 1e-6},
         },
     )
-    assert main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "bag")]) == 0
+    assert (
+        main(["simulate", str(tmp_path / "sim.yaml"), "-o", str(tmp_path / "bag")]) == 0
+    )
     return str(tmp_path / "bag")
 
 
@@ -97,17 +99,35 @@ def test_it_is_found_sized_and_said(sagging, capsys):
 @pytest.mark.usefixtures("stage_sag")
 @pytest.mark.parametrize("size", ["", ":1e-5"])
 def test_it_is_a_term_of_the_model(sagging, capsys, size):
-    code, result, shown = solved(sagging, capsys, "--model", f"stage_sag{size}", "--budget")
-    term = next(term for term in result["model"]["terms"] if term["name"] == "stage_sag")
+    code, result, shown = solved(
+        sagging, capsys, "--model", f"stage_sag{size}", "--budget"
+    )
+    term = next(
+        term for term in result["model"]["terms"] if term["name"] == "stage_sag"
+    )
     [estimate] = term["estimates"]
-    assert abs(estimate["value"] - SAG) < 4 * estimate["u"] < 0.2 * SAG  # bending of 5 nm
-    assert code == 0 and "stage_sag" not in [c["name"] for c in result["verdict"]["causes"]]
+    # bending of 5 nm
+    assert abs(estimate["value"] - SAG) < 4 * estimate["u"] < 0.2 * SAG
+    assert code == 0 and "stage_sag" not in [
+        c["name"] for c in result["verdict"]["causes"]
+    ]
     assert ("term stage_sag" in shown) == bool(size)
 
 
 @pytest.mark.usefixtures("stage_sag")
 def test_a_plan_that_does_not_tell_it_is_refused_with_its_cure(capsys):
-    assert main(["plan", "check", str(ROOT / "config/plans/hu.yaml"), "--model", "stage_sag"]) == 0
+    assert (
+        main(
+            [
+                "plan",
+                "check",
+                str(ROOT / "config/plans/hu.yaml"),
+                "--model",
+                "stage_sag",
+            ]
+        )
+        == 0
+    )
     assert "stage_sag" in capsys.readouterr().out
     assert [term.name for term in parse_terms(["stage_sag:1e-6,drift"], "x")] == [
         "drift",
@@ -127,7 +147,10 @@ def test_a_plan_that_does_not_tell_it_is_refused_with_its_cure(capsys):
             "sag = stage_sag:BLOCK",
             "^block 'sag' .*: it is not a selfcal_ros.blocks.Block of this name",
         ),
-        ("drift = stage_sag:BLOCK", "^block 'drift' .*, or another block has the name; correct"),
+        (
+            "drift = stage_sag:BLOCK",
+            "^block 'drift' .*, or another block has the name; correct",
+        ),
     ],
 )
 def test_a_block_that_cannot_be_used_is_named(tmp_path, monkeypatch, entry, message):

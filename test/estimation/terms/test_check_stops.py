@@ -66,7 +66,12 @@ def estimated(measurements):
 def test_scale_turn_and_shear_are_found_within_their_uncertainty(sense):
     _, measurements = measured(sense)
     found = estimated(measurements)
-    for part, true in (("scale", 0.01), ("turn", 5e-3), ("stretch", 0.0), ("shear", 2e-3)):
+    for part, true in (
+        ("scale", 0.01),
+        ("turn", 5e-3),
+        ("stretch", 0.0),
+        ("shear", 2e-3),
+    ):
         value, u = found[part]
         assert abs(value - true) < 3 * u
         # noise over the offsets of as many readings along both axes
@@ -75,7 +80,11 @@ def test_scale_turn_and_shear_are_found_within_their_uncertainty(sense):
 
 def test_the_map_of_a_wrong_microscope_is_right_however_it_is_known():
     truth, measurements = measured(Sense.MICROSCOPE_MOVES)
-    for options, grade in ((FREE, Grade.GOOD), (BARE, Grade.ENLARGED), (Options(), Grade.GOOD)):
+    for options, grade in (
+        (FREE, Grade.GOOD),
+        (BARE, Grade.ENLARGED),
+        (Options(), Grade.GOOD),
+    ):
         result = calibrate(measurements, options)
         assert result.verdict.grade is grade
         assert covered(result, truth.g) > 0.85
@@ -90,7 +99,9 @@ def test_without_check_stops_the_same_machine_does_not_show_it():
 @pytest.mark.parametrize("consecutive", [False, True])
 def test_a_check_stop_that_was_lost_does_not_bias_the_map_with_the_term(consecutive):
     """The mean of its mark then has a mean offset, which the columns of the term have as well."""
-    _, measurements = measured(Sense.MICROSCOPE_MOVES, servo_sigma_m=0.0, consecutive=consecutive)
+    _, measurements = measured(
+        Sense.MICROSCOPE_MOVES, servo_sigma_m=0.0, consecutive=consecutive
+    )
     view = measurements.views[0]
     visits = view.visits
     last = int(np.argmax(visits.offset_y))  # the one at -y of a mark

@@ -70,11 +70,19 @@ def views(*poses, lines, repeats, order):
         View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, lines > 0, n, order)
         for (name, q, a, b), n in zip(poses, repeats, strict=True)
     ]
-    turned = [View("line", 2 * np.pi / lines, (0.0, 0.0), False, True, 3)] if lines else []
+    turned = (
+        [View("line", 2 * np.pi / lines, (0.0, 0.0), False, True, 3)] if lines else []
+    )
     return (*named[:2], *turned, *named[2:])
 
 
-FIVE = (("0", 0, 0, 0), ("90", 1, 0, 0), ("+x", 0, 1, 0), ("-x", 0, -1, 0), ("+y", 0, 0, 1))
+FIVE = (
+    ("0", 0, 0, 0),
+    ("90", 1, 0, 0),
+    ("+x", 0, 1, 0),
+    ("-x", 0, -1, 0),
+    ("+y", 0, 0, 1),
+)
 PLANS = {
     "lines": Plan(
         "lines",
@@ -140,9 +148,12 @@ def solved(readings, model, **how):
     terms = parse_terms([MODELS[model]], "")
     result = solve_joint(
         readings,
-        Options(terms=terms, uncertainty=True, drift_degree=DEGREE, **{"assumed": (), **how}),
+        Options(
+            terms=terms, uncertainty=True, drift_degree=DEGREE, **{"assumed": (), **how}
+        ),
     ).result
-    assert all(term.size_used is None for term in result.model.terms)  # none is contradicted
+    # none is contradicted
+    assert all(term.size_used is None for term in result.model.terms)
     return result
 
 
@@ -182,7 +193,9 @@ def require_same(result, dense, *, of_u=0.01, axes=False):
     if not axes:
         require_same_plate(result, dense, of_u)
     found = {
-        (term.name, e.view, e.component): e for term in result.model.terms for e in term.estimates
+        (term.name, e.view, e.component): e
+        for term in result.model.terms
+        for e in term.estimates
     }
     coefficients = dense.coefficients()
     assert set(found) == set(coefficients)
@@ -196,12 +209,17 @@ def require_same_plate(result, dense, of_u):
     plate = result.artifact_map
     known, sites = np.isfinite(plate.ax), np.isfinite(result.error_map.gx)
     for value, u, wanted, spread in zip(
-        (plate.ax, plate.ay), (plate.u_ax, plate.u_ay), *dense.plate(known, sites), strict=True
+        (plate.ax, plate.ay),
+        (plate.u_ax, plate.u_ay),
+        *dense.plate(known, sites),
+        strict=True,
     ):
         assert np.abs(u[known] / spread[known] - 1).max() < 0.1 * of_u
         assert np.abs((value - wanted)[known] / u[known]).max() < of_u
     if result.artifact.angular_count:
-        wanted, spread = dense.plate_theta(np.isfinite(result.error_map.g_theta), sites, known)
+        wanted, spread = dense.plate_theta(
+            np.isfinite(result.error_map.g_theta), sites, known
+        )
         known = np.isfinite(plate.a_theta)
         assert np.abs(plate.u_a_theta[known] / spread[known] - 1).max() < 0.1 * of_u
         assert np.abs((plate.a_theta - wanted)[known] / spread[known]).max() < of_u
@@ -217,13 +235,20 @@ def require_same_plate(result, dense, of_u):
     ],
 )
 def test_a_model_as_the_dense_matrix_has_it(plan, model, sense):
-    require_same(*both(measured(plan, model, sense), model, misalignment_model="linear"))
+    require_same(
+        *both(measured(plan, model, sense), model, misalignment_model="linear")
+    )
 
 
 @pytest.mark.parametrize("model", ["none", "free"])
 def test_nothing_more_is_assumed_of_a_linear_model(model):
     require_same(
-        *both(measured("lines", model), model, misalignment_model="linear", assumed=default_terms())
+        *both(
+            measured("lines", model),
+            model,
+            misalignment_model="linear",
+            assumed=default_terms(),
+        )
     )
 
 
@@ -247,7 +272,8 @@ def test_with_marks_and_lines_missing(model, sense):
 
 
 @pytest.mark.parametrize(
-    ("model", "sense"), [("assumed", Sense.MICROSCOPE_MOVES), ("sized", Sense.PLATE_MOVES)]
+    ("model", "sense"),
+    [("assumed", Sense.MICROSCOPE_MOVES), ("sized", Sense.PLATE_MOVES)],
 )
 def test_in_the_datum_of_the_axes(model, sense):
     require_same(
@@ -262,10 +288,13 @@ def test_in_the_datum_of_the_axes(model, sense):
 
 
 @pytest.mark.parametrize(
-    ("model", "sense"), [("none", Sense.MICROSCOPE_MOVES), ("assumed", Sense.PLATE_MOVES)]
+    ("model", "sense"),
+    [("none", Sense.MICROSCOPE_MOVES), ("assumed", Sense.PLATE_MOVES)],
 )
 def test_plates_that_turn_by_finite_angles(model, sense):
-    require_same(*both(measured("lines", model, sense, rotation="finite"), model), of_u=0.03)
+    require_same(
+        *both(measured("lines", model, sense, rotation="finite"), model), of_u=0.03
+    )
 
 
 def maps_of(result):
@@ -296,7 +325,9 @@ def test_a_stage_that_stands_a_tenth_of_a_pitch_off_the_sites(model, sense):
     np.testing.assert_allclose(u, spread, rtol=0.1)
     assert np.sqrt(np.mean((u / spread) ** 2)) == pytest.approx(1, abs=0.01)
     same_noise = at_sites.noise.sigma_xy / result.noise.sigma_xy
-    assert np.sqrt(np.mean((u / u_other) ** 2)) * same_noise == pytest.approx(1.054, abs=0.01)
+    assert np.sqrt(np.mean((u / u_other) ** 2)) * same_noise == pytest.approx(
+        1.054, abs=0.01
+    )
 
 
 @pytest.mark.parametrize("sense", Sense)
@@ -311,7 +342,10 @@ def test_an_approach_turns_with_the_frame_of_the_plate(sense):
     )
     found = solve_joint(
         simulate_measurements(
-            truth, plan, np.random.default_rng(4), settings=CellSettings(sense, servo_sigma_m=0.0)
+            truth,
+            plan,
+            np.random.default_rng(4),
+            settings=CellSettings(sense, servo_sigma_m=0.0),
         ),
         Options(terms=parse_terms(["approach"], ""), assumed=(), at_places=False),
     ).result

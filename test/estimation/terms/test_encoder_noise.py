@@ -20,9 +20,14 @@ def measured(servo_m, seed=0, *, offsets_m=0.0, **spread):
     plan, rng = hu_plan(Artifact(7, 0.01, 8), repeats=5), np.random.default_rng(seed)
     truth = random_truth(plan.artifact, 4, rng, Spread(**spread))
     settings = CellSettings(
-        sigma_xy_m=offsets_m, sigma_theta_rad=2e-6, encoder_sigma_m=NOISE, servo_sigma_m=servo_m
+        sigma_xy_m=offsets_m,
+        sigma_theta_rad=2e-6,
+        encoder_sigma_m=NOISE,
+        servo_sigma_m=servo_m,
     )
-    return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings, visits=True
+    )
 
 
 def scale_of(result):
@@ -36,7 +41,8 @@ def test_scatter_as_small_as_the_noise_of_the_encoders_shows_no_scale(seed):
     truth, readings = measured(NOISE, seed, phi_rad=5e-5)
     result = calibrate(readings)
     value, u = scale_of(result)
-    assert abs(value) < 3 * u < 0.03  # 0.5 by the scatter alone, 50 times its default uncertainty
+    # 0.5 by the scatter alone, 50 times its default uncertainty
+    assert abs(value) < 3 * u < 0.03
     assert result.verdict.grade is Grade.GOOD
     assert covered(result, truth.g) > 0.85
 
@@ -55,4 +61,6 @@ def test_to_measure_again_is_no_remedy_for_the_wrong_unit():
     verdict = calibrate(readings).verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
     assert "microscope" in [cause.name for cause in verdict.causes]
-    assert all(remedy.kind != "view" for cause in verdict.causes for remedy in cause.remedies)
+    assert all(
+        remedy.kind != "view" for cause in verdict.causes for remedy in cause.remedies
+    )

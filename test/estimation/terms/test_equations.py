@@ -48,7 +48,8 @@ def columns_of(rng, free, sized, hidden):
 
 @pytest.mark.parametrize("taken", [0, 1])
 @pytest.mark.parametrize(
-    ("free", "sized", "hidden"), [(4, 0, 0), (4, 0, 1), (5, 0, 2), (3, 2, 0), (3, 2, 1), (2, 3, 0)]
+    ("free", "sized", "hidden"),
+    [(4, 0, 0), (4, 0, 1), (5, 0, 2), (3, 2, 0), (3, 2, 1), (2, 3, 0)],
 )
 def test_untold_combinations_have_no_covariance_and_the_others_their_own(
     free, sized, hidden, taken
@@ -57,7 +58,9 @@ def test_untold_combinations_have_no_covariance_and_the_others_their_own(
     for _ in range(20):
         columns = columns_of(rng, free, sized, hidden)
         size = np.r_[np.full(free, np.inf), 10.0 ** rng.uniform(-9, -6, sized)]
-        own = equations(columns, size, rng.uniform(1, 9, free + sized), taken=[0] if taken else [])
+        own = equations(
+            columns, size, rng.uniform(1, 9, free + sized), taken=[0] if taken else []
+        )
         undetermined = own.undetermined(np.isinf(size))
         assert undetermined.shape[1] == max(hidden, taken)
         # coefficients x of which no undetermined combination has a part, sizes as readings of them
@@ -67,12 +70,17 @@ def test_untold_combinations_have_no_covariance_and_the_others_their_own(
         inner = basis.T @ (own.information + prior) @ basis
         unit = np.sqrt(np.diag(inner))
         wanted = (
-            basis @ (np.linalg.inv(inner / np.outer(unit, unit)) / np.outer(unit, unit)) @ basis.T
+            basis
+            @ (np.linalg.inv(inner / np.outer(unit, unit)) / np.outer(unit, unit))
+            @ basis.T
         )
         found = own.inverse(SIGMA)
         # in units of each one's uncertainty; where that is nothing but rounding, of its column
         spread = np.sqrt(np.diag(wanted))
         spread = np.where(spread * own.norm < 1e-9, 1 / own.norm, spread)
         assert np.allclose(
-            found / np.outer(spread, spread), wanted / np.outer(spread, spread), rtol=0, atol=1e-6
+            found / np.outer(spread, spread),
+            wanted / np.outer(spread, spread),
+            rtol=0,
+            atol=1e-6,
         )

@@ -17,7 +17,9 @@ def equations(sizes, hidden):
     free = np.array([size == INF for size in sizes.values()])
     return SimpleNamespace(
         columns=SimpleNamespace(
-            columns=[SimpleNamespace(term=name, size=size) for name, size in sizes.items()]
+            columns=[
+                SimpleNamespace(term=name, size=size) for name, size in sizes.items()
+            ]
         ),
         free=free,
         rows=lambda wanted: np.isin(names, [str(name) for name in wanted]),
@@ -39,7 +41,9 @@ def equations(sizes, hidden):
         ({("drift", "plate_scale"): 3}, {"drift": 3, "plate_scale": 3}),
     ],
 )
-def test_terms_are_named_that_hide_modes_alone_or_else_all_that_do_together(hidden, named):
+def test_terms_are_named_that_hide_modes_alone_or_else_all_that_do_together(
+    hidden, named
+):
     """A microscope with a size is no free term: it is never named."""
     found = unseen_by_term(
         equations(

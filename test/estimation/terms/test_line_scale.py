@@ -22,12 +22,18 @@ SPREAD = Spread(rotation="finite", phi_rad=1e-3)
 BOTH = list(Sense)
 
 
-def measured(factor, sense=Sense.MICROSCOPE_MOVES, *, spread=SPREAD, plan=None, seed=3, **how):
+def measured(
+    factor, sense=Sense.MICROSCOPE_MOVES, *, spread=SPREAD, plan=None, seed=3, **how
+):
     """Return a machine whose published offsets of lines are `factor` times the true ones."""
     plan, rng = plan or hu_plan(ARTIFACT, 4), np.random.default_rng(seed)
-    truth = random_truth(ARTIFACT, len(plan.views), rng, replace(spread, line_factor=factor))
+    truth = random_truth(
+        ARTIFACT, len(plan.views), rng, replace(spread, line_factor=factor)
+    )
     settings = CellSettings(sense, 2e-8, 2e-6, **{"servo_sigma_m": 0.0} | how)
-    return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings, visits=True
+    )
 
 
 def with_stops():
@@ -66,7 +72,9 @@ def test_a_known_microscope_shows_the_scale_of_the_lines(factor, sense):
     assert scale.u < 1e-3 and scale.unit == "m/m" and not scale.view
     assert result.verdict.grade is Grade.GOOD and off(result, truth) < 1.5
     # without the term the map is too small or too large by as much
-    without = calibrate(readings, Options(terms=parse_terms(["microscope:0", "line_scale:0"], "")))
+    without = calibrate(
+        readings, Options(terms=parse_terms(["microscope:0", "line_scale:0"], ""))
+    )
     assert off(without, truth) > 3
 
 
@@ -107,9 +115,12 @@ def test_where_all_plates_lie_alike_it_is_a_part_of_the_uncertainty():
     assert scale_of(result).u == pytest.approx(0.01, rel=0.05)
     added = result.kept.angular["line_scale"]
     wanted = truth.g_theta - truth.g_theta.mean()
-    assert added == pytest.approx(0.01 * np.abs(wanted), abs=0.1 * 0.01 * np.abs(wanted).max())
-    assert result.error_map.u_g_theta**2 - exact.error_map.u_g_theta**2 == pytest.approx(
-        added**2, rel=0.05, abs=0.02 * (added**2).max()
+    assert added == pytest.approx(
+        0.01 * np.abs(wanted), abs=0.1 * 0.01 * np.abs(wanted).max()
+    )
+    assert (
+        result.error_map.u_g_theta** 2 - exact.error_map.u_g_theta** 2
+        == pytest.approx(added**2, rel=0.05, abs=0.02 * (added**2).max())
     )
 
 
@@ -120,7 +131,9 @@ def test_a_stage_that_turns_to_the_lines_has_no_offsets_to_scale(sense):
     result = calibrate(readings, Options(terms=parse_terms(["microscope:0"], "")))
     assert result.verdict.grade is Grade.GOOD and off(result, truth) < 1.5
     assert all(
-        abs(view.axis_theta - np.mean(view.dtheta)) < 1e-6 for view in readings.views if len(view.k)
+        abs(view.axis_theta - np.mean(view.dtheta)) < 1e-6
+        for view in readings.views
+        if len(view.k)
     )
 
 

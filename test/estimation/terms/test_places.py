@@ -56,7 +56,9 @@ def readings(stands_m, sense=Sense.MICROSCOPE_MOVES):
 def found_in(measurements, known=None):
     grid = grid_data(measurements)
     known = np.ones((N, N), dtype=bool) if known is None else known
-    return places_of(measurements, grid, term_inputs(measurements, grid, 3 * PITCH_M), known)
+    return places_of(
+        measurements, grid, term_inputs(measurements, grid, 3 * PITCH_M), known
+    )
 
 
 def stands(x, y):
@@ -80,7 +82,9 @@ def test_the_error_is_that_of_the_true_place_in_the_stage_frame(sense):
     field = h[0] + 1j * h[1]
     near = places.errors(field, places.differences(field))
     moved = places.differences(field, near)
-    at = np.flatnonzero((np.abs(places.site // N - 3) < 3) & (np.abs(places.site % N - 3) < 3))
+    at = np.flatnonzero(
+        (np.abs(places.site // N - 3) < 3) & (np.abs(places.site % N - 3) < 3)
+    )
     x, y = sign * SITES[places.site[at] // N], sign * SITES[places.site[at] % N]
     true = x + 1.2e-3 + 1j * (y - 0.7e-3) - sign * near[at]  # indicated less the error
     wanted = sign * (error_at(true.real, true.imag) - error_at(x, y))
@@ -93,21 +97,30 @@ def test_readings_have_it_in_the_frame_of_their_view():
     moved = np.arange(2 * N * N) + 1j
     changes = places.changes(moved, TURN_RAD)
     assert changes[0, 1, 2] == moved[N + 2] * np.exp(-1j * TURN_RAD[0])
-    assert changes[1, 1, 2] == pytest.approx(-1j * moved[N * N + N + 2] * np.exp(-1j * TURN_RAD[1]))
+    assert changes[1, 1, 2] == pytest.approx(
+        -1j * moved[N * N + N + 2] * np.exp(-1j * TURN_RAD[1])
+    )
 
 
 def test_visits_differ_by_the_slopes_between_their_places():
-    places, field = found_in(readings(stands(1.2e-3, -0.7e-3))), FIELD[0] + 1j * FIELD[1]
+    places, field = (
+        found_in(readings(stands(1.2e-3, -0.7e-3))),
+        FIELD[0] + 1j * FIELD[1],
+    )
     near = places.errors(field)
     first, second = places.about(field, near, TURN_RAD)
     at = 3 * N + 4
     x, y = 1.2e-3 - near[at].real, PITCH_M - 0.7e-3 - near[at].imag
-    wanted = (error_at(x + 2e-5, y) - error_at(x - 2e-5, y)) / 2 * np.exp(-1j * TURN_RAD[0])
+    wanted = (
+        (error_at(x + 2e-5, y) - error_at(x - 2e-5, y)) / 2 * np.exp(-1j * TURN_RAD[0])
+    )
     np.testing.assert_allclose(first[2 * at : 2 * at + 2], [-wanted, wanted], rtol=1e-4)
     turned = N * 2 + 3  # mark (-1, 0), which lies on site (0, -1) after a quarter turn
     y = -PITCH_M - 0.7e-3 - near[N * N + turned].imag
     x = 1.2e-3 - near[N * N + turned].real
-    wanted = (error_at(x + 2e-5, y) - error_at(x - 2e-5, y)) / 2j * np.exp(-1j * TURN_RAD[1])
+    wanted = (
+        (error_at(x + 2e-5, y) - error_at(x - 2e-5, y)) / 2j * np.exp(-1j * TURN_RAD[1])
+    )
     np.testing.assert_allclose(second[2 * turned + 1], wanted, rtol=1e-4)
 
 
@@ -139,7 +152,9 @@ def test_unknown_sites_are_on_lines_through_known_ones():
     known[0, :5], known[3], known[:, 2] = False, False, False
     known[5, 5] = True
     plane = (3 * STEPS[:, None] - 2j * STEPS) + 7
-    np.testing.assert_allclose(_filled(np.where(known, plane, 99), known), plane, atol=1e-13)
+    np.testing.assert_allclose(
+        _filled(np.where(known, plane, 99), known), plane, atol=1e-13
+    )
     one = np.zeros((N, N), dtype=bool)
     one[2, 3] = True
     np.testing.assert_array_equal(_filled(np.where(one, plane, 99), one), plane[2, 3])
@@ -153,7 +168,9 @@ def test_an_unknown_site_lies_between_its_neighbours():
     known = np.ones((N, N), dtype=bool)
     known[1, 1] = known[N - 2, 2] = False
     expected = field + ~known
-    np.testing.assert_allclose(_filled(np.where(known, field, 99), known), expected, atol=1e-13)
+    np.testing.assert_allclose(
+        _filled(np.where(known, field, 99), known), expected, atol=1e-13
+    )
 
 
 def test_readings_at_unknown_sites_are_left_alone():

@@ -32,9 +32,9 @@ def machine(seed=1, plan=PLAN, strain=0.0):
     scale, stretch, shear = rng.normal(0, strain, (3, len(plan.views)))
     return replace(
         truth,
-        plate_strain=np.stack([scale + stretch, shear, shear, scale - stretch], axis=1).reshape(
-            -1, 2, 2
-        ),
+        plate_strain=np.stack(
+            [scale + stretch, shear, shear, scale - stretch], axis=1
+        ).reshape(-1, 2, 2),
     ), rng
 
 
@@ -42,7 +42,9 @@ def machine(seed=1, plan=PLAN, strain=0.0):
 def measured(plan=PLAN, strain=0.0):
     """Return the readings of a machine; views are the cells of the images."""
     truth, rng = machine(plan=plan, strain=strain)
-    return collect(plan_events(truth, plan, settings=SETTINGS, rng=rng, start_ns=START_NS))[0]
+    return collect(
+        plan_events(truth, plan, settings=SETTINGS, rng=rng, start_ns=START_NS)
+    )[0]
 
 
 def columns_of(measurements, name, size):
@@ -72,7 +74,9 @@ def test_a_placing_has_its_columns_in_all_cells(name, size, count):
     assert rows == ({0, 9} if np.isfinite(size) else {9})
     for column, block in zip(columns.columns, columns.grid, strict=True):
         there = np.abs(block).reshape(18, -1).max(axis=1) > 0
-        assert there.tolist() == [column.view <= row < column.view + 9 for row in range(18)]
+        assert there.tolist() == [
+            column.view <= row < column.view + 9 for row in range(18)
+        ]
         assert inputs.name_of(name, column.view) == ("0", "90")[column.view // 9]
 
 
@@ -97,7 +101,8 @@ def test_u_holds_a_strain_that_all_cells_share():
         measurements = simulate_measurements(truth, PLAN, rng, settings=SETTINGS)
         emap = solve_joint(measurements, bare(terms=(term,))).result.error_map
         error = remove_modes(
-            np.stack([emap.gx, emap.gy]) - truth.g, datum_modes(truth.artifact, scale=True)
+            np.stack([emap.gx, emap.gy]) - truth.g,
+            datum_modes(truth.artifact, scale=True),
         )
         z.append(error / np.stack([emap.u_gx, emap.u_gy]))
     assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.3
@@ -106,7 +111,9 @@ def test_u_holds_a_strain_that_all_cells_share():
 def test_a_held_out_cell_is_predicted_with_the_terms_of_its_placing(monkeypatch):
     monkeypatch.setattr(validation, "N_DRAWS", 16)
     measurements = measured(strain=1e-5)
-    found = validate(measurements, bare(terms=(ModelTerm("plate_strain", 1e-5),)), folds=1)
+    found = validate(
+        measurements, bare(terms=(ModelTerm("plate_strain", 1e-5),)), folds=1
+    )
     assert not [item for item in found if item.exceeds]
     assert max(item.ratio for item in found if np.isfinite(item.ratio)) < 2
 
@@ -114,7 +121,9 @@ def test_a_held_out_cell_is_predicted_with_the_terms_of_its_placing(monkeypatch)
 def test_views_without_images_are_placings_of_their_own():
     plan = replace(
         plan_of("0, 90, tx", 5, count=0),
-        views=tuple(replace(view, repeats=2) for view in plan_of("0, 90, tx", 5, count=0).views),
+        views=tuple(
+            replace(view, repeats=2) for view in plan_of("0, 90, tx", 5, count=0).views
+        ),
     )
     measurements = measured(plan)
     inputs, columns = columns_of(measurements, "plate_strain", 1e-6)

@@ -17,11 +17,14 @@ def test_visits_do_not_depend_on_the_nodes_of_the_map():
     placed = replace(plan.artifact, map_grid=MapGrid(5, plan.artifact.grid_pitch_m))
     assumed = Assumed(order="serpentine@plate")
     grounds = [
-        planned_inputs(artifact, plan.views, assumed) for artifact in (plan.artifact, placed)
+        planned_inputs(artifact, plan.views, assumed)
+        for artifact in (plan.artifact, placed)
     ]
     for one, other in zip(*(inputs.visits for inputs in grounds), strict=True):
         for name in ("mark", "weight", "offset", "phase", "approach_x", "approach_y"):
-            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-18)
+            np.testing.assert_allclose(
+                getattr(one, name), getattr(other, name), atol=1e-18
+            )
 
 
 def test_a_check_stop_is_approached_as_its_place_beside_the_mark_tells():

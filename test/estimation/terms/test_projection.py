@@ -25,9 +25,14 @@ def system():
     rng = np.random.default_rng(3)
     poses = tuple(LatticePose(q, shift, None) for q, *shift in POSES)
     field = GridSystem(poses, np.zeros((len(POSES), *SHAPE))).views.in_field
-    weight = rng.integers(1, 5, field.shape) * (rng.random(field.shape) > 0.1) * field * 1.0
+    weight = (
+        rng.integers(1, 5, field.shape) * (rng.random(field.shape) > 0.1) * field * 1.0
+    )
     return NormalEquations(
-        GridSystem(poses, weight), AngularSystem((), np.zeros((0, 0))), tuple(range(len(POSES))), ()
+        GridSystem(poses, weight),
+        AngularSystem((), np.zeros((0, 0))),
+        tuple(range(len(POSES))),
+        (),
     )
 
 
@@ -76,17 +81,25 @@ def parts(values):
     return np.concatenate([values.real, values.imag])
 
 
-def test_what_is_left_of_columns_and_their_maps_are_those_of_a_dense_solution(system, shapes):
+def test_what_is_left_of_columns_and_their_maps_are_those_of_a_dense_solution(
+    system, shapes
+):
     grid = system.grid
     rows, places = design(grid)
     dense = np.concatenate([rows.real, rows.imag])
-    columns = np.array([parts(np.sqrt(grid.weight[places]) * one[places]) for one in shapes.grid]).T
+    columns = np.array(
+        [parts(np.sqrt(grid.weight[places]) * one[places]) for one in shapes.grid]
+    ).T
     found = np.linalg.pinv(dense, rcond=1e-12) @ columns
     left = columns - dense @ found
     reduced = reduce_columns(grid, shapes)
-    projected = project(system, reduced, system.grid_inverse, NO_LINES, ratio=0.0, half_width_m=1.0)
+    projected = project(
+        system, reduced, system.grid_inverse, NO_LINES, ratio=0.0, half_width_m=1.0
+    )
     assert projected.gram == pytest.approx(left.T @ left, abs=1e-9)
-    for mine, wanted in zip(projected.fields.T, found[: 2 * grid.n_sites].T, strict=True):
+    for mine, wanted in zip(
+        projected.fields.T, found[: 2 * grid.n_sites].T, strict=True
+    ):
         moved = mine - (wanted[::2] + 1j * wanted[1::2])
         rest = system.gauge.remove(
             moved.reshape(SHAPE), system.gauge.coefficients(moved.reshape(SHAPE))

@@ -38,7 +38,8 @@ def measured(seed, grown, *, sense=Sense.MICROSCOPE_MOVES, sigma=1e-10, marks=No
         one, two = (np.s_[:, m + 2, n + 2] for m, n in marks)
         apart = np.stack([X, Y])[two] - np.stack([X, Y])[one]
         radial = (truth.a[two] - truth.a[one]) @ apart / (apart @ apart)
-    truth.a[:] -= radial * np.stack([X, Y])  # it was certified without an error of its length
+    # it was certified without an error of its length
+    truth.a[:] -= radial * np.stack([X, Y])
     truth = replace(truth, plate_scale=np.asarray(grown))
     return truth, simulate_measurements(truth, plan, rng, sigma_m=sigma, sense=sense)
 
@@ -63,7 +64,9 @@ def u_of_scale(readings, chosen):
 
 @pytest.mark.parametrize("reference", [PLATE, reference_length("marks")])
 @pytest.mark.parametrize("sense", Sense)
-def test_growth_that_all_views_share_is_in_the_uncertainty_of_the_scale(sense, reference):
+def test_growth_that_all_views_share_is_in_the_uncertainty_of_the_scale(
+    sense, reference
+):
     """No reading tells the mean growth: known to SIZE in each view, to SIZE / sqrt(n) in all."""
     chosen = options(f"plate_scale:{SIZE}", reference)
     truth, readings = measured(1, 4 * [SIZE], sense=sense, marks=reference.marks)
@@ -78,9 +81,15 @@ def test_growth_that_all_views_share_is_in_the_uncertainty_of_the_scale(sense, r
 
 def test_errors_of_the_scale_are_as_large_as_their_uncertainty():
     chosen, rng = options(f"plate_scale:{SIZE}"), np.random.default_rng(7)
-    drawn = [measured(seed, rng.normal(0, SIZE, len(VIEWS)), sigma=2e-9) for seed in range(60)]
+    drawn = [
+        measured(seed, rng.normal(0, SIZE, len(VIEWS)), sigma=2e-9)
+        for seed in range(60)
+    ]
     u = u_of_scale(drawn[0][1], chosen)  # of all: the noise is small beside the size
-    errors = [scale_error(solve_joint(readings, chosen).result, truth) for truth, readings in drawn]
+    errors = [
+        scale_error(solve_joint(readings, chosen).result, truth)
+        for truth, readings in drawn
+    ]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(u, rel=0.3)
 
 

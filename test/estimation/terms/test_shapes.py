@@ -20,7 +20,9 @@ def made():
     """Return seven columns of four shapes: of one view, of all, of two, of none but the last."""
     values = drawn(1, 4, VIEWS, MARKS)
     where = ([1], [0, 1, 2], [0, 2], [2])
-    means = [{view: values[at, view] for view in views} for at, views in enumerate(where)]
+    means = [
+        {view: values[at, view] for view in views} for at, views in enumerate(where)
+    ]
     full = np.zeros((len(UNIT), VIEWS, *LATTICE), dtype=complex)
     for column, (at, unit) in enumerate(zip(OF_COLUMN, UNIT, strict=True)):
         for view in where[at]:
@@ -40,13 +42,17 @@ def test_inner_products_are_those_of_the_columns(made):
     for at, column in ((0, 0), (1, 6), (2, 3), (3, 5)):
         every[at] = full[column].reshape(-1)
     rows = full.reshape(len(UNIT), -1)
-    assert shapes.products(every.conj() @ every.T) == pytest.approx((rows.conj() @ rows.T).real)
+    assert shapes.products(every.conj() @ every.T) == pytest.approx(
+        (rows.conj() @ rows.T).real
+    )
     other = drawn(2, VIEWS, *LATTICE)
     assert shapes.against(shapes.sums(other)) == pytest.approx(
         (rows.conj() @ other.reshape(-1)).real
     )
     weight = np.abs(drawn(3, VIEWS, *LATTICE))
-    assert shapes.squares(weight) == pytest.approx((weight * abs(full) ** 2).sum(axis=(1, 2, 3)))
+    assert shapes.squares(weight) == pytest.approx(
+        (weight * abs(full) ** 2).sum(axis=(1, 2, 3))
+    )
     linear = drawn(4, 6, VIEWS * MARKS)
     assert shapes.of_columns(linear @ every.T) == pytest.approx(linear @ rows.T)
 
@@ -55,7 +61,9 @@ def test_inner_products_are_those_of_the_columns(made):
 def test_columns_are_added_up_by_their_coefficients(made, only):
     shapes, full = made
     coefficients = np.random.default_rng(5).normal(size=len(UNIT))
-    wanted = np.tensordot(coefficients if only is None else coefficients * only, full, axes=1)
+    wanted = np.tensordot(
+        coefficients if only is None else coefficients * only, full, axes=1
+    )
     assert shapes.combined(coefficients, only) == pytest.approx(wanted)
 
 

@@ -70,9 +70,13 @@ def matrix_of(scale, turn, stretch, shear):
 
 def measured(seed, sizes, *, sigma_m=20e-9, phi_rad=1e-4):
     rng, plan = np.random.default_rng(seed), plan_of(5, 2)
-    truth = random_truth(plan.artifact, len(plan.views), rng, replace(CLEAN, phi_rad=phi_rad))
+    truth = random_truth(
+        plan.artifact, len(plan.views), rng, replace(CLEAN, phi_rad=phi_rad)
+    )
     truth = of_sizes(truth, rng, sizes)
-    return truth, simulate_measurements(truth, plan, rng, settings=settings(sigma_m), visits=True)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings(sigma_m), visits=True
+    )
 
 
 def options(*terms, **more):
@@ -89,7 +93,13 @@ def test_sizes_that_are_right_are_contradicted_at_the_rate_of_the_level():
         _, readings = measured(seed, SIZES)
         sizes = fitted(readings, options(*(f"{n}:{s}" for n, s in SIZES.items()))).sizes
         assert {test.name for test in sizes} == set(SIZES)
-        assert [test.rank for test in sorted(sizes, key=lambda t: t.name)] == [2, 30, 4, 4, 23]
+        assert [test.rank for test in sorted(sizes, key=lambda t: t.name)] == [
+            2,
+            30,
+            4,
+            4,
+            23,
+        ]
         p += [test.p for test in sizes]
     p = np.array(p)
     assert p.min() > 5e-4
@@ -126,13 +136,18 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
 
     def squares(without=None):
         terms = tuple(
-            ModelTerm(term.name) if term.name == without else term for term in wanted.terms
+            ModelTerm(term.name) if term.name == without else term
+            for term in wanted.terms
         )
-        return DenseFit(readings, terms, (model.fitted.xy.sigma, 1.0), places=False).squares
+        return DenseFit(
+            readings, terms, (model.fitted.xy.sigma, 1.0), places=False
+        ).squares
 
     tests = {test.name: test for test in model.sizes}
     for name in ("plate_scale", "plate_shape", "approach"):
-        assert tests[name].statistic == pytest.approx(squares() - squares(name), rel=1e-5), name
+        assert tests[name].statistic == pytest.approx(
+            squares() - squares(name), rel=1e-5
+        ), name
 
 
 @pytest.mark.parametrize(
@@ -140,7 +155,10 @@ def test_the_statistic_is_what_the_size_adds_to_the_sum_of_squares():
     [
         ("plate_scale:1e-8", "a term 'plate_scale' as large as "),
         ("drift:1e-9", "a term 'drift' as large as "),
-        ("microscope:1e-6", "a microscope that shows lengths along x longer than along y by "),
+        (
+            "microscope:1e-6",
+            "a microscope that shows lengths along x longer than along y by ",
+        ),
         ("approach:1e-10", "an indicated x that changes by ±(0.0"),
     ],
 )
@@ -167,12 +185,18 @@ def test_a_calibration_with_a_contradicted_size_says_so_and_its_u_is_honest(term
     assert np.sqrt(np.mean((error / u) ** 2)) < 1.5
 
 
-@pytest.mark.parametrize(("size", "grade"), [("1e-9", "not_qualified"), ("1.5e-7", "good")])
-def test_what_is_there_and_not_determined_passes_only_if_its_size_is_declared(size, grade):
+@pytest.mark.parametrize(
+    ("size", "grade"), [("1e-9", "not_qualified"), ("1.5e-7", "good")]
+)
+def test_what_is_there_and_not_determined_passes_only_if_its_size_is_declared(
+    size, grade
+):
     _, readings = measured(4, {"plate_shape": 5 * SIZES["plate_shape"]})
     verdict = calibrate(readings, options(f"plate_shape:{size}")).verdict
     assert verdict.grade == grade
-    assert [cause.name for cause in verdict.causes] == ["plate_shape"] * (grade != "good")
+    assert [cause.name for cause in verdict.causes] == ["plate_shape"] * (
+        grade != "good"
+    )
 
 
 def test_doubtful_sizes_are_raised_to_the_limit_of_their_chi_square():
@@ -190,12 +214,18 @@ def test_doubtful_sizes_are_raised_to_the_limit_of_their_chi_square():
     assert raised and min(raised) > 1
 
 
-@pytest.mark.parametrize(("plausible", "grade"), [(4.0, Grade.GOOD), (0.5, Grade.NOT_QUALIFIED)])
-def test_doubt_raises_no_size_beyond_what_is_plausible_or_shown(monkeypatch, plausible, grade):
+@pytest.mark.parametrize(
+    ("plausible", "grade"), [(4.0, Grade.GOOD), (0.5, Grade.NOT_QUALIFIED)]
+)
+def test_doubt_raises_no_size_beyond_what_is_plausible_or_shown(
+    monkeypatch, plausible, grade
+):
     """What the readings show beyond what is plausible is a fault, though it be only doubtful."""
     size, seen = SIZES["plate_scale"], 0
     monkeypatch.setitem(
-        blocks(), "plate_scale", replace(blocks()["plate_scale"], plausible=plausible * size)
+        blocks(),
+        "plate_scale",
+        replace(blocks()["plate_scale"], plausible=plausible * size),
     )
     for seed in range(8):
         _, readings = measured(seed, {"plate_scale": 3 * size})
@@ -217,7 +247,9 @@ def test_a_size_that_is_too_small_is_kept_beside_the_one_that_was_used():
     assert term.size == 1e-8 and 1e-6 < term.size_used < 1e-4
     back = result_from_dict(result_to_dict(worded(result)), "r.json")
     assert back.model == result.model
-    line = next(c for c in budgets(result)[0].lines if c.component == "term plate_scale")
+    line = next(
+        c for c in budgets(result)[0].lines if c.component == "term plate_scale"
+    )
     assert line_text(line).startswith("size 1e-08, too small for the readings; of ")
     assert (line.source, line.details["allowed"]) == ("readings", term.size_used)
     right = calibrate(readings, options("plate_scale:5e-6"))
@@ -251,7 +283,9 @@ def test_one_pattern_of_bending_alone_contradicts_the_size_of_all():
         parts[:, :, 2] = rng.normal(0, 3 * size, parts.shape[:2])
         truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
         truth = replace(truth, plate_shape_m=bending(parts))
-        readings = simulate_measurements(truth, plan, rng, settings=settings(), visits=True)
+        readings = simulate_measurements(
+            truth, plan, rng, settings=settings(), visits=True
+        )
         (test,) = fitted(readings, options(f"plate_shape:{size}")).sizes
         found.append((test.p, test.p_together))
     p, together = np.array(found).T
@@ -263,7 +297,9 @@ def test_a_coefficient_that_is_known_exactly_leaves_no_part_to_free_ones():
     """Rounding, over a variance of zero, overflowed."""
     sizes = ModelTerm("line_eccentricity", 1.0), ModelTerm("rotation", 1.0)
     columns = SimpleNamespace(
-        columns=tuple(SimpleNamespace(term=term.name, size=term.size) for term in sizes),
+        columns=tuple(
+            SimpleNamespace(term=term.name, size=term.size) for term in sizes
+        ),
         size=np.ones(2),
         rows=lambda names: np.array([term.name in names for term in sizes]),
     )

@@ -62,7 +62,15 @@ def plan_of(size=5, repeats=4, order="x_back_y_back", lines=0):
         "p",
         Artifact(size, PITCH, lines),
         tuple(
-            View(name, q * np.pi / 2, (a * PITCH, b * PITCH), True, lines > 0, repeats, order)
+            View(
+                name,
+                q * np.pi / 2,
+                (a * PITCH, b * PITCH),
+                True,
+                lines > 0,
+                repeats,
+                order,
+            )
             for name, q, (a, b) in poses
         ),
     )
@@ -70,7 +78,12 @@ def plan_of(size=5, repeats=4, order="x_back_y_back", lines=0):
 
 def settings(sigma_m=0.0, sense=Sense.MICROSCOPE_MOVES, **more):
     return CellSettings(
-        sense, sigma_m, stop_sigma_m=20e-6, servo_sigma_m=0.0, servo_sigma_theta_rad=0.0, **more
+        sense,
+        sigma_m,
+        stop_sigma_m=20e-6,
+        servo_sigma_m=0.0,
+        servo_sigma_theta_rad=0.0,
+        **more,
     )
 
 
@@ -78,7 +91,9 @@ def measured(plan, spread=MACHINE, *, seed=3, change=None, **how):
     rng = np.random.default_rng(seed)
     truth = random_truth(plan.artifact, len(plan.views), rng, spread)
     truth = change(truth) if change else truth
-    return truth, simulate_measurements(truth, plan, rng, settings=settings(**how), visits=True)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings(**how), visits=True
+    )
 
 
 def true_stage(truth):
@@ -101,7 +116,9 @@ def test_a_machine_that_does_it_all_is_recovered_to_rounding(sense):
     # the plate's own error grows with it, by less than a picometre
     assert np.abs([result.error_map.gx, result.error_map.gy]).max() < 3e-12
     found = {
-        (t.name, e.view, e.component): e.value for t in result.model.terms for e in t.estimates
+        (t.name, e.view, e.component): e.value
+        for t in result.model.terms
+        for e in t.estimates
     }
     for key, value in parts_of(MACHINE.microscope).items():
         assert found["microscope", "", key] == pytest.approx(value, abs=1e-8)
@@ -125,11 +142,17 @@ def test_the_matrix_of_a_microscope_is_found_within_its_uncertainty():
         _, readings = measured(plan_of(), spread, seed=seed, sigma_m=20e-9)
         result = calibrate(
             readings,
-            bare(terms=parse_terms(["microscope"], ""), misalignment_model="rigid", causes=False),
+            bare(
+                terms=parse_terms(["microscope"], ""),
+                misalignment_model="rigid",
+                causes=False,
+            ),
         )
         (term,) = result.model.terms
         wanted = parts_of(spread.microscope)
-        squares += [((e.value - wanted[e.component]) / e.u) ** 2 for e in term.estimates]
+        squares += [
+            ((e.value - wanted[e.component]) / e.u) ** 2 for e in term.estimates
+        ]
     assert 0.4 < np.mean(squares) < 1.8  # chi2 of 48: outside once in ten thousand
 
 
@@ -146,7 +169,9 @@ def test_a_drift_that_looks_like_the_stage_is_refused_and_a_size_widens_u():
     assert not caught.value.observability.identifiable
     u = {}
     for size in ("1e-9", "1e-6"):
-        result = calibrate(readings, bare(terms=parse_terms([f"drift:{size}"], ""), drift_degree=1))
+        result = calibrate(
+            readings, bare(terms=parse_terms([f"drift:{size}"], ""), drift_degree=1)
+        )
         u[size] = float(np.sqrt(np.mean(result.error_map.u_gx**2)))
     assert u["1e-6"] > 4 * u["1e-9"]
 
@@ -155,16 +180,26 @@ def test_a_drift_that_looks_like_the_stage_is_refused_and_a_size_widens_u():
 def test_axes_that_the_stage_does_not_have_are_no_noise_of_the_readings(terms):
     """The datum of theta shifts the angular map; whether the stage keeps it is another test."""
     plan = plan_of(lines=8)
-    plan = replace(plan, views=(*plan.views, View("line", np.pi / 4, (0.0, 0.0), False, True)))
+    plan = replace(
+        plan, views=(*plan.views, View("line", np.pi / 4, (0.0, 0.0), False, True))
+    )
     _, readings = measured(
-        plan, Spread(encoder="independent", rotation="finite"), sigma_m=20e-9, sigma_theta_rad=2e-6
+        plan,
+        Spread(encoder="independent", rotation="finite"),
+        sigma_m=20e-9,
+        sigma_theta_rad=2e-6,
     )
     found = [
-        calibrate(readings, bare(terms=parse_terms([terms], ""), datum_theta=datum, causes=False))
+        calibrate(
+            readings,
+            bare(terms=parse_terms([terms], ""), datum_theta=datum, causes=False),
+        )
         for datum in ("xy_axes", "zero_mean")
     ]
     assert [item.verdict.qualified for item in found] == [False, True]
-    assert all("axis conditions" in reason for reason in worded(found[0]).verdict.reasons)
+    assert all(
+        "axis conditions" in reason for reason in worded(found[0]).verdict.reasons
+    )
     for values in zip(
         *(
             (
@@ -181,7 +216,9 @@ def test_axes_that_the_stage_does_not_have_are_no_noise_of_the_readings(terms):
 
 
 @pytest.mark.parametrize("one_sided", [("y",), ("x", "y")])
-def test_an_axis_that_arrives_from_one_side_alone_has_no_approach_and_keeps_its_map(one_sided):
+def test_an_axis_that_arrives_from_one_side_alone_has_no_approach_and_keeps_its_map(
+    one_sided,
+):
     """What it adds is the same everywhere: the views' own positions take it up."""
     _, readings = measured(
         plan_of(), Spread(encoder="independent", rotation="finite"), sigma_m=20e-9
@@ -218,7 +255,9 @@ def test_an_axis_that_arrives_from_one_side_alone_has_no_approach_and_keeps_its_
 
 def test_terms_need_visits():
     _, readings = measured(plan_of())
-    without = replace(readings, views=tuple(replace(v, visits=None) for v in readings.views))
+    without = replace(
+        readings, views=tuple(replace(v, visits=None) for v in readings.views)
+    )
     with pytest.raises(
         InputError,
         match="view '0': the term 'drift' needs the time, the offset "
@@ -236,7 +275,10 @@ def test_terms_need_visits():
         ("drift:x", "--model: drift: the size 'x' is not a positive number"),
         ("drift:-1e-9", "the size '-1e-9' is not a positive number"),
         ("drift:inf", "the size 'inf' is not a positive number"),
-        ("drift:1e300", "--model: drift: the size 1e300 is outside 1e-18 to 1; give a standard"),
+        (
+            "drift:1e300",
+            "--model: drift: the size 1e300 is outside 1e-18 to 1; give a standard",
+        ),
         ("drift:9e-19", "the size 9e-19 is outside 1e-18 to 1"),
         ("drift:1.01", "the size 1.01 is outside 1e-18 to 1"),
         ("drift:", "the size '' is not a positive number"),
@@ -254,13 +296,18 @@ def test_terms_are_read_in_one_order():
         ModelTerm("drift"),
         ModelTerm("approach", 2e-8),
     )
-    assert [str(t) for t in parse_terms(["drift:5e-8,approach"], "")] == ["drift:5e-08", "approach"]
+    assert [str(t) for t in parse_terms(["drift:5e-8,approach"], "")] == [
+        "drift:5e-08",
+        "approach",
+    ]
 
 
 def test_no_columns_make_nothing_of_any_visit():
     rng = np.random.default_rng(1)
     plan = Plan("one", Artifact(5, 0.01), (View("a"),))
-    readings = simulate_measurements(random_truth(plan.artifact, 1, rng), plan, rng, visits=True)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 1, rng), plan, rng, visits=True
+    )
     inputs = term_inputs(readings, grid_data(readings), 0.02)
     columns = term_columns(inputs, [ModelTerm("plate_scale")])
     assert columns.columns == () and columns.at_visits(np.zeros(0)) == [0.0]

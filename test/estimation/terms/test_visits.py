@@ -33,7 +33,9 @@ def test_a_mark_that_was_visited_twice_has_the_weighted_mean_of_both():
     twice = visits([2, 0, 2], [1, 5, 3])
     values = np.array([[4 + 4j, 7j, 8 - 4j], [1, 2, 1]])
     assert twice.repeated
-    assert twice.means(values, 4) == pytest.approx(np.array([[7j, 0, 7 - 2j, 0], [2, 0, 1, 0]]))
+    assert twice.means(values, 4) == pytest.approx(
+        np.array([[7j, 0, 7 - 2j, 0], [2, 0, 1, 0]])
+    )
     assert twice.about_means(values, 4) == pytest.approx(
         np.array([[-3 + 6j, 0, 1 - 2j], [0, 0, 0]])
     )
@@ -45,7 +47,9 @@ def test_visits_of_a_mark_that_does_not_count_have_its_plain_mean():
     twice = visits([2, 0, 2, 0], [0, 5, 0, 15])
     values = np.array([[4 + 4j, 7j, 8 - 4j, 3j]])
     assert twice.means(values, 3) == pytest.approx(np.array([[4j, 0, 6]]))
-    assert twice.about_means(values, 3) == pytest.approx(np.array([[-2 + 4j, 3j, 2 - 4j, -1j]]))
+    assert twice.about_means(values, 3) == pytest.approx(
+        np.array([[-2 + 4j, 3j, 2 - 4j, -1j]])
+    )
 
 
 def test_a_visit_that_is_the_only_one_of_its_mark_is_its_mean():
@@ -59,14 +63,18 @@ def test_a_visit_that_is_the_only_one_of_its_mark_is_its_mean():
 def test_a_view_without_visits_has_no_means():
     none = visits([], [])
     assert not none.repeated
-    assert np.array_equal(none.means(np.zeros((2, 0), dtype=complex), 3), np.zeros((2, 3)))
+    assert np.array_equal(
+        none.means(np.zeros((2, 0), dtype=complex), 3), np.zeros((2, 3))
+    )
 
 
 def with_visits(**changed):
     """Return readings of two views whose visits have other columns than they should."""
     m, n = (array.ravel() - 1 for array in np.indices((3, 3)))
     zero, one = np.zeros(9), np.ones(9, dtype=int)
-    at = GridVisits(np.arange(9), zero, zero, one, np.arange(9), zero, zero, 0 * one, 0 * one)
+    at = GridVisits(
+        np.arange(9), zero, zero, one, np.arange(9), zero, zero, 0 * one, 0 * one
+    )
     plain = ViewReadings(
         View("a", angular=False), m, n, zero, zero, one, visits=replace(at, **changed)
     )
@@ -86,11 +94,20 @@ def with_visits(**changed):
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"offset_x": np.full(9, np.nan)}, "a deviation or offset is not a finite number"),
+        (
+            {"offset_x": np.full(9, np.nan)},
+            "a deviation or offset is not a finite number",
+        ),
         ({"offset_y": np.full(9, 1e6)}, "a deviation or offset is not a finite number"),
         ({"dy": np.full(9, -np.inf)}, "a deviation or offset is not a finite number"),
-        ({"mark": np.arange(1, 10)}, "a visit belongs to none of the marks that were read"),
-        ({"mark": np.arange(-1, 8)}, "a visit belongs to none of the marks that were read"),
+        (
+            {"mark": np.arange(1, 10)},
+            "a visit belongs to none of the marks that were read",
+        ),
+        (
+            {"mark": np.arange(-1, 8)},
+            "a visit belongs to none of the marks that were read",
+        ),
         ({"count": np.arange(9)}, "a count below 1"),
         ({"approach_y": np.zeros(8)}, "differ in length"),
     ],

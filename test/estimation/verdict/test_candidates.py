@@ -50,7 +50,8 @@ def noise(sums: Sums, taken: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(
-    ("taken", "squares"), [((), 0), ((0,), 36), ((1,), 64), ((0, 1), 100), ((0, 1, 2), 100)]
+    ("taken", "squares"),
+    [((), 0), ((0,), 36), ((1,), 64), ((0, 1), 100), ((0, 1, 2), 100)],
 )
 def test_columns_explain_the_squares_of_their_parts(taken, squares):
     found = pool(Sums(164.0, 10, 0.0, 0)).explain(rows(*taken))
@@ -71,23 +72,40 @@ def test_columns_explain_the_squares_of_their_parts(taken, squares):
         (4, (0, 1, 2), 64, 1),
     ],
 )
-def test_the_noise_beside_columns_has_a_degree_of_freedom_less_for_each(dof, taken, left, dof_left):
+def test_the_noise_beside_columns_has_a_degree_of_freedom_less_for_each(
+    dof, taken, left, dof_left
+):
     variance, found = noise(Sums(164.0, dof, float("nan"), 0), rows(*taken))
-    assert (variance, found) == (pytest.approx(left / dof_left), pytest.approx(dof_left))
+    assert (variance, found) == (
+        pytest.approx(left / dof_left),
+        pytest.approx(dof_left),
+    )
 
 
 @pytest.mark.parametrize(
     ("dof", "dof_within", "taken"),
-    [(2, 0, (0, 1)), (3, 0, (0, 1, 2)), (1, 0, (1,)), (1, 1, (0, 1)), (2, 1, (0, 1, 2))],
+    [
+        (2, 0, (0, 1)),
+        (3, 0, (0, 1, 2)),
+        (1, 0, (1,)),
+        (1, 1, (0, 1)),
+        (2, 1, (0, 1, 2)),
+    ],
 )
-def test_where_columns_take_all_degrees_of_freedom_no_noise_is_left(dof, dof_within, taken):
+def test_where_columns_take_all_degrees_of_freedom_no_noise_is_left(
+    dof, dof_within, taken
+):
     variance, found = noise(Sums(164.0, dof, 5.0, dof_within), rows(*taken))
     assert np.isnan(variance) and found == 0
 
 
 @pytest.mark.parametrize(
     ("within", "dof_within", "variance", "dof"),
-    [(9.0, 90, 8.0, 8), (2000.0, 90, (64 + 2000) / 98, 98), (30.0, 1, (64 + 30) / 9, 9)],
+    [
+        (9.0, 90, 8.0, 8),
+        (2000.0, 90, (64 + 2000) / 98, 98),
+        (30.0, 1, (64 + 30) / 9, 9),
+    ],
 )
 def test_the_larger_of_the_noises_of_marks_and_of_all_visits_counts(
     within, dof_within, variance, dof
@@ -120,7 +138,17 @@ def test_sets_of_all_sizes_are_each_as_a_dense_solution_has_them():
         np.zeros(6),
         np.zeros(6),
     )
-    sets = [(), (3,), (0, 1), (1, 3, 4), (5,), (0, 2, 5), (0, 2), (0, 1, 2, 3, 4, 5), (1, 5)]
+    sets = [
+        (),
+        (3,),
+        (0, 1),
+        (1, 3, 4),
+        (5,),
+        (0, 2, 5),
+        (0, 2),
+        (0, 1, 2, 3, 4, 5),
+        (1, 5),
+    ]
     for chosen in sets:
         found = pool.explain(np.isin(np.arange(6), chosen))
         used = readings[:, list(chosen)]
@@ -143,7 +171,9 @@ def test_terms_of_the_model_stay_within_what_their_sizes_allow():
     rows = np.diag(np.sqrt(prior))[:2]
     taken = np.zeros(4)
     taken[:2] = np.linalg.lstsq(
-        np.vstack([columns[:, :2], rows[:, :2]]), np.concatenate([y, np.zeros(2)]), rcond=None
+        np.vstack([columns[:, :2], rows[:, :2]]),
+        np.concatenate([y, np.zeros(2)]),
+        rcond=None,
     )[0]
     left = y - columns @ taken
     equations = SimpleNamespace(
@@ -155,13 +185,17 @@ def test_terms_of_the_model_stay_within_what_their_sizes_allow():
     )
     pool = Candidates(
         equations,
-        Score(columns.T @ left, np.zeros(4), Sums(float(left @ left), 30, float("nan"), 0)),
+        Score(
+            columns.T @ left, np.zeros(4), Sums(float(left @ left), 30, float("nan"), 0)
+        ),
         prior,
         taken,
     )
     both = pool.explain(np.array([True, True, True, False]))
     whole = np.linalg.lstsq(
-        np.vstack([columns[:, :3], rows[:, :3]]), np.concatenate([y, np.zeros(2)]), rcond=None
+        np.vstack([columns[:, :3], rows[:, :3]]),
+        np.concatenate([y, np.zeros(2)]),
+        rcond=None,
     )[0]
     assert both.values + taken[:3] == pytest.approx(whole)
     alone = pool.explain(np.array([True, True, False, False]))
@@ -185,11 +219,15 @@ def test_at_most_four_causes_are_named_the_likeliest_first():
     parts = np.arange(1.0, 7.0) * 1e-6
     many = Candidates(
         equations,
-        Score(parts, np.zeros(6), Sums(float(parts @ parts) + 1e-14, 100, float("nan"), 0)),
+        Score(
+            parts, np.zeros(6), Sums(float(parts @ parts) + 1e-14, 100, float("nan"), 0)
+        ),
         np.zeros(6),
         np.zeros(6),
     )
     groups = [Group(name, np.arange(6) == number) for number, name in enumerate(names)]
     found = select_explanations(many, groups, np.zeros(6, dtype=bool))
     assert [item.name for item in found] == ["f", "e", "d", "c"]
-    assert [float(item.values[0]) for item in found] == pytest.approx([6e-6, 5e-6, 4e-6, 3e-6])
+    assert [float(item.values[0]) for item in found] == pytest.approx(
+        [6e-6, 5e-6, 4e-6, 3e-6]
+    )

@@ -31,13 +31,17 @@ FINE_RAD, COARSE_RAD = 2e-7, 2e-5
 
 def truth_and_readings(seed, sigma_rad, *, repeats=2, spread=None, **how):
     plan, rng = hu_plan(ARTIFACT, repeats), np.random.default_rng(seed)
-    truth = random_truth(ARTIFACT, len(plan.views), rng, spread or Spread(rotation="finite"))
+    truth = random_truth(
+        ARTIFACT, len(plan.views), rng, spread or Spread(rotation="finite")
+    )
     settings = CellSettings(
         sigma_xy_m=2e-8,
         sigma_theta_rad=sigma_rad,
         **{"servo_sigma_m": 0.0, "servo_sigma_theta_rad": 0.0} | how,
     )
-    return truth, simulate_measurements(truth, plan, rng, settings=settings, visits=True)
+    return truth, simulate_measurements(
+        truth, plan, rng, settings=settings, visits=True
+    )
 
 
 def measured(*args, **how):
@@ -73,9 +77,13 @@ def test_a_plate_that_turns_between_marks_and_lines_is_named(index, by_rad):
     (cause,) = result.verdict.causes
     assert (cause.name, cause.unit) == ("rotation", "rad") and cause.p < 5e-4
     # the median of three views is the datum: a third one may carry noise of the same size
-    assert cause.size == pytest.approx(by_rad, abs=6 * cause.u) and cause.u < 0.1 * abs(by_rad)
+    assert cause.size == pytest.approx(by_rad, abs=6 * cause.u) and cause.u < 0.1 * abs(
+        by_rad
+    )
     way = "counter-clockwise" if cause.size > 0 else "clockwise"
-    assert cause.text.startswith(f"lines turned {way} by {abs(cause.size) * 206264.8:.3f} ± ")
+    assert cause.text.startswith(
+        f"lines turned {way} by {abs(cause.size) * 206264.8:.3f} ± "
+    )
     assert cause.view == name and Remedy("view", name) in cause.remedies
     assert "check whether the plate moved between marks and lines" in cause.text
 
@@ -97,7 +105,9 @@ SCALES = ["microscope", "line_scale"]
         (replace(ASKEW, plate_strain=2e-6), 0.0, ["plate_strain"], Sense.PLATE_MOVES),
     ],
 )
-def test_what_turns_lines_against_marks_is_told_from_what_is_assumed(spread, by_rad, names, sense):
+def test_what_turns_lines_against_marks_is_told_from_what_is_assumed(
+    spread, by_rad, names, sense
+):
     """No size grows for a turn of lines, and no turn of lines is named where a size is wrong."""
     truth, readings = truth_and_readings(
         5, FINE_RAD, spread=spread, sense=sense, servo_sigma_m=2e-8
@@ -116,21 +126,30 @@ def test_scales_of_offsets_that_explain_a_plate_that_grew_are_not_the_only_cause
     artifact = Artifact(11, 0.01, 24)
     plan, rng = hu_plan(artifact, 5), np.random.default_rng(seed)
     truth = replace(
-        random_truth(artifact, 4, rng, Spread(rotation="finite", encoder="independent")),
+        random_truth(
+            artifact, 4, rng, Spread(rotation="finite", encoder="independent")
+        ),
         phi_rad=np.array([7e-3, 0.4e-3, 7.1e-3, -3.8e-3]),
         plate_scale=np.array([0, 1e-6, 0, 0]),
     )
-    settings = CellSettings(sigma_xy_m=2e-8, sigma_theta_rad=np.deg2rad(1e-3), servo_sigma_m=2e-8)
+    settings = CellSettings(
+        sigma_xy_m=2e-8, sigma_theta_rad=np.deg2rad(1e-3), servo_sigma_m=2e-8
+    )
     readings = simulate_measurements(truth, plan, rng, settings=settings, visits=True)
     result = calibrate(readings, Options())
-    assert [cause.name for cause in result.verdict.causes] == ["line_scale", "plate_strain"]
+    assert [cause.name for cause in result.verdict.causes] == [
+        "line_scale",
+        "plate_strain",
+    ]
     assert covered(result, truth.g) > 0.9
     error = result.error_map.g_theta - truth.g_theta
     error -= error.mean()
     assert (abs(error) < 2 * result.error_map.u_g_theta).mean() > 0.8
 
 
-@pytest.mark.parametrize("options", [BARE, Options(), apart()], ids=["bare", "assumed", "held"])
+@pytest.mark.parametrize(
+    "options", [BARE, Options(), apart()], ids=["bare", "assumed", "held"]
+)
 def test_what_moves_no_map_disqualifies_nothing(options):
     # all lines were read in every view: a turn of all lines of one moves none against another
     readings = turned(measured(2, COARSE_RAD), 1, 1e-4)
@@ -151,7 +170,9 @@ def test_without_an_uncertainty_it_cannot_be_said_to_be_harmless():
 )
 def test_offsets_of_lines_with_the_other_sign_are_no_bent_plate(options):
     readings = measured(3, COARSE_RAD, servo_sigma_m=2e-8)
-    wrong = replace(readings, views=tuple(replace(v, dtheta=-v.dtheta) for v in readings.views))
+    wrong = replace(
+        readings, views=tuple(replace(v, dtheta=-v.dtheta) for v in readings.views)
+    )
     assert calibrate(readings, options).verdict.grade is Grade.GOOD
     with pytest.raises(WiringError, match="offset_theta has the other sign"):
         calibrate(wrong, options)  # the angular map would be that of another stage
@@ -205,7 +226,10 @@ def test_one_common_view_tells_nothing():
     ]
     views = (
         *grids,
-        *(View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True, 2) for k in (1, 6)),
+        *(
+            View(f"lines {k}", k * np.pi / 12, (0.0, 0.0), False, True, 2)
+            for k in (1, 6)
+        ),
     )
     plan, rng = Plan("p", ARTIFACT, views), np.random.default_rng(0)
     readings = simulate_measurements(random_truth(ARTIFACT, 5, rng), plan, rng)

@@ -49,7 +49,8 @@ def calibrated(size=3, **how):
 
 
 @pytest.mark.parametrize(
-    "how", [{"reference": REFERENCE}, {"terms": parse_terms(["plate_shape:100e-9"], "")}, {}]
+    "how",
+    [{"reference": REFERENCE}, {"terms": parse_terms(["plate_shape:100e-9"], "")}, {}],
 )
 def test_one_k_is_read_everywhere(how):
     result = calibrated(**how)
@@ -89,7 +90,9 @@ def test_what_is_known_beforehand_adds_degrees_of_freedom():
     artifact = with_it.artifact
     known = np.mean(np.stack([artifact.x_m, artifact.y_m]) ** 2) * 9e-12
     # GUM G.2b with one component of finite degrees of freedom
-    assert noise.dof_map_xy == pytest.approx(own.dof_xy * (u2 / (u2 - known)) ** 2, rel=1e-9)
+    assert noise.dof_map_xy == pytest.approx(
+        own.dof_xy * (u2 / (u2 - known)) ** 2, rel=1e-9
+    )
     assert noise.k_xy < own.k_xy
 
 
@@ -103,7 +106,9 @@ def test_a_term_that_its_size_holds_adds_degrees_of_freedom_and_one_that_is_told
 def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles():
     """By GUM G.2b, with the noise of the lines as the one component of finite degrees."""
     settings = replace(SETTINGS, sigma_theta_rad=2e-6)
-    result = calibrate(measured(settings=settings), Options(terms=parse_terms(["microscope"], "")))
+    result = calibrate(
+        measured(settings=settings), Options(terms=parse_terms(["microscope"], ""))
+    )
     u2 = np.mean(result.error_map.u_g_theta**2)
     assumed = sum(
         np.mean(np.square(result.kept.angular[name]))
@@ -113,7 +118,9 @@ def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles():
     assert 0.01 < assumed / u2 < 1
     assert result.noise.dof_map_theta == pytest.approx(dof, rel=1e-9)
     assert result.noise.k_theta == pytest.approx(student.ppf(0.97725, dof), rel=1e-12)
-    assert next(b for b in budgets(result) if b.quantity == "theta").dof == pytest.approx(dof)
+    assert next(
+        b for b in budgets(result) if b.quantity == "theta"
+    ).dof == pytest.approx(dof)
 
 
 def test_declared_noise_has_a_budget_with_k_after_it_is_read():
@@ -122,10 +129,14 @@ def test_declared_noise_has_a_budget_with_k_after_it_is_read():
         found,
         noise=replace(
             found.noise,
-            **dict.fromkeys(("dof_xy", "dof_map_xy", "dof_theta", "dof_map_theta"), math.inf),
+            **dict.fromkeys(
+                ("dof_xy", "dof_map_xy", "dof_theta", "dof_map_theta"), math.inf
+            ),
         ),
     )
-    again = result_from_dict(json.loads(json.dumps(plain(result_to_dict(declared)))), "r.json")
+    again = result_from_dict(
+        json.loads(json.dumps(plain(result_to_dict(declared)))), "r.json"
+    )
     for budget in budgets(again):
         assert budget.k == pytest.approx(2.0, abs=1e-4)
         assert budget.U_rms == pytest.approx(2 * budget.u_rms, rel=1e-4)
@@ -134,6 +145,8 @@ def test_declared_noise_has_a_budget_with_k_after_it_is_read():
 def test_a_map_without_degrees_of_freedom_has_those_of_its_noise():
     result = calibrated(reference=REFERENCE)
     nan = float("nan")
-    bare = replace(result, noise=replace(result.noise, dof_map_xy=nan, dof_map_theta=nan))
+    bare = replace(
+        result, noise=replace(result.noise, dof_map_xy=nan, dof_map_theta=nan)
+    )
     assert bare.noise.dof_of("xy") == result.noise.dof_xy == budgets(bare)[0].dof
     assert bare.noise.dof_of("theta") == result.noise.dof_theta

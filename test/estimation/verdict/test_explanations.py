@@ -48,7 +48,13 @@ def plan_of(order="x_back_y_back", repeats=4):
 
 
 def calibrated(
-    spread=CLEAN, *, change=lambda truth: truth, plan=None, seed=1, spoil=lambda m: m, **how
+    spread=CLEAN,
+    *,
+    change=lambda truth: truth,
+    plan=None,
+    seed=1,
+    spoil=lambda m: m,
+    **how,
 ):
     """Return the truth and the result."""
     plan, rng = plan or plan_of(), np.random.default_rng(seed)
@@ -103,7 +109,10 @@ CASES = {
         "microscope",
         -2e-3,
         "a microscope turned clockwise by ",
-        {"spread": replace(CLEAN, microscope_rotation_rad=-2e-3), "stop_sigma_m": 20e-6},
+        {
+            "spread": replace(CLEAN, microscope_rotation_rad=-2e-3),
+            "stop_sigma_m": 20e-6,
+        },
     ),
     "scaled": (
         "microscope",
@@ -111,7 +120,12 @@ CASES = {
         "a microscope that shows lengths too short by ",
         {"spread": replace(CLEAN, microscope_scale=5e-3), "stop_sigma_m": 20e-6},
     ),
-    "drift": ("drift", 500e-9, "along x during view '90'", {"change": steadily(500e-9)}),
+    "drift": (
+        "drift",
+        500e-9,
+        "along x during view '90'",
+        {"change": steadily(500e-9)},
+    ),
     "grown": (
         "plate_scale",
         2e-6,
@@ -124,7 +138,12 @@ CASES = {
         "an indicated x that changes by ±(",
         {"spread": replace(CLEAN, backlash_x_m=50e-9)},
     ),
-    "slip": ("slip", 250e-9, "of view '+x'", {"change": slipping(0.45, (200e-9, -150e-9))}),
+    "slip": (
+        "slip",
+        250e-9,
+        "of view '+x'",
+        {"change": slipping(0.45, (200e-9, -150e-9))},
+    ),
 }
 
 
@@ -171,7 +190,9 @@ def test_a_noisy_view_is_named():
     assert covered(result, truth.g) >= 0.85
     # nobody knows which nodes rest on the view: u is as for its noise everywhere
     wider = result.error_map.u_gx / judged().error_map.u_gx
-    assert wider == pytest.approx(3 * SETTINGS.sigma_xy_m / result.noise.sigma_xy, rel=0.1)
+    assert wider == pytest.approx(
+        3 * SETTINGS.sigma_xy_m / result.noise.sigma_xy, rel=0.1
+    )
     cause = verdict.causes[names.index("noise")]
     assert " times as much noise in view '-x' as in" in cause.text
     assert cause.view == "-x" and cause.size == pytest.approx(3, rel=0.1)
@@ -195,7 +216,10 @@ def test_causes_can_be_left_out():
 def test_the_effect_of_a_cause_is_what_holding_it_does_to_the_map():
     plan, rng = plan_of(), np.random.default_rng(1)
     truth = random_truth(
-        plan.artifact, len(plan.views), rng, replace(CLEAN, microscope_rotation_rad=2e-3)
+        plan.artifact,
+        len(plan.views),
+        rng,
+        replace(CLEAN, microscope_rotation_rad=2e-3),
     )
     readings = simulate_measurements(
         truth, plan, rng, visits=True, settings=replace(SETTINGS, stop_sigma_m=20e-6)
@@ -227,7 +251,11 @@ def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms
     plan, rng = plan_of("serpentine", repeats), np.random.default_rng(1)
     truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
     readings = simulate_measurements(
-        truth, plan, rng, visits=True, settings=replace(SETTINGS, consecutive=consecutive)
+        truth,
+        plan,
+        rng,
+        visits=True,
+        settings=replace(SETTINGS, consecutive=consecutive),
     )
     result = calibrate(readings, replace(OPTIONS, terms=parse_terms(terms, "")))
     assert result.verdict.qualified
@@ -239,7 +267,9 @@ def test_a_term_on_which_no_reading_depends_is_said_to_be_left_out():
     plan, rng = plan_of("serpentine", 4), np.random.default_rng(1)
     truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
     readings = simulate_measurements(truth, plan, rng, visits=True, settings=SETTINGS)
-    terms = parse_terms(["yaw", "line_scale:0.01", "line_eccentricity:0", "drift:1e-8"], "")
+    terms = parse_terms(
+        ["yaw", "line_scale:0.01", "line_eccentricity:0", "drift:1e-8"], ""
+    )
     result = calibrate(readings, replace(OPTIONS, terms=terms))
     assert [finding.text for finding in worded(result).findings] == [
         "no reading depends on yaw: it is not in the model; leave it out"
@@ -253,11 +283,16 @@ def test_a_view_whose_repeats_contradict_each_other_is_named(lost, said):
     truth = random_truth(plan.artifact, len(plan.views), rng, CLEAN)
     readings = simulate_measurements(truth, plan, rng, visits=True, settings=SETTINGS)
     first, *others = readings.views
-    first = replace(first, used=200, rejected={"outlier_among_repeats": lost, "low_score": 99})
+    first = replace(
+        first, used=200, rejected={"outlier_among_repeats": lost, "low_score": 99}
+    )
     result = worded(calibrate(replace(readings, views=(first, *others)), OPTIONS))
     assert [found.name for found in result.findings] == ["repeats_contradict"] * said
     for found in result.findings:
-        assert (found.view, found.details) == (first.view.name, {"rejected": lost, "of": 260})
+        assert (found.view, found.details) == (
+            first.view.name,
+            {"rejected": lost, "of": 260},
+        )
         assert found.text == (
             f"60 of 260 readings of view '{first.view.name}' contradict the other repeats of their "
             "marks and were left out: the plate slipped within the view, or a second publisher "
@@ -268,7 +303,10 @@ def test_a_view_whose_repeats_contradict_each_other_is_named(lost, said):
 def test_a_drift_is_tried_as_a_whole_in_each_view_and_in_each_view_steadily():
     found = [(view, part) for view in range(3) for part in ("x P1", "y P1", "x P2")]
     columns = [Column("drift", view, part, np.inf) for view, part in found]
-    tried = [[found[at] for at in group.rows] for group in _groups(columns, ["approach", "drift"])]
+    tried = [
+        [found[at] for at in group.rows]
+        for group in _groups(columns, ["approach", "drift"])
+    ]
     assert tried == [
         found,
         *(

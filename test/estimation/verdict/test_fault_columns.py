@@ -19,7 +19,11 @@ def inputs():
     """Return the inputs of two views of 7 x 7 marks, the second turned by 90 deg."""
     plan, rng = plan_of("0,90,tx", Artifact(7, 0.01)), np.random.default_rng(4)
     readings = simulate_measurements(
-        random_truth(plan.artifact, 3, rng), plan, rng, settings=CellSettings(), visits=True
+        random_truth(plan.artifact, 3, rng),
+        plan,
+        rng,
+        settings=CellSettings(),
+        visits=True,
     )
     return term_inputs(readings, grid_data(readings), 0.03)
 
@@ -33,7 +37,9 @@ def test_twelve_instants_divide_the_visits_of_a_view_evenly(inputs, view):
     time, mark = inputs.visits[view].time, inputs.visits[view].mark
     unit = (1, -1j)[view]  # a stage axis in the frame of a plate turned by 90 deg
     for part in parts:
-        x, y, phi = (made.unit[at] * made.at[made.of_column[at]][view] for at in rows[part])
+        x, y, phi = (
+            made.unit[at] * made.at[made.of_column[at]][view] for at in rows[part]
+        )
         after = time >= np.sort(time)[round(49 * part)]
         assert np.array_equal(x, unit * after) and np.array_equal(y, 1j * unit * after)
         assert np.array_equal(phi, 1j * inputs.z.ravel()[mark] * after)
@@ -46,5 +52,7 @@ def test_each_column_moves_its_own_view_alone(inputs):
     for mine, view, _ in found:
         assert [made.columns[at].component for at in mine] == ["x", "y", "phi"]
         for at in mine:
-            assert np.flatnonzero(np.abs(made.grid[at]).max(axis=(1, 2))).tolist() == [view]
+            assert np.flatnonzero(np.abs(made.grid[at]).max(axis=(1, 2))).tolist() == [
+                view
+            ]
             assert made.columns[at].view == view

@@ -42,7 +42,8 @@ def readings():
 
 
 @pytest.mark.parametrize(
-    ("p", "holds"), [(0.04, False), (0.0499, False), (0.05, True), (0.06, True), (0.9, True)]
+    ("p", "holds"),
+    [(0.04, False), (0.0499, False), (0.05, True), (0.06, True), (0.9, True)],
 )
 def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
     options = Options(misalignment_model="linear", causes=False)
@@ -60,9 +61,13 @@ def test_axis_conditions_that_nobody_asked_for_hold(readings):
 
 
 @pytest.mark.parametrize("terms", [(), (ModelTerm("plate_scale", 1e-9),)])
-def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(readings, terms):
+def test_axes_that_the_stage_does_not_keep_are_found_without_an_uncertainty_map(
+    readings, terms
+):
     """The rotary encoder owes nothing to the axes: its map in their datum is wrong."""
-    options = Options(misalignment_model="linear", datum_theta=ThetaDatum.XY_AXES, terms=terms)
+    options = Options(
+        misalignment_model="linear", datum_theta=ThetaDatum.XY_AXES, terms=terms
+    )
     wanted, plain = (
         calibrate(readings, replace(options, uncertainty=uncertainty))
         for uncertainty in (None, False)
@@ -112,7 +117,9 @@ def test_a_search_needs_a_field_that_is_not_large_and_noise(
 ):
     searched = []
     monkeypatch.setattr(search, "ALWAYS_SITES", sites)
-    monkeypatch.setattr(search, "_search", lambda *args, failed: searched.append(failed))
+    monkeypatch.setattr(
+        search, "_search", lambda *args, failed: searched.append(failed)
+    )
     options = Options(misalignment_model="linear")
     solved = solve_joint(readings, options)
     if noise_m is not None:
@@ -121,10 +128,14 @@ def test_a_search_needs_a_field_that_is_not_large_and_noise(
     assert searched == [False] * wanted
 
 
-def test_a_size_that_is_contradicted_has_causes_sought_in_a_large_field(readings, monkeypatch):
+def test_a_size_that_is_contradicted_has_causes_sought_in_a_large_field(
+    readings, monkeypatch
+):
     searched = []
     monkeypatch.setattr(search, "ALWAYS_SITES", 24)
-    monkeypatch.setattr(search, "_search", lambda *args, failed: searched.append(failed))
+    monkeypatch.setattr(
+        search, "_search", lambda *args, failed: searched.append(failed)
+    )
     options = Options(terms=parse_terms(["plate_scale:1e-3"], ""))
     solved = solve_joint(readings, options)
     assert [test.name for test in solved.model.sizes if test.contradicted] == []
@@ -161,7 +172,11 @@ def offsets_of(
         **how,
     )
     return simulate_measurements(
-        random_truth(plan.artifact, 4, rng, spread), plan, rng, settings=settings, visits=True
+        random_truth(plan.artifact, 4, rng, spread),
+        plan,
+        rng,
+        settings=settings,
+        visits=True,
     )
 
 
@@ -201,7 +216,9 @@ def test_lines_alone_show_the_sign_of_offsets_only_if_theirs_is_right(
     """
     readings = offsets_of(*scatter, phi_rad=1e-3, repeats=repeats, sense=sense)
     asked = ["sign_shown_by_lines"] * by_lines
-    assert [found.name for found in calibrate(readings, Options()).verdict.failed] == asked
+    assert [
+        found.name for found in calibrate(readings, Options()).verdict.failed
+    ] == asked
     declared = calibrate(readings, Options(terms=parse_terms(["microscope:1e-2"], "")))
     assert declared.verdict.grade is Grade.GOOD
     reversed_all = turned_readings(readings, REVERSED)
@@ -229,7 +246,9 @@ def test_noise_of_the_encoders_shows_no_sign(moves_m):
 def test_the_sign_of_lines_is_shown_by_the_turns_of_the_plate(turn_rad, asked, sense):
     """With the wrong sign the angular map is that of another stage: refused, or nobody knows."""
     plan, rng = hu_plan(Artifact(7, 0.01, 24), 5), np.random.default_rng(3)
-    truth = random_truth(plan.artifact, 4, rng, Spread(rotation="finite", phi_rad=turn_rad))
+    truth = random_truth(
+        plan.artifact, 4, rng, Spread(rotation="finite", phi_rad=turn_rad)
+    )
     readings = simulate_measurements(
         truth,
         plan,
@@ -244,7 +263,8 @@ def test_the_sign_of_lines_is_shown_by_the_turns_of_the_plate(turn_rad, asked, s
         ),
     )
     reversed_lines = replace(
-        readings, views=tuple(replace(view, dtheta=-view.dtheta) for view in readings.views)
+        readings,
+        views=tuple(replace(view, dtheta=-view.dtheta) for view in readings.views),
     )
     names = [found.name for found in calibrate(readings, Options()).verdict.failed]
     assert ("lines_sign_not_shown" in names) is asked
@@ -258,7 +278,9 @@ def test_the_sign_of_lines_is_shown_by_the_turns_of_the_plate(turn_rad, asked, s
 @pytest.mark.parametrize(
     ("given", "is_declared"), [("plate_shape:0", True), ("plate_scale:0", False)]
 )
-def test_a_term_declared_to_be_zero_that_the_readings_show_is_named_so(given, is_declared):
+def test_a_term_declared_to_be_zero_that_the_readings_show_is_named_so(
+    given, is_declared
+):
     rng, plan = np.random.default_rng(5), hu_plan(Artifact(7, 0.01), repeats=2)
     bent = replace(
         random_truth(plan.artifact, len(plan.views), rng),
@@ -284,13 +306,19 @@ def test_a_term_declared_to_be_zero_that_the_readings_show_is_named_so(given, is
         (1.3, {"terms": parse_terms(["microscope:0.3:0.01:0.002"], "")}, False),
     ],
 )
-def test_repeats_disqualify_a_scale_of_the_microscope_that_no_fit_corrects(pixels, how, wanted):
+def test_repeats_disqualify_a_scale_of_the_microscope_that_no_fit_corrects(
+    pixels, how, wanted
+):
     """Stops that scatter by five times the noise are too small for the fit."""
     plan, rng = hu_plan(Artifact(7, 0.01, 0), 4), np.random.default_rng(5)
     settings = CellSettings(sigma_xy_m=20e-9, servo_sigma_m=100e-9)
     spread = Spread(rotation="finite", phi_rad=1e-4, microscope_pixels=pixels)
     readings = simulate_measurements(
-        random_truth(plan.artifact, 4, rng, spread), plan, rng, settings=settings, visits=True
+        random_truth(plan.artifact, 4, rng, spread),
+        plan,
+        rng,
+        settings=settings,
+        visits=True,
     )
     verdict = worded(calibrate(readings, Options(**how))).verdict
     assert [f.name for f in verdict.failed] == ["scale_of_offsets"] * wanted
@@ -299,13 +327,17 @@ def test_repeats_disqualify_a_scale_of_the_microscope_that_no_fit_corrects(pixel
         assert found.size == pytest.approx(pixels, abs=0.08) and found.unit == "m/m"
         assert (found.size > 1) == (pixels > 1) and found.size < found.details["most"]
         assert f"{found.size:.3f} ± {found.u:.3f} to" in verdict.sentence
-        assert "the scale is taken as 1 ± 0.01: correct the pixel size" in verdict.sentence
+        assert (
+            "the scale is taken as 1 ± 0.01: correct the pixel size" in verdict.sentence
+        )
         assert verdict.grade is Grade.NOT_QUALIFIED
 
 
 def test_the_origin_is_from_the_first_exposure_to_the_last():
     plan, rng = hu_plan(Artifact(5, 0.01), repeats=2), np.random.default_rng(2)
-    readings = simulate_measurements(random_truth(plan.artifact, 4, rng), plan, rng, visits=True)
+    readings = simulate_measurements(
+        random_truth(plan.artifact, 4, rng), plan, rng, visits=True
+    )
     one = replace(readings, views=readings.views[1:2])
     stamps = one.views[0].visits.stamp_ns
     found = provenance_of(one, BARE)
@@ -320,7 +352,9 @@ def test_the_origin_is_from_the_first_exposure_to_the_last():
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_microscope_of_an_implausible_scale_does_not_pass_for_a_turn_of_the_lines(seed):
+def test_a_microscope_of_an_implausible_scale_does_not_pass_for_a_turn_of_the_lines(
+    seed,
+):
     """Lines turn against marks in each view by as much as the plate: its scale is 20 % wrong."""
     rng, plan = np.random.default_rng(seed), hu_plan(Artifact(7, 0.01, 24), repeats=5)
     how = CellSettings(
@@ -331,6 +365,8 @@ def test_a_microscope_of_an_implausible_scale_does_not_pass_for_a_turn_of_the_li
     )
     spread = Spread(phi_rad=np.deg2rad(0.01), t_m=5e-6, microscope_scale=0.2)
     truth = random_truth(plan.artifact, 4, rng, spread)
-    verdict = calibrate(simulate_measurements(truth, plan, rng, settings=how, visits=True)).verdict
+    verdict = calibrate(
+        simulate_measurements(truth, plan, rng, settings=how, visits=True)
+    ).verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
     assert "microscope" in [cause.name for cause in verdict.causes]

@@ -27,8 +27,12 @@ def thinned(readings, marks, lines, rejected):
     """Return the readings with the first marks and lines of one view alone."""
     view = readings.views[LATE]
     part = subset(view, np.arange(len(view.m)) < marks, np.arange(len(view.k)) < lines)
-    part = replace(part, used=int(part.count.sum() + part.count_theta.sum()), rejected=rejected)
-    return replace(readings, views=tuple(part if one is view else one for one in readings.views))
+    part = replace(
+        part, used=int(part.count.sum() + part.count_theta.sum()), rejected=rejected
+    )
+    return replace(
+        readings, views=tuple(part if one is view else one for one in readings.views)
+    )
 
 
 def left_out(result):
@@ -67,7 +71,9 @@ def test_a_view_that_was_left_out_is_a_warning_of_the_result(
 ):
     view = readings.views[LATE]
     result = worded(calibrate(thinned(readings, marks, lines, rejected)))
-    line = f"view '{view.view.name}' " + said.format(marks=len(view.m), lines=len(view.k))
+    line = f"view '{view.view.name}' " + said.format(
+        marks=len(view.m), lines=len(view.k)
+    )
     data = result_to_dict(result)
     assert [text for text in data["warnings"] if " the map: " in text] == [line]
     summary = " ".join(summary_text(result_from_dict(data, "r")).split())
@@ -82,7 +88,9 @@ def test_a_view_without_most_of_its_marks_or_lines_is_told_and_no_other(readings
     assert left_out(calibrate(thinned(readings, marks // 2 - 1, lines, {})))
     assert left_out(calibrate(thinned(readings, marks, lines // 2 - 1, {})))
     for kept in (1.0, 0.8, 0.6):
-        part = thinned(readings, int(kept * marks), int(kept * lines), {"low_score": 1000})
+        part = thinned(
+            readings, int(kept * marks), int(kept * lines), {"low_score": 1000}
+        )
         result = worded(calibrate(part))
         assert not left_out(result)
         assert summary_text(result).startswith("Calibrated from 5 views")
@@ -93,7 +101,9 @@ def test_lines_that_no_view_has_are_not_missed(readings):
         subset(view, np.full(len(view.m), True), np.full(len(view.k), False))
         for view in readings.views
     )
-    assert [one.view for one in left_out(calibrate(replace(readings, views=views)))] == ["line"]
+    assert [
+        one.view for one in left_out(calibrate(replace(readings, views=views)))
+    ] == ["line"]
 
 
 def test_the_parts_of_a_view_that_slipped_are_one_view(readings):

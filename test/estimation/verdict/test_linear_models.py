@@ -63,7 +63,8 @@ def test_a_plate_that_really_turns_is_told_with_its_largest_turn(method):
         (
             "joint",
             Options(
-                misalignment_model="linear", terms=(ModelTerm("microscope"), ModelTerm("drift"))
+                misalignment_model="linear",
+                terms=(ModelTerm("microscope"), ModelTerm("drift")),
             ),
             2,
         ),
@@ -73,7 +74,11 @@ def test_rotations_are_named_where_nothing_tells_the_noise_or_terms_take_them_up
     method, options, repeats
 ):
     """A turned microscope, strain, and lines of the other sign were named instead."""
-    turned = {"spread": replace(FLAT, phi_rad=1e-2), "repeats": repeats, "servo_sigma_m": 1e-7}
+    turned = {
+        "spread": replace(FLAT, phi_rad=1e-2),
+        "repeats": repeats,
+        "servo_sigma_m": 1e-7,
+    }
     verdict = judged(method, options, **turned)[1].verdict
     assert verdict.grade is Grade.NOT_QUALIFIED and not verdict.causes
     assert "the plate was turned by up to" in verdict.sentence
@@ -87,7 +92,9 @@ def test_a_turned_microscope_is_named(method):
         method, spread=replace(FLAT, microscope_rotation_rad=2e-3), stop_sigma_m=20e-6
     )
     assert [cause.name for cause in found.verdict.causes] == ["microscope"]
-    assert found.verdict.causes[0].size == pytest.approx(2e-3, abs=4 * found.verdict.causes[0].u)
+    assert found.verdict.causes[0].size == pytest.approx(
+        2e-3, abs=4 * found.verdict.causes[0].u
+    )
     assert not any("linear" in reason for reason in found.verdict.reasons)
     if method == "law":  # which cannot hold it
         assert found.verdict.grade is Grade.NOT_QUALIFIED
@@ -120,14 +127,19 @@ def test_a_linear_model_asks_for_the_sign_of_the_offsets(method):
     assert judged(method, linear, **scatter)[1].verdict.grade is Grade.GOOD
     turned = judged(method, linear, replace(FLAT, phi_rad=3e-4))[1].verdict
     assert [found.name for found in turned.failed] == ["sign_shown_by_lines"]
-    stood = judged(method, linear, replace(FLAT, phi_rad=3e-4), servo_sigma_m=1e-8)[1].verdict
+    stood = judged(method, linear, replace(FLAT, phi_rad=3e-4), servo_sigma_m=1e-8)[
+        1
+    ].verdict
     assert stood.grade is Grade.GOOD
 
 
 @METHODS
 def test_nothing_is_looked_for_where_nobody_asks(method):
     found = judged(method, replace(LINEAR, causes=False), replace(FLAT, phi_rad=5e-3))
-    assert found[1].verdict.grade is Grade.NOT_QUALIFIED and len(found[1].verdict.reasons) == 1
+    assert (
+        found[1].verdict.grade is Grade.NOT_QUALIFIED
+        and len(found[1].verdict.reasons) == 1
+    )
 
 
 @METHODS
@@ -135,6 +147,8 @@ def test_axes_that_the_stage_does_not_have_are_not_qualified(method):
     axes = replace(LINEAR, datum_theta="xy_axes")
     own = judged(method, axes)[1].verdict
     assert own.grade is Grade.NOT_QUALIFIED
-    assert any("does not satisfy the axis conditions" in reason for reason in own.reasons)
+    assert any(
+        "does not satisfy the axis conditions" in reason for reason in own.reasons
+    )
     kept = judged(method, axes, replace(FLAT, encoder="xy_axes"))[1]
     assert kept.verdict.grade is Grade.GOOD

@@ -31,7 +31,10 @@ STEPS = np.arange(N) - (N - 1) // 2
 
 def stage_error(x, y, bend_m=5e-7, rough_m=0.0):
     """Indicated minus true position where the stage is, m: bent, and waves of 2.7 pitches."""
-    (u, v), (p, q) = np.array([x, y]) / HALF_M, np.array([x, y]) / PITCH_M * 2 * np.pi / 2.7
+    (u, v), (p, q) = (
+        np.array([x, y]) / HALF_M,
+        np.array([x, y]) / PITCH_M * 2 * np.pi / 2.7,
+    )
     return bend_m * np.array([u**2 + 0.5 * u * v, v**2 - u * v]) + rough_m * np.array(
         [np.cos(p) * np.cos(q + 0.3), np.sin(p + q)]
     )
@@ -55,7 +58,8 @@ def readings(
         turned = np.array([(m, n), (-n, m)][quarter]) + np.array([[a], [b]])
         here = (abs(turned) <= (N - 1) // 2).all(axis=0)
         site = turned[:, here] * PITCH_M
-        mark = site + beside[:, None]  # a plate without errors, laid down beside its place
+        # a plate without errors, laid down beside its place
+        mark = site + beside[:, None]
         true = sign * (mark if follow else site)
         indicated = true + stage_error(*true, **stage)
         seen = mark - sign * true + rng.normal(0, sigma_m, mark.shape)
@@ -71,16 +75,22 @@ def readings(
             0 * count.astype("i1"),
             0 * count.astype("i1"),
         )
-        view = View(f"{quarter} {a} {b}", quarter * np.pi / 2, (a * PITCH_M, b * PITCH_M))
+        view = View(
+            f"{quarter} {a} {b}", quarter * np.pi / 2, (a * PITCH_M, b * PITCH_M)
+        )
         views.append(
-            ViewReadings(view, m[here], n[here], dx, dy, count, visits=at if visits else None)
+            ViewReadings(
+                view, m[here], n[here], dx, dy, count, visits=at if visits else None
+            )
         )
     return Measurements("beside", Artifact(N, PITCH_M, 0), tuple(views), sense)
 
 
 def without_datum(field):
     """Return a field (2, N, N) without translation, rotation and magnification, flat."""
-    x, y = (array.ravel() * PITCH_M for array in np.meshgrid(STEPS, STEPS, indexing="ij"))
+    x, y = (
+        array.ravel() * PITCH_M for array in np.meshgrid(STEPS, STEPS, indexing="ij")
+    )
     one, none = np.ones_like(x), np.zeros_like(x)
     modes = np.array([[*one, *none], [*none, *one], [*-y, *x], [*x, *y]]).T
     flat = field.reshape(-1)
@@ -118,8 +128,12 @@ def test_without_noise_it_has_them_but_for_the_origin_that_nothing_tells(sense):
     """The datum moves the stage by 0.2 um, over which its slope changes by 1e-10."""
     result = calibrate(readings(follow=True, sense=sense, sigma_m=0.0), BARE)
     assert abs(error_of(result)).max() < 1e-11
-    other = Sense.PLATE_MOVES if sense is Sense.MICROSCOPE_MOVES else Sense.MICROSCOPE_MOVES
-    wrong = calibrate(replace(readings(follow=True, sense=sense, sigma_m=0.0), sense=other), BARE)
+    other = (
+        Sense.PLATE_MOVES if sense is Sense.MICROSCOPE_MOVES else Sense.MICROSCOPE_MOVES
+    )
+    wrong = calibrate(
+        replace(readings(follow=True, sense=sense, sigma_m=0.0), sense=other), BARE
+    )
     assert abs(error_of(wrong)).max() > 1e-8
 
 
@@ -142,9 +156,13 @@ def test_a_stage_that_is_rough_there_has_a_larger_u(sense):
     cause = result.verdict.causes[0]
     assert (cause.name, cause.unit) == ("off_sites", "m") and cause.p < 5e-4
     assert cause.effect_rms == pytest.approx(np.sqrt(more.mean()), rel=1e-6)
-    assert cause.effect_max == cause.size == pytest.approx(np.sqrt(more.max()), rel=1e-6)
+    assert (
+        cause.effect_max == cause.size == pytest.approx(np.sqrt(more.max()), rel=1e-6)
+    )
     assert covered(result, **rough) >= 0.85
-    assert cause.text.startswith("a stage that stood 0.567 mm off the sites, where its error ")
+    assert cause.text.startswith(
+        "a stage that stood 0.567 mm off the sites, where its error "
+    )
     assert "place the plate closer to its nominal pose" in cause.text
 
 
@@ -155,7 +173,9 @@ def test_a_stage_too_rough_for_it_is_not_qualified():
 
 
 def test_a_little_beside_is_no_matter():
-    verdict = calibrate(readings(follow=True, beside=BESIDE_M / 100, rough_m=1e-7), BARE).verdict
+    verdict = calibrate(
+        readings(follow=True, beside=BESIDE_M / 100, rough_m=1e-7), BARE
+    ).verdict
     assert verdict.grade is Grade.GOOD
 
 
@@ -163,14 +183,18 @@ def test_with_a_microscope_that_nobody_knows_the_sign_of_its_offsets_is_not_show
     """All views lie beside their places alike: a microscope of any scale shows the same."""
     verdict = calibrate(readings(follow=True, rough_m=1e-7)).verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
-    assert verdict.failed[0] == Finding("sign_not_shown") and verdict.causes[0].name == "off_sites"
+    assert (
+        verdict.failed[0] == Finding("sign_not_shown")
+        and verdict.causes[0].name == "off_sites"
+    )
 
 
 @pytest.mark.parametrize("at_places", [True, False])
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_of_the_map_is_no_roughness_of_the_stage(seed, at_places):
     verdict = calibrate(
-        readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0), bare(at_places=at_places)
+        readings(follow=True, seed=seed, beside=2 * BESIDE_M, bend_m=0.0),
+        bare(at_places=at_places),
     ).verdict
     assert verdict.grade is Grade.GOOD
 
@@ -182,8 +206,12 @@ def test_without_noise_a_stage_at_the_sites_is_at_the_sites():
 def test_what_spoils_the_map_comes_before_places_that_residuals_do_not_show():
     whole = readings(follow=True, rough_m=1e-7)
     off = whole.views[0].visits.dx + np.where(np.arange(N * N) == 10, 5e-7, 0.0)
-    first = replace(whole.views[0], dx=off, visits=replace(whole.views[0].visits, dx=off))
-    causes = calibrate(replace(whole, views=(first, *whole.views[1:])), BARE).verdict.causes
+    first = replace(
+        whole.views[0], dx=off, visits=replace(whole.views[0].visits, dx=off)
+    )
+    causes = calibrate(
+        replace(whole, views=(first, *whole.views[1:])), BARE
+    ).verdict.causes
     assert [cause.name for cause in causes] == ["reading", "off_sites"]
 
 
@@ -207,7 +235,10 @@ def test_where_visits_are_not_known_or_causes_not_wanted_nothing_is_said():
 def test_it_is_found_whatever_else_is_asked_for(options):
     found = trusted(readings(follow=True, rough_m=1e-7), options).verdict
     assert found.causes[0].name == "off_sites"
-    assert calibrate(readings(follow=False, rough_m=1e-7), options).verdict.grade is Grade.GOOD
+    assert (
+        calibrate(readings(follow=False, rough_m=1e-7), options).verdict.grade
+        is Grade.GOOD
+    )
 
 
 def test_places_that_do_not_converge_are_given_up_and_named(monkeypatch):
@@ -224,9 +255,15 @@ def test_places_that_do_not_converge_are_given_up_and_named(monkeypatch):
 def test_the_same_readings_tell_the_same_in_either_sense():
     """The map is mirrored, and its uncertainty with it; what the places do to it is the same."""
     whole = readings(follow=True, rough_m=1e-7)
-    views = tuple(replace(view, count=np.where(view.m < 0, 1, 9)) for view in whole.views)
-    one, two = (trusted(replace(whole, views=views, sense=sense), BARE) for sense in Sense)
-    assert not np.allclose(one.error_map.u_gx, one.error_map.u_gx[::-1], rtol=0.1, atol=0)
+    views = tuple(
+        replace(view, count=np.where(view.m < 0, 1, 9)) for view in whole.views
+    )
+    one, two = (
+        trusted(replace(whole, views=views, sense=sense), BARE) for sense in Sense
+    )
+    assert not np.allclose(
+        one.error_map.u_gx, one.error_map.u_gx[::-1], rtol=0.1, atol=0
+    )
     (first, *_), (second, *_) = one.verdict.causes, two.verdict.causes
     assert (first.name, first.size, first.u) == (
         second.name,

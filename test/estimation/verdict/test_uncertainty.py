@@ -35,7 +35,12 @@ def result():
     truth = random_truth(plan.artifact, 4, rng)
     return calibrate(
         simulate_measurements(truth, plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-6),
-        bare(terms=(ModelTerm("plate_strain", 2e-7), ModelTerm("line_eccentricity", 1e-6))),
+        bare(
+            terms=(
+                ModelTerm("plate_strain", 2e-7),
+                ModelTerm("line_eccentricity", 1e-6),
+            )
+        ),
     )
 
 
@@ -55,8 +60,12 @@ def test_a_field_of_a_moved_plate_is_that_of_the_opposite_place_with_the_other_s
     np.testing.assert_array_equal(ahead.theta, lines)
     np.testing.assert_array_equal(back.theta, [0, -7, -6, -5, -4, -3, -2, -1])
     np.testing.assert_array_equal(ahead.xy, [FIELD.real, FIELD.imag])
-    assert back.xy[0, 0, 0] == -FIELD[4, 2].real and back.xy[1, 4, 0] == -FIELD[0, 2].imag
-    np.testing.assert_array_equal(back.xy, [-FIELD.real[::-1, ::-1], -FIELD.imag[::-1, ::-1]])
+    assert (
+        back.xy[0, 0, 0] == -FIELD[4, 2].real and back.xy[1, 4, 0] == -FIELD[0, 2].imag
+    )
+    np.testing.assert_array_equal(
+        back.xy, [-FIELD.real[::-1, ::-1], -FIELD.imag[::-1, ::-1]]
+    )
 
 
 def test_effects_add_up_in_quadrature_and_leave_the_map_alone(result):
@@ -64,7 +73,9 @@ def test_effects_add_up_in_quadrature_and_leave_the_map_alone(result):
     found = enlarged(result, (slip, turned, nothing)).error_map
     before = result.error_map
     for name, at in (("u_gx", 0), ("u_gy", 1)):
-        wanted = np.sqrt(getattr(before, name) ** 2 + slip.xy[at] ** 2 + turned.xy[at] ** 2)
+        wanted = np.sqrt(
+            getattr(before, name) ** 2 + slip.xy[at] ** 2 + turned.xy[at] ** 2
+        )
         np.testing.assert_allclose(getattr(found, name), wanted, rtol=1e-12)
     np.testing.assert_allclose(
         found.u_g_theta, np.hypot(before.u_g_theta, turned.theta), rtol=1e-12
@@ -78,7 +89,9 @@ def test_a_saved_map_has_the_covariance_of_its_effects(result):
     slip, turned, nothing = effects_of(result)
     known = result.error_map.valid
     larger = enlarged(result, (slip, turned, nothing))
-    saved = result_from_dict(json.loads(json.dumps(result_to_dict(worded(larger)))), "r")
+    saved = result_from_dict(
+        json.loads(json.dumps(result_to_dict(worded(larger)))), "r"
+    )
     assert saved.kept.factors.terms[-2:] == ("slip", "rotation")
     found = covariance_of(saved, "xy", known)
     wanted = covariance_of(result, "xy", known)
@@ -93,7 +106,9 @@ def test_a_saved_map_has_the_covariance_of_its_effects(result):
 
 def test_a_map_without_uncertainty_stays_without(result):
     nowhere = np.full(result.artifact.shape, np.nan)
-    bare_map = replace(result.error_map, u_gx=nowhere, u_gy=nowhere, u_g_theta=np.full(8, np.nan))
+    bare_map = replace(
+        result.error_map, u_gx=nowhere, u_gy=nowhere, u_g_theta=np.full(8, np.nan)
+    )
     found = enlarged(replace(result, error_map=bare_map), effects_of(result)).error_map
     assert np.isnan(found.u_gx).all() and np.isnan(found.u_g_theta).all()
 
@@ -104,7 +119,9 @@ def test_the_difference_of_two_maps_is_theirs_without_a_common_angle(result):
     gy[1, 2] = np.nan
     g_theta = emap.g_theta + 7e-6 - np.arange(8) * 1e-6
     g_theta[7] = np.nan
-    other = replace(result, error_map=replace(emap, gx=emap.gx - 1e-9, gy=gy, g_theta=g_theta))
+    other = replace(
+        result, error_map=replace(emap, gx=emap.gx - 1e-9, gy=gy, g_theta=g_theta)
+    )
     found = difference("rotation", result, other)
     np.testing.assert_allclose(found.xy[0], 1e-9, rtol=1e-6)
     wanted = np.full(emap.gy.shape, -2e-9)
@@ -119,7 +136,9 @@ def test_what_enlarged_an_uncertainty_is_listed_the_most_first(result):
     slip, turned, _ = effects_of(result)
     only_lines = replace(turned, name="reading", xy=np.zeros_like(turned.xy))
     found = enlargements(
-        result, ["plate_strain", "line_eccentricity", "plate_strain", "drift"], (slip, only_lines)
+        result,
+        ["plate_strain", "line_eccentricity", "plate_strain", "drift"],
+        (slip, only_lines),
     )
     by_name = {item.name: item for item in found}
     assert sorted(by_name) == ["line_eccentricity", "plate_strain", "reading", "slip"]
@@ -141,7 +160,9 @@ def test_the_interpolation_of_angles_does_not_depend_on_where_the_lines_begin(re
         turned = replace(
             result,
             error_map=replace(
-                emap, g_theta=np.roll(emap.g_theta, steps), u_g_theta=np.roll(emap.u_g_theta, steps)
+                emap,
+                g_theta=np.roll(emap.g_theta, steps),
+                u_g_theta=np.roll(emap.u_g_theta, steps),
             ),
         )
         return next(
@@ -151,5 +172,7 @@ def test_the_interpolation_of_angles_does_not_depend_on_where_the_lines_begin(re
         )
 
     lines = [line(steps) for steps in range(8)]
-    assert all(one.effect_rms == pytest.approx(lines[0].effect_rms, rel=1e-12) for one in lines)
+    assert all(
+        one.effect_rms == pytest.approx(lines[0].effect_rms, rel=1e-12) for one in lines
+    )
     assert lines[0].effect_rms > 0

@@ -79,10 +79,17 @@ def test_noise_beyond_the_repeats_is_in_the_noise_once():
     parts = parts_of(budgets(result)[0])
     part, lack = parts["reading noise"], parts["effect lack_of_fit"]
     u = np.stack([result.error_map.u_gx, result.error_map.u_gy])
-    assert np.hypot(part.effect_rms, lack.effect_rms) == pytest.approx(np.sqrt((u**2).mean()))
+    assert np.hypot(part.effect_rms, lack.effect_rms) == pytest.approx(
+        np.sqrt((u**2).mean())
+    )
     # in full at every node, by the view that has most, with its upper limit
-    assert 3e-8 < lack.effect_rms < 4.5e-8 and lack.effect_max == pytest.approx(lack.effect_rms)
-    assert line_text(lack) == "residuals beyond the scatter of repeats, met in full at every place"
+    assert 3e-8 < lack.effect_rms < 4.5e-8 and lack.effect_max == pytest.approx(
+        lack.effect_rms
+    )
+    assert (
+        line_text(lack)
+        == "residuals beyond the scatter of repeats, met in full at every place"
+    )
     assert part.dof == result.noise.dof_xy_residuals
     assert part.details == by("residuals", contradicted=True)
     assert line_text(part) == (
@@ -114,7 +121,8 @@ def test_noise_that_repeats_show_beyond_the_declared_is_not_lack_of_fit():
         truth, hu_plan(ARTIFACT, 5), rng, sigma_m=2e-8, sigma_theta_rad=2e-5
     )
     views = tuple(
-        replace(view, u=np.full(view.dx.shape, 1e-8 / np.sqrt(5))) for view in readings.views
+        replace(view, u=np.full(view.dx.shape, 1e-8 / np.sqrt(5)))
+        for view in readings.views
     )
     result = calibrate(replace(readings, views=views), BARE)
     assert result.verdict.grade == Grade.ENLARGED  # the declaration is contradicted
@@ -137,7 +145,10 @@ def test_nodes_and_field_are_told_apart():
         "XY, one coordinate anywhere in the field, map interpolated between its nodes"
     )
     assert quantity_text(of_lines) == "theta at the lines of the map"
-    assert quantity_text(at_any_angle) == "theta at any angle, map interpolated between its lines"
+    assert (
+        quantity_text(at_any_angle)
+        == "theta at any angle, map interpolated between its lines"
+    )
     assert "interpolation" not in parts_of(at_nodes) | parts_of(of_lines)
     assert parts_of(in_field)["interpolation"].effect_rms > 5 * at_nodes.u_rms
     assert in_field.u_rms == pytest.approx(
@@ -159,16 +170,23 @@ def test_a_term_with_a_size_has_a_line_and_the_lines_add_up():
     emap = result.error_map
     total = np.mean(np.stack([emap.u_gx, emap.u_gy]) ** 2)
     line = parts["term plate_shape"]
-    assert total == pytest.approx(sum(part.effect_rms**2 for part in parts.values()), rel=1e-4)
+    assert total == pytest.approx(
+        sum(part.effect_rms**2 for part in parts.values()), rel=1e-4
+    )
     own = np.stack([alone.error_map.u_gx, alone.error_map.u_gy]) / alone.noise.sigma_xy
     noise = np.sqrt(np.mean(own**2)) * result.noise.sigma_xy
     assert parts["reading noise"].effect_rms == pytest.approx(noise, rel=1e-3)
     assert line.effect_rms > 0.2 * noise
     assert line_text(line).startswith("size 1e-07, of which the readings leave ")
     loose = parts_of(
-        budgets(calibrate(readings, replace(plain, terms=(ModelTerm("plate_shape", 1e-9),))))[0]
+        budgets(
+            calibrate(readings, replace(plain, terms=(ModelTerm("plate_shape", 1e-9),)))
+        )[0]
     )["term plate_shape"]
-    assert (loose.kind, loose.dof) == ("B", np.inf) and loose.effect_rms < line.effect_rms
+    assert (loose.kind, loose.dof) == (
+        "B",
+        np.inf,
+    ) and loose.effect_rms < line.effect_rms
 
 
 def test_reference_length_grows_with_the_distance_from_the_centre():
@@ -186,7 +204,9 @@ def test_the_reference_is_not_counted_twice():
     noise = parts_of(budgets(result)[0])["reading noise"]
     own = 3e-7 * np.stack([ARTIFACT.x_m, ARTIFACT.y_m])
     emap = result.error_map
-    with_scale = replace(emap, u_gx=np.hypot(emap.u_gx, own[0]), u_gy=np.hypot(emap.u_gy, own[1]))
+    with_scale = replace(
+        emap, u_gx=np.hypot(emap.u_gx, own[0]), u_gy=np.hypot(emap.u_gy, own[1])
+    )
     reference = ReferenceLength("artifact", 0.0, 3e-7)
     found = parts_of(drawn_up(result, error_map=with_scale, reference=reference)[0])
     assert found["reading noise"].effect_rms == pytest.approx(noise.effect_rms)
@@ -197,9 +217,12 @@ def test_interpolation_error_of_a_parabola_is_the_exact_one():
     result = calibrated()
     x = ARTIFACT.x_m
     nothing = np.zeros(ARTIFACT.shape)
-    curved = replace(result.error_map, gx=1e-3 * x**2, gy=nothing, u_gx=nothing, u_gy=nothing)
+    curved = replace(
+        result.error_map, gx=1e-3 * x**2, gy=nothing, u_gx=nothing, u_gy=nothing
+    )
     part = parts_of(drawn_up(result, error_map=curved)[1])["interpolation"]
-    middle = 1e-3 * 0.01**2 / 4  # linear interpolation of a x^2 over a pitch, at its middle
+    # linear interpolation of a x^2 over a pitch, at its middle
+    middle = 1e-3 * 0.01**2 / 4
     assert part.effect_max == pytest.approx(middle)
     assert part.effect_rms == pytest.approx(np.sqrt(8 / 15 / 2) * middle)
     nodes = replace(result, placed_plate=replace(ARTIFACT, map_grid=MapGrid(9, 0.01)))
@@ -218,7 +241,9 @@ def test_sum_degrees_of_freedom_and_coverage_factor():
     assert budget.u_rms == pytest.approx(np.sqrt(np.sum(np.square(rms))))
     expected = budget.u_rms**4 / sum(p.effect_rms**4 / p.dof for p in budget.lines)
     assert budget.dof == pytest.approx(expected)
-    assert budget.k == pytest.approx(student.isf(0.02275, budget.dof)) and budget.k > 2.0
+    assert (
+        budget.k == pytest.approx(student.isf(0.02275, budget.dof)) and budget.k > 2.0
+    )
     assert budget.U_rms == pytest.approx(budget.k * budget.u_rms)
     assert budget.unit == "m"
 
@@ -239,7 +264,10 @@ def test_the_table_names_all_lines_and_their_sum():
 
 def test_a_result_has_its_budget_also_in_a_file():
     result = worded(calibrated())
-    assert [(line.quantity, line.component, line.kind, line.source) for line in result.budget] == [
+    assert [
+        (line.quantity, line.component, line.kind, line.source)
+        for line in result.budget
+    ] == [
         ("xy", "reading noise", "A", "readings"),
         ("xy", "reference length", "B", "default"),
         ("xy", "interpolation", "B", "readings"),
@@ -267,7 +295,9 @@ def test_a_result_has_its_budget_also_in_a_file():
     assert again.budget == result.budget and budgets(again) == budgets(result)
     old = replace(again, budget=())
     assert [b.lines for b in budgets(old)] == [b.lines for b in budgets(calibrated())]
-    bare = replace(result, error_map=replace(result.error_map, u_gx=result.error_map.gx * np.nan))
+    bare = replace(
+        result, error_map=replace(result.error_map, u_gx=result.error_map.gx * np.nan)
+    )
     assert list(budget_lines(bare)) == [] and drawn_up(bare) == []
 
 
@@ -280,7 +310,9 @@ def test_a_line_says_what_its_size_rests_on(given, source):
     readings = simulate_measurements(
         random_truth(ARTIFACT, 4, rng), plan, rng, sigma_m=2e-8, sigma_theta_rad=2e-5
     )
-    result = calibrate(readings, Options(terms=parse_terms([given], "") if given else ()))
+    result = calibrate(
+        readings, Options(terms=parse_terms([given], "") if given else ())
+    )
     line = parts_of(budgets(result)[0])["term plate_strain"]
     (term,) = (term for term in result.model.terms if term.name == "plate_strain")
     assert (line.kind, line.source, line.unit, line.dof) == ("B", source, "m/m", np.inf)

@@ -37,18 +37,23 @@ def measured(
 ):
     """Return readings of Hu's views, which drift all alike, and the truth."""
     rng = np.random.default_rng(seed)
-    spread = Spread(phi_rad=5e-4, drift_linear_m=2 * drift_m)  # from -drift to +drift in a view
+    # from -drift to +drift in a view
+    spread = Spread(phi_rad=5e-4, drift_linear_m=2 * drift_m)
     truth = random_truth(PLATE, 4, rng, spread)
     truth = replace(truth, drift_m=truth.drift_m[:1].repeat(len(truth.drift_m), axis=0))
     plan = hu_plan(PLATE, repeats)
     plan = replace(
         plan,
         views=tuple(
-            replace(view, visit_order="x_back_y_back" if view.grid and repeats == 4 else "")
+            replace(
+                view, visit_order="x_back_y_back" if view.grid and repeats == 4 else ""
+            )
             for view in plan.views
         ),
     )
-    how = CellSettings(sense, sigma_xy_m=noise_m, sigma_theta_rad=2e-5, consecutive=consecutive)
+    how = CellSettings(
+        sense, sigma_xy_m=noise_m, sigma_theta_rad=2e-5, consecutive=consecutive
+    )
     return simulate_measurements(
         truth,
         plan,
@@ -78,7 +83,11 @@ def test_a_drift_that_the_order_hides_is_assumed(sense):
     readings, _ = measured(consecutive=True, sense=sense)
     result = calibrate(readings, Options())
     line = lines(result)["drift"]
-    assert (line.component, line.u, line.source) == ("term drift", DRIFT.size, "default")
+    assert (line.component, line.u, line.source) == (
+        "term drift",
+        DRIFT.size,
+        "default",
+    )
     assert line_text(line) == "size 1e-08, what the readings do not determine of it"
     none = calibrate(readings, Options(terms=(replace(DRIFT, size=0.0),)))
     added = np.sqrt(u_of(result) ** 2 - u_of(none) ** 2)
@@ -94,7 +103,10 @@ def test_its_nodes_are_correlated_as_by_the_declared_term():
     readings, _ = measured(consecutive=True)
     one, other = (
         covariance_of(result, "xy", result.error_map.valid)
-        for result in (calibrate(readings, Options()), calibrate(readings, Options(terms=(DRIFT,))))
+        for result in (
+            calibrate(readings, Options()),
+            calibrate(readings, Options(terms=(DRIFT,))),
+        )
     )
     np.testing.assert_allclose(one, other, atol=0.05 * np.abs(other).max())
 
@@ -107,8 +119,12 @@ def test_a_drift_that_the_readings_determine_is_not():
 @pytest.mark.parametrize(
     "options", [BARE, Options(misalignment_model="linear"), Options(uncertainty=False)]
 )
-def test_nothing_is_assumed_where_nothing_is_to_be_or_no_uncertainty_is_asked_for(options):
-    assert not {"drift", "approach"} & {*lines(calibrate(measured(consecutive=True)[0], options))}
+def test_nothing_is_assumed_where_nothing_is_to_be_or_no_uncertainty_is_asked_for(
+    options,
+):
+    assert not {"drift", "approach"} & {
+        *lines(calibrate(measured(consecutive=True)[0], options))
+    }
 
 
 def test_without_visits_no_drift_can_be_weighed():
@@ -123,7 +139,8 @@ def test_a_drift_of_the_assumed_size_lies_in_u():
         readings, truth = measured(seed, repeats=1, drift_m=DRIFT.size, noise_m=5e-9)
         for size in (DRIFT.size, 0.0):
             result = calibrate(
-                readings, Options(assumed=(), causes=False, terms=(replace(DRIFT, size=size),))
+                readings,
+                Options(assumed=(), causes=False, terms=(replace(DRIFT, size=size),)),
             )
             error = np.stack([result.error_map.gx, result.error_map.gy]) - truth.g
             error = remove_modes(error, datum_modes(PLATE, scale=True))
@@ -138,7 +155,13 @@ def test_the_plate_has_its_share_of_a_drift_that_one_pass_hides(sense):
     readings, _ = measured(repeats=1, sense=sense)
     none = (
         *parse_terms(
-            ["microscope:0", "plate_strain:0", "approach:0", "rotation:0", "line_eccentricity:0"],
+            [
+                "microscope:0",
+                "plate_strain:0",
+                "approach:0",
+                "rotation:0",
+                "line_eccentricity:0",
+            ],
             "test",
         ),
         ModelTerm("plate_shape", 5e-9),
@@ -148,9 +171,11 @@ def test_the_plate_has_its_share_of_a_drift_that_one_pass_hides(sense):
         for drift in ((), (replace(DRIFT, size=0.0),))
     )
     dense = Dense(plan_of("0, 90, tx", 9), Assumed(SIGMA, order="serpentine"), sense)
+    # against the noise of `Dense`
     sized = [
-        replace(term, size=term.size * SIGMA / hidden.noise.sigma_xy) for term in (none[-1], DRIFT)
-    ]  # against the noise of `Dense`
+        replace(term, size=term.size * SIGMA / hidden.noise.sigma_xy)
+        for term in (none[-1], DRIFT)
+    ]
     stage, of_plate = np.split(dense.solver(sized)[0][: 4 * PLATE.m.size], 2)
     z = (PLATE.m + 1j * PLATE.n).ravel()
     modes = np.stack([np.ones(z.shape), 1j * np.ones(z.shape), 1j * z])
@@ -160,7 +185,9 @@ def test_the_plate_has_its_share_of_a_drift_that_one_pass_hides(sense):
     scale = np.stack([z.real, z.imag], axis=-1).ravel()
     # what the datum takes off the stage as its scale, the plate has
     of_plate = of_plate + np.outer(scale, scale @ stage / (scale @ scale))
-    wanted = hidden.noise.sigma_xy * np.sqrt((of_plate**2).sum(axis=1)).reshape(*PLATE.m.shape, 2)
+    wanted = hidden.noise.sigma_xy * np.sqrt((of_plate**2).sum(axis=1)).reshape(
+        *PLATE.m.shape, 2
+    )
     found, less = (
         np.stack([each.artifact_map.u_ax, each.artifact_map.u_ay], axis=-1)
         for each in (hidden, without)

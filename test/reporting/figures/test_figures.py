@@ -50,13 +50,18 @@ from test.support.results import chapters_of, known_result, with_residuals
 
 
 def drawn(result, truth=None):
-    return [figure.drawing for chapter in chapters_of(result, truth) for figure in chapter.figures]
+    return [
+        figure.drawing
+        for chapter in chapters_of(result, truth)
+        for figure in chapter.figures
+    ]
 
 
 def long_names(result):
     """Return a result whose views have long names, and one that has a model with a drift."""
     views = tuple(
-        replace(v, name=f"{v.name} of the third repetition on Monday morning") for v in result.views
+        replace(v, name=f"{v.name} of the third repetition on Monday morning")
+        for v in result.views
     )
     rows = [
         {**row, "view": view.name}
@@ -131,8 +136,12 @@ def test_vectors_begin_at_their_sites_and_point_along_the_error():
     pitch = starts[3, 0] - starts[0, 0]
     assert pitch > 0 and starts[1, 1] - starts[0, 1] == pytest.approx(-pitch)
     scale = pitch / emap.artifact.grid_pitch_m * factor
-    np.testing.assert_allclose(ends[:, 0] - starts[:, 0], emap.gx.ravel() * scale, atol=1e-9)
-    np.testing.assert_allclose(ends[:, 1] - starts[:, 1], -emap.gy.ravel() * scale, atol=1e-9)
+    np.testing.assert_allclose(
+        ends[:, 0] - starts[:, 0], emap.gx.ravel() * scale, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        ends[:, 1] - starts[:, 1], -emap.gy.ravel() * scale, atol=1e-9
+    )
 
 
 def test_residuals_of_a_turned_view_stand_where_its_marks_lie():
@@ -168,7 +177,16 @@ def test_steps_of_a_scale_from_zero(value, step):
 
 @pytest.mark.parametrize(
     ("value", "step"),
-    [(-2.0, 0), (-1.0, 0), (-0.11, 4), (-0.09, 5), (0.09, 5), (0.11, 6), (1.0, 10), (np.nan, -1)],
+    [
+        (-2.0, 0),
+        (-1.0, 0),
+        (-0.11, 4),
+        (-0.09, 5),
+        (0.09, 5),
+        (0.11, 6),
+        (1.0, 10),
+        (np.nan, -1),
+    ],
 )
 def test_steps_of_a_scale_to_both_sides(value, step):
     assert levels(np.array([value]), Scale("d", -1.0, 1.0)) == [step]
@@ -208,9 +226,14 @@ def test_components_share_one_scale_and_their_u_another_that_shows_where_it_is_l
     assert fills(drawing, "d")[:4] == ["d5", "d10", "d0", "d5"]
     assert fills(drawing, "v")[:4] == ["v0", "v9"] * 2
     words = [item.text for item in drawing.items if isinstance(item, Label)]
-    assert words[0].endswith("U with k = 2.28") and {"U(Gx)", "U(Gy)", "0.05"} <= set(words)
+    assert words[0].endswith("U with k = 2.28") and {"U(Gx)", "U(Gy)", "0.05"} <= set(
+        words
+    )
     even = replace(
-        result, error_map=replace(emap, u_gx=np.full((3, 3), 1e-7), u_gy=np.full((3, 3), 1.001e-7))
+        result,
+        error_map=replace(
+            emap, u_gx=np.full((3, 3), 1e-7), u_gy=np.full((3, 3), 1.001e-7)
+        ),
     )
     drawing = component_maps(even)
     words = [item.text for item in drawing.items if isinstance(item, Label)]
@@ -233,7 +256,9 @@ def test_ellipses_are_as_wide_as_u_along_x_and_as_high_as_u_along_y_with_the_k_o
         if isinstance(item, Discs) and item.fill == "band" and len(item.radii) > 1
     )
     vectors = np.array(shafts(drawing))
-    gain = (vectors[:, 1, 0] - vectors[:, 0, 0]) / result.error_map.gx.ravel()  # pixels a metre
+    gain = (
+        vectors[:, 1, 0] - vectors[:, 0, 0]
+    ) / result.error_map.gx.ravel()  # pixels a metre
     np.testing.assert_allclose(found.radii, np.outer(gain, (2.5 * 3e-7, 2.5 * 1e-7)))
     np.testing.assert_allclose(found.centres, vectors[:, 1])
     words = [item.text for item in drawing.items if isinstance(item, Label)]
@@ -245,7 +270,9 @@ def test_ellipses_are_as_wide_as_u_along_x_and_as_high_as_u_along_y_with_the_k_o
 def test_a_map_without_one_known_site_says_so():
     result, _ = known_result(3, 0)
     nothing = np.full((3, 3), np.nan)
-    drawing = error_map(replace(result, error_map=replace(result.error_map, gx=nothing)))
+    drawing = error_map(
+        replace(result, error_map=replace(result.error_map, gx=nothing))
+    )
     assert "no site is known" in [i.text for i in drawing.items if isinstance(i, Label)]
     assert shafts(drawing, width=1.2) == []
 
@@ -271,7 +298,16 @@ def test_ordinals(number, words):
 
 @pytest.mark.parametrize(
     ("value", "rounded"),
-    [(1, 1), (1.99, 1), (2, 2), (4.9, 2), (5, 5), (9.99, 5), (19564, 10000), (0.0021, 0.002)],
+    [
+        (1, 1),
+        (1.99, 1),
+        (2, 2),
+        (4.9, 2),
+        (5, 5),
+        (9.99, 5),
+        (19564, 10000),
+        (0.0021, 0.002),
+    ],
 )
 def test_round_numbers(value, rounded):
     assert round_down(value) == pytest.approx(rounded)
@@ -280,12 +316,18 @@ def test_round_numbers(value, rounded):
 def test_lines_lie_outside_the_circle_where_the_error_is_positive():
     result, _ = known_result(3, 4)
     emap = replace(
-        result.error_map, g_theta=np.array([1e-5, -1e-5, 0.0, np.nan]), u_g_theta=np.zeros(4)
+        result.error_map,
+        g_theta=np.array([1e-5, -1e-5, 0.0, np.nan]),
+        u_g_theta=np.zeros(4),
     )
     drawing = angular_map(replace(result, error_map=emap))
-    dots = next(i for i in drawing.items if isinstance(i, Discs) and i.radii[0][0] == 1.8).centres
+    dots = next(
+        i for i in drawing.items if isinstance(i, Discs) and i.radii[0][0] == 1.8
+    ).centres
     away = [math.dist(CENTRE, dot) for dot in dots]
-    assert away[0] > ZERO + 50 and away[1] < ZERO - 50 and away[2] == pytest.approx(ZERO)
+    assert (
+        away[0] > ZERO + 50 and away[1] < ZERO - 50 and away[2] == pytest.approx(ZERO)
+    )
     assert dots[0][0] > CENTRE[0] + ZERO and dots[1][1] < CENTRE[1] - 30
     assert len(dots) == 3
 
@@ -293,7 +335,10 @@ def test_lines_lie_outside_the_circle_where_the_error_is_positive():
 def test_histograms_hold_every_residual():
     result = with_residuals(11, 24)
     found = residuals_in(result)
-    for kind, values in (("xy", [v.xy_m for v in found]), ("theta", [v.theta_rad for v in found])):
+    for kind, values in (
+        ("xy", [v.xy_m for v in found]),
+        ("theta", [v.theta_rad for v in found]),
+    ):
         drawing = distributions(found, kind)
         said = [
             int(i.text.split()[0])
@@ -316,7 +361,9 @@ def test_a_drift_is_drawn_from_its_legendre_coefficients():
         TermEstimate("identity", "y P2", 2e-7, 1e-9, "m"),
     )
     drawing = drift_found(
-        replace(result, model=ModelResult("rigid", (TermResult("drift", None, estimates),)))
+        replace(
+            result, model=ModelResult("rigid", (TermResult("drift", None, estimates),))
+        )
     )
     x, y = (
         next(
@@ -327,7 +374,9 @@ def test_a_drift_is_drawn_from_its_legendre_coefficients():
         for dash in ((), (5, 3))
     )
     zero = next(
-        i.lines[0][0][1] for i in drawing.items if isinstance(i, Path) and i.stroke == "line"
+        i.lines[0][0][1]
+        for i in drawing.items
+        if isinstance(i, Path) and i.stroke == "line"
     )
     up = np.array([zero - point[1] for point in x])
     assert up[0] == pytest.approx(-up[-1]) and up[-1] > 0  # P1 goes from -1 to 1
@@ -350,7 +399,9 @@ def test_courses_need_times_and_show_a_rise_upwards():
         del row["course"]
     found = residuals_in(replace(result, extra={"residuals": {"views": rows}}))
     drawing = courses(found, 1e-8)
-    rise = next(i.lines[0] for i in drawing.items if isinstance(i, Path) and i.stroke == "c0")
+    rise = next(
+        i.lines[0] for i in drawing.items if isinstance(i, Path) and i.stroke == "c0"
+    )
     assert len(rise) == 5 and rise[-1][1] < rise[0][1] - 20
     assert courses(found[1:], 1e-8) is None
 
@@ -379,7 +430,9 @@ def heads(drawing):
     ("rotation", "corner", "sense"),
     [(90, (-1, -1), "left"), (-90, (1, 1), "right"), (180, (-1, 1), "left")],
 )
-def test_the_arrow_leads_the_corner_of_a_turned_plate_the_way_it_is_turned(rotation, corner, sense):
+def test_the_arrow_leads_the_corner_of_a_turned_plate_the_way_it_is_turned(
+    rotation, corner, sense
+):
     """Pixels grow downwards: (-1, -1) is top left, where a quarter turn to the left leads it."""
     drawing, middle = turned(rotation)
     (dot,) = (
@@ -391,11 +444,15 @@ def test_the_arrow_leads_the_corner_of_a_turned_plate_the_way_it_is_turned(rotat
     (way,) = (
         np.array(item.lines[0]) - middle
         for item in drawing.items
-        if isinstance(item, Path) and item.stroke == "truth" and len(item.lines[0]) == 61
+        if isinstance(item, Path)
+        and item.stroke == "truth"
+        and len(item.lines[0]) == 61
     )
-    assert way[0][0] > 0 > way[0][1]  # begins at the top right, where the corner is without a turn
+    # begins at the top right, where the corner is without a turn
+    assert way[0][0] > 0 > way[0][1]
     assert np.sign(way[-1]).tolist() == list(corner)
-    across = way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0]  # < 0: counter-clockwise
+    # < 0: counter-clockwise
+    across = way[:-1, 0] * way[1:, 1] - way[:-1, 1] * way[1:, 0]
     assert (across < 0).all() if sense == "left" else (across > 0).all()
     (head,) = heads(drawing)
     np.testing.assert_allclose(head[0] - middle, way[-1])
@@ -408,8 +465,14 @@ def test_a_plate_off_the_lattice_is_drawn_within_its_panel():
     drawing, middle = turned(
         37, view.translation_m, grid, angular=False, check_marks=1, check_offset_m=2e-5
     )
-    (hollow,) = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
-    (read,) = (item for item in drawing.items if isinstance(item, Discs) and item.fill == "ink")
+    (hollow,) = (
+        item
+        for item in drawing.items
+        if isinstance(item, Discs) and item.stroke == "bad"
+    )
+    (read,) = (
+        item for item in drawing.items if isinstance(item, Discs) and item.fill == "ink"
+    )
     inside = view.pose.in_field(Artifact(5, 0.01, 24, 9, grid))
     assert (len(read.centres), len(hollow.centres)) == (inside.sum(), (~inside).sum())
     frame = next(
@@ -425,16 +488,21 @@ def test_a_plate_off_the_lattice_is_drawn_within_its_panel():
     assert (frame.min(axis=0) < plate.min(axis=0)).all()
     assert (plate.max(axis=0) < frame.max(axis=0)).all()
     places = view.pose.places(Artifact(5, 0.01), 0, 0)
+    # pixels grow downwards
     assert np.sign(np.mean(plate[:4], axis=0) - middle).tolist() == [
         np.sign(places.real),
         -np.sign(places.imag),
-    ]  # pixels grow downwards
+    ]
 
 
 def test_a_plate_that_is_not_turned_has_no_arrow_and_marks_off_the_field_are_hollow():
     drawing, middle = turned(0, (0.01, 0.0))
     assert heads(drawing) == []
-    (hollow,) = (item for item in drawing.items if isinstance(item, Discs) and item.stroke == "bad")
+    (hollow,) = (
+        item
+        for item in drawing.items
+        if isinstance(item, Discs) and item.stroke == "bad"
+    )
     assert len(hollow.centres) == 9 and all(x > middle[0] for x, _ in hollow.centres)
 
 
@@ -455,7 +523,9 @@ def test_check_stops_are_crosses_at_the_marks_that_are_visited_again():
     assert sites == {(0, 0), (1, -2), (-1, -2), (-1, 2), (1, 2)}
     words = [item.text for item in drawing.items if isinstance(item, Label)]
     assert words[-1] == "crosses: check stops, measured again with the stage 20 µm off"
-    assert not any("crosses" in item.text for item in turned(0)[0].items if isinstance(item, Label))
+    assert not any(
+        "crosses" in item.text for item in turned(0)[0].items if isinstance(item, Label)
+    )
 
 
 def test_rejected_readings_stand_where_they_happened():
@@ -465,7 +535,8 @@ def test_rejected_readings_stand_where_they_happened():
         ("identity", "low_score", 10.0, 20.0),
         ("identity", "too_far_from_nominal", -20.0, 0.0),
     ]
-    view, reason, x, y = found[2]  # mark (1, 0) in the view that is turned by 90 degrees
+    # mark (1, 0) in the view that is turned by 90 degrees
+    view, reason, x, y = found[2]
     assert (view, reason) == (result.views[1].name, "outlier_among_views")
     assert (x, y) == pytest.approx((0.0, 10.0), abs=1e-9)
     words = [i.text for i in rejected_map(result).items if isinstance(i, Label)]
@@ -500,9 +571,16 @@ def test_readings_rejected_far_away_stand_at_the_edge_of_their_panel():
         {"residuals": {"views": []}},
         {"residuals": {"views": "abc"}},
         {"residuals": {"views": [1, 2, 3, 4]}, "rejected_at": [7]},
-        {"residuals": {"views": [{"dx": [[1]], "course": {"dx": "x"}}] * 4}, "rejected_at": [{}]},
+        {
+            "residuals": {"views": [{"dx": [[1]], "course": {"dx": "x"}}] * 4},
+            "rejected_at": [{}],
+        },
         {"rejected_at": [{"view": "identity", "reason": "abc", "x": [1], "y": ["b"]}]},
-        {"outliers": {"removed": [{"view": "identity", "kind": "grid", "mark": "1; 2"}]}},
+        {
+            "outliers": {
+                "removed": [{"view": "identity", "kind": "grid", "mark": "1; 2"}]
+            }
+        },
     ],
 )
 def test_extras_of_another_form_are_left_out(extra):
@@ -517,7 +595,10 @@ def test_svg_of_a_figure_stands_alone_and_is_the_same_twice():
     drawing = error_map(result, truth)
     text = svg_file(drawing)
     assert text == svg_file(error_map(result, truth))
-    assert 'xmlns="http://www.w3.org/2000/svg"' in text and "prefers-color-scheme: dark" in text
+    assert (
+        'xmlns="http://www.w3.org/2000/svg"' in text
+        and "prefers-color-scheme: dark" in text
+    )
     assert "url(" not in text and "<script" not in text and "href" not in text
     used = set(re.findall(r'class="(?:[^"]* )?[fs]-(\w+)', text))
     assert used and used <= set(COLOURS)

@@ -39,16 +39,24 @@ def test_the_picture_holds_the_figures_of_the_report_beside_each_other():
     result, truth = known_result(5, 8)
     found = map_picture(result, truth)
     figures = error_map(result, truth), angular_map(result, truth)
-    assert len(found.items) == sum(len(figure.items) for figure in figures) + 3  # two lines, origin
+    # two lines, origin
+    assert len(found.items) == sum(len(figure.items) for figure in figures) + 3
     shapes = [item for item in found.items if isinstance(item, Path)]
-    alone = [item for figure in figures for item in figure.items if isinstance(item, Path)]
-    moves = [np.subtract(a.lines[0][0], b.lines[0][0]) for a, b in zip(shapes, alone, strict=True)]
+    alone = [
+        item for figure in figures for item in figure.items if isinstance(item, Path)
+    ]
+    moves = [
+        np.subtract(a.lines[0][0], b.lines[0][0])
+        for a, b in zip(shapes, alone, strict=True)
+    ]
     count = sum(isinstance(item, Path) for item in figures[0].items)
     np.testing.assert_allclose(moves[:count], np.broadcast_to(moves[0], (count, 2)))
-    np.testing.assert_allclose(moves[count:], np.broadcast_to(moves[-1], (len(moves) - count, 2)))
-    assert moves[-1][0] - moves[0][0] >= figures[0].width and moves[0][1] == pytest.approx(
-        moves[-1][1]
+    np.testing.assert_allclose(
+        moves[count:], np.broadcast_to(moves[-1], (len(moves) - count, 2))
     )
+    assert moves[-1][0] - moves[0][0] >= figures[0].width and moves[0][
+        1
+    ] == pytest.approx(moves[-1][1])
     for kind in (Discs, Label):
         assert (
             min(
@@ -66,10 +74,18 @@ def test_maps_without_size_and_of_absurd_size_are_drawn(tmp_path, coarse, value)
     result, _ = known_result(3, 8)
     field, lines = np.full((3, 3), value), np.full(8, value)
     emap = replace(
-        result.error_map, gx=field, gy=field, u_gx=field, u_gy=field, g_theta=lines, u_g_theta=lines
+        result.error_map,
+        gx=field,
+        gy=field,
+        u_gx=field,
+        u_gy=field,
+        g_theta=lines,
+        u_g_theta=lines,
     )
     if value == 1e300:
-        emap = replace(emap, gx=field * 1e-302, gy=field * 1e-302, g_theta=lines * 1e-302)
+        emap = replace(
+            emap, gx=field * 1e-302, gy=field * 1e-302, g_theta=lines * 1e-302
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         save_picture(map_picture(replace(result, error_map=emap)), tmp_path / "map.png")
     assert imread(tmp_path / "map.png").shape[0] > 200
@@ -78,7 +94,9 @@ def test_maps_without_size_and_of_absurd_size_are_drawn(tmp_path, coarse, value)
 def test_text_of_the_user_is_drawn_as_it_is(tmp_path, coarse):
     result, _ = known_result(3, 0)
     save_picture(
-        map_picture(replace(result, plan_id=r"$\frac{ $ 長 \x", input={"file": "$a_$"})),
+        map_picture(
+            replace(result, plan_id=r"$\frac{ $ 長 \x", input={"file": "$a_$"})
+        ),
         tmp_path / "map.png",
     )
     assert drawable("a\nb 長 θ$") == "a?b ? θ$"
@@ -90,7 +108,9 @@ def test_unusable_truth_names_and_folders_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"^truth gx: has the shape \(5, 5\)"):
         map_picture(result, {**truth, "gx": np.zeros((5, 5))})
     drawing = Drawing("a", "b", 10, 10)
-    with pytest.raises(InputError, match=r"map\.jpg: not a picture format by its suffix"):
+    with pytest.raises(
+        InputError, match=r"map\.jpg: not a picture format by its suffix"
+    ):
         save_picture(drawing, tmp_path / "map.jpg")
     with pytest.raises(InputError, match=r"none/a\.png: cannot be written"):
         save_picture(drawing, tmp_path / "none" / "a.png")

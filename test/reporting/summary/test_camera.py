@@ -13,7 +13,11 @@ from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.figures.places import camera_errors, stage_yaw, views_in
 from selfcal_ros.reporting.summary.numbers import camera_facts, significant, yaw_facts
-from selfcal_ros.reporting.summary.sections import state_sentence, summary_text, terms_section
+from selfcal_ros.reporting.summary.sections import (
+    state_sentence,
+    summary_text,
+    terms_section,
+)
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.standards import dcc as standards
@@ -37,7 +41,10 @@ def result():
         ),
     )
     measured = simulate_measurements(
-        truth, plan, rng, settings=CellSettings(sigma_xy_m=2e-8, image_xy_m=4e-8, servo_sigma_m=0.0)
+        truth,
+        plan,
+        rng,
+        settings=CellSettings(sigma_xy_m=2e-8, image_xy_m=4e-8, servo_sigma_m=0.0),
     )
     made = worded(calibrate(measured))
     return result_from_dict(result_to_dict(made), "test")
@@ -64,7 +71,9 @@ def test_the_summary_states_the_camera():
 
 
 def test_cells_of_images_are_no_views():
-    assert state_sentence(result()).startswith("Calibrated from 2 views with images of 9 marks: ")
+    assert state_sentence(result()).startswith(
+        "Calibrated from 2 views with images of 9 marks: "
+    )
     assert "2 views with images of 9 marks, 2 measured" in summary_text(result())
     assert [view.name for view in views_in(result())] == ["0", "90"]
     named = standards._meta(result(), {})
@@ -99,13 +108,16 @@ def test_the_report_draws_the_yaw():
     drawing, yaw = stage_yaw(result()), result().stage_yaw
     spots = [item for item in drawing.items if type(item).__name__ == "Spot"]
     assert len(spots) == 25
-    assert spots[7].title.startswith(f"x {yaw.x[7] * 1e3:.4g} mm, y {yaw.y[7] * 1e3:.4g} mm")
+    assert spots[7].title.startswith(
+        f"x {yaw.x[7] * 1e3:.4g} mm, y {yaw.y[7] * 1e3:.4g} mm"
+    )
     assert f": {significant(yaw.yaw[7] * 1e6)} ±" in spots[7].title
+    # those of the scale are closed
     fields = [
         item
         for item in drawing.items
         if getattr(item, "fill", "").startswith("d") and len(item.lines[0]) == 4
-    ]  # those of the scale are closed
+    ]
     assert len({item.fill for item in fields}) > 5
     corners = np.concatenate([item.lines for item in fields])
     low, high = corners.min(axis=1), corners.max(axis=1)
@@ -115,7 +127,9 @@ def test_the_report_draws_the_yaw():
         if getattr(item, "stroke", "") == "soft" and len(item.lines[0]) == 5
     )
     assert len(corners) == 25  # 5 x 5 fields that fill the frame
-    assert high - low == pytest.approx(np.tile([right - left, bottom - top], (25, 1)) / 5)
+    assert high - low == pytest.approx(
+        np.tile([right - left, bottom - top], (25, 1)) / 5
+    )
     assert low.min(axis=0) == pytest.approx([left, top])
 
 
@@ -132,7 +146,9 @@ def test_a_cell_without_an_error_is_not_drawn():
     assert blind.known_cells.shape == (6, 8)
 
 
-@pytest.mark.parametrize("camera", [[1], {"cells": []}, {"yaw": {"x": [1.0]}}, {"yaw": []}])
+@pytest.mark.parametrize(
+    "camera", [[1], {"cells": []}, {"yaw": {"x": [1.0]}}, {"yaw": []}]
+)
 def test_a_damaged_camera_is_refused(camera):
     data = result_to_dict(result()) | {"camera": camera}
     with pytest.raises(InputError, match="damaged result"):

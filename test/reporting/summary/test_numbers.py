@@ -15,15 +15,21 @@ def test_the_constant_of_an_angular_difference_is_weighted():
     result, truth = known_result(3, 4)
     difference, u = np.array([3.0, -1.0, 0.0, 0.0]), np.array([1.0, 2.0, 1.0, 4.0])
     emap = replace(
-        result.error_map, g_theta=truth["g_theta"] + difference * 1e-6, u_g_theta=u * 1e-6
+        result.error_map,
+        g_theta=truth["g_theta"] + difference * 1e-6,
+        u_g_theta=u * 1e-6,
     )
     mean = (3 - 1 / 4) / (1 + 1 / 4 + 1 + 1 / 16)
     rest = difference - mean
     found = truth_figures(emap, truth)
-    assert found.rms_theta_rad == pytest.approx(1e-6 * np.sqrt(np.mean(rest**2)), rel=1e-9)
+    assert found.rms_theta_rad == pytest.approx(
+        1e-6 * np.sqrt(np.mean(rest**2)), rel=1e-9
+    )
     assert found.largest_theta_rad == pytest.approx(1e-6 * (1 + mean), rel=1e-9)
     assert found.line == 1
-    assert found.rms_theta_in_u == pytest.approx(np.sqrt(np.mean((rest / u) ** 2)), rel=1e-9)
+    assert found.rms_theta_in_u == pytest.approx(
+        np.sqrt(np.mean((rest / u) ** 2)), rel=1e-9
+    )
     assert found.largest_theta_in_u == pytest.approx(3 - mean, rel=1e-9)
     assert found.theta_within_2u == 1.0
 

@@ -17,7 +17,12 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
-from selfcal_ros.model.result import Noise, Observability, result_from_dict, result_to_dict
+from selfcal_ros.model.result import (
+    Noise,
+    Observability,
+    result_from_dict,
+    result_to_dict,
+)
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import (
     Cause,
@@ -69,10 +74,14 @@ def line_with(text, label):
 def test_every_first_sentence_says_what_u_owes_to_a_size_that_is_assumed():
     plan, rng = hu_plan(Artifact(7, 0.01, 8), repeats=3), np.random.default_rng(4)
     truth = random_truth(plan.artifact, len(plan.views), rng)
-    readings = simulate_measurements(truth, plan, rng, sigma_m=5e-9, sigma_theta_rad=1e-6)
+    readings = simulate_measurements(
+        truth, plan, rng, sigma_m=5e-9, sigma_theta_rad=1e-6
+    )
     found = worded(calibrate(readings))
     assumed = assumption_text(found)
-    assert assumed.startswith("U assumes a plate that bends by 0.005 µm (k=1) from view to view")
+    assert assumed.startswith(
+        "U assumes a plate that bends by 0.005 µm (k=1) from view to view"
+    )
     for text in (
         state_sentence(found),
         state_line(found),
@@ -81,9 +90,15 @@ def test_every_first_sentence_says_what_u_owes_to_a_size_that_is_assumed():
     ):
         assert text.count("assumes a plate that bends") == 1, text
     # a solution with the larger size has no larger U, and hardly a smaller one
-    larger = calibrate(readings, Options(terms=parse_terms(["plate_shape:15e-9"], "test")))
-    told = float(re.search(r"times as much would make it up to ([\d.]+) µm", assumed)[1])
-    assert 1 <= told / (larger.noise.k_xy * np.nanmax(larger.error_map.u_xy) * 1e6) < 1.15
+    larger = calibrate(
+        readings, Options(terms=parse_terms(["plate_shape:15e-9"], "test"))
+    )
+    told = float(
+        re.search(r"times as much would make it up to ([\d.]+) µm", assumed)[1]
+    )
+    assert (
+        1 <= told / (larger.noise.k_xy * np.nanmax(larger.error_map.u_xy) * 1e6) < 1.15
+    )
     # what a user declares is no assumption of ours
     assert "bends" not in assumption_text(worded(larger))
 
@@ -107,7 +122,11 @@ def test_numbers_of_a_map_by_hand():
     gx, gy = np.zeros((2, 3, 3))
     gx[2, 0], gy[2, 0] = 3e-6, -4e-6
     emap = small_map(
-        gx, gy, u=2e-8, g_theta=[0, -np.deg2rad(2 / 3600), 0, 0], u_theta=np.deg2rad(0.5 / 3600)
+        gx,
+        gy,
+        u=2e-8,
+        g_theta=[0, -np.deg2rad(2 / 3600), 0, 0],
+        u_theta=np.deg2rad(0.5 / 3600),
     )
     result = replace(known_result(3, 4)[0], error_map=emap)
     numbers = summary_numbers(result)
@@ -124,12 +143,19 @@ def test_numbers_of_a_map_by_hand():
         )
         for wanted in (False, True)
     )
-    assert numbers["rms_uncertainty_anywhere_um"] == pytest.approx(between.u_rms * 1e6, rel=1e-14)
-    assert numbers["max_uncertainty_anywhere_um"] == pytest.approx(between.u_max * 1e6, rel=1e-14)
-    assert between.u_max > 10 * node.u_max  # a map of one peak is rough between its sites
+    assert numbers["rms_uncertainty_anywhere_um"] == pytest.approx(
+        between.u_rms * 1e6, rel=1e-14
+    )
+    assert numbers["max_uncertainty_anywhere_um"] == pytest.approx(
+        between.u_max * 1e6, rel=1e-14
+    )
+    # a map of one peak is rough between its sites
+    assert between.u_max > 10 * node.u_max
     assert map_figures(emap).max_site == (1, -1)
     assert place_text(emap, (1, -1)) == "at x 10 mm, y -10 mm (site 1, -1)"
-    assert "at x 10 mm, y -10 mm (site 1, -1)" in line_with(summary_text(result), "largest error")
+    assert "at x 10 mm, y -10 mm (site 1, -1)" in line_with(
+        summary_text(result), "largest error"
+    )
 
 
 def test_unknown_sites_do_not_count():
@@ -157,7 +183,9 @@ def test_state_sentence_says_what_was_found():
     assert sentence.startswith("Calibrated from 4 views: largest error 0.")
     assert "every site known to ±0.0" in sentence and sentence.endswith("arcsec.")
     assert f"any place to ±{um(anywhere_m(result)[2])}" in sentence
-    assert state_sentence(replace(result, warnings=("a", "b"))).endswith("; 2 warnings.")
+    assert state_sentence(replace(result, warnings=("a", "b"))).endswith(
+        "; 2 warnings."
+    )
 
 
 def test_the_line_of_the_topic_has_grade_error_and_each_u_and_is_shown_whole():
@@ -217,7 +245,10 @@ def test_state_sentence_without_one_known_site():
 def test_summary_shows_every_part():
     result, truth = known_result()
     text = summary_text(result, truth=truth)
-    assert "plate         11 × 11 marks, pitch 10 mm, field 100 × 100 mm, 24 angular lines" in text
+    assert (
+        "plate         11 × 11 marks, pitch 10 mm, field 100 × 100 mm, 24 angular lines"
+        in text
+    )
     assert "input         bags/hu.mcap (sha256 abababababababab)" in text
     row = line_with(text, "shift_x").split()
     assert row[:4] == ["shift_x", "0°", "(+1,", "0)"] and row[-2:] == ["603", "3"]
@@ -257,7 +288,9 @@ def test_orthogonality_and_scale_keep_their_signs_and_lengths():
     assert (
         f"R -3.00 ± {u_r} (k=1) µm/m = -0.300 µm over 100 mm; X and Y differ by 2|R| = 6.00"
     ) in text
-    damaged = replace(result, views=(replace(result.views[0], read_grid="x"), *result.views[1:]))
+    damaged = replace(
+        result, views=(replace(result.views[0], read_grid="x"), *result.views[1:])
+    )
     assert "µrad" in summary_text(damaged)
 
 
@@ -300,9 +333,14 @@ def test_a_verdict_comes_before_everything_else():
         sentence="Not qualified: most likely drift of 51 nm",
     )
     text = summary_text(replace(result, verdict=bad))
-    assert text.startswith("Not qualified: most likely drift of 51 nm. Map as it is: Calibrated")
+    assert text.startswith(
+        "Not qualified: most likely drift of 51 nm. Map as it is: Calibrated"
+    )
     assert "Verdict: NOT QUALIFIED\n  residuals exceed repeats\n" in text
-    assert "likely cause: drift of 51 ± 2 nm along x: solve with --model drift (p = 1e-12)" in text
+    assert (
+        "likely cause: drift of 51 ± 2 nm along x: solve with --model drift (p = 1e-12)"
+        in text
+    )
     assert summary_text(result).startswith("Calibrated")
 
 
@@ -346,7 +384,8 @@ def test_few_degrees_of_freedom_widen_what_is_claimed():
 def test_no_repeats_and_no_noise_at_all():
     result, _ = known_result()
     once = replace(
-        result, noise=Noise(1e-8, float("nan"), sigma_xy_residuals=1e-8, dof_xy_residuals=10)
+        result,
+        noise=Noise(1e-8, float("nan"), sigma_xy_residuals=1e-8, dof_xy_residuals=10),
     )
     assert line_with(summary_text(once), "x, y").split() == [
         "x,",
@@ -366,7 +405,10 @@ def test_no_repeats_and_no_noise_at_all():
 def test_a_view_that_was_not_measured_shows_dashes():
     result, _ = known_result()
     nan = float("nan")
-    views = (*result.views[:3], replace(result.views[3], phi=nan, tx=nan, ty=nan, used=0))
+    views = (
+        *result.views[:3],
+        replace(result.views[3], phi=nan, tx=nan, ty=nan, used=0),
+    )
     text = summary_text(replace(result, views=views))
     assert line_with(text, "shift_x").split()[4:] == ["–", "–", "–", "0", "3"]
     assert "4 views, 3 measured" in text
@@ -406,7 +448,13 @@ def test_datum_difference_does_not_change_the_comparison(shift):
     }
     before = truth_figures(result.error_map, truth)
     after = truth_figures(result.error_map, moved)
-    for name in ("largest_m", "rms_m", "rms_in_u", "largest_theta_rad", "rms_theta_rad"):
+    for name in (
+        "largest_m",
+        "rms_m",
+        "rms_in_u",
+        "largest_theta_rad",
+        "rms_theta_rad",
+    ):
         assert getattr(after, name) == pytest.approx(getattr(before, name), rel=1e-6)
 
 
@@ -520,6 +568,7 @@ def test_symbols_only_where_the_stream_has_them():
 
 def test_summary_does_not_load_matplotlib():
     code = (
-        "import sys, selfcal_ros.reporting.summary.sections; sys.exit('matplotlib' in sys.modules)"
+        "import sys, selfcal_ros.reporting.summary.sections; "
+        "sys.exit('matplotlib' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

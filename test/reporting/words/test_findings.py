@@ -45,7 +45,9 @@ TESTED = Noise(1e-8, 1e-6, p_theta=0.4)
 
 def explanation(name, components, values, u, **more):
     """Return an explanation with equal, independent uncertainties; (view, component) each."""
-    columns = tuple(Column(name, view, component, np.inf) for view, component in components)
+    columns = tuple(
+        Column(name, view, component, np.inf) for view, component in components
+    )
     return Explanation(
         name,
         columns,
@@ -64,7 +66,9 @@ def microscope(*values):
 
 def strained(part, size):
     values = [size * (part == one) for one in ("scale", "stretch", "shear")]
-    return explanation("plate_strain", [(1, "scale"), (1, "stretch"), (1, "shear")], values, 1e-7)
+    return explanation(
+        "plate_strain", [(1, "scale"), (1, "stretch"), (1, "shear")], values, 1e-7
+    )
 
 
 @pytest.mark.parametrize(
@@ -177,7 +181,9 @@ def strained(part, size):
             "m",
         ),
         (
-            explanation("plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, determined=False),
+            explanation(
+                "plate_shape", [(1, "x x2")], [-3e-8], 1.5e-9, determined=False
+            ),
             "a plate bent by 0.0300 ± 0.0015 µm at the middle of an edge "
             "in view '90' relative to view "
             f"'0', part of which cannot be separated from the stage: {CLAMP}",
@@ -225,7 +231,9 @@ def strained(part, size):
             "m",
         ),
         (
-            explanation("reading", [(2, "x"), (2, "y")], [-3e-7, 4e-7], 1e-8, mark=(-2, 5)),
+            explanation(
+                "reading", [(2, "x"), (2, "y")], [-3e-7, 4e-7], 1e-8, mark=(-2, 5)
+            ),
             "a reading of mark (-2, 5) in view '+x' that is off by 0.500 "
             "± 0.010 µm: solve with --robust, "
             "or measure it again",
@@ -237,12 +245,19 @@ def strained(part, size):
 )
 def test_a_cause_in_words(found, text, size, u, unit):
     cause = cause_of(found, GROUND)
-    assert (cause.name, sentence_of(cause), cause.unit, cause.p) == (found.name, text, unit, 1e-6)
+    assert (cause.name, sentence_of(cause), cause.unit, cause.p) == (
+        found.name,
+        text,
+        unit,
+        1e-6,
+    )
     assert (cause.size, cause.u) == pytest.approx((size, u), rel=1e-12)
 
 
 TURN = Cause("microscope", 2e-3, 1e-5, "rad", 1e-6, details={"part": "turn"})
-SCALE = Cause("microscope", 0.06, 1e-3, "m/m", 1e-6, details={"part": "scale", "either": True})
+SCALE = Cause(
+    "microscope", 0.06, 1e-3, "m/m", 1e-6, details={"part": "scale", "either": True}
+)
 COMPARE = "compare the offset of a line at two angles of the rotary axis"
 CAUSES = [
     *(
@@ -271,14 +286,18 @@ CAUSES = [
         for size, how, other in ((0.06, "short", "large"), (-0.06, "long", "small"))
     ),
     (
-        Cause("reading", -2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90", mark=(7,)),
+        Cause(
+            "reading", -2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90", mark=(7,)
+        ),
         "a reading of line 7 in view '90' that is off by 2.00 ± 0.10 "
         "arcsec: solve with --robust, or "
         "measure it again",
     ),
     *(
         (
-            Cause("rotation", sign * 2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90"),
+            Cause(
+                "rotation", sign * 2 * ARCSEC_RAD, 0.1 * ARCSEC_RAD, "rad", 1e-6, "90"
+            ),
             f"lines turned {way} by 2.00 ± 0.10 arcsec relative to the marks in view '90': check "
             "whether the plate moved between marks and lines, and the sign of the lines' offsets",
         )
@@ -310,7 +329,10 @@ CAUSES = [
 
 def noise(size, stated, unit, *, declared):
     return Finding(
-        "noise_contradicted", size, unit=unit, details={"stated": stated, "declared": declared}
+        "noise_contradicted",
+        size,
+        unit=unit,
+        details={"stated": stated, "declared": declared},
     )
 
 
@@ -322,7 +344,8 @@ def slip(places, *, spoils, y=-4e-7, phi=5e-6):
         view="90",
         details={
             "places": [
-                {"view": view, "axis": axis, "first": first} for view, axis, first in places
+                {"view": view, "axis": axis, "first": first}
+                for view, axis, first in places
             ],
             "x": 3e-7,
             "y": y,
@@ -369,7 +392,9 @@ FINDINGS = [
         "known; read every mark twice",
     ),
     (
-        Finding("finite_rotation", 5.126e-3, unit="rad", details={"residuals": 2.04e-8}),
+        Finding(
+            "finite_rotation", 5.126e-3, unit="rad", details={"residuals": 2.04e-8}
+        ),
         "the model is linear, but the plate was turned by up to 5.13 mrad: leave out "
         "--misalignment linear (or --method law); solved jointly "
         "with finite rotations, the default, "
@@ -381,7 +406,9 @@ FINDINGS = [
         "arcsec, p = 0.0012); use zero_mean",
     ),
     (
-        Finding("prediction_failed", 3.456, view="ty", details={"tenth": 0, "limit": 1.2}),
+        Finding(
+            "prediction_failed", 3.456, view="ty", details={"tenth": 0, "limit": 1.2}
+        ),
         "view 'ty' is predicted with 3.46 times the noise, beyond the limit of 1.20",
     ),
     (
@@ -446,7 +473,10 @@ FINDINGS = [
         "more than 10% of the readings contradict the others: none was removed; look for a wrong "
         "plan or a faulty view",
     ),
-    (Finding("outliers_kept"), "removing more outliers would leave the stage undetermined"),
+    (
+        Finding("outliers_kept"),
+        "removing more outliers would leave the stage undetermined",
+    ),
     (
         Finding("outliers_given_up", details={"rounds": 60}),
         "gave up on outliers after 60 rounds: the readings seem to contain more; look for a wrong "
@@ -495,7 +525,9 @@ FINDINGS = [
 
 
 @pytest.mark.parametrize(
-    ("found", "text"), [*CAUSES, *FINDINGS], ids=[found.name for found, _ in [*CAUSES, *FINDINGS]]
+    ("found", "text"),
+    [*CAUSES, *FINDINGS],
+    ids=[found.name for found, _ in [*CAUSES, *FINDINGS]],
 )
 def test_a_finding_in_words(found, text):
     assert sentence_of(found) == text
@@ -532,8 +564,12 @@ def test_every_finding_of_the_package_has_its_words_and_no_words_are_left_over()
     }
     sentences = {*SENTENCES, *OF_OBSERVABILITY, "rest_not_identified"}
     unsaid, unused = (made | elsewhere) - sentences, sentences - made - elsewhere
-    assert not unsaid, f"add to SENTENCES in reporting/words/findings.py: {sorted(unsaid)}"
-    assert not unused, f"no Finding has these names, remove their sentences: {sorted(unused)}"
+    assert not unsaid, (
+        f"add to SENTENCES in reporting/words/findings.py: {sorted(unsaid)}"
+    )
+    assert not unused, (
+        f"no Finding has these names, remove their sentences: {sorted(unused)}"
+    )
     with pytest.raises(KeyError, match="no words for unheard"):
         sentence_of(Finding("unheard"))
     with pytest.raises(KeyError, match="unheard"):
@@ -548,7 +584,10 @@ def test_a_remedy_that_was_tried_comes_first_and_a_view_is_for_programs():
         "a drift of 0.0200 ± 0.0020 µm along x during view '90': solve with --model drift:2e-08, "
         "or visit the marks there and back"
     )
-    assert remedies(cause) == (*tried, Remedy("action", "visit the marks there and back"))
+    assert remedies(cause) == (
+        *tried,
+        Remedy("action", "visit the marks there and back"),
+    )
 
 
 ODD = "run 2: shift x"
@@ -563,7 +602,10 @@ def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
     found = explanation("plate_scale", [(1, ""), (2, "")], [1e-7, 2e-6], 1e-7)
     cause = replace(
         cause_of(
-            found, SimpleNamespace(names_of=lambda term: ("0: first", "90", ODD), half_width_m=0.05)
+            found,
+            SimpleNamespace(
+                names_of=lambda term: ("0: first", "90", ODD), half_width_m=0.05
+            ),
         ),
         remedies=(Remedy("model", "plate_scale:3e-06"), Remedy("view", ODD)),
     )
@@ -584,9 +626,14 @@ def test_a_view_with_a_colon_in_its_name_cuts_no_sentence_of_a_saved_result():
     assert verdict.sentence == f"Not qualified: most likely {what}: {remedy}"
     assert (what_it_is(verdict.causes[0]), advice(verdict.causes[0])) == (what, remedy)
     assert again.warnings == verdict.reasons[:1]
-    assert worded(again).warnings == again.warnings and saved_and_read(again).verdict == verdict
+    assert (
+        worded(again).warnings == again.warnings
+        and saved_and_read(again).verdict == verdict
+    )
     # what a program needs: which view to measure again
-    views = [remedy.value for remedy in verdict.causes[0].remedies if remedy.kind == "view"]
+    views = [
+        remedy.value for remedy in verdict.causes[0].remedies if remedy.kind == "view"
+    ]
     assert views == [verdict.causes[0].view] == [ODD] == [verdict.failed[0].view]
 
 
@@ -598,7 +645,9 @@ def test_a_cause_of_a_file_without_its_data_is_its_text():
 def test_a_verdict_names_the_likeliest_cause_or_else_the_first_reason():
     drift = Cause("drift", 5e-7, 1e-8, "m", 1e-6, "90", "x")
     unknown = Finding("noise_unknown")
-    found = worded_verdict(Verdict(Grade.NOT_QUALIFIED, (unknown,), (TURN, drift)), TESTED)
+    found = worded_verdict(
+        Verdict(Grade.NOT_QUALIFIED, (unknown,), (TURN, drift)), TESTED
+    )
     assert found.sentence == (
         "Not qualified: most likely a microscope turned counter-clockwise by "
         f"2.000 ± 0.010 mrad: {ALIGN}"
@@ -607,7 +656,10 @@ def test_a_verdict_names_the_likeliest_cause_or_else_the_first_reason():
         sentence_of(unknown),
         *(f"the readings show {what_it_is(cause)}" for cause in (TURN, drift)),
     )
-    assert [cause.text for cause in found.causes] == [sentence_of(TURN), sentence_of(drift)]
+    assert [cause.text for cause in found.causes] == [
+        sentence_of(TURN),
+        sentence_of(drift),
+    ]
     assert not found.qualified and worded_verdict(found, TESTED) is found
     alone = worded_verdict(Verdict(Grade.NOT_QUALIFIED, (unknown,)), TESTED)
     assert alone.sentence == f"Not qualified: {sentence_of(unknown)}"
@@ -633,7 +685,10 @@ def test_a_result_is_worded_once_and_only_then_written():
         result_of(random_map(Artifact(3, 0.01, 8), 1)),
         warnings=("as read",),
         verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("noise_unknown"),), (TURN,)),
-        findings=(Finding("outliers_kept"), Finding("slips_given_up", details={"slips": 3})),
+        findings=(
+            Finding("outliers_kept"),
+            Finding("slips_given_up", details={"slips": 3}),
+        ),
     )
     for part in (bare, replace(bare, findings=())):
         with pytest.raises(ValueError, match=re.escape("is not worded")):
