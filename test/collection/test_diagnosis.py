@@ -7,7 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.diagnosis import Evidence, _stopped, diagnose, main_reason
+from selfcal_ros.collection.diagnosis import (
+    Evidence,
+    _encoder_stopped,
+    diagnose,
+    main_reason,
+)
 from selfcal_ros.collection.inputs import REMEDY, Reason, rejections
 from selfcal_ros.collection.marks.seen_poses import NamedMarks, _fitted
 from selfcal_ros.model.artifact import Artifact
@@ -544,11 +549,11 @@ def test_a_mark_that_is_read_many_times_is_not_a_stage_that_has_stopped():
     places = np.array([0j] * 5 + [3 + 1j] * 20)
     marks = SimpleNamespace(stage=places, sites=places)
     seen = SimpleNamespace(marks=[marks], pitch_m=0.01, sense=Sense.MICROSCOPE_MOVES)
-    assert _stopped(seen) is None
+    assert _encoder_stopped(seen) is None
     marks.sites = places + np.linspace(0, 2, 25)
     assert (
         "the stage has stopped: it is indicated at x = 0.03 m, y = 0.01 m"
-        in _stopped(seen)
+        in _encoder_stopped(seen)
     )
 
 
