@@ -159,7 +159,7 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int | None], None]]:
         yield _nothing
         return
     from rich.console import Console  # for a terminal only
-    from rich.progress import Progress  # for a terminal only  # for a terminal only
+    from rich.progress import Progress  # for a terminal only
 
     with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=None)
@@ -218,7 +218,7 @@ def _watch(label: str, after_s: float, ended: threading.Event) -> None:
     if ended.wait(after_s):
         return
     from rich.console import Console  # for a terminal only
-    from rich.progress import (  # for a terminal only  # for a terminal only
+    from rich.progress import (  # for a terminal only
         Progress,
         SpinnerColumn,
         TextColumn,

@@ -23,6 +23,7 @@ from selfcal_ros.estimation.verdict.causes import (
     MAX_CAUSES,
     READING,
     Explanation,
+    OffSites,
     cause_of,
     find_explanations,
     fitted_term,
@@ -105,77 +106,27 @@ def search_causes(
     search = SearchResult(solved)
     if options.causes is False or solved.model is None:
         return search
-    sizes = [test for test in solved.model.sizes if test.contradicted]
+    contradicted = any(test.contradicted for test in solved.model.sizes)
     off_sites = (
         None
         if measurements.artifact.map_grid
         else off_sites_cause(solved.model, solved.result.error_map)
     )
-    failed = failed or bool(sizes or off_sites)
+    failed = failed or contradicted or off_sites is not None
     sites = solved.model.problem.system.grid.n_sites
     if solved.xy.sigma > LEAST_NOISE_M and is_searched(sites, options, failed=failed):
         _search(search, measurements, options, failed=failed)
-    solved = search.solved
-    tests = search.solved.joint.sizes
-    raised = {
-        str(test.name): _raised_cause(solved, test)
-        for test in tests
-        if (test.contradicted or not _is_plausible(test))
-        and test.name not in search.terms
-    }
-    scales = (
-        _either_scale(solved, measurements, options)
-        if any(block_of(name).of_offsets for name, cause in raised.items() if cause)
-        else {}
-    )
-    raised = scales | {
-        name: cause for name, cause in raised.items() if name not in scales
-    }
-    names = [name for name, cause in raised.items() if cause is not None]
-    search.bounded &= not any(_beyond_u(solved, test) for test in tests)
-    plausible = all(map(_is_plausible, tests))
-    between = any(block_of(name).between for name in raised)
-    alike = bool(scales) or (
-        between and _as_a_microscope(search, measurements, options)
-    )
-    search.causes[:0] = [cause for cause in raised.values() if cause is not None]
-    _allow_for_plates(search, names, measurements, options)
-    turned = turned_too_far(solved.joint, solved.result, measurements)
-    if turned is not None:
-        search.bounded = False
-        if turned.name not in [cause.name for cause in search.causes]:
-            search.causes.append(turned)
-    for rough in filter(
-        None, (adequacy_of(solved.joint), line_adequacy_of(solved.joint))
-    ):
-        search.effects.append(rough.effect(solved.result))
-        if (cause := rough.cause) is not None:
-            nodes = (
-                _better_map(measurements, options)
-                if advise and not rough.of_lines
-                else ""
-            )
-            search.causes.append(
-                replace(cause, remedies=(Remedy("map", nodes),) if nodes else ())
-            )
+
+    raised, alike = _add_raised_sizes(search, measurements, options)
+    turned = _add_turned_lines(search, measurements)
+    _add_roughness(search, measurements, options, advise=advise)
     if off_sites is not None:
-        search.causes.insert(
-            0 if off_sites.residuals_show_it else len(search.causes), off_sites.cause
-        )
-        search.effects.append(
-            effect_of_field(
-                off_sites.cause.name,
-                off_sites.map_change,
-                measurements.sense,
-                np.zeros(measurements.artifact.angular_count),
-            )
-        )
-        search.bounded &= off_sites.bounded
-    search.solved, search.terms = (
-        _from_readings(solved, search.terms),
-        [*names, *search.terms],
-    )
+        _add_off_sites(search, off_sites, measurements)
+    plausible = all(map(_is_plausible, search.solved.joint.sizes))
     search.bounded &= plausible
+    search.solved = _from_readings(search.solved, search.terms)
+    search.terms = [*raised, *search.terms]
+
     if advise and search.causes:
         tried = search.terms and plausible and not alike
         model = _best_model(search, measurements, options) if tried else None
@@ -188,6 +139,81 @@ def search_causes(
             _advised(cause, model, search.terms, faulty) for cause in search.causes
         ]
     return search
+
+
+def _add_raised_sizes(
+    search: SearchResult, measurements: Measurements, options: Options
+) -> tuple[list[str], bool]:
+    """Put the terms first whose sizes the readings contradict, or that are not plausible.
+
+    Return their names, and whether something else explains the readings as well as one of them.
+    """
+    solved = search.solved
+    raised = {
+        str(test.name): _raised_cause(solved, test)
+        for test in solved.joint.sizes
+        if (test.contradicted or not _is_plausible(test))
+        and test.name not in search.terms
+    }
+    scales = (
+        _either_scale(solved, measurements, options)
+        if any(block_of(name).of_offsets for name, cause in raised.items() if cause)
+        else {}
+    )
+    raised = scales | {
+        name: cause for name, cause in raised.items() if name not in scales
+    }
+    search.bounded &= not any(_beyond_u(solved, test) for test in solved.joint.sizes)
+    between = any(block_of(name).between for name in raised)
+    alike = bool(scales) or (
+        between and _as_a_microscope(search, measurements, options)
+    )
+    search.causes[:0] = [cause for cause in raised.values() if cause is not None]
+    names = [name for name, cause in raised.items() if cause is not None]
+    _allow_for_plates(search, names, measurements, options)
+    return names, alike
+
+
+def _add_turned_lines(search: SearchResult, measurements: Measurements) -> Cause | None:
+    """Add that lines turn against marks as plates do, and return it; None if they do not."""
+    solved = search.solved
+    turned = turned_too_far(solved.joint, solved.result, measurements)
+    if turned is not None:
+        search.bounded = False
+        if turned.name not in [cause.name for cause in search.causes]:
+            search.causes.append(turned)
+    return turned
+
+
+def _add_roughness(
+    search: SearchResult, measurements: Measurements, options: Options, *, advise: bool
+) -> None:
+    """Add what maps with nodes of their own do not follow, of marks and of lines."""
+    model = search.solved.joint
+    for rough in filter(None, (adequacy_of(model), line_adequacy_of(model))):
+        search.effects.append(rough.effect(search.solved.result))
+        if (cause := rough.cause) is None:
+            continue
+        nodes = ""
+        if advise and not rough.of_lines:
+            nodes = _better_map(measurements, options)
+        remedies = (Remedy("map", nodes),) if nodes else ()
+        search.causes.append(replace(cause, remedies=remedies))
+
+
+def _add_off_sites(
+    search: SearchResult, off_sites: OffSites, measurements: Measurements
+) -> None:
+    """Add a stage off the sites: first if residuals show it, too."""
+    place = 0 if off_sites.residuals_show_it else len(search.causes)
+    search.causes.insert(place, off_sites.cause)
+    lines = np.zeros(measurements.artifact.angular_count)
+    search.effects.append(
+        effect_of_field(
+            off_sites.cause.name, off_sites.map_change, measurements.sense, lines
+        )
+    )
+    search.bounded &= off_sites.bounded
 
 
 def _better_map(measurements: Measurements, options: Options) -> str:
