@@ -92,73 +92,47 @@ def judged(
     noises = _noise_findings(solved)
     checked = checked_by(solved, measurements, options, failed=bool(noises))
     is_same = checked is solved
-    failed = []
-    if not is_same and checked.model is not None and checked.model.problem.rigid:
-        failed.append(
-            Finding(
-                "finite_rotation",
-                max(abs(view.phi) for view in checked.result.views),
-                unit="rad",
-                details={"residuals": checked.xy.residuals},
-            )
-        )
-    p, size_rad = checked.axes
-    if not p >= USUAL_LEVEL:
-        failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
-    if not solved.converged:
-        failed.append(Finding("not_converged"))
-    failed += _sign_findings(checked, measurements, options)
-    failed += _lines_sign_findings(checked, measurements, options)
+    failed = _failed_tests(solved, checked, measurements, options)
     searched = search_causes(
         checked, measurements, options, failed=bool(noises), advise=advise
     )
-    zero = {str(term.name) for term in options.terms if term.size == 0}
-    causes = tuple(
-        replace(cause, details={**cause.details, "declared": 0.0})
-        if str(cause.name) in zero
-        else cause
-        for cause in searched.causes
-    )
+    causes = _with_declared_zeros(searched.causes, options)
     if is_same:
         solved = searched.solved
         noises = _noise_findings(solved)
-    failed += _scale_findings(
-        solved if is_same else checked, measurements, options, causes
-    )
-    result = replace(solved.result, reference=options.reference)
+    explained = solved if is_same else checked
+    failed += _scale_findings(explained, measurements, options, causes)
+
     effects = [*searched.effects, *_beyond_repeats(solved)]
     result = with_coverage(
-        enlarged(result, [*effects, *undetermined_effects(solved, options)])
+        enlarged(
+            replace(solved.result, reference=options.reference),
+            [*effects, *undetermined_effects(solved, options)],
+        )
     )
     bounded = (
         searched.bounded and (is_same or not causes) and not _unexplained_noise(solved)
     )
-    grade = (
-        Grade.GOOD
-        if not (failed or noises or causes)
-        else Grade.ENLARGED
-        if bounded and not failed and result.has_uncertainty
-        else Grade.NOT_QUALIFIED
-    )
-    # else a line of the budget alone
-    named = [
-        *((cause.name, cause.unit) for cause in causes),
-        *((LACK_OF_FIT, noise.unit) for noise in noises),
+    if not (failed or noises or causes):
+        grade = Grade.GOOD
+    elif bounded and not failed and result.has_uncertainty:
+        grade = Grade.ENLARGED
+    else:
+        grade = Grade.NOT_QUALIFIED
+    # what is neither a cause nor a failed test is a line of the budget alone
+    named = {(cause.name, cause.unit) for cause in causes}
+    named |= {(LACK_OF_FIT, noise.unit) for noise in noises}
+    shown_effects = [
+        effect
+        for effect in effects
+        if effect.name not in (ROUGHNESS, LACK_OF_FIT)
+        or (effect.name, effect.unit) in named
     ]
     verdict = Verdict(
         grade,
         (*failed, *noises),
         causes,
-        enlargements(
-            result,
-            searched.terms,
-            [
-                effect
-                for effect in effects
-                if effect.name not in (ROUGHNESS, LACK_OF_FIT)
-                or (effect.name, effect.unit) in named
-            ],
-        ),
+        enlargements(result, searched.terms, shown_effects),
     )
     untested = solved.model is not None and is_untested(solved.model.problem)
     result = replace(
@@ -174,6 +148,55 @@ def judged(
         provenance=provenance_of(measurements, options),
     )
     return replace(solved, result=replace(result, budget=tuple(budget_lines(result))))
+
+
+def _failed_tests(
+    solved: Solved, checked: Solved, measurements: Measurements, options: Options
+) -> list[Finding]:
+    """Return the tests that fail whatever the causes: model, axes, iteration, signs.
+
+    Parameters
+    ----------
+    solved, checked : Solved
+        The solution, and the one in which causes are searched for.
+    measurements, options : Measurements, Options
+        Its readings, and how they were solved.
+    """
+    failed = []
+    if (
+        checked is not solved
+        and checked.model is not None
+        and checked.model.problem.rigid
+    ):
+        failed.append(
+            Finding(
+                "finite_rotation",
+                max(abs(view.phi) for view in checked.result.views),
+                unit="rad",
+                details={"residuals": checked.xy.residuals},
+            )
+        )
+    p, size_rad = checked.axes
+    if not p >= USUAL_LEVEL:
+        failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
+    if not solved.converged:
+        failed.append(Finding("not_converged"))
+    failed += _sign_findings(checked, measurements, options)
+    failed += _lines_sign_findings(checked, measurements, options)
+    return failed
+
+
+def _with_declared_zeros(
+    causes: Iterable[Cause], options: Options
+) -> tuple[Cause, ...]:
+    """Return the causes; those of terms that were declared to be 0 say so."""
+    zero = {str(term.name) for term in options.terms if term.size == 0}
+    return tuple(
+        replace(cause, details={**cause.details, "declared": 0.0})
+        if str(cause.name) in zero
+        else cause
+        for cause in causes
+    )
 
 
 def _without_readings(solved: Solved, options: Options) -> Iterator[Finding]:
