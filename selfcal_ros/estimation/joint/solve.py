@@ -408,28 +408,43 @@ def _fitted(
         problem, observability = prepare(
             measurements, replace(options, assumed=assumed)
         )
-        for at_places in (True, False) if problem.moves else (False,):
-            try:
-                model = fit_model(
-                    replace(problem, at_places=at_places),
-                    partial(require_terms_determined, observability=observability),
-                )
-            except NotSettledError as error:
-                if whole_only:
-                    raise
-                failed = error
-                continue
-            as_assumed = assumed == options.assumed and at_places == problem.moves
-            solution = model, observability, as_assumed
-            sigma_m = model.fitted.xy.sigma
-            if nearly_exact is not None and sigma_m < LEAST_NOISE_M:
-                return solution
-            if not LEAST_NOISE_M <= sigma_m < NEARLY_EXACT_M:
-                return nearly_exact or solution
-            nearly_exact = nearly_exact or solution
+        try:
+            model = _fitted_at_places(problem, observability, or_sites=not whole_only)
+        except NotSettledError as error:
+            if whole_only:
+                raise
+            failed = error
+            continue
+        at_places = model.problem.moves == problem.moves
+        solution = model, observability, assumed == options.assumed and at_places
+        sigma_m = model.fitted.xy.sigma
+        if whole_only or sigma_m < LEAST_NOISE_M:
+            return solution
+        if nearly_exact is None and not sigma_m < NEARLY_EXACT_M:
+            return solution
+        nearly_exact = nearly_exact or solution
     if nearly_exact is not None:
         return nearly_exact
     raise failed or AssertionError("something was tried")
+
+
+def _fitted_at_places(
+    problem: Problem, observability: Observability, *, or_sites: bool
+) -> ModelFit:
+    """Return the fit with the places of the stage, else with readings at their sites.
+
+    Raises
+    ------
+    NotSettledError
+        If neither converges; without `or_sites` if that with the places does not.
+    """
+    check = partial(require_terms_determined, observability=observability)
+    try:
+        return fit_model(problem, check)
+    except NotSettledError:
+        if not (or_sites and problem.moves):
+            raise
+    return fit_model(replace(problem, at_places=False), check)
 
 
 def prepare(
