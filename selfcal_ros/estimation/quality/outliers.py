@@ -54,6 +54,7 @@ from selfcal_ros.estimation.verdict.causes import (
 )
 from selfcal_ros.estimation.verdict.leverage import (
     FEW_DRAWS,
+    FEW_OUTLIERS,
     MAX_REMOVED,
     FitOfKind,
     lines_alone,
@@ -441,9 +442,6 @@ NEAR_LARGEST = 0.5
 """Share of the largest ratio above which a reading is removed in the same round: an outlier
 increases the residuals of its neighbours."""
 
-NAMED = 5
-"""Number of outliers listed in their finding; ``extra["outliers"]`` has all."""
-
 LEFT = {
     "noisy_view",
     "too_many_outliers",
@@ -772,7 +770,7 @@ def _findings(
                             "mark": list(item.mark),
                             "standardised": item.standardised,
                         }
-                        for item in removed[:NAMED]
+                        for item in removed[:FEW_OUTLIERS]
                     ],
                 },
             )

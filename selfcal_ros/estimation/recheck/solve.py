@@ -12,6 +12,7 @@ import numpy as np
 
 from selfcal_ros.blocks import AXES, SHARED
 from selfcal_ros.errors import InputError, NoDataError
+from selfcal_ros.estimation.checks.wiring import BEYOND
 from selfcal_ros.estimation.comparison.covariance import (
     dof_of_marks,
     kept_covariances,
@@ -364,12 +365,8 @@ def _off(solved: Rechecked) -> tuple[Finding, ...]:
     )
 
 
-BEYOND = 3
-"""Sizes of the assumption from which on a microscope is another than is assumed."""
 SIMILAR = ("scale", "turn")
 """Coefficients of a microscope that may be any once it has been touched."""
-SAME_VARIANCE = 1e-6
-"""Relative change of a variance at which its estimate ends."""
 
 
 def _by_microscope(
@@ -596,7 +593,7 @@ def _seen_by_visits(problem: Problem) -> SeenMicroscope | None:
         )
         before = variance
         variance = float(remaining) / within.dof
-        if abs(variance - before) <= SAME_VARIANCE * before:
+        if abs(variance - before) <= TRACE * before:
             break
     slope = complex(*fitted_values[free])  # E / (1 + E)
     coefficients = fitted_values[of_offsets] / abs(1 - slope) ** 2

@@ -34,6 +34,7 @@ from selfcal_ros.estimation.joint.problem import (
     noise_excess,
     pooled,
 )
+from selfcal_ros.estimation.joint.solve import NEARLY_EXACT_M
 from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.terms.columns import Column, ColumnBuilder
 from selfcal_ros.estimation.terms.equations import (
@@ -165,10 +166,6 @@ OFF_SITES = "off_sites"
 SMALL = 0.02
 """Change of the readings, in standard uncertainties of the map (rms), that is ignored."""
 
-LEAST_U_M = 1e-10
-"""Smallest standard uncertainty of the map in these tests: finite rotations of a stage that is
-rotated relative to its datum leave as much."""
-
 ROUGH = 2.5
 """Ratio of the error of the spline to its difference from a spline with slopes from neighbours,
 for a stage whose errors at neighbouring sites are independent; smaller for smoother stages."""
@@ -219,7 +216,8 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
     places = model.problem.places
     if places is None:
         return None
-    u = np.maximum(_uncertainty(model, error_map), LEAST_U_M)
+    # finite rotations of a stage that is rotated relative to its datum leave as much
+    u = np.maximum(_uncertainty(model, error_map), NEARLY_EXACT_M)
     known_sites = problem.system.known_sites
     error_there = places.errors(model.fitted.field)
     reading_change = places.changes(

@@ -37,7 +37,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.terms.equations import DOUBT_LEVEL
 from selfcal_ros.estimation.terms.visits import time_ranges
 from selfcal_ros.estimation.verdict.causes import NOISY
-from selfcal_ros.estimation.verdict.leverage import MAX_REMOVED
+from selfcal_ros.estimation.verdict.leverage import FEW_OUTLIERS, MAX_REMOVED
 from selfcal_ros.estimation.verdict.roughness import NAME as ROUGHNESS
 from selfcal_ros.estimation.verdict.search import (
     ALWAYS_SITES,
@@ -69,9 +69,6 @@ show the sign of the offsets."""
 
 LACK_LEVEL = 0.02
 """Two-sided level from which residuals beyond the scatter of repeats count as lack of fit."""
-
-FEW_OUTLIERS = 5
-"""Outliers among repeats of a view that are not chance, if they are above `MAX_REMOVED` as well."""
 
 
 @one_thread()

@@ -28,6 +28,10 @@ FEW_DRAWS = 16
 MAX_REMOVED = 0.1
 """Largest share of readings that are outliers; if it is more, the fault is another one."""
 
+FEW_OUTLIERS = 5
+"""Outliers that are few: among repeats of a view no more may be chance, and a finding names as
+many."""
+
 CHECKED = 0.05
 """Smallest 1 - h of a reading that the others can check."""
 
