@@ -41,6 +41,8 @@ class Adjusted:
         Derivatives of the errors with respect to readings and linear errors.
     residuals_m : float array (K, D, n)
         Readings minus model.
+    residuals_by_readings, residuals_by_linear : float arrays (K*D*n, K*D*n) and (K*D*n, D*n)
+        Their derivatives.
     """
 
     errors_m: np.ndarray
@@ -48,6 +50,8 @@ class Adjusted:
     by_readings: np.ndarray
     by_linear: np.ndarray
     residuals_m: np.ndarray
+    residuals_by_readings: np.ndarray
+    residuals_by_linear: np.ndarray
 
 
 class Geometry:
@@ -168,7 +172,7 @@ def adjust(data: StepDiagonal) -> Adjusted:
             "the least squares does not converge",
             "check units, steps and the order of the columns",
         )
-    return _solution(data, geometry, (errors, tilt, pinv[: free.sum()] * weights))
+    return _solution(data, geometry, (errors, tilt, pinv * weights))
 
 
 def _solver(matrix: np.ndarray, data: StepDiagonal) -> np.ndarray:
@@ -189,13 +193,17 @@ def _solution(
     geometry: Geometry,
     estimate: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> Adjusted:
-    errors, tilt, gain = estimate
-    by_errors, _ = geometry.derivatives(errors, tilt)
+    errors, tilt, gain_of_all = estimate
+    by_errors, by_tilt = geometry.derivatives(errors, tilt)
     is_linear = np.zeros(geometry.free.shape, dtype=bool)
     for j in range(data.dim):
         is_linear[j, :, j] = True
     is_linear = is_linear.ravel()
     free = geometry.free.ravel()
+    gain = gain_of_all[: free.sum()]
+    left = (
+        np.eye(len(by_errors)) - np.hstack([by_errors[:, free], by_tilt]) @ gain_of_all
+    )
     by_readings = np.zeros((free.size, gain.shape[1]))
     by_readings[free] = gain
     by_linear = np.zeros((free.size, int(is_linear.sum())))
@@ -207,4 +215,6 @@ def _solution(
         by_readings,
         by_linear,
         data.readings_m - geometry.readings(errors, tilt),
+        left,
+        -left @ by_errors[:, is_linear],
     )

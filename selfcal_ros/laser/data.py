@@ -168,8 +168,10 @@ class Closure:
         state. None without linear errors or with a missing diagonal.
     between_m, u_between_m : float array (D, n, D) or None
         2D, new formulation: errors from pp alone minus those from np alone.
-    residual_rms_m : float or None
-        rms residual of the least squares; None without redundancy.
+    residual_rms_m, u_residual_rms_m : float or None
+        rms residual of the least squares, and what the noise alone leaves; None without redundancy.
+    contradiction : str
+        What residuals beyond the noise say; empty where there are none.
     """
 
     lengths_m: float | None = None
@@ -177,6 +179,8 @@ class Closure:
     between_m: np.ndarray | None = None
     u_between_m: np.ndarray | None = None
     residual_rms_m: float | None = None
+    u_residual_rms_m: float | None = None
+    contradiction: str = ""
 
 
 @dataclass(frozen=True, eq=False)

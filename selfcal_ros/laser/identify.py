@@ -13,7 +13,7 @@ and p change sign.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,14 +30,17 @@ from selfcal_ros.laser.data import (
     turn_to_first_step,
 )
 from selfcal_ros.laser.noise import (
+    CONTRADICTION,
     between_diagonals,
     check_lengths,
     length_closure,
     propagated,
     reading_covariance,
     reading_noise,
+    residuals_by_noise,
 )
 from selfcal_ros.model.error_map import rms
+from selfcal_ros.units import UM_PER_M
 
 
 def eq3(r: np.ndarray, u: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -291,9 +294,14 @@ def identify_ibaraki(
         name: np.arctan(tilt).tolist()
         for name, tilt in zip(data.diagonals, adjusted.tilt, strict=True)
     }
-    between, u_between, residual = None, None, None
+    between, u_between = None, None
+    residual, u_residual, contradiction = None, None, ""
     if len(data.diagonals) > 1:
         residual = rms(adjusted.residuals_m)
+        by_noise = residuals_by_noise(data, adjusted)
+        if by_noise:
+            u_residual = by_noise[0]
+            contradiction = _contradiction(data, residual, by_noise)
         if data.dim == 2:
             by_diagonal = [adjust(data.pick([name])) for name in data.diagonals]
             between, u_between = between_diagonals(data, by_diagonal)
@@ -304,7 +312,43 @@ def identify_ibaraki(
         Method.NEW,
         form,
         mirror,
-        Closure(lengths[0], lengths[1], between, u_between, residual),
+        Closure(
+            lengths[0],
+            lengths[1],
+            between,
+            u_between,
+            residual,
+            u_residual,
+            contradiction,
+        ),
+    )
+
+
+def _contradiction(
+    data: StepDiagonal, residual_m: float, by_noise: tuple[float, float]
+) -> str:
+    """Return what residuals that noise does not explain say; empty where it explains them."""
+    expected_m, probability = by_noise
+    if probability > CONTRADICTION:
+        return ""
+    found = (
+        f"the readings of the diagonals contradict each other by "
+        f"{residual_m * UM_PER_M:.3g} um rms, where their repeats allow "
+        f"{expected_m * UM_PER_M:.3g} um; errors are beyond their u: "
+    )
+    samples = data.samples_m.copy()
+    samples[:, data.signs < 0] = samples[:, data.signs < 0][:, :, ::-1]
+    other = replace(data, samples_m=samples)
+    otherwise = residuals_by_noise(other, adjust(other))
+    if otherwise and otherwise[1] > CONTRADICTION:
+        return (
+            found
+            + "in the other order the blocks of the axes that run backwards (rx_np) agree; "
+            "a block is a position on the axis, not a time"
+        )
+    return (
+        found + "the machine or the set-up changed between the runs, the mirror turned "
+        "with the axes, or blocks are not in the order of their positions"
     )
 
 

@@ -4,15 +4,19 @@
 A reading of a step is the difference of two laser distances. If the distances are noisy,
 neighbouring readings in time share one distance and their correlation is -1/2; for independent
 readings it is 0. The correlation is estimated from the repeats and used, because
-profiles and squareness are sums of readings.
+profiles and squareness are sums of readings. What whole runs scatter by beyond that (the air, a
+machine that grows) is a change of scale from run to run, which adds up over all blocks.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import dst
+from scipy.stats import f as f_distribution
 
 from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.joint.problem import coverage_factor
 from selfcal_ros.laser.adjust import Adjusted
 from selfcal_ros.laser.data import DIAGONALS, StepDiagonal
 from selfcal_ros.model.error_map import rms
@@ -31,11 +35,17 @@ class ReadingNoise:
         Correlation of successive readings, -0.5 to 0.
     dof : int
         Degrees of freedom of sigma.
+    run_m : float
+        Standard deviation of the length of a run beyond that of its readings, as if well known.
+    run_dof : int
+        Degrees of freedom of `run_m`; 0 where readings explain the lengths.
     """
 
     sigma_m: float
     correlation: float = 0.0
     dof: int = 0
+    run_m: float = 0.0
+    run_dof: int = 0
 
 
 def time_order(signs: np.ndarray, n_blocks: int) -> np.ndarray:
@@ -62,18 +72,27 @@ def reading_noise(data: StepDiagonal) -> ReadingNoise:
         ],
         axis=1,
     )
-    return _pooled(runs.reshape(len(deviation), len(order), -1))
+    largest = float(np.abs(data.readings_m).max())
+    return _pooled(runs.reshape(len(deviation), len(order), -1), largest)
 
 
 def linear_noise(data: StepDiagonal) -> ReadingNoise:
     """Return the noise of the directly measured linear errors, from the scatter of repeats."""
     if data.linear_m is None:
         return ReadingNoise(float("nan"))
-    return _pooled(data.linear_m - data.linear_mean_m)
+    largest = float(np.abs(data.linear_mean_m).max())
+    return _pooled(data.linear_m - data.linear_mean_m, largest)
 
 
-def _pooled(runs: np.ndarray) -> ReadingNoise:
+ROUNDING = 1e-14
+"""Deviations from a mean below this, relative to the largest, are those of its rounding."""
+RUN_DOUBT = 0.1
+"""Probability of run lengths that scatter so much by the noise of readings; less tells a scale."""
+
+
+def _pooled(runs: np.ndarray, largest_m: float) -> ReadingNoise:
     """Return the noise of deviations from means, (repeats, series, time); NaN = not measured."""
+    runs = np.where(np.abs(runs) <= ROUNDING * largest_m, 0.0, runs)
     counts = np.isfinite(runs).sum(axis=0)
     dof = int((counts - 1).sum())
     if dof == 0:
@@ -88,10 +107,31 @@ def _pooled(runs: np.ndarray) -> ReadingNoise:
         or runs.shape[2] < 2
     ):
         return ReadingNoise(float(np.sqrt(variance)), 0.0, dof)
-    correlation, variance = _likeliest(
-        np.nan_to_num(runs), int((complete.sum(axis=0) - 1).sum())
+    runs = np.nan_to_num(runs)
+    run_dof = int((complete.sum(axis=0) - 1).sum())
+    correlation, variance = _likeliest(runs, run_dof)
+    length = float(np.sum(runs.sum(axis=2) ** 2)) / run_dof
+    by_readings = variance * _sum_of_band(runs.shape[2], correlation)
+    if f_distribution.sf(length / by_readings, run_dof, dof - run_dof) > RUN_DOUBT:
+        return ReadingNoise(float(np.sqrt(variance)), correlation, dof)
+    level = runs - runs.mean(axis=2, keepdims=True)
+    correlation, variance = _likeliest(level, run_dof)
+    size = runs.shape[2]
+    variance *= size / (size - _sum_of_band(size, correlation) / size)
+    by_readings = variance * _sum_of_band(size, correlation)
+    few = coverage_factor(run_dof) / coverage_factor(math.inf)
+    return ReadingNoise(
+        float(np.sqrt(variance)),
+        correlation,
+        dof - run_dof,
+        few * float(np.sqrt(max(length - by_readings, 0.0))),
+        run_dof,
     )
-    return ReadingNoise(float(np.sqrt(variance)), correlation, dof)
+
+
+def _sum_of_band(size: int, correlation: float) -> float:
+    """Return the variance of the sum of readings of variance 1."""
+    return size + 2 * correlation * (size - 1)
 
 
 def _likeliest(runs: np.ndarray, dof: int) -> tuple[float, float]:
@@ -118,10 +158,10 @@ def reading_covariance(data: StepDiagonal, noise: ReadingNoise) -> np.ndarray:
     size = data.dim * data.n_blocks
     out = np.zeros((len(data.diagonals) * size,) * 2)
     for k, signs in enumerate(data.signs):
-        index = k * size + time_order(signs, data.n_blocks)
-        out[np.ix_(index, index)] = _band(
-            data.counts[k].ravel()[index - k * size], noise
-        )
+        order = time_order(signs, data.n_blocks)
+        index = k * size + order
+        share = data.readings_m[k].ravel()[order] / data.readings_m[k].sum()
+        out[np.ix_(index, index)] = _band(data.counts[k].ravel()[order], share, noise)
     return out
 
 
@@ -132,15 +172,18 @@ def linear_covariance(data: StepDiagonal, noise: ReadingNoise) -> np.ndarray:
     out = np.zeros((counts.size,) * 2)
     for j, count in enumerate(counts):
         rows = slice(j * data.n_blocks, (j + 1) * data.n_blocks)
-        out[rows, rows] = _band(count, noise)
+        share = np.full(data.n_blocks, 1 / data.n_blocks)
+        out[rows, rows] = _band(count, share, noise)
     return out
 
 
-def _band(counts: np.ndarray, noise: ReadingNoise) -> np.ndarray:
+def _band(counts: np.ndarray, share: np.ndarray, noise: ReadingNoise) -> np.ndarray:
+    """Return the covariance of means of `counts` readings, each its `share` of the run's length."""
     sigma = noise.sigma_m / np.sqrt(counts)
     band = np.eye(len(counts))
     band += noise.correlation * (np.eye(len(counts), k=1) + np.eye(len(counts), k=-1))
-    return band * np.outer(sigma, sigma)
+    run = noise.run_m * share / np.sqrt(counts)
+    return band * np.outer(sigma, sigma) + np.outer(run, run)
 
 
 LENGTH_TOLERANCE = 1e-3
@@ -210,6 +253,31 @@ def between_diagonals(
     return difference, np.sqrt(np.maximum(np.diag(covariance), 0.0)).reshape(
         difference.shape
     )
+
+
+CONTRADICTION = 1e-4
+"""Probability of residuals that noise does not explain."""
+
+
+def residuals_by_noise(
+    data: StepDiagonal, adjusted: Adjusted
+) -> tuple[float, float] | None:
+    """Return the rms residual that noise leaves, m, and the probability of those found.
+
+    None without repeats.
+    """
+    covariance = propagated(
+        data, adjusted.residuals_by_readings, adjusted.residuals_by_linear
+    )
+    if covariance is None or not covariance.any():
+        return None
+    expected = float(np.trace(covariance))
+    dof = expected**2 / float(np.sum(covariance**2))
+    found = float(np.sum(adjusted.residuals_m**2))
+    noises = (reading_noise(data), linear_noise(data))
+    known = min(noise.dof for noise in noises if noise.dof)
+    probability = float(f_distribution.sf(found / expected, dof, known))
+    return float(np.sqrt(expected / adjusted.residuals_m.size)), probability
 
 
 def check_lengths(data: StepDiagonal) -> None:

@@ -20,7 +20,13 @@ from selfcal_ros.laser.simulation import StepMachine
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.figures.drawing import Drawing
 from selfcal_ros.reporting.figures.parts import Curve, chart, titled
-from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M, UM_PER_MM
+from selfcal_ros.units import (
+    M_PER_MM,
+    MM_PER_M,
+    MRAD_PER_RAD,
+    UM_PER_M,
+    UM_PER_MM,
+)
 
 SCHEMA = "selfcal.step_diagonal/1"
 CONVENTION = {
@@ -66,7 +72,12 @@ def outcome(
     out |= {profiles.name_of(j, c): _mm(result.errors_m[j, :, c]) for j, c in kinds}
     u = result.u_errors_m
     if u is not None:
-        out |= {f"u_{profiles.name_of(j, c)}": _mm(u[j, :, c]) for j, c in kinds}
+        out |= {
+            f"u_{profiles.name_of(j, c)}": _mm(u[j, :, c])
+            if profiles.is_told(result, j, c)
+            else None
+            for j, c in kinds
+        }
     out |= geometry(result, line)
     out["profiles"] = {
         f"p{profiles.name_of(j, c)[1:]}": {
@@ -88,8 +99,12 @@ def outcome(
         "reading": readings.sigma_m / M_PER_MM,
         "reading_dof": readings.dof,
         "correlation": readings.correlation,
+        "run": readings.run_m / M_PER_MM,
+        "run_dof": readings.run_dof,
         "linear": linear.sigma_m / M_PER_MM,
         "linear_dof": linear.dof,
+        "linear_run": linear.run_m / M_PER_MM,
+        "linear_run_dof": linear.run_dof,
     }
     out["convention"] = CONVENTION
     out["warnings"] = [*warnings, *_advice(result)]
@@ -144,6 +159,7 @@ def _closure(result: StepDiagonalResult) -> dict[str, Any]:
             ("lengths", closure.lengths_m),
             ("u_lengths", closure.u_lengths_m),
             ("residual_rms", closure.residual_rms_m),
+            ("u_residual_rms", closure.u_residual_rms_m),
         )
     }
     for prefix, values in (("", closure.between_m), ("u_", closure.u_between_m)):
@@ -171,9 +187,46 @@ def _advice(result: StepDiagonalResult) -> list[str]:
             f"{lengths * UM_PER_M:.3g} um: the laser is off the machine's diagonal, or "
             "the linear errors are of another state of the machine"
         )
+    if result.closure.contradiction:
+        out.append(result.closure.contradiction)
+    out += _set_up(result)
     if result.covariance is not None and not result.covariance.any():
         out.append("all repeats are identical: an uncertainty of zero cannot be right")
     return out
+
+
+LASER_OFF_RAD = 1e-4
+"""A laser is not known to be nearer to the machine's diagonal: 10 um of its spot over 100 mm."""
+
+
+def _set_up(result: StepDiagonalResult) -> list[str]:
+    """Return what u leaves out: the mirror's angle, by formulation."""
+    x, y = (result.n_blocks * step for step in result.steps_m[:2])
+    if result.method == Method.CONVENTIONAL:
+        wrong = (
+            f"1 mrad on one diagonal adds {1e-3 * y / 2 * UM_PER_M:.3g} um to Px(x)"
+            if result.dim == 2
+            else "squareness as well"
+        )
+        return [
+            "the linear errors, which have no u, hold only if the mirror is square to the laser: "
+            f"{wrong}; measure them along the axes, and use --method new"
+        ]
+    angles = np.array(list(result.mirror_rad.values()))
+    if not angles.size or result.covariance is None:
+        return []
+    diagonal = result.n_blocks * float(np.linalg.norm(result.steps_m))
+    share = diagonal**2 / (x * len(angles))
+    off_m = LASER_OFF_RAD * float(np.linalg.norm(angles)) * share
+    u_m = profiles.squareness(result).u
+    if u_m is None or off_m <= u_m:
+        return []
+    return [
+        f"the mirror is off the laser by up to {np.abs(angles).max() * MRAD_PER_RAD:.3g} mrad: "
+        f"where the laser is {LASER_OFF_RAD * MRAD_PER_RAD:g} mrad off the machine's diagonal, "
+        f"squareness errs by {off_m * UM_PER_M:.2g} um, which u does not contain; turn the "
+        "mirror square to the laser"
+    ]
 
 
 def summary(result: dict[str, Any]) -> str:
