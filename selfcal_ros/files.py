@@ -43,8 +43,9 @@ WHOLE_LIMIT = 1 << 63
 class _Strict(Composer, SafeConstructor, Resolver):
     """Construct values from YAML events; floats as in YAML 1.2 and rcl: 5e-4, 1.0e3, -.5.
 
-    Refuses a duplicate key, a whole number beyond 64 bits, and a document of more
-    than `MAX_YAML_NODES` values, aliases expanded.
+    Refuses a duplicate key, a whole number beyond 64 bits, a number that YAML 1.1
+    and 1.2 read differently, and a document of more than `MAX_YAML_NODES` values,
+    aliases expanded.
     """
 
     _n_nodes = 0
@@ -106,12 +107,19 @@ class _Strict(Composer, SafeConstructor, Resolver):
 
     def whole_number(self, node: yaml.ScalarNode) -> int:
         """Return a whole number that fits into 64 bits."""
+        _refuse_two_readings(node)
         return _whole_number(
             self.construct_yaml_int(node) if len(node.value) < 70 else node.value
         )
 
+    def real_number(self, node: yaml.ScalarNode) -> float:
+        """Return a number that YAML 1.1 and 1.2 read alike."""
+        _refuse_two_readings(node)
+        return self.construct_yaml_float(node)
+
     yaml_constructors: ClassVar = SafeConstructor.yaml_constructors | {
-        "tag:yaml.org,2002:int": whole_number
+        "tag:yaml.org,2002:int": whole_number,
+        "tag:yaml.org,2002:float": real_number,
     }
 
 
@@ -155,6 +163,22 @@ def _yaml_size(node: yaml.Node, size_of_node: dict[int, int]) -> int:
             _yaml_size(child, size_of_node) for child in children
         )
     return size_of_node[id(node)]
+
+
+TWO_READINGS = re.compile(r"[-+]?0[0-9]+|.*[_:].*")
+"""Numbers of YAML 1.1 alone: 045 is 37, 45:30 is 2730, 1_000 is 1000."""
+
+
+def _refuse_two_readings(node: yaml.ScalarNode) -> None:
+    """Raise ConstructorError for a number that YAML 1.1 and 1.2 read differently."""
+    if TWO_READINGS.fullmatch(node.value):
+        raise yaml.constructor.ConstructorError(
+            None,
+            None,
+            f"programs differ on what number {node.value[:20]} is: write it without"
+            " leading 0, _ and :, or a text in quotes",
+            node.start_mark,
+        )
 
 
 def _whole_number(value: int | str) -> int:

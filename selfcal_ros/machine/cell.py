@@ -292,12 +292,12 @@ def _numbers(
 
 
 def _pair(value: Any, where: str) -> tuple[float, float]:
-    numbers = (
-        [item for item in value if isinstance(item, int | float)]
-        if isinstance(value, list)
-        else []
-    )
-    if len(numbers) != 2 or not numbers[0] < numbers[1]:
+    numbers = value if isinstance(value, list) else []
+    if not (
+        len(numbers) == 2
+        and all(type(item) in (int, float) for item in numbers)
+        and numbers[0] < numbers[1]
+    ):
         raise InputError(
             where, f"{value!r} is not [low, high]", "give two rising numbers, SI"
         )

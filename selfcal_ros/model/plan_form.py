@@ -257,7 +257,7 @@ def _translation_m(raw: dict, where: str, artifact: Artifact) -> tuple[float, fl
             "give translation_mm: [a, b]",
         )
     shift = raw[keys[0]] if keys else [0, 0]
-    if len(shift) != 2 or not all(isinstance(s, int | float) for s in shift):
+    if len(shift) != 2 or not all(type(step) in (int, float) for step in shift):
         raise InputError(f"{where}: {keys[0]}", "not two numbers", "give [a, b]")
     if keys == ["translation_mm"]:
         return shift[0] / MM_PER_M, shift[1] / MM_PER_M

@@ -9,6 +9,7 @@ from typing import Any
 
 from selfcal_ros.errors import InputError, check_celsius, known_are
 from selfcal_ros.files import read_yaml
+from selfcal_ros.plain_numbers import number_of
 
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
 """Places of a calibration that the schema knows."""
@@ -46,7 +47,7 @@ def _date(value: Any) -> str | None:
 
 def _number(value: Any) -> float | None:
     try:
-        number = float(value) if not isinstance(value, bool) else math.nan
+        number = math.nan if isinstance(value, bool) else number_of(str(value))
     except (TypeError, ValueError):
         return None
     return number if abs(number) < 1e9 else None

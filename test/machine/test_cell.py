@@ -83,6 +83,14 @@ def test_a_cell_with_all_its_keys(tmp_path):
             "machine: simulated\nlimits: {x: [1, -1], y: [-1, 1]}\n",
             "[1, -1] is not [low, high]",
         ),
+        (
+            "machine: simulated\nlimits: {x: [-1, mm, 1], y: [-1, 1]}\n",
+            "[-1, 'mm', 1] is not [low, high]",
+        ),
+        (
+            "machine: simulated\nlimits: {x: [-1, 1], y: [false, true]}\n",
+            "[False, True] is not [low, high]",
+        ),
     ],
 )
 def test_a_wrong_key_is_named(tmp_path, text, said):

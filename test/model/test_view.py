@@ -328,6 +328,10 @@ def test_a_plate_without_angular_count_has_no_lines():
             "f: views[0]: translation_pitch: not two number",
         ),
         (
+            plan_with({"translation_pitch": [True, 0]}),
+            "f: views[0]: translation_pitch: not two number",
+        ),
+        (
             plan_with({"translation_pitch": [0.5, 0], "grid": False}),
             "view 'a' translation: 0.5 is not a whole number of pitch "
             "steps; place the plate on the latt",

@@ -696,6 +696,10 @@ def changed(value, *path):
             changed("warm", "conditions", 0, "value"),
             r"conditions\[0\].value: 'warm' is not a number",
         ),
+        (
+            changed("1_000", "conditions", 1, "value"),
+            r"conditions\[1\].value: '1_000' is not a number",
+        ),
         (changed("degF", "conditions", 0, "unit"), "'degF' is not one of degC"),
         (
             changed(293.55, "conditions", 0, "value"),
