@@ -79,6 +79,10 @@ class _Strict(Composer, SafeConstructor, Resolver):
         """Return the value of a node whose text is valid for its tag: `!!int ''` is not."""
         try:
             return super().construct_object(node, deep)
+        except ValueError as error:  # an invalid date, a number too long
+            raise yaml.constructor.ConstructorError(
+                None, None, first_line(error), node.start_mark
+            ) from error
         except (LookupError, AttributeError) as error:
             raise yaml.constructor.ConstructorError(
                 None,
@@ -375,7 +379,7 @@ def read_yaml(path: str | os.PathLike, *, as_written: bool = False) -> Any:
         ) from error
     except yaml.YAMLError as error:
         raise InputError(str(path), "not YAML", "give a YAML text file") from error
-    except (ValueError, RecursionError) as error:  # an invalid date, brackets too deep
+    except RecursionError as error:  # brackets too deep
         raise InputError(
             str(path), f"not usable YAML ({first_line(error)})", "correct the value"
         ) from error

@@ -340,7 +340,7 @@ def test_faults_in_json(tmp_path, text, message):
         ("- !!timestamp x", ":1:3: not YAML (not a value of the type timestamp)"),
         (
             "a: 2001-13-40",
-            ": not usable YAML (month must be in 1..12); correct the value",
+            ":1:4: not YAML (month must be in 1..12); correct the line",
         ),
         ("[" * 2_000, ": not usable YAML (maximum recursion depth"),
     ],
@@ -522,7 +522,7 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
         ("a: {b: 1, b: 1}\n", r"f\.yaml:1:11: not YAML \(the key 'b' is given twice\)"),
         (
             "a: " + "9" * 400,
-            r"f\.yaml: not usable YAML \(a whole number beyond 64 bits\); correct",
+            r"f\.yaml:1:4: not YAML \(a whole number beyond 64 bits\); correct",
         ),
         (
             "a: 045",
@@ -533,6 +533,7 @@ def test_what_json_writes_is_what_json_reads(tmp_path):
         ("a: 1_000", r"what number 1_000 is"),
         ("a: 1:30.5", r"what number 1:30\.5 is"),
         ("a: 0.000_1", r"what number 0\.000_1 is"),
+        ("a:\n  b: 2026-13-45", r"f\.yaml:2:6: not YAML \(month must be in 1\.\.12\)"),
         ("a: 9223372036854775808", "a whole number beyond 64 bits"),
         ("a: -9223372036854775809", "a whole number beyond 64 bits"),
         ("a: &a [*a]", "its aliases expand to more than 50000 values"),
