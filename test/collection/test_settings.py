@@ -174,6 +174,18 @@ def test_nested_namespaces_and_nested_names():
     assert overrides_in(dotted, "solver", "f") == {"a.b.c": 1, "d": 2}
 
 
+def test_cells_that_differ_are_refused():
+    text = "/left/measurement_collector: {ros__parameters: {max_speed: 0.5}}\n/right: "
+    right = "{measurement_collector: {ros__parameters: {max_speed: %s}}}\n"
+    assert values_in(text + right % 0.5).max_speed == 0.5
+    message = (
+        r"^p\.yaml: max_speed: differs between /left/measurement_collector and "
+        r"/right/measurement_collector; give a file of one cell$"
+    )
+    with pytest.raises(InputError, match=message):
+        values_in(text + right % 0.25)
+
+
 def test_sections_of_other_nodes_do_not_reach():
     text = "solver: {ros__parameters: {method: law}}\nbag_player: {ros__parameters: {rate: 0.0}}"
     assert values_in(text) == CollectorSettings.checked({}, "f")

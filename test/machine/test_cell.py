@@ -69,7 +69,10 @@ def test_a_cell_with_all_its_keys(tmp_path):
             f"{LIMITS}machine: simulated\nsettle: {{tim: 3}}\n",
             "tim: unknown key; did you mean 'time'?",
         ),
-        (f"{LIMITS}machine: simulated\nsettle: {{time: -3}}\n", "-3.0 is outside"),
+        (
+            f"{LIMITS}machine: simulated\nsettle: {{time: -3}}\n",
+            "settle: time: -3.0 is below 0.0; correct the value",
+        ),
         (
             f"{LIMITS}machine: simulated\norigin: {{x: low}}\n",
             "'low' is not of type float",

@@ -678,9 +678,11 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
     """Return what a parsed ROS parameter file sets for `node`, nested names joined by dots.
 
     Sections count if they are ``/**``, ``**``, the node's name, or end with ``/`` + its name;
-    a section of a node that this package does not have is an error.
+    a section of a node that this package does not have is an error, and so are two cells
+    that differ.
     """
     overrides: dict[str, Any] = {}
+    section_of: dict[str, str] = {}
     for name, section in _sections(data, "", where):
         last = name.rsplit("/", 1)[-1]
         if last not in ("**", "*") and last not in NODE_PARAMETERS:
@@ -701,6 +703,16 @@ def overrides_in(data: object, node: str, where: str) -> dict[str, Any]:
                     for key, value in flat.items()
                     if key in names_of_node or key not in everywhere
                 }
+            for key in flat if "*" not in name else ():
+                if (
+                    section_of.setdefault(key, name) != name
+                    and flat[key] != overrides[key]
+                ):
+                    raise InputError(
+                        f"{where}: {key}",
+                        f"differs between {section_of[key]} and {name}",
+                        "give a file of one cell",
+                    )
             overrides |= flat
     return overrides
 

@@ -63,7 +63,11 @@ class Parameter:
         ):
             raise InputError(
                 f"{where}: {self.name}",
-                f"{value} is outside {self.low} to {self.high} {self.unit}".rstrip(),
+                (
+                    f"{value} is below {self.low} {self.unit}"
+                    if self.high is None
+                    else f"{value} is outside {self.low} to {self.high} {self.unit}"
+                ).rstrip(),
                 "correct the value",
             )
         return value
