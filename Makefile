@@ -4,7 +4,7 @@ SHELL := /bin/bash
 BIN := .venv/bin
 
 QUICK := test/shipped/test_bags.py test/shipped/test_configs.py test/cli/test_mistakes.py test/cli/test_front.py \
-	test/cli/test_arguments.py test/cli/test_solve.py test/cli/test_apply.py test/sessions test/reporting/test_html.py \
+	test/cli/test_arguments.py test/cli/test_solve.py test/cli/test_apply.py test/nodes/sessions test/reporting/test_html.py \
 	test/test_house.py test/test_portable.py
 
 .PHONY: help setup demo quick test tests test-313 test-oldest lint ament-lint mistakes bench soak chaos power-cuts mutants reality \
@@ -49,7 +49,7 @@ test-313:  ## the quick tests with Python 3.13, where it is there
 		VENV=.venv-313 PYTHON=$$python tools/setup.sh && .venv-313/bin/python -m pytest -q -n 2 -m "not ros" $(QUICK)
 mistakes: setup  ## what newcomers type wrong, and whether one line helps
 	@$(BIN)/python tools/mistakes.py
-test-oldest:  ## with the libraries of Ubuntu 24.04, e.g. make test-oldest TESTS=test/laser
+test-oldest:  ## with the libraries of Ubuntu 24.04, e.g. make test-oldest TESTS=test/applications/laser
 	@pkg-config --exists freetype2 && test -e /usr/include/libqhull_r/qhull_ra.h || { \
 		echo "test-oldest: apt install pkg-config libfreetype-dev libqhull-dev" >&2; exit 2; }
 	@VENV=.venv-oldest PINS=tools/oldest.txt SOURCES=matplotlib MPLSETUPCFG="$$PWD/tools/matplotlib.cfg" \

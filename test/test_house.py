@@ -108,6 +108,13 @@ def test_libraries_are_imported_in_one_place_each():
             assert layer_of(path) == place, f"{path}: {name} belongs elsewhere"
 
 
+def test_sessions_decide_without_ros():
+    of_ros = {library for library, place in ONLY_IN.items() if place == "nodes"}
+    for path in (PACKAGE / "nodes/sessions").glob("*.py"):
+        used = {name.partition(".")[0] for name in imports(path)}
+        assert not used & of_ros, f"{path}: {used & of_ros} belongs into a node"
+
+
 def test_every_module_names_its_licence():
     first = "# SPDX-License-Identifier: Apache-2.0\n"
     assert [path for path in SOURCES if not source(path).text.startswith(first)] == []

@@ -7,26 +7,38 @@ from pathlib import Path
 
 import pytest
 
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
+from selfcal_ros.settings.nodes import NODE_PARAMETERS
 from test.support.sources import PACKAGE, ROOT, SOURCES, source
 
-ESTIMATION = (
-    "options",
-    "checks",
-    "lattice",
-    "multifrontal",
-    "normal",
-    "datum",
-    "terms",
-    "observability",
-    "joint",
-    "verdict",
-    "comparison",
-    "recheck",
-    "quality",
-    "api",
-)
-"""The parts of estimation/: each imports only those before it."""
+PARTS = {
+    "estimation": (
+        "options",
+        "checks",
+        "lattice",
+        "multifrontal",
+        "normal",
+        "datum",
+        "terms",
+        "observability",
+        "joint",
+        "verdict",
+        "comparison",
+        "recheck",
+        "quality",
+        "api",
+    ),
+    "applications": (
+        "laser",
+        "papers",
+        "batch",
+        "aerotech",
+        "controllers",
+        "standards",
+    ),
+    "bagio": ("messages",),
+    "nodes": ("sessions",),
+}
+"""The parts of packages: each imports only those before it, and no module beside them."""
 
 
 def dotted(path: Path) -> str:
@@ -94,18 +106,27 @@ def test_no_module_imports_itself_through_others():
     assert circle_in(graph()) == []
 
 
-def part_of(module: str) -> str:
-    return module.split(".")[2]
+@pytest.mark.parametrize("package", PARTS)
+def test_the_parts_of_a_package_import_only_those_before_them(package):
+    parts = PARTS[package]
+    inside = f"selfcal_ros.{package}."
 
+    def place_of(module: str) -> int:
+        part = module.removeprefix(inside).partition(".")[0]
+        return parts.index(part) if part in parts else len(parts)
 
-def test_the_parts_of_estimation_import_only_those_before_them():
-    parts = sorted(name for name in NAMES if name.startswith("selfcal_ros.estimation."))
-    for module in parts:
-        place = ESTIMATION.index(part_of(module))
-        for other in graph()[module].intersection(parts):
-            assert ESTIMATION.index(part_of(other)) <= place, (
+    modules = sorted(name for name in NAMES if name.startswith(inside))
+    for module in modules:
+        for other in graph()[module].intersection(modules):
+            assert place_of(other) <= place_of(module), (
                 f"{module} imports the later {other}: move what they share to an earlier part"
             )
+
+
+def test_every_part_of_a_package_has_its_place():
+    for package, parts in PARTS.items():
+        folders = {path.parent.name for path in (PACKAGE / package).glob("*/*.py")}
+        assert folders <= {*parts}, f"give {folders - {*parts}} a place in PARTS"
 
 
 def test_imports_in_functions_state_their_reason():

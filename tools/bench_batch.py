@@ -92,7 +92,7 @@ def timed(bags: Path, out: Path, workers: int) -> tuple[float, float]:
 SOLVER = """
 import sys, time
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.collection.settings.nodes import CollectorSettings
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.api import calibrate
 def solve():
     calibrate(collect_bag(sys.argv[1], CollectorSettings.checked({}, "bench")).measurements)

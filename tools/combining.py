@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal_ros.applications.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.combine import Combination, Member, combine
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import datum_modes, remove_modes
-from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.parallel import check_workers, outcomes
 from selfcal_ros.simulation.machine import random_truth
 

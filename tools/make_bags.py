@@ -17,13 +17,13 @@ import yaml
 from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import TRUTH_FILE, bag_input, collect_bag
 from selfcal_ros.cli.replay import domain, process
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.outputs import write_text
 from selfcal_ros.reporting.summary.numbers import summary_numbers
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.simulation.bag import write_simulation
 from selfcal_ros.simulation.spec import read_simulation
 from selfcal_ros.units import PPM_PER_ONE, URAD_PER_RAD

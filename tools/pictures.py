@@ -10,9 +10,6 @@ import numpy as np
 from PIL import Image
 
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult, with_input
@@ -23,6 +20,9 @@ from selfcal_ros.reporting.figures.places import plan_figure
 from selfcal_ros.reporting.figures.svg import svg_file
 from selfcal_ros.reporting.summary.numbers import truth_arrays
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.simulation.rendering import Camera, Exposure
 from selfcal_ros.simulation.spec import read_simulation
 from selfcal_ros.vision.detector import MarkDetector

@@ -11,12 +11,12 @@ from typing import Any
 
 from yaml import safe_dump
 
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
-from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.plan_form import plan_from_dict
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.outputs import write_text
+from selfcal_ros.settings.nodes import NODE_PARAMETERS
+from selfcal_ros.settings.parameter import Parameter
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs/reference/reference.md"
@@ -293,9 +293,9 @@ def example() -> dict[str, Any]:
     """Return the RESULT.json of a small simulated measurement."""
     import numpy as np
 
+    from selfcal_ros.applications.papers.readings import hu_plan, simulate_measurements
     from selfcal_ros.estimation.api import calibrate
     from selfcal_ros.model.artifact import Artifact
-    from selfcal_ros.papers.readings import hu_plan, simulate_measurements
     from selfcal_ros.reporting.words.findings import worded
     from selfcal_ros.simulation.machine import random_truth
 

@@ -14,16 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal_ros.laser import simulation as measure
-from selfcal_ros.laser.data import (
+from selfcal_ros.applications.laser import simulation as measure
+from selfcal_ros.applications.laser.data import (
     DIAGONALS,
     Closure,
     Method,
     StepDiagonal,
     StepDiagonalResult,
 )
-from selfcal_ros.laser.identify import Choice, identify
-from selfcal_ros.laser.profiles import squareness, straightness
+from selfcal_ros.applications.laser.identify import Choice, identify
+from selfcal_ros.applications.laser.profiles import squareness, straightness
 from selfcal_ros.reporting.figures.drawing import SERIES, Drawing
 from selfcal_ros.reporting.figures.paper import save_picture
 from selfcal_ros.reporting.figures.parts import Curve, chart, legend, titled

@@ -28,16 +28,16 @@ from rclpy.node import Node
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
+from selfcal_ros.applications.papers.readings import hu_plan, simulate_measurements
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.writer import build
 from selfcal_ros.cli.processes import domain, process
 from selfcal_ros.collection.inputs import Phase
 from selfcal_ros.files import read_json
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
-from selfcal_ros.papers.readings import hu_plan, simulate_measurements
 from selfcal_ros.simulation.machine import random_truth
 
 ROOT = Path(__file__).parents[1]

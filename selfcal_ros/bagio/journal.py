@@ -28,11 +28,11 @@ from selfcal_ros.bagio.journal_file import (
     records,
     scan_file,
 )
+from selfcal_ros.bagio.messages.to_model import stamp_ns
 from selfcal_ros.bagio.schemas import ChannelDecoder, definition_of, store_of_schema
 from selfcal_ros.bagio.writer import BagTopic, Closing, Metadata, writing
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
 from selfcal_ros.errors import InputError, SelfcalError
-from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S, S_PER_NS
 

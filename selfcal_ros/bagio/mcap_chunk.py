@@ -23,7 +23,7 @@ from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
 from mcap.stream_reader import CRCValidationError, breakup_chunk
 
 from selfcal_ros.bagio import mcap_salvage
-from selfcal_ros.messages.cdr import Payloads
+from selfcal_ros.bagio.messages.cdr import Payloads
 
 FRONT = mcap_salvage.HEAD.size + mcap_salvage.MESSAGE_FRONT
 """Bytes of a message record before its payload."""

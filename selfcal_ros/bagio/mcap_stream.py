@@ -21,8 +21,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema, Statistics
 
 from selfcal_ros.bagio import mcap_chunk, mcap_salvage
+from selfcal_ros.bagio.messages.cdr import Payloads
 from selfcal_ros.errors import InputError, first_line
-from selfcal_ros.messages.cdr import Payloads
 
 CHECKED = (
     Opcode.HEADER,

@@ -12,6 +12,7 @@ from mcap.records import Channel
 
 from selfcal_ros.bagio.mcap_chunk import MessageBlock
 from selfcal_ros.bagio.mcap_stream import CONVERT, McapStream, streams
+from selfcal_ros.bagio.messages.to_model import first_stamps_ns
 from selfcal_ros.bagio.schemas import (
     ChannelDecoder,
     Input,
@@ -22,10 +23,9 @@ from selfcal_ros.bagio.schemas import (
 )
 from selfcal_ros.collection.clock_steps import ClockStep, StepWatch, future_lines
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml
-from selfcal_ros.messages.to_model import first_stamps_ns
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     DETECTION_TOPIC,

@@ -22,9 +22,8 @@ from rosbags.typesys import (
 )
 from rosbags.typesys.store import Typestore
 
-from selfcal_ros.errors import InputError, first_line
-from selfcal_ros.messages import to_model
-from selfcal_ros.messages.cdr import (
+from selfcal_ros.bagio.messages import to_model
+from selfcal_ros.bagio.messages.cdr import (
     LITTLE,
     MAX_LENGTH,
     SEQUENCE,
@@ -35,6 +34,7 @@ from selfcal_ros.messages.cdr import (
     Payloads,
     layout_of,
 )
+from selfcal_ros.errors import InputError, first_line
 from selfcal_ros.topics import (
     DETECTION_TOPIC,
     ENCODER_TOPIC,

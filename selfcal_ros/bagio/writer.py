@@ -20,9 +20,9 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Nodetype
 from rosbags.typesys.store import Typestore
 
+from selfcal_ros.bagio.messages.from_model import Fields
 from selfcal_ros.bagio.schemas import definition_of, hash_of, store_with
 from selfcal_ros.errors import InputError
-from selfcal_ros.messages.from_model import Fields
 from selfcal_ros.outputs import temporary_folder, write_text
 
 CHUNK_SIZE = 256 * 1024

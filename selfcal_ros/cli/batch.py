@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from selfcal_ros.batch.course import compared, sentence
-from selfcal_ros.batch.folder import (
+from selfcal_ros.applications.batch.course import compared, sentence
+from selfcal_ros.applications.batch.folder import (
     BatchJob,
     BatchSettings,
     Record,
@@ -18,9 +18,9 @@ from selfcal_ros.batch.folder import (
     kept_records,
     opened,
 )
-from selfcal_ros.batch.jobs import run_job
-from selfcal_ros.batch.page import page_html
-from selfcal_ros.batch.table import (
+from selfcal_ros.applications.batch.jobs import run_job
+from selfcal_ros.applications.batch.page import page_html
+from selfcal_ros.applications.batch.table import (
     batch_json,
     csv_text,
     series_of,
@@ -77,7 +77,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve the remaining bags, write the table and the page, print a summary."""
     if not args.dask:  # first: the modules of the workers load in parallel
-        begin("selfcal_ros.batch.jobs", check_workers(args.workers))
+        begin("selfcal_ros.applications.batch.jobs", check_workers(args.workers))
 
     if args.dask and args.dask != LOCAL and ":" not in args.dask:
         raise InputError(

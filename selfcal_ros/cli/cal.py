@@ -10,26 +10,31 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from selfcal_ros.aerotech import export
-from selfcal_ros.aerotech.evaluate import AxisSetup, CalEvaluator, MachineSetup
-from selfcal_ros.aerotech.model import Severity, Table1D, Table2D
-from selfcal_ros.aerotech.one_axis import OneAxisFit
-from selfcal_ros.aerotech.read import (
+from selfcal_ros.applications.aerotech import export
+from selfcal_ros.applications.aerotech.evaluate import (
+    AxisSetup,
+    CalEvaluator,
+    MachineSetup,
+)
+from selfcal_ros.applications.aerotech.model import Severity, Table1D, Table2D
+from selfcal_ros.applications.aerotech.one_axis import OneAxisFit
+from selfcal_ros.applications.aerotech.read import (
     load_cal,
     load_cals,
     parse_cal,
     read_cal,
     refuse_errors,
 )
-from selfcal_ros.aerotech.rules import Gi4
-from selfcal_ros.aerotech.verify import (
+from selfcal_ros.applications.aerotech.rules import Gi4
+from selfcal_ros.applications.aerotech.verify import (
     controller_figure,
     frame_of_file,
     plane_correction,
     setup_of,
     verify_tables,
 )
-from selfcal_ros.aerotech.write import cal_text
+from selfcal_ros.applications.aerotech.write import cal_text
+from selfcal_ros.applications.controllers.export import place_to_look
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
@@ -42,7 +47,6 @@ from selfcal_ros.compensation.residual import (
     bends_between,
     combined,
 )
-from selfcal_ros.controllers.export import place_to_look
 from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check_celsius
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import plain

@@ -16,10 +16,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from selfcal_ros import __version__
-from selfcal_ros.aerotech import export as cal_lines
-from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
-from selfcal_ros.aerotech.header import SMALLEST, ArgumentFault, number
-from selfcal_ros.aerotech.write import cal_text
+from selfcal_ros.applications.aerotech import export as cal_lines
+from selfcal_ros.applications.aerotech.export import (
+    DECIMALS,
+    AxisCorrection,
+    line_table,
+)
+from selfcal_ros.applications.aerotech.header import SMALLEST, ArgumentFault, number
+from selfcal_ros.applications.aerotech.write import cal_text
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say, tell
 from selfcal_ros.compensation.export import origin_lines, verdict_lines

@@ -10,10 +10,10 @@ import numpy as np
 
 from selfcal_ros.bagio.images import ImageBag, encoder_track, read_positions
 from selfcal_ros.cli.terminal import add_json, say
-from selfcal_ros.collection.settings.detector import ANY_NUMBER, DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.settings.detector import ANY_NUMBER, DetectorSettings
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
 from selfcal_ros.vision.exposures import ImageDetector

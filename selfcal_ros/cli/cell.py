@@ -12,12 +12,12 @@ from pathlib import Path
 from selfcal_ros.cli.camera import pose_text
 from selfcal_ros.cli.processes import need_ros, process, ros_arguments
 from selfcal_ros.cli.terminal import add_json, aside, put, say, tell
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.machine.cell import connected, read_cell, with_values
 from selfcal_ros.machine.trying import Trial, values_of
 from selfcal_ros.outputs import write_bytes
 from selfcal_ros.portable import ended_by_signals
+from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.units import M_PER_UM
 from selfcal_ros.vision.drawing import circled
 

@@ -3,13 +3,13 @@
 
 import argparse
 
+from selfcal_ros.applications.standards.dcc import certificate
+from selfcal_ros.applications.standards.details import read_details
+from selfcal_ros.applications.standards.statements import is_traceable
 from selfcal_ros.cli.deliver import deliver
 from selfcal_ros.cli.terminal import add_json, file_of
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.results import read_result
-from selfcal_ros.standards.dcc import certificate
-from selfcal_ros.standards.details import read_details
-from selfcal_ros.standards.statements import is_traceable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

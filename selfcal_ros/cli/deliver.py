@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from selfcal_ros.aerotech.write import write_cals
+from selfcal_ros.applications.aerotech.write import write_cals
 from selfcal_ros.cli.terminal import STDOUT, exit_code, say
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, utf8, write_bytes

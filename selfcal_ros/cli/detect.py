@@ -12,15 +12,15 @@ from pathlib import Path
 from selfcal_ros.bagio.images import ImageBag, read_positions, write_pictures
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.cli.terminal import add_json, add_parameters, given, node_settings, say
-from selfcal_ros.collection.settings.detector import (
+from selfcal_ros.errors import InputError
+from selfcal_ros.files import read_bytes
+from selfcal_ros.outputs import write_bytes
+from selfcal_ros.settings.detector import (
     ANY_NUMBER,
     OPTIONS,
     DetectorSettings,
 )
-from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.errors import InputError
-from selfcal_ros.files import read_bytes
-from selfcal_ros.outputs import write_bytes
+from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.vision.detector import Judged, Mark
 from selfcal_ros.vision.drawing import circled
 from selfcal_ros.vision.exposures import ImageDetector

@@ -4,12 +4,12 @@
 import argparse
 import sys
 
+from selfcal_ros.applications.controllers.export import FORMATS, export, loaded
+from selfcal_ros.applications.controllers.grid import Source, Wiring
 from selfcal_ros.cli.cal import figures_of, numbered, ready, residual_text, say_bent
 from selfcal_ros.cli.cal_lines import add_frame, frame_of, numbers
 from selfcal_ros.cli.deliver import command, replace_files, replaced
 from selfcal_ros.cli.terminal import add_json, exit_code, say
-from selfcal_ros.controllers.export import FORMATS, export, loaded
-from selfcal_ros.controllers.grid import Source, Wiring
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
 

@@ -8,19 +8,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.cli.cal import ready
-from selfcal_ros.cli.cal_lines import add_frame, frame_of
-from selfcal_ros.cli.deliver import command, deliver
-from selfcal_ros.cli.terminal import add_json, file_of
-from selfcal_ros.compensation.export import origin_lines
-from selfcal_ros.controllers.gcode import (
+from selfcal_ros.applications.controllers.gcode import (
     OF_SAMPLES,
     Rewriter,
     commented,
     corrected_program,
 )
-from selfcal_ros.controllers.gcode_codes import DIALECTS
-from selfcal_ros.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
+from selfcal_ros.applications.controllers.gcode_codes import DIALECTS
+from selfcal_ros.applications.controllers.grid import ROUNDING_M, Wiring, nodes, wanted
+from selfcal_ros.cli.cal import ready
+from selfcal_ros.cli.cal_lines import add_frame, frame_of
+from selfcal_ros.cli.deliver import command, deliver
+from selfcal_ros.cli.terminal import add_json, file_of
+from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
 from selfcal_ros.model.error_map import ErrorMap

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.batch.history import Drift, Entry, drift_from, history
+from selfcal_ros.applications.batch.history import Drift, Entry, drift_from, history
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.comparison.maps import MapDifference

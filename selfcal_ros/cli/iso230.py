@@ -7,18 +7,18 @@ import argparse
 import sys
 from typing import Any
 
+from selfcal_ros.applications.standards import iso230
+from selfcal_ros.applications.standards.iso230 import AxisFigures, PathFigures
 from selfcal_ros.apply import StageMap, load
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.readings import Measurements, Sense
 from selfcal_ros.outputs import plain
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.standards import iso230
-from selfcal_ros.standards.iso230 import AxisFigures, PathFigures
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.units import M_PER_MM, MM_PER_M, UM_PER_M
 
 

@@ -12,13 +12,13 @@ from selfcal_ros.cli import solve, verify
 from selfcal_ros.cli.terminal import add_json, aside
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.machine.cell import connected, read_cell
 from selfcal_ros.machine.interface import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.outputs import can_print_symbols, to_ascii
 from selfcal_ros.portable import ended_by_signals, say_no_more
+from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.units import MM_PER_M, NM_PER_M
 
 

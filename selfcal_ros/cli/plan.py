@@ -13,7 +13,6 @@ from typing import Any
 from selfcal_ros.cli import plan_new, plan_terms
 from selfcal_ros.cli.recheck import planned
 from selfcal_ros.cli.terminal import busy, late_progress, tell
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.normal.equations import KNOWN
 from selfcal_ros.estimation.observability.plan_check import (
@@ -47,6 +46,7 @@ from selfcal_ros.outputs import check_outputs, plain
 from selfcal_ros.reporting.summary.numbers import counted
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.tables import plan_budget_text, search_text, step_text
+from selfcal_ros.settings.estimator import read_plan
 from selfcal_ros.units import MM_PER_M, UM_PER_M
 
 SHOWN = 8

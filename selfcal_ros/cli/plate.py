@@ -4,11 +4,11 @@
 import argparse
 
 from selfcal_ros.cli.terminal import add_json, say
-from selfcal_ros.collection.settings.detector import MARKS
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.outputs import check_outputs
 from selfcal_ros.reporting.artwork import PAPERS_MM, artwork_of, save_artwork
+from selfcal_ros.settings.detector import MARKS
+from selfcal_ros.settings.estimator import read_plan
 
 ON_PAPER = (
     "paper and a printer are true to about 0.1 mm: enough to try a camera or a printer's "

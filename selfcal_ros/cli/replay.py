@@ -35,17 +35,17 @@ from selfcal_ros.cli.terminal import (
     show,
 )
 from selfcal_ros.collection.inputs import rejections
-from selfcal_ros.collection.settings.detector import (
-    ANY_NUMBER,
-    OPTIONS,
-    DetectorSettings,
-)
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_json, write_yaml
 from selfcal_ros.model.result import result_from_dict, with_digests
 from selfcal_ros.outputs import check_outputs, temporary_folder, write_json
 from selfcal_ros.portable import ended_by_signals
+from selfcal_ros.settings.detector import (
+    ANY_NUMBER,
+    OPTIONS,
+    DetectorSettings,
+)
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import INPUT_TOPICS
 
 AS_RECORDED = -1

@@ -6,8 +6,10 @@ import os
 import sys
 from pathlib import Path
 
-from selfcal_ros.aerotech.read import load_cal
-from selfcal_ros.aerotech.verify import table_chapter
+from selfcal_ros.applications.aerotech.read import load_cal
+from selfcal_ros.applications.aerotech.verify import table_chapter
+from selfcal_ros.applications.standards.chapter import certificate_chapter, certified
+from selfcal_ros.applications.standards.details import read_details
 from selfcal_ros.cli.arguments import refuse_existing
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import InputError
@@ -18,8 +20,6 @@ from selfcal_ros.reporting.figures.maps import map_picture
 from selfcal_ros.reporting.report import check_name, write_report
 from selfcal_ros.reporting.summary.sections import summary_text
 from selfcal_ros.results import read_result
-from selfcal_ros.standards.chapter import certificate_chapter, certified
-from selfcal_ros.standards.details import read_details
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -5,13 +5,17 @@ import argparse
 import sys
 from pathlib import Path
 
+from selfcal_ros.applications.papers.figures import hu_figures, qiao_figures
+from selfcal_ros.applications.papers.hu import hu_text, reproduce_hu
+from selfcal_ros.applications.papers.ibaraki import (
+    CASE_STUDY_UM,
+    ibaraki_text,
+    reproduce_ibaraki,
+)
+from selfcal_ros.applications.papers.qiao import SIZES, qiao_text, reproduce_qiao
 from selfcal_ros.cli.terminal import add_json, late_progress, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.outputs import write_text
-from selfcal_ros.papers.figures import hu_figures, qiao_figures
-from selfcal_ros.papers.hu import hu_text, reproduce_hu
-from selfcal_ros.papers.ibaraki import CASE_STUDY_UM, ibaraki_text, reproduce_ibaraki
-from selfcal_ros.papers.qiao import SIZES, qiao_text, reproduce_qiao
 from selfcal_ros.parallel import Progress, check_workers
 from selfcal_ros.reporting.figures.drawing import Drawing
 

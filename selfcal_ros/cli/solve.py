@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from selfcal_ros.applications.papers.methods import calibrate_by
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
 from selfcal_ros.blocks import BUILT_IN
 from selfcal_ros.cli.terminal import (
@@ -25,11 +26,6 @@ from selfcal_ros.cli.terminal import (
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.collection.reduce import with_places
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import (
-    CollectorSettings,
-    SolverSettings,
-)
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
@@ -45,7 +41,6 @@ from selfcal_ros.model.result import (
 )
 from selfcal_ros.model.terms import microscope_term
 from selfcal_ros.outputs import check_outputs, write_json
-from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.observability import with_advice
@@ -54,6 +49,11 @@ from selfcal_ros.reporting.words.tables import (
     budget_text,
     validation_json,
     validation_text,
+)
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import (
+    CollectorSettings,
+    SolverSettings,
 )
 
 

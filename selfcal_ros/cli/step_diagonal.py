@@ -8,39 +8,55 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from selfcal_ros import __version__
-from selfcal_ros.aerotech.export import DECIMALS, AxisCorrection, line_table
-from selfcal_ros.aerotech.model import Table1D
-from selfcal_ros.aerotech.write import cal_text, refuse_existing, write_cals
-from selfcal_ros.cli.cal_lines import add_frame, frame_of
-from selfcal_ros.cli.terminal import add_json, busy, put, say, tell
-from selfcal_ros.compensation.frame import MachineFrame
-from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.files import read_yaml, sha256_of
-from selfcal_ros.laser.bag import SeriesTopics, read_series
-from selfcal_ros.laser.data import (
+from selfcal_ros.applications.aerotech.export import (
+    DECIMALS,
+    AxisCorrection,
+    line_table,
+)
+from selfcal_ros.applications.aerotech.model import Table1D
+from selfcal_ros.applications.aerotech.write import (
+    cal_text,
+    refuse_existing,
+    write_cals,
+)
+from selfcal_ros.applications.laser.bag import SeriesTopics, read_series
+from selfcal_ros.applications.laser.data import (
     DIAGONALS,
     Form,
     Method,
     StepDiagonal,
     StepDiagonalResult,
 )
-from selfcal_ros.laser.identify import (
+from selfcal_ros.applications.laser.identify import (
     EQUAL_READINGS,
     Choice,
     identify,
     readings_are_equal,
 )
-from selfcal_ros.laser.profiles import ReferenceLine, axis_corrections
-from selfcal_ros.laser.report import outcome, profiles_figure, summary, truth_of
-from selfcal_ros.laser.simulation import simulate_step_diagonal, simulation_from_dict
-from selfcal_ros.laser.table import (
+from selfcal_ros.applications.laser.profiles import ReferenceLine, axis_corrections
+from selfcal_ros.applications.laser.report import (
+    outcome,
+    profiles_figure,
+    summary,
+    truth_of,
+)
+from selfcal_ros.applications.laser.simulation import (
+    simulate_step_diagonal,
+    simulation_from_dict,
+)
+from selfcal_ros.applications.laser.table import (
     RequiredColumns,
     dimension_of,
     read_table,
     table_text,
     write_table,
 )
-from selfcal_ros.laser.zigzag import CutRule, cut_zigzag
+from selfcal_ros.applications.laser.zigzag import CutRule, cut_zigzag
+from selfcal_ros.cli.cal_lines import add_frame, frame_of
+from selfcal_ros.cli.terminal import add_json, busy, put, say, tell
+from selfcal_ros.compensation.frame import MachineFrame
+from selfcal_ros.errors import ExitCode, InputError
+from selfcal_ros.files import read_yaml, sha256_of
 from selfcal_ros.outputs import check_outputs, write_json, write_text
 from selfcal_ros.units import M_PER, M_PER_MM, M_PER_UM
 

@@ -9,13 +9,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TextIO
 
-from selfcal_ros.collection.settings.nodes import overrides_in
-from selfcal_ros.collection.settings.parameter import Settings
 from selfcal_ros.errors import ExitCode, printable
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
 from selfcal_ros.outputs import can_print_symbols, json_text, to_ascii
+from selfcal_ros.settings.nodes import overrides_in
+from selfcal_ros.settings.parameter import Settings
 
 STDOUT = "-"
 """Name of an output file: the result goes to stdout, everything else to stderr."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from selfcal_ros.cli.monitor import watch
 from selfcal_ros.cli.processes import Supervisor, eyes, need_ros, ros_arguments
 from selfcal_ros.cli.terminal import add_json
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.cell import read_cell
 from selfcal_ros.portable import ended_by_signals
+from selfcal_ros.settings.estimator import read_plan
 
 MOST_OF_A_NAME = 200
 """Characters of the name of a folder, below the limit of file systems."""

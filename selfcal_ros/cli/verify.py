@@ -7,8 +7,6 @@ import sys
 from selfcal_ros.bagio.offline import bag_input, collect_bag
 from selfcal_ros.cli import solve
 from selfcal_ros.cli.terminal import busy, progress_bar, say, say_unless_qualified
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.api import calibrate_corrected
 from selfcal_ros.estimation.checks.placing import PlacingError
@@ -26,6 +24,8 @@ from selfcal_ros.reporting.words.verification import (
     with_verification,
 )
 from selfcal_ros.results import read_result
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import SolverSettings
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -20,7 +20,6 @@ from selfcal_ros.collection.marks.identify import IdentityRules
 from selfcal_ros.collection.marks.stops import count_stops
 from selfcal_ros.collection.reduce import Rules
 from selfcal_ros.collection.samples import Limits
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.timeline import (
     Timeline,
     ViewCache,
@@ -30,6 +29,7 @@ from selfcal_ros.collection.timeline import (
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import plan_keys
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import COMMAND_TOPIC
 from selfcal_ros.units import NS_PER_S
 

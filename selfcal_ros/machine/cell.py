@@ -13,14 +13,14 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
 
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.errors import InputError, first_line, known_are
 from selfcal_ros.files import read_text, read_yaml
 from selfcal_ros.machine.calling import called
 from selfcal_ros.machine.interface import Machine, MachineError
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.outputs import write_text
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.parameter import Parameter
 
 AXES = ("x", "y", "theta")
 ENTRY_POINTS = "selfcal.machines"

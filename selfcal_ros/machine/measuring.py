@@ -22,7 +22,6 @@ from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
 from selfcal_ros.collection.sequencer import ENDED, Sequencer, State
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.placing import Misplaced, misplaced, placing_error
 from selfcal_ros.estimation.checks.wiring import check_wiring
@@ -40,6 +39,7 @@ from selfcal_ros.model.readings import (
     placing_digest,
 )
 from selfcal_ros.model.view import Plan
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     INPUT_TOPICS,

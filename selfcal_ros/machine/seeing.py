@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from selfcal_ros.collection.inputs import Detection, Kind
-from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.interface import Image, MachineError, Offset
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.vision.images import Picture
 
 if TYPE_CHECKING:

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from selfcal_ros.collection.inputs import EncoderSample
-from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.machine.cell import Cell
 from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.interface import Image, Machine, MachineError
 from selfcal_ros.machine.visiting import Visitor
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.units import NS_PER_S, UM_PER_M
 from selfcal_ros.vision.camera_pose import CameraPose, camera_pose, require_size
 from selfcal_ros.vision.detector import LARGEST_SIZE, SMALLEST_SIZE, MarkDetector

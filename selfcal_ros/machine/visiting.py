@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind
 from selfcal_ros.errors import NoDataError, first_line
 from selfcal_ros.machine.calling import called
@@ -21,7 +22,6 @@ from selfcal_ros.machine.clock import Clock
 from selfcal_ros.machine.duty import Again
 from selfcal_ros.machine.interface import Image, Machine, MachineError, Offset
 from selfcal_ros.machine.seeing import Eye
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import View

@@ -7,12 +7,12 @@ from typing import Any
 
 from rclpy.task import Future
 
-from selfcal_ros.collection.settings.nodes import CollectorSettings, PlayerSettings
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.health import Diagnosis, Level
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
+from selfcal_ros.settings.nodes import CollectorSettings, PlayerSettings
 
 STALLED_S = 2.0
 """Time after which a listener that takes no further messages is a warning."""

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from selfcal_ros.bagio.writer import BagWriter
-from selfcal_ros.collection.settings.nodes import RecorderSettings
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.names import MatchedInput, kept_names, offered
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.health import Diagnosis, Level
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
+from selfcal_ros.settings.nodes import RecorderSettings
 
 
 class BagRecorder(SelfcalNode[RecorderSettings]):

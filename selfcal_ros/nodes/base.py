@@ -17,7 +17,6 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.publisher import Publisher
 from rclpy.timer import Timer
 
-from selfcal_ros.collection.settings.parameter import BARE_Y, Parameter, Settings
 from selfcal_ros.errors import InputError, printable
 from selfcal_ros.nodes.callbacks import WithInfo
 from selfcal_ros.nodes.filling import fill, status_of
@@ -29,8 +28,8 @@ from selfcal_ros.nodes.names import (
     private,
 )
 from selfcal_ros.nodes.services import Answering
-from selfcal_ros.sessions.clocks import RosTime
-from selfcal_ros.sessions.health import (
+from selfcal_ros.nodes.sessions.clocks import RosTime
+from selfcal_ros.nodes.sessions.health import (
     Diagnosis,
     Level,
     Losses,
@@ -38,6 +37,7 @@ from selfcal_ros.sessions.health import (
     Refusals,
     merged,
 )
+from selfcal_ros.settings.parameter import BARE_Y, Parameter, Settings
 
 BEAT_S = 1.0  # between two health messages
 

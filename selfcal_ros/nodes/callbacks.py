@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from rclpy.waitable import Waitable
 
 from selfcal_ros.errors import as_answer
-from selfcal_ros.sessions.health import Refusals
+from selfcal_ros.nodes.sessions.health import Refusals
 
 TASKS = ("execute", "_execute_goal", "_send_result_response")
 """Methods of events and actions of rclpy run as tasks by an executor."""

@@ -14,16 +14,16 @@ from typing import Any
 
 from rclpy.task import Future
 
-from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.names import MatchedInput
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.cell_check import CellCheck
-from selfcal_ros.sessions.health import Level
+from selfcal_ros.nodes.sessions.cell_check import CellCheck
+from selfcal_ros.nodes.sessions.health import Level
+from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.settings.nodes import CollectorSettings
 
 OF_A_CELL = ("cell_driver", "mark_detector")
 """Nodes of this package that are part of a cell."""

@@ -4,15 +4,15 @@
 import sys
 from typing import Any
 
-from selfcal_ros.collection.settings.nodes import DriverSettings
+from selfcal_ros.bagio.messages import to_model
 from selfcal_ros.errors import InputError
 from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.machine.driver import Driver
-from selfcal_ros.messages import to_model
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.running import run
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.nodes.telling import CellNode
-from selfcal_ros.sessions.health import Diagnosis, Level
+from selfcal_ros.settings.nodes import DriverSettings
 
 TICK_S = 0.005
 """Time between two looks for what the machine has told."""

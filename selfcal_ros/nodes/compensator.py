@@ -10,15 +10,15 @@ from typing import Any
 
 from selfcal_msgs.srv import Correct
 
-from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.polling import ByTheClock
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.compensating import CompensatingSession
-from selfcal_ros.sessions.health import Diagnosis, Level, merged
+from selfcal_ros.nodes.sessions.compensating import CompensatingSession
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level, merged
+from selfcal_ros.settings.nodes import CompensatorSettings
 
 LOOK_S = 0.1
 """Time between two looks at the publishers of maps."""

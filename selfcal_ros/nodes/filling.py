@@ -12,11 +12,11 @@ from geometry_msgs.msg import Point
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from selfcal_ros.bagio.messages.from_model import header
 from selfcal_ros.errors import printable
-from selfcal_ros.messages.from_model import header
 from selfcal_ros.model.error_map import ErrorMap
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.reporting.figures.drawing import round_down
-from selfcal_ros.sessions.health import Diagnosis, Level
 from selfcal_ros.units import UM_PER_M
 
 MOST_SITES = 51

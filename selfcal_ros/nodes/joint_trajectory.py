@@ -17,8 +17,8 @@ from sensor_msgs.msg import Image as ImageMessage
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from selfcal_ros.bagio.messages.to_model import stamp_ns
 from selfcal_ros.machine.interface import Image, MachineError, Offset
-from selfcal_ros.messages.to_model import stamp_ns
 from selfcal_ros.vision.images import picture_of
 
 LEAST_S = 0.1

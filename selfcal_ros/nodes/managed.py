@@ -10,10 +10,10 @@ from typing import Any
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.errors import SelfcalError, first_line
 from selfcal_ros.nodes.base import NodeBase
-from selfcal_ros.sessions.health import Diagnosis, Level
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
+from selfcal_ros.settings.parameter import ManagedSettings
 
 
 class WhileConfigured[T]:

@@ -7,7 +7,6 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import BEAT_S
 from selfcal_ros.nodes.filling import fill
@@ -15,7 +14,8 @@ from selfcal_ros.nodes.managed import WhileConfigured
 from selfcal_ros.nodes.names import MatchedInput
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.detecting import DetectingSession
+from selfcal_ros.nodes.sessions.detecting import DetectingSession
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.topics import IMAGE_TOPICS
 
 TICK_S = 0.2

@@ -10,7 +10,6 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from selfcal_ros.collection.collector import keep_freed_memory
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import BEAT_S
@@ -18,10 +17,11 @@ from selfcal_ros.nodes.managed import WhileConfigured, stop
 from selfcal_ros.nodes.names import MatchedInput, kept_names, offered
 from selfcal_ros.nodes.polling import ByTheClock, PollingNode, wake
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.collecting import CollectingSession
-from selfcal_ros.sessions.health import Diagnosis, merged
-from selfcal_ros.sessions.journal_keeper import JournalKeeper, KeptTopic
-from selfcal_ros.sessions.reception import Reception
+from selfcal_ros.nodes.sessions.collecting import CollectingSession
+from selfcal_ros.nodes.sessions.health import Diagnosis, merged
+from selfcal_ros.nodes.sessions.journal_keeper import JournalKeeper, KeptTopic
+from selfcal_ros.nodes.sessions.reception import Reception
+from selfcal_ros.settings.nodes import CollectorSettings
 
 TICK_S = 0.1
 """Period of processing received messages."""

@@ -27,8 +27,8 @@ from selfcal_ros.nodes import names
 from selfcal_ros.nodes.callbacks import Guarded
 from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.health import Level, Ports, Refusals
-from selfcal_ros.sessions.watching import Watch
+from selfcal_ros.nodes.sessions.health import Level, Ports, Refusals
+from selfcal_ros.nodes.sessions.watching import Watch
 
 REQUESTS = {
     "start": "start",

@@ -24,7 +24,7 @@ from visualization_msgs.msg import MarkerArray
 
 from selfcal_ros import topics
 from selfcal_ros.model.plan_form import MAX_VIEWS
-from selfcal_ros.sessions.health import Diagnosis, Level
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.topics import qos_profile
 
 

@@ -10,16 +10,16 @@ from typing import Any
 from rclpy.duration import Duration
 
 from selfcal_ros.bagio.offline import Playlist
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.nodes import (
-    CollectorSettings,
-    SequencerSettings,
-    SolverSettings,
-)
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.hearing import hears, not_heard, others_on
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.nodes import (
+    CollectorSettings,
+    SequencerSettings,
+    SolverSettings,
+)
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     DETECTION_TOPIC,

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from selfcal_ros.collection.settings.parameter import ManagedSettings
 from selfcal_ros.nodes.managed import ManagedNode
+from selfcal_ros.settings.parameter import ManagedSettings
 
 MOST = 2000
 """Largest number of messages taken per poll; the others wait."""

@@ -13,16 +13,16 @@ from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
 from selfcal_ros.collection.sequencer import State
-from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.collection.settings.nodes import SequencerSettings
 from selfcal_ros.errors import ExitCode, NoDataError, as_answer
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import diagnosis_of
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.compensating import plan_file_name
-from selfcal_ros.sessions.health import Level
-from selfcal_ros.sessions.sequencing import SequencingSession
+from selfcal_ros.nodes.sessions.compensating import plan_file_name
+from selfcal_ros.nodes.sessions.health import Level
+from selfcal_ros.nodes.sessions.sequencing import SequencingSession
+from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.settings.nodes import SequencerSettings
 
 
 class CalibrationAction:

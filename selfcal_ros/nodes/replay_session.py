@@ -17,12 +17,12 @@ from rclpy.task import Future
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
-from selfcal_ros.collection.settings.nodes import PlayerSettings
 from selfcal_ros.errors import ExitCode, SelfcalError
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
 from selfcal_ros.nodes.player import IMAGES, Player
 from selfcal_ros.nodes.running import run
+from selfcal_ros.settings.nodes import PlayerSettings
 
 PATIENCE_S = 60.0
 """Longest wait for the nodes to appear, to receive the messages, or to answer."""

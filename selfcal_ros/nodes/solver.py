@@ -9,12 +9,17 @@ from typing import Any
 from selfcal_msgs.srv import LoadMap, SaveMap
 from visualization_msgs.msg import Marker
 
-from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import map_markers, rejected_marker
 from selfcal_ros.nodes.managed import ManagedNode, WhileConfigured, stop
 from selfcal_ros.nodes.running import run
-from selfcal_ros.sessions.solving import SolvingOutcome, SolvingSession, solve, warm_up
+from selfcal_ros.nodes.sessions.solving import (
+    SolvingOutcome,
+    SolvingSession,
+    solve,
+    warm_up,
+)
+from selfcal_ros.settings.nodes import SolverSettings
 
 READY_FOR = 21
 """Marks per side of the plate for which the worker prepares memory."""

@@ -13,22 +13,22 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.bagio.messages import to_model
 from selfcal_ros.collection.inputs import Command, EncoderSample, check_simulated
-from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.collection.settings.nodes import SimulatorSettings
 from selfcal_ros.machine.cell import AXES, Cell, Settle
 from selfcal_ros.machine.clock import SimulatedClock
 from selfcal_ros.machine.duty import Again, Duty
 from selfcal_ros.machine.interface import Placing
 from selfcal_ros.machine.simulated import SimulatedMachine
 from selfcal_ros.machine.visiting import Event, Visitor
-from selfcal_ros.messages import to_model
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.running import run
+from selfcal_ros.nodes.sessions.cell_check import PLAN_ID as CHECK_ID
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.nodes.telling import CellNode
-from selfcal_ros.sessions.cell_check import PLAN_ID as CHECK_ID
-from selfcal_ros.sessions.health import Diagnosis, Level
+from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.settings.nodes import SimulatorSettings
 from selfcal_ros.simulation.bag import write_truth
 from selfcal_ros.simulation.spec import Simulation, camera_of, settings_of, spread_of
 from selfcal_ros.units import NS_PER_S

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base of the nodes that drive a machine: they publish what is read and seen."""
 
-from selfcal_ros.collection.settings.nodes import DriverSettings, SimulatorSettings
 from selfcal_ros.machine.visiting import Event, message_of
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.base import SelfcalNode
+from selfcal_ros.settings.nodes import DriverSettings, SimulatorSettings
 
 IMAGES_KEPT = 100
 """Images that wait for a slow detector."""

@@ -9,11 +9,11 @@ import numpy as np
 
 from selfcal_ros import topics
 from selfcal_ros.bagio.images import COLUMNS
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.offline import TRUTH_FILE
 from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection import inputs
 from selfcal_ros.errors import InputError
-from selfcal_ros.messages import from_model
 from selfcal_ros.outputs import plain, write_json, write_text
 from selfcal_ros.simulation.machine import Truth
 from selfcal_ros.simulation.physics import stage_error

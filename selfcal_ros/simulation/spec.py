@@ -10,10 +10,6 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Kind
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.estimator import plan_of, read_plan
-from selfcal_ros.collection.settings.nodes import SimulatorSettings
-from selfcal_ros.collection.settings.parameter import Parameter
 from selfcal_ros.compensation.compensator import Compensator
 from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
@@ -21,6 +17,10 @@ from selfcal_ros.model.error_map import ErrorMap
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.results import read_result
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.estimator import plan_of, read_plan
+from selfcal_ros.settings.nodes import SimulatorSettings
+from selfcal_ros.settings.parameter import Parameter
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.rendering import Camera, Exposure, exposures

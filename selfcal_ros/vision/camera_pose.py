@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.units import M_PER_UM
 
 NOT_SIMILAR = 0.02

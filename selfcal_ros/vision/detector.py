@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from selfcal_ros.collection.inputs import Detection, Kind
-from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.vision.finding import Candidate, candidates
 from selfcal_ros.vision.fitting import Fit, Windows, fit_marks, lie_inside, windows_of
 from selfcal_ros.vision.images import Picture

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+from selfcal_ros.bagio.messages.to_model import stamp_ns
 from selfcal_ros.collection.inputs import Detection
-from selfcal_ros.collection.settings.detector import DetectorSettings
 from selfcal_ros.errors import InputError, NoDataError, printable
-from selfcal_ros.messages.to_model import stamp_ns
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.vision.coded import CodedPlate
 from selfcal_ros.vision.detector import (
     Judged,

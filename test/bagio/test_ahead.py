@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import pytest
 
+from selfcal_ros.bagio.messages.from_model import event_fields
 from selfcal_ros.bagio.offline import Playlist, collect_bag
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
-from selfcal_ros.messages.from_model import event_fields
-from selfcal_ros.sessions.collecting import CollectingSession
-from selfcal_ros.sessions.health import Level
-from selfcal_ros.sessions.journal_keeper import JournalKeeper
-from selfcal_ros.sessions.reception import Reception
+from selfcal_ros.nodes.sessions.collecting import CollectingSession
+from selfcal_ros.nodes.sessions.health import Level
+from selfcal_ros.nodes.sessions.journal_keeper import JournalKeeper
+from selfcal_ros.nodes.sessions.reception import Reception
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     DETECTION_TOPIC,

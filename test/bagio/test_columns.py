@@ -12,10 +12,10 @@ from mcap.writer import CompressionType, Writer
 
 from selfcal_ros.bagio import mcap_chunk, mcap_salvage
 from selfcal_ros.bagio.mcap_chunk import MessageBlock, chunk_items
+from selfcal_ros.bagio.messages.to_model import detection, encoder_sample
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import ENOUGH
 from selfcal_ros.collection.inputs import Detection, EncoderSample
-from selfcal_ros.messages.to_model import detection, encoder_sample
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from test.support import bags
 from test.support.bags import COMPRESSIONS, Foreign

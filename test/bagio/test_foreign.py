@@ -9,18 +9,18 @@ import zstandard
 from rosbags.rosbag2 import CompressionMode, Reader
 
 from selfcal_ros.bagio.mcap_stream import McapStream
+from selfcal_ros.bagio.messages import to_model
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.messages import to_model
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.reporting.words.findings import worded
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import COMMAND_TOPIC, DETECTION_TOPIC, ENCODER_TOPIC
 from test.support import bags
 from test.support.bags import COMPRESSIONS, NO_SUMMARY, Foreign

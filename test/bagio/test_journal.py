@@ -21,16 +21,16 @@ from rosbags.rosbag2 import Reader
 from selfcal_ros.bagio import journal, journal_file
 from selfcal_ros.bagio.journal import resume, start, unfinished
 from selfcal_ros.bagio.mcap_stream import McapStream
+from selfcal_ros.bagio.messages.from_model import event_fields
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.writer import BagWriter, build
 from selfcal_ros.collection.inputs import Command, EncoderSample, Phase
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import Options, calibrate
-from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.model.result import result_to_dict
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import ENCODER_TOPIC, INPUT_TOPICS, qos_profile
 from test.support.bags import Foreign
 from test.support.sessions import events_of, small_plan

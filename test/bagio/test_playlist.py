@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.messages import from_model
+from selfcal_ros.bagio.messages.from_model import event_fields
 from selfcal_ros.bagio.offline import Playlist
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.inputs import EncoderSample
-from selfcal_ros.messages import from_model
-from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.topics import IMAGE_TYPES, INPUT_TOPICS
 from test.support import bags
 from test.support.bags import Foreign

@@ -10,13 +10,13 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
+from selfcal_ros.bagio.messages import from_model
+from selfcal_ros.bagio.messages.from_model import event_fields
 from selfcal_ros.bagio.reader import INPUT_TOPICS, BagReader
 from selfcal_ros.bagio.schemas import hash_of, typestore
 from selfcal_ros.bagio.writer import BagWriter, new_bag
 from selfcal_ros.collection.inputs import Detection, EncoderSample
 from selfcal_ros.errors import InputError
-from selfcal_ros.messages import from_model
-from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.simulation.bag import QOS
 from selfcal_ros.topics import qos_profile
 from test.support.sessions import decoded, events_of, small_plan

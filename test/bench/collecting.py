@@ -21,10 +21,10 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.inputs import DETECTION, Command, Kind, Phase
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import readings_digest
 from selfcal_ros.model.view import View
+from selfcal_ros.settings.nodes import CollectorSettings
 
 SIZE, PITCH_M = 21, 0.01
 START_NS, S = 1_700_000_000_000_000_000, 1_000_000_000

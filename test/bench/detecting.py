@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from timing import median_time
 
-from selfcal_ros.collection.settings.detector import DetectorSettings
+from selfcal_ros.settings.detector import DetectorSettings
 from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.images import Picture

@@ -203,8 +203,8 @@ def worker(benchmark: str, method: str, bag: Path) -> dict:
 def in_parts(bag: Path, method: str) -> tuple[Taken, float | None]:
     """Return the time of reading or of solving, and the error of the map that comes out."""
     from selfcal_ros.bagio.offline import collect_bag
-    from selfcal_ros.collection.settings.nodes import CollectorSettings
     from selfcal_ros.estimation.api import Options, calibrate
+    from selfcal_ros.settings.nodes import CollectorSettings
 
     values = CollectorSettings.checked({}, "bench")
     reading, (measurements, _, lost, _) = timed(lambda: collect_bag(bag, values))

@@ -16,11 +16,11 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 
+from selfcal_ros.bagio.messages import from_model
+from selfcal_ros.bagio.messages.cdr import layout_of
 from selfcal_ros.bagio.schemas import fields_of, typestore
 from selfcal_ros.bagio.writer import build
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind, Phase
-from selfcal_ros.messages import from_model
-from selfcal_ros.messages.cdr import layout_of
 from selfcal_ros.topics import (
     COMMAND_TOPIC,
     DETECTION_TOPIC,

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.aerotech.read import load_cal
+from selfcal_ros.applications.aerotech.read import load_cal
 from selfcal_ros.cli.main import main
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import Observability, result_to_dict

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.aerotech.read import load_cal
-from selfcal_ros.aerotech.verify import verify_tables
+from selfcal_ros.applications.aerotech.read import load_cal
+from selfcal_ros.applications.aerotech.verify import verify_tables
 from selfcal_ros.bagio.offline import read_truth
 from selfcal_ros.cli.main import main
 from selfcal_ros.compensation.frame import frame_from_comments

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli.main import main
 from selfcal_ros.collection.inputs import EncoderSample
-from selfcal_ros.collection.settings.nodes import overrides_in
 from selfcal_ros.files import read_yaml
-from selfcal_ros.messages import from_model
+from selfcal_ros.settings.nodes import overrides_in
 from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.topics import ENCODER_TOPIC, IMAGE_TOPICS, IMAGE_TYPES, INPUT_TOPICS
 

@@ -14,9 +14,9 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.verdict import Grade
+from selfcal_ros.nodes.sessions.compensating import CompensatingSession
 from selfcal_ros.outputs import write_json
 from selfcal_ros.results import read_result
-from selfcal_ros.sessions.compensating import CompensatingSession
 from test.support.ports import Hands, settings_of
 from test.support.truth import hu_plan, random_truth, simulate_measurements
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from selfcal_ros.aerotech.read import load_cal
+from selfcal_ros.applications.aerotech.read import load_cal
 from selfcal_ros.cli.main import main
 from selfcal_ros.outputs import to_ascii
 

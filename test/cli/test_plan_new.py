@@ -9,9 +9,9 @@ import pytest
 
 from selfcal_ros.cli import plan_new
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.files import read_yaml
 from selfcal_ros.machine.cell import SHIPPED, read_cell
+from selfcal_ros.settings.estimator import read_plan
 from test.support.disks import files_no_larger_than
 from test.support.terminals import SELFCAL, in_terminal
 

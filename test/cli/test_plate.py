@@ -10,9 +10,9 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.edge_markers import edge_markers
+from selfcal_ros.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.vision.detector import MarkDetector
 from selfcal_ros.vision.exposures import ImageDetector
 from selfcal_ros.vision.images import Picture

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.files import read_json
+from selfcal_ros.settings.estimator import read_plan
 
 EXACT = Path(__file__).parents[2] / "bags/hu_exact"
 PLAN = {

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.cli.main import main
-from selfcal_ros.laser.simulation import (
+from selfcal_ros.applications.laser.simulation import (
     LaserNoise,
     Measurement,
     SetUp,
     random_machine,
     simulate_step_diagonal,
 )
-from selfcal_ros.laser.table import write_table
+from selfcal_ros.applications.laser.table import write_table
+from selfcal_ros.cli.main import main
 
 CONFIG = Path(__file__).parents[2] / "config" / "step_diagonal"
 EXAMPLE = CONFIG / "case_study.csv"
@@ -308,7 +308,7 @@ def test_a_picture_has_a_known_format(tmp_path, capsys):
 
 
 def test_the_corrections_are_written_as_tables(tmp_path, capsys):
-    from selfcal_ros.aerotech.read import load_cal
+    from selfcal_ros.applications.aerotech.read import load_cal
 
     cal = tmp_path / "s.cal"
     args = (
@@ -345,7 +345,7 @@ def test_the_corrections_are_written_as_tables(tmp_path, capsys):
 
 
 def recorded_bag(path, **options):
-    from selfcal_ros.laser.simulation import case_study_machine
+    from selfcal_ros.applications.laser.simulation import case_study_machine
     from test.support.laser import recorded
     from test.support.laser_bags import write_laser_bag
 

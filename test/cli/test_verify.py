@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.cli.main import main
 from selfcal_ros.collection.inputs import Command, Phase
-from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.messages import from_model
-from selfcal_ros.sessions.solving import SolvingSession, solve
+from selfcal_ros.nodes.sessions.solving import SolvingSession, solve
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.support.ports import Hands, message, settings_of
 from test.support.verbs import simulate
 

@@ -20,11 +20,11 @@ from selfcal_ros.collection.inputs import (
     Phase,
     Reason,
 )
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense, ViewReadings
 from selfcal_ros.model.view import View
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.simulation.spec import Faults, apply_faults
 from test.support.collecting import START_NS, collect, digest, gathered, scene, table
 from test.support.truth import angular_deviation, grid_deviation

@@ -16,9 +16,9 @@ from selfcal_ros.collection.exposures import Exposures, Tracks
 from selfcal_ros.collection.inputs import DETECTION, Command, Detection, EncoderSample
 from selfcal_ros.collection.marks import identify, repeats
 from selfcal_ros.collection.samples import Limits
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import NoDataError
 from selfcal_ros.model.readings import readings_digest, session_digest
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.simulation.spec import Faults, apply_faults
 from test.support.collecting import collect, digest, scene
 

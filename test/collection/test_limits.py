@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.collection.inputs import (
     MAX_EXPOSURES,
     Command,
@@ -15,10 +16,9 @@ from selfcal_ros.collection.inputs import (
     good_sigmas,
 )
 from selfcal_ros.errors import InputError, SelfcalError
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
-from selfcal_ros.sessions.solving import SolvingSession, solve
+from selfcal_ros.nodes.sessions.solving import SolvingSession, solve
 from test.support.collecting import collect, scene
 from test.support.ports import Hands, message, settings_of
 from test.support.sessions import collected, events_of, small_plan

@@ -6,20 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.messages import from_model, to_model
 from selfcal_ros.collection.expected import expected_marks, missing_marks
 from selfcal_ros.collection.inputs import Command, Phase, Reason, check_view
 from selfcal_ros.collection.marks.identify import IdentityRules, identify_grid
-from selfcal_ros.collection.settings.estimator import plan_of
 from selfcal_ros.errors import InputError
-from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.marks import marks_of
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import ViewReadings, placing_digest
 from selfcal_ros.model.view import View
 from selfcal_ros.model.visit_order import visit_sequence
-from selfcal_ros.sessions.watching import plate_picture
-from test.messages.test_convert import through_cdr
+from selfcal_ros.nodes.sessions.watching import plate_picture
+from selfcal_ros.settings.estimator import plan_of
+from test.bagio.messages.test_convert import through_cdr
 from test.support.mark_lists import HALF_M, lattice, rings, scatter
 
 RULES = IdentityRules(1e-3, 0.5, 0.02)

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.collection.inputs import Kind, Reason
 from selfcal_ros.collection.reduce import PlaceList
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.readings import RejectedPlaces, Sense
 from test.support.collecting import collect, scene, table
 

@@ -9,10 +9,10 @@ import pytest
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.inputs import Command, EncoderSample, Phase, Reason
 from selfcal_ros.collection.marks.repeats import reduce_repeats
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.collection.timeline import build_timeline
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
+from selfcal_ros.settings.nodes import CollectorSettings
 
 
 def test_clean_readings_of_small_views_are_kept():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.applications.papers.methods import calibrate_by_law
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.observability.plan_check import check_plan, predict_plan
@@ -17,7 +18,6 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.plan_form import plan_from_dict, plan_to_dict
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.papers.methods import calibrate_by_law
 from test.support.options import BARE, bare
 from test.support.refusals import refused
 from test.support.truth import Spread, random_truth, simulate_measurements

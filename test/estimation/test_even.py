@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.applications.papers.methods import calibrate_by, calibrate_by_law
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import solve_joint
@@ -13,7 +14,6 @@ from selfcal_ros.estimation.observability.plan_check import check_plan
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.papers.methods import calibrate_by, calibrate_by_law
 from test.support.collecting import collect, scene
 from test.support.dense_lattice import solve
 from test.support.options import BARE

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.applications.papers.methods import calibrate_by_law
 from selfcal_ros.apply import StageMap
 from selfcal_ros.compensation.circle import fourier_basis
 from selfcal_ros.errors import InputError
@@ -30,7 +31,6 @@ from selfcal_ros.model.error_map import ThetaDatum
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.papers.methods import calibrate_by_law
 from selfcal_ros.reporting.figures.drawing import Path
 from selfcal_ros.reporting.figures.maps import CENTRE, angular_map
 from selfcal_ros.reporting.words.findings import worded

@@ -3,10 +3,10 @@
 
 import pytest
 
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.reference import ReferenceLength
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import SolverSettings
 
 
 @pytest.mark.parametrize(

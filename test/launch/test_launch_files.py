@@ -70,7 +70,7 @@ def test_it_states_its_arguments(description, path):
 def test_it_starts_executables_of_this_package(description, path):
     from launch_ros.actions import Node
 
-    from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
+    from selfcal_ros.settings.nodes import NODE_PARAMETERS
 
     nodes = [
         entity for entity in description(path).entities if isinstance(entity, Node)

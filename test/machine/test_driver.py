@@ -9,12 +9,12 @@ from types import SimpleNamespace
 import pytest
 
 from selfcal_ros.collection.inputs import Command, Detection, Phase
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.cell import open_machine, read_cell
 from selfcal_ros.machine.driver import Driver
 from selfcal_ros.machine.duty import PATIENCE_NS
 from selfcal_ros.machine.measuring import Run
+from selfcal_ros.settings.estimator import read_plan
 from test.support.cells import START_NS, Agreeing, Jumping, write_cell
 from test.support.waiting import wait_until
 

@@ -12,9 +12,9 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.machine.ophyd import OphydMachine
+from selfcal_ros.settings.estimator import read_plan
 from test.machine.test_measuring import away_from
 from test.support.cells import FEW, QUIET, Agreeing, write_cell
 

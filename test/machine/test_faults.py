@@ -12,11 +12,11 @@ import pytest
 
 from selfcal_ros.bagio.journal import Journal
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.checks.wiring import WiringError
 from selfcal_ros.machine import MachineError, visiting
 from selfcal_ros.machine.clock import Clock
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.machine.test_measuring import away_from, run_of
 from test.support.cells import PLAN, Agreeing, Jumping, write_cell
 from test.support.faults import Spoilt

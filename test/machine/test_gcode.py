@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.machine import MachineError, gcode
 from selfcal_ros.machine.gcode import GcodeMachine
 from selfcal_ros.machine.measuring import Run
+from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.machine.test_measuring import away_from
 from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell
 from test.support.firmware import (

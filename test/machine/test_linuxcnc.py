@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.applications.controllers.export import export
+from selfcal_ros.applications.controllers.grid import Wiring
 from selfcal_ros.compensation.frame import MachineFrame
-from selfcal_ros.controllers.export import export
-from selfcal_ros.controllers.grid import Wiring
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.settings.estimator import read_plan
 from test.machine.test_measuring import away_from
 from test.support import linuxcnc
 from test.support.cells import CELL, FEW, QUIET, Agreeing, WithPlate, write_cell

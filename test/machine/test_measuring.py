@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run, collector_settings
+from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.support.cells import CELL, PLAN, SIMULATION, Agreeing, Jumping, write_cell
 from test.support.faults import Spoilt
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.cell import open_machine, read_cell, with_values
 from selfcal_ros.machine.measuring import Run, collector_settings
 from selfcal_ros.machine.micromanager import MicroManagerMachine
+from selfcal_ros.settings.estimator import read_plan
 from test.machine.test_measuring import away_from
 from test.support.cells import Agreeing
 

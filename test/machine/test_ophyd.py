@@ -7,10 +7,10 @@ import types
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.machine.ophyd import OphydMachine
+from selfcal_ros.settings.estimator import read_plan
 from test.machine.test_measuring import away_from
 from test.support.cells import QUIET, Agreeing, Jumping, write_cell
 

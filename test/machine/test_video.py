@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image as Pillow
 
-from selfcal_ros.collection.settings.estimator import read_plan
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run
 from selfcal_ros.machine.video import VideoCamera, grey
+from selfcal_ros.settings.estimator import read_plan
 from test.machine.test_measuring import away_from
 from test.support.cells import FEW, QUIET, Agreeing, write_cell
 from test.support.faults import Spoilt

@@ -19,16 +19,16 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rosgraph_msgs.msg import Clock
 
+from selfcal_ros.bagio.messages import to_model
 from selfcal_ros.cli import cell
 from selfcal_ros.cli.main import main
 from selfcal_ros.cli.processes import process
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Phase
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.messages import to_model
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.cell_checker import CellChecker
+from selfcal_ros.nodes.sessions import cell_check
 from selfcal_ros.nodes.stage_simulator import StageSimulator
-from selfcal_ros.sessions import cell_check
 from test.support.mark_lists import listed_plan
 from test.support.plans import plan_of
 from test.support.sessions import plan_file, small_plan

@@ -17,14 +17,14 @@ from rosgraph_msgs.msg import Clock
 from selfcal_msgs.msg import MarkDetection, ViewCommand
 from std_srvs.srv import Trigger
 
+from selfcal_ros.bagio.messages import from_model, to_model
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.inputs import Command, Detection, Phase
-from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.readings import readings_digest, session_digest
 from selfcal_ros.nodes import base, measurement_collector, names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
-from selfcal_ros.sessions import rejections
+from selfcal_ros.nodes.sessions import rejections
 from selfcal_ros.units import NS_PER_S
 from test.support.collecting import scene
 from test.support.plans import image_plan, plan_of

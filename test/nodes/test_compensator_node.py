@@ -13,14 +13,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from selfcal_msgs.srv import Correct
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.compensation.compensator import Compensator
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.nodes import compensator, names
 from selfcal_ros.nodes.compensator import KEPT, CompensatorNode
 from selfcal_ros.nodes.filling import fill
-from selfcal_ros.sessions.compensating import KEEPS_UP
+from selfcal_ros.nodes.sessions.compensating import KEEPS_UP
 from test.support.maps import random_map, result_of
 from test.support.waiting import PATIENCE_S
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from selfcal_msgs.msg import ViewCommand
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.cli.main import main
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.machine.cell import open_machine, read_cell
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.nodes import names

@@ -20,10 +20,10 @@ from selfcal_msgs.action import RunCalibration
 from std_srvs.srv import Trigger
 
 from selfcal_ros import nodes as every_node
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample
 from selfcal_ros.errors import InputError, SelfcalError
 from selfcal_ros.estimation.api import calibrate
-from selfcal_ros.messages import from_model
 from selfcal_ros.nodes import monitor_session, names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
@@ -37,10 +37,10 @@ from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import Player
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.replay_session import ReplaySession
+from selfcal_ros.nodes.sessions.health import Refusals
+from selfcal_ros.nodes.sessions.solving import SolvingSession, solve
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
-from selfcal_ros.sessions.health import Refusals
-from selfcal_ros.sessions.solving import SolvingSession, solve
 from test.support.cameras import DETECTS
 from test.support.hostile import TEXTS, torn, worst
 from test.support.maps import random_map, result_of

@@ -15,8 +15,6 @@ from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import read_json, read_yaml
@@ -26,6 +24,8 @@ from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import WAITING_IMAGES
 from selfcal_ros.nodes.solver import Solver
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.cli.test_detect import compressed, rewritten
 from test.support.sessions import small_bag, small_plan
 from test.support.verbs import simulate

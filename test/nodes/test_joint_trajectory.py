@@ -12,12 +12,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from selfcal_ros.collection.settings.estimator import read_plan
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.machine import MachineError
 from selfcal_ros.machine.measuring import Run
-from selfcal_ros.messages import from_model
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.joint_trajectory import JointTrajectoryMachine
+from selfcal_ros.settings.estimator import read_plan
 from test.machine.test_measuring import away_from
 from test.support.cells import PLAN, Agreeing, write_cell
 

@@ -10,10 +10,10 @@ from std_srvs.srv import Trigger
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.collection.inputs import Command, Phase
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.api import Options, calibrate
 from selfcal_ros.files import read_json
 from selfcal_ros.nodes import names
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.support.killed import Cell
 from test.support.mark_lists import listed_plan
 from test.support.sessions import collected, events_of, small_plan

@@ -22,8 +22,8 @@ from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.mark_detector import MarkDetectorNode
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level
 from selfcal_ros.nodes.solver import Solver
-from selfcal_ros.sessions.health import Diagnosis, Level
 from test.support.cameras import DETECTS, camera
 from test.support.sessions import decoded, plan_file, small_plan
 

@@ -7,13 +7,13 @@ from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
 from selfcal_ros.bagio.images import ImageBag
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli.main import main
-from selfcal_ros.messages import from_model
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.mark_detector import MarkDetectorNode
-from selfcal_ros.sessions.health import Level
+from selfcal_ros.nodes.sessions.health import Level
 from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.topics import DETECTION_TOPIC, IMAGE_TYPES
 from test.support.cameras import DETECTS

@@ -7,7 +7,6 @@ import pytest
 import yaml
 from rclpy.parameter import Parameter as RosParameter
 
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS, overrides_in
 from selfcal_ros.errors import InputError
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
@@ -18,6 +17,7 @@ from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
+from selfcal_ros.settings.nodes import NODE_PARAMETERS, overrides_in
 from test.support.cameras import DETECTS
 from test.support.sessions import plan_file, small_bag, small_plan
 

@@ -18,8 +18,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 
 from selfcal_ros.cli import processes
 from selfcal_ros.cli.replay import NODES
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.nodes import names, running
+from selfcal_ros.settings.nodes import NODE_PARAMETERS
 from test.support.forked import Fork, Forks
 from test.support.sessions import plan_file, small_bag, small_plan
 from test.support.shared_memory import remove_stale

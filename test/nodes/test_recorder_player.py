@@ -14,14 +14,14 @@ from rclpy.qos import qos_profile_sensor_data
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode, InputError, NoDataError
 from selfcal_ros.model.readings import readings_digest
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.bag_recorder import BagRecorder
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
-from selfcal_ros.sessions.health import Level
+from selfcal_ros.nodes.sessions.health import Level
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.support.sessions import decoded, small_bag
 
 

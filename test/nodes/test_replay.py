@@ -14,6 +14,7 @@ from selfcal_msgs.srv import SaveMap
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from selfcal_ros.bagio.messages.from_model import event_fields
 from selfcal_ros.bagio.offline import Playlist, bag_input, bag_lines
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.cli import replay as replay_verb
@@ -21,7 +22,6 @@ from selfcal_ros.cli.main import main as selfcal
 from selfcal_ros.collection.inputs import Command, Detection, Phase
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
-from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.player import Player

@@ -13,9 +13,9 @@ from selfcal_msgs.action import RunCalibration
 from selfcal_msgs.srv import SaveMap
 from std_srvs.srv import Trigger
 
+from selfcal_ros.bagio.messages import from_model, to_model
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.collection.sequencer import State
-from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.nodes import names, pose_sequencer
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer

@@ -4,7 +4,7 @@
 import pytest
 from mcap.reader import make_reader
 
-from selfcal_ros.messages import to_model
+from selfcal_ros.bagio.messages import to_model
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer

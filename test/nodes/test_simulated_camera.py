@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.bagio.offline import collect_bag
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import read_yaml
 from selfcal_ros.nodes import names
@@ -16,6 +15,7 @@ from selfcal_ros.nodes.measurement_collector import MeasurementCollector
 from selfcal_ros.nodes.pose_sequencer import PoseSequencer
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.nodes.stage_simulator import StageSimulator
+from selfcal_ros.settings.nodes import CollectorSettings
 
 CONFIG = Path(__file__).parents[2] / "config"
 CAMERA, PLAN = (

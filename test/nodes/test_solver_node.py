@@ -12,24 +12,24 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from selfcal_msgs.srv import LoadMap, SaveMap
 from visualization_msgs.msg import Marker
 
+from selfcal_ros.bagio.messages import from_model, to_model
 from selfcal_ros.collection.inputs import Command, Phase
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, NotSettledError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
-from selfcal_ros.messages import from_model, to_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.result import result_to_dict
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes import solver as solver_module
 from selfcal_ros.nodes.filling import fill, map_geometry
+from selfcal_ros.nodes.sessions.compensating import read_result
+from selfcal_ros.nodes.sessions.solving import SolvingOutcome
 from selfcal_ros.nodes.solver import Solver
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.summary.sections import state_line
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.reporting.words.observability import with_advice
-from selfcal_ros.sessions.compensating import read_result
-from selfcal_ros.sessions.solving import SolvingOutcome
 from test.support.maps import random_map, result_of
 from test.support.sessions import START_NS, collected, events_of, small_plan
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.collection.inputs import Command, Detection, Phase
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.view import View
 from selfcal_ros.nodes import names

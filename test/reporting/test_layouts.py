@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
+from selfcal_ros.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.topics import IMAGE_TOPICS, MAP_MARKERS_TOPIC, PROGRESS_TOPIC
 
 ROOT = Path(__file__).parents[2]

@@ -6,15 +6,15 @@ import pytest
 
 from selfcal_ros.bagio.images import ImageBag
 from selfcal_ros.bagio.offline import bag_input, collect_bag, read_truth
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.reporting.summary.numbers import um
 from selfcal_ros.reporting.summary.sections import summary_text
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import CollectorSettings, SolverSettings
 from selfcal_ros.vision.exposures import ImageDetector
 from test.support.refusals import refused
 from test.support.shipped import BAGS, MANIFEST, OF_IMAGES, require_map

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
+from selfcal_ros.bagio.messages.cdr import MAX_LENGTH
 from selfcal_ros.cli.main import VERBS, main
 from selfcal_ros.collection.inputs import Reason
-from selfcal_ros.collection.settings.detector import DetectorSettings
-from selfcal_ros.collection.settings.nodes import CompensatorSettings
 from selfcal_ros.compensation.plausible import PLAUSIBLE, PLAUSIBLE_M
 from selfcal_ros.files import MAX_JSON_VALUES, MAX_YAML_BYTES, MAX_YAML_NODES
-from selfcal_ros.messages.cdr import MAX_LENGTH
 from selfcal_ros.model.artifact import MAX_GRID_SIZE
 from selfcal_ros.model.plan_form import MAX_VIEWS
-from selfcal_ros.sessions.compensating import LARGEST_FILE, LEAST_RADIUS_M
+from selfcal_ros.nodes.sessions.compensating import LARGEST_FILE, LEAST_RADIUS_M
+from selfcal_ros.settings.detector import DetectorSettings
+from selfcal_ros.settings.nodes import CompensatorSettings
 from selfcal_ros.vision.exposures import SETTLED
 from selfcal_ros.vision.images import EXPANSION, FORMATS, LARGEST
 from test.support.pages import PAGES

@@ -10,10 +10,10 @@ import pytest
 
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.cli.main import main
-from selfcal_ros.collection.settings.estimator import read_plan
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.machine import Machine, MachineError
 from selfcal_ros.machine.measuring import Run
+from selfcal_ros.settings.estimator import read_plan
+from selfcal_ros.settings.nodes import CollectorSettings
 from test.support.cells import CELL, Agreeing, Jumping, write_cell
 from test.support.pages import PAGES, ROOT, lines_of
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal_ros.collection.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.artifact import MapGrid
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.settings.nodes import NODE_PARAMETERS
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread
 from selfcal_ros.simulation.spec import (

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from hypothesis import strategies as st
 
-from selfcal_ros.aerotech.model import Table1D, Table2D, Unit, UnitWord
+from selfcal_ros.applications.aerotech.model import Table1D, Table2D, Unit, UnitWord
 
 AXES = (1, 2, 3)
 

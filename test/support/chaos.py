@@ -29,22 +29,22 @@ from rclpy.node import Node
 from selfcal_msgs.msg import ViewCommand
 from std_srvs.srv import Trigger
 
+from selfcal_ros.bagio.messages import from_model
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.writer import BagWriter
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Detection
-from selfcal_ros.collection.settings.nodes import CollectorSettings
 from selfcal_ros.errors import ExitCode, NotIdentifiableError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.files import read_json
-from selfcal_ros.messages import from_model
 from selfcal_ros.model.view import Plan
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.bag_player import BagPlayer
 from selfcal_ros.nodes.compensator import CompensatorNode
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.mark_detector import MarkDetectorNode
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.simulation.cell import Event
 from selfcal_ros.simulation.spec import Faults, apply_faults
 from selfcal_ros.topics import INPUT_TOPICS

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.bagio.messages.to_model import EncoderBlock
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import (
@@ -17,8 +18,6 @@ from selfcal_ros.collection.inputs import (
     EncoderSample,
     Kind,
 )
-from selfcal_ros.collection.settings.nodes import CollectorSettings
-from selfcal_ros.messages.to_model import EncoderBlock
 from selfcal_ros.model.readings import (
     Measurements,
     ViewReadings,
@@ -26,6 +25,7 @@ from selfcal_ros.model.readings import (
     session_digest,
 )
 from selfcal_ros.model.view import Plan
+from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.simulation.cell import CellSettings, Event, plan_events
 from test.support.plans import plan_of
 from test.support.truth import Truth, random_truth

@@ -25,8 +25,8 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import BinaryIO
 
-from selfcal_ros import sessions
 from selfcal_ros.cli.processes import PR_SET_PDEATHSIG, stop
+from selfcal_ros.nodes import sessions
 
 MESSAGES = (
     "diagnostic_msgs.msg",

@@ -5,15 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal_ros.laser.data import DIAGONALS, StepDiagonal, signs_of, step_vectors
-from selfcal_ros.laser.simulation import (
+from selfcal_ros.applications.laser.data import (
+    DIAGONALS,
+    StepDiagonal,
+    signs_of,
+    step_vectors,
+)
+from selfcal_ros.applications.laser.simulation import (
     LaserNoise,
     Measurement,
     SetUp,
     simulate_step_diagonal,
     trace,
 )
-from selfcal_ros.laser.zigzag import Recording
+from selfcal_ros.applications.laser.zigzag import Recording
 
 MM = 1e-3
 

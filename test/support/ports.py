@@ -3,8 +3,8 @@
 
 from selfcal_ros.bagio.schemas import typestore
 from selfcal_ros.bagio.writer import build
-from selfcal_ros.collection.settings.nodes import NODE_SETTINGS, Settings
-from selfcal_ros.sessions.health import Level, Ports
+from selfcal_ros.nodes.sessions.health import Level, Ports
+from selfcal_ros.settings.nodes import NODE_SETTINGS, Settings
 
 START_NS = 1_700_000_000_000_000_000
 

@@ -12,7 +12,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from selfcal_ros.messages.from_model import event_fields
+from selfcal_ros.bagio.messages.from_model import event_fields
 from selfcal_ros.nodes import names
 from selfcal_ros.nodes.filling import fill
 from selfcal_ros.nodes.names import Topic

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import yaml
 
+from selfcal_ros.bagio.messages.from_model import event_fields
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.bagio.schemas import ChannelDecoder, typestore
 from selfcal_ros.bagio.writer import BagWriter, build
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.expected import ViewProgress
-from selfcal_ros.messages.from_model import event_fields
 from selfcal_ros.model.plan_form import plan_to_dict
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.view import Plan

@@ -5,14 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal_ros.applications.papers import readings as white
+from selfcal_ros.applications.papers.readings import (
+    angular_deviation,
+    grid_deviation,
+    hu_plan,
+)
 from selfcal_ros.collection.marks.repeats import repeat_motion
 from selfcal_ros.collection.marks.stops import without_aside
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.model.visit_order import stage_targets
-from selfcal_ros.papers import readings as white
-from selfcal_ros.papers.readings import angular_deviation, grid_deviation, hu_plan
 from selfcal_ros.simulation import cell
 from selfcal_ros.simulation.machine import Spread, Truth, random_truth
 from selfcal_ros.simulation.physics import rotate

@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.laser.data import Method
-from selfcal_ros.laser.simulation import case_study_machine
+from selfcal_ros.applications.laser.data import Method
+from selfcal_ros.applications.laser.simulation import case_study_machine
 from selfcal_ros.reporting.figures.drawing import Label
 from selfcal_ros.reporting.figures.drawing import Path as Line
 from tools import sensitivity as tool

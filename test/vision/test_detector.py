@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.errors import InputError
+from selfcal_ros.settings.detector import MARKS, DetectorSettings
 from selfcal_ros.simulation.rendering import Camera
 from selfcal_ros.vision.detector import MarkDetector, offset
 from selfcal_ros.vision.finding import _noise, candidates

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.applications.papers.readings import hu_plan
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.papers.readings import hu_plan
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from selfcal_ros.applications.papers.readings import hu_plan
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.readings import Measurements, Sense, subset
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.papers.readings import hu_plan
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import WALK_STEPS, Spread, Truth, Waves
 from tools.reality.cases import (

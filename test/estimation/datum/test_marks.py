@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal_ros.collection.settings.estimator import solver_options
-from selfcal_ros.collection.settings.nodes import SolverSettings
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint.solve import solve_joint
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.reference import ReferenceLength
+from selfcal_ros.settings.estimator import solver_options
+from selfcal_ros.settings.nodes import SolverSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
 from test.support.lattice_plans import plan_of
 from test.support.options import bare

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
+from selfcal_ros.applications.papers.methods import calibrate_by_law
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.comparison.covariance import covariance_of
@@ -23,7 +24,6 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.view import View
-from selfcal_ros.papers.methods import calibrate_by_law
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation import physics
 from selfcal_ros.simulation.cell import CellSettings

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from selfcal_ros.applications.standards.statements import is_traceable, scale_texts
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
@@ -18,7 +19,6 @@ from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.reporting.words.findings import worded
-from selfcal_ros.standards.statements import is_traceable, scale_texts
 from test.support.lattice_plans import plan_of
 from test.support.truth import random_truth, simulate_measurements
 

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.applications.papers.methods import calibrate_by
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.terms import ModelTerm
 from selfcal_ros.model.verdict import Grade
-from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth

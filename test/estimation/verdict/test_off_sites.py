@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from selfcal_ros.applications.papers.methods import calibrate_by
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import model_fit
 from selfcal_ros.model.artifact import Artifact
@@ -13,7 +14,6 @@ from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewRead
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import Finding, Grade
 from selfcal_ros.model.view import View
-from selfcal_ros.papers.methods import calibrate_by
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from selfcal_ros.applications.standards import dcc as standards
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.result import result_from_dict, result_to_dict
@@ -20,7 +21,6 @@ from selfcal_ros.reporting.summary.sections import (
 )
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
-from selfcal_ros.standards import dcc as standards
 from test.support.plans import image_plan
 from test.support.truth import Spread, random_truth, simulate_measurements
 

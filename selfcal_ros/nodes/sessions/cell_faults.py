@@ -1,0 +1,421 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one fault of a cell that explains its rejections: what would be used if it were not there.
+
+Each possible fault is undone in the recorded messages, which are collected again.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, product
+from math import degrees, pi, radians
+
+import numpy as np
+
+from selfcal_ros.collection.collector import Collector
+from selfcal_ros.collection.diagnosis import fault_text
+from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.checks.wiring import wiring_faults
+from selfcal_ros.model.readings import Sense
+from selfcal_ros.settings.nodes import CollectorSettings
+from selfcal_ros.units import MM_PER_M
+
+type Event = EncoderSample | Detection
+
+STILL = 0.25
+"""Part of the pitch within which a stage has not moved."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault, its remedy, and the messages as they would be without it."""
+
+    what: str
+    remedy: str
+    command: Command
+    events: tuple[Event, ...] = ()
+
+
+def explaining(
+    command: Command, events: Sequence[Event], settings: CollectorSettings
+) -> Fault | None:
+    """Return the fault without which most of the rejected detections would be used, if any.
+
+    Of several, one whose offsets then follow the stage; all of them if nothing tells them apart.
+
+    Parameters
+    ----------
+    command : Command
+        MEASURE of the view.
+    events : sequence of EncoderSample or Detection
+        All messages of the view.
+    settings : CollectorSettings
+        Names of the joints, sense, limits.
+    """
+    standing = _standing(command, events, settings)
+    if standing is not None:
+        return standing
+    total = sum(isinstance(event, Detection) for event in events)
+    used, *_ = _outcome(Fault("", "", command, tuple(events)), settings)
+    faults: list[Fault] = []
+    best: tuple[float, float, float] = ((used + total) / 2, -np.inf, 0)
+    for fault in _faults(command, events, settings):
+        try:
+            outcome = _outcome(fault, settings)
+        except InputError:  # an even and an odd side do not lie so
+            continue
+        if outcome > best:
+            faults = []
+            best = outcome
+        if outcome == best:
+            faults.append(fault)
+    return (
+        replace(
+            faults[0],
+            what=", or ".join(fault.what for fault in faults),
+            remedy="; or ".join(fault.remedy for fault in faults),
+        )
+        if faults
+        else None
+    )
+
+
+def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int]:
+    """Return the detections that would be used, minus the faults of the offsets, marks seen."""
+    collector = Collector(settings)
+    collector.add_command(fault.command)
+    samples = [event for event in fault.events if isinstance(event, EncoderSample)]
+    for (names, _, _), alike in groupby(
+        samples,
+        key=lambda sample: (
+            sample.names,
+            len(sample.positions),
+            len(sample.velocities),
+        ),
+    ):
+        stamps, positions, velocities = zip(
+            *(
+                (sample.stamp_ns, sample.positions, sample.velocities)
+                for sample in alike
+            ),
+            strict=True,
+        )
+        collector.add_encoder_block(
+            np.array(stamps),
+            names,
+            np.array(positions, dtype=float),
+            np.array(velocities, dtype=float),
+        )
+    for event in fault.events:
+        if isinstance(event, Detection):
+            collector.add_detection(event)
+    measurements, _ = collector.collect()
+    views = measurements.views
+    return (
+        sum(view.used for view in views),
+        -len(wiring_faults(measurements)),
+        sum(len(view.m) + len(view.k) for view in views),
+    )
+
+
+def _standing(
+    command: Command, events: Sequence[Event], settings: CollectorSettings
+) -> Fault | None:
+    """Return the fault of a stage that is indicated at one place, or turn, during the view."""
+    plate = command.artifact
+    samples = [event for event in events if isinstance(event, EncoderSample)]
+    places = np.array(
+        [place for sample in samples if (place := _place(sample, settings)) is not None]
+    )
+    if not len(places) or plate is None:
+        return None
+    if np.ptp(places, axis=0).max() <= STILL * plate.grid_pitch_m:
+        x, y = np.median(places, axis=0) * MM_PER_M
+        return Fault(
+            f"the stage does not move: it is indicated at x = {x:.6g} mm, y = {y:.6g} mm "
+            "during the whole view",
+            "move the stage to each mark, and name the joints that move in joint_x and joint_y",
+            command,
+        )
+    lines = {
+        event.k for event in events if isinstance(event, Detection) and _is_line(event)
+    }
+    _, turns = _turns(samples, settings)
+    if (
+        len(lines) > 1
+        and len(turns)
+        and np.ptp(turns) <= STILL * 2 * pi / plate.angular_count
+    ):
+        return Fault(
+            f"theta does not move: it is indicated at {np.median(turns):.6g} rad during "
+            "the whole view",
+            "turn the stage to each line, and name the joint that turns in joint_theta",
+            command,
+        )
+    return None
+
+
+def _place(
+    sample: EncoderSample, settings: CollectorSettings
+) -> tuple[float, float] | None:
+    """Return the indicated x and y of a sample that has both."""
+    where = dict(zip(sample.names, sample.positions, strict=False))
+    if settings.joint_x not in where or settings.joint_y not in where:
+        return None
+    return where[settings.joint_x], where[settings.joint_y]
+
+
+def _faults(
+    command: Command, events: Sequence[Event], settings: CollectorSettings
+) -> Iterator[Fault]:
+    """Yield the faults that are tried."""
+    readings = [event for event in events if isinstance(event, Detection)]
+    samples = [event for event in events if isinstance(event, EncoderSample)]
+
+    def fault(what: str, remedy: str, detections: Sequence[Detection]) -> Fault:
+        return Fault(what, remedy, command, (*samples, *detections))
+
+    yield from _counts(command, samples, readings, settings, fault)
+    yield fault(
+        "m and n are exchanged",
+        "m counts the marks along plate x, n along plate y",
+        [replace(reading, m=reading.n, n=reading.m) for reading in readings],
+    )
+    for scale, unit in ((1e3, "mm"), (1e6, "µm")):
+        yield fault(
+            f"the offsets are in {unit}",
+            "publish offset_x and offset_y in m",
+            [
+                replace(
+                    reading,
+                    offset_x=reading.offset_x / scale,
+                    offset_y=reading.offset_y / scale,
+                )
+                for reading in readings
+            ],
+        )
+    for late in (1, 2):
+        exposures = f"{late} exposure{'s' * (late > 1)}"
+        yield fault(
+            f"each detection shows the mark of {exposures} before its stamp",
+            "stamp detections with the time of the exposure, and read each image once",
+            [
+                replace(reading, stamp_ns=before.stamp_ns)
+                for reading, before in zip(readings[late:], readings, strict=False)
+            ],
+        )
+        yield fault(
+            f"each detection shows the mark of {exposures} after its stamp",
+            "stamp detections with the time of the exposure",
+            [
+                replace(reading, stamp_ns=after.stamp_ns)
+                for reading, after in zip(readings, readings[late:], strict=False)
+            ],
+        )
+    turns = list(product((1.0,), (False, True), ((1, 1), (-1, -1), (-1, 1), (1, -1))))
+    for scale, swapped, signs in (
+        *turns[1:],
+        (1e3, False, (1, 1)),
+        (1e6, False, (1, 1)),
+    ):
+        what, _, remedy = fault_text(
+            scale, swapped=swapped, signs=signs, sense=Sense(settings.measurement_sense)
+        ).partition("; ")
+        yield Fault(
+            what,
+            remedy,
+            command,
+            (
+                *(
+                    _sample_at(
+                        sample, settings, scale=scale, swapped=swapped, signs=signs
+                    )
+                    for sample in samples
+                ),
+                *readings,
+            ),
+        )
+    for what, remedy, factor in (
+        ("theta is indicated with the wrong sign", "reverse the sign of theta", -1.0),
+        ("theta is indicated in degrees", "publish theta in rad", radians(1.0)),
+    ):
+        yield Fault(
+            what,
+            remedy,
+            command,
+            (
+                *(_turned(sample, settings, factor=factor) for sample in samples),
+                *readings,
+            ),
+        )
+    yield from _placings(command, events)
+
+
+def _counts(
+    command: Command,
+    samples: Sequence[EncoderSample],
+    detections: Sequence[Detection],
+    settings: CollectorSettings,
+    fault: Callable[[str, str, Sequence[Detection]], Fault],
+) -> Iterator[Fault]:
+    """Yield that marks or lines are counted otherwise; `fault` makes one of other detections."""
+    view, plate = command.view, command.artifact
+    if view is None or plate is None:
+        return
+    for signs, what in (
+        ((-1, 1), "m is counted against plate x"),
+        ((1, -1), "n is counted against plate y"),
+        ((-1, -1), "m and n are counted against plate x and y"),
+    ):
+        even = [
+            sign < 0 and size % 2 == 0
+            for sign, size in zip(signs, plate.shape, strict=True)
+        ]
+        yield fault(
+            what,
+            "m counts the marks along plate x, n along plate y",
+            [
+                replace(
+                    detection,
+                    m=signs[0] * detection.m - even[0],
+                    n=signs[1] * detection.n - even[1],
+                )
+                for detection in detections
+            ],
+        )
+    lines = [detection for detection in detections if _is_line(detection)]
+    if not lines or not plate.angular_count:
+        return
+    yield fault(
+        "the lines are counted clockwise",
+        "count k counter-clockwise",
+        [
+            replace(detection, k=-detection.k % plate.angular_count)
+            for detection in detections
+        ],
+    )
+    zero = _other_zero(view.rotation_rad, plate.angular_count, samples, lines, settings)
+    yield Fault(
+        f"theta is indicated {degrees(zero):+.4g}° from where the lines are",
+        "count k from the line along plate x, and set theta to 0 where that line is read",
+        command,
+        (
+            *(_turned(sample, settings, zero_rad=zero) for sample in samples),
+            *detections,
+        ),
+    )
+
+
+def _other_zero(
+    rotation_rad: float,
+    count: int,
+    samples: Sequence[EncoderSample],
+    lines: Sequence[Detection],
+    settings: CollectorSettings,
+) -> float:
+    """Return the mean difference of the indicated theta to that of the lines, rad."""
+    stamps, turns = _turns(samples, settings)
+    if not turns:
+        return 0.0
+    theta_rad = np.interp([line.stamp_ns for line in lines], stamps, turns)
+    sites = rotation_rad + 2 * pi * np.array([line.k for line in lines]) / count
+    return float(
+        np.angle(
+            np.exp(
+                1j * (theta_rad - Sense(settings.measurement_sense).sign * sites)
+            ).mean()
+        )
+    )
+
+
+def _is_line(event: Detection) -> bool:
+    """Return whether a detection names an angular line."""
+    return event.kind == Kind.ANGULAR and event.has_id
+
+
+def _turns(
+    samples: Sequence[EncoderSample], settings: CollectorSettings
+) -> tuple[list[int], list[float]]:
+    """Return stamps, ns, and theta, rad, of the samples that have it."""
+    turns = [
+        (sample.stamp_ns, theta)
+        for sample in samples
+        if (
+            theta := dict(zip(sample.names, sample.positions, strict=False)).get(
+                settings.joint_theta
+            )
+        )
+        is not None
+    ]
+    return [stamp for stamp, _ in turns], [theta for _, theta in turns]
+
+
+def _turned(
+    sample: EncoderSample,
+    settings: CollectorSettings,
+    *,
+    factor: float = 1.0,
+    zero_rad: float = 0.0,
+) -> EncoderSample:
+    """Return a sample with another theta."""
+    return replace(
+        sample,
+        positions=tuple(
+            factor * position - zero_rad if name == settings.joint_theta else position
+            for name, position in zip(sample.names, sample.positions, strict=False)
+        ),
+    )
+
+
+def _sample_at(
+    sample: EncoderSample,
+    settings: CollectorSettings,
+    *,
+    scale: float,
+    swapped: bool,
+    signs: tuple[int, int],
+) -> EncoderSample:
+    """Return a sample with other x and y."""
+    place = _place(sample, settings)
+    if place is None:
+        return sample
+    x, y = place[::-1] if swapped else place
+    joint_positions = {
+        settings.joint_x: signs[0] * x / scale,
+        settings.joint_y: signs[1] * y / scale,
+    }
+    return replace(
+        sample,
+        positions=tuple(
+            joint_positions.get(name, position)
+            for name, position in zip(sample.names, sample.positions, strict=False)
+        ),
+    )
+
+
+def _placings(command: Command, events: Sequence[Event]) -> Iterator[Fault]:
+    """Yield that the plate lies, or the cell goes, otherwise than commanded."""
+    view, plate = command.view, command.artifact
+    if view is None or plate is None:
+        return
+    remedy = "place the plate as commanded, and measure the view of the command"
+    for deg in (90, 180, 270):
+        yield Fault(
+            f"the marks are those of a plate turned by {deg}°",
+            remedy,
+            replace(command, view=replace(view, rotation_rad=radians(deg))),
+            tuple(events),
+        )
+    for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        yield Fault(
+            f"the marks are those of a plate shifted by {a or b:+d} pitch along "
+            f"{'x' if a else 'y'}",
+            remedy,
+            replace(
+                command,
+                view=replace(
+                    view, translation_m=(a * plate.grid_pitch_m, b * plate.grid_pitch_m)
+                ),
+            ),
+            tuple(events),
+        )

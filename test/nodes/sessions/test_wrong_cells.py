@@ -1,0 +1,467 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`selfcal cell check` of a machine that shares no code with the package, right and wrong.
+
+Each wrong cell fails; the first line names its fault, and what follows from it is told as such.
+"""
+
+import tracemalloc
+from itertools import islice
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from selfcal_ros.nodes.sessions.cell_check import (
+    MOST_KEPT,
+    CellCheck,
+    CheckItem,
+    grouped,
+)
+from selfcal_ros.nodes.sessions.health import Level
+from test.support.bench_cell import Bench
+from test.support.ports import Hands, settings_of
+from test.support.sessions import small_plan
+
+TICK_S, PERIOD_S = 0.05, 0.1
+PLACE, MEASURE, DONE, ABORT = range(4)
+
+
+class Cell(Bench):
+    """A bench that is driven without ROS: a stage that stops for 0.1 s at each exposure.
+
+    `fault` is what is wrong with it, in words.
+    """
+
+    def __init__(self, fault, hands, **kwargs):
+        super().__init__(seed=4, **kwargs)
+        self.fault, self.hands, self.check = fault, hands, None
+        self.work, self.acted, self.begun_s, self.last = [], 0, 0.0, None
+        # a view without an end is exposed only until it is aborted
+        self.planned = iter(())
+        self.view, self.position, self.late = None, self.home, []  # in transit
+        self.noise = np.random.default_rng(1)
+        self.came = 1.0  # sign of the last motion along x
+
+    def lay(self):
+        """Place the plate turned by 1 mrad, or too straight to show the sign of the lines."""
+        super().lay()
+        self.laid[0] = 2e-5 if self.fault.endswith("straight") else 1e-3
+
+    def obey(self, fields):
+        """Act on a command, once."""
+        view = SimpleNamespace(**fields)
+        stamp = fields["header"]["stamp"]
+        stamp = stamp["sec"] * 10**9 + stamp["nanosec"]
+        if stamp <= self.acted or (
+            self.fault == "ignores ABORT" and view.phase == ABORT
+        ):
+            return
+        self.acted, self.work, self.planned = stamp, [], iter(())
+        if view.phase == PLACE:
+            self.lay()
+        elif view.phase == MEASURE:
+            if self.fault == "another view":
+                view.rotation += np.pi / 2
+            if self.fault.endswith("no check stops"):
+                view.check_marks = 0
+            self.view, self.planned = view, self.exposures(view)
+            self.take_next()
+            self.begun_s = self.hands.seconds
+
+    def take_next(self):
+        """Plan the next stop of the view."""
+        self.work += islice(self.planned, 1)
+
+    def see_again(self, fields):
+        """Measure what a status names as missing."""
+        if not self.work and self.view is not None and not fields["complete"]:
+            for m, n in zip(fields["missing_m"], fields["missing_n"], strict=True):
+                self.work += self.stops(self.view, m, n)
+            self.begun_s = self.hands.seconds
+
+    def tick(self):
+        """Publish the encoder, and the detection that is due."""
+        now = self.hands.seconds
+        if self.work and now >= self.begun_s:
+            before, self.position = self.position[0], self.work[0][0]
+            self.came = np.sign(self.position[0] - before) or self.came
+        self.check.take_encoder(self.encoder(now))
+        while self.late and self.late[0][0] <= now:
+            self.check.take_detection(self.late.pop(0)[1])
+        if self.work and now >= self.begun_s + PERIOD_S / 2:
+            _, seen = self.work.pop(0)
+            self.take_next()
+            self.begun_s = now + PERIOD_S / 2
+            self.show(seen, now - TICK_S / 2)
+
+    def encoder(self, now):
+        """Return the sample of the encoder."""
+        x, y, theta = self.position
+        if self.fault == "does not move":
+            x, y, theta = self.home
+        if self.fault == "x and y exchanged":
+            x, y = y, x
+        if self.fault == "millimetres":
+            x, y = 1e3 * x, 1e3 * y
+        if self.fault.startswith("reversed x"):
+            x = -x
+        if self.fault == "reversed theta":
+            theta = -theta
+        if self.fault == "theta in degrees":
+            theta = np.rad2deg(theta)
+        if self.fault == "frozen theta":
+            theta = 0.0
+        if self.fault == "another zero of theta":
+            theta += 0.4
+        names = ("a", "b", "c") if self.fault == "other joints" else ("x", "y", "theta")
+        return SimpleNamespace(
+            header=self.header(now), name=names, position=[x, y, theta]
+        )
+
+    def show(self, seen, seconds):
+        """Publish a detection of an exposure."""
+        seen, before = dict(FIELDS) | seen, self.last
+        self.last = seen
+        if self.fault == "repeats the last detection" and before is not None:
+            seen = before
+        if self.fault.startswith("theta reversed"):
+            seen["offset_theta"] *= -1
+        if self.fault.startswith("camera turned"):
+            turned = np.exp(1j * np.deg2rad(float(self.fault.split()[2]))) * (
+                seen["offset_x"] + 1j * seen["offset_y"]
+            )
+            seen = seen | {"offset_x": turned.real, "offset_y": turned.imag}
+        if self.fault == "mirrored camera":
+            seen = seen | {"offset_x": -seen["offset_x"]}
+        if self.fault == "offsets in mm":
+            seen = seen | {key: 1e3 * seen[key] for key in ("offset_x", "offset_y")}
+        if self.fault == "pixels too large":
+            seen = seen | {key: 1.3 * seen[key] for key in ("offset_x", "offset_y")}
+        if self.fault == "no offsets":
+            seen = seen | {"offset_x": 0.0, "offset_y": 0.0}
+        if self.fault == "offsets 1000 times too small":
+            noise = self.noise.normal(scale=2e-8, size=2)
+            seen = seen | {
+                key: 1e-3 * seen[key] + float(one)
+                for key, one in zip(("offset_x", "offset_y"), noise, strict=True)
+            }
+        if self.fault == "backlash":
+            seen = seen | {"offset_x": seen["offset_x"] + 1e-6 * self.came}
+        seen = seen | {
+            "m and n exchanged": {"m": seen["n"], "n": seen["m"]},
+            "m reversed": {"m": -seen["m"]},
+            "n reversed": {"n": -seen["n"]},
+            "m and n reversed": {"m": -seen["m"], "n": -seen["n"]},
+            "k reversed": {"k": -seen["k"] % 8},
+            "k shifted": {"k": (seen["k"] + 1) % 8},
+        }.get(self.fault, {})
+        seconds += {"stamped late": PERIOD_S, "old stamps": -30.0}.get(self.fault, 0.0)
+        arrives = self.hands.seconds + 11.0 * (self.fault == "arrives late")
+        self.late.append(
+            (arrives, SimpleNamespace(header=self.header(seconds), **seen))
+        )
+
+    def header(self, seconds):
+        stamp = self.hands.now_ns + round((seconds - self.hands.seconds) * 1e9)
+        return SimpleNamespace(
+            stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)
+        )
+
+
+FIELDS = {
+    "m": 0,
+    "n": 0,
+    "k": 0,
+    "offset_x": 0.0,
+    "offset_y": 0.0,
+    "offset_theta": 0.0,
+    "sigma": 0.0,
+}
+
+
+def checked(fault="", statuses=(), joints=(), **cell):
+    """Return the items of a check of a cell, beside nodes with these statuses, and other joints."""
+    hands = Hands()
+    bench = Cell(fault, hands, **cell)
+    check = bench.check = CellCheck(
+        small_plan(),
+        settings_of("measurement_collector"),
+        hands.ports,
+        settle_s=0.2,
+        patience_s=30.0,
+    )
+    for status in statuses:
+        check.take_diagnosis(*status)
+    if joints:
+        check.take_encoder(
+            SimpleNamespace(
+                header=bench.header(0.0), name=joints, position=[0.0] * len(joints)
+            )
+        )
+    while not check.done:
+        hands.published.clear()
+        check.tick()
+        for output, fields in hands.published:
+            (bench.obey if output == "command" else bench.see_again)(fields)
+        bench.tick()
+        hands.pass_time(TICK_S)
+    return check.items
+
+
+@pytest.mark.parametrize("cell", [{}, {"ids": False}])
+def test_the_right_cell_passes(cell):
+    assert [item for item in checked(**cell) if not item.passed] == []
+
+
+REVERSED_THETA = (
+    "the lines are counted clockwise, or theta is indicated with the wrong sign (54"
+)
+WRONG = [
+    ("theta reversed", "theta", "offset_theta has the other sign"),
+    ("theta reversed, straight", "theta", "too little to tell the sign"),
+    ("laid straight", "theta", "too little to tell the sign"),
+    ("ignores ABORT", "abort", "detections later than 2 s after ABORT"),
+    ("camera turned 30", "signs", "the offsets are turned by +30.0°"),
+    ("camera turned 90", "signs", "the offsets are turned by +90.0°"),
+    ("mirrored camera", "signs", "offsets of the other sign: offset_x rises"),
+    (
+        "pixels too large",
+        "signs",
+        "the offsets are 1.3 times as large as the motion of the stage",
+    ),
+    (
+        "no offsets",
+        "signs",
+        "the offsets do not follow the stage: between the stops at a mark",
+    ),
+    ("offsets 1000 times too small", "signs", "it moves by 27 um rms, they by 0.05"),
+    ("backlash", "marks", "16 outlier_among_repeats"),
+    ("m and n exchanged", "ids", "m and n are exchanged"),
+    ("x and y exchanged", "ids", "x and y are exchanged"),
+    ("millimetres", "ids", "the indicated positions are 1000 times those of the marks"),
+    ("offsets in mm", "ids", "the offsets are in mm"),
+    ("reversed x", "ids", "x is indicated with the wrong sign"),
+    ("m reversed", "ids", "m is counted against plate x (54"),
+    (
+        "reversed x, no check stops",
+        "ids",
+        "m is counted against plate x, or x is indicated with the wrong sign (34",
+    ),
+    ("n reversed", "ids", "n is counted against plate y (54"),
+    ("m and n reversed", "ids", "m and n are counted against plate x and y (54"),
+    ("reversed theta", "ids", REVERSED_THETA),
+    ("k reversed", "ids", REVERSED_THETA),
+    ("theta in degrees", "ids", "theta is indicated in degrees (54"),
+    (
+        "frozen theta",
+        "ids",
+        "theta does not move: it is indicated at 0 rad during the whole view",
+    ),
+    (
+        "another zero of theta",
+        "ids",
+        "theta is indicated +22.92° from where the lines are (54",
+    ),
+    ("k shifted", "ids", "theta is indicated -45° from where the lines are (54"),
+    ("other joints", "joints", "heard a, b, c"),
+    ("old stamps", "detection clock", "stamps 3.008e+04 ms old when they arrive"),
+    ("arrives late", "detection clock", "stamps 1.108e+04 ms old when they arrive"),
+    (
+        "stamped late",
+        "ids",
+        "each detection shows the mark of 1 exposure before its stamp",
+    ),
+    (
+        "repeats the last detection",
+        "ids",
+        "each detection shows the mark of 1 exposure before",
+    ),
+    (
+        "does not move",
+        "ids",
+        "the stage does not move: it is indicated at x = 0 mm, y = 0 mm",
+    ),
+    ("another view", "ids", "the marks are those of a plate turned by 90°"),
+]
+
+
+REMEDIES = {
+    "theta reversed, straight": "turn the plate by 1 mrad and check again",
+    "laid straight": "turn the plate by 1 mrad and check again",
+    "arrives late": "publish each detection as soon as it is found",
+    "pixels too large": "divide pixel_size by this factor",
+    "no offsets": "measure the offset anew in each image, and publish it in m",
+    "offsets 1000 times too small": "measure the offset anew in each image",
+    "backlash": "repeats of a mark contradict each other; check the stage for backlash, that one "
+    "node alone publishes detections (ros2 topic info -v)",
+    "old stamps": "stamp detections at the instant of exposure",
+    "reversed theta": "count k counter-clockwise; or reverse the sign of theta",
+    "theta in degrees": "publish theta in rad",
+    "frozen theta": "turn the stage to each line",
+    "k shifted": "count k from the line along plate x, and set theta to 0",
+    "m reversed": "m counts the marks along plate x",
+    "x and y exchanged": "exchange joint_x and joint_y",
+    "reversed x": "reverse the sign",
+}
+
+
+@pytest.mark.parametrize(
+    ("fault", "name", "figure"), WRONG, ids=[fault for fault, *_ in WRONG]
+)
+def test_a_wrong_cell_fails_once_and_what_follows_is_told_as_that(fault, name, figure):
+    first, *others = [item for item in checked(fault) if not item.passed]
+    assert (first.name, first.follows) == (name, "")
+    assert figure in first.figure
+    assert first.remedy.startswith(REMEDIES.get(fault, ""))
+    assert first.remedy
+    assert {(item.follows, item.remedy) for item in others} <= {(name, "")}
+
+
+def test_a_unit_that_would_make_all_marks_one_is_not_named():
+    """Without ids, positions a million times too large would all be those of one mark."""
+    first = next(item for item in checked("millimetres", ids=False) if not item.passed)
+    assert first.figure.startswith(
+        "the indicated positions are 1000 times those of the marks: they are in mm ("
+    )
+
+
+def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
+    hands = Hands()
+    bench = Cell("stands still", hands)
+    check = bench.check = CellCheck(
+        small_plan(),
+        settings_of("measurement_collector"),
+        hands.ports,
+        settle_s=0.2,
+        patience_s=5.0,
+    )
+    check.take_health("mark_detector", Level.ERROR, "no image")
+    check.take_health("mark_detector", Level.OK, "")
+    check.take_health(
+        "cell_driver", Level.ERROR, "first move: x is reversed; correct turn"
+    )
+    while not check.done:
+        check.tick()
+        bench.tick()
+        hands.pass_time(TICK_S)
+    assert check.items[-1] == CheckItem(
+        "commands",
+        False,
+        "0 detections in 5 s after MEASURE: cell_driver: first move: x is reversed",
+        "correct turn",
+    )
+
+
+HOT = ("motor x", Level.ERROR, "too hot")
+
+
+@pytest.mark.parametrize(
+    "statuses, told",
+    [
+        ([HOT], "ERROR on /diagnostics: motor x: too hot"),
+        ([HOT, ("motor x", Level.OK, "cooled")], ""),
+        ([("fan", Level.WARN, "slow")], ""),
+        (
+            [(f"axis {number}", Level.ERROR, "off") for number in range(7)],
+            "axis 4: off; and 2 more",
+        ),
+    ],
+)
+def test_other_nodes_in_error_fail_the_check_of_a_right_cell(statuses, told):
+    failed = [item for item in checked(statuses=statuses) if not item.passed]
+    assert [item.name for item in failed] == ["diagnostics"] * bool(told)
+    assert not told or failed[0].figure.endswith(told)
+
+
+def kept_of(number: int) -> int:
+    """Return the memory, bytes, that as many statuses in error, each of a new name, take."""
+    check = CellCheck(small_plan(), settings_of("measurement_collector"), Hands().ports)
+    tracemalloc.start()
+    for name in range(number):
+        check.take_diagnosis(f"{name} " + "x" * 20_000, Level.ERROR, "y" * 20_000)
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return kept
+
+
+def test_names_of_statuses_without_end_take_no_memory():
+    assert kept_of(8 * MOST_KEPT) < 1.1 * kept_of(MOST_KEPT) < 1_000_000
+
+
+def test_joints_without_end_do_not_hide_those_of_the_stage():
+    made_up = [f"{number} " + "z" * 20_000 for number in range(2 * MOST_KEPT)]
+    joints = next(item for item in checked(joints=made_up) if item.name == "joints")
+    assert joints.passed and len(joints.figure) < 10_000
+
+
+def test_what_was_not_read_is_said_and_fails():
+    statuses = [
+        (f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)
+    ]
+    statuses += [(name, Level.OK, "on") for name, _, _ in statuses[1:]]
+    (item,) = (item for item in checked(statuses=statuses) if not item.passed)
+    assert item.figure == (
+        "ERROR on /diagnostics: axis 000: off; there were more than 100 names, "
+        "and others were not read"
+    )
+
+
+def test_a_status_that_is_known_is_read_however_many_there_are():
+    statuses = [
+        (f"axis {number:03}", Level.ERROR, "off") for number in range(MOST_KEPT + 1)
+    ]
+    (item,) = (
+        item
+        for item in checked(statuses=[*statuses, ("axis 000", Level.ERROR, "hot")])
+        if not item.passed
+    )
+    assert item.figure.startswith(
+        "ERROR on /diagnostics: axis 000: hot; axis 001: off; "
+    )
+    assert item.figure.endswith(
+        "; and 95 more; there were more than 100 names, and others were not read"
+    )
+
+
+def test_two_publishers_are_the_only_fault():
+    hands = Hands()
+    check = CellCheck(small_plan(), settings_of("measurement_collector"), hands.ports)
+    cell = Cell("", hands)
+    cell.check, check.publishers = (
+        check,
+        {"stage/mark_detections": ["camera", "old_camera"]},
+    )
+    while not check.done:
+        check.tick()
+        cell.tick()
+        hands.pass_time(TICK_S)
+    [item] = check.items
+    assert (item.name, item.passed) == ("publishers", False)
+    assert item.figure == "2 publishers of stage/mark_detections: camera, old_camera"
+
+
+def test_faults_that_have_nothing_to_do_with_each_other_stand_side_by_side():
+    items = [
+        CheckItem(name, passed, name)
+        for name, passed in (
+            ("rest", True),
+            ("ids", False),
+            ("marks", False),
+            ("signs", False),
+            ("theta", False),
+        )
+    ]
+    assert [(item.name, item.follows) for item in grouped(items, "signs")] == [
+        ("rest", ""),
+        ("signs", ""),
+        ("ids", "signs"),
+        ("marks", "signs"),
+        ("theta", ""),
+    ]
+    assert [(item.name, item.follows) for item in grouped(items, "")] == [
+        ("rest", ""),
+        ("ids", ""),
+        ("marks", "ids"),
+        ("signs", "ids"),
+        ("theta", ""),
+    ]
