@@ -158,8 +158,8 @@ def what_now(picture: dict[str, Any]) -> str:
         "DONE",
         "ABORTED",
     ):
-        return f"Nothing: {printable(health['message'])}."
-    look = f"Look: {printable(health['message'])}." if health["level"] else ""
+        return f"Nothing: {health['message']}."
+    look = f"Look: {health['message']}." if health["level"] else ""
     if state == "PLACING":
         x, y = command.get("translation_mm") or (None, None)
         turn = command.get("rotation_deg")
@@ -171,7 +171,7 @@ def what_now(picture: dict[str, Any]) -> str:
             )
         )
         name = command.get("view_name") or health["values"].get("view_name", "")
-        return f"Place the plate for view '{printable(name)}'{pose}; then press c. {look}".rstrip()
+        return f"Place the plate for view '{name}'{pose}; then press c. {look}".rstrip()
     if state == "MEASURING":
         return look or "Nothing: the view is being measured."
     return {
@@ -179,7 +179,7 @@ def what_now(picture: dict[str, Any]) -> str:
         "DONE": "Done. s starts another run.",
         "ABORTED": "Aborted. s starts a new run.",
         "FOLLOWING": "Nothing: another sequencer is in command; a ends that.",
-    }.get(state, printable(health["message"]))
+    }.get(state, health["message"])
 
 
 def _sense_of(turn_deg: Any) -> str:
@@ -234,17 +234,17 @@ def _task(picture: dict[str, Any]) -> list[Text]:
     heading = "no view yet"
     if command and views:
         heading = (
-            f"view {index + 1} of {views}: {printable(name)}"
+            f"view {index + 1} of {views}: {name}"
             if command["phase"] in ("PLACE", "MEASURE")
             else f"{min(index, views)} of {views} views done"
         )
-    run = printable(values.get("run_id") or (command or {}).get("run_id") or "-")
-    plan = printable(values.get("plan_id") or (command or {}).get("plan_id") or "-")
+    run = values.get("run_id") or (command or {}).get("run_id") or "-"
+    plan = values.get("plan_id") or (command or {}).get("plan_id") or "-"
     return [
         Text.assemble((heading, "bold"), (f"   plan {plan}, run {run}", "dim")),
         Text(what_now(picture), style="bold cyan"),
         *(
-            [Text(f"The map is saved as {printable(saved_as(picture))}")]
+            [Text(f"The map is saved as {saved_as(picture)}")]
             if saved_as(picture)
             else []
         ),
@@ -263,7 +263,7 @@ def _measured(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
     if view is None:
         return headed("coverage", [Text("nothing measured yet")], width)
     reasons = [
-        Text(f"{count:6d}  {printable(reason)}")
+        Text(f"{count:6d}  {reason}")
         for reason, count in sorted(view["rejected"].items(), key=lambda item: -item[1])
     ] or [Text("none")]
     rejected = headed(
@@ -276,9 +276,7 @@ def _measured(picture: dict[str, Any], width: int, rows: int) -> list[Text]:
     plate = _plate(view, width, room) if view["plate"] else []
     return fitted(
         [
-            *headed(
-                f"coverage of {printable(view['view_name'])}", [*text, *plate], width
-            ),
+            *headed(f"coverage of {view['view_name']}", [*text, *plate], width),
             *rejected,
         ],
         rows,
@@ -376,10 +374,10 @@ def _verdict(picture: dict[str, Any]) -> list[Text]:
     earlier = "; an earlier run" if run and now and run != now else ""
     texts = [
         Text.assemble((word, colour), f"; views {done} of {planned}{earlier}"),
-        Text(printable(summary["state"])),
+        Text(summary["state"]),
     ]
     texts += [
-        Text(f"- {printable(line)}", style="yellow")
+        Text(f"- {line}", style="yellow")
         for line in (*summary["causes"], *summary["advice"])
     ]
     if summary["max_error_um"] is None:
@@ -432,7 +430,7 @@ def _health(picture: dict[str, Any]) -> list[Text]:
             if health is None
             else LEVELS.get(health["level"], LEVELS[2])
         )
-        message = "" if health is None else f" {printable(health['message'])}"
+        message = "" if health is None else f" {health['message']}"
         texts.append(Text.assemble((f"{node}: ", "bold"), (word, colour), message))
     return [
         *texts,

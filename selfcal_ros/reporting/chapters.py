@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from selfcal_ros import __version__
-from selfcal_ros.errors import printable
 from selfcal_ros.estimation.comparison.covariance import plate_as_map
 from selfcal_ros.estimation.verdict.uncertainty import Budget, budgets
 from selfcal_ros.model.reference import reference_to_dict
@@ -179,7 +178,7 @@ def _unit(key: str) -> tuple[str, str, float]:
 
 
 def _words(key: str) -> str:
-    return printable(key).replace("_", " ").strip()
+    return str(key).replace("_", " ").strip()
 
 
 def _heading(key: str) -> str:
@@ -197,7 +196,7 @@ def _cell(key: str, value: Any) -> str:
     scale = _unit(key)[2]
     if isinstance(value, float) or (isinstance(value, int) and scale != 1.0):
         return significant(value * scale)
-    return printable(value)
+    return str(value)
 
 
 ABOUT = {
@@ -227,15 +226,11 @@ def heading(result: CalibrationResult, about: Mapping[str, str]) -> Section:
     return Section(
         "Calibration",
         (
-            *(
-                (_words(key), printable(value))
-                for key, value in about.items()
-                if key not in ABOUT
-            ),
+            *((_words(key), value) for key, value in about.items() if key not in ABOUT),
             *(
                 (
                     _words(key),
-                    printable(facts.get(key) or f"{UNKNOWN} (not given: {hint})"),
+                    facts.get(key) or f"{UNKNOWN} (not given: {hint})",
                 )
                 for key, hint in ABOUT.items()
             ),
@@ -268,7 +263,7 @@ def convention_section(result: CalibrationResult) -> Section:
     if result.artifact.angular_count:
         facts.append(("θ datum", sections.THETA_DATUM[result.error_map.datum_theta]))
     facts += [
-        ("sense", _SENSE.get(result.sense, printable(result.sense))),
+        ("sense", _SENSE.get(result.sense, result.sense)),
         (
             "uncertainty",
             "u is the standard uncertainty (k=1), U = k u the expanded one, "
@@ -290,13 +285,13 @@ def text_of(value: Any) -> str:
         return ", ".join(
             f"{_words(key)}: {text_of(item)}" for key, item in value.items()
         )
-    return f"{value:.6g}" if isinstance(value, float) else printable(str(value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def provenance_section(result: CalibrationResult) -> Section:
     """Return the provenance of the numbers: input and digest, method, software."""
     source = result.input
-    facts = [(_words(key), printable(value)) for key, value in source.items() if value]
+    facts = [(_words(key), str(value)) for key, value in source.items() if value]
     facts += [
         (
             "method",
@@ -304,7 +299,7 @@ def provenance_section(result: CalibrationResult) -> Section:
                 "joint": "joint least squares of all readings",
                 "law": "Hu's closed-form law",
                 COMBINED: "weighted mean of several calibrations",
-            }.get(result.method, printable(result.method)),
+            }.get(result.method, result.method),
         ),
         ("result schema", SCHEMA),
         ("software", f"selfcal_ros {__version__}"),
@@ -461,11 +456,11 @@ def _causes(result: CalibrationResult) -> Chapter:
         rows.append(
             (
                 cause.name.replace("_", " "),
-                printable(what_it_is(cause)),
+                what_it_is(cause),
                 *fixed_column([cause.size * scale, cause.u * scale], 3),
                 unit,
                 f"{cause.p:.1g}",
-                printable(advice(cause)),
+                advice(cause),
             )
         )
     header = ("cause", "what the readings show", "size", "u", "unit", "p", "remedy")
@@ -481,10 +476,8 @@ def _causes(result: CalibrationResult) -> Chapter:
         (
             Section(
                 "Verdict",
-                (("verdict", printable(verdict.sentence)),) if verdict.sentence else (),
-                notes=tuple(
-                    f"failed: {printable(reason)}" for reason in verdict.reasons
-                ),
+                (("verdict", verdict.sentence),) if verdict.sentence else (),
+                notes=tuple(f"failed: {reason}" for reason in verdict.reasons),
             ),
             Section(
                 "Likely causes, the most likely first",
@@ -620,7 +613,7 @@ def _budget_table(budget: Budget, unit: str, scale: float) -> Section:
             unit,
             dof_text(line.dof),
             line.source,
-            printable(line.text or line_text(line)),
+            line.text or line_text(line),
         )
         for line, *effect in zip(budget.lines, *effects, strict=True)
     ]

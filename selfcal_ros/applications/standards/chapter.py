@@ -9,7 +9,7 @@ from selfcal_ros.applications.standards.statements import (
     statement_texts,
 )
 from selfcal_ros.apply import StageMap
-from selfcal_ros.errors import InputError, printable, visible
+from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.reporting.chapters import Chapter
 from selfcal_ros.reporting.summary.sections import Section
@@ -52,18 +52,11 @@ def certificate_chapter(result: CalibrationResult, details: dict[str, Any]) -> C
         stage = StageMap(result)
         distance = distance_text(stage, *stage.length_uncertainty())
     except InputError as error:
-        distance = (
-            f"the correlations between nodes are not known ({printable(error.what)})"
-        )
+        distance = f"the correlations between nodes are not known ({error.what})"
     sections += [
-        *(
-            Section(name, notes=tuple(map(visible, texts)))
-            for name, texts in statement_texts(result)
-        ),
+        *(Section(name, notes=tuple(texts)) for name, texts in statement_texts(result)),
         Section("Uncertainty of distances", notes=(distance,)),
-        Section(
-            "Remarks", notes=tuple(visible(item["text"]) for item in details["remarks"])
-        ),
+        Section("Remarks", notes=tuple(item["text"] for item in details["remarks"])),
     ]
     return Chapter("Certificate", sections=tuple(sections))
 
@@ -97,10 +90,7 @@ def _addressed(party: dict[str, Any]) -> str:
 def _facts(title: str, facts: dict[str, Any]) -> Section:
     return Section(
         title,
-        tuple(
-            (key.replace("_", " "), printable(str(value)))
-            for key, value in facts.items()
-        ),
+        tuple((key.replace("_", " "), str(value)) for key, value in facts.items()),
     )
 
 
@@ -110,7 +100,7 @@ def _table(title: str, rows: list[dict[str, Any]]) -> Section:
         title,
         table=(
             tuple(key.replace("_", " ") for key in keys),
-            *(tuple(printable(str(row.get(key, ""))) for key in keys) for row in rows),
+            *(tuple(str(row.get(key, "")) for key in keys) for row in rows),
         )
         if rows
         else (),

@@ -75,14 +75,16 @@ class Watch:
         self._map = message
 
     def picture(self) -> dict[str, Any]:
-        """Return everything as JSON values."""
-        return {
-            "health": {node: self._health(node) for node in sorted(self._seen)},
-            "command": self._commanded(),
-            "view": self._view(),
-            "summary": self._summed(),
-            "map": self._mapped(),
-        }
+        """Return everything as JSON values, its texts printable."""
+        return _printable_texts(
+            {
+                "health": {node: self._health(node) for node in sorted(self._seen)},
+                "command": self._commanded(),
+                "view": self._view(),
+                "summary": self._summed(),
+                "map": self._mapped(),
+            }
+        )
 
     def _health(self, node: str) -> dict[str, Any] | None:
         health = self._presence.of(node)
@@ -91,11 +93,8 @@ class Watch:
             if health is None
             else {
                 "level": int(health.level),
-                "message": printable(health.message),
-                "values": {
-                    printable(key): printable(value)
-                    for key, value in islice(health.values.items(), MOST_ENTRIES)
-                },
+                "message": health.message,
+                "values": dict(islice(health.values.items(), MOST_ENTRIES)),
             }
         )
 
@@ -103,10 +102,10 @@ class Watch:
         command = self._command
         return command and {
             "phase": Phase(command.phase).name if command.phase in list(Phase) else "?",
-            "plan_id": printable(command.plan_id),
-            "run_id": printable(command.run_id),
+            "plan_id": command.plan_id,
+            "run_id": command.run_id,
             "view_index": command.view_index,
-            "view_name": printable(command.view_name),
+            "view_name": command.view_name,
             "views_planned": command.views_planned,
             "rotation_deg": _finite(math.degrees(command.rotation)),
             "translation_mm": [
@@ -126,7 +125,7 @@ class Watch:
             return None  # nothing measured in this run yet
         plate, step = self._plate()
         return {
-            "view_name": printable(status.view_name),
+            "view_name": status.view_name,
             "complete": bool(status.complete),
             "grid": [status.grid_done, status.grid_expected],
             "angular": [status.angular_done, status.angular_expected],
@@ -174,7 +173,7 @@ class Watch:
     def _summed(self) -> dict[str, Any] | None:
         summary = self._summary
         return summary and {
-            "state": printable(summary.state),
+            "state": summary.state,
             "views": [summary.views_done, summary.views_planned],
             "identifiable": bool(summary.identifiable),
             "qualified": bool(summary.qualified),
@@ -184,7 +183,7 @@ class Watch:
             "rms_uncertainty_um": _finite(summary.rms_uncertainty_um),
             "advice": _lines(summary.advice),
             "causes": _lines(summary.causes),
-            "run_id": printable(summary.run_id),
+            "run_id": summary.run_id,
         }
 
     def _mapped(self) -> dict[str, Any] | None:
@@ -207,7 +206,7 @@ class Watch:
                 size, np.arange(0, size.shape[axis], step), axis=axis
             )
         return {
-            "run_id": printable(message.run_id),
+            "run_id": message.run_id,
             "qualified": bool(message.qualified),
             "step": step,
             "um": [[_finite(value) for value in row] for row in size.T[::-1].tolist()],
@@ -215,7 +214,19 @@ class Watch:
 
 
 def _lines(texts: Iterable[str]) -> list[str]:
-    return [printable(text) for text in islice(texts, MOST_ENTRIES)]
+    return list(islice(texts, MOST_ENTRIES))
+
+
+def _printable_texts(value: Any) -> Any:
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, dict):
+        return {
+            _printable_texts(key): _printable_texts(item) for key, item in value.items()
+        }
+    if isinstance(value, list):
+        return [_printable_texts(item) for item in value]
+    return value
 
 
 def _finite(value: float) -> float | None:

@@ -72,10 +72,9 @@ def all_sections(
 def verdict_section(result: CalibrationResult) -> Section:
     """Return the verdict with failed tests and their likely causes; empty if none failed."""
     verdict = result.verdict
-    notes = [printable(reason) for reason in verdict.reasons]
+    notes = list(verdict.reasons)
     notes += [
-        f"likely cause: {printable(cause.text)} (p = {cause.p:.1g})"
-        for cause in verdict.causes
+        f"likely cause: {cause.text} (p = {cause.p:.1g})" for cause in verdict.causes
     ]
     return Section(_TITLES[verdict.grade], notes=(*notes, *enlargement_texts(verdict)))
 
@@ -161,7 +160,7 @@ def measurement_section(result: CalibrationResult) -> Section:
     }
     views = f"{counted_views(result.views)}, {len(measured_names)} measured"
     facts = [
-        ("plan", f"{printable(result.plan_id) or UNKNOWN}: {views}"),
+        ("plan", f"{result.plan_id or UNKNOWN}: {views}"),
         (
             "plate",
             f"{marks}, field {x:.6g} × {y:.6g} mm, {artifact.angular_count or 'no'} angular lines",
@@ -183,7 +182,7 @@ def measurement_section(result: CalibrationResult) -> Section:
         ),
         (
             "method",
-            f"{printable(result.method)}, {printable(result.sense).replace('_', ' ')}, "
+            f"{result.method}, {result.sense.replace('_', ' ')}, "
             f"{result.model.misalignment} misalignments",
         ),
         (
@@ -207,11 +206,11 @@ def measurement_section(result: CalibrationResult) -> Section:
             )
         )
     if result.input.get("file"):
-        digest = printable(result.input.get("sha256") or "")
+        digest = str(result.input.get("sha256") or "")
         facts.append(
             (
                 "input",
-                printable(result.input["file"])
+                str(result.input["file"])
                 + (f" (sha256 {digest[:16]})" if digest else ""),
             )
         )
@@ -235,7 +234,7 @@ def views_section(result: CalibrationResult) -> Section:
     """Return the table of views: nominal pose, misalignment, detections."""
     artifact, views = result.plate, result.views
     columns = [
-        [printable(v.name) for v in views],
+        [v.name for v in views],
         [
             pose_text(v.rotation, (v.translation_x, v.translation_y), artifact)
             for v in views
@@ -510,10 +509,7 @@ def rejected_section(result: CalibrationResult) -> Section:
     used = sum(v.used for v in result.views)
     facts = [
         ("detections", f"{used} used, {total} rejected"),
-        *(
-            (printable(reason).replace("_", " "), str(count))
-            for reason, count in counts
-        ),
+        *((reason.replace("_", " "), str(count)) for reason, count in counts),
     ]
     return Section("Rejected detections", tuple(facts))
 
@@ -521,11 +517,9 @@ def rejected_section(result: CalibrationResult) -> Section:
 def attention_section(result: CalibrationResult) -> Section:
     """Return unseen modes, advice and warnings, which require action."""
     observability = result.observability
-    lines = [
-        f"undetermined mode: {printable(mode.text)}" for mode in observability.modes
-    ]
-    lines += [f"advice: {printable(advice.text)}" for advice in observability.advice]
-    lines += [f"warning: {printable(warning)}" for warning in result.warnings]
+    lines = [f"undetermined mode: {mode.text}" for mode in observability.modes]
+    lines += [f"advice: {advice.text}" for advice in observability.advice]
+    lines += [f"warning: {warning}" for warning in result.warnings]
     return Section("Attention", notes=tuple(lines))
 
 
@@ -659,7 +653,7 @@ def summary_text(
     """
 
     def spell(text: str) -> str:
-        return to_ascii(text) if ascii_only else text
+        return printable(to_ascii(text) if ascii_only else text)
 
     lines = [spell(state_sentence(result))]
     for section in all_sections(result, truth):
