@@ -91,7 +91,7 @@ def test_text_and_plots_are_changed_only_where_it_is_asked_for(tmp_path):
         }
 
     assert sampled() == {"estimation/a.py", "laser/a.py", "files.py"}
-    assert sampled("selfcal_ros/cli", "selfcal_ros/applications/laser/") == {
+    assert sampled("selfcal_ros/cli", "selfcal_ros/laser/") == {
         "cli/a.py",
         "laser/a.py",
     }
