@@ -239,7 +239,8 @@ class StageMap(Compensator):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the error indicated - true of distances, and its standard uncertainty, (P,) m.
 
-        The uncertainty is NaN where an end lies outside the field.
+        The uncertainty is NaN where an end lies outside the field, both where one lies next to an
+        unknown site.
 
         Parameters
         ----------
@@ -260,17 +261,19 @@ class StageMap(Compensator):
         if not (length > 0).all():
             raise InputError("distance", "its ends coincide", "give two points")
         (ax, ay), (bx, by) = self.error(x1, y1), self.error(x2, y2)
+        error = np.hypot(dx + bx - ax, dy + by - ay) - length
         u = np.full(len(length), np.nan)
-        inside = np.flatnonzero(self.inside(x1, y1) & self.inside(x2, y2))
-        for start in range(0, len(inside), MAX_POINTS // 2):
-            chunk = inside[start : start + MAX_POINTS // 2]
+        inside = self.inside(x1, y1) & self.inside(x2, y2)
+        told = np.flatnonzero(inside & np.isfinite(error))
+        for start in range(0, len(told), MAX_POINTS // 2):
+            chunk = told[start : start + MAX_POINTS // 2]
             cover = self.covariance(
                 np.append(x1[chunk], x2[chunk]), np.append(y1[chunk], y2[chunk])
             )
             u[chunk] = _along(
                 cover, dx[chunk] / length[chunk], dy[chunk] / length[chunk]
             )
-        return np.hypot(dx + bx - ax, dy + by - ay) - length, u
+        return error, u
 
     def length_uncertainty(self, *, anywhere: bool = True) -> tuple[float, float]:
         """Return a in m and b in m/m: U of a distance L in the field is at most a + b L.

@@ -305,6 +305,12 @@ def test_a_map_with_nodes_of_its_own_is_applied_by_its_interpolation(nodes, meth
         )
         x, y = stage.command(place.real, place.imag)
         assert complex(x[0], y[0]) - place[0] == pytest.approx(wanted[0], abs=1e-15)
+        return
+    holes = result.artifact.x_m[~result.error_map.valid]
+    far = ([0.0, holes[0]], [0.0, result.artifact.y_m[~result.error_map.valid][0]])
+    error, u = stage.length_error(([0.01, 0.01], [0.0, 0.0]), far)
+    assert np.isfinite(error[0]) and u[0] > 0
+    assert np.isnan(error[1]) and np.isnan(u[1])
 
 
 def stage_of(plate, covariance, monkeypatch, halfway=((0, 0), (0, 0))):

@@ -258,7 +258,8 @@ def distances(
             file=sys.stderr,
         )
     rows = np.column_stack([points, np.hypot(x2 - x1, y2 - y1), error, u])
-    return _csv([*ENDS, "length", "error", "u"], rows), 0, int(outside.sum())
+    unknown = int((np.isnan(error) & ~outside).sum())
+    return _csv([*ENDS, "length", "error", "u"], rows), unknown, int(outside.sum())
 
 
 def _csv(head: list[str], rows: np.ndarray) -> str:

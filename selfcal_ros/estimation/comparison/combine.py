@@ -669,7 +669,8 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
 
     Differences of datum are removed first. The weight of a run is the inverse of its mean variance
     plus that between runs. What all runs of a machine share (the microscope as declared, and with
-    `keep_scale` the reference length) does not average out.
+    `keep_scale` the reference length, unless each run names a certificate of its own) does not
+    average out.
 
     Parameters
     ----------
@@ -704,10 +705,11 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     shapes = {"xy": _polynomials(first.artifact.x_m, first.artifact.y_m, known_sites)}
     if lines.sum() > 1:
         shapes["theta"] = _waves(lines)
+    same_length = keep_scale and not _lengths_of_their_own(members)
     means = {
         kind: mean_of(
             [
-                _run(member, kind, common[kind], keep_scale=keep_scale)
+                _run(member, kind, common[kind], same_length=same_length)
                 for member in members
             ],
             datum_columns(first.artifact, kind, common[kind], scale=not keep_scale),
@@ -719,6 +721,13 @@ def combine(members: Sequence[Member], *, keep_scale: bool = False) -> Combinati
     if not keep_scale:
         result = replace(result, reference=None)
     return Combination(result, known_sites, means["xy"], means.get("theta"))
+
+
+def _lengths_of_their_own(members: Sequence[Member]) -> bool:
+    """Return whether each run names another certificate of its length."""
+    references = [member.result.reference for member in members if member.result]
+    names = [reference.certificate for reference in references if reference]
+    return all(names) and len(set(names)) == len(references)
 
 
 def _checked(members: Sequence[Member], *, keep_scale: bool) -> CalibrationResult:
@@ -817,7 +826,7 @@ def _same_recording(first: CalibrationResult, second: CalibrationResult) -> bool
 
 
 def _run(
-    member: Member, kind: str, known_places: np.ndarray, *, keep_scale: bool
+    member: Member, kind: str, known_places: np.ndarray, *, same_length: bool
 ) -> RunValues:
     values, u = (of[:, known_places].ravel() for of in member.error_map.of(kind))
     result = member.result
@@ -826,7 +835,7 @@ def _run(
         return RunValues(values, u**2, np.zeros(len(u)), False, np.inf)
     covariance = covariance_of(result, kind, known_places)
     if kind == "xy":
-        factors = _common(result, known_places, keep_scale=keep_scale)
+        factors = _common(result, known_places, same_length=same_length)
     common = factors.T @ factors if covariance.ndim == 2 else (factors**2).sum(axis=0)
     return RunValues(
         values, covariance - common, common, True, result.noise.dof_of(kind)
@@ -834,11 +843,11 @@ def _run(
 
 
 def _common(
-    result: CalibrationResult, known_sites: np.ndarray, *, keep_scale: bool
+    result: CalibrationResult, known_sites: np.ndarray, *, same_length: bool
 ) -> np.ndarray:
     """Return factors L (r, 2n) of the covariance L' L of what the runs of a machine share, m.
 
-    Terms of the microscope that are known from elsewhere, and the reference length.
+    Terms of the microscope that are known from elsewhere, and the same reference length.
     """
     terms = {term.name: term for term in result.model.terms}
     names = [
@@ -851,7 +860,7 @@ def _common(
     factors = saved.of_map[np.isin(saved.terms, names)][:, :, known_sites]
     factors = factors.reshape(len(factors), 2 * int(known_sites.sum()))
     factors = factors * np.nan_to_num(result.noise.sigma_xy)
-    if keep_scale and result.reference is not None:
+    if same_length and result.reference is not None:
         lattice = result.artifact
         place = (
             np.concatenate([lattice.x_m[known_sites], lattice.y_m[known_sites]])

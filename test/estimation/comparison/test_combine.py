@@ -305,6 +305,19 @@ def test_a_reference_length_is_kept_once():
         combine([*runs, part("c", C)], keep_scale=True)
 
 
+def test_lengths_of_different_certificates_explain_that_magnifications_differ():
+    """1 µm/m apart with u of 1 µm/m each: the maps differ by less than their uncertainties."""
+    runs = []
+    for name, error in (("PTB 1", 1e-5), ("laser 7", 1.1e-5)):
+        length = ReferenceLength("artifact", error, 1e-6, name)
+        options = Options(assumed=(), causes=False, reference=length)
+        runs.append(part(name, calibrated(len(runs) + 1, options=options)))
+    found = combine(runs, keep_scale=True)
+    assert not found.xy.common.any()
+    assert found.result.verdict.grade is Grade.GOOD
+    assert all(run["agrees"] for run in found.result.extra["combined"]["runs"])
+
+
 def test_the_part_between_runs_has_the_pattern_of_a_polynomial_and_of_a_wave():
     """x y in Gx and two waves per turn, amplitudes -1, 0, 1 of 1 µm and 1 mrad."""
     x, y = ARTIFACT.x_m / 0.03, ARTIFACT.y_m / 0.03
