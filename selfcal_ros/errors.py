@@ -155,13 +155,3 @@ def visible(text: str) -> str:
         c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
         for c in text
     )
-
-
-def check_celsius(value: float, where: str, of: str = "") -> None:
-    """Raise InputError for a temperature that no machine has in degC, as one given in kelvin."""
-    if not -50.0 <= value <= 100.0:
-        raise InputError(
-            where,
-            f"{value:g}{of} is not a temperature from -50 to 100 degC: is it in K?",
-            "give degC",
-        )

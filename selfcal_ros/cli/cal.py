@@ -47,7 +47,8 @@ from selfcal_ros.compensation.residual import (
     bends_between,
     combined,
 )
-from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError, check_celsius
+from selfcal_ros.errors import ExitCode, InputError, NotIdentifiableError
+from selfcal_ros.model.reference import check_celsius
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import plain
 from selfcal_ros.results import read_result

@@ -22,10 +22,10 @@ from selfcal_ros.collection.reduce import Rules
 from selfcal_ros.collection.samples import Limits
 from selfcal_ros.collection.timeline import (
     Timeline,
-    ViewCache,
     build_timeline,
     without_strays,
 )
+from selfcal_ros.collection.view_readings import ViewCache
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.model.readings import Measurements, Sense, ViewReadings
 from selfcal_ros.model.view import plan_keys

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal_ros.errors import InputError, check_celsius
+from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.plain_numbers import number_of, whole_number_of
@@ -290,3 +290,13 @@ def reference_from_dict(raw: Any) -> ReferenceLength | None:
         return None if raw is None else read(ReferenceLength, raw)
     except InputError as error:
         raise ValueError(str(error)) from error
+
+
+def check_celsius(value: float, where: str, of: str = "") -> None:
+    """Raise InputError for a temperature that no machine has in degC, as one given in kelvin."""
+    if not -50.0 <= value <= 100.0:
+        raise InputError(
+            where,
+            f"{value:g}{of} is not a temperature from -50 to 100 degC: is it in K?",
+            "give degC",
+        )

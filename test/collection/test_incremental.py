@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from selfcal_ros.collection import timeline
+from selfcal_ros.collection import view_readings
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.collection.encoder import JointTrack, TrackLimits
 from selfcal_ros.collection.exposures import Exposures, Tracks
@@ -137,7 +137,11 @@ def test_what_is_asked_on_the_way_changes_nothing(seed, spread, asked):
 
 @pytest.mark.parametrize("size", [1, 7, 100])
 def test_how_many_are_looked_at_together_changes_nothing(monkeypatch, size):
-    for module, name in ((timeline, "TOGETHER"), (identify, "PART"), (repeats, "PART")):
+    for module, name in (
+        (view_readings, "TOGETHER"),
+        (identify, "PART"),
+        (repeats, "PART"),
+    ):
         monkeypatch.setattr(module, name, size)
     assert digest(EVENTS) == digest(late(4, 10**6)) == WANTED
 

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from datetime import date
 from typing import Any
 
-from selfcal_ros.errors import InputError, check_celsius, known_are
+from selfcal_ros.errors import InputError, known_are
 from selfcal_ros.files import read_yaml
+from selfcal_ros.model.reference import check_celsius
 from selfcal_ros.plain_numbers import number_of
 
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
