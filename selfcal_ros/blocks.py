@@ -6,11 +6,11 @@ what it is as a finding. Whatever estimates, tests, searches or reports terms of
 over the blocks; those of other packages are registered as entry points `selfcal.blocks`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -71,18 +71,51 @@ Located = Iterator[tuple[dict[str, Any], np.ndarray]]
 of the finding, and the weights of the coefficients."""
 
 
-def by_coefficient(explanation: Any, names: tuple[str, ...]) -> Located:
+class Coefficient(Protocol):
+    """One coefficient of a block."""
+
+    @property
+    def view(self) -> int:
+        """View whose coefficient it is, or `SHARED`."""
+        ...
+
+    @property
+    def component(self) -> str:
+        """Name of its component."""
+        ...
+
+
+class Estimates(Protocol):
+    """Estimated coefficients of a block, SI units."""
+
+    @property
+    def columns(self) -> Sequence[Coefficient]:
+        """The coefficients, (p,)."""
+        ...
+
+    @property
+    def values(self) -> np.ndarray:
+        """Their values, (p,)."""
+        ...
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Their covariance, (p, p)."""
+        ...
+
+
+def by_coefficient(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield every coefficient: the usual `Block.located`.
 
     Parameters
     ----------
-    explanation : Explanation
-        With `columns`, `values` and `covariance` of the coefficients.
+    estimates : Estimates
+        The coefficients of the block that explain the residuals.
     names : tuple of str
         Names of the views that the columns count.
     """
     for column, weights in zip(
-        explanation.columns, np.eye(len(explanation.columns)), strict=True
+        estimates.columns, np.eye(len(estimates.columns)), strict=True
     ):
         yield (
             {
@@ -174,7 +207,7 @@ class Block:
     part_of: str = ""
     shared: bool = False
     alone: Callable[[str], bool] = lambda component: False
-    located: Callable[[Any, tuple[str, ...]], Located] = by_coefficient
+    located: Callable[[Estimates, tuple[str, ...]], Located] = by_coefficient
     change: str = "view"
     cure: str = ""
     sentence: Callable[[Any], str] | None = None

@@ -29,11 +29,14 @@ from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.errors import InputError, NotIdentifiableError
 from selfcal_ros.estimation.checks.placing import PlacingError
 from selfcal_ros.estimation.checks.wiring import WiringError
+from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.outliers import clean
 from selfcal_ros.estimation.quality.validation import judged_by, validate
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.plate_form import with_nodes
+from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import (
+    CalibrationResult,
     created_now,
     result_to_dict,
     unidentified_result,
@@ -320,7 +323,7 @@ def run(args: argparse.Namespace) -> int:
     return exit_code(result)
 
 
-def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
+def _with_map(args: argparse.Namespace, measurements: Measurements) -> Measurements:
     """Return the readings with the nodes of --map, if it is given."""
     if not args.map:
         return measurements
@@ -330,8 +333,12 @@ def _with_map(args: argparse.Namespace, measurements: Any) -> Any:
 
 
 def _calibrated(
-    args: argparse.Namespace, measurements: Any, options: Any, *, method: str
-) -> Any:
+    args: argparse.Namespace,
+    measurements: Measurements,
+    options: Options,
+    *,
+    method: str,
+) -> CalibrationResult:
     """Return the result without sentences; errors of offsets or plate name the bag."""
     try:
         return calibrate_by(method, measurements, options)
@@ -350,8 +357,11 @@ def _write(args: argparse.Namespace, data: dict[str, Any]) -> None:
 
 
 def _validated(
-    args: argparse.Namespace, measurements: Any, options: Any, result: Any
-) -> tuple[Any, list[str]]:
+    args: argparse.Namespace,
+    measurements: Measurements,
+    options: Options,
+    result: CalibrationResult,
+) -> tuple[CalibrationResult, list[str]]:
     """Return the result with places, validated if requested, and the text to print."""
     lines: list[str] = []
     result = with_places(result, measurements.views)
@@ -378,7 +388,7 @@ def _validated(
     return result, lines
 
 
-def _since(result: Any) -> list[str]:
+def _since(result: CalibrationResult) -> list[str]:
     """Return the text of the change since the calibration of a known plate."""
     recheck = result.recheck
     return (
@@ -392,7 +402,7 @@ def _since(result: Any) -> list[str]:
     )
 
 
-def _budget(result: Any) -> list[str]:
+def _budget(result: CalibrationResult) -> list[str]:
     """Return the text of the budget."""
     if not result.has_uncertainty:
         return [

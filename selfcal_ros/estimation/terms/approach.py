@@ -5,11 +5,10 @@ V has +-(h_x s_x + i h_y s_y), s the signs of approach; minus where the plate mo
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from selfcal_ros.blocks import AXES, Block, Located, Pattern, by_coefficient
+from selfcal_ros.blocks import AXES, Block, Estimates, Located, Pattern, by_coefficient
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -28,9 +27,9 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
         yield Pattern((coefficient,), marks, visits)
 
 
-def located(explanation: Any, names: tuple[str, ...]) -> Located:
+def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield each axis."""
-    for fields, weights in by_coefficient(explanation, names):
+    for fields, weights in by_coefficient(estimates, names):
         yield {"axis": fields["details"]["part"]}, weights
 
 

@@ -5,12 +5,11 @@ V has sum_l d_l P_l(tau), tau the view's time in [-1, 1]: 2 coefficients a degre
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legval
 
-from selfcal_ros.blocks import AXES, Block, Located, Pattern
+from selfcal_ros.blocks import AXES, Block, Estimates, Located, Pattern
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -42,19 +41,19 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
             )
 
 
-def located(explanation: Any, names: tuple[str, ...]) -> Located:
+def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the range of the path of each view along each axis."""
-    for view in sorted({column.view for column in explanation.columns}):
+    for view in sorted({column.view for column in estimates.columns}):
         for axis in "xy":
             shape = np.array(
                 [
                     polynomial(int(c.component[3:]), TIMES)
                     if c.view == view and c.component[0] == axis
                     else 0 * TIMES
-                    for c in explanation.columns
+                    for c in estimates.columns
                 ]
             )
-            path = explanation.values @ shape
+            path = estimates.values @ shape
             yield (
                 {"view": names[view], "axis": axis},
                 (shape[:, int(path.argmax())] - shape[:, int(path.argmin())]),

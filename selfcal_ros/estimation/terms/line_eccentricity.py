@@ -5,11 +5,10 @@ As a fraction of its radius: Vtheta has c cos theta_k + s sin theta_k.
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Located, Pattern
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -25,14 +24,14 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
             yield Pattern(((component, 1),), view=view, lines=values)
 
 
-def located(explanation: Any, names: tuple[str, ...]) -> Located:
+def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the size of each view's eccentricity."""
-    for view in sorted({column.view for column in explanation.columns}):
-        mine = np.array([column.view == view for column in explanation.columns])
-        size = float(np.hypot.reduce(explanation.values[mine]))
+    for view in sorted({column.view for column in estimates.columns}):
+        mine = np.array([column.view == view for column in estimates.columns])
+        size = float(np.hypot.reduce(estimates.values[mine]))
         yield (
             {"view": names[view]},
-            np.where(mine, explanation.values, 0.0) / (size or 1.0),
+            np.where(mine, estimates.values, 0.0) / (size or 1.0),
         )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Located, Pattern, by_coefficient
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern, by_coefficient
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -24,9 +24,9 @@ def patterns(inputs: TermInputs, _: ModelTerm) -> Iterator[Pattern]:
         yield Pattern(pair, marks, visits)
 
 
-def located(explanation: object, names: tuple[str, ...]) -> Located:
+def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield every coefficient; of a rotation in rad."""
-    for fields, weights in by_coefficient(explanation, names):
+    for fields, weights in by_coefficient(estimates, names):
         component = fields["details"]["part"]
         yield (
             fields | {"unit": "rad" if component in ("turn", "shear") else "m/m"},

@@ -6,11 +6,10 @@ ones are relative to the first placing, as what all have in common is the plate'
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
-from selfcal_ros.blocks import Located, Pattern
+from selfcal_ros.blocks import Estimates, Located, Pattern
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -41,16 +40,16 @@ def of_each_placing(
             yield Pattern(((component, factor),), of_form[number], view=first)
 
 
-def against_first(explanation: Any, names: tuple[str, ...]) -> Located:
+def against_first(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the differences of the coefficients from those of the first view.
 
     If the term is free, the first view has no coefficients of its own: they are 0.
     """
     for column, row in zip(
-        explanation.columns, np.eye(len(explanation.columns)), strict=True
+        estimates.columns, np.eye(len(estimates.columns)), strict=True
     ):
         row -= [
-            c.view == 0 and c.component == column.component for c in explanation.columns
+            c.view == 0 and c.component == column.component for c in estimates.columns
         ]
         if row.any():
             yield (

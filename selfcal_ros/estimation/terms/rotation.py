@@ -2,11 +2,10 @@
 """Rotation: the plate turns between the marks and the lines of a view; Vtheta has r."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Located, Pattern
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -19,10 +18,10 @@ def patterns(inputs: TermInputs, term: ModelTerm) -> Iterator[Pattern]:
         yield Pattern((("turn", 1),), view=view, lines=values)
 
 
-def located(explanation: Any, names: tuple[str, ...]) -> Located:
+def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the view that differs most from all others: a common rotation belongs to the datum."""
-    n = len(explanation.values)
-    unit = np.eye(len(explanation.values))
+    n = len(estimates.values)
+    unit = np.eye(len(estimates.values))
     apart = []
     for at in range(n):
         differences = [
@@ -31,7 +30,7 @@ def located(explanation: Any, names: tuple[str, ...]) -> Located:
         apart.append(
             min(
                 (
-                    abs(explanation.values @ weights) / _u(explanation, weights)
+                    abs(estimates.values @ weights) / _u(estimates, weights)
                     for weights in differences
                 ),
                 default=0.0,
@@ -40,20 +39,20 @@ def located(explanation: Any, names: tuple[str, ...]) -> Located:
     at = int(np.argmax(apart))
     weights = unit[at] - (1 - unit[at]) / max(n - 1, 1)
     # u is that of the difference from the nearest
-    nearest = abs(float(explanation.values @ weights)) / max(apart[at], 1e-300)
+    nearest = abs(float(estimates.values @ weights)) / max(apart[at], 1e-300)
     yield (
         {
-            "view": names[explanation.columns[at].view],
-            "u": max(_u(explanation, weights), nearest),
+            "view": names[estimates.columns[at].view],
+            "u": max(_u(estimates, weights), nearest),
         },
         weights,
     )
 
 
-def _u(explanation: Any, weights: np.ndarray) -> float:
+def _u(estimates: Estimates, weights: np.ndarray) -> float:
     """Return the standard uncertainty of weights @ values, at least the least number."""
     return max(
-        float(np.sqrt(max(weights @ explanation.covariance @ weights, 0.0))), 1e-300
+        float(np.sqrt(max(weights @ estimates.covariance @ weights, 0.0))), 1e-300
     )
 
 

@@ -7,11 +7,10 @@ the optical axis is read at d - i yaw d (eq. 4.17).
 
 from collections.abc import Iterator
 from itertools import product
-from typing import Any
 
 import numpy as np
 
-from selfcal_ros.blocks import Block, Located, Pattern, by_coefficient
+from selfcal_ros.blocks import Block, Estimates, Located, Pattern, by_coefficient
 from selfcal_ros.estimation.terms.visits import TermInputs
 from selfcal_ros.model.terms import ModelTerm
 
@@ -76,11 +75,11 @@ def _beside_cells(inputs: TermInputs) -> np.ndarray:
     return out
 
 
-def located(explanation: Any, names: tuple[str, ...]) -> Located:
+def located(estimates: Estimates, names: tuple[str, ...]) -> Located:
     """Yield the size of every node's."""
     return (
-        ({}, weights * np.sign(explanation.values))
-        for _, weights in by_coefficient(explanation, names)
+        ({}, weights * np.sign(estimates.values))
+        for _, weights in by_coefficient(estimates, names)
     )
 
 
