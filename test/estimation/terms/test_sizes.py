@@ -214,6 +214,19 @@ def test_doubtful_sizes_are_raised_to_the_limit_of_their_chi_square():
     assert raised and min(raised) > 1
 
 
+def test_two_coefficients_make_a_size_doubtful_at_a_looser_level():
+    """Both may be small by chance while those that no reading determines are not."""
+    wanted = options(f"approach:{SIZES['approach']}")
+    tests = []
+    for seed in range(16):
+        _, readings = measured(seed, {"approach": 1.5 * SIZES["approach"]})
+        tests += fitted(readings, wanted).sizes
+    assert {test.rank for test in tests} == {2}
+    assert all(test.raised == (test.p < 0.2) for test in tests)
+    assert all((test.allowed > test.given) == test.raised for test in tests)
+    assert any(0.1 < test.p < 0.2 for test in tests)
+
+
 @pytest.mark.parametrize(
     ("plausible", "grade"), [(4.0, Grade.GOOD), (0.5, Grade.NOT_QUALIFIED)]
 )
