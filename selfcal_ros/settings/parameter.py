@@ -70,7 +70,7 @@ class Parameter:
                 ).rstrip(),
                 "correct the value",
             )
-        return value
+        return value + 0.0 if kind is float else value  # -0.0 is 0
 
 
 def declared(

@@ -22,6 +22,7 @@ from selfcal_ros.simulation.machine import Truth
 
 FINE = 8
 """Points of the fine grid along a pixel."""
+LARGEST_MARK_PX = 2000
 DIRT_RADIUS = (0.05, 0.2)
 """Range of the radius of dirt, in sizes of a mark."""
 
@@ -62,7 +63,7 @@ class Camera:
     Raises
     ------
     InputError
-        For an empty image, or sizes that are not positive.
+        For sizes that are not positive, or a mark of more than `LARGEST_MARK_PX` pixels.
     """
 
     width: int = 96
@@ -89,6 +90,13 @@ class Camera:
         if min(self.pixel_size_m, self.mark_size_m, self.mark_width_m) <= 0:
             raise InputError(
                 "camera", "a size is 0", "give pixel_size, mark_size and mark_width"
+            )
+        if self.mark_size_m > LARGEST_MARK_PX * self.pixel_size_m:
+            raise InputError(
+                "camera: mark_size",
+                f"{self.mark_size_m / self.pixel_size_m:.3g} pixels",
+                f"a mark has up to {LARGEST_MARK_PX} pixels; correct mark_size or"
+                " pixel_size",
             )
 
     @property

@@ -564,6 +564,18 @@ def test_a_camera_allows_no_faults_of_detections(tmp_path):
         simulation(tmp_path, {"plan": PLAN, "camera": {}, "faults": {"outliers": 0.1}})
 
 
+def test_a_mark_larger_than_any_image_is_refused(tmp_path):
+    with pytest.raises(
+        InputError, match=r"camera: mark_size: 8e\+06 pixels; a mark has up to 2000 pix"
+    ):
+        simulation(tmp_path, {"plan": PLAN, "camera": {"mark_size": 16.0}})
+
+
+def test_a_negative_zero_is_zero(tmp_path):
+    data = {"plan": PLAN, "truth": {"a": -0.0, "t": -0.0, "phi": -0.0}}
+    simulation(tmp_path, data).run()
+
+
 def test_lost_images_are_counted(tmp_path):
     _, arrivals, ledger = simulation(
         tmp_path, {"plan": PLAN, "camera": {}, "faults": {"lost": 0.5}}
