@@ -134,7 +134,7 @@ class CompensatingSession:
                 require_plausible(
                     error_map,
                     f"the map of {_source(message)}",
-                    "load its file with ~/load_map",
+                    "name its file in the parameter map",
                 )
                 self._use(
                     error_map,

@@ -485,7 +485,9 @@ def test_a_steep_map_is_used_from_its_file_alone(tmp_path):
     (tmp_path / "map.json").write_text(json.dumps(result_to_dict(result_of(steep))))
     used = Desk(map=str(tmp_path / "map.json"), require_qualified=False)
     assert used.x_at(0.02) is not None
-    with pytest.raises(InputError, match="if it is, load its file with ~/load_map"):
+    with pytest.raises(
+        InputError, match="if it is, name its file in the parameter map"
+    ):
         Desk(require_qualified=False).session.take_map(map_of(steep))
 
 
