@@ -47,6 +47,11 @@ LOOKED_AT = 500
 NEVER_NS = np.iinfo(np.int64).max
 
 
+def step_watches(limit_s: float) -> dict[str, StepWatch]:
+    """Return a watch of the clock of each topic whose steps are told."""
+    return {role: StepWatch(limit_s) for role in (ENCODER_TOPIC, DETECTION_TOPIC)}
+
+
 @dataclass
 class BagReader:
     """Read one bag.
@@ -62,6 +67,8 @@ class BagReader:
         Larger clock steps are recorded.
     leave_ahead : bool
         Omit messages stamped ahead of their log time.
+    watches : dict, optional
+        Topic -> watch of its clock, that has seen the file before this one.
 
     Attributes
     ----------
@@ -81,6 +88,7 @@ class BagReader:
     namespace: str | None = None
     clock_limit_s: float = CLOCK_LIMIT_S
     leave_ahead: bool = False
+    watches: dict[str, StepWatch] | None = None
     lost: list[str] = field(default_factory=list)
     steps: dict[str, list[ClockStep]] = field(default_factory=dict)
     ahead: Counter = field(default_factory=Counter)
@@ -262,7 +270,9 @@ class BagReader:
         bad: Counter,
     ) -> Iterator[tuple[MessageBlock, list[tuple[ChannelDecoder, np.ndarray]]]]:
         """Yield each block with the indices of its messages on our topics, by channel."""
-        watches = self._watches()
+        watches = (
+            step_watches(self.clock_limit_s) if self.watches is None else self.watches
+        )
         decoders: dict[tuple[Path, int, int], ChannelDecoder | None] = {}
         latest_ns, part = 0, None
         for stream, block in self._streams():
@@ -294,7 +304,7 @@ class BagReader:
                     self.lost.append(
                         f"{overlap(stream, by_ns)}; each reading counts once"
                     )
-                    watches = self._watches()
+                    watches.update(step_watches(self.clock_limit_s))
                 part = (stream.path, stream.begin)
                 latest_ns = max(latest_ns, int(logged_ns.max()))
             for decoder, index in parts:
@@ -305,12 +315,6 @@ class BagReader:
                         block[index[:: _stride(index)]],
                     )
             yield block, parts
-
-    def _watches(self) -> dict[str, StepWatch]:
-        return {
-            role: StepWatch(self.clock_limit_s)
-            for role in (ENCODER_TOPIC, DETECTION_TOPIC)
-        }
 
     def _in_time(self, role: str, block: MessageBlock, index: np.ndarray) -> np.ndarray:
         """Count messages stamped ahead of their log time; return the indices to be read."""

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from selfcal_ros.bagio import journal as journals
 from selfcal_ros.bagio.offline import block_handlers
-from selfcal_ros.bagio.reader import BagReader
+from selfcal_ros.bagio.reader import BagReader, step_watches
 from selfcal_ros.collection.clock_steps import ClockStep
 from selfcal_ros.collection.collector import Collector
 from selfcal_ros.errors import InputError
@@ -62,9 +62,12 @@ def take_up(files: list[Path], settings: CollectorSettings) -> ResumedRun:
     refused: list[InputError] = []
     steps: dict[str, list[ClockStep]] = {}
     feed = block_handlers(collector, lost)
+    watches = step_watches(settings.clock_limit)
     for file in files:
         try:
-            reader = BagReader(file, clock_limit_s=settings.clock_limit)
+            reader = BagReader(
+                file, clock_limit_s=settings.clock_limit, watches=watches
+            )
             for topic, item in reader.columns():
                 feed[topic](item)
             lost += reader.lost

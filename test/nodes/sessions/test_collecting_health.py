@@ -21,7 +21,7 @@ from selfcal_ros.nodes.sessions.journal_keeper import take_up
 from selfcal_ros.nodes.sessions.rejections import PATIENCE_S
 from selfcal_ros.nodes.sessions.solving import SolvingSession, solve
 from selfcal_ros.simulation.cell import CellSettings, plan_events
-from selfcal_ros.topics import INPUT_TOPICS
+from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC, INPUT_TOPICS
 from test.support.collecting import detection_table, encoder_block
 from test.support.misplaced import laid
 from test.support.ports import START_NS, Hands, message, settings_of
@@ -348,6 +348,26 @@ def test_a_clock_that_stepped_is_in_the_live_result_as_in_the_offline_one(
     assert [line for line in offline.warnings if "clock" in line] == again.hands.of(
         "measurement"
     )[-1]["session_notes"]
+
+
+def test_what_has_waited_for_a_restarted_collector_is_no_step(tmp_path):
+    events = events_of(small_plan("0, 90, tx", repeats=4))
+    half, waited = len(events) // 2, 400
+    ready_ns = events[half + waited].stamp_ns + 2 * 10**9
+    later = [
+        replace(event, stamp_ns=event.stamp_ns + 5 * 10**9)
+        for event in events[half + waited :]
+    ]
+    before = logged(tmp_path / "0", [(item, item.stamp_ns) for item in events[:half]])
+    after = logged(
+        tmp_path / "1",
+        [(item, ready_ns) for item in events[half : half + waited]]
+        + [(item, item.stamp_ns) for item in later],
+    )
+    files = [*before.glob("*.mcap"), *after.glob("*.mcap")]
+    steps = take_up(files, settings_of("measurement_collector")).steps
+    assert steps == {ENCODER_TOPIC: [], DETECTION_TOPIC: []}
+    assert take_up(files[1:], settings_of("measurement_collector")).steps != steps
 
 
 def test_no_step_no_note(tmp_path):
