@@ -241,44 +241,24 @@ def recheck(
         (`PlacingError`).
     """
     solved = recheck_of(measurements, options, plate)
-    readings = solved.readings
-    solution = solved.solution
     problem = solved.readings.problem
-    covers = {
-        "xy": np.sum(list(solved.covariances.values()), axis=0),
-        "theta": solved.of_lines,
-    }
-    change = map_change(solved.new, solved.artifact, plate)
     outcome = recheck_found(
-        change,
+        map_change(solved.new, solved.artifact, plate),
         line_change(solved.lines, plate),
         solved.artifact,
         plate,
         passes=min(view.view.repeats for view in measurements.views),
     )
-    noise = _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate)
     declared = {term.name for term in options.terms}
     changes = _findings(outcome) + _off(solved)
-    other_plate = check_plate(solved.measurements, plate, solved.xy.sigma)
-    failed = (
-        (other_plate,)
-        if other_plate is not None
-        else _misfit(
-            solution.square,
-            readings.dof,
-            dof_of_marks(plate.result) if measurements.has_images else solved.xy.dof,
-        )
+    failed = _failed(solved, outcome, changes, drift_declared="drift" in declared)
+    covers = {
+        "xy": np.sum(list(solved.covariances.values()), axis=0),
+        "theta": solved.of_lines,
+    }
+    unknowns = (
+        2 * int(solved.readings.known.sum()) + problem.system.grid.n_misalignments
     )
-    if (
-        not failed
-        and outcome.changed
-        and outcome.passes == 1
-        and "drift" not in declared
-    ):
-        failed = (replace(changes[0], name="changed_or_drifted"),)
-    if outcome.changed:
-        failed += _by_microscope(solved, outcome, changes[0])
-    unknowns = 2 * int(readings.known.sum()) + problem.system.grid.n_misalignments
     terms = tuple(
         TermResult(
             str(term.name),
@@ -293,9 +273,9 @@ def recheck(
         measurements.plan_id,
         solved.error_map(),
         plate.result.artifact_map,
-        views_of(measurements, problem, solution.parameters),
+        views_of(measurements, problem, solved.solution.parameters),
         Observability(unknowns, unknowns, 0, True),
-        noise,
+        _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate),
         measurements.all_rejected(),
         findings=(*(() if failed else changes), *views_findings(measurements)),
         sense=str(measurements.sense),
@@ -313,6 +293,32 @@ def recheck(
         recheck=outcome,
     )
     return replace(result, budget=tuple(_budget(result, solved.variances, plate)))
+
+
+def _failed(
+    solved: Rechecked,
+    outcome: Recheck,
+    changes: tuple[Finding, ...],
+    *,
+    drift_declared: bool,
+) -> tuple[Finding, ...]:
+    """Return why the map is not qualified: the plate, the residuals, or what a change may be.
+
+    A change that one pass shows may be drift, unless that is declared; one that another microscope
+    explains may be that.
+    """
+    other_plate = check_plate(solved.measurements, solved.plate, solved.xy.sigma)
+    if other_plate is not None:
+        failed: tuple[Finding, ...] = (other_plate,)
+    else:
+        of_images = solved.measurements.has_images
+        dof_noise = dof_of_marks(solved.plate.result) if of_images else solved.xy.dof
+        failed = _misfit(solved.solution.square, solved.readings.dof, dof_noise)
+    if not outcome.changed:
+        return failed
+    if not failed and outcome.passes == 1 and not drift_declared:
+        failed = (replace(changes[0], name="changed_or_drifted"),)
+    return failed + _by_microscope(solved, outcome, changes[0])
 
 
 def _findings(outcome: Recheck) -> tuple[Finding, ...]:
