@@ -56,7 +56,8 @@ class IndependentCell(Bench, Node):
             ViewCommand,
             "selfcal/view_command",
             self.on_command,
-            QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+            # a PLACE that MEASURE overtakes would leave the plate where it was
+            QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL),
         )
         self.create_timer(PERIOD_S, self.on_timer)
 
