@@ -37,7 +37,7 @@ from selfcal_ros.applications.aerotech.write import cal_text
 from selfcal_ros.applications.controllers.export import place_to_look
 from selfcal_ros.cli import cal_lines
 from selfcal_ros.cli.deliver import command, replace_files, replaced
-from selfcal_ros.cli.terminal import add_json, busy, exit_code, say
+from selfcal_ros.cli.terminal import add_json, busy, exit_code, say, tell
 from selfcal_ros.compensation.export import fill_unknown, provenance
 from selfcal_ros.compensation.frame import MachineFrame, frame_from_comments
 from selfcal_ros.compensation.plausible import require_plausible
@@ -196,10 +196,10 @@ def _check(args: argparse.Namespace) -> int:
         )
     else:
         for finding in cal.findings:
-            print(finding.text(args.file))
+            tell(finding.text(args.file))
         for table in cal.tables:
-            print(f"{args.file}:{table.line}: {_described(table)['text']}")
-        print(
+            tell(f"{args.file}:{table.line}: {_described(table)['text']}")
+        tell(
             f"{args.file}: {len(cal.tables)} tables, {counts[Severity.ERROR]} errors, "
             f"{counts[Severity.WARNING]} warnings, {counts[Severity.TOLERATED]} tolerated"
         )
@@ -498,25 +498,25 @@ def _verify(args: argparse.Namespace) -> int:
             "check signs, axes, unit, home position and encoder directions",
         )
     for part in unfit_parts:
-        print(
+        tell(
             f"{args.leaf.prog}: {cal.where}: of {part.name}, which 1D tables can correct, the "
             f"tables leave {part.rms_left / M_PER_UM:.4g} of {part.rms / M_PER_UM:.4g} µm rms, "
             f"{part.largest_left / M_PER_UM:.4g} of {part.largest / M_PER_UM:.4g} µm at most, "
             "more than the U of the map: they are not those of this map; check sign, offset, "
             "unit and number of entries, or write them again",
-            file=sys.stderr,
+            sys.stderr,
         )
     unfit = verification.unfit(result.error_map)
     for residual in unfit:
         rms_left, peak_left = (
             size("after") / size("before") for size in (residual.rms, residual.largest)
         )
-        print(
+        tell(
             f"{args.leaf.prog}: {cal.where}: the tables leave {rms_left:.0%} of the error at the "
             f"{residual.place}, {peak_left:.0%} of the largest, more than the U of the map: they "
             "are not those of this map; check offset, unit and number of rows, or export "
             "them again",
-            file=sys.stderr,
+            sys.stderr,
         )
     return int(ExitCode.NOT_QUALIFIED if unfit or unfit_parts else ExitCode.DONE)
 

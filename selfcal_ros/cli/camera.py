@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from selfcal_ros.bagio.images import ImageBag, encoder_track, read_positions
-from selfcal_ros.cli.terminal import add_json, say
+from selfcal_ros.cli.terminal import add_json, say, tell
 from selfcal_ros.errors import InputError, NoDataError
 from selfcal_ros.files import read_bytes, write_yaml
 from selfcal_ros.model.readings import Sense
@@ -98,10 +98,10 @@ def run(args: argparse.Namespace) -> int:
     positions, images = (_of_files if args.positions else _of_bag)(args, detector)
     counts = detector.counts
     if counts.empty:
-        print(
+        tell(
             f"selfcal camera: {args.bag}: {counts.empty} of {counts.images} images show no mark "
             "and are left out",
-            file=sys.stderr,
+            sys.stderr,
         )
     camera = camera_pose(positions, images, Sense(args.sense))
     require_size(
@@ -164,7 +164,7 @@ def _of_bag(
                     np.array([(mark.offset_x, mark.offset_y) for mark in marks])
                 )
     for line, count in bag.lost.items():
-        print(f"selfcal camera: {args.bag}: {count} x {line}", file=sys.stderr)
+        tell(f"selfcal camera: {args.bag}: {count} x {line}", sys.stderr)
     if not exposed or not len(stamps):
         raise NoDataError(
             args.bag,

@@ -114,10 +114,10 @@ def _try(args: argparse.Namespace) -> int:
         )
         if pixels is not None:
             write_bytes(output, circled(pixels, marks, trial.mark_pixels))
-            print(
+            tell(
                 f"{output}: {len(marks)} marks of {trial.mark_pixels:.3g} pixels in an image of "
                 f"{pixels.shape[1]} x {pixels.shape[0]}",
-                file=aside(args),
+                aside(args),
             )
         if not args.yes and not _agrees(args, trial.step_m):
             say(args, "nothing was moved or written", {"marks": len(marks)})

@@ -3,11 +3,12 @@
 
 import argparse
 import shlex
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from selfcal_ros.applications.aerotech.write import write_cals
-from selfcal_ros.cli.terminal import STDOUT, exit_code, say
+from selfcal_ros.cli.terminal import STDOUT, exit_code, put, put_text, say
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.outputs import check_outputs, utf8, write_bytes
 
@@ -41,7 +42,10 @@ def deliver(
     raw = utf8(content) if isinstance(content, str) else content
     if args.output == STDOUT:
         text = raw.decode()
-        say(args, text.removesuffix("\n"), {key: text})
+        if args.json:
+            put({key: text})
+        else:
+            put_text(text.removesuffix("\n"), sys.stdout)
     else:
         write_bytes(args.output, raw)
         say(args, f"written: {args.output}{note}", {"written": args.output, **data})

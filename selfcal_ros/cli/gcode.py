@@ -19,7 +19,7 @@ from selfcal_ros.applications.controllers.grid import ROUNDING_M, Wiring, nodes,
 from selfcal_ros.cli.cal import ready
 from selfcal_ros.cli.cal_lines import add_frame, frame_of
 from selfcal_ros.cli.deliver import command, deliver
-from selfcal_ros.cli.terminal import add_json, file_of
+from selfcal_ros.cli.terminal import add_json, file_of, tell
 from selfcal_ros.compensation.export import origin_lines
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_text
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     ):
         warnings = []
     for line in warnings:
-        print(f"selfcal gcode: {args.program}: {line}", file=sys.stderr)
+        tell(f"selfcal gcode: {args.program}: {line}", sys.stderr)
     comments = [*origin_lines(result, command(args)), *warnings]
     return deliver(
         args,

@@ -33,6 +33,7 @@ from selfcal_ros.cli.terminal import (
     progress_bar,
     put,
     show,
+    tell,
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.errors import ExitCode, InputError
@@ -134,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
     for (
         line
     ) in bag.faults:  # first: what the nodes say of the readings follows from them
-        print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
+        tell(f"selfcal replay: {args.bag}: {line}", sys.stderr)
     with (
         ended_by_signals(),
         temporary_folder(Path(tempfile.gettempdir())) as folder,
@@ -157,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
     lines = rejections(result.rejected, sum(view.used for view in result.views))
     if lines and (detector is not None or not offline(args, args.bag).findings):
         for line in lines:
-            print(f"selfcal replay: {args.bag}: {line}", file=sys.stderr)
+            tell(f"selfcal replay: {args.bag}: {line}", sys.stderr)
     if not args.quiet:
         show(result, args.bag, file_of(args), aside(args))
     return exit_code(result)
@@ -359,5 +360,5 @@ def _play(
             elif word == "lost":
                 lost.append(tail)
                 if tail not in printed_faults:
-                    print(f"selfcal replay: {args.bag}: {tail}", file=sys.stderr)
+                    tell(f"selfcal replay: {args.bag}: {tail}", sys.stderr)
         return session.wait(), lost

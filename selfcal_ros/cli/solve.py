@@ -23,6 +23,7 @@ from selfcal_ros.cli.terminal import (
     progress_bar,
     put,
     show,
+    tell,
 )
 from selfcal_ros.collection.inputs import rejections
 from selfcal_ros.collection.reduce import with_places
@@ -260,7 +261,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     # a clock step is a finding, and noted in the result
     for line in dict.fromkeys(warnings):
-        print(f"selfcal {args.verb}: {args.bag}: {line}", file=sys.stderr)
+        tell(f"selfcal {args.verb}: {args.bag}: {line}", sys.stderr)
     measurements = _with_map(args, measurements)
     options = solver_options(
         solver, measurements, plate_from=getattr(args, "plate_from", "")

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TextIO
 
-from selfcal_ros.errors import ExitCode, printable
+from selfcal_ros.errors import ExitCode, printable, visible
 from selfcal_ros.files import read_yaml
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verdict import Grade
@@ -86,9 +86,18 @@ def say(args: argparse.Namespace, text: str, data: dict[str, Any]) -> None:
         tell(text)
 
 
-def tell(text: str) -> None:
-    """Print text; if stdout cannot encode µ, ° and the like, they are spelled out."""
-    print(text if can_print_symbols(sys.stdout) else to_ascii(text))
+def tell(text: str, stream: TextIO | None = None) -> None:
+    """Print text, on stdout unless said, without control characters, as of names of files.
+
+    If the stream cannot encode µ, ° and the like, they are spelled out.
+    """
+    lines = "\n".join(visible(line) for line in text.split("\n"))
+    put_text(lines, stream or sys.stdout)
+
+
+def put_text(text: str, stream: TextIO) -> None:
+    """Print text as it is, if the stream can encode it."""
+    print(text if can_print_symbols(stream) else to_ascii(text), file=stream)
 
 
 def put(data: Any) -> None:
@@ -129,7 +138,7 @@ def show(
         file=stream,
     )
     if output:
-        print(f"result: {output}", file=stream)
+        tell(f"result: {output}", stream)
     elif stream is sys.stdout:
         print("result: not kept; -o RESULT.json writes it", file=stream)
 

@@ -103,3 +103,26 @@ def test_no_reason_is_cut(folder, monkeypatch, capsys):
     )
     (record,) = json.loads(Path("batch/batch.json").read_text())["records"]
     assert record["message"] == sentence
+
+
+def test_no_name_of_a_file_reaches_the_terminal_with_control_characters(
+    folder, monkeypatch, capsys
+):
+    monkeypatch.chdir(folder)
+    odd = "a\x1b[31m\u202e"
+    Path(f"{odd}.json").write_text(Path("r.json").read_text())
+    for line in (
+        f"report {odd}.json -o {odd}.html --plot {odd}.svg",
+        f"table {odd}.json -o {odd}.csv",
+        f"cal export {odd}.json -o {odd}.cal",
+        f"cal check {odd}.cal",
+        f"export kmotion {odd}.json -o {odd}.txt",
+        "history .",
+        f"solve bag -o {odd}2.json",
+    ):
+        main(line.split(" "))
+        shown = "".join(capsys.readouterr())
+        assert "a\\x1b[31m\\u202e" in shown, line
+        assert all(part.isprintable() for part in shown.split("\n")), line
+    main(["table", f"{odd}.json", "-o", "-"])
+    assert capsys.readouterr().out == Path(f"{odd}.csv").read_text()

@@ -26,6 +26,8 @@ BASE = (
     "result",
     "grade",
 )
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""With these a cell begins that a spreadsheet computes."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ def csv_text(records: Sequence[Record]) -> str:
         likeliest = causes[0] if causes else {"name": "", "view": ""}
         writer.writerow(
             [_field(record.get(name)) for name in BASE]
-            + [likeliest["name"], likeliest["view"]]
+            + [_field(likeliest["name"]), _field(likeliest["view"])]
             + [
                 _field(((record.get("baseline") or {}) | record).get(name))
                 for name in ("adjusted_p", "changed", "not_compared")
@@ -158,13 +160,12 @@ def csv_text(records: Sequence[Record]) -> str:
 
 
 def _field(value: Any) -> Any:
-    return (
-        ""
-        if value is None
-        else str(value).lower()
-        if isinstance(value, bool)
-        else value
-    )
+    """Return a cell of the table; text that would be a formula begins with an apostrophe."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA else value
 
 
 def batch_json(

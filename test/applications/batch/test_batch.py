@@ -427,6 +427,16 @@ def test_plans_and_plates_are_not_mixed():
     assert series_of([record | {"first_exposure": None} for record in records()]) == []
 
 
+def test_no_name_in_the_table_is_a_formula():
+    record = records()[0] | {"bag": "=1+1", "plan_id": "-2", "message": "@x"}
+    record["causes"] = [{"name": "drift", "view": "+cmd|' /C calc'!A0"}]
+    record["quantities"] = {"nonorthogonality_arcsec": -0.5}
+    (row,) = csv.DictReader(io.StringIO(csv_text([record])))
+    assert (row["bag"], row["plan_id"], row["message"]) == ("'=1+1", "'-2", "'@x")
+    assert row["cause_view"] == "'+cmd|' /C calc'!A0"
+    assert row["nonorthogonality_arcsec"] == "-0.5"
+
+
 def test_the_table_has_a_line_a_bag_in_the_order_of_time():
     failed = {
         "bag": '/bags/bad, or "worse"',
