@@ -341,8 +341,11 @@ def _findings(outcome: Recheck) -> tuple[Finding, ...]:
             ),
         )
     if scale.changed:
+        passes = {"passes": outcome.passes, **of}
         out += (
-            Finding("scale_changed", scale.change, scale.u, "m/m", scale.p, details=of),
+            Finding(
+                "scale_changed", scale.change, scale.u, "m/m", scale.p, details=passes
+            ),
         )
     return out
 

@@ -10,7 +10,7 @@ from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
 from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
-from selfcal_ros.model.recheck import LargestChange, Recheck
+from selfcal_ros.model.recheck import LargestChange, Recheck, ScaleChange
 from selfcal_ros.model.result import ViewResult
 from selfcal_ros.model.verdict import BudgetLine, Finding
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
@@ -187,7 +187,7 @@ def recheck_sentence(recheck: Recheck) -> str:
         return _changed(since, clearest, recheck.p)
     if scale.changed:
         return (
-            f"{_scale_changed(since, scale.change, scale.u, scale.p)}; otherwise no "
+            f"{_scale_changed(since, scale, one_pass=recheck.passes == 1)}; otherwise no "
             f"change beyond its uncertainty (p = {recheck.p:.2g}); {clearest}"
         )
     return (
@@ -209,17 +209,23 @@ def _changed(since: str, clearest: str, p: float) -> str:
     )
 
 
-def _scale_changed(since: str, change: float, u: float, p: float) -> str:
+def _scale_changed(since: str, scale: ScaleChange, *, one_pass: bool) -> str:
+    how_much = (
+        f"by {scale.change * UM_PER_M:+.3g} ± {scale.u * UM_PER_M:.2g} µm/m (k=1, "
+        f"p = {scale.p:.2g})"
+    )
+    if one_pass:
+        return f"Scale changed or drifted since {since} {how_much}; {ONE_PASS}"
     return (
-        f"Scale changed since {since} by {change * UM_PER_M:+.3g} ± {u * UM_PER_M:.2g} µm/m "
-        f"(k=1, p = {p:.2g}): the temperature of the plate or of the encoders has changed, one "
-        "plate cannot tell which"
+        f"Scale changed since {since} {how_much}: the temperature of the plate or of the "
+        "encoders has changed, one plate cannot tell which"
     )
 
 
 def scale_changed_text(finding: Finding, of: Mapping[str, Any]) -> str:
     """Return the warning of encoders whose scale against the plate has changed."""
-    return _scale_changed(_since(str(of["of"])), finding.size, finding.u, finding.p)
+    scale = ScaleChange(True, finding.size, finding.u, finding.p)
+    return _scale_changed(_since(str(of["of"])), scale, one_pass=of.get("passes") == 1)
 
 
 def other_plate_text(finding: Finding, of: Mapping[str, Any]) -> str:

@@ -198,6 +198,19 @@ def test_a_scale_that_has_changed_is_the_headline():
     assert same.verdict.sentence.startswith("Still good") and not same.warnings
 
 
+def test_a_scale_that_one_pass_shows_may_be_drift():
+    """A raster pass that drifts by 0.3 µm along its slow axis reads like a longer plate."""
+    truth, plate = calibrated(Sense.MICROSCOPE_MOVES)
+    grown = 5e-6 * np.stack([ARTIFACT.x_m, ARTIFACT.y_m])
+    once = once_more(Sense.MICROSCOPE_MOVES, a=truth.a + grown, repeats=1)
+    result = worded(recheck(once, BARE, plate))
+    assert result.recheck.scale.changed and result.recheck.passes == 1
+    for text in (result.verdict.sentence, result.warnings[0]):
+        assert text.startswith("Scale changed or drifted since r.json by ")
+        assert "a single pass cannot tell a change from drift" in text
+        assert "temperature" not in text
+
+
 def test_a_change_that_one_pass_shows_is_not_qualified_unless_drift_is_declared():
     truth, plate = calibrated(Sense.MICROSCOPE_MOVES)
     bent = 3e-7 * np.stack([ARTIFACT.y_m**2, ARTIFACT.x_m**2]) / 9e-4
