@@ -104,13 +104,19 @@ def provenance(
             for term in result.model.terms
         ),
         *_reference_lines(result),
-        f"datum: no translation, rotation, magnification; theta: {emap.datum_theta}",
+        f"datum: no {_removed(result)}; theta: {emap.datum_theta}",
         "correction = + (indicated - true), added to the command",
         frame.comment(),
     ]
     if filled:
         lines.append(f"{filled} sites were not measured: mean of their neighbours")
     return lines
+
+
+def _removed(result: CalibrationResult) -> str:
+    if result.reference is not None:
+        return "translation, rotation"
+    return "translation, rotation, magnification"
 
 
 def origin_lines(result: CalibrationResult, command: str = "") -> list[str]:

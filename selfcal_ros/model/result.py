@@ -97,8 +97,8 @@ class ArtifactMap:
 
     `u_ax`, `u_ay`, `u_a_theta` are their standard uncertainties, NaN where unknown or not
     computed; empty in results that do not have them.
-    `magnification` is the least-squares scale of A, with its standard uncertainty: that of the
-    plate relative to the encoders, whose own scale the datum removes from the map.
+    `magnification` is by how much the encoders indicate the plate larger than nominal, with its
+    standard uncertainty: the least-squares scale of A where no reference length sets another.
     """
 
     ax: np.ndarray

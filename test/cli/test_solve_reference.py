@@ -16,8 +16,9 @@ def solved(tmp_path, *options, code=0):
     out = tmp_path / "r.json"
     assert main(["solve", BAG, "--quiet", "--force", "-o", str(out), *options]) == code
     result = json.loads(out.read_text())
-    maps = result["error_map"] | result["artifact_map"]
-    return {key: np.array(maps[key]) for key in ("gx", "gy", "u_gx", "ax", "ay")}
+    maps = result["error_map"] | result["artifact_map"] | result["artifact"]
+    keys = ("gx", "gy", "u_gx", "ax", "ay", "magnification")
+    return {key: np.array(maps[key]) for key in keys}
 
 
 @pytest.mark.parametrize("kind", ["artifact", "stage_x", "stage_y"])
@@ -25,6 +26,8 @@ def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
     free = solved(tmp_path)
     # the length is not that of the stage: what misalignments make of the scale is 1 nm
     fixed = solved(tmp_path, "--reference", f"{kind}:2e-6:1e-7")
+    # what the encoders indicate does not depend on what is known of the plate
+    assert fixed["magnification"] == pytest.approx(free["magnification"], abs=1e-9)
     x = (np.arange(11) - 5)[:, None] * 0.01 * np.ones(11)
     grown_x, grown_y = fixed["gx"] - free["gx"], fixed["gy"] - free["gy"]
     scale = (grown_x * x).sum() / (x * x).sum()

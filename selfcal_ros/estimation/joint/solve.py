@@ -824,6 +824,9 @@ def _artifact_map(
     scale = scale_of(
         system, unscaled, field=fitted.field, plate=fitted.plate, half_width_m=length
     )
+    scale += _scale_of_field(
+        system, fitted.field
+    )  # what a reference took from the plate
     u = float("nan")
     sigma = fitted.xy.sigma
     u_x = u_y = np.full(plate.shape, np.nan)
@@ -850,6 +853,13 @@ def _artifact_map(
         u_y,
         u_theta,
     )
+
+
+def _scale_of_field(system: NormalEquations, field: np.ndarray) -> float:
+    """Return the least-squares scale of a map, m at the unit of position."""
+    z, values = (of[system.known_sites] for of in (system.grid.views.z_sites, field))
+    z = z - z.mean()
+    return float(np.vdot(z, values).real / np.vdot(z, z).real)
 
 
 def views_of(

@@ -201,8 +201,8 @@ def measurement_section(result: CalibrationResult) -> Section:
         facts.append(
             (
                 "magnification",
-                f"plate {'larger' if value >= 0 else 'smaller'} than the "
-                f"encoders indicate by {significant(abs(value))}{spread} µm/m",
+                f"encoders indicate the plate {'larger' if value >= 0 else 'smaller'} than "
+                f"nominal by {significant(abs(value))}{spread} µm/m",
             )
         )
     if result.input.get("file"):

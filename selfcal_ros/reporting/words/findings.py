@@ -297,7 +297,7 @@ SENTENCES: dict[str, Words] = {
     "repeats_contradict": phrases.repeats_contradict_text,
     "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
     "magnification": lambda f, of: (
-        f"the plate is {_either(f, 'larger', 'smaller')} than the encoders indicate by "
+        f"the encoders indicate the plate {_either(f, 'larger', 'smaller')} than nominal by "
         f"{plus_minus(f, RATIO)}, more than plate and encoders should differ: check the pitch in "
         "the plan (grid_pitch), and the scale of the encoders"
     ),

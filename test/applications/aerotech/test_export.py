@@ -24,6 +24,7 @@ from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
 from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.reference import ReferenceLength
 from test.support.maps import random_map, result_of
 from test.support.slow_cal import slow_2d
 from test.support.truth import hu_plan, random_truth, simulate_measurements
@@ -353,6 +354,10 @@ def test_provenance_says_bag_plan_date_and_uncertainty(datum):
         * 1e6
     )
     assert f"(k=1): {u:.3g} um rms" in text
+    assert f"datum: no translation, rotation, magnification; theta: {datum}" in text
+    known = replace(result, reference=ReferenceLength("artifact", 1e-6, 1e-7))
+    text = "\n".join(provenance(known, MachineFrame()))
+    assert f"datum: no translation, rotation; theta: {datum}" in text
 
 
 def test_the_residual_is_true_minus_commanded():

@@ -439,7 +439,7 @@ FINDINGS = [
     *(
         (
             Finding("magnification", sign * 2e-3, 1e-5, "m/m"),
-            f"the plate is {word} than the encoders indicate by 2000 ± 10 "
+            f"the encoders indicate the plate {word} than nominal by 2000 ± 10 "
             "µm/m, more than plate and "
             "encoders should differ: check the pitch in the plan "
             "(grid_pitch), and the scale of the "
