@@ -6,6 +6,8 @@ Names are relative: a namespace is put in front.
 
 from pathlib import Path
 
+LARGEST_DOMAIN = 232
+"""Largest ROS domain whose ports exist."""
 IMAGE_TOPICS = {"raw": "stage/image", "compressed": "stage/image/compressed"}
 IMAGE_TYPES = {
     "raw": "sensor_msgs/msg/Image",

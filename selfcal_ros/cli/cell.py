@@ -208,7 +208,11 @@ def _check(args: argparse.Namespace) -> int:
         ) as child,
     ):
         for line in child.stdout or ():
-            items.append(json.loads(line))
+            try:
+                items.append(json.loads(line))
+            except ValueError:  # of the middleware
+                tell(line.rstrip("\n"), sys.stderr)
+                continue
             if not args.json:
                 tell(_line(items[-1]))
         code = child.wait()

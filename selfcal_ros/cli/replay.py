@@ -47,12 +47,10 @@ from selfcal_ros.settings.detector import (
     DetectorSettings,
 )
 from selfcal_ros.settings.nodes import CollectorSettings
-from selfcal_ros.topics import INPUT_TOPICS
+from selfcal_ros.topics import INPUT_TOPICS, LARGEST_DOMAIN
 
 AS_RECORDED = -1
 LARGEST_SEED = 2**31
-MOST_DOMAIN = 232
-"""Largest ROS domain whose ports exist."""
 NODES = ("measurement_collector", "pose_sequencer", "solver")
 
 
@@ -121,11 +119,11 @@ def run(args: argparse.Namespace) -> int:
             f"{args.shuffle} is not a seed",
             f"give a number from 0 to {LARGEST_SEED}",
         )
-    if args.domain is not None and not 0 <= args.domain <= MOST_DOMAIN:
+    if args.domain is not None and not 0 <= args.domain <= LARGEST_DOMAIN:
         raise InputError(
             "--domain",
             f"{args.domain} is not a ROS domain",
-            f"give a number from 0 to {MOST_DOMAIN}",
+            f"give a number from 0 to {LARGEST_DOMAIN}",
         )
     check_outputs([args.bag, args.params], [file_of(args)])
     source = bag_input(args.bag)

@@ -22,6 +22,7 @@ from rclpy.task import Future
 
 from selfcal_ros.errors import ExitCode, InputError, SelfcalError
 from selfcal_ros.nodes.callbacks import Guarded
+from selfcal_ros.topics import LARGEST_DOMAIN
 
 SPIN_SECONDS = 86400.0
 """An infinite time-out overflows in the executor of the wheels; loop with a day instead."""
@@ -53,6 +54,8 @@ def spin(node: Guarded, until: Future) -> None:
 
 LOG_FOLDERS = ("HOME", "ROS_HOME", "ROS_LOG_DIR")
 """Variables of the environment of which one must name where ROS keeps its log."""
+ARGUMENTS = "arguments after --ros-args"
+ENVIRONMENT = "variables HOME and ROS_* of the environment"
 
 
 def _init(argv: list[str] | None) -> None:
@@ -60,13 +63,26 @@ def _init(argv: list[str] | None) -> None:
         raise InputError(
             "HOME", "is not set, and ROS keeps its log there", "set it, or ROS_LOG_DIR"
         )
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not (domain.isdecimal() and int(domain) <= LARGEST_DOMAIN):  # ends the process
+        raise InputError(
+            "ROS_DOMAIN_ID",
+            f"{domain!r} is not a ROS domain",
+            f"give a number from 0 to {LARGEST_DOMAIN}",
+        )
     try:
         rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
-    except (RCLError, UnknownROSArgsError) as error:
-        reason = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
-        raise InputError(
-            "arguments after --ros-args", reason, "correct them"
-        ) from error
+    except UnknownROSArgsError as error:
+        raise _refused(error, ARGUMENTS) from error
+    except RCLError as error:
+        of_arguments = "arse" in str(error)  # Couldn't parse, failed to parse
+        raise _refused(error, ARGUMENTS if of_arguments else ENVIRONMENT) from error
+
+
+def _refused(error: Exception, where: str) -> InputError:
+    """Return what ROS says as one line."""
+    reason = re.sub(r",? at /\S+", "", " ".join(str(error).split()))
+    return InputError(where, reason, "correct them")
 
 
 def _keep_what_is_loaded() -> None:
@@ -89,7 +105,10 @@ def run(make_node: Callable[[], Guarded], argv: list[str] | None = None) -> int:
     code = int(ExitCode.DONE)
     try:
         _init(argv)
-        node = make_node()
+        try:
+            node = make_node()
+        except RCLError as error:
+            raise _refused(error, ENVIRONMENT) from error
         getattr(node, "autostart", lambda: None)()
         finished = getattr(node, "finished", None)
         if finished is not None:

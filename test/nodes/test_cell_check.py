@@ -425,14 +425,16 @@ def test_what_the_verb_says(tmp_path, monkeypatch, capfd, code, words, said):
 
     @contextmanager
     def child(*_, **__):
-        yield SimpleNamespace(stdout=[json.dumps(item)], wait=lambda: code)
+        lines = ["a word of the middleware\n", json.dumps(item)]
+        yield SimpleNamespace(stdout=lines, wait=lambda: code)
 
     monkeypatch.setattr(cell, "process", child)
     assert (
         main(["cell", "check", "--plan", plan_file(tmp_path, small_plan()), *words])
         == code
     )
-    found = capfd.readouterr().out
+    found, aside = capfd.readouterr()
+    assert aside == "a word of the middleware\n"
     assert (json.loads(found) if words else found) == said
 
 

@@ -40,6 +40,35 @@ def test_what_a_node_has_loaded_is_not_gone_through_while_it_works(monkeypatch, 
     assert not any(found is made[0] for found in gc.get_objects())
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        (
+            "ROS_DOMAIN_ID",
+            "999",
+            "ROS_DOMAIN_ID: '999' is not a ROS domain; give a num",
+        ),
+        ("ROS_DOMAIN_ID", "a", "ROS_DOMAIN_ID: 'a' is not a ROS domain; give a number"),
+        ("ROS_LOG_DIR", "/proc/x", "variables HOME and ROS_* of the environment: fai"),
+        ("ROS_STATIC_PEERS", "///", "variables HOME and ROS_* of the environment: err"),
+    ],
+)
+def test_an_environment_that_ros_refuses_is_one_line(
+    ros_environment, name, value, said
+):
+    done = subprocess.run(
+        [sys.executable, "-m", "selfcal_ros.nodes.compensator"],
+        env=ros_environment | {name: value},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith(f"selfcal: {said}")
+    assert "Traceback" not in done.stderr
+
+
 HANGING = """
 import os, signal, time
 from rclpy.task import Future
