@@ -49,8 +49,6 @@ from selfcal_ros.settings.detector import (
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import INPUT_TOPICS, LARGEST_DOMAIN
 
-AS_RECORDED = -1
-LARGEST_SEED = 2**31
 NODES = ("measurement_collector", "pose_sequencer", "solver")
 
 
@@ -68,12 +66,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     speed.add_argument(
         "--fast", action="store_true", help="as fast as the nodes can follow"
-    )
-    parser.add_argument(
-        "--shuffle",
-        type=int,
-        metavar="SEED",
-        help="deliver the messages in shuffled order",
     )
     parser.add_argument(
         "-o",
@@ -112,12 +104,6 @@ def run(args: argparse.Namespace) -> int:
     if not args.fast and not args.rate > 0:
         raise InputError(
             "--rate", f"{args.rate:g} is not a speed", "give a number above 0"
-        )
-    if args.shuffle is not None and not 0 <= args.shuffle <= LARGEST_SEED:
-        raise InputError(
-            "--shuffle",
-            f"{args.shuffle} is not a seed",
-            f"give a number from 0 to {LARGEST_SEED}",
         )
     if args.domain is not None and not 0 <= args.domain <= LARGEST_DOMAIN:
         raise InputError(
@@ -338,7 +324,6 @@ def _play(
                 [
                     args.bag,
                     str(rate),
-                    str(AS_RECORDED if args.shuffle is None else args.shuffle),
                     str(saved),
                     cell,
                     *quiet,

@@ -69,7 +69,7 @@ class Player:
         bag: str,
         *,
         rate: float,
-        seed: int,
+        seed: int = -1,
         namespace: str | None = None,
         listener: str = CollectorSettings.NODE,
         beside_others: bool = False,

@@ -165,12 +165,10 @@ class ReplaySession(SelfcalNode[PlayerSettings]):
 
 
 def main() -> None:
-    """Run the session: BAG RATE SEED RESULT.json NAMESPACE."""
-    bag, rate, seed, output, cell = sys.argv[1:6]
-    player = partial(
-        Player, bag=bag, rate=float(rate), seed=int(seed), namespace=cell or None
-    )
-    sys.exit(run(lambda: ReplaySession(player, output), sys.argv[6:]))
+    """Run the session: BAG RATE RESULT.json NAMESPACE."""
+    bag, rate, output, cell = sys.argv[1:5]
+    player = partial(Player, bag=bag, rate=float(rate), namespace=cell or None)
+    sys.exit(run(lambda: ReplaySession(player, output), sys.argv[5:]))
 
 
 if __name__ == "__main__":

@@ -210,8 +210,6 @@ def test_processes_give_the_result_of_detect_and_solve_bit_for_bit(
                 "--namespace",
                 "cell2",
                 "--fast",
-                "--shuffle",
-                "3",
                 "--pixel-size",
                 "6e-6",
                 *common,
@@ -393,7 +391,7 @@ def test_the_code_of_images_is_that_of_detect_and_solve(
     @contextmanager
     def process(module, given, *_, **__):
         if module.endswith("replay_session") and ends == 3:
-            Path(given[3]).write_bytes(unidentified.read_bytes())
+            Path(given[2]).write_bytes(unidentified.read_bytes())
         yield SimpleNamespace(stdout=[], wait=lambda: ends)
 
     def collected(bag, *_, **__):

@@ -176,12 +176,11 @@ def test_of_two_cells_one_must_be_named(graph, two_cells):
 @pytest.mark.parametrize(
     ("options", "arguments"),
     [
-        ([], ["1.0", "-1", ""]),
-        (["--fast"], ["0.0", "-1", ""]),
-        (["--rate", "50"], ["50.0", "-1", ""]),
-        (["--shuffle", "3"], ["1.0", "3", ""]),
-        (["--namespace", "/"], ["1.0", "-1", "/"]),
-        (["--namespace", "cell2"], ["1.0", "-1", "/cell2"]),
+        ([], ["1.0", ""]),
+        (["--fast"], ["0.0", ""]),
+        (["--rate", "50"], ["50.0", ""]),
+        (["--namespace", "/"], ["1.0", "/"]),
+        (["--namespace", "cell2"], ["1.0", "/cell2"]),
     ],
     ids=" ".join,
 )
@@ -198,8 +197,8 @@ def test_what_a_session_is_told_and_that_its_code_is_that_of_the_command(
     monkeypatch.setattr(replay_verb, "process", process)
     assert selfcal(["replay", bag, *options]) == 4
     assert list(started) == [*replay_verb.NODES, "replay_session"]
-    played_bag, *rest = started["replay_session"][:5]
-    saved = rest.pop(2)
+    played_bag, *rest = started["replay_session"][:4]
+    saved = rest.pop(1)
     assert (played_bag, rest) == (bag, arguments)
     assert f"result_folder:={Path(saved).parent}" in started["solver"]
 
@@ -282,7 +281,7 @@ def test_a_plate_placed_otherwise_is_bad_input_as_by_solve(
     def process(module, given, *_, **__):
         """Stand for a session that found the plan not identified."""
         if module.endswith("replay_session"):
-            assert selfcal(["solve", given[0], "--quiet", "-o", given[3]]) in (2, 3)
+            assert selfcal(["solve", given[0], "--quiet", "-o", given[2]]) in (2, 3)
             capsys.readouterr()
         yield SimpleNamespace(stdout=[], wait=lambda: 3)
 
@@ -313,7 +312,7 @@ def test_a_clock_that_stepped_is_said_once_as_solve_says_it(
         if module.endswith("replay_session"):
             print("what the nodes say", file=sys.stderr)
             write_json(
-                given[3], solved | {"warnings": solved["warnings"] if noted else others}
+                given[2], solved | {"warnings": solved["warnings"] if noted else others}
             )
         yield SimpleNamespace(stdout=[], wait=lambda: 0)
 
@@ -349,7 +348,7 @@ def test_many_rejections_are_said_as_solve_says_them(monkeypatch, tmp_path, caps
     @contextmanager
     def process(module, given, *_, **__):
         if module.endswith("replay_session"):
-            write_json(given[3], read_json(tmp_path / "solved.json"))
+            write_json(given[2], read_json(tmp_path / "solved.json"))
         yield SimpleNamespace(stdout=[], wait=lambda: 0)
 
     monkeypatch.setattr(replay_verb, "process", process)
@@ -385,7 +384,7 @@ def test_a_lost_command_is_said_once_whether_or_not_it_spoils_the_map(
     @contextmanager
     def process(module, given, *_, **__):
         if module.endswith("replay_session"):
-            write_json(given[3], read_json(solved))
+            write_json(given[2], read_json(solved))
         yield SimpleNamespace(stdout=[], wait=lambda: 3 if code else 0)
 
     monkeypatch.setattr(replay_verb, "process", process)
@@ -428,7 +427,7 @@ def test_messages_of_the_future_are_rejected_by_the_command_as_by_solve(
     @contextmanager
     def process(module, given, *_, **__):
         if module.endswith("replay_session"):
-            write_json(given[3], solved | {"rejected": {}, "warnings": before})
+            write_json(given[2], solved | {"rejected": {}, "warnings": before})
         yield SimpleNamespace(
             stdout=[f"lost {text}" for text in Playlist(bag).lost], wait=lambda: 0
         )
@@ -596,22 +595,14 @@ def test_nothing_is_played_before_the_nodes_listen(graph):
             "--domain: 233 is not a ROS domain; give a number from 0 to 232",
         ),
         (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0"),
-        (
-            ["--shuffle", "-1"],
-            "--shuffle: -1 is not a seed; give a number from 0 to 2147483648",
-        ),
-        (
-            ["--shuffle", "2147483649"],
-            "--shuffle: 2147483649 is not a seed; give a number from 0",
-        ),
     ],
 )
-def test_speeds_and_seeds_that_are_none(options, problem, capsys):
+def test_speeds_and_domains_that_are_none(options, problem, capsys):
     assert selfcal(["replay", "bag", *options]) == 2
     assert problem in capsys.readouterr().err
 
 
-def test_what_follows_the_five_arguments_of_a_session_is_for_ros(monkeypatch):
+def test_what_follows_the_four_arguments_of_a_session_is_for_ros(monkeypatch):
     from selfcal_ros.nodes import replay_session
 
     given = []
@@ -623,7 +614,7 @@ def test_what_follows_the_five_arguments_of_a_session_is_for_ros(monkeypatch):
         ["--ros-args", "-p", "a:=1", "-p", "b:=2", "-p", "c:=3", "-p", "d:=4"],
     ):
         monkeypatch.setattr(
-            "sys.argv", ["session", "bag", "2.0", "-1", "r.json", "/cell", *more]
+            "sys.argv", ["session", "bag", "2.0", "r.json", "/cell", *more]
         )
         with pytest.raises(SystemExit) as ended:
             replay_session.main()
