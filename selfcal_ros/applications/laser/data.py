@@ -267,7 +267,8 @@ LINEAR_SHARE = 0.05
 _UNITS = {1e-3: "metres", 1e3: "micrometres", 1e6: "nanometres", 1 / 25.4: "inches"}
 
 
-def _is_near(ratio: float) -> bool:
+def is_near(ratio: float) -> bool:
+    """Return whether a reading is about its nominal value."""
     return 1 / NEAR < ratio < NEAR
 
 
@@ -295,16 +296,16 @@ def check_reading(value_m: float, nominal_m: float, where: str) -> None:
     values_text = (
         f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
     )
-    if _is_near(ratio):
+    if is_near(ratio):
         return
-    if _is_near(-ratio):
+    if is_near(-ratio):
         raise InputError(
             where,
             f"{values_text}: the sign is wrong",
             "readings are positive on every diagonal (np: R_x = -l . dx)",
         )
     for factor, unit in _UNITS.items():
-        if _is_near(ratio / factor):
+        if is_near(ratio / factor):
             raise InputError(
                 where, f"{values_text}: it looks like {unit}", "give millimetres"
             )
@@ -324,7 +325,7 @@ def check_linear(value_m: float, step_m: float, where: str) -> None:
             where, "not a finite number", "measure the block again or correct the cell"
         )
     if abs(value_m) > LINEAR_SHARE * step_m:
-        if _is_near((value_m + step_m) / step_m) or not _is_near(value_m / step_m):
+        if is_near((value_m + step_m) / step_m) or not is_near(value_m / step_m):
             hint = "it looks like micrometres; give millimetres"
         else:
             hint = "it looks like the step itself; give measured step - nominal step"

@@ -20,10 +20,10 @@ from selfcal_ros.applications.laser.data import (
     DIAGONALS,
     MAX_BLOCKS,
     StepDiagonal,
-    check_reading,
+    is_near,
 )
 from selfcal_ros.errors import InputError, NoDataError
-from selfcal_ros.units import NS_PER_S
+from selfcal_ros.units import MM_PER_M, NS_PER_S
 
 OUTLIER = 10.0
 """Laser samples of a rest farther than this from its median are ignored, in median distances: for
@@ -381,9 +381,28 @@ def _readings(
             if single_axis
             else (steps**2 / np.linalg.norm(steps))[move.axis]
         )
-        check_reading(move.reading_m, nominal, where)
+        _check_distance(move.reading_m, nominal, where)
         out[move.axis, block] = move.reading_m
     return out[chain[0].axis] if single_axis else out
+
+
+def _check_distance(value_m: float, nominal_m: float, where: str) -> None:
+    """Refuse a distance that no move of this step can have; the remedy is an option of the bag."""
+    ratio = value_m / nominal_m
+    if is_near(ratio):
+        return
+    values = f"{value_m * MM_PER_M:.6g} where {nominal_m * MM_PER_M:.6g} mm is nominal"
+    if is_near(-ratio):
+        raise InputError(
+            where,
+            f"{values}: the sign is wrong",
+            "give --laser-sign -1 if the distance decreases along the diagonals, else leave it out",
+        )
+    raise InputError(
+        where,
+        f"{values}, {ratio:.4g} times as much",
+        "check --laser-unit and --step-x, --step-y",
+    )
 
 
 def _same_length(named: dict[str, list[list[Move]]], dim: int) -> None:

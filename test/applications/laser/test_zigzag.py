@@ -101,7 +101,8 @@ def test_a_distance_that_shrinks_along_the_diagonal_is_turned_by_the_sign():
     series = recording()
     shrinking = replace(series, laser_m=-series.laser_m)
     with pytest.raises(
-        InputError, match=r"run pp, x move, block 1: .*the sign is wrong"
+        InputError,
+        match=r"run pp, x move, block 1: .*the sign is wrong; give --laser-sign -1",
     ):
         cut_zigzag(shrinking, RULE)
     turned = cut_zigzag(shrinking, replace(RULE, laser_sign=-1)).data
@@ -193,7 +194,7 @@ def test_runs_over_different_places_are_refused():
             lambda s: replace(s, laser_m=s.laser_m * 1000),
             InputError,
             "run pp, x move, block 1: 7067.64 where 7.07107 mm is "
-            "nominal: it looks like micrometres",
+            "nominal, 999.5 times as much; check --laser-unit and --step-x, --step-y",
         ),
     ],
 )
