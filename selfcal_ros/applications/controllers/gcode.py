@@ -249,6 +249,8 @@ class Rewriter:
                 )
             if not value and not line.code("home", "unknown"):
                 self._refuse(f"{letter} has no number", "give one")
+            if letter == "F" and float(value) <= 0:  # of the first piece alone
+                self._refuse(f"F{value} is not a feed", "give one above 0")
 
         if self._ended and (line.codes or line.values):
             self._refuse("the line follows the end of the program", "remove it")

@@ -378,6 +378,8 @@ linuxcnc | % // M5 // % // M3 | 4
 linuxcnc | +G1 X#1 Y0 | 4: 'X' does not
 linuxcnc | +G0 X[1+2] | 4: 'X' does not
 grbl | +G1 X1 X2 | 4: X is given twice
+grbl | +G0 X0 Y0 // G1 X9 F0 | 5: F0 is not a feed; give one above 0
+klipper | +G0 X0 Y0 // G1 X9 F-.5 | 5: F-.5 is not a feed
 grbl | +G0 G1 X1 | 4: G0 G1 in one
 grbl | +G0 X0 M30 | 4: the program stops in the line of a move; stop in the next line
 linuxcnc | +G0 X0 M1 | 4: the program stops
