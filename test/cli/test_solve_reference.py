@@ -48,6 +48,13 @@ def test_a_reference_length_adds_its_scale_and_its_uncertainty(tmp_path, kind):
     assert fixed["u_gx"][0, 5] == pytest.approx(0.05 * 1e-7, rel=0.05)
 
 
+def test_a_reference_far_from_the_encoders_is_a_warning(tmp_path):
+    solved(tmp_path, "--reference", "artifact:1.2e-3:1e-7")
+    (warning,) = json.loads((tmp_path / "r.json").read_text())["warnings"][:1]
+    assert warning.startswith("by the reference length the encoders indicate lengths ")
+    assert "shorter than they are by 1200" in warning
+
+
 def test_the_distance_of_two_marks_is_met(tmp_path):
     plate = solved(
         tmp_path,

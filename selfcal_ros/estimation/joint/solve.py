@@ -552,7 +552,7 @@ def _solved(
     artifact_map = _artifact_map(model, cover if with_uncertainty else None, rms(sigma))
     findings = (
         *_unchecked(problem.system, measurements.sense),
-        *_magnification(artifact_map, options),
+        *_magnification(artifact_map, _scale_of_map(model), options),
     )
     if not with_uncertainty and asked_for is None:
         findings = (Finding("no_uncertainty"), *findings)
@@ -601,11 +601,20 @@ def _kept_images(measurements: Measurements, model: ModelFit) -> ImagesKept | No
     )
 
 
-def _magnification(plate_map: ArtifactMap, options: Options) -> tuple[Finding, ...]:
-    """Return whether plate and encoders differ in scale by more than is plausible."""
-    if options.reference is not None or not (
-        abs(plate_map.magnification) > options.magnification_limit
-    ):
+def _magnification(
+    plate_map: ArtifactMap, of_map: float, options: Options
+) -> tuple[Finding, ...]:
+    """Return whether plate or reference and encoders differ in scale by more than is plausible.
+
+    `of_map` is the scale that a reference length gives the map, m/m.
+    """
+    limit = options.magnification_limit
+    if options.reference is not None:
+        if abs(of_map) <= limit:
+            return ()
+        u = options.reference.u_relative
+        return (Finding("reference_off", of_map, u, "m/m"),)
+    if not abs(plate_map.magnification) > limit:
         return ()
     return (
         Finding(
@@ -824,9 +833,7 @@ def _artifact_map(
     scale = scale_of(
         system, unscaled, field=fitted.field, plate=fitted.plate, half_width_m=length
     )
-    scale += _scale_of_field(
-        system, fitted.field
-    )  # what a reference took from the plate
+    scale += _scale_of_map(model) * length  # what a reference took from the plate
     u = float("nan")
     sigma = fitted.xy.sigma
     u_x = u_y = np.full(plate.shape, np.nan)
@@ -855,11 +862,14 @@ def _artifact_map(
     )
 
 
-def _scale_of_field(system: NormalEquations, field: np.ndarray) -> float:
-    """Return the least-squares scale of a map, m at the unit of position."""
-    z, values = (of[system.known_sites] for of in (system.grid.views.z_sites, field))
+def _scale_of_map(model: ModelFit) -> float:
+    """Return the least-squares scale of the map, m/m: none without a reference length."""
+    system = model.problem.system
+    of_sites = (system.grid.views.z_sites, model.fitted.field)
+    z, values = (of[system.known_sites] for of in of_sites)
     z = z - z.mean()
-    return float(np.vdot(z, values).real / np.vdot(z, z).real)
+    scale = np.vdot(z, values).real / np.vdot(z, z).real
+    return float(scale) / model.problem.half_width_m
 
 
 def views_of(

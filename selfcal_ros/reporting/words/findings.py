@@ -301,6 +301,12 @@ SENTENCES: dict[str, Words] = {
         f"{plus_minus(f, RATIO)}, more than plate and encoders should differ: check the pitch in "
         "the plan (grid_pitch), and the scale of the encoders"
     ),
+    "reference_off": lambda f, of: (
+        f"by the reference length the encoders indicate lengths "
+        f"{_either(f, 'longer', 'shorter')} than they are by {plus_minus(f, RATIO)}, more than "
+        "encoders should: check its error and the unit of that (relative, not µm/m), and the "
+        "pitch in the plan (grid_pitch)"
+    ),
     "drawn_uncertainty": lambda f, of: (
         f"uncertainties of Hu's law from {of['draws']} draws of unit noise: "
         f"{100 / math.sqrt(2 * of['draws']):.1f} % standard error"

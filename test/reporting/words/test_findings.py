@@ -447,6 +447,16 @@ FINDINGS = [
         )
         for sign, word in ((1, "larger"), (-1, "smaller"))
     ),
+    *(
+        (
+            Finding("reference_off", sign * 2e-3, 1e-5, "m/m"),
+            "by the reference length the encoders indicate lengths "
+            f"{word} than they are by 2000 ± 10 µm/m, more than encoders should: check its "
+            "error and the unit of that (relative, not µm/m), and the pitch in the plan "
+            "(grid_pitch)",
+        )
+        for sign, word in ((1, "longer"), (-1, "shorter"))
+    ),
     (
         Finding("drawn_uncertainty", details={"draws": 200}),
         "uncertainties of Hu's law from 200 draws of unit noise: 5.0 % standard error",
