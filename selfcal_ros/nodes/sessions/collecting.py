@@ -440,7 +440,9 @@ class CollectingSession:
             else ""
         )
         state += f"; {gap}" if gap else ""
-        bad = missed or self._problem or self.collector.unusable or stored or gap
+        unusable = self.collector.unusable
+        state += f"; messages not used: {_counted(unusable)}" if unusable else ""
+        bad = missed or self._problem or unusable or stored or gap
         main = Diagnosis(
             Level.WARN if bad else Level.OK,
             state,
@@ -570,3 +572,8 @@ class CollectingSession:
         return Diagnosis(
             Level.WARN if problems else Level.OK, "; ".join(problems), values
         )
+
+
+def _counted(count_of_reason: Mapping[str, int]) -> str:
+    """Return reasons with their counts, for the health."""
+    return ", ".join(f"{reason} {count}" for reason, count in count_of_reason.items())

@@ -762,6 +762,7 @@ def test_a_run_stamped_a_day_ahead_hides_no_later_one_nor_does_its_journal(
         )
     )
     assert told.level == Level.WARN
+    assert f"messages not used: command_from_the_future {counts[0]}, " in told.message
     assert {line.partition(": ")[0] for line in desk.refused} == set(INPUT_TOPICS)
     assert all(
         re.search(
