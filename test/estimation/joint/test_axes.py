@@ -80,7 +80,8 @@ def test_either_coordinate_lies_within_its_own_uncertainty(repeats):
                 for e, u in zip(error, (emap.u_gx, emap.u_gy), strict=True)
             ]
         )
-    assert np.mean(inside, axis=0) == pytest.approx([0.96, 0.96], abs=0.025)
+    # a size that chance makes doubtful widens U
+    assert np.mean(inside, axis=0) == pytest.approx([0.96, 0.96], abs=0.03)
 
 
 def test_equal_noises_are_not_told_apart():

@@ -14,6 +14,7 @@ from selfcal_ros.compensation.export import provenance
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.options import Options
+from selfcal_ros.estimation.terms import equations
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.reference import ReferenceLength
@@ -103,8 +104,9 @@ def test_a_term_that_its_size_holds_adds_degrees_of_freedom_and_one_that_is_told
     assert told.dof_map_xy == told.dof_xy
 
 
-def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles():
+def test_an_assumed_eccentricity_adds_degrees_of_freedom_to_the_angles(monkeypatch):
     """By GUM G.2b, with the noise of the lines as the one component of finite degrees."""
+    monkeypatch.setattr(equations, "DOUBT_LEVEL_OF_FEW", 0.0)
     settings = replace(SETTINGS, sigma_theta_rad=2e-6)
     result = calibrate(
         measured(settings=settings), Options(terms=parse_terms(["microscope"], ""))
