@@ -106,3 +106,11 @@ def test_a_view_that_leaves_the_field_adds_nothing(shift, q):
     field, out = np.zeros((2, SIDE, SIDE), dtype=complex)
     views.add_scattered(out, 0, field + 1)
     assert not out.any() and not views.gather(field + 1)[0].any()
+
+
+def test_a_mark_and_its_index_name_each_other():
+    views = LatticeViews((5, 3), (LatticePose(0, (0, 0), None),))
+    assert views.mark_at(0, 0) == (-2, -1)
+    assert views.mark_at(4, 1) == (2, 0)
+    for index in np.ndindex(5, 3):
+        assert views.index_of(*views.mark_at(*index)) == index
