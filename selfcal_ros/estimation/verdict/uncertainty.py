@@ -460,6 +460,12 @@ def _term_line(
         )
     remaining = remaining_part(term)
     determined = remaining < DETERMINED_BELOW
+    by_images = (
+        result.camera is not None
+        and name in blocks()
+        and block_of(name).of_microscope
+        and term.source == "default"
+    )
     largest = max(
         term.estimates, key=lambda estimate: abs(np.nan_to_num(estimate.value))
     )
@@ -472,7 +478,7 @@ def _term_line(
         largest.unit,
         *effect,
         _dof(result.noise, quantity) if determined else np.inf,
-        "readings" if determined or term.size_used else term.source,
+        "readings" if determined or term.size_used or by_images else term.source,
         {
             "given": term.size or term.solved_with,
             "allowed": term.size_used,

@@ -10,6 +10,7 @@ import pytest
 from selfcal_ros.applications.standards import dcc as standards
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.api import calibrate
+from selfcal_ros.estimation.verdict.uncertainty import _term_line
 from selfcal_ros.model.result import result_from_dict, result_to_dict
 from selfcal_ros.reporting.chapters import chapters
 from selfcal_ros.reporting.figures.places import camera_errors, stage_yaw, views_in
@@ -48,6 +49,12 @@ def result():
     )
     made = worded(calibrate(measured))
     return result_from_dict(result_to_dict(made), "test")
+
+
+def test_the_size_of_the_microscope_is_that_of_the_images():
+    u = np.full(3, 1e-9)
+    assert _term_line("xy", "microscope", u, result()).source == "readings"
+    assert _term_line("xy", "plate_strain", u, result()).source == "default"
 
 
 def test_the_summary_states_the_camera():
