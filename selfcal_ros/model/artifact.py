@@ -76,7 +76,7 @@ class Artifact:
         H, harmonics of the angular map, below K/2: a Fourier series, for views at any turn. 0 = one
         value for each line, for views turned by whole lines.
     marks : MarkList, optional
-        The marks if they are no lattice; `grid_size` is then their number and `grid_pitch_m` the
+        The marks if they are not a lattice; `grid_size` is then their number and `grid_pitch_m` the
         median distance of neighbours, whatever is given.
 
     Raises

@@ -129,7 +129,7 @@ def marks_of(
     for number, x, y, place in zip(ids, x_m, y_m, where, strict=True):
         if not -(2**31) <= number < 2**31:
             raise InputError(
-                place, f"id {number} is no 32 bit integer", "number the marks anew"
+                place, f"id {number} is not a 32 bit integer", "number the marks anew"
             )
         if not (isfinite(x) and isfinite(y)):
             raise InputError(

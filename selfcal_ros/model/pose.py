@@ -31,7 +31,7 @@ class StagePose(ABC):
         Position of the plate's centre along stage x and y, pitches.
     turn_lines : float or None
         s, 0 to K, the total turn in angular lines: an int unless the map is a Fourier series. None
-        if it is no whole number of them.
+        if it is not a whole number of them.
     """
 
     shift: tuple[float, float]

@@ -218,7 +218,7 @@ class View:
         ------
         InputError
             As `lattice_pose`; if the map has nodes of its own, only if the pose is not finite, is
-            beyond every field, or has lines to be measured and is no whole number of them.
+            beyond every field, or has lines to be measured and is not a whole number of them.
         """
         if artifact.map_grid is None and artifact.marks is None:
             return self.lattice_pose(artifact)

@@ -238,7 +238,7 @@ def _terms(
     if not words and measurements is not None:
         return planned, "plan"
     terms = parse_terms(entries, "model_terms")
-    # the microscope's uncertainty in the plan is no choice of a model
+    # the microscope's uncertainty in the plan is not a choice of a model
     microscope_terms = [
         term
         for term in planned

@@ -103,7 +103,7 @@ def camera_pose(
     NoDataError
         If too few marks were followed.
     InputError
-        If the stage moved along one line, the marks do not follow it, or the image is no similar
+        If the stage moved along one line, the marks do not follow it, or the image is not a similar
         image of the motion.
     """
     number = np.concatenate([np.zeros(0, int), *tracks(images)])

@@ -87,7 +87,10 @@ def test_a_plan_reads_its_marks_from_a_table(tmp_path):
             GOOD + "6,20.5,0\n",
             r"marks.csv:7: .*beyond every plate \(2 m\); is it in mm\?",
         ),
-        (GOOD + f"{2**31},0,0\n", r"marks.csv:7: id 2147483648 is no 32 bit integer"),
+        (
+            GOOD + f"{2**31},0,0\n",
+            r"marks.csv:7: id 2147483648 is not a 32 bit integer",
+        ),
         ("id,x,y\n1,0,0\n2,0,0.1\n3,0.1,0\n", r"marks.csv: 3 marks, not 4 to 10000"),
         (
             "id,x,y\n1,-.1,0\n2,-.05,0\n3,0.05,0\n4,.1,1e-6\n",

@@ -230,7 +230,7 @@ class Axis:
         """Return the spline through nodes at -half, ..., half; three of them have a parabola."""
         nodes = np.arange(-half, half + 1.0)
         degree = 1 if interpolation is Interpolation.BILINEAR else min(3, int(2 * half))
-        # not-a-knot: the second and the last but one node are no knots of a cubic
+        # not-a-knot: the second and the last but one node are not knots of a cubic
         inner = {1: nodes[1:-1], 2: nodes[:0], 3: nodes[2:-2]}[degree]
         ends = nodes[[0, -1]].repeat(degree + 1)
         return cls(np.sort(np.concatenate([ends, inner])), degree, nodes)
