@@ -122,3 +122,26 @@ def test_no_fault_changes_nothing_and_a_seed_decides_the_rest():
     first, again, other = (spoilt(many, seed=seed) for seed in (3, 3, 4))
     assert (first[1], first[2]) == (again[1], again[2])
     assert first[1] != other[1]
+
+
+def test_outliers_are_1_to_20_um_and_mrad_off_in_any_direction():
+    cell, arrivals, _ = spoilt(Faults(outliers=1.0))
+    right = {event.stamp_ns: event for event in cell.detections}
+    far = [
+        (event, right[event.stamp_ns])
+        for _, event in arrivals
+        if isinstance(event, Detection)
+    ]
+    turned_mrad = np.array([1e3 * (e.offset_theta - r.offset_theta) for e, r in far])
+    moved_um = np.array(
+        [
+            (1e6 * (e.offset_x - r.offset_x), 1e6 * (e.offset_y - r.offset_y))
+            for e, r in far
+        ]
+    )
+    turned_mrad = turned_mrad[turned_mrad != 0]
+    size_um = np.hypot(*moved_um.T)
+    for size in (np.abs(turned_mrad), size_um[size_um > 0]):
+        assert 1 <= size.min() < 2 and 19 < size.max() <= 20
+    assert (turned_mrad < 0).any() and (turned_mrad > 0).any()
+    assert (moved_um < 0).any(axis=0).all() and (moved_um > 0).any(axis=0).all()
