@@ -77,12 +77,36 @@ def _replacement(target: Path) -> Iterator[BinaryIO]:
             os.fsync(fd)
             temporary.chmod(_mode(target))
             if portable.LOCKS:  # else it cannot be renamed while it is open
-                temporary.replace(target)
+                _put(temporary, target)
         if not portable.LOCKS:
-            temporary.replace(target)
+            _put(temporary, target)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+NEW: set[str] = set()
+"""Outputs that were not there when the command began, and must not replace a file."""
+
+
+def _put(temporary: Path, target: Path) -> None:
+    """Give a file its name; InputError if `target` is new, and was written meanwhile."""
+    if str(target) in NEW:
+        NEW.discard(str(target))
+        try:
+            os.link(temporary, target)
+        except FileExistsError as error:
+            raise InputError(
+                str(target),
+                "was written by another command meanwhile",
+                "name another file, or replace it with --force",
+            ) from error
+        except OSError:  # a file system without links
+            temporary.replace(target)
+        else:
+            temporary.unlink()
+    else:
+        temporary.replace(target)
 
 
 @contextlib.contextmanager

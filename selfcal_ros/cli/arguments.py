@@ -156,6 +156,10 @@ def refuse_existing(path: str | os.PathLike, *, force: bool) -> None:
             "the file exists",
             "name another file, or replace it with --force",
         )
+    from selfcal_ros.outputs import NEW  # with numpy, which help does without
+
+    place = os.path.realpath(path)
+    (NEW.discard if force or os.path.exists(place) else NEW.add)(place)
 
 
 def misplaced(args: argparse.Namespace) -> InputError | None:
