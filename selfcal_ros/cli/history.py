@@ -13,6 +13,7 @@ from selfcal_ros.applications.batch.history import Drift, Entry, drift_from, his
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.estimation.comparison.maps import MapDifference
+from selfcal_ros.estimation.comparison.verification import require_correctable
 from selfcal_ros.outputs import plain, write_text
 from selfcal_ros.results import ACTIVE, active_map, read_result
 from selfcal_ros.units import NM_PER_M, UM_PER_M
@@ -73,12 +74,7 @@ def _activate(folder: Path, path: Path) -> None:
     path = path if path.exists() else folder / path
     if folder.resolve() not in path.resolve().parents:
         raise InputError(str(path), f"is not in {folder}", "copy it there first")
-    if not read_result(path).verdict.qualified:
-        raise InputError(
-            str(path),
-            "is not qualified, so it is not a map to correct with",
-            "calibrate again",
-        )
+    require_correctable(read_result(path), str(path))
     now = datetime.now(UTC).isoformat(timespec="seconds")
     write_text(
         folder / ACTIVE, f"{path.resolve().relative_to(folder.resolve())}\n{now}\n"

@@ -1,9 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What acts in machines that loaded the table rightly or wrongly, with noise and new plates."""
 
+from dataclasses import replace
+
 import pytest
 
-from selfcal_ros.estimation.comparison.verification import TableFault, verify
+from selfcal_ros.errors import InputError
+from selfcal_ros.estimation.comparison.verification import (
+    TableFault,
+    require_correctable,
+    verify,
+)
+from selfcal_ros.model.result import Observability
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.verification import verification_sentence
 from test.support.wired import WRONG, machine
 
@@ -47,3 +56,16 @@ def test_each_arrangement_of_a_table_is_named(fault, loaded):
     before, after, _ = machine(101, loaded)
     found = verify(before, after)
     assert found.fault is fault and not found.passed
+
+
+@pytest.mark.parametrize("missing", ["a known stage", "a good grade"])
+def test_a_map_that_is_not_known_or_not_good_is_not_one_to_correct_with(missing):
+    before, _, _ = machine(1, "right")
+    require_correctable(before, "MAP.json")
+    if missing == "a known stage":
+        before = replace(before, observability=Observability(8, 6, 2, False))
+    else:
+        verdict = replace(before.verdict, grade=Grade.NOT_QUALIFIED)
+        before = replace(before, verdict=verdict)
+    with pytest.raises(InputError, match=r"MAP\.json: is not qualified, so it is not"):
+        require_correctable(before, "MAP.json")
