@@ -10,6 +10,7 @@ from scipy.special import gamma
 
 from selfcal_ros.applications.standards.iso230 import (
     Scatter,
+    _true_shares,
     axis_figures,
     bidirectional,
     circle_figures,
@@ -474,3 +475,16 @@ def test_u_holds_the_bias_of_what_is_largest_of_noisy_values(
     ):
         assert np.mean(np.abs(ratios[name]) < 2) > least, name
     assert np.sqrt(np.mean(np.square(ratios["B"]))) < 1.4
+
+
+def test_what_scatters_far_beyond_its_noise_is_true():
+    """Of 40 values that differ by 10 u nearly all is true; of equal ones nothing."""
+    rng = np.random.default_rng(1)
+    u = np.full(40, 0.1)
+    values = 5.0 + rng.normal(0, 1.0, 40)
+    centre, share = _true_shares(values, u, rng)
+    assert share.mean() == pytest.approx(0.99, abs=0.005)
+    assert centre.mean() == pytest.approx(values.mean(), abs=0.02)
+    assert centre.std() == pytest.approx(1 / np.sqrt(40), rel=0.3)
+    _, share = _true_shares(5.0 + rng.normal(0, 0.1, 40), u, rng)
+    assert not share.any()

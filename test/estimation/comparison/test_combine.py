@@ -305,6 +305,27 @@ def test_a_reference_length_is_kept_once():
         combine([*runs, part("c", C)], keep_scale=True)
 
 
+def test_the_length_that_large_maps_share_does_not_average_out():
+    artifact, rng = Artifact(33, 0.01), np.random.default_rng(3)
+    base = random_map(artifact, 1)
+    length = ReferenceLength("artifact", 0.0, 1e-7, "PTB 1")
+    of_length = np.stack([artifact.x_m, artifact.y_m]) * 1e-7
+    u = np.hypot(3e-9, of_length)
+    runs = []
+    for name in "abc":
+        noise = rng.normal(0, 3e-9, u.shape)
+        emap = replace(
+            base, gx=base.gx + noise[0], gy=base.gy + noise[1], u_gx=u[0], u_gy=u[1]
+        )
+        result = replace(result_of(emap), input={}, reference=length)
+        runs.append(Member(name, emap, result))
+    found = combine(runs, keep_scale=True)
+    assert found.xy.covariance.ndim == 1
+    np.testing.assert_allclose(
+        found.xy.common, of_length.ravel() ** 2, rtol=0.01, atol=1e-19
+    )
+
+
 def test_lengths_of_different_certificates_explain_that_magnifications_differ():
     """1 µm/m apart with u of 1 µm/m each: the maps differ by less than their uncertainties."""
     runs = []
