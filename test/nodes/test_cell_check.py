@@ -25,13 +25,14 @@ from selfcal_ros.cli.main import main
 from selfcal_ros.cli.processes import process
 from selfcal_ros.collection.inputs import Detection, EncoderSample, Phase
 from selfcal_ros.errors import ExitCode, InputError
-from selfcal_ros.nodes import names
+from selfcal_ros.nodes import cell_checker, names
 from selfcal_ros.nodes.cell_checker import CellChecker
 from selfcal_ros.nodes.sessions import cell_check
 from selfcal_ros.nodes.stage_simulator import StageSimulator
 from test.support.mark_lists import listed_plan
 from test.support.plans import plan_of
 from test.support.sessions import plan_file, small_plan
+from test.support.sources import ROOT
 
 SECOND = 10**9
 STEP_NS = 40_000_000
@@ -468,3 +469,14 @@ def test_the_response_of_each_axis_is_its_own(graph):
         pytest.approx(-1 / 1.02, abs=3e-3),
         pytest.approx(-1 / 0.98, abs=3e-3),
     )
+
+
+def test_what_follows_the_three_arguments_of_a_check_is_for_ros(monkeypatch):
+    given = []
+    monkeypatch.setattr(cell_checker, "run", lambda make, args: given.append(args) or 3)
+    for more in ([], ["--ros-args", "-p", "a:=1", "-p", "b:=2", "-p", "c:=3"]):
+        plan = str(ROOT / "config/plans/small.yaml")
+        monkeypatch.setattr("sys.argv", ["check", plan, "0.5", "30", *more])
+        with pytest.raises(SystemExit) as ended:
+            cell_checker.main()
+        assert ended.value.code == 3 and given.pop() == more

@@ -62,6 +62,11 @@ class Cell(Bench):
         elif view.phase == MEASURE:
             if self.fault == "another view":
                 view.rotation += np.pi / 2
+            if self.fault.startswith("shifted view"):
+                _, _, pitches, axis = self.fault.split()
+                along = f"translation_{axis}"
+                shift_m = int(pitches) * view.grid_pitch
+                setattr(view, along, getattr(view, along) + shift_m)
             if self.fault.endswith("no check stops"):
                 view.check_marks = 0
             self.view, self.planned = view, self.exposures(view)
@@ -282,6 +287,15 @@ WRONG = [
         "the stage does not move: it is indicated at x = 0 mm, y = 0 mm",
     ),
     ("another view", "ids", "the marks are those of a plate turned by 90°"),
+    *(
+        (
+            f"shifted view {pitches} {axis}",
+            "ids",
+            f"the marks are those of a plate shifted by {pitches} pitch along {axis}",
+        )
+        for axis in "xy"
+        for pitches in ("+1", "-1")
+    ),
 ]
 
 
