@@ -25,6 +25,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.quality.validation import line_errors
 from selfcal_ros.estimation.recheck.views import Effects, map_of_lines
 from selfcal_ros.estimation.terms.columns import LineColumns
+from selfcal_ros.estimation.verdict.roughness import _fitted_lines
 from selfcal_ros.estimation.verdict.uncertainty import budget_lines
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
@@ -494,3 +495,10 @@ def test_the_picture_follows_the_series_between_the_lines():
     np.testing.assert_allclose(
         radius, np.polyval(np.polyfit(error, radius, 1), error), atol=1e-6
     )
+
+
+def test_the_mean_variance_is_that_of_maps_of_noise():
+    lines = HarmonicSystem((0.0, 8.0, 5.0), np.ones((3, 24)), 4)
+    rng = np.random.default_rng(1)
+    maps = [_fitted_lines(lines, rng.standard_normal((3, 24)))[1] for _ in range(1000)]
+    assert np.mean(np.square(maps)) == pytest.approx(lines.mean_variance, rel=0.05)

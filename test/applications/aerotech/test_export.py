@@ -376,3 +376,10 @@ def test_the_residual_is_true_minus_commanded():
         lines.before[0], emap.g_theta.mean() - emap.g_theta, atol=1e-6
     )
     assert np.corrcoef(lines.before[0], emap.g_theta)[0, 1] < -0.99
+
+
+@pytest.mark.parametrize("counts", [0.0, -1.0, np.inf, np.nan])
+def test_counts_of_theta_are_positive_numbers(counts):
+    assert MachineFrame(1, 2, 3, theta_counts_per_unit=0.5).theta_counts_per_unit == 0.5
+    with pytest.raises(InputError, match="is not a positive number; give the encoder"):
+        MachineFrame(1, 2, 3, theta_counts_per_unit=counts)

@@ -8,6 +8,7 @@ from selfcal_ros.applications.laser.data import DIAGONALS, Form, StepDiagonal
 from selfcal_ros.applications.laser.identify import identify_ibaraki, identify_wang
 from selfcal_ros.applications.laser.noise import check_lengths
 from selfcal_ros.applications.laser.profiles import squareness, straightness
+from selfcal_ros.applications.laser.report import outcome
 from selfcal_ros.applications.laser.simulation import (
     LaserNoise,
     Measurement,
@@ -95,13 +96,17 @@ def test_the_closure_between_diagonals_is_zero_for_one_machine_and_the_differenc
     assert np.abs(identify_ibaraki(data).closure.between_m).max() < 1e-5 * NM
     samples = data.samples_m.copy()
     samples[:, 1, 1] += 10 * NM  # every Y reading of np too long
-    other = identify_ibaraki(
-        StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m)
-    )
+    longer = StepDiagonal(data.steps_m, data.diagonals, samples, data.linear_m)
+    other = identify_ibaraki(longer)
     # np alone: Ex(y) shrinks by sqrt(2) 10 nm, so pp - np grows by as much.
     np.testing.assert_allclose(
         other.closure.between_m[1, :, 0], np.sqrt(2) * 10 * NM, rtol=1e-3
     )
+    stated = outcome(other, longer)["closure"]
+    np.testing.assert_allclose(
+        stated["ex_y_pp_minus_np"], np.sqrt(2) * 10e-6, rtol=1e-3
+    )
+    assert np.abs(stated["ey_x_pp_minus_np"]).max() < 1e-9
     np.testing.assert_allclose(
         other.errors_m[1, :, 0] - errors[1, :, 0], -10 * NM / np.sqrt(2), rtol=1e-3
     )
