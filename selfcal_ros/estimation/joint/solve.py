@@ -549,10 +549,14 @@ def _solved(
     error_map, closure, kept_parts = _error_map(
         measurements, model, cover, sigma, with_uncertainty=with_uncertainty
     )
-    artifact_map = _artifact_map(model, cover if with_uncertainty else None, rms(sigma))
+    # without a reference length the datum leaves the map no scale
+    of_map = 0.0 if options.reference is None else _scale_of_map(model)
+    artifact_map = _artifact_map(
+        model, cover if with_uncertainty else None, rms(sigma), of_map
+    )
     findings = (
         *_unchecked(problem.system, measurements.sense),
-        *_magnification(artifact_map, _scale_of_map(model), options),
+        *_magnification(artifact_map, of_map, options),
     )
     if not with_uncertainty and asked_for is None:
         findings = (Finding("no_uncertainty"), *findings)
@@ -823,9 +827,12 @@ def _beside_map(
 
 
 def _artifact_map(
-    model: ModelFit, cover: MapsCovariance | None, sigma_m: float
+    model: ModelFit, cover: MapsCovariance | None, sigma_m: float, of_map: float
 ) -> ArtifactMap:
-    """Return the plate's map; `sigma_m` is the noise of a reading as it counts there."""
+    """Return the plate's map.
+
+    `sigma_m` is the noise of a reading as it counts there, `of_map` the scale of the stage's map.
+    """
     problem, fitted = model.problem, model.fitted
     system, length = problem.system, problem.half_width_m
     plate = np.where(system.known_marks, fitted.plate, complex(np.nan, np.nan))
@@ -833,7 +840,7 @@ def _artifact_map(
     scale = scale_of(
         system, unscaled, field=fitted.field, plate=fitted.plate, half_width_m=length
     )
-    scale += _scale_of_map(model) * length  # what a reference took from the plate
+    scale += of_map * length  # what a reference took from the plate
     u = float("nan")
     sigma = fitted.xy.sigma
     u_x = u_y = np.full(plate.shape, np.nan)
@@ -863,7 +870,7 @@ def _artifact_map(
 
 
 def _scale_of_map(model: ModelFit) -> float:
-    """Return the least-squares scale of the map, m/m: none without a reference length."""
+    """Return the least-squares scale of the map, m/m."""
     system = model.problem.system
     of_sites = (system.grid.views.z_sites, model.fitted.field)
     z, values = (of[system.known_sites] for of in of_sites)
