@@ -34,7 +34,7 @@ from selfcal_ros.nodes.sessions.health import (
     Rate,
     merged,
 )
-from selfcal_ros.nodes.sessions.progress import progress_line
+from selfcal_ros.nodes.sessions.progress import counted_reasons, progress_line
 from selfcal_ros.nodes.sessions.rejections import RejectionWatch
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.topics import DETECTION_TOPIC, ENCODER_TOPIC
@@ -441,7 +441,8 @@ class CollectingSession:
         )
         state += f"; {gap}" if gap else ""
         unusable = self.collector.unusable
-        state += f"; messages not used: {_counted(unusable)}" if unusable else ""
+        if unusable:
+            state += f"; messages not used: {counted_reasons(unusable.items())}"
         bad = missed or self._problem or unusable or stored or gap
         main = Diagnosis(
             Level.WARN if bad else Level.OK,
@@ -572,8 +573,3 @@ class CollectingSession:
         return Diagnosis(
             Level.WARN if problems else Level.OK, "; ".join(problems), values
         )
-
-
-def _counted(count_of_reason: Mapping[str, int]) -> str:
-    """Return reasons with their counts, for the health."""
-    return ", ".join(f"{reason} {count}" for reason, count in count_of_reason.items())

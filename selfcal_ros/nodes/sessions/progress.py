@@ -2,6 +2,7 @@
 """The progress of the measurement in one line for a person."""
 
 import math
+from collections.abc import Iterable
 
 from selfcal_ros.collection.expected import ViewProgress
 from selfcal_ros.collection.inputs import Command, Phase
@@ -50,13 +51,17 @@ def _phrases(view: ViewProgress) -> list[str]:
     readings = view.readings
     rejected = sorted(readings.rejected.items(), key=lambda item: (-item[1], item[0]))
     if rejected:
-        reasons = ", ".join(
-            f"{printable(reason)} {count}" for reason, count in rejected
+        parts.append(
+            f"{sum(readings.rejected.values())} rejected ({counted_reasons(rejected)})"
         )
-        parts.append(f"{sum(readings.rejected.values())} rejected ({reasons})")
 
     if math.isfinite(readings.sigma_xy):
         parts.append(f"σ {significant(readings.sigma_xy * NM_PER_M, 2)} nm")
     elif math.isfinite(readings.sigma_theta):
         parts.append(f"σ {arcsec(readings.sigma_theta)}")
     return parts
+
+
+def counted_reasons(counts: Iterable[tuple[str, int]]) -> str:
+    """Return reasons with their counts, in the order given."""
+    return ", ".join(f"{printable(reason)} {count}" for reason, count in counts)
