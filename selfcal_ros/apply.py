@@ -264,9 +264,9 @@ class StageMap(Compensator):
         error = np.hypot(dx + bx - ax, dy + by - ay) - length
         u = np.full(len(length), np.nan)
         inside = self.inside(x1, y1) & self.inside(x2, y2)
-        told = np.flatnonzero(inside & np.isfinite(error))
-        for start in range(0, len(told), MAX_POINTS // 2):
-            chunk = told[start : start + MAX_POINTS // 2]
+        known_pairs = np.flatnonzero(inside & np.isfinite(error))
+        for start in range(0, len(known_pairs), MAX_POINTS // 2):
+            chunk = known_pairs[start : start + MAX_POINTS // 2]
             cover = self.covariance(
                 np.append(x1[chunk], x2[chunk]), np.append(y1[chunk], y2[chunk])
             )

@@ -50,8 +50,8 @@ def profile_m(result: StepDiagonalResult, axis: int, direction: int) -> np.ndarr
     return np.concatenate([[0.0], np.cumsum(result.errors_m[axis, :, direction])])
 
 
-def is_told(result: StepDiagonalResult, axis: int, direction: int) -> bool:
-    """Return whether an uncertainty of an error is known.
+def has_u(result: StepDiagonalResult, axis: int, direction: int) -> bool:
+    """Return whether the uncertainty of an error is known.
 
     The conventional formulation takes the mirror's angle for a linear error, whatever the scatter.
     """
@@ -63,7 +63,7 @@ def u_profile_m(
     result: StepDiagonalResult, axis: int, direction: int
 ) -> np.ndarray | None:
     """Return the standard uncertainty of the profile, (n+1,), m; None if unknown."""
-    if not is_told(result, axis, direction):
+    if not has_u(result, axis, direction):
         return None
     rows = _accumulate(result.n_blocks)
     block = _block(result, (axis, direction), (axis, direction))

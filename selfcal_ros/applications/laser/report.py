@@ -74,7 +74,7 @@ def outcome(
     if u is not None:
         out |= {
             f"u_{profiles.name_of(j, c)}": _mm(u[j, :, c])
-            if profiles.is_told(result, j, c)
+            if profiles.has_u(result, j, c)
             else None
             for j, c in kinds
         }

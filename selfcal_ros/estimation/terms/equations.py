@@ -729,8 +729,9 @@ DOUBT_LEVEL = 0.1
 limit with as much confidence, which is far above what few coefficients show."""
 
 DOUBT_LEVEL_OF_FEW = 0.2
-"""The same where the readings determine two combinations of the coefficients, or one: two of
-eccentricities of 7.5 times the assumed size were no doubt in 6 of 96 machines, in 2 of 100 now."""
+"""The same where the readings determine no more than two combinations of the coefficients. Both may
+be small by chance: with 0.1, eccentricities of 7.5 times the assumed size passed in 6 of 96
+machines with seven lines, with 0.2 in 2 of 100."""
 
 TAIL = (1 - COVERAGE) / 2
 """Probability of a small statistic below which a size is too large."""
@@ -748,7 +749,7 @@ class SizeTest:
         Its size, SI unit of the term; the largest one of a microscope.
     shown, allowed : float
         The size shown by the readings, and the largest that they allow: the upper one of two limits
-        with a coverage of 95.45 % if they contradict the given size; the limit of `DOUBT_LEVEL` if
+        with a coverage of 95.45 % if they contradict the given size; the limit of `doubt` if
         they make it doubtful; beyond what is plausible no more than `shown`; otherwise the given
         size.
     statistic : float
@@ -762,6 +763,8 @@ class SizeTest:
     evidence : float
         Logarithm of how much likelier the readings are with the size that they show (ratio of
         marginal likelihoods); 0 if they do not make the given one doubtful.
+    doubt : float
+        Level below which the size is doubtful.
     """
 
     name: str
