@@ -85,14 +85,35 @@ def _replacement(target: Path) -> Iterator[BinaryIO]:
         raise
 
 
-NEW: set[str] = set()
+_NEW: set[str] = set()
 """Outputs that were not there when the command began, and must not replace a file."""
+
+
+def has_content(path: str | os.PathLike) -> bool:
+    """Return whether `path` is a file with content: an empty one has nothing to lose."""
+    return os.path.isfile(path) and os.path.getsize(path) > 0
+
+
+def refuse_existing(paths: Iterable[str | os.PathLike], *, force: bool) -> None:
+    """Raise InputError if one of `paths` is a file with content, unless `force` allows it.
+
+    Nor does this process then replace one that another writes in the meantime.
+    """
+    for path in paths:
+        if not force and has_content(path):
+            raise InputError(
+                str(path),
+                "the file exists",
+                "name another file, or replace it with --force",
+            )
+        place = os.path.realpath(path)
+        (_NEW.discard if force or os.path.exists(path) else _NEW.add)(place)
 
 
 def _put(temporary: Path, target: Path) -> None:
     """Give a file its name; InputError if `target` is new, and was written meanwhile."""
-    if str(target) in NEW:
-        NEW.discard(str(target))
+    if str(target) in _NEW:
+        _NEW.discard(str(target))
         try:
             os.link(temporary, target)
         except FileExistsError as error:

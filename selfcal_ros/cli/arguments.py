@@ -124,13 +124,17 @@ def check_existing(args: argparse.Namespace) -> None:
     InputError
         If the file of an output exists, or its name is that of another kind of file.
     """
+    from selfcal_ros.outputs import (
+        refuse_existing,
+    )  # with numpy, which help does without
+
     inputs = {os.path.realpath(item.path) for item in _files(args)}
     for action in _outputs(args.leaf):
         name = getattr(args, action.dest)
         place = os.path.realpath(name or "")
         if name and place not in inputs and os.path.dirname(place) not in inputs:
             _refuse_ending(name, str(action.metavar))
-            refuse_existing(name, force=args.force)
+            refuse_existing([name], force=args.force)
 
 
 def _refuse_ending(path: str, metavar: str) -> None:
@@ -146,20 +150,6 @@ def _refuse_ending(path: str, metavar: str) -> None:
             f"{metavar} is written here, which is not {ending}",
             f"end the name in {wanted}",
         )
-
-
-def refuse_existing(path: str | os.PathLike, *, force: bool) -> None:
-    """Raise InputError if `path` is a file with content, and ``--force`` is not given."""
-    if not force and os.path.isfile(path) and os.path.getsize(path):
-        raise InputError(
-            str(path),
-            "the file exists",
-            "name another file, or replace it with --force",
-        )
-    from selfcal_ros.outputs import NEW  # with numpy, which help does without
-
-    place = os.path.realpath(path)
-    (NEW.discard if force or os.path.exists(place) else NEW.add)(place)
 
 
 def misplaced(args: argparse.Namespace) -> InputError | None:

@@ -41,7 +41,12 @@ from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import default_terms
 from selfcal_ros.model.view import MOST_CHECK_OFFSET, Plan, View
-from selfcal_ros.outputs import check_outputs, utf8, write_together
+from selfcal_ros.outputs import (
+    check_outputs,
+    refuse_existing,
+    utf8,
+    write_together,
+)
 from selfcal_ros.plain_numbers import number_of
 from selfcal_ros.reporting.words.observability import (
     describe_view,
@@ -219,13 +224,15 @@ def run(args: argparse.Namespace) -> int:
     cell_path = Path(args.cell) if args.cell else path.with_name("cell.yaml")
     simulation = cell_path.with_name(f"{cell_path.stem}_simulation.yaml")
     if sys.stdin.isatty():  # before anything is asked
-        _require_new([path, cell_path], force=args.force)
+        check_outputs([], [path, cell_path])
+        refuse_existing([path, cell_path], force=args.force)
     answers = _answers(args)
     artifact = _artifact(answers)
     _require_travel(answers, artifact)
     simulated = answers.machine == "simulated"
     outputs = [path, cell_path, *([simulation] if simulated else [])]
-    _require_new(outputs, force=args.force)
+    check_outputs([], outputs)
+    refuse_existing(outputs, force=args.force)
     with late_progress("judging plans") as progress:
         plan = _best(answers, artifact, path.stem, lambda: progress(0, None))
         prediction = _budget(plan), _next(plan)
@@ -246,18 +253,6 @@ def run(args: argparse.Namespace) -> int:
         _json(answers, plan, prediction, outputs),
     )
     return int(ExitCode.DONE)
-
-
-def _require_new(paths: list[Path], *, force: bool) -> None:
-    """Refuse files that cannot be written, or exist and are not to be replaced."""
-    check_outputs([], paths)
-    for path in paths:
-        if path.exists() and not force:
-            raise InputError(
-                str(path),
-                "exists already",
-                "name another file, or replace it with --force",
-            )
 
 
 def _answers(args: argparse.Namespace) -> Known:

@@ -10,11 +10,10 @@ from selfcal_ros.applications.aerotech.read import load_cal
 from selfcal_ros.applications.aerotech.verify import table_chapter
 from selfcal_ros.applications.standards.chapter import certificate_chapter, certified
 from selfcal_ros.applications.standards.details import read_details
-from selfcal_ros.cli.arguments import refuse_existing
 from selfcal_ros.cli.terminal import add_json, busy, say
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_json
-from selfcal_ros.outputs import can_print_symbols, check_outputs
+from selfcal_ros.outputs import can_print_symbols, check_outputs, refuse_existing
 from selfcal_ros.reporting.chapters import ABOUT
 from selfcal_ros.reporting.figures.maps import map_picture
 from selfcal_ros.reporting.report import check_name, write_report
@@ -76,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         [args.result, args.truth, args.table, args.details], [output, args.plot]
     )
     check_name(output)
-    refuse_existing(output, force=args.force)
+    refuse_existing([output], force=args.force)
     result = read_result(args.result)
     truth = read_truth(args.truth) if args.truth else None
     details = read_details(args.details) if args.details else None

@@ -14,11 +14,7 @@ from selfcal_ros.applications.aerotech.export import (
     line_table,
 )
 from selfcal_ros.applications.aerotech.model import Table1D
-from selfcal_ros.applications.aerotech.write import (
-    cal_text,
-    refuse_existing,
-    write_cals,
-)
+from selfcal_ros.applications.aerotech.write import cal_text, write_cals
 from selfcal_ros.applications.laser.bag import SeriesTopics, read_series
 from selfcal_ros.applications.laser.data import (
     DIAGONALS,
@@ -57,7 +53,7 @@ from selfcal_ros.cli.terminal import add_json, busy, put, say, tell
 from selfcal_ros.compensation.frame import MachineFrame
 from selfcal_ros.errors import ExitCode, InputError
 from selfcal_ros.files import read_yaml, sha256_of
-from selfcal_ros.outputs import check_outputs, write_json, write_text
+from selfcal_ros.outputs import check_outputs, refuse_existing, write_json, write_text
 from selfcal_ros.units import M_PER, M_PER_MM, M_PER_UM
 
 STEP_MM = 10.0

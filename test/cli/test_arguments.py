@@ -3,11 +3,11 @@
 
 import pytest
 
-from selfcal_ros.cli.arguments import kind_of, refuse_existing
+from selfcal_ros.cli.arguments import kind_of
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.model.result import result_to_dict
-from selfcal_ros.outputs import write_json, write_text
+from selfcal_ros.outputs import refuse_existing, write_json, write_text
 from test.support.results import known_result
 from test.support.sources import ROOT
 
@@ -169,16 +169,16 @@ def test_what_is_not_kept_is_said(desk, capsys):
 
 def test_a_file_that_another_command_wrote_meanwhile_stays(tmp_path):
     out = tmp_path / "a.csv"
-    refuse_existing(out, force=False)
+    refuse_existing([out], force=False)
     out.write_text("theirs")
     with pytest.raises(InputError, match="was written by another command meanwhile"):
         write_text(out, "ours")
     assert out.read_text() == "theirs"
     assert list(tmp_path.iterdir()) == [out]
-    refuse_existing(out, force=True)
+    refuse_existing([out], force=True)
     write_text(out, "ours")
     assert out.read_text() == "ours"
-    refuse_existing(tmp_path / "b.csv", force=False)
+    refuse_existing([tmp_path / "b.csv"], force=False)
     for text in ("first", "second"):
         write_text(tmp_path / "b.csv", text)
     assert (tmp_path / "b.csv").read_text() == "second"

@@ -152,10 +152,22 @@ def test_what_cannot_work_is_refused_in_a_line(options, line, capsys):
 def test_nothing_is_overwritten(capsys):
     Path("cell.yaml").write_text("mine")
     assert new(*STAGE) == 2
-    assert "cell.yaml: exists already" in capsys.readouterr().err
+    assert "cell.yaml: the file exists" in capsys.readouterr().err
     assert Path("cell.yaml").read_text() == "mine"
     assert new(*STAGE, "--minutes", "30", "--force") == 0
     assert Path("cell.yaml").read_text().startswith("# From `selfcal plan new`.")
+
+
+def test_a_cell_that_another_command_wrote_meanwhile_stays(monkeypatch, capsys):
+    def written_meanwhile(plan):
+        Path("cell.yaml").write_text("theirs")
+        return ONCE["_budget"](plan)
+
+    monkeypatch.setattr(plan_new, "_budget", written_meanwhile)
+    assert new(*STAGE) == 2
+    assert "cell.yaml: was written by another command" in capsys.readouterr().err
+    assert Path("cell.yaml").read_text() == "theirs"
+    assert not Path("plan.yaml").exists()
 
 
 def test_a_person_is_asked_in_a_terminal(tmp_path):

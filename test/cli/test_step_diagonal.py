@@ -219,7 +219,7 @@ def test_outputs_are_refused_before_anything_is_written(
     monkeypatch.chdir(tmp_path)
     for name, text in (
         ("d.csv", EXAMPLE.read_text()),
-        ("old.cal", ""),
+        ("old.cal", "old"),
         ("s.yaml", EXAMPLE.with_suffix(".yaml").read_text()),
     ):
         (tmp_path / name).write_text(text)

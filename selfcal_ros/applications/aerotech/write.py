@@ -22,7 +22,7 @@ from selfcal_ros.applications.aerotech.read import parse_cal, refuse_errors
 from selfcal_ros.applications.aerotech.rules import check_tables
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_bytes
-from selfcal_ros.outputs import write_together
+from selfcal_ros.outputs import has_content, refuse_existing, write_together
 
 
 def decimal(value: float) -> str:
@@ -147,19 +147,6 @@ def _argument(value: float | int | str | Unit) -> str:
     return decimal(value) if isinstance(value, float) else str(value)
 
 
-def refuse_existing(paths: Sequence[str | os.PathLike], *, force: bool) -> None:
-    """Raise InputError if one of `paths` exists, unless `force` allows replacing it."""
-    for path in paths:
-        if Path(path).is_dir():
-            raise InputError(str(path), "it is a folder", "name a file")
-        if Path(path).exists() and not force:
-            raise InputError(
-                str(path),
-                "the file exists",
-                "name another file, or replace it with --force (the old one is kept)",
-            )
-
-
 def write_cals(
     texts: Mapping[str, str], *, force: bool = False, now: datetime | None = None
 ) -> dict[str, Path | None]:
@@ -182,9 +169,11 @@ def write_cals(
     refuse_existing(list(texts), force=force)
     stamp = (now or datetime.now(UTC)).strftime("%Y-%m-%dT%H%M%SZ")
     backups = {
-        path: _backup(Path(path), stamp) if Path(path).exists() else None
+        path: _backup(Path(path), stamp) if has_content(path) else None
         for path in texts
     }
+    # nor may another command that replaces the same file take the name of the old one
+    refuse_existing(filter(None, backups.values()), force=False)
     contents: dict[str | os.PathLike, bytes] = {
         path: text.encode() for path, text in texts.items()
     }

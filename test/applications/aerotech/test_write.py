@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from selfcal_ros.applications.aerotech import write
 from selfcal_ros.applications.aerotech.model import (
     Severity,
     Table1D,
@@ -16,6 +17,7 @@ from selfcal_ros.applications.aerotech.model import (
 from selfcal_ros.applications.aerotech.read import parse_cal
 from selfcal_ros.applications.aerotech.write import cal_text, decimal, write_cals
 from selfcal_ros.errors import InputError
+from selfcal_ros.outputs import write_together
 from test.support.cal_tables import tables_1d, tables_2d, tables_galvo
 from test.support.disks import files_no_larger_than
 
@@ -159,8 +161,37 @@ def test_of_two_files_on_a_full_disk_none_is_replaced(tmp_path):
     }
 
 
+@pytest.mark.parametrize("force", [False, True])
+def test_what_another_command_writes_meanwhile_stays(tmp_path, monkeypatch, force):
+    """A new file, and the copy of the old one that both replace."""
+    path, backup = tmp_path / "f.cal", tmp_path / "f.cal.2026-01-02T030405Z.bak"
+    if force:
+        path.write_text("old\n")
+    theirs = backup if force else path
+
+    def written_meanwhile(contents):
+        theirs.write_text("theirs\n")
+        write_together(contents)
+
+    monkeypatch.setattr(write, "write_together", written_meanwhile)
+    with pytest.raises(InputError, match="was written by another command meanwhile"):
+        write_cal(path, "new\n", force=force, now=WHEN)
+    kept = {path.name: "old\n"} if force else {}
+    assert {one.name: one.read_text() for one in tmp_path.iterdir()} == {
+        **kept,
+        theirs.name: "theirs\n",
+    }
+
+
+def test_an_empty_file_has_nothing_to_lose(tmp_path):
+    path = tmp_path / "f.cal"
+    path.touch()
+    assert write_cal(path, "new\n") is None
+    assert [one.read_text() for one in tmp_path.iterdir()] == ["new\n"]
+
+
 def test_folders_are_refused(tmp_path):
-    with pytest.raises(InputError, match="it is a folder"):
+    with pytest.raises(InputError, match="cannot be written"):
         write_cal(tmp_path, "x", force=True)
     with pytest.raises(InputError, match="cannot be written"):
         write_cal(tmp_path / "none" / "f.cal", "x")
