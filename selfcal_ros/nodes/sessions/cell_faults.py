@@ -56,13 +56,15 @@ def explaining(
     if standing is not None:
         return standing
     total = sum(isinstance(event, Detection) for event in events)
-    used, *_ = _outcome(Fault("", "", command, tuple(events)), settings)
+    used, _, seen = _outcome(Fault("", "", command, tuple(events)), settings)
     faults: list[Fault] = []
     best: tuple[float, float, float] = ((used + total) / 2, -np.inf, 0)
     for fault in _faults(command, events, settings):
         try:
             outcome = _outcome(fault, settings)
         except InputError:  # an even and an odd side do not lie so
+            continue
+        if outcome[-1] < seen:  # without ids, positions in mm are all those of one mark
             continue
         if outcome > best:
             faults = []

@@ -104,6 +104,8 @@ class Cell(Bench):
         x, y, theta = self.position
         if self.fault == "does not move":
             x, y, theta = self.home
+        if self.fault == "is pushed at times":  # to 0.1 mm and back, at 1 mm/s
+            x += 5e-5 * max(0, 2 - abs(round(now / TICK_S) % 41 - 2))
         if self.fault == "x and y exchanged":
             x, y = y, x
         if self.fault == "millimetres":
@@ -337,6 +339,14 @@ def test_a_unit_that_would_make_all_marks_one_is_not_named():
     assert first.figure.startswith(
         "the indicated positions are 1000 times those of the marks: they are in mm ("
     )
+
+
+def test_a_few_exposures_while_the_stage_moves_are_no_wrong_unit():
+    """Without ids and in mm, all would be readings of one mark, at rest."""
+    first = next(
+        item for item in checked("is pushed at times", ids=False) if not item.passed
+    )
+    assert first.name == "rest" and "exposures while the stage moved" in first.figure
 
 
 def test_what_a_node_of_the_cell_knows_of_its_fault_is_told():
