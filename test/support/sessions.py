@@ -56,9 +56,9 @@ def collected(
     return collector, *collector.collect()
 
 
-def cdr_of(event: Event) -> bytes:
+def cdr_of(event: Event, frame_id: str = "stage") -> bytes:
     """Return the bytes of an event as a raw subscription of rclpy hands them over."""
-    topic, fields = event_fields(event, "stage")
+    topic, fields = event_fields(event, frame_id)
     name = INPUT_TOPICS[topic]
     return (
         bytes(typestore().serialize_cdr(build(typestore(), name, fields), name)) + TAIL

@@ -603,6 +603,14 @@ def first_stamps_ns(messages: cdr.Payloads) -> tuple[np.ndarray, np.ndarray]:
     ), has_header
 
 
+def frame_id(message: bytes) -> str:
+    """Return the frame_id of a message that begins with a header; "" if it is damaged."""
+    begin = STAMP_END + 4
+    is_little = message[:2] == cdr.LITTLE
+    n_bytes = int.from_bytes(message[STAMP_END:begin], "little" if is_little else "big")
+    return message[begin : begin + n_bytes].rstrip(b"\0").decode(errors="replace")
+
+
 def encoder_block(group: cdr.Columns) -> EncoderBlock:
     """Return the samples in messages of sensor_msgs/JointState."""
     velocities = group["velocity"] if "velocity" in group else np.zeros((len(group), 0))

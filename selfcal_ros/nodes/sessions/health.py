@@ -92,7 +92,7 @@ def merged(main: Diagnosis, others: Iterable[Diagnosis]) -> Diagnosis:
         values |= item.values
     return Diagnosis(
         max([main.level, *(item.level for item in others)]),
-        "; ".join(dict.fromkeys([*wrong, main.message])),
+        "; ".join(dict.fromkeys(filter(None, [*wrong, main.message]))),
         values,
     )
 

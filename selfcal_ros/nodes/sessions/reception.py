@@ -8,21 +8,21 @@ and a few per minute at rest: an encoder at 1 kHz would write 15 GB a day.
 
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
 from typing import Any
 
 import numpy as np
 
 from selfcal_ros.bagio.messages.cdr import Payloads
-from selfcal_ros.bagio.messages.to_model import first_stamps_ns
+from selfcal_ros.bagio.messages.to_model import first_stamps_ns, frame_id
 from selfcal_ros.bagio.offline import FROM_THE_FUTURE
 from selfcal_ros.bagio.schemas import ChannelDecoder, typestore
 from selfcal_ros.collection.encoder import LOOK_BACK_NS
 from selfcal_ros.collection.inputs import MAX_AHEAD_NS, Phase
-from selfcal_ros.errors import InputError
+from selfcal_ros.errors import InputError, printable
 from selfcal_ros.nodes.sessions.collecting import CollectingSession
-from selfcal_ros.nodes.sessions.health import Diagnosis, Level
+from selfcal_ros.nodes.sessions.health import Diagnosis, Level, merged
 from selfcal_ros.nodes.sessions.journal_keeper import (
     JournalKeeper,
     ResumedRun,
@@ -83,6 +83,7 @@ class Reception:
         self._worker: Executor | None = None
         self._restoring: Future[ResumedRun] | None = None
         self._source = ""  # the journal being resumed
+        self._frames: dict[str, str] = {}  # topic -> of its newest message
         self._bad: Counter = Counter()
         self._decoders = {
             topic: ChannelDecoder(topic, name, (typestore(),), self._bad, told=True)
@@ -149,6 +150,8 @@ class Reception:
         While a journal is being resumed, messages are written and held back.
         """
         adopted, came, self._waiting, self._n_detections = False, self._waiting, [], 0
+        newest = {topic: data for topic, data, _, _ in came}
+        self._frames |= {topic: frame_id(data) for topic, data in newest.items()}
         waiting = self._believable(came)
         self._advance()
         self._write(waiting)
@@ -272,13 +275,25 @@ class Reception:
             self._refuse(place, error)
 
     def diagnosis(self) -> Diagnosis:
-        """Return the diagnosis of the journal."""
+        """Return the diagnosis of the journal and of the frames."""
         diagnosis = self.journal.diagnosis()
         if self.restoring:
-            return Diagnosis(
+            diagnosis = Diagnosis(
                 Level.WARN, f"reading the journal {self._source}", diagnosis.values
             )
-        return diagnosis
+        return merged(diagnosis, self._frame_diagnoses())
+
+    def _frame_diagnoses(self) -> Iterator[Diagnosis]:
+        """Yield a WARN of each topic in another frame than the stage's; "" states none."""
+        stage_frame = self.session.settings.frame_id
+        for topic, frame in sorted(self._frames.items()):
+            if frame not in ("", stage_frame):
+                yield Diagnosis(
+                    Level.WARN,
+                    f"{topic} names the frame '{printable(frame)}', but is used in "
+                    f"{stage_frame!r}: transform it first, or set frame_id if it is the "
+                    "stage's",
+                )
 
     def close(self) -> None:
         """Take waiting messages, and close the journal."""

@@ -4,6 +4,7 @@
 import errno
 import os
 import re
+import struct
 import time
 from collections import Counter
 from concurrent.futures import Future
@@ -13,6 +14,8 @@ import pytest
 
 from selfcal_ros.bagio import journal, journal_file
 from selfcal_ros.bagio.journal import resume
+from selfcal_ros.bagio.messages import cdr
+from selfcal_ros.bagio.messages.to_model import frame_id
 from selfcal_ros.bagio.offline import collect_bag
 from selfcal_ros.bagio.reader import BagReader
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Phase
@@ -863,6 +866,34 @@ def test_a_clock_that_was_set_back_is_a_warning_and_a_restart_ends_it(
     measurements, _ = second.session.collector.collect()
     assert digests(measurements) == digests(collected(honest)[1])
     assert line not in second.session.diagnosis(detections_matched=True).message
+
+
+@pytest.mark.parametrize("frame", ["stage", "", "camera\x1b"])
+def test_a_topic_in_another_frame_is_a_warning_as_long_as_it_is(events, frame):
+    """The readings are used all the same: a driver may know the stage by another name."""
+    desk = Desk()
+    detection = next(event for event in events if isinstance(event, Detection))
+    desk.reception.detection(cdr_of(detection, frame), 0)
+    desk.reception.drain()
+    told = desk.reception.diagnosis()
+    assert told.level == (Level.WARN if "camera" in frame else Level.OK)
+    assert told.message == (
+        r"stage/mark_detections names the frame 'camera\x1b', but is used in 'stage': "
+        "transform it first, or set frame_id if it is the stage's"
+        if "camera" in frame
+        else ""
+    )
+    assert desk.session.collector.received["detection"] == 1
+    desk.receive([detection]).reception.drain()
+    assert desk.reception.diagnosis().level == Level.OK
+
+
+@pytest.mark.parametrize("order", [cdr.LITTLE, cdr.BIG])
+def test_the_frame_of_a_message_in_either_byte_order(order):
+    ends = "<" if order == cdr.LITTLE else ">"
+    message = order + bytes(2) + struct.pack(f"{ends}iII", 5, 6, 4) + b"cam\0more"
+    assert frame_id(message) == "cam"
+    assert [frame_id(message[:size]) for size in (0, 8, 14)] == ["", "", ""]
 
 
 def test_a_newer_run_that_is_not_shown_is_a_warning_until_it_is(events):
