@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files, signals and streams as each system has them: locks, interrupts, readers that are gone.
+"""Files, signals and streams as each system has them: locks, alarms, readers that are gone.
 
-On Windows nothing is locked and no interrupt is held back; bags and results are worked on all the
-same.
+On Windows nothing is locked; bags and results are worked on all the same.
 """
 
 import contextlib
@@ -35,14 +34,6 @@ def lock(descriptor: int, *, wait: bool = False) -> None:
     """
     if LOCKS:
         fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-
-
-def hold_interrupts(*, held: bool) -> None:
-    """Block Ctrl-C in this thread, or let it through, at once if it came meanwhile."""
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(
-            signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT}
-        )
 
 
 class Ended(SystemExit):

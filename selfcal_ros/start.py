@@ -2,16 +2,15 @@
 """Entry points of all commands. An interrupt during imports waits until they are done.
 
 Otherwise Python would end in the middle of an import with a traceback. Blocked, Ctrl-C is kept by
-the system until `cli.main.main` or `nodes.running.run` unblock it.
+the system until `cli.main.main` or `nodes.running.run` unblock it. So this module imports as little
+as it can.
 """
 
-import importlib.util
+import importlib
 import os
+import signal
 import sys
 from functools import partial
-
-from selfcal_ros.portable import hold_interrupts
-from selfcal_ros.topics import message_texts
 
 BUILD = "colcon build --base-paths src/selfcal_ros src/selfcal_ros/msg_defs"
 """Command that builds the messages as well: colcon does not search inside a package."""
@@ -31,8 +30,12 @@ def missing_ros() -> str:
 
     A module, or a field of a message that was built before the field was added.
     """
+    from importlib.util import find_spec  # not before interrupts are held
+
+    from selfcal_ros.topics import message_texts  # likewise
+
     for name, remedy in NEEDED.items():
-        if importlib.util.find_spec(name) is None:
+        if find_spec(name) is None:
             return f"there is no {name} in this environment; {remedy}"
     built = importlib.import_module("selfcal_msgs.msg")
     for name, text in message_texts().items():
@@ -53,6 +56,17 @@ def fields_of(text: str) -> list[str]:
         line.partition("#")[0].split() for line in text.splitlines() if line.strip()
     ]
     return [words[1] for words in lines if len(words) > 1 and "=" not in "".join(words)]
+
+
+def hold_interrupts(*, held: bool) -> None:
+    """Block Ctrl-C in this thread, or let it through, at once if it came meanwhile.
+
+    Not on Windows.
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(
+            signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, {signal.SIGINT}
+        )
 
 
 def begin_node() -> None:
@@ -79,8 +93,8 @@ def open_streams() -> None:
 
 def selfcal() -> int:
     """Run the command ``selfcal``."""
-    open_streams()
     hold_interrupts(held=True)
+    open_streams()
     return importlib.import_module("selfcal_ros.cli.main").main()
 
 

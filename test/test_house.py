@@ -16,7 +16,7 @@ BASE = {
     "units": set(),
     "plain_numbers": set(),
     "portable": set(),
-    "start": {"portable", "topics"},
+    "start": {"topics"},
     "outputs": {"errors", "portable"},
     "files": {"errors", "outputs", "portable"},
     "results": {"errors", "files", "model"},

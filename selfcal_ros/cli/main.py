@@ -38,7 +38,8 @@ from selfcal_ros.errors import (
     printable,
 )
 from selfcal_ros.plain_numbers import number_of, whole_number_of
-from selfcal_ros.portable import hold_interrupts, say_no_more
+from selfcal_ros.portable import say_no_more
+from selfcal_ros.start import hold_interrupts
 
 NOT_A_NUMBER = re.compile(r"argument (\S+): invalid (float|int) value: (.*)")
 NUMBERS = {

@@ -373,7 +373,14 @@ def test_whatever_needs_a_module_that_is_not_there_says_what_brings_it(
 
 
 @pytest.mark.parametrize(
-    "module", ["argparse", "selfcal_ros.cli.solve", "selfcal_ros.errors"]
+    "module",
+    [
+        "argparse",
+        "selfcal_ros.cli.solve",
+        "selfcal_ros.errors",
+        "selfcal_ros.portable",
+        "selfcal_ros.topics",
+    ],
 )
 def test_a_signal_while_the_command_is_imported_is_one_line(group, module):
     code, out, err = ended(
