@@ -255,7 +255,7 @@ def test_offsets_that_do_not_follow_the_stage(graph, cell, figure, remedy):
     ("fault", "name", "figure"),
     [
         ("deaf", "commands", "0 detections in 5 s after MEASURE"),
-        ("goes on after ABORT", "abort", "detections later than"),
+        ("goes on after ABORT", "abort", "detections exposed later than"),
         (
             "acts again",
             "old commands",
@@ -321,6 +321,22 @@ def test_lines_that_are_counted_from_another_one_are_named(graph, sense, deg):
     assert items["ids"].figure.startswith(
         f"theta is indicated {deg}° from where the lines are ("
     )
+
+
+@pytest.mark.usefixtures("short")
+def test_detections_of_another_quality_of_service_are_named(graph, monkeypatch):
+    unheard = replace(names.DETECTIONS, qos=names.CORRECTED.qos)  # best effort
+    monkeypatch.setattr(names, "DETECTIONS", unheard)
+    graph.node(partial(FaultyCell, ""), servo_sigma=1e-9, use_sim_time=True)
+    monkeypatch.undo()
+    node = graph.node(
+        partial(Checker, small_plan(), settle_s=0.2, patience_s=5.0), use_sim_time=True
+    )
+    graph.until(node.finished.done, "the end of the check")
+    item = node.session.items[-1]
+    assert item.name == "commands" and not item.passed
+    assert "no messages are received from /stage_simulator (" in item.figure
+    assert item.remedy == "offer the QoS in docs/reference/ros2.md"
 
 
 @pytest.mark.usefixtures("short")

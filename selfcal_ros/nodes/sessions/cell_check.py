@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The session of `selfcal cell check`: a short run that shows the faults of a cell."""
 
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
+from math import isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -32,7 +34,7 @@ from selfcal_ros.model.view import Plan, View
 from selfcal_ros.nodes.sessions.cell_faults import explaining
 from selfcal_ros.nodes.sessions.health import Level, Ports
 from selfcal_ros.settings.nodes import CollectorSettings
-from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, S_PER_NS, UM_PER_M
+from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
 
 PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
 """Settings of the run: marks per side in the middle of the plate, repeats, check offset."""
@@ -177,6 +179,7 @@ class CellCheck:
             tuple[float, int, bool]
         ] = []  # received, s; age, ns; whether with an id
         self._joints: set[str] = set()
+        self._n_unknown: Counter[str] = Counter()  # samples of a joint without a number
         self._errors: dict[str, str] = {}  # of nodes of the cell, by their names
         self._foreign: dict[
             str, str
@@ -194,15 +197,17 @@ class CellCheck:
         """Take a sample of the encoder."""
         sample: EncoderSample = to_model.encoder_sample(message)
         self._samples.append((sample.stamp_ns, self._ports.now_ns() - sample.stamp_ns))
-        self._note_joints(sample.names)
+        self._note_joints(sample)
         self._collector.add_encoder(sample)
         self._events.append(sample)
 
-    def _note_joints(self, names: Iterable[str]) -> None:
+    def _note_joints(self, sample: EncoderSample) -> None:
         """Keep the names of joints: all that are wanted, of others so many."""
-        for name in names:
+        where = dict(zip(sample.names, sample.positions, strict=False))
+        for name in sample.names:
             if name in self._wanted_joints:
                 self._joints.add(name)
+                self._n_unknown[name] += not isfinite(where.get(name, nan))
             elif len(self._joints) < MOST_KEPT:
                 self._joints.add(printable(name))
 
@@ -345,11 +350,11 @@ class CellCheck:
         yield from self._wait(self._pause_s)
         before = len(self._events)
         yield from self._wait(self._pause_s)
-        late = self._exposed_since(aborted, before)
+        late = self._exposed_since(aborted, before, self._pause_s / 2)
         self._tell(
             "abort",
             not late,
-            f"{late} detections later than {self._pause_s:.3g} s after ABORT",
+            f"{late} detections exposed later than {self._pause_s / 2:.3g} s after ABORT",
             "stop measuring when ABORT arrives",
         )
         return command
@@ -411,13 +416,16 @@ class CellCheck:
             "remember the stamps of executed commands and do not execute them again",
         )
 
-    def _exposed_since(self, command: Command, before: int) -> int:
+    def _exposed_since(
+        self, command: Command, before: int, grace_s: float = 0.0
+    ) -> int:
         """Return the number of detections exposed after a command: others are in transit.
 
-        Of those received after the first `before` messages.
+        Of those received after the first `before` messages, and exposed `grace_s` after it.
         """
+        end_ns = command.stamp_ns + round(grace_s * NS_PER_S)
         return sum(
-            isinstance(event, Detection) and event.stamp_ns > command.stamp_ns
+            isinstance(event, Detection) and event.stamp_ns > end_ns
             for event in self._events[before:]
         )
 
@@ -472,12 +480,17 @@ class CellCheck:
         return True
 
     def _longest_pause_s(self) -> float:
-        """Return the time in which a detection in transit arrives: twice the longest interval."""
-        received = [received_s for received_s, _, _ in self._seen]
-        return (
-            max(WATCH_S, 2 * float(np.diff(received).max()))
-            if len(received) > 1
-            else WATCH_S
+        """Return the time in which a detection in transit arrives.
+
+        Twice the longest interval, or so much more than the usual age.
+        """
+        if len(self._seen) < 2:
+            return WATCH_S
+        received_s, ages_ns, _ = zip(*self._seen, strict=True)
+        age_s = float(np.median(ages_ns)) * S_PER_NS
+        return max(
+            WATCH_S + float(np.clip(age_s, 0.0, OLDEST_S)),
+            2 * float(np.diff(received_s).max()),
         )
 
     def _collected(self) -> tuple[Measurements, ViewProgress]:
@@ -509,28 +522,40 @@ class CellCheck:
         settings = self._settings
         stamps, ages = np.array(self._samples).T
         missing = [joint for joint in self._wanted_joints if joint not in self._joints]
+        unknown = {name: count for name, count in self._n_unknown.items() if count}
         self._tell(
             "joints",
-            not missing,
-            f"heard {printable(', '.join(sorted(self._joints)))}",
+            not missing and not unknown,
+            f"heard {printable(', '.join(sorted(self._joints)))}"
+            + "".join(
+                f"; {name} without a number in {count} of {len(stamps)} samples"
+                for name, count in unknown.items()
+            ),
             f"no joint {', '.join(missing)}: set joint_x, joint_y, joint_theta of "
-            "measurement_collector",
+            "measurement_collector"
+            if missing
+            else "publish a position of each joint that is named, NaN is none",
         )
         steps = np.diff(np.sort(stamps)) * S_PER_NS
-        gap = float(steps.max()) if len(steps) else float("inf")
-        rate = len(steps) / float(steps.sum()) if steps.sum() > 0 else 0.0
+        moves_on = bool(steps.sum() > 0)
+        gap = float(steps.max()) if moves_on else float("inf")
+        rate = len(steps) / float(steps.sum()) if moves_on else 0.0
         jitter = (
-            float(np.ptp(np.quantile(steps, [0.025, 0.975]))) / 2 if len(steps) else 0.0
+            float(np.ptp(np.quantile(steps, [0.025, 0.975]))) / 2 if moves_on else 0.0
         )
         self._tell(
             "encoder rate",
             gap <= settings.max_encoder_gap and rate >= settings.encoder_rate_min,
             f"{rate:.4g} Hz, intervals ± {jitter * MS_PER_S:.3g} ms, largest "
-            f"{gap * MS_PER_S:.3g} ms",
-            f"publish with gaps below max_encoder_gap "
+            f"{gap * MS_PER_S:.3g} ms"
+            if moves_on
+            else f"{len(stamps)} samples, all with one stamp",
+            f"stamp each sample when it is taken, publish with gaps below max_encoder_gap "
             f"({settings.max_encoder_gap:g} s) and encoder_rate_min "
             f"({settings.encoder_rate_min:g} Hz), or set these",
         )
+        if not moves_on:
+            return False
         age = float(np.median(ages)) * S_PER_NS
         self._tell(
             "encoder clock",
@@ -539,7 +564,7 @@ class CellCheck:
             "stamp samples when they are taken, by a clock synchronised with this machine's "
             "(NTP, PTP)",
         )
-        return not missing
+        return not missing and not unknown
 
     def _judge_readings(
         self, measurements: Measurements, progress: ViewProgress
@@ -605,13 +630,20 @@ class CellCheck:
             if reason not in MISTAKEN
         }
         grid, angular = expected_marks(self.plate, self.view)
+        twice = rejected.get(Reason.DUPLICATE)
         self._tell(
             "marks",
-            progress.grid_done >= grid and progress.angular_done >= angular,
+            progress.grid_done >= grid
+            and progress.angular_done >= angular
+            and not twice,
             f"{progress.grid_done} of {grid} marks and {progress.angular_done} of {angular} "
             f"lines {REPEATS} times; {progress.readings.used} of {total} detections used"
             + "".join(f", {count} {reason}" for reason, count in not_mistaken.items()),
-            "; ".join(REMEDY.get(Reason(reason), reason) for reason in not_mistaken)
+            "publish each detection once"
+            if twice
+            else "; ".join(
+                REMEDY.get(Reason(reason), reason) for reason in not_mistaken
+            )
             or "measure every mark `repeats` times; publish reliable, depth 1000",
         )
         self._tell(
@@ -719,8 +751,8 @@ class CellCheck:
                 "divide pixel_size by this factor, or find it with selfcal camera init: no "
                 "map would be qualified"
             )
-        if stops and not offsets_follow and not what:
-            moved_um, seen_um = _spreads_um(view.motion)
+        moved_um, seen_um = _spreads_um(view.motion)
+        if stops and not offsets_follow and not what and moved_um > 0:
             what = (
                 f"the offsets do not follow the stage: between the stops at a mark it moves by "
                 f"{moved_um:.3g} um rms, they by {seen_um:.3g} um"

@@ -7,7 +7,7 @@ Each possible fault is undone in the recorded messages, which are collected agai
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby, product
-from math import degrees, pi, radians
+from math import degrees, isfinite, nan, pi, radians
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from selfcal_ros.collection.diagnosis import fault_text
 from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kind
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import wiring_faults
+from selfcal_ros.model.artifact import MAX_GRID_SIZE
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.units import MM_PER_M
@@ -160,11 +161,10 @@ def _standing(
 def _place(
     sample: EncoderSample, settings: CollectorSettings
 ) -> tuple[float, float] | None:
-    """Return the indicated x and y of a sample that has both."""
+    """Return the indicated x and y of a sample that has both, as numbers."""
     where = dict(zip(sample.names, sample.positions, strict=False))
-    if settings.joint_x not in where or settings.joint_y not in where:
-        return None
-    return where[settings.joint_x], where[settings.joint_y]
+    x, y = (where.get(joint, nan) for joint in (settings.joint_x, settings.joint_y))
+    return (x, y) if isfinite(x) and isfinite(y) else None
 
 
 def _faults(
@@ -183,7 +183,7 @@ def _faults(
         "m counts the marks along plate x, n along plate y",
         [replace(reading, m=reading.n, n=reading.m) for reading in readings],
     )
-    for scale, unit in ((1e3, "mm"), (1e6, "µm")):
+    for scale, unit in ((1e3, "mm"), (1e6, "µm or pixels")):
         yield fault(
             f"the offsets are in {unit}",
             "publish offset_x and offset_y in m",
@@ -285,6 +285,17 @@ def _counts(
                 for detection in detections
             ],
         )
+    shift = _other_origin(command, samples, detections, settings)
+    if any(shift):
+        yield fault(
+            "m and n are counted from another mark: the one in the middle is called "
+            f"({shift[0]}, {shift[1]})",
+            "call the mark in the middle of the plate (0, 0): m and n begin at -(N//2)",
+            [
+                replace(detection, m=detection.m - shift[0], n=detection.n - shift[1])
+                for detection in detections
+            ],
+        )
     lines = [detection for detection in detections if _is_line(detection)]
     if not lines or not plate.angular_count:
         return
@@ -306,6 +317,39 @@ def _counts(
             *detections,
         ),
     )
+
+
+def _other_origin(
+    command: Command,
+    samples: Sequence[EncoderSample],
+    detections: Sequence[Detection],
+    settings: CollectorSettings,
+) -> tuple[int, int]:
+    """Return by how much m and n are usually higher than those of the mark at the axis."""
+    view, plate = command.view, command.artifact
+    marks = [one for one in detections if one.kind == Kind.GRID and one.has_id]
+    if view is None or plate is None or plate.marks or not marks:
+        return 0, 0
+    places = [
+        (sample.stamp_ns, *place)
+        for sample in samples
+        if (place := _place(sample, settings)) is not None
+    ]
+    if not places:
+        return 0, 0
+    stamps, x, y = zip(*places, strict=True)
+    when = [mark.stamp_ns for mark in marks]
+    at = np.interp(when, stamps, x) + 1j * np.interp(when, stamps, y)
+    at = Sense(settings.measurement_sense).sign * at - complex(*view.translation_m)
+    at *= np.exp(-1j * view.rotation_rad) / plate.grid_pitch_m
+    off_m, off_n = plate.off_centre
+    higher = (
+        np.median([mark.m for mark in marks] - at.real + off_m),
+        np.median([mark.n for mark in marks] - at.imag + off_n),
+    )
+    if max(map(abs, higher)) > MAX_GRID_SIZE:  # then the places are wrong
+        return 0, 0
+    return round(higher[0]), round(higher[1])
 
 
 def _other_zero(

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from selfcal_ros.nodes.sessions import cell_check
 from selfcal_ros.nodes.sessions.cell_check import (
     MOST_KEPT,
     CellCheck,
@@ -56,7 +57,9 @@ class Cell(Bench):
             self.fault == "ignores ABORT" and view.phase == ABORT
         ):
             return
-        self.acted, self.work, self.planned = stamp, [], iter(())
+        self.acted, self.planned = stamp, iter(())
+        self.work = self.work[:1] if self.fault == "arrives late, right" else []
+        self.begun_s = self.hands.seconds  # an exposure that has begun may end
         if view.phase == PLACE:
             self.lay()
         elif view.phase == MEASURE:
@@ -106,6 +109,10 @@ class Cell(Bench):
             x, y, theta = self.home
         if self.fault == "is pushed at times":  # to 0.1 mm and back, at 1 mm/s
             x += 5e-5 * max(0, 2 - abs(round(now / TICK_S) % 41 - 2))
+        if self.fault == "indicates NaN" or (
+            self.fault == "indicates NaN at times" and self.noise.random() < 0.3
+        ):
+            x = np.nan
         if self.fault == "x and y exchanged":
             x, y = y, x
         if self.fault == "millimetres":
@@ -121,8 +128,9 @@ class Cell(Bench):
         if self.fault == "another zero of theta":
             theta += 0.4
         names = ("a", "b", "c") if self.fault == "other joints" else ("x", "y", "theta")
+        stamped = 0.0 if self.fault == "one stamp" else now
         return SimpleNamespace(
-            header=self.header(now), name=names, position=[x, y, theta]
+            header=self.header(stamped), name=names, position=[x, y, theta]
         )
 
     def show(self, seen, seconds):
@@ -159,14 +167,20 @@ class Cell(Bench):
             "m reversed": {"m": -seen["m"]},
             "n reversed": {"n": -seen["n"]},
             "m and n reversed": {"m": -seen["m"], "n": -seen["n"]},
+            "counts from a corner": {"m": seen["m"] + 1, "n": seen["n"] + 1},
+            "counts from one": {"m": seen["m"] + 2, "n": seen["n"] + 2},
             "k reversed": {"k": -seen["k"] % 8},
             "k shifted": {"k": (seen["k"] + 1) % 8},
         }.get(self.fault, {})
         seconds += {"stamped late": PERIOD_S, "old stamps": -30.0}.get(self.fault, 0.0)
-        arrives = self.hands.seconds + 11.0 * (self.fault == "arrives late")
-        self.late.append(
-            (arrives, SimpleNamespace(header=self.header(seconds), **seen))
-        )
+        arrives = self.hands.seconds + {
+            "arrives late": 11.0,
+            "arrives late, right": 2.0,
+        }.get(self.fault, 0.0)
+        for _ in range(2 if self.fault == "publishes twice" else 1):
+            self.late.append(
+                (arrives, SimpleNamespace(header=self.header(seconds), **seen))
+            )
 
     def header(self, seconds):
         stamp = self.hands.now_ns + round((seconds - self.hands.seconds) * 1e9)
@@ -220,6 +234,12 @@ def test_the_right_cell_passes(cell):
     assert [item for item in checked(**cell) if not item.passed] == []
 
 
+def test_a_right_cell_that_takes_its_time_for_each_image_passes():
+    """What it exposed as ABORT came arrives long after it."""
+    items = checked("arrives late, right")
+    assert [item for item in items if not item.passed] == []
+
+
 REVERSED_THETA = (
     "the lines are counted clockwise, or theta is indicated with the wrong sign (54"
 )
@@ -227,7 +247,7 @@ WRONG = [
     ("theta reversed", "theta", "offset_theta has the other sign"),
     ("theta reversed, straight", "theta", "too little to tell the sign"),
     ("laid straight", "theta", "too little to tell the sign"),
-    ("ignores ABORT", "abort", "detections later than 2 s after ABORT"),
+    ("ignores ABORT", "abort", "detections exposed later than 1.04 s after ABORT"),
     ("camera turned 30", "signs", "the offsets are turned by +30.0°"),
     ("camera turned 90", "signs", "the offsets are turned by +90.0°"),
     ("mirrored camera", "signs", "offsets of the other sign: offset_x rises"),
@@ -256,6 +276,10 @@ WRONG = [
     ),
     ("n reversed", "ids", "n is counted against plate y (54"),
     ("m and n reversed", "ids", "m and n are counted against plate x and y (54"),
+    ("counts from a corner", "ids", "the one in the middle is called (1, 1) (54"),
+    ("counts from one", "ids", "the one in the middle is called (2, 2) (54"),
+    ("publishes twice", "marks", "54 of 108 detections used, 54 duplicate"),
+    ("one stamp", "encoder rate", "samples, all with one stamp"),
     ("reversed theta", "ids", REVERSED_THETA),
     ("k reversed", "ids", REVERSED_THETA),
     ("theta in degrees", "ids", "theta is indicated in degrees (54"),
@@ -270,9 +294,11 @@ WRONG = [
         "theta is indicated +22.92° from where the lines are (54",
     ),
     ("k shifted", "ids", "theta is indicated -45° from where the lines are (54"),
+    ("indicates NaN", "joints", "heard theta, x, y; x without a number in 4"),
+    ("indicates NaN at times", "joints", "; x without a number in 1"),
     ("other joints", "joints", "heard a, b, c"),
     ("old stamps", "detection clock", "stamps 3.008e+04 ms old when they arrive"),
-    ("arrives late", "detection clock", "stamps 1.108e+04 ms old when they arrive"),
+    ("arrives late", "detection clock", "stamps 1.102e+04 ms old when they arrive"),
     (
         "stamped late",
         "ids",
@@ -339,6 +365,16 @@ def test_a_unit_that_would_make_all_marks_one_is_not_named():
     assert first.figure.startswith(
         "the indicated positions are 1000 times those of the marks: they are in mm ("
     )
+
+
+def test_of_offsets_without_repeats_nothing_is_said(monkeypatch):
+    """Most exposures were while the stage moved: that is the fault."""
+    monkeypatch.setattr(cell_check, "wiring_faults", lambda measurements: [])
+    check = CellCheck(small_plan(), settings_of("measurement_collector"), Hands().ports)
+    view = SimpleNamespace(motion=None, motion_theta=None)
+    told = check._judge_wiring(SimpleNamespace(views=[view]), stops=5)
+    assert told == (False, False)
+    assert check.items[-1].figure == "offset against stage not known (-1 expected)"
 
 
 def test_a_few_exposures_while_the_stage_moves_are_no_wrong_unit():
