@@ -159,6 +159,8 @@ def _with_checks(
 
 def _name(text: str, where: str) -> str:
     """Return the name of a plan or view, which has to fit in commands, lines and drawings."""
+    if not text.strip():
+        raise InputError(where, "the name is empty", "give one")
     if not text.isprintable():
         raise InputError(
             where,

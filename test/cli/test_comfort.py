@@ -5,7 +5,9 @@ import csv
 import io
 import itertools
 import json
+import os
 import re
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +28,7 @@ from test.support.bags import Foreign
 from test.support.details import simulated_details
 from test.support.results import known_result
 from test.support.sessions import events_of, small_bag, small_plan
+from test.support.terminals import SELFCAL
 
 
 @pytest.fixture(scope="module")
@@ -522,6 +525,20 @@ def test_the_picture_of_a_result_is_what_its_ending_says_and_repeatable(
     if not hasattr(RendererSVG, "_get_clippath_id"):
         data = [re.sub(rb"\bp[0-9a-f]{10}\b", b"path", found) for found in data]
     assert data[0] == data[1] and data[0].startswith(begins) and len(data[0]) > 5000
+
+
+def test_a_home_that_cannot_be_written_is_no_word_beside_a_picture(tmp_path):
+    write_json(tmp_path / "r.json", result_to_dict(known_result(5, 0)[0]))
+    homes = ("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")
+    said = subprocess.run(
+        [*SELFCAL, "plot", "r.json", "-o", "r.svg"],
+        cwd=tmp_path,
+        env=os.environ | dict.fromkeys(homes, "/proc/none"),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert (said.stdout, said.stderr) == ("written: r.svg\n", "")
 
 
 def test_a_picture_of_no_kind(tmp_path, capsys):

@@ -250,6 +250,11 @@ def test_a_plate_without_angular_count_has_no_lines():
             plan_with(plan_id="a\r\x1b[31m\u202e"),
             r"f: plan_id: 'a\r\x1b[31m\u202e' has characters that cannot be printed, such as",
         ),
+        (plan_with(plan_id=" "), "f: plan_id: the name is empty; give one"),
+        (
+            plan_with(views=[{"name": ""}]),
+            "f: views[0]: name: the name is empty; give one",
+        ),
         (
             plan_with(plan_id="n" * 201),
             "f: plan_id: a name of 201 characters; give one of at m",
