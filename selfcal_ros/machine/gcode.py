@@ -3,7 +3,8 @@
 
 Positions are the machine's own coordinates: GRBL's MPos, the steps that Marlin counts, Klipper's
 M114, LinuxCNC's absolute actual position. Moves are G1 in mm with the feed rate of CELL.yaml, with
-G53 where the dialect has it.
+G53 where the dialect has it. Modes of units,
+distances and feeds that a program left are set anew.
 """
 
 import math
@@ -26,6 +27,8 @@ PATIENCE_S = 5.0
 POLL_S = 0.02
 GREETING_S = 2.0
 """Longest silence in the greeting of a board that was reset by opening its port."""
+SAME_ZERO_MM = 0.02
+"""Difference of a position that Marlin tells, to two decimals, from its steps without an offset."""
 HOLD_S = 0.3
 """Time from a feed hold to the reset: a reset during the motion loses the position."""
 MOTION_STATES = ("run", "jog", "hold", "home", "check", "door")
@@ -242,8 +245,18 @@ class _Grbl(_Talk):
     def _begin(self) -> None:
         self._lines.send("")
         self._until_quiet()
-        self._status()  # raises if it does not answer, or is in alarm
-        self._ok("G21 G90")
+        state, _ = self._status()  # raises if it does not answer, or is in alarm
+        if state != "idle":
+            raise MachineError(
+                f"the controller is in state '{state}'",
+                "controller",
+                "let its program end, or leave the mode, first",
+            )
+        if any(setting.startswith("$13=1") for setting in self._ok("$$")):
+            raise MachineError(
+                "it reports positions in inches ($13=1)", "controller", "set $13=0"
+            )
+        self._ok("G21 G90 G94")
 
     def _until_quiet(self) -> None:
         """Read the greeting away; a controller that was open before says nothing."""
@@ -348,16 +361,31 @@ class _Marlin(_Talk):
             position_of_letter = {
                 letter: float(value) for letter, value in NUMBER.findall(logical)
             }
-            position_of_letter |= {
+            by_steps = {
                 letter: float(value) / self._per_mm[letter]
                 for letter, value in NUMBER.findall(counted)
                 if self._per_mm.get(letter)
             }
+            self._refuse_offset(position_of_letter, by_steps)
+            position_of_letter |= by_steps
             if {LETTERS[axis] for axis in self._axes} <= position_of_letter.keys():
                 return [position_of_letter[LETTERS[axis]] for axis in self._axes]
         raise MachineError(
             "M114 tells no position of all axes", "controller", "correct axes"
         )
+
+    def _refuse_offset(
+        self, told: dict[str, float], by_steps: dict[str, float]
+    ) -> None:
+        """Raise if moves count from another zero than the steps: G92, M206."""
+        for letter, counted in by_steps.items():
+            if abs(told.get(letter, counted) - counted) > SAME_ZERO_MM:
+                raise MachineError(
+                    f"it says {letter}{told[letter]:g}, its steps say {counted:.6g} mm: an "
+                    "offset is active",
+                    "controller",
+                    "home it; reset G92 and M206",
+                )
 
     def move(self, travel: _Travel) -> None:
         self._ok(f"G1 {travel.words}", travel.longest_s)
@@ -397,7 +425,7 @@ class _LinuxCnc(_Talk):
             f"enable {enable}",
             "mode mdi",
             "set_wait done",
-            "mdi G21 G90",
+            "mdi G21 G90 G94",
         ):
             self._set(words)
 

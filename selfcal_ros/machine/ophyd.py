@@ -14,6 +14,16 @@ from selfcal_ros.machine.interface import Image, MachineError, Offset
 from selfcal_ros.machine.video import grey
 from selfcal_ros.units import M_PER, RAD_PER
 
+UNITS: dict[str, str] = {unit: unit for unit in (*M_PER, *RAD_PER)} | {
+    "µm": "um",
+    "micron": "um",
+    "micrometer": "um",
+    "millimeter": "mm",
+    "degree": "deg",
+    "radian": "rad",
+}
+"""What motors call their unit, in lower case and without a plural -> its name here."""
+
 _called = partial(called, remedy="check limits, connection and the alarm of the axis")
 
 
@@ -74,6 +84,8 @@ class OphydMachine:
         }
         self._timeout_s, self._image = timeout, image
         self._motors = {axis: _object(name, timeout) for axis, name in names.items()}
+        for axis, motor in self._motors.items():
+            _require_unit(axis, motor, angle_unit if axis == "theta" else unit)
         self._detector = _object(detector, timeout) if detector else None
 
     def position(self) -> tuple[float, ...]:
@@ -128,6 +140,19 @@ class OphydMachine:
 
     def close(self) -> None:
         """Do nothing: the objects belong to their module."""
+
+
+def _require_unit(axis: str, motor: Any, stated: str) -> None:
+    """Raise if a positioner says that it counts in another unit: EGU of a motor record."""
+    egu = _called(f"unit of {axis}", lambda: getattr(motor, "egu", ""))
+    says = str(egu).strip()
+    unit = UNITS.get(says.lower().removesuffix("s"))
+    if unit not in (None, stated):
+        raise MachineError(
+            f"its motor counts in {says}, stated is {stated}",
+            axis,
+            "correct unit or angle_unit below ophyd",
+        )
 
 
 def _object(name: str, timeout_s: float) -> Any:

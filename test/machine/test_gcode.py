@@ -88,6 +88,45 @@ def test_the_rotary_axis_is_a_in_degrees():
         machine.close()
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"settings": b"$10=1\r\n$13=1\r\n"}, r"in inches \(\$13=1\).*set \$13=0"),
+        ({"resting": "Run"}, "is in state 'run'.*let its program end"),
+        ({"resting": "Check"}, "is in state 'check'.*leave the mode"),
+        ({"resting": "Hold:0"}, "is in state 'hold'"),
+    ],
+)
+def test_a_grbl_that_is_not_ready_is_refused_and_not_moved(changes, said):
+    firmware = Grbl()
+    vars(firmware).update(changes)
+    with over_tcp(firmware) as port, pytest.raises(MachineError, match=said):
+        GcodeMachine(port, "grbl", feed=6000.0)
+    assert not [line for line in firmware.lines if line.startswith("G")]
+
+
+@pytest.mark.parametrize("dialect", ["grbl", "linuxcnc"])
+def test_a_feed_of_inverse_time_that_a_program_left_is_ended(dialect):
+    """With G93 the first move would take a 6000th of a minute, however long it is."""
+    firmware = KINDS[dialect]()
+    with over_tcp(firmware) as port:
+        GcodeMachine(port, dialect, feed=6000.0).close()
+    assert any(line.endswith("G21 G90 G94") for line in firmware.lines)
+
+
+def test_a_marlin_whose_moves_count_from_another_zero_is_refused_and_not_moved():
+    """G92 X0 at 100 mm: a move to 100.05 by its steps would go to 200.05."""
+    firmware = Marlin()
+    firmware.at["X"], firmware.zero = 100.0, 100.0
+    with over_tcp(firmware) as port:
+        machine = GcodeMachine(port, "marlin", feed=6000.0)
+        said = "it says X0, its steps say 100 mm: an offset is active"
+        with pytest.raises(MachineError, match=said):
+            machine.move_to((0.10005, 0.0))
+        machine.close()
+    assert not [line for line in firmware.lines if line.startswith("G1")]
+
+
 @pytest.mark.parametrize("dialect", KINDS)
 def test_an_alarm_in_the_middle_stops_and_is_named(dialect):
     firmware = KINDS[dialect]()

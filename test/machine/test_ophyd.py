@@ -25,7 +25,8 @@ def devices(monkeypatch):
     from ophyd.sim import SynAxis
 
     module = types.ModuleType("beamline")
-    module.x, module.y = SynAxis(name="x"), SynAxis(name="y")
+    # as motors that do not know their unit
+    module.x, module.y = SynAxis(name="x", egu=""), SynAxis(name="y", egu="")
     monkeypatch.setitem(sys.modules, "beamline", module)
     return module
 
@@ -62,6 +63,28 @@ def test_a_plan_is_measured_to_its_true_map(tmp_path, devices):
     away, result = away_from(simulated.truth, tmp_path / "bag")
     assert result.verdict.qualified
     assert np.abs(away).max() < 5e-8
+
+
+@pytest.mark.parametrize(
+    ("egu", "unit", "named"),
+    [
+        ("mm", "mm", ""),
+        ("Microns", "um", ""),
+        ("", "mm", ""),
+        ("steps", "mm", ""),
+        ("um", "mm", "x: its motor counts in um, stated is mm"),
+        ("mm", "um", "x: its motor counts in mm, stated is um"),
+        ("degrees", "mm", "x: its motor counts in degrees, stated is mm"),
+    ],
+)
+def test_a_unit_that_the_motors_contradict_is_refused(devices, egu, unit, named):
+    """A motor record has its own unit, EGU."""
+    devices.x = types.SimpleNamespace(position=0.0, egu=egu)
+    if not named:
+        OphydMachine("beamline:x", "beamline:y", unit=unit)
+        return
+    with pytest.raises(MachineError, match=named):
+        OphydMachine("beamline:x", "beamline:y", unit=unit)
 
 
 def test_positions_are_in_the_unit_of_the_motors(devices):

@@ -23,6 +23,7 @@ class Firmware:
     def __init__(self) -> None:
         self.at = {"X": 0.0, "Y": 0.0, "A": 0.0}
         self.lines, self.stopped, self.dead, self.alarm = [], 0, False, ""
+        self.zero = 0.0  # of the x of moves, mm: G92, M206
         self._moving = 0
 
     def answer(self, line: str) -> bytes:
@@ -57,10 +58,13 @@ class Firmware:
 
 class Grbl(Firmware):
     greeting, realtime = b"\r\nGrbl 1.1h ['$' for help]\r\n", b"?!\x18"
+    settings, resting = b"$10=1\r\n$13=0\r\n$32=0\r\n", "Idle"
 
     def answer(self, line):
         if self.alarm:
             return b"error:9\r\n"
+        if line == "$$":
+            return self.settings + b"ok\r\n"
         if " G1 " in f" {line} ":
             if "G53" not in line or "F" not in line:
                 return b"error:22\r\n"
@@ -72,7 +76,7 @@ class Grbl(Firmware):
             self.stopped += 1
             return self.greeting if byte == b"\x18" else b""
         self._moving = max(self._moving - 1, 0)
-        state = "Alarm" if self.alarm else "Run" if self._moving else "Idle"
+        state = "Alarm" if self.alarm else "Run" if self._moving else self.resting
         return (
             f"<{state}|MPos:{self.at['X']:.3f},{self.at['Y']:.3f},0.000|FS:0,0>\r\n"
         ).encode()
@@ -121,7 +125,7 @@ class Marlin(Firmware):
                 letter: round(value * self.PER_MM) for letter, value in self.at.items()
             }
             return (
-                f"X:{steps['X'] / 80:.2f} Y:{steps['Y'] / 80:.2f} Z:0.00 E:0.00 "
+                f"X:{steps['X'] / 80 - self.zero:.2f} Y:{steps['Y'] / 80:.2f} Z:0.00 E:0.00 "
                 f"Count X:{steps['X']} Y:{steps['Y']} Z:0\nok\n"
             ).encode()
         if line == "M410":
