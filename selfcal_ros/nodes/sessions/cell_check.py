@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
-from math import isfinite, nan
+from math import degrees, isfinite, nan
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,7 @@ from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.readings import Measurements, RepeatMotion
 from selfcal_ros.model.terms import block_of_offsets
 from selfcal_ros.model.view import Plan, View
-from selfcal_ros.nodes.sessions.cell_faults import explaining
+from selfcal_ros.nodes.sessions.cell_faults import FOLLOWS, explaining, slope_of
 from selfcal_ros.nodes.sessions.health import Level, Ports
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.units import MRAD_PER_RAD, MS_PER_S, NS_PER_S, S_PER_NS, UM_PER_M
@@ -41,8 +41,6 @@ PLAN_ID, MARKS, REPEATS, OFFSET_M = "cell_check", 3, 2, 20e-6
 LISTEN_S, WATCH_S, STATUS_S, STALL_S = 2.0, 2.0, 0.5, 5.0
 """Times: for the encoder alone, for messages that should not come, between statuses, and without a
 detection until an incomplete view ends."""
-FOLLOWS = 0.9
-"""Fraction of the variance of an offset that must follow the stage for a valid slope."""
 TURNED_DEG = 5.0
 """Turn of the offsets against the stage beyond which they are turned."""
 CLEARLY, LEAST_TURN_RAD = 0.25, 2e-4
@@ -59,6 +57,7 @@ REVISIT_S = 10.0
 OLDEST_S = 10.0
 """Largest age of a detection for a valid stamp of exposure."""
 COVERED = {
+    "commands": ("detection clock", "rest", "ids", "marks", "check stops", "signs"),
     "detection clock": ("rest", "ids", "marks", "check stops", "signs"),
     "rest": ("ids", "marks", "check stops", "signs"),
     "ids": ("rest", "marks", "check stops", "signs"),
@@ -187,6 +186,7 @@ class CellCheck:
         self._has_unread = (
             False  # whether there were more of them at a time than are kept
         )
+        self._n_early = 0  # detections between PLACE and MEASURE
         self._command = Command(0, Phase.ABORT, PLAN_ID)
         self._pause_s = WATCH_S  # after which a detection in transit has arrived
         self._script = self._run_and_diagnosed()
@@ -363,6 +363,7 @@ class CellCheck:
         """Measure the view until it is complete or detections stop; return its MEASURE."""
         self._collector, self._seen, self._events = Collector(self._settings), [], []
         command = yield from self._place_and_measure(self.view)
+        self._n_early = len(self._seen)
         self._collector.add_command(command)
         begin = self._ports.now_s()
 
@@ -577,6 +578,13 @@ class CellCheck:
             float(value) * S_PER_NS for value in (np.median(ages), min(ages))
         )
         outside = rejected.get(Reason.OUTSIDE_VIEWS, 0) + rejected.get(Reason.FUTURE, 0)
+        if self._n_early:
+            self._tell(
+                "commands",
+                False,
+                f"{self._n_early} detections between PLACE and MEASURE",
+                "measure after MEASURE: until then the plate may still be moved",
+            )
         # whether the stage stood at the marks at these stamps
         good = progress.readings.used > (total - outside) / 2
         self._tell(
@@ -672,6 +680,9 @@ class CellCheck:
             turned and abs(by_lines - sign * by_marks) < CLEARLY * abs(by_marks)
             for sign in (1, -1)
         )
+        in_degrees = turned and abs(by_lines - degrees(by_marks)) < CLEARLY * abs(
+            degrees(by_marks)
+        )
         scatters = (
             view.motion_theta is not None and view.motion_theta.products[1, 1] > 0
         )
@@ -683,6 +694,9 @@ class CellCheck:
         if reversed_:
             figure += ": offset_theta has the other sign"
             remedy = "reverse the sign of offset_theta: line - axis of the stage, counter-clockwise"
+        elif in_degrees:
+            figure += ": offset_theta is in degrees"
+            remedy = "publish offset_theta in rad"
         elif not turned:
             remedy = "turn the plate by 1 mrad and check again"
             figure += "" if sign_is_shown else ", too little to tell the sign"
@@ -712,9 +726,9 @@ class CellCheck:
         [view] = measurements.views
         faults = [wiring_error(fault) for fault in wiring_faults(measurements)]
         slopes = {
-            "x": _slope(view.motion, 0),
-            "y": _slope(view.motion, 1),
-            "theta": _slope(view.motion_theta, 0),
+            "x": slope_of(view.motion, 0),
+            "y": slope_of(view.motion, 1),
+            "theta": slope_of(view.motion_theta, 0),
         }
         figure = ", ".join(
             f"{axis} {slope:+.3f}"
@@ -768,18 +782,6 @@ class CellCheck:
             remedy or "let the stage stop off the marks: check stops",
         )
         return offsets_follow and not faults, bool(what)
-
-
-def _slope(motion: RepeatMotion | None, axis: int) -> float | None:
-    """Return the response of an offset to its axis; None if mostly noise."""
-    if motion is None:
-        return None
-    n = len(motion.products) // 2
-    place, offset, cross = (
-        float(motion.products[index])
-        for index in ((axis, axis), (n + axis, n + axis), (axis, n + axis))
-    )
-    return cross / place if cross**2 > FOLLOWS * place * offset else None
 
 
 def _spreads_um(motion: RepeatMotion | None) -> tuple[float, float]:

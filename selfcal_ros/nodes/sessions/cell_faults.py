@@ -17,14 +17,20 @@ from selfcal_ros.collection.inputs import Command, Detection, EncoderSample, Kin
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.checks.wiring import wiring_faults
 from selfcal_ros.model.artifact import MAX_GRID_SIZE
-from selfcal_ros.model.readings import Sense
+from selfcal_ros.model.readings import RepeatMotion, Sense
 from selfcal_ros.settings.nodes import CollectorSettings
 from selfcal_ros.units import MM_PER_M
 
 type Event = EncoderSample | Detection
 
+AT_ONE_PLACE_M = 1e-4
+"""Way that is none: the stops beside a mark."""
 STILL = 0.25
 """Part of the pitch within which a stage has not moved."""
+
+
+FOLLOWS = 0.9
+"""Fraction of the variance of an offset that must follow the stage for a valid slope."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +63,17 @@ def explaining(
     if standing is not None:
         return standing
     total = sum(isinstance(event, Detection) for event in events)
-    used, _, seen = _outcome(Fault("", "", command, tuple(events)), settings)
+    used, *_, seen = _outcome(Fault("", "", command, tuple(events)), settings)
     faults: list[Fault] = []
-    best: tuple[float, float, float] = ((used + total) / 2, -np.inf, 0)
+    best: tuple[float, ...] = ((used + total) / 2, -np.inf, 0, 0)
     for fault in _faults(command, events, settings):
         try:
             outcome = _outcome(fault, settings)
         except InputError:  # an even and an odd side do not lie so
             continue
         if outcome[-1] < seen:  # without ids, positions in mm are all those of one mark
+            continue
+        if outcome[2] == 0:  # any offset is small enough in another unit
             continue
         if outcome > best:
             faults = []
@@ -83,8 +91,20 @@ def explaining(
     )
 
 
-def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int]:
-    """Return the detections that would be used, minus the faults of the offsets, marks seen."""
+def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int, int]:
+    """Return what would be without a fault.
+
+    Returns
+    -------
+    used : int
+        Detections that would be used.
+    faults : int
+        Minus the faults of the offsets.
+    following : int
+        Of x and y, how many offsets follow the stage; 2 if no check stops show it.
+    seen : int
+        Marks and lines seen.
+    """
     collector = Collector(settings)
     collector.add_command(fault.command)
     samples = [event for event in fault.events if isinstance(event, EncoderSample)]
@@ -112,13 +132,28 @@ def _outcome(fault: Fault, settings: CollectorSettings) -> tuple[int, int, int]:
     for event in fault.events:
         if isinstance(event, Detection):
             collector.add_detection(event)
-    measurements, _ = collector.collect()
+    measurements, progress = collector.collect()
     views = measurements.views
+    slopes = [slope_of(view.motion, axis) for view in views for axis in (0, 1)]
+    following = sum(slope is not None and -4 < slope < -0.25 for slope in slopes)
     return (
         sum(view.used for view in views),
         -len(wiring_faults(measurements)),
+        following if any(view.check_done for view in progress.values()) else 2,
         sum(len(view.m) + len(view.k) for view in views),
     )
+
+
+def slope_of(motion: RepeatMotion | None, axis: int) -> float | None:
+    """Return the response of an offset to its axis; None if mostly noise."""
+    if motion is None:
+        return None
+    n = len(motion.products) // 2
+    place, offset, cross = (
+        float(motion.products[index])
+        for index in ((axis, axis), (n + axis, n + axis), (axis, n + axis))
+    )
+    return cross / place if cross**2 > FOLLOWS * place * offset else None
 
 
 def _standing(
@@ -132,14 +167,26 @@ def _standing(
     )
     if not len(places) or plate is None:
         return None
-    if np.ptp(places, axis=0).max() <= STILL * plate.grid_pitch_m:
+    way_m = float(np.ptp(places, axis=0).max())
+    if way_m <= STILL * plate.grid_pitch_m:
         x, y = np.median(places, axis=0) * MM_PER_M
         return Fault(
-            f"the stage does not move: it is indicated at x = {x:.6g} mm, y = {y:.6g} mm "
-            "during the whole view",
-            "move the stage to each mark, and name the joints that move in joint_x and joint_y",
+            f"the stage moves by {way_m * MM_PER_M:.3g} mm alone during the whole view"
+            if way_m > AT_ONE_PLACE_M
+            else f"the stage does not move: it is indicated at x = {x:.6g} mm, "
+            f"y = {y:.6g} mm during the whole view",
+            "move the stage to each mark, name the joints that move in joint_x and joint_y, "
+            "and publish them in m",
             command,
         )
+    for axis, way in zip("xy", np.ptp(places, axis=0).tolist(), strict=True):
+        if way <= STILL * plate.grid_pitch_m:
+            return Fault(
+                f"{axis} does not move: it is indicated within {way * MM_PER_M:.3g} mm during "
+                "the whole view",
+                f"move the stage to each mark, and name the joint that moves in joint_{axis}",
+                command,
+            )
     lines = {
         event.k for event in events if isinstance(event, Detection) and _is_line(event)
     }
@@ -196,6 +243,19 @@ def _faults(
                 for reading in readings
             ],
         )
+    places = _places_at(samples, readings, settings)
+    yield fault(
+        "the offsets are places of the marks on the stage",
+        "publish mark - optical axis: leave out the position of the stage",
+        [
+            replace(
+                reading,
+                offset_x=reading.offset_x - place.real,
+                offset_y=reading.offset_y - place.imag,
+            )
+            for reading, place in zip(readings, places, strict=True)
+        ],
+    )
     for late in (1, 2):
         exposures = f"{late} exposure{'s' * (late > 1)}"
         yield fault(
@@ -330,16 +390,7 @@ def _other_origin(
     marks = [one for one in detections if one.kind == Kind.GRID and one.has_id]
     if view is None or plate is None or plate.marks or not marks:
         return 0, 0
-    places = [
-        (sample.stamp_ns, *place)
-        for sample in samples
-        if (place := _place(sample, settings)) is not None
-    ]
-    if not places:
-        return 0, 0
-    stamps, x, y = zip(*places, strict=True)
-    when = [mark.stamp_ns for mark in marks]
-    at = np.interp(when, stamps, x) + 1j * np.interp(when, stamps, y)
+    at = _places_at(samples, marks, settings)
     at = Sense(settings.measurement_sense).sign * at - complex(*view.translation_m)
     at *= np.exp(-1j * view.rotation_rad) / plate.grid_pitch_m
     off_m, off_n = plate.off_centre
@@ -347,9 +398,26 @@ def _other_origin(
         np.median([mark.m for mark in marks] - at.real + off_m),
         np.median([mark.n for mark in marks] - at.imag + off_n),
     )
-    if max(map(abs, higher)) > MAX_GRID_SIZE:  # then the places are wrong
+    if not max(map(abs, higher)) < MAX_GRID_SIZE:  # then the places are wrong
         return 0, 0
     return round(higher[0]), round(higher[1])
+
+
+def _places_at(
+    samples: Sequence[EncoderSample],
+    detections: Sequence[Detection],
+    settings: CollectorSettings,
+) -> np.ndarray:
+    """Return x + i y indicated at each detection, complex array, m; NaN if nothing is indicated."""
+    places = [
+        (sample.stamp_ns, complex(*place))
+        for sample in samples
+        if (place := _place(sample, settings)) is not None
+    ]
+    if not places:
+        return np.full(len(detections), np.nan + 0j)
+    stamps, at = zip(*places, strict=True)
+    return np.interp([one.stamp_ns for one in detections], stamps, at)
 
 
 def _other_zero(

@@ -62,6 +62,9 @@ class Cell(Bench):
         self.begun_s = self.hands.seconds  # an exposure that has begun may end
         if view.phase == PLACE:
             self.lay()
+            if self.fault == "measures at PLACE":
+                self.view, self.planned = view, self.exposures(view)
+                self.take_next()
         elif view.phase == MEASURE:
             if self.fault == "another view":
                 view.rotation += np.pi / 2
@@ -115,8 +118,12 @@ class Cell(Bench):
             x = np.nan
         if self.fault == "x and y exchanged":
             x, y = y, x
-        if self.fault == "millimetres":
-            x, y = 1e3 * x, 1e3 * y
+        scale = {
+            "millimetres": (1e3, 1e3),
+            "a tenth": (0.1, 0.1),
+            "y does not move": (1.0, 0.0),
+        }.get(self.fault, (1.0, 1.0))
+        x, y = scale[0] * x, scale[1] * y
         if self.fault.startswith("reversed x"):
             x = -x
         if self.fault == "reversed theta":
@@ -164,6 +171,13 @@ class Cell(Bench):
             seen = seen | {"offset_x": seen["offset_x"] + 1e-6 * self.came}
         seen = seen | {
             "m and n exchanged": {"m": seen["n"], "n": seen["m"]},
+            "offsets with the place of the stage": {
+                "offset_x": seen["offset_x"] + self.position[0],
+                "offset_y": seen["offset_y"] + self.position[1],
+            },
+            "offset_theta in degrees": {
+                "offset_theta": np.degrees(seen["offset_theta"])
+            },
             "m reversed": {"m": -seen["m"]},
             "n reversed": {"n": -seen["n"]},
             "m and n reversed": {"m": -seen["m"], "n": -seen["n"]},
@@ -266,7 +280,16 @@ WRONG = [
     ("m and n exchanged", "ids", "m and n are exchanged"),
     ("x and y exchanged", "ids", "x and y are exchanged"),
     ("millimetres", "ids", "the indicated positions are 1000 times those of the marks"),
-    ("offsets in mm", "ids", "the offsets are in mm"),
+    ("offsets in mm", "ids", "the offsets are in mm (54"),
+    (
+        "offsets with the place of the stage",
+        "ids",
+        "the offsets are places of the marks on the stage (54",
+    ),
+    ("y does not move", "ids", "y does not move: it is indicated within 0 mm during"),
+    ("a tenth", "ids", "the stage moves by 2 mm alone during the whole view"),
+    ("offset_theta in degrees", "theta", ": offset_theta is in degrees"),
+    ("measures at PLACE", "commands", "detections between PLACE and MEASURE"),
     ("reversed x", "ids", "x is indicated with the wrong sign"),
     ("m reversed", "ids", "m is counted against plate x (54"),
     (
