@@ -36,6 +36,13 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.recheck.plate import KnownPlate, known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.judge import judged
+from selfcal_ros.model.findings import (
+    LinesSignNotShown,
+    ScaleOfOffsets,
+    SignNotShown,
+    SignShownByLines,
+    SlipFound,
+)
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import microscope_term
@@ -160,15 +167,11 @@ def calibrate_corrected(
     return calibrate(readings, replace(options, plate=corrected(before)))
 
 
-BY_LINES = "sign_shown_by_lines"
-"""The finding that contradicts nothing: the readings agree, with both signs of all offsets."""
-
-
 def _agree(result: CalibrationResult) -> bool:
     """Return whether the readings agree, whatever the sign of the offsets."""
     verdict = result.verdict
-    of_repeats = {"sign_not_shown", "scale_of_offsets", "lines_sign_not_shown"}
-    failed = {finding.name for finding in verdict.failed} - {BY_LINES}
+    of_repeats = {SignNotShown, ScaleOfOffsets, LinesSignNotShown}
+    failed = {type(finding) for finding in verdict.failed} - {SignShownByLines}
     if verdict.failed and not failed:
         return _fits(result)
     return verdict.qualified or (bool(failed) and failed <= of_repeats)
@@ -187,8 +190,8 @@ def _fits(result: CalibrationResult) -> bool:
         for cause in result.verdict.causes
         if cause.name in blocks()
     ]
-    failed = {causes_of_blocks.name for causes_of_blocks in result.verdict.failed}
-    return failed <= {BY_LINES} and not any(
+    failed = {type(finding) for finding in result.verdict.failed}
+    return failed <= {SignShownByLines} and not any(
         block.between or abs(cause.size) > block.plausible
         for cause, block in causes_of_blocks
     )
@@ -278,7 +281,7 @@ def robust_calibrate(
     spoiling = tuple(
         finding
         for finding in cleaned.findings
-        if finding.name in LEFT or finding.details.get("spoils")
+        if type(finding) in LEFT or (isinstance(finding, SlipFound) and finding.spoils)
     )
     verdict = result.verdict
     if spoiling:

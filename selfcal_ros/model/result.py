@@ -23,6 +23,13 @@ from selfcal_ros.model.camera import (
     shown_by_images,
 )
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.findings import (
+    Finding,
+    InWords,
+    NotIdentified,
+    finding_from_dict,
+    finding_to_dict,
+)
 from selfcal_ros.model.kept import KEYS, Kept, kept_from_dict
 from selfcal_ros.model.plate_form import (
     artifact_of,
@@ -39,14 +46,11 @@ from selfcal_ros.model.reference import (
 )
 from selfcal_ros.model.verdict import (
     BudgetLine,
-    Finding,
     Grade,
     ModelResult,
     Provenance,
     Verdict,
     budget_from_list,
-    finding_to_dict,
-    findings_from_list,
     line_to_dict,
     provenance_from_dict,
     verdict_from_dict,
@@ -297,7 +301,7 @@ def unidentified_result(
         Noise(nan, nan),
         measurements.all_rejected(),
         sense=str(measurements.sense),
-        verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_identified"),)),
+        verdict=Verdict(Grade.NOT_QUALIFIED, (NotIdentified(),)),
         provenance=Provenance(version=__version__),
         run_id=measurements.run_id,
         placed_plate=artifact.placed,
@@ -557,7 +561,7 @@ def _parse(data: dict) -> CalibrationResult:
         reference=reference_from_dict(data.get("reference")),
         provenance=provenance_from_dict(data.get("provenance")),
         run_id=read(str, data.get("run_id", "")),
-        findings=findings_from_list(Finding, data.get("findings", [])),
+        findings=tuple(map(finding_from_dict, read(list, data.get("findings", [])))),
         budget=budget_from_list(data.get("budget", [])),
         placed_plate=artifact if artifact.map_grid else None,
         recheck=read(Recheck | None, data.get("recheck")),
@@ -616,8 +620,7 @@ def _seen_to_dict(observability: Observability) -> dict[str, Any]:
 def _seen_from_dict(data: dict[str, Any]) -> Observability:
     words = {
         name: tuple(
-            Finding("in_words", text=text)
-            for text in read(tuple[str, ...], data.get(name, []))
+            InWords(text=text) for text in read(tuple[str, ...], data.get(name, []))
         )
         for name in ("modes", "advice")
     }

@@ -4,76 +4,16 @@
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal
+from typing import Any
 
 from selfcal_ros.files import read
-
-
-@dataclass(frozen=True)
-class Remedy:
-    """Remedy for a cause: solve with a `model` or `map`, measure a `view`, or an `action`."""
-
-    kind: Literal["model", "map", "view", "action"]
-    value: str
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something found in the readings, as data in SI units.
-
-    `selfcal_ros.reporting.words.findings` has the sentence of each name.
-
-    Attributes
-    ----------
-    name : str
-        Name of a term, or another name with a sentence.
-    size, u : float
-        Its largest component and standard uncertainty, in `unit`; NaN if none.
-    unit : str
-        ``m``, ``rad`` or ``m/m`` (also for a ratio of noises); empty without a size.
-    p : float
-        Probability of as much without it.
-    view, axis : str
-        Location: name of the view, ``x`` or ``y``; empty if not applicable.
-    mark : tuple of int
-        Mark (m, n) or line (k,) of a single reading; else empty.
-    details : dict
-        Further data of its sentence, by name.
-    text : str
-        Its sentence; empty before wording.
-    """
-
-    name: str
-    size: float = math.nan
-    u: float = math.nan
-    unit: str = ""
-    p: float = math.nan
-    view: str = ""
-    axis: str = ""
-    mark: tuple[int, ...] = ()
-    details: dict[str, Any] = field(default_factory=dict)
-    text: str = ""
-
-
-@dataclass(frozen=True)
-class Cause(Finding):
-    """Explanation of the residuals, or of an enlarged uncertainty.
-
-    Attributes
-    ----------
-    effect_rms, effect_max : float
-        Effect on the map: of one coordinate, m, or of the angular map, rad, if `unit` is
-        rad and it is in the lines; NaN if unknown.
-    told : bool
-        Whether the readings determine all of it.
-    remedies : tuple of Remedy
-        Remedies, the best first; those that name a model were tried on these readings.
-    """
-
-    effect_rms: float = math.nan
-    effect_max: float = math.nan
-    told: bool = True
-    remedies: tuple[Remedy, ...] = ()
+from selfcal_ros.model.findings import (
+    Cause,
+    Finding,
+    cause_from_dict,
+    finding_from_dict,
+    finding_to_dict,
+)
 
 
 class Grade(StrEnum):
@@ -253,40 +193,6 @@ class Provenance:
         return {**self.extra, **{name: time for name, time in times.items() if time}}
 
 
-def finding_to_dict(finding: Finding) -> dict[str, Any]:
-    """Return the JSON form of a finding, or of a cause.
-
-    Raises
-    ------
-    ValueError
-        If it has no sentence.
-    """
-    if not finding.text:
-        raise ValueError(f"the finding '{finding.name}' is not worded")
-    data = {**vars(finding), "mark": list(finding.mark)}
-    if isinstance(finding, Cause):
-        data["remedies"] = [{remedy.kind: remedy.value} for remedy in finding.remedies]
-    return data
-
-
-def findings_from_list(kind: type, data: Any) -> tuple:
-    """Return findings, or causes."""
-    return tuple(
-        read(
-            kind,
-            finding
-            | {
-                "remedies": [
-                    {"kind": name, "value": value}
-                    for remedy in finding.get("remedies", [])
-                    for name, value in remedy.items()
-                ]
-            },
-        )
-        for finding in read(list, data)
-    )
-
-
 def verdict_to_dict(verdict: Verdict) -> dict[str, Any]:
     """Return the JSON form of a verdict; ValueError if it has no sentences."""
     return {
@@ -313,8 +219,8 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
         raise ValueError(f"the grade '{grade}' contradicts qualified {qualified}")
     return Verdict(
         grade,
-        findings_from_list(Finding, data.get("failed", [])),
-        findings_from_list(Cause, data["causes"]),
+        tuple(map(finding_from_dict, read(list, data.get("failed", [])))),
+        tuple(map(cause_from_dict, read(list, data["causes"]))),
         read(tuple[Enlargement, ...], data.get("enlarged_by", [])),
         read(str, data["sentence"]),
         read(tuple[str, ...], data["reasons"]),

@@ -11,6 +11,17 @@ import pytest
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import (
+    Cause,
+    FewRead,
+    FewReadCell,
+    InWords,
+    NoiseContradicted,
+    Remedy,
+    TakenForSlip,
+    ViewLeftOut,
+    VisitedOnce,
+)
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import (
@@ -21,12 +32,9 @@ from selfcal_ros.model.result import (
     with_input,
 )
 from selfcal_ros.model.verdict import (
-    Cause,
     Enlargement,
-    Finding,
     Grade,
     ModelResult,
-    Remedy,
     TermResult,
     Verdict,
 )
@@ -127,8 +135,8 @@ def test_an_unidentified_plan_has_maps_of_nulls():
                 39,
                 14,
                 False,
-                (Finding("in_words", text="m"),),
-                (Finding("in_words", text="add tx"),),
+                (InWords(text="m"),),
+                (InWords(text="add tx"),),
             ),
         )
     )
@@ -259,16 +267,16 @@ def test_a_reference_is_off_by_less_than_a_tenth(error, u, is_one):
 
 
 CAUSE = Cause(
-    "drift",
-    5e-8,
-    1e-9,
-    "m",
-    1e-7,
-    "tx",
-    "x",
-    (1, -2),
-    {"part": "x x2"},
-    "drift along x",
+    name="drift",
+    size=5e-8,
+    u=1e-9,
+    unit="m",
+    p=1e-7,
+    view="tx",
+    axis="x",
+    mark=(1, -2),
+    details={"part": "x x2"},
+    text="drift along x",
     effect_rms=2e-9,
     effect_max=6e-9,
     told=False,
@@ -278,8 +286,8 @@ CAUSE = Cause(
 
 @pytest.mark.parametrize("grade", Grade)
 def test_a_grade_with_its_causes_and_terms_comes_back(grade):
-    failed = Finding(
-        "noise_contradicted", 3e-8, unit="m", details={"stated": 1e-8}, text="noisy"
+    failed = NoiseContradicted(
+        size=3e-8, unit="m", stated=1e-8, declared=False, text="noisy"
     )
     verdict = Verdict(
         grade,
@@ -301,6 +309,41 @@ def test_a_grade_with_its_causes_and_terms_comes_back(grade):
     assert data["causes"][0]["remedies"] == [{"model": "drift:8e-8"}, {"view": "tx"}]
     assert through_json(result).verdict == verdict
     assert through_json(result).model == result.model
+
+
+def test_findings_come_back_as_what_they_are():
+    cell = FewReadCell(view="tx", cell=(0, 1), read=3, shown=9)
+    findings = (
+        FewRead(unknown=((0, 1),), cells=(cell,), text="few"),
+        FewRead(unknown=None, cells=(), text="few, and no camera"),
+        ViewLeftOut(
+            view="a", read=(1, 0), asked=(9, 0), rejected={"late": 8}, text="out"
+        ),
+        TakenForSlip(
+            cause="drift", slip_in="a", of_cause={"part": "x P1"}, text="no slip"
+        ),
+        VisitedOnce(text="once"),
+    )
+    result = replace(known_result()[0], findings=findings)
+    assert through_json(result).findings == findings
+
+
+@pytest.mark.parametrize(
+    ("name", "details"),
+    [
+        ("of_a_later_version", {"x": [1, 2]}),
+        ("noise_contradicted", {"stated": 1e-8}),  # and what is declared was lost
+        ("few_read", {"unknown": None, "cells": [{"cell": "?"}]}),
+    ],
+)
+def test_a_finding_that_is_not_understood_is_kept_in_its_words(name, details):
+    data = result_to_dict(
+        replace(known_result()[0], findings=(VisitedOnce(text="as it was said"),))
+    )
+    data["findings"][0] |= {"name": name, "details": details}
+    result = result_from_dict(data, "r")
+    assert result.findings == (InWords(kind=name, data=details, text="as it was said"),)
+    assert result_to_dict(result)["findings"] == data["findings"]
 
 
 def test_a_verdict_of_before_has_the_grade_of_its_qualification():

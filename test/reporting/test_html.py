@@ -14,8 +14,9 @@ import pytest
 from selfcal_ros import __version__
 from selfcal_ros.errors import InputError
 from selfcal_ros.estimation.joint.problem import coverage_factor
+from selfcal_ros.model.findings import Cause, InWords, Remedy
 from selfcal_ros.model.result import Observability, result_from_dict, result_to_dict
-from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Remedy, Verdict
+from selfcal_ros.model.verdict import Grade, Provenance, Verdict
 from selfcal_ros.reporting.chapters import (
     MAX_ROWS,
     convention_section,
@@ -244,19 +245,19 @@ def test_causes_come_as_a_table_with_one_unit_each():
     result, _ = known_result(3, 0)
     causes = (
         Cause(
-            "drift",
-            8e-8,
-            3e-9,
-            "m",
-            1e-9,
-            "run 2: shift x",
-            "x",
+            name="drift",
+            size=8e-8,
+            u=3e-9,
+            unit="m",
+            p=1e-9,
+            view="run 2: shift x",
+            axis="x",
             remedies=(
                 Remedy("model", "drift:8e-8"),
                 Remedy("action", "measure there and back"),
             ),
         ),
-        Cause("noise", 2.0, 0.1, "m/m", 2e-4, "a"),
+        Cause(name="noise", size=2.0, u=0.1, unit="m/m", p=2e-4, view="a"),
     )
     verdict = Verdict(
         Grade.NOT_QUALIFIED,
@@ -332,7 +333,7 @@ def test_text_from_files_is_escaped():
         extra={evil: evil, "outliers": [{evil: evil}]},
         views=(replace(result.views[0], name=evil),),
         observability=Observability(
-            1, 2, 1, False, (Finding("", text=evil),), (Finding("", text=evil),)
+            1, 2, 1, False, (InWords(text=evil),), (InWords(text=evil),)
         ),
     )
     page = parsed(html_of(hostile))
@@ -347,8 +348,8 @@ def test_a_deficient_plan_is_marked_and_comes_first():
         3,
         2,
         False,
-        (Finding("", text="scale difference"),),
-        (Finding("", text="add a view turned by 90 deg"),),
+        (InWords(text="scale difference"),),
+        (InWords(text="add a view turned by 90 deg"),),
     )
     html = html_of(replace(result, observability=seen))
     assert '<p class="verdict not_qualified">Not a calibration: 2 modes' in html

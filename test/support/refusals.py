@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from selfcal_ros.errors import NotIdentifiableError
-from selfcal_ros.model.verdict import Finding
+from selfcal_ros.model.findings import Finding
 from selfcal_ros.reporting.words.observability import with_advice, worded
 
 

@@ -17,7 +17,7 @@ from selfcal_ros.collection.reduce import with_places
 from selfcal_ros.errors import ExitCode, NotIdentifiableError, SelfcalError
 from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.model import result as results
-from selfcal_ros.model.verdict import finding_to_dict
+from selfcal_ros.model.findings import finding_to_dict
 from selfcal_ros.outputs import plain, write_json
 from selfcal_ros.reporting.summary.numbers import summary_numbers
 from selfcal_ros.reporting.words.findings import worded

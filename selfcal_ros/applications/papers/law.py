@@ -21,6 +21,7 @@ from selfcal_ros.estimation.normal.angular import FLOOR
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, half_axis_slopes
+from selfcal_ros.model.findings import DrawnUncertainty, Finding
 from selfcal_ros.model.readings import (
     Measurements,
     Sense,
@@ -35,7 +36,6 @@ from selfcal_ros.model.result import (
     Observability,
     ViewResult,
 )
-from selfcal_ros.model.verdict import Finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -647,4 +647,4 @@ def _to_stage(
 def _findings(artifact: Artifact, options: Options) -> tuple[Finding, ...]:
     if artifact.grid_size <= EXACT_SIZE or options.uncertainty is False:
         return ()
-    return (Finding("drawn_uncertainty", details={"draws": N_DRAWS}),)
+    return (DrawnUncertainty(draws=N_DRAWS),)

@@ -49,6 +49,7 @@ from selfcal_ros.model.error_map import (
     first_order,
     rms,
 )
+from selfcal_ros.model.findings import BetweenRuns, EnlargedRuns, Finding, NotInAll
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import (
@@ -61,7 +62,6 @@ from selfcal_ros.model.result import (
 from selfcal_ros.model.verdict import (
     BudgetLine,
     Enlargement,
-    Finding,
     Grade,
     ModelResult,
     Provenance,
@@ -956,7 +956,7 @@ def _result(
         model=ModelResult(first.model.misalignment),
         reference=shared_reference(runs, means["xy"].weights),
         provenance=of_all_runs(runs),
-        findings=(Finding("not_in_all", details={"sites": int((~known_sites).sum())}),)
+        findings=(NotInAll(sites=int((~known_sites).sum())),)
         if not known_sites.all()
         else (),
         placed_plate=first.placed_plate,
@@ -1020,7 +1020,7 @@ def _of_run(deviation: Deviation, kind: str, limit: float) -> dict[str, Any]:
 def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
     """Return the verdict: enlarged if a run's U was, or if the runs differ by more than their U."""
     enlarged: dict[str, Enlargement] = {}
-    failed = []
+    failed: list[Finding] = []
     for kind, mean in means.items():
         if mean.p_between < USUAL_LEVEL:
             u = np.sqrt(mean.between)
@@ -1028,12 +1028,12 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
             unit = KINDS[kind]
             enlarged[name] = Enlargement(name, rms(u), float(u.max()), unit)
             failed.append(
-                Finding(
-                    "between_runs",
-                    mean.u_between,
+                BetweenRuns(
+                    size=mean.u_between,
                     unit=unit,
                     p=mean.p_between,
-                    details={"runs": len(members), "quantity": kind},
+                    runs=len(members),
+                    quantity=kind,
                 )
             )
     for member in members:
@@ -1047,7 +1047,7 @@ def _verdict(members: Sequence[Member], means: Mapping[str, Mean]) -> Verdict:
         if member.result and member.result.verdict.grade is Grade.ENLARGED
     ]
     if of_runs:
-        failed.append(Finding("enlarged_runs", details={"runs": of_runs}))
+        failed.append(EnlargedRuns(runs=tuple(of_runs)))
     return Verdict(
         Grade.ENLARGED if failed else Grade.GOOD,
         tuple(failed),

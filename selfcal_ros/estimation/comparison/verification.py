@@ -32,6 +32,7 @@ from selfcal_ros.estimation.comparison.maps import (
 from selfcal_ros.estimation.multifrontal.factor import one_thread
 from selfcal_ros.estimation.terms.equations import CAUSE_LEVEL
 from selfcal_ros.model.error_map import ErrorMap, datum_columns, rms
+from selfcal_ros.model.findings import OtherPlate
 from selfcal_ros.model.recheck import Significance
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.verified import AxisError
@@ -268,7 +269,7 @@ def is_believed(after: CalibrationResult, verification: "Verification") -> bool:
         TableFault.OTHER,
         TableFault.OLDER,
     )
-    other_plate = {cause.name for cause in after.verdict.failed} == {"other_plate"}
+    other_plate = {type(finding) for finding in after.verdict.failed} == {OtherPlate}
     return after.verdict.qualified or (named and other_plate)
 
 

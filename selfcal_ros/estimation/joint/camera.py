@@ -21,10 +21,10 @@ from selfcal_ros.estimation.observability.rank import DETERMINED
 from selfcal_ros.estimation.terms.equations import score
 from selfcal_ros.model.camera import CameraCell, CameraErrors, CameraPower, StageYawMap
 from selfcal_ros.model.error_map import MANY_DOF
+from selfcal_ros.model.findings import FewRead, FewReadCell, Finding
 from selfcal_ros.model.pose import ImageCells
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import View
 
 POWERS = {1: ((1, 0), (0, 1)), 2: ((2, 0), (1, 1), (0, 2)), 3: ((2, 1),)}
@@ -413,25 +413,13 @@ def few_read(
     unknown = (
         None
         if camera is None
-        else [list(cell) for cell in camera.image.cells if cell not in camera.cells]
+        else tuple(cell for cell in camera.image.cells if cell not in camera.cells)
     )
-    return (
-        Finding(
-            "few_read",
-            details={
-                "unknown": unknown,
-                "cells": [
-                    {
-                        "view": name,
-                        "cell": list(cell),
-                        "read": int(n_read),
-                        "shown": int(n_shown),
-                    }
-                    for name, cell, (n_read, n_shown) in few
-                ],
-            },
-        ),
+    cells = tuple(
+        FewReadCell(view=name, cell=cell, read=int(n_read), shown=int(n_shown))
+        for name, cell, (n_read, n_shown) in few
     )
+    return (FewRead(unknown=unknown, cells=cells),)
 
 
 def _read_and_shown(

@@ -61,6 +61,13 @@ from selfcal_ros.estimation.terms.equations import (
 )
 from selfcal_ros.estimation.terms.visits import check_visits, term_inputs
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum, rms
+from selfcal_ros.model.findings import (
+    Finding,
+    Magnification,
+    NoUncertainty,
+    ReferenceOff,
+    Unchecked,
+)
 from selfcal_ros.model.kept import Factors, ImagesKept, Kept, rounded
 from selfcal_ros.model.readings import (
     GridVisits,
@@ -78,7 +85,7 @@ from selfcal_ros.model.result import (
     ViewResult,
 )
 from selfcal_ros.model.terms import block_of_offsets
-from selfcal_ros.model.verdict import Finding, ModelResult, TermEstimate, TermResult
+from selfcal_ros.model.verdict import ModelResult, TermEstimate, TermResult
 from selfcal_ros.model.view import Plan, cells_seen
 from selfcal_ros.units import NS_PER_S
 
@@ -554,12 +561,12 @@ def _solved(
     artifact_map = _artifact_map(
         model, cover if with_uncertainty else None, rms(sigma), of_map
     )
-    findings = (
+    findings: tuple[Finding, ...] = (
         *_unchecked(problem.system, measurements.sense),
         *_magnification(artifact_map, of_map, options),
     )
     if not with_uncertainty and asked_for is None:
-        findings = (Finding("no_uncertainty"), *findings)
+        findings = (NoUncertainty(), *findings)
     axes = (1.0, 0.0)
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
         axes = misclosure_test(fitted.misclosure, closure)
@@ -617,12 +624,12 @@ def _magnification(
         if abs(of_map) <= limit:
             return ()
         u = options.reference.u_relative
-        return (Finding("reference_off", of_map, u, "m/m"),)
+        return (ReferenceOff(size=of_map, u=u, unit="m/m"),)
     if not abs(plate_map.magnification) > limit:
         return ()
     return (
-        Finding(
-            "magnification", plate_map.magnification, plate_map.u_magnification, "m/m"
+        Magnification(
+            size=plate_map.magnification, u=plate_map.u_magnification, unit="m/m"
         ),
     )
 
@@ -635,9 +642,8 @@ def _unchecked(system: NormalEquations, sense: Sense) -> tuple[Finding, ...]:
     if not len(sites) and not len(lines):
         return ()
     return (
-        Finding(
-            "unchecked",
-            details={"sites": sites.tolist(), "lines": lines[:, 0].tolist()},
+        Unchecked(
+            sites=tuple(map(tuple, sites.tolist())), lines=tuple(lines[:, 0].tolist())
         ),
     )
 

@@ -23,7 +23,6 @@ from selfcal_ros.estimation.normal.equations import (
     planned_system,
 )
 from selfcal_ros.estimation.observability.rank import (
-    add_views,
     full_observability,
     identifies,
     smaller,
@@ -32,6 +31,7 @@ from selfcal_ros.estimation.observability.rank import (
 )
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum, rms
+from selfcal_ros.model.findings import AddViews, OrAddViews
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.view import ORDERS, Plan, View, parse_order
@@ -179,8 +179,8 @@ def with_unseen_modes(
     modes = tuple(unseen_modes(system))
     cures = tuple(find_cures(plan))
     advice = tuple(
-        add_views(plan.artifact, *cure, name="or_add_views" if number else "add_views")
-        for number, cure in enumerate(cures[:3])
+        kind(views=tuple(cure), plate=plan.artifact)
+        for kind, cure in zip((AddViews, OrAddViews, OrAddViews), cures, strict=False)
     )
     return PlanCheck(
         replace(observability, modes=modes, advice=advice or observability.advice),

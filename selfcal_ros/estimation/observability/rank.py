@@ -29,8 +29,29 @@ from selfcal_ros.estimation.normal.equations import (
 )
 from selfcal_ros.estimation.normal.grid import GridSystem
 from selfcal_ros.model.artifact import Artifact, default_map_grid
+from selfcal_ros.model.findings import (
+    AddViews,
+    AddViewsOrFewerNodes,
+    BendingX,
+    BendingY,
+    EveryField,
+    Finding,
+    GroupsOfLines,
+    GroupsOfSites,
+    HarmonicsUnseen,
+    LineOffsets,
+    LinesNeverVisited,
+    MarksMissing,
+    MarksNeverRead,
+    Nonorthogonality,
+    PeriodicFields,
+    PeriodicLines,
+    RotationSymmetric,
+    ScaleDifference,
+    SitesNeverVisited,
+    UndeterminedFields,
+)
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import Plan, View, with_sub_views
 
 DATUM_ROWS = 7
@@ -220,14 +241,11 @@ def _measured_observability(
         return full
     sites, lines = system.known_sites, system.known_lines
     if sites.mean() < DETERMINED or (len(lines) and lines.mean() < DETERMINED):
-        missing = Finding(
-            "marks_missing",
-            details={
-                "sites": int(sites.sum()),
-                "of_sites": sites.size,
-                "lines": int(lines.sum()),
-                "of_lines": len(lines),
-            },
+        missing = MarksMissing(
+            sites=int(sites.sum()),
+            of_sites=sites.size,
+            lines=int(lines.sum()),
+            of_lines=len(lines),
         )
         return Observability(
             full.rank, full.unknowns, full.deficiency, False, advice=(missing,)
@@ -313,14 +331,9 @@ def advice_for(artifact: Artifact, views: Iterable[View]) -> tuple[Finding, ...]
         missing += _missing_lines(
             artifact, [v.on_stage(artifact).turn_lines or 0 for v in views if v.angular]
         )
-    return tuple(add_views(artifact, view) for view in missing) or (
+    return tuple(AddViews(views=(view,), plate=artifact) for view in missing) or (
         _tried(artifact, views),
     )
-
-
-def add_views(artifact: Artifact, *views: View, name: str = "add_views") -> Finding:
-    """Return the advice to add views."""
-    return Finding(name, details={"views": views, "plate": artifact})
 
 
 def _usual_views(artifact: Artifact) -> tuple[View, View, View]:
@@ -336,16 +349,16 @@ def _usual_views(artifact: Artifact) -> tuple[View, View, View]:
     )
 
 
-def _tried(artifact: Artifact, views: tuple[View, ...]) -> Finding:
+def _tried(artifact: Artifact, views: tuple[View, ...]) -> AddViews:
     """Return the first single view, by trial, that cures the plan."""
     turned, along_x, along_y = usual = _usual_views(artifact)
     if artifact.map_grid is not None:
-        return add_views(artifact, *usual, name="add_views_or_fewer_nodes")
+        return AddViewsOrFewerNodes(views=usual, plate=artifact)
     again = View("", 0.0, (0.0, 0.0), True, artifact.angular_count > 0)
     for more in (along_y, along_x, turned, again):
         if identifies(artifact, (*views, more)):
-            return add_views(artifact, more)
-    return add_views(artifact, *usual)
+            return AddViews(views=(more,), plate=artifact)
+    return AddViews(views=usual, plate=artifact)
 
 
 def _missing_lines(artifact: Artifact, turns: list[float]) -> list[View]:
@@ -414,37 +427,38 @@ def unseen_modes(system: NormalEquations) -> Iterator[Finding]:
     if grid.n_views > 1:
         yield from _known_families(system)
     if len(modes):
-        yield Finding("undetermined_fields", details={"count": len(modes)})
+        yield UndeterminedFields(count=len(modes))
     yield from _component_family(grid)
     missing = (grid.components.of_site < 0).reshape(grid.views.shape)
     if missing.any():
-        yield Finding(
-            "sites_never_visited",
-            details={"count": int(missing.sum()), "first": _sites(missing, grid)[0]},
+        yield SitesNeverVisited(
+            count=int(missing.sum()), first=_sites(missing, grid)[0]
         )
     if n := int((grid.components.of_mark < 0).sum()):
-        yield Finding("marks_never_read", details={"count": n})
+        yield MarksNeverRead(count=n)
     if system.angular.n_views:
         yield from _angular_families(system.angular)
 
 
-def _sites(chosen: np.ndarray, grid: GridSystem) -> list[list[int]]:
+def _sites(chosen: np.ndarray, grid: GridSystem) -> tuple[tuple[int, ...], ...]:
     """Return the numbers (m, n) of chosen sites."""
-    return (np.argwhere(chosen) - np.array(grid.views.shape) // 2).tolist()
+    numbers = np.argwhere(chosen) - np.array(grid.views.shape) // 2
+    return tuple(map(tuple, numbers.tolist()))
 
 
 def _known_families(system: NormalEquations) -> Iterator[Finding]:
     """Yield the unseen fields among the named ones."""
     z = system.grid.views.z_sites
     x, y = z.real, z.imag
-    for name, field in (
-        ("nonorthogonality", y + 1j * x),
-        ("scale_difference", x - 1j * y),
-        ("bending_x", x * y - 0.5j * x**2),
-        ("bending_y", 0.5 * y**2 - 1j * x * y),
-    ):
+    fields: tuple[tuple[Finding, np.ndarray], ...] = (
+        (Nonorthogonality(), y + 1j * x),
+        (ScaleDifference(), x - 1j * y),
+        (BendingX(), x * y - 0.5j * x**2),
+        (BendingY(), 0.5 * y**2 - 1j * x * y),
+    )
+    for family, field in fields:
         if is_unseen(system, field):
-            yield Finding(name)
+            yield family
 
 
 def _component_family(grid: GridSystem) -> Iterator[Finding]:
@@ -466,31 +480,21 @@ def _shape_of(grid: GridSystem, label: np.ndarray, *, n: int) -> Finding:
     shifts = {(pose.a, pose.b) for pose in grid.views.poses}
     turns = sorted({(pose.q - grid.views.poses[0].q) % 4 for pose in grid.views.poses})
     if len(grid.views.poses) == 1:
-        return Finding("every_field")
+        return EveryField()
     for axis, lines in ((0, "rows"), (1, "columns")):
         first = np.take(label, [label.shape[axis] // 2], axis=axis)
         if (label == first).all():
-            return Finding(
-                "line_offsets", details={"lines": lines, "opposite": len(turns) > 1}
-            )
+            return LineOffsets(lines=lines, opposite=len(turns) > 1)
     beside_datum = 2 * n - 2  # rotation and scale, or the translations
     if len(shifts) == 1:
-        return Finding(
-            "rotation_symmetric",
-            details={"half": not any(t % 2 for t in turns), "numbers": beside_datum},
+        return RotationSymmetric(
+            half=not any(t % 2 for t in turns), numbers=beside_datum
         )
     if period := _period(label):
-        return Finding(
-            "periodic_fields", details={"period": period, "numbers": beside_datum}
-        )
+        return PeriodicFields(period=period, numbers=beside_datum)
     numbers, sizes = np.unique(label[label >= 0], return_counts=True)
-    return Finding(
-        "groups_of_sites",
-        details={
-            "count": n,
-            "smallest": _sites(label == numbers[np.argmin(sizes)], grid),
-        },
-    )
+    smallest = numbers[np.argmin(sizes)]
+    return GroupsOfSites(count=n, smallest=_sites(label == smallest, grid))
 
 
 def _period(label: np.ndarray) -> tuple[int, int] | None:
@@ -516,23 +520,19 @@ def _angular_families(angular: AngularSystem) -> Iterator[Finding]:
     """Yield the unseen modes of the angular map."""
     if isinstance(angular, HarmonicSystem):
         if angular.missed:
-            yield Finding(
-                "harmonics_unseen",
-                details={
-                    "harmonics": [*map(int, angular.missed)],
-                    "turned": angular.n_views > 1,
-                },
+            yield HarmonicsUnseen(
+                harmonics=tuple(map(int, angular.missed)), turned=angular.n_views > 1
             )
         return
     components = angular.components
     n = len(components.balanced)
     lines = np.arange(len(components.of_site))
     if n > 1 and np.array_equal(components.of_site, components.of_site[lines % n]):
-        yield Finding("periodic_lines", details={"period": n, "of": len(lines)})
+        yield PeriodicLines(period=n, of=len(lines))
     elif n > 1:
-        yield Finding("groups_of_lines", details={"count": n})
+        yield GroupsOfLines(count=n)
     if missing := int((components.of_site < 0).sum()):
-        yield Finding("lines_never_visited", details={"count": missing})
+        yield LinesNeverVisited(count=missing)
 
 
 def equivalent_key(artifact: Artifact, views: Iterable[View]) -> tuple:

@@ -61,6 +61,20 @@ from selfcal_ros.estimation.verdict.leverage import (
     marks_alone,
 )
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.findings import (
+    Cause,
+    Finding,
+    NoisyView,
+    OutlierRemoved,
+    OutliersGivenUp,
+    OutliersKept,
+    OutliersRemoved,
+    SlipBefore,
+    SlipFound,
+    SlipsGivenUp,
+    TakenForSlip,
+    TooManyOutliers,
+)
 from selfcal_ros.model.readings import (
     AFTER_SLIP,
     Key,
@@ -71,7 +85,6 @@ from selfcal_ros.model.readings import (
     without,
 )
 from selfcal_ros.model.terms import ModelTerm
-from selfcal_ros.model.verdict import Cause, Finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,9 +228,9 @@ class SlipPlace:
     chi2: float = 0.0
 
     @property
-    def place(self) -> dict[str, str | int]:
+    def place(self) -> SlipBefore:
         """View, axis and first line of marks after the slip."""
-        return {"view": self.view, "axis": self.axis, "first": self.first}
+        return SlipBefore(self.view, self.axis, self.first)
 
 
 @dataclass(frozen=True)
@@ -237,20 +250,17 @@ class Slip(SlipPlace):
     phi_rad: float = 0.0
     alternatives: tuple[SlipPlace, ...] = ()
 
-    def finding(self, *, spoils: bool) -> Finding:
+    def finding(self, *, spoils: bool) -> SlipFound:
         """Return the slip as a finding; `spoils` if the view had to be kept unsplit."""
-        return Finding(
-            "slip_found",
-            float(np.hypot(self.tx_m, self.ty_m)),
+        return SlipFound(
+            size=float(np.hypot(self.tx_m, self.ty_m)),
             unit="m",
             view=self.view,
-            details={
-                "places": [place.place for place in (self, *self.alternatives)],
-                "x": self.tx_m,
-                "y": self.ty_m,
-                "phi": self.phi_rad,
-                "spoils": spoils,
-            },
+            places=tuple(slip.place for slip in (self, *self.alternatives)),
+            x=self.tx_m,
+            y=self.ty_m,
+            phi=self.phi_rad,
+            spoils=spoils,
         )
 
 
@@ -442,13 +452,7 @@ NEAR_LARGEST = 0.5
 """Share of the largest ratio above which a reading is removed in the same round: an outlier
 increases the residuals of its neighbours."""
 
-LEFT = {
-    "noisy_view",
-    "too_many_outliers",
-    "outliers_kept",
-    "outliers_given_up",
-    "slips_given_up",
-}
+LEFT = (NoisyView, TooManyOutliers, OutliersKept, OutliersGivenUp, SlipsGivenUp)
 """Findings of faults that could not be corrected."""
 
 
@@ -561,21 +565,18 @@ def _without_slips(
             screened,
             notes=(
                 *screened.notes,
-                Finding(
-                    "taken_for_slip",
-                    cause.size,
-                    cause.u,
-                    cause.unit,
-                    cause.p,
-                    cause.view,
-                    cause.axis,
-                    cause.mark,
-                    {
-                        **cause.details,
-                        "cause": cause.name,
-                        "told": cause.told,
-                        "slip_in": slip.view,
-                    },
+                TakenForSlip(
+                    size=cause.size,
+                    u=cause.u,
+                    unit=cause.unit,
+                    p=cause.p,
+                    view=cause.view,
+                    axis=cause.axis,
+                    mark=cause.mark,
+                    cause=cause.name,
+                    slip_in=slip.view,
+                    told=cause.told,
+                    of_cause=cause.details,
                 ),
             ),
         )
@@ -591,7 +592,7 @@ def _without_slips(
         screened,
         notes=(
             *screened.notes,
-            Finding("slips_given_up", details={"slips": len(screened.slips)}),
+            SlipsGivenUp(slips=len(screened.slips)),
         ),
     )
 
@@ -646,17 +647,17 @@ def _reject(
             return (
                 {},
                 residuals_of(measurements, options),
-                Finding("too_many_outliers", details={"limit": MAX_REMOVED}),
+                TooManyOutliers(limit=MAX_REMOVED),
             )
         try:
             residuals = residuals_of(without(measurements, outliers | worst), options)
         except NotIdentifiableError:
-            return outliers, residuals, Finding("outliers_kept")
+            return outliers, residuals, OutliersKept()
         outliers |= worst
     else:
         return (
             *_restored(measurements, options, outliers, residuals),
-            Finding("outliers_given_up", details={"rounds": MAX_STEPS}),
+            OutliersGivenUp(rounds=MAX_STEPS),
         )
     return (*_restored(measurements, options, outliers, residuals), None)
 
@@ -757,31 +758,15 @@ def _findings(
     noisy: tuple[tuple[str, float], ...],
     stopped: Finding | None,
 ) -> list[Finding]:
-    out = (
-        [
-            Finding(
-                "outliers_removed",
-                details={
-                    "number": len(removed),
-                    "first": [
-                        {
-                            "view": item.view,
-                            "kind": item.kind,
-                            "mark": list(item.mark),
-                            "standardised": item.standardised,
-                        }
-                        for item in removed[:FEW_OUTLIERS]
-                    ],
-                },
-            )
-        ]
-        if removed
-        else []
-    )
-    out += [
-        Finding("noisy_view", ratio, unit="m/m", view=name) for name, ratio in noisy
-    ]
-    return out + ([stopped] if stopped else [])
+    findings: list[Finding] = []
+    if removed:
+        first = tuple(
+            OutlierRemoved(item.view, item.kind, item.mark, item.standardised)
+            for item in removed[:FEW_OUTLIERS]
+        )
+        findings.append(OutliersRemoved(number=len(removed), first=first))
+    findings += [NoisyView(size=ratio, unit="m/m", view=name) for name, ratio in noisy]
+    return findings if stopped is None else [*findings, stopped]
 
 
 def _flattened(measurements: Measurements, options: Options) -> Measurements:

@@ -54,9 +54,17 @@ from selfcal_ros.estimation.terms.visits import (
 )
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS
 from selfcal_ros.model.error_map import MANY_DOF, ThetaDatum, rms
+from selfcal_ros.model.findings import (
+    Finding,
+    NothingToPredict,
+    OwnTermsUnknown,
+    PredictionFailed,
+    RestNotConverged,
+    RestNotIdentified,
+)
 from selfcal_ros.model.readings import Measurements, subset
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import Finding, Grade
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan
 
 READINGS_DRAWN = 2_000_000
@@ -490,7 +498,7 @@ def _held_out(
     except (NotIdentifiableError, NoDataError):
         return HeldOut(why=_rest_not_identified(fitted, held_out))
     except NotSettledError:
-        return HeldOut(why=Finding("rest_not_converged"))
+        return HeldOut(why=RestNotConverged())
     predicted = held_readings(solved.joint, fitted, held_out)
     error = prediction_errors(solved, predicted)
     angles = line_errors(solved, angular_data(held_out))
@@ -498,7 +506,7 @@ def _held_out(
     coordinates = np.stack([error[predictable].real, error[predictable].imag])
     lines_off = angles[np.isfinite(angles)]
     if not coordinates.size and not lines_off.size:
-        return HeldOut(why=Finding("nothing_to_predict"))
+        return HeldOut(why=NothingToPredict())
     ratio, limit, why = _ratio_and_limit(
         solved, predicted, predictable=predictable, error=error
     )
@@ -547,7 +555,7 @@ def _ratio_and_limit(
         return (
             ratio,
             NOTHING,
-            Finding("own_terms_unknown", details={"terms": own_terms}),
+            OwnTermsUnknown(terms=tuple(own_terms)),
         )
     if not (noise.sigma_xy > FLOOR and noise.dof_xy > 0):
         return ratio, NOTHING, None
@@ -579,19 +587,8 @@ def _rest_not_identified(fitted: Measurements, held_out: Measurements) -> Findin
         if pose_of(more, plan.artifact) not in poses_held_out and identifies(
             plan.artifact, (*plan.views, more)
         ):
-            return Finding(
-                "rest_not_identified",
-                details={
-                    "add": {
-                        "rotation": more.rotation_rad,
-                        "translation_x": more.translation_m[0],
-                        "translation_y": more.translation_m[1],
-                        "grid": more.grid,
-                        "angular": more.angular,
-                    }
-                },
-            )
-    return Finding("rest_not_identified")
+            return RestNotIdentified(add=more)
+    return RestNotIdentified()
 
 
 def judged_by(
@@ -599,12 +596,12 @@ def judged_by(
 ) -> CalibrationResult:
     """Return the result, disqualified if a prediction error exceeds its limit."""
     failed = tuple(
-        Finding(
-            "prediction_failed",
-            item.ratio,
+        PredictionFailed(
+            size=item.ratio,
             unit="m/m",
             view=item.view,
-            details={"tenth": item.tenth, "limit": item.limit},
+            tenth=item.tenth,
+            limit=item.limit,
         )
         for item in predictions
         if item.exceeds

@@ -32,11 +32,11 @@ from selfcal_ros.estimation.lattice.maps import MapSpline
 from selfcal_ros.estimation.normal.angular import GAP
 from selfcal_ros.model.artifact import Artifact, Interpolation
 from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.findings import Finding, OtherPlate
 from selfcal_ros.model.pose import EDGE
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import Finding
 from selfcal_ros.units import MM_PER_M
 
 
@@ -379,13 +379,13 @@ def check_plate(
                 f"plan '{measurements.plan_id}', ",
             )
         if _of_marks(read_marks.marks[readable], remaining, read_marks.u):
-            return Finding(
-                "other_plate",
-                _size(remaining),
-                read_marks.u,
-                "m",
+            return OtherPlate(
+                size=_size(remaining),
+                u=read_marks.u,
+                unit="m",
                 view=view.view.name,
-                details={"times": many, "of": plate.where},
+                times=many,
+                of=plate.where,
             )
     return None
 

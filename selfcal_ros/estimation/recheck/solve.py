@@ -79,13 +79,21 @@ from selfcal_ros.model.error_map import (
     first_order,
     rms,
 )
+from selfcal_ros.model.findings import (
+    Changed,
+    ChangedOrDrifted,
+    ChangedOrMicroscope,
+    Finding,
+    MicroscopeOff,
+    PlateMisfit,
+    ScaleChanged,
+)
 from selfcal_ros.model.readings import Measurements, ViewReadings
 from selfcal_ros.model.recheck import Recheck
 from selfcal_ros.model.result import CalibrationResult, Noise, Observability
 from selfcal_ros.model.terms import ModelTerm, block_of_offsets
 from selfcal_ros.model.verdict import (
     BudgetLine,
-    Finding,
     Grade,
     ModelResult,
     TermResult,
@@ -250,7 +258,7 @@ def recheck(
         passes=min(view.view.repeats for view in measurements.views),
     )
     declared = {term.name for term in options.terms}
-    changes = _findings(outcome) + _off(solved)
+    changes = _changes(outcome)
     failed = _failed(solved, outcome, changes, drift_declared="drift" in declared)
     covers = {
         "xy": np.sum(list(solved.covariances.values()), axis=0),
@@ -277,7 +285,10 @@ def recheck(
         Observability(unknowns, unknowns, 0, True),
         _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate),
         measurements.all_rejected(),
-        findings=(*(() if failed else changes), *views_findings(measurements)),
+        findings=(
+            *(() if failed else (*changes, *_scale_changes(outcome), *_off(solved))),
+            *views_findings(measurements),
+        ),
         sense=str(measurements.sense),
         kept=kept_covariances(covers),
         run_id=measurements.run_id,
@@ -298,7 +309,7 @@ def recheck(
 def _failed(
     solved: Rechecked,
     outcome: Recheck,
-    changes: tuple[Finding, ...],
+    changes: tuple[Changed, ...],
     *,
     drift_declared: bool,
 ) -> tuple[Finding, ...]:
@@ -314,40 +325,47 @@ def _failed(
         of_images = solved.measurements.has_images
         dof_noise = dof_of_marks(solved.plate.result) if of_images else solved.xy.dof
         failed = _misfit(solved.solution.square, solved.readings.dof, dof_noise)
-    if not outcome.changed:
+    if not changes:
         return failed
     if not failed and outcome.passes == 1 and not drift_declared:
-        failed = (replace(changes[0], name="changed_or_drifted"),)
+        failed = (ChangedOrDrifted(**vars(changes[0])),)
     return failed + _by_microscope(solved, outcome, changes[0])
 
 
-def _findings(outcome: Recheck) -> tuple[Finding, ...]:
-    """Return what has changed: the map, and the scale that is not part of it."""
+def _changes(outcome: Recheck) -> tuple[Changed, ...]:
+    """Return the change of the map, if there is one."""
+    if not outcome.changed:
+        return ()
     largest = outcome.largest
+    return (
+        Changed(
+            size=largest.change,
+            u=largest.u,
+            unit="m",
+            p=outcome.p,
+            axis=largest.axis,
+            x=largest.x,
+            y=largest.y,
+            of=outcome.of,
+        ),
+    )
+
+
+def _scale_changes(outcome: Recheck) -> tuple[ScaleChanged, ...]:
+    """Return the change of the scale, which is not part of the map, if there is one."""
     scale = outcome.scale
-    of = {"of": outcome.of}
-    where = {"x": largest.x, "y": largest.y, **of}
-    out: tuple[Finding, ...] = ()
-    if outcome.changed:
-        out = (
-            Finding(
-                "changed",
-                largest.change,
-                largest.u,
-                "m",
-                outcome.p,
-                axis=largest.axis,
-                details=where,
-            ),
-        )
-    if scale.changed:
-        passes = {"passes": outcome.passes, **of}
-        out += (
-            Finding(
-                "scale_changed", scale.change, scale.u, "m/m", scale.p, details=passes
-            ),
-        )
-    return out
+    if not scale.changed:
+        return ()
+    return (
+        ScaleChanged(
+            size=scale.change,
+            u=scale.u,
+            unit="m/m",
+            p=scale.p,
+            passes=outcome.passes,
+            of=outcome.of,
+        ),
+    )
 
 
 def _off(solved: Rechecked) -> tuple[Finding, ...]:
@@ -364,12 +382,12 @@ def _off(solved: Rechecked) -> tuple[Finding, ...]:
     if (np.abs(values[:2]) <= BEYOND * np.array(sizes)).all():
         return ()
     return (
-        Finding(
-            "microscope_off",
-            float(values[0]),
-            float(u[0]),
-            "m/m",
-            details={"turn": float(values[1]), "u_turn": float(u[1])},
+        MicroscopeOff(
+            size=float(values[0]),
+            u=float(u[0]),
+            unit="m/m",
+            turn=float(values[1]),
+            u_turn=float(u[1]),
         ),
     )
 
@@ -379,7 +397,7 @@ SIMILAR = ("scale", "turn")
 
 
 def _by_microscope(
-    solved: Rechecked, outcome: Recheck, changed: Finding
+    solved: Rechecked, outcome: Recheck, changed: Changed
 ) -> tuple[Finding, ...]:
     """Return a finding if another microscope explains a change as well as a changed stage does.
 
@@ -407,16 +425,12 @@ def _by_microscope(
     scale, turn = readings.effects.mean[rows] + explained_by.values
     u_scale, u_turn = explained_by.u
     return (
-        replace(
-            changed,
-            name="changed_or_microscope",
-            details={
-                **changed.details,
-                "scale": float(scale),
-                "u_scale": float(u_scale),
-                "turn": float(turn),
-                "u_turn": float(u_turn),
-            },
+        ChangedOrMicroscope(
+            **vars(changed),
+            scale=float(scale),
+            u_scale=float(u_scale),
+            turn=float(turn),
+            u_turn=float(u_turn),
         ),
     )
 
@@ -753,7 +767,7 @@ def _misfit(square: float, dof: int, dof_noise: float) -> tuple[Finding, ...]:
     ratio = float(np.sqrt(square / dof))
     if not (p < F_LEVEL and ratio > SAME):
         return ()
-    return (Finding("plate_misfit", ratio, unit="m/m", p=p),)
+    return (PlateMisfit(size=ratio, unit="m/m", p=p),)
 
 
 def _with_coverage(

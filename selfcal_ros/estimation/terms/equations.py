@@ -31,9 +31,9 @@ from selfcal_ros.estimation.normal.equations import TRACE, NormalEquations
 from selfcal_ros.estimation.normal.grid import GridSystem, of_misalignments
 from selfcal_ros.estimation.terms.columns import LineColumns, Shapes, TermColumns
 from selfcal_ros.model.error_map import COVERAGE, MANY_DOF
+from selfcal_ros.model.findings import LooksLikeStage, SeparateTerm
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import ModelTerm
-from selfcal_ros.model.verdict import Finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -1011,10 +1011,9 @@ def require_terms_determined(
         return
     by_term = unseen_by_term(equations)
     alike = tuple(
-        Finding("looks_like_stage", details={"term": name, "count": count})
-        for name, count in by_term.items()
+        LooksLikeStage(term=name, count=count) for name, count in by_term.items()
     )
-    advice = tuple(Finding("separate_term", details={"term": name}) for name in by_term)
+    advice = tuple(SeparateTerm(term=name) for name in by_term)
     free = int(equations.free.sum())
     with_terms = replace(
         observability,

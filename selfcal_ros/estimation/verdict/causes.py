@@ -47,10 +47,10 @@ from selfcal_ros.estimation.terms.places import StagePlaces
 from selfcal_ros.estimation.terms.visits import TermInputs, ViewVisits, without_noise
 from selfcal_ros.estimation.verdict.leverage import FEW_DRAWS, lines_alone
 from selfcal_ros.model.error_map import ErrorMap, rms
+from selfcal_ros.model.findings import Cause
 from selfcal_ros.model.readings import Measurements, turned_over
 from selfcal_ros.model.result import CalibrationResult
 from selfcal_ros.model.terms import ModelTerm
-from selfcal_ros.model.verdict import Cause
 
 READING = "reading"
 
@@ -240,11 +240,11 @@ def off_sites_cause(model: ModelFit, error_map: ErrorMap) -> OffSites | None:
         return None
     worst = np.unravel_index(int(effect.argmax()), effect.shape)
     cause = Cause(
-        OFF_SITES,
-        float(effect[worst]),
-        float(u_of_effect[worst]),
-        "m",
-        p,
+        name=OFF_SITES,
+        size=float(effect[worst]),
+        u=float(u_of_effect[worst]),
+        unit="m",
+        p=p,
         details={"away": places.distance * places.pitch_m},
         effect_rms=rms(effect),
         effect_max=float(effect[worst]),
@@ -858,7 +858,9 @@ def noisier_views(views: Sequence[tuple[str, float, float]]) -> list[Cause]:
         p = float(fdtrc(dof, other_dof, ratio**2)) * len(views)
         if p < CAUSE_LEVEL and ratio > NOISY:
             u = float(ratio * np.sqrt((1 / dof + 1 / other_dof) / 2))
-            causes.append(Cause("noise", float(ratio), u, "m/m", p, name))
+            causes.append(
+                Cause(name="noise", size=float(ratio), u=u, unit="m/m", p=p, view=name)
+            )
     return causes
 
 
@@ -970,7 +972,13 @@ def line_cause(model: ModelFit, measurements: Measurements) -> Cause | None:
     view = measurements.views[problem.angular.index[v]].view.name
     return (
         Cause(
-            READING, float(lines.residual[v, k] / checked), u, "rad", p, view, mark=(k,)
+            name=READING,
+            size=float(lines.residual[v, k] / checked),
+            u=u,
+            unit="rad",
+            p=p,
+            view=view,
+            mark=(k,),
         )
         if p < CAUSE_LEVEL
         else None

@@ -53,6 +53,24 @@ from selfcal_ros.estimation.verdict.uncertainty import (
 )
 from selfcal_ros.estimation.verdict.undetermined import undetermined_effects
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.findings import (
+    AxesNotMet,
+    Cause,
+    Finding,
+    FiniteRotation,
+    LinesSignNotShown,
+    NoiseContradicted,
+    NoiseUnknown,
+    NotConverged,
+    RepeatsContradict,
+    RoughnessUntested,
+    ScaleOfOffsets,
+    SignNotShown,
+    SignShownByLines,
+    TermWithoutReadings,
+    ViewLeftOut,
+    VisitedOnce,
+)
 from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.readings import (
     AFTER_SLIP,
@@ -60,7 +78,7 @@ from selfcal_ros.model.readings import (
     Measurements,
     ViewReadings,
 )
-from selfcal_ros.model.verdict import Cause, Finding, Grade, Provenance, Verdict
+from selfcal_ros.model.verdict import Grade, Provenance, Verdict
 from selfcal_ros.units import NS_PER_S
 
 SIGN_U = 0.3
@@ -139,7 +157,7 @@ def judged(
             *result.findings,
             *_visits_findings(checked),
             *views_findings(measurements),
-            *[Finding("roughness_untested")] * untested,
+            *[RoughnessUntested()] * untested,
             *_without_readings(solved, options),
         ),
         provenance=provenance_of(measurements, options),
@@ -159,25 +177,24 @@ def _failed_tests(
     measurements, options : Measurements, Options
         Its readings, and how they were solved.
     """
-    failed = []
+    failed: list[Finding] = []
     if (
         checked is not solved
         and checked.model is not None
         and checked.model.problem.rigid
     ):
         failed.append(
-            Finding(
-                "finite_rotation",
-                max(abs(view.phi) for view in checked.result.views),
+            FiniteRotation(
+                size=max(abs(view.phi) for view in checked.result.views),
                 unit="rad",
-                details={"residuals": checked.xy.residuals},
+                residuals=checked.xy.residuals,
             )
         )
     p, size_rad = checked.axes
     if not p >= USUAL_LEVEL:
-        failed.append(Finding("axes_not_met", size_rad, unit="rad", p=p))
+        failed.append(AxesNotMet(size=size_rad, unit="rad", p=p))
     if not solved.converged:
-        failed.append(Finding("not_converged"))
+        failed.append(NotConverged())
     failed += _sign_findings(checked, measurements, options)
     failed += _lines_sign_findings(checked, measurements, options)
     return failed
@@ -203,7 +220,7 @@ def _without_readings(solved: Solved, options: Options) -> Iterator[Finding]:
     estimated = {term.name for term in solved.model.problem.terms}
     for term in options.terms:
         if term.size > 0 and term.name not in estimated:
-            yield Finding("term_without_readings", details={"term": str(term.name)})
+            yield TermWithoutReadings(term=str(term.name))
 
 
 def _beyond_repeats(solved: Solved) -> Iterator[Effect]:
@@ -355,8 +372,8 @@ def _sign_findings(
     if _stops_show_the_sign(model, measurements):
         return []
     if with_lines:
-        return [Finding("sign_shown_by_lines")]
-    return [Finding("sign_not_shown")]
+        return [SignShownByLines()]
+    return [SignNotShown()]
 
 
 def _stops_show_the_sign(model: ModelFit, measurements: Measurements) -> bool:
@@ -433,7 +450,7 @@ def _lines_sign_findings(
         read = replace(problem, angular=replace(angular, y=y))
         squared.append(squares(read, fit(read, model.y), of_noise=False)[0])
     worse = (squared[1] - squared[0]) / max(solved.xy.sigma, LEAST_NOISE_M) ** 2
-    return [] if worse > -2 * np.log(SHOWN) else [Finding("lines_sign_not_shown")]
+    return [] if worse > -2 * np.log(SHOWN) else [LinesSignNotShown()]
 
 
 def _scale_findings(
@@ -473,14 +490,14 @@ def _scale_findings(
         []
         if response is None
         else [
-            Finding(
-                "scale_of_offsets",
-                -response.slope,
-                response.u_slope,
+            ScaleOfOffsets(
+                size=-response.slope,
+                u=response.u_slope,
                 unit="m/m",
                 p=response.p,
                 axis=response.axis,
-                details={"most": response.most, "u_scale": u},
+                most=response.most,
+                u_scale=u,
             )
         ]
     )
@@ -495,21 +512,18 @@ def _rigid_fit(measurements: Measurements, options: Options) -> ModelFit | None:
 
 
 def _noise_findings(solved: Solved) -> list[Finding]:
-    out = [
-        Finding(
-            "noise_contradicted",
-            noise.residuals,
+    out: list[Finding] = [
+        NoiseContradicted(
+            size=noise.residuals,
             unit=unit,
             p=noise.p,
-            details={
-                "stated": noise.stated,
-                "declared": bool(np.isfinite(noise.declared)),
-            },
+            stated=noise.stated,
+            declared=bool(np.isfinite(noise.declared)),
         )
         for noise, unit in ((solved.xy, "m"), (solved.theta, "rad"))
         if noise.contradicted
     ]
-    return out if np.isfinite(solved.xy.sigma) else [*out, Finding("noise_unknown")]
+    return out if np.isfinite(solved.xy.sigma) else [*out, NoiseUnknown()]
 
 
 def _visits_findings(solved: Solved) -> list[Finding]:
@@ -523,7 +537,7 @@ def _visits_findings(solved: Solved) -> list[Finding]:
         v.repeated for v in visits
     )
     return (
-        [Finding("visited_once")]
+        [VisitedOnce()]
         if visited_once and not time_fitted and problem.repeats_xy[1] > 0
         else []
     )
@@ -541,11 +555,7 @@ def views_findings(measurements: Measurements) -> Iterator[Finding]:
         n_lost = counts[REPEAT_OUTLIER]
         total = counts[REPEAT_OUTLIER] + n_used[name]
         if n_lost > max(FEW_OUTLIERS, MAX_REMOVED * total):
-            yield Finding(
-                "repeats_contradict",
-                view=name,
-                details={"rejected": n_lost, "of": total},
-            )
+            yield RepeatsContradict(view=name, rejected=n_lost, of=total)
     yield from _left_out_findings(measurements)
 
 
@@ -593,15 +603,12 @@ def _left_out_findings(measurements: Measurements) -> Iterator[Finding]:
                 (Counter(readings.rejected) for readings in readings_of_cells),
                 Counter[str](),
             )
-            yield Finding(
-                "view_left_out",
+            yield ViewLeftOut(
                 view=name,
-                details={
-                    "read": list(n_read),
-                    "asked": list(n_planned),
-                    "rejected": {
-                        str(reason): count for reason, count in rejected.most_common(3)
-                    },
+                read=n_read,
+                asked=n_planned,
+                rejected={
+                    str(reason): count for reason, count in rejected.most_common(3)
                 },
             )
 

@@ -30,10 +30,10 @@ from selfcal_ros.estimation.normal.angular import FLOOR, AngularSystem, Harmonic
 from selfcal_ros.estimation.normal.equations import GAP, PlacedEquations, grid_residuals
 from selfcal_ros.estimation.verdict.uncertainty import Effect
 from selfcal_ros.model.artifact import Interpolation
+from selfcal_ros.model.findings import Cause
 from selfcal_ros.model.plate_form import with_nodes
 from selfcal_ros.model.readings import Measurements, turned_over
 from selfcal_ros.model.result import CalibrationResult
-from selfcal_ros.model.verdict import Cause
 
 NAME = "roughness"
 """Name of the cause, and of the effect."""
@@ -99,11 +99,11 @@ class Adequacy:
             else {"nodes": list(self.nodes)}
         )
         return Cause(
-            NAME,
-            self.lack,
-            0.0,
-            "rad" if self.of_lines else "m",
-            self.p,
+            name=NAME,
+            size=self.lack,
+            u=0.0,
+            unit="rad" if self.of_lines else "m",
+            p=self.p,
             effect_rms=self.lack,
             effect_max=self.lack,
             details=size,

@@ -45,9 +45,10 @@ from selfcal_ros.estimation.verdict.uncertainty import (
     enlargements,
 )
 from selfcal_ros.model.error_map import rms
+from selfcal_ros.model.findings import Cause, Remedy
 from selfcal_ros.model.readings import Measurements
 from selfcal_ros.model.terms import ModelTerm, merged
-from selfcal_ros.model.verdict import Cause, Remedy, TermResult
+from selfcal_ros.model.verdict import TermResult
 
 ALWAYS_SITES = FULL_SIZE**2
 """Field up to which causes are always searched for; in a larger one only if a test fails."""
@@ -466,12 +467,12 @@ def _raised_cause(solved: Solved, test: SizeTest) -> Cause | None:
         return cause  # otherwise the readings do not determine which view or part it is
     largest = max(term.estimates, key=lambda e: abs(e.value))
     return Cause(
-        str(test.name),
-        abs(largest.value),
-        largest.u,
-        largest.unit,
-        test.p,
-        largest.view,
+        name=str(test.name),
+        size=abs(largest.value),
+        u=largest.u,
+        unit=largest.unit,
+        p=test.p,
+        view=largest.view,
         details={"given": test.given},
     )
 

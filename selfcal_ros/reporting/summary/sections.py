@@ -13,6 +13,7 @@ from selfcal_ros.estimation.comparison.covariance import first_order_u
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact, MapGrid
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.findings import ViewLeftOut
 from selfcal_ros.model.pose import without_cell
 from selfcal_ros.model.result import CalibrationResult, Noise, ViewResult
 from selfcal_ros.model.verdict import Grade, Verdict
@@ -225,7 +226,7 @@ def measured(view: ViewResult) -> bool:
 def _in_the_map(result: CalibrationResult) -> Callable[[ViewResult], bool]:
     """Return whether a view was measured, and no finding says that most of it is missing."""
     missing = {
-        finding.view for finding in result.findings if finding.name == "view_left_out"
+        finding.view for finding in result.findings if isinstance(finding, ViewLeftOut)
     }
     return lambda view: measured(view) and without_cell(view.name) not in missing
 

@@ -5,15 +5,55 @@ Elsewhere findings are data. Lengths are in µm, ratios in µm/m, rotations in m
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import fields, replace
+from functools import singledispatch
 from typing import Any, NamedTuple
 
 from selfcal_ros.blocks import blocks
 from selfcal_ros.estimation.verdict.uncertainty import TERM, budgets
+from selfcal_ros.model.findings import (
+    AxesNotMet,
+    BetweenRuns,
+    Cause,
+    DrawnUncertainty,
+    EnlargedRuns,
+    Finding,
+    FiniteRotation,
+    Found,
+    LinesSignNotShown,
+    Magnification,
+    NoiseContradicted,
+    NoiseUnknown,
+    NoisyView,
+    NotConverged,
+    NothingToPredict,
+    NotIdentified,
+    NotInAll,
+    NoUncertainty,
+    OutliersGivenUp,
+    OutliersKept,
+    OutliersRemoved,
+    OwnTermsUnknown,
+    PredictionFailed,
+    ReferenceOff,
+    Remedy,
+    RestNotConverged,
+    RoughnessUntested,
+    ScaleOfOffsets,
+    SignNotShown,
+    SignShownByLines,
+    SlipFound,
+    SlipsGivenUp,
+    TakenForSlip,
+    TermWithoutReadings,
+    TooManyOutliers,
+    Unchecked,
+    VisitedOnce,
+)
 from selfcal_ros.model.result import COMBINED, CalibrationResult, Noise
 from selfcal_ros.model.terms import TIMES
-from selfcal_ros.model.verdict import BudgetLine, Cause, Finding, Grade, Remedy, Verdict
+from selfcal_ros.model.verdict import BudgetLine, Grade, Verdict
 from selfcal_ros.reporting.words import phrases
 from selfcal_ros.reporting.words.observability import worded_observability
 from selfcal_ros.reporting.words.phrases import line_text
@@ -54,13 +94,13 @@ def unit_of(name: str, si: str) -> DisplayUnit:
     return {"m": UM, "rad": MRAD, "m/m": RATIO}.get(si, DisplayUnit(1.0, si))
 
 
-def plus_minus(finding: Finding, unit: DisplayUnit, times: float = 1.0) -> str:
+def plus_minus(finding: Found, unit: DisplayUnit, times: float = 1.0) -> str:
     """Return size without sign, uncertainty with two digits, and unit of a finding.
 
     Parameters
     ----------
-    finding : Finding
-        Finding with size and u.
+    finding : Found
+        Finding or cause with size and u.
     unit : Unit
         Display unit.
     times : float
@@ -75,15 +115,15 @@ def plus_minus(finding: Finding, unit: DisplayUnit, times: float = 1.0) -> str:
     return f"{value:.{digits}f} ± {u:.{digits}f} {unit.name}"
 
 
-def _either(finding: Finding, positive: str, negative: str) -> str:
+def _either(finding: Found, positive: str, negative: str) -> str:
     """Return one of two directions, by the sign of a size."""
     return positive if finding.size >= 0 else negative
 
 
-def _slipped(of: dict[str, Any]) -> str:
+def _slipped(x_m: float, y_m: float, phi_rad: float) -> str:
     return (
-        f"({of['x'] * UM_PER_M:.3g}, {of['y'] * UM_PER_M:.3g}) µm and "
-        f"{of['phi'] * URAD_PER_RAD:.3g} µrad"
+        f"({x_m * UM_PER_M:.3g}, {y_m * UM_PER_M:.3g}) µm and "
+        f"{phi_rad * URAD_PER_RAD:.3g} µrad"
     )
 
 
@@ -115,76 +155,75 @@ _STRAIN: dict[str, Callable[[Cause], str]] = {
     ),
 }
 
-Words = Callable[[Any, dict[str, Any]], str]
-"""A finding and its details -> its sentence."""
-
-_CAUSES: dict[str, Words] = {
-    "microscope": lambda c, of: (
-        _MICROSCOPE[of["part"]](c)
+_CAUSES: dict[str, Callable[[Cause], str]] = {
+    "microscope": lambda c: (
+        _MICROSCOPE[c.details["part"]](c)
         + (
             f", or offsets of the lines too {_either(c, 'large', 'small')} by as much"
-            if of.get("either")
+            if c.details.get("either")
             else ""
         )
     ),
-    "drift": lambda c, of: (
+    "drift": lambda c: (
         f"a drift of {plus_minus(c, UM)} along {c.axis} during view '{c.view}'"
     ),
-    "plate_scale": lambda c, of: (
+    "plate_scale": lambda c: (
         f"a plate {_either(c, 'larger', 'smaller')} by {plus_minus(c, RATIO)} in view '{c.view}' "
-        f"than in view '{of['against']}'"
+        f"than in view '{c.details['against']}'"
     ),
-    "plate_strain": lambda c, of: (
-        f"a plate {_STRAIN[of['part']](c)} by {plus_minus(c, RATIO)} in view '{c.view}' relative "
-        f"to view '{of['against']}'"
+    "plate_strain": lambda c: (
+        f"a plate {_STRAIN[c.details['part']](c)} by {plus_minus(c, RATIO)} in view '{c.view}' "
+        f"relative to view '{c.details['against']}'"
     ),
-    "plate_shape": lambda c, of: (
+    "plate_shape": lambda c: (
         f"a plate bent by {plus_minus(c, UM)} at the middle of an edge in view '{c.view}' relative "
-        f"to view '{of['against']}'"
+        f"to view '{c.details['against']}'"
         + ("" if c.told else ", part of which cannot be separated from the stage")
     ),
-    "line_eccentricity": lambda c, of: (
+    "line_eccentricity": lambda c: (
         f"a circle of lines off the axis of rotation by {plus_minus(c, URAD)} of its radius in "
         f"view '{c.view}'"
     ),
-    "line_scale": lambda c, of: (
+    "line_scale": lambda c: (
         f"offsets of the lines too {_either(c, 'small', 'large')} by {plus_minus(c, PERCENT)}"
         + (
             f", or a microscope that shows lengths too {_either(c, 'long', 'short')} by as much"
-            if of.get("either")
+            if c.details.get("either")
             else ""
         )
     ),
-    "yaw": lambda c, of: (
+    "yaw": lambda c: (
         f"a stage that yaws by up to {plus_minus(c, URAD)} over its travel"
     ),
-    "approach": lambda c, of: (
+    "approach": lambda c: (
         f"an indicated {c.axis} that changes by ±({plus_minus(c, UM)}) with the direction of "
         "approach"
     ),
-    "slip": lambda c, of: (
-        f"a plate that slipped by {_slipped(of)} after about {of['after']:.0%} of view '{c.view}'"
+    "slip": lambda c: (
+        "a plate that slipped by "
+        f"{_slipped(c.details['x'], c.details['y'], c.details['phi'])} after about "
+        f"{c.details['after']:.0%} of view '{c.view}'"
     ),
-    "rotation": lambda c, of: (
+    "rotation": lambda c: (
         f"lines turned {_either(c, 'counter-clockwise', 'clockwise')} by {plus_minus(c, ARCSEC)} "
         f"relative to the marks in view '{c.view}'"
     ),
-    "reading": lambda c, of: (
+    "reading": lambda c: (
         f"a reading of {f'mark {c.mark}' if len(c.mark) > 1 else f'line {c.mark[0]}'} in view "
         f"'{c.view}' that is off by {plus_minus(c, UM if len(c.mark) > 1 else ARCSEC)}"
     ),
-    "off_sites": lambda c, of: (
-        f"a stage that stood {of['away'] * MM_PER_M:.3g} mm off the sites, where its error differs "
-        f"by {plus_minus(c, UM)}"
+    "off_sites": lambda c: (
+        f"a stage that stood {c.details['away'] * MM_PER_M:.3g} mm off the sites, where its error "
+        f"differs by {plus_minus(c, UM)}"
     ),
-    "roughness": lambda c, of: (
-        f"a rotary encoder rougher than the {of['harmonics']} harmonics of its map can follow, by "
-        f"{c.size * ARCSEC_PER_RAD:.3g} arcsec (rms)"
+    "roughness": lambda c: (
+        f"a rotary encoder rougher than the {c.details['harmonics']} harmonics of its map can "
+        f"follow, by {c.size * ARCSEC_PER_RAD:.3g} arcsec (rms)"
         if c.unit == "rad"
-        else f"a stage rougher than the {of['nodes'][0]} x {of['nodes'][1]} nodes of its map can "
-        f"follow, by {c.size * UM_PER_M:.3g} µm (rms)"
+        else f"a stage rougher than the {' x '.join(map(str, c.details['nodes']))} nodes of its "
+        f"map can follow, by {c.size * UM_PER_M:.3g} µm (rms)"
     ),
-    "noise": lambda c, of: (
+    "noise": lambda c: (
         f"{c.size:.2f} times as much noise in view '{c.view}' as in the others"
     ),
 }
@@ -211,158 +250,240 @@ _ACTIONS = {
 }
 """What to do about a cause besides what was tried on the readings."""
 
-SENTENCES: dict[str, Words] = {
-    # tests that failed
-    "not_identified": lambda f, of: "the readings do not identify the stage",
-    "sign_not_shown": lambda f, of: (
+FIXED: dict[type, str] = {
+    NotIdentified: "the readings do not identify the stage",
+    SignNotShown: (
         "nothing in the readings shows the sign of the microscope's offsets, and with the opposite "
         "sign the map would be that of a different stage: have the stage stop next to the marks "
         "deliberately (check_stops in the plan), or declare the microscope (--microscope 0.01)"
     ),
-    "sign_shown_by_lines": lambda f, of: (
+    SignShownByLines: (
         "only lines that turn with the marks show the sign of the microscope's offsets, and "
         "nothing shows that of the lines: if both are opposite, the map is that of a different "
         "stage: have the stage stop next to the marks deliberately (check_stops in the plan), or "
         "declare the microscope (--microscope 0.01)"
     ),
-    "lines_sign_not_shown": lambda f, of: (
+    LinesSignNotShown: (
         "nothing in the readings shows the sign of offset_theta, and with the other sign the "
         "angular map would be that of a different stage: turn the plate by 0.1 mrad or more "
         "between the views, or declare the microscope (--microscope 0.01)"
     ),
-    "scale_of_offsets": lambda f, of: (
-        f"offsets along {f.axis} are {f.size:.3f} ± {f.u:.3f} to {of['most']:.3f} times what the "
-        f"stage moves among repeats, but the scale is taken as 1 ± {of['u_scale']:.3g}: correct "
-        "the pixel size, or add check stops, which determine the scale"
-    ),
-    "not_converged": lambda f, of: (
+    NotConverged: (
         "the estimate converged only without the assumptions about the measurement, which the "
         "readings do not fit: check the sense, the axes and the pixel size of the microscope"
     ),
-    "finite_rotation": lambda f, of: (
-        f"the model is linear, but the plate was turned by up to {f.size * MRAD_PER_RAD:.2f} mrad: "
-        "leave out --misalignment linear (or --method law); solved jointly with finite rotations, "
-        f"the default, the readings leave {of['residuals'] * UM_PER_M:.3g} µm"
-    ),
-    "view_left_out": phrases.view_left_out_text,
-    "noise_contradicted": lambda f, of: _noise_contradicted(f, of),
-    "noise_unknown": lambda f, of: (
+    NoiseUnknown: (
         "grid readings: neither repeats nor residuals determine the noise, so the uncertainty is "
         "not known; read every mark twice"
     ),
-    "axes_not_met": lambda f, of: (
-        "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
-        f"{f.size * ARCSEC_PER_RAD:.3g} arcsec, p = {f.p:.2g}); use zero_mean"
-    ),
-    "changed": phrases.changed_text,
-    "changed_or_drifted": phrases.changed_or_drifted_text,
-    "microscope_off": phrases.microscope_off_text,
-    "changed_or_microscope": phrases.changed_or_microscope_text,
-    "plate_misfit": phrases.misfit_text,
-    "scale_changed": phrases.scale_changed_text,
-    "other_plate": phrases.other_plate_text,
-    "prediction_failed": lambda f, of: (
-        f"{held_out_text(f.view, of['tenth'])} is predicted with {f.size:.2f} times the noise, "
-        f"beyond the limit of {of['limit']:.2f}"
-    ),
-    "between_runs": lambda f, of: (
-        f"the {of['runs']} runs differ by more than their uncertainties: a variation of "
-        f"{f.size * (UM if f.unit == 'm' else ARCSEC).per_si:.3g} "
-        f"{(UM if f.unit == 'm' else ARCSEC).name} (rms) between runs, p = {f.p:.2g}, is in U"
-    ),
-    "enlarged_runs": lambda f, of: (
-        f"the uncertainty of {', '.join(of['runs'])} was enlarged"
-    ),
-    # what was left out, or could not be done
-    "not_in_all": lambda f, of: (
-        f"sites that are not known in all runs are unknown in the mean: {of['sites']}"
-    ),
-    "no_uncertainty": lambda f, of: (
+    NoUncertainty: (
         "no uncertainty map, because of the size of the field: ask for it (--uncertainty always)"
     ),
-    "roughness_untested": lambda f, of: (
+    RoughnessUntested: (
         "whether the nodes of the map suffice for the stage was not tested, and U has no "
         "contribution for it: they are too many (more than 17 x 17, bilinear 15 x 15), or the "
         "readings too few, for a finer map; solve with fewer nodes once, or add a view"
     ),
-    "term_without_readings": lambda f, of: (
-        f"no reading depends on {of['term']}: it is not in the model; leave it out"
-    ),
-    "visited_once": lambda f, of: (
+    VisitedOnce: (
         "each mark was visited once in a view, its repeats one after the other: a drift that is "
         "the same in all views becomes part of the map, and repeats do not show it; visit the "
         "marks there and back, along x and along y"
     ),
-    "few_read": phrases.few_read_text,
-    "repeats_contradict": phrases.repeats_contradict_text,
-    "unchecked": lambda f, of: _unchecked(of["sites"], of["lines"]),
-    "magnification": lambda f, of: (
-        f"the encoders indicate the plate {_either(f, 'larger', 'smaller')} than nominal by "
-        f"{plus_minus(f, RATIO)}, more than plate and encoders should differ: check the pitch in "
-        "the plan (grid_pitch), and the scale of the encoders"
-    ),
-    "reference_off": lambda f, of: (
-        f"by the reference length the encoders indicate lengths "
-        f"{_either(f, 'longer', 'shorter')} than they are by {plus_minus(f, RATIO)}, more than "
-        "encoders should: check its error and the unit of that (relative, not µm/m), and the "
-        "pitch in the plan (grid_pitch)"
-    ),
-    "drawn_uncertainty": lambda f, of: (
-        f"uncertainties of Hu's law from {of['draws']} draws of unit noise: "
-        f"{100 / math.sqrt(2 * of['draws']):.1f} % standard error"
-    ),
-    "outliers_removed": lambda f, of: _outliers_removed(of["number"], of["first"]),
-    "noisy_view": lambda f, of: (
-        f"view '{f.view}' is {f.size:.1f} times as noisy as the others: measure it again"
-    ),
-    "too_many_outliers": lambda f, of: (
-        f"more than {of['limit']:.0%} of the readings contradict the others: none was removed; "
-        "look for a wrong plan or a faulty view"
-    ),
-    "outliers_kept": lambda f, of: (
-        "removing more outliers would leave the stage undetermined"
-    ),
-    "outliers_given_up": lambda f, of: (
-        f"gave up on outliers after {of['rounds']} rounds: the readings seem to contain more; look "
-        "for a wrong plan or a faulty view"
-    ),
-    "slip_found": lambda f, of: _slip_found(f, of),
-    "taken_for_slip": lambda f, of: (
-        f"view '{of['slip_in']}' looks as if the plate slipped, but the readings show "
-        + what_it_is(
-            Cause(**{**vars(f), "name": of["cause"], "told": of.get("told", True)})
-        )
-        + ", which explains them better: no view was split"
-    ),
-    "slips_given_up": lambda f, of: (
-        f"gave up on slips after {of['slips']}: the readings seem to contain more; measure again"
-    ),
-    # why readings held out were not predicted, or not judged
-    "rest_not_converged": lambda f, of: (
-        "cannot be held out: the rest does not converge"
-    ),
-    "nothing_to_predict": lambda f, of: (
-        "nothing to predict: no held-out mark is known from the rest"
-    ),
-    "own_terms_unknown": lambda f, of: (
-        f"its own {' and '.join(of['terms'])} cannot be known: not judged"
-    ),
+    OutliersKept: "removing more outliers would leave the stage undetermined",
+    RestNotConverged: "cannot be held out: the rest does not converge",
+    NothingToPredict: "nothing to predict: no held-out mark is known from the rest",
 }
+"""The sentence of each finding without data."""
 
 
-def _noise_contradicted(finding: Finding, of: dict[str, Any]) -> str:
+@singledispatch
+def sentence_of(finding: Finding | Cause) -> str:
+    """Return the sentence of a finding, for a cause with its remedies.
+
+    Raises
+    ------
+    KeyError
+        If there are no words for it.
+    """
+    text = FIXED.get(type(finding))
+    if text is None:
+        raise KeyError(f"no words for {finding.name}")
+    return text
+
+
+for _text_of in (
+    phrases.changed_or_drifted_text,
+    phrases.changed_or_microscope_text,
+    phrases.changed_text,
+    phrases.few_read_text,
+    phrases.microscope_off_text,
+    phrases.misfit_text,
+    phrases.other_plate_text,
+    phrases.repeats_contradict_text,
+    phrases.scale_changed_text,
+    phrases.view_left_out_text,
+):
+    sentence_of.register(_text_of)
+
+
+@sentence_of.register
+def _(cause: Cause) -> str:
+    return f"{what_it_is(cause)}: {advice(cause)}"
+
+
+@sentence_of.register
+def _(finding: ScaleOfOffsets) -> str:
+    return (
+        f"offsets along {finding.axis} are {finding.size:.3f} ± {finding.u:.3f} to "
+        f"{finding.most:.3f} times what the stage moves among repeats, but the scale is taken as "
+        f"1 ± {finding.u_scale:.3g}: correct the pixel size, or add check stops, which determine "
+        "the scale"
+    )
+
+
+@sentence_of.register
+def _(finding: FiniteRotation) -> str:
+    return (
+        "the model is linear, but the plate was turned by up to "
+        f"{finding.size * MRAD_PER_RAD:.2f} mrad: leave out --misalignment linear (or --method "
+        "law); solved jointly with finite rotations, the default, the readings leave "
+        f"{finding.residuals * UM_PER_M:.3g} µm"
+    )
+
+
+@sentence_of.register
+def _(finding: NoiseContradicted) -> str:
     kind, unit = ("grid", UM) if finding.unit == "m" else ("angular", ARCSEC)
-    name = "the detections' own sigma" if of["declared"] else "repeats"
+    name = "the detections' own sigma" if finding.declared else "repeats"
+    why = (
+        "the readings contain something other than random noise"
+        if finding.size > finding.stated
+        else "repeats share what single readings do not (drift between passes), or the stated "
+        "noise is too large"
+    )
     return (
         f"{kind} readings: residuals show a noise of {finding.size * unit.per_si:.3g} "
-        f"{unit.name}, {name} {of['stated'] * unit.per_si:.3g} {unit.name}; "
-        + (
-            "the readings contain something other than random noise"
-            if finding.size > of["stated"]
-            else "repeats share what single readings do not (drift between passes), or the stated "
-            "noise is too large"
-        )
+        f"{unit.name}, {name} {finding.stated * unit.per_si:.3g} {unit.name}; {why}"
     )
+
+
+@sentence_of.register
+def _(finding: AxesNotMet) -> str:
+    return (
+        "theta: the stage does not satisfy the axis conditions of the datum xy_axes (misclosure "
+        f"{finding.size * ARCSEC_PER_RAD:.3g} arcsec, p = {finding.p:.2g}); use zero_mean"
+    )
+
+
+@sentence_of.register
+def _(finding: PredictionFailed) -> str:
+    return (
+        f"{held_out_text(finding.view, finding.tenth)} is predicted with {finding.size:.2f} times "
+        f"the noise, beyond the limit of {finding.limit:.2f}"
+    )
+
+
+@sentence_of.register
+def _(finding: BetweenRuns) -> str:
+    unit = UM if finding.unit == "m" else ARCSEC
+    return (
+        f"the {finding.runs} runs differ by more than their uncertainties: a variation of "
+        f"{finding.size * unit.per_si:.3g} {unit.name} (rms) between runs, p = {finding.p:.2g}, "
+        "is in U"
+    )
+
+
+@sentence_of.register
+def _(finding: EnlargedRuns) -> str:
+    return f"the uncertainty of {', '.join(finding.runs)} was enlarged"
+
+
+@sentence_of.register
+def _(finding: NotInAll) -> str:
+    return (
+        f"sites that are not known in all runs are unknown in the mean: {finding.sites}"
+    )
+
+
+@sentence_of.register
+def _(finding: TermWithoutReadings) -> str:
+    return f"no reading depends on {finding.term}: it is not in the model; leave it out"
+
+
+@sentence_of.register
+def _(finding: Magnification) -> str:
+    return (
+        f"the encoders indicate the plate {_either(finding, 'larger', 'smaller')} than nominal by "
+        f"{plus_minus(finding, RATIO)}, more than plate and encoders should differ: check the "
+        "pitch in the plan (grid_pitch), and the scale of the encoders"
+    )
+
+
+@sentence_of.register
+def _(finding: ReferenceOff) -> str:
+    return (
+        "by the reference length the encoders indicate lengths "
+        f"{_either(finding, 'longer', 'shorter')} than they are by {plus_minus(finding, RATIO)}, "
+        "more than encoders should: check its error and the unit of that (relative, not µm/m), "
+        "and the pitch in the plan (grid_pitch)"
+    )
+
+
+@sentence_of.register
+def _(finding: DrawnUncertainty) -> str:
+    return (
+        f"uncertainties of Hu's law from {finding.draws} draws of unit noise: "
+        f"{100 / math.sqrt(2 * finding.draws):.1f} % standard error"
+    )
+
+
+@sentence_of.register
+def _(finding: NoisyView) -> str:
+    return (
+        f"view '{finding.view}' is {finding.size:.1f} times as noisy as the others: measure it "
+        "again"
+    )
+
+
+@sentence_of.register
+def _(finding: TooManyOutliers) -> str:
+    return (
+        f"more than {finding.limit:.0%} of the readings contradict the others: none was removed; "
+        "look for a wrong plan or a faulty view"
+    )
+
+
+@sentence_of.register
+def _(finding: OutliersGivenUp) -> str:
+    return (
+        f"gave up on outliers after {finding.rounds} rounds: the readings seem to contain more; "
+        "look for a wrong plan or a faulty view"
+    )
+
+
+@sentence_of.register
+def _(finding: TakenForSlip) -> str:
+    data = {item.name: getattr(finding, item.name) for item in fields(Found)}
+    cause = Cause(
+        **data, name=finding.cause, details=finding.of_cause, told=finding.told
+    )
+    return (
+        f"view '{finding.slip_in}' looks as if the plate slipped, but the readings show "
+        f"{what_it_is(cause)}, which explains them better: no view was split"
+    )
+
+
+@sentence_of.register
+def _(finding: SlipsGivenUp) -> str:
+    return (
+        f"gave up on slips after {finding.slips}: the readings seem to contain more; measure "
+        "again"
+    )
+
+
+@sentence_of.register
+def _(finding: OwnTermsUnknown) -> str:
+    return f"its own {' and '.join(finding.terms)} cannot be known: not judged"
 
 
 def held_out_text(view: str, tenth: int) -> str:
@@ -370,15 +491,16 @@ def held_out_text(view: str, tenth: int) -> str:
     return f"a random tenth ({tenth})" if tenth else f"view '{view}'"
 
 
-def _unchecked(sites: list[list[int]], lines: list[int]) -> str:
+@sentence_of.register
+def _(finding: Unchecked) -> str:
     subject = " and ".join(
         _counted(places, kind)
-        for places, kind in (([tuple(site) for site in sites], "site"), (lines, "line"))
+        for places, kind in ((finding.sites, "site"), (finding.lines, "line"))
         if places
     )
     predicate, them = (
         ("rests on a single reading", "it")
-        if len(sites) + len(lines) == 1
+        if len(finding.sites) + len(finding.lines) == 1
         else ("rest on single readings", "them")
     )
     return (
@@ -387,40 +509,45 @@ def _unchecked(sites: list[list[int]], lines: list[int]) -> str:
     )
 
 
-def _counted(places: list, kind: str) -> str:
+def _counted(places: Sequence[Any], kind: str) -> str:
     if len(places) == 1:
         return f"1 {kind} {places[0]}"
     more = f" and {len(places) - NAMED} more" if len(places) > NAMED else ""
     return f"{len(places)} {kind}s ({', '.join(map(str, places[:NAMED]))}{more})"
 
 
-def _outliers_removed(number: int, first: list[dict[str, Any]]) -> str:
+@sentence_of.register
+def _(finding: OutliersRemoved) -> str:
     named = ", ".join(
-        f"'{item['view']}' {item['kind']} "
-        f"{tuple(item['mark']) if len(item['mark']) > 1 else item['mark'][0]} "
-        f"({item['standardised']:.1f} sigma)"
-        for item in first
+        f"'{reading.view}' {reading.kind} "
+        f"{reading.mark if len(reading.mark) > 1 else reading.mark[0]} "
+        f"({reading.standardised:.1f} sigma)"
+        for reading in finding.first
     )
-    more = f" and {number - len(first)} more" if number > len(first) else ""
-    return f"removed {number} outlier{'s' * (number != 1)}: {named}{more}"
+    n_more = finding.number - len(finding.first)
+    more = f" and {n_more} more" if n_more > 0 else ""
+    plural = "s" * (finding.number != 1)
+    return f"removed {finding.number} outlier{plural}: {named}{more}"
 
 
-def _slip_found(finding: Finding, of: dict[str, Any]) -> str:
+@sentence_of.register
+def _(finding: SlipFound) -> str:
     places = [
-        f"before {place['axis']} = {place['first']}"
-        + ("" if place["view"] == finding.view else f" in view '{place['view']}'")
-        for place in of["places"]
+        f"before {place.axis} = {place.first}"
+        + ("" if place.view == finding.view else f" in view '{place.view}'")
+        for place in finding.places
     ]
+    how_much = _slipped(finding.x, finding.y, finding.phi)
     spoils = "; this spoils the map: measure the view again"
     if len(places) > 1:
         return (
-            f"view '{finding.view}': the plate slipped by about {_slipped(of)}, "
+            f"view '{finding.view}': the plate slipped by about {how_much}, "
             f"{' or '.join(places)}; the readings do not determine which"
-            f"{spoils if of['spoils'] else '; the view is left out'}"
+            f"{spoils if finding.spoils else '; the view is left out'}"
         )
     return (
-        f"view '{finding.view}': the plate slipped {places[0]} by {_slipped(of)}; treated as two "
-        f"placements{spoils if of['spoils'] else ''}"
+        f"view '{finding.view}': the plate slipped {places[0]} by {how_much}; treated as two "
+        f"placements{spoils if finding.spoils else ''}"
     )
 
 
@@ -442,7 +569,7 @@ def _action(name: str) -> str:
 def _cause_words(cause: Cause) -> str:
     """Return the sentence of a cause; of a block of another package its own, if that is there."""
     if cause.name in _CAUSES:
-        return _CAUSES[cause.name](cause, cause.details)
+        return _CAUSES[cause.name](cause)
     block = blocks().get(cause.name)
     if block is not None and block.sentence is not None:
         return block.sentence(cause)
@@ -490,15 +617,6 @@ def _larger_term(cause: Cause, assumed_si: float) -> str:
         f"a term '{name}' as large as {cause.size * unit.per_si:.3g} {unit.name}{where}, "
         f"{f'{ratio:.3g}' if ratio < 1e3 else f'{ratio:.0f}'} times the size assumed"
     )
-
-
-def sentence_of(finding: Finding) -> str:
-    """Return the sentence of a finding, for a cause with its remedies."""
-    if finding.name in SENTENCES:
-        return SENTENCES[finding.name](finding, finding.details)
-    if not isinstance(finding, Cause):
-        raise KeyError(f"no words for {finding.name}")
-    return f"{what_it_is(finding)}: {advice(finding)}"
 
 
 def worded(result: CalibrationResult) -> CalibrationResult:
@@ -573,7 +691,7 @@ def _assumed(line: BudgetLine) -> str:
     return _ASSUMED.get(name, f"a {name} of {{}}").format(size)
 
 
-def _with_text[Kind: Finding](finding: Kind) -> Kind:
+def _with_text[Kind: (Finding, Cause)](finding: Kind) -> Kind:
     return finding if finding.text else replace(finding, text=sentence_of(finding))
 
 
@@ -582,9 +700,8 @@ def worded_verdict(verdict: Verdict, noise: Noise) -> Verdict:
 
     `noise` of the same result tells whether there was something to compare residuals with.
     """
-    new = [
-        finding for finding in (*verdict.failed, *verdict.causes) if not finding.text
-    ]
+    found: tuple[Finding | Cause, ...] = (*verdict.failed, *verdict.causes)
+    new = [finding for finding in found if not finding.text]
     if verdict.sentence and not new:
         return verdict
     reasons = (

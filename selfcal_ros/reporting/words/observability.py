@@ -2,15 +2,38 @@
 """What readings or a plan do not determine, and the views that would, in words."""
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from functools import singledispatch
 
 from selfcal_ros.blocks import block_of
 from selfcal_ros.errors import NotIdentifiableError
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import (
+    AddViews,
+    AddViewsOrFewerNodes,
+    BendingX,
+    BendingY,
+    EveryField,
+    Finding,
+    GroupsOfLines,
+    GroupsOfSites,
+    HarmonicsUnseen,
+    LineOffsets,
+    LinesNeverVisited,
+    LooksLikeStage,
+    MarksMissing,
+    MarksNeverRead,
+    Nonorthogonality,
+    OrAddViews,
+    PeriodicFields,
+    PeriodicLines,
+    RotationSymmetric,
+    ScaleDifference,
+    SeparateTerm,
+    SitesNeverVisited,
+    UndeterminedFields,
+)
 from selfcal_ros.model.result import Observability
-from selfcal_ros.model.verdict import Finding
 from selfcal_ros.model.view import View
 from selfcal_ros.units import MM_PER_M
 
@@ -41,11 +64,7 @@ def with_advice(error: NotIdentifiableError) -> NotIdentifiableError:
 
 def worded(finding: Finding) -> Finding:
     """Return a mode or an advice with its sentence; an existing one is kept."""
-    return (
-        finding
-        if finding.text
-        else replace(finding, text=SENTENCES[finding.name](finding.details))
-    )
+    return finding if finding.text else replace(finding, text=mode_text(finding))
 
 
 def describe_view(view: View, artifact: Artifact) -> str:
@@ -77,97 +96,134 @@ def describe_view(view: View, artifact: Artifact) -> str:
     return description + (also + " and ".join(shifted) if shifted else "")
 
 
-def _add(of: Mapping[str, Any]) -> str:
-    return "add " + " and ".join(
-        describe_view(view, of["plate"]) for view in of["views"]
+FIXED: dict[type[Finding], str] = {
+    Nonorthogonality: "non-orthogonality of the axes: Gx = O y, Gy = O x",
+    ScaleDifference: "scale difference of the axes: Gx = R x, Gy = -R y",
+    BendingX: "steady turn from column to column: Gx = x y, Gy = -x^2/2",
+    BendingY: "steady turn from row to row: Gx = y^2/2, Gy = -x y",
+    EveryField: "everything: one view cannot separate the stage from the plate",
+}
+"""The sentence of each mode without data."""
+
+
+@singledispatch
+def mode_text(finding: Finding) -> str:
+    """Return the sentence of a mode or an advice; KeyError if there is none."""
+    return FIXED[type(finding)]
+
+
+@mode_text.register
+def _(mode: UndeterminedFields) -> str:
+    return (
+        f"{mode.count} fields whose standard uncertainty exceeds ten times the noise of a "
+        "reading"
     )
 
 
-def _line_offsets(of: Mapping[str, Any]) -> str:
-    opposite = f", opposite in opposite {of['lines']}" if of["opposite"] else ""
-    return f"offsets of the {of['lines']} against each other, in x and in y{opposite}"
+@mode_text.register
+def _(mode: SitesNeverVisited) -> str:
+    return f"{mode.count} sites that no mark reaches, the first is {mode.first}"
 
 
-def _periodic(of: Mapping[str, Any]) -> str:
+@mode_text.register
+def _(mode: MarksNeverRead) -> str:
+    return f"{mode.count} marks of the plate that no view reads"
+
+
+@mode_text.register
+def _(mode: LineOffsets) -> str:
+    opposite = f", opposite in opposite {mode.lines}" if mode.opposite else ""
+    return f"offsets of the {mode.lines} against each other, in x and in y{opposite}"
+
+
+@mode_text.register
+def _(mode: RotationSymmetric) -> str:
+    turn = "half" if mode.half else "quarter"
+    return (
+        f"rotation-symmetric fields: every field that a {turn} turn maps to itself "
+        f"({mode.numbers} numbers beside the datum)"
+    )
+
+
+@mode_text.register
+def _(mode: PeriodicFields) -> str:
     along = " and ".join(
         f"every {period} pitches along {axis}"
-        for period, axis in zip(of["period"], "xy", strict=True)
+        for period, axis in zip(mode.period, "xy", strict=True)
         if period > 1
     )
-    return f"patterns that repeat {along} ({of['numbers']} numbers beside the datum)"
+    return f"patterns that repeat {along} ({mode.numbers} numbers beside the datum)"
 
 
-def _groups(of: Mapping[str, Any]) -> str:
-    smallest = [f"({m}, {n})" for m, n in of["smallest"]]
-    more = ["..."] * (len(smallest) > NAMED)
+@mode_text.register
+def _(mode: GroupsOfSites) -> str:
+    more = ["..."] * (len(mode.smallest) > NAMED)
     return (
-        f"{of['count']} groups of sites that no reading connects: each may move "
-        f"independently; the smallest is {', '.join([*smallest[:NAMED], *more])}"
+        f"{mode.count} groups of sites that no reading connects: each may move independently; "
+        f"the smallest is {', '.join([*map(str, mode.smallest[:NAMED]), *more])}"
     )
 
 
-def _harmonics(of: Mapping[str, Any]) -> str:
-    *most, last = map(str, of["harmonics"])
+@mode_text.register
+def _(mode: HarmonicsUnseen) -> str:
+    *most, last = map(str, mode.harmonics)
     numbers = f"s {', '.join(most)} and {last}" if most else f" {last}"
     why = (
         "every turn between views is a whole number of their periods, or nearly so"
-        if of["turned"]
+        if mode.turned
         else "no view turns the lines"
     )
     return f"angular map: harmonic{numbers}, as {why}"
 
 
-def _periodic_lines(of: Mapping[str, Any]) -> str:
-    if of["period"] == of["of"]:
+@mode_text.register
+def _(mode: PeriodicLines) -> str:
+    if mode.period == mode.of:
         return "angular map: everything, as no view turns the lines"
-    return f"angular map: patterns that repeat every {of['period']} lines"
+    return f"angular map: patterns that repeat every {mode.period} lines"
 
 
-SENTENCES: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "nonorthogonality": lambda of: "non-orthogonality of the axes: Gx = O y, Gy = O x",
-    "scale_difference": lambda of: "scale difference of the axes: Gx = R x, Gy = -R y",
-    "bending_x": lambda of: "steady turn from column to column: Gx = x y, Gy = -x^2/2",
-    "bending_y": lambda of: "steady turn from row to row: Gx = y^2/2, Gy = -x y",
-    "undetermined_fields": lambda of: (
-        f"{of['count']} fields whose standard uncertainty exceeds ten times the noise of a reading"
-    ),
-    "sites_never_visited": lambda of: (
-        f"{of['count']} sites that no mark reaches, the first is "
-        f"({of['first'][0]}, {of['first'][1]})"
-    ),
-    "marks_never_read": lambda of: (
-        f"{of['count']} marks of the plate that no view reads"
-    ),
-    "every_field": lambda of: (
-        "everything: one view cannot separate the stage from the plate"
-    ),
-    "line_offsets": _line_offsets,
-    "rotation_symmetric": lambda of: (
-        f"rotation-symmetric fields: every field that a {'half' if of['half'] else 'quarter'} "
-        f"turn maps to itself ({of['numbers']} numbers beside the datum)"
-    ),
-    "periodic_fields": _periodic,
-    "groups_of_sites": _groups,
-    "harmonics_unseen": _harmonics,
-    "periodic_lines": _periodic_lines,
-    "groups_of_lines": lambda of: (
-        f"angular map: {of['count']} groups of lines that no view connects"
-    ),
-    "lines_never_visited": lambda of: (
-        f"{of['count']} angles of the stage that no line reaches"
-    ),
-    "looks_like_stage": lambda of: (
-        f"{of['term']}: {of['count']} mode{'s' * (of['count'] != 1)} of the stage look like it"
-    ),
-    "separate_term": lambda of: (
-        f"{of['term']}: {block_of(of['term']).cure}, or give it a size, as in {of['term']}:SIZE"
-    ),
-    "marks_missing": lambda of: (
-        f"read the missing marks: only {of['sites']} of {of['of_sites']} sites and "
-        f"{of['lines']} of {of['of_lines']} lines are determined"
-    ),
-    "add_views": _add,
-    "or_add_views": lambda of: f"or {_add(of)}",
-    "add_views_or_fewer_nodes": lambda of: f"{_add(of)}, or give the map fewer nodes",
-}
-"""The sentence of each mode and advice."""
+@mode_text.register
+def _(mode: GroupsOfLines) -> str:
+    return f"angular map: {mode.count} groups of lines that no view connects"
+
+
+@mode_text.register
+def _(mode: LinesNeverVisited) -> str:
+    return f"{mode.count} angles of the stage that no line reaches"
+
+
+@mode_text.register
+def _(mode: LooksLikeStage) -> str:
+    modes = f"{mode.count} mode{'s' * (mode.count != 1)}"
+    return f"{mode.term}: {modes} of the stage look like it"
+
+
+@mode_text.register
+def _(advice: SeparateTerm) -> str:
+    cure = block_of(advice.term).cure
+    return f"{advice.term}: {cure}, or give it a size, as in {advice.term}:SIZE"
+
+
+@mode_text.register
+def _(advice: MarksMissing) -> str:
+    return (
+        f"read the missing marks: only {advice.sites} of {advice.of_sites} sites and "
+        f"{advice.lines} of {advice.of_lines} lines are determined"
+    )
+
+
+@mode_text.register
+def _added(advice: AddViews) -> str:
+    views = (describe_view(view, advice.plate) for view in advice.views)
+    return f"add {' and '.join(views)}"
+
+
+@mode_text.register
+def _(advice: OrAddViews) -> str:
+    return f"or {_added(advice)}"
+
+
+@mode_text.register
+def _(advice: AddViewsOrFewerNodes) -> str:
+    return f"{_added(advice)}, or give the map fewer nodes"

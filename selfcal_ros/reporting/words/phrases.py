@@ -3,16 +3,29 @@
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from selfcal_ros.errors import printable
 from selfcal_ros.estimation.verdict.uncertainty import INTERPOLATION
+from selfcal_ros.model.findings import (
+    Changed,
+    ChangedOrDrifted,
+    ChangedOrMicroscope,
+    FewRead,
+    Finding,
+    MicroscopeOff,
+    OtherPlate,
+    PlateMisfit,
+    RepeatsContradict,
+    ScaleChanged,
+    ViewLeftOut,
+)
 from selfcal_ros.model.kept import LACK_OF_FIT
 from selfcal_ros.model.pose import cell_label, without_cell
 from selfcal_ros.model.recheck import LargestChange, Recheck, ScaleChange
 from selfcal_ros.model.result import ViewResult
-from selfcal_ros.model.verdict import BudgetLine, Finding
+from selfcal_ros.model.verdict import BudgetLine
 from selfcal_ros.units import ARCSEC_PER_RAD, MM_PER_M, MRAD_PER_RAD, UM_PER_M
 
 _NOISES = {
@@ -59,35 +72,34 @@ def counted_views(
     return f"{share}{number} view{'s' * (number != 1)}{images}"
 
 
-def few_read_text(finding: Finding, of: dict[str, Any]) -> str:
+def few_read_text(finding: FewRead) -> str:
     """Return the sentence on cells of images with few readings."""
     where = " and ".join(
-        f"in cell {cell_label(cell['cell'])} of the images"
-        f"{f' of view {cell["view"]!r}' * bool(cell['view'])} ({cell['read']} of {cell['shown']})"
-        for cell in of["cells"]
+        f"in cell {cell_label(few.cell)} of the images"
+        f"{f' of view {few.view!r}' * bool(few.view)} ({few.read} of {few.shown})"
+        for few in finding.cells
     )
     unknown = (
         "the camera's error could not be determined"
-        if of["unknown"] is None
-        else (f"the camera's error is not known in {_named(of['unknown'])}")
+        if finding.unknown is None
+        else f"the camera's error is not known in {_named(finding.unknown)}"
     )
     return (
         f"few marks were read {where}: look for dirt or a shadow in that part of the image"
-        + (f"; {unknown}" if of["unknown"] != [] else "")
+        + (f"; {unknown}" if finding.unknown != () else "")
     )
 
 
-def view_left_out_text(finding: Finding, of: dict[str, Any]) -> str:
+def view_left_out_text(finding: ViewLeftOut) -> str:
     """Return the sentence on a view of which nothing, or a small part, became readings."""
     rejected = ", ".join(
-        f"{reason} {count}" for reason, count in of["rejected"].items()
+        f"{reason} {count}" for reason, count in finding.rejected.items()
     )
-    read = of.get("read", [0, 0])  # older results name only views without readings
-    if any(read):
+    if any(finding.read):
         counts = " and ".join(
             f"{got} of {asked} {kind}"
             for got, asked, kind in zip(
-                read, of["asked"], ("marks", "lines"), strict=True
+                finding.read, finding.asked, ("marks", "lines"), strict=True
             )
             if asked
         )
@@ -103,11 +115,11 @@ def view_left_out_text(finding: Finding, of: dict[str, Any]) -> str:
     return f"{text} ({rejected})" if rejected else text
 
 
-def repeats_contradict_text(finding: Finding, of: dict[str, Any]) -> str:
+def repeats_contradict_text(finding: RepeatsContradict) -> str:
     """Return the sentence on a view in which many readings are outliers among repeats."""
     return (
-        f"{of['rejected']} of {of['of']} readings of view '{finding.view}' contradict the other "
-        "repeats of their marks and were left out: the plate slipped within the view, or a "
+        f"{finding.rejected} of {finding.of} readings of view '{finding.view}' contradict the "
+        "other repeats of their marks and were left out: the plate slipped within the view, or a "
         "second publisher sent readings (ros2 topic info -v); measure it again"
     )
 
@@ -120,10 +132,10 @@ def of_few_read(findings: Sequence[Finding]) -> str:
     """Return what the first sentence on a result says of cells with few readings."""
     cells = list(
         dict.fromkeys(
-            tuple(cell["cell"])
+            few.cell
             for finding in findings
-            if finding.name == "few_read"
-            for cell in finding.details.get("cells", [])
+            if isinstance(finding, FewRead)
+            for few in finding.cells
         )
     )
     return f", few of them read in {_named(cells)}" if cells else ""
@@ -222,18 +234,18 @@ def _scale_changed(since: str, scale: ScaleChange, *, one_pass: bool) -> str:
     )
 
 
-def scale_changed_text(finding: Finding, of: Mapping[str, Any]) -> str:
+def scale_changed_text(finding: ScaleChanged) -> str:
     """Return the warning of encoders whose scale against the plate has changed."""
     scale = ScaleChange(True, finding.size, finding.u, finding.p)
-    return _scale_changed(_since(str(of["of"])), scale, one_pass=of.get("passes") == 1)
+    return _scale_changed(_since(finding.of), scale, one_pass=finding.passes == 1)
 
 
-def other_plate_text(finding: Finding, of: Mapping[str, Any]) -> str:
+def other_plate_text(finding: OtherPlate) -> str:
     """Return the reason why what was read is not the plate that is known."""
-    since = _since(str(of["of"]))
+    since = _since(finding.of)
     return (
         f"another plate, or the plate has changed, in view '{printable(finding.view)}': its "
-        f"marks differ from {since} by {finding.size * UM_PER_M:.3g} µm, {of['times']:.0f} times "
+        f"marks differ from {since} by {finding.size * UM_PER_M:.3g} µm, {finding.times:.0f} times "
         "u, and neighbouring marks are not correlated, unlike the errors of a stage: check "
         "which plate it is, that it is clean and lies as planned; if it has changed, calibrate "
         "again"
@@ -274,48 +286,48 @@ def recheck_lines(recheck: Recheck) -> list[str]:
     ]
 
 
-def changed_text(finding: Finding, of: Mapping[str, Any]) -> str:
+def changed_text(finding: Changed) -> str:
     """Return the warning of a stage that has changed."""
-    return _changed(_since(str(of["of"])), _clearest_of(finding, of), finding.p)
+    return _changed(_since(finding.of), _clearest_of(finding), finding.p)
 
 
-def changed_or_drifted_text(finding: Finding, of: Mapping[str, Any]) -> str:
+def changed_or_drifted_text(finding: ChangedOrDrifted) -> str:
     """Return the reason why a change that one pass shows is not qualified."""
     return (
-        f"the map differs from {_since(str(of['of']))}, {_clearest_of(finding, of)} "
+        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
         f"(p = {finding.p:.2g}); {ONE_PASS}"
     )
 
 
-def changed_or_microscope_text(finding: Finding, of: Mapping[str, Any]) -> str:
+def changed_or_microscope_text(finding: ChangedOrMicroscope) -> str:
     """Return the reason why a change that a microscope explains too is not qualified."""
     return (
-        f"the map differs from {_since(str(of['of']))}, {_clearest_of(finding, of)} "
+        f"the map differs from {_since(finding.of)}, {_clearest_of(finding)} "
         f"(p = {finding.p:.2g}); a changed stage, or a microscope with a scale wrong by "
-        f"{of['scale']:+.1%} ± {of['u_scale']:.1%} and turned by "
-        f"{of['turn'] * MRAD_PER_RAD:+.2g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad (k=1) "
+        f"{finding.scale:+.1%} ± {finding.u_scale:.1%} and turned by "
+        f"{finding.turn * MRAD_PER_RAD:+.2g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad (k=1) "
         "explains it alike: measure check stops (check_stops in the plan), or correct the "
         "pixel size"
     )
 
 
-def microscope_off_text(finding: Finding, of: Mapping[str, Any]) -> str:
+def microscope_off_text(finding: MicroscopeOff) -> str:
     """Return the warning of a microscope that is not as assumed, which the readings correct."""
     return (
         f"the scale of the microscope is wrong by {finding.size:+.2%} ± {finding.u:.2%} and it is "
-        f"turned by {of['turn'] * MRAD_PER_RAD:+.3g} ± {of['u_turn'] * MRAD_PER_RAD:.2g} mrad "
+        f"turned by {finding.turn * MRAD_PER_RAD:+.3g} ± {finding.u_turn * MRAD_PER_RAD:.2g} mrad "
         "(k=1), as visits of one mark at several places show: the readings were corrected by "
         "that; correct the pixel size before the next calibration"
     )
 
 
-def _clearest_of(finding: Finding, of: Mapping[str, Any]) -> str:
+def _clearest_of(finding: Changed) -> str:
     return _clearest(
-        LargestChange(of["x"], of["y"], finding.axis, finding.size, finding.u)
+        LargestChange(finding.x, finding.y, finding.axis, finding.size, finding.u)
     )
 
 
-def misfit_text(finding: Finding, _: Mapping[str, Any]) -> str:
+def misfit_text(finding: PlateMisfit) -> str:
     """Return the reason why readings do not fit a known plate."""
     return (
         f"residuals are {finding.size:.2f} times what the noise and the known plate allow "

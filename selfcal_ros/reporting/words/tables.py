@@ -11,9 +11,10 @@ from selfcal_ros.estimation.observability.suggest import Search
 from selfcal_ros.estimation.quality.validation import HeldOut
 from selfcal_ros.estimation.verdict.uncertainty import Budget
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import Finding, RestNotIdentified
 from selfcal_ros.model.terms import TIMES
-from selfcal_ros.model.verdict import BudgetLine, Finding
-from selfcal_ros.model.view import Plan, View
+from selfcal_ros.model.verdict import BudgetLine
+from selfcal_ros.model.view import Plan
 from selfcal_ros.reporting.words.findings import held_out_text, sentence_of
 from selfcal_ros.reporting.words.observability import describe_view
 from selfcal_ros.reporting.words.phrases import dof_text, line_text
@@ -22,18 +23,12 @@ from selfcal_ros.units import ARCSEC_PER_RAD, NM_PER_M, UM_PER_M, URAD_PER_RAD
 
 def why_text(why: Finding | None, artifact: Artifact) -> str:
     """Return why there is no prediction or no limit; empty for None."""
-    if why is None or why.name != "rest_not_identified":
+    if not isinstance(why, RestNotIdentified):
         return "" if why is None else sentence_of(why)
     more = "no single further view would change that"
-    if add := why.details.get("add"):
-        view = View(
-            "",
-            add["rotation"],
-            (add["translation_x"], add["translation_y"]),
-            add["grid"],
-            add["angular"],
-        )
-        more = f"with {describe_view(view, artifact)} measured as well it could be"
+    if why.add is not None:
+        view = describe_view(why.add, artifact)
+        more = f"with {view} measured as well it could be"
     return f"cannot be held out: the rest does not identify the stage; {more}"
 
 

@@ -18,11 +18,11 @@ from selfcal_ros.estimation.comparison.covariance import covariance_of
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.findings import DrawnUncertainty
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.reference import ReferenceKind, ReferenceLength
 from selfcal_ros.model.result import Observability
 from selfcal_ros.model.terms import ModelTerm
-from selfcal_ros.model.verdict import Finding
 from test.support.recalibrations import responses, sizes_of
 from test.support.truth import Spread, hu_plan, random_truth, simulate_measurements
 
@@ -170,10 +170,7 @@ def test_exact_and_drawn_propagation_agree(monkeypatch):
         ratio = getattr(drawn.error_map, name) / getattr(exact.error_map, name)
         assert abs(np.sqrt((ratio**2).mean()) - 1) < 0.1
     assert drawn.noise.sigma_xy == pytest.approx(exact.noise.sigma_xy, rel=0.02)
-    assert (
-        drawn.findings == (Finding("drawn_uncertainty", details={"draws": 400}),)
-        and exact.findings == ()
-    )
+    assert drawn.findings == (DrawnUncertainty(draws=400),) and exact.findings == ()
 
 
 @pytest.mark.parametrize("exact_size", [21, 3])

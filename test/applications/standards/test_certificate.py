@@ -28,9 +28,10 @@ from selfcal_ros.estimation.recheck.plate import known_plate
 from selfcal_ros.estimation.recheck.solve import recheck
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import NotConverged
 from selfcal_ros.model.reference import ReferenceLength
 from selfcal_ros.model.result import result_from_dict, result_to_dict
-from selfcal_ros.model.verdict import Finding, Grade, Verdict
+from selfcal_ros.model.verdict import Grade, Verdict
 from selfcal_ros.outputs import write_json
 from selfcal_ros.reporting.words.findings import worded
 from test.support.lattice_plans import plan_of
@@ -62,9 +63,7 @@ def solved(reference=None, *, lines=8):
 
 
 RESULT = solved()
-BAD = worded(
-    replace(RESULT, verdict=Verdict(Grade.NOT_QUALIFIED, (Finding("not_converged"),)))
-)
+BAD = worded(replace(RESULT, verdict=Verdict(Grade.NOT_QUALIFIED, (NotConverged(),))))
 
 
 def details():

@@ -9,7 +9,7 @@ import pytest
 from selfcal_ros.collection.inputs import Detection
 from selfcal_ros.estimation.api import _fits, calibrate
 from selfcal_ros.estimation.checks.wiring import WiringError
-from selfcal_ros.model.verdict import Cause
+from selfcal_ros.model.findings import Cause
 from selfcal_ros.simulation.cell import CellSettings, plan_events
 from test.support.collecting import gathered
 from test.support.sessions import START_NS, small_plan
@@ -98,7 +98,7 @@ def test_a_microscope_that_undoes_the_sign_speaks_against_it(scale, fits):
     The readings were refused for their lines, although these were right.
     """
     result = calibrate(measured())
-    cause = Cause("microscope", scale, 1e-3, "m/m", 1e-9)
+    cause = Cause(name="microscope", size=scale, u=1e-3, unit="m/m", p=1e-9)
     assert (
         _fits(replace(result, verdict=replace(result.verdict, causes=(cause,)))) is fits
     )

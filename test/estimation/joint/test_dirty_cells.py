@@ -159,7 +159,7 @@ def test_one_row_of_cells_shows_no_camera():
     found, straight = api._camera(measurements, Options())
     assert found is None and straight is measurements
     (finding,) = camera.few_read(measurements, found)
-    assert few_read_text(finding, finding.details).endswith(
+    assert few_read_text(finding).endswith(
         "; the camera's error could not be determined"
     )
 

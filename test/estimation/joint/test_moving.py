@@ -197,11 +197,5 @@ def test_the_worst_reading_is_found_and_no_other():
     (removed,) = (
         finding for finding in found.findings if finding.name == "outliers_removed"
     )
-    assert (
-        removed.details["number"] == 1
-        and removed.details["first"][0]["view"] == "rot90"
-    )
-    assert removed.details["first"][0]["mark"] == [
-        int(views[1].m[50]),
-        int(views[1].n[50]),
-    ]
+    assert removed.number == 1 and removed.first[0].view == "rot90"
+    assert removed.first[0].mark == (int(views[1].m[50]), int(views[1].n[50]))

@@ -9,8 +9,8 @@ import pytest
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.lattice.connectivity import rest_on_one
 from selfcal_ros.estimation.observability.plan_check import check_plan
+from selfcal_ros.model.findings import Unchecked
 from selfcal_ros.model.readings import Sense
-from selfcal_ros.model.verdict import Finding
 from test.support.plans import plan_of
 from test.support.truth import random_truth, simulate_measurements
 
@@ -18,7 +18,7 @@ SIGMA_M = 20e-9
 
 
 def unchecked(sites, lines):
-    return Finding("unchecked", details={"sites": sites, "lines": lines})
+    return Unchecked(sites=sites, lines=lines)
 
 
 def one_by_one(site, mark):
@@ -178,8 +178,8 @@ def test_what_is_counted(names, gone, lines, expected):
     result = calibrate(measured(names, gone, lines=tuple(lines)))
     assert result.findings == expected
     seen = result.observability
-    assert seen.unchecked_sites == sum(len(one.details["sites"]) for one in expected)
-    assert seen.unchecked_lines == sum(len(one.details["lines"]) for one in expected)
+    assert seen.unchecked_sites == sum(len(one.sites) for one in expected)
+    assert seen.unchecked_lines == sum(len(one.lines) for one in expected)
 
 
 def test_a_site_that_is_not_known_is_not_counted():
@@ -197,6 +197,4 @@ def test_a_plan_tells_where_it_leaves_sites_unchecked(names, expected):
     assert check_plan(plan).observability.unchecked_sites == expected
     result = calibrate(measured(names, {}, size=7, size_y=3))
     assert result.observability.unchecked_sites == expected
-    assert all(
-        abs(m) > 1 for found in result.findings for m, _ in found.details["sites"]
-    )
+    assert all(abs(m) > 1 for found in result.findings for m, _ in found.sites)

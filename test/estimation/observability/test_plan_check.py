@@ -165,7 +165,7 @@ def test_four_turns_leave_half_of_n_squared_less_5_fields(size):
     orbits = (size**2 - 1) // 4  # of sites under a quarter turn; the centre stays
     seen = check_plan(plan_of("0, 90, 180, 270", size)).observability
     assert seen.deficiency == 2 * orbits - 2 == (size**2 - 5) // 2
-    assert seen.modes[0].details["numbers"] == seen.deficiency
+    assert seen.modes[0].numbers == seen.deficiency
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_a_touched_camera_is_named_beside_a_changed_stage(scale, turn, sense):
     (found,) = result.verdict.failed
     assert found.name == "changed_or_microscope"
     for name, true in (("scale", scale), ("turn", turn)):
-        assert abs(found.details[name] - true) < 4 * found.details[f"u_{name}"] < 0.1
+        assert abs(getattr(found, name) - true) < 4 * getattr(found, f"u_{name}") < 0.1
 
 
 @pytest.mark.parametrize("view", [{}, STOPS], ids=["", "check stops"])
@@ -132,7 +132,7 @@ def test_a_touched_camera_that_visits_show_is_no_changed_stage(view, stop_m, sen
     assert found.name == "microscope_off" and found.size == pytest.approx(
         -0.1, abs=4 * found.u
     )
-    assert found.details["turn"] == pytest.approx(0.05, abs=4 * found.details["u_turn"])
+    assert found.turn == pytest.approx(0.05, abs=4 * found.u_turn)
     _, plate = calibrated(sense)
     assert result.noise.sigma_xy < 1.5 * plate.result.noise.sigma_xy
 

@@ -14,8 +14,8 @@ from selfcal_ros.blocks import block_of, blocks
 from selfcal_ros.cli.main import main
 from selfcal_ros.errors import InputError
 from selfcal_ros.files import read_yaml, write_yaml
+from selfcal_ros.model.findings import Cause
 from selfcal_ros.model.terms import default_terms, parse_terms
-from selfcal_ros.model.verdict import Cause
 from selfcal_ros.reporting.words.findings import sentence_of
 from selfcal_ros.simulation import physics
 
@@ -161,7 +161,7 @@ def test_a_block_that_cannot_be_used_is_named(tmp_path, monkeypatch, entry, mess
 
 
 def test_a_result_of_an_absent_block_can_be_read():
-    said = sentence_of(Cause("stage_sag", 8e-6, 1e-7, "m/m", 0.0))
+    said = sentence_of(Cause(name="stage_sag", size=8e-6, u=1e-7, unit="m/m", p=0.0))
     assert said.startswith("an effect 'stage_sag' of 8.00 ± 0.10 µm/m")
 
 

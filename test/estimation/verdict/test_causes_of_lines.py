@@ -13,9 +13,10 @@ from selfcal_ros.estimation.joint.model_fit import fit_model
 from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.options import Options
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import Remedy
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
-from selfcal_ros.model.verdict import Grade, Remedy
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings

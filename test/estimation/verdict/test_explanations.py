@@ -12,8 +12,9 @@ from selfcal_ros.estimation.joint.solve import prepare
 from selfcal_ros.estimation.terms.columns import Column
 from selfcal_ros.estimation.verdict.causes import _groups, find_explanations
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import VisitedOnce
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.verdict import Finding, Grade
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import Plan, View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
@@ -259,7 +260,7 @@ def test_repeats_that_are_of_one_time_are_said_to_be(consecutive, repeats, terms
     )
     result = calibrate(readings, replace(OPTIONS, terms=parse_terms(terms, "")))
     assert result.verdict.qualified
-    assert result.findings == ((Finding("visited_once"),) if said else ())
+    assert result.findings == ((VisitedOnce(),) if said else ())
 
 
 def test_a_term_on_which_no_reading_depends_is_said_to_be_left_out():

@@ -16,9 +16,10 @@ from selfcal_ros.estimation.verdict.judge import judged, provenance_of
 from selfcal_ros.estimation.verdict.search import is_searched, search_causes
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ThetaDatum
+from selfcal_ros.model.findings import AxesNotMet
 from selfcal_ros.model.readings import Sense
 from selfcal_ros.model.terms import ModelTerm, parse_terms
-from selfcal_ros.model.verdict import Finding, Grade
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
 from selfcal_ros.simulation.machine import Spread, random_truth
@@ -51,7 +52,7 @@ def test_the_axis_conditions_are_tested_at_5_percent(readings, p, holds):
     verdict = judged(solved, readings, options).result.verdict
     assert verdict.grade is (Grade.GOOD if holds else Grade.NOT_QUALIFIED)
     assert verdict.failed == (
-        () if holds else (Finding("axes_not_met", 3 * ARCSEC_RAD, unit="rad", p=p),)
+        () if holds else (AxesNotMet(size=3 * ARCSEC_RAD, unit="rad", p=p),)
     )
 
 
@@ -325,7 +326,7 @@ def test_repeats_disqualify_a_scale_of_the_microscope_that_no_fit_corrects(
     if wanted:
         (found,) = verdict.failed
         assert found.size == pytest.approx(pixels, abs=0.08) and found.unit == "m/m"
-        assert (found.size > 1) == (pixels > 1) and found.size < found.details["most"]
+        assert (found.size > 1) == (pixels > 1) and found.size < found.most
         assert f"{found.size:.3f} ± {found.u:.3f} to" in verdict.sentence
         assert (
             "the scale is taken as 1 ± 0.01: correct the pixel size" in verdict.sentence

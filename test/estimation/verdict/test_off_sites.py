@@ -10,9 +10,10 @@ from selfcal_ros.applications.papers.methods import calibrate_by
 from selfcal_ros.estimation.api import calibrate
 from selfcal_ros.estimation.joint import model_fit
 from selfcal_ros.model.artifact import Artifact
+from selfcal_ros.model.findings import NotConverged, SignNotShown
 from selfcal_ros.model.readings import GridVisits, Measurements, Sense, ViewReadings
 from selfcal_ros.model.terms import parse_terms
-from selfcal_ros.model.verdict import Finding, Grade
+from selfcal_ros.model.verdict import Grade
 from selfcal_ros.model.view import View
 from selfcal_ros.reporting.words.findings import worded
 from selfcal_ros.simulation.cell import CellSettings
@@ -183,10 +184,7 @@ def test_with_a_microscope_that_nobody_knows_the_sign_of_its_offsets_is_not_show
     """All views lie beside their places alike: a microscope of any scale shows the same."""
     verdict = calibrate(readings(follow=True, rough_m=1e-7)).verdict
     assert verdict.grade is Grade.NOT_QUALIFIED
-    assert (
-        verdict.failed[0] == Finding("sign_not_shown")
-        and verdict.causes[0].name == "off_sites"
-    )
+    assert verdict.failed[0] == SignNotShown() and verdict.causes[0].name == "off_sites"
 
 
 @pytest.mark.parametrize("at_places", [True, False])
@@ -248,7 +246,7 @@ def test_places_that_do_not_converge_are_given_up_and_named(monkeypatch):
     at_sites = calibrate(whole, bare(at_places=False))
     np.testing.assert_array_equal(result.error_map.gx, at_sites.error_map.gx)
     assert result.verdict.grade is Grade.NOT_QUALIFIED
-    assert result.verdict.failed == (Finding("not_converged"),)
+    assert result.verdict.failed == (NotConverged(),)
     assert result.verdict.causes[0].name == "off_sites"
 
 

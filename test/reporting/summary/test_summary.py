@@ -17,6 +17,7 @@ from selfcal_ros.estimation.options import Options
 from selfcal_ros.estimation.verdict.uncertainty import budgets
 from selfcal_ros.model.artifact import Artifact
 from selfcal_ros.model.error_map import ErrorMap, ThetaDatum
+from selfcal_ros.model.findings import Cause, InWords
 from selfcal_ros.model.result import (
     Noise,
     Observability,
@@ -25,8 +26,6 @@ from selfcal_ros.model.result import (
 )
 from selfcal_ros.model.terms import parse_terms
 from selfcal_ros.model.verdict import (
-    Cause,
-    Finding,
     Grade,
     ModelResult,
     TermEstimate,
@@ -62,8 +61,8 @@ UNSEEN = Observability(
     7,
     2,
     False,
-    (Finding("", text="non-orthogonality"), Finding("", text="scale difference")),
-    (Finding("", text="add a view turned by 90 deg"),),
+    (InWords(text="non-orthogonality"), InWords(text="scale difference")),
+    (InWords(text="add a view turned by 90 deg"),),
 )
 
 
@@ -199,7 +198,7 @@ def test_the_line_of_the_topic_has_grade_error_and_each_u_and_is_shown_whole():
         f"U {arcsec(noise.k_theta * emap.u_g_theta.max())}."
     )
     assert len(line) <= 128
-    cause = Cause("slip", text="view 'a' slipped: measure it again")
+    cause = Cause(name="slip", text="view 'a' slipped: measure it again")
     for verdict, lead, reason in (
         (
             Verdict(Grade.NOT_QUALIFIED, causes=(cause,)),
@@ -319,11 +318,11 @@ def test_names_cannot_steer_the_terminal():
 def test_a_verdict_comes_before_everything_else():
     result, _ = known_result()
     cause = Cause(
-        "drift",
-        5.1e-8,
-        2e-9,
-        "m",
-        1e-12,
+        name="drift",
+        size=5.1e-8,
+        u=2e-9,
+        unit="m",
+        p=1e-12,
         text="drift of 51 ± 2 nm along x: solve with --model drift",
     )
     bad = Verdict(
