@@ -117,12 +117,12 @@ def read_positions(path: str | Path, plan: Plan | None) -> list[Position]:
             )
         rows.append(
             Position(
-                where,
-                cells["file"],
-                names.index(view),
-                _metres(cells["x"], where),
-                _metres(cells["y"], where),
-                _stamp_ns(cells[TIME], where) if TIME in heading else None,
+                where=where,
+                file=cells["file"],
+                view=names.index(view),
+                x_m=_metres(cells["x"], where),
+                y_m=_metres(cells["y"], where),
+                stamp_ns=_stamp_ns(cells[TIME], where) if TIME in heading else None,
             )
         )
     if plan:
@@ -251,13 +251,13 @@ def write_pictures(
             f"/{COMMAND_TOPIC}",
             from_model.command(
                 Command(
-                    now,
-                    phase,
-                    plan.plan_id,
-                    index,
-                    planned,
-                    plan.artifact if planned else None,
-                    len(plan.views),
+                    stamp_ns=now,
+                    phase=phase,
+                    plan_id=plan.plan_id,
+                    view_index=index,
+                    view=planned,
+                    artifact=plan.artifact if planned else None,
+                    views_planned=len(plan.views),
                     run_id=run_id,
                     model_terms=plan.model_terms,
                 ),

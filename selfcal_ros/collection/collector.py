@@ -350,12 +350,14 @@ class Collector:
         tracks = {axis: getattr(self.tracks, axis) for axis in self._joints.values()}
         spans = [span for span in (track.store.span() for track in self.tracks) if span]
         return EncoderFacts(
-            {axis: name for name, axis in self._joints.items()},
-            {axis: len(track) > 0 for axis, track in tracks.items()},
-            tuple(self._foreign),
-            (min(s[0] for s in spans), max(s[1] for s in spans)) if spans else None,
-            self.tracks.x.usual_step_s(),
-            self.tracks.x.limits.max_gap_ns / NS_PER_S,
+            names={axis: name for name, axis in self._joints.items()},
+            sampled={axis: len(track) > 0 for axis, track in tracks.items()},
+            foreign=tuple(self._foreign),
+            span_ns=(min(s[0] for s in spans), max(s[1] for s in spans))
+            if spans
+            else None,
+            step_s=self.tracks.x.usual_step_s(),
+            max_gap_s=self.tracks.x.limits.max_gap_ns / NS_PER_S,
         )
 
 

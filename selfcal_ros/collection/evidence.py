@@ -296,12 +296,12 @@ class DetectionsSeen:
             offset = np.stack([table["ox"][good], table["oy"][good]])
             cells = places_of_cells(readings.view, offset)
             named_marks[index] = NamedMarks(
-                readings.view.name,
-                readings.view.on_stage(self.artifact),
-                x + 1j * y,
-                self.sense.sign * where[good] / pitch,
-                _complex(cells) / pitch,
-                _complex(offset - cells) / pitch,
+                view=readings.view.name,
+                pose=readings.view.on_stage(self.artifact),
+                marks=x + 1j * y,
+                stage=self.sense.sign * where[good] / pitch,
+                cells=_complex(cells) / pitch,
+                offsets=_complex(offset - cells) / pitch,
                 listed=self.artifact.marks is not None,
             )
         return named_marks

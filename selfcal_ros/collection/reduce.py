@@ -273,14 +273,14 @@ class _GridMarks:
             )
         )
         return _GridMarks(
-            self.detections[in_cell],
-            index,
-            deviation,
-            residual,
-            position,
-            approach,
-            self.phi_rad,
-            self.cell[in_cell],
+            detections=self.detections[in_cell],
+            index=index,
+            deviation=deviation,
+            residual=residual,
+            position=position,
+            approach=approach,
+            phi_rad=self.phi_rad,
+            cell=self.cell[in_cell],
         )
 
 
@@ -317,14 +317,14 @@ def _grid_marks(
     quarter_line_rad = np.pi / 2 / max(artifact.angular_count, 1)
     phi_determined = assignment.phi_error_rad <= quarter_line_rad
     return _GridMarks(
-        d,
-        index,
-        deviation,
-        residual,
-        position,
-        approach,
-        assignment.rigid.phi_rad if phi_determined else None,
-        number,
+        detections=d,
+        index=index,
+        deviation=deviation,
+        residual=residual,
+        position=position,
+        approach=approach,
+        phi_rad=assignment.rigid.phi_rad if phi_determined else None,
+        cell=number,
     )
 
 

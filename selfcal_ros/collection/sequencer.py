@@ -166,13 +166,13 @@ class Sequencer:
         if phase in (Phase.DONE, Phase.ABORT):
             return Command(0, phase, plan.plan_id, self.index, views_planned=number)
         return Command(
-            0,
-            phase,
-            plan.plan_id,
-            self.index,
-            plan.views[self.index],
-            plan.artifact,
-            number,
+            stamp_ns=0,
+            phase=phase,
+            plan_id=plan.plan_id,
+            view_index=self.index,
+            view=plan.views[self.index],
+            artifact=plan.artifact,
+            views_planned=number,
             model_terms=plan.model_terms,
             artifact_from=plan.artifact_from,
             **plan_keys(plan),

@@ -272,13 +272,13 @@ class Run:
     def _sequencer_command(self) -> Command:
         index = self._sequencer.index
         return Command(
-            self._stamp_ns,
-            Phase.PLACE,
-            self.plan.plan_id,
-            index,
-            self.plan.views[index],
-            self.plan.artifact,
-            len(self.plan.views),
+            stamp_ns=self._stamp_ns,
+            phase=Phase.PLACE,
+            plan_id=self.plan.plan_id,
+            view_index=index,
+            view=self.plan.views[index],
+            artifact=self.plan.artifact,
+            views_planned=len(self.plan.views),
             run_id=self._run_id,
         )
 

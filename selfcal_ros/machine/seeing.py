@@ -168,15 +168,15 @@ def _detection(offset: Offset, stamp_ns: int) -> Detection:
     m, n = offset.mark or (0, 0)
     is_line = offset.theta is not None
     return Detection(
-        offset.stamp_ns or stamp_ns,
-        int(Kind.ANGULAR if is_line else Kind.GRID),
-        (offset.line if is_line else offset.mark) is not None,
-        int(m),
-        int(n),
-        int(offset.line or 0),
-        float(offset.x),
-        float(offset.y),
-        float(offset.theta or 0.0),
-        float(offset.sigma),
-        float(offset.score),
+        stamp_ns=offset.stamp_ns or stamp_ns,
+        kind=int(Kind.ANGULAR if is_line else Kind.GRID),
+        has_id=(offset.line if is_line else offset.mark) is not None,
+        m=int(m),
+        n=int(n),
+        k=int(offset.line or 0),
+        offset_x=float(offset.x),
+        offset_y=float(offset.y),
+        offset_theta=float(offset.theta or 0.0),
+        sigma=float(offset.sigma),
+        score=float(offset.score),
     )

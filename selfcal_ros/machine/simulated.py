@@ -78,13 +78,13 @@ class SimulatedMachine:
         self._rested = self._n_placed = self._free_ns = 0
         self._lay(
             Command(
-                0,
-                Phase.PLACE,
-                self._plan.plan_id,
-                0,
-                self._plan.views[0],
-                self._plan.artifact,
-                len(self._plan.views),
+                stamp_ns=0,
+                phase=Phase.PLACE,
+                plan_id=self._plan.plan_id,
+                view_index=0,
+                view=self._plan.views[0],
+                artifact=self._plan.artifact,
+                views_planned=len(self._plan.views),
             )
         )
 

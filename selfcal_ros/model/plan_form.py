@@ -220,13 +220,13 @@ def _view_from_dict(data: object, where: str, artifact: Artifact, order: str) ->
             where, "neither grid nor angular marks are wanted", "set one to true"
         )
     return View(
-        _name(raw["name"], f"{where}: name"),
-        turn,
-        (a, b),
-        raw["grid"],
-        raw["angular"],
-        raw["repeats"],
-        _order(raw["visit_order"], where),
+        name=_name(raw["name"], f"{where}: name"),
+        rotation_rad=turn,
+        translation_m=(a, b),
+        grid=raw["grid"],
+        angular=raw["angular"],
+        repeats=raw["repeats"],
+        visit_order=_order(raw["visit_order"], where),
     )
 
 

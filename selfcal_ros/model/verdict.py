@@ -218,12 +218,12 @@ def verdict_from_dict(data: dict | None, *, identifiable: bool) -> Verdict:
     if qualified is (grade is Grade.NOT_QUALIFIED):
         raise ValueError(f"the grade '{grade}' contradicts qualified {qualified}")
     return Verdict(
-        grade,
-        tuple(map(finding_from_dict, read(list, data.get("failed", [])))),
-        tuple(map(cause_from_dict, read(list, data["causes"]))),
-        read(tuple[Enlargement, ...], data.get("enlarged_by", [])),
-        read(str, data["sentence"]),
-        read(tuple[str, ...], data["reasons"]),
+        grade=grade,
+        failed=tuple(map(finding_from_dict, read(list, data.get("failed", [])))),
+        causes=tuple(map(cause_from_dict, read(list, data["causes"]))),
+        enlarged_by=read(tuple[Enlargement, ...], data.get("enlarged_by", [])),
+        sentence=read(str, data["sentence"]),
+        reasons=read(tuple[str, ...], data["reasons"]),
     )
 
 

@@ -88,7 +88,16 @@ def visit_sequence(
     chosen = parse_order(order or view.visit_order or DEFAULT_ORDER)
     if not view.grid:
         m, n, i, j, count, index = np.zeros((6, 0), dtype=int)
-        return VisitSequence(m, n, i, j, count, index, np.zeros(0), np.zeros((2, 0)))
+        return VisitSequence(
+            m=m,
+            n=n,
+            i=i,
+            j=j,
+            count=count,
+            pass_number=index,
+            time=np.zeros(0),
+            aside_m=np.zeros((2, 0)),
+        )
     marks, sites = view.on_stage(artifact).marks_in_field(artifact)
     n_passes = 1 if consecutive else view.repeats
     # no lines of sites off the lattice
@@ -207,7 +216,16 @@ def _visits(
     count = np.add.reduceat(exposures, first)
     time = np.cumsum(count) - (count + 1) / 2
     (m, n), (i, j) = marks[:, index[first]], sites[:, index[first]]
-    return VisitSequence(m, n, i, j, count, number[first], time, aside[:, first])
+    return VisitSequence(
+        m=m,
+        n=n,
+        i=i,
+        j=j,
+        count=count,
+        pass_number=number[first],
+        time=time,
+        aside_m=aside[:, first],
+    )
 
 
 def check_marks(sites: np.ndarray, number: int) -> np.ndarray:

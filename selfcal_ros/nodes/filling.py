@@ -84,7 +84,13 @@ def map_geometry(error_map: ErrorMap) -> MapGeometry:
     )
     below = -(artifact.half[1] * artifact.grid_pitch_m + 1.5 * spacing)
     return MapGeometry(
-        factor, ends, sites, _colours(u, largest), spacing, legend, (0.0, below, 0.0)
+        factor=factor,
+        ends=ends,
+        sites=sites,
+        colours=_colours(u, largest),
+        spacing_m=spacing,
+        legend=legend,
+        legend_at=(0.0, below, 0.0),
     )
 
 

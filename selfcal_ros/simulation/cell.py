@@ -398,13 +398,13 @@ def plan_events(
     for index, view in enumerate(plan.views):
         for phase in (Phase.PLACE, Phase.MEASURE):
             yield Command(
-                now,
-                phase,
-                plan.plan_id,
-                index,
-                view,
-                plan.artifact,
-                len(plan.views),
+                stamp_ns=now,
+                phase=phase,
+                plan_id=plan.plan_id,
+                view_index=index,
+                view=view,
+                artifact=plan.artifact,
+                views_planned=len(plan.views),
                 model_terms=plan.model_terms,
                 artifact_from=plan.artifact_from,
                 **plan_keys(plan),

@@ -182,7 +182,12 @@ _NODE: Section = {
 
 
 def _keys(*names: str, unit: str = "", high: float = 1.0) -> Section:
-    return {name: Parameter(name, 0.0, "", unit, 0.0, high) for name in names}
+    return {
+        name: Parameter(
+            name=name, default=0.0, description="", unit=unit, low=0.0, high=high
+        )
+        for name in names
+    }
 
 
 def field_of(key: str, kind: type) -> str:
@@ -242,7 +247,14 @@ PHYSICS: Section = {
     if name not in TRUTH and field_of(name, Spread)
 }
 FAULTS: Section = _keys(*PARTS) | {
-    f"{name}{unit}": Parameter(f"{name}{unit}", 0.0, "", "s", 0.0, 3600.0)
+    f"{name}{unit}": Parameter(
+        name=f"{name}{unit}",
+        default=0.0,
+        description="",
+        unit="s",
+        low=0.0,
+        high=3600.0,
+    )
     for unit in ("", "_s")
     for name in ("delay", "clock_step", "encoder_gap")
 }
@@ -262,12 +274,19 @@ CAMERA: Section = (
             "mirror",
         )
     }
-    | {name: Parameter(name, 0, "", "px", 8, 10_000) for name in ("width", "height")}
+    | {
+        name: Parameter(
+            name=name, default=0, description="", unit="px", low=8, high=10_000
+        )
+        for name in ("width", "height")
+    }
     | _keys("blur", unit="px", high=100.0)
     | _keys("dirt", high=1000.0)
     | _keys("ground", "contrast", "read_noise", "shot_noise", "vignetting")
     | {
-        "distortion": Parameter("distortion", 0.0, "", "", -0.5, 0.5),
+        "distortion": Parameter(
+            name="distortion", default=0.0, description="", unit="", low=-0.5, high=0.5
+        ),
         "encoding": Parameter("encoding", "mono8", "", choices=("mono8", "mono16")),
     }
 )
@@ -285,7 +304,14 @@ TOP = (
         low=0,
         high=2**61,
     ),
-    Parameter("start_time", 1.7e9, "first stamp", "s", 0.0, LAST_START_S),
+    Parameter(
+        name="start_time",
+        default=1.7e9,
+        description="first stamp",
+        unit="s",
+        low=0.0,
+        high=LAST_START_S,
+    ),
     Parameter("compression", "zstd", "of the bag", choices=("zstd", "lz4", "none")),
 )
 

@@ -248,12 +248,12 @@ class MarkDetector:
             return fault
         u_u, u_v = fit.sigmas
         return Mark(
-            column + float(fit.centre[0]),
-            row + float(fit.centre[1]),
-            u_u,
-            u_v,
-            min(max(fit.explained, 0.0), 1.0),
-            fit,
+            u=column + float(fit.centre[0]),
+            v=row + float(fit.centre[1]),
+            u_u=u_u,
+            u_v=u_v,
+            score=min(max(fit.explained, 0.0), 1.0),
+            fit=fit,
         )
 
     def _fault(self, fit: Fit) -> MarkFault | None:

@@ -270,12 +270,12 @@ class _PairOfAxes:
         centred = targets[0] - targets[0].mean()
         along, corrected = self.pair
         return OneAxisPart(
-            f"{corrected} from the position of {along}{without}",
-            rms(centred),
-            float(np.abs(centred).max()),
-            rms_left,
-            largest_left,
-            self.u,
+            name=f"{corrected} from the position of {along}{without}",
+            rms=rms(centred),
+            largest=float(np.abs(centred).max()),
+            rms_left=rms_left,
+            largest_left=largest_left,
+            u=self.u,
         )
 
     def _spline(self, target: np.ndarray) -> np.ndarray:
@@ -327,12 +327,12 @@ def _squareness(
     nodes, u = turning[0].nodes, turning[0].u
     far = float(np.abs(nodes).max())
     return OneAxisPart(
-        "squareness",
-        abs(map_slope) * rms(nodes),
-        abs(map_slope) * far,
-        residual_slope * rms(nodes),
-        residual_slope * far,
-        u,
+        name="squareness",
+        rms=abs(map_slope) * rms(nodes),
+        largest=abs(map_slope) * far,
+        rms_left=residual_slope * rms(nodes),
+        largest_left=residual_slope * far,
+        u=u,
     )
 
 

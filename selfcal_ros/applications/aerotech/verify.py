@@ -194,7 +194,14 @@ def verify_tables(
             entries = _at_entries(error, xy, frame, evaluator)
     if theta:
         lines = _at_lines(error_map, frame, CalEvaluator(theta, setup_of(frame)))
-    return TableVerification(frame, sites, between, lines, one_axis, entries)
+    return TableVerification(
+        frame=frame,
+        sites=sites,
+        between=between,
+        lines=lines,
+        one_axis=one_axis,
+        entries=entries,
+    )
 
 
 def _at_entries(
@@ -250,12 +257,12 @@ def _at_entries(
     residual_m = np.sign(residual_m) * np.maximum(np.abs(residual_m) - doubt, 0.0)
     mean = error[:, :sites].mean(axis=1)
     return Residual(
-        "entries",
-        position[:, sites:],
-        (error - mean[:, None])[:, sites:],
-        residual_m[:, sites:],
-        mean,
-        np.zeros(2),
+        place="entries",
+        position=position[:, sites:],
+        before=(error - mean[:, None])[:, sites:],
+        after=residual_m[:, sites:],
+        shift_before=mean,
+        shift_after=np.zeros(2),
     )
 
 

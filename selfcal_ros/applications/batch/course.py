@@ -87,7 +87,13 @@ def course_of(
     Without a decision, which `courses` makes for all quantities together.
     """
     nothing = Course(
-        len(values), (0.0, 0.0, 0.0), 1.0, 1.0, 0, float(values[0]), float(values[0])
+        n=len(values),
+        slope_per_day=(0.0, 0.0, 0.0),
+        p_trend=1.0,
+        p_change=1.0,
+        change=0,
+        before=float(values[0]),
+        after=float(values[0]),
     )
     if len(values) < FEWEST or np.ptp(values) == 0 or np.ptp(days) == 0:
         return nothing
@@ -97,13 +103,13 @@ def course_of(
     change = step_of(values)
     p_change = pettitt(values, rng, orders=orders)
     return Course(
-        len(values),
-        (float(slope), float(low), float(high)),
-        float(stats.kendalltau(days, values).pvalue),
-        p_change,
-        change,
-        float(np.median(values[:change])),
-        float(np.median(values[change:])),
+        n=len(values),
+        slope_per_day=(float(slope), float(low), float(high)),
+        p_trend=float(stats.kendalltau(days, values).pvalue),
+        p_change=p_change,
+        change=change,
+        before=float(np.median(values[:change])),
+        after=float(np.median(values[change:])),
     )
 
 

@@ -86,12 +86,12 @@ class Format:
 
 FORMATS = {
     "kmotion": Format(
-        "Dynomotion KMotion: Geo Table",
-        write_kmotion,
-        read_kmotion,
-        "# ",
-        "in",
-        True,
+        what="Dynomotion KMotion: Geo Table",
+        write=write_kmotion,
+        read=read_kmotion,
+        comment="# ",
+        unit="in",
+        comments_last=True,
         notes=("positions in the unit of KMotion's coordinates, which is the inch",),
         steps=(
             "KMotionCNC, Tool Setup, Trajectory Planner: enter {files} as Geometric Correction",

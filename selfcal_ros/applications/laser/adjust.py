@@ -210,11 +210,11 @@ def _solution(
     by_linear[is_linear] = np.eye(int(is_linear.sum()))
     by_linear[free] = -gain @ by_errors[:, is_linear]
     return Adjusted(
-        errors,
-        tilt,
-        by_readings,
-        by_linear,
-        data.readings_m - geometry.readings(errors, tilt),
-        left,
-        -left @ by_errors[:, is_linear],
+        errors_m=errors,
+        tilt=tilt,
+        by_readings=by_readings,
+        by_linear=by_linear,
+        residuals_m=data.readings_m - geometry.readings(errors, tilt),
+        residuals_by_readings=left,
+        residuals_by_linear=-left @ by_errors[:, is_linear],
     )

@@ -223,13 +223,13 @@ def identify_wang(data: StepDiagonal) -> StepDiagonalResult:
         jac = jacobian(lambda r: solve_blocks(data, r, gain), readings)
         covariance = jac @ reading_covariance(data, noise) @ jac.T
     return StepDiagonalResult(
-        data.steps_m,
-        errors,
-        covariance,
-        Method.CONVENTIONAL,
-        Form.PRINTED,
-        {},
-        Closure(residual_rms_m=_residual(data, readings)),
+        steps_m=data.steps_m,
+        errors_m=errors,
+        covariance=covariance,
+        method=Method.CONVENTIONAL,
+        form=Form.PRINTED,
+        mirror_rad={},
+        closure=Closure(residual_rms_m=_residual(data, readings)),
     )
 
 
@@ -306,20 +306,20 @@ def identify_ibaraki(
             by_diagonal = [adjust(data.pick([name])) for name in data.diagonals]
             between, u_between = between_diagonals(data, by_diagonal)
     return StepDiagonalResult(
-        data.steps_m,
-        adjusted.errors_m,
-        propagated(data, adjusted.by_readings, adjusted.by_linear),
-        Method.NEW,
-        form,
-        mirror,
-        Closure(
-            lengths[0],
-            lengths[1],
-            between,
-            u_between,
-            residual,
-            u_residual,
-            contradiction,
+        steps_m=data.steps_m,
+        errors_m=adjusted.errors_m,
+        covariance=propagated(data, adjusted.by_readings, adjusted.by_linear),
+        method=Method.NEW,
+        form=form,
+        mirror_rad=mirror,
+        closure=Closure(
+            lengths_m=lengths[0],
+            u_lengths_m=lengths[1],
+            between_m=between,
+            u_between_m=u_between,
+            residual_rms_m=residual,
+            u_residual_rms_m=u_residual,
+            contradiction=contradiction,
         ),
     )
 
@@ -366,13 +366,13 @@ def _paper(
     by_linear = jacobian(lambda e: solve(readings, e).mean(axis=0), linear)
     between = by_diagonal[0] - by_diagonal[1] if len(by_diagonal) == 2 else None
     return StepDiagonalResult(
-        data.steps_m,
-        by_diagonal.mean(axis=0),
-        propagated(data, by_readings, by_linear),
-        Method.NEW,
-        form,
-        {},
-        Closure(*lengths, between),
+        steps_m=data.steps_m,
+        errors_m=by_diagonal.mean(axis=0),
+        covariance=propagated(data, by_readings, by_linear),
+        method=Method.NEW,
+        form=form,
+        mirror_rad={},
+        closure=Closure(*lengths, between),
     )
 
 

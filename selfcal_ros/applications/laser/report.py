@@ -299,7 +299,13 @@ def profiles_figure(result: StepDiagonalResult, data: StepDiagonal) -> Drawing:
 def truth_of(machine: StepMachine) -> dict[str, Any]:
     """Return the result of a perfect identification of a machine, mm, in the datum of results."""
     truth = StepDiagonalResult(
-        machine.steps_m, machine.truth_m(), None, "", "", {}, Closure()
+        steps_m=machine.steps_m,
+        errors_m=machine.truth_m(),
+        covariance=None,
+        method="",
+        form="",
+        mirror_rad={},
+        closure=Closure(),
     )
     errors = {
         profiles.name_of(j, c): (truth.errors_m[j, :, c] / M_PER_MM).tolist()

@@ -60,24 +60,24 @@ class Published:
 
 TABLES = (
     Published(
-        "Table 1",
-        ("Figure 6", "Figure 7"),
-        (20, 20),
-        0.02,
-        0.001,
-        (
+        name="Table 1",
+        figures=("Figure 6", "Figure 7"),
+        n_draws=(20, 20),
+        sigma_um=0.02,
+        sigma_deg=0.001,
+        table=(
             (0.0541, -0.0490, 0.0195),
             (0.0511, -0.0506, 0.0196),
             (1.5877e-3, -1.2065e-3, 7.1184e-4),
         ),
     ),
     Published(
-        "Table 2",
-        ("Figure 8", "Figure 9"),
-        (10, 20),
-        0.002,
-        0.0001,
-        (
+        name="Table 2",
+        figures=("Figure 8", "Figure 9"),
+        n_draws=(10, 20),
+        sigma_um=0.002,
+        sigma_deg=0.0001,
+        table=(
             (0.0051, -0.0051, 0.0020),
             (0.0051, -0.0053, 0.0020),
             (2.9963e-4, -6.9733e-4, 7.6657e-5),

@@ -353,8 +353,8 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
     artifact = measurements.artifact
     sites = artifact.shape[0] * artifact.shape[1]
     result = CalibrationResult(
-        measurements.plan_id,
-        ErrorMap(
+        plan_id=measurements.plan_id,
+        error_map=ErrorMap(
             artifact,
             gx,
             gy,
@@ -366,10 +366,10 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
             scale_difference=float(solution.r[0]),
             datum_theta=law.datum,
         ),
-        ArtifactMap(
+        artifact_map=ArtifactMap(
             solution.a[0, ..., 0], solution.a[1, ..., 0], solution.a_theta[:, 0]
         ),
-        tuple(
+        views=tuple(
             ViewResult(
                 view.view.name,
                 view.view.rotation_rad,
@@ -383,11 +383,11 @@ def solve_law(measurements: Measurements, options: Options) -> Solved:
             for i, view in enumerate(measurements.views)
         ),
         # complete views: each site and each line has two readings or more
-        Observability(
+        observability=Observability(
             4 * sites + 9, 4 * sites + 9, 0, True, unchecked_sites=0, unchecked_lines=0
         ),
-        noise,
-        measurements.all_rejected(),
+        noise=noise,
+        rejected=measurements.all_rejected(),
         findings=_findings(artifact, options),
         method="law",
         sense=str(sense),

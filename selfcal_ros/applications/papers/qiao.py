@@ -172,13 +172,13 @@ def reproduce_qiao(
         planned_system(ARTIFACT, plan.views), ARTIFACT, ThetaDatum.XY_AXES
     ).rms_xy
     return QiaoReproduction(
-        np.array([[s.rank for s in row] for row in observability]),
-        np.array([[s.unknowns for s in row] for row in observability]),
-        (first, second),
-        _rms(normal),
-        _rms(uniform),
-        normal[0],
-        gain * SIGMA_M * UM_PER_M,
+        ranks=np.array([[s.rank for s in row] for row in observability]),
+        unknowns=np.array([[s.unknowns for s in row] for row in observability]),
+        programs=(first, second),
+        rms_um=_rms(normal),
+        rms_uniform_um=_rms(uniform),
+        error_um=normal[0],
+        bound_um=gain * SIGMA_M * UM_PER_M,
     )
 
 
@@ -204,7 +204,12 @@ def _with_uniform_noise(
     def shaken(view: ViewReadings) -> ViewReadings:
         dx, dy = rng.uniform(-SIGMA_M, SIGMA_M, (2, len(view.dx)))
         return ViewReadings(
-            view.view, view.m, view.n, view.dx + dx, view.dy + dy, view.count
+            view=view.view,
+            m=view.m,
+            n=view.n,
+            dx=view.dx + dx,
+            dy=view.dy + dy,
+            count=view.count,
         )
 
     return Measurements(
@@ -257,13 +262,13 @@ def _truth_of(vector: np.ndarray, artifact: Artifact, n_views: int) -> Truth:
     shape = (2, *artifact.shape)
     tail = vector[4 * sites :].reshape(n_views, 3)
     return Truth(
-        artifact,
-        vector[: 2 * sites].reshape(shape),
-        vector[2 * sites : 4 * sites].reshape(shape),
-        np.zeros(0),
-        np.zeros(0),
-        tail[:, 0] / pitch,
-        tail[:, 1:],
+        artifact=artifact,
+        g=vector[: 2 * sites].reshape(shape),
+        a=vector[2 * sites : 4 * sites].reshape(shape),
+        g_theta=np.zeros(0),
+        a_theta=np.zeros(0),
+        phi_rad=tail[:, 0] / pitch,
+        t_m=tail[:, 1:],
         linear=True,
     )
 

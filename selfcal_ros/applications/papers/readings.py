@@ -142,9 +142,37 @@ def hu_plan(artifact: Artifact, repeats: int = 1, plan_id: str = "hu") -> Plan:
     line = 2 * np.pi / artifact.angular_count if artifact.angular_count else 0.0
     angular = artifact.angular_count > 0
     views = [
-        View("identity", 0.0, (0.0, 0.0), True, angular, repeats),
-        View("rot90", np.pi / 2, (0.0, 0.0), True, angular, repeats),
-        View("line", line, (0.0, 0.0), False, True, repeats),
-        View("shift_x", 0.0, (artifact.grid_pitch_m, 0.0), True, angular, repeats),
+        View(
+            name="identity",
+            rotation_rad=0.0,
+            translation_m=(0.0, 0.0),
+            grid=True,
+            angular=angular,
+            repeats=repeats,
+        ),
+        View(
+            name="rot90",
+            rotation_rad=np.pi / 2,
+            translation_m=(0.0, 0.0),
+            grid=True,
+            angular=angular,
+            repeats=repeats,
+        ),
+        View(
+            name="line",
+            rotation_rad=line,
+            translation_m=(0.0, 0.0),
+            grid=False,
+            angular=True,
+            repeats=repeats,
+        ),
+        View(
+            name="shift_x",
+            rotation_rad=0.0,
+            translation_m=(artifact.grid_pitch_m, 0.0),
+            grid=True,
+            angular=angular,
+            repeats=repeats,
+        ),
     ]
     return Plan(plan_id, artifact, tuple(v for v in views if v.grid or angular))

@@ -178,13 +178,13 @@ def _scatter(parts: list[tuple[np.ndarray, np.ndarray]]) -> Scatter | None:
         return None
     s = np.sqrt(square / dof)
     return Scatter(
-        float(weighted_reversal / weight),
-        float(1 / np.sqrt(weight)),
-        float(s[0]),
-        float(s[1]),
-        int(dof[0]),
-        int(dof[1]),
-        float(signs.mean()),
+        reversal_m=float(weighted_reversal / weight),
+        u_reversal_m=float(1 / np.sqrt(weight)),
+        s_up_m=float(s[0]),
+        s_down_m=float(s[1]),
+        dof_up=int(dof[0]),
+        dof_down=int(dof[1]),
+        mean_sign=float(signs.mean()),
     )
 
 

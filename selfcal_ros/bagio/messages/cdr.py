@@ -140,7 +140,14 @@ def layout_of(fields: Sequence[Field], data: bytes) -> Layout | None:
         walk.fields(fields, "")
     except (struct.error, ValueError):
         return None
-    return Layout(len(data), walk.at, walk.values, walk.texts, bytes(walk.fixed), data)
+    return Layout(
+        length=len(data),
+        end=walk.at,
+        values=walk.values,
+        texts=walk.texts,
+        fixed=bytes(walk.fixed),
+        example=data,
+    )
 
 
 class _Walk:

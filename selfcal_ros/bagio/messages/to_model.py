@@ -81,17 +81,17 @@ def _floats(values: Any) -> list[float]:
 def detection(message: Any) -> Detection:
     """Return the detection in a selfcal_msgs/MarkDetection."""
     return Detection(
-        stamp_ns(message),
-        int(message.kind),
-        bool(message.has_id),
-        int(message.m),
-        int(message.n),
-        int(message.k),
-        float(message.offset_x),
-        float(message.offset_y),
-        float(message.offset_theta),
-        float(message.sigma),
-        float(message.score),
+        stamp_ns=stamp_ns(message),
+        kind=int(message.kind),
+        has_id=bool(message.has_id),
+        m=int(message.m),
+        n=int(message.n),
+        k=int(message.k),
+        offset_x=float(message.offset_x),
+        offset_y=float(message.offset_y),
+        offset_theta=float(message.offset_theta),
+        sigma=float(message.sigma),
+        score=float(message.score),
     )
 
 
@@ -116,11 +116,11 @@ def command(message: Any) -> Command:
         ) from error
     placed = phase in (Phase.PLACE, Phase.MEASURE)
     return Command(
-        stamp_ns(message),
-        phase,
-        str(message.plan_id),
-        int(message.view_index),
-        view_of(
+        stamp_ns=stamp_ns(message),
+        phase=phase,
+        plan_id=str(message.plan_id),
+        view_index=int(message.view_index),
+        view=view_of(
             message,
             repeats=max(1, int(message.repeats)),
             grid=bool(message.grid),
@@ -128,7 +128,7 @@ def command(message: Any) -> Command:
         )
         if placed
         else None,
-        artifact_of(message) if placed else None,
+        artifact=artifact_of(message) if placed else None,
         views_planned=int(getattr(message, "views_planned", 0)),
         run_id=str(getattr(message, "run_id", "")),
         model_terms=terms_of(message),
@@ -183,13 +183,13 @@ def artifact_of(message: Any) -> Artifact:
         marks_of(ids, _floats(message.mark_x), _floats(message.mark_y)) if ids else None
     )
     return Artifact(
-        int(message.grid_size),
-        float(message.grid_pitch),
-        int(message.angular_count),
-        int(getattr(message, "grid_size_y", 0)),
-        _map_grid_of(message),
-        int(getattr(message, "map_harmonics", 0)),
-        marks,
+        grid_size=int(message.grid_size),
+        grid_pitch_m=float(message.grid_pitch),
+        angular_count=int(message.angular_count),
+        grid_size_y=int(getattr(message, "grid_size_y", 0)),
+        map_grid=_map_grid_of(message),
+        harmonics=int(getattr(message, "map_harmonics", 0)),
+        marks=marks,
     )
 
 
@@ -547,13 +547,13 @@ class PositionEditor:
         mask = int.from_bytes(layout.fixed)
         self._known.appendleft(
             _Positions(
-                len(data),
-                mask,
-                int.from_bytes(data) & mask,
-                layout.texts["name"],
-                layout.texts["header.frame_id"][0],
-                Struct(f"{code[0]}{count}d"),
-                offset,
+                length=len(data),
+                mask=mask,
+                value=int.from_bytes(data) & mask,
+                names=layout.texts["name"],
+                frame_id=layout.texts["header.frame_id"][0],
+                form=Struct(f"{code[0]}{count}d"),
+                at=offset,
             )
         )
         return True

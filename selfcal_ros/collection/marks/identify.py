@@ -152,7 +152,14 @@ def identify_grid(
         (named_unknown, Reason.UNKNOWN_MARK),
     ):
         reasons[where] = reason
-    return MarkAssignment(marks, deviation, residual, reasons, rigid, fit.phi_error_rad)
+    return MarkAssignment(
+        index=marks,
+        deviation=deviation,
+        residual=residual,
+        reasons=reasons,
+        rigid=rigid,
+        phi_error_rad=fit.phi_error_rad,
+    )
 
 
 def _at_most_two(numbers: np.ndarray) -> bool:

@@ -176,7 +176,14 @@ def average(
         mean[:0] if companions is None else _means(companions, weight, inverse, total)
     )
     return Means(
-        marks, mean, count, u, pooled, dof, np.zeros(len(key), dtype=bool), more
+        key=marks,
+        mean=mean,
+        count=count,
+        u=u,
+        sigma=pooled,
+        dof=dof,
+        outlier=np.zeros(len(key), dtype=bool),
+        companions=more,
     )
 
 
@@ -402,15 +409,15 @@ def grid_visits(
         for row in approach
     )
     return GridVisits(
-        mark[order],
-        visits.mean[0, order],
-        visits.mean[1, order],
-        visits.count[order],
-        stamps_ns[first][order] + np.rint(since).astype(np.int64),
-        offset_x,
-        offset_y,
-        came_x,
-        came_y,
+        mark=mark[order],
+        dx=visits.mean[0, order],
+        dy=visits.mean[1, order],
+        count=visits.count[order],
+        stamp_ns=stamps_ns[first][order] + np.rint(since).astype(np.int64),
+        offset_x=offset_x,
+        offset_y=offset_y,
+        approach_x=came_x,
+        approach_y=came_y,
         u=visits.u[order] if len(visits.u) else visits.u,
         sigma_m=visits.sigma,
         dof=visits.dof,

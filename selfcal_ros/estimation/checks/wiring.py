@@ -355,12 +355,12 @@ def _response(
     cross = float(motion.products[i, n + j])
     r2 = min(cross**2 / (place * offset), 1.0)
     return OffsetResponse(
-        axes[j],
-        axes[i],
-        cross / place,
-        float(np.sqrt((1 - r2) * offset / place / (motion.dof - 1))),
-        offset / abs(cross),
-        _p_of(float(np.sqrt(r2)), motion.dof),
+        offset=axes[j],
+        axis=axes[i],
+        slope=cross / place,
+        u_slope=float(np.sqrt((1 - r2) * offset / place / (motion.dof - 1))),
+        most=offset / abs(cross),
+        p=_p_of(float(np.sqrt(r2)), motion.dof),
     )
 
 

@@ -470,16 +470,16 @@ def mean_of(runs: list[RunValues], removed: np.ndarray, shapes: np.ndarray) -> M
             power=power_within + shared_part + between,
         )
     return Mean(
-        weights @ values,
-        covariance,
-        power_within,
-        shared_part,
-        between,
-        float(np.sqrt(spread.mean())),
-        p,
-        weights,
-        dof,
-        tuple(
+        values=weights @ values,
+        covariance=covariance,
+        within=power_within,
+        common=shared_part,
+        between=between,
+        u_between=float(np.sqrt(spread.mean())),
+        p_between=p,
+        weights=weights,
+        dof=dof,
+        deviations=tuple(
             _deviation(i, runs, values, covariances, common, weights, q, added)
             for i in range(len(runs))
         ),
@@ -917,27 +917,29 @@ def _result(
     (gx, gy), (u_gx, u_gy) = maps["xy"], u["xy"]
     o, r = first_order(first.artifact, maps["xy"])
     emap = ErrorMap(
-        first.artifact,
-        gx,
-        gy,
-        u_gx,
-        u_gy,
-        maps["theta"][0],
-        u["theta"][0],
-        o,
-        r,
-        ThetaDatum.ZERO_MEAN,
+        artifact=first.artifact,
+        gx=gx,
+        gy=gy,
+        u_gx=u_gx,
+        u_gy=u_gy,
+        g_theta=maps["theta"][0],
+        u_g_theta=u["theta"][0],
+        nonorthogonality=o,
+        scale_difference=r,
+        datum_theta=ThetaDatum.ZERO_MEAN,
     )
     unknown = np.full(plate.shape, np.nan)
     unknowns = 2 * int(known_sites.sum())
     runs = [member.result for member in members]
     result = CalibrationResult(
-        "+".join(dict.fromkeys(run.plan_id for run in runs if run)),
-        emap,
-        ArtifactMap(unknown, unknown, np.full(plate.angular_count, np.nan)),
-        (),
-        Observability(unknowns, unknowns, 0, True),
-        Noise(
+        plan_id="+".join(dict.fromkeys(run.plan_id for run in runs if run)),
+        error_map=emap,
+        artifact_map=ArtifactMap(
+            unknown, unknown, np.full(plate.angular_count, np.nan)
+        ),
+        views=(),
+        observability=Observability(unknowns, unknowns, 0, True),
+        noise=Noise(
             np.nan,
             np.nan,
             dof_xy=dof["xy"],
@@ -1075,17 +1077,17 @@ def _budget(
             u = np.sqrt(variance)
             lines.append(
                 BudgetLine(
-                    kind,
-                    component,
-                    letter,
-                    0.0,
-                    size,
-                    KINDS[kind],
-                    rms(u),
-                    float(u.max()),
-                    dof,
-                    "readings",
-                    {"runs": len(mean.weights)},
+                    quantity=kind,
+                    component=component,
+                    kind=letter,
+                    value=0.0,
+                    u=size,
+                    unit=KINDS[kind],
+                    effect_rms=rms(u),
+                    effect_max=float(u.max()),
+                    dof=dof,
+                    source="readings",
+                    details={"runs": len(mean.weights)},
                 )
             )
         lines += [line for line in between if line.quantity == kind]

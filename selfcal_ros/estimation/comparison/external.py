@@ -71,7 +71,13 @@ def map_from_table(text: str, where: str, artifact: Artifact) -> ErrorMap:
         np.where(known_sites, values, np.nan) for values in grid.values()
     )
     return ErrorMap(
-        artifact, gx, gy, u_gx, u_gy, circle["g_theta"], circle["u_g_theta"]
+        artifact=artifact,
+        gx=gx,
+        gy=gy,
+        u_gx=u_gx,
+        u_gy=u_gy,
+        g_theta=circle["g_theta"],
+        u_g_theta=circle["u_g_theta"],
     )
 
 

@@ -156,15 +156,15 @@ def significance(values: np.ndarray, spread: ReducedNoise) -> Significance | Non
     p_z, limit = _of_largest(largest, int(varies.sum()), drawn, dof)
     of_largest = spread.variance[np.abs(values).argmax()]
     return Significance(
-        square / rank,
-        float(rank),
-        p,
-        spread.correlated,
-        largest,
-        limit,
-        p_z,
-        dof,
-        min(p, p_z) < USUAL_LEVEL / 2,
+        chi2_ratio=square / rank,
+        dof=float(rank),
+        p=p,
+        correlated=spread.correlated,
+        largest_z=largest,
+        z_limit=limit,
+        p_z=p_z,
+        noise_dof=dof,
+        significant=min(p, p_z) < USUAL_LEVEL / 2,
         u_rms=float(np.sqrt(spread.variance.mean())),
         u_largest=float(np.sqrt(of_largest)),
     )
@@ -312,17 +312,17 @@ def compare(
     )
     dx, dy = xy.values
     return MapDifference(
-        dx,
-        dy,
-        theta.values[0],
-        (float(xy.datum[0]), float(xy.datum[1])),
-        float(xy.datum[2]),
-        0.0 if keep_scale else float(xy.datum[3]),
-        float(theta.datum[0]),
-        o,
-        r,
-        xy.test,
-        theta.test,
+        dx=dx,
+        dy=dy,
+        d_theta=theta.values[0],
+        translation_m=(float(xy.datum[0]), float(xy.datum[1])),
+        rotation_rad=float(xy.datum[2]),
+        scale=0.0 if keep_scale else float(xy.datum[3]),
+        theta_rad=float(theta.datum[0]),
+        nonorthogonality=o,
+        scale_difference=r,
+        xy=xy.test,
+        theta=theta.test,
     )
 
 

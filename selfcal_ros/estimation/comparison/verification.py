@@ -343,16 +343,16 @@ def verify(
     gx, gy = np.full((2, *known_nodes.shape), np.nan)
     gx[known_nodes], gy[known_nodes] = maps.by_axis(maps.after)
     return Verification(
-        better,
-        fault,
-        theta_fault,
-        maps.remains,
-        axes,
-        maps.alike,
-        maps.remaining,
-        gx,
-        gy,
-        g_theta,
+        better=better,
+        fault=fault,
+        theta_fault=theta_fault,
+        remains=maps.remains,
+        axes=axes,
+        alike=maps.alike,
+        remaining=maps.remaining,
+        gx=gx,
+        gy=gy,
+        g_theta=g_theta,
     )
 
 
@@ -383,7 +383,16 @@ def _maps(
     free = [
         values_of_map - datum @ (datum.T @ values_of_map) for values_of_map in values
     ]
-    return _Maps(kind, known_places, free[0], free[1], covers[0], covers[1], datum, dof)
+    return _Maps(
+        kind=kind,
+        known=known_places,
+        before=free[0],
+        after=free[1],
+        cover_before=covers[0],
+        cover_after=covers[1],
+        datum=datum,
+        dof=dof,
+    )
 
 
 def _axes(

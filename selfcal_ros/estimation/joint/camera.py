@@ -205,16 +205,16 @@ def camera_of(measurements: Measurements, model: ModelFit) -> FittedCamera | Non
             break
     drawn_corrections = samples @ fit.T
     return FittedCamera(
-        powers,
-        fit @ error,
-        image,
-        cells,
-        published - error,
-        error,
-        _spread(samples - drawn_corrections[:, :1]),
-        _spread(drawn_corrections),
-        noises.image,
-        noises.mark,
+        powers=powers,
+        coefficients=fit @ error,
+        image=image,
+        cells=cells,
+        place=published - error,
+        error=error,
+        u=_spread(samples - drawn_corrections[:, :1]),
+        u_coefficients=_spread(drawn_corrections),
+        noise_image=noises.image,
+        noise_mark=noises.mark,
     )
 
 

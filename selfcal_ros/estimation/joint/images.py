@@ -270,7 +270,12 @@ def _drawn(
     drawn = np.zeros((N_DRAWS, 2, 3))
     fitted = _fitted_terms(system, columns)
     plain = ImageNoise(
-        stops, grid.read, weight, drawn, np.zeros((N_DRAWS, 2, 3 * len(views))), fitted
+        stop=stops,
+        read=grid.read,
+        weight=weight,
+        drawn=drawn,
+        parameters=np.zeros((N_DRAWS, 2, 3 * len(views))),
+        fitted=fitted,
     )
     power = np.zeros(2)
     rng = np.random.default_rng(0)

@@ -142,13 +142,13 @@ def spread_of(equations: TermEquations, covariance: np.ndarray) -> TermSpread:
         )
     ]
     return TermSpread(
-        columns.grid,
-        on_lines,
-        fit.fields,
-        np.array(plates).T,
-        fit.parameters,
-        fit.turned,
-        covariance,
+        columns=columns.grid,
+        lines=on_lines,
+        fields=fit.fields,
+        plates=np.array(plates).T,
+        parameters=fit.parameters,
+        turned=fit.turned,
+        covariance=covariance,
     )
 
 

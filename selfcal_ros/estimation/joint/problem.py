@@ -640,18 +640,18 @@ def fit(problem: Problem, y: np.ndarray, theta: AngularPart | None = None) -> Jo
     parameters[system.phi_at] = phi * length
     a_theta = angular.plate(problem.angular.y, g_theta, phi)[0]
     return JointFit(
-        field,
-        plate,
-        residuals,
-        parameters,
-        g_theta,
-        a_theta,
-        residuals_theta,
-        misclosure,
-        xy,
-        theta.noise,
-        inverse,
-        ratio,
+        field=field,
+        plate=plate,
+        residuals=residuals,
+        parameters=parameters,
+        g_theta=g_theta,
+        a_theta=a_theta,
+        residuals_theta=residuals_theta,
+        misclosure=misclosure,
+        xy=xy,
+        theta=theta.noise,
+        inverse=inverse,
+        ratio=ratio,
     )
 
 

@@ -133,24 +133,24 @@ class Solved:
 def noise_of(xy: NoiseEstimate, theta: NoiseEstimate) -> Noise:
     """Return the noises of a result."""
     return Noise(
-        xy.sigma,
-        theta.sigma,
-        xy.repeats,
-        theta.repeats,
-        xy.residuals,
-        theta.residuals,
-        xy.dof_repeats,
-        theta.dof_repeats,
-        xy.dof_residuals,
-        theta.dof_residuals,
-        xy.declared,
-        theta.declared,
-        xy.dof,
-        theta.dof,
-        xy.k,
-        theta.k,
-        xy.p,
-        theta.p,
+        sigma_xy=xy.sigma,
+        sigma_theta=theta.sigma,
+        sigma_xy_repeats=xy.repeats,
+        sigma_theta_repeats=theta.repeats,
+        sigma_xy_residuals=xy.residuals,
+        sigma_theta_residuals=theta.residuals,
+        dof_xy_repeats=xy.dof_repeats,
+        dof_theta_repeats=theta.dof_repeats,
+        dof_xy_residuals=xy.dof_residuals,
+        dof_theta_residuals=theta.dof_residuals,
+        sigma_xy_declared=xy.declared,
+        sigma_theta_declared=theta.declared,
+        dof_xy=xy.dof,
+        dof_theta=theta.dof,
+        k_xy=xy.k,
+        k_theta=theta.k,
+        p_xy=xy.p,
+        p_theta=theta.p,
     )
 
 
@@ -571,17 +571,17 @@ def _solved(
     if problem.conditions.datum is ThetaDatum.XY_AXES and closure is not None:
         axes = misclosure_test(fitted.misclosure, closure)
     result = CalibrationResult(
-        measurements.plan_id,
-        error_map,
-        artifact_map,
-        views_of(
+        plan_id=measurements.plan_id,
+        error_map=error_map,
+        artifact_map=artifact_map,
+        views=views_of(
             measurements,
             problem,
             np.where(problem.system.known_views, fitted.parameters, np.nan),
         ),
-        observability,
-        noise_of(fitted.xy, fitted.theta),
-        measurements.all_rejected(),
+        observability=observability,
+        noise=noise_of(fitted.xy, fitted.theta),
+        rejected=measurements.all_rejected(),
         findings=findings,
         sense=str(measurements.sense),
         extra=kept_residuals(measurements, model),
@@ -780,16 +780,16 @@ def _error_map(
     u_theta = lines_turned_over(sense, u_theta, sign=1)
     return (
         ErrorMap(
-            measurements.artifact.field,
-            field.real.copy(),
-            field.imag.copy(),
-            u_x,
-            u_y,
-            g_theta,
-            u_theta,
-            o / length,
-            r / length,
-            problem.conditions.datum,
+            artifact=measurements.artifact.field,
+            gx=field.real.copy(),
+            gy=field.imag.copy(),
+            u_gx=u_x,
+            u_gy=u_y,
+            g_theta=g_theta,
+            u_g_theta=u_theta,
+            nonorthogonality=o / length,
+            scale_difference=r / length,
+            datum_theta=problem.conditions.datum,
         ),
         closure,
         kept_parts,
@@ -864,14 +864,14 @@ def _artifact_map(
                 LinesCovariance(cover, (sigma, fitted.theta.sigma)).of_plate()
             )
     return ArtifactMap(
-        plate.real.copy(),
-        plate.imag.copy(),
-        np.where(system.known_plate_lines, fitted.a_theta, np.nan),
-        scale / length,
-        u,
-        u_x,
-        u_y,
-        u_theta,
+        ax=plate.real.copy(),
+        ay=plate.imag.copy(),
+        a_theta=np.where(system.known_plate_lines, fitted.a_theta, np.nan),
+        magnification=scale / length,
+        u_magnification=u,
+        u_ax=u_x,
+        u_ay=u_y,
+        u_a_theta=u_theta,
     )
 
 

@@ -181,13 +181,13 @@ class PlannedTerms:
         rms, largest = self._effect(name, size)
         kinds = {term.name: "free" if term.free else "sized" for term in self.model}
         return TermCheck(
-            name,
-            kinds.get(name, ""),
-            self._unseen_modes(name),
-            size,
-            rms,
-            largest,
-            self._power(name, size, level),
+            name=name,
+            model=kinds.get(name, ""),
+            unseen_modes=self._unseen_modes(name),
+            size=size,
+            effect_rms_m=rms,
+            effect_max_m=largest,
+            power=self._power(name, size, level),
         )
 
     @one_thread()
@@ -503,16 +503,16 @@ def _line(
     source: str,
 ) -> BudgetLine:
     return BudgetLine(
-        quantity,
-        component,
-        "A" if component == NOISE else "B",
-        float("nan"),
-        u,
-        unit,
-        float(np.sqrt(variance.mean())),
-        float(np.sqrt(variance.max())),
-        np.inf,
-        source,
+        quantity=quantity,
+        component=component,
+        kind="A" if component == NOISE else "B",
+        value=float("nan"),
+        u=u,
+        unit=unit,
+        effect_rms=float(np.sqrt(variance.mean())),
+        effect_max=float(np.sqrt(variance.max())),
+        dof=np.inf,
+        source=source,
     )
 
 

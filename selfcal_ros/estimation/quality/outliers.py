@@ -519,12 +519,12 @@ def clean(measurements: Measurements, options: Options) -> OutlierScreening:
         (np.isnan(residuals.marks.squares) & (residuals.marks.weight > 0)).sum()
     )
     return OutlierScreening(
-        without(screened.measurements, outliers, mark=True),
-        removed,
-        screened.slips,
-        noisy,
-        unchecked,
-        tuple(findings),
+        measurements=without(screened.measurements, outliers, mark=True),
+        removed=removed,
+        slips=screened.slips,
+        noisy=noisy,
+        unchecked=unchecked,
+        findings=tuple(findings),
     )
 
 
@@ -695,12 +695,12 @@ def _worst(residuals: Residuals, measurements: Measurements) -> dict[Key, Remove
             index = of_views.index[at[0]]
             mark = problem.system.grid.views.mark_at(*at[1:]) if grid else at[1:]
             outliers[index, readings.kind, mark] = Removed(
-                measurements.views[index].view.name,
-                readings.kind,
-                mark,
-                float(np.sqrt(ratio[at])),
-                float(1 - readings.redundancy[at]),
-                float(abs(readings.residual[at])),
+                view=measurements.views[index].view.name,
+                kind=readings.kind,
+                mark=mark,
+                standardised=float(np.sqrt(ratio[at])),
+                leverage=float(1 - readings.redundancy[at]),
+                residual=float(abs(readings.residual[at])),
             )
     return outliers
 

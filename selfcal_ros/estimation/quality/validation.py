@@ -511,16 +511,16 @@ def _held_out(
         solved, predicted, predictable=predictable, error=error
     )
     return HeldOut(
-        "",
-        0,
-        coordinates.shape[1],
-        len(lines_off),
-        rms(coordinates) if coordinates.size else NOTHING,
-        float(abs(coordinates).max()) if coordinates.size else NOTHING,
-        rms(lines_off) if lines_off.size else NOTHING,
-        ratio,
-        why,
-        limit,
+        view="",
+        tenth=0,
+        n_grid=coordinates.shape[1],
+        n_angular=len(lines_off),
+        rms_m=rms(coordinates) if coordinates.size else NOTHING,
+        max_m=float(abs(coordinates).max()) if coordinates.size else NOTHING,
+        rms_rad=rms(lines_off) if lines_off.size else NOTHING,
+        ratio=ratio,
+        why=why,
+        limit=limit,
     )
 
 

@@ -243,14 +243,14 @@ def map_change(new: NewMap, artifact: Artifact, plate: KnownPlate) -> Change:
     out[:, common] = in_datum, np.sqrt(np.maximum(tests.variance, 0.0))
     changes, u = out.reshape(2, 2, *artifact.shape)
     return Change(
-        changes,
-        u,
-        test,
-        1.0 if test is None else tests.p(in_datum),
-        scale,
-        u_scale,
-        2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
-        None if test is None else tests,
+        values=changes,
+        u=u,
+        test=test,
+        p=1.0 if test is None else tests.p(in_datum),
+        scale=scale,
+        u_scale=u_scale,
+        p_scale=2 * float(stdtr(min(dof, MANY_DOF), -abs(scale) / u_scale)),
+        tests=None if test is None else tests,
     )
 
 
@@ -445,13 +445,13 @@ def recheck_found(
     )
     (dx, dy), (u_dx, u_dy) = change.values, change.u
     outcome = Recheck(
-        plate.where,
-        _calibration(plate.result),
-        p < USUAL_LEVEL,
-        p,
-        largest,
-        rms(change.values),
-        rms(change.u),
+        of=plate.where,
+        calibration=_calibration(plate.result),
+        changed=p < USUAL_LEVEL,
+        p=p,
+        largest=largest,
+        rms=rms(change.values),
+        u_rms=rms(change.u),
         p_xy=change.p,
         significance_xy=change.test,
         scale=scale,
@@ -483,10 +483,10 @@ def recheck_found(
 def _calibration(result: CalibrationResult) -> PlateCalibration:
     provenance = result.provenance
     return PlateCalibration(
-        result.plan_id,
-        result.run_id,
-        provenance.created,
-        dict(result.input),
-        provenance.first_exposure or None,
-        provenance.last_exposure or None,
+        plan_id=result.plan_id,
+        run_id=result.run_id,
+        created=provenance.created,
+        readings=dict(result.input),
+        first_exposure=provenance.first_exposure or None,
+        last_exposure=provenance.last_exposure or None,
     )

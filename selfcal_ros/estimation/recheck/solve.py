@@ -178,7 +178,16 @@ class Rechecked:
         )
         o, r = first_order(artifact, np.stack([gx, gy]))
         return ErrorMap(
-            artifact, gx, gy, u_x, u_y, theta, u_theta, o, r, ThetaDatum.ZERO_MEAN
+            artifact=artifact,
+            gx=gx,
+            gy=gy,
+            u_gx=u_x,
+            u_gy=u_y,
+            g_theta=theta,
+            u_g_theta=u_theta,
+            nonorthogonality=o,
+            scale_difference=r,
+            datum_theta=ThetaDatum.ZERO_MEAN,
         )
 
 
@@ -215,15 +224,15 @@ def recheck_of(
     )
     solution = solve_marks(readings)
     return Rechecked(
-        measurements,
-        plate,
-        readings,
-        solution,
-        map_of_marks(readings, solution, xy.dof),
-        _new_lines(readings, plate, theta),
-        xy,
-        theta,
-        microscope,
+        measurements=measurements,
+        plate=plate,
+        readings=readings,
+        solution=solution,
+        new=map_of_marks(readings, solution, xy.dof),
+        lines=_new_lines(readings, plate, theta),
+        xy=xy,
+        theta=theta,
+        microscope=microscope,
     )
 
 
@@ -278,13 +287,15 @@ def recheck(
         for term in problem.terms
     )
     result = CalibrationResult(
-        measurements.plan_id,
-        solved.error_map(),
-        plate.result.artifact_map,
-        views_of(measurements, problem, solved.solution.parameters),
-        Observability(unknowns, unknowns, 0, True),
-        _with_coverage(noise_of(solved.xy, solved.theta), solved.variances, plate),
-        measurements.all_rejected(),
+        plan_id=measurements.plan_id,
+        error_map=solved.error_map(),
+        artifact_map=plate.result.artifact_map,
+        views=views_of(measurements, problem, solved.solution.parameters),
+        observability=Observability(unknowns, unknowns, 0, True),
+        noise=_with_coverage(
+            noise_of(solved.xy, solved.theta), solved.variances, plate
+        ),
+        rejected=measurements.all_rejected(),
         findings=(
             *(() if failed else (*changes, *_scale_changes(outcome), *_off(solved))),
             *views_findings(measurements),
@@ -832,17 +843,17 @@ def _budget(
         if name == NOISE:
             details = {"by": by, "contradicted": False}
         yield BudgetLine(
-            "xy",
-            name,
-            kind,
-            0.0,
-            u,
-            unit,
-            rms(u_map),
-            float(u_map.max()),
-            dof,
-            source,
-            details,
+            quantity="xy",
+            component=name,
+            kind=kind,
+            value=0.0,
+            u=u,
+            unit=unit,
+            effect_rms=rms(u_map),
+            effect_max=float(u_map.max()),
+            dof=dof,
+            source=source,
+            details=details,
         )
     yield from (
         line

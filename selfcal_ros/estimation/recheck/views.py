@@ -356,12 +356,12 @@ def _map_of(
     fields = np.real(rows.conj().T @ fields)
     of_effects = fields @ remaining
     return NewMap(
-        known_values,
-        np.real(rows.conj().T @ field),
-        covariance + of_effects @ effects.covariance @ (fields - of_effects).T,
-        of_effects,
-        effects,
-        dof,
+        known=known_values,
+        values=np.real(rows.conj().T @ field),
+        white=covariance + of_effects @ effects.covariance @ (fields - of_effects).T,
+        of_effects=of_effects,
+        effects=effects,
+        dof=dof,
     )
 
 
@@ -426,7 +426,12 @@ def map_of_lines(
     if not known_lines.any():
         nothing = np.zeros((0, len(effects.mean)))
         return NewMap(
-            known_lines, np.zeros(0), np.zeros((0, 0)), nothing, effects, noise.dof
+            known=known_lines,
+            values=np.zeros(0),
+            white=np.zeros((0, 0)),
+            of_effects=nothing,
+            effects=effects,
+            dof=noise.dof,
         )
     inverse = pseudo_inverse(spectrum[0], spectrum[1], scale)
     fields, _, remaining = effects.projected(

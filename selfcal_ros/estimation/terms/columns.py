@@ -160,12 +160,12 @@ def shapes_of(
             )
         )
     return Shapes(
-        len(means),
-        weight.shape[1:],
-        tuple(rows),
-        tuple(values),
-        np.array(of_column, dtype=int),
-        np.array(unit, dtype=complex),
+        n=len(means),
+        lattice=weight.shape[1:],
+        rows=tuple(rows),
+        values=tuple(values),
+        of_column=np.array(of_column, dtype=int),
+        unit=np.array(unit, dtype=complex),
     )
 
 

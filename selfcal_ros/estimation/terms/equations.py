@@ -845,7 +845,16 @@ def _coefficients_test(
     values, information, of_size = _estimates_if_free(equations, right, rows, sigma)
     rank = len(values)
     if not rank:
-        return SizeTest(term.name, term.size, term.size, term.size, 0.0, 0, 1.0, 1.0)
+        return SizeTest(
+            name=term.name,
+            given=term.size,
+            shown=term.size,
+            allowed=term.size,
+            statistic=0.0,
+            rank=0,
+            p_together=1.0,
+            p=1.0,
+        )
     root = np.sqrt(information)
     # in independent combinations
     of_unit, turn = np.linalg.eigh(root[:, None] * of_size * root)
@@ -861,14 +870,14 @@ def _coefficients_test(
     p = float(fdtrc(rank, min(dof, MANY_DOF), of_given / rank))
     doubt = DOUBT_LEVEL_OF_FEW if rank <= 2 else DOUBT_LEVEL
     test = SizeTest(
-        term.name,
-        term.size,
-        term.size,
-        term.size,
-        of_given,
-        rank,
-        p,
-        min(1.0, among * p),
+        name=term.name,
+        given=term.size,
+        shown=term.size,
+        allowed=term.size,
+        statistic=of_given,
+        rank=rank,
+        p_together=p,
+        p=min(1.0, among * p),
         doubt=doubt,
     )
     if not test.raised:

@@ -244,11 +244,11 @@ def places_of(
     if not np.abs(away[located]).max(initial=0.0) > AT_SITES * pitch_m:
         return None
     return StagePlaces(
-        views,
-        pitch_m,
-        known_sites,
-        np.nonzero(located),
-        away[located],
-        tuple(marks),
-        tuple(about),
+        views=views,
+        pitch_m=pitch_m,
+        known=known_sites,
+        at=np.nonzero(located),
+        away_m=away[located],
+        marks=tuple(marks),
+        about_m=tuple(about),
     )

@@ -205,15 +205,15 @@ def _visits(
     # the sense of measurement does not matter: the stage's motion and its part of a reading
     # both change sign
     return GridVisits(
-        np.searchsorted(artifact.flat(readings.m, readings.n), mark),
-        np.zeros(n),
-        np.zeros(n),
-        sequence.count,
-        np.rint(2 * sequence.time).astype(int),
-        offset.real,
-        offset.imag,
-        approach_signs((sites + aside).real),
-        approach_signs((sites + aside).imag),
+        mark=np.searchsorted(artifact.flat(readings.m, readings.n), mark),
+        dx=np.zeros(n),
+        dy=np.zeros(n),
+        count=sequence.count,
+        stamp_ns=np.rint(2 * sequence.time).astype(int),
+        offset_x=offset.real,
+        offset_y=offset.imag,
+        approach_x=approach_signs((sites + aside).real),
+        approach_y=approach_signs((sites + aside).imag),
     )
 
 

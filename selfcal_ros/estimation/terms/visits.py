@@ -135,14 +135,14 @@ def _visits_of(
     weight = visit_weight / total[mark] * grid.weight[row].reshape(-1)[mark]
     phase = grid.poses[row].phase.conjugate()
     return ViewVisits(
-        mark,
-        weight,
-        (visits.dx + 1j * visits.dy) * phase,
-        view_time(visits.stamp_ns, *ends),
-        visits.offset_x + 1j * visits.offset_y,
-        visits.approach_x.astype(float),
-        visits.approach_y.astype(float),
-        phase,
+        mark=mark,
+        weight=weight,
+        y=(visits.dx + 1j * visits.dy) * phase,
+        time=view_time(visits.stamp_ns, *ends),
+        offset=visits.offset_x + 1j * visits.offset_y,
+        approach_x=visits.approach_x.astype(float),
+        approach_y=visits.approach_y.astype(float),
+        phase=phase,
     )
 
 
@@ -412,22 +412,22 @@ def term_inputs(
         for row, view in enumerate(readings)
     )
     return TermInputs(
-        z,
-        half_width_m,
-        grid.weight,
-        visits,
-        tuple(view.name for view in views),
-        measurements.sense,
-        tuple(view.view.name for view in lines),
-        measurements.artifact.angular_count,
-        _line_offsets_of(lines, measurements.artifact.angular_count),
-        shared if len(shared) > 1 else (),
-        placings,
-        tuple(view.plan_view for view in views),
-        np.array([view.cell_m for view in views]),
-        measurements.artifact.field,
-        drift_degree,
-        tuple(view.pose for view in views),
+        z=z,
+        half_width_m=half_width_m,
+        weight=grid.weight,
+        visits=visits,
+        names=tuple(view.name for view in views),
+        sense=measurements.sense,
+        line_names=tuple(view.view.name for view in lines),
+        n_lines=measurements.artifact.angular_count,
+        line_offsets=_line_offsets_of(lines, measurements.artifact.angular_count),
+        with_lines=shared if len(shared) > 1 else (),
+        placings=placings,
+        placing_names=tuple(view.plan_view for view in views),
+        cells_m=np.array([view.cell_m for view in views]),
+        stage=measurements.artifact.field,
+        drift_degree=drift_degree,
+        poses=tuple(view.pose for view in views),
     )
 
 

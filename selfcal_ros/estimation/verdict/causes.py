@@ -391,13 +391,13 @@ class Candidates:
             gram @ values - 2 * self.right.between[chosen]
         )
         return Explained(
-            chosen,
-            inverse,
-            int(determined.sum()),
-            values,
-            float(right @ values),
-            float(between),
-            sums.dof_between - float((inverse * gram).sum()),
+            columns=chosen,
+            inverse=inverse,
+            rank=int(determined.sum()),
+            values=values,
+            explained=float(right @ values),
+            between=float(between),
+            dof_between=sums.dof_between - float((inverse * gram).sum()),
         )
 
     @cached_property
@@ -604,7 +604,14 @@ def find_explanations(
     excess = noise_excess(problem, model.fitted.residuals)
     common = excess * model.fitted.xy.residuals**2 if problem.images else 0.0
     return select_explanations(
-        Candidates(equations, right_side, prior, coefficients, excess, common),
+        Candidates(
+            equations=equations,
+            right=right_side,
+            prior=prior,
+            coefficients=coefficients,
+            excess=excess,
+            common=common,
+        ),
         groups,
         columns.rows(own_terms),
     )
@@ -736,15 +743,15 @@ def _explanation(
     coefficients[group.rows] = fitted.values[of_group]
     columns = tuple(compress(pool.equations.columns.columns, group.rows))
     return Explanation(
-        group.name,
-        columns,
-        fitted.values[of_group],
-        variance * fitted.inverse[np.ix_(of_group, of_group)],
-        p,
-        pool.explain(group.rows).rank == int(group.rows.sum()),
-        0.0,
-        group.share_before,
-        group.mark,
+        name=group.name,
+        columns=columns,
+        values=fitted.values[of_group],
+        covariance=variance * fitted.inverse[np.ix_(of_group, of_group)],
+        p=p,
+        determined=pool.explain(group.rows).rank == int(group.rows.sum()),
+        effect_m=0.0,
+        share_before=group.share_before,
+        mark=group.mark,
     ).with_effect(pool.equations, coefficients)
 
 
@@ -805,7 +812,13 @@ def fitted_term(
     covariance = model.covariance[np.ix_(rows, rows)] * model.fitted.xy.sigma**2
     columns = tuple(compress(equations.columns.columns, rows))
     explanation = Explanation(
-        str(name), columns, model.coefficients[rows], covariance, p, determined, 0.0
+        name=str(name),
+        columns=columns,
+        values=model.coefficients[rows],
+        covariance=covariance,
+        p=p,
+        determined=determined,
+        effect_m=0.0,
     )
     return explanation.with_effect(equations, np.where(rows, model.coefficients, 0.0))
 

@@ -639,7 +639,14 @@ def provenance_of(measurements: Measurements, options: Options) -> Provenance:
     if first < FIRST_DATE_NS:
         return Provenance(version=__version__, extra=extra)
     duration_s = (last - first) / NS_PER_S
-    return Provenance("", duration_s, __version__, extra, _iso(first), _iso(last))
+    return Provenance(
+        created="",
+        duration_s=duration_s,
+        version=__version__,
+        extra=extra,
+        first_exposure=_iso(first),
+        last_exposure=_iso(last),
+    )
 
 
 def _iso(stamp_ns: int) -> str:

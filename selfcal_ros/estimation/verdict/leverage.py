@@ -114,24 +114,24 @@ def marks_alone(system: NormalEquations, y: np.ndarray, *, exact: bool) -> FitOf
         else (drawn_redundancy(system), np.zeros(y.shape))
     )
     return FitOfKind(
-        "grid",
-        grid_residuals(system, y),
-        system.grid.weight,
-        redundancy,
-        2 * system.grid.n_readings - system.rank_grid,
-        skew,
+        kind="grid",
+        residual=grid_residuals(system, y),
+        weight=system.grid.weight,
+        redundancy=redundancy,
+        dof=2 * system.grid.n_readings - system.rank_grid,
+        skew=skew,
     )
 
 
 def lines_alone(system: NormalEquations, y: np.ndarray) -> FitOfKind:
     """Return the readings of lines y, (views, K), rad, fitted by themselves."""
     return FitOfKind(
-        "angular",
-        angular_residuals(system, y),
-        system.angular.weight,
-        angular_redundancy(system),
-        system.angular.n_readings - system.rank_angular,
-        np.zeros(y.shape),
+        kind="angular",
+        residual=angular_residuals(system, y),
+        weight=system.angular.weight,
+        redundancy=angular_redundancy(system),
+        dof=system.angular.n_readings - system.rank_angular,
+        skew=np.zeros(y.shape),
     )
 
 

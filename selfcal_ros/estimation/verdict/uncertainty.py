@@ -387,7 +387,16 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
     unit = "m" if kind == "xy" else "rad"
     if not (np.isfinite(sigma) and sigma > 0):
         return BudgetLine(
-            kind, "reading noise", "A", 0.0, 0.0, unit, 0.0, 0.0, np.inf, "readings"
+            quantity=kind,
+            component="reading noise",
+            kind="A",
+            value=0.0,
+            u=0.0,
+            unit=unit,
+            effect_rms=0.0,
+            effect_max=0.0,
+            dof=np.inf,
+            source="readings",
         )
     dof = _dof(noise, kind)
     by = (
@@ -400,17 +409,17 @@ def _noise_line(kind: str, u: np.ndarray, noise: Noise) -> BudgetLine:
         else "together"
     )
     return BudgetLine(
-        kind,
-        "reading noise",
-        "B" if by == "declared" else "A",
-        0.0,
-        sigma,
-        unit,
-        rms(u),
-        float(np.nanmax(u)),
-        dof,
-        "declared" if by == "declared" else "readings",
-        {"by": by, "contradicted": bool(p < F_LEVEL)},
+        quantity=kind,
+        component="reading noise",
+        kind="B" if by == "declared" else "A",
+        value=0.0,
+        u=sigma,
+        unit=unit,
+        effect_rms=rms(u),
+        effect_max=float(np.nanmax(u)),
+        dof=dof,
+        source="declared" if by == "declared" else "readings",
+        details={"by": by, "contradicted": bool(p < F_LEVEL)},
     )
 
 
@@ -490,20 +499,29 @@ def _term_line(
 def _reference_line(u: np.ndarray, reference: ReferenceLength | None) -> BudgetLine:
     if reference is None:
         return BudgetLine(
-            "xy", "reference length", "B", 0.0, 0.0, "m/m", 0.0, 0.0, np.inf, "default"
+            quantity="xy",
+            component="reference length",
+            kind="B",
+            value=0.0,
+            u=0.0,
+            unit="m/m",
+            effect_rms=0.0,
+            effect_max=0.0,
+            dof=np.inf,
+            source="default",
         )
     return BudgetLine(
-        "xy",
-        "reference length",
-        "B",
-        reference.relative_error,
-        reference.u_relative,
-        "m/m",
-        rms(u),
-        float(u.max()),
-        np.inf,
-        "declared",
-        {"kind": str(reference.kind)},
+        quantity="xy",
+        component="reference length",
+        kind="B",
+        value=reference.relative_error,
+        u=reference.u_relative,
+        unit="m/m",
+        effect_rms=rms(u),
+        effect_max=float(u.max()),
+        dof=np.inf,
+        source="declared",
+        details={"kind": str(reference.kind)},
     )
 
 
@@ -541,14 +559,14 @@ def _interpolation_theta(result: CalibrationResult) -> BudgetLine:
 def _interpolation(quantity: str, halfway: float, largest: float) -> BudgetLine:
     u = float(np.sqrt(CELL_MEAN) * halfway)
     return BudgetLine(
-        quantity,
-        INTERPOLATION,
-        "B",
-        0.0,
-        u,
-        "m" if quantity == "xy" else "rad",
-        u,
-        largest,
-        np.inf,
-        "readings",
+        quantity=quantity,
+        component=INTERPOLATION,
+        kind="B",
+        value=0.0,
+        u=u,
+        unit="m" if quantity == "xy" else "rad",
+        effect_rms=u,
+        effect_max=largest,
+        dof=np.inf,
+        source="readings",
     )

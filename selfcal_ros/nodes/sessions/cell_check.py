@@ -441,14 +441,14 @@ class CellCheck:
         begins = phase is Phase.PLACE or not self._command.run_id
         run_id = str(stamp) if begins else self._command.run_id
         self._command = Command(
-            stamp,
-            phase,
-            PLAN_ID,
-            0,
-            view,
-            None if view is None else self.plate,
-            1,
-            run_id,
+            stamp_ns=stamp,
+            phase=phase,
+            plan_id=PLAN_ID,
+            view_index=0,
+            view=view,
+            artifact=None if view is None else self.plate,
+            views_planned=1,
+            run_id=run_id,
         )
         self._publish(self._command)
         return self._command

@@ -162,24 +162,24 @@ def pure_noise(marks: int) -> Measurements:
         once = np.ones(len(m), dtype=int)
         mark = np.arange(len(m))
         visits = GridVisits(
-            mark,
-            dx,
-            dy,
-            once,
-            (1000 * number + mark) * NS_PER_S,
-            offset_x,
-            offset_y,
-            once,
-            once,
+            mark=mark,
+            dx=dx,
+            dy=dy,
+            count=once,
+            stamp_ns=(1000 * number + mark) * NS_PER_S,
+            offset_x=offset_x,
+            offset_y=offset_y,
+            approach_x=once,
+            approach_y=once,
         )
         views.append(
             ViewReadings(
-                view,
-                m,
-                n,
-                dx,
-                dy,
-                once,
+                view=view,
+                m=m,
+                n=n,
+                dx=dx,
+                dy=dy,
+                count=once,
                 k=lines,
                 dtheta=rng.normal(0.0, 1e-6, len(lines)),
                 count_theta=np.ones(len(lines), dtype=int),
@@ -435,12 +435,12 @@ class SolvingSession:
             self._take_none(outcome)
             return
         self.shown = Shown(
-            outcome.result,
-            outcome.problem,
-            job.run,
-            job.views_done,
-            job.stamp_ns,
-            job.digest,
+            result=outcome.result,
+            problem=outcome.problem,
+            run=job.run,
+            views_done=job.views_done,
+            stamp_ns=job.stamp_ns,
+            digest=job.digest,
         )
         self._saved = ""
         self._publish(outcome.result)
@@ -451,7 +451,12 @@ class SolvingSession:
         """Show why there is no result; raise it unless remaining views may change this."""
         job = outcome.job
         self.shown = Shown(
-            None, outcome.problem, job.run, job.views_done, job.stamp_ns, job.digest
+            result=None,
+            problem=outcome.problem,
+            run=job.run,
+            views_done=job.views_done,
+            stamp_ns=job.stamp_ns,
+            digest=job.digest,
         )
         self._publish_summary()
         if not self._unfinished():

@@ -265,7 +265,17 @@ class Drawing:
         turned: bool = False,
     ) -> None:
         """Write text with its baseline at (x, y)."""
-        self.items.append(Label((x, y), text, size, anchor, colour, bold, turned))
+        self.items.append(
+            Label(
+                at=(x, y),
+                text=text,
+                size=size,
+                anchor=anchor,
+                colour=colour,
+                bold=bold,
+                turned=turned,
+            )
+        )
 
     def spot(self, x: float, y: float, radius: float, title: str) -> None:
         """Add a tooltip."""
